@@ -1,0 +1,2 @@
+//! Shows any artifact.
+fn main() {}

@@ -1,0 +1,1 @@
+//! What the executables share towards their user.

@@ -1,0 +1,2 @@
+//! Linear and display images, their files, and what is computed on them.
+pub mod raster;

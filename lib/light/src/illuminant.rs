@@ -1,0 +1,26 @@
+//! What the renderer asks of any distant light.
+use glam::{Vec2, Vec3};
+
+/// A direction drawn in proportion to the light, with its radiance and density.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LightSample {
+    /// Unit vector towards the light, world space.
+    pub direction: Vec3,
+    /// Radiance arriving from `direction`, linear Rec.709.
+    pub radiance: Vec3,
+    /// Density per steradian with which `direction` was drawn; 0 means "no sample" (a black light).
+    pub pdf: f32,
+}
+
+/// Light that arrives from infinitely far away.
+///
+/// `sample` and `pdf` describe one density over the unit sphere: it integrates to 1
+/// (or is 0 everywhere for a black light) and is positive wherever `eval` is.
+pub trait Illuminant: Sync {
+    /// Radiance arriving from the unit vector `direction`.
+    fn eval(&self, direction: Vec3) -> Vec3;
+    /// Draws a direction from two uniform numbers in `[0, 1)`.
+    fn sample(&self, u: Vec2) -> LightSample;
+    /// Density per steradian of `sample` at the unit vector `direction`.
+    fn pdf(&self, direction: Vec3) -> f32;
+}

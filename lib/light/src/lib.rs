@@ -1,0 +1,2 @@
+//! Light from far away: spherical Gaussians and environment maps.
+pub mod illuminant;

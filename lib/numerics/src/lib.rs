@@ -1,0 +1,9 @@
+//! Numbers that behave: guarded functions, counter-based random numbers and
+//! low-discrepancy samples, warps, deterministic reductions, statistics.
+pub mod gradcheck;
+pub mod guarded;
+pub mod hashing;
+pub mod sampler;
+pub mod stats;
+pub mod sum;
+pub mod warp;

@@ -1,0 +1,1 @@
+//! Configuration, artifacts and stages, whatever the stages compute.

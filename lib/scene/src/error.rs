@@ -1,0 +1,153 @@
+//! What can go wrong between a `[scene]` table and a scene.
+use std::path::PathBuf;
+
+/// Every message names the offending key, file or element, the accepted form, and one remedy.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A key of the `[scene]` table holds a value that makes no sense.
+    #[error("{key} is {value}; accepted: {accepted}")]
+    Config {
+        /// Dotted path of the key, `scene.camera.fov_deg`.
+        key: String,
+        /// The value as written.
+        value: String,
+        /// The accepted form, with an example.
+        accepted: String,
+    },
+    /// A key of the `[scene]` table is missing.
+    #[error("{key} is missing; {remedy}")]
+    Missing {
+        /// Dotted path of the key.
+        key: String,
+        /// What to write.
+        remedy: String,
+    },
+    /// Two keys exclude each other.
+    #[error("{first} and {second} cannot both be given; keep one of them")]
+    Conflict {
+        /// Dotted path of the one key.
+        first: String,
+        /// Dotted path of the other key.
+        second: String,
+    },
+    /// A file cannot be read.
+    #[error("cannot read {role} \"{path}\": {source}", path = path.display())]
+    Read {
+        /// What the file was wanted for.
+        role: String,
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+    /// A file cannot be written.
+    #[error("cannot write \"{path}\": {source}", path = path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+    /// Something is wrong inside a file.
+    #[error("\"{path}\": {source}", path = path.display())]
+    InFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong there.
+        source: Box<Error>,
+    },
+    /// An image cannot be decoded.
+    #[error("image {name}: {detail}")]
+    Image {
+        /// File or name of the image.
+        name: String,
+        /// What the decoder says.
+        detail: String,
+    },
+    /// The file is not of the kind that its extension or header promises.
+    #[error("{detail}; {remedy}")]
+    Malformed {
+        /// What is wrong and where.
+        detail: String,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// The file needs an extension that cannot be ignored.
+    #[error("the file requires the glTF extension {extension}, which is not supported; {remedy}")]
+    UnsupportedExtension {
+        /// Name of the extension.
+        extension: String,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// A reference points past the end of what it refers to.
+    #[error("{place} is {index}, but the file has {count} {things}; export the file again")]
+    Dangling {
+        /// Where the reference stands, `nodes[3].mesh`.
+        place: String,
+        /// The reference.
+        index: u64,
+        /// How many there are.
+        count: u64,
+        /// Of what, in the plural.
+        things: &'static str,
+    },
+    /// A value is NaN or infinite.
+    #[error(
+        "{place}, element {element} is ({value}), which is not finite; repair the mesh and export it again"
+    )]
+    NotFinite {
+        /// Which attribute.
+        place: String,
+        /// Index of the vertex.
+        element: u64,
+        /// The value.
+        value: String,
+    },
+    /// The file would need more memory than allowed.
+    #[error("{what}: more than the limit of {limit}; simplify the object")]
+    TooLarge {
+        /// What is too large and how large.
+        what: String,
+        /// The limit.
+        limit: u64,
+    },
+    /// There is nothing to render in the file.
+    #[error("the file holds no triangles; {remedy}")]
+    Empty {
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// An input is not what it was when the scene description was written.
+    #[error(
+        "{role} \"{path}\" changed since the scene was set up: its BLAKE3 hash is {found}, the scene description has {expected}; run dipir-scene again",
+        path = path.display()
+    )]
+    Changed {
+        /// What the file was wanted for.
+        role: String,
+        /// The file.
+        path: PathBuf,
+        /// The hash now.
+        found: String,
+        /// The hash then.
+        expected: String,
+    },
+}
+
+impl Error {
+    /// Says in which file this went wrong.
+    pub fn in_file(self, path: impl Into<PathBuf>) -> Self {
+        Self::InFile {
+            path: path.into(),
+            source: Box::new(self),
+        }
+    }
+
+    pub(crate) fn malformed(detail: impl Into<String>, remedy: &'static str) -> Self {
+        Self::Malformed {
+            detail: detail.into(),
+            remedy,
+        }
+    }
+}

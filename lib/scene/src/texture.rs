@@ -1,0 +1,240 @@
+//! Textures: kept as their source file holds them, decoded only for the effects that need them.
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use dipir_imaging::raster::Raster;
+use dipir_imaging::transfer::Transfer;
+use glam::{Vec2, Vec4};
+
+use crate::error::Error;
+
+/// What happens to texture coordinates outside `[0, 1)`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Wrap {
+    /// The image is tiled.
+    #[default]
+    Repeat,
+    /// The image is tiled, every other tile mirrored.
+    MirroredRepeat,
+    /// The outermost texels extend for ever.
+    ClampToEdge,
+}
+
+impl Wrap {
+    /// The texel inside `0..size` that stands for texel `i`.
+    fn texel(self, i: i64, size: usize) -> usize {
+        let n = size as i64;
+        let wrapped = match self {
+            Self::Repeat => i.rem_euclid(n),
+            Self::MirroredRepeat => {
+                let k = i.rem_euclid(2 * n);
+                k.min(2 * n - 1 - k)
+            }
+            Self::ClampToEdge => i.clamp(0, n - 1),
+        };
+        wrapped as usize
+    }
+}
+
+/// How a value between texel centres is formed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Filter {
+    /// The texel that contains the position.
+    Nearest,
+    /// Bilinear interpolation of the four nearest texels, in linear light.
+    #[default]
+    Linear,
+}
+
+/// How the colour channels are encoded; alpha is always linear.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Encoding {
+    /// sRGB curve: base colour and emission.
+    Srgb,
+    /// Plain numbers: normals, roughness, metalness and weights.
+    Linear,
+}
+
+/// An image as a file holds it, encoded.
+#[derive(Clone, Debug)]
+pub enum ImageSource {
+    /// A PNG or JPEG file, read when it is decoded.
+    File(PathBuf),
+    /// The bytes of a PNG or JPEG file that is embedded in another.
+    Bytes {
+        /// What to call the image in messages.
+        name: String,
+        /// The encoded file.
+        bytes: Arc<[u8]>,
+    },
+}
+
+impl ImageSource {
+    /// What to call the image in messages.
+    pub fn name(&self) -> String {
+        match self {
+            Self::File(path) => format!("\"{}\"", path.display()),
+            Self::Bytes { name, .. } => name.clone(),
+        }
+    }
+
+    /// Whether both are the same file or share the same bytes.
+    pub fn is_same(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::File(a), Self::File(b)) => a == b,
+            (Self::Bytes { bytes: a, .. }, Self::Bytes { bytes: b, .. }) => Arc::ptr_eq(a, b),
+            _ => false,
+        }
+    }
+
+    fn decode(&self) -> Result<Raster<[u8; 4]>, Error> {
+        let decode = |bytes: &[u8]| {
+            dipir_imaging::file::decode_texture(bytes).map_err(|e| Error::Image {
+                name: self.name(),
+                detail: e.to_string(),
+            })
+        };
+        match self {
+            Self::File(path) => decode(&read(path, "the texture")?),
+            Self::Bytes { bytes, .. } => decode(bytes),
+        }
+    }
+}
+
+fn read(path: &Path, role: &str) -> Result<Vec<u8>, Error> {
+    std::fs::read(path).map_err(|source| Error::Read {
+        role: role.into(),
+        path: path.into(),
+        source,
+    })
+}
+
+/// A texture as the source file holds it: the encoded image and how to look it up.
+#[derive(Clone, Debug)]
+pub struct Texture {
+    /// The image.
+    pub image: ImageSource,
+    /// What the colour channels mean.
+    pub encoding: Encoding,
+    /// Behaviour outside `[0, 1)` along u and v.
+    pub wrap: [Wrap; 2],
+    /// Interpolation.
+    pub filter: Filter,
+}
+
+impl Texture {
+    /// Reads and decodes the image. Fails on anything but a readable PNG or JPEG.
+    pub fn decode(&self) -> Result<DecodedTexture, Error> {
+        Ok(self.with_texels(Arc::new(self.image.decode()?)))
+    }
+
+    /// Looks `texels` up the way this texture says.
+    pub fn with_texels(&self, texels: Arc<Raster<[u8; 4]>>) -> DecodedTexture {
+        let linear = |transfer: Transfer| {
+            std::array::from_fn(|i| transfer.decode_value(i as f32 / 255.0))
+        };
+        DecodedTexture {
+            texels,
+            color_linear: Box::new(match self.encoding {
+                Encoding::Srgb => linear(Transfer::Srgb),
+                Encoding::Linear => linear(Transfer::Linear),
+            }),
+            wrap: self.wrap,
+            filter: self.filter,
+        }
+    }
+}
+
+/// Decodes the textures for which `wanted(index)` holds; an image that several of them share is
+/// decoded and stored once.
+pub fn decode_textures(
+    textures: &[Texture],
+    wanted: impl Fn(usize) -> bool,
+) -> Result<Vec<Option<DecodedTexture>>, Error> {
+    let mut decoded: Vec<Option<DecodedTexture>> = Vec::with_capacity(textures.len());
+    for (i, texture) in textures.iter().enumerate() {
+        if !wanted(i) {
+            decoded.push(None);
+            continue;
+        }
+        let shared = (0..i).find_map(|j| {
+            let earlier = decoded[j].as_ref()?;
+            textures[j]
+                .image
+                .is_same(&texture.image)
+                .then(|| earlier.texels.clone())
+        });
+        decoded.push(Some(match shared {
+            Some(texels) => texture.with_texels(texels),
+            None => texture.decode()?,
+        }));
+    }
+    Ok(decoded)
+}
+
+/// A texture that can be sampled.
+#[derive(Clone, Debug)]
+pub struct DecodedTexture {
+    texels: Arc<Raster<[u8; 4]>>,
+    /// Linear value of each byte of a colour channel.
+    color_linear: Box<[f32; 256]>,
+    wrap: [Wrap; 2],
+    filter: Filter,
+}
+
+impl DecodedTexture {
+    /// The linear RGBA value at `uv` (glTF convention: (0, 0) is the top left corner of the
+    /// image, v points down). Coordinates that are not finite read texel (0, 0).
+    pub fn sample(&self, uv: Vec2) -> Vec4 {
+        let (w, h) = (self.texels.width(), self.texels.height());
+        let uv = if uv.is_finite() { uv } else { Vec2::ZERO };
+        let x = reduce(uv.x, self.wrap[0]) * w as f32;
+        let y = reduce(uv.y, self.wrap[1]) * h as f32;
+        match self.filter {
+            Filter::Nearest => self.texel(x.floor() as i64, y.floor() as i64),
+            Filter::Linear => {
+                let (x, y) = (x - 0.5, y - 0.5);
+                let (x0, y0) = (x.floor(), y.floor());
+                let (fx, fy) = (x - x0, y - y0);
+                let (x0, y0) = (x0 as i64, y0 as i64);
+                let top = self.texel(x0, y0).lerp(self.texel(x0 + 1, y0), fx);
+                let bottom = self.texel(x0, y0 + 1).lerp(self.texel(x0 + 1, y0 + 1), fx);
+                top.lerp(bottom, fy)
+            }
+        }
+    }
+
+    /// Width and height, texels.
+    pub fn size(&self) -> [usize; 2] {
+        [self.texels.width(), self.texels.height()]
+    }
+
+    /// The texels as decoded, RGBA.
+    pub fn texels(&self) -> &Raster<[u8; 4]> {
+        &self.texels
+    }
+
+    fn texel(&self, x: i64, y: i64) -> Vec4 {
+        let [r, g, b, a] = *self.texels.get(
+            self.wrap[0].texel(x, self.texels.width()),
+            self.wrap[1].texel(y, self.texels.height()),
+        );
+        let c = &self.color_linear;
+        Vec4::new(
+            c[r as usize],
+            c[g as usize],
+            c[b as usize],
+            a as f32 / 255.0,
+        )
+    }
+}
+
+/// Brings a coordinate into the first period (or near the edge), so that the product with the
+/// image's size keeps its digits and fits an integer whatever the coordinate.
+fn reduce(u: f32, wrap: Wrap) -> f32 {
+    match wrap {
+        Wrap::Repeat => u - u.floor(),
+        Wrap::MirroredRepeat => u - 2.0 * (u * 0.5).floor(),
+        Wrap::ClampToEdge => u.clamp(-1.0, 2.0),
+    }
+}
