@@ -1,2 +1,12 @@
 //! Linear and display images, their files, and what is computed on them.
+pub mod composite;
+pub mod error;
+mod exr_file;
+pub mod file;
+mod jpeg_header;
+pub mod layers;
+pub mod metrics;
 pub mod raster;
+pub mod transfer;
+
+pub use error::ImagingError;

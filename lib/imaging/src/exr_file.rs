@@ -1,0 +1,285 @@
+//! OpenEXR files in and out, between the `exr` library and [`Layers`].
+use crate::{
+    error::{ImagingError, MAX_PIXELS},
+    layers::{Layers, Precision},
+    raster::Raster,
+};
+use exr::{
+    block::{chunk::TileCoordinates, lines::LineRef},
+    image::{
+        read::{
+            any_channels::{ReadAnyChannels, ReadSamples, SamplesReader},
+            layers::ReadChannels,
+        },
+        write::WritableImage,
+    },
+    math::Vec2,
+    meta::{
+        attribute::{AttributeValue, ChannelDescription, EnvironmentMap, SampleType, Text},
+        header::{Header, LayerAttributes},
+    },
+    prelude::{
+        AnyChannel, AnyChannels, Compression, Encoding, FlatSamples, Image, Layer, ReadLayers,
+        SmallVec,
+    },
+};
+use half::f16;
+use rayon::prelude::*;
+use std::{
+    fs::File,
+    io::{BufReader, BufWriter, Write},
+    path::Path,
+};
+
+/// What an OpenEXR file begins with.
+pub(crate) const MAGIC: [u8; 4] = [0x76, 0x2f, 0x31, 0x01];
+
+/// The name of the format in messages.
+const FORMAT: &str = "OpenEXR";
+
+/// Writes all channels as one part of scan lines, ZIP1.
+pub(crate) fn write(layers: &Layers, path: &Path) -> Result<(), ImagingError> {
+    // Text only fails on characters above U+00FF; names were checked when they were inserted.
+    let named: Vec<_> = layers.channels().collect();
+    let channels: Vec<AnyChannel<FlatSamples>> = named
+        .par_iter()
+        .map(|(name, channel)| {
+            let samples = match channel.precision {
+                Precision::Half => half_samples(channel.samples.pixels()),
+                Precision::Full => FlatSamples::F32(channel.samples.pixels().to_vec()),
+            };
+            AnyChannel::new(Text::new_or_panic(name), samples)
+        })
+        .collect();
+    let mut attributes = LayerAttributes::default();
+    if layers.latlong {
+        attributes.environment_map = Some(EnvironmentMap::LatitudeLongitude);
+    }
+    for (name, value) in &layers.attributes {
+        let (Some(name), Some(value)) = (Text::new_or_none(name), Text::new_or_none(value)) else {
+            continue;
+        };
+        attributes.other.insert(name, AttributeValue::Text(value));
+    }
+    let encoding = Encoding {
+        compression: Compression::ZIP1,
+        ..Encoding::SMALL_LOSSLESS
+    };
+    let layer = Layer::new(
+        (layers.width(), layers.height()),
+        attributes,
+        encoding,
+        AnyChannels::sort(SmallVec::from_vec(channels)),
+    );
+    let file = File::create(path).map_err(|e| ImagingError::io("create", path, e))?;
+    let mut writer = BufWriter::with_capacity(1 << 20, file);
+    Image::from_layer(layer)
+        .write()
+        .to_buffered(&mut writer)
+        .map_err(|error| write_error(path, error))?;
+    writer
+        .flush()
+        .map_err(|e| ImagingError::io("write", path, e))
+}
+
+/// Half floats, unless a finite value would overflow to infinity.
+fn half_samples(values: &[f32]) -> FlatSamples {
+    let limit = f16::MAX.to_f32();
+    if values.iter().any(|v| v.is_finite() && v.abs() > limit) {
+        return FlatSamples::F32(values.to_vec());
+    }
+    FlatSamples::F16(values.iter().map(|&v| f16::from_f32(v)).collect())
+}
+
+/// Reads the channels `names`, or all, onto the display window.
+pub(crate) fn read(path: &Path, names: Option<&[&str]>) -> Result<Layers, ImagingError> {
+    let file = File::open(path).map_err(|e| ImagingError::io("read", path, e))?;
+    let reader = ReadAnyChannels {
+        read_samples: WantedSamples {
+            names: names.map(|names| names.iter().map(|name| name.to_string()).collect()),
+        },
+    };
+    let image = reader
+        .all_layers()
+        .all_attributes()
+        .from_buffered(BufReader::with_capacity(1 << 20, file))
+        .map_err(|error| read_error(path, error))?;
+
+    let window = image.attributes.display_window;
+    let (width, height) = (window.size.0, window.size.1);
+    check_size(path, width, height)?;
+    let mut layers = Layers::from_file(width, height, path);
+    for part in image.layer_data {
+        if part.attributes.environment_map == Some(EnvironmentMap::LatitudeLongitude) {
+            layers.latlong = true;
+        }
+        for (name, value) in &part.attributes.other {
+            if let AttributeValue::Text(text) = value {
+                layers.attributes.insert(name.to_string(), text.to_string());
+            }
+        }
+        let part_name = part.attributes.layer_name.as_ref().map(Text::to_string);
+        let offset = Vec2(
+            part.attributes.layer_position.0 - window.position.0,
+            part.attributes.layer_position.1 - window.position.1,
+        );
+        for channel in part.channel_data.list {
+            let Some((precision, values)) = channel.sample_data else {
+                continue;
+            };
+            let mut name = channel.name.to_string();
+            if let (true, Some(part)) = (layers.contains(&name), &part_name) {
+                name = format!("{part}.{name}");
+            }
+            let samples = place(values, part.size, offset, (width, height));
+            layers.insert(name, precision, samples)?;
+        }
+    }
+    for name in names.unwrap_or_default() {
+        layers.channel(name)?;
+    }
+    Ok(layers)
+}
+
+/// Moves a data window onto the display window.
+fn place(
+    values: Vec<f32>,
+    size: Vec2<usize>,
+    offset: Vec2<i32>,
+    display: (usize, usize),
+) -> Raster<f32> {
+    let (width, height) = display;
+    if offset == Vec2(0, 0) && (size.0, size.1) == display {
+        return Raster::from_pixels(width, height, values);
+    }
+    let mut placed = Raster::filled(width, height, 0.0);
+    for (row, line) in values.chunks_exact(size.0).enumerate() {
+        let y = row as i64 + i64::from(offset.1);
+        if !(0..height as i64).contains(&y) {
+            continue;
+        }
+        for (column, &value) in line.iter().enumerate() {
+            let x = column as i64 + i64::from(offset.0);
+            if (0..width as i64).contains(&x) {
+                *placed.get_mut(x as usize, y as usize) = value;
+            }
+        }
+    }
+    placed
+}
+
+fn check_size(path: &Path, width: usize, height: usize) -> Result<(), ImagingError> {
+    match width.checked_mul(height) {
+        Some(1..=MAX_PIXELS) => Ok(()),
+        _ => Err(ImagingError::BadSize {
+            what: format!("`{}`", path.display()),
+            width,
+            height,
+        }),
+    }
+}
+
+fn read_error(path: &Path, error: exr::error::Error) -> ImagingError {
+    match error {
+        exr::error::Error::Io(source) => ImagingError::io("read", path, source),
+        exr::error::Error::NotSupported(what) => ImagingError::Unsupported {
+            path: path.to_owned(),
+            what: format!("uses {what}"),
+            remedy: "save it as scan lines with ZIP compression",
+        },
+        other => ImagingError::Damaged {
+            path: path.to_owned(),
+            format: FORMAT,
+            detail: other.to_string(),
+        },
+    }
+}
+
+fn write_error(path: &Path, error: exr::error::Error) -> ImagingError {
+    let source = match error {
+        exr::error::Error::Io(source) => source,
+        other => std::io::Error::other(other.to_string()),
+    };
+    ImagingError::io("write", path, source)
+}
+
+/// Reads every channel straight to f32, and keeps only those that are wanted.
+struct WantedSamples {
+    names: Option<Vec<String>>,
+}
+
+struct WantedSamplesReader {
+    kept: Option<(SampleType, Vec<f32>)>,
+    size: Vec2<usize>,
+}
+
+impl ReadSamples for WantedSamples {
+    type Reader = WantedSamplesReader;
+
+    fn create_sample_reader(
+        &self,
+        header: &Header,
+        channel: &ChannelDescription,
+    ) -> exr::error::Result<WantedSamplesReader> {
+        let size = header.layer_size;
+        let wanted = self
+            .names
+            .as_ref()
+            .is_none_or(|names| names.iter().any(|name| channel.name == *name.as_str()));
+        if wanted && channel.sampling != Vec2(1, 1) {
+            return Err(exr::error::Error::NotSupported(
+                format!("subsampled channels (`{}`)", channel.name).into(),
+            ));
+        }
+        let area = size.0.checked_mul(size.1).filter(|&n| n <= MAX_PIXELS);
+        let Some(area) = area else {
+            return Err(exr::error::Error::NotSupported(
+                format!("{} x {} pixels", size.0, size.1).into(),
+            ));
+        };
+        Ok(WantedSamplesReader {
+            kept: wanted.then(|| (channel.sample_type, vec![0.0; area])),
+            size,
+        })
+    }
+}
+
+impl SamplesReader for WantedSamplesReader {
+    type Samples = Option<(Precision, Vec<f32>)>;
+
+    fn filter_block(&self, tile: TileCoordinates) -> bool {
+        tile.level_index == Vec2(0, 0)
+    }
+
+    fn read_line(&mut self, line: LineRef<'_>) -> exr::error::UnitResult {
+        let Some((kind, samples)) = &mut self.kept else {
+            return Ok(());
+        };
+        let at = line.location;
+        let start = at.position.1 * self.size.0 + at.position.0;
+        let target = &mut samples[start..start + at.sample_count];
+        match kind {
+            SampleType::F32 => line.read_samples_into_slice(target)?,
+            SampleType::F16 => {
+                for (to, from) in target.iter_mut().zip(line.read_samples::<f16>()) {
+                    *to = from?.to_f32();
+                }
+            }
+            SampleType::U32 => {
+                for (to, from) in target.iter_mut().zip(line.read_samples::<u32>()) {
+                    *to = from? as f32;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn into_samples(self) -> Self::Samples {
+        let (kind, samples) = self.kept?;
+        let precision = match kind {
+            SampleType::F16 => Precision::Half,
+            SampleType::F32 | SampleType::U32 => Precision::Full,
+        };
+        Some((precision, samples))
+    }
+}

@@ -1,0 +1,49 @@
+//! What a JPEG file's markers say before it is decoded: the decoder fills in missing data without
+//! an error, and converts ink to light by a rule of its own.
+use crate::error::ImagingError;
+use std::path::Path;
+
+/// Errors on files that end before their end-of-image marker, on CMYK, and on other than 8 bits.
+pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
+    let damaged = |detail: &str| ImagingError::Damaged {
+        path: path.to_owned(),
+        format: "JPEG",
+        detail: detail.to_string(),
+    };
+    let unsupported = |what: String| ImagingError::Unsupported {
+        path: path.to_owned(),
+        what,
+        remedy: "save it as 8-bit RGB",
+    };
+    let mut at = 2;
+    loop {
+        // Between segments there may be entropy-coded data or fill bytes: go to the next marker.
+        // 0xff00 is a stuffed data byte, 0xffd0 to 0xffd7 are restart markers inside the data.
+        while at + 1 < bytes.len()
+            && !(bytes[at] == 0xff && !matches!(bytes[at + 1], 0x00 | 0xff | 0xd0..=0xd7))
+        {
+            at += 1;
+        }
+        let Some(&marker) = bytes.get(at + 1) else {
+            return Err(damaged("no end-of-image marker"));
+        };
+        if marker == 0xd9 {
+            return Ok(());
+        }
+        let Some(&[high, low]) = bytes.get(at + 2..at + 4).and_then(|s| s.first_chunk()) else {
+            return Err(damaged("a segment has no length"));
+        };
+        // Start of frame, all codings; C4, C8 and CC are other tables.
+        if matches!(marker, 0xc0..=0xcf) && !matches!(marker, 0xc4 | 0xc8 | 0xcc) {
+            let (Some(&bits), Some(&components)) = (bytes.get(at + 4), bytes.get(at + 9)) else {
+                return Err(damaged("the frame header is cut off"));
+            };
+            match (bits, components) {
+                (_, 4) => return Err(unsupported("is a CMYK JPEG".to_string())),
+                (8, _) => {}
+                _ => return Err(unsupported(format!("is a {bits}-bit JPEG"))),
+            }
+        }
+        at += 2 + usize::from(u16::from_be_bytes([high, low])).max(2);
+    }
+}

@@ -1,0 +1,236 @@
+//! Images of named channels, as compositing programs exchange them: OpenEXR files.
+use crate::{
+    error::{ImagingError, MAX_PIXELS},
+    exr_file,
+    raster::Raster,
+};
+use glam::Vec3;
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
+
+/// How a channel's samples are stored in a file. In memory they are always f32.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// 16-bit float: 11 significant bits, largest value 65504. A channel that holds a larger
+    /// finite value is stored in full instead, so that no light is lost.
+    Half,
+    /// 32-bit float.
+    Full,
+}
+
+/// Samples of one channel, and how a file stores them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Channel {
+    /// How the file stores the samples.
+    pub precision: Precision,
+    /// One value a pixel.
+    pub samples: Raster<f32>,
+}
+
+/// Named channels of one size: `R`, `shadow.G`, `depth.Z`. The part before the last dot is the
+/// layer. Files are OpenEXR, scan lines, ZIP1.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layers {
+    width: usize,
+    height: usize,
+    channels: BTreeMap<String, Channel>,
+    /// Whether the image is a latitude-longitude environment map (the `envmap` attribute).
+    pub latlong: bool,
+    /// Further attributes, as text.
+    pub attributes: BTreeMap<String, String>,
+    path: Option<PathBuf>,
+}
+
+impl Layers {
+    /// No channels yet, `width` x `height` pixels.
+    pub fn new(width: usize, height: usize) -> Self {
+        Self {
+            width,
+            height,
+            channels: BTreeMap::new(),
+            latlong: false,
+            attributes: BTreeMap::new(),
+            path: None,
+        }
+    }
+
+    pub(crate) fn from_file(width: usize, height: usize, path: &Path) -> Self {
+        Self {
+            path: Some(path.to_owned()),
+            ..Self::new(width, height)
+        }
+    }
+
+    /// Columns.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Rows.
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// Channel names in alphabetical order.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.channels.keys().map(String::as_str)
+    }
+
+    /// All channels with their names, in alphabetical order.
+    pub fn channels(&self) -> impl Iterator<Item = (&str, &Channel)> {
+        self.channels.iter().map(|(name, c)| (name.as_str(), c))
+    }
+
+    /// Adds the channel `name`, or replaces it. Errors if the size differs or the name is one that
+    /// compositing programs do not take (empty, only digits, over 255 bytes).
+    pub fn insert(
+        &mut self,
+        name: impl Into<String>,
+        precision: Precision,
+        samples: Raster<f32>,
+    ) -> Result<(), ImagingError> {
+        let name = name.into();
+        check_name(&name)?;
+        if (samples.width(), samples.height()) != (self.width, self.height) {
+            return Err(ImagingError::SizeMismatch {
+                what: format!("channel `{name}`"),
+                found: (samples.width(), samples.height()),
+                expected: (self.width, self.height),
+                reference: "the other layers",
+            });
+        }
+        self.channels.insert(name, Channel { precision, samples });
+        Ok(())
+    }
+
+    /// Adds colour as `R`, `G`, `B` of `layer`; bare names if `layer` is empty.
+    pub fn insert_rgb(
+        &mut self,
+        layer: &str,
+        precision: Precision,
+        colour: &Raster<Vec3>,
+    ) -> Result<(), ImagingError> {
+        self.insert_triple(layer, ["R", "G", "B"], precision, colour)
+    }
+
+    /// Adds vectors as `X`, `Y`, `Z` of `layer`.
+    pub fn insert_xyz(
+        &mut self,
+        layer: &str,
+        precision: Precision,
+        vectors: &Raster<Vec3>,
+    ) -> Result<(), ImagingError> {
+        self.insert_triple(layer, ["X", "Y", "Z"], precision, vectors)
+    }
+
+    fn insert_triple(
+        &mut self,
+        layer: &str,
+        suffixes: [&str; 3],
+        precision: Precision,
+        values: &Raster<Vec3>,
+    ) -> Result<(), ImagingError> {
+        for (i, suffix) in suffixes.into_iter().enumerate() {
+            self.insert(channel_name(layer, suffix), precision, values.map(|v| v[i]))?;
+        }
+        Ok(())
+    }
+
+    /// Whether the channel exists.
+    pub fn contains(&self, name: &str) -> bool {
+        self.channels.contains_key(name)
+    }
+
+    /// Samples of the channel `name`; the error lists the channels that exist.
+    pub fn channel(&self, name: &str) -> Result<&Raster<f32>, ImagingError> {
+        match self.channels.get(name) {
+            Some(channel) => Ok(&channel.samples),
+            None => Err(self.missing(name)),
+        }
+    }
+
+    /// `R`, `G`, `B` of `layer` as colour; bare names if `layer` is empty.
+    pub fn rgb(&self, layer: &str) -> Result<Raster<Vec3>, ImagingError> {
+        self.triple(layer, ["R", "G", "B"])
+    }
+
+    /// `X`, `Y`, `Z` of `layer` as vectors.
+    pub fn xyz(&self, layer: &str) -> Result<Raster<Vec3>, ImagingError> {
+        self.triple(layer, ["X", "Y", "Z"])
+    }
+
+    fn triple(&self, layer: &str, suffixes: [&str; 3]) -> Result<Raster<Vec3>, ImagingError> {
+        let x = self.channel(&channel_name(layer, suffixes[0]))?.pixels();
+        let y = self.channel(&channel_name(layer, suffixes[1]))?.pixels();
+        let z = self.channel(&channel_name(layer, suffixes[2]))?.pixels();
+        let pixels = (0..x.len()).map(|i| Vec3::new(x[i], y[i], z[i])).collect();
+        Ok(Raster::from_pixels(self.width, self.height, pixels))
+    }
+
+    pub(crate) fn missing(&self, name: &str) -> ImagingError {
+        ImagingError::MissingChannel {
+            path: self.path.clone(),
+            channel: name.to_string(),
+            present: self.channels.keys().cloned().collect(),
+        }
+    }
+
+    /// Writes an OpenEXR file: one part, scan lines, ZIP1. Replaces an existing file.
+    pub fn write_exr(&self, path: impl AsRef<Path>) -> Result<(), ImagingError> {
+        let path = path.as_ref();
+        if self.width == 0 || self.height == 0 || self.width * self.height > MAX_PIXELS {
+            return Err(ImagingError::BadSize {
+                what: format!("the image for `{}`", path.display()),
+                width: self.width,
+                height: self.height,
+            });
+        }
+        exr_file::write(self, path)
+    }
+
+    /// Reads all channels of an OpenEXR file.
+    ///
+    /// The result has the size of the display window: pixels outside the data window are 0, those
+    /// outside the display window are dropped. Channels of a further part whose name is taken
+    /// already get the part's name in front. Values are not checked for NaN or infinity: depth may
+    /// be infinite.
+    pub fn read_exr(path: impl AsRef<Path>) -> Result<Self, ImagingError> {
+        exr_file::read(path.as_ref(), None)
+    }
+
+    /// Reads only the channels `names`; the rest is not kept in memory. Errors if one is missing.
+    pub fn read_exr_channels(path: impl AsRef<Path>, names: &[&str]) -> Result<Self, ImagingError> {
+        exr_file::read(path.as_ref(), Some(names))
+    }
+}
+
+/// `layer.suffix`, or the bare suffix for the beauty layer.
+fn channel_name(layer: &str, suffix: &str) -> String {
+    if layer.is_empty() {
+        suffix.to_string()
+    } else {
+        format!("{layer}.{suffix}")
+    }
+}
+
+fn check_name(name: &str) -> Result<(), ImagingError> {
+    let reason = if name.is_empty() {
+        "is empty"
+    } else if name.len() > 255 {
+        "is longer than 255 bytes"
+    } else if !name.bytes().all(|b| b.is_ascii_graphic()) {
+        "has characters other than printable ASCII"
+    } else if name.split('.').any(str::is_empty) {
+        "has an empty part"
+    } else if name.bytes().all(|b| b.is_ascii_digit()) {
+        "is only digits"
+    } else {
+        return Ok(());
+    };
+    Err(ImagingError::BadChannelName {
+        name: name.to_string(),
+        reason,
+    })
+}
