@@ -1,1 +1,14 @@
-//! Configuration, artifacts and stages, whatever the stages compute.
+//! Configuration, stage manifests and atomic outputs: everything that the executables share
+//! and that knows nothing of pictures or light.
+//!
+//! - [`config`]: `pipeline.toml` with `--set` overrides, read into the domain crates' own types.
+//! - [`stage`]: a stage's output folder, written beside its target and swapped in whole.
+//! - [`manifest`]: `stage.json`, the last file that a stage writes.
+//! - [`fingerprint`]: why a stage has to run again, in words.
+//! - [`lock`]: one writer a folder.
+pub mod config;
+pub mod error;
+pub mod fingerprint;
+pub mod lock;
+pub mod manifest;
+pub mod stage;

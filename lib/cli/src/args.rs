@@ -1,0 +1,60 @@
+//! Arguments that every stage takes.
+use std::path::PathBuf;
+
+use clap::Args;
+
+/// Options common to all stages.
+#[derive(Args, Clone, Debug)]
+pub struct CommonArgs {
+    /// The file that configures all stages; relative paths in it start from its folder
+    #[arg(
+        long,
+        short = 'p',
+        value_name = "FILE",
+        default_value = "pipeline.toml"
+    )]
+    pub pipeline: PathBuf,
+
+    /// Set a key of the file, as in --set scene.class=car or
+    /// --set scene.objects.0.yaw_deg=30; may be repeated, the last one wins
+    #[arg(long = "set", short = 's', value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+
+    /// Folder of all artifacts, relative to the current folder; each stage writes a folder of
+    /// its own in it [default: [pipeline] out]
+    #[arg(long, short = 'o', value_name = "DIR")]
+    pub out: Option<PathBuf>,
+
+    /// Worker threads, 0 for one a core; the results do not depend on it
+    /// [default: [pipeline] threads]
+    #[arg(long, short = 'j', value_name = "N")]
+    pub threads: Option<usize>,
+
+    /// Seed of every random number [default: [pipeline] seed]
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+
+    /// Wait for another run that writes the same folder instead of refusing
+    #[arg(long)]
+    pub wait: bool,
+
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub output: OutputArgs,
+}
+
+/// Options about what is printed.
+#[derive(Args, Clone, Copy, Debug, Default)]
+pub struct OutputArgs {
+    /// Print the result as JSON
+    #[arg(long)]
+    pub json: bool,
+
+    /// Print errors only
+    #[arg(long, short = 'q', conflicts_with = "verbose")]
+    pub quiet: bool,
+
+    /// Print more about what is done
+    #[arg(long, short = 'v')]
+    pub verbose: bool,
+}

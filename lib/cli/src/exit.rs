@@ -1,0 +1,114 @@
+//! From an error to a message and an exit code.
+use std::fmt;
+use std::process::ExitCode;
+
+use dipir_pipeline::error::ConfigError;
+
+use crate::interrupt::Interrupted;
+use crate::style::{bold_red, color_on_stderr};
+
+/// Done.
+pub const DONE: u8 = 0;
+/// Failed.
+pub const FAILED: u8 = 1;
+/// Wrong usage or configuration.
+pub const USAGE: u8 = 2;
+/// Interrupted: 128 + SIGINT, as shells count.
+pub const INTERRUPTED: u8 = 130;
+
+/// Marks an error as the fault of the command line or the configuration.
+#[derive(Debug)]
+pub struct Usage(pub String);
+
+impl fmt::Display for Usage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for Usage {}
+
+/// Runs `main`, prints what went wrong with all its causes, and picks the exit code.
+pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
+    let code = match main() {
+        Ok(()) => DONE,
+        Err(error) => {
+            let code = code_of(&error);
+            if code != INTERRUPTED {
+                let label = bold_red("error:", color_on_stderr());
+                eprintln!("{label} {}", describe(&error));
+            } else {
+                eprintln!("interrupted; earlier results are as they were");
+            }
+            code
+        }
+    };
+    ExitCode::from(code)
+}
+
+/// The exit code of an error.
+pub fn code_of(error: &anyhow::Error) -> u8 {
+    let is = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
+    if is(|e| e.is::<Interrupted>()) {
+        INTERRUPTED
+    } else if is(|e| e.is::<ConfigError>() || e.is::<Usage>()) {
+        USAGE
+    } else {
+        FAILED
+    }
+}
+
+/// The message, then its causes. A cause that its parent quotes already is not repeated.
+pub fn describe(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    let mut parent = String::new();
+    for cause in error.chain() {
+        let message = cause.to_string();
+        if parent.contains(&message) {
+            continue;
+        }
+        if !text.is_empty() {
+            text.push_str("\n  caused by: ");
+        }
+        text.push_str(&message);
+        parent = message;
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use anyhow::Context;
+    use dipir_pipeline::config::Config;
+
+    use super::*;
+
+    #[derive(Debug, thiserror::Error)]
+    #[error("cannot read a.png: {source}")]
+    struct Quoting {
+        source: std::io::Error,
+    }
+
+    #[test]
+    fn causes_are_listed_once_each() {
+        let source = std::io::Error::other("disk on fire");
+        let error = anyhow::Error::new(Quoting { source }).context("the scene cannot be set up");
+        assert_eq!(
+            describe(&error),
+            "the scene cannot be set up\n  caused by: cannot read a.png: disk on fire"
+        );
+    }
+
+    #[test]
+    fn exit_codes_tell_failure_usage_and_interruption_apart() {
+        let config = Config::parse(Path::new("p.toml"), "[x]\n", &[]).unwrap_err();
+        assert_eq!(code_of(&anyhow::Error::new(config).context("outer")), USAGE);
+        assert_eq!(code_of(&Usage("bad flag".into()).into()), USAGE);
+        assert_eq!(code_of(&anyhow::Error::new(Interrupted)), INTERRUPTED);
+        assert_eq!(code_of(&anyhow::anyhow!("broken")), FAILED);
+        let wrapped = Err::<(), _>(Interrupted).context("while rendering");
+        assert_eq!(code_of(&wrapped.unwrap_err()), INTERRUPTED);
+    }
+}

@@ -1,0 +1,161 @@
+//! One run of a stage: its configuration read, its threads started, its output decided.
+use std::io::{Write, stdout};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use dipir_pipeline::config::{Config, PipelineTable};
+use dipir_pipeline::lock::WhenLocked;
+use serde_json::Value;
+
+use crate::args::{CommonArgs, OutputArgs};
+use crate::exit::Usage;
+use crate::interrupt;
+use crate::progress::Progress;
+use crate::style::{bold_yellow, color_on_stderr};
+
+/// What a stage needs of its command line and configuration.
+#[derive(Debug)]
+pub struct Session {
+    /// The configuration with its overrides.
+    pub config: Config,
+    /// The `[pipeline]` table with the command line's `--seed` and `--threads`.
+    pub pipeline: PipelineTable,
+    /// Folder of all artifacts, relative to the current folder.
+    pub out: PathBuf,
+    /// What to do when another run writes the same folder.
+    pub when_locked: WhenLocked,
+    output: OutputArgs,
+}
+
+impl Session {
+    /// Reads the configuration, starts the worker threads and listens for Ctrl-C.
+    pub fn start(args: &CommonArgs) -> anyhow::Result<Self> {
+        let config = Config::read(&args.pipeline, &args.set)?;
+        let mut pipeline = config.pipeline()?;
+        pipeline.seed = args.seed.unwrap_or(pipeline.seed);
+        pipeline.threads = args.threads.unwrap_or(pipeline.threads);
+        let out = match &args.out {
+            Some(out) => out.clone(),
+            None => config.resolve(&pipeline.out),
+        };
+        if out.as_os_str().is_empty() {
+            return Err(
+                Usage("the folder of artifacts is empty: name one with --out".into()).into(),
+            );
+        }
+        start_threads(pipeline.threads)?;
+        interrupt::listen()?;
+        Ok(Self {
+            config,
+            pipeline,
+            out,
+            when_locked: match args.wait {
+                true => WhenLocked::Wait,
+                false => WhenLocked::Refuse,
+            },
+            output: args.output,
+        })
+    }
+
+    /// The folder of a stage.
+    pub fn stage_folder(&self, stage: &str) -> PathBuf {
+        self.out.join(stage)
+    }
+
+    /// A path of the configuration, relative to the current folder.
+    pub fn resolve(&self, path: &Path) -> PathBuf {
+        self.config.resolve(path)
+    }
+
+    /// A progress bar.
+    pub fn progress(&self, title: &str) -> Progress {
+        Progress::new(title, self.output.quiet)
+    }
+
+    /// Prints a warning.
+    pub fn warn(&self, message: &str) {
+        self.output.warn(message);
+    }
+
+    /// Prints a remark that only `--verbose` shows.
+    pub fn remark(&self, message: impl FnOnce() -> String) {
+        if self.output.verbose {
+            eprintln!("{}", message());
+        }
+    }
+
+    /// Prints the result: `human`, or `json` with `--json`.
+    pub fn result(&self, human: impl FnOnce() -> String, json: impl FnOnce() -> Value) {
+        self.output.result(human, json);
+    }
+}
+
+impl OutputArgs {
+    /// Prints a warning.
+    pub fn warn(&self, message: &str) {
+        if !self.quiet {
+            eprintln!("{} {message}", bold_yellow("warning:", color_on_stderr()));
+        }
+    }
+
+    /// Prints the result: `human`, or `json` with `--json`.
+    pub fn result(&self, human: impl FnOnce() -> String, json: impl FnOnce() -> Value) {
+        if self.json {
+            print_line(&format!("{:#}", json()));
+        } else if !self.quiet {
+            print_line(&human());
+        }
+    }
+}
+
+/// Prints a line on standard output; a reader that went away, as `head` does, is no error.
+pub fn print_line(text: &str) {
+    let mut out = stdout().lock();
+    let _ = writeln!(out, "{text}").and_then(|()| out.flush());
+}
+
+fn start_threads(threads: usize) -> anyhow::Result<()> {
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build_global()
+        .context("cannot start the worker threads; ask for fewer with --threads")
+}
+
+/// `1.2 s`, `3 min 20 s`.
+pub fn duration(seconds: f64) -> String {
+    match seconds {
+        s if s < 10.0 => format!("{s:.2} s"),
+        s if s < 60.0 => format!("{s:.1} s"),
+        s => format!("{} min {:02} s", (s / 60.0) as u64, (s % 60.0) as u64),
+    }
+}
+
+/// `1.5 MiB`.
+pub fn size(bytes: u64) -> String {
+    const UNITS: [&str; 4] = ["KiB", "MiB", "GiB", "TiB"];
+    if bytes < 1024 {
+        return format!("{bytes} B");
+    }
+    let mut value = bytes as f64 / 1024.0;
+    let mut unit = 0;
+    while value >= 1024.0 && unit + 1 < UNITS.len() {
+        value /= 1024.0;
+        unit += 1;
+    }
+    format!("{value:.1} {}", UNITS[unit])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_and_sizes_read_well() {
+        assert_eq!(duration(1.234), "1.23 s");
+        assert_eq!(duration(59.0), "59.0 s");
+        assert_eq!(duration(200.4), "3 min 20 s");
+        assert_eq!(size(512), "512 B");
+        assert_eq!(size(1536), "1.5 KiB");
+        assert_eq!(size(3 << 30), "3.0 GiB");
+    }
+}

@@ -1,0 +1,237 @@
+//! `pipeline.toml`: one file for all stages, each of which reads its own table.
+//!
+//! Values keep the line that they came from, so that a wrong one is reported as
+//! `file:line: key is …, accepted: …`. The tables are read into the domain crates' own serde
+//! types; a type that refuses unknown fields makes a misspelt key an error that names the
+//! accepted keys and the nearest one.
+mod deserialize;
+mod tree;
+
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+use crate::error::{ConfigError, plain};
+use tree::{Node, Value};
+
+/// The tables that a `pipeline.toml` may hold.
+pub const TABLES: [&str; 7] = [
+    "pipeline",
+    "model",
+    "scene",
+    "concepts",
+    "lora",
+    "optimize",
+    "composite",
+];
+
+/// Where a value was written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// A line of a file, counted from 1.
+    Line {
+        /// As it was named on the command line.
+        file: PathBuf,
+        /// Counted from 1.
+        line: usize,
+    },
+    /// A file as a whole.
+    File {
+        /// As it was named on the command line.
+        file: PathBuf,
+    },
+    /// A command-line option, quoted.
+    Flag(String),
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Line { file, line } => write!(f, "{}:{line}", file.display()),
+            Self::File { file } => write!(f, "{}", file.display()),
+            Self::Flag(text) => write!(f, "{text}"),
+        }
+    }
+}
+
+/// How much work is done where the configuration does not say.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Quality {
+    /// Quick looks.
+    Draft,
+    /// Results.
+    #[default]
+    Standard,
+    /// Final frames.
+    High,
+}
+
+/// The `[pipeline]` table, which every executable reads.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PipelineTable {
+    /// Folder of all artifacts; each stage writes a folder of its own in it.
+    pub out: PathBuf,
+    /// Every random number follows from it.
+    pub seed: u64,
+    /// Worker threads; 0 means one for every core. Never changes a result.
+    pub threads: usize,
+    /// `cpu`, `cuda:N` or `auto`.
+    pub device: String,
+    /// Sets what is not set elsewhere.
+    pub quality: Quality,
+}
+
+impl Default for PipelineTable {
+    fn default() -> Self {
+        Self {
+            out: "out".into(),
+            seed: 0,
+            threads: 0,
+            device: "cpu".into(),
+            quality: Quality::Standard,
+        }
+    }
+}
+
+/// A `pipeline.toml` with its overrides applied.
+#[derive(Clone, Debug)]
+pub struct Config {
+    path: PathBuf,
+    root: Node,
+}
+
+impl Config {
+    /// Reads `path` and applies `overrides`, each `table.key=value`: a TOML value, or else a bare
+    /// string. Later overrides win.
+    pub fn read(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let text = fs::read_to_string(path).map_err(|e| ConfigError::Read {
+            path: path.into(),
+            cause: plain(&e),
+        })?;
+        Self::parse(path, &text, overrides)
+    }
+
+    /// As [`read`](Self::read), with the file's text at hand.
+    pub fn parse(path: &Path, text: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let mut root = tree::parse_file(path, text)?;
+        for text in overrides {
+            tree::apply_override(&mut root, text)?;
+        }
+        let config = Self {
+            path: path.into(),
+            root,
+        };
+        config.check_tables()?;
+        Ok(config)
+    }
+
+    fn check_tables(&self) -> Result<(), ConfigError> {
+        let Value::Table(entries) = &self.root.value else {
+            unreachable!("a TOML file is a table");
+        };
+        for entry in entries {
+            if !TABLES.contains(&entry.name.as_str()) {
+                return Err(ConfigError::UnknownKey {
+                    at: entry.place.clone(),
+                    key: entry.name.clone(),
+                    table: String::new(),
+                    nearest: nearest(&entry.name, TABLES),
+                    accepted: TABLES.map(String::from).into(),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// The table `[name]` as a `T`; an absent table reads as an empty one.
+    pub fn table<T: DeserializeOwned>(&self, name: &str) -> Result<T, ConfigError> {
+        let empty = Node {
+            value: Value::Table(Vec::new()),
+            place: Place::File {
+                file: self.path.clone(),
+            },
+        };
+        let node = self.root.get(name).unwrap_or(&empty);
+        deserialize::read(node, name)
+    }
+
+    /// Whether the table `[name]` is there.
+    pub fn has_table(&self, name: &str) -> bool {
+        self.root.get(name).is_some()
+    }
+
+    /// Whether the dotted key is set, in the file or on the command line.
+    pub fn has(&self, dotted: &str) -> bool {
+        self.place(dotted).is_some()
+    }
+
+    /// Where the dotted key was set, for a message about its value.
+    pub fn place(&self, dotted: &str) -> Option<Place> {
+        let mut node = &self.root;
+        for step in dotted.split('.') {
+            node = node.get(step)?;
+        }
+        Some(node.place.clone())
+    }
+
+    /// An error about the value of a dotted key, found by its reader.
+    pub fn invalid(&self, dotted: &str, message: impl Into<String>) -> ConfigError {
+        ConfigError::Invalid {
+            at: self.place(dotted).unwrap_or_else(|| Place::File {
+                file: self.path.clone(),
+            }),
+            key: dotted.into(),
+            message: message.into(),
+        }
+    }
+
+    /// The `[pipeline]` table.
+    pub fn pipeline(&self) -> Result<PipelineTable, ConfigError> {
+        self.table("pipeline")
+    }
+
+    /// The file that was read.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The folder that relative paths in the file start from.
+    pub fn base_dir(&self) -> PathBuf {
+        match self.path.parent() {
+            Some(folder) if !folder.as_os_str().is_empty() => folder.into(),
+            _ => PathBuf::from("."),
+        }
+    }
+
+    /// A path of the file, made relative to the current folder.
+    pub fn resolve(&self, path: &Path) -> PathBuf {
+        match self.path.parent() {
+            Some(folder) => folder.join(path),
+            None => path.into(),
+        }
+    }
+}
+
+/// The candidate nearest to `name`, if it is near enough to be a slip of the pen.
+pub fn nearest<S: AsRef<str>>(
+    name: &str,
+    candidates: impl IntoIterator<Item = S>,
+) -> Option<String> {
+    // Jaro-Winkler of 0.75 accepts transpositions and one or two lost letters in a word of
+    // usual length, and rejects unrelated words of the same length.
+    const NEAR: f64 = 0.75;
+    candidates
+        .into_iter()
+        .map(|c| (strsim::jaro_winkler(name, c.as_ref()), c))
+        .filter(|(score, _)| *score >= NEAR)
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .map(|(_, c)| c.as_ref().to_string())
+}
+
+#[cfg(test)]
+mod tests;

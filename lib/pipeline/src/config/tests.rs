@@ -1,0 +1,237 @@
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use super::*;
+
+#[derive(Debug, Default, Deserialize, PartialEq)]
+#[serde(rename_all = "snake_case")]
+enum Transfer {
+    #[default]
+    Srgb,
+    Gamma22,
+}
+
+#[derive(Debug, Deserialize, PartialEq)]
+#[serde(deny_unknown_fields)]
+struct Object {
+    path: PathBuf,
+    #[serde(default)]
+    position: [f32; 3],
+}
+
+#[derive(Debug, Deserialize, PartialEq)]
+#[serde(deny_unknown_fields)]
+struct Scene {
+    background: PathBuf,
+    #[serde(default)]
+    transfer: Transfer,
+    #[serde(default)]
+    samples: Option<u32>,
+    #[serde(default)]
+    objects: Vec<Object>,
+}
+
+const TEXT: &str = r#"# a comment
+[pipeline]
+seed = 7
+
+[scene]
+background = "photo.png"
+transfer = "gamma22"
+
+[[scene.objects]]
+path = "car.glb"
+position = [0, 1.5, 0]
+"#;
+
+fn parse(text: &str, set: &[&str]) -> Result<Config, ConfigError> {
+    let set: Vec<String> = set.iter().map(|s| (*s).into()).collect();
+    Config::parse(Path::new("pipeline.toml"), text, &set)
+}
+
+fn scene(text: &str, set: &[&str]) -> Result<Scene, ConfigError> {
+    parse(text, set)?.table("scene")
+}
+
+fn message(text: &str, set: &[&str]) -> String {
+    scene(text, set).unwrap_err().to_string()
+}
+
+#[test]
+fn reads_tables_into_typed_structs() {
+    let config = parse(TEXT, &[]).unwrap();
+    assert_eq!(config.pipeline().unwrap().seed, 7);
+    let scene: Scene = config.table("scene").unwrap();
+    assert_eq!(scene.transfer, Transfer::Gamma22);
+    assert_eq!(scene.objects[0].position, [0.0, 1.5, 0.0]);
+    assert_eq!(scene.samples, None);
+}
+
+#[test]
+fn overrides_replace_add_and_step_into_lists() {
+    let set = [
+        "scene.background=other photo.png",
+        "scene.samples=16",
+        "scene.objects.0.position=[1, 2, 3]",
+        "scene.samples = 32",
+    ];
+    let scene = scene(TEXT, &set).unwrap();
+    assert_eq!(scene.background, PathBuf::from("other photo.png"));
+    assert_eq!(scene.samples, Some(32));
+    assert_eq!(scene.objects[0].position, [1.0, 2.0, 3.0]);
+}
+
+#[test]
+fn an_override_may_create_its_table() {
+    let config = parse("", &["pipeline.threads=2"]).unwrap();
+    assert_eq!(config.pipeline().unwrap().threads, 2);
+}
+
+#[test]
+fn an_unknown_key_is_an_error_with_its_line_and_the_nearest_name() {
+    let text = "[scene]\n\nbackgruond = \"a.png\"\n";
+    assert_eq!(
+        message(text, &[]),
+        "pipeline.toml:3: unknown key \"scene.backgruond\" (did you mean \"background\"?); \
+         [scene] accepts: background, transfer, samples, objects"
+    );
+}
+
+#[test]
+fn an_unknown_key_in_a_list_names_its_index() {
+    let text = "[scene]\nbackground = \"a\"\n[[scene.objects]]\npath = \"b\"\nxyz = 1\n";
+    assert_eq!(
+        message(text, &[]),
+        "pipeline.toml:5: unknown key \"scene.objects.0.xyz\"; \
+         [scene.objects.0] accepts: path, position"
+    );
+}
+
+#[test]
+fn an_unknown_table_is_an_error() {
+    assert_eq!(
+        parse("[scnee]\n", &[]).unwrap_err().to_string(),
+        "pipeline.toml:1: unknown key \"scnee\" (did you mean \"scene\"?); the top level accepts: \
+         pipeline, model, scene, concepts, lora, optimize, composite"
+    );
+}
+
+#[test]
+fn a_wrong_type_says_what_was_found_and_what_is_accepted() {
+    let text = "[scene]\nbackground = \"a\"\nsamples = \"many\"\n";
+    assert_eq!(
+        message(text, &[]),
+        "pipeline.toml:3: scene.samples is the string \"many\", accepted: a whole number, 0 or more"
+    );
+    assert_eq!(
+        message("[scene]\nbackground = 3\n", &[]),
+        "pipeline.toml:2: scene.background is the integer 3, accepted: a path in quotes"
+    );
+    assert_eq!(
+        message(TEXT, &["scene.samples=-1"]),
+        "--set scene.samples=-1: scene.samples is the integer -1, accepted: a whole number, 0 or more"
+    );
+    assert_eq!(
+        message("scene = 3\n", &[]),
+        "pipeline.toml:1: scene is the integer 3, accepted: a table"
+    );
+}
+
+#[test]
+fn a_list_of_the_wrong_length_says_both_lengths() {
+    for (value, found) in [("[1, 2]", 2), ("[1, 2, 3, 4]", 4)] {
+        let set = format!("scene.objects.0.position={value}");
+        let text = message(TEXT, &[&set]);
+        assert!(
+            text.contains(&format!("a list of {found} values")) && text.contains("list of 3"),
+            "{text}"
+        );
+    }
+}
+
+#[test]
+fn an_unknown_choice_lists_the_accepted_ones() {
+    assert_eq!(
+        message(TEXT, &["scene.transfer=gama22"]),
+        "--set scene.transfer=gama22: scene.transfer is \"gama22\" (did you mean \"gamma22\"?), \
+         accepted: \"srgb\", \"gamma22\""
+    );
+    assert_eq!(
+        message(TEXT, &["scene.transfer=2.2"]),
+        "--set scene.transfer=2.2: scene.transfer is the number 2.2, accepted: \"srgb\", \"gamma22\""
+    );
+}
+
+#[test]
+fn a_missing_key_says_how_to_give_it() {
+    assert_eq!(
+        message("[scene]\n", &[]),
+        "pipeline.toml:1: [scene] lacks the key \"background\"; \
+         add it there or pass --set scene.background=VALUE"
+    );
+    assert_eq!(
+        message("", &[]),
+        "pipeline.toml: [scene] lacks the key \"background\"; \
+         add it there or pass --set scene.background=VALUE"
+    );
+}
+
+#[test]
+fn broken_toml_names_the_line() {
+    let text = parse("[scene]\nbackground = \n", &[])
+        .unwrap_err()
+        .to_string();
+    assert!(
+        text.starts_with("pipeline.toml:2: not valid TOML: "),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_malformed_override_shows_the_form() {
+    let tail = "; write --set table.key=value, as in --set scene.class=car";
+    for (set, finding) in [
+        ("scene.background", "has no \"=\""),
+        ("seed=3", "\"seed\" names no table"),
+        ("scene..x=3", "\"scene..x\" is not a dotted key"),
+        (
+            "scene.objects.4.path=x",
+            "\"4\" is no index of a list of 1; accepted: 0 to 0",
+        ),
+        (
+            "scene.transfer.x=1",
+            "\"x\" is below a key that is not a table",
+        ),
+    ] {
+        assert_eq!(
+            message(TEXT, &[set]),
+            format!("--set {set}: {finding}{tail}")
+        );
+    }
+}
+
+#[test]
+fn a_missing_file_points_at_the_option() {
+    let error = Config::read(Path::new("no/such.toml"), &[]).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "cannot read no/such.toml: no such file or directory; name another file with --pipeline"
+    );
+}
+
+#[test]
+fn paths_are_relative_to_the_file() {
+    let config = Config::parse(Path::new("a/b/pipeline.toml"), "", &[]).unwrap();
+    assert_eq!(config.resolve(Path::new("x.png")), Path::new("a/b/x.png"));
+    assert_eq!(config.resolve(Path::new("/x.png")), Path::new("/x.png"));
+    let here = Config::parse(Path::new("pipeline.toml"), "", &[]).unwrap();
+    assert_eq!(here.resolve(Path::new("x.png")), Path::new("x.png"));
+    assert_eq!(here.base_dir(), Path::new("."));
+}
+
+#[test]
+fn unrelated_names_are_not_suggested() {
+    assert_eq!(nearest("zzz", TABLES), None);
+    assert_eq!(nearest("optimise", TABLES), Some("optimize".into()));
+}

@@ -1,0 +1,195 @@
+//! TOML values that remember where they were written.
+use std::path::Path;
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use super::Place;
+use crate::error::ConfigError;
+
+/// A value and its place.
+#[derive(Clone, Debug)]
+pub(super) struct Node {
+    pub value: Value,
+    pub place: Place,
+}
+
+/// A TOML value.
+#[derive(Clone, Debug)]
+pub(super) enum Value {
+    String(String),
+    Integer(i64),
+    Float(f64),
+    Boolean(bool),
+    Datetime,
+    Array(Vec<Node>),
+    Table(Vec<Entry>),
+}
+
+/// A key, where it stands, and its value.
+#[derive(Clone, Debug)]
+pub(super) struct Entry {
+    pub name: String,
+    pub place: Place,
+    pub node: Node,
+}
+
+impl Node {
+    /// The member `step` of a table, or the element with that index of an array.
+    pub fn get(&self, step: &str) -> Option<&Node> {
+        match &self.value {
+            Value::Table(entries) => entries.iter().find(|e| e.name == step).map(|e| &e.node),
+            Value::Array(items) => items.get(step.parse::<usize>().ok()?),
+            _ => None,
+        }
+    }
+}
+
+/// Parses a whole file.
+pub(super) fn parse_file(path: &Path, text: &str) -> Result<Node, ConfigError> {
+    let line_starts: Vec<usize> = std::iter::once(0)
+        .chain(text.match_indices('\n').map(|(i, _)| i + 1))
+        .collect();
+    let place = |offset: usize| Place::Line {
+        file: path.into(),
+        line: line_starts.partition_point(|&start| start <= offset),
+    };
+    let table = DeTable::parse(text).map_err(|e| ConfigError::Syntax {
+        at: place(e.span().map_or(0, |s| s.start)),
+        message: one_line(e.message()),
+    })?;
+    let table_place = Place::File { file: path.into() };
+    Ok(Node {
+        value: Value::Table(entries(table.get_ref(), &place)?),
+        place: table_place,
+    })
+}
+
+fn one_line(message: &str) -> String {
+    message.split('\n').collect::<Vec<_>>().join(", ")
+}
+
+fn entries(table: &DeTable<'_>, place: &dyn Fn(usize) -> Place) -> Result<Vec<Entry>, ConfigError> {
+    table
+        .iter()
+        .map(|(name, value)| {
+            let at = place(name.span().start);
+            Ok(Entry {
+                name: name.get_ref().to_string(),
+                node: node(value, place, name.get_ref())?,
+                place: at,
+            })
+        })
+        .collect()
+}
+
+fn node(
+    spanned: &Spanned<DeValue<'_>>,
+    place: &dyn Fn(usize) -> Place,
+    key: &str,
+) -> Result<Node, ConfigError> {
+    let at = place(spanned.span().start);
+    let value = match spanned.get_ref() {
+        DeValue::String(s) => Value::String(s.to_string()),
+        DeValue::Integer(i) => match i64::from_str_radix(i.as_str(), i.radix()) {
+            Ok(i) => Value::Integer(i),
+            Err(_) => {
+                return Err(ConfigError::WrongType {
+                    at,
+                    key: key.into(),
+                    found: format!("the integer {}", i.as_str()),
+                    accepted: "a whole number that fits 64 bits".into(),
+                });
+            }
+        },
+        DeValue::Float(f) => match f.as_str().parse() {
+            Ok(f) => Value::Float(f),
+            Err(_) => {
+                return Err(ConfigError::WrongType {
+                    at,
+                    key: key.into(),
+                    found: format!("the number {}", f.as_str()),
+                    accepted: "a number".into(),
+                });
+            }
+        },
+        DeValue::Boolean(b) => Value::Boolean(*b),
+        DeValue::Datetime(_) => Value::Datetime,
+        DeValue::Array(items) => Value::Array(
+            items
+                .iter()
+                .map(|item| node(item, place, key))
+                .collect::<Result<_, _>>()?,
+        ),
+        DeValue::Table(table) => Value::Table(entries(table, place)?),
+    };
+    Ok(Node { value, place: at })
+}
+
+/// Applies one `table.key=value`. Numbers step into arrays: `scene.objects.0.yaw_deg=10`.
+pub(super) fn apply_override(root: &mut Node, text: &str) -> Result<(), ConfigError> {
+    let wrong = |message: String| ConfigError::Override {
+        text: text.into(),
+        message,
+    };
+    let (key, value) = text
+        .split_once('=')
+        .ok_or_else(|| wrong("has no \"=\"".into()))?;
+    let steps: Vec<&str> = key.split('.').map(str::trim).collect();
+    if steps.iter().any(|s| s.is_empty()) {
+        return Err(wrong(format!("\"{key}\" is not a dotted key")));
+    }
+    if steps.len() < 2 {
+        return Err(wrong(format!("\"{key}\" names no table")));
+    }
+    let place = Place::Flag(format!("--set {text}"));
+    let at = |_: usize| place.clone();
+    let node = match DeValue::parse(value.trim()) {
+        Ok(parsed) => node(&parsed, &at, key)?,
+        Err(_) => Node {
+            value: Value::String(value.to_string()),
+            place: place.clone(),
+        },
+    };
+    insert(root, &steps, node, &place).map_err(wrong)
+}
+
+fn insert(target: &mut Node, steps: &[&str], node: Node, place: &Place) -> Result<(), String> {
+    let Some((step, rest)) = steps.split_first() else {
+        *target = node;
+        return Ok(());
+    };
+    match &mut target.value {
+        Value::Table(entries) => {
+            let index = entries.iter().position(|e| e.name == *step);
+            let index = index.unwrap_or_else(|| {
+                entries.push(Entry {
+                    name: (*step).into(),
+                    place: place.clone(),
+                    node: Node {
+                        value: Value::Table(Vec::new()),
+                        place: place.clone(),
+                    },
+                });
+                entries.len() - 1
+            });
+            insert(&mut entries[index].node, rest, node, place)
+        }
+        Value::Array(items) => {
+            let count = items.len();
+            let item = step
+                .parse::<usize>()
+                .ok()
+                .and_then(|i| items.get_mut(i))
+                .ok_or_else(|| match count {
+                    0 => format!("\"{step}\" steps into an empty list"),
+                    _ => format!(
+                        "\"{step}\" is no index of a list of {count}; accepted: 0 to {}",
+                        count - 1
+                    ),
+                })?;
+            insert(item, rest, node, place)
+        }
+        _ => Err(format!("\"{step}\" is below a key that is not a table")),
+    }
+}

@@ -1,0 +1,256 @@
+//! What can go wrong with configuration and with stage folders.
+use std::fmt;
+use std::io;
+use std::path::PathBuf;
+
+use crate::config::Place;
+
+/// A `pipeline.toml`, or a `--set` that amends it, cannot be used as it stands.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ConfigError {
+    /// The file could not be read.
+    #[error("cannot read {}: {cause}; name another file with --pipeline", path.display())]
+    Read {
+        /// The file that was asked for.
+        path: PathBuf,
+        /// The operating system's reason.
+        cause: String,
+    },
+    /// The text is not TOML.
+    #[error("{at}: not valid TOML: {message}")]
+    Syntax {
+        /// Where.
+        at: Place,
+        /// The parser's finding.
+        message: String,
+    },
+    /// A `--set` is not of the form `table.key=value`.
+    #[error("--set {text}: {message}; write --set table.key=value, as in --set scene.class=car")]
+    Override {
+        /// What followed `--set`.
+        text: String,
+        /// What is wrong with it.
+        message: String,
+    },
+    /// A key or table that nothing reads.
+    #[error("{at}: unknown key \"{key}\"{}; {} accepts: {}", did_you_mean(nearest), table_name(table), accepted.join(", "))]
+    UnknownKey {
+        /// Where.
+        at: Place,
+        /// The whole dotted key.
+        key: String,
+        /// The dotted name of the table that it stands in; empty for the top level.
+        table: String,
+        /// Keys that the table knows.
+        accepted: Vec<String>,
+        /// The accepted key that looks most like it.
+        nearest: Option<String>,
+    },
+    /// A value of the wrong type or out of its type's range.
+    #[error("{at}: {key} is {found}, accepted: {accepted}")]
+    WrongType {
+        /// Where.
+        at: Place,
+        /// The whole dotted key.
+        key: String,
+        /// What stands there.
+        found: String,
+        /// What may stand there.
+        accepted: String,
+    },
+    /// A string that is not one of the accepted ones.
+    #[error(
+        "{at}: {key} is \"{found}\"{}, accepted: {}",
+        did_you_mean(nearest),
+        quoted(accepted)
+    )]
+    UnknownChoice {
+        /// Where.
+        at: Place,
+        /// The whole dotted key.
+        key: String,
+        /// What stands there.
+        found: String,
+        /// What may stand there.
+        accepted: Vec<String>,
+        /// The accepted value that looks most like it.
+        nearest: Option<String>,
+    },
+    /// A key without a default is absent.
+    #[error(
+        "{at}: {} lacks the key \"{key}\"; add it there or pass --set {dotted}=VALUE",
+        table_name(table)
+    )]
+    MissingKey {
+        /// Where.
+        at: Place,
+        /// The dotted name of the table that lacks it.
+        table: String,
+        /// The key's own name.
+        key: String,
+        /// The whole dotted key.
+        dotted: String,
+    },
+    /// A value that its reader refuses, for the reason given.
+    #[error("{at}: {key}: {message}")]
+    Invalid {
+        /// Where.
+        at: Place,
+        /// The whole dotted key.
+        key: String,
+        /// The reader's own words.
+        message: String,
+    },
+}
+
+fn did_you_mean(nearest: &Option<String>) -> String {
+    nearest
+        .as_ref()
+        .map_or_else(String::new, |name| format!(" (did you mean \"{name}\"?)"))
+}
+
+fn table_name(table: &str) -> String {
+    if table.is_empty() {
+        "the top level".into()
+    } else {
+        format!("[{table}]")
+    }
+}
+
+fn quoted(values: &[String]) -> String {
+    let quoted: Vec<_> = values.iter().map(|v| format!("\"{v}\"")).collect();
+    quoted.join(", ")
+}
+
+/// A stage's folder cannot be read, locked or written.
+#[derive(Debug, thiserror::Error)]
+pub enum StageError {
+    /// The file system refused.
+    #[error("cannot {action} {}: {}{}", path.display(), plain(source), remedy(source))]
+    Io {
+        /// A verb, as in "write".
+        action: &'static str,
+        /// The file or folder.
+        path: PathBuf,
+        /// The operating system's reason.
+        source: io::Error,
+    },
+    /// Another process writes the same folder.
+    #[error("{} is being written by {holder}; wait for it to end, pass --wait, or choose another folder with --out", folder.display())]
+    Locked {
+        /// The stage's folder.
+        folder: PathBuf,
+        /// Who holds the lock, in words.
+        holder: String,
+    },
+    /// The target holds something that no stage wrote.
+    #[error("{} is there already and holds no stage.json, so no stage wrote it and it is left alone; move it away or choose another folder with --out", folder.display())]
+    Foreign {
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// An earlier stage has not run.
+    #[error("{} is missing: run {executable} first", path.display())]
+    NotRun {
+        /// The `stage.json` that was looked for.
+        path: PathBuf,
+        /// The executable that writes it.
+        executable: String,
+    },
+    /// `stage.json` cannot be understood.
+    #[error("{}: not a stage manifest: {message}; run the stage again", path.display())]
+    Manifest {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        message: String,
+    },
+    /// An output no longer has the bytes that its stage wrote.
+    #[error("{}: {damage}; run the stage \"{stage}\" again", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// The stage that wrote it.
+        stage: String,
+        /// What differs.
+        damage: Damage,
+    },
+    /// A name that would leave the stage's folder.
+    #[error("{}: an artifact's path must stay inside its stage's folder", path.display())]
+    Escapes {
+        /// The offending relative path.
+        path: PathBuf,
+    },
+}
+
+impl StageError {
+    pub(crate) fn io(action: &'static str, path: impl Into<PathBuf>, source: io::Error) -> Self {
+        Self::Io {
+            action,
+            path: path.into(),
+            source,
+        }
+    }
+}
+
+/// How an artifact differs from what its manifest says.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(tag = "damage", rename_all = "snake_case")]
+pub enum Damage {
+    /// The file is gone.
+    Missing,
+    /// The file has another length.
+    Length {
+        /// Bytes when it was written.
+        written: u64,
+        /// Bytes now.
+        found: u64,
+    },
+    /// Same length, other bytes.
+    Content {
+        /// Hash when it was written.
+        written: String,
+        /// Hash now.
+        found: String,
+    },
+}
+
+impl fmt::Display for Damage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Missing => write!(f, "the file is gone"),
+            Self::Length { written, found } => {
+                write!(f, "damaged: {found} bytes, but {written} were written")
+            }
+            Self::Content { written, found } => write!(
+                f,
+                "damaged: its BLAKE3 hash is {}…, but {}… was written",
+                &found[..found.len().min(12)],
+                &written[..written.len().min(12)]
+            ),
+        }
+    }
+}
+
+/// The operating system's reason without Rust's "(os error 28)".
+pub(crate) fn plain(error: &io::Error) -> String {
+    let text = error.to_string();
+    let end = text.find(" (os error").unwrap_or(text.len());
+    let mut reason = text[..end].to_string();
+    if let Some(first) = reason.get_mut(..1) {
+        first.make_ascii_lowercase();
+    }
+    reason
+}
+
+fn remedy(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+            "; free some space or choose another folder with --out (earlier results are untouched)"
+        }
+        io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
+            "; choose a folder that you may write with --out (earlier results are untouched)"
+        }
+        _ => "",
+    }
+}

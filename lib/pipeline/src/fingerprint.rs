@@ -1,0 +1,403 @@
+//! Whether a stage has to run again, and why.
+//!
+//! | enters the fingerprint | does not |
+//! |---|---|
+//! | stage name and code version | crate version, executable |
+//! | parameters, defaults filled in, in any order | comments and layout of the TOML |
+//! | seed | number of threads, device |
+//! | role and content hash of every input | modification times, absolute paths |
+//!
+//! Where a parameter is the path of an input, the input's role stands in for it: moving a file
+//! does not change what is in it.
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use serde_json::Value;
+
+use crate::error::{Damage, StageError};
+use crate::manifest::{Artifact, Manifest};
+use crate::stage::StagePlan;
+
+/// A hash of everything that decides a stage's outputs.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
+pub struct Fingerprint(String);
+
+impl Fingerprint {
+    /// The fingerprint of a planned run.
+    pub fn of_plan(plan: &StagePlan) -> Self {
+        Self::new(
+            &plan.stage,
+            plan.version,
+            &plan.params,
+            plan.seed,
+            &plan.inputs,
+        )
+    }
+
+    /// The fingerprint of a run that was made.
+    pub fn of_manifest(m: &Manifest) -> Self {
+        Self::new(&m.stage, m.version, &m.params, m.seed, &m.inputs)
+    }
+
+    fn new(stage: &str, version: u32, params: &Value, seed: u64, inputs: &[Artifact]) -> Self {
+        let mut hasher = blake3::Hasher::new();
+        let mut put = |text: &str| {
+            hasher.update(&(text.len() as u64).to_le_bytes());
+            hasher.update(text.as_bytes());
+        };
+        put("fingerprint 1");
+        put(stage);
+        put(&version.to_string());
+        put(&seed.to_string());
+        for (key, value) in flat(params, inputs) {
+            put(&key);
+            put(&value);
+        }
+        put("inputs");
+        for (role, hash) in by_role(inputs) {
+            put(role);
+            put(hash);
+        }
+        Self(hasher.finalize().to_hex().to_string())
+    }
+
+    /// 64 hexadecimal digits.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+/// Why a stage has to run.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(tag = "reason", rename_all = "snake_case")]
+pub enum StaleReason {
+    /// It never ran here, or its manifest cannot be read.
+    NeverRun,
+    /// The stage's code is newer.
+    Version {
+        /// Version that made the outputs.
+        was: u32,
+        /// Version at hand.
+        now: u32,
+    },
+    /// Another seed.
+    Seed {
+        /// Seed of the outputs.
+        was: u64,
+        /// Seed asked for.
+        now: u64,
+    },
+    /// A parameter differs; `None` means absent.
+    Parameter {
+        /// Dotted key.
+        key: String,
+        /// JSON text of the outputs' value.
+        was: Option<String>,
+        /// JSON text of the value asked for.
+        now: Option<String>,
+    },
+    /// An input has other bytes.
+    InputChanged {
+        /// Its role.
+        role: String,
+        /// Where it is.
+        path: PathBuf,
+    },
+    /// An input that was not there before.
+    InputAdded {
+        /// Its role.
+        role: String,
+    },
+    /// An input that is no longer read.
+    InputRemoved {
+        /// Its role.
+        role: String,
+    },
+    /// An output is not as it was written.
+    OutputDamaged {
+        /// The file.
+        path: PathBuf,
+        /// How it differs.
+        damage: Damage,
+    },
+}
+
+impl fmt::Display for StaleReason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let shown = |v: &Option<String>| v.clone().unwrap_or_else(|| "unset".into());
+        match self {
+            Self::NeverRun => write!(f, "it has not run yet"),
+            Self::Version { was, now } => {
+                write!(f, "its code changed from version {was} to {now}")
+            }
+            Self::Seed { was, now } => write!(f, "the seed changed from {was} to {now}"),
+            Self::Parameter { key, was, now } => {
+                write!(f, "{key} changed from {} to {}", shown(was), shown(now))
+            }
+            Self::InputChanged { role, path } => {
+                write!(f, "the {role} {} has other content", path.display())
+            }
+            Self::InputAdded { role } => write!(f, "it now reads the {role}"),
+            Self::InputRemoved { role } => write!(f, "it no longer reads the {role}"),
+            Self::OutputDamaged { path, damage } => write!(f, "{}: {damage}", path.display()),
+        }
+    }
+}
+
+/// Every reason why the outputs in `folder` are not those of `plan`; none if they are.
+pub fn stale_reasons(plan: &StagePlan, folder: &Path) -> Result<Vec<StaleReason>, StageError> {
+    let manifest = match Manifest::read(folder, "") {
+        Ok(m) if m.stage == plan.stage => m,
+        Ok(_) | Err(StageError::NotRun { .. } | StageError::Manifest { .. }) => {
+            return Ok(vec![StaleReason::NeverRun]);
+        }
+        Err(e) => return Err(e),
+    };
+    let mut reasons = Vec::new();
+    if manifest.version != plan.version {
+        reasons.push(StaleReason::Version {
+            was: manifest.version,
+            now: plan.version,
+        });
+    }
+    if manifest.seed != plan.seed {
+        reasons.push(StaleReason::Seed {
+            was: manifest.seed,
+            now: plan.seed,
+        });
+    }
+    reasons.extend(parameter_changes(&manifest, plan));
+    reasons.extend(input_changes(&manifest.inputs, &plan.inputs));
+    let damages = manifest.damages(folder)?;
+    reasons.extend(
+        damages
+            .into_iter()
+            .map(|(path, damage)| StaleReason::OutputDamaged { path, damage }),
+    );
+    Ok(reasons)
+}
+
+fn parameter_changes(manifest: &Manifest, plan: &StagePlan) -> Vec<StaleReason> {
+    let was = flat(&manifest.params, &manifest.inputs);
+    let now = flat(&plan.params, &plan.inputs);
+    let mut keys: Vec<&String> = was.iter().chain(&now).map(|(key, _)| key).collect();
+    keys.sort();
+    keys.dedup();
+    let find = |list: &[(String, String)], key: &str| {
+        list.iter().find(|(k, _)| k == key).map(|(_, v)| v.clone())
+    };
+    keys.into_iter()
+        .map(|key| (key, find(&was, key), find(&now, key)))
+        .filter(|(_, was, now)| was != now)
+        .map(|(key, was, now)| StaleReason::Parameter {
+            key: key.clone(),
+            was,
+            now,
+        })
+        .collect()
+}
+
+fn input_changes(was: &[Artifact], now: &[Artifact]) -> Vec<StaleReason> {
+    let mut reasons = Vec::new();
+    for input in now {
+        match was.iter().find(|a| a.role == input.role) {
+            None => reasons.push(StaleReason::InputAdded {
+                role: input.role.clone(),
+            }),
+            Some(old) if old.blake3 != input.blake3 => reasons.push(StaleReason::InputChanged {
+                role: input.role.clone(),
+                path: input.path.clone(),
+            }),
+            Some(_) => {}
+        }
+    }
+    for old in was {
+        if !now.iter().any(|a| a.role == old.role) {
+            reasons.push(StaleReason::InputRemoved {
+                role: old.role.clone(),
+            });
+        }
+    }
+    reasons
+}
+
+fn by_role(inputs: &[Artifact]) -> Vec<(&str, &str)> {
+    let mut pairs: Vec<_> = inputs
+        .iter()
+        .map(|a| (a.role.as_str(), a.blake3.as_str()))
+        .collect();
+    pairs.sort_unstable();
+    pairs
+}
+
+/// Every leaf of `params` as (dotted key, JSON text), sorted by key.
+fn flat(params: &Value, inputs: &[Artifact]) -> Vec<(String, String)> {
+    let mut leaves = Vec::new();
+    collect(params, String::new(), inputs, &mut leaves);
+    leaves.sort();
+    leaves
+}
+
+fn collect(value: &Value, key: String, inputs: &[Artifact], leaves: &mut Vec<(String, String)>) {
+    let below = |step: &str| match key.is_empty() {
+        true => step.to_string(),
+        false => format!("{key}.{step}"),
+    };
+    match value {
+        Value::Object(members) if !members.is_empty() => {
+            for (name, member) in members {
+                collect(member, below(name), inputs, leaves);
+            }
+        }
+        Value::Array(items) if !items.is_empty() => {
+            for (i, item) in items.iter().enumerate() {
+                collect(item, below(&i.to_string()), inputs, leaves);
+            }
+        }
+        Value::String(text) => {
+            let input = inputs.iter().find(|a| a.path == Path::new(text));
+            let text = match input {
+                Some(input) => format!("<{}>", input.role),
+                None => value.to_string(),
+            };
+            leaves.push((key, text));
+        }
+        leaf => leaves.push((key, leaf.to_string())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use serde_json::json;
+
+    use super::*;
+    use crate::lock::WhenLocked;
+    use crate::stage::StageWriter;
+
+    fn plan(folder: &Path) -> StagePlan {
+        let background = folder.join("background.png");
+        if !background.exists() {
+            fs::write(&background, "pixels").unwrap();
+        }
+        let params = json!({
+            "background": background,
+            "class": "car",
+            "position": [0.0, 1.0, 2.0],
+        });
+        let mut plan = StagePlan::new("scene", 1, params, 0);
+        plan.input("background", &background, &background).unwrap();
+        plan
+    }
+
+    fn run(plan: &StagePlan, target: &Path) {
+        let mut writer = StageWriter::begin(target, plan.clone(), WhenLocked::Refuse).unwrap();
+        fs::write(writer.output("image", "a.png").unwrap(), "a").unwrap();
+        writer.finish().unwrap();
+    }
+
+    fn reasons(plan: &StagePlan, target: &Path) -> Vec<String> {
+        let reasons = stale_reasons(plan, target).unwrap();
+        let manifest = Manifest::read(target, "").unwrap();
+        let same = Fingerprint::of_manifest(&manifest) == Fingerprint::of_plan(plan);
+        let only_outputs = reasons
+            .iter()
+            .all(|r| matches!(r, StaleReason::OutputDamaged { .. }));
+        assert_eq!(same, only_outputs, "fingerprints and reasons must agree");
+        reasons.iter().map(ToString::to_string).collect()
+    }
+
+    #[test]
+    fn a_stage_that_ran_with_the_same_plan_is_fresh() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("scene");
+        let plan = plan(dir.path());
+        assert_eq!(
+            stale_reasons(&plan, &target).unwrap(),
+            [StaleReason::NeverRun]
+        );
+        run(&plan, &target);
+        assert!(reasons(&plan, &target).is_empty());
+    }
+
+    #[test]
+    fn every_kind_of_change_is_named_in_words() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("scene");
+        let first = plan(dir.path());
+        run(&first, &target);
+
+        let mut changed = first.clone();
+        changed.seed = 5;
+        assert_eq!(reasons(&changed, &target), ["the seed changed from 0 to 5"]);
+
+        let mut changed = first.clone();
+        changed.version = 2;
+        assert_eq!(
+            reasons(&changed, &target),
+            ["its code changed from version 1 to 2"]
+        );
+
+        let mut changed = first.clone();
+        changed.params["class"] = json!("chair");
+        changed.params["position"][1] = json!(1.5);
+        changed.params["extra"] = json!(true);
+        assert_eq!(
+            reasons(&changed, &target),
+            [
+                "class changed from \"car\" to \"chair\"",
+                "extra changed from unset to true",
+                "position.1 changed from 1.0 to 1.5",
+            ]
+        );
+
+        fs::write(dir.path().join("background.png"), "other").unwrap();
+        let path = dir.path().join("background.png");
+        assert_eq!(
+            reasons(&plan(dir.path()), &target),
+            [format!(
+                "the background {} has other content",
+                path.display()
+            )]
+        );
+    }
+
+    #[test]
+    fn moving_the_folder_or_touching_a_file_changes_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let here = dir.path().join("here");
+        fs::create_dir(&here).unwrap();
+        run(&plan(&here), &here.join("scene"));
+        let there = dir.path().join("there");
+        fs::rename(&here, &there).unwrap();
+        fs::write(there.join("background.png"), "pixels").unwrap();
+        assert!(reasons(&plan(&there), &there.join("scene")).is_empty());
+    }
+
+    #[test]
+    fn the_order_of_parameters_does_not_matter() {
+        let a = StagePlan::new("s", 1, json!({"a": 1, "b": {"c": 2, "d": 3}}), 0);
+        let b = StagePlan::new("s", 1, json!({"b": {"d": 3, "c": 2}, "a": 1}), 0);
+        let c = StagePlan::new("s", 1, json!({"b": {"d": 2, "c": 3}, "a": 1}), 0);
+        assert_eq!(Fingerprint::of_plan(&a), Fingerprint::of_plan(&b));
+        assert_ne!(Fingerprint::of_plan(&a), Fingerprint::of_plan(&c));
+    }
+
+    #[test]
+    fn a_damaged_output_makes_its_stage_stale() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("scene");
+        let plan = plan(dir.path());
+        run(&plan, &target);
+        fs::write(target.join("a.png"), "").unwrap();
+        assert_eq!(
+            reasons(&plan, &target),
+            [format!(
+                "{}: damaged: 0 bytes, but 1 were written",
+                target.join("a.png").display()
+            )]
+        );
+    }
+}

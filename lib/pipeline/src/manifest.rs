@@ -1,0 +1,201 @@
+//! `stage.json`: what a stage read, with which settings, and what it wrote.
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::{Component, Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Damage, StageError, plain};
+
+/// Version of the manifest's own layout.
+pub const SCHEMA: u32 = 1;
+/// The manifest's file name in a stage's folder.
+pub const FILE_NAME: &str = "stage.json";
+
+/// One file that a stage read or wrote.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Artifact {
+    /// What it is to the stage, as in `background`; unique among the stage's inputs or outputs.
+    pub role: String,
+    /// Inputs: as named in the configuration. Outputs: relative to the stage's folder.
+    pub path: PathBuf,
+    /// Length.
+    pub bytes: u64,
+    /// Hash of the content, 64 hexadecimal digits.
+    pub blake3: String,
+}
+
+impl Artifact {
+    /// Hashes the file `location`, to be known as `path`.
+    pub fn of(role: &str, path: &Path, location: &Path) -> Result<Self, StageError> {
+        let (bytes, blake3) = hash_file(location)?;
+        Ok(Self {
+            role: role.into(),
+            path: path.into(),
+            bytes,
+            blake3,
+        })
+    }
+
+    /// How the file `location` differs from this entry, if it does.
+    pub fn damage(&self, location: &Path) -> Result<Option<Damage>, StageError> {
+        let (found, hash) = match hash_file(location) {
+            Ok(found) => found,
+            Err(StageError::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {
+                return Ok(Some(Damage::Missing));
+            }
+            Err(e) => return Err(e),
+        };
+        Ok(if found != self.bytes {
+            Some(Damage::Length {
+                written: self.bytes,
+                found,
+            })
+        } else if hash != self.blake3 {
+            Some(Damage::Content {
+                written: self.blake3.clone(),
+                found: hash,
+            })
+        } else {
+            None
+        })
+    }
+}
+
+/// The content of `stage.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    /// Layout of this file: [`SCHEMA`].
+    pub schema: u32,
+    /// Name of the stage, as in `scene`.
+    pub stage: String,
+    /// Version of the stage's code; raised whenever the same inputs give other outputs.
+    pub version: u32,
+    /// Settings, defaults filled in.
+    pub params: serde_json::Value,
+    /// Seed of every random number.
+    pub seed: u64,
+    /// What computed it, as in `cpu`.
+    pub device: String,
+    /// Files that were read.
+    pub inputs: Vec<Artifact>,
+    /// Files that were written, but this one.
+    pub outputs: Vec<Artifact>,
+    /// Wall time, seconds.
+    pub elapsed_s: f64,
+    /// Largest resident memory of the process, where the operating system tells.
+    pub peak_rss_bytes: Option<u64>,
+    /// The stage's own estimate of its error, in the unit that its documentation names.
+    pub estimated_error: Option<f64>,
+}
+
+impl Manifest {
+    /// Reads the manifest in a stage's `folder`; `executable` is named if it is not there.
+    pub fn read(folder: &Path, executable: &str) -> Result<Self, StageError> {
+        let path = folder.join(FILE_NAME);
+        let text = match fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+                return Err(StageError::NotRun {
+                    path,
+                    executable: executable.into(),
+                });
+            }
+            Err(e) => return Err(StageError::io("read", path, e)),
+        };
+        Self::parse(&text, &path)
+    }
+
+    /// Reads a manifest from its text; `path` is for messages.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, StageError> {
+        let wrong = |message: String| StageError::Manifest {
+            path: path.into(),
+            message,
+        };
+        let manifest: Self = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
+        if manifest.schema != SCHEMA {
+            return Err(wrong(format!(
+                "schema {} is not the {SCHEMA} that this version reads",
+                manifest.schema
+            )));
+        }
+        for artifact in &manifest.outputs {
+            check_inside(&artifact.path)?;
+        }
+        Ok(manifest)
+    }
+
+    /// Every output that no longer has the bytes that were written.
+    pub fn damages(&self, folder: &Path) -> Result<Vec<(PathBuf, Damage)>, StageError> {
+        let mut damages = Vec::new();
+        for artifact in &self.outputs {
+            let location = folder.join(&artifact.path);
+            if let Some(damage) = artifact.damage(&location)? {
+                damages.push((location, damage));
+            }
+        }
+        Ok(damages)
+    }
+
+    /// The output with the given role, checked against its hash.
+    pub fn output(&self, folder: &Path, role: &str) -> Result<PathBuf, StageError> {
+        let artifact = self
+            .outputs
+            .iter()
+            .find(|a| a.role == role)
+            .ok_or_else(|| StageError::Manifest {
+                path: folder.join(FILE_NAME),
+                message: format!("it lists no output \"{role}\""),
+            })?;
+        let path = folder.join(&artifact.path);
+        match artifact.damage(&path)? {
+            None => Ok(path),
+            Some(damage) => Err(StageError::Damaged {
+                path,
+                stage: self.stage.clone(),
+                damage,
+            }),
+        }
+    }
+}
+
+/// Refuses paths that leave the folder that they are relative to.
+pub(crate) fn check_inside(path: &Path) -> Result<(), StageError> {
+    let inside = path.components().all(|c| matches!(c, Component::Normal(_)));
+    if inside && path.components().next().is_some() {
+        Ok(())
+    } else {
+        Err(StageError::Escapes { path: path.into() })
+    }
+}
+
+/// Length and BLAKE3 hash of a file, read in pieces.
+pub fn hash_file(path: &Path) -> Result<(u64, String), StageError> {
+    let failed = |e| StageError::io("read", path, e);
+    let mut file = File::open(path).map_err(failed)?;
+    let mut hasher = blake3::Hasher::new();
+    let mut buffer = vec![0; 1 << 18];
+    let mut bytes = 0;
+    loop {
+        match file.read(&mut buffer).map_err(failed)? {
+            0 => return Ok((bytes, hasher.finalize().to_hex().to_string())),
+            n => {
+                hasher.update(&buffer[..n]);
+                bytes += n as u64;
+            }
+        }
+    }
+}
+
+/// The process's largest resident memory so far, where the operating system tells.
+pub fn peak_rss_bytes() -> Option<u64> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|l| l.starts_with("VmHWM:"))?;
+    let kib: u64 = line.split_whitespace().nth(1)?.parse().ok()?;
+    Some(kib * 1024)
+}
+
+/// For messages about files that other crates read: the operating system's reason alone.
+pub fn plain_reason(error: &std::io::Error) -> String {
+    plain(error)
+}

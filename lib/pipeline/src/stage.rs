@@ -1,0 +1,252 @@
+//! A stage's output folder: all of it, or nothing.
+//!
+//! A stage writes into `.NAME.partial` beside its target under a lock. When it is done, its files
+//! are flushed to disk, `stage.json` is written last, and the two folders change places in one
+//! step. Killed at any instant, the target holds either the earlier result or the new one.
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use crate::error::StageError;
+use crate::lock::{FolderLock, WhenLocked, create_folder, sibling};
+use crate::manifest::{Artifact, FILE_NAME, Manifest, SCHEMA, check_inside, peak_rss_bytes};
+
+/// What identifies a run of a stage, before it has run.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StagePlan {
+    /// Name of the stage, as in `scene`.
+    pub stage: String,
+    /// Version of the stage's code.
+    pub version: u32,
+    /// Settings, defaults filled in.
+    pub params: serde_json::Value,
+    /// Seed of every random number.
+    pub seed: u64,
+    /// What computes it, as in `cpu`.
+    pub device: String,
+    /// Files that are read, hashed.
+    pub inputs: Vec<Artifact>,
+}
+
+impl StagePlan {
+    /// A plan without inputs on the CPU.
+    pub fn new(stage: &str, version: u32, params: serde_json::Value, seed: u64) -> Self {
+        Self {
+            stage: stage.into(),
+            version,
+            params,
+            seed,
+            device: "cpu".into(),
+            inputs: Vec::new(),
+        }
+    }
+
+    /// Adds the file `location`, which the configuration calls `path`.
+    pub fn input(&mut self, role: &str, path: &Path, location: &Path) -> Result<(), StageError> {
+        self.inputs.push(Artifact::of(role, path, location)?);
+        Ok(())
+    }
+}
+
+/// An output folder being written. Dropped unfinished, it leaves nothing behind.
+#[derive(Debug)]
+pub struct StageWriter {
+    target: PathBuf,
+    partial: PathBuf,
+    plan: StagePlan,
+    outputs: Vec<(String, PathBuf)>,
+    estimated_error: Option<f64>,
+    started: Instant,
+    finished: bool,
+    _lock: FolderLock,
+}
+
+impl StageWriter {
+    /// Locks `target` and opens an empty folder beside it.
+    pub fn begin(
+        target: &Path,
+        plan: StagePlan,
+        when_locked: WhenLocked,
+    ) -> Result<Self, StageError> {
+        let started = Instant::now();
+        if let Some(parent) = target.parent().filter(|p| !p.as_os_str().is_empty()) {
+            create_folder(parent)?;
+        }
+        let lock = FolderLock::take(target, when_locked)?;
+        recover(target)?;
+        refuse_foreign(target)?;
+        let partial = sibling(target, "partial");
+        remove_folder(&partial)?;
+        create_folder(&partial)?;
+        Ok(Self {
+            target: target.into(),
+            partial,
+            plan,
+            outputs: Vec::new(),
+            estimated_error: None,
+            started,
+            finished: false,
+            _lock: lock,
+        })
+    }
+
+    /// Registers the output `name` (relative, `/` allowed) and returns where to write it.
+    pub fn output(&mut self, role: &str, name: impl AsRef<Path>) -> Result<PathBuf, StageError> {
+        let name = name.as_ref();
+        check_inside(name)?;
+        let path = self.partial.join(name);
+        if let Some(parent) = path.parent() {
+            create_folder(parent)?;
+        }
+        self.outputs.push((role.into(), name.into()));
+        Ok(path)
+    }
+
+    /// Writes `value` as indented JSON with a final newline.
+    pub fn write_json(
+        &mut self,
+        role: &str,
+        name: &str,
+        value: &impl serde::Serialize,
+    ) -> Result<(), StageError> {
+        let path = self.output(role, name)?;
+        write_json(&path, value)
+    }
+
+    /// What `stage.json` will say of the stage's error.
+    pub fn set_estimated_error(&mut self, error: f64) {
+        self.estimated_error = Some(error);
+    }
+
+    /// Seconds since [`begin`](Self::begin).
+    pub fn elapsed_s(&self) -> f64 {
+        self.started.elapsed().as_secs_f64()
+    }
+
+    /// Writes `stage.json`, flushes everything and swaps the folder in.
+    pub fn finish(mut self) -> Result<Manifest, StageError> {
+        let mut outputs = Vec::with_capacity(self.outputs.len());
+        for (role, name) in &self.outputs {
+            let path = self.partial.join(name);
+            flush(&path)?;
+            outputs.push(Artifact::of(role, name, &path)?);
+        }
+        let plan = self.plan.clone();
+        let manifest = Manifest {
+            schema: SCHEMA,
+            stage: plan.stage,
+            version: plan.version,
+            params: plan.params,
+            seed: plan.seed,
+            device: plan.device,
+            inputs: plan.inputs,
+            outputs,
+            elapsed_s: self.elapsed_s(),
+            peak_rss_bytes: peak_rss_bytes(),
+            estimated_error: self.estimated_error,
+        };
+        let path = self.partial.join(FILE_NAME);
+        write_json(&path, &manifest)?;
+        flush(&path)?;
+        flush(&self.partial)?;
+        swap(&self.partial, &self.target)?;
+        self.finished = true;
+        // The result stands; an earlier one that cannot be removed now goes at the next run.
+        let _ = remove_folder(&self.partial);
+        if let Some(parent) = self.target.parent().filter(|p| !p.as_os_str().is_empty()) {
+            flush(parent)?;
+        }
+        Ok(manifest)
+    }
+}
+
+impl Drop for StageWriter {
+    fn drop(&mut self) {
+        if !self.finished {
+            let _ = remove_folder(&self.partial);
+        }
+    }
+}
+
+fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), StageError> {
+    let failed = |e| StageError::io("write", path, e);
+    let mut text = serde_json::to_vec_pretty(value).map_err(|e| failed(e.into()))?;
+    text.push(b'\n');
+    let mut file = File::create(path).map_err(failed)?;
+    file.write_all(&text).map_err(failed)
+}
+
+fn flush(path: &Path) -> Result<(), StageError> {
+    let file = File::open(path).map_err(|e| StageError::io("read", path, e))?;
+    match file.sync_all() {
+        // Some file systems cannot flush a folder; its files have been flushed all the same.
+        Err(e) if path.is_dir() && e.kind() == io::ErrorKind::InvalidInput => Ok(()),
+        other => other.map_err(|e| StageError::io("write", path, e)),
+    }
+}
+
+/// A crash between the two renames of [`swap`]'s slow way leaves the earlier result here.
+fn recover(target: &Path) -> Result<(), StageError> {
+    let previous = sibling(target, "previous");
+    if !previous.exists() {
+        return Ok(());
+    }
+    if target.exists() {
+        return remove_folder(&previous);
+    }
+    fs::rename(&previous, target).map_err(|e| StageError::io("restore", target, e))
+}
+
+fn refuse_foreign(target: &Path) -> Result<(), StageError> {
+    let foreign = match fs::read_dir(target) {
+        Ok(mut entries) => entries.next().is_some() && !target.join(FILE_NAME).exists(),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => false,
+        Err(e) if e.kind() == io::ErrorKind::NotADirectory => true,
+        Err(e) => return Err(StageError::io("read", target, e)),
+    };
+    if foreign {
+        return Err(StageError::Foreign {
+            folder: target.into(),
+        });
+    }
+    Ok(())
+}
+
+fn remove_folder(folder: &Path) -> Result<(), StageError> {
+    match fs::remove_dir_all(folder) {
+        Err(e) if e.kind() != io::ErrorKind::NotFound => Err(StageError::io("remove", folder, e)),
+        _ => Ok(()),
+    }
+}
+
+/// Puts `partial` in `target`'s place; what was there before, if anything, ends up in `partial`.
+fn swap(partial: &Path, target: &Path) -> Result<(), StageError> {
+    let failed = |e| StageError::io("write", target, e);
+    if !target.exists() {
+        return fs::rename(partial, target).map_err(failed);
+    }
+    #[cfg(any(target_os = "linux", target_vendor = "apple"))]
+    {
+        use rustix::fs::{CWD, RenameFlags, renameat_with};
+        use rustix::io::Errno;
+        match renameat_with(CWD, partial, CWD, target, RenameFlags::EXCHANGE) {
+            Ok(()) => return Ok(()),
+            // Not every file system can exchange two names.
+            Err(Errno::INVAL | Errno::NOSYS | Errno::NOTSUP) => {}
+            Err(e) => return Err(failed(e.into())),
+        }
+    }
+    swap_in_two_steps(partial, target)
+}
+
+fn swap_in_two_steps(partial: &Path, target: &Path) -> Result<(), StageError> {
+    let failed = |e| StageError::io("write", target, e);
+    let previous = sibling(target, "previous");
+    fs::rename(target, &previous).map_err(failed)?;
+    fs::rename(partial, target).map_err(failed)?;
+    remove_folder(&previous)
+}
+
+#[cfg(test)]
+mod tests;
