@@ -43,3 +43,51 @@ impl Camera {
             .then(|| self.principal_px + self.focal_px * Vec2::new(c.x / -c.z, -c.y / -c.z))
     }
 }
+
+/// How wide the camera sees.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum FieldOfView {
+    /// Vertical angle, radians, in `(0, pi)`.
+    Vertical(f32),
+    /// A lens and the width of the sensor behind it, millimetres.
+    Lens {
+        /// Focal length.
+        focal_mm: f32,
+        /// Width of the sensor.
+        sensor_mm: f32,
+    },
+}
+
+/// Which axis of a camera file's world points up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum WorldUp {
+    /// +y, as here.
+    Y,
+    /// +z, as nerfstudio: (x, y, z) becomes (x, z, -y).
+    Z,
+}
+
+/// The checked `[scene.camera]` table.
+#[derive(Clone, Debug, PartialEq)]
+pub enum CameraSettings {
+    /// A camera by where it stands and what it looks at.
+    LookAt {
+        /// Centre of projection, metres.
+        position: Vec3,
+        /// The point in the centre of the image, metres.
+        look_at: Vec3,
+        /// What is up in the image; not parallel to the line of sight.
+        up: Vec3,
+        /// How wide it sees.
+        field_of_view: FieldOfView,
+    },
+    /// A frame of a nerfstudio `transforms.json`.
+    Transforms {
+        /// The file.
+        path: std::path::PathBuf,
+        /// Index of the frame.
+        frame: u32,
+        /// Which axis of the file's world is up.
+        up: WorldUp,
+    },
+}

@@ -1,6 +1,8 @@
 //! What can go wrong between a `[scene]` table and a scene.
 use std::path::PathBuf;
 
+use dipir_imaging::ImagingError;
+
 /// Every message names the offending key, file or element, the accepted form, and one remedy.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -57,13 +59,8 @@ pub enum Error {
         source: Box<Error>,
     },
     /// An image cannot be decoded.
-    #[error("image {name}: {detail}")]
-    Image {
-        /// File or name of the image.
-        name: String,
-        /// What the decoder says.
-        detail: String,
-    },
+    #[error(transparent)]
+    Image(ImagingError),
     /// The file is not of the kind that its extension or header promises.
     #[error("{detail}; {remedy}")]
     Malformed {

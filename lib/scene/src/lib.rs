@@ -1,13 +1,17 @@
 //! What stands in front of the camera: meshes, materials, textures, the camera,
 //! the proxy geometry that receives shadows, and the BVH that finds them.
+pub mod bvh;
 pub mod camera;
 pub mod config;
 pub mod error;
 pub mod import;
 pub mod material;
 pub mod mesh;
+pub mod placement;
 pub mod proxy;
+pub mod ray_offset;
 pub mod scene;
 pub mod texture;
+pub mod triangle;
 
 pub use error::Error;

@@ -89,10 +89,7 @@ impl ImageSource {
 
     fn decode(&self) -> Result<Raster<[u8; 4]>, Error> {
         let decode = |bytes: &[u8]| {
-            dipir_imaging::file::decode_texture(bytes).map_err(|e| Error::Image {
-                name: self.name(),
-                detail: e.to_string(),
-            })
+            dipir_imaging::file::decode_texture(bytes, &self.name()).map_err(Error::Image)
         };
         match self {
             Self::File(path) => decode(&read(path, "the texture")?),
@@ -131,7 +128,7 @@ impl Texture {
     /// Looks `texels` up the way this texture says.
     pub fn with_texels(&self, texels: Arc<Raster<[u8; 4]>>) -> DecodedTexture {
         let linear = |transfer: Transfer| {
-            std::array::from_fn(|i| transfer.decode_value(i as f32 / 255.0))
+            std::array::from_fn(|i| transfer.decode_scalar(i as f32 / 255.0))
         };
         DecodedTexture {
             texels,

@@ -1,0 +1,565 @@
+//! The `[scene]` table of `pipeline.toml`: as it is written, and what it means once checked.
+//!
+//! Two types for two moments: [`SceneConfig`] and its parts hold what was typed, with every key
+//! optional that has a default; [`SceneConfig::validate`] turns it into [`SceneSettings`], in which
+//! nothing contradicts anything else. Unknown keys are refused while parsing.
+use std::path::PathBuf;
+
+use dipir_imaging::transfer::Transfer;
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+use crate::camera::{CameraSettings, FieldOfView, WorldUp};
+use crate::error::Error;
+use crate::placement::{Anchor, Placement, Rest, Size};
+use crate::proxy::Plane;
+
+/// The `[scene]` table as written.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneConfig {
+    /// The photograph, required.
+    pub background: Option<PathBuf>,
+    /// How its values are encoded: `srgb` (default), `gamma22` or `linear`.
+    pub transfer: Option<String>,
+    /// What the object is called in prompts; `object` by default.
+    pub class: Option<String>,
+    /// Mask of the photo's own foreground: white lies in front of the object.
+    pub occluders: Option<PathBuf>,
+    /// At least one.
+    #[serde(default)]
+    pub objects: Vec<ObjectConfig>,
+    /// Required.
+    pub camera: Option<CameraConfig>,
+    /// What receives the shadow; nothing if absent.
+    pub proxy: Option<ProxyConfig>,
+    /// What to simulate.
+    #[serde(default)]
+    pub effects: EffectsConfig,
+}
+
+/// One `[[scene.objects]]` table as written.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ObjectConfig {
+    /// `.glb`, `.gltf` or `.obj`, required.
+    pub path: Option<PathBuf>,
+    /// Where the object rests, metres; the origin by default.
+    pub position: Option<[f32; 3]>,
+    /// Turn about the axis that points away from the proxy, counter-clockwise from above.
+    pub yaw_deg: Option<f32>,
+    /// Turn about the object's own x axis, before yaw.
+    pub pitch_deg: Option<f32>,
+    /// Turn about the object's own z axis, before pitch.
+    pub roll_deg: Option<f32>,
+    /// Factor on the file's metres, 1 by default.
+    pub scale: Option<f32>,
+    /// Instead of `scale`: the height of the object as placed, metres.
+    pub height_m: Option<f32>,
+    /// `proxy`: dropped onto the proxy at `position`'s x and z; `position`: the lowest point gets
+    /// `position`'s height, whatever the proxy. By default `position` where the proxy is a
+    /// horizontal plane or absent, else `proxy`.
+    pub rest: Option<String>,
+    /// Which point of the object comes to lie at `position`'s x and z: the file's `origin`
+    /// (default) or the `center` of its bounding box.
+    pub anchor: Option<String>,
+}
+
+/// The `[scene.camera]` table as written.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraConfig {
+    /// Centre of projection, metres.
+    pub position: Option<[f32; 3]>,
+    /// The point in the centre of the image, metres.
+    pub look_at: Option<[f32; 3]>,
+    /// What is up in the image, +y by default.
+    pub up: Option<[f32; 3]>,
+    /// Vertical field of view, degrees.
+    pub fov_deg: Option<f32>,
+    /// Focal length, millimetres; needs `sensor_mm`.
+    pub focal_mm: Option<f32>,
+    /// Width of the sensor, millimetres (36 for full frame).
+    pub sensor_mm: Option<f32>,
+    /// A nerfstudio `transforms.json` instead of all of the above.
+    pub transforms: Option<PathBuf>,
+    /// Which of its frames, 0 by default.
+    pub frame: Option<u32>,
+    /// Which axis of its world is up: `z` (nerfstudio's, default) or `y`.
+    pub transforms_up: Option<String>,
+}
+
+/// The `[scene.proxy]` table as written.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ProxyConfig {
+    /// An infinite plane.
+    pub plane: Option<PlaneConfig>,
+    /// Or a mesh, in world coordinates.
+    pub mesh: Option<PathBuf>,
+}
+
+/// `plane = { point = …, normal = … }`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlaneConfig {
+    /// Any point of the plane, metres; the origin by default.
+    #[serde(default)]
+    pub point: [f32; 3],
+    /// Points to the side that is seen, any length; +y by default.
+    #[serde(default = "plus_y")]
+    pub normal: [f32; 3],
+}
+
+fn plus_y() -> [f32; 3] {
+    [0.0, 1.0, 0.0]
+}
+
+/// Whether planning decides what is simulated.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EffectsMode {
+    /// Only what the scene calls for.
+    #[default]
+    Planned,
+    /// Everything.
+    All,
+}
+
+/// What the user says about one effect.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EffectSwitch {
+    /// Simulated, whatever it contributes.
+    On,
+    /// Left out, whatever it contributes.
+    Off,
+    /// Planning decides.
+    Auto,
+}
+
+macro_rules! effects_config {
+    ($($name:ident: $what:literal),* $(,)?) => {
+        /// The `[scene.effects]` table.
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub struct EffectsConfig {
+            /// Whether planning decides what is simulated.
+            #[serde(default)]
+            pub mode: EffectsMode,
+            /// Display-referred RMSE that may be left out, 0.002 by default.
+            #[serde(skip_serializing_if = "Option::is_none")]
+            pub tolerance: Option<f32>,
+            $(
+                #[doc = $what]
+                #[serde(skip_serializing_if = "Option::is_none")]
+                pub $name: Option<EffectSwitch>,
+            )*
+        }
+
+        impl EffectsConfig {
+            /// Every effect by the name that the table and `effects.json` use, with what the user
+            /// says about it.
+            pub fn switches(&self) -> Vec<(&'static str, EffectSwitch)> {
+                vec![$((stringify!($name), self.$name.unwrap_or(EffectSwitch::Auto))),*]
+            }
+        }
+    };
+}
+
+effects_config! {
+    shadow: "Light that the object takes from the proxy.",
+    proxy_occlusion: "Light that the proxy takes from itself.",
+    interreflection: "Light that bounces between parts of the object.",
+    specular: "Mirror-like reflection at the surface.",
+    textures: "Base colour, metalness and roughness that vary over the surface.",
+    normal_mapping: "Shading normals from textures.",
+    alpha_mask: "Coverage from base-colour alpha, masked or blended.",
+    emission: "Light that the object emits.",
+    emission_on_proxy: "Light that the object sheds on the proxy.",
+    clearcoat: "A coat over the base.",
+    transmission: "Light that passes through the surface.",
+    bounce_to_proxy: "Light that the object reflects onto the proxy.",
+    bounce_from_proxy: "Light that the proxy reflects onto the object.",
+    occluders: "The photo's own foreground in front of the object.",
+    motion: "Blur of a moving camera or object.",
+}
+
+impl EffectsConfig {
+    /// Default of [`tolerance`](Self::tolerance): half an 8-bit step.
+    pub const DEFAULT_TOLERANCE: f32 = 0.002;
+
+    /// Display-referred RMSE that may be left out.
+    pub fn tolerance(&self) -> f32 {
+        self.tolerance.unwrap_or(Self::DEFAULT_TOLERANCE)
+    }
+}
+
+/// The checked `[scene]` table; paths are still as written.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SceneSettings {
+    /// The photograph.
+    pub background: PathBuf,
+    /// How its values are encoded.
+    pub transfer: Transfer,
+    /// What the object is called in prompts.
+    pub class: String,
+    /// Mask of the photo's own foreground.
+    pub occluders: Option<PathBuf>,
+    /// At least one.
+    pub objects: Vec<ObjectSettings>,
+    /// Where the photo was taken from.
+    pub camera: CameraSettings,
+    /// What receives the shadow.
+    pub proxy: ProxySettings,
+    /// What to simulate.
+    pub effects: EffectsConfig,
+}
+
+/// A checked `[[scene.objects]]` table.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ObjectSettings {
+    /// The object's file.
+    pub path: PathBuf,
+    /// Where it goes.
+    pub placement: Placement,
+}
+
+/// A checked `[scene.proxy]` table.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ProxySettings {
+    /// No proxy.
+    None,
+    /// A plane with a unit normal.
+    Plane(Plane),
+    /// A mesh file.
+    Mesh(PathBuf),
+}
+
+impl SceneConfig {
+    /// Checks every key; the first that is wrong is reported with its value and the accepted form.
+    pub fn validate(&self) -> Result<SceneSettings, Error> {
+        let background = self.background.clone().ok_or_else(|| {
+            missing("scene.background", "name the photograph: background = \"photo.jpg\"")
+        })?;
+        let transfer = match self.transfer.as_deref() {
+            None | Some("srgb") => Transfer::Srgb,
+            Some("gamma22") => Transfer::Gamma22,
+            Some("linear") => Transfer::Linear,
+            Some(other) => {
+                return Err(wrong_word("scene.transfer", other, &["srgb", "gamma22", "linear"]));
+            }
+        };
+        let class = self.class.as_deref().unwrap_or("object").trim();
+        if class.is_empty() {
+            return Err(wrong(
+                "scene.class",
+                "\"\"",
+                "a word for the object, for instance class = \"car\"",
+            ));
+        }
+        if self.objects.is_empty() {
+            return Err(missing(
+                "scene.objects",
+                "add a table [[scene.objects]] with path = \"object.glb\"",
+            ));
+        }
+        let objects = self
+            .objects
+            .iter()
+            .enumerate()
+            .map(|(i, object)| object.validate(&format!("scene.objects[{i}]")))
+            .collect::<Result<_, _>>()?;
+        let camera = self.camera.as_ref().ok_or_else(|| {
+            missing(
+                "scene.camera",
+                "add a table [scene.camera] with position, look_at and fov_deg, or with transforms",
+            )
+        })?;
+        if let Some(t) = self.effects.tolerance
+            && !(t >= 0.0 && t <= 1.0)
+        {
+            return Err(wrong(
+                "scene.effects.tolerance",
+                t,
+                "a display-referred error from 0 to 1, for instance tolerance = 0.002",
+            ));
+        }
+        Ok(SceneSettings {
+            background,
+            transfer,
+            class: class.into(),
+            occluders: self.occluders.clone(),
+            objects,
+            camera: camera.validate()?,
+            proxy: match &self.proxy {
+                None => ProxySettings::None,
+                Some(proxy) => proxy.validate()?,
+            },
+            effects: self.effects,
+        })
+    }
+}
+
+impl ObjectConfig {
+    fn validate(&self, at: &str) -> Result<ObjectSettings, Error> {
+        let key = |name: &str| format!("{at}.{name}");
+        let path = self.path.clone().ok_or_else(|| {
+            missing(&key("path"), "name the object's file: path = \"object.glb\"")
+        })?;
+        let angle_rad = |name: &str, value: Option<f32>| match value.unwrap_or(0.0) {
+            v if v.is_finite() => Ok(v.to_radians()),
+            v => Err(wrong(&key(name), v, "a finite angle in degrees")),
+        };
+        let positive = |name: &str, value: f32, unit: &str, example: &str| {
+            if value.is_finite() && value > 0.0 {
+                Ok(value)
+            } else {
+                Err(wrong(
+                    &key(name),
+                    value,
+                    &format!("{unit} above 0, for instance {name} = {example}"),
+                ))
+            }
+        };
+        let size = match (self.scale, self.height_m) {
+            (Some(_), Some(_)) => return Err(conflict(&key("scale"), &key("height_m"))),
+            (scale, None) => Size::Scale(positive("scale", scale.unwrap_or(1.0), "a factor", "1.0")?),
+            (None, Some(h)) => Size::Height(positive("height_m", h, "metres", "1.4")?),
+        };
+        Ok(ObjectSettings {
+            path,
+            placement: Placement {
+                position: finite_point(&key("position"), self.position.unwrap_or_default())?,
+                yaw_rad: angle_rad("yaw_deg", self.yaw_deg)?,
+                pitch_rad: angle_rad("pitch_deg", self.pitch_deg)?,
+                roll_rad: angle_rad("roll_deg", self.roll_deg)?,
+                size,
+                rest: match self.rest.as_deref() {
+                    None => None,
+                    Some("proxy") => Some(Rest::Proxy),
+                    Some("position") => Some(Rest::Position),
+                    Some(other) => {
+                        return Err(wrong_word(&key("rest"), other, &["proxy", "position"]));
+                    }
+                },
+                anchor: match self.anchor.as_deref() {
+                    None | Some("origin") => Anchor::Origin,
+                    Some("center") => Anchor::Center,
+                    Some(other) => {
+                        return Err(wrong_word(&key("anchor"), other, &["origin", "center"]));
+                    }
+                },
+            },
+        })
+    }
+}
+
+impl CameraConfig {
+    fn validate(&self) -> Result<CameraSettings, Error> {
+        match &self.transforms {
+            Some(path) => self.validate_transforms(path.clone()),
+            None => self.validate_look_at(),
+        }
+    }
+
+    fn validate_transforms(&self, path: PathBuf) -> Result<CameraSettings, Error> {
+        let others = [
+            ("position", self.position.is_some()),
+            ("look_at", self.look_at.is_some()),
+            ("up", self.up.is_some()),
+            ("fov_deg", self.fov_deg.is_some()),
+            ("focal_mm", self.focal_mm.is_some()),
+            ("sensor_mm", self.sensor_mm.is_some()),
+        ];
+        if let Some((name, _)) = others.iter().find(|(_, given)| *given) {
+            return Err(conflict("scene.camera.transforms", &format!("scene.camera.{name}")));
+        }
+        Ok(CameraSettings::Transforms {
+            path,
+            frame: self.frame.unwrap_or(0),
+            up: match self.transforms_up.as_deref() {
+                None | Some("z") => WorldUp::Z,
+                Some("y") => WorldUp::Y,
+                Some(other) => {
+                    return Err(wrong_word("scene.camera.transforms_up", other, &["z", "y"]));
+                }
+            },
+        })
+    }
+
+    fn validate_look_at(&self) -> Result<CameraSettings, Error> {
+        for (name, given) in [
+            ("frame", self.frame.is_some()),
+            ("transforms_up", self.transforms_up.is_some()),
+        ] {
+            if given {
+                return Err(missing(
+                    "scene.camera.transforms",
+                    &format!("name the transforms.json that scene.camera.{name} is about"),
+                ));
+            }
+        }
+        let point = |name: &str, value: Option<[f32; 3]>| {
+            let key = format!("scene.camera.{name}");
+            match value {
+                Some(p) => finite_point(&key, p),
+                None => Err(missing(&key, &format!("write {name} = [x, y, z] in metres"))),
+            }
+        };
+        let position = point("position", self.position)?;
+        let look_at = point("look_at", self.look_at)?;
+        let backward = position - look_at;
+        if backward.length() < 1e-6 * (1.0 + position.length()) {
+            return Err(wrong(
+                "scene.camera.look_at",
+                triple(look_at),
+                "a point away from scene.camera.position",
+            ));
+        }
+        let up = finite_point("scene.camera.up", self.up.unwrap_or([0.0, 1.0, 0.0]))?;
+        // Below a thousandth of a radian between both directions roll is down to rounding.
+        if backward.normalize().cross(up.normalize_or_zero()).length() < 1e-3 {
+            return Err(wrong(
+                "scene.camera.up",
+                triple(up),
+                "a direction across the line of sight; looking straight down or up, write up = [0.0, 0.0, -1.0]",
+            ));
+        }
+        Ok(CameraSettings::LookAt {
+            position,
+            look_at,
+            up,
+            field_of_view: self.field_of_view()?,
+        })
+    }
+
+    fn field_of_view(&self) -> Result<FieldOfView, Error> {
+        let millimetres = |name: &str, value: f32| {
+            if value.is_finite() && value > 0.0 {
+                Ok(value)
+            } else {
+                Err(wrong(
+                    &format!("scene.camera.{name}"),
+                    value,
+                    "millimetres above 0, for instance focal_mm = 35.0 with sensor_mm = 36.0",
+                ))
+            }
+        };
+        match (self.fov_deg, self.focal_mm, self.sensor_mm) {
+            (Some(_), Some(_), _) => Err(conflict("scene.camera.fov_deg", "scene.camera.focal_mm")),
+            (Some(_), _, Some(_)) => Err(conflict("scene.camera.fov_deg", "scene.camera.sensor_mm")),
+            (Some(fov), None, None) if fov > 0.0 && fov < 180.0 => {
+                Ok(FieldOfView::Vertical(fov.to_radians()))
+            }
+            (Some(fov), None, None) => Err(wrong(
+                "scene.camera.fov_deg",
+                fov,
+                "a vertical field of view between 0 and 180 degrees, for instance fov_deg = 40.0",
+            )),
+            (None, Some(focal), Some(sensor)) => Ok(FieldOfView::Lens {
+                focal_mm: millimetres("focal_mm", focal)?,
+                sensor_mm: millimetres("sensor_mm", sensor)?,
+            }),
+            (None, Some(_), None) => Err(missing(
+                "scene.camera.sensor_mm",
+                "scene.camera.focal_mm needs the sensor's width, for instance sensor_mm = 36.0",
+            )),
+            (None, None, Some(_)) => Err(missing(
+                "scene.camera.focal_mm",
+                "scene.camera.sensor_mm needs the focal length, for instance focal_mm = 35.0",
+            )),
+            (None, None, None) => Err(missing(
+                "scene.camera.fov_deg",
+                "write the vertical field of view, fov_deg = 40.0, or focal_mm with sensor_mm",
+            )),
+        }
+    }
+}
+
+impl ProxyConfig {
+    fn validate(&self) -> Result<ProxySettings, Error> {
+        match (&self.plane, &self.mesh) {
+            (Some(_), Some(_)) => Err(conflict("scene.proxy.plane", "scene.proxy.mesh")),
+            (None, Some(path)) => Ok(ProxySettings::Mesh(path.clone())),
+            (None, None) => Err(missing(
+                "scene.proxy.plane",
+                "write plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] } or mesh = \"proxy.glb\", or leave the table out",
+            )),
+            (Some(plane), None) => {
+                let point = finite_point("scene.proxy.plane.point", plane.point)?;
+                let normal = finite_point("scene.proxy.plane.normal", plane.normal)?;
+                let unit = normal.as_dvec3().normalize_or_zero().as_vec3();
+                if unit == Vec3::ZERO {
+                    return Err(wrong(
+                        "scene.proxy.plane.normal",
+                        triple(normal),
+                        "a direction that is not zero, for instance normal = [0.0, 1.0, 0.0]",
+                    ));
+                }
+                Ok(ProxySettings::Plane(Plane {
+                    point,
+                    normal: unit,
+                }))
+            }
+        }
+    }
+}
+
+fn finite_point(key: &str, value: [f32; 3]) -> Result<Vec3, Error> {
+    let point = Vec3::from_array(value);
+    if point.is_finite() {
+        Ok(point)
+    } else {
+        Err(wrong(key, triple(point), "three finite numbers [x, y, z]"))
+    }
+}
+
+fn triple(v: Vec3) -> String {
+    format!("[{:?}, {:?}, {:?}]", v.x, v.y, v.z)
+}
+
+fn wrong(key: &str, value: impl std::fmt::Display, accepted: &str) -> Error {
+    Error::Config {
+        key: key.into(),
+        value: value.to_string(),
+        accepted: accepted.into(),
+    }
+}
+
+fn wrong_word(key: &str, value: &str, accepted: &[&str]) -> Error {
+    let mut list = String::new();
+    for (i, word) in accepted.iter().enumerate() {
+        let separator = match i {
+            0 => "",
+            _ if i + 1 == accepted.len() => " or ",
+            _ => ", ",
+        };
+        list += &format!("{separator}\"{word}\"");
+    }
+    let nearest = accepted
+        .iter()
+        .map(|word| (strsim::damerau_levenshtein(word, value), word))
+        .min();
+    if let Some((distance, word)) = nearest
+        && distance <= 2
+        && distance < word.len()
+    {
+        list += &format!(" (did you mean \"{word}\"?)");
+    }
+    wrong(key, format!("\"{value}\""), &list)
+}
+
+fn missing(key: &str, remedy: &str) -> Error {
+    Error::Missing {
+        key: key.into(),
+        remedy: remedy.into(),
+    }
+}
+
+fn conflict(first: &str, second: &str) -> Error {
+    Error::Conflict {
+        first: first.into(),
+        second: second.into(),
+    }
+}
