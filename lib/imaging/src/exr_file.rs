@@ -1,6 +1,7 @@
 //! OpenEXR files in and out, between the `exr` library and [`Layers`].
 use crate::{
     error::{ImagingError, MAX_PIXELS},
+    format::Format,
     layers::{Layers, Precision},
     raster::Raster,
 };
@@ -23,23 +24,21 @@ use exr::{
         SmallVec,
     },
 };
-use half::f16;
+use half::{f16, slice::HalfFloatSliceExt};
 use rayon::prelude::*;
 use std::{
     fs::File,
-    io::{BufReader, BufWriter, Write},
+    io::{BufRead, BufReader, BufWriter, Read, Seek, Write},
     path::Path,
 };
 
-/// What an OpenEXR file begins with.
-pub(crate) const MAGIC: [u8; 4] = [0x76, 0x2f, 0x31, 0x01];
-
 /// The name of the format in messages.
 const FORMAT: &str = "OpenEXR";
+const EXPECTED: &str = "an OpenEXR image";
 
 /// Writes all channels as one part of scan lines, ZIP1.
 pub(crate) fn write(layers: &Layers, path: &Path) -> Result<(), ImagingError> {
-    // Text only fails on characters above U+00FF; names were checked when they were inserted.
+    // Names were checked when they were inserted: they fit the format's one byte a character.
     let named: Vec<_> = layers.channels().collect();
     let channels: Vec<AnyChannel<FlatSamples>> = named
         .par_iter()
@@ -55,11 +54,12 @@ pub(crate) fn write(layers: &Layers, path: &Path) -> Result<(), ImagingError> {
     if layers.latlong {
         attributes.environment_map = Some(EnvironmentMap::LatitudeLongitude);
     }
-    for (name, value) in &layers.attributes {
-        let (Some(name), Some(value)) = (Text::new_or_none(name), Text::new_or_none(value)) else {
-            continue;
-        };
-        attributes.other.insert(name, AttributeValue::Text(value));
+    for (name, value) in layers.attributes() {
+        // Checked when they were set.
+        attributes.other.insert(
+            Text::new_or_panic(name),
+            AttributeValue::Text(Text::new_or_panic(value)),
+        );
     }
     let encoding = Encoding {
         compression: Compression::ZIP1,
@@ -88,12 +88,36 @@ fn half_samples(values: &[f32]) -> FlatSamples {
     if values.iter().any(|v| v.is_finite() && v.abs() > limit) {
         return FlatSamples::F32(values.to_vec());
     }
-    FlatSamples::F16(values.iter().map(|&v| f16::from_f32(v)).collect())
+    let mut halves = vec![f16::ZERO; values.len()];
+    halves.convert_from_f32_slice(values);
+    FlatSamples::F16(halves)
 }
 
-/// Reads the channels `names`, or all, onto the display window.
-pub(crate) fn read(path: &Path, names: Option<&[&str]>) -> Result<Layers, ImagingError> {
-    let file = File::open(path).map_err(|e| ImagingError::io("read", path, e))?;
+/// Opens `path` and reads as [`read`], after a look at its first bytes.
+pub(crate) fn open(path: &Path, names: Option<&[&str]>) -> Result<Layers, ImagingError> {
+    let failed = |e| ImagingError::io("read", path, e);
+    let file = File::open(path).map_err(failed)?;
+    let mut reader = BufReader::with_capacity(1 << 20, file);
+    let start = reader.fill_buf().map_err(failed)?;
+    if start.is_empty() {
+        return Err(ImagingError::Empty {
+            path: path.to_owned(),
+            expected: EXPECTED,
+        });
+    }
+    match Format::of(&start[..start.len().min(Format::SNIFF_LENGTH)]) {
+        Format::Exr => read(reader, path, names),
+        other => Err(other.refuse(path, EXPECTED)),
+    }
+}
+
+/// Reads the channels `names`, or all, onto the display window. A name that the file lacks is
+/// left out; asking the layers for it is an error.
+pub(crate) fn read(
+    source: impl Read + Seek + Send,
+    path: &Path,
+    names: Option<&[&str]>,
+) -> Result<Layers, ImagingError> {
     let reader = ReadAnyChannels {
         read_samples: WantedSamples {
             names: names.map(|names| names.iter().map(|name| name.to_string()).collect()),
@@ -102,7 +126,7 @@ pub(crate) fn read(path: &Path, names: Option<&[&str]>) -> Result<Layers, Imagin
     let image = reader
         .all_layers()
         .all_attributes()
-        .from_buffered(BufReader::with_capacity(1 << 20, file))
+        .from_buffered(source)
         .map_err(|error| read_error(path, error))?;
 
     let window = image.attributes.display_window;
@@ -115,16 +139,18 @@ pub(crate) fn read(path: &Path, names: Option<&[&str]>) -> Result<Layers, Imagin
         }
         for (name, value) in &part.attributes.other {
             if let AttributeValue::Text(text) = value {
-                layers.attributes.insert(name.to_string(), text.to_string());
+                layers.keep_attribute(name.to_string(), text.to_string());
             }
         }
         let part_name = part.attributes.layer_name.as_ref().map(Text::to_string);
-        let offset = Vec2(
-            part.attributes.layer_position.0 - window.position.0,
-            part.attributes.layer_position.1 - window.position.1,
+        let at = part.attributes.layer_position;
+        let offset = (
+            i64::from(at.0) - i64::from(window.position.0),
+            i64::from(at.1) - i64::from(window.position.1),
         );
         for channel in part.channel_data.list {
             let Some((precision, values)) = channel.sample_data else {
+                layers.note_skipped(channel.name.to_string());
                 continue;
             };
             let mut name = channel.name.to_string();
@@ -135,9 +161,6 @@ pub(crate) fn read(path: &Path, names: Option<&[&str]>) -> Result<Layers, Imagin
             layers.insert(name, precision, samples)?;
         }
     }
-    for name in names.unwrap_or_default() {
-        layers.channel(name)?;
-    }
     Ok(layers)
 }
 
@@ -145,21 +168,21 @@ pub(crate) fn read(path: &Path, names: Option<&[&str]>) -> Result<Layers, Imagin
 fn place(
     values: Vec<f32>,
     size: Vec2<usize>,
-    offset: Vec2<i32>,
+    offset: (i64, i64),
     display: (usize, usize),
 ) -> Raster<f32> {
     let (width, height) = display;
-    if offset == Vec2(0, 0) && (size.0, size.1) == display {
+    if offset == (0, 0) && (size.0, size.1) == display {
         return Raster::from_pixels(width, height, values);
     }
     let mut placed = Raster::filled(width, height, 0.0);
     for (row, line) in values.chunks_exact(size.0).enumerate() {
-        let y = row as i64 + i64::from(offset.1);
+        let y = row as i64 + offset.1;
         if !(0..height as i64).contains(&y) {
             continue;
         }
         for (column, &value) in line.iter().enumerate() {
-            let x = column as i64 + i64::from(offset.0);
+            let x = column as i64 + offset.0;
             if (0..width as i64).contains(&x) {
                 *placed.get_mut(x as usize, y as usize) = value;
             }
@@ -211,6 +234,8 @@ struct WantedSamples {
 struct WantedSamplesReader {
     kept: Option<(SampleType, Vec<f32>)>,
     size: Vec2<usize>,
+    /// One line before conversion.
+    halves: Vec<f16>,
 }
 
 impl ReadSamples for WantedSamples {
@@ -240,6 +265,7 @@ impl ReadSamples for WantedSamples {
         Ok(WantedSamplesReader {
             kept: wanted.then(|| (channel.sample_type, vec![0.0; area])),
             size,
+            halves: Vec::new(),
         })
     }
 }
@@ -261,9 +287,9 @@ impl SamplesReader for WantedSamplesReader {
         match kind {
             SampleType::F32 => line.read_samples_into_slice(target)?,
             SampleType::F16 => {
-                for (to, from) in target.iter_mut().zip(line.read_samples::<f16>()) {
-                    *to = from?.to_f32();
-                }
+                self.halves.resize(at.sample_count, f16::ZERO);
+                line.read_samples_into_slice(&mut self.halves)?;
+                self.halves.convert_to_f32_slice(target);
             }
             SampleType::U32 => {
                 for (to, from) in target.iter_mut().zip(line.read_samples::<u32>()) {

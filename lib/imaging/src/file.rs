@@ -1,7 +1,9 @@
 //! Photographs, masks, textures and linear images in files.
 use crate::{
     error::{ImagingError, MAX_PIXELS},
-    exr_file, jpeg_header,
+    exr_file,
+    format::Format,
+    jpeg_header,
     layers::Layers,
     raster::{DisplayImage, LinearImage, Raster},
     transfer::Transfer,
@@ -36,58 +38,6 @@ pub struct Photo {
     pub transfer: Transfer,
 }
 
-/// What the first bytes of a file say.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Format {
-    Png,
-    Jpeg,
-    Exr,
-    Hdr,
-    Other(&'static str),
-}
-
-impl Format {
-    fn of(bytes: &[u8]) -> Self {
-        let starts = |magic: &[u8]| bytes.starts_with(magic);
-        match () {
-            _ if starts(b"\x89PNG\r\n\x1a\n") => Self::Png,
-            _ if starts(&[0xff, 0xd8, 0xff]) => Self::Jpeg,
-            _ if starts(&exr_file::MAGIC) => Self::Exr,
-            _ if starts(b"#?") => Self::Hdr,
-            _ if starts(b"GIF8") => Self::Other("a GIF image"),
-            _ if starts(b"BM") => Self::Other("a BMP image"),
-            _ if starts(b"II*\0") || starts(b"MM\0*") => Self::Other("a TIFF image"),
-            _ if starts(b"RIFF") && bytes.get(8..12) == Some(b"WEBP") => {
-                Self::Other("a WebP image")
-            }
-            _ if bytes.get(4..8) == Some(b"ftyp") => Self::Other("a HEIF or AVIF image"),
-            _ if starts(b"\xabKTX") => Self::Other("a KTX texture"),
-            _ if starts(b"DDS ") => Self::Other("a DDS texture"),
-            _ => Self::Other("not an image format known here"),
-        }
-    }
-
-    fn name(self) -> &'static str {
-        match self {
-            Self::Png => "PNG",
-            Self::Jpeg => "JPEG",
-            Self::Exr => "OpenEXR",
-            Self::Hdr => "Radiance HDR",
-            Self::Other(name) => name,
-        }
-    }
-
-    fn described(self) -> &'static str {
-        match self {
-            Self::Png => "a PNG image (display-referred)",
-            Self::Jpeg => "a JPEG image (display-referred)",
-            Self::Exr => "an OpenEXR image",
-            Self::Hdr => "a Radiance HDR image",
-            Self::Other(name) => name,
-        }
-    }
-}
-
 /// Reads a photograph: PNG (8 or 16 bit; grey, RGB, with or without alpha, palette) or JPEG, decoded
 /// with `transfer`; OpenEXR and Radiance HDR are linear already. Embedded colour profiles and PNG
 /// gamma chunks are ignored: `transfer` says how the pixels were encoded.
@@ -107,8 +57,7 @@ pub fn read_photo(path: impl AsRef<Path>, transfer: Transfer) -> Result<Photo, I
             })
         }
         Format::Exr => {
-            drop(bytes);
-            let layers = Layers::read_exr(path)?;
+            let layers = read_colour(&bytes, path)?;
             Ok(Photo {
                 image: linear_of_layers(&layers, path)?,
                 alpha: layers.channel("A").ok().cloned(),
@@ -120,7 +69,7 @@ pub fn read_photo(path: impl AsRef<Path>, transfer: Transfer) -> Result<Photo, I
             alpha: None,
             transfer,
         }),
-        other => Err(wrong_format(path, other, PHOTO_FORMATS)),
+        other => Err(other.refuse(path, PHOTO_FORMATS)),
     }
 }
 
@@ -130,12 +79,9 @@ pub fn read_linear(path: impl AsRef<Path>) -> Result<LinearImage, ImagingError> 
     let path = path.as_ref();
     let bytes = read_bytes(path, LINEAR_FORMATS)?;
     match Format::of(&bytes) {
-        Format::Exr => {
-            drop(bytes);
-            linear_of_layers(&Layers::read_exr(path)?, path)
-        }
+        Format::Exr => linear_of_layers(&read_colour(&bytes, path)?, path),
         Format::Hdr => decode_hdr(&bytes, path),
-        other => Err(wrong_format(path, other, LINEAR_FORMATS)),
+        other => Err(other.refuse(path, LINEAR_FORMATS)),
     }
 }
 
@@ -225,14 +171,6 @@ fn read_bytes(path: &Path, expected: &'static str) -> Result<Vec<u8>, ImagingErr
     Ok(bytes)
 }
 
-fn wrong_format(path: &Path, found: Format, expected: &'static str) -> ImagingError {
-    ImagingError::WrongFormat {
-        path: path.to_owned(),
-        found: found.described(),
-        expected,
-    }
-}
-
 /// Whether an Exif orientation is applied.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Orient {
@@ -258,7 +196,7 @@ fn decode_display(
             let decoder = JpegDecoder::new(Cursor::new(bytes)).map_err(failed)?;
             decode_with(decoder, path, orient).map_err(failed)?
         }
-        other => Err(wrong_format(path, other, expected)),
+        other => Err(other.refuse(path, expected)),
     }
 }
 
@@ -339,6 +277,10 @@ fn linearise(decoded: DynamicImage, transfer: Transfer) -> (LinearImage, Option<
     (image, alpha)
 }
 
+fn read_colour(bytes: &[u8], path: &Path) -> Result<Layers, ImagingError> {
+    exr_file::read(Cursor::new(bytes), path, Some(&["R", "G", "B", "A", "Y"]))
+}
+
 fn linear_of_layers(layers: &Layers, path: &Path) -> Result<LinearImage, ImagingError> {
     let colour = if !layers.contains("R") && layers.contains("Y") {
         layers.channel("Y")?.map(|&v| Vec3::splat(v))
@@ -351,7 +293,13 @@ fn linear_of_layers(layers: &Layers, path: &Path) -> Result<LinearImage, Imaging
 
 fn decode_hdr(bytes: &[u8], path: &Path) -> Result<LinearImage, ImagingError> {
     let failed = |error| image_error(path, Format::Hdr, error);
-    let decoder = HdrDecoder::new(Cursor::new(bytes)).map_err(failed)?;
+    // Some programs sign with `#?RGBE`, which the strict decoder does not know.
+    let decoder = if bytes.starts_with(b"#?RADIANCE") {
+        HdrDecoder::new(Cursor::new(bytes))
+    } else {
+        HdrDecoder::new_nonstrict(Cursor::new(bytes))
+    };
+    let decoder = decoder.map_err(failed)?;
     let decoded = decode_with(decoder, path, Orient::AsStored).map_err(failed)??;
     let rgb = decoded.into_rgb32f();
     let (width, height) = (rgb.width() as usize, rgb.height() as usize);

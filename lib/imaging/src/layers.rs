@@ -31,16 +31,17 @@ pub struct Channel {
 
 /// Named channels of one size: `R`, `shadow.G`, `depth.Z`. The part before the last dot is the
 /// layer. Files are OpenEXR, scan lines, ZIP1.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct Layers {
     width: usize,
     height: usize,
     channels: BTreeMap<String, Channel>,
     /// Whether the image is a latitude-longitude environment map (the `envmap` attribute).
     pub latlong: bool,
-    /// Further attributes, as text.
-    pub attributes: BTreeMap<String, String>,
+    attributes: BTreeMap<String, String>,
     path: Option<PathBuf>,
+    /// Channels of the file that were not asked for.
+    skipped: Vec<String>,
 }
 
 impl Layers {
@@ -53,6 +54,7 @@ impl Layers {
             latlong: false,
             attributes: BTreeMap::new(),
             path: None,
+            skipped: Vec::new(),
         }
     }
 
@@ -61,6 +63,46 @@ impl Layers {
             path: Some(path.to_owned()),
             ..Self::new(width, height)
         }
+    }
+
+    pub(crate) fn note_skipped(&mut self, name: String) {
+        self.skipped.push(name);
+    }
+
+    pub(crate) fn keep_attribute(&mut self, name: String, value: String) {
+        self.attributes.insert(name, value);
+    }
+
+    /// Sets a text attribute. The name starts with `dipir` by convention, so that it cannot meet
+    /// one that OpenEXR defines; it is at most 31 bytes of printable ASCII, and the text is ASCII.
+    pub fn set_attribute(&mut self, name: &str, value: &str) -> Result<(), ImagingError> {
+        let reason =
+            if name.is_empty() || name.len() > 31 || !name.bytes().all(|b| b.is_ascii_graphic()) {
+                "must have 1 to 31 printable ASCII characters"
+            } else if DEFINED_ATTRIBUTES.contains(&name) {
+                "is defined by OpenEXR"
+            } else if !value.is_ascii() {
+                "has a text with characters outside ASCII"
+            } else {
+                self.keep_attribute(name.to_string(), value.to_string());
+                return Ok(());
+            };
+        Err(ImagingError::BadAttribute {
+            name: name.to_string(),
+            reason,
+        })
+    }
+
+    /// The text attribute `name`.
+    pub fn attribute(&self, name: &str) -> Option<&str> {
+        self.attributes.get(name).map(String::as_str)
+    }
+
+    /// All text attributes, in alphabetical order.
+    pub fn attributes(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.attributes
+            .iter()
+            .map(|(n, v)| (n.as_str(), v.as_str()))
     }
 
     /// Columns.
@@ -169,11 +211,12 @@ impl Layers {
         Ok(Raster::from_pixels(self.width, self.height, pixels))
     }
 
-    pub(crate) fn missing(&self, name: &str) -> ImagingError {
+    fn missing(&self, name: &str) -> ImagingError {
+        let present = self.channels.keys().chain(&self.skipped);
         ImagingError::MissingChannel {
             path: self.path.clone(),
             channel: name.to_string(),
-            present: self.channels.keys().cloned().collect(),
+            present: present.cloned().collect(),
         }
     }
 
@@ -197,14 +240,52 @@ impl Layers {
     /// already get the part's name in front. Values are not checked for NaN or infinity: depth may
     /// be infinite.
     pub fn read_exr(path: impl AsRef<Path>) -> Result<Self, ImagingError> {
-        exr_file::read(path.as_ref(), None)
+        exr_file::open(path.as_ref(), None)
     }
 
     /// Reads only the channels `names`; the rest is not kept in memory. Errors if one is missing.
     pub fn read_exr_channels(path: impl AsRef<Path>, names: &[&str]) -> Result<Self, ImagingError> {
-        exr_file::read(path.as_ref(), Some(names))
+        let layers = exr_file::open(path.as_ref(), Some(names))?;
+        for name in names {
+            layers.channel(name)?;
+        }
+        Ok(layers)
     }
 }
+
+/// Attributes with a meaning of their own [OpenEXR, standard attributes], most of them not text.
+const DEFINED_ATTRIBUTES: [&str; 30] = [
+    "channels",
+    "compression",
+    "dataWindow",
+    "displayWindow",
+    "lineOrder",
+    "pixelAspectRatio",
+    "screenWindowCenter",
+    "screenWindowWidth",
+    "tiles",
+    "name",
+    "type",
+    "version",
+    "chunkCount",
+    "view",
+    "chromaticities",
+    "whiteLuminance",
+    "adoptedNeutral",
+    "renderingTransform",
+    "lookModTransform",
+    "xDensity",
+    "owner",
+    "comments",
+    "capDate",
+    "envmap",
+    "wrapmodes",
+    "multiView",
+    "preview",
+    "software",
+    "keyCode",
+    "timeCode",
+];
 
 /// `layer.suffix`, or the bare suffix for the beauty layer.
 fn channel_name(layer: &str, suffix: &str) -> String {
@@ -233,4 +314,13 @@ fn check_name(name: &str) -> Result<(), ImagingError> {
         name: name.to_string(),
         reason,
     })
+}
+
+/// Equal size, channels, precision and attributes, wherever they came from.
+impl PartialEq for Layers {
+    fn eq(&self, other: &Self) -> bool {
+        (self.width, self.height, self.latlong) == (other.width, other.height, other.latlong)
+            && self.channels == other.channels
+            && self.attributes == other.attributes
+    }
 }

@@ -3,10 +3,12 @@ pub mod composite;
 pub mod error;
 mod exr_file;
 pub mod file;
+mod format;
 mod jpeg_header;
 pub mod layers;
 pub mod metrics;
 pub mod raster;
+pub mod resize;
 pub mod transfer;
 
 pub use error::ImagingError;
