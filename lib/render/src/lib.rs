@@ -1,3 +1,18 @@
 //! Light transport: from a scene and a light to pictures.
+pub mod adaptive;
+pub mod blocker;
 pub mod bsdf;
+pub mod convexity;
+pub mod counters;
+pub mod error;
+pub mod features;
+pub mod film;
+pub mod footprint;
+pub mod foreground;
+pub mod light;
+pub mod photo;
+pub mod render;
+pub mod shadow;
+pub mod shapes;
 pub mod surface;
+pub mod world;

@@ -1,0 +1,295 @@
+//! How many samples go where, and when there are enough.
+//!
+//! Samples are drawn in rounds. After each round the display-referred squared error of every job
+//! (a layer of a block of pixels) is estimated from the spread of its independently scrambled
+//! replicates, and the next round's samples go where they lower the total error most per unit of
+//! cost: `n_i` in proportion to `sqrt(V_i / c_i)`, with `V_i` the variance and `c_i` the cost of
+//! one sample (Lagrange's rule). Cost is counted in rays and samples, never in seconds, so that the
+//! same samples are drawn by any number of threads on any machine; a time budget only decides
+//! after which round to stop.
+use std::ops::ControlFlow;
+use std::time::{Duration, Instant};
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::counters::RayCounts;
+use crate::error::RenderError;
+use crate::film::{Film, Job, REPLICATES, SquaredError, Viewing};
+
+/// When to stop.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Stop {
+    /// After this many samples in every pixel (rounded up to a multiple of [`REPLICATES`]).
+    Samples(u32),
+    /// When the 95% bound of the estimated error is at most this display-referred RMSE.
+    TargetError(f32),
+    /// After the last round that was expected to end in time.
+    TimeBudget(Duration),
+}
+
+/// Samples per pixel and replicate of the first adaptive round: the fewest whose spread says
+/// anything about the error.
+const FIRST_ROUND: u32 = 8;
+
+/// No job grows faster than this from one round to the next, because early variances are
+/// uncertain.
+const MAX_GROWTH: f64 = 4.0;
+
+/// Under a time budget the total cost grows by this factor a round: small enough that at most a
+/// third of the time goes unused.
+const TIMED_GROWTH: f64 = 1.5;
+
+/// The estimated error of the composite.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct EstimatedError {
+    /// Display-referred RMSE over the pixels that the object or its shadow touches.
+    pub rmse: f64,
+    /// One-sided 95% confidence bound of it.
+    pub upper_95: f64,
+    /// Those pixels.
+    pub touched_pixels: u64,
+}
+
+/// State after a round.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Progress {
+    /// Rounds done, from 1.
+    pub round: u32,
+    /// Error so far.
+    pub error: EstimatedError,
+    /// Image samples drawn so far, all layers.
+    pub samples: u64,
+    /// Rays traced so far.
+    pub rays: u64,
+    /// Time since the first round began.
+    pub elapsed: Duration,
+    /// Share of the work that is done, in `[0, 1]`, as far as it can be foreseen.
+    pub fraction: f64,
+}
+
+/// What the rounds led to.
+#[derive(Clone, Debug)]
+pub struct Refined {
+    /// The layers.
+    pub film: Film,
+    /// Their error.
+    pub error: EstimatedError,
+    /// Rays traced.
+    pub counts: RayCounts,
+    /// Image samples drawn, all layers.
+    pub samples: u64,
+    /// Rounds.
+    pub rounds: u32,
+}
+
+/// Draws samples until `stop`. `advance(job, n)` brings a job to `n` samples per pixel and
+/// replicate; `progress` may break off after any round.
+pub fn refine(
+    size: (usize, usize),
+    jobs: &mut [Job],
+    stop: Stop,
+    max_samples: u32,
+    viewing: &Viewing,
+    advance: &(impl Fn(&mut Job, u32) + Sync),
+    progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
+) -> Result<Refined, RenderError> {
+    let start = Instant::now();
+    let limit = max_samples.div_ceil(REPLICATES as u32).max(1);
+    let mut film = Film::new(size.0, size.1);
+    let mut goals = vec![first_goal(stop, limit); jobs.len()];
+    let mut round = 0;
+    loop {
+        let round_start = Instant::now();
+        let cost_before: f64 = jobs.iter().map(Job::cost).sum();
+        jobs.par_iter_mut()
+            .zip(&goals)
+            .with_max_len(1)
+            .for_each(|(job, &goal)| {
+                if goal > job.samples {
+                    advance(job, goal);
+                }
+            });
+        round += 1;
+        for job in jobs.iter() {
+            film.develop(job);
+        }
+        let errors: Vec<SquaredError> = jobs
+            .par_iter()
+            .map(|job| viewing.squared_error(&film, job))
+            .collect();
+        let error = total_error(&errors, &film, viewing);
+        let cost: f64 = jobs.iter().map(Job::cost).sum();
+        let next = next_goals(stop, limit, jobs, &errors, &error, cost);
+        let out_of_time = match stop {
+            Stop::TimeBudget(budget) => {
+                let rate = round_start.elapsed().as_secs_f64() / (cost - cost_before).max(1.0);
+                let expected = rate * cost * (TIMED_GROWTH - 1.0);
+                start.elapsed().as_secs_f64() + expected > budget.as_secs_f64()
+            }
+            _ => false,
+        };
+        let done = out_of_time || next.iter().zip(jobs.iter()).all(|(&n, job)| n <= job.samples);
+        let report = Progress {
+            round,
+            error,
+            samples: jobs.iter().map(Job::samples_drawn).sum(),
+            rays: jobs.iter().map(|j| j.counts.total()).sum(),
+            elapsed: start.elapsed(),
+            fraction: if done {
+                1.0
+            } else {
+                fraction(stop, &error, cost, jobs, &next, start.elapsed())
+            },
+        };
+        if progress(&report).is_break() {
+            return Err(RenderError::Interrupted);
+        }
+        if done {
+            let mut counts = RayCounts::default();
+            jobs.iter().for_each(|job| counts.merge(&job.counts));
+            return Ok(Refined {
+                film,
+                error,
+                counts,
+                samples: report.samples,
+                rounds: round,
+            });
+        }
+        goals = next;
+    }
+}
+
+fn first_goal(stop: Stop, limit: u32) -> u32 {
+    match stop {
+        // A quarter first, so that long renders show something early.
+        Stop::Samples(n) => {
+            let n = n.div_ceil(REPLICATES as u32).max(1);
+            if n >= 4 * FIRST_ROUND { n / 4 } else { n }
+        }
+        _ => FIRST_ROUND.min(limit),
+    }
+}
+
+fn total_error(errors: &[SquaredError], film: &Film, viewing: &Viewing) -> EstimatedError {
+    let total = errors
+        .iter()
+        .fold(SquaredError::default(), |sum, e| sum.merge(*e));
+    let (width, height) = (film.alpha.width(), film.alpha.height());
+    let touched: u64 = (0..height)
+        .into_par_iter()
+        .map(|y| {
+            (0..width)
+                .filter(|&x| viewing.is_touched(film, x, y))
+                .count() as u64
+        })
+        .sum();
+    let pixels = touched.max(1) as f64;
+    // 1.645 standard errors bound a normal variable from above in 95% of cases; the sum runs
+    // over hundreds of pixels.
+    let upper = total.sum + 1.645 * total.variance.sqrt();
+    EstimatedError {
+        rmse: (total.sum / pixels).sqrt(),
+        upper_95: (upper / pixels).sqrt(),
+        touched_pixels: touched,
+    }
+}
+
+/// Samples per pixel and replicate that every job should reach in the next round.
+fn next_goals(
+    stop: Stop,
+    limit: u32,
+    jobs: &[Job],
+    errors: &[SquaredError],
+    error: &EstimatedError,
+    cost: f64,
+) -> Vec<u32> {
+    let unchanged = || jobs.iter().map(|job| job.samples).collect();
+    match stop {
+        Stop::Samples(n) => vec![n.div_ceil(REPLICATES as u32).max(1); jobs.len()],
+        Stop::TargetError(target) => {
+            if error.upper_95 <= f64::from(target) {
+                return unchanged();
+            }
+            // The estimate itself has to come as far below the target as its bound lies above it.
+            let slack = error.rmse / error.upper_95;
+            let allowed = (f64::from(target) * slack).powi(2) * error.touched_pixels as f64;
+            let scale = spread(jobs, errors).map(|(root, c)| root * c).sum::<f64>() / allowed;
+            goals(jobs, errors, scale, limit)
+        }
+        Stop::TimeBudget(_) => {
+            let per_scale = spread(jobs, errors).map(|(root, c)| root * c).sum::<f64>();
+            if per_scale == 0.0 {
+                return unchanged();
+            }
+            // Jobs that are ahead of their share stay, so look for the scale that spends what
+            // the round may spend.
+            let spent = |scale: f64| -> f64 {
+                goals(jobs, errors, scale, limit)
+                    .iter()
+                    .zip(jobs)
+                    .map(|(&n, job)| job.cost() * f64::from(n) / f64::from(job.samples.max(1)))
+                    .sum()
+            };
+            let (mut low, mut high) = (cost / per_scale * 0.5, cost / per_scale * 8.0);
+            for _ in 0..24 {
+                let middle = 0.5 * (low + high);
+                if spent(middle) < cost * TIMED_GROWTH {
+                    low = middle;
+                } else {
+                    high = middle;
+                }
+            }
+            goals(jobs, errors, high, limit)
+        }
+    }
+}
+
+/// `(sqrt(V / c), c)` of every job: V the variance times samples, c the cost of a sample per pixel
+/// and replicate.
+fn spread<'a>(
+    jobs: &'a [Job],
+    errors: &'a [SquaredError],
+) -> impl Iterator<Item = (f64, f64)> + 'a {
+    jobs.iter().zip(errors).map(|(job, e)| {
+        let n = f64::from(job.samples.max(1));
+        let cost = (job.cost() / n).max(1e-9);
+        ((e.sum * n / cost).sqrt(), cost)
+    })
+}
+
+fn goals(jobs: &[Job], errors: &[SquaredError], scale: f64, limit: u32) -> Vec<u32> {
+    spread(jobs, errors)
+        .zip(jobs)
+        .map(|((root, _), job)| {
+            let n = f64::from(job.samples);
+            let wanted = (root * scale).min(n * MAX_GROWTH).ceil() as u32;
+            // Multiples of four keep the sequences stratified.
+            wanted.next_multiple_of(4).min(limit).max(job.samples)
+        })
+        .collect()
+}
+
+fn fraction(
+    stop: Stop,
+    error: &EstimatedError,
+    cost: f64,
+    jobs: &[Job],
+    next: &[u32],
+    elapsed: Duration,
+) -> f64 {
+    let f = match stop {
+        // Cost falls with the square of the error.
+        Stop::TargetError(target) => (f64::from(target) / error.upper_95).powi(2),
+        Stop::TimeBudget(budget) => elapsed.as_secs_f64() / budget.as_secs_f64().max(1e-9),
+        Stop::Samples(_) => {
+            let all: f64 = jobs
+                .iter()
+                .zip(next)
+                .map(|(job, &n)| job.cost() * f64::from(n) / f64::from(job.samples.max(1)))
+                .sum();
+            cost / all.max(1.0)
+        }
+    };
+    if f.is_finite() { f.clamp(0.0, 1.0) } else { 0.0 }
+}

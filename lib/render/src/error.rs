@@ -1,0 +1,40 @@
+//! What can go wrong.
+use thiserror::Error;
+
+/// A failure of this crate.
+#[derive(Debug, Error)]
+pub enum RenderError {
+    /// A texture that an effect needs could not be read.
+    #[error(transparent)]
+    Scene(#[from] dipir_scene::error::Error),
+    /// An image that must match the camera does not.
+    #[error(
+        "the {what} is {width} x {height} pixels, the camera {camera_width} x {camera_height}: \
+         give images of the camera's size"
+    )]
+    SizeMismatch {
+        /// Which image.
+        what: &'static str,
+        /// Its columns.
+        width: usize,
+        /// Its rows.
+        height: usize,
+        /// The camera's columns.
+        camera_width: usize,
+        /// The camera's rows.
+        camera_height: usize,
+    },
+    /// An effect name that does not exist.
+    #[error("unknown effect \"{name}\": known effects are {known}; the nearest is \"{nearest}\"")]
+    UnknownEffect {
+        /// What was given.
+        name: String,
+        /// All names.
+        known: String,
+        /// The most similar one.
+        nearest: String,
+    },
+    /// The caller asked to stop.
+    #[error("rendering was interrupted")]
+    Interrupted,
+}

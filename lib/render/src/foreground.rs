@@ -1,0 +1,211 @@
+//! The object under a distant light, by unidirectional path tracing.
+//!
+//! Computes, for one image sample, the radiance that reaches the camera from the object after at
+//! most D interactions with it, and whether the sample meets the object at all; their averages
+//! over the pixel's square (a box filter, which is what the over-compositing of coverage means)
+//! are premultiplied colour and antialiased alpha. Light comes from two techniques at every
+//! vertex, the light's own sampling and the BSDF's, combined by the balance heuristic [Veach and
+//! Guibas 1995]; mirror-like lobes belong to the BSDF alone.
+//!
+//! What it cannot do: caustics from light through rough glass onto the object converge slowly, as
+//! in every unidirectional path tracer; refracted rays see the distant light, not the photograph.
+use dipir_numerics::hashing::hash_u64s;
+use dipir_numerics::sampler::Sampler;
+use dipir_numerics::warp::balance_heuristic;
+use dipir_scene::camera::Ray;
+use glam::{Vec2, Vec3};
+
+use crate::bsdf::Bsdf;
+use crate::bsdf::features::{EMISSION, has};
+use crate::counters::{RayCounts, RayKind};
+use crate::features::PROXY_RADIANCE;
+use crate::light::SceneLight;
+use crate::photo::Photo;
+use crate::world::World;
+
+/// What a path tracer needs beside the scene.
+pub struct PathContext<'a, L> {
+    /// Object, surfaces, proxy.
+    pub world: &'a World<'a>,
+    /// Where light comes from.
+    pub light: &'a L,
+    /// What the proxy looks like to rays that leave the object.
+    pub photo: Option<&'a Photo<'a>>,
+    /// Most interactions with the object, D; 0 leaves emission alone.
+    pub max_depth: u32,
+    /// Interactions after which Russian roulette may end a path.
+    pub roulette_depth: u32,
+}
+
+impl<L> Clone for PathContext<'_, L> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<L> Copy for PathContext<'_, L> {}
+
+/// One image sample of the object.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct PathSample {
+    /// Radiance, linear; 0 where the object is missed.
+    pub radiance: Vec3,
+    /// 1 where the object is met, else 0.
+    pub coverage: f32,
+}
+
+/// Dimension pairs per vertex: light, lobe, direction, roulette.
+const DIMENSIONS_PER_VERTEX: u32 = 4;
+
+/// Paths keep at least this chance of going on, so that survivors' weights stay bounded.
+const MIN_SURVIVAL: f32 = 0.1;
+
+impl<L: SceneLight> PathContext<'_, L> {
+    /// One path through the pixel whose top left corner is `corner`, in pixels.
+    #[inline]
+    pub fn camera_sample<const F: u32>(
+        &self,
+        corner: Vec2,
+        sampler: &mut Sampler,
+        counts: &mut RayCounts,
+    ) -> PathSample {
+        let ray = self.world.camera().ray(corner + sampler.next_2d());
+        let alpha_key = sampler.next_u64();
+        counts.add(RayKind::Camera);
+        self.radiance::<F>(&ray, alpha_key, sampler, counts)
+    }
+
+    /// Radiance along `ray` from the object. Draws from the sampler's current dimension on.
+    pub fn radiance<const F: u32>(
+        &self,
+        ray: &Ray,
+        alpha_key: u64,
+        sampler: &mut Sampler,
+        counts: &mut RayCounts,
+    ) -> PathSample {
+        let world = self.world;
+        // Loop state.
+        let mut ray = *ray; //                       the segment that is traced next
+        let mut throughput = Vec3::ONE; //           product of BSDF weights so far
+        let mut radiance = Vec3::ZERO; //            light gathered so far
+        let mut sampled_pdf = f32::INFINITY; //      density of the segment's direction, infinite
+        //                                           if the light could not have drawn it
+        let mut leaves = false; //                   the segment is known to miss the object
+        let first_dimension = sampler.dimension();
+        let emits = has(F, EMISSION) && has(world.mask, EMISSION);
+
+        for depth in 0..=self.max_depth {
+            let alpha_key = hash_u64s(&[alpha_key, u64::from(depth)]);
+
+            // ---- Next hit -------------------------------------------------------------------
+            if depth > 0 && !leaves {
+                counts.add(RayKind::Bounce);
+            }
+            if depth == self.max_depth && depth > 0 && !leaves && !emits {
+                // Nothing at the last hit could add light: any hit will do.
+                leaves = true;
+                if world.hides_light::<F>(&ray, alpha_key) {
+                    break;
+                }
+            }
+            let hit = match leaves {
+                true => None,
+                false => world.closest::<F>(&ray, alpha_key),
+            };
+
+            // ---- Escape: the light, as found by BSDF sampling -------------------------------
+            let Some(hit) = hit else {
+                if depth == 0 {
+                    return PathSample::default();
+                }
+                let (light, light_pdf) = self.light.eval_with_pdf(ray.direction);
+                let seen = self.seen_beyond::<F>(&ray, light, counts);
+                radiance += throughput * seen * balance_heuristic(sampled_pdf, light_pdf);
+                break;
+            };
+
+            // ---- Emission -------------------------------------------------------------------
+            let surface = world
+                .surfaces
+                .interact::<F>(ray.direction, hit.triangle, hit.u, hit.v);
+            if has(F, EMISSION) {
+                if surface.unlit {
+                    radiance += throughput * surface.base_color;
+                    break;
+                }
+                radiance += throughput * surface.emission;
+            }
+            if depth == self.max_depth {
+                break;
+            }
+            let bsdf = Bsdf::<F>::new(&surface, -ray.direction);
+            sampler.set_dimension(first_dimension + depth * DIMENSIONS_PER_VERTEX);
+            let light_numbers = sampler.next_2d();
+            let lobe_number = sampler.next_1d();
+            let direction_numbers = sampler.next_2d();
+
+            // ---- Light sampling -------------------------------------------------------------
+            if !bsdf.is_delta() {
+                let light = self.light.sample(light_numbers);
+                let (value, bsdf_pdf) = bsdf.eval_pdf(light.direction);
+                // Both densities may underflow to 0: then there is no such sample.
+                if light.pdf > 0.0 && value != Vec3::ZERO && light.radiance != Vec3::ZERO {
+                    let shadow = world.leave(&surface, light.direction);
+                    let known = world.escapes && is_outward(&surface, light.direction);
+                    if !known {
+                        counts.add(RayKind::Light);
+                    }
+                    if known || !world.hides_light::<F>(&shadow, !alpha_key) {
+                        let seen = self.seen_beyond::<F>(&shadow, light.radiance, counts);
+                        let weight = balance_heuristic(light.pdf, bsdf_pdf) / light.pdf;
+                        radiance += throughput * value * seen * weight;
+                    }
+                }
+            }
+
+            // ---- BSDF sampling --------------------------------------------------------------
+            let Some(sample) = bsdf.sample(lobe_number, direction_numbers) else {
+                break;
+            };
+            throughput *= sample.weight;
+            if throughput.max_element() <= 0.0 {
+                break;
+            }
+            sampled_pdf = if sample.delta { f32::INFINITY } else { sample.pdf };
+            leaves = world.escapes && is_outward(&surface, sample.wi);
+            ray = world.leave(&surface, sample.wi);
+
+            // ---- Russian roulette: only where a dim path would go on for many segments ------
+            if depth + 1 >= self.roulette_depth && !leaves {
+                let survival = throughput.max_element().clamp(MIN_SURVIVAL, 1.0);
+                if sampler.next_1d() >= survival {
+                    break;
+                }
+                throughput /= survival;
+            }
+        }
+        PathSample {
+            radiance,
+            coverage: 1.0,
+        }
+    }
+
+    /// Radiance along a ray that is known to miss the object: `light`, unless it meets the part
+    /// of the proxy that the photograph shows.
+    #[inline(always)]
+    fn seen_beyond<const F: u32>(&self, ray: &Ray, light: Vec3, counts: &mut RayCounts) -> Vec3 {
+        if !has(F, PROXY_RADIANCE) {
+            return light;
+        }
+        match self.photo {
+            Some(photo) => photo.seen_along(self.world, ray, counts).unwrap_or(light),
+            None => light,
+        }
+    }
+}
+
+/// Whether `direction` leaves `surface` on the outer side of its triangle.
+#[inline(always)]
+fn is_outward(surface: &crate::surface::SurfacePoint, direction: Vec3) -> bool {
+    surface.front_face && direction.dot(surface.geometric_normal) > 0.0
+}

@@ -1,0 +1,399 @@
+//! From a scene, a light and a plan to the layers of a composite.
+use std::ops::ControlFlow;
+use std::sync::Arc;
+
+use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_imaging::transfer::Transfer;
+use dipir_numerics::hashing::hash_u64s;
+use dipir_numerics::sampler::{Sampler, Stream};
+use dipir_scene::scene::Scene;
+use glam::{Vec2, Vec3};
+
+use crate::adaptive::{EstimatedError, Progress, Stop, refine};
+use crate::blocker::Blocker;
+use crate::counters::RayCounts;
+use crate::error::RenderError;
+use crate::features::{ALPHA, has, with_features};
+use crate::film::{Film, Job, Layer, REPLICATES, Viewing};
+use crate::footprint::Footprint;
+use crate::foreground::PathContext;
+use crate::light::{PlaneLight, SceneLight};
+use crate::photo::Photo;
+use crate::shadow::{Block, SampleRange, ShadowContext};
+use crate::world::{Geometry, ProxyGeometry, World};
+
+/// Which phenomena are simulated: what remains of an effects plan for the kernels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Simulation {
+    /// Bits of [`crate::features`].
+    pub features: u32,
+    /// Most interactions of a path with the object, D.
+    pub max_depth: u32,
+    /// Whether the shadow ratio is computed.
+    pub shadow: bool,
+    /// Whether a proxy mesh shadows itself.
+    pub proxy_occlusion: bool,
+    /// Most interactions after which light from the object counts on the proxy; 0 is emission
+    /// alone, `None` nothing.
+    pub light_on_proxy: Option<u32>,
+}
+
+/// How a picture is rendered, whatever is in it.
+#[derive(Clone, Copy, Debug)]
+pub struct Settings<'a> {
+    /// Seed of all random numbers.
+    pub seed: u64,
+    /// When to stop.
+    pub stop: Stop,
+    /// Most samples in any pixel.
+    pub max_samples: u32,
+    /// The photograph, linear, of the camera's size: weighs errors by what is seen of them, and
+    /// is what the proxy looks like to rays from the object.
+    pub background: Option<&'a LinearImage>,
+    /// From linear to display values, in which errors are measured.
+    pub transfer: Transfer,
+    /// 1 where the photograph's own foreground hides the object, 0 where it does not; of the
+    /// camera's size.
+    pub occluders: Option<&'a Raster<f32>>,
+    /// Share of a plane's light that may be blocked without being looked for.
+    pub shadow_tolerance: f32,
+}
+
+impl Default for Settings<'_> {
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            stop: Stop::TargetError(0.004),
+            max_samples: 1 << 14,
+            background: None,
+            transfer: Transfer::Srgb,
+            occluders: None,
+            // Display values change by less than a tenth of an 8-bit step.
+            shadow_tolerance: 2e-4,
+        }
+    }
+}
+
+/// The layers and how they came about.
+#[derive(Clone, Debug)]
+pub struct Rendered {
+    /// Colour, coverage, shadow ratio and their variances.
+    pub film: Film,
+    /// Estimated error of the composite.
+    pub error: EstimatedError,
+    /// Rays traced.
+    pub counts: RayCounts,
+    /// Image samples drawn, all layers.
+    pub samples: u64,
+    /// Rounds of adaptive sampling.
+    pub rounds: u32,
+}
+
+/// Side of the blocks of pixels that are scheduled and refined as one.
+const BLOCK: u32 = 8;
+
+/// Interactions after which Russian roulette may end a path. Earlier, the rays that it saves
+/// are outweighed by its variance: most paths of opaque objects have left by then.
+const ROULETTE_DEPTH: u32 = 4;
+
+/// A scene with its hierarchies built, to be rendered under lights and plans.
+pub struct Renderer<'a> {
+    scene: &'a Scene,
+    geometry: Arc<Geometry>,
+}
+
+impl<'a> Renderer<'a> {
+    /// Builds the hierarchies of `scene`.
+    pub fn new(scene: &'a Scene) -> Self {
+        Self {
+            scene,
+            geometry: Arc::new(Geometry::new(scene)),
+        }
+    }
+
+    /// The scene.
+    pub fn scene(&self) -> &'a Scene {
+        self.scene
+    }
+
+    /// Shapes and hierarchies.
+    pub fn geometry(&self) -> &Arc<Geometry> {
+        &self.geometry
+    }
+
+    /// Makes the scene ready for the effects in `mask`.
+    pub fn world(&self, mask: u32) -> Result<World<'a>, RenderError> {
+        World::new(self.scene, self.geometry.clone(), mask)
+    }
+
+    /// Renders the layers. `progress` is told after every round and may break off. The result
+    /// does not depend on the number of threads.
+    pub fn render<L: SceneLight>(
+        &self,
+        light: &L,
+        simulation: &Simulation,
+        settings: &Settings,
+        progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
+    ) -> Result<Rendered, RenderError> {
+        self.check_sizes(settings)?;
+        let world = self.world(simulation.features)?;
+        let photo = settings.background.map(|image| Photo { image });
+        let path = PathContext {
+            world: &world,
+            light,
+            photo: photo.as_ref(),
+            max_depth: simulation.max_depth,
+            roulette_depth: ROULETTE_DEPTH,
+        };
+        let plane = match &self.geometry.proxy {
+            ProxyGeometry::Plane(plane) if simulation.shadow => Some(light.on_plane(plane.normal)),
+            _ => None,
+        };
+        let blocker = self
+            .geometry
+            .bvh
+            .bounding_sphere()
+            .map(|whole| Blocker::new(whole, self.geometry.bvh.clusters()));
+        let mut jobs = self.object_jobs(settings);
+        if let (Some(blocker), true) = (&blocker, simulation.shadow) {
+            let arriving = plane.as_ref().map(|p| p.irradiance().as_vec3());
+            let shadow = ShadowContext {
+                path,
+                blocker,
+                plane: plane.as_ref(),
+                proxy_occlusion: simulation.proxy_occlusion,
+                light_on_proxy: simulation.light_on_proxy,
+                tolerance: settings.shadow_tolerance,
+            };
+            jobs.extend(self.shadow_jobs(&shadow, arriving, settings));
+            let advance = |job: &mut Job, goal: u32| match job.layer {
+                Layer::Object => advance_object(&path, settings.seed, job, goal),
+                _ => advance_shadow(&shadow, settings.seed, job, goal),
+            };
+            self.run(jobs, settings, &advance, progress)
+        } else {
+            let advance =
+                |job: &mut Job, goal: u32| advance_object(&path, settings.seed, job, goal);
+            self.run(jobs, settings, &advance, progress)
+        }
+    }
+
+    fn run(
+        &self,
+        mut jobs: Vec<Job>,
+        settings: &Settings,
+        advance: &(impl Fn(&mut Job, u32) + Sync),
+        progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
+    ) -> Result<Rendered, RenderError> {
+        let [width, height] = self.scene.camera.resolution.map(|n| n as usize);
+        let viewing = Viewing {
+            background: settings.background,
+            transfer: settings.transfer,
+        };
+        let refined = refine(
+            (width, height),
+            &mut jobs,
+            settings.stop,
+            settings.max_samples,
+            &viewing,
+            advance,
+            progress,
+        )?;
+        let mut film = refined.film;
+        if let Some(mask) = settings.occluders {
+            film.hide_behind(mask);
+        }
+        Ok(Rendered {
+            film,
+            error: refined.error,
+            counts: refined.counts,
+            samples: refined.samples,
+            rounds: refined.rounds,
+        })
+    }
+
+    fn check_sizes(&self, settings: &Settings) -> Result<(), RenderError> {
+        let [camera_width, camera_height] = self.scene.camera.resolution.map(|n| n as usize);
+        let check = |what, width, height| {
+            if (width, height) == (camera_width, camera_height) {
+                return Ok(());
+            }
+            Err(RenderError::SizeMismatch {
+                what,
+                width,
+                height,
+                camera_width,
+                camera_height,
+            })
+        };
+        if let Some(image) = settings.background {
+            check("background", image.0.width(), image.0.height())?;
+        }
+        if let Some(mask) = settings.occluders {
+            check("occluder mask", mask.width(), mask.height())?;
+        }
+        Ok(())
+    }
+
+    fn blocks(&self) -> impl Iterator<Item = Block> {
+        let [width, height] = self.scene.camera.resolution;
+        (0..height.div_ceil(BLOCK)).flat_map(move |j| {
+            (0..width.div_ceil(BLOCK)).map(move |i| {
+                let (x, y) = (i * BLOCK, j * BLOCK);
+                Block {
+                    x,
+                    y,
+                    width: BLOCK.min(width - x),
+                    height: BLOCK.min(height - y),
+                }
+            })
+        })
+    }
+
+    fn object_jobs(&self, settings: &Settings) -> Vec<Job> {
+        let bvh = &self.geometry.bvh;
+        let footprint = Footprint::new(&self.scene.camera, bvh.bounds(), bvh.clusters());
+        self.blocks()
+            .filter(|b| footprint.overlaps(b.x, b.y, b.width, b.height))
+            .filter_map(|block| {
+                let pixels: Vec<_> = pixels_of(block)
+                    .filter(|&(x, y)| footprint.holds(x, y) && is_visible(settings, x, y))
+                    .collect();
+                (!pixels.is_empty()).then(|| Job::new(Layer::Object, block, pixels, None))
+            })
+            .collect()
+    }
+
+    fn shadow_jobs<L: SceneLight>(
+        &self,
+        shadow: &ShadowContext<L, L::OnPlane>,
+        arriving: Option<Vec3>,
+        settings: &Settings,
+    ) -> Vec<Job> {
+        let layer = match self.geometry.proxy {
+            ProxyGeometry::None => return Vec::new(),
+            ProxyGeometry::Plane(_) => Layer::PlaneShadow,
+            ProxyGeometry::Mesh { .. } => Layer::MeshShadow,
+        };
+        let mut restriction = shadow.plane.map(|p| p.restriction());
+        self.blocks()
+            .filter(|&block| match &mut restriction {
+                Some(r) => shadow.may_shade(block, r),
+                None => true,
+            })
+            .filter_map(|block| {
+                let pixels: Vec<_> = pixels_of(block).collect();
+                let visible = pixels.iter().any(|&(x, y)| is_visible(settings, x, y));
+                visible.then(|| Job::new(layer, block, pixels, arriving))
+            })
+            .collect()
+    }
+}
+
+fn is_visible(settings: &Settings, x: u32, y: u32) -> bool {
+    settings
+        .occluders
+        .is_none_or(|mask| *mask.get(x as usize, y as usize) < 1.0)
+}
+
+fn pixels_of(block: Block) -> impl Iterator<Item = (u32, u32)> {
+    (block.y..block.y + block.height)
+        .flat_map(move |y| (block.x..block.x + block.width).map(move |x| (x, y)))
+}
+
+/// The sequence of one replicate of one pixel. Rows are padded to 2^16 columns, so that a crop or
+/// another resolution keeps a pixel's numbers.
+fn sequence(seed: u64, stream: Stream, replicate: usize, (x, y): (u32, u32)) -> Sampler {
+    Sampler::new(
+        hash_u64s(&[seed, replicate as u64]),
+        stream,
+        (y << 16) | (x & 0xffff),
+        0,
+    )
+}
+
+/// Brings `job` to `goal` samples per pixel and replicate.
+fn advance_object<L: SceneLight>(path: &PathContext<L>, seed: u64, job: &mut Job, goal: u32) {
+    with_features!(path.world.mask, F => advance_object_with::<L, F>(path, seed, job, goal))
+}
+
+fn advance_object_with<L: SceneLight, const F: u32>(
+    path: &PathContext<L>,
+    seed: u64,
+    job: &mut Job,
+    goal: u32,
+) {
+    let mut counts = job.counts;
+    for index in 0..job.pixels.len() {
+        let (x, y) = job.pixels[index];
+        let corner = Vec2::new(x as f32, y as f32);
+        for replicate in 0..REPLICATES {
+            let base = sequence(seed, Stream::FOREGROUND, replicate, (x, y));
+            let (mut radiance, mut coverage) = (Vec3::ZERO, 0.0);
+            for sample in job.samples..goal {
+                let mut sampler = base.with_sample(sample);
+                let s = path.camera_sample::<F>(corner, &mut sampler, &mut counts);
+                radiance += s.radiance;
+                coverage += s.coverage;
+            }
+            job.add(index, replicate, &[radiance.x, radiance.y, radiance.z, coverage]);
+        }
+    }
+    job.counts = counts;
+    job.samples = goal;
+}
+
+fn advance_shadow<L: SceneLight>(
+    shadow: &ShadowContext<L, L::OnPlane>,
+    seed: u64,
+    job: &mut Job,
+    goal: u32,
+) {
+    // Blocking alone asks nothing of a surface but its coverage.
+    let wanted = match shadow.light_on_proxy {
+        Some(_) => shadow.path.world.mask,
+        None if has(shadow.path.world.mask, ALPHA) => ALPHA,
+        None => 0,
+    };
+    with_features!(wanted, F => advance_shadow_with::<L, F>(shadow, seed, job, goal))
+}
+
+fn advance_shadow_with<L: SceneLight, const F: u32>(
+    shadow: &ShadowContext<L, L::OnPlane>,
+    seed: u64,
+    job: &mut Job,
+    goal: u32,
+) {
+    let mut counts = job.counts;
+    let range = SampleRange {
+        first: job.samples,
+        count: goal - job.samples,
+    };
+    let block = job.block;
+    for replicate in 0..REPLICATES {
+        let sampler = |x, y| sequence(seed, Stream::SHADOW, replicate, (x, y));
+        if let Some(plane) = shadow.plane {
+            let mut restriction = plane.restriction();
+            shadow.plane_block::<F>(
+                block,
+                range,
+                &sampler,
+                &mut restriction,
+                &mut counts,
+                &mut |x, y, blocked| {
+                    let index = ((y - block.y) * block.width + (x - block.x)) as usize;
+                    job.add(index, replicate, &blocked.to_array());
+                },
+            );
+        } else {
+            for index in 0..job.pixels.len() {
+                let (x, y) = job.pixels[index];
+                let s = shadow.mesh_pixel::<F>((x, y), range, &sampler(x, y), &mut counts);
+                let (b, a) = (s.blocked, s.arriving);
+                job.add(index, replicate, &[b.x, b.y, b.z, a.x, a.y, a.z, s.hits]);
+            }
+        }
+    }
+    job.counts = counts;
+    job.samples = goal;
+}

@@ -1,0 +1,406 @@
+//! The shadow ratio: light that reaches the proxy with the object, over light without it.
+//!
+//! On a plane with nothing but the object above it the denominator is a closed-form sum over the
+//! light, the same for every pixel. The numerator is that sum minus what the object blocks, so
+//! only directions inside the object's bounding cone are sampled, in proportion to
+//! luminance times cosine *within the cone*: pixels whose cone holds no light, or too little to
+//! matter, are known without a ray, and an achromatic estimate lies in [0, 1] by construction.
+//! A proxy mesh that shadows itself has no closed form: numerator and denominator are estimated
+//! over the same samples, whose errors cancel in the ratio.
+//!
+//! Light that the object sends to the proxy (emitted or reflected) is optional and is added to the
+//! numerator.
+use dipir_numerics::hashing::hash_u64s;
+use dipir_numerics::sampler::Sampler;
+use dipir_numerics::warp::{
+    Frame, balance_heuristic, cone_pdf, cosine_hemisphere_pdf, square_to_cone,
+    square_to_cosine_hemisphere,
+};
+use glam::{Vec2, Vec3};
+
+use crate::blocker::{Blocker, Cone};
+use crate::counters::{RayCounts, RayKind};
+use crate::foreground::PathContext;
+use crate::light::{PlaneLight, SceneLight, irradiance_luminance};
+use crate::world::{ProxyGeometry, ProxyPoint};
+
+/// What a shadow kernel needs beside the scene.
+pub struct ShadowContext<'a, L, P> {
+    /// Object, light and depth; also traces the light that the object sends to the proxy.
+    pub path: PathContext<'a, L>,
+    /// Where the object is.
+    pub blocker: &'a Blocker,
+    /// The plane's light; `None` for a proxy mesh.
+    pub plane: Option<&'a P>,
+    /// Whether a proxy mesh shadows itself.
+    pub proxy_occlusion: bool,
+    /// Most interactions after which light that the object sends to the proxy counts: 0 is
+    /// emission alone, `None` nothing at all.
+    pub light_on_proxy: Option<u32>,
+    /// Share of the plane's light below which blocking is not looked for.
+    pub tolerance: f32,
+}
+
+/// Sums over the samples of one pixel, from which the ratio follows.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ShadowSums {
+    /// Light that is missing because of the object, minus what it adds.
+    pub blocked: Vec3,
+    /// Light without the object; unused on planes, whose sum is known.
+    pub arriving: Vec3,
+    /// Samples that meet the proxy.
+    pub hits: f32,
+}
+
+/// The ratio from sums over `samples` samples, `arriving` being the light per sample that meets
+/// the proxy, if known. Samples beside the proxy count as unshadowed, and so does every channel in
+/// which no light arrives at all.
+pub fn ratio(sums: &ShadowSums, samples: f32, arriving: Option<Vec3>) -> Vec3 {
+    if !(samples > 0.0) {
+        return Vec3::ONE;
+    }
+    let channel = |blocked: f32, arriving: f32, share: f32| {
+        if arriving > 0.0 {
+            (1.0 - share * (blocked / arriving)).max(0.0)
+        } else {
+            1.0
+        }
+    };
+    let (arriving, share) = match arriving {
+        Some(e) => (e * samples, 1.0),
+        None => (sums.arriving, sums.hits / samples),
+    };
+    Vec3::new(
+        channel(sums.blocked.x, arriving.x, share),
+        channel(sums.blocked.y, arriving.y, share),
+        channel(sums.blocked.z, arriving.z, share),
+    )
+}
+
+/// A block of at most `2^n x 2^n` pixels may share a cone that its extent on the plane widens by
+/// at most this share of the object's radius: wider cones waste samples, more cones waste time.
+const MAX_REACH: f32 = 0.15;
+
+/// A rectangle of pixels: first column and row, width and height.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Block {
+    /// First column.
+    pub x: u32,
+    /// First row.
+    pub y: u32,
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+/// The samples that a call adds to every pixel: sequence key and index range.
+#[derive(Clone, Copy, Debug)]
+pub struct SampleRange {
+    /// Samples `first..first + count` of the sequence.
+    pub first: u32,
+    /// How many.
+    pub count: u32,
+}
+
+impl<'p, L: SceneLight, P: PlaneLight> ShadowContext<'p, L, P> {
+    /// Adds `samples` samples to the sums of every pixel of `block` on a plane.
+    /// `sampler(x, y)` is the pixel's sequence; `add(x, y, blocked)` takes one pixel's new sum.
+    pub fn plane_block<const F: u32>(
+        &self,
+        block: Block,
+        samples: SampleRange,
+        sampler: &impl Fn(u32, u32) -> Sampler,
+        restriction: &mut P::Restriction<'p>,
+        counts: &mut RayCounts,
+        add: &mut dyn FnMut(u32, u32, Vec3),
+    ) {
+        let Some(light) = self.plane else {
+            return;
+        };
+        let single = block.width == 1 && block.height == 1;
+        let corners = self.corners_on_plane(block);
+        if let Some((center, reach)) = corners {
+            let cone = self.blocker.cone(center, reach);
+            let bound = light.restrict(restriction, &cone);
+            if bound <= self.threshold(light) && self.light_on_proxy.is_none() {
+                return;
+            }
+            if single || reach <= MAX_REACH * self.blocker.radius() {
+                for y in block.y..block.y + block.height {
+                    for x in block.x..block.x + block.width {
+                        let base = sampler(x, y);
+                        let sum = self.plane_pixel::<F>(
+                            (x, y),
+                            samples,
+                            &base,
+                            Some(&cone),
+                            light,
+                            restriction,
+                            counts,
+                        );
+                        add(x, y, sum);
+                    }
+                }
+                return;
+            }
+        }
+        if single {
+            // The pixel straddles the horizon: no footprint, so every sample has its own cone.
+            let base = sampler(block.x, block.y);
+            let sum = self.plane_pixel::<F>(
+                (block.x, block.y),
+                samples,
+                &base,
+                None,
+                light,
+                restriction,
+                counts,
+            );
+            add(block.x, block.y, sum);
+            return;
+        }
+        if corners.is_none() && self.is_above_horizon(block) {
+            return;
+        }
+        for part in quarters(block) {
+            self.plane_block::<F>(part, samples, sampler, restriction, counts, add);
+        }
+    }
+
+    /// Whether any pixel of `block` could be shadowed noticeably, or receive light of the object.
+    pub fn may_shade(&self, block: Block, restriction: &mut P::Restriction<'p>) -> bool {
+        let Some(light) = self.plane else {
+            return true;
+        };
+        if let Some((center, reach)) = self.corners_on_plane(block) {
+            let cone = self.blocker.cone(center, reach);
+            let bound = light.restrict(restriction, &cone);
+            return self.light_on_proxy.is_some() || bound > self.threshold(light);
+        }
+        !self.is_above_horizon(block)
+    }
+
+    /// Blocked light, summed over `samples` samples of the pixel `(x, y)`.
+    fn plane_pixel<const F: u32>(
+        &self,
+        (x, y): (u32, u32),
+        samples: SampleRange,
+        base: &Sampler,
+        cone: Option<&Cone>,
+        light: &'p P,
+        restriction: &mut P::Restriction<'p>,
+        counts: &mut RayCounts,
+    ) -> Vec3 {
+        let world = self.path.world;
+        let corner = Vec2::new(x as f32, y as f32);
+        let mut blocked = Vec3::ZERO;
+        for index in samples.first..samples.first + samples.count {
+            let mut sampler = base.with_sample(index);
+            let view = world.camera().ray(corner + sampler.next_2d());
+            let direction_numbers = sampler.next_2d();
+            let Some(point) = world.proxy_point(&view) else {
+                continue;
+            };
+            let own;
+            let cone = match cone {
+                Some(cone) => cone,
+                None => {
+                    own = self.blocker.cone(point.position, 0.0);
+                    light.restrict(restriction, &own);
+                    &own
+                }
+            };
+            let (direction, weight) = light.sample(restriction, direction_numbers);
+            if weight != Vec3::ZERO {
+                counts.add(RayKind::Shadow);
+                if world.shades::<F>(&point.ray(direction), sampler.next_u64()) {
+                    blocked += weight;
+                }
+            }
+            if self.light_on_proxy.is_some() {
+                blocked -= self.light_sent::<F>(&point, cone, &mut sampler, counts);
+            }
+        }
+        blocked
+    }
+
+    /// Adds `samples` samples to the sums of the pixel `(x, y)` on a proxy mesh.
+    ///
+    /// Half of the directions come from the light, half from the cosine; both ratio parts use all
+    /// of them with the balance heuristic's weights.
+    pub fn mesh_pixel<const F: u32>(
+        &self,
+        (x, y): (u32, u32),
+        samples: SampleRange,
+        base: &Sampler,
+        counts: &mut RayCounts,
+    ) -> ShadowSums {
+        let world = self.path.world;
+        let ProxyGeometry::Mesh { bvh, .. } = &world.geometry.proxy else {
+            return ShadowSums::default();
+        };
+        let corner = Vec2::new(x as f32, y as f32);
+        let mut sums = ShadowSums::default();
+        for index in samples.first..samples.first + samples.count {
+            let mut sampler = base.with_sample(index);
+            let view = world.camera().ray(corner + sampler.next_2d());
+            let (light_numbers, cosine_numbers) = (sampler.next_2d(), sampler.next_2d());
+            counts.add(RayKind::Proxy);
+            let Some(point) = world.proxy_point(&view) else {
+                continue;
+            };
+            sums.hits += 1.0;
+            let cone = self.blocker.cone(point.position, 0.0);
+            let alpha_key = sampler.next_u64();
+            for technique in 0..2 {
+                let (direction, weight) =
+                    self.light_at(&point, technique, light_numbers, cosine_numbers);
+                if weight == Vec3::ZERO {
+                    continue;
+                }
+                let ray = point.ray(direction);
+                if self.proxy_occlusion {
+                    counts.add(RayKind::ProxyOcclusion);
+                    if bvh.occluded(&ray, f32::INFINITY, |_, _, _| true) {
+                        continue;
+                    }
+                }
+                sums.arriving += weight;
+                if direction.dot(cone.axis) < cone.cos_half_angle {
+                    continue;
+                }
+                counts.add(RayKind::Shadow);
+                if world.shades::<F>(&ray, alpha_key) {
+                    sums.blocked += weight;
+                }
+            }
+            if self.light_on_proxy.is_some() {
+                sums.blocked -= self.light_sent::<F>(&point, &cone, &mut sampler, counts);
+            }
+        }
+        sums
+    }
+
+    /// A direction drawn from the light (`technique` 0) or the cosine (1), with its share of
+    /// radiance times cosine over density.
+    fn light_at(
+        &self,
+        point: &ProxyPoint,
+        technique: u32,
+        light_numbers: Vec2,
+        cosine_numbers: Vec2,
+    ) -> (Vec3, Vec3) {
+        let (direction, radiance, light_pdf) = if technique == 0 {
+            let s = self.path.light.sample(light_numbers);
+            (s.direction, s.radiance, s.pdf)
+        } else {
+            let direction = Frame::from_normal(point.normal)
+                .to_world(square_to_cosine_hemisphere(cosine_numbers));
+            let (radiance, pdf) = self.path.light.eval_with_pdf(direction);
+            (direction, radiance, pdf)
+        };
+        let cosine = direction.dot(point.normal);
+        let cosine_pdf = cosine_hemisphere_pdf(cosine);
+        let (own, other) = match technique {
+            0 => (light_pdf, cosine_pdf),
+            _ => (cosine_pdf, light_pdf),
+        };
+        if !(own > 0.0 && cosine > 0.0) {
+            return (direction, Vec3::ZERO);
+        }
+        let weight = balance_heuristic(own, other) / own;
+        (direction, radiance * (cosine * weight))
+    }
+
+    /// Irradiance that the object sends to `point`: one path through a uniform direction of the
+    /// cone.
+    fn light_sent<const F: u32>(
+        &self,
+        point: &ProxyPoint,
+        cone: &Cone,
+        sampler: &mut Sampler,
+        counts: &mut RayCounts,
+    ) -> Vec3 {
+        let Some(max_depth) = self.light_on_proxy else {
+            return Vec3::ZERO;
+        };
+        let local = square_to_cone(sampler.next_2d(), cone.cos_half_angle);
+        let direction = Frame::from_normal(cone.axis).to_world(local);
+        let cosine = direction.dot(point.normal);
+        if cosine <= 0.0 {
+            return Vec3::ZERO;
+        }
+        counts.add(RayKind::LightOnProxy);
+        let path = PathContext {
+            max_depth,
+            photo: None,
+            ..self.path
+        };
+        let alpha_key = hash_u64s(&[sampler.next_u64(), 1]);
+        let sent = path.radiance::<F>(&point.ray(direction), alpha_key, sampler, counts);
+        sent.radiance * (cosine / cone_pdf(cone.cos_half_angle))
+    }
+
+    /// Luminance of blocked light that is not looked for.
+    fn threshold(&self, light: &P) -> f32 {
+        self.tolerance * irradiance_luminance(light)
+    }
+
+    /// A point of the plane and how far from it the corners of `block` land there; `None` unless
+    /// all four do.
+    fn corners_on_plane(&self, block: Block) -> Option<(Vec3, f32)> {
+        let world = self.path.world;
+        let (x0, y0) = (block.x as f32, block.y as f32);
+        let (x1, y1) = (x0 + block.width as f32, y0 + block.height as f32);
+        let corners = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)];
+        let mut points = [Vec3::ZERO; 4];
+        for (p, (x, y)) in points.iter_mut().zip(corners) {
+            *p = world
+                .proxy_point(&world.camera().ray(Vec2::new(x, y)))?
+                .position;
+        }
+        // The block's image on the plane is the convex hull of its corners'.
+        let center = 0.25 * (points[0] + points[1] + points[2] + points[3]);
+        let reach = points
+            .iter()
+            .fold(0f32, |r, p| r.max(p.distance(center)));
+        (reach.is_finite()).then_some((center, reach * (1.0 + 1e-6)))
+    }
+
+    /// Whether no ray through `block` meets the plane. A plane's horizon is a straight line in
+    /// the image, so no corner below it means no pixel below it.
+    fn is_above_horizon(&self, block: Block) -> bool {
+        let world = self.path.world;
+        let (x0, y0) = (block.x as f32, block.y as f32);
+        let (x1, y1) = (x0 + block.width as f32, y0 + block.height as f32);
+        [(x0, y0), (x1, y0), (x0, y1), (x1, y1)]
+            .into_iter()
+            .all(|(x, y)| {
+                world
+                    .proxy_point(&world.camera().ray(Vec2::new(x, y)))
+                    .is_none()
+            })
+    }
+}
+
+/// Splits a block in halves along its sides longer than one pixel.
+fn quarters(block: Block) -> impl Iterator<Item = Block> {
+    let halves = |first: u32, length: u32| {
+        let half = length / 2;
+        [(first, half), (first + half, length - half)]
+    };
+    let rows = halves(block.y, block.height);
+    let columns = halves(block.x, block.width);
+    rows.into_iter().flat_map(move |(y, height)| {
+        columns
+            .into_iter()
+            .filter(move |&(_, width)| width > 0 && height > 0)
+            .map(move |(x, width)| Block {
+                x,
+                y,
+                width,
+                height,
+            })
+    })
+}

@@ -1,0 +1,235 @@
+//! What rays meet: the object, its surfaces, and the proxy.
+use std::sync::Arc;
+
+use dipir_numerics::hashing::mix64;
+use dipir_scene::bvh::{Bvh, Hit, Sphere};
+use dipir_scene::camera::{Camera, Ray};
+use dipir_scene::mesh::TriangleMesh;
+use dipir_scene::proxy::{Plane, Proxy};
+use dipir_scene::ray_offset::spawn_origin;
+use dipir_scene::scene::Scene;
+use glam::Vec3;
+
+use crate::bsdf::features::{ALPHA, TRANSMISSION, has};
+use crate::convexity::is_convex;
+use crate::error::RenderError;
+use crate::surface::{SurfacePoint, Surfaces};
+
+/// The proxy, ready for rays.
+pub enum ProxyGeometry {
+    /// Nothing catches a shadow.
+    None,
+    /// An infinite plane with a unit normal.
+    Plane(Plane),
+    /// A mesh that may shadow itself.
+    Mesh {
+        /// Its triangles.
+        mesh: TriangleMesh,
+        /// Their hierarchy.
+        bvh: Bvh,
+    },
+}
+
+/// A point on the proxy as the camera sees it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ProxyPoint {
+    /// World space, metres.
+    pub position: Vec3,
+    /// Unit normal on the side of the camera.
+    pub normal: Vec3,
+    /// Bound on the distance of `position` from the surface, metres.
+    pub error: f32,
+}
+
+/// Shapes and hierarchies of a scene: what does not depend on the effects that are on.
+pub struct Geometry {
+    /// Hierarchy over the object.
+    pub bvh: Bvh,
+    /// The proxy.
+    pub proxy: ProxyGeometry,
+    /// Largest extent of the object, metres.
+    pub extent: f32,
+    /// The object is one closed convex surface: no ray that leaves it outwards meets it again.
+    pub convex: bool,
+}
+
+impl Geometry {
+    /// Builds the hierarchies.
+    pub fn new(scene: &Scene) -> Self {
+        let proxy = match &scene.proxy {
+            Proxy::None => ProxyGeometry::None,
+            Proxy::Plane(plane) => match plane.normal.try_normalize() {
+                Some(normal) => ProxyGeometry::Plane(Plane { normal, ..*plane }),
+                None => ProxyGeometry::None,
+            },
+            Proxy::Mesh(mesh) => ProxyGeometry::Mesh {
+                bvh: Bvh::build(mesh),
+                mesh: mesh.clone(),
+            },
+        };
+        let bvh = Bvh::build(&scene.mesh);
+        Self {
+            extent: bvh
+                .bounds()
+                .map_or(0.0, |b| (b.max - b.min).max_element()),
+            bvh,
+            proxy,
+            convex: is_convex(&scene.mesh),
+        }
+    }
+}
+
+/// A scene made ready for the effects of one plan.
+pub struct World<'a> {
+    /// The scene.
+    pub scene: &'a Scene,
+    /// Shapes and hierarchies.
+    pub geometry: Arc<Geometry>,
+    /// Materials and textures, stripped of what the plan leaves out.
+    pub surfaces: Surfaces<'a>,
+    /// The effects that `surfaces` was prepared for ([`crate::features`]).
+    pub mask: u32,
+    /// No ray that leaves the object outwards meets it again, and none passes through.
+    pub escapes: bool,
+}
+
+impl<'a> World<'a> {
+    /// Prepares `scene` for the effects in `mask`; decodes only the textures that they need.
+    pub fn new(scene: &'a Scene, geometry: Arc<Geometry>, mask: u32) -> Result<Self, RenderError> {
+        let surfaces = Surfaces::new(scene, mask)?;
+        let transmits = scene.materials.iter().any(|m| m.transmission.is_some());
+        let holes = (0..scene.mesh.indices.len() as u32).any(|t| surfaces.has_alpha(t));
+        let opaque = !(has(mask, ALPHA) && holes) && !(has(mask, TRANSMISSION) && transmits);
+        Ok(Self {
+            scene,
+            escapes: geometry.convex && opaque,
+            geometry,
+            surfaces,
+            mask,
+        })
+    }
+
+    /// The photo's camera.
+    pub fn camera(&self) -> &Camera {
+        &self.scene.camera
+    }
+
+    /// The ray that leaves the object at `surface` towards `direction`.
+    #[inline]
+    pub fn leave(&self, surface: &SurfacePoint, direction: Vec3) -> Ray {
+        // Rounding of the position, and of vertices relative to the hierarchy's centre, whose
+        // unit is at most twice half the extent; see `Bvh::surface_point`.
+        let error = f32::EPSILON
+            * (surface.position.abs().max_element() + 2.0 * self.geometry.extent);
+        Ray {
+            origin: spawn_origin(
+                surface.position,
+                surface.geometric_normal,
+                direction,
+                error,
+            ),
+            direction,
+        }
+    }
+
+    /// A ball around the object; `None` without triangles.
+    pub fn bounding_sphere(&self) -> Option<Sphere> {
+        self.geometry.bvh.bounding_sphere()
+    }
+
+    /// Nearest surface along a camera ray or a path. Back faces of single-sided surfaces are
+    /// not there, and covered surfaces are by chance, keyed by `alpha_key`.
+    #[inline]
+    pub fn closest<const F: u32>(&self, ray: &Ray, alpha_key: u64) -> Option<Hit> {
+        self.geometry.bvh.closest(ray, f32::INFINITY, |t, u, v| {
+            self.is_seen(ray, t) && self.is_covered::<F>(t, u, v, alpha_key)
+        })
+    }
+
+    /// Whether the object hides the light in the direction of a ray that leaves the object.
+    #[inline]
+    pub fn hides_light<const F: u32>(&self, ray: &Ray, alpha_key: u64) -> bool {
+        self.geometry.bvh.occluded(ray, f32::INFINITY, |t, u, v| {
+            self.is_seen(ray, t) && self.is_covered::<F>(t, u, v, alpha_key)
+        })
+    }
+
+    /// Whether the object hides the light from the proxy. Back faces do.
+    #[inline]
+    pub fn shades<const F: u32>(&self, ray: &Ray, alpha_key: u64) -> bool {
+        self.geometry
+            .bvh
+            .occluded(ray, f32::INFINITY, |t, u, v| {
+                self.is_covered::<F>(t, u, v, alpha_key)
+            })
+    }
+
+    #[inline(always)]
+    fn is_seen(&self, ray: &Ray, triangle: u32) -> bool {
+        !self.surfaces.single_sided(triangle)
+            || ray
+                .direction
+                .dot(self.surfaces.geometric_normal(triangle))
+                <= 0.0
+    }
+
+    #[inline(always)]
+    fn is_covered<const F: u32>(&self, triangle: u32, u: f32, v: f32, key: u64) -> bool {
+        if !has(F, ALPHA) || !self.surfaces.has_alpha(triangle) {
+            return true;
+        }
+        // A hash of the triangle, not a running number: traversal may ask twice, in any order.
+        let chance = (mix64(key ^ u64::from(triangle)) >> 40) as f32 * (1.0 / 16_777_216.0);
+        chance < self.surfaces.coverage::<F>(triangle, u, v)
+    }
+
+    /// Where `ray`, from the camera, meets the side of the proxy that is seen.
+    #[inline]
+    pub fn proxy_point(&self, ray: &Ray) -> Option<ProxyPoint> {
+        match &self.geometry.proxy {
+            ProxyGeometry::None => None,
+            ProxyGeometry::Plane(plane) => plane_point(plane, ray),
+            ProxyGeometry::Mesh { mesh, bvh } => {
+                let hit = bvh.closest(ray, f32::INFINITY, |_, _, _| true)?;
+                let point = bvh.surface_point(mesh, &hit);
+                let side = -point.geometric_normal.dot(ray.direction).signum();
+                Some(ProxyPoint {
+                    position: point.position,
+                    normal: point.geometric_normal * side,
+                    error: point.error,
+                })
+            }
+        }
+    }
+}
+
+/// Where `ray` meets the front of `plane`; `None` for rays that run along it, away from it or
+/// come from behind.
+#[inline]
+pub fn plane_point(plane: &Plane, ray: &Ray) -> Option<ProxyPoint> {
+    let towards = -ray.direction.dot(plane.normal);
+    let height = (ray.origin - plane.point).dot(plane.normal);
+    if !(towards > 0.0 && height > 0.0) {
+        return None;
+    }
+    let t = height / towards;
+    let position = ray.origin + ray.direction * t;
+    // A few ulp of the largest term in that sum. Beyond 1e30 m squares overflow.
+    let scale = ray.origin.abs().max_element().max(t);
+    (scale < 1e15).then_some(ProxyPoint {
+        position,
+        normal: plane.normal,
+        error: 4.0 * f32::EPSILON * scale,
+    })
+}
+
+impl ProxyPoint {
+    /// The ray from this point towards `direction`.
+    #[inline]
+    pub fn ray(&self, direction: Vec3) -> Ray {
+        Ray {
+            origin: spawn_origin(self.position, self.normal, direction, self.error),
+            direction,
+        }
+    }
+}
