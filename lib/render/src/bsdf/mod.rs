@@ -4,9 +4,23 @@
 //! `wo` points to the viewer, `wi` to the light; both are unit vectors that leave the surface.
 //! **`eval` includes the cosine `|wi . n|`.** Everything is monomorphised over a mask of
 //! [`features`]: what a mask lacks costs nothing.
-use dipir_numerics::warp::Frame;
+mod clearcoat;
+pub mod energy;
+mod energy_table;
+pub mod fresnel;
+pub mod ggx;
+mod lambert;
+mod metallic_roughness;
+mod transmission;
+
+use dipir_numerics::warp::{Frame, square_to_cosine_hemisphere};
 use glam::{Vec2, Vec3};
 
+use self::clearcoat::Coat;
+use self::features::{CLEARCOAT, PLAIN_GGX, TRANSMISSION, has};
+use self::fresnel::{schlick, schlick_weight};
+use self::ggx::reflect;
+use self::metallic_roughness::Base;
 use crate::surface::SurfacePoint;
 
 /// What a kernel simulates: a bit mask that is a const parameter of [`Bsdf`] and of
@@ -47,8 +61,7 @@ pub struct BsdfSample {
     pub wi: Vec3,
     /// `eval / pdf`; for a delta lobe the lobe's reflectance over the chance of choosing it.
     pub weight: Vec3,
-    /// Density per solid angle of *all* non-delta lobes at `wi`; for a delta lobe the chance
-    /// of choosing it.
+    /// Density per solid angle of *all* non-delta lobes at `wi`; infinite for a delta lobe.
     pub pdf: f32,
     /// Drawn from a mirror-like lobe that `eval` and `pdf` do not see: light sampling cannot
     /// find it, so its MIS weight is 1.
@@ -57,63 +70,295 @@ pub struct BsdfSample {
     pub transmitted: bool,
 }
 
+/// How a direction is drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Technique {
+    /// A visible normal of the base reflects.
+    Specular,
+    /// The cosine on the side of `wo`: diffuse light and further bounces.
+    Cosine,
+    /// A visible normal of the base transmits.
+    Transmit,
+    /// The cosine on the other side: further bounces of transmitted light.
+    CosineBelow,
+    /// A visible normal of the coat reflects.
+    Coat,
+    /// The cosine to the coat's normal: further bounces between its facets.
+    CoatCosine,
+}
+
+const TECHNIQUES: [Technique; 6] = [
+    Technique::Specular,
+    Technique::Cosine,
+    Technique::Transmit,
+    Technique::CosineBelow,
+    Technique::Coat,
+    Technique::CoatCosine,
+];
+
 /// The scattering function of one surface point for one `wo`.
+///
+/// Reflection is seen where `wi` lies above both the shading and the geometric plane,
+/// transmission where it lies below both: smooth shading leaks no light.
 #[derive(Clone, Copy, Debug)]
 pub struct Bsdf<const F: u32> {
     frame: Frame,
     geometric_normal: Vec3,
+    base: Base,
+    coat: Option<Coat>,
     albedo: Vec3,
+    /// Chance of each of [`TECHNIQUES`]; all 0 where nothing is reflected.
+    chances: [f32; 6],
 }
 
 impl<const F: u32> Bsdf<F> {
-    /// `wo` must lie on the side of `surface.geometric_normal`.
+    /// Prepares what depends on the unit vector `wo` alone. `wo` lies on the side of
+    /// `surface.geometric_normal`.
     pub fn new(surface: &SurfacePoint, wo: Vec3) -> Self {
-        let _ = wo;
+        let frame = Frame::from_normal(surface.normal);
+        let local = frame.to_local(wo);
+        let base = Base::new::<F>(surface, local);
+        let coat = match has(F, CLEARCOAT) {
+            true => Coat::new(&surface.coat, wo, &base),
+            false => None,
+        };
+        let (below, below_diffuse, coat_albedo) = match &coat {
+            Some(c) => (c.passing_o, c.passing_o, c.albedo),
+            None => (1.0, 1.0, [0.0; 2]),
+        };
+        let a = &base.albedo;
+        let mut albedo = (a.specular + a.further + a.transmitted + a.transmitted_further) * below
+            + a.diffuse * below_diffuse
+            + Vec3::splat(coat_albedo[0] + coat_albedo[1]);
+        let grey = |c: Vec3| c.element_sum() * (1.0 / 3.0);
+        let mut chances = [
+            grey(a.specular) * below,
+            grey(a.further) * below + grey(a.diffuse) * below_diffuse,
+            grey(a.transmitted) * below,
+            grey(a.transmitted_further) * below,
+            coat_albedo[0],
+            coat_albedo[1],
+        ];
+        let sum: f32 = chances.iter().sum();
+        let unseen = has(F, PLAIN_GGX) && local.z <= 0.0;
+        let scale = if sum > 0.0 && !unseen { 1.0 / sum } else { 0.0 };
+        for chance in &mut chances {
+            *chance *= scale;
+        }
+        if unseen {
+            albedo = Vec3::ZERO;
+        }
         Self {
-            frame: Frame::from_normal(surface.normal),
+            frame,
             geometric_normal: surface.geometric_normal,
-            albedo: surface.base_color * (1.0 - surface.metallic),
+            base,
+            coat,
+            albedo,
+            chances,
         }
     }
 
+    /// Share of light that leaves towards `wo` under a white sky: what a path's throughput
+    /// will be multiplied by on average.
+    #[inline]
+    pub fn albedo(&self) -> Vec3 {
+        self.albedo
+    }
+
     /// Whether there is no lobe that light sampling could find.
+    #[inline]
     pub fn is_delta(&self) -> bool {
-        false
+        let smooth_base = self.base.ggx.is_none();
+        let smooth_coat = self.coat.as_ref().is_none_or(|c| c.ggx.is_none());
+        let c = &self.chances;
+        c[1] == 0.0
+            && (smooth_base || (c[0] == 0.0 && c[2] == 0.0 && c[3] == 0.0))
+            && (smooth_coat || (c[4] == 0.0 && c[5] == 0.0))
     }
 
     /// BSDF times `|wi . n|`, delta lobes left out.
+    #[inline]
     pub fn eval(&self, wi: Vec3) -> Vec3 {
         self.eval_pdf(wi).0
     }
 
     /// Density per solid angle with which [`Self::sample`] draws `wi`, delta lobes left out.
+    #[inline]
     pub fn pdf(&self, wi: Vec3) -> f32 {
         self.eval_pdf(wi).1
     }
 
     /// Both at once, for multiple importance sampling.
+    #[inline]
     pub fn eval_pdf(&self, wi: Vec3) -> (Vec3, f32) {
-        let l = self.frame.to_local(wi);
-        if l.z <= 0.0 || wi.dot(self.geometric_normal) <= 0.0 {
-            return (Vec3::ZERO, 0.0);
+        let local = self.frame.to_local(wi);
+        let side = wi.dot(self.geometric_normal);
+        let [
+            specular,
+            cosine,
+            transmit,
+            cosine_below,
+            coat_chance,
+            coat_cosine,
+        ] = self.chances;
+        let (mut value, mut pdf) = (Vec3::ZERO, 0.0);
+        if side > 0.0 {
+            let coat = self.coat_at(wi);
+            if local.z > 0.0 && specular + cosine > 0.0 {
+                let r = self.base.reflected::<F>(local);
+                value = match &coat {
+                    Some((c, _, passing)) => {
+                        r.specular * c.over_specular(*passing)
+                            + r.diffuse * c.over_diffuse(*passing)
+                    }
+                    None => r.specular + r.diffuse,
+                };
+                pdf = specular * r.specular_pdf + cosine * r.cosine_pdf;
+            }
+            if let Some((c, wi, _)) = coat
+                && wi.z > 0.0
+            {
+                let r = c.reflected(wi);
+                value += Vec3::splat(r.value);
+                pdf += coat_chance * r.specular_pdf + coat_cosine * r.cosine_pdf;
+            }
+        } else if has(F, TRANSMISSION)
+            && transmit + cosine_below > 0.0
+            && local.z < 0.0
+            && side < 0.0
+        {
+            let (transmitted, visible_pdf) = self.base.transmitted(local);
+            let passing = self.coat_at(wi).map_or(1.0, |(c, _, p)| c.over_specular(p));
+            value = transmitted * passing;
+            pdf = transmit * visible_pdf - cosine_below * local.z * std::f32::consts::FRAC_1_PI;
         }
-        let pdf = l.z * std::f32::consts::FRAC_1_PI;
-        (self.albedo * pdf, pdf)
+        (value, pdf)
     }
 
-    /// Draws `wi`; `None` where the path ends (absorbed, or below the horizon).
+    /// The coat, `wi` in its frame, and what it lets pass from there.
+    #[inline]
+    fn coat_at(&self, wi: Vec3) -> Option<(&Coat, Vec3, f32)> {
+        if !has(F, CLEARCOAT) {
+            return None;
+        }
+        let coat = self.coat.as_ref()?;
+        let local = coat.frame.to_local(wi);
+        // A transmitted ray leaves through a coat on the other side; a ray below the horizon of
+        // a tilted coat grazes it.
+        let below = wi.dot(self.geometric_normal) < 0.0;
+        let cosine = if below { -local.z } else { local.z };
+        Some((coat, local, coat.passing(cosine.clamp(0.0, 1.0))))
+    }
+
+    /// Draws `wi`; `None` where the path ends (absorbed, or below the horizon). `u_lobe` and
+    /// both of `u` lie in `[0, 1)`.
     pub fn sample(&self, u_lobe: f32, u: Vec2) -> Option<BsdfSample> {
-        let _ = u_lobe;
-        let wi = self
-            .frame
-            .to_world(dipir_numerics::warp::square_to_cosine_hemisphere(u));
+        let technique = self.choose(u_lobe)?;
+        let wo = self.base.wo;
+        let local = match technique {
+            Technique::Cosine => square_to_cosine_hemisphere(u),
+            Technique::CosineBelow => -square_to_cosine_hemisphere(u),
+            Technique::Specular | Technique::Transmit => {
+                let Some(ggx) = &self.base.ggx else {
+                    return self.sample_delta(technique);
+                };
+                let (wi, _) = reflect(wo, ggx.sample(wo, u));
+                if wi.z <= 0.0 {
+                    return None;
+                }
+                match technique {
+                    Technique::Specular => wi,
+                    _ => Vec3::new(wi.x, wi.y, -wi.z),
+                }
+            }
+            Technique::Coat | Technique::CoatCosine => return self.sample_coat(technique, u),
+        };
+        self.weigh(self.frame.to_world(local))
+    }
+
+    /// The technique that `u` falls on; `None` if nothing is reflected.
+    #[inline]
+    fn choose(&self, u: f32) -> Option<Technique> {
+        let mut rest = u;
+        let mut last = None;
+        for (technique, chance) in TECHNIQUES.into_iter().zip(self.chances) {
+            if chance > 0.0 {
+                if rest < chance {
+                    return Some(technique);
+                }
+                rest -= chance;
+                // Rounding may leave a rest: it belongs to the last one.
+                last = Some(technique);
+            }
+        }
+        last
+    }
+
+    fn sample_coat(&self, technique: Technique, u: Vec2) -> Option<BsdfSample> {
+        let coat = self.coat.as_ref()?;
+        let local = match (technique, &coat.ggx) {
+            (Technique::CoatCosine, _) => square_to_cosine_hemisphere(u),
+            (_, Some(ggx)) => reflect(coat.wo, ggx.sample(coat.wo, u)).0,
+            (_, None) => return self.sample_delta(technique),
+        };
+        if local.z <= 0.0 {
+            return None;
+        }
+        self.weigh(coat.frame.to_world(local))
+    }
+
+    /// A drawn direction with the value and density of all lobes.
+    #[inline]
+    fn weigh(&self, wi: Vec3) -> Option<BsdfSample> {
         let (value, pdf) = self.eval_pdf(wi);
-        (pdf > 0.0).then(|| BsdfSample {
+        (pdf > 0.0 && value != Vec3::ZERO).then(|| BsdfSample {
             wi,
             weight: value / pdf,
             pdf,
             delta: false,
-            transmitted: false,
+            transmitted: wi.dot(self.geometric_normal) < 0.0,
+        })
+    }
+
+    /// The direction of a smooth lobe.
+    fn sample_delta(&self, technique: Technique) -> Option<BsdfSample> {
+        let base = &self.base;
+        let fresnel = schlick_weight(base.wo.z);
+        let mirrored = |v: Vec3| Vec3::new(-v.x, -v.y, v.z);
+        let (wi, value, chance) = match technique {
+            Technique::Specular => {
+                let f = match has(F, PLAIN_GGX) {
+                    true => base.f0,
+                    false => schlick(base.f0, fresnel),
+                };
+                (self.frame.to_world(mirrored(base.wo)), f, self.chances[0])
+            }
+            Technique::Transmit => {
+                let passing = 1.0 - base.dielectric_fresnel(fresnel);
+                let wi = self.frame.to_world(-base.wo);
+                (wi, base.transmitted.color * passing, self.chances[2])
+            }
+            _ => {
+                let coat = self.coat.as_ref()?;
+                let wi = coat.frame.to_world(mirrored(coat.wo));
+                (wi, Vec3::splat(coat.albedo[0]), self.chances[4])
+            }
+        };
+        let transmitted = technique == Technique::Transmit;
+        let side = wi.dot(self.geometric_normal);
+        if transmitted != (side < 0.0) {
+            return None;
+        }
+        let attenuation = match (technique, self.coat_at(wi)) {
+            (Technique::Specular | Technique::Transmit, Some((c, _, p))) => c.over_specular(p),
+            _ => 1.0,
+        };
+        Some(BsdfSample {
+            wi,
+            weight: value * (attenuation / chance),
+            pdf: f32::INFINITY,
+            delta: true,
+            transmitted,
         })
     }
 }

@@ -1,0 +1,262 @@
+//! The glTF 2.0 metallic-roughness base: a GGX lobe over a Lambertian or transmissive
+//! dielectric, mixed with a metal.
+//!
+//! Appendix B of the specification couples the diffuse lobe by `1 - F(wo.h)`, which neither
+//! keeps energy nor is meant to: it allows any coupling that does. Here:
+//! - the specular lobe gets back what single scattering loses, as a broad lobe
+//!   `(1 - E(wo)) (1 - E(wi)) / (pi (1 - Eavg))` times the mean Fresnel factor of further
+//!   bounces [Kulla and Conty 2017];
+//! - the diffuse lobe gets what the *whole* specular lobe of the dielectric leaves over, in
+//!   the same reciprocal form `(1 - Ed(wo)) (1 - Ed(wi)) / (pi (1 - Ed_avg))`
+//!   [Kelemen and Szirmay-Kalos 2001].
+//!
+//! So a white base returns all light at any roughness, metalness and angle, up to the
+//! interpolation of the energy table, and every lobe is reciprocal.
+use std::f32::consts::FRAC_1_PI;
+
+use glam::Vec3;
+
+use super::energy::LobeEnergy;
+use super::features::{PLAIN_GGX, SPECULAR, TRANSMISSION, has};
+use super::fresnel::{f0_from_ior, schlick, schlick_weight};
+use super::ggx::Ggx;
+use super::lambert;
+use super::transmission::Transmitted;
+use crate::surface::SurfacePoint;
+
+/// The least cosine of `wo`: where rounding puts it at or below the horizon, it grazes.
+const MIN_COSINE: f32 = 1e-7;
+
+/// The base for one `wo`, in the frame of the shading normal.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Base {
+    /// Towards the viewer.
+    pub wo: Vec3,
+    /// Its length with the tangential part scaled by alpha.
+    pub wo_length: f32,
+    /// `None` for a mirror.
+    pub ggx: Option<Ggx>,
+    pub energy: LobeEnergy,
+    /// Reflectance at normal incidence, dielectric and metal mixed.
+    pub f0: Vec3,
+    /// The dielectric's part of that.
+    pub f0_dielectric: f32,
+    /// Reflectance at grazing incidence: 0 where the interface is left out, else 1.
+    pub f90: f32,
+    /// Mean Fresnel factor of the dielectric's further bounces.
+    pub further_dielectric: f32,
+    /// Of the lobe of further bounces, all that does not depend on `wi`.
+    pub further: Vec3,
+    /// Of the diffuse lobe, all that does not depend on `wi`.
+    pub diffuse: Vec3,
+    /// The transmitted lobes.
+    pub transmitted: Transmitted,
+    /// Directional albedo of the lobes at `wo`.
+    pub albedo: BaseAlbedo,
+}
+
+/// How much light each lobe returns towards `wo` from a white sky.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct BaseAlbedo {
+    pub specular: Vec3,
+    pub further: Vec3,
+    pub diffuse: Vec3,
+    pub transmitted: Vec3,
+    pub transmitted_further: Vec3,
+}
+
+/// Values (cosine included) and densities of the reflecting lobes at one `wi`.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Reflected {
+    /// Single and further scattering at the interface.
+    pub specular: Vec3,
+    pub diffuse: Vec3,
+    /// Density of sampling visible normals.
+    pub specular_pdf: f32,
+    /// Density of sampling the cosine.
+    pub cosine_pdf: f32,
+}
+
+impl Base {
+    pub fn new<const F: u32>(surface: &SurfacePoint, wo: Vec3) -> Self {
+        let glossy = has(F, SPECULAR);
+        let plain = has(F, PLAIN_GGX);
+        let transmissive = has(F, TRANSMISSION);
+        let wo = Vec3::new(wo.x, wo.y, wo.z.max(MIN_COSINE));
+        let (color, metallic) = (surface.base_color, surface.metallic);
+        let passing = if transmissive {
+            surface.transmission
+        } else {
+            0.0
+        };
+        let diffuse_color = color * ((1.0 - metallic) * (1.0 - passing));
+        if !glossy && !(transmissive && passing > 0.0) {
+            return Self::lambertian(wo, diffuse_color);
+        }
+
+        let energy = LobeEnergy::new(surface.roughness);
+        let ggx = Ggx::new(surface.roughness);
+        let f0_dielectric = if glossy {
+            f0_from_ior(surface.ior)
+        } else {
+            0.0
+        };
+        let f0 = Vec3::splat(f0_dielectric).lerp(color, metallic) * f32::from(glossy);
+        let (loss, share) = (energy.loss(wo.z), energy.share(wo.z));
+        let mut base = Self {
+            wo,
+            wo_length: ggx.map_or(wo.z, |g| g.stretched_length(wo)),
+            ggx,
+            energy,
+            f0,
+            f0_dielectric,
+            f90: f32::from(glossy),
+            further_dielectric: 0.0,
+            further: Vec3::ZERO,
+            diffuse: diffuse_color * FRAC_1_PI,
+            transmitted: Transmitted::default(),
+            albedo: BaseAlbedo::default(),
+        };
+        if plain {
+            base.albedo.specular = f0 * (1.0 - loss);
+            base.albedo.diffuse = diffuse_color;
+            return base;
+        }
+
+        let mut further = Vec3::ZERO;
+        if glossy {
+            base.further_dielectric = energy.further_fresnel(f0_dielectric);
+            let metal = Vec3::from(color.to_array().map(|c| energy.further_fresnel(c)));
+            further = Vec3::splat(base.further_dielectric).lerp(metal, metallic);
+            base.albedo.specular = schlick(f0, share) * (1.0 - loss);
+            base.albedo.further = further * loss;
+            let left = 1.0 - base.dielectric_albedo(loss, share);
+            base.albedo.diffuse = diffuse_color * left;
+            base.diffuse =
+                diffuse_color * (left * lambert::coupling(base.mean_dielectric_albedo()));
+        } else {
+            base.albedo.diffuse = diffuse_color;
+        }
+        let broad = loss * energy.inverse_mean_loss() * FRAC_1_PI;
+        base.further = further * broad;
+        if transmissive {
+            let color = color * ((1.0 - metallic) * passing);
+            let below = 1.0 - base.further_dielectric;
+            base.transmitted = Transmitted {
+                color,
+                further: color * (below * broad),
+            };
+            base.albedo.transmitted =
+                color * ((1.0 - base.dielectric_fresnel(share)) * (1.0 - loss));
+            base.albedo.transmitted_further = color * (below * loss);
+        }
+        base
+    }
+
+    fn lambertian(wo: Vec3, color: Vec3) -> Self {
+        Self {
+            wo,
+            wo_length: wo.z,
+            ggx: None,
+            energy: LobeEnergy::MIRROR,
+            f0: Vec3::ZERO,
+            f0_dielectric: 0.0,
+            f90: 0.0,
+            further_dielectric: 0.0,
+            further: Vec3::ZERO,
+            diffuse: color * FRAC_1_PI,
+            transmitted: Transmitted::default(),
+            albedo: BaseAlbedo {
+                diffuse: color,
+                ..BaseAlbedo::default()
+            },
+        }
+    }
+
+    /// All that the dielectric's interface reflects towards a direction with these
+    /// [`LobeEnergy::loss`] and [`LobeEnergy::share`].
+    #[inline]
+    pub fn dielectric_albedo(&self, loss: f32, share: f32) -> f32 {
+        self.dielectric_fresnel(share) * (1.0 - loss) + self.further_dielectric * loss
+    }
+
+    /// The dielectric's Fresnel factor for a Schlick weight or its mean.
+    #[inline]
+    pub fn dielectric_fresnel(&self, weight: f32) -> f32 {
+        self.f0_dielectric + (self.f90 - self.f0_dielectric) * weight
+    }
+
+    /// Cosine-weighted mean of [`Self::dielectric_albedo`].
+    pub fn mean_dielectric_albedo(&self) -> f32 {
+        self.energy.mean_albedo(self.f0_dielectric)
+            + self.further_dielectric * self.energy.mean_loss
+    }
+
+    /// The reflecting lobes at `wi`, which lies above the surface; delta lobes left out.
+    #[inline]
+    pub fn reflected<const F: u32>(&self, wi: Vec3) -> Reflected {
+        let cosine_pdf = wi.z * FRAC_1_PI;
+        if !has(F, SPECULAR) {
+            return Reflected {
+                diffuse: self.diffuse * wi.z,
+                cosine_pdf,
+                ..Reflected::default()
+            };
+        }
+        let mut result = Reflected {
+            cosine_pdf,
+            ..Reflected::default()
+        };
+        if let Some(ggx) = self.ggx {
+            let facet = Facet::new(&ggx, self.wo, wi);
+            let visibility = match has(F, PLAIN_GGX) {
+                true => Ggx::separable_visibility,
+                false => Ggx::visibility,
+            };
+            let fresnel = match has(F, PLAIN_GGX) {
+                true => self.f0,
+                false => schlick(self.f0, schlick_weight(facet.cosine)),
+            };
+            let v = visibility(self.wo.z, self.wo_length, wi.z, facet.wi_length);
+            result.specular = fresnel * (facet.d * v * wi.z);
+            result.specular_pdf = Ggx::reflection_pdf(facet.d, self.wo.z, self.wo_length);
+        }
+        if has(F, PLAIN_GGX) {
+            result.diffuse = self.diffuse * wi.z;
+            return result;
+        }
+        let loss = self.energy.loss(wi.z);
+        result.specular += self.further * (loss * wi.z);
+        if self.diffuse != Vec3::ZERO {
+            let left = 1.0 - self.dielectric_albedo(loss, self.energy.share(wi.z));
+            result.diffuse = self.diffuse * (left * wi.z);
+        }
+        result
+    }
+}
+
+/// The microfacet that reflects `wo` to `wi`.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Facet {
+    /// Cosine between the facet's normal and either direction.
+    pub cosine: f32,
+    /// Density of such facets, per steradian.
+    pub d: f32,
+    /// Stretched length of `wi`.
+    pub wi_length: f32,
+}
+
+impl Facet {
+    #[inline]
+    pub fn new(ggx: &Ggx, wo: Vec3, wi: Vec3) -> Self {
+        // Both unit vectors lie above the surface, so their sum is not zero; its length is
+        // twice the cosine, the same seen from either side.
+        let sum = wo + wi;
+        let length = sum.length();
+        Self {
+            cosine: (0.5 * length).min(1.0),
+            d: ggx.d(sum / length),
+            wi_length: ggx.stretched_length(wi),
+        }
+    }
+}
