@@ -23,6 +23,18 @@ use crate::light::SceneLight;
 use crate::photo::Photo;
 use crate::world::World;
 
+/// Where paths begin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PathStart {
+    /// At the camera: everything is seen.
+    Camera,
+    /// On the proxy: surfaces without lighting shed no light there.
+    Proxy {
+        /// Whether light counts that the object emits and sends straight to the proxy.
+        emission: bool,
+    },
+}
+
 /// What a path tracer needs beside the scene.
 pub struct PathContext<'a, L> {
     /// Object, surfaces, proxy.
@@ -33,6 +45,8 @@ pub struct PathContext<'a, L> {
     pub photo: Option<&'a Photo<'a>>,
     /// Most interactions with the object, D; 0 leaves emission alone.
     pub max_depth: u32,
+    /// Where paths begin, which decides what emission they see.
+    pub start: PathStart,
     /// Interactions after which Russian roulette may end a path.
     pub roulette_depth: u32,
 }
@@ -130,10 +144,14 @@ impl<L: SceneLight> PathContext<'_, L> {
                 .interact::<F>(ray.direction, hit.triangle, hit.u, hit.v);
             if has(F, EMISSION) {
                 if surface.unlit {
-                    radiance += throughput * surface.base_color;
+                    if depth > 0 || self.start == PathStart::Camera {
+                        radiance += throughput * surface.base_color;
+                    }
                     break;
                 }
-                radiance += throughput * surface.emission;
+                if depth > 0 || self.start != (PathStart::Proxy { emission: false }) {
+                    radiance += throughput * surface.emission;
+                }
             }
             if depth == self.max_depth {
                 break;

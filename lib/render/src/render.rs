@@ -6,6 +6,7 @@ use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::{Sampler, Stream};
+use dipir_scene::camera::Camera;
 use dipir_scene::scene::Scene;
 use glam::{Vec2, Vec3};
 
@@ -13,13 +14,13 @@ use crate::adaptive::{EstimatedError, Progress, Stop, refine};
 use crate::blocker::Blocker;
 use crate::counters::RayCounts;
 use crate::error::RenderError;
-use crate::features::{ALPHA, has, with_features};
+use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
 use crate::film::{Film, Job, Layer, REPLICATES, Viewing};
 use crate::footprint::Footprint;
-use crate::foreground::PathContext;
+use crate::foreground::{PathContext, PathStart};
 use crate::light::{PlaneLight, SceneLight};
 use crate::photo::Photo;
-use crate::shadow::{Block, SampleRange, ShadowContext};
+use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext};
 use crate::world::{Geometry, ProxyGeometry, World};
 
 /// Which phenomena are simulated: what remains of an effects plan for the kernels.
@@ -33,9 +34,8 @@ pub struct Simulation {
     pub shadow: bool,
     /// Whether a proxy mesh shadows itself.
     pub proxy_occlusion: bool,
-    /// Most interactions after which light from the object counts on the proxy; 0 is emission
-    /// alone, `None` nothing.
-    pub light_on_proxy: Option<u32>,
+    /// Light of the object on the proxy, if it counts.
+    pub light_on_proxy: Option<LightOnProxy>,
 }
 
 /// How a picture is rendered, whatever is in it.
@@ -97,8 +97,10 @@ const BLOCK: u32 = 8;
 const ROULETTE_DEPTH: u32 = 4;
 
 /// A scene with its hierarchies built, to be rendered under lights and plans.
+#[derive(Clone)]
 pub struct Renderer<'a> {
     scene: &'a Scene,
+    camera: Camera,
     geometry: Arc<Geometry>,
 }
 
@@ -107,8 +109,22 @@ impl<'a> Renderer<'a> {
     pub fn new(scene: &'a Scene) -> Self {
         Self {
             scene,
+            camera: scene.camera,
             geometry: Arc::new(Geometry::new(scene)),
         }
+    }
+
+    /// The same scene seen by another camera; the hierarchies are shared.
+    pub fn with_camera(&self, camera: Camera) -> Self {
+        Self {
+            camera,
+            ..self.clone()
+        }
+    }
+
+    /// The camera that renders.
+    pub fn camera(&self) -> &Camera {
+        &self.camera
     }
 
     /// The scene.
@@ -123,7 +139,7 @@ impl<'a> Renderer<'a> {
 
     /// Makes the scene ready for the effects in `mask`.
     pub fn world(&self, mask: u32) -> Result<World<'a>, RenderError> {
-        World::new(self.scene, self.geometry.clone(), mask)
+        World::new(self.scene, self.camera, self.geometry.clone(), mask)
     }
 
     /// Renders the layers. `progress` is told after every round and may break off. The result
@@ -137,12 +153,16 @@ impl<'a> Renderer<'a> {
     ) -> Result<Rendered, RenderError> {
         self.check_sizes(settings)?;
         let world = self.world(simulation.features)?;
-        let photo = settings.background.map(|image| Photo { image });
+        let photo = settings
+            .background
+            .filter(|_| has(simulation.features, PROXY_RADIANCE))
+            .map(|image| Photo { image });
         let path = PathContext {
             world: &world,
             light,
             photo: photo.as_ref(),
             max_depth: simulation.max_depth,
+            start: PathStart::Camera,
             roulette_depth: ROULETTE_DEPTH,
         };
         let plane = match &self.geometry.proxy {
@@ -185,7 +205,7 @@ impl<'a> Renderer<'a> {
         advance: &(impl Fn(&mut Job, u32) + Sync),
         progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
     ) -> Result<Rendered, RenderError> {
-        let [width, height] = self.scene.camera.resolution.map(|n| n as usize);
+        let [width, height] = self.camera.resolution.map(|n| n as usize);
         let viewing = Viewing {
             background: settings.background,
             transfer: settings.transfer,
@@ -213,7 +233,7 @@ impl<'a> Renderer<'a> {
     }
 
     fn check_sizes(&self, settings: &Settings) -> Result<(), RenderError> {
-        let [camera_width, camera_height] = self.scene.camera.resolution.map(|n| n as usize);
+        let [camera_width, camera_height] = self.camera.resolution.map(|n| n as usize);
         let check = |what, width, height| {
             if (width, height) == (camera_width, camera_height) {
                 return Ok(());
@@ -236,7 +256,7 @@ impl<'a> Renderer<'a> {
     }
 
     fn blocks(&self) -> impl Iterator<Item = Block> {
-        let [width, height] = self.scene.camera.resolution;
+        let [width, height] = self.camera.resolution;
         (0..height.div_ceil(BLOCK)).flat_map(move |j| {
             (0..width.div_ceil(BLOCK)).map(move |i| {
                 let (x, y) = (i * BLOCK, j * BLOCK);
@@ -252,7 +272,7 @@ impl<'a> Renderer<'a> {
 
     fn object_jobs(&self, settings: &Settings) -> Vec<Job> {
         let bvh = &self.geometry.bvh;
-        let footprint = Footprint::new(&self.scene.camera, bvh.bounds(), bvh.clusters());
+        let footprint = Footprint::new(&self.camera, bvh.bounds(), bvh.clusters());
         self.blocks()
             .filter(|b| footprint.overlaps(b.x, b.y, b.width, b.height))
             .filter_map(|block| {

@@ -20,9 +20,18 @@ use glam::{Vec2, Vec3};
 
 use crate::blocker::{Blocker, Cone};
 use crate::counters::{RayCounts, RayKind};
-use crate::foreground::PathContext;
+use crate::foreground::{PathContext, PathStart};
 use crate::light::{PlaneLight, SceneLight, irradiance_luminance};
 use crate::world::{ProxyGeometry, ProxyPoint};
+
+/// Which light of the object counts on the proxy.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LightOnProxy {
+    /// Light that the object emits.
+    pub emission: bool,
+    /// Light that the object reflects or lets pass.
+    pub bounce: bool,
+}
 
 /// What a shadow kernel needs beside the scene.
 pub struct ShadowContext<'a, L, P> {
@@ -34,9 +43,8 @@ pub struct ShadowContext<'a, L, P> {
     pub plane: Option<&'a P>,
     /// Whether a proxy mesh shadows itself.
     pub proxy_occlusion: bool,
-    /// Most interactions after which light that the object sends to the proxy counts: 0 is
-    /// emission alone, `None` nothing at all.
-    pub light_on_proxy: Option<u32>,
+    /// Light of the object on the proxy, if it counts.
+    pub light_on_proxy: Option<LightOnProxy>,
     /// Share of the plane's light below which blocking is not looked for.
     pub tolerance: f32,
 }
@@ -322,7 +330,7 @@ impl<'p, L: SceneLight, P: PlaneLight> ShadowContext<'p, L, P> {
         sampler: &mut Sampler,
         counts: &mut RayCounts,
     ) -> Vec3 {
-        let Some(max_depth) = self.light_on_proxy else {
+        let Some(sent) = self.light_on_proxy else {
             return Vec3::ZERO;
         };
         let local = square_to_cone(sampler.next_2d(), cone.cos_half_angle);
@@ -333,7 +341,10 @@ impl<'p, L: SceneLight, P: PlaneLight> ShadowContext<'p, L, P> {
         }
         counts.add(RayKind::LightOnProxy);
         let path = PathContext {
-            max_depth,
+            max_depth: if sent.bounce { self.path.max_depth } else { 0 },
+            start: PathStart::Proxy {
+                emission: sent.emission,
+            },
             photo: None,
             ..self.path
         };

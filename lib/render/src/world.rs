@@ -83,6 +83,8 @@ impl Geometry {
 pub struct World<'a> {
     /// The scene.
     pub scene: &'a Scene,
+    /// The camera that renders.
+    pub camera: Camera,
     /// Shapes and hierarchies.
     pub geometry: Arc<Geometry>,
     /// Materials and textures, stripped of what the plan leaves out.
@@ -95,13 +97,19 @@ pub struct World<'a> {
 
 impl<'a> World<'a> {
     /// Prepares `scene` for the effects in `mask`; decodes only the textures that they need.
-    pub fn new(scene: &'a Scene, geometry: Arc<Geometry>, mask: u32) -> Result<Self, RenderError> {
+    pub fn new(
+        scene: &'a Scene,
+        camera: Camera,
+        geometry: Arc<Geometry>,
+        mask: u32,
+    ) -> Result<Self, RenderError> {
         let surfaces = Surfaces::new(scene, mask)?;
         let transmits = scene.materials.iter().any(|m| m.transmission.is_some());
         let holes = (0..scene.mesh.indices.len() as u32).any(|t| surfaces.has_alpha(t));
         let opaque = !(has(mask, ALPHA) && holes) && !(has(mask, TRANSMISSION) && transmits);
         Ok(Self {
             scene,
+            camera,
             escapes: geometry.convex && opaque,
             geometry,
             surfaces,
@@ -109,9 +117,10 @@ impl<'a> World<'a> {
         })
     }
 
-    /// The photo's camera.
+    /// The camera that renders.
+    #[inline]
     pub fn camera(&self) -> &Camera {
-        &self.scene.camera
+        &self.camera
     }
 
     /// The ray that leaves the object at `surface` towards `direction`.

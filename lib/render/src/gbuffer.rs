@@ -1,0 +1,123 @@
+//! What lies behind every pixel: depth, normal, albedo, and who covers it.
+use dipir_imaging::error::ImagingError;
+use dipir_imaging::layers::{Layers, Precision};
+use dipir_imaging::raster::Raster;
+use dipir_numerics::sampler::{Sampler, Stream};
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+
+use crate::error::RenderError;
+use crate::features::{EVERYTHING, with_features};
+use crate::footprint::Footprint;
+use crate::render::Renderer;
+use crate::world::World;
+
+/// Geometry and albedo as the camera sees them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GBuffer {
+    /// Distance along the optical axis to the nearest surface, object before proxy, metres;
+    /// infinite where there is none. Not averaged: edges keep the nearest of their samples.
+    pub depth: Raster<f32>,
+    /// Unit shading normal of the object, else normal of the proxy, world space; 0 where neither.
+    pub normal: Raster<Vec3>,
+    /// Base colour of the object, linear, not premultiplied; 0 where there is none.
+    pub albedo: Raster<Vec3>,
+    /// Antialiased coverage of the object.
+    pub object_alpha: Raster<f32>,
+    /// Antialiased coverage of the proxy, whether the object hides it or not.
+    pub proxy_alpha: Raster<f32>,
+}
+
+/// Samples per pixel: coverage in steps of a sixteenth.
+const SAMPLES: u32 = 16;
+
+#[derive(Clone, Copy)]
+struct Pixel {
+    depth: f32,
+    normal: Vec3,
+    albedo: Vec3,
+    object: f32,
+    proxy: f32,
+}
+
+impl GBuffer {
+    /// Of the scene of `renderer`, textures included.
+    pub fn new(renderer: &Renderer, seed: u64) -> Result<Self, RenderError> {
+        let world = renderer.world(EVERYTHING)?;
+        let [width, height] = world.camera().resolution;
+        let bvh = &world.geometry.bvh;
+        let footprint = Footprint::new(world.camera(), bvh.bounds(), bvh.clusters());
+        let pixels: Vec<Pixel> = (0..width * height)
+            .into_par_iter()
+            .map(|i| {
+                let (x, y) = (i % width, i / width);
+                let object = footprint.holds(x, y);
+                with_features!(world.mask, F => pixel::<F>(&world, (x, y), object, seed))
+            })
+            .collect();
+        let (width, height) = (width as usize, height as usize);
+        fn raster<T>(width: usize, pixels: &[Pixel], get: impl Fn(&Pixel) -> T) -> Raster<T> {
+            let values: Vec<T> = pixels.iter().map(get).collect();
+            Raster::from_pixels(width, pixels.len() / width.max(1), values)
+        }
+        debug_assert_eq!(pixels.len(), width * height);
+        Ok(Self {
+            depth: raster(width, &pixels, |p| p.depth),
+            normal: raster(width, &pixels, |p| p.normal),
+            albedo: raster(width, &pixels, |p| p.albedo),
+            object_alpha: raster(width, &pixels, |p| p.object),
+            proxy_alpha: raster(width, &pixels, |p| p.proxy),
+        })
+    }
+
+    /// As the channels `depth.Z normal.X/Y/Z albedo.R/G/B object.A proxy.A`; depth in full
+    /// precision, the rest in half.
+    pub fn to_layers(&self) -> Result<Layers, ImagingError> {
+        let mut layers = Layers::new(self.depth.width(), self.depth.height());
+        layers.insert("depth.Z", Precision::Full, self.depth.clone())?;
+        layers.insert_xyz("normal", Precision::Half, &self.normal)?;
+        layers.insert_rgb("albedo", Precision::Half, &self.albedo)?;
+        layers.insert("object.A", Precision::Half, self.object_alpha.clone())?;
+        layers.insert("proxy.A", Precision::Half, self.proxy_alpha.clone())?;
+        Ok(layers)
+    }
+}
+
+fn pixel<const F: u32>(world: &World, (x, y): (u32, u32), object: bool, seed: u64) -> Pixel {
+    let camera = world.camera();
+    let axis = -camera.rotation.z_axis;
+    let corner = Vec2::new(x as f32, y as f32);
+    let (mut object_depth, mut proxy_depth) = (f32::INFINITY, f32::INFINITY);
+    let (mut object_normal, mut proxy_normal) = (Vec3::ZERO, Vec3::ZERO);
+    let (mut albedo, mut object_hits, mut proxy_hits) = (Vec3::ZERO, 0.0, 0.0);
+    for sample in 0..SAMPLES {
+        let mut sampler = Sampler::new(seed, Stream::FOREGROUND, (y << 16) | (x & 0xffff), sample);
+        let ray = camera.ray(corner + sampler.next_2d());
+        if let Some(point) = world.proxy_point(&ray) {
+            proxy_hits += 1.0;
+            proxy_normal += point.normal;
+            proxy_depth = proxy_depth.min((point.position - ray.origin).dot(axis));
+        }
+        let hit = match object {
+            true => world.closest::<F>(&ray, sampler.next_u64()),
+            false => None,
+        };
+        if let Some(hit) = hit {
+            let surface = world
+                .surfaces
+                .interact::<F>(ray.direction, hit.triangle, hit.u, hit.v);
+            object_hits += 1.0;
+            object_normal += surface.normal;
+            albedo += surface.base_color;
+            object_depth = object_depth.min((surface.position - ray.origin).dot(axis));
+        }
+    }
+    let seen = object_hits > 0.0;
+    Pixel {
+        depth: if seen { object_depth } else { proxy_depth },
+        normal: if seen { object_normal } else { proxy_normal }.normalize_or_zero(),
+        albedo: if seen { albedo / object_hits } else { Vec3::ZERO },
+        object: object_hits / SAMPLES as f32,
+        proxy: proxy_hits / SAMPLES as f32,
+    }
+}
