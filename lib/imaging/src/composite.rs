@@ -84,3 +84,65 @@ fn same_size(
         reference: "the background",
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dipir_numerics::gradcheck::{central_difference, relative_error};
+
+    fn one(value: Vec3) -> LinearImage {
+        LinearImage(Raster::filled(1, 1, value))
+    }
+
+    #[test]
+    fn full_coverage_hides_the_background_and_none_shows_it_shadowed() {
+        let (background, object) = (Vec3::new(0.2, 0.4, 0.6), Vec3::new(0.9, 0.5, 0.1));
+        let shadow = Vec3::new(0.5, 0.25, 1.0);
+        let of = |rgb, alpha| {
+            let alpha = Raster::filled(1, 1, alpha);
+            composite(&one(background), &one(rgb), &alpha, &one(shadow)).unwrap()
+        };
+        assert_eq!(of(object, 1.0).0.pixels()[0], object);
+        assert_eq!(of(Vec3::ZERO, 0.0).0.pixels()[0], background * shadow);
+        let half = of(object * 0.5, 0.5).0.pixels()[0];
+        assert_eq!(half, background * shadow * 0.5 + object * 0.5);
+    }
+
+    #[test]
+    fn layers_of_another_size_are_refused_by_name() {
+        let alpha = Raster::filled(2, 1, 0.0);
+        let error = composite(&one(Vec3::ONE), &one(Vec3::ONE), &alpha, &one(Vec3::ONE));
+        assert_eq!(
+            error.unwrap_err().to_string(),
+            "the object's alpha is 2 x 1 pixels; expected 1 x 1, the size of the background"
+        );
+    }
+
+    #[test]
+    fn the_composite_gradient_follows_central_differences() {
+        let (background, shadow) = (Vec3::new(0.2, 0.4, 0.6), Vec3::new(0.5, 0.25, 1.0));
+        let (object, weight) = (Vec3::new(0.3, 0.2, 0.1), Vec3::new(1.0, -2.0, 0.5));
+        let got = composite_pixel_vjp(background, 0.3, shadow, weight);
+        // Bilinear in every input, so central differences have no truncation error; f32 has 1e-7.
+        let check = |got: f32, f: &dyn Fn(f64) -> f64, at: f32| {
+            let want = central_difference(f, f64::from(at), 1e-3);
+            assert!(
+                relative_error(f64::from(got), want, 1e-3) < 1e-6,
+                "{got} {want}"
+            );
+        };
+        let loss = |object: glam::DVec3, alpha: f64, shadow: glam::DVec3| {
+            (background.as_dvec3() * shadow * (1.0 - alpha) + object).dot(weight.as_dvec3())
+        };
+        let (o, b, a) = (object.as_dvec3(), shadow.as_dvec3(), f64::from(0.3f32));
+        check(got.alpha, &|v| loss(o, v, b), 0.3);
+        for c in 0..3 {
+            let with = |mut base: glam::DVec3, v: f64| {
+                base[c] = v;
+                base
+            };
+            check(got.object[c], &|v| loss(with(o, v), a, b), object[c]);
+            check(got.shadow[c], &|v| loss(o, a, with(b, v)), shadow[c]);
+        }
+    }
+}

@@ -9,6 +9,8 @@ pub mod layers;
 pub mod metrics;
 pub mod raster;
 pub mod resize;
+pub mod spline;
+pub mod tone;
 pub mod transfer;
 
 pub use error::ImagingError;

@@ -163,3 +163,103 @@ fn window_positions(length: usize) -> Vec<Window> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The picture of the reference script below.
+    fn waves(width: usize, height: usize, phase: f64, scale: f32) -> Raster<Vec3> {
+        let pixel = |i: usize| {
+            let (x, y) = ((i % width) as f64, (i / width) as f64);
+            let value = |c: f64| {
+                let wave = (0.3 * x + 0.017 * y * y + c + phase).sin();
+                (0.5 + 0.5 * wave) as f32 * scale
+            };
+            Vec3::new(value(0.0), value(1.0), value(2.0))
+        };
+        Raster::from_pixels(width, height, (0..width * height).map(pixel).collect())
+    }
+
+    /// The numbers are those of scikit-image 0.26:
+    /// ```python
+    /// structural_similarity(a, b, data_range=1.0, gaussian_weights=True, sigma=1.5,
+    ///                       use_sample_covariance=False, channel_axis=2)
+    /// ```
+    /// which averages over the same positions, on the pictures of `waves` in f64.
+    #[test]
+    fn ssim_agrees_with_scikit_image() {
+        for (width, height, want) in [
+            (33, 21, 0.806_202_133_966_658_4),
+            (11, 11, 0.738_085_003_302_474_2),
+        ] {
+            let (a, b) = (
+                waves(width, height, 0.0, 1.0),
+                waves(width, height, 0.4, 0.8),
+            );
+            let got = ssim(&a, &b);
+            // A last bit of f32 where two sine libraries differ moves the mean by less than 1e-7.
+            assert!(
+                (got - want).abs() < 1e-7,
+                "{width} x {height}: {got} {want}"
+            );
+        }
+    }
+
+    #[test]
+    fn equal_images_have_no_error_and_full_similarity() {
+        for (width, height) in [(1, 1), (3, 17), (40, 12)] {
+            let image = waves(width, height, 1.0, 1.0);
+            assert_eq!(rmse(&image, &image), 0.0);
+            assert_eq!(mae(&image, &image), 0.0);
+            assert!(si_rmse(&image, &image) < 1e-15);
+            assert!((ssim(&image, &image) - 1.0).abs() < 1e-12);
+        }
+        let black = Raster::filled(12, 12, Vec3::ZERO);
+        assert_eq!(ssim(&black, &black), 1.0);
+        assert_eq!(si_rmse(&black, &black), 0.0);
+    }
+
+    #[test]
+    fn constant_images_have_the_closed_form_ssim() {
+        // No variance: only the luminance term is left.
+        let (a, b) = (
+            Raster::filled(15, 13, Vec3::splat(0.25)),
+            Raster::filled(15, 13, Vec3::splat(0.75)),
+        );
+        let want = (2.0 * 0.25 * 0.75 + SSIM_C1) / (0.0625 + 0.5625 + SSIM_C1);
+        assert!((ssim(&a, &b) - want).abs() < 1e-12);
+    }
+
+    #[test]
+    fn errors_are_means_over_pixels_and_channels() {
+        let a = Raster::from_pixels(2, 1, vec![Vec3::ZERO, Vec3::new(0.0, 0.0, 3.0)]);
+        let b = Raster::filled(2, 1, Vec3::ZERO);
+        assert!((rmse(&a, &b) - (9.0f64 / 6.0).sqrt()).abs() < 1e-15);
+        assert!((mae(&a, &b) - 0.5).abs() < 1e-15);
+    }
+
+    #[test]
+    fn si_rmse_forgives_exposure_and_nothing_else() {
+        let reference = waves(20, 10, 0.0, 1.0);
+        for scale in [1e-3, 0.5, 1024.0] {
+            let scaled = reference.map(|&c| c * scale);
+            // The scaled values round in f32.
+            assert!(
+                si_rmse(&scaled, &reference) < 2.0 * f64::from(f32::EPSILON),
+                "{scale}"
+            );
+        }
+        let other = waves(20, 10, 0.5, 1.0);
+        let least = si_rmse(&other, &reference);
+        for scale in [0.2, 0.9, 1.0, 1.1, 3.0] {
+            assert!(
+                rmse(&other.map(|&c| c * scale), &reference) >= least - 1e-6,
+                "{scale}"
+            );
+        }
+        // A black image cannot be scaled to anything: the error is the reference itself.
+        let black = Raster::filled(20, 10, Vec3::ZERO);
+        assert_eq!(si_rmse(&black, &reference), rmse(&black, &reference));
+    }
+}

@@ -234,3 +234,153 @@ fn filter_columns<T: Sample>(image: &Raster<T>, taps: &Taps) -> Raster<T> {
     });
     output
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    fn noise(width: usize, height: usize) -> Raster<f32> {
+        let value = |i: usize| ((i * 7919 % 1009) as f32) / 1009.0;
+        Raster::from_pixels(width, height, (0..width * height).map(value).collect())
+    }
+
+    #[test]
+    fn the_same_size_changes_nothing() {
+        let image = noise(7, 5);
+        for filter in [Filter::Area, Filter::Bilinear] {
+            assert_eq!(resize(&image, 7, 5, filter), image);
+        }
+    }
+
+    #[test]
+    fn a_constant_stays_constant_at_odd_sizes_and_down_to_one_pixel() {
+        let image = Raster::filled(13, 9, Vec3::new(0.25, 2.0, 1e6));
+        for (width, height) in [(1, 1), (5, 3), (13, 1), (17, 31), (200, 7)] {
+            for filter in [Filter::Area, Filter::Bilinear] {
+                for p in resize(&image, width, height, filter).pixels() {
+                    // Up to 26 rounded weights a direction sum to 1 within 26 ulp.
+                    let error = (*p / *image.get(0, 0) - Vec3::ONE).abs().max_element();
+                    assert!(
+                        error < 52.0 * f32::EPSILON,
+                        "{filter:?} {width} x {height}: {p}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn one_pixel_grows_to_a_constant() {
+        for filter in [Filter::Area, Filter::Bilinear] {
+            let grown = resize(&Raster::filled(1, 1, 0.7f32), 4, 3, filter);
+            assert!(grown.pixels().iter().all(|&v| v == 0.7));
+        }
+    }
+
+    #[test]
+    fn area_takes_block_means() {
+        let image = noise(6, 4);
+        let small = resize(&image, 3, 2, Filter::Area);
+        for y in 0..2 {
+            for x in 0..3 {
+                let mut sum = 0.0;
+                for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                    sum += image.get(2 * x + dx, 2 * y + dy);
+                }
+                assert!((small.get(x, y) - sum / 4.0).abs() < 4.0 * f32::EPSILON);
+            }
+        }
+    }
+
+    #[test]
+    fn bilinear_interpolates_between_pixel_centres_and_holds_at_the_border() {
+        let ramp = Raster::from_pixels(4, 1, vec![0.0f32, 1.0, 2.0, 3.0]);
+        let double = resize(&ramp, 8, 1, Filter::Bilinear);
+        // Output centre o + 1/2 lies at (o + 1/2) / 2 - 1/2 input pixels.
+        let want = [0.0, 0.25, 0.75, 1.25, 1.75, 2.25, 2.75, 3.0];
+        for (got, want) in double.pixels().iter().zip(want) {
+            assert!((got - want).abs() < 4.0 * f32::EPSILON, "{got} {want}");
+        }
+    }
+
+    #[test]
+    fn a_crop_sees_nothing_outside_its_box() {
+        let inside = PixelBox {
+            x: 2,
+            y: 1,
+            width: 4,
+            height: 3,
+        };
+        let mut image = noise(9, 6);
+        let cut = (0..12).map(|i| *image.get(2 + i % 4, 1 + i / 4)).collect();
+        let cut = Raster::from_pixels(4, 3, cut);
+        for filter in [Filter::Area, Filter::Bilinear] {
+            let want = resize(&cut, 10, 2, filter);
+            let crop = CropResize::new((9, 6), inside, (10, 2), filter);
+            assert_eq!(crop.apply(&image), want);
+        }
+        for y in 0..6 {
+            for x in 0..9 {
+                if !(2..6).contains(&x) || !(1..4).contains(&y) {
+                    *image.get_mut(x, y) = f32::NAN;
+                }
+            }
+        }
+        let crop = CropResize::new((9, 6), inside, (10, 2), Filter::Bilinear);
+        assert!(crop.apply(&image).pixels().iter().all(|v| v.is_finite()));
+    }
+
+    #[test]
+    fn the_adjoint_is_the_transpose() {
+        // <A x, y> = <x, A' y>; f32 products of order 1, some 200 of them: 200 eps of the sum's size.
+        let cases = [
+            (
+                (9, 6),
+                PixelBox {
+                    x: 2,
+                    y: 1,
+                    width: 5,
+                    height: 4,
+                },
+                (12, 10),
+            ),
+            (
+                (40, 31),
+                PixelBox {
+                    x: 0,
+                    y: 3,
+                    width: 40,
+                    height: 27,
+                },
+                (7, 5),
+            ),
+            (
+                (3, 3),
+                PixelBox {
+                    x: 2,
+                    y: 2,
+                    width: 1,
+                    height: 1,
+                },
+                (4, 4),
+            ),
+        ];
+        for (source, inside, output) in cases {
+            for filter in [Filter::Area, Filter::Bilinear] {
+                let crop = CropResize::new(source, inside, output, filter);
+                let (x, y) = (noise(source.0, source.1), noise(output.0, output.1));
+                let dot = |a: &Raster<f32>, b: &Raster<f32>| -> f64 {
+                    let pairs = a.pixels().iter().zip(b.pixels());
+                    pairs.map(|(&a, &b)| f64::from(a) * f64::from(b)).sum()
+                };
+                let (left, right) = (dot(&crop.apply(&x), &y), dot(&x, &crop.apply_vjp(&y)));
+                let tolerance = 200.0 * f64::from(f32::EPSILON) * left.abs();
+                assert!(
+                    (left - right).abs() < tolerance,
+                    "{filter:?} {output:?}: {left} {right}"
+                );
+            }
+        }
+    }
+}

@@ -39,7 +39,8 @@ impl Transfer {
         let v = linear.clamp(0.0, 1.0);
         match self {
             Self::Srgb if v <= SRGB_LINEAR_KNEE => 12.92 * v,
-            Self::Srgb => 1.055 * v.powf(1.0 / 2.4) - 0.055,
+            // 1.055 p - 0.055, arranged so that white is exactly 1 in f32.
+            Self::Srgb => 1.055 * (v.powf(1.0 / 2.4) - 1.0) + 1.0,
             Self::Gamma22 => v.powf(1.0 / 2.2),
             Self::Linear => v,
         }
@@ -105,4 +106,101 @@ fn map_channels(mut raster: Raster<Vec3>, f: impl Fn(f32) -> f32 + Sync) -> Rast
         .par_iter_mut()
         .for_each(|p| *p = Vec3::new(f(p.x), f(p.y), f(p.z)));
     raster
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dipir_numerics::gradcheck::{central_difference, relative_error};
+
+    const ALL: [Transfer; 3] = [Transfer::Srgb, Transfer::Gamma22, Transfer::Linear];
+
+    fn encode_f64(transfer: Transfer, v: f64) -> f64 {
+        match transfer {
+            Transfer::Srgb if v <= 0.003_130_8 => 12.92 * v,
+            Transfer::Srgb => 1.055 * v.powf(1.0 / 2.4) - 0.055,
+            Transfer::Gamma22 => v.powf(1.0 / 2.2),
+            Transfer::Linear => v,
+        }
+    }
+
+    #[test]
+    fn every_8_and_16_bit_value_survives_the_round_trip() {
+        for transfer in ALL {
+            for max in [255u32, 65535] {
+                for i in 0..=max {
+                    let display = i as f32 / max as f32;
+                    let back = transfer.encode_scalar(transfer.decode_scalar(display));
+                    let rounded = (back * max as f32 + 0.5) as u32;
+                    assert_eq!(rounded, i, "{transfer:?} of {max}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn srgb_agrees_with_the_standard_in_f64() {
+        // The f32 power and the argument's rounding give a few ulp of a value up to 1.
+        for i in 0..=1000 {
+            let v = i as f32 / 1000.0;
+            for transfer in ALL {
+                let want = encode_f64(transfer, f64::from(v));
+                let got = f64::from(transfer.encode_scalar(v));
+                assert!(
+                    (got - want).abs() < 4.0 * f64::from(f32::EPSILON),
+                    "{transfer:?} {v}"
+                );
+            }
+        }
+        assert_eq!(Transfer::Srgb.encode_scalar(1.0), 1.0);
+        assert_eq!(Transfer::Srgb.decode_scalar(1.0), 1.0);
+    }
+
+    #[test]
+    fn light_outside_the_display_is_clipped_and_has_no_gradient() {
+        for transfer in ALL {
+            assert_eq!(transfer.encode_scalar(-0.5), 0.0);
+            assert_eq!(transfer.encode_scalar(1e6), 1.0);
+            assert_eq!(transfer.encode_scalar(f32::INFINITY), 1.0);
+            assert!(transfer.encode_scalar(f32::NAN).is_nan());
+            for v in [-0.5, -1e-9, 1.000_001, 1e6, f32::NAN] {
+                assert_eq!(transfer.encode_scalar_vjp(v, 3.0), 0.0, "{transfer:?} {v}");
+            }
+            for v in [0.0, 1.0] {
+                let slope = transfer.encode_scalar_vjp(v, 1.0);
+                assert!(slope.is_finite() && slope > 0.0, "{transfer:?} {v}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_display_gradient_follows_central_differences() {
+        // f64 differences with h = 1e-6 v: error 1e-12 + 2e-16 / (h slope) < 1e-7; f32 adds 1e-6.
+        for transfer in ALL {
+            for v in [1e-5f32, 0.002, 0.0032, 0.05, 0.3, 0.999] {
+                let at = f64::from(v);
+                let want = central_difference(|v| encode_f64(transfer, v), at, 1e-6 * at);
+                let got = f64::from(transfer.encode_scalar_vjp(v, 1.0));
+                assert!(
+                    relative_error(got, want, 1e-3) < 1e-5,
+                    "{transfer:?} {v}: {got} {want}"
+                );
+            }
+        }
+        let image = LinearImage(Raster::from_pixels(1, 1, vec![Vec3::new(0.2, -1.0, 0.001)]));
+        let gradient = Raster::filled(1, 1, Vec3::new(2.0, 3.0, 4.0));
+        let got = Transfer::Srgb.encode_vjp(&image, &gradient).pixels()[0];
+        let red = Transfer::Srgb.encode_scalar_vjp(0.2, 2.0);
+        assert_eq!(got, Vec3::new(red, 0.0, 12.92 * 4.0));
+    }
+
+    #[test]
+    fn images_are_transferred_channel_by_channel() {
+        let display = DisplayImage(Raster::from_pixels(1, 1, vec![Vec3::new(0.0, 0.5, 1.0)]));
+        let linear = Transfer::Srgb.decode(display.clone());
+        let half = Transfer::Srgb.decode_scalar(0.5);
+        assert_eq!(linear.0.pixels()[0], Vec3::new(0.0, half, 1.0));
+        let back = Transfer::Srgb.encode(&linear).0.pixels()[0];
+        assert!(back.abs_diff_eq(display.0.pixels()[0], 2.0 * f32::EPSILON));
+    }
 }

@@ -1,0 +1,570 @@
+//! The camera's tone curve: Reinhard and one monotonic spline for the object, three monotonic
+//! splines for the shadow ratio [DiPIR, section 4.1]. All on linear RGB.
+use crate::{
+    error::ImagingError,
+    raster::{LinearImage, Raster},
+    spline::{KnotGradient, Knots, PARAMETERS, SplineParameters},
+};
+use dipir_numerics::sum::par_reduce;
+use glam::Vec3;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// `x / (1 + x)` [Reinhard et al. 2002, eq. 3]: light in `[0, inf)` to `[0, 1)`. Below 0, where no
+/// light is, it goes on as the odd function `x / (1 + |x|)`, so that it is smooth and finite.
+#[inline]
+pub fn reinhard(x: f64) -> f64 {
+    x / (1.0 + x.abs())
+}
+
+/// Adjoint of [`reinhard`]. The derivative is 1 at 0 and falls as `1 / x^2`.
+#[inline]
+pub fn reinhard_vjp(x: f64, gradient: f64) -> f64 {
+    let d = 1.0 + x.abs();
+    gradient / (d * d)
+}
+
+/// The light that [`reinhard`] maps to `y` in `[0, 1)`.
+#[inline]
+pub fn reinhard_inverse(y: f64) -> f64 {
+    y / (1.0 - y.abs())
+}
+
+/// Unconstrained parameters of the four curves; zero everywhere is the identity.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ToneParameters {
+    /// Of the object, after Reinhard.
+    pub foreground: SplineParameters,
+    /// Of the shadow ratio, red, green, blue.
+    pub shadow: [SplineParameters; 3],
+}
+
+/// Numbers in [`ToneParameters`].
+pub const TONE_PARAMETERS: usize = 4 * PARAMETERS;
+
+/// The four curves, as knots: what `tone.json` holds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ToneCurves {
+    /// Of the object, after Reinhard, the same for each channel.
+    pub foreground: Knots,
+    /// Of the shadow ratio, red, green, blue.
+    pub shadow: [Knots; 3],
+}
+
+/// Gradient of a scalar with respect to [`ToneCurves`].
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ToneGradient {
+    /// With respect to the object's knots.
+    pub foreground: KnotGradient,
+    /// With respect to the shadow's knots.
+    pub shadow: [KnotGradient; 3],
+}
+
+impl ToneGradient {
+    fn merge(self, other: Self) -> Self {
+        let [r, g, b] = self.shadow;
+        Self {
+            foreground: self.foreground.merge(other.foreground),
+            shadow: [
+                r.merge(other.shadow[0]),
+                g.merge(other.shadow[1]),
+                b.merge(other.shadow[2]),
+            ],
+        }
+    }
+}
+
+impl ToneParameters {
+    /// The curves.
+    pub fn curves(&self) -> ToneCurves {
+        ToneCurves {
+            foreground: self.foreground.knots(),
+            shadow: self.shadow.map(|s| s.knots()),
+        }
+    }
+
+    /// Gradient with respect to the parameters, given that with respect to the curves.
+    pub fn curves_vjp(&self, gradient: &ToneGradient) -> Self {
+        let [r, g, b] = &self.shadow;
+        Self {
+            foreground: self.foreground.knots_vjp(&gradient.foreground),
+            shadow: [
+                r.knots_vjp(&gradient.shadow[0]),
+                g.knots_vjp(&gradient.shadow[1]),
+                b.knots_vjp(&gradient.shadow[2]),
+            ],
+        }
+    }
+
+    /// All parameters in one array: foreground, then the shadow's red, green, blue.
+    pub fn to_array(&self) -> [f64; TONE_PARAMETERS] {
+        let mut all = [0.0; TONE_PARAMETERS];
+        let splines = [
+            self.foreground,
+            self.shadow[0],
+            self.shadow[1],
+            self.shadow[2],
+        ];
+        for (part, spline) in all.as_chunks_mut::<PARAMETERS>().0.iter_mut().zip(splines) {
+            *part = spline.to_array();
+        }
+        all
+    }
+
+    /// The reverse of [`to_array`](Self::to_array).
+    pub fn from_array(all: &[f64; TONE_PARAMETERS]) -> Self {
+        let part = |i: usize| SplineParameters::from_array(all.as_chunks().0[i]);
+        Self {
+            foreground: part(0),
+            shadow: [part(1), part(2), part(3)],
+        }
+    }
+}
+
+/// Pixels of one chunk of a parallel gradient sum. A constant, because the chunks fix the rounding.
+const CHUNK: usize = 1 << 12;
+
+impl ToneCurves {
+    /// Reinhard alone for the object, no change of the shadow.
+    pub fn identity() -> Self {
+        ToneParameters::default().curves()
+    }
+
+    /// Tone-maps one premultiplied pixel of the object: Reinhard and the spline act on
+    /// `object / alpha`, the colour of the covered part, and the result is premultiplied again.
+    /// Black where `alpha` is 0.
+    #[inline]
+    pub fn object_pixel(&self, object: Vec3, alpha: f32) -> Vec3 {
+        if alpha <= 0.0 {
+            return Vec3::ZERO;
+        }
+        let alpha = f64::from(alpha);
+        let tone = |v: f32| (alpha * self.foreground.eval(reinhard(f64::from(v) / alpha))) as f32;
+        Vec3::new(tone(object.x), tone(object.y), tone(object.z))
+    }
+
+    /// Adjoint of [`object_pixel`](Self::object_pixel) for a fixed `alpha`: adds to `knots`, returns
+    /// the gradient with respect to the premultiplied colour.
+    #[inline]
+    pub fn object_pixel_vjp(
+        &self,
+        object: Vec3,
+        alpha: f32,
+        gradient: Vec3,
+        knots: &mut KnotGradient,
+    ) -> Vec3 {
+        if alpha <= 0.0 {
+            return Vec3::ZERO;
+        }
+        let alpha = f64::from(alpha);
+        let mut channel = |v: f32, g: f32| {
+            let v = f64::from(v) / alpha;
+            // The two factors of alpha, before and after the curve, cancel in this gradient.
+            let inner = self
+                .foreground
+                .eval_vjp(reinhard(v), alpha * f64::from(g), knots);
+            (reinhard_vjp(v, inner) / alpha) as f32
+        };
+        Vec3::new(
+            channel(object.x, gradient.x),
+            channel(object.y, gradient.y),
+            channel(object.z, gradient.z),
+        )
+    }
+
+    /// Tone-maps one pixel's shadow ratio, each channel by its own curve. 1 stays 1.
+    #[inline]
+    pub fn shadow_pixel(&self, shadow: Vec3) -> Vec3 {
+        let tone = |c: usize| self.shadow[c].eval(f64::from(shadow[c])) as f32;
+        Vec3::new(tone(0), tone(1), tone(2))
+    }
+
+    /// Adjoint of [`shadow_pixel`](Self::shadow_pixel): adds to `knots`, returns the gradient with
+    /// respect to the ratio.
+    #[inline]
+    pub fn shadow_pixel_vjp(
+        &self,
+        shadow: Vec3,
+        gradient: Vec3,
+        knots: &mut [KnotGradient; 3],
+    ) -> Vec3 {
+        let mut channel = |c: usize| {
+            let (x, g) = (f64::from(shadow[c]), f64::from(gradient[c]));
+            self.shadow[c].eval_vjp(x, g, &mut knots[c]) as f32
+        };
+        Vec3::new(channel(0), channel(1), channel(2))
+    }
+
+    /// [`object_pixel`](Self::object_pixel) over an image. Panics if the sizes differ.
+    pub fn apply_object(&self, object: &LinearImage, alpha: &Raster<f32>) -> LinearImage {
+        let (width, height) = same_size(&object.0, alpha);
+        let pixels = object.0.pixels().par_iter().zip(alpha.pixels());
+        let toned = pixels.map(|(&rgb, &a)| self.object_pixel(rgb, a)).collect();
+        LinearImage(Raster::from_pixels(width, height, toned))
+    }
+
+    /// Adjoint of [`apply_object`](Self::apply_object): the gradients with respect to the
+    /// premultiplied object and to the object's knots; the same bytes for any number of threads.
+    pub fn apply_object_vjp(
+        &self,
+        object: &LinearImage,
+        alpha: &Raster<f32>,
+        gradient: &Raster<Vec3>,
+    ) -> (Raster<Vec3>, KnotGradient) {
+        same_size(&object.0, alpha);
+        let (object, alpha) = (&object.0, alpha.pixels());
+        let (pixels, tone) = vjp_by_chunks(object, gradient, |i, rgb, g, knots| {
+            self.object_pixel_vjp(rgb, alpha[i], g, &mut knots.foreground)
+        });
+        (pixels, tone.foreground)
+    }
+
+    /// [`shadow_pixel`](Self::shadow_pixel) over an image.
+    pub fn apply_shadow(&self, shadow: &LinearImage) -> LinearImage {
+        let (width, height) = (shadow.0.width(), shadow.0.height());
+        let pixels = shadow.0.pixels().par_iter();
+        let toned = pixels.map(|&beta| self.shadow_pixel(beta)).collect();
+        LinearImage(Raster::from_pixels(width, height, toned))
+    }
+
+    /// Adjoint of [`apply_shadow`](Self::apply_shadow): the gradients with respect to the ratio and
+    /// to the shadow's knots; the same bytes for any number of threads.
+    pub fn apply_shadow_vjp(
+        &self,
+        shadow: &LinearImage,
+        gradient: &Raster<Vec3>,
+    ) -> (Raster<Vec3>, [KnotGradient; 3]) {
+        let (pixels, tone) = vjp_by_chunks(&shadow.0, gradient, |_, beta, g, knots| {
+            self.shadow_pixel_vjp(beta, g, &mut knots.shadow)
+        });
+        (pixels, tone.shadow)
+    }
+
+    /// Writes `tone.json`.
+    pub fn write_json(&self, path: impl AsRef<Path>) -> Result<(), ImagingError> {
+        let path = path.as_ref();
+        let text = serde_json::to_string_pretty(self).map_err(|e| bad_tone(path, e.to_string()))?;
+        std::fs::write(path, text + "\n").map_err(|e| ImagingError::io("write", path, e))
+    }
+
+    /// Reads `tone.json` and checks that its curves are monotonic.
+    pub fn read_json(path: impl AsRef<Path>) -> Result<Self, ImagingError> {
+        let path = path.as_ref();
+        let text = std::fs::read(path).map_err(|e| ImagingError::io("read", path, e))?;
+        let curves: Self =
+            serde_json::from_slice(&text).map_err(|e| bad_tone(path, e.to_string()))?;
+        let named = [
+            ("foreground", &curves.foreground),
+            ("shadow[0]", &curves.shadow[0]),
+            ("shadow[1]", &curves.shadow[1]),
+            ("shadow[2]", &curves.shadow[2]),
+        ];
+        for (name, knots) in named {
+            knots
+                .check()
+                .map_err(|what| bad_tone(path, format!("in `{name}`, {what}")))?;
+        }
+        Ok(curves)
+    }
+}
+
+fn bad_tone(path: &Path, detail: String) -> ImagingError {
+    ImagingError::BadTone {
+        path: path.to_owned(),
+        detail,
+    }
+}
+
+fn same_size<T, U>(a: &Raster<T>, b: &Raster<U>) -> (usize, usize) {
+    let size = (a.width(), a.height());
+    assert_eq!(size, (b.width(), b.height()), "layers of one size");
+    size
+}
+
+/// Runs a pixel's adjoint over an image. `pixel` gets the index, the input, its result's gradient
+/// and the chunk's knot gradients.
+fn vjp_by_chunks(
+    input: &Raster<Vec3>,
+    gradient: &Raster<Vec3>,
+    pixel: impl Fn(usize, Vec3, Vec3, &mut ToneGradient) -> Vec3 + Sync,
+) -> (Raster<Vec3>, ToneGradient) {
+    let (width, height) = same_size(input, gradient);
+    let (input, gradient) = (input.pixels(), gradient.pixels());
+    let parts = par_reduce(
+        input.len(),
+        CHUNK,
+        |range| {
+            let mut knots = ToneGradient::default();
+            let chunk = range.map(|i| pixel(i, input[i], gradient[i], &mut knots));
+            let chunk: Vec<Vec3> = chunk.collect();
+            (chunk, knots)
+        },
+        |(mut pixels, knots), (more, further)| {
+            pixels.extend(more);
+            (pixels, knots.merge(further))
+        },
+    );
+    let (pixels, knots) = parts.unwrap_or_default();
+    (Raster::from_pixels(width, height, pixels), knots)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dipir_numerics::gradcheck::{central_difference, relative_error};
+
+    fn bent() -> ToneParameters {
+        let mut all = [0.0; TONE_PARAMETERS];
+        for (i, p) in all.iter_mut().enumerate() {
+            *p = (i as f64 * 2.3).sin();
+        }
+        ToneParameters::from_array(&all)
+    }
+
+    /// A small picture of the object with dark, bright, half-covered and empty pixels.
+    fn picture() -> (LinearImage, Raster<f32>, Raster<Vec3>) {
+        let alpha = Raster::from_pixels(3, 2, vec![1.0, 0.5, 0.0, 1e-3, 1.0, 0.9]);
+        let colours = vec![
+            Vec3::new(0.0, 0.2, 0.7),
+            Vec3::new(0.1, 3.0, 0.02),
+            Vec3::ZERO,
+            Vec3::new(1e-4, 1e-3, 2e-3),
+            Vec3::new(1e4, 50.0, 0.9),
+            Vec3::new(0.3, 0.4, 0.5),
+        ];
+        let gradient = (0..6).map(|i| Vec3::new(1.0, -0.5, 0.25) * (1.0 + i as f32));
+        (
+            LinearImage(Raster::from_pixels(3, 2, colours)),
+            alpha,
+            Raster::from_pixels(3, 2, gradient.collect()),
+        )
+    }
+
+    #[test]
+    fn reinhard_and_its_inverse_agree_and_its_gradient_follows_central_differences() {
+        for x in [0.0, 1e-6, 0.1, 1.0, 30.0, 1e4, -0.5] {
+            let back = reinhard_inverse(reinhard(x));
+            // y is within an ulp of 1 - 1/x, and the inverse's slope there is x^2.
+            assert!(
+                (back - x).abs() <= 4.0 * f64::EPSILON * (1.0 + x * x),
+                "{x}: {back}"
+            );
+            // Error: h^2 f'''/6 = 1e-10 of the slope, and eps / (h slope), the slope being 1/x^2.
+            let h = 1e-5 * (1.0 + f64::abs(x));
+            let want = central_difference(reinhard, x, h);
+            assert!(
+                relative_error(reinhard_vjp(x, 1.0), want, 1e-9) < 1e-5,
+                "{x}"
+            );
+        }
+        assert_eq!(reinhard(1e6), 1e6 / (1e6 + 1.0));
+    }
+
+    #[test]
+    fn at_start_the_object_sees_reinhard_alone_and_the_shadow_nothing() {
+        let curves = ToneCurves::identity();
+        let (object, alpha, _) = picture();
+        let toned = curves.apply_object(&object, &alpha);
+        for ((got, &rgb), &a) in toned
+            .0
+            .pixels()
+            .iter()
+            .zip(object.0.pixels())
+            .zip(alpha.pixels())
+        {
+            let want = if a > 0.0 {
+                rgb / (Vec3::ONE + rgb / a)
+            } else {
+                Vec3::ZERO
+            };
+            // The reference rounds four times in f32, the result is below 1.
+            assert!(got.abs_diff_eq(want, 4.0 * f32::EPSILON), "{got} {want}");
+        }
+        let shadow = LinearImage(object.0.map(|&c| c.min(Vec3::ONE)));
+        let toned = curves.apply_shadow(&shadow);
+        for (got, want) in toned.0.pixels().iter().zip(shadow.0.pixels()) {
+            assert!(got.abs_diff_eq(*want, f32::EPSILON), "{got} {want}");
+        }
+    }
+
+    #[test]
+    fn an_unshadowed_pixel_stays_unshadowed_under_every_curve() {
+        assert_eq!(bent().curves().shadow_pixel(Vec3::ONE), Vec3::ONE);
+        assert_eq!(bent().curves().shadow_pixel(Vec3::ZERO), Vec3::ZERO);
+    }
+
+    #[test]
+    fn the_curve_acts_on_the_covered_part_whatever_the_coverage() {
+        let curves = bent().curves();
+        let colour = Vec3::new(0.2, 1.0, 4.0);
+        let full = curves.object_pixel(colour, 1.0);
+        for alpha in [1e-6, 0.1, 0.75] {
+            let part = curves.object_pixel(colour * alpha, alpha) / alpha;
+            // The product and the quotient round in f32, and the curve's slope is under 4.
+            assert!(part.abs_diff_eq(full, 8.0 * f32::EPSILON), "{alpha}");
+        }
+        assert_eq!(curves.object_pixel(Vec3::ZERO, 0.0), Vec3::ZERO);
+    }
+
+    #[test]
+    fn the_object_gradients_follow_central_differences() {
+        let parameters = bent();
+        let (object, alpha, weights) = picture();
+        // The same function in f64 throughout.
+        let loss = |parameters: &ToneParameters, colours: &[[f64; 3]]| {
+            let knots = parameters.foreground.knots();
+            let mut sum = 0.0;
+            for (i, colour) in colours.iter().enumerate() {
+                let a = f64::from(alpha.pixels()[i]);
+                for c in 0..3 {
+                    if a > 0.0 {
+                        let toned = a * knots.eval(reinhard(colour[c] / a));
+                        sum += toned * f64::from(weights.pixels()[i][c]);
+                    }
+                }
+            }
+            sum
+        };
+        let colours: Vec<[f64; 3]> = object
+            .0
+            .pixels()
+            .iter()
+            .map(|c| c.as_dvec3().to_array())
+            .collect();
+        let curves = parameters.curves();
+        let (to_pixels, to_knots) = curves.apply_object_vjp(&object, &alpha, &weights);
+        for i in 0..colours.len() {
+            for c in 0..3 {
+                let of = |v: f64| {
+                    let mut colours = colours.clone();
+                    colours[i][c] = v;
+                    loss(&parameters, &colours)
+                };
+                // Relative to the covered colour's scale; f32 results hold 1e-6, a sum of about 10
+                // in f64 loses 1e-15 / h.
+                let h = 1e-5 * f64::from(alpha.pixels()[i]).max(1e-9) * (1.0 + colours[i][c].abs());
+                let want = central_difference(of, colours[i][c], h);
+                let got = f64::from(to_pixels.pixels()[i][c]);
+                let error = relative_error(got, want, 1e-3);
+                assert!(
+                    error < 1e-4,
+                    "pixel {i}, channel {c}: {got}, numerically {want}"
+                );
+            }
+        }
+        let gradient = ToneGradient {
+            foreground: to_knots,
+            ..ToneGradient::default()
+        };
+        let got = parameters.curves_vjp(&gradient).to_array();
+        for i in 0..TONE_PARAMETERS {
+            let of = |v: f64| {
+                let mut all = parameters.to_array();
+                all[i] = v;
+                loss(&ToneParameters::from_array(&all), &colours)
+            };
+            let want = central_difference(of, parameters.to_array()[i], 1e-6);
+            let error = relative_error(got[i], want, 1e-2);
+            assert!(
+                error < 1e-5,
+                "parameter {i}: {}, numerically {want}",
+                got[i]
+            );
+        }
+    }
+
+    #[test]
+    fn the_shadow_gradients_follow_central_differences() {
+        let parameters = bent();
+        let ratios = [0.0, 0.03, 0.4, 0.77, 0.999, 1.0];
+        let shadow = Raster::from_pixels(6, 1, ratios.map(Vec3::splat).to_vec());
+        let weights = Raster::from_pixels(6, 1, ratios.map(|r| Vec3::new(1.0, -2.0, r)).to_vec());
+        let curves = parameters.curves();
+        let (to_pixels, to_knots) = curves.apply_shadow_vjp(&LinearImage(shadow), &weights);
+        let gradient = ToneGradient {
+            shadow: to_knots,
+            ..ToneGradient::default()
+        };
+        let got = parameters.curves_vjp(&gradient).to_array();
+        let loss = |parameters: &ToneParameters| {
+            let mut sum = 0.0;
+            for (&ratio, weight) in ratios.iter().zip(weights.pixels()) {
+                for c in 0..3 {
+                    sum +=
+                        parameters.shadow[c].knots().eval(f64::from(ratio)) * f64::from(weight[c]);
+                }
+            }
+            sum
+        };
+        for i in 0..TONE_PARAMETERS {
+            let of = |v: f64| {
+                let mut all = parameters.to_array();
+                all[i] = v;
+                loss(&ToneParameters::from_array(&all))
+            };
+            let want = central_difference(of, parameters.to_array()[i], 1e-6);
+            let error = relative_error(got[i], want, 1e-2);
+            assert!(
+                error < 1e-5,
+                "parameter {i}: {}, numerically {want}",
+                got[i]
+            );
+        }
+        for (i, &ratio) in ratios.iter().enumerate() {
+            for c in 0..3 {
+                let knots = curves.shadow[c];
+                // Once differentiable at both ends, so one-sided errors are h f'' / 2.
+                let slope = central_difference(|x| knots.eval(x), f64::from(ratio), 1e-7);
+                let want = slope * f64::from(weights.pixels()[i][c]);
+                let got = f64::from(to_pixels.pixels()[i][c]);
+                assert!(
+                    relative_error(got, want, 1e-3) < 1e-5,
+                    "{ratio}: {got}, numerically {want}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn gradients_are_the_same_bytes_for_any_number_of_threads() {
+        let n = 3 * CHUNK + 17;
+        let pixel = |i: usize| Vec3::new(i as f32 * 1e-3, (i as f32).sin().abs(), 0.5);
+        let object = LinearImage(Raster::from_pixels(n, 1, (0..n).map(pixel).collect()));
+        let alpha = Raster::filled(n, 1, 0.8);
+        let curves = bent().curves();
+        let run = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+            pool.unwrap()
+                .install(|| curves.apply_object_vjp(&object, &alpha, &object.0))
+        };
+        assert_eq!(run(1), run(3));
+    }
+
+    #[test]
+    fn tone_json_keeps_every_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tone.json");
+        let curves = bent().curves();
+        curves.write_json(&path).unwrap();
+        assert_eq!(ToneCurves::read_json(&path).unwrap(), curves);
+    }
+
+    #[test]
+    fn tone_json_with_a_falling_curve_is_refused_by_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tone.json");
+        let mut curves = ToneCurves::identity();
+        curves.shadow[1].y[2] = 0.1;
+        curves.write_json(&path).unwrap();
+        let error = ToneCurves::read_json(&path).unwrap_err();
+        let want = format!(
+            "`{}` is not a tone file: in `shadow[1]`, `y` does not rise after knot 1; expected \
+             `foreground` and three `shadow` curves of 6 knots each, rising from 0 to 1: write it \
+             again with the optimisation",
+            path.display()
+        );
+        assert_eq!(error.to_string(), want);
+    }
+}

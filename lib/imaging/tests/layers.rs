@@ -1,0 +1,280 @@
+//! OpenEXR layers: what is written is what is read, and files of other programs are understood.
+use dipir_imaging::{
+    ImagingError,
+    layers::{Layers, Precision},
+    raster::Raster,
+};
+use exr::prelude::{
+    AnyChannel, AnyChannels, Encoding, FlatSamples, Image, ImageAttributes, IntegerBounds, Layer,
+    LayerAttributes, SmallVec, Text, Vec2, WritableImage,
+};
+use glam::Vec3;
+use proptest::prelude::*;
+
+fn ramp(width: usize, height: usize) -> Raster<f32> {
+    Raster::from_pixels(
+        width,
+        height,
+        (0..width * height).map(|i| i as f32).collect(),
+    )
+}
+
+/// A composite's layers: mixed precision, dotted names, attributes.
+fn sample() -> Layers {
+    let mut layers = Layers::new(5, 3);
+    let colour = ramp(5, 3).map(|&v| Vec3::new(v, 0.5 * v, 1.0));
+    layers.insert_rgb("", Precision::Half, &colour).unwrap();
+    layers
+        .insert_rgb("shadow", Precision::Half, &colour)
+        .unwrap();
+    layers
+        .insert_xyz("normal", Precision::Full, &colour)
+        .unwrap();
+    let mut depth = ramp(5, 3).map(|v| v + 0.1);
+    *depth.get_mut(4, 2) = f32::INFINITY;
+    layers.insert("depth.Z", Precision::Full, depth).unwrap();
+    layers.latlong = true;
+    layers.set_attribute("dipirExposure", "0.5").unwrap();
+    layers
+}
+
+#[test]
+fn mixed_precision_names_and_attributes_round_trip() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    sample().write_exr(&path).unwrap();
+    let back = Layers::read_exr(&path).unwrap();
+    assert_eq!(back, sample());
+    assert!(back.latlong);
+    assert_eq!(back.attribute("dipirExposure"), Some("0.5"));
+    assert_eq!(back.rgb("shadow").unwrap(), sample().rgb("shadow").unwrap());
+    assert_eq!(back.xyz("normal").unwrap(), sample().xyz("normal").unwrap());
+}
+
+#[test]
+fn the_file_declares_latlong_zip1_and_each_channels_type() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    sample().write_exr(&path).unwrap();
+    let meta = exr::meta::MetaData::read_from_file(&path, true).unwrap();
+    let header = &meta.headers[0];
+    assert_eq!(header.compression, exr::prelude::Compression::ZIP1);
+    assert_eq!(
+        header.own_attributes.environment_map,
+        Some(exr::meta::attribute::EnvironmentMap::LatitudeLongitude)
+    );
+    let types: Vec<_> = header
+        .channels
+        .list
+        .iter()
+        .map(|c| (c.name.to_string(), c.sample_type))
+        .collect();
+    assert!(types.contains(&("depth.Z".to_string(), exr::prelude::SampleType::F32)));
+    assert!(types.contains(&("shadow.G".to_string(), exr::prelude::SampleType::F16)));
+}
+
+#[test]
+fn a_named_subset_reads_those_channels_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    sample().write_exr(&path).unwrap();
+    let some = Layers::read_exr_channels(&path, &["shadow.G", "depth.Z"]).unwrap();
+    assert_eq!(some.names().collect::<Vec<_>>(), ["depth.Z", "shadow.G"]);
+    let whole = sample();
+    assert_eq!(
+        some.channel("shadow.G").unwrap(),
+        whole.channel("shadow.G").unwrap()
+    );
+}
+
+#[test]
+fn a_missing_channel_is_an_error_that_lists_those_in_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    let mut layers = Layers::new(1, 1);
+    layers
+        .insert("depth.Z", Precision::Full, ramp(1, 1))
+        .unwrap();
+    layers
+        .insert("proxy.A", Precision::Half, ramp(1, 1))
+        .unwrap();
+    layers.write_exr(&path).unwrap();
+    let error = Layers::read_exr_channels(&path, &["depth.Z", "object.A"]).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        format!(
+            "`{}` has no channel `object.A`; it has `depth.Z`, `proxy.A`",
+            path.display()
+        )
+    );
+    let error = Layers::new(1, 1).channel("R").unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "the image has no channel `R`; it has no channels"
+    );
+}
+
+#[test]
+fn light_too_bright_for_half_is_stored_in_full() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    let mut layers = Layers::new(2, 1);
+    let sun = Raster::from_pixels(2, 1, vec![1e6, 0.1]);
+    layers.insert("R", Precision::Half, sun.clone()).unwrap();
+    layers.insert("G", Precision::Half, ramp(2, 1)).unwrap();
+    layers.write_exr(&path).unwrap();
+    let back = Layers::read_exr(&path).unwrap();
+    assert_eq!(*back.channel("R").unwrap(), sun);
+    let precision: Vec<_> = back.channels().map(|(_, c)| c.precision).collect();
+    assert_eq!(precision, [Precision::Half, Precision::Full]);
+}
+
+#[test]
+fn names_that_compositing_programs_refuse_are_refused() {
+    let mut layers = Layers::new(1, 1);
+    for (name, reason) in [
+        ("", "is empty"),
+        ("0", "is only digits"),
+        ("a b", "has characters other than printable ASCII"),
+        ("shadow.", "has an empty part"),
+    ] {
+        let error = layers
+            .insert(name, Precision::Half, ramp(1, 1))
+            .unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            format!("channel name `{name}` {reason}; use a name such as `R` or `shadow.R`")
+        );
+    }
+    let error = layers.set_attribute("compression", "none").unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "attribute `compression` is defined by OpenEXR; use a name such as `dipirExposure` and \
+         plain text"
+    );
+}
+
+#[test]
+fn channels_of_another_size_are_refused() {
+    let mut layers = Layers::new(2, 2);
+    let error = layers.insert("R", Precision::Half, ramp(2, 1)).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "channel `R` is 2 x 1 pixels; expected 2 x 2, the size of the other layers"
+    );
+    let empty = Layers::new(0, 4);
+    let error = empty.write_exr("x.exr").unwrap_err();
+    assert!(matches!(
+        error,
+        ImagingError::BadSize {
+            width: 0,
+            height: 4,
+            ..
+        }
+    ));
+}
+
+#[test]
+fn one_pixel_and_odd_sizes_round_trip() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    for (width, height) in [(1, 1), (1, 7), (13, 1), (17, 33)] {
+        let mut layers = Layers::new(width, height);
+        layers
+            .insert("Y", Precision::Half, ramp(width, height))
+            .unwrap();
+        layers.write_exr(&path).unwrap();
+        assert_eq!(Layers::read_exr(&path).unwrap(), layers);
+    }
+}
+
+/// Writes a file as another program would: `size` pixels at `position`, in a display window.
+fn write_windowed(
+    path: &std::path::Path,
+    display: IntegerBounds,
+    parts: &[(&str, Vec2<i32>, Vec2<usize>)],
+) {
+    let layers = parts.iter().map(|&(name, position, size)| {
+        let values = (0..size.0 * size.1).map(|i| 1.0 + i as f32).collect();
+        let channel = AnyChannel::new("R", FlatSamples::F32(values));
+        let attributes = LayerAttributes {
+            layer_position: position,
+            ..LayerAttributes::named(Text::new_or_panic(name))
+        };
+        let channels = AnyChannels::sort(SmallVec::from_vec(vec![channel]));
+        Layer::new(size, attributes, Encoding::SMALL_LOSSLESS, channels)
+    });
+    let attributes = ImageAttributes::new(display);
+    let image = Image::from_layers(attributes, layers.collect::<SmallVec<[_; 2]>>());
+    image.write().to_file(path).unwrap();
+}
+
+#[test]
+fn a_data_window_is_placed_on_the_display_window_and_cut_by_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    let display = IntegerBounds::new((10, 20), (4, 3));
+    // Two columns right and one row down of the corner, reaching one column beyond the window.
+    write_windowed(&path, display, &[("beauty", Vec2(12, 21), Vec2(3, 2))]);
+    let layers = Layers::read_exr(&path).unwrap();
+    assert_eq!((layers.width(), layers.height()), (4, 3));
+    let want = vec![0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 4.0, 5.0];
+    assert_eq!(layers.channel("R").unwrap().pixels(), want);
+}
+
+#[test]
+fn a_second_part_with_a_taken_name_is_told_apart_by_the_parts_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    let display = IntegerBounds::new((0, 0), (2, 2));
+    let parts = [
+        ("beauty", Vec2(0, 0), Vec2(2, 2)),
+        ("mist", Vec2(0, 0), Vec2(2, 2)),
+    ];
+    write_windowed(&path, display, &parts);
+    let layers = Layers::read_exr(&path).unwrap();
+    assert_eq!(layers.names().collect::<Vec<_>>(), ["R", "mist.R"]);
+}
+
+#[test]
+fn a_file_of_another_format_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    std::fs::write(&path, b"#?RADIANCE\n").unwrap();
+    assert_eq!(
+        Layers::read_exr(&path).unwrap_err().to_string(),
+        format!(
+            "`{}` is a Radiance HDR image; expected an OpenEXR image: convert the file",
+            path.display()
+        )
+    );
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn exr_in_full_is_exact_and_in_half_rounds_to_nearest(
+        width in 1usize..24,
+        height in 1usize..24,
+        values in proptest::collection::vec(-6e4f32..6e4, 23 * 23),
+        small in -1e-7f32..1e-7,
+    ) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.exr");
+        let mut values = values[..width * height].to_vec();
+        values[0] = small;
+        let samples = Raster::from_pixels(width, height, values);
+        let mut layers = Layers::new(width, height);
+        layers.insert("full", Precision::Full, samples.clone()).unwrap();
+        layers.insert("half", Precision::Half, samples.clone()).unwrap();
+        layers.write_exr(&path).unwrap();
+        let back = Layers::read_exr(&path).unwrap();
+        prop_assert_eq!(back.channel("full").unwrap(), &samples);
+        for (got, want) in back.channel("half").unwrap().pixels().iter().zip(samples.pixels()) {
+            // Half an ulp of 11 bits, or of the subnormal step 2^-24.
+            let step = (want.abs() / 2048.0).max(2f32.powi(-25));
+            prop_assert!((got - want).abs() <= step, "{} {}", got, want);
+        }
+    }
+}
