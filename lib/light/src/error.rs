@@ -6,12 +6,15 @@ use std::path::PathBuf;
 #[non_exhaustive]
 pub enum LightError {
     /// The file could not be read or written as an image.
-    #[error("{path}: {reason}", path = path.display())]
-    Image {
+    #[error(transparent)]
+    Image(#[from] dipir_imaging::ImagingError),
+    /// The file is an image, but no environment map.
+    #[error("cannot light a scene with `{}`", path.display())]
+    Map {
         /// The file.
         path: PathBuf,
-        /// What the image library said.
-        reason: String,
+        /// What is wrong with it.
+        source: Box<LightError>,
     },
     /// A map without texels.
     #[error(

@@ -24,3 +24,27 @@ pub trait Illuminant: Sync {
     /// Density per steradian of `sample` at the unit vector `direction`.
     fn pdf(&self, direction: Vec3) -> f32;
 }
+
+impl<T: Illuminant + ?Sized> Illuminant for &T {
+    fn eval(&self, direction: Vec3) -> Vec3 {
+        (**self).eval(direction)
+    }
+    fn sample(&self, u: Vec2) -> LightSample {
+        (**self).sample(u)
+    }
+    fn pdf(&self, direction: Vec3) -> f32 {
+        (**self).pdf(direction)
+    }
+}
+
+impl<T: Illuminant + Send + ?Sized> Illuminant for std::sync::Arc<T> {
+    fn eval(&self, direction: Vec3) -> Vec3 {
+        (**self).eval(direction)
+    }
+    fn sample(&self, u: Vec2) -> LightSample {
+        (**self).sample(u)
+    }
+    fn pdf(&self, direction: Vec3) -> f32 {
+        (**self).pdf(direction)
+    }
+}

@@ -1,8 +1,17 @@
 //! Light from far away: spherical Gaussians and environment maps.
+pub mod cone;
+pub mod cosine;
 pub mod environment;
 mod environment_sampler;
 pub mod error;
 pub mod gaussian;
 pub mod illuminant;
 pub mod luminance;
+mod mixture;
+pub mod plane;
+mod quadrature;
+pub mod rasterize;
 mod trigonometry;
+
+#[cfg(test)]
+mod testing;
