@@ -87,3 +87,81 @@ pub struct Material {
     /// `KHR_materials_unlit`: radiance is the base colour, whatever the light.
     pub unlit: bool,
 }
+
+impl TextureRef {
+    /// Texture coordinates after the material's transform.
+    pub fn apply(&self, uv: glam::Vec2) -> glam::Vec2 {
+        self.transform.transform_point2(uv)
+    }
+}
+
+impl Default for Material {
+    /// glTF's default material: white, fully metallic, fully rough.
+    fn default() -> Self {
+        Self {
+            name: String::new(),
+            base_color: Vec4::ONE,
+            base_color_texture: None,
+            metallic: 1.0,
+            roughness: 1.0,
+            metallic_roughness_texture: None,
+            normal_texture: None,
+            emissive: Vec3::ZERO,
+            emissive_texture: None,
+            alpha_mode: AlphaMode::Opaque,
+            double_sided: false,
+            ior: 1.5,
+            clearcoat: None,
+            transmission: None,
+            unlit: false,
+        }
+    }
+}
+
+impl Material {
+    /// All uses of textures.
+    pub fn texture_refs(&self) -> impl Iterator<Item = &TextureRef> {
+        self.textures().into_iter().flatten()
+    }
+
+    /// Adds `offset` to the index of every texture, as is needed when the textures of several
+    /// files are put into one list.
+    pub fn shift_textures(&mut self, offset: u32) {
+        let coat = self.clearcoat.as_mut();
+        let (coat_factor, coat_roughness, coat_normal) = match coat {
+            Some(c) => (
+                c.factor_texture.as_mut(),
+                c.roughness_texture.as_mut(),
+                c.normal_texture.as_mut().map(|(t, _)| t),
+            ),
+            None => (None, None, None),
+        };
+        let all = [
+            self.base_color_texture.as_mut(),
+            self.metallic_roughness_texture.as_mut(),
+            self.normal_texture.as_mut().map(|(t, _)| t),
+            self.emissive_texture.as_mut(),
+            coat_factor,
+            coat_roughness,
+            coat_normal,
+            self.transmission.as_mut().and_then(|t| t.texture.as_mut()),
+        ];
+        for texture in all.into_iter().flatten() {
+            texture.texture += offset;
+        }
+    }
+
+    fn textures(&self) -> [Option<&TextureRef>; 8] {
+        let coat = self.clearcoat.as_ref();
+        [
+            self.base_color_texture.as_ref(),
+            self.metallic_roughness_texture.as_ref(),
+            self.normal_texture.as_ref().map(|(t, _)| t),
+            self.emissive_texture.as_ref(),
+            coat.and_then(|c| c.factor_texture.as_ref()),
+            coat.and_then(|c| c.roughness_texture.as_ref()),
+            coat.and_then(|c| c.normal_texture.as_ref().map(|(t, _)| t)),
+            self.transmission.as_ref().and_then(|t| t.texture.as_ref()),
+        ]
+    }
+}

@@ -1,0 +1,232 @@
+//! The GLB container, data URIs, and where files that a document names are found.
+use std::cell::RefCell;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::error::Error;
+use crate::texture::ImageSource;
+
+/// Finds the files that a document refers to.
+pub trait Resolver {
+    /// The contents of the file that the percent-encoded relative `uri` names.
+    fn read(&self, uri: &str) -> io::Result<Vec<u8>>;
+
+    /// The image that `uri` names, not decoded; it must exist.
+    fn image(&self, uri: &str) -> io::Result<ImageSource> {
+        Ok(ImageSource::Bytes {
+            name: format!("\"{uri}\""),
+            bytes: Arc::from(self.read(uri)?),
+        })
+    }
+}
+
+/// Refuses every file: for documents that must stand alone.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct NoFiles;
+
+impl Resolver for NoFiles {
+    fn read(&self, _uri: &str) -> io::Result<Vec<u8>> {
+        Err(io::Error::new(
+            io::ErrorKind::NotFound,
+            "no other files are read here",
+        ))
+    }
+}
+
+/// Finds files relative to a folder and remembers which ones were asked for.
+#[derive(Debug)]
+pub struct Folder {
+    path: PathBuf,
+    used: RefCell<Vec<PathBuf>>,
+}
+
+impl Folder {
+    /// Files are found relative to `path`.
+    pub fn new(path: impl Into<PathBuf>) -> Self {
+        Self {
+            path: path.into(),
+            used: RefCell::default(),
+        }
+    }
+
+    /// The files found so far, each once, in the order of first use.
+    pub fn into_used(self) -> Vec<PathBuf> {
+        self.used.into_inner()
+    }
+
+    fn find(&self, uri: &str) -> io::Result<PathBuf> {
+        if let Some((scheme, _)) = uri.split_once("://") {
+            return Err(io::Error::new(
+                io::ErrorKind::Unsupported,
+                format!("{scheme} addresses are not followed; download the file beside the object"),
+            ));
+        }
+        // Some exporters forget to encode: the name as it stands is the second guess.
+        let decoded = self.path.join(percent_decoded(uri));
+        let literal = self.path.join(uri);
+        let found = if decoded.is_file() || !literal.is_file() {
+            decoded
+        } else {
+            literal
+        };
+        std::fs::metadata(&found)?;
+        let mut used = self.used.borrow_mut();
+        if !used.contains(&found) {
+            used.push(found.clone());
+        }
+        Ok(found)
+    }
+}
+
+impl Resolver for Folder {
+    fn read(&self, uri: &str) -> io::Result<Vec<u8>> {
+        std::fs::read(self.find(uri)?)
+    }
+
+    fn image(&self, uri: &str) -> io::Result<ImageSource> {
+        self.find(uri).map(ImageSource::File)
+    }
+}
+
+/// Where a file that was asked for would have to lie, for messages.
+pub(super) fn named(uri: &str) -> PathBuf {
+    Path::new(&percent_decoded(uri)).into()
+}
+
+/// `%20` and the like replaced by what they stand for; what is no valid escape stays.
+fn percent_decoded(uri: &str) -> String {
+    let bytes = uri.as_bytes();
+    let mut out = Vec::with_capacity(bytes.len());
+    let mut i = 0;
+    while i < bytes.len() {
+        let hex = |k: usize| {
+            bytes
+                .get(i + k)
+                .and_then(|b| (*b as char).to_digit(16))
+                .map(|d| d as u8)
+        };
+        match (bytes[i], hex(1), hex(2)) {
+            (b'%', Some(high), Some(low)) => {
+                out.push(high * 16 + low);
+                i += 3;
+            }
+            (byte, ..) => {
+                out.push(byte);
+                i += 1;
+            }
+        }
+    }
+    String::from_utf8(out).unwrap_or_else(|_| uri.to_owned())
+}
+
+/// The payload of a `data:` URI, or `None` if `uri` is not one.
+pub(super) fn data_uri(uri: &str, place: &str) -> Option<Result<Vec<u8>, Error>> {
+    let rest = uri.strip_prefix("data:")?;
+    let Some((header, payload)) = rest.split_once(',') else {
+        return Some(Err(Error::malformed(
+            format!("{place} is a data URI without a comma"),
+            "export the file again",
+        )));
+    };
+    Some(if header.ends_with(";base64") {
+        base64_decoded(payload).ok_or_else(|| {
+            Error::malformed(
+                format!("{place} is a data URI that is not valid base64"),
+                "export the file again",
+            )
+        })
+    } else {
+        Ok(percent_decoded(payload).into_bytes())
+    })
+}
+
+/// RFC 4648, both alphabets, padding optional; `None` on any other character.
+fn base64_decoded(text: &str) -> Option<Vec<u8>> {
+    let text = text.trim_end_matches('=').as_bytes();
+    if text.len() % 4 == 1 {
+        return None;
+    }
+    let mut out = Vec::with_capacity(text.len() / 4 * 3 + 2);
+    let (mut bits, mut held) = (0u32, 0);
+    for &c in text {
+        let digit = match c {
+            b'A'..=b'Z' => c - b'A',
+            b'a'..=b'z' => c - b'a' + 26,
+            b'0'..=b'9' => c - b'0' + 52,
+            b'+' | b'-' => 62,
+            b'/' | b'_' => 63,
+            _ => return None,
+        };
+        bits = (bits << 6) | u32::from(digit);
+        held += 6;
+        if held >= 8 {
+            held -= 8;
+            out.push((bits >> held) as u8);
+        }
+    }
+    Some(out)
+}
+
+/// The JSON text of a glTF file and the binary chunk behind it, if it is a GLB.
+pub(super) fn split(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), Error> {
+    const COPY: &str = "export or copy the file again";
+    if !bytes.starts_with(b"glTF") {
+        let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+        return match text.iter().find(|b| !b.is_ascii_whitespace()) {
+            Some(b'{') => Ok((text, None)),
+            None => Err(Error::malformed("the file is empty", COPY)),
+            _ => Err(Error::malformed(
+                "neither a GLB header nor a JSON object stands at the start",
+                "use a .glb or .gltf file",
+            )),
+        };
+    }
+    let word = |at: usize| -> Option<u32> {
+        Some(u32::from_le_bytes(
+            bytes.get(at..at.checked_add(4)?)?.try_into().ok()?,
+        ))
+    };
+    let (Some(version), Some(length)) = (word(4), word(8)) else {
+        return Err(Error::malformed(
+            format!("the GLB header has 12 bytes, the file only {}", bytes.len()),
+            COPY,
+        ));
+    };
+    if version != 2 {
+        return Err(Error::malformed(
+            format!("the GLB header says version {version}; accepted: 2"),
+            "export the file as glTF 2.0",
+        ));
+    }
+    if length as usize > bytes.len() {
+        return Err(Error::malformed(
+            format!(
+                "the GLB header announces {length} bytes, the file has {}: it is cut short",
+                bytes.len()
+            ),
+            COPY,
+        ));
+    }
+    let mut chunks = Vec::new();
+    let mut at = 12;
+    while at + 8 <= length as usize && chunks.len() < 2 {
+        let (size, kind) = (word(at).unwrap_or(0) as usize, word(at + 4).unwrap_or(0));
+        let Some(chunk) = bytes.get(at + 8..at + 8 + size) else {
+            return Err(Error::malformed(
+                format!(
+                    "the GLB chunk at byte {at} announces {size} bytes, {} are left",
+                    bytes.len() - at - 8
+                ),
+                COPY,
+            ));
+        };
+        chunks.push((kind, chunk));
+        at += 8 + size;
+    }
+    match chunks[..] {
+        [(0x4E4F_534A, json), (0x004E_4942, binary), ..] => Ok((json, Some(binary))),
+        [(0x4E4F_534A, json), ..] => Ok((json, None)),
+        _ => Err(Error::malformed("the GLB file has no JSON chunk", COPY)),
+    }
+}

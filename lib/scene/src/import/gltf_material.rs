@@ -1,0 +1,381 @@
+//! Materials, textures and images of a glTF document.
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use glam::{Mat3, Vec2, Vec3, Vec4};
+
+use super::accessor::{Buffers, get};
+use super::container::{self, Resolver};
+use super::document::{self, Document, TextureInfo};
+use crate::error::Error;
+use crate::material::{AlphaMode, Clearcoat, Material, TextureRef, Transmission};
+use crate::texture::{Encoding, Filter, ImageSource, Texture, Wrap};
+
+const EXPORT: &str = "export the file again";
+
+/// Image formats that hide behind a texture extension, each with what to do instead.
+pub(super) const IMAGE_EXTENSIONS: [&str; 4] = [
+    "KHR_texture_basisu",
+    "EXT_texture_webp",
+    "EXT_texture_avif",
+    "MSFT_texture_dds",
+];
+
+/// Remedy for those.
+pub(super) const PLAIN_IMAGES: &str = "export the textures as PNG or JPEG";
+
+/// Collects what materials refer to.
+pub(super) struct MaterialReader<'a> {
+    document: &'a Document,
+    buffers: &'a Buffers<'a>,
+    resolver: &'a dyn Resolver,
+    images: HashMap<usize, ImageSource>,
+    /// By glTF texture and encoding.
+    known: HashMap<(usize, Encoding), u32>,
+    pub textures: Vec<Texture>,
+    pub warnings: Vec<String>,
+}
+
+impl<'a> MaterialReader<'a> {
+    pub fn new(
+        document: &'a Document,
+        buffers: &'a Buffers<'a>,
+        resolver: &'a dyn Resolver,
+    ) -> Self {
+        Self {
+            document,
+            buffers,
+            resolver,
+            images: HashMap::new(),
+            known: HashMap::new(),
+            textures: Vec::new(),
+            warnings: Vec::new(),
+        }
+    }
+
+    /// Reads `materials[index]`.
+    pub fn read(&mut self, index: usize) -> Result<Material, Error> {
+        let at = format!("materials[{index}]");
+        let source = &self.document.materials[index];
+        let extensions = &source.extensions;
+        if !extensions.others.is_empty() {
+            let names: Vec<&str> = extensions.others.keys().map(String::as_str).collect();
+            self.warnings.push(format!(
+                "{at}: {} not supported and left out",
+                names.join(", ")
+            ));
+        }
+        let mut material = Material {
+            name: source.name.clone().unwrap_or_default(),
+            double_sided: source.double_sided,
+            unlit: extensions.unlit.is_some(),
+            ..Material::default()
+        };
+        self.read_base(source, &at, &mut material)?;
+        material.normal_texture = self.normal_map(&source.normal_texture, &at, "normalTexture")?;
+        self.read_emission(source, &at, &mut material)?;
+        let cutoff = source.alpha_cutoff.unwrap_or(0.5);
+        material.alpha_mode = match source.alpha_mode.as_deref() {
+            None | Some("OPAQUE") => AlphaMode::Opaque,
+            Some("MASK") => AlphaMode::Mask {
+                cutoff: self.factor(cutoff, f32::MAX, 0.5, &at, "alphaCutoff"),
+            },
+            Some("BLEND") => AlphaMode::Blend,
+            Some(other) => {
+                return Err(Error::malformed(
+                    format!("{at}.alphaMode is \"{other}\"; accepted: OPAQUE, MASK, BLEND"),
+                    EXPORT,
+                ));
+            }
+        };
+        if let Some(coat) = &extensions.clearcoat {
+            material.clearcoat = self.clearcoat(coat, &at)?;
+        }
+        if let Some(transmission) = &extensions.transmission {
+            let factor = transmission.transmission_factor;
+            let factor = self.factor(factor, 1.0, 0.0, &at, "transmissionFactor");
+            if factor > 0.0 {
+                material.transmission = Some(Transmission {
+                    factor,
+                    texture: self.texture(
+                        &transmission.transmission_texture,
+                        &at,
+                        "transmissionTexture",
+                        Encoding::Linear,
+                    )?,
+                });
+            }
+        }
+        if let Some(ior) = extensions.ior.as_ref().and_then(|e| e.ior) {
+            // 0 is the extension's name for "reflects like a mirror everywhere": large enough.
+            let ior = if ior == 0.0 { 1e4 } else { ior };
+            material.ior = self.factor(ior, 1e4, 1.5, &at, "ior").max(1.0);
+        }
+        Ok(material)
+    }
+
+    fn read_base(
+        &mut self,
+        source: &document::Material,
+        at: &str,
+        material: &mut Material,
+    ) -> Result<(), Error> {
+        let unit = |s: &mut Self, v, name| s.factor(v, 1.0, 1.0, at, name);
+        let color = |s: &mut Self, c: [f32; 4]| {
+            Vec4::from_array(c.map(|v| s.factor(v, 1.0, 1.0, at, "baseColorFactor")))
+        };
+        if let Some(pbr) = &source.pbr_metallic_roughness {
+            material.base_color = color(self, pbr.base_color_factor.unwrap_or([1.0; 4]));
+            material.metallic = unit(self, pbr.metallic_factor.unwrap_or(1.0), "metallicFactor");
+            material.roughness = unit(self, pbr.roughness_factor.unwrap_or(1.0), "roughnessFactor");
+            material.base_color_texture = self.texture(
+                &pbr.base_color_texture,
+                at,
+                "baseColorTexture",
+                Encoding::Srgb,
+            )?;
+            material.metallic_roughness_texture = self.texture(
+                &pbr.metallic_roughness_texture,
+                at,
+                "metallicRoughnessTexture",
+                Encoding::Linear,
+            )?;
+        } else if let Some(old) = &source.extensions.specular_glossiness {
+            self.warnings.push(format!(
+                "{at}: KHR_materials_pbrSpecularGlossiness is read as a dielectric; its specular colour is left out"
+            ));
+            material.base_color = color(self, old.diffuse_factor.unwrap_or([1.0; 4]));
+            material.metallic = 0.0;
+            material.roughness = 1.0
+                - unit(
+                    self,
+                    old.glossiness_factor.unwrap_or(1.0),
+                    "glossinessFactor",
+                );
+            material.base_color_texture =
+                self.texture(&old.diffuse_texture, at, "diffuseTexture", Encoding::Srgb)?;
+        }
+        Ok(())
+    }
+
+    fn read_emission(
+        &mut self,
+        source: &document::Material,
+        at: &str,
+        material: &mut Material,
+    ) -> Result<(), Error> {
+        let strength = source.extensions.emissive_strength.as_ref();
+        let strength = strength.and_then(|e| e.emissive_strength).unwrap_or(1.0);
+        let strength = self.factor(strength, 1e12, 1.0, at, "emissiveStrength");
+        let factor = source.emissive_factor.unwrap_or_default();
+        let factor = factor.map(|v| self.factor(v, 1e12, 0.0, at, "emissiveFactor"));
+        material.emissive = Vec3::from_array(factor) * strength;
+        // A texture times zero is no reason to decode it.
+        if material.emissive != Vec3::ZERO {
+            material.emissive_texture = self.texture(
+                &source.emissive_texture,
+                at,
+                "emissiveTexture",
+                Encoding::Srgb,
+            )?;
+        }
+        Ok(())
+    }
+
+    fn clearcoat(
+        &mut self,
+        coat: &document::Clearcoat,
+        at: &str,
+    ) -> Result<Option<Clearcoat>, Error> {
+        let factor = self.factor(coat.clearcoat_factor, 1.0, 0.0, at, "clearcoatFactor");
+        if factor == 0.0 {
+            return Ok(None);
+        }
+        let roughness = coat.clearcoat_roughness_factor;
+        Ok(Some(Clearcoat {
+            factor,
+            factor_texture: self.texture(
+                &coat.clearcoat_texture,
+                at,
+                "clearcoatTexture",
+                Encoding::Linear,
+            )?,
+            roughness: self.factor(roughness, 1.0, 0.0, at, "clearcoatRoughnessFactor"),
+            roughness_texture: self.texture(
+                &coat.clearcoat_roughness_texture,
+                at,
+                "clearcoatRoughnessTexture",
+                Encoding::Linear,
+            )?,
+            normal_texture: self.normal_map(
+                &coat.clearcoat_normal_texture,
+                at,
+                "clearcoatNormalTexture",
+            )?,
+        }))
+    }
+
+    /// Brings a factor into `[0, max]`, with a warning if it was outside.
+    fn factor(&mut self, value: f32, max: f32, fallback: f32, at: &str, name: &str) -> f32 {
+        let kept = if value.is_finite() {
+            value.clamp(0.0, max)
+        } else {
+            fallback
+        };
+        if kept != value {
+            self.warnings
+                .push(format!("{at}: {name} is {value}; {kept} is used"));
+        }
+        kept
+    }
+
+    fn normal_map(
+        &mut self,
+        info: &Option<TextureInfo>,
+        at: &str,
+        name: &str,
+    ) -> Result<Option<(TextureRef, f32)>, Error> {
+        let scale = info.as_ref().and_then(|i| i.scale).unwrap_or(1.0);
+        let scale = if scale.is_finite() { scale } else { 1.0 };
+        let texture = self.texture(info, at, name, Encoding::Linear)?;
+        Ok(texture.map(|t| (t, scale)))
+    }
+
+    fn texture(
+        &mut self,
+        info: &Option<TextureInfo>,
+        at: &str,
+        name: &str,
+        encoding: Encoding,
+    ) -> Result<Option<TextureRef>, Error> {
+        let Some(info) = info else {
+            return Ok(None);
+        };
+        let place = format!("{at}.{name}.index");
+        get(&self.document.textures, info.index, &place, "textures")?;
+        let Some(texture) = self.texture_index(info.index, encoding)? else {
+            return Ok(None);
+        };
+        let transform = info.extensions.transform.as_ref();
+        let set = transform
+            .and_then(|t| t.tex_coord)
+            .unwrap_or(info.tex_coord);
+        if set > 1 {
+            self.warnings.push(format!(
+                "{at}: {name} reads TEXCOORD_{set}; two sets are supported, TEXCOORD_0 is used"
+            ));
+        }
+        Ok(Some(TextureRef {
+            texture,
+            uv_set: if set == 1 { 1 } else { 0 },
+            transform: transform.map_or(Mat3::IDENTITY, uv_transform),
+        }))
+    }
+
+    /// Our index of a glTF texture; `None` if it has no image.
+    fn texture_index(&mut self, index: usize, encoding: Encoding) -> Result<Option<u32>, Error> {
+        if let Some(&known) = self.known.get(&(index, encoding)) {
+            return Ok(Some(known));
+        }
+        let source = &self.document.textures[index];
+        let at = format!("textures[{index}]");
+        let Some(image) = source.source else {
+            return match IMAGE_EXTENSIONS
+                .iter()
+                .find(|e| source.extensions.contains_key(**e))
+            {
+                Some(extension) => Err(Error::UnsupportedExtension {
+                    extension: (*extension).into(),
+                    remedy: PLAIN_IMAGES,
+                }),
+                None => {
+                    self.warnings
+                        .push(format!("{at} has no image and is left out"));
+                    Ok(None)
+                }
+            };
+        };
+        let (wrap, filter) = match source.sampler {
+            None => Default::default(),
+            Some(sampler) => {
+                let place = format!("{at}.sampler");
+                lookup(get(&self.document.samplers, sampler, &place, "samplers")?)
+            }
+        };
+        let image = self.image(image, &format!("{at}.source"))?;
+        self.textures.push(Texture {
+            image,
+            encoding,
+            wrap,
+            filter,
+        });
+        let ours = self.textures.len() as u32 - 1;
+        self.known.insert((index, encoding), ours);
+        Ok(Some(ours))
+    }
+
+    fn image(&mut self, index: usize, place: &str) -> Result<ImageSource, Error> {
+        if let Some(known) = self.images.get(&index) {
+            return Ok(known.clone());
+        }
+        let source = get(&self.document.images, index, place, "images")?;
+        let at = format!("images[{index}]");
+        let name = match &source.name {
+            Some(name) => format!("{at} ({name})"),
+            None => at.clone(),
+        };
+        let embedded = |bytes: Vec<u8>| ImageSource::Bytes {
+            name: name.clone(),
+            bytes: Arc::from(bytes),
+        };
+        let image = match (&source.uri, source.buffer_view) {
+            (None, None) => {
+                return Err(Error::malformed(
+                    format!("{at} has neither uri nor bufferView"),
+                    EXPORT,
+                ));
+            }
+            (None, Some(view)) => {
+                let (bytes, _) = self.buffers.view(view, &format!("{at}.bufferView"))?;
+                embedded(bytes.to_vec())
+            }
+            (Some(uri), _) => match container::data_uri(uri, &at) {
+                Some(bytes) => embedded(bytes?),
+                None => self.resolver.image(uri).map_err(|source| Error::Read {
+                    role: format!("the texture {name}"),
+                    path: container::named(uri),
+                    source,
+                })?,
+            },
+        };
+        self.images.insert(index, image.clone());
+        Ok(image)
+    }
+}
+
+/// `KHR_texture_transform`: scale, then rotate counter-clockwise in the image, then offset.
+fn uv_transform(t: &document::TextureTransform) -> Mat3 {
+    let scale = Vec2::from_array(t.scale.unwrap_or([1.0; 2]));
+    let offset = Vec2::from_array(t.offset.unwrap_or_default());
+    let (sin, cos) = t.rotation.sin_cos();
+    let all = Mat3::from_cols(
+        Vec3::new(cos, -sin, 0.0) * scale.x,
+        Vec3::new(sin, cos, 0.0) * scale.y,
+        offset.extend(1.0),
+    );
+    if all.is_finite() { all } else { Mat3::IDENTITY }
+}
+
+/// glTF's codes, which are OpenGL's. There are no mipmaps here: only the magnification filter counts.
+fn lookup(sampler: &document::Sampler) -> ([Wrap; 2], Filter) {
+    let wrap = |code: Option<u32>| match code {
+        Some(33071) => Wrap::ClampToEdge,
+        Some(33648) => Wrap::MirroredRepeat,
+        _ => Wrap::Repeat,
+    };
+    let filter = match sampler.mag_filter {
+        Some(9728) => Filter::Nearest,
+        _ => Filter::Linear,
+    };
+    ([wrap(sampler.wrap_s), wrap(sampler.wrap_t)], filter)
+}

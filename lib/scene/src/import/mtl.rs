@@ -1,0 +1,327 @@
+//! Material libraries of OBJ files, with the usual extension for physically based materials.
+//!
+//! `Kd`/`map_Kd` become the base colour, `Pm` metalness, `Pr` roughness; without `Pr` roughness
+//! follows from the Blinn-Phong exponent `Ns` by `alpha^2 = 2 / (Ns + 2)` [Walter et al. 2007,
+//! section 5.2]. A black `Ks` switches the dielectric reflection off. Surfaces are double-sided, for
+//! the format does not say which side is the front.
+use std::collections::HashMap;
+
+use glam::{Mat3, Vec2, Vec3, Vec4};
+
+use super::container::{self, Resolver};
+use crate::error::Error;
+use crate::material::{AlphaMode, Material, TextureRef};
+use crate::texture::{Encoding, Filter, Texture, Wrap};
+
+/// What a triangle without a material gets.
+pub(super) fn grey() -> Material {
+    Material {
+        base_color: Vec4::new(0.8, 0.8, 0.8, 1.0),
+        metallic: 0.0,
+        roughness: 1.0,
+        double_sided: true,
+        ..Material::default()
+    }
+}
+
+/// The materials of all libraries of a file.
+#[derive(Default)]
+pub(super) struct Library {
+    pub materials: Vec<Material>,
+    pub textures: Vec<Texture>,
+    pub warnings: Vec<String>,
+    by_name: HashMap<String, u32>,
+    by_file: HashMap<(String, Encoding, bool), u32>,
+}
+
+/// A material while its statements are read.
+#[derive(Default)]
+struct Draft {
+    base_file: String,
+    shininess: Option<f32>,
+    roughness: Option<f32>,
+    roughness_file: Option<String>,
+    metallic_file: Option<String>,
+    alpha_file: Option<String>,
+}
+
+/// An image statement: the file and its options.
+struct Map {
+    file: String,
+    transform: Mat3,
+    clamp: bool,
+    bump: f32,
+}
+
+impl Library {
+    pub fn index_of(&self, name: &str) -> Option<u32> {
+        self.by_name.get(name).copied()
+    }
+
+    /// Reads a library; `name` is its path relative to the object, which textures are relative to.
+    pub fn read(&mut self, bytes: &[u8], name: &str, resolver: &dyn Resolver) -> Result<(), Error> {
+        let name = name.replace('\\', "/");
+        let folder = name.rfind('/').map_or("", |i| &name[..=i]);
+        let text = String::from_utf8_lossy(bytes);
+        let mut current: Option<(Material, Draft)> = None;
+        for (i, line) in text.lines().enumerate() {
+            let line = line.split('#').next().unwrap_or("").trim();
+            let (word, rest) = line
+                .split_once(char::is_whitespace)
+                .map_or((line, ""), |(w, r)| (w, r.trim()));
+            if word == "newmtl" {
+                if let Some(done) = current.take() {
+                    self.finish(done);
+                }
+                let material = Material {
+                    name: rest.to_owned(),
+                    ..grey()
+                };
+                current = Some((material, Draft::default()));
+            } else if let Some((material, draft)) = &mut current {
+                self.statement(word, rest, folder, resolver, material, draft)
+                    .map_err(|e| match e {
+                        Error::Malformed { detail, remedy } => {
+                            Error::malformed(format!("line {}: {detail}", i + 1), remedy)
+                        }
+                        other => other,
+                    })?;
+            }
+        }
+        if let Some(done) = current {
+            self.finish(done);
+        }
+        Ok(())
+    }
+
+    fn statement(
+        &mut self,
+        word: &str,
+        rest: &str,
+        folder: &str,
+        resolver: &dyn Resolver,
+        material: &mut Material,
+        draft: &mut Draft,
+    ) -> Result<(), Error> {
+        let unit = |rest| number(rest).map(|v| v.clamp(0.0, 1.0));
+        match word {
+            "Kd" => {
+                let alpha = material.base_color.w;
+                material.base_color = color(rest)?.min(Vec3::ONE).extend(alpha);
+            }
+            "Ks" if color(rest)? == Vec3::ZERO => material.ior = 1.0,
+            "Ke" => material.emissive = color(rest)?,
+            "Ns" => draft.shininess = Some(number(rest)?.max(0.0)),
+            "Ni" => {
+                let ior = number(rest)?;
+                // 1 is what exporters write that know no better, and would leave no reflection.
+                if ior > 1.0 && material.ior > 1.0 {
+                    material.ior = ior.min(10.0);
+                }
+            }
+            "Pr" => draft.roughness = Some(unit(rest)?),
+            "Pm" => material.metallic = unit(rest)?,
+            "d" => material.base_color.w = unit(rest)?,
+            "Tr" => material.base_color.w = 1.0 - unit(rest)?,
+            "map_Kd" => {
+                let map = Map::parse(rest);
+                // White, so that the texture is seen as it is where no Kd was meant.
+                if material.base_color.truncate() == Vec3::ZERO {
+                    material.base_color = Vec4::ONE.with_w(material.base_color.w);
+                }
+                material.base_color_texture =
+                    Some(self.texture(&map, folder, resolver, Encoding::Srgb)?);
+                draft.base_file = map.file;
+            }
+            "map_Ke" => {
+                let map = Map::parse(rest);
+                if material.emissive == Vec3::ZERO {
+                    material.emissive = Vec3::ONE;
+                }
+                material.emissive_texture =
+                    Some(self.texture(&map, folder, resolver, Encoding::Srgb)?);
+            }
+            "map_Pr" => {
+                let map = Map::parse(rest);
+                material.metallic_roughness_texture =
+                    Some(self.texture(&map, folder, resolver, Encoding::Linear)?);
+                draft.roughness_file = Some(map.file);
+            }
+            "map_Pm" => draft.metallic_file = Some(Map::parse(rest).file),
+            "map_d" => draft.alpha_file = Some(Map::parse(rest).file),
+            "norm" | "map_Bump" | "map_bump" | "bump" => {
+                if word != "norm" {
+                    self.warnings.push(format!(
+                        "material \"{}\": {word} is read as a normal map",
+                        material.name
+                    ));
+                }
+                let map = Map::parse(rest);
+                let texture = self.texture(&map, folder, resolver, Encoding::Linear)?;
+                material.normal_texture = Some((texture, map.bump));
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self, (mut material, draft): (Material, Draft)) {
+        let name = material.name.clone();
+        material.roughness = match (draft.roughness, draft.shininess) {
+            (Some(r), _) => r,
+            (None, Some(ns)) => (2.0 / (ns + 2.0)).powf(0.25),
+            // A texture multiplies the factor.
+            (None, None) => 1.0,
+        };
+        if draft.roughness_file.is_some() && draft.roughness.is_none() {
+            material.roughness = 1.0;
+        }
+        // One texture holds both, in green and blue: a grey roughness map would dim the metal.
+        match (&draft.roughness_file, &draft.metallic_file) {
+            (Some(r), Some(m)) if r == m => {
+                if material.metallic == 0.0 {
+                    material.metallic = 1.0;
+                }
+            }
+            (None, None) | (Some(_), None) if material.metallic == 0.0 => {}
+            (None, None) => {}
+            _ => self.warnings.push(format!(
+                "material \"{name}\": metalness and roughness textures are read only from one common file; metalness is constant"
+            )),
+        }
+        if let Some(file) = &draft.alpha_file {
+            if *file == draft.base_file {
+                material.alpha_mode = AlphaMode::Blend;
+            } else {
+                self.warnings.push(format!(
+                    "material \"{name}\": map_d is read only from the alpha of map_Kd's file"
+                ));
+            }
+        }
+        if material.base_color.w < 1.0 {
+            material.alpha_mode = AlphaMode::Blend;
+        }
+        self.by_name.insert(name, self.materials.len() as u32);
+        self.materials.push(material);
+    }
+
+    fn texture(
+        &mut self,
+        map: &Map,
+        folder: &str,
+        resolver: &dyn Resolver,
+        encoding: Encoding,
+    ) -> Result<TextureRef, Error> {
+        let file = format!("{folder}{}", map.file);
+        let key = (file.clone(), encoding, map.clamp);
+        let texture = match self.by_file.get(&key) {
+            Some(&known) => known,
+            None => {
+                let image = resolver.image(&file).map_err(|source| Error::Read {
+                    role: "the texture".into(),
+                    path: container::named(&file),
+                    source,
+                })?;
+                let wrap = if map.clamp {
+                    Wrap::ClampToEdge
+                } else {
+                    Wrap::Repeat
+                };
+                self.textures.push(Texture {
+                    image,
+                    encoding,
+                    wrap: [wrap; 2],
+                    filter: Filter::Linear,
+                });
+                let index = self.textures.len() as u32 - 1;
+                self.by_file.insert(key, index);
+                index
+            }
+        };
+        Ok(TextureRef {
+            texture,
+            uv_set: 0,
+            transform: map.transform,
+        })
+    }
+}
+
+impl Map {
+    /// Splits options from the file name, which may contain blanks.
+    fn parse(rest: &str) -> Self {
+        let mut map = Self {
+            file: String::new(),
+            transform: Mat3::IDENTITY,
+            clamp: false,
+            bump: 1.0,
+        };
+        let (mut scale, mut offset) = (Vec2::ONE, Vec2::ZERO);
+        let mut rest = rest;
+        while rest.starts_with('-') {
+            let (option, after) = word(rest);
+            rest = after;
+            // Vectors have one to three numbers: as many as look like numbers are taken.
+            let most = match option {
+                "-o" | "-s" | "-t" => 3,
+                "-mm" => 2,
+                _ => 1,
+            };
+            let mut values = [None; 3];
+            for value in values.iter_mut().take(most) {
+                let (text, after) = word(rest);
+                let parsed = text.parse::<f32>().ok().filter(|v| v.is_finite());
+                if parsed.is_none() && most > 1 {
+                    break;
+                }
+                if option == "-clamp" {
+                    map.clamp = text == "on";
+                }
+                *value = parsed;
+                rest = after;
+            }
+            match option {
+                "-bm" => map.bump = values[0].unwrap_or(1.0),
+                "-s" => scale = Vec2::new(values[0].unwrap_or(1.0), values[1].unwrap_or(1.0)),
+                "-o" => offset = Vec2::new(values[0].unwrap_or(0.0), values[1].unwrap_or(0.0)),
+                _ => {}
+            }
+        }
+        // The format's v points up: v' = 1 - (s (1 - v) + o).
+        map.transform = Mat3::from_cols(
+            Vec3::new(scale.x, 0.0, 0.0),
+            Vec3::new(0.0, scale.y, 0.0),
+            Vec3::new(offset.x, 1.0 - scale.y - offset.y, 1.0),
+        );
+        map.file = rest.trim().replace('\\', "/");
+        map
+    }
+}
+
+/// The first word and what follows it.
+fn word(text: &str) -> (&str, &str) {
+    text.split_once(char::is_whitespace)
+        .map_or((text, ""), |(w, r)| (w, r.trim_start()))
+}
+
+fn number(rest: &str) -> Result<f32, Error> {
+    // "d -halo 0.5" is the one statement with a word in front.
+    let text = rest
+        .split_ascii_whitespace()
+        .find(|t| *t != "-halo")
+        .unwrap_or("");
+    match text.parse::<f32>() {
+        Ok(v) if v.is_finite() => Ok(v),
+        _ => Err(Error::malformed(
+            format!("\"{text}\" is not a finite number"),
+            "export the material library again",
+        )),
+    }
+}
+
+/// Three numbers, or one that stands for all three; at least 0.
+fn color(rest: &str) -> Result<Vec3, Error> {
+    let mut words = rest.split_ascii_whitespace();
+    let first = number(words.next().unwrap_or(""))?;
+    let mut next = || words.next().map_or(Ok(first), number);
+    Ok(Vec3::new(first, next()?, next()?).max(Vec3::ZERO))
+}

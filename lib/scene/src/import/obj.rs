@@ -1,0 +1,356 @@
+//! Wavefront OBJ files.
+//!
+//! Read line by line, so that an error names its line; polygons become fans of triangles, texture
+//! coordinates are turned to glTF's convention (v down).
+use std::borrow::Cow;
+use std::collections::HashMap;
+
+use dipir_imaging::transfer::Transfer;
+use glam::{DVec3, Mat3, Vec2, Vec3, Vec4};
+
+use super::container::{self, Resolver};
+use super::mtl::Library;
+use super::tangents;
+use super::{Imported, Limits};
+use crate::error::Error;
+use crate::material::Material;
+use crate::mesh::TriangleMesh;
+
+const EXPORT: &str = "export the file again";
+
+/// A corner of a face: indices of position, texture coordinate and normal, from 0.
+type Corner = (u32, Option<u32>, Option<u32>);
+
+/// Reads an OBJ file from memory; `resolver` finds its material libraries and their textures.
+pub fn load_obj_bytes(
+    bytes: &[u8],
+    resolver: &dyn Resolver,
+    limits: &Limits,
+) -> Result<Imported, Error> {
+    let mut reader = Reader {
+        limits: *limits,
+        ..Reader::default()
+    };
+    for (number, line) in logical_lines(bytes) {
+        reader
+            .statement(&line, resolver)
+            .map_err(|problem| match problem {
+                Problem::Here(detail) => {
+                    Error::malformed(format!("line {number}: {detail}"), EXPORT)
+                }
+                Problem::Elsewhere(error) => *error,
+            })?;
+    }
+    reader.finish()
+}
+
+/// Lines by number, comments cut off, continuation lines joined.
+fn logical_lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
+    let mut lines = bytes.split(|b| *b == b'\n').enumerate();
+    std::iter::from_fn(move || {
+        let (number, first) = lines.next()?;
+        let mut text = String::from_utf8_lossy(first);
+        while let Some(head) = text.trim_end().strip_suffix('\\') {
+            let mut joined = head.to_owned();
+            let Some((_, next)) = lines.next() else {
+                return Some((number + 1, Cow::Owned(joined)));
+            };
+            joined.push(' ');
+            joined += &String::from_utf8_lossy(next);
+            text = Cow::Owned(joined);
+        }
+        Some((number + 1, text))
+    })
+}
+
+enum Problem {
+    /// In the current line.
+    Here(String),
+    /// In another file, or about the whole.
+    Elsewhere(Box<Error>),
+}
+
+impl From<Error> for Problem {
+    fn from(error: Error) -> Self {
+        Self::Elsewhere(Box::new(error))
+    }
+}
+
+#[derive(Default)]
+struct Reader {
+    limits: Limits,
+    positions: Vec<Vec3>,
+    colors: Vec<Vec4>,
+    uvs: Vec<Vec2>,
+    normals: Vec<Vec3>,
+    mesh: TriangleMesh,
+    vertices: HashMap<Corner, u32>,
+    corners: Vec<u32>,
+    library: Library,
+    material: Option<u32>,
+    /// Whether some corner names a texture coordinate, a normal.
+    has: [bool; 2],
+    uses_default: bool,
+    warnings: Vec<String>,
+}
+
+impl Reader {
+    fn statement(&mut self, line: &str, resolver: &dyn Resolver) -> Result<(), Problem> {
+        let line = line.split('#').next().unwrap_or("").trim();
+        let (word, rest) = line
+            .split_once(char::is_whitespace)
+            .map_or((line, ""), |(w, r)| (w, r.trim()));
+        match word {
+            "v" => self.vertex(rest)?,
+            "vt" => {
+                let ([u, v], _) = floats::<2>(rest, 1, "vt u v")?;
+                self.uvs.push(if u.is_finite() && v.is_finite() {
+                    Vec2::new(u, 1.0 - v)
+                } else {
+                    Vec2::ZERO
+                });
+            }
+            "vn" => {
+                let (n, _) = floats::<3>(rest, 3, "vn x y z")?;
+                self.normals.push(Vec3::from_array(n));
+            }
+            "f" => self.face(rest)?,
+            "usemtl" => self.use_material(rest),
+            "mtllib" => self.read_library(rest, resolver)?,
+            "p" | "l" => self
+                .warnings
+                .push("points and lines are not drawn".to_owned()),
+            // Objects, groups and smoothing do not matter here; curves and surfaces are rare.
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn vertex(&mut self, rest: &str) -> Result<(), Problem> {
+        let (v, count) = floats::<7>(rest, 3, "v x y z")?;
+        let position = Vec3::new(v[0], v[1], v[2]);
+        if !position.is_finite() {
+            return Err(Error::NotFinite {
+                place: "vertices (v)".into(),
+                element: self.positions.len() as u64 + 1,
+                value: format!("{}, {}, {}", v[0], v[1], v[2]),
+            }
+            .into());
+        }
+        // Three more numbers are a display-referred colour; a single one is a weight.
+        if count >= 6 {
+            let linear = |x: f32| {
+                if x.is_finite() {
+                    Transfer::Srgb.decode_scalar(x.clamp(0.0, 1.0))
+                } else {
+                    1.0
+                }
+            };
+            self.colors.resize(self.positions.len(), Vec4::ONE);
+            let k = count - 3;
+            let k = if count == 7 { k - 1 } else { k };
+            self.colors.push(Vec4::new(
+                linear(v[k]),
+                linear(v[k + 1]),
+                linear(v[k + 2]),
+                1.0,
+            ));
+        }
+        self.positions.push(position);
+        if !self.colors.is_empty() {
+            self.colors.resize(self.positions.len(), Vec4::ONE);
+        }
+        Ok(())
+    }
+
+    fn face(&mut self, rest: &str) -> Result<(), Problem> {
+        self.corners.clear();
+        for text in rest.split_ascii_whitespace() {
+            let corner = self.corner(text)?;
+            let next = self.vertices.len() as u32;
+            let index = *self.vertices.entry(corner).or_insert(next);
+            if index == next {
+                self.mesh.positions.push(self.positions[corner.0 as usize]);
+            }
+            self.corners.push(index);
+        }
+        let n = self.corners.len();
+        if n < 3 {
+            return Err(Problem::Here(format!(
+                "a face of {n} corners; accepted: 3 or more"
+            )));
+        }
+        let material = self.material.unwrap_or_else(|| {
+            self.uses_default = true;
+            u32::MAX
+        });
+        for k in 1..n - 1 {
+            let [a, b, c] = [self.corners[0], self.corners[k], self.corners[k + 1]];
+            if a != b && b != c && c != a {
+                self.mesh.indices.push([a, b, c]);
+                self.mesh.materials.push(material);
+            }
+        }
+        self.limits.check(
+            self.mesh.positions.len() as u64,
+            self.mesh.indices.len() as u64,
+        )?;
+        Ok(())
+    }
+
+    fn corner(&mut self, text: &str) -> Result<Corner, Problem> {
+        let mut parts = text.split('/');
+        let position = parts.next().unwrap_or("");
+        let v = index(position, self.positions.len(), "vertices (v)")?;
+        let mut optional = |count: usize, things: &str, has: &mut bool| match parts.next() {
+            None | Some("") => Ok(None),
+            Some(text) => {
+                *has = true;
+                index(text, count, things).map(Some)
+            }
+        };
+        let vt = optional(self.uvs.len(), "texture coordinates (vt)", &mut self.has[0])?;
+        let vn = optional(self.normals.len(), "normals (vn)", &mut self.has[1])?;
+        Ok((v, vt, vn))
+    }
+
+    fn use_material(&mut self, name: &str) {
+        self.material = self.library.index_of(name);
+        if self.material.is_none() {
+            self.warnings
+                .push(format!("material \"{name}\" is not defined; grey is used"));
+        }
+    }
+
+    fn read_library(&mut self, name: &str, resolver: &dyn Resolver) -> Result<(), Problem> {
+        match resolver.read(&name.replace('\\', "/")) {
+            Ok(bytes) => {
+                let path = container::named(name);
+                self.library
+                    .read(&bytes, name, resolver)
+                    .map_err(|e| Problem::from(e.in_file(path)))
+            }
+            Err(e) => {
+                self.warnings.push(format!(
+                    "material library \"{name}\" cannot be read ({e}); grey is used"
+                ));
+                Ok(())
+            }
+        }
+    }
+
+    fn finish(mut self) -> Result<Imported, Error> {
+        if self.mesh.indices.is_empty() {
+            return Err(Error::Empty {
+                remedy: "check that the file has faces (f)",
+            });
+        }
+        let mut materials = std::mem::take(&mut self.library.materials);
+        let default = materials.len() as u32;
+        for m in &mut self.mesh.materials {
+            *m = (*m).min(default);
+        }
+        if self.uses_default {
+            materials.push(super::mtl::grey());
+        }
+        self.gather(&materials);
+        let mut warnings = self.warnings;
+        warnings.append(&mut self.library.warnings);
+        let mut seen = std::collections::HashSet::new();
+        warnings.retain(|w| seen.insert(w.clone()));
+        Ok(Imported {
+            mesh: self.mesh,
+            origin: DVec3::ZERO,
+            materials,
+            textures: self.library.textures,
+            warnings,
+            dependencies: Vec::new(),
+        })
+    }
+
+    /// Fills the attributes of the vertices that faces use.
+    fn gather(&mut self, materials: &[Material]) {
+        let n = self.mesh.positions.len();
+        let reads_uv = materials.iter().any(|m| m.texture_refs().next().is_some());
+        let has_normal_map = materials.iter().any(|m| m.normal_texture.is_some());
+        if reads_uv {
+            if !self.has[0] {
+                self.warnings
+                    .push("there are textures but no texture coordinates".to_owned());
+            }
+            self.mesh.uvs[0] = vec![Vec2::ZERO; n];
+        }
+        if self.has[1] {
+            self.mesh.normals = vec![Vec3::ZERO; n];
+        }
+        if !self.colors.is_empty() {
+            self.mesh.colors = vec![Vec4::ONE; n];
+        }
+        for (&(v, vt, vn), &i) in &self.vertices {
+            let i = i as usize;
+            if let (Some(vt), Some(uv)) = (vt, self.mesh.uvs[0].get_mut(i)) {
+                *uv = self.uvs[vt as usize];
+            }
+            if let (Some(vn), Some(normal)) = (vn, self.mesh.normals.get_mut(i)) {
+                *normal = self.normals[vn as usize];
+            }
+            if let Some(color) = self.mesh.colors.get_mut(i) {
+                *color = self.colors[v as usize];
+            }
+        }
+        if self.has[1] {
+            let repaired = self.mesh.repair_normals();
+            if repaired > 0 {
+                self.warnings.push(format!(
+                    "{repaired} normals were missing or broken and are computed from the triangles"
+                ));
+            }
+        }
+        if has_normal_map {
+            if self.mesh.normals.is_empty() {
+                self.mesh.split_flat();
+            }
+            tangents::generate(&mut self.mesh, 0, &Mat3::IDENTITY);
+        }
+    }
+}
+
+/// Up to `N` numbers, at least `least`; the rest is zero. Returns how many there were.
+fn floats<const N: usize>(
+    rest: &str,
+    least: usize,
+    form: &str,
+) -> Result<([f32; N], usize), Problem> {
+    let mut out = [0.0; N];
+    let mut count = 0;
+    for text in rest.split_ascii_whitespace().take(N) {
+        out[count] = text
+            .parse()
+            .map_err(|_| Problem::Here(format!("\"{text}\" is not a number; accepted: {form}")))?;
+        count += 1;
+    }
+    if count < least {
+        return Err(Problem::Here(format!("{count} numbers; accepted: {form}")));
+    }
+    Ok((out, count))
+}
+
+/// An index from 1, or from the end if negative, as one from 0.
+fn index(text: &str, count: usize, things: &str) -> Result<u32, Problem> {
+    let number: i64 = text.parse().map_err(|_| {
+        Problem::Here(format!(
+            "\"{text}\" is not an index; accepted: f v/vt/vn with whole numbers"
+        ))
+    })?;
+    let from_zero = match number {
+        1.. => number - 1,
+        // Zero is no index in this format: it becomes `count`, which is refused.
+        _ => number.saturating_add(count as i64),
+    };
+    match u32::try_from(from_zero) {
+        Ok(i) if (i as usize) < count => Ok(i),
+        _ => Err(Problem::Here(format!(
+            "a face refers to {number}, but there are {count} {things} so far"
+        ))),
+    }
+}
