@@ -128,9 +128,14 @@ def for_mitsuba(texels):
     """The piecewise-constant map at the points between which `envmap` interpolates."""
     h, w = texels.shape[0], texels.shape[1]
     rows, columns = h * UPSAMPLE + 1, w * UPSAMPLE
-    i = np.minimum((np.arange(rows) / (rows - 1) * h).astype(int), h - 1)
     j = ((np.arange(columns) + 0.5) / columns * w).astype(int)
-    return np.ascontiguousarray(texels[i][:, j])
+    # Rows that lie on a border between texels take the mean of both sides: the interpolated
+    # step is then centred on the border, and no energy moves.
+    position = np.arange(rows) / UPSAMPLE
+    below = np.minimum(np.floor(position).astype(int), h - 1)
+    above = np.maximum(np.ceil(position).astype(int) - 1, 0)
+    fine = 0.5 * (texels[below] + texels[above])
+    return np.ascontiguousarray(fine[:, j])
 
 
 def mesh(name, v, f, bsdf):

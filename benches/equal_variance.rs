@@ -1,0 +1,178 @@
+//! Time times variance of an insertion at 512 x 512 under a sunny sky, for `equal_variance.py`,
+//! which runs the same scene through Mitsuba 3.
+//!
+//! `export DIR` writes the scene's mesh and sky for the other renderer; `render SAMPLES SEEDS
+//! MATERIAL` prints one line of JSON: seconds of each render and the mean variance of the two
+//! layers. Without arguments (plain `cargo bench`) it renders a few seeds.
+use std::f32::consts::PI;
+use std::io::Write;
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+use dipir_light::environment::{EnvironmentMap, EnvironmentSampler, direction_at};
+
+use dipir_numerics::stats::median;
+use dipir_render::adaptive::{Progress, Stop};
+use dipir_render::bsdf::features::SPECULAR;
+use dipir_render::film::Film;
+use dipir_render::render::{Renderer, Settings, Simulation};
+use dipir_render::shapes;
+use dipir_scene::camera::Camera;
+use dipir_scene::material::Material;
+use dipir_scene::mesh::TriangleMesh;
+use dipir_scene::proxy::{Plane, Proxy};
+use dipir_scene::scene::Scene;
+use glam::{Mat3, Vec2, Vec3, Vec4};
+
+const SIZE: u32 = 512;
+const FOV_DEG: f32 = 32.0;
+const POSITION: Vec3 = Vec3::new(2.6, 2.0, 3.8);
+const TARGET: Vec3 = Vec3::new(0.0, 0.6, 0.0);
+
+/// A trefoil of 96,000 triangles that stands on the plane: concave, self-shadowing.
+fn mesh() -> TriangleMesh {
+    let mut mesh = shapes::torus_knot(Vec3::ZERO, 0.4, 0.13, 1000, 48);
+    let lowest = mesh.positions.iter().fold(f32::INFINITY, |m, p| m.min(p.y));
+    mesh.positions.iter_mut().for_each(|p| p.y -= lowest);
+    mesh.materials = vec![0; mesh.indices.len()];
+    mesh
+}
+
+/// A blue sky over a brown ground, with a sun of half a degree at 6e4.
+fn sky() -> EnvironmentMap {
+    let (width, height) = (1024, 512);
+    let sun = Vec3::new(0.55, 0.6, 0.35).normalize();
+    let cos_radius = (0.265 * PI / 180.0).cos();
+    let texels = (0..width * height)
+        .map(|t| {
+            let u = (t % width) as f32 + 0.5;
+            let v = (t / width) as f32 + 0.5;
+            let d = direction_at(u / width as f32, v / height as f32);
+            if d.dot(sun) > cos_radius {
+                return Vec3::new(6.0e4, 5.6e4, 5.0e4);
+            }
+            match d.y > 0.0 {
+                true => Vec3::new(0.35, 0.55, 0.9) * (0.6 + 0.4 * d.y),
+                false => Vec3::new(0.22, 0.19, 0.15),
+            }
+        })
+        .collect();
+    EnvironmentMap::new(width, height, texels).expect("a valid map")
+}
+
+fn scene(metal: bool) -> Scene {
+    let backward = (POSITION - TARGET).normalize();
+    let right = Vec3::Y.cross(backward).normalize();
+    Scene {
+        mesh: mesh(),
+        materials: vec![Material {
+            base_color: Vec4::new(0.8, 0.5, 0.2, 1.0),
+            metallic: f32::from(u8::from(metal)),
+            roughness: if metal { 0.3 } else { 1.0 },
+            ..Default::default()
+        }],
+        textures: Vec::new(),
+        camera: Camera {
+            position: POSITION,
+            rotation: Mat3::from_cols(right, backward.cross(right), backward),
+            focal_px: Vec2::splat(0.5 * SIZE as f32 / (0.5 * FOV_DEG).to_radians().tan()),
+            principal_px: Vec2::splat(0.5 * SIZE as f32),
+            resolution: [SIZE, SIZE],
+        },
+        proxy: Proxy::Plane(Plane {
+            point: Vec3::ZERO,
+            normal: Vec3::Y,
+        }),
+    }
+}
+
+fn export(folder: &Path) -> std::io::Result<()> {
+    std::fs::create_dir_all(folder)?;
+    let mesh = mesh();
+    let mut out = std::io::BufWriter::new(std::fs::File::create(folder.join("mesh.obj"))?);
+    for p in &mesh.positions {
+        writeln!(out, "v {} {} {}", p.x, p.y, p.z)?;
+    }
+    for n in &mesh.normals {
+        writeln!(out, "vn {} {} {}", n.x, n.y, n.z)?;
+    }
+    for [a, b, c] in mesh.indices {
+        let [a, b, c] = [a + 1, b + 1, c + 1];
+        writeln!(out, "f {a}//{a} {b}//{b} {c}//{c}")?;
+    }
+    out.flush()?;
+    sky()
+        .write(folder.join("sky.exr"))
+        .map_err(std::io::Error::other)
+}
+
+/// Mean over pixels and channels of the variance over renders, of display-clamped values.
+fn variance(films: &[Film], layer: impl Fn(&Film, usize) -> Vec3) -> f64 {
+    let pixels = (SIZE * SIZE) as usize;
+    let n = films.len() as f64;
+    let of_pixel = |p: usize| {
+        let values: Vec<_> = films
+            .iter()
+            .map(|f| layer(f, p).clamp(Vec3::ZERO, Vec3::ONE).as_dvec3())
+            .collect();
+        let mean = values.iter().sum::<glam::DVec3>() / n;
+        let m2: f64 = values.iter().map(|v| (*v - mean).length_squared()).sum();
+        m2 / (n - 1.0) / 3.0
+    };
+    (0..pixels).map(of_pixel).sum::<f64>() / pixels as f64
+}
+
+fn render(samples: u32, seeds: u64, material: &str) {
+    let scene = scene(material == "metal");
+    let renderer = Renderer::new(&scene);
+    let light = EnvironmentSampler::new(Arc::new(sky()));
+    let simulation = Simulation {
+        features: if material == "metal" { SPECULAR } else { 0 },
+        max_depth: 4,
+        shadow: true,
+        proxy_occlusion: false,
+        light_on_proxy: None,
+    };
+    let (mut films, mut seconds) = (Vec::new(), Vec::new());
+    for seed in 0..seeds {
+        let settings = Settings {
+            seed,
+            stop: Stop::Samples(samples),
+            ..Default::default()
+        };
+        let start = Instant::now();
+        let mut go_on = |_: &Progress| ControlFlow::Continue(());
+        let rendered = renderer
+            .render(&light, &simulation, &settings, &mut go_on)
+            .expect("a valid scene renders");
+        seconds.push(start.elapsed().as_secs_f64());
+        films.push(rendered.film);
+    }
+    println!(
+        "{{\"seconds\": {:.4}, \"foreground\": {:e}, \"shadow\": {:e}}}",
+        median(&seconds).unwrap_or(f64::NAN),
+        variance(&films, |f, p| f.object.pixels()[p]),
+        variance(&films, |f, p| f.shadow.pixels()[p]
+            * (1.0 - f.alpha.pixels()[p])),
+    );
+}
+
+fn main() {
+    let arguments: Vec<String> = std::env::args()
+        .skip(1)
+        .filter(|a| a != "--bench")
+        .collect();
+    let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    match words.as_slice() {
+        [] => render(16, 4, "diffuse"),
+        ["export", folder] => export(Path::new(folder)).expect("a writable folder"),
+        ["render", samples, seeds, material] => render(
+            samples.parse().expect("samples per pixel"),
+            seeds.parse().expect("number of seeds, at least 2"),
+            material,
+        ),
+        _ => eprintln!("usage: [export DIR | render SAMPLES SEEDS diffuse|metal]"),
+    }
+}
