@@ -1,6 +1,11 @@
 //! A pinhole camera that looks down its own -z.
-use glam::{Mat3, Vec2, Vec3};
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, Mat3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
+
+use crate::error::Error;
+use crate::transforms;
 
 /// A ray with a unit direction.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -39,8 +44,7 @@ impl Camera {
     /// The image position of `point`, or `None` if it does not lie in front of the camera.
     pub fn project(&self, point: Vec3) -> Option<Vec2> {
         let c = self.rotation.transpose() * (point - self.position);
-        (c.z < 0.0)
-            .then(|| self.principal_px + self.focal_px * Vec2::new(c.x / -c.z, -c.y / -c.z))
+        (c.z < 0.0).then(|| self.principal_px + self.focal_px * Vec2::new(c.x / -c.z, -c.y / -c.z))
     }
 }
 
@@ -67,6 +71,66 @@ pub enum WorldUp {
     Z,
 }
 
+impl Camera {
+    /// A camera at `position` with `look_at` in the middle of its image.
+    pub fn look_at(
+        position: Vec3,
+        look_at: Vec3,
+        up: Vec3,
+        field_of_view: FieldOfView,
+        resolution: [u32; 2],
+    ) -> Self {
+        let backward = (position - look_at).as_dvec3().normalize();
+        let right = up.as_dvec3().cross(backward).normalize();
+        let [w, h] = resolution.map(|n| n as f32);
+        let focal = match field_of_view {
+            FieldOfView::Vertical(angle_rad) => 0.5 * h / (0.5 * angle_rad).tan(),
+            FieldOfView::Lens {
+                focal_mm,
+                sensor_mm,
+            } => focal_mm / sensor_mm * w,
+        };
+        Self {
+            position,
+            rotation: DMat3::from_cols(right, backward.cross(right), backward).as_mat3(),
+            focal_px: Vec2::splat(focal),
+            principal_px: Vec2::new(0.5 * w, 0.5 * h),
+            resolution,
+        }
+    }
+}
+
+impl CameraSettings {
+    /// The camera of a photo of `resolution`; files are found relative to `base_dir`. Warnings say
+    /// what of a camera file was ignored.
+    pub fn resolve(
+        &self,
+        resolution: [u32; 2],
+        base_dir: &Path,
+    ) -> Result<(Camera, Vec<String>), Error> {
+        match self {
+            Self::LookAt {
+                position,
+                look_at,
+                up,
+                field_of_view,
+            } => {
+                let camera = Camera::look_at(*position, *look_at, *up, *field_of_view, resolution);
+                Ok((camera, Vec::new()))
+            }
+            Self::Transforms { path, frame, up } => {
+                let path = base_dir.join(path);
+                let bytes = std::fs::read(&path).map_err(|source| Error::Read {
+                    role: "the camera file".into(),
+                    path: path.clone(),
+                    source,
+                })?;
+                transforms::camera(&bytes, *frame, *up, resolution).map_err(|e| e.in_file(path))
+            }
+        }
+    }
+}
+
 /// The checked `[scene.camera]` table.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CameraSettings {
@@ -84,7 +148,7 @@ pub enum CameraSettings {
     /// A frame of a nerfstudio `transforms.json`.
     Transforms {
         /// The file.
-        path: std::path::PathBuf,
+        path: PathBuf,
         /// Index of the frame.
         frame: u32,
         /// Which axis of the file's world is up.

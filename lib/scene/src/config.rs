@@ -240,14 +240,21 @@ impl SceneConfig {
     /// Checks every key; the first that is wrong is reported with its value and the accepted form.
     pub fn validate(&self) -> Result<SceneSettings, Error> {
         let background = self.background.clone().ok_or_else(|| {
-            missing("scene.background", "name the photograph: background = \"photo.jpg\"")
+            missing(
+                "scene.background",
+                "name the photograph: background = \"photo.jpg\"",
+            )
         })?;
         let transfer = match self.transfer.as_deref() {
             None | Some("srgb") => Transfer::Srgb,
             Some("gamma22") => Transfer::Gamma22,
             Some("linear") => Transfer::Linear,
             Some(other) => {
-                return Err(wrong_word("scene.transfer", other, &["srgb", "gamma22", "linear"]));
+                return Err(wrong_word(
+                    "scene.transfer",
+                    other,
+                    &["srgb", "gamma22", "linear"],
+                ));
             }
         };
         let class = self.class.as_deref().unwrap_or("object").trim();
@@ -305,7 +312,10 @@ impl ObjectConfig {
     fn validate(&self, at: &str) -> Result<ObjectSettings, Error> {
         let key = |name: &str| format!("{at}.{name}");
         let path = self.path.clone().ok_or_else(|| {
-            missing(&key("path"), "name the object's file: path = \"object.glb\"")
+            missing(
+                &key("path"),
+                "name the object's file: path = \"object.glb\"",
+            )
         })?;
         let angle_rad = |name: &str, value: Option<f32>| match value.unwrap_or(0.0) {
             v if v.is_finite() => Ok(v.to_radians()),
@@ -324,7 +334,9 @@ impl ObjectConfig {
         };
         let size = match (self.scale, self.height_m) {
             (Some(_), Some(_)) => return Err(conflict(&key("scale"), &key("height_m"))),
-            (scale, None) => Size::Scale(positive("scale", scale.unwrap_or(1.0), "a factor", "1.0")?),
+            (scale, None) => {
+                Size::Scale(positive("scale", scale.unwrap_or(1.0), "a factor", "1.0")?)
+            }
             (None, Some(h)) => Size::Height(positive("height_m", h, "metres", "1.4")?),
         };
         Ok(ObjectSettings {
@@ -373,7 +385,10 @@ impl CameraConfig {
             ("sensor_mm", self.sensor_mm.is_some()),
         ];
         if let Some((name, _)) = others.iter().find(|(_, given)| *given) {
-            return Err(conflict("scene.camera.transforms", &format!("scene.camera.{name}")));
+            return Err(conflict(
+                "scene.camera.transforms",
+                &format!("scene.camera.{name}"),
+            ));
         }
         Ok(CameraSettings::Transforms {
             path,
@@ -404,7 +419,10 @@ impl CameraConfig {
             let key = format!("scene.camera.{name}");
             match value {
                 Some(p) => finite_point(&key, p),
-                None => Err(missing(&key, &format!("write {name} = [x, y, z] in metres"))),
+                None => Err(missing(
+                    &key,
+                    &format!("write {name} = [x, y, z] in metres"),
+                )),
             }
         };
         let position = point("position", self.position)?;
@@ -448,7 +466,9 @@ impl CameraConfig {
         };
         match (self.fov_deg, self.focal_mm, self.sensor_mm) {
             (Some(_), Some(_), _) => Err(conflict("scene.camera.fov_deg", "scene.camera.focal_mm")),
-            (Some(_), _, Some(_)) => Err(conflict("scene.camera.fov_deg", "scene.camera.sensor_mm")),
+            (Some(_), _, Some(_)) => {
+                Err(conflict("scene.camera.fov_deg", "scene.camera.sensor_mm"))
+            }
             (Some(fov), None, None) if fov > 0.0 && fov < 180.0 => {
                 Ok(FieldOfView::Vertical(fov.to_radians()))
             }

@@ -60,7 +60,7 @@ pub enum Error {
     },
     /// An image cannot be decoded.
     #[error(transparent)]
-    Image(ImagingError),
+    Image(#[from] ImagingError),
     /// The file is not of the kind that its extension or header promises.
     #[error("{detail}; {remedy}")]
     Malformed {

@@ -3,7 +3,9 @@
 pub mod bvh;
 pub mod camera;
 pub mod config;
+pub mod description;
 pub mod error;
+pub mod features;
 pub mod import;
 pub mod material;
 pub mod mesh;
@@ -12,6 +14,7 @@ pub mod proxy;
 pub mod ray_offset;
 pub mod scene;
 pub mod texture;
+pub mod transforms;
 pub mod triangle;
 
 pub use error::Error;

@@ -1,6 +1,14 @@
 //! Where an object stands: its lowest point rests on the proxy.
-use glam::Vec3;
+//!
+//! Up is the normal of a proxy plane and +y otherwise. The object is turned by roll (z), pitch (x)
+//! and yaw (y), in this order, stood upright, scaled, and moved until its anchor lies over the
+//! contact point and its lowest point at it. All of it in double precision.
+use glam::{DMat3, DMat4, DQuat, DVec3, Vec3, swizzles::Vec3Swizzles};
 use serde::{Deserialize, Serialize};
+
+use crate::error::Error;
+use crate::mesh::TriangleMesh;
+use crate::proxy::Proxy;
 
 /// How large the object is.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -50,4 +58,127 @@ pub struct Placement {
     pub rest: Option<Rest>,
     /// Which point lies at the position.
     pub anchor: Anchor,
+}
+
+impl Placement {
+    /// The map from the coordinates of `mesh`, whose zero lies at `origin` in its file, to the
+    /// world. `key` names the object's table in messages; a warning is returned if the object
+    /// hovers over a plane or reaches below it.
+    pub fn resolve(
+        &self,
+        mesh: &TriangleMesh,
+        origin: DVec3,
+        proxy: &Proxy,
+        key: &str,
+    ) -> Result<(DMat4, Option<String>), Error> {
+        let up = match proxy {
+            Proxy::Plane(plane) => plane.normal.as_dvec3().normalize(),
+            _ => DVec3::Y,
+        };
+        let turn = DMat3::from_rotation_y(self.yaw_rad.into())
+            * DMat3::from_rotation_x(self.pitch_rad.into())
+            * DMat3::from_rotation_z(self.roll_rad.into());
+        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        for corner in mesh.corners() {
+            let p = turn * corner.as_dvec3();
+            low = low.min(p);
+            high = high.max(p);
+        }
+        let scale = match self.size {
+            Size::Scale(s) => f64::from(s),
+            Size::Height(h) if high.y - low.y > 0.0 => f64::from(h) / (high.y - low.y),
+            Size::Height(h) => {
+                return Err(Error::Config {
+                    key: format!("{key}.height_m"),
+                    value: h.to_string(),
+                    accepted: "left out, for the object is flat and has no height; write scale"
+                        .into(),
+                });
+            }
+        };
+        let anchor = match self.anchor {
+            Anchor::Origin => turn * -origin,
+            Anchor::Center => (low + high) * 0.5,
+        };
+        let foot = DVec3::new(anchor.x, low.y, anchor.z);
+        let (contact, warning) = self.contact(proxy, key)?;
+        let upright = DMat4::from_quat(DQuat::from_rotation_arc(DVec3::Y, up));
+        let map = DMat4::from_translation(contact)
+            * upright
+            * DMat4::from_scale(DVec3::splat(scale))
+            * DMat4::from_translation(-foot)
+            * DMat4::from_mat3(turn);
+        Ok((map, warning))
+    }
+
+    /// The point that the object's foot gets.
+    fn contact(&self, proxy: &Proxy, key: &str) -> Result<(DVec3, Option<String>), Error> {
+        let position = self.position.as_dvec3();
+        let rest = self.rest.unwrap_or(match proxy {
+            Proxy::None => Rest::Position,
+            Proxy::Plane(plane) if plane.normal.y > 1.0 - 1e-6 => Rest::Position,
+            _ => Rest::Proxy,
+        });
+        match (proxy, rest) {
+            (Proxy::Plane(plane), _) => {
+                let n = plane.normal.as_dvec3();
+                let height = n.dot(position - plane.point.as_dvec3());
+                if rest == Rest::Proxy {
+                    // Straight down; along the normal where the plane is a wall.
+                    let down = if n.y.abs() > 1e-3 {
+                        DVec3::Y * (height / n.y)
+                    } else {
+                        n * height
+                    };
+                    return Ok((position - down, None));
+                }
+                let warning = (height.abs() > 1e-3).then(|| {
+                    let how = if height > 0.0 { "hovers" } else { "sinks" };
+                    let side = if height > 0.0 { "above" } else { "below" };
+                    format!(
+                        "{key} {how} {:.3} m {side} the proxy plane, as its position says; rest = \"proxy\" puts it there",
+                        height.abs()
+                    )
+                });
+                Ok((position, warning))
+            }
+            (Proxy::Mesh(mesh), Rest::Proxy) => match highest(mesh, position) {
+                Some(y) => Ok((position.with_y(y), None)),
+                None => Err(Error::Config {
+                    key: format!("{key}.position"),
+                    value: format!(
+                        "[{:?}, {:?}, {:?}]",
+                        self.position.x, self.position.y, self.position.z
+                    ),
+                    accepted: match mesh.bounds() {
+                        Some((low, high)) => format!(
+                            "a position with the proxy mesh below or above it, which spans x from {} to {} and z from {} to {}; or rest = \"position\"",
+                            low.x, high.x, low.z, high.z
+                        ),
+                        None => "rest = \"position\", for the proxy mesh has no triangles".into(),
+                    },
+                }),
+            },
+            _ => Ok((position, None)),
+        }
+    }
+}
+
+/// The height of the mesh's highest point on the vertical line through `position`.
+fn highest(mesh: &TriangleMesh, position: DVec3) -> Option<f64> {
+    let target = position.xz();
+    let mut best: Option<f64> = None;
+    for triangle in &mesh.indices {
+        let p = triangle.map(|i| mesh.positions[i as usize].as_dvec3());
+        let [a, b, c] = p.map(|p| p.xz() - target);
+        // Weights by areas; edges count as inside.
+        let w = [b.perp_dot(c), c.perp_dot(a), a.perp_dot(b)];
+        let area = w[0] + w[1] + w[2];
+        if area == 0.0 || w.iter().any(|w| w * area < 0.0) {
+            continue;
+        }
+        let y = (w[0] * p[0].y + w[1] * p[1].y + w[2] * p[2].y) / area;
+        best = Some(best.map_or(y, |b| b.max(y)));
+    }
+    best
 }

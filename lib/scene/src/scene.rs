@@ -1,9 +1,18 @@
 //! Everything that a renderer needs of a scene, but the light.
-use std::path::Path;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
 
-use crate::camera::Camera;
-use crate::config::SceneConfig;
+use dipir_imaging::file::{self, Photo};
+use dipir_imaging::raster::Raster;
+use dipir_imaging::transfer::Transfer;
+use glam::DMat4;
+
+use crate::camera::{Camera, CameraSettings};
+use crate::config::{EffectsConfig, ProxySettings, SceneConfig};
+use crate::description::{FileRecord, ObjectRecord, PhotoRecord, ProxyRecord, SceneDescription};
 use crate::error::Error;
+use crate::features::SceneFeatures;
+use crate::import::{self, Imported};
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
 use crate::proxy::Proxy;
@@ -24,11 +33,30 @@ pub struct Scene {
     pub proxy: Proxy,
 }
 
-/// A scene, the record of what it was made of, and what was ignored or repaired on the way.
+/// A file that went into a scene.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Input {
+    /// What it is: `background`, `object`, …
+    pub role: String,
+    /// As written, relative to the folder of the pipeline file where it can be.
+    pub path: PathBuf,
+    /// Where it was found.
+    pub location: PathBuf,
+}
+
+/// A scene with its photo, the record of what it was made of, and what was ignored or repaired.
 #[derive(Clone, Debug)]
 pub struct LoadedScene {
     /// The scene.
     pub scene: Scene,
+    /// The photo, linear.
+    pub photo: Photo,
+    /// The photo's own foreground, 1 in front of the object; of the photo's size.
+    pub occluders: Option<Raster<f32>>,
+    /// From which the same scene can be rebuilt.
+    pub description: SceneDescription,
+    /// All files that were read.
+    pub inputs: Vec<Input>,
     /// One sentence each.
     pub warnings: Vec<String>,
 }
@@ -36,10 +64,348 @@ pub struct LoadedScene {
 impl Scene {
     /// Reads all files that `config` names, relative to `base_dir`, and places the objects.
     pub fn load(config: &SceneConfig, base_dir: &Path) -> Result<LoadedScene, Error> {
-        let _ = (config, base_dir);
-        Err(Error::Missing {
-            key: "scene.objects".into(),
-            remedy: "name an object".into(),
+        let settings = config.validate()?;
+        let mut files = Files::new(base_dir);
+        let (photo, background) = files.photo(&settings.background, settings.transfer)?;
+        let resolution = [background.width, background.height];
+        let occluders = match &settings.occluders {
+            None => None,
+            Some(path) => Some((
+                files.mask(path, resolution)?,
+                files.record("occluders", path)?,
+            )),
+        };
+        if let CameraSettings::Transforms { path, .. } = &settings.camera {
+            files.input("camera", path);
+        }
+        let (camera, warnings) = settings.camera.resolve(resolution, base_dir)?;
+        files.warnings.extend(warnings);
+        let (proxy, proxy_record) = match &settings.proxy {
+            ProxySettings::None => (Proxy::None, ProxyRecord::None),
+            ProxySettings::Plane(plane) => (Proxy::Plane(*plane), ProxyRecord::Plane(*plane)),
+            ProxySettings::Mesh(path) => {
+                let (mesh, record) = files.proxy_mesh(path)?;
+                (Proxy::Mesh(mesh), ProxyRecord::Mesh(record))
+            }
+        };
+        let mut assembly = Assembly::new(settings.objects.iter().map(|o| o.path.clone()));
+        let mut objects = Vec::new();
+        for (i, object) in settings.objects.iter().enumerate() {
+            let key = format!("scene.objects[{i}]");
+            let (placed, warning) = assembly.add(&mut files, &object.path, |imported| {
+                let (map, warning) =
+                    object
+                        .placement
+                        .resolve(&imported.mesh, imported.origin, &proxy, &key)?;
+                // The record's map starts from the file's coordinates.
+                Ok((map * DMat4::from_translation(-imported.origin), warning))
+            })?;
+            files.warnings.extend(warning);
+            objects.push(placed);
+        }
+        let (mesh, materials, textures) = assembly.into_parts();
+        let (occluders, occluders_record) = occluders.unzip();
+        Ok(LoadedScene {
+            scene: Scene {
+                mesh,
+                materials,
+                textures,
+                camera,
+                proxy,
+            },
+            photo,
+            occluders,
+            description: SceneDescription {
+                schema: SceneDescription::SCHEMA.into(),
+                seed: 0,
+                class: settings.class,
+                background,
+                occluders: occluders_record,
+                objects,
+                camera,
+                proxy: proxy_record,
+                effects: settings.effects,
+            },
+            inputs: files.inputs,
+            warnings: files.warnings,
         })
+    }
+
+    /// Which kinds of surface the triangles have.
+    pub fn features(&self) -> SceneFeatures {
+        SceneFeatures::of(self)
+    }
+}
+
+impl SceneDescription {
+    /// Rebuilds the scene from the files it was made of; an error if one of them changed.
+    pub fn load(&self, base_dir: &Path) -> Result<LoadedScene, Error> {
+        let mut files = Files::new(base_dir);
+        files.check("the background", &self.background.file)?;
+        let (photo, background) =
+            files.photo(&self.background.file.path, self.background.transfer)?;
+        let resolution = [background.width, background.height];
+        let occluders = match &self.occluders {
+            None => None,
+            Some(record) => {
+                files.check("the occluders' mask", record)?;
+                files.input("occluders", &record.path);
+                Some(files.mask(&record.path, resolution)?)
+            }
+        };
+        let proxy = match &self.proxy {
+            ProxyRecord::None => Proxy::None,
+            ProxyRecord::Plane(plane) => Proxy::Plane(*plane),
+            ProxyRecord::Mesh(record) => {
+                files.check_object("the proxy mesh", record)?;
+                Proxy::Mesh(files.proxy_mesh(&record.file.path)?.0)
+            }
+        };
+        let mut assembly = Assembly::new(self.objects.iter().map(|o| o.file.path.clone()));
+        for object in &self.objects {
+            files.check_object("the object", object)?;
+            assembly.add(&mut files, &object.file.path, |_| {
+                Ok((object.transform(), ()))
+            })?;
+        }
+        let (mesh, materials, textures) = assembly.into_parts();
+        Ok(LoadedScene {
+            scene: Scene {
+                mesh,
+                materials,
+                textures,
+                camera: self.camera,
+                proxy,
+            },
+            photo,
+            occluders,
+            description: self.clone(),
+            inputs: files.inputs,
+            warnings: files.warnings,
+        })
+    }
+
+    /// What the user says about effects.
+    pub fn effects(&self) -> &EffectsConfig {
+        &self.effects
+    }
+}
+
+/// Reads files relative to a folder and keeps the list.
+struct Files<'a> {
+    base_dir: &'a Path,
+    inputs: Vec<Input>,
+    warnings: Vec<String>,
+    hashes: HashMap<PathBuf, String>,
+}
+
+impl<'a> Files<'a> {
+    fn new(base_dir: &'a Path) -> Self {
+        Self {
+            base_dir,
+            inputs: Vec::new(),
+            warnings: Vec::new(),
+            hashes: HashMap::new(),
+        }
+    }
+
+    fn input(&mut self, role: &str, path: &Path) {
+        let input = Input {
+            role: role.into(),
+            path: path.into(),
+            location: self.base_dir.join(path),
+        };
+        if !self.inputs.contains(&input) {
+            self.inputs.push(input);
+        }
+    }
+
+    /// Notes a file with its hash.
+    fn record(&mut self, role: &str, path: &Path) -> Result<FileRecord, Error> {
+        self.input(role, path);
+        Ok(FileRecord {
+            path: path.into(),
+            blake3: self.hash(role, path)?,
+        })
+    }
+
+    fn hash(&mut self, role: &str, path: &Path) -> Result<String, Error> {
+        let location = self.base_dir.join(path);
+        if let Some(known) = self.hashes.get(&location) {
+            return Ok(known.clone());
+        }
+        let mut hasher = blake3::Hasher::new();
+        std::fs::File::open(&location)
+            .and_then(|file| hasher.update_reader(file).map(|_| ()))
+            .map_err(|source| Error::Read {
+                role: role.into(),
+                path: location.clone(),
+                source,
+            })?;
+        let hash = hasher.finalize().to_hex().to_string();
+        self.hashes.insert(location, hash.clone());
+        Ok(hash)
+    }
+
+    fn check(&mut self, role: &str, record: &FileRecord) -> Result<(), Error> {
+        let found = self.hash(role, &record.path)?;
+        if found == record.blake3 {
+            return Ok(());
+        }
+        Err(Error::Changed {
+            role: role.into(),
+            path: record.path.clone(),
+            found,
+            expected: record.blake3.clone(),
+        })
+    }
+
+    fn check_object(&mut self, role: &str, record: &ObjectRecord) -> Result<(), Error> {
+        self.check(role, &record.file)?;
+        for dependency in &record.dependencies {
+            self.check(&format!("a part of {role}"), dependency)?;
+        }
+        Ok(())
+    }
+
+    fn photo(&mut self, path: &Path, transfer: Transfer) -> Result<(Photo, PhotoRecord), Error> {
+        let photo = file::read_photo(self.base_dir.join(path), transfer)?;
+        let record = PhotoRecord {
+            file: self.record("background", path)?,
+            width: photo.image.0.width() as u32,
+            height: photo.image.0.height() as u32,
+            transfer,
+        };
+        Ok((photo, record))
+    }
+
+    fn mask(&self, path: &Path, [width, height]: [u32; 2]) -> Result<Raster<f32>, Error> {
+        let mask = file::read_mask(self.base_dir.join(path))?;
+        if (mask.width(), mask.height()) == (width as usize, height as usize) {
+            return Ok(mask);
+        }
+        Err(Error::Config {
+            key: "scene.occluders".into(),
+            value: format!(
+                "an image of {} x {} pixels (\"{}\")",
+                mask.width(),
+                mask.height(),
+                path.display()
+            ),
+            accepted: format!("one of the background's size, {width} x {height}"),
+        })
+    }
+
+    /// Imports an object and notes all files that it consists of.
+    fn import(&mut self, role: &str, path: &Path) -> Result<(Imported, ObjectRecord), Error> {
+        let imported = import::load_object(&self.base_dir.join(path))?;
+        let shown = path.display();
+        self.warnings.extend(
+            imported
+                .warnings
+                .iter()
+                .map(|w| format!("\"{shown}\": {w}")),
+        );
+        let file = self.record(role, path)?;
+        let mut dependencies = Vec::new();
+        for found in &imported.dependencies {
+            let relative = found.strip_prefix(self.base_dir).unwrap_or(found);
+            dependencies.push(self.record(&format!("part of {role}"), relative)?);
+        }
+        let record = ObjectRecord {
+            file,
+            dependencies,
+            transform: ObjectRecord::rows(&DMat4::IDENTITY),
+            vertices: imported.mesh.positions.len() as u64,
+            triangles: imported.mesh.indices.len() as u64,
+        };
+        Ok((imported, record))
+    }
+
+    fn proxy_mesh(&mut self, path: &Path) -> Result<(TriangleMesh, ObjectRecord), Error> {
+        let (mut imported, record) = self.import("proxy", path)?;
+        imported
+            .mesh
+            .transform(&DMat4::from_translation(imported.origin));
+        Ok((imported.mesh, record))
+    }
+}
+
+/// Objects put together into one mesh; a file that several objects use is read once and its
+/// materials are shared.
+struct Assembly {
+    mesh: TriangleMesh,
+    materials: Vec<Material>,
+    textures: Vec<Texture>,
+    /// How many objects of each file are still to come.
+    pending: HashMap<PathBuf, usize>,
+    kept: HashMap<PathBuf, (Imported, ObjectRecord, u32)>,
+}
+
+impl Assembly {
+    fn new(paths: impl Iterator<Item = PathBuf>) -> Self {
+        let mut pending = HashMap::new();
+        for path in paths {
+            *pending.entry(path).or_insert(0) += 1;
+        }
+        Self {
+            mesh: TriangleMesh::default(),
+            materials: Vec::new(),
+            textures: Vec::new(),
+            pending,
+            kept: HashMap::new(),
+        }
+    }
+
+    /// Adds the object in `path`; `place` gives the map from its file's coordinates to the world.
+    fn add<W>(
+        &mut self,
+        files: &mut Files,
+        path: &Path,
+        place: impl FnOnce(&Imported) -> Result<(DMat4, W), Error>,
+    ) -> Result<(ObjectRecord, W), Error> {
+        let (mut imported, mut record, first_material) = match self.kept.remove(path) {
+            Some(kept) => kept,
+            None => {
+                let (mut imported, record) = files.import("object", path)?;
+                let first_material = self.materials.len() as u32;
+                let first_texture = self.textures.len() as u32;
+                for mut material in std::mem::take(&mut imported.materials) {
+                    material.shift_textures(first_texture);
+                    self.materials.push(material);
+                }
+                self.textures.append(&mut imported.textures);
+                (imported, record, first_material)
+            }
+        };
+        let (map, extra) = place(&imported)?;
+        let pending = self.pending.entry(path.into()).or_insert(1);
+        *pending -= 1;
+        let origin = imported.origin;
+        let mut mesh = if *pending > 0 {
+            let mesh = imported.mesh.clone();
+            let kept = (imported, record.clone(), first_material);
+            self.kept.insert(path.into(), kept);
+            mesh
+        } else {
+            std::mem::take(&mut imported.mesh)
+        };
+        mesh.transform(&(map * DMat4::from_translation(origin)));
+        if let Some(bad) = mesh.first_non_finite() {
+            return Err(Error::NotFinite {
+                place: format!("\"{}\", as placed", path.display()),
+                element: bad as u64,
+                value: format!("{:?}", mesh.positions[bad].to_array()),
+            });
+        }
+        record.transform = ObjectRecord::rows(&map);
+        let total = self.mesh.positions.len() as u64 + mesh.positions.len() as u64;
+        import::Limits::default().check(total, self.mesh.indices.len() as u64)?;
+        self.mesh.append(mesh, first_material);
+        Ok((record, extra))
+    }
+
+    fn into_parts(self) -> (TriangleMesh, Vec<Material>, Vec<Texture>) {
+        (self.mesh, self.materials, self.textures)
     }
 }

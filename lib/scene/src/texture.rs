@@ -127,9 +127,8 @@ impl Texture {
 
     /// Looks `texels` up the way this texture says.
     pub fn with_texels(&self, texels: Arc<Raster<[u8; 4]>>) -> DecodedTexture {
-        let linear = |transfer: Transfer| {
-            std::array::from_fn(|i| transfer.decode_scalar(i as f32 / 255.0))
-        };
+        let linear =
+            |transfer: Transfer| std::array::from_fn(|i| transfer.decode_scalar(i as f32 / 255.0));
         DecodedTexture {
             texels,
             color_linear: Box::new(match self.encoding {

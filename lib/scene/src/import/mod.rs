@@ -60,7 +60,7 @@ impl Default for Limits {
 }
 
 impl Limits {
-    fn check(&self, vertices: u64, triangles: u64) -> Result<(), Error> {
+    pub(crate) fn check(&self, vertices: u64, triangles: u64) -> Result<(), Error> {
         for (count, things, limit) in [
             (vertices, "vertices", self.max_vertices),
             (triangles, "triangles", self.max_triangles),

@@ -1,0 +1,135 @@
+//! `scene.json`: what a scene was made of, so that another executable rebuilds the same.
+use std::path::{Path, PathBuf};
+
+use dipir_imaging::transfer::Transfer;
+use glam::DMat4;
+use serde::{Deserialize, Serialize};
+
+use crate::camera::Camera;
+use crate::config::EffectsConfig;
+use crate::error::Error;
+use crate::proxy::Plane;
+
+/// A file with the hash of its contents.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FileRecord {
+    /// Relative to the folder of the pipeline file, or absolute.
+    pub path: PathBuf,
+    /// BLAKE3, hexadecimal.
+    pub blake3: String,
+}
+
+/// The photo.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PhotoRecord {
+    /// Its file.
+    #[serde(flatten)]
+    pub file: FileRecord,
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// How its values are encoded.
+    pub transfer: Transfer,
+}
+
+/// An object as placed, or a proxy mesh.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ObjectRecord {
+    /// The object's file.
+    #[serde(flatten)]
+    pub file: FileRecord,
+    /// Buffers, images and material libraries beside it.
+    pub dependencies: Vec<FileRecord>,
+    /// Rows of the matrix that maps the file's coordinates to the world, metres.
+    pub transform: [[f64; 4]; 4],
+    /// Vertices after import.
+    pub vertices: u64,
+    /// Triangles after import.
+    pub triangles: u64,
+}
+
+impl ObjectRecord {
+    pub(crate) fn rows(map: &DMat4) -> [[f64; 4]; 4] {
+        map.transpose().to_cols_array_2d()
+    }
+
+    /// Maps the file's coordinates to the world.
+    pub fn transform(&self) -> DMat4 {
+        DMat4::from_cols_array_2d(&self.transform).transpose()
+    }
+}
+
+/// What receives the shadow.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ProxyRecord {
+    /// Nothing.
+    None,
+    /// A plane.
+    Plane(Plane),
+    /// A mesh in world coordinates.
+    Mesh(ObjectRecord),
+}
+
+/// The content of `scene.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneDescription {
+    /// [`SceneDescription::SCHEMA`].
+    pub schema: String,
+    /// Of every random number.
+    pub seed: u64,
+    /// What the object is called in prompts.
+    pub class: String,
+    /// The photo.
+    pub background: PhotoRecord,
+    /// Mask of the photo's own foreground.
+    pub occluders: Option<FileRecord>,
+    /// In the order of the configuration.
+    pub objects: Vec<ObjectRecord>,
+    /// The photo's camera.
+    pub camera: Camera,
+    /// What receives the shadow.
+    pub proxy: ProxyRecord,
+    /// What the user says about effects.
+    pub effects: EffectsConfig,
+}
+
+impl SceneDescription {
+    /// Name and version of the format.
+    pub const SCHEMA: &str = "dipir.scene.v1";
+
+    /// Writes the description as JSON.
+    pub fn write(&self, path: &Path) -> Result<(), Error> {
+        let mut text = serde_json::to_string_pretty(self)
+            .map_err(|e| Error::malformed(e.to_string(), "report this as a bug"))?;
+        text.push('\n');
+        std::fs::write(path, text).map_err(|source| Error::Write {
+            path: path.into(),
+            source,
+        })
+    }
+
+    /// Reads a description.
+    pub fn read(path: &Path) -> Result<Self, Error> {
+        const AGAIN: &str = "run dipir-scene again";
+        let bytes = std::fs::read(path).map_err(|source| Error::Read {
+            role: "the scene description".into(),
+            path: path.into(),
+            source,
+        })?;
+        let description: Self = serde_json::from_slice(&bytes).map_err(|e| {
+            Error::malformed(format!("not a scene description: {e}"), AGAIN).in_file(path)
+        })?;
+        if description.schema != Self::SCHEMA {
+            let detail = format!(
+                "schema is \"{}\"; accepted: \"{}\"",
+                description.schema,
+                Self::SCHEMA
+            );
+            return Err(Error::malformed(detail, AGAIN).in_file(path));
+        }
+        Ok(description)
+    }
+}
