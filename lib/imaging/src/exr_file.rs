@@ -1,6 +1,7 @@
 //! OpenEXR files in and out, between the `exr` library and [`Layers`].
 use crate::{
     error::{ImagingError, MAX_PIXELS},
+    file::check_size,
     format::Format,
     layers::{Layers, Precision},
     raster::Raster,
@@ -189,17 +190,6 @@ fn place(
         }
     }
     placed
-}
-
-fn check_size(path: &Path, width: usize, height: usize) -> Result<(), ImagingError> {
-    match width.checked_mul(height) {
-        Some(1..=MAX_PIXELS) => Ok(()),
-        _ => Err(ImagingError::BadSize {
-            what: format!("`{}`", path.display()),
-            width,
-            height,
-        }),
-    }
 }
 
 fn read_error(path: &Path, error: exr::error::Error) -> ImagingError {

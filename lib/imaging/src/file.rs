@@ -208,12 +208,8 @@ fn decode_with(
 ) -> image::ImageResult<Result<DynamicImage, ImagingError>> {
     let (width, height) = decoder.dimensions();
     let (width, height) = (width as usize, height as usize);
-    if width.saturating_mul(height) > MAX_PIXELS {
-        return Ok(Err(ImagingError::BadSize {
-            what: format!("`{}`", path.display()),
-            width,
-            height,
-        }));
+    if let Err(error) = check_size(path, width, height) {
+        return Ok(Err(error));
     }
     let orientation = decoder.orientation();
     let mut decoded = DynamicImage::from_decoder(decoder)?;
@@ -291,6 +287,17 @@ fn linear_of_layers(layers: &Layers, path: &Path) -> Result<LinearImage, Imaging
     Ok(LinearImage(colour))
 }
 
+pub(crate) fn check_size(path: &Path, width: usize, height: usize) -> Result<(), ImagingError> {
+    if (1..=MAX_PIXELS).contains(&width.saturating_mul(height)) {
+        return Ok(());
+    }
+    Err(ImagingError::BadSize {
+        what: format!("`{}`", path.display()),
+        width,
+        height,
+    })
+}
+
 fn decode_hdr(bytes: &[u8], path: &Path) -> Result<LinearImage, ImagingError> {
     let failed = |error| image_error(path, Format::Hdr, error);
     // Some programs sign with `#?RGBE`, which the strict decoder does not know.
@@ -300,16 +307,14 @@ fn decode_hdr(bytes: &[u8], path: &Path) -> Result<LinearImage, ImagingError> {
         HdrDecoder::new_nonstrict(Cursor::new(bytes))
     };
     let decoder = decoder.map_err(failed)?;
-    let decoded = decode_with(decoder, path, Orient::AsStored).map_err(failed)??;
-    let rgb = decoded.into_rgb32f();
-    let (width, height) = (rgb.width() as usize, rgb.height() as usize);
-    let pixels = rgb
-        .into_raw()
-        .as_chunks::<3>()
-        .0
-        .iter()
-        .map(|&c| Vec3::from_array(c))
-        .collect();
+    let (width, height) = decoder.dimensions();
+    let (width, height) = (width as usize, height as usize);
+    check_size(path, width, height)?;
+    // Decoded in place: a 4k map is 100 MB, which a conversion would move twice.
+    let mut samples = vec![[0.0f32; 3]; width * height];
+    let bytes = bytemuck::cast_slice_mut(&mut samples);
+    decoder.read_image(bytes).map_err(failed)?;
+    let pixels = samples.into_iter().map(Vec3::from_array).collect();
     let image = Raster::from_pixels(width, height, pixels);
     check_finite(path, &image)?;
     Ok(LinearImage(image))

@@ -18,10 +18,7 @@ pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
     let mut at = 2;
     loop {
         // Between segments there may be entropy-coded data or fill bytes: go to the next marker.
-        // 0xff00 is a stuffed data byte, 0xffd0 to 0xffd7 are restart markers inside the data.
-        while at + 1 < bytes.len()
-            && !(bytes[at] == 0xff && !matches!(bytes[at + 1], 0x00 | 0xff | 0xd0..=0xd7))
-        {
+        while at + 1 < bytes.len() && !is_marker(bytes[at], bytes[at + 1]) {
             at += 1;
         }
         let Some(&marker) = bytes.get(at + 1) else {
@@ -46,4 +43,10 @@ pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
         }
         at += 2 + usize::from(u16::from_be_bytes([high, low])).max(2);
     }
+}
+
+/// Whether two bytes start a segment. 0xff00 is a stuffed data byte, 0xffff fill, and 0xffd0 to
+/// 0xffd7 are restart markers inside the data.
+fn is_marker(first: u8, second: u8) -> bool {
+    first == 0xff && !matches!(second, 0x00 | 0xff | 0xd0..=0xd7)
 }

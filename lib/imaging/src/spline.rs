@@ -174,8 +174,8 @@ impl Knots {
                     "`{name}` goes from {first} to {last}, not from 0 to 1"
                 ));
             }
-            // Negated, so that NaN fails.
-            if let Some(k) = (0..BINS).find(|&k| !(values[k + 1] > values[k])) {
+            let rises = |k: &usize| values[k + 1] > values[*k];
+            if let Some(k) = (0..BINS).find(|k| !rises(k)) {
                 return Err(format!("`{name}` does not rise after knot {k}"));
             }
         }
@@ -192,62 +192,99 @@ impl Knots {
         }
     }
 
-    /// The curve at `x`. Strictly increasing, once continuously differentiable everywhere.
+    /// The curve, prepared for many inputs.
+    pub fn curve(&self) -> Curve {
+        Curve {
+            knots: *self,
+            bins: std::array::from_fn(|k| Bin::new(self, k)),
+        }
+    }
+
+    /// [`Curve::eval`] at one input.
+    pub fn eval(&self, x: f64) -> f64 {
+        self.curve().eval(x)
+    }
+
+    /// [`Curve::slope`] at one input.
+    pub fn slope(&self, x: f64) -> f64 {
+        self.curve().slope(x)
+    }
+
+    /// [`Curve::eval_vjp`] at one input.
+    pub fn eval_vjp(&self, x: f64, gradient: f64, knots: &mut KnotGradient) -> f64 {
+        self.curve().eval_vjp(x, gradient, knots)
+    }
+
+    /// [`Curve::inverse`] at one height.
+    pub fn inverse(&self, y: f64) -> f64 {
+        self.curve().inverse(y)
+    }
+}
+
+/// The curve through [`Knots`], with what each bin needs worked out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Curve {
+    knots: Knots,
+    bins: [Bin; BINS],
+}
+
+impl Curve {
+    /// The curve at `x`. Strictly increasing, once continuously differentiable everywhere, exact
+    /// at both ends.
     #[inline]
     pub fn eval(&self, x: f64) -> f64 {
-        if x < 0.0 {
-            return self.slopes[0] * x;
+        if x <= 0.0 {
+            return self.knots.slopes[0] * x;
         }
-        if x > 1.0 {
-            return 1.0 + self.slopes[BINS] * (x - 1.0);
+        if x >= 1.0 {
+            return 1.0 + self.knots.slopes[BINS] * (x - 1.0);
         }
-        let bin = self.bin(x, &self.x);
-        let at = bin.at((x - bin.x) / bin.w);
-        bin.y + bin.h * at.numerator / at.denominator
+        let bin = &self.bins[find(x, &self.knots.x)];
+        let at = bin.at(x);
+        bin.y + bin.h * at.ratio
     }
 
     /// Derivative of [`eval`](Self::eval), positive.
     #[inline]
     pub fn slope(&self, x: f64) -> f64 {
-        if x < 0.0 {
-            return self.slopes[0];
+        if x <= 0.0 {
+            return self.knots.slopes[0];
         }
-        if x > 1.0 {
-            return self.slopes[BINS];
+        if x >= 1.0 {
+            return self.knots.slopes[BINS];
         }
-        let bin = self.bin(x, &self.x);
-        bin.slope(&bin.at((x - bin.x) / bin.w))
+        let bin = &self.bins[find(x, &self.knots.x)];
+        bin.slope(&bin.at(x))
     }
 
     /// Adjoint of [`eval`](Self::eval): adds to `knots` the gradient with respect to the knots, and
-    /// returns that with respect to `x`, for a gradient with respect to the result. At a knot the
-    /// bin above counts, at 1 the last bin.
+    /// returns that with respect to `x`, for a gradient with respect to the result. At an inner
+    /// knot the bin above counts, at both ends the tail.
     #[inline]
     pub fn eval_vjp(&self, x: f64, gradient: f64, knots: &mut KnotGradient) -> f64 {
-        if x < 0.0 {
+        if x <= 0.0 {
             knots.slopes[0] += gradient * x;
-            return gradient * self.slopes[0];
+            return gradient * self.knots.slopes[0];
         }
-        if x > 1.0 {
+        if x >= 1.0 {
             knots.slopes[BINS] += gradient * (x - 1.0);
-            return gradient * self.slopes[BINS];
+            return gradient * self.knots.slopes[BINS];
         }
-        let bin = self.bin(x, &self.x);
-        let at = bin.at((x - bin.x) / bin.w);
-        let (xi, q) = (at.xi, at.q);
-        let ratio = at.numerator / at.denominator;
+        let k = find(x, &self.knots.x);
+        let bin = &self.bins[k];
+        let at = bin.at(x);
+        let (xi, q, ratio) = (at.xi, at.q, at.ratio);
         let input = gradient * bin.slope(&at);
 
         // y = y0 + h N / D with N = s xi^2 + d0 q and D = s + (d0 + d1 - 2 s) q.
-        let to_ratio = gradient * bin.h / at.denominator;
+        let to_ratio = gradient * bin.h * at.per_denominator;
         let to_d0 = to_ratio * q * (1.0 - ratio);
         let to_d1 = -to_ratio * q * ratio;
         let to_s = to_ratio * (xi * xi - ratio * (1.0 - 2.0 * q));
         // s = h / w and xi = (x - x0) / w, whose derivative was taken with the slope.
-        let to_h = gradient * ratio + to_s / bin.w;
-        let to_w = -(to_s * bin.s / bin.w + input * xi);
+        let to_h = gradient * ratio + to_s * bin.per_w;
+        let to_w = -(to_s * bin.s * bin.per_w + input * xi);
 
-        let k = bin.index;
         knots.x[k] += -input - to_w;
         knots.x[k + 1] += to_w;
         knots.y[k] += gradient - to_h;
@@ -259,13 +296,14 @@ impl Knots {
 
     /// The `x` at which the curve is `y`.
     pub fn inverse(&self, y: f64) -> f64 {
-        if y < 0.0 {
-            return y / self.slopes[0];
+        if y <= 0.0 {
+            return y / self.knots.slopes[0];
         }
-        if y > 1.0 {
-            return 1.0 + (y - 1.0) / self.slopes[BINS];
+        if y >= 1.0 {
+            return 1.0 + (y - 1.0) / self.knots.slopes[BINS];
         }
-        let bin = self.bin(y, &self.y);
+        let k = find(y, &self.knots.y);
+        let bin = &self.bins[k];
         // The root of a xi^2 + b xi + c that lies in [0, 1], in the form that does not cancel
         // [Durkan et al. 2019, appendix A]. The discriminant is not negative but for rounding.
         let rise = (y - bin.y) / bin.h;
@@ -274,35 +312,22 @@ impl Knots {
         let c = -bin.s * rise;
         let root = (b * b - 4.0 * a * c).max(0.0).sqrt();
         let xi = if c == 0.0 { 0.0 } else { -2.0 * c / (b + root) };
-        bin.x + bin.w * xi.clamp(0.0, 1.0)
-    }
-
-    /// The bin that holds `value` in `[0, 1]` along the axis whose knots are `edges`.
-    #[inline]
-    fn bin(&self, value: f64, edges: &[f64; KNOTS]) -> Bin {
-        let index = (1..BINS).map(|k| usize::from(value >= edges[k])).sum();
-        let w = self.x[index + 1] - self.x[index];
-        let h = self.y[index + 1] - self.y[index];
-        let (d0, d1, s) = (self.slopes[index], self.slopes[index + 1], h / w);
-        Bin {
-            index,
-            x: self.x[index],
-            w,
-            y: self.y[index],
-            h,
-            d0,
-            d1,
-            s,
-            bend: d0 + d1 - 2.0 * s,
-        }
+        bin.x + (self.knots.x[k + 1] - bin.x) * xi.clamp(0.0, 1.0)
     }
 }
 
-/// One bin: its lower left corner, size, slopes at its ends, and mean slope `s`.
+/// The bin that holds `value` in `[0, 1]` along the axis whose knots are `edges`.
+#[inline]
+fn find(value: f64, edges: &[f64; KNOTS]) -> usize {
+    (1..BINS).map(|k| usize::from(value >= edges[k])).sum()
+}
+
+/// One bin: its lower left corner, height, `1 / w` of its width, slopes at its ends, mean slope
+/// `s = h / w`, and `d0 + d1 - 2 s`.
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Bin {
-    index: usize,
     x: f64,
-    w: f64,
+    per_w: f64,
     y: f64,
     h: f64,
     d0: f64,
@@ -311,24 +336,42 @@ struct Bin {
     bend: f64,
 }
 
-/// A position in a bin, with `q = xi (1 - xi)` and the two quadratics.
+/// A position in a bin, with `q = xi (1 - xi)`, and the quotient of the two quadratics.
 struct Position {
     xi: f64,
     q: f64,
-    numerator: f64,
-    denominator: f64,
+    per_denominator: f64,
+    ratio: f64,
 }
 
 impl Bin {
+    fn new(knots: &Knots, k: usize) -> Self {
+        let w = knots.x[k + 1] - knots.x[k];
+        let h = knots.y[k + 1] - knots.y[k];
+        let (d0, d1, s) = (knots.slopes[k], knots.slopes[k + 1], h / w);
+        Self {
+            x: knots.x[k],
+            per_w: 1.0 / w,
+            y: knots.y[k],
+            h,
+            d0,
+            d1,
+            s,
+            bend: d0 + d1 - 2.0 * s,
+        }
+    }
+
     #[inline]
-    fn at(&self, xi: f64) -> Position {
+    fn at(&self, x: f64) -> Position {
+        let xi = (x - self.x) * self.per_w;
         let q = xi * (1.0 - xi);
+        // The denominator is s (1 - 2 q) + (d0 + d1) q, positive as q <= 1/4.
+        let per_denominator = 1.0 / (self.s + self.bend * q);
         Position {
             xi,
             q,
-            numerator: self.s * xi * xi + self.d0 * q,
-            // Positive: a weighted mean of s, d0 and d1 in disguise, as q <= 1/4.
-            denominator: self.s + self.bend * q,
+            per_denominator,
+            ratio: (self.s * xi * xi + self.d0 * q) * per_denominator,
         }
     }
 
@@ -336,7 +379,7 @@ impl Bin {
     fn slope(&self, at: &Position) -> f64 {
         let rest = 1.0 - at.xi;
         let quadratic = self.d1 * at.xi * at.xi + 2.0 * self.s * at.q + self.d0 * rest * rest;
-        let ratio = self.s / at.denominator;
+        let ratio = self.s * at.per_denominator;
         ratio * ratio * quadratic
     }
 }

@@ -3,7 +3,7 @@
 use crate::{
     error::ImagingError,
     raster::{LinearImage, Raster},
-    spline::{KnotGradient, Knots, PARAMETERS, SplineParameters},
+    spline::{Curve, KnotGradient, Knots, PARAMETERS, SplineParameters},
 };
 use dipir_numerics::sum::par_reduce;
 use glam::Vec3;
@@ -132,76 +132,22 @@ impl ToneCurves {
         ToneParameters::default().curves()
     }
 
-    /// Tone-maps one premultiplied pixel of the object: Reinhard and the spline act on
-    /// `object / alpha`, the colour of the covered part, and the result is premultiplied again.
-    /// Black where `alpha` is 0.
-    #[inline]
-    pub fn object_pixel(&self, object: Vec3, alpha: f32) -> Vec3 {
-        if alpha <= 0.0 {
-            return Vec3::ZERO;
+    /// The curves, prepared for many pixels.
+    pub fn mapper(&self) -> ToneMapper {
+        ToneMapper {
+            foreground: self.foreground.curve(),
+            shadow: self.shadow.map(|s| s.curve()),
         }
-        let alpha = f64::from(alpha);
-        let tone = |v: f32| (alpha * self.foreground.eval(reinhard(f64::from(v) / alpha))) as f32;
-        Vec3::new(tone(object.x), tone(object.y), tone(object.z))
     }
 
-    /// Adjoint of [`object_pixel`](Self::object_pixel) for a fixed `alpha`: adds to `knots`, returns
-    /// the gradient with respect to the premultiplied colour.
-    #[inline]
-    pub fn object_pixel_vjp(
-        &self,
-        object: Vec3,
-        alpha: f32,
-        gradient: Vec3,
-        knots: &mut KnotGradient,
-    ) -> Vec3 {
-        if alpha <= 0.0 {
-            return Vec3::ZERO;
-        }
-        let alpha = f64::from(alpha);
-        let mut channel = |v: f32, g: f32| {
-            let v = f64::from(v) / alpha;
-            // The two factors of alpha, before and after the curve, cancel in this gradient.
-            let inner = self
-                .foreground
-                .eval_vjp(reinhard(v), alpha * f64::from(g), knots);
-            (reinhard_vjp(v, inner) / alpha) as f32
-        };
-        Vec3::new(
-            channel(object.x, gradient.x),
-            channel(object.y, gradient.y),
-            channel(object.z, gradient.z),
-        )
-    }
-
-    /// Tone-maps one pixel's shadow ratio, each channel by its own curve. 1 stays 1.
-    #[inline]
-    pub fn shadow_pixel(&self, shadow: Vec3) -> Vec3 {
-        let tone = |c: usize| self.shadow[c].eval(f64::from(shadow[c])) as f32;
-        Vec3::new(tone(0), tone(1), tone(2))
-    }
-
-    /// Adjoint of [`shadow_pixel`](Self::shadow_pixel): adds to `knots`, returns the gradient with
-    /// respect to the ratio.
-    #[inline]
-    pub fn shadow_pixel_vjp(
-        &self,
-        shadow: Vec3,
-        gradient: Vec3,
-        knots: &mut [KnotGradient; 3],
-    ) -> Vec3 {
-        let mut channel = |c: usize| {
-            let (x, g) = (f64::from(shadow[c]), f64::from(gradient[c]));
-            self.shadow[c].eval_vjp(x, g, &mut knots[c]) as f32
-        };
-        Vec3::new(channel(0), channel(1), channel(2))
-    }
-
-    /// [`object_pixel`](Self::object_pixel) over an image. Panics if the sizes differ.
+    /// [`ToneMapper::object_pixel`] over an image. Panics if the sizes differ.
     pub fn apply_object(&self, object: &LinearImage, alpha: &Raster<f32>) -> LinearImage {
         let (width, height) = same_size(&object.0, alpha);
         let pixels = object.0.pixels().par_iter().zip(alpha.pixels());
-        let toned = pixels.map(|(&rgb, &a)| self.object_pixel(rgb, a)).collect();
+        let mapper = self.mapper();
+        let toned = pixels
+            .map(|(&rgb, &a)| mapper.object_pixel(rgb, a))
+            .collect();
         LinearImage(Raster::from_pixels(width, height, toned))
     }
 
@@ -214,18 +160,19 @@ impl ToneCurves {
         gradient: &Raster<Vec3>,
     ) -> (Raster<Vec3>, KnotGradient) {
         same_size(&object.0, alpha);
-        let (object, alpha) = (&object.0, alpha.pixels());
+        let (object, alpha, mapper) = (&object.0, alpha.pixels(), self.mapper());
         let (pixels, tone) = vjp_by_chunks(object, gradient, |i, rgb, g, knots| {
-            self.object_pixel_vjp(rgb, alpha[i], g, &mut knots.foreground)
+            mapper.object_pixel_vjp(rgb, alpha[i], g, &mut knots.foreground)
         });
         (pixels, tone.foreground)
     }
 
-    /// [`shadow_pixel`](Self::shadow_pixel) over an image.
+    /// [`ToneMapper::shadow_pixel`] over an image.
     pub fn apply_shadow(&self, shadow: &LinearImage) -> LinearImage {
         let (width, height) = (shadow.0.width(), shadow.0.height());
         let pixels = shadow.0.pixels().par_iter();
-        let toned = pixels.map(|&beta| self.shadow_pixel(beta)).collect();
+        let mapper = self.mapper();
+        let toned = pixels.map(|&beta| mapper.shadow_pixel(beta)).collect();
         LinearImage(Raster::from_pixels(width, height, toned))
     }
 
@@ -236,8 +183,9 @@ impl ToneCurves {
         shadow: &LinearImage,
         gradient: &Raster<Vec3>,
     ) -> (Raster<Vec3>, [KnotGradient; 3]) {
+        let mapper = self.mapper();
         let (pixels, tone) = vjp_by_chunks(&shadow.0, gradient, |_, beta, g, knots| {
-            self.shadow_pixel_vjp(beta, g, &mut knots.shadow)
+            mapper.shadow_pixel_vjp(beta, g, &mut knots.shadow)
         });
         (pixels, tone.shadow)
     }
@@ -267,6 +215,83 @@ impl ToneCurves {
                 .map_err(|what| bad_tone(path, format!("in `{name}`, {what}")))?;
         }
         Ok(curves)
+    }
+}
+
+/// [`ToneCurves`] prepared for many pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ToneMapper {
+    foreground: Curve,
+    shadow: [Curve; 3],
+}
+
+impl ToneMapper {
+    /// Tone-maps one premultiplied pixel of the object: Reinhard and the spline act on
+    /// `object / alpha`, the colour of the covered part, and the result is premultiplied again.
+    /// Black where `alpha` is 0.
+    #[inline]
+    pub fn object_pixel(&self, object: Vec3, alpha: f32) -> Vec3 {
+        if alpha <= 0.0 {
+            return Vec3::ZERO;
+        }
+        let alpha = f64::from(alpha);
+        let per_alpha = 1.0 / alpha;
+        let tone = |v: f32| {
+            let covered = f64::from(v) * per_alpha;
+            (alpha * self.foreground.eval(reinhard(covered))) as f32
+        };
+        Vec3::new(tone(object.x), tone(object.y), tone(object.z))
+    }
+
+    /// Adjoint of [`ToneMapper::object_pixel`] for a fixed `alpha`: adds to `knots`, returns
+    /// the gradient with respect to the premultiplied colour.
+    #[inline]
+    pub fn object_pixel_vjp(
+        &self,
+        object: Vec3,
+        alpha: f32,
+        gradient: Vec3,
+        knots: &mut KnotGradient,
+    ) -> Vec3 {
+        if alpha <= 0.0 {
+            return Vec3::ZERO;
+        }
+        let alpha = f64::from(alpha);
+        let per_alpha = 1.0 / alpha;
+        let mut channel = |v: f32, g: f32| {
+            let v = f64::from(v) * per_alpha;
+            let to_curve = alpha * f64::from(g);
+            let inner = self.foreground.eval_vjp(reinhard(v), to_curve, knots);
+            (reinhard_vjp(v, inner) * per_alpha) as f32
+        };
+        Vec3::new(
+            channel(object.x, gradient.x),
+            channel(object.y, gradient.y),
+            channel(object.z, gradient.z),
+        )
+    }
+
+    /// Tone-maps one pixel's shadow ratio, each channel by its own curve. 1 stays 1.
+    #[inline]
+    pub fn shadow_pixel(&self, shadow: Vec3) -> Vec3 {
+        let tone = |c: usize| self.shadow[c].eval(f64::from(shadow[c])) as f32;
+        Vec3::new(tone(0), tone(1), tone(2))
+    }
+
+    /// Adjoint of [`ToneMapper::shadow_pixel`]: adds to `knots`, returns the gradient with
+    /// respect to the ratio.
+    #[inline]
+    pub fn shadow_pixel_vjp(
+        &self,
+        shadow: Vec3,
+        gradient: Vec3,
+        knots: &mut [KnotGradient; 3],
+    ) -> Vec3 {
+        let mut channel = |c: usize| {
+            let (x, g) = (f64::from(shadow[c]), f64::from(gradient[c]));
+            self.shadow[c].eval_vjp(x, g, &mut knots[c]) as f32
+        };
+        Vec3::new(channel(0), channel(1), channel(2))
     }
 }
 
@@ -391,13 +416,16 @@ mod tests {
 
     #[test]
     fn an_unshadowed_pixel_stays_unshadowed_under_every_curve() {
-        assert_eq!(bent().curves().shadow_pixel(Vec3::ONE), Vec3::ONE);
-        assert_eq!(bent().curves().shadow_pixel(Vec3::ZERO), Vec3::ZERO);
+        assert_eq!(bent().curves().mapper().shadow_pixel(Vec3::ONE), Vec3::ONE);
+        assert_eq!(
+            bent().curves().mapper().shadow_pixel(Vec3::ZERO),
+            Vec3::ZERO
+        );
     }
 
     #[test]
     fn the_curve_acts_on_the_covered_part_whatever_the_coverage() {
-        let curves = bent().curves();
+        let curves = bent().curves().mapper();
         let colour = Vec3::new(0.2, 1.0, 4.0);
         let full = curves.object_pixel(colour, 1.0);
         for alpha in [1e-6, 0.1, 0.75] {

@@ -543,3 +543,55 @@ proptest! {
         }
     }
 }
+
+/// One small file of each kind that is read.
+fn one_of_each() -> Vec<Vec<u8>> {
+    let noise: Vec<u8> = (0..16 * 16 * 3).map(|i| (i * 7919 % 251) as u8).collect();
+    let light: Vec<image::Rgb<f32>> = noise
+        .as_chunks::<3>()
+        .0
+        .iter()
+        .map(|&c| image::Rgb(c.map(f32::from)))
+        .collect();
+    let mut hdr = Vec::new();
+    codecs::hdr::HdrEncoder::new(&mut hdr)
+        .encode(&light, 16, 16)
+        .unwrap();
+    let folder = folder();
+    let path = folder.path().join("x.exr");
+    let colour = light.iter().map(|c| Vec3::from_array(c.0)).collect();
+    let mut layers = Layers::new(16, 16);
+    layers
+        .insert_rgb("", Precision::Half, &Raster::from_pixels(16, 16, colour))
+        .unwrap();
+    layers.write_exr(&path).unwrap();
+    vec![
+        png(&noise, 16, 16, ExtendedColorType::Rgb8),
+        jpeg(&noise, 16, 16, ExtendedColorType::Rgb8),
+        hdr,
+        std::fs::read(&path).unwrap(),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(128))]
+
+    /// An error or a picture, never a panic.
+    #[test]
+    fn files_with_damaged_bytes_never_panic(
+        kind in 0usize..4,
+        damage in proptest::collection::vec((0usize..400, any::<u8>()), 1..6),
+    ) {
+        let folder = folder();
+        let mut file = one_of_each().swap_remove(kind);
+        for (at, value) in damage {
+            let at = at % file.len();
+            file[at] = value;
+        }
+        let path = put(&folder, "x", &file);
+        if let Ok(photo) = read_photo(&path, Transfer::Srgb) {
+            prop_assert!(photo.image.0.pixels().iter().all(|p| p.is_finite()));
+        }
+        let _ = Layers::read_exr(&path);
+    }
+}
