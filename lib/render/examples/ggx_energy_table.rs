@@ -6,11 +6,11 @@ mod energy_quadrature;
 use dipir_render::bsdf::energy::grid;
 use energy_quadrature::{directional_albedo, mean_albedo};
 
-const LOSS_COLUMNS: usize = 33;
+const LOSS_COLUMNS: usize = 67;
 const LOSS_ROWS: usize = 33;
 const SHARE_COLUMNS: usize = 33;
 const SHARE_ROWS: usize = 65;
-const MEAN_ROWS: usize = 65;
+const MEAN_ROWS: usize = 129;
 const STEPS: usize = 384;
 
 fn quantise(x: f64, full_scale: f64) -> u16 {
@@ -31,6 +31,24 @@ fn print_table(
         println!("    [{}],", entries.join(", "));
     }
     println!("];");
+}
+
+/// What the loss table stores. Beyond normal incidence, where there are no directions, the line
+/// through the last ones goes on, so that interpolation up to there is right.
+fn loss_quotient(column: usize, alpha: f64) -> f64 {
+    let at = |mu: f64| directional_albedo(mu, alpha, STEPS).0 / grid::loss_shape(mu, alpha);
+    let x = grid::loss_abscissa(column);
+    if x * alpha <= 1.0 {
+        return at(x * alpha);
+    }
+    let before = (0..column)
+        .map(grid::loss_abscissa)
+        .take_while(|x| x * alpha < 0.85)
+        .last()
+        .unwrap_or(0.5 / alpha);
+    let slope = (at(1.0) - at(before * alpha)) / (1.0 / alpha - before);
+    // Not further than one octave: what lies there is never read.
+    at(1.0) + slope * (x.min(2.0 / alpha) - 1.0 / alpha)
 }
 
 fn main() {
@@ -56,9 +74,7 @@ fn main() {
         |column, row| {
             let r = grid::roughness(row, LOSS_ROWS);
             let alpha = r * r;
-            let mu = grid::loss_cosine(column, LOSS_COLUMNS, alpha);
-            let loss = directional_albedo(mu, alpha, STEPS).0;
-            quantise(loss / grid::loss_shape(mu, alpha), 8.0)
+            quantise(loss_quotient(column, alpha), 8.0)
         },
         (LOSS_COLUMNS, LOSS_ROWS),
     );

@@ -44,7 +44,7 @@ pub(super) struct Coat {
     /// Weight of the layer where it attenuates, and where it is seen.
     factor: f32,
     shown: f32,
-    energy: LobeEnergy,
+    pub energy: LobeEnergy,
     further_fresnel: f32,
     further: f32,
     /// `1 - C(wo)`.
@@ -60,7 +60,7 @@ pub(super) struct Coat {
 pub(super) struct CoatReflected {
     pub value: f32,
     pub specular_pdf: f32,
-    pub cosine_pdf: f32,
+    pub further_pdf: f32,
 }
 
 impl Coat {
@@ -144,12 +144,13 @@ impl Coat {
     }
 
     /// The coat's lobes at `wi` in its frame, above it; delta lobes left out.
+    /// `sum` is `wo + wi` in that frame.
     #[inline]
-    pub fn reflected(&self, wi: Vec3) -> CoatReflected {
+    pub fn reflected(&self, wi: Vec3, sum: Vec3) -> CoatReflected {
         let mut value = self.further * self.energy.loss(wi.z);
         let mut specular_pdf = 0.0;
         if let Some(ggx) = self.ggx {
-            let facet = Facet::new(&ggx, self.wo, wi);
+            let facet = Facet::new(&ggx, wi, sum);
             let fresnel = F0 + (1.0 - F0) * schlick_weight(facet.cosine);
             let v = Ggx::visibility(self.wo.z, self.wo_length, wi.z, facet.wi_length);
             value += fresnel * facet.d * v;
@@ -158,7 +159,7 @@ impl Coat {
         CoatReflected {
             value: self.shown * value * wi.z,
             specular_pdf,
-            cosine_pdf: wi.z * FRAC_1_PI,
+            further_pdf: self.energy.further_pdf(wi.z),
         }
     }
 }

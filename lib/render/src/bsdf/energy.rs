@@ -16,6 +16,10 @@ use super::energy_table::{
     LOSS, LOSS_COLUMNS, LOSS_ROWS, MEAN_LOSS, MEAN_ROWS, MEAN_SHARE, SHARE, SHARE_COLUMNS,
     SHARE_ROWS,
 };
+use std::f32::consts::TAU;
+
+use glam::{Vec2, Vec3};
+
 use super::fresnel::schlick_weight;
 use super::ggx::Ggx;
 
@@ -32,6 +36,8 @@ pub struct LobeEnergy {
     alpha: f32,
     loss_row: (usize, f32),
     share_row: (usize, f32),
+    /// `ln(1 + 1 / alpha)`.
+    log_range: f32,
     /// `1 - Eavg`: the share of light that single scattering loses on average.
     pub mean_loss: f32,
     /// `E5avg`: mean of single scattering with Fresnel factor `(1 - wo.h)^5`.
@@ -41,9 +47,20 @@ pub struct LobeEnergy {
 /// Index of the cell below `x * cells` and the position in it, for `x` in `[0, 1]`.
 #[inline]
 fn cell(x: f32, cells: usize) -> (usize, f32) {
-    let p = x * cells as f32;
+    split(x * cells as f32, cells)
+}
+
+#[inline]
+fn split(p: f32, cells: usize) -> (usize, f32) {
     let i = (p as usize).min(cells - 1);
     (i, p - i as f32)
+}
+
+/// The logarithm to base 2 of `x >= 0`, linear within each octave: a coordinate that costs two
+/// instructions. Very negative for 0.
+#[inline]
+fn octaves(x: f32) -> f32 {
+    (x.to_bits() as i32 - (127 << 23)) as f32 * (1.0 / 8_388_608.0)
 }
 
 #[inline]
@@ -66,6 +83,7 @@ impl LobeEnergy {
         alpha: 0.0,
         loss_row: (0, 0.0),
         share_row: (0, 0.0),
+        log_range: f32::INFINITY,
         mean_loss: 0.0,
         mean_e5: MEAN_SCHLICK,
     };
@@ -83,6 +101,7 @@ impl LobeEnergy {
             alpha,
             loss_row: cell(r, LOSS_ROWS - 1),
             share_row: cell(r, SHARE_ROWS - 1),
+            log_range: (1.0 + 1.0 / alpha).ln(),
             mean_loss: alpha * alpha * lerp(&MEAN_LOSS),
             mean_e5: lerp(&MEAN_SHARE),
         }
@@ -97,9 +116,9 @@ impl LobeEnergy {
         let sum = mu + self.alpha;
         let s = mu / sum;
         let w = self.alpha / sum;
-        // s grows to 1 / (1 + alpha) at normal incidence: use all columns.
-        let x = (s * (1.0 + self.alpha)).min(1.0).sqrt();
-        let q = bilinear(&LOSS, self.loss_row, cell(x, LOSS_COLUMNS - 1));
+        let column = octaves(mu / self.alpha) - grid::LOSS_FIRST_OCTAVE as f32;
+        let x = (column * (grid::LOSS_PER_OCTAVE as f32)).clamp(0.0, (LOSS_COLUMNS - 1) as f32);
+        let q = bilinear(&LOSS, self.loss_row, split(x, LOSS_COLUMNS - 1));
         q * LOSS_SCALE * s * w * w
     }
 
@@ -111,6 +130,25 @@ impl LobeEnergy {
         }
         let x = mu.min(1.0).sqrt();
         bilinear(&SHARE, self.share_row, cell(x, SHARE_COLUMNS - 1)) * SHARE_SCALE
+    }
+
+    /// Draws a direction for further bounces: the light that they return, `loss(mu) mu`, is
+    /// spread evenly over the logarithm of `mu` down to alpha, so the cosine has the density
+    /// `1 / ((mu + alpha) ln(1 + 1 / alpha))`. The cosine-weighted density would give rare
+    /// grazing directions weights of `1 / alpha`.
+    #[inline]
+    pub fn sample_further(&self, u: Vec2) -> Vec3 {
+        let mu = (self.alpha * (u.x * self.log_range).exp_m1()).clamp(0.0, 1.0);
+        let r = ((1.0 - mu) * (1.0 + mu)).sqrt();
+        let (s, c) = (TAU * u.y).sin_cos();
+        Vec3::new(r * c, r * s, mu)
+    }
+
+    /// Density per steradian of [`Self::sample_further`]; 0 for a mirror, which has no
+    /// further bounces.
+    #[inline]
+    pub fn further_pdf(&self, mu: f32) -> f32 {
+        1.0 / (TAU * (mu + self.alpha) * self.log_range)
     }
 
     /// `1 / (1 - Eavg)`, or 0 where nothing is lost and there is nothing to give back.
@@ -150,11 +188,17 @@ pub mod grid {
         (i as f64 / (rows - 1) as f64).max(MIN_ROUGHNESS)
     }
 
-    /// Cosine of column `i` of the loss table.
-    pub fn loss_cosine(i: usize, columns: usize, alpha: f64) -> f64 {
-        let x = i as f64 / (columns - 1) as f64;
-        let s = x * x / (1.0 + alpha);
-        (alpha * s / (1.0 - s)).clamp(1e-6 * alpha, 1.0)
+    /// Columns of the loss table lie at `mu / alpha` from 2^-8, below which hardly anything changes, to
+    /// the largest there is, 2^14; linearly within each octave.
+    pub const LOSS_FIRST_OCTAVE: i32 = -8;
+    /// Columns an octave.
+    pub const LOSS_PER_OCTAVE: usize = 3;
+
+    /// `mu / alpha` at column `i` of the loss table.
+    pub fn loss_abscissa(i: usize) -> f64 {
+        let octave = LOSS_FIRST_OCTAVE + (i / LOSS_PER_OCTAVE) as i32;
+        let fraction = (i % LOSS_PER_OCTAVE) as f64 / LOSS_PER_OCTAVE as f64;
+        2f64.powi(octave) * (1.0 + fraction)
     }
 
     /// What divides the loss before it is stored.

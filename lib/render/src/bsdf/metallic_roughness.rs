@@ -75,6 +75,8 @@ pub(super) struct Reflected {
     pub specular_pdf: f32,
     /// Density of sampling the cosine.
     pub cosine_pdf: f32,
+    /// Density of sampling further bounces.
+    pub further_pdf: f32,
 }
 
 impl Base {
@@ -192,9 +194,10 @@ impl Base {
             + self.further_dielectric * self.energy.mean_loss
     }
 
-    /// The reflecting lobes at `wi`, which lies above the surface; delta lobes left out.
+    /// The reflecting lobes at `wi`, which lies above the surface; delta lobes left out. `sum`
+    /// is `wo + wi`.
     #[inline]
-    pub fn reflected<const F: u32>(&self, wi: Vec3) -> Reflected {
+    pub fn reflected<const F: u32>(&self, wi: Vec3, sum: Vec3) -> Reflected {
         let cosine_pdf = wi.z * FRAC_1_PI;
         if !has(F, SPECULAR) {
             return Reflected {
@@ -208,7 +211,7 @@ impl Base {
             ..Reflected::default()
         };
         if let Some(ggx) = self.ggx {
-            let facet = Facet::new(&ggx, self.wo, wi);
+            let facet = Facet::new(&ggx, wi, sum);
             let visibility = match has(F, PLAIN_GGX) {
                 true => Ggx::separable_visibility,
                 false => Ggx::visibility,
@@ -226,6 +229,7 @@ impl Base {
             return result;
         }
         let loss = self.energy.loss(wi.z);
+        result.further_pdf = self.energy.further_pdf(wi.z);
         result.specular += self.further * (loss * wi.z);
         if self.diffuse != Vec3::ZERO {
             let left = 1.0 - self.dielectric_albedo(loss, self.energy.share(wi.z));
@@ -247,11 +251,13 @@ pub(super) struct Facet {
 }
 
 impl Facet {
+    /// From `wi` and the sum `wo + wi`, which the caller forms *before* both are turned into
+    /// the frame of the surface: where light grazes, the sum is short, and the rounding of two
+    /// turned vectors would exceed the width of a smooth surface's lobe.
     #[inline]
-    pub fn new(ggx: &Ggx, wo: Vec3, wi: Vec3) -> Self {
+    pub fn new(ggx: &Ggx, wi: Vec3, sum: Vec3) -> Self {
         // Both unit vectors lie above the surface, so their sum is not zero; its length is
         // twice the cosine, the same seen from either side.
-        let sum = wo + wi;
         let length = sum.length();
         Self {
             cosine: (0.5 * length).min(1.0),

@@ -13,11 +13,18 @@ mod lambert;
 mod metallic_roughness;
 mod transmission;
 
+#[cfg(test)]
+mod energy_quadrature;
+#[cfg(test)]
+mod harness;
+#[cfg(test)]
+mod tests;
+
 use dipir_numerics::warp::{Frame, square_to_cosine_hemisphere};
 use glam::{Vec2, Vec3};
 
 use self::clearcoat::Coat;
-use self::features::{CLEARCOAT, PLAIN_GGX, TRANSMISSION, has};
+use self::features::{CLEARCOAT, PLAIN_GGX, SPECULAR, TRANSMISSION, has};
 use self::fresnel::{schlick, schlick_weight};
 use self::ggx::reflect;
 use self::metallic_roughness::Base;
@@ -73,27 +80,30 @@ pub struct BsdfSample {
 /// How a direction is drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Technique {
+    /// The cosine: diffuse light.
+    Diffuse,
     /// A visible normal of the base reflects.
     Specular,
-    /// The cosine on the side of `wo`: diffuse light and further bounces.
-    Cosine,
+    /// Further bounces between the base's facets.
+    Further,
     /// A visible normal of the base transmits.
     Transmit,
-    /// The cosine on the other side: further bounces of transmitted light.
-    CosineBelow,
+    /// Further bounces of transmitted light.
+    TransmitFurther,
     /// A visible normal of the coat reflects.
     Coat,
-    /// The cosine to the coat's normal: further bounces between its facets.
-    CoatCosine,
+    /// Further bounces between the coat's facets.
+    CoatFurther,
 }
 
-const TECHNIQUES: [Technique; 6] = [
+const TECHNIQUES: [Technique; 7] = [
+    Technique::Diffuse,
     Technique::Specular,
-    Technique::Cosine,
+    Technique::Further,
     Technique::Transmit,
-    Technique::CosineBelow,
+    Technique::TransmitFurther,
     Technique::Coat,
-    Technique::CoatCosine,
+    Technique::CoatFurther,
 ];
 
 /// The scattering function of one surface point for one `wo`.
@@ -104,11 +114,13 @@ const TECHNIQUES: [Technique; 6] = [
 pub struct Bsdf<const F: u32> {
     frame: Frame,
     geometric_normal: Vec3,
+    /// In world space.
+    wo: Vec3,
     base: Base,
     coat: Option<Coat>,
     albedo: Vec3,
     /// Chance of each of [`TECHNIQUES`]; all 0 where nothing is reflected.
-    chances: [f32; 6],
+    chances: [f32; TECHNIQUES.len()],
 }
 
 impl<const F: u32> Bsdf<F> {
@@ -122,18 +134,20 @@ impl<const F: u32> Bsdf<F> {
             true => Coat::new(&surface.coat, wo, &base),
             false => None,
         };
-        let (below, below_diffuse, coat_albedo) = match &coat {
-            Some(c) => (c.passing_o, c.passing_o, c.albedo),
-            None => (1.0, 1.0, [0.0; 2]),
+        let (below, coat_albedo) = match &coat {
+            Some(c) => (c.passing_o, c.albedo),
+            None => (1.0, [0.0; 2]),
         };
         let a = &base.albedo;
-        let mut albedo = (a.specular + a.further + a.transmitted + a.transmitted_further) * below
-            + a.diffuse * below_diffuse
-            + Vec3::splat(coat_albedo[0] + coat_albedo[1]);
+        let below_coat = a.diffuse + a.specular + a.further + a.transmitted + a.transmitted_further;
+        let mut albedo = below_coat * below + Vec3::splat(coat_albedo[0] + coat_albedo[1]);
         let grey = |c: Vec3| c.element_sum() * (1.0 / 3.0);
+        // A black metal seen from above reflects nothing there, but something elsewhere.
+        let least = if has(F, SPECULAR) { 1e-3 } else { 0.0 };
         let mut chances = [
-            grey(a.specular) * below,
-            grey(a.further) * below + grey(a.diffuse) * below_diffuse,
+            grey(a.diffuse) * below,
+            grey(a.specular).max(least) * below,
+            grey(a.further) * below,
             grey(a.transmitted) * below,
             grey(a.transmitted_further) * below,
             coat_albedo[0],
@@ -151,6 +165,7 @@ impl<const F: u32> Bsdf<F> {
         Self {
             frame,
             geometric_normal: surface.geometric_normal,
+            wo,
             base,
             coat,
             albedo,
@@ -170,10 +185,10 @@ impl<const F: u32> Bsdf<F> {
     pub fn is_delta(&self) -> bool {
         let smooth_base = self.base.ggx.is_none();
         let smooth_coat = self.coat.as_ref().is_none_or(|c| c.ggx.is_none());
-        let c = &self.chances;
-        c[1] == 0.0
-            && (smooth_base || (c[0] == 0.0 && c[2] == 0.0 && c[3] == 0.0))
-            && (smooth_coat || (c[4] == 0.0 && c[5] == 0.0))
+        let [diffuse, specular, _, transmit, _, coat, _] = self.chances;
+        diffuse == 0.0
+            && (smooth_base || (specular == 0.0 && transmit == 0.0))
+            && (smooth_coat || coat == 0.0)
     }
 
     /// BSDF times `|wi . n|`, delta lobes left out.
@@ -194,43 +209,47 @@ impl<const F: u32> Bsdf<F> {
         let local = self.frame.to_local(wi);
         let side = wi.dot(self.geometric_normal);
         let [
+            diffuse,
             specular,
-            cosine,
+            further,
             transmit,
-            cosine_below,
-            coat_chance,
-            coat_cosine,
+            transmit_further,
+            coat,
+            coat_further,
         ] = self.chances;
         let (mut value, mut pdf) = (Vec3::ZERO, 0.0);
+        // Added in world space: see `Facet::new`.
+        let sum = self.wo + wi;
+        let half = |frame: &Frame, height: f32| {
+            Vec3::new(frame.tangent.dot(sum), frame.bitangent.dot(sum), height)
+        };
         if side > 0.0 {
-            let coat = self.coat_at(wi);
-            if local.z > 0.0 && specular + cosine > 0.0 {
-                let r = self.base.reflected::<F>(local);
-                value = match &coat {
-                    Some((c, _, passing)) => {
-                        r.specular * c.over_specular(*passing)
-                            + r.diffuse * c.over_diffuse(*passing)
+            let coat_at = self.coat_at(wi);
+            if local.z > 0.0 && diffuse + specular > 0.0 {
+                let sum = half(&self.frame, self.base.wo.z + local.z);
+                let r = self.base.reflected::<F>(local, sum);
+                value = match &coat_at {
+                    Some((c, _, p)) => {
+                        r.specular * c.over_specular(*p) + r.diffuse * c.over_diffuse(*p)
                     }
                     None => r.specular + r.diffuse,
                 };
-                pdf = specular * r.specular_pdf + cosine * r.cosine_pdf;
+                pdf = diffuse * r.cosine_pdf + specular * r.specular_pdf + further * r.further_pdf;
             }
-            if let Some((c, wi, _)) = coat
+            if let Some((c, wi, _)) = coat_at
                 && wi.z > 0.0
             {
-                let r = c.reflected(wi);
+                let r = c.reflected(wi, half(&c.frame, c.wo.z + wi.z));
                 value += Vec3::splat(r.value);
-                pdf += coat_chance * r.specular_pdf + coat_cosine * r.cosine_pdf;
+                pdf += coat * r.specular_pdf + coat_further * r.further_pdf;
             }
-        } else if has(F, TRANSMISSION)
-            && transmit + cosine_below > 0.0
-            && local.z < 0.0
-            && side < 0.0
-        {
-            let (transmitted, visible_pdf) = self.base.transmitted(local);
+        } else if has(F, TRANSMISSION) && transmit > 0.0 && local.z < 0.0 && side < 0.0 {
+            let sum = half(&self.frame, self.base.wo.z - local.z);
+            let (transmitted, visible_pdf) = self.base.transmitted(local, sum);
             let passing = self.coat_at(wi).map_or(1.0, |(c, _, p)| c.over_specular(p));
             value = transmitted * passing;
-            pdf = transmit * visible_pdf - cosine_below * local.z * std::f32::consts::FRAC_1_PI;
+            pdf =
+                transmit * visible_pdf + transmit_further * self.base.energy.further_pdf(-local.z);
         }
         (value, pdf)
     }
@@ -255,9 +274,11 @@ impl<const F: u32> Bsdf<F> {
     pub fn sample(&self, u_lobe: f32, u: Vec2) -> Option<BsdfSample> {
         let technique = self.choose(u_lobe)?;
         let wo = self.base.wo;
+        let below = |w: Vec3| Vec3::new(w.x, w.y, -w.z);
         let local = match technique {
-            Technique::Cosine => square_to_cosine_hemisphere(u),
-            Technique::CosineBelow => -square_to_cosine_hemisphere(u),
+            Technique::Diffuse => square_to_cosine_hemisphere(u),
+            Technique::Further => self.base.energy.sample_further(u),
+            Technique::TransmitFurther => below(self.base.energy.sample_further(u)),
             Technique::Specular | Technique::Transmit => {
                 let Some(ggx) = &self.base.ggx else {
                     return self.sample_delta(technique);
@@ -268,10 +289,10 @@ impl<const F: u32> Bsdf<F> {
                 }
                 match technique {
                     Technique::Specular => wi,
-                    _ => Vec3::new(wi.x, wi.y, -wi.z),
+                    _ => below(wi),
                 }
             }
-            Technique::Coat | Technique::CoatCosine => return self.sample_coat(technique, u),
+            Technique::Coat | Technique::CoatFurther => return self.sample_coat(technique, u),
         };
         self.weigh(self.frame.to_world(local))
     }
@@ -297,7 +318,7 @@ impl<const F: u32> Bsdf<F> {
     fn sample_coat(&self, technique: Technique, u: Vec2) -> Option<BsdfSample> {
         let coat = self.coat.as_ref()?;
         let local = match (technique, &coat.ggx) {
-            (Technique::CoatCosine, _) => square_to_cosine_hemisphere(u),
+            (Technique::CoatFurther, _) => coat.energy.sample_further(u),
             (_, Some(ggx)) => reflect(coat.wo, ggx.sample(coat.wo, u)).0,
             (_, None) => return self.sample_delta(technique),
         };
@@ -331,17 +352,17 @@ impl<const F: u32> Bsdf<F> {
                     true => base.f0,
                     false => schlick(base.f0, fresnel),
                 };
-                (self.frame.to_world(mirrored(base.wo)), f, self.chances[0])
+                (self.frame.to_world(mirrored(base.wo)), f, self.chances[1])
             }
             Technique::Transmit => {
                 let passing = 1.0 - base.dielectric_fresnel(fresnel);
                 let wi = self.frame.to_world(-base.wo);
-                (wi, base.transmitted.color * passing, self.chances[2])
+                (wi, base.transmitted.color * passing, self.chances[3])
             }
             _ => {
                 let coat = self.coat.as_ref()?;
                 let wi = coat.frame.to_world(mirrored(coat.wo));
-                (wi, Vec3::splat(coat.albedo[0]), self.chances[4])
+                (wi, Vec3::splat(coat.albedo[0]), self.chances[5])
             }
         };
         let transmitted = technique == Technique::Transmit;
