@@ -76,7 +76,8 @@ pub struct Material {
     pub emissive_texture: Option<TextureRef>,
     /// Coverage.
     pub alpha_mode: AlphaMode,
-    /// Whether the back face reflects too; otherwise it is not there for camera and light rays alike.
+    /// Whether the back face is seen too. The back of a single-sided surface is invisible to camera
+    /// and path rays, but still blocks the light that would reach the proxy.
     pub double_sided: bool,
     /// Index of refraction of the dielectric interface (`KHR_materials_ior`), 1.5 by default.
     pub ior: f32,

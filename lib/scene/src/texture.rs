@@ -234,3 +234,118 @@ fn reduce(u: f32, wrap: Wrap) -> f32 {
         Wrap::ClampToEdge => u.clamp(-1.0, 2.0),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Texels of these red bytes in one row.
+    fn row(reds: &[u8], wrap: Wrap, filter: Filter) -> DecodedTexture {
+        let texture = Texture {
+            image: ImageSource::File("unused".into()),
+            encoding: Encoding::Linear,
+            wrap: [wrap; 2],
+            filter,
+        };
+        let texels = reds.iter().map(|r| [*r, 0, 0, 255]).collect();
+        texture.with_texels(Arc::new(Raster::from_pixels(reds.len(), 1, texels)))
+    }
+
+    fn red(texture: &DecodedTexture, u: f32) -> f32 {
+        texture.sample(Vec2::new(u, 0.5)).x * 255.0
+    }
+
+    /// Bytes of order 255 after a few roundings.
+    const ROUNDING: f32 = 255.0 * 4.0 * f32::EPSILON;
+
+    #[test]
+    fn linear_filtering_meets_texel_centres_and_halves_between_them() {
+        let texture = row(&[0, 200, 100, 40], Wrap::ClampToEdge, Filter::Linear);
+        for (u, expected) in [
+            (0.125, 0.0),
+            (0.375, 200.0),
+            (0.25, 100.0),
+            (0.5, 150.0),
+            (0.875, 40.0),
+            // Beyond the outermost centres the edge extends.
+            (0.0, 0.0),
+            (1.0, 40.0),
+            (-7.0, 0.0),
+        ] {
+            assert!((red(&texture, u) - expected).abs() < ROUNDING, "u = {u}");
+        }
+    }
+
+    #[test]
+    fn wrap_modes_agree_with_their_tilings() {
+        let reds = [10, 20, 30];
+        for (wrap, tiled) in [
+            (Wrap::Repeat, [10, 20, 30, 10, 20, 30, 10, 20, 30]),
+            (Wrap::MirroredRepeat, [30, 20, 10, 10, 20, 30, 30, 20, 10]),
+            (Wrap::ClampToEdge, [10, 10, 10, 10, 20, 30, 30, 30, 30]),
+        ] {
+            let texture = row(&reds, wrap, Filter::Nearest);
+            for (i, expected) in tiled.iter().enumerate() {
+                // Texel centres of the tiles from -1 to 2.
+                let u = (i as f32 + 0.5) / 3.0 - 1.0;
+                let found = red(&texture, u);
+                assert!(
+                    (found - *expected as f32).abs() < ROUNDING,
+                    "{wrap:?} at {u}: {found}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn repeat_interpolates_across_the_seam() {
+        let texture = row(&[0, 100], Wrap::Repeat, Filter::Linear);
+        assert!((red(&texture, 0.0) - 50.0).abs() < ROUNDING);
+        assert!((red(&texture, 1.0) - 50.0).abs() < ROUNDING);
+        assert!((red(&texture, -3.25) - 100.0).abs() < ROUNDING);
+    }
+
+    #[test]
+    fn any_coordinate_reads_a_texel() {
+        for wrap in [Wrap::Repeat, Wrap::MirroredRepeat, Wrap::ClampToEdge] {
+            for filter in [Filter::Nearest, Filter::Linear] {
+                let texture = row(&[10, 20, 30], wrap, filter);
+                for u in [
+                    f32::NAN,
+                    f32::INFINITY,
+                    -f32::INFINITY,
+                    f32::MAX,
+                    -f32::MAX,
+                    1e9,
+                    -1e-9,
+                ] {
+                    let found = red(&texture, u);
+                    assert!((9.99..=30.01).contains(&found), "{wrap:?} at {u}: {found}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn srgb_is_decoded_before_it_is_interpolated() {
+        let mut texture = row(&[0, 255], Wrap::ClampToEdge, Filter::Linear);
+        let curve = Texture {
+            image: ImageSource::File("unused".into()),
+            encoding: Encoding::Srgb,
+            wrap: [Wrap::ClampToEdge; 2],
+            filter: Filter::Linear,
+        };
+        texture = curve.with_texels(texture.texels.clone());
+        // Halfway between black and white in light, not in bytes.
+        assert!((texture.sample(Vec2::new(0.5, 0.5)).x - 0.5).abs() < 4.0 * f32::EPSILON);
+        assert_eq!(texture.sample(Vec2::new(0.5, 0.5)).w, 1.0);
+    }
+
+    #[test]
+    fn one_texel_is_constant() {
+        let texture = row(&[77], Wrap::Repeat, Filter::Linear);
+        for u in [-3.3, 0.0, 0.49, 12.7] {
+            assert!((red(&texture, u) - 77.0).abs() < ROUNDING);
+        }
+    }
+}

@@ -204,3 +204,85 @@ fn lens(
         Vec2::new((cx * sx) as f32, (cy * sy) as f32),
     ))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    /// A camera 2 m above the ground of a z-up world, at y = -5, that looks along +y.
+    const FILE: &str = r#"{
+        "camera_model": "OPENCV", "fl_x": 100.0, "fl_y": 110.0, "cx": 50.0, "cy": 40.0,
+        "w": 100, "h": 80, "aabb_scale": 16,
+        "frames": [{
+            "file_path": "images/1.jpg",
+            "transform_matrix": [[1, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 2], [0, 0, 0, 1]]
+        }]
+    }"#;
+
+    fn read(text: &str, index: u32, resolution: [u32; 2]) -> Result<Camera, String> {
+        camera(text.as_bytes(), index, WorldUp::Z, resolution)
+            .map(|(camera, _)| camera)
+            .map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn a_z_up_world_becomes_a_y_up_world() {
+        let camera = read(FILE, 0, [100, 80]).unwrap();
+        assert_eq!(camera.position, Vec3::new(0.0, 2.0, 5.0));
+        let forward = camera.ray(camera.principal_px).direction;
+        assert!((forward - Vec3::NEG_Z).length() < 4.0 * f32::EPSILON);
+        // A point to the right (+x) and above (z there, y here) lies right of and above the centre.
+        let p = camera.project(Vec3::new(1.0, 3.0, 0.0)).unwrap();
+        assert!((p - Vec2::new(50.0 + 100.0 / 5.0, 40.0 - 110.0 / 5.0)).length() < 1e-4);
+    }
+
+    #[test]
+    fn intrinsics_follow_the_photos_resolution() {
+        let camera = read(FILE, 0, [200, 160]).unwrap();
+        assert_eq!(camera.focal_px, Vec2::new(200.0, 220.0));
+        assert_eq!(camera.principal_px, Vec2::new(100.0, 80.0));
+        assert_eq!(
+            read(FILE, 0, [100, 100]).unwrap_err(),
+            "frames[0] was taken at 100 x 80 pixels, the photo has 100 x 100, which is another shape; name the frame that belongs to the photo, or do not crop it"
+        );
+    }
+
+    #[test]
+    fn an_angle_of_view_stands_for_the_focal_length() {
+        let text = FILE.replace(
+            "\"fl_x\": 100.0, \"fl_y\": 110.0",
+            &format!("\"camera_angle_x\": {}", std::f64::consts::FRAC_PI_2),
+        );
+        let camera = read(&text, 0, [100, 80]).unwrap();
+        // Half the width at 45 degrees.
+        assert!((camera.focal_px - Vec2::splat(50.0)).length() < 1e-4);
+    }
+
+    #[test]
+    fn wrong_files_are_explained() {
+        assert_eq!(
+            read(FILE, 3, [100, 80]).unwrap_err(),
+            "scene.camera.frame is 3; accepted: an index below 1, the number of frames"
+        );
+        assert_eq!(
+            read(&FILE.replace("[1, 0, 0, 0]", "[9, 0, 0, 0]"), 0, [100, 80]).unwrap_err(),
+            "frames[0].transform_matrix does not rotate; accepted: a rotation and a position, 4 by 4; export the cameras again"
+        );
+        assert_eq!(
+            read(&FILE.replace("OPENCV", "OPENCV_FISHEYE"), 0, [100, 80]).unwrap_err(),
+            "frames[0]: camera_model is \"OPENCV_FISHEYE\"; accepted: OPENCV, PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL; undistort the photo to a pinhole camera"
+        );
+        assert_eq!(
+            read(
+                &FILE
+                    .replace("\"fl_x\"", "\"fx\"")
+                    .replace("\"fl_y\"", "\"fy\""),
+                0,
+                [100, 80]
+            )
+            .unwrap_err(),
+            "frames[0] has no focal length; accepted: fl_x in pixels or camera_angle_x in radians; export the cameras again"
+        );
+    }
+}

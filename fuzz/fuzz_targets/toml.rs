@@ -1,0 +1,15 @@
+#![no_main]
+use std::path::Path;
+
+use dipir_pipeline::config::Config;
+use dipir_scene::config::SceneConfig;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|text: &str| {
+    if let Ok(config) = Config::parse(Path::new("pipeline.toml"), text, &[]) {
+        let _ = config.pipeline();
+        if let Ok(scene) = config.table::<SceneConfig>("scene") {
+            let _ = scene.validate();
+        }
+    }
+});

@@ -1,0 +1,223 @@
+//! One clear message each: what is wrong, where, and what to do.
+use dipir_scene::import::{Limits, NoFiles, load_gltf_bytes, load_object};
+use dipir_scene::texture::{Encoding, Filter, ImageSource, Texture};
+use serde_json::json;
+
+use crate::glb::{Glb, TRIANGLE, U8};
+
+fn message(glb: &Glb) -> String {
+    glb.try_load().unwrap_err().to_string()
+}
+
+fn message_of(bytes: &[u8]) -> String {
+    load_gltf_bytes(bytes, &NoFiles, &Limits::default())
+        .unwrap_err()
+        .to_string()
+}
+
+#[test]
+fn a_broken_glb_says_where_it_breaks() {
+    let whole = Glb::triangle(json!({})).bytes();
+    assert_eq!(message_of(b""), "the file is empty; export or copy the file again");
+    assert_eq!(
+        message_of(&whole[..9]),
+        "the GLB header has 12 bytes, the file only 9; export or copy the file again"
+    );
+    assert_eq!(
+        message_of(&whole[..whole.len() - 20]),
+        format!(
+            "the GLB header announces {} bytes, the file has {}: it is cut short; export or copy the file again",
+            whole.len(),
+            whole.len() - 20
+        )
+    );
+    let mut old = whole.clone();
+    old[4] = 1;
+    assert_eq!(
+        message_of(&old),
+        "the GLB header says version 1; accepted: 2; export the file as glTF 2.0"
+    );
+    let mut long_chunk = whole.clone();
+    long_chunk[14] = 1;
+    let size = u32::from_le_bytes(long_chunk[12..16].try_into().unwrap());
+    assert_eq!(
+        message_of(&long_chunk),
+        format!(
+            "the GLB chunk at byte 12 announces {size} bytes, {} are left; export or copy the file again",
+            whole.len() - 20
+        )
+    );
+    assert_eq!(
+        message_of(b"\x89PNG"),
+        "neither a GLB header nor a JSON object stands at the start; use a .glb or .gltf file"
+    );
+    assert_eq!(
+        message_of(b"{ \"nodes\": 3 }"),
+        "the glTF JSON cannot be read: invalid type: integer `3`, expected a sequence at line 1 column 12; export the file again"
+    );
+}
+
+#[test]
+fn an_index_out_of_range_names_itself() {
+    let mut glb = Glb::triangle(json!({}));
+    let indices = glb.accessor(&[0, 1, 3], U8, "SCALAR", 3);
+    glb.json["meshes"][0]["primitives"][0]["indices"] = json!(indices);
+    assert_eq!(
+        message(&glb),
+        "meshes[0].primitives[0].indices, element 2, is 3, but the file has 3 vertices there; export the file again"
+    );
+    let mut glb = Glb::triangle(json!({}));
+    glb.json["nodes"][0]["mesh"] = json!(4);
+    assert_eq!(
+        message(&glb),
+        "nodes[0].mesh is 4, but the file has 1 meshes; export the file again"
+    );
+    let glb = Glb::triangle(json!({ "material": 2 }));
+    assert_eq!(
+        message(&glb),
+        "meshes[0].primitives[0].material is 2, but the file has 0 materials; export the file again"
+    );
+}
+
+#[test]
+fn an_accessor_that_overruns_its_view_is_refused() {
+    let mut glb = Glb::triangle(json!({}));
+    glb.json["accessors"][0]["count"] = json!(4);
+    assert_eq!(
+        message(&glb),
+        "accessors[0] reads 4 elements of 12 bytes every 12 bytes from byte 0, but bufferViews[0] has 36 bytes; export the file again"
+    );
+    let mut glb = Glb::triangle(json!({}));
+    glb.json["bufferViews"][0]["byteLength"] = json!(u64::MAX);
+    assert_eq!(
+        message(&glb),
+        "bufferViews[0] wants 18446744073709551615 bytes from byte 0, but buffers[0] has 36; export the file again"
+    );
+    let mut glb = Glb::triangle(json!({}));
+    glb.json["accessors"][0]["count"] = json!(1u64 << 40);
+    assert_eq!(
+        message(&glb),
+        "the object has 1099511627776 vertices: more than the limit of 268435456; simplify the object"
+    );
+}
+
+#[test]
+fn a_nan_position_names_its_vertex() {
+    let mut glb = Glb::new();
+    let mut corners = TRIANGLE;
+    corners[4] = f32::NAN;
+    let position = glb.floats("VEC3", &corners);
+    glb.mesh(json!({ "attributes": { "POSITION": position } }));
+    glb.push("nodes", json!({ "mesh": 0 }));
+    assert_eq!(
+        message(&glb),
+        "meshes[0].primitives[0].attributes.POSITION, element 1 is (1, NaN, 0), which is not finite; repair the mesh and export it again"
+    );
+}
+
+#[test]
+fn required_extensions_that_cannot_be_ignored_are_refused_by_name() {
+    for (extension, remedy) in [
+        ("KHR_draco_mesh_compression", "export the object without mesh compression"),
+        ("EXT_meshopt_compression", "export the object without mesh compression"),
+        ("KHR_texture_basisu", "export the textures as PNG or JPEG"),
+        ("EXT_texture_webp", "export the textures as PNG or JPEG"),
+        ("ACME_shapes", "export the object without it"),
+    ] {
+        let mut glb = Glb::triangle(json!({}));
+        glb.json["extensionsRequired"] = json!([extension]);
+        assert_eq!(
+            message(&glb),
+            format!(
+                "the file requires the glTF extension {extension}, which is not supported; {remedy}"
+            )
+        );
+    }
+    for harmless in ["KHR_materials_specular", "KHR_materials_volume", "KHR_materials_sheen"] {
+        let mut glb = Glb::triangle(json!({}));
+        glb.json["extensionsRequired"] = json!([harmless]);
+        assert!(glb.try_load().is_ok(), "{harmless}");
+    }
+}
+
+#[test]
+fn a_missing_texture_is_named_with_its_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut glb = Glb::triangle(json!({ "material": 0 }));
+    glb.push("images", json!({ "uri": "no%20paint.png" }));
+    glb.push("textures", json!({ "source": 0 }));
+    glb.push(
+        "materials",
+        json!({ "pbrMetallicRoughness": { "baseColorTexture": { "index": 0 } } }),
+    );
+    let path = folder.path().join("car.glb");
+    std::fs::write(&path, glb.bytes()).unwrap();
+    assert_eq!(
+        load_object(&path).unwrap_err().to_string(),
+        format!(
+            "\"{}\": cannot read the texture images[0] \"no paint.png\": No such file or directory (os error 2)",
+            path.display()
+        )
+    );
+}
+
+#[test]
+fn a_png_of_zero_bytes_is_refused_when_it_is_decoded() {
+    let texture = Texture {
+        image: ImageSource::Bytes {
+            name: "images[0] (paint)".into(),
+            bytes: [].into(),
+        },
+        encoding: Encoding::Srgb,
+        wrap: Default::default(),
+        filter: Filter::Linear,
+    };
+    assert_eq!(
+        texture.decode().unwrap_err().to_string(),
+        "`images[0] (paint)` is empty (0 bytes); expected a PNG or JPEG image: export the file again"
+    );
+}
+
+#[test]
+fn a_node_with_two_parents_or_a_cycle_is_refused() {
+    let mut glb = Glb::triangle(json!({}));
+    glb.json["scenes"] = json!([{ "nodes": [0] }]);
+    glb.json["nodes"] = json!([{ "children": [1] }, { "children": [0], "mesh": 0 }]);
+    assert_eq!(
+        message(&glb),
+        "nodes[0] is reached twice; a node has one parent; export the file again"
+    );
+}
+
+#[test]
+fn attributes_of_different_lengths_are_refused() {
+    let mut glb = Glb::triangle(json!({}));
+    let normal = glb.floats("VEC3", &[0.0, 0.0, 1.0]);
+    glb.json["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = json!(normal);
+    assert_eq!(
+        message(&glb),
+        "meshes[0].primitives[0].attributes.NORMAL has 1 elements, but there are 3 positions; export the file again"
+    );
+}
+
+#[test]
+fn a_file_without_triangles_is_refused() {
+    let mut glb = Glb::new();
+    glb.push("nodes", json!({}));
+    assert_eq!(
+        message(&glb),
+        "the file holds no triangles; check that the file's default scene contains a mesh"
+    );
+}
+
+#[test]
+fn an_unknown_kind_of_file_names_the_known_ones() {
+    assert_eq!(
+        load_object("car.fbx".as_ref()).unwrap_err().to_string(),
+        "\"car.fbx\" is not a kind of object that is read; use a .glb, .gltf or .obj file"
+    );
+    assert_eq!(
+        load_object("nowhere.glb".as_ref()).unwrap_err().to_string(),
+        "cannot read the object \"nowhere.glb\": No such file or directory (os error 2)"
+    );
+}

@@ -1,0 +1,168 @@
+//! The `[scene]` table: what is accepted, and the exact words for what is not.
+use dipir_scene::config::{EffectSwitch, EffectsMode, ProxySettings, SceneConfig};
+use dipir_scene::placement::{Rest, Size};
+
+const OBJECT: &str = "[[objects]]\npath = \"car.glb\"\n";
+const CAMERA: &str = "[camera]\nposition = [0, 1.6, 6]\nlook_at = [0, 0.5, 0]\nfov_deg = 40\n";
+
+fn parse(text: &str) -> SceneConfig {
+    toml::from_str(text).unwrap()
+}
+
+fn message(text: &str) -> String {
+    parse(text).validate().unwrap_err().to_string()
+}
+
+/// A complete table with `line` first and `rest` last.
+fn table(line: &str, rest: &str) -> String {
+    format!("background = \"photo.jpg\"\n{line}\n{OBJECT}{CAMERA}{rest}")
+}
+
+#[test]
+fn the_documented_table_is_accepted() {
+    let settings = parse(
+        r#"
+        background = "data/demo/background.png"
+        transfer = "srgb"
+        class = "car"
+        occluders = "mask.png"
+        [[objects]]
+        path = "data/demo/car.glb"
+        position = [0.0, 0.0, 0.0]
+        yaw_deg = 30.0
+        height_m = 1.4
+        rest = "proxy"
+        [camera]
+        position = [0.0, 1.6, 6.0]
+        look_at = [0.0, 0.5, 0.0]
+        fov_deg = 40.0
+        [proxy]
+        plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 2.0, 0.0] }
+        [effects]
+        mode = "planned"
+        tolerance = 0.002
+        shadow = "on"
+        clearcoat = "off"
+        "#,
+    )
+    .validate()
+    .unwrap();
+    assert_eq!(settings.class, "car");
+    let placement = settings.objects[0].placement;
+    assert_eq!(placement.size, Size::Height(1.4));
+    assert_eq!(placement.rest, Some(Rest::Proxy));
+    assert!((placement.yaw_rad - std::f32::consts::FRAC_PI_6).abs() < f32::EPSILON);
+    let ProxySettings::Plane(plane) = settings.proxy else {
+        panic!("a plane");
+    };
+    assert_eq!(plane.normal, glam::Vec3::Y);
+    assert_eq!(settings.effects.mode, EffectsMode::Planned);
+    let switches = settings.effects.switches();
+    assert_eq!(switches.len(), 15);
+    assert_eq!(switches[0], ("shadow", EffectSwitch::On));
+    assert!(switches.contains(&("clearcoat", EffectSwitch::Off)));
+    assert!(switches.contains(&("textures", EffectSwitch::Auto)));
+}
+
+#[test]
+fn unknown_keys_are_refused() {
+    for (text, key) in [
+        ("backgrund = \"photo.jpg\"", "backgrund"),
+        ("[camera]\nfov = 40", "fov"),
+        ("[[objects]]\nyaw = 40", "yaw"),
+        ("[proxy]\nplane = { up = [0, 1, 0] }", "up"),
+        ("[effects]\nshadows = \"on\"", "shadows"),
+    ] {
+        let error = toml::from_str::<SceneConfig>(text).unwrap_err().to_string();
+        assert!(error.contains(&format!("unknown field `{key}`")), "{error}");
+    }
+}
+
+#[test]
+fn missing_tables_say_what_to_write() {
+    assert_eq!(
+        message(""),
+        "scene.background is missing; name the photograph: background = \"photo.jpg\""
+    );
+    assert_eq!(
+        message("background = \"photo.jpg\""),
+        "scene.objects is missing; add a table [[scene.objects]] with path = \"object.glb\""
+    );
+    assert_eq!(
+        message(&format!("background = \"photo.jpg\"\n{OBJECT}")),
+        "scene.camera is missing; add a table [scene.camera] with position, look_at and fov_deg, or with transforms"
+    );
+}
+
+#[test]
+fn wrong_values_are_quoted_with_the_accepted_form() {
+    assert_eq!(
+        message(&table("transfer = \"sgrb\"", "")),
+        "scene.transfer is \"sgrb\"; accepted: \"srgb\", \"gamma22\" or \"linear\" (did you mean \"srgb\"?)"
+    );
+    let object = |line: &str| {
+        format!("background = \"photo.jpg\"\n{OBJECT}{line}\n{CAMERA}")
+    };
+    assert_eq!(
+        message(&object("scale = -1")),
+        "scene.objects[0].scale is -1; accepted: a factor above 0, for instance scale = 1.0"
+    );
+    assert_eq!(
+        message(&object("scale = 1\nheight_m = 2")),
+        "scene.objects[0].scale and scene.objects[0].height_m cannot both be given; keep one of them"
+    );
+    assert_eq!(
+        message(&object("position = [0, nan, 0]")),
+        "scene.objects[0].position is [0.0, NaN, 0.0]; accepted: three finite numbers [x, y, z]"
+    );
+    assert_eq!(
+        message(&object("rest = \"floor\"")),
+        "scene.objects[0].rest is \"floor\"; accepted: \"proxy\" or \"position\""
+    );
+    assert_eq!(
+        message(&table("", "[proxy]\nplane = { normal = [0, 0, 0] }")),
+        "scene.proxy.plane.normal is [0.0, 0.0, 0.0]; accepted: a direction that is not zero, for instance normal = [0.0, 1.0, 0.0]"
+    );
+    assert_eq!(
+        message(&table("", "[effects]\ntolerance = 2")),
+        "scene.effects.tolerance is 2; accepted: a display-referred error from 0 to 1, for instance tolerance = 0.002"
+    );
+}
+
+#[test]
+fn wrong_cameras_are_explained() {
+    let camera = |lines: &str| format!("background = \"photo.jpg\"\n{OBJECT}[camera]\n{lines}");
+    let stands = "position = [0, 1, 5]\nlook_at = [0, 1, 0]\n";
+    assert_eq!(
+        message(&camera(&format!("{stands}fov_deg = 190"))),
+        "scene.camera.fov_deg is 190; accepted: a vertical field of view between 0 and 180 degrees, for instance fov_deg = 40.0"
+    );
+    assert_eq!(
+        message(&camera(stands)),
+        "scene.camera.fov_deg is missing; write the vertical field of view, fov_deg = 40.0, or focal_mm with sensor_mm"
+    );
+    assert_eq!(
+        message(&camera(&format!("{stands}focal_mm = 35"))),
+        "scene.camera.sensor_mm is missing; scene.camera.focal_mm needs the sensor's width, for instance sensor_mm = 36.0"
+    );
+    assert_eq!(
+        message(&camera(&format!("{stands}fov_deg = 40\nfocal_mm = 35"))),
+        "scene.camera.fov_deg and scene.camera.focal_mm cannot both be given; keep one of them"
+    );
+    assert_eq!(
+        message(&camera("position = [0, 1, 5]\nlook_at = [0, 1, 5]\nfov_deg = 40")),
+        "scene.camera.look_at is [0.0, 1.0, 5.0]; accepted: a point away from scene.camera.position"
+    );
+    assert_eq!(
+        message(&camera("position = [0, 5, 0]\nlook_at = [0, 0, 0]\nfov_deg = 40")),
+        "scene.camera.up is [0.0, 1.0, 0.0]; accepted: a direction across the line of sight; looking straight down or up, write up = [0.0, 0.0, -1.0]"
+    );
+    assert_eq!(
+        message(&camera("transforms = \"transforms.json\"\nfov_deg = 40")),
+        "scene.camera.transforms and scene.camera.fov_deg cannot both be given; keep one of them"
+    );
+    assert_eq!(
+        message(&camera(&format!("{stands}fov_deg = 40\nframe = 1"))),
+        "scene.camera.transforms is missing; name the transforms.json that scene.camera.frame is about"
+    );
+}

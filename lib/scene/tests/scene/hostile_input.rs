@@ -1,0 +1,199 @@
+//! Any bytes end in an object or in an error, never in a panic or in unbounded memory.
+use dipir_scene::import::{Limits, NoFiles, load_gltf_bytes, load_obj_bytes};
+use proptest::prelude::*;
+use serde_json::{Value, json};
+
+use crate::glb::{Glb, U8, one_texel_png};
+
+const SMALL: Limits = Limits {
+    max_vertices: 1 << 16,
+    max_triangles: 1 << 16,
+};
+
+/// A file that uses much of the format.
+fn rich() -> Glb {
+    let mut glb = Glb::triangle(json!({ "material": 0 }));
+    let normal = glb.floats("VEC3", &[0.0, 0.0, 1.0].repeat(3));
+    let uv = glb.floats("VEC2", &[0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);
+    let color = glb.accessor(&[255; 12], U8, "VEC4", 3);
+    let indices = glb.accessor(&[0, 1, 2], U8, "SCALAR", 3);
+    let weights = glb.floats("VEC4", &[1.0, 0.0, 0.0, 0.0].repeat(3));
+    let joints = glb.accessor(&[0; 12], U8, "VEC4", 3);
+    let delta = glb.floats("VEC3", &[0.1; 9]);
+    let bind = glb.floats(
+        "MAT4",
+        &[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+    );
+    let targets = glb.view(&[1]);
+    let values = glb.view(&[0; 12]);
+    let image = glb.view(&one_texel_png([0.5; 3]));
+    glb.json["accessors"][0]["sparse"] = json!({
+        "count": 1,
+        "indices": { "bufferView": targets, "componentType": U8 },
+        "values": { "bufferView": values },
+    });
+    glb.json["meshes"][0] = json!({
+        "weights": [0.5],
+        "primitives": [{
+            "attributes": {
+                "POSITION": 0, "NORMAL": normal, "TEXCOORD_0": uv, "COLOR_0": color,
+                "JOINTS_0": joints, "WEIGHTS_0": weights,
+            },
+            "indices": indices, "material": 0, "mode": 4,
+            "targets": [{ "POSITION": delta, "NORMAL": delta }],
+        }],
+    });
+    glb.json["nodes"] = json!([
+        { "children": [1, 2], "scale": [1.0, -1.0, 1.0] },
+        { "mesh": 0, "skin": 0 },
+        {
+            "mesh": 0, "translation": [1.0, 2.0, 3.0], "rotation": [0.0, 0.0, 0.0, 1.0],
+            "extensions": { "EXT_mesh_gpu_instancing": { "attributes": { "TRANSLATION": normal } } },
+        },
+    ]);
+    glb.json["scenes"] = json!([{ "nodes": [0] }]);
+    glb.push("skins", json!({ "joints": [1], "inverseBindMatrices": bind }));
+    glb.push("images", json!({ "bufferView": image }));
+    glb.push("samplers", json!({ "wrapS": 33071 }));
+    glb.push("textures", json!({ "source": 0, "sampler": 0 }));
+    glb.push(
+        "materials",
+        json!({
+            "normalTexture": { "index": 0, "scale": 2.0, "extensions": {
+                "KHR_texture_transform": { "offset": [0.1, 0.2], "rotation": 1.0, "scale": [2.0, 3.0] }
+            } },
+            "alphaMode": "MASK", "alphaCutoff": 0.5,
+            "extensions": { "KHR_materials_clearcoat": {
+                "clearcoatFactor": 1.0, "clearcoatNormalTexture": { "index": 0 }
+            } },
+        }),
+    );
+    glb
+}
+
+/// Paths of all numbers and strings of a JSON value.
+fn leaves(value: &Value, at: String, out: &mut Vec<String>) {
+    match value {
+        Value::Array(list) => {
+            for (i, v) in list.iter().enumerate() {
+                leaves(v, format!("{at}/{i}"), out);
+            }
+        }
+        Value::Object(map) => {
+            for (k, v) in map {
+                leaves(v, format!("{at}/{k}"), out);
+            }
+        }
+        _ => out.push(at),
+    }
+}
+
+fn survives(bytes: &[u8]) {
+    if let Ok(imported) = load_gltf_bytes(bytes, &NoFiles, &SMALL) {
+        let mesh = &imported.mesh;
+        let vertices = mesh.positions.len();
+        assert!(mesh.first_non_finite().is_none());
+        assert!(mesh.indices.iter().flatten().all(|i| (*i as usize) < vertices));
+        assert_eq!(mesh.materials.len(), mesh.indices.len());
+        let materials = imported.materials.len();
+        assert!(mesh.materials.iter().all(|m| (*m as usize) < materials));
+        for count in [
+            mesh.normals.len(),
+            mesh.tangents.len(),
+            mesh.colors.len(),
+            mesh.uvs[0].len(),
+            mesh.uvs[1].len(),
+        ] {
+            assert!(count == 0 || count == vertices);
+        }
+        for texture in imported.materials.iter().flat_map(|m| m.texture_refs()) {
+            assert!((texture.texture as usize) < imported.textures.len());
+        }
+    }
+}
+
+#[test]
+fn the_rich_file_loads() {
+    let imported = rich().load();
+    // One skinned triangle and three copies.
+    assert_eq!(imported.mesh.indices.len(), 4);
+    survives(&rich().bytes());
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 256, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn random_bytes_never_panic(
+        mut bytes in proptest::collection::vec(any::<u8>(), 0..256),
+        header in any::<bool>(),
+    ) {
+        if header && bytes.len() >= 20 {
+            bytes[..8].copy_from_slice(b"glTF\x02\0\0\0");
+            bytes[9..12].fill(0);
+            bytes[16..20].copy_from_slice(b"JSON");
+        }
+        survives(&bytes);
+    }
+
+    #[test]
+    fn damaged_files_never_panic(
+        damage in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..8),
+        keep in any::<prop::sample::Index>(),
+        cut in any::<bool>(),
+    ) {
+        let mut bytes = rich().bytes();
+        for (at, value) in damage {
+            let at = at.index(bytes.len());
+            bytes[at] = value;
+        }
+        if cut {
+            bytes.truncate(keep.index(bytes.len()));
+        }
+        survives(&bytes);
+    }
+
+    #[test]
+    fn wrong_values_in_the_document_never_panic(
+        changes in proptest::collection::vec((any::<prop::sample::Index>(), 0usize..12), 1..4),
+    ) {
+        let mut glb = rich();
+        let mut paths = Vec::new();
+        leaves(&glb.json, String::new(), &mut paths);
+        for (which, value) in changes {
+            let values = [
+                json!(0), json!(1), json!(2), json!(-1), json!(7), json!(5126), json!(u64::MAX),
+                json!(1u64 << 33), json!(1e38), json!(0.5), json!("x"), json!(null),
+            ];
+            let path = &paths[which.index(paths.len())];
+            if let Some(leaf) = glb.json.pointer_mut(path) {
+                *leaf = values[value].clone();
+            }
+        }
+        survives(&glb.bytes());
+    }
+
+    #[test]
+    fn random_obj_lines_never_panic(
+        lines in proptest::collection::vec(
+            prop_oneof![
+                Just("v 0 0 0".to_owned()),
+                Just("v 1 2 3 0.5 0.5 0.5".to_owned()),
+                Just("vn 0 0 1".to_owned()),
+                Just("vt 0.5 0.5".to_owned()),
+                "f( -?[0-9]{1,20}(/[0-9]{0,3}){0,3}){1,5}",
+                "(v|vt|vn|f|usemtl|mtllib|l)[ -~]{0,20}",
+                "[ -~]{0,10}\\\\",
+            ],
+            0..24,
+        ),
+    ) {
+        let text = lines.join("\n");
+        if let Ok(imported) = load_obj_bytes(text.as_bytes(), &NoFiles, &SMALL) {
+            let vertices = imported.mesh.positions.len();
+            prop_assert!(imported.mesh.indices.iter().flatten().all(|i| (*i as usize) < vertices));
+            let materials = imported.materials.len();
+            prop_assert!(imported.mesh.materials.iter().all(|m| (*m as usize) < materials));
+        }
+    }
+}

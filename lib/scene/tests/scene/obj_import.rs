@@ -1,0 +1,156 @@
+//! OBJ and MTL files.
+use dipir_scene::import::{Imported, Limits, NoFiles, load_obj_bytes, load_object};
+use dipir_scene::material::AlphaMode;
+use glam::{Vec2, Vec3, Vec4};
+
+use crate::glb::one_texel_png;
+
+fn load(text: &str) -> Imported {
+    load_obj_bytes(text.as_bytes(), &NoFiles, &Limits::default()).unwrap()
+}
+
+fn message(text: &str) -> String {
+    load_obj_bytes(text.as_bytes(), &NoFiles, &Limits::default())
+        .unwrap_err()
+        .to_string()
+}
+
+const SQUARE: &str = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n";
+
+#[test]
+fn polygons_become_fans_and_negative_indices_count_from_the_end() {
+    for face in ["f 1 2 3 4", "f -4 -3 -2 -1", "f 1 2 \\\n 3 4"] {
+        let imported = load(&format!("{SQUARE}{face}\n"));
+        assert_eq!(imported.mesh.indices, [[0, 1, 2], [0, 2, 3]], "{face}");
+        assert!(imported.mesh.normals.is_empty());
+        assert!(imported.materials[0].double_sided);
+    }
+}
+
+#[test]
+fn hostile_indices_are_refused_with_their_line() {
+    for (face, number, things) in [
+        ("f 1 2 5", "5", "4 vertices (v)"),
+        ("f 0 1 2", "0", "4 vertices (v)"),
+        ("f -5 1 2", "-5", "4 vertices (v)"),
+        (
+            "f 1 2 9223372036854775807",
+            "9223372036854775807",
+            "4 vertices (v)",
+        ),
+        (
+            "f -9223372036854775808 1 2",
+            "-9223372036854775808",
+            "4 vertices (v)",
+        ),
+        ("f 1/1 2 3", "1", "0 texture coordinates (vt)"),
+        ("f 1//7 2 3", "7", "0 normals (vn)"),
+    ] {
+        assert_eq!(
+            message(&format!("{SQUARE}{face}\n")),
+            format!(
+                "line 5: a face refers to {number}, but there are {things} so far; export the file again"
+            )
+        );
+    }
+}
+
+#[test]
+fn malformed_lines_are_named() {
+    assert_eq!(
+        message("v 0 zero 0\n"),
+        "line 1: \"zero\" is not a number; accepted: v x y z; export the file again"
+    );
+    assert_eq!(
+        message(&format!("{SQUARE}f 1 2\n")),
+        "line 5: a face of 2 corners; accepted: 3 or more; export the file again"
+    );
+    assert_eq!(
+        message("v 0 nan 0\n"),
+        "vertices (v), element 1 is (0, NaN, 0), which is not finite; repair the mesh and export it again"
+    );
+    assert_eq!(
+        message("# nothing\n"),
+        "the file holds no triangles; check that the file has faces (f)"
+    );
+}
+
+#[test]
+fn a_missing_material_library_is_a_warning() {
+    let imported = load(&format!("mtllib gone.mtl\n{SQUARE}usemtl red\nf 1 2 3\n"));
+    assert_eq!(
+        imported.warnings,
+        [
+            "material library \"gone.mtl\" cannot be read (no other files are read here); grey is used",
+            "material \"red\" is not defined; grey is used",
+        ]
+    );
+    assert_eq!(imported.materials[0].base_color, Vec4::new(0.8, 0.8, 0.8, 1.0));
+}
+
+#[test]
+fn material_statements_become_metallic_roughness() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    std::fs::write(file("my paint.png"), one_texel_png([1.0, 0.0, 0.0])).unwrap();
+    std::fs::write(
+        file("m.mtl"),
+        "newmtl phong\nKd 0.1 0.2 0.3\nKs 0.5 0.5 0.5\nNs 30\nd 0.5\n\
+         newmtl pbr\nPm 0.9\nPr 0.2\nKe 1 2 3\nmap_Kd -s 2 4 1 my paint.png\nnorm my paint.png\n\
+         newmtl dull\nKs 0 0 0\n",
+    )
+    .unwrap();
+    std::fs::write(
+        file("m.obj"),
+        format!(
+            "mtllib m.mtl\n{SQUARE}vt 0 0\nvt 1 0.25\nusemtl phong\nf 1 2 3\nusemtl pbr\nf 1/1 3/2 4/1\n"
+        ),
+    )
+    .unwrap();
+    let imported = load_object(&file("m.obj")).unwrap();
+    let [phong, pbr, dull] = &imported.materials[..] else {
+        panic!("three materials");
+    };
+    assert_eq!(phong.base_color, Vec4::new(0.1, 0.2, 0.3, 0.5));
+    assert_eq!(phong.alpha_mode, AlphaMode::Blend);
+    // alpha^2 = 2 / 32, and roughness is the root of alpha.
+    assert!((phong.roughness - 0.5).abs() < f32::EPSILON);
+    assert_eq!((phong.metallic, phong.ior), (0.0, 1.5));
+    assert_eq!((pbr.metallic, pbr.roughness), (0.9, 0.2));
+    assert_eq!(pbr.emissive, Vec3::new(1.0, 2.0, 3.0));
+    assert_eq!(dull.ior, 1.0);
+    let paint = pbr.base_color_texture.unwrap();
+    // s = 2, 4 on a v that points up: 1 - 4 (1 - v).
+    assert_eq!(paint.apply(Vec2::new(0.5, 1.0)), Vec2::new(1.0, 1.0));
+    assert_eq!(paint.apply(Vec2::new(0.5, 0.75)), Vec2::new(1.0, 0.0));
+    assert_eq!(imported.mesh.materials, [0, 1]);
+    assert!(imported.mesh.uvs[0].contains(&Vec2::new(1.0, 0.75)));
+    assert_eq!(imported.mesh.tangents.len(), imported.mesh.positions.len());
+    assert_eq!(imported.dependencies, [file("m.mtl"), file("my paint.png")]);
+}
+
+#[test]
+fn a_texture_that_a_library_names_must_exist() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("m.mtl"), "newmtl a\nmap_Kd gone.png\n").unwrap();
+    let path = folder.path().join("m.obj");
+    std::fs::write(&path, format!("mtllib m.mtl\n{SQUARE}f 1 2 3\n")).unwrap();
+    assert_eq!(
+        load_object(&path).unwrap_err().to_string(),
+        format!(
+            "\"{}\": \"m.mtl\": cannot read the texture \"gone.png\": No such file or directory (os error 2)",
+            path.display()
+        )
+    );
+}
+
+#[test]
+fn normals_and_display_referred_vertex_colours_arrive() {
+    let imported = load(
+        "v 0 0 0 1 0.5 0\nv 1 0 0 1 0.5 0\nv 0 1 0 1 0.5 0\nvn 0 0 2\nf 1//1 2//1 3//1\n",
+    );
+    assert_eq!(imported.mesh.normals, [Vec3::Z; 3]);
+    // sRGB 0.5 is ((0.5 + 0.055) / 1.055)^2.4 in linear light.
+    let linear = (0.555f32 / 1.055).powf(2.4);
+    assert!((imported.mesh.colors[0].y - linear).abs() < 4.0 * f32::EPSILON);
+}

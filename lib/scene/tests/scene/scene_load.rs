@@ -1,0 +1,213 @@
+//! Whole scenes from a `[scene]` table.
+use std::path::Path;
+
+use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_scene::config::SceneConfig;
+use dipir_scene::description::SceneDescription;
+use dipir_scene::import::load_object;
+use dipir_scene::proxy::Proxy;
+use dipir_scene::scene::{LoadedScene, Scene};
+use glam::{Vec2, Vec3};
+use serde_json::json;
+
+use crate::glb::Glb;
+
+/// A folder with a photo of 64 x 32 pixels and a tetrahedron of unit edges along the axes, whose
+/// lowest point lies at y = -1.
+fn folder() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let photo = DisplayImage(Raster::filled(64, 32, Vec3::splat(0.5)));
+    dipir_imaging::file::write_png(folder.path().join("photo.png"), &photo).unwrap();
+    let mut glb = Glb::new();
+    let position = glb.floats(
+        "VEC3",
+        &[0.0, -1.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 1.0],
+    );
+    let indices = glb.accessor(&[0, 1, 3, 0, 2, 1, 0, 3, 2, 1, 2, 3], crate::glb::U8, "SCALAR", 12);
+    glb.mesh(json!({ "attributes": { "POSITION": position }, "indices": indices }));
+    glb.push("nodes", json!({ "mesh": 0 }));
+    std::fs::write(folder.path().join("tetrahedron.glb"), glb.bytes()).unwrap();
+    folder
+}
+
+fn config(object: &str, rest: &str) -> SceneConfig {
+    toml::from_str(&format!(
+        "background = \"photo.png\"\n\
+         [[objects]]\npath = \"tetrahedron.glb\"\n{object}\n\
+         [camera]\nposition = [0, 1.6, 6]\nlook_at = [0, 0.5, 0]\nfov_deg = 40\n{rest}"
+    ))
+    .unwrap()
+}
+
+fn load(folder: &Path, object: &str, rest: &str) -> LoadedScene {
+    Scene::load(&config(object, rest), folder).unwrap()
+}
+
+fn message(folder: &Path, object: &str, rest: &str) -> String {
+    Scene::load(&config(object, rest), folder).unwrap_err().to_string()
+}
+
+/// A few roundings of numbers of order ten.
+const ROUNDING: f32 = 20.0 * f32::EPSILON;
+
+#[test]
+fn the_lowest_point_rests_at_the_position() {
+    let folder = folder();
+    let object = "position = [1.0, 0.25, -2.0]\nyaw_deg = 90.0\nscale = 2.0";
+    let loaded = load(folder.path(), object, "");
+    let (low, high) = loaded.scene.mesh.bounds().unwrap();
+    // A quarter turn counter-clockwise from above sends +x to -z and +z to +x.
+    assert!((low - Vec3::new(1.0, 0.25, -4.0)).length() < ROUNDING, "{low}");
+    assert!((high - Vec3::new(3.0, 2.25, -2.0)).length() < ROUNDING, "{high}");
+    assert!(matches!(loaded.scene.proxy, Proxy::None));
+}
+
+#[test]
+fn height_sets_the_extent_along_up_and_center_the_middle() {
+    let folder = folder();
+    let loaded = load(folder.path(), "height_m = 3.0\nanchor = \"center\"", "");
+    let (low, high) = loaded.scene.mesh.bounds().unwrap();
+    assert!((low - Vec3::new(-1.5, 0.0, -1.5)).length() < ROUNDING, "{low}");
+    assert!((high - Vec3::new(1.5, 3.0, 1.5)).length() < ROUNDING, "{high}");
+}
+
+#[test]
+fn on_a_tilted_plane_up_is_its_normal_and_the_foot_touches() {
+    let folder = folder();
+    let plane = "[proxy]\nplane = { point = [0, 1, 0], normal = [1.0, 2.0, 0.5] }";
+    let object = "position = [3.0, 50.0, 1.0]\nyaw_deg = 30.0";
+    let mesh = load(folder.path(), object, plane).scene.mesh;
+    let n = Vec3::new(1.0, 2.0, 0.5).normalize();
+    let heights: Vec<f32> = mesh.corners().map(|p| n.dot(p - Vec3::Y)).collect();
+    let low = heights.iter().copied().fold(f32::INFINITY, f32::min);
+    let high = heights.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    assert!(low.abs() < ROUNDING, "touches: {low}");
+    // The object is one metre tall.
+    assert!((high - 1.0).abs() < ROUNDING, "stands upright: {high}");
+}
+
+#[test]
+fn hovering_over_a_horizontal_plane_is_obeyed_with_a_warning() {
+    let folder = folder();
+    let plane = "[proxy]\nplane = {}";
+    let loaded = load(folder.path(), "position = [0.0, 0.5, 0.0]", plane);
+    assert!((loaded.scene.mesh.bounds().unwrap().0.y - 0.5).abs() < ROUNDING);
+    assert_eq!(
+        loaded.warnings,
+        [
+            "scene.objects[0] hovers 0.500 m above the proxy plane, as its position says; rest = \"proxy\" puts it there"
+        ]
+    );
+    let loaded = load(folder.path(), "position = [0.0, 0.5, 0.0]\nrest = \"proxy\"", plane);
+    assert!(loaded.scene.mesh.bounds().unwrap().0.y.abs() < ROUNDING);
+    assert!(loaded.warnings.is_empty());
+}
+
+#[test]
+fn objects_are_dropped_onto_a_proxy_mesh() {
+    let folder = folder();
+    // A ramp of slope 1/2 along x between x = -10 and 10.
+    let mut glb = Glb::new();
+    let position = glb.floats(
+        "VEC3",
+        &[-10.0, -5.0, 10.0, 10.0, 5.0, 10.0, 10.0, 5.0, -10.0, -10.0, -5.0, -10.0],
+    );
+    let indices = glb.accessor(&[0, 1, 2, 0, 2, 3], crate::glb::U8, "SCALAR", 6);
+    glb.mesh(json!({ "attributes": { "POSITION": position }, "indices": indices }));
+    glb.push("nodes", json!({ "mesh": 0 }));
+    std::fs::write(folder.path().join("ramp.glb"), glb.bytes()).unwrap();
+    let ramp = "[proxy]\nmesh = \"ramp.glb\"";
+    let loaded = load(folder.path(), "position = [4.0, 0.0, 1.0]", ramp);
+    assert!((loaded.scene.mesh.bounds().unwrap().0.y - 2.0).abs() < ROUNDING);
+    assert_eq!(
+        message(folder.path(), "position = [40.0, 0.0, 1.0]", ramp),
+        "scene.objects[0].position is [40.0, 0.0, 1.0]; accepted: a position with the proxy mesh below or above it, which spans x from -10 to 10 and z from -10 to 10; or rest = \"position\""
+    );
+}
+
+#[test]
+fn the_camera_takes_its_resolution_from_the_photo() {
+    let folder = folder();
+    let camera = load(folder.path(), "", "").scene.camera;
+    assert_eq!(camera.resolution, [64, 32]);
+    let centre = camera.project(Vec3::new(0.0, 0.5, 0.0)).unwrap();
+    // Pixels of order fifty.
+    assert!((centre - Vec2::new(32.0, 16.0)).length() < 100.0 * f32::EPSILON);
+    let top = camera.ray(Vec2::new(32.0, 0.0)).direction;
+    let middle = camera.ray(Vec2::new(32.0, 16.0)).direction;
+    assert!((top.angle_between(middle) - 20f32.to_radians()).abs() < 1e-5);
+    assert!(top.y > middle.y, "row 0 is at the top");
+}
+
+#[test]
+fn the_description_rebuilds_the_same_scene() {
+    let folder = folder();
+    let plane = "[proxy]\nplane = { normal = [0.1, 1.0, 0.0] }";
+    let mut first = load(folder.path(), "yaw_deg = 33.0\nheight_m = 1.7", plane);
+    first.description.seed = u64::MAX;
+    let path = folder.path().join("scene.json");
+    first.description.write(&path).unwrap();
+    let description = SceneDescription::read(&path).unwrap();
+    assert_eq!(description, first.description);
+    let second = description.load(folder.path()).unwrap();
+    assert_eq!(second.scene.mesh, first.scene.mesh);
+    assert_eq!(second.scene.camera, first.scene.camera);
+    assert_eq!(second.description.objects[0].triangles, 4);
+    let roles: Vec<&str> = first.inputs.iter().map(|i| i.role.as_str()).collect();
+    assert_eq!(roles, ["background", "object"]);
+}
+
+#[test]
+fn a_changed_object_is_noticed() {
+    let folder = folder();
+    let first = load(folder.path(), "", "");
+    let path = folder.path().join("tetrahedron.glb");
+    let mut bytes = std::fs::read(&path).unwrap();
+    bytes.push(0);
+    std::fs::write(&path, &bytes).unwrap();
+    let error = first.description.load(folder.path()).unwrap_err().to_string();
+    assert_eq!(
+        error,
+        format!(
+            "the object \"tetrahedron.glb\" changed since the scene was set up: its BLAKE3 hash is {}, the scene description has {}; run dipir-scene again",
+            blake3::hash(&bytes).to_hex(),
+            first.description.objects[0].file.blake3
+        )
+    );
+}
+
+#[test]
+fn objects_of_one_file_share_its_materials() {
+    let folder = folder();
+    let twice = "[[objects]]\npath = \"tetrahedron.glb\"\nposition = [5.0, 0.0, 0.0]";
+    let scene = load(folder.path(), "", twice).scene;
+    assert_eq!(scene.materials.len(), 1);
+    assert_eq!(scene.mesh.indices.len(), 8);
+    let alone = load_object(&folder.path().join("tetrahedron.glb")).unwrap();
+    let n = alone.mesh.positions.len();
+    for (a, b) in scene.mesh.positions[..n].iter().zip(&scene.mesh.positions[n..]) {
+        assert!((*b - *a - Vec3::new(5.0, 0.0, 0.0)).length() < ROUNDING);
+    }
+}
+
+#[test]
+fn features_are_absent_unless_a_used_material_has_them() {
+    let folder = folder();
+    let features = load(folder.path(), "", "").scene.features();
+    assert!(features.specular && features.single_sided);
+    assert!(!features.textures && !features.emission && !features.clearcoat);
+    assert!(!features.alpha_mask && !features.alpha_blend && !features.transmission);
+}
+
+#[test]
+fn a_mask_of_another_size_is_refused() {
+    let folder = folder();
+    let mask = DisplayImage(Raster::filled(10, 10, Vec3::ONE));
+    dipir_imaging::file::write_png(folder.path().join("mask.png"), &mask).unwrap();
+    let mut config = config("", "");
+    config.occluders = Some("mask.png".into());
+    assert_eq!(
+        Scene::load(&config, folder.path()).unwrap_err().to_string(),
+        "scene.occluders is an image of 10 x 10 pixels (\"mask.png\"); accepted: one of the background's size, 64 x 32"
+    );
+}
