@@ -1,2 +1,25 @@
 //! Latent diffusion models at any size: model folders in the diffusers
 //! layout, layers whose gradients pass, samplers, LoRA and score distillation.
+
+pub mod config;
+pub mod distillation;
+pub mod error;
+mod kernels;
+pub mod layers;
+pub mod lora;
+pub mod model;
+pub mod noise;
+pub mod optimizer;
+pub mod parameters;
+pub mod pass;
+pub mod recompute;
+mod resnet;
+pub mod sampler;
+pub mod schedule;
+pub mod text_encoder;
+pub mod tokenizer;
+pub mod unet;
+pub mod vae;
+pub mod weights;
+
+pub use error::{Error, Result};

@@ -1,0 +1,124 @@
+//! Reading configuration files that carry more keys than matter here:
+//! unknown keys are tolerated, known ones with unsupported values refused.
+
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+use crate::error::{Error, Result, io};
+
+/// A parsed JSON configuration and where it came from.
+#[derive(Debug, Clone)]
+pub struct ConfigFile {
+    path: PathBuf,
+    value: Value,
+}
+
+impl ConfigFile {
+    /// Reads `path`.
+    pub fn read(path: &Path) -> Result<Self> {
+        let bytes = std::fs::read(path).map_err(io("read", path))?;
+        let value: Value = serde_json::from_slice(&bytes).map_err(|e| Error::Config {
+            path: path.to_owned(),
+            message: format!("not JSON: {e}"),
+        })?;
+        if !value.is_object() {
+            return Err(Error::Config {
+                path: path.to_owned(),
+                message: "not a JSON object".into(),
+            });
+        }
+        Ok(Self {
+            path: path.to_owned(),
+            value,
+        })
+    }
+
+    /// A configuration that is in memory already; `path` is for messages.
+    pub fn from_value(path: impl Into<PathBuf>, value: Value) -> Self {
+        Self {
+            path: path.into(),
+            value,
+        }
+    }
+
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The value of `key`; null counts as absent.
+    pub fn get(&self, key: &str) -> Option<&Value> {
+        self.value.get(key).filter(|value| !value.is_null())
+    }
+
+    /// Converts to a typed configuration that takes the keys it knows.
+    pub fn parse<T: DeserializeOwned>(&self) -> Result<T> {
+        // Null means "default" in diffusers' files.
+        let present = match &self.value {
+            Value::Object(map) => Value::Object(
+                map.iter()
+                    .filter(|(_, v)| !v.is_null())
+                    .map(|(k, v)| (k.clone(), v.clone()))
+                    .collect(),
+            ),
+            other => other.clone(),
+        };
+        serde_json::from_value(present).map_err(|e| self.error(e.to_string()))
+    }
+
+    /// Refuses `key` unless it is absent, null or one of `accepted`.
+    pub fn require(&self, key: &str, accepted: &[Value]) -> Result<()> {
+        match self.get(key) {
+            Some(value) if !accepted.contains(value) => {
+                let accepted: Vec<String> = accepted.iter().map(Value::to_string).collect();
+                let accepted = if accepted.is_empty() {
+                    "null".into()
+                } else {
+                    accepted.join(", ")
+                };
+                Err(self.error(format!(
+                    "{key} = {value} is not supported, accepted: {accepted}; use a model of the Stable Diffusion 1 or 2 family"
+                )))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// An error about this file.
+    pub fn error(&self, message: impl Into<String>) -> Error {
+        Error::Config {
+            path: self.path.clone(),
+            message: message.into(),
+        }
+    }
+}
+
+/// One value for all levels or one for each.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(untagged)]
+pub enum PerLevel {
+    /// The same at every level.
+    All(usize),
+    /// From the finest level to the coarsest.
+    Each(Vec<usize>),
+}
+
+impl PerLevel {
+    /// The value at `level`; `None` if the list is too short.
+    pub fn at(&self, level: usize) -> Option<usize> {
+        match self {
+            Self::All(value) => Some(*value),
+            Self::Each(values) => values.get(level).copied(),
+        }
+    }
+
+    /// Whether it fits `levels` levels.
+    pub fn fits(&self, levels: usize) -> bool {
+        match self {
+            Self::All(_) => true,
+            Self::Each(values) => values.len() == levels,
+        }
+    }
+}

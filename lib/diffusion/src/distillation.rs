@@ -1,0 +1,168 @@
+//! Score distillation: what a diffusion model would change about latents,
+//! as a gradient that is injected there. The network is never differentiated.
+
+use std::sync::Arc;
+
+use candle_core::Tensor;
+
+use crate::error::{Result, argument};
+use crate::lora::Lora;
+use crate::pass::Pass;
+use crate::sampler::guided;
+use crate::schedule::NoiseSchedule;
+use crate::unet::UNet;
+
+/// Which difference of predictions.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Guidance {
+    /// Guided prediction minus the noise that was added [Poole et al. 2023];
+    /// `scale` as in [`guided`].
+    Sds {
+        /// Classifier-free guidance scale, 1 + s in the paper's notation.
+        scale: f64,
+    },
+    /// Conditional minus unconditional prediction [Yu et al. 2024].
+    Csd,
+    /// Adapted conditional minus un-adapted unconditional prediction
+    /// [Liang et al. 2024, eq. 8].
+    Lds,
+}
+
+/// w(t).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Weighting {
+    /// 1 - alpha bar, the usual choice: it vanishes with the noise.
+    #[default]
+    NoiseVariance,
+    /// 1.
+    Uniform,
+}
+
+impl Weighting {
+    /// w at this alpha bar.
+    pub fn at(self, alpha_bar: f64) -> f64 {
+        match self {
+            Self::NoiseVariance => 1.0 - alpha_bar,
+            Self::Uniform => 1.0,
+        }
+    }
+}
+
+/// Channels that an inpainting network sees beside the noisy latents.
+#[derive(Debug, Clone)]
+pub struct InpaintCondition {
+    /// 1 where the network may paint, [batch or 1, 1, h, w] in latent pixels.
+    pub mask: Tensor,
+    /// Latents of the image with the masked part blanked, [batch or 1, c, h, w].
+    pub masked_latents: Tensor,
+}
+
+impl InpaintCondition {
+    /// Latents, mask and masked latents side by side.
+    pub fn join(&self, latents: &Tensor) -> Result<Tensor> {
+        let (batch, _, h, w) = latents.dims4()?;
+        let spread = |t: &Tensor| -> Result<Tensor> {
+            Ok(t.broadcast_as((batch, t.dim(1)?, h, w))?.contiguous()?)
+        };
+        Ok(Tensor::cat(
+            &[
+                latents,
+                &spread(&self.mask)?,
+                &spread(&self.masked_latents)?,
+            ],
+            1,
+        )?)
+    }
+}
+
+/// Everything of a score-distillation step but latents, t and noise.
+#[derive(Debug)]
+pub struct ScoreDistillation<'a> {
+    /// The network.
+    pub unet: &'a UNet,
+    /// Its schedule.
+    pub schedule: &'a NoiseSchedule,
+    /// Which difference.
+    pub guidance: Guidance,
+    /// w(t).
+    pub weighting: Weighting,
+    /// Adapter of the personalised model. SDS and CSD use it in both terms,
+    /// LDS in the conditional one only.
+    pub lora: Option<&'a Arc<Lora>>,
+    /// States of the prompt, [1 or batch, tokens, width].
+    pub conditional: &'a Tensor,
+    /// States of the empty prompt.
+    pub unconditional: &'a Tensor,
+    /// For 9-channel networks.
+    pub inpaint: Option<&'a InpaintCondition>,
+}
+
+/// The result of a step.
+#[derive(Debug, Clone)]
+pub struct ScoreGradient {
+    /// w(t) times the difference, [batch, c, h, w]: the gradient at the
+    /// latents, dz_t/dz left out as is usual.
+    pub gradient: Tensor,
+    /// Mean square of the difference without w(t).
+    pub difference: f64,
+}
+
+impl ScoreDistillation<'_> {
+    /// The gradient at `latents` [batch, c, h, w] for timestep `t` and the
+    /// given standard normal noise of the same shape.
+    pub fn gradient(&self, latents: &Tensor, t: usize, noise: &Tensor) -> Result<ScoreGradient> {
+        if latents.dims() != noise.dims() {
+            return argument(format!(
+                "score distillation: latents {:?}, noise {:?}",
+                latents.dims(),
+                noise.dims()
+            ));
+        }
+        let latents = latents.detach();
+        let x_t = self.schedule.add_noise(&latents, noise, t)?;
+        let (conditional, unconditional) = self.predictions(&x_t, t)?;
+        let difference = match self.guidance {
+            Guidance::Sds { scale } => (guided(&unconditional, &conditional, scale)? - noise)?,
+            Guidance::Csd | Guidance::Lds => (conditional - unconditional)?,
+        };
+        let weight = self.weighting.at(self.schedule.alpha_bar(t)?);
+        let mean_square = difference
+            .to_dtype(candle_core::DType::F32)?
+            .sqr()?
+            .mean_all()?
+            .to_scalar::<f32>()?;
+        Ok(ScoreGradient {
+            gradient: (&difference * weight)?,
+            difference: mean_square as f64,
+        })
+    }
+
+    /// Noise predictions (conditional, unconditional), in one batch.
+    fn predictions(&self, x_t: &Tensor, t: usize) -> Result<(Tensor, Tensor)> {
+        let batch = x_t.dim(0)?;
+        let input = match self.inpaint {
+            Some(condition) => condition.join(x_t)?,
+            None => x_t.clone(),
+        };
+        let spread = |context: &Tensor| -> Result<Tensor> {
+            let (_, tokens, width) = context.dims3()?;
+            Ok(context.broadcast_as((batch, tokens, width))?.contiguous()?)
+        };
+        let context = Tensor::cat(&[spread(self.conditional)?, spread(self.unconditional)?], 0)?;
+        let both = Tensor::cat(&[&input, &input], 0)?;
+        let lora_rows = (self.guidance == Guidance::Lds).then_some(batch);
+        let pass = Pass {
+            lora: self.lora.cloned(),
+            lora_rows,
+            recompute: None,
+        };
+        let output = self
+            .unet
+            .forward(&both, &[t as f64], &context, &pass)?
+            .detach();
+        let noise = self
+            .schedule
+            .noise_of(&output, &Tensor::cat(&[x_t, x_t], 0)?, t)?;
+        Ok((noise.narrow(0, 0, batch)?, noise.narrow(0, batch, batch)?))
+    }
+}

@@ -1,0 +1,116 @@
+//! What can go wrong with a diffusion model, said so that it can be mended.
+
+use std::path::PathBuf;
+
+/// Errors of this crate.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A file or folder could not be read or written.
+    #[error("cannot {action} {path}: {source}")]
+    Io {
+        /// "read", "write", "create"...
+        action: &'static str,
+        /// The file or folder.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A JSON file does not hold what is needed.
+    #[error("{path}: {message}")]
+    Config {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, the accepted form and a remedy.
+        message: String,
+    },
+    /// A safetensors file is damaged or hostile.
+    #[error("{path}: not a usable safetensors file: {message}; fetch or export the file again")]
+    Safetensors {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        message: String,
+    },
+    /// Weights do not fit the model that their configuration describes.
+    #[error("{path}: weights do not fit the configuration beside them: {}", list(.problems))]
+    Weights {
+        /// The file or folder of the weights.
+        path: PathBuf,
+        /// One sentence for each tensor.
+        problems: Vec<String>,
+    },
+    /// A LoRA file does not fit the model.
+    #[error("{path}: not a LoRA for this model: {}", list(.problems))]
+    Lora {
+        /// The file.
+        path: PathBuf,
+        /// One sentence for each key.
+        problems: Vec<String>,
+    },
+    /// An argument is outside its range or of a wrong shape.
+    #[error("{0}")]
+    Argument(String),
+    /// A checkpoint does not belong to this run.
+    #[error("{path}: cannot resume from this checkpoint: {message}")]
+    Checkpoint {
+        /// The checkpoint.
+        path: PathBuf,
+        /// What differs.
+        message: String,
+    },
+    /// A trainable tensor got no gradient, or one that is not finite.
+    #[error("parameter {name}: {message}")]
+    Gradient {
+        /// The parameter's name.
+        name: String,
+        /// What is wrong with its gradient.
+        message: String,
+    },
+    /// The tokenizer could not be built or used.
+    #[error("{path}: tokenizer: {message}")]
+    Tokenizer {
+        /// The tokenizer's folder.
+        path: PathBuf,
+        /// What is wrong.
+        message: String,
+    },
+    /// A tensor operation failed.
+    #[error(transparent)]
+    Tensor(#[from] candle_core::Error),
+}
+
+/// Result with this crate's error.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// How many problems an error message spells out before it only counts.
+const SPELLED_OUT: usize = 8;
+
+fn list(problems: &[String]) -> String {
+    let mut text = problems
+        .iter()
+        .take(SPELLED_OUT)
+        .cloned()
+        .collect::<Vec<_>>()
+        .join("; ");
+    if problems.len() > SPELLED_OUT {
+        text += &format!("; and {} more", problems.len() - SPELLED_OUT);
+    }
+    text
+}
+
+pub(crate) fn io(
+    action: &'static str,
+    path: impl Into<PathBuf>,
+) -> impl FnOnce(std::io::Error) -> Error {
+    let path = path.into();
+    move |source| Error::Io {
+        action,
+        path,
+        source,
+    }
+}
+
+pub(crate) fn argument<T>(message: impl Into<String>) -> Result<T> {
+    Err(Error::Argument(message.into()))
+}

@@ -1,0 +1,173 @@
+//! Matrix products over `gemm`, with the strides spelled out.
+
+use gemm::{Parallelism, gemm};
+
+/// A row-major view: element (i, j) at `i * row + j * column`.
+#[derive(Clone, Copy)]
+pub(crate) struct View<'a> {
+    pub data: &'a [f32],
+    pub row: usize,
+    pub column: usize,
+}
+
+impl<'a> View<'a> {
+    /// Rows of `width` contiguous elements.
+    pub(crate) fn rows(data: &'a [f32], width: usize) -> Self {
+        Self {
+            data,
+            row: width,
+            column: 1,
+        }
+    }
+
+    /// The same elements with rows and columns exchanged.
+    pub(crate) fn transposed(self) -> Self {
+        Self {
+            data: self.data,
+            row: self.column,
+            column: self.row,
+        }
+    }
+
+    fn check(&self, rows: usize, columns: usize) {
+        if rows > 0 && columns > 0 {
+            assert!(
+                (rows - 1) * self.row + (columns - 1) * self.column < self.data.len(),
+                "matrix view out of range"
+            );
+        }
+    }
+}
+
+/// Threads for one product.
+#[derive(Clone, Copy, PartialEq)]
+pub(crate) enum Threads {
+    One,
+    All,
+}
+
+/// `out[m x n] = keep * out + scale * a[m x k] b[k x n]`, where `out` has rows
+/// of stride `out_row` and contiguous columns.
+///
+/// # Safety
+/// `out` is valid for writes of m rows of n elements at stride `out_row`, and
+/// for reads if `keep` is not 0, and nobody else uses them meanwhile.
+pub(crate) unsafe fn product_at(
+    (m, n, k): (usize, usize, usize),
+    out: *mut f32,
+    out_row: usize,
+    keep: f32,
+    scale: f32,
+    a: View,
+    b: View,
+    threads: Threads,
+) {
+    a.check(m, k);
+    b.check(k, n);
+    let parallelism = match threads {
+        Threads::One => Parallelism::None,
+        Threads::All => Parallelism::Rayon(rayon::current_num_threads()),
+    };
+    // SAFETY: both views were checked, `out` is the caller's contract.
+    unsafe {
+        gemm(
+            m,
+            n,
+            k,
+            out,
+            1,
+            out_row as isize,
+            keep != 0.0,
+            a.data.as_ptr(),
+            a.column as isize,
+            a.row as isize,
+            b.data.as_ptr(),
+            b.column as isize,
+            b.row as isize,
+            keep,
+            scale,
+            false,
+            false,
+            false,
+            parallelism,
+        );
+    }
+}
+
+/// [`product_at`] into a contiguous slice.
+pub(crate) fn product(
+    (m, n, k): (usize, usize, usize),
+    out: &mut [f32],
+    keep: f32,
+    a: View,
+    b: View,
+    threads: Threads,
+) {
+    assert!(out.len() >= m * n, "product: output too short");
+    // SAFETY: the length was checked and the borrow is exclusive.
+    unsafe { product_at((m, n, k), out.as_mut_ptr(), n, keep, 1.0, a, b, threads) }
+}
+
+/// `y = x w^T + bias` for x [rows, inputs], w [outputs, inputs].
+pub(crate) fn linear(
+    rows: usize,
+    inputs: usize,
+    outputs: usize,
+    x: &[f32],
+    w: &[f32],
+    bias: Option<&[f32]>,
+) -> Vec<f32> {
+    let mut y = match bias {
+        Some(bias) => bias.repeat(rows),
+        None => vec![0.0; rows * outputs],
+    };
+    let keep = if bias.is_some() { 1.0 } else { 0.0 };
+    let (a, b) = (View::rows(x, inputs), View::rows(w, inputs).transposed());
+    product((rows, outputs, inputs), &mut y, keep, a, b, Threads::All);
+    y
+}
+
+/// Gradient of [`linear`] with respect to x, for the gradient `g` of y.
+pub(crate) fn linear_vjp_input(
+    rows: usize,
+    inputs: usize,
+    outputs: usize,
+    g: &[f32],
+    w: &[f32],
+) -> Vec<f32> {
+    let mut dx = vec![0.0; rows * inputs];
+    product(
+        (rows, inputs, outputs),
+        &mut dx,
+        0.0,
+        View::rows(g, outputs),
+        View::rows(w, inputs),
+        Threads::All,
+    );
+    dx
+}
+
+/// Gradient of [`linear`] with respect to w.
+pub(crate) fn linear_vjp_weight(
+    rows: usize,
+    inputs: usize,
+    outputs: usize,
+    g: &[f32],
+    x: &[f32],
+) -> Vec<f32> {
+    let mut dw = vec![0.0; outputs * inputs];
+    let (a, b) = (View::rows(g, outputs).transposed(), View::rows(x, inputs));
+    product((outputs, inputs, rows), &mut dw, 0.0, a, b, Threads::All);
+    dw
+}
+
+/// Sum over rows: the gradient of a bias.
+pub(crate) fn column_sums(g: &[f32], columns: usize) -> Vec<f32> {
+    let mut sums = vec![0f64; columns];
+    for row in g.chunks_exact(columns) {
+        for (sum, &value) in sums.iter_mut().zip(row) {
+            *sum += value as f64;
+        }
+    }
+    sums.into_iter().map(|sum| sum as f32).collect()
+}

@@ -1,0 +1,114 @@
+//! Activation functions.
+
+use candle_core::backend::BackendStorage;
+use candle_core::{CpuStorage, CustomOp1, D, Layout, Shape, Tensor};
+
+use crate::error::{Result, argument};
+use crate::kernels::pointwise;
+use crate::kernels::tensor::{floats, from_floats, read, store};
+
+/// Activation functions that model configurations name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Activation {
+    /// x / (1 + e^-x), "silu" or "swish".
+    Silu,
+    /// x Phi(x) with the exact normal distribution, "gelu".
+    Gelu,
+    /// x / (1 + e^(-1.702 x)), "quick_gelu".
+    QuickGelu,
+}
+
+impl Activation {
+    /// The function that a configuration calls `name`.
+    pub fn from_name(name: &str) -> Option<Self> {
+        match name {
+            "silu" | "swish" => Some(Self::Silu),
+            "gelu" => Some(Self::Gelu),
+            "quick_gelu" => Some(Self::QuickGelu),
+            _ => None,
+        }
+    }
+
+    fn kernel(self) -> pointwise::Activation {
+        match self {
+            Self::Silu => pointwise::Activation::Silu,
+            Self::Gelu => pointwise::Activation::Gelu,
+            Self::QuickGelu => pointwise::Activation::QuickGelu,
+        }
+    }
+}
+
+/// f(x), elementwise.
+pub fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
+    let x = x.contiguous()?;
+    if x.device().is_cpu() {
+        return Ok(x.apply_op1(ActivationOp(f))?);
+    }
+    Ok(match f {
+        Activation::Silu => x.silu()?,
+        Activation::Gelu => x.gelu_erf()?,
+        // x sigmoid(a x) = silu(a x) / a
+        Activation::QuickGelu => ((&x * 1.702)?.silu()? / 1.702)?,
+    })
+}
+
+/// The gated unit of the transformer blocks: x = (value, gate) in the last
+/// dimension to value * gelu(gate) [Shazeer 2020].
+pub fn geglu(x: &Tensor) -> Result<Tensor> {
+    let x = x.contiguous()?;
+    let width = x.dim(D::Minus1)?;
+    if width % 2 != 0 {
+        return argument(format!(
+            "geglu needs an even last dimension, got {:?}",
+            x.dims()
+        ));
+    }
+    if x.device().is_cpu() {
+        return Ok(x.apply_op1(GegluOp)?);
+    }
+    let halves = x.chunk(2, D::Minus1)?;
+    Ok((&halves[0] * halves[1].gelu_erf()?)?)
+}
+
+struct ActivationOp(Activation);
+
+impl CustomOp1 for ActivationOp {
+    fn name(&self) -> &'static str {
+        "activation"
+    }
+
+    fn cpu_fwd(&self, x: &CpuStorage, lx: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
+        let y = pointwise::eval(self.0.kernel(), &floats(x, lx)?);
+        Ok((store(y, x.dtype()), lx.shape().clone()))
+    }
+
+    fn bwd(&self, x: &Tensor, _: &Tensor, g: &Tensor) -> candle_core::Result<Option<Tensor>> {
+        let g = g.contiguous()?;
+        let dx = pointwise::eval_vjp(self.0.kernel(), &read(x)?, &read(&g)?);
+        Ok(Some(from_floats(dx, x.shape(), x.dtype())?))
+    }
+}
+
+struct GegluOp;
+
+impl CustomOp1 for GegluOp {
+    fn name(&self) -> &'static str {
+        "geglu"
+    }
+
+    fn cpu_fwd(&self, x: &CpuStorage, lx: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
+        let mut shape = lx.dims().to_vec();
+        let width = shape.pop().unwrap_or(0) / 2;
+        shape.push(width);
+        Ok((
+            store(pointwise::geglu(&floats(x, lx)?, width), x.dtype()),
+            Shape::from(shape),
+        ))
+    }
+
+    fn bwd(&self, x: &Tensor, _: &Tensor, g: &Tensor) -> candle_core::Result<Option<Tensor>> {
+        let g = g.contiguous()?;
+        let dx = pointwise::geglu_vjp(&read(x)?, g.dim(D::Minus1)?, &read(&g)?);
+        Ok(Some(from_floats(dx, x.shape(), x.dtype())?))
+    }
+}

@@ -1,0 +1,197 @@
+//! 2-D convolution.
+
+use candle_core::backend::BackendStorage;
+use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
+
+use crate::error::{Result, argument};
+use crate::kernels::conv::{self, ConvShape};
+use crate::kernels::tensor::{floats, from_floats, read, store};
+use crate::parameters::{Init, Parameters};
+
+/// Zeros around the input of a convolution.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Padding {
+    /// As many on each side.
+    Same(usize),
+    /// Only after the last row and column, as the autoencoder's downsampling.
+    After(usize),
+}
+
+/// Convolution of [batch, inputs, height, width] with square kernels.
+#[derive(Debug, Clone)]
+pub struct Conv2d {
+    weight: Tensor,
+    bias: Tensor,
+    stride: usize,
+    padding: Padding,
+}
+
+impl Conv2d {
+    /// Weight [outputs, inputs, kernel, kernel] and bias below `parameters`.
+    pub fn new(
+        parameters: &Parameters,
+        (inputs, outputs): (usize, usize),
+        kernel: usize,
+        stride: usize,
+        padding: Padding,
+    ) -> Result<Self> {
+        let fan_in = Init::FanIn(inputs * kernel * kernel);
+        let weight = parameters.get("weight", &[outputs, inputs, kernel, kernel], fan_in)?;
+        let bias = parameters.get("bias", &[outputs], fan_in)?;
+        Ok(Self {
+            weight,
+            bias,
+            stride,
+            padding,
+        })
+    }
+
+    /// From tensors; refuses shapes that do not fit each other.
+    pub fn from_tensors(
+        weight: Tensor,
+        bias: Tensor,
+        stride: usize,
+        padding: Padding,
+    ) -> Result<Self> {
+        let (outputs, _, height, width) = weight.dims4()?;
+        if bias.dims() != [outputs] || height != width || stride == 0 {
+            return argument(format!(
+                "convolution: weight {:?}, bias {:?}, stride {stride}: kernels are square, the bias has one value an output, the stride is at least 1",
+                weight.dims(),
+                bias.dims()
+            ));
+        }
+        Ok(Self {
+            weight,
+            bias,
+            stride,
+            padding,
+        })
+    }
+
+    /// Number of input channels.
+    pub fn inputs(&self) -> usize {
+        self.weight.dims()[1]
+    }
+
+    /// Applies the layer.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let x = x.contiguous()?;
+        let (before, after) = match self.padding {
+            Padding::Same(n) => (n, n),
+            Padding::After(n) => (0, n),
+        };
+        if x.device().is_cpu() {
+            return Ok(x.apply_op3(
+                &self.weight,
+                &self.bias,
+                ConvOp {
+                    stride: self.stride,
+                    before,
+                    after,
+                },
+            )?);
+        }
+        let y = if before == after {
+            x.conv2d(&self.weight, before, self.stride, 1, 1)?
+        } else {
+            let padded = x
+                .pad_with_zeros(2, before, after)?
+                .pad_with_zeros(3, before, after)?;
+            padded.conv2d(&self.weight, 0, self.stride, 1, 1)?
+        };
+        Ok(y.broadcast_add(&self.bias.reshape((1, (), 1, 1))?)?)
+    }
+}
+
+struct ConvOp {
+    stride: usize,
+    before: usize,
+    after: usize,
+}
+
+impl ConvOp {
+    fn shape(&self, x: &Shape, w: &Shape) -> candle_core::Result<ConvShape> {
+        let (batch, inputs, height, width) = x.dims4()?;
+        let (outputs, depth, kernel, _) = w.dims4()?;
+        let (before, after) = (self.before, self.after);
+        if depth != inputs {
+            candle_core::bail!("convolution of {depth} channels got an input of {inputs} channels");
+        }
+        if height + before + after < kernel || width + before + after < kernel {
+            candle_core::bail!(
+                "convolution with a kernel of {kernel} got an input of only {height}x{width}"
+            );
+        }
+        let stride = self.stride;
+        Ok(ConvShape {
+            batch,
+            inputs,
+            height,
+            width,
+            outputs,
+            kernel,
+            stride,
+            pad_before: before,
+            pad_after: after,
+        })
+    }
+}
+
+impl CustomOp3 for ConvOp {
+    fn name(&self) -> &'static str {
+        "conv2d"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        lx: &Layout,
+        w: &CpuStorage,
+        lw: &Layout,
+        b: &CpuStorage,
+        lb: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        let shape = self.shape(lx.shape(), lw.shape())?;
+        let y = conv::conv2d(
+            shape,
+            &floats(x, lx)?,
+            &floats(w, lw)?,
+            Some(&floats(b, lb)?),
+        );
+        let dims = (
+            shape.batch,
+            shape.outputs,
+            shape.out_height(),
+            shape.out_width(),
+        );
+        Ok((store(y, x.dtype()), Shape::from(dims)))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+        _: &Tensor,
+        g: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let shape = self.shape(x.shape(), w.shape())?;
+        let g = g.contiguous()?;
+        let g_values = read(&g)?;
+        let mut result = (None, None, None);
+        if x.track_op() {
+            let dx = conv::conv2d_vjp_input(shape, &g_values, &read(w)?);
+            result.0 = Some(from_floats(dx, x.shape(), x.dtype())?);
+        }
+        if w.track_op() {
+            let dw = conv::conv2d_vjp_weight(shape, &g_values, &read(x)?);
+            result.1 = Some(from_floats(dw, w.shape(), w.dtype())?);
+        }
+        if b.track_op() {
+            let db = conv::conv2d_vjp_bias(shape, &g_values);
+            result.2 = Some(from_floats(db, b.shape(), b.dtype())?);
+        }
+        Ok(result)
+    }
+}

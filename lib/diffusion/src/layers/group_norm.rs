@@ -1,0 +1,156 @@
+//! Group normalisation, optionally followed by SiLU.
+
+use candle_core::backend::BackendStorage;
+use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
+
+use crate::error::{Result, argument};
+use crate::kernels::norm::{self, GroupShape};
+use crate::kernels::tensor::{floats, from_floats, read, store};
+use crate::parameters::{Init, Parameters};
+
+/// What follows the normalisation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NormActivation {
+    /// Nothing.
+    None,
+    /// x / (1 + e^-x)
+    Silu,
+}
+
+/// Normalises groups of channels of [batch, channels, ...] to mean 0 and
+/// variance 1 [Wu & He 2018]; statistics in f32 or better for every storage.
+#[derive(Debug, Clone)]
+pub struct GroupNorm {
+    gamma: Tensor,
+    beta: Tensor,
+    groups: usize,
+    eps: f64,
+    activation: NormActivation,
+}
+
+impl GroupNorm {
+    /// Scale and shift [channels] below `parameters`.
+    pub fn new(
+        parameters: &Parameters,
+        groups: usize,
+        channels: usize,
+        eps: f64,
+        activation: NormActivation,
+    ) -> Result<Self> {
+        if groups == 0 || channels % groups != 0 {
+            return argument(format!(
+                "group norm {:?}: {channels} channels do not divide into {groups} groups",
+                parameters.path()
+            ));
+        }
+        let gamma = parameters.get("weight", &[channels], Init::Constant(1.0))?;
+        let beta = parameters.get("bias", &[channels], Init::Constant(0.0))?;
+        Ok(Self {
+            gamma,
+            beta,
+            groups,
+            eps,
+            activation,
+        })
+    }
+
+    /// Applies the layer.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let x = x.contiguous()?;
+        if x.device().is_cpu() {
+            let silu = self.activation == NormActivation::Silu;
+            let op = GroupNormOp {
+                groups: self.groups,
+                eps: self.eps as f32,
+                silu,
+            };
+            return Ok(x.apply_op3(&self.gamma, &self.beta, op)?);
+        }
+        let (batch, channels) = (x.dims()[0], x.dims()[1]);
+        let grouped = x.to_dtype(DType::F32)?.reshape((batch, self.groups, ()))?;
+        let centred = grouped.broadcast_sub(&grouped.mean_keepdim(2)?)?;
+        let variance = centred.sqr()?.mean_keepdim(2)?;
+        let normalised = centred
+            .broadcast_div(&(variance + self.eps)?.sqrt()?)?
+            .reshape(x.shape())?;
+        let mut shape = vec![1; x.rank()];
+        shape[1] = channels;
+        let gamma = self.gamma.to_dtype(DType::F32)?.reshape(shape.as_slice())?;
+        let beta = self.beta.to_dtype(DType::F32)?.reshape(shape)?;
+        let y = normalised.broadcast_mul(&gamma)?.broadcast_add(&beta)?;
+        let y = if self.activation == NormActivation::Silu {
+            y.silu()?
+        } else {
+            y
+        };
+        Ok(y.to_dtype(x.dtype())?)
+    }
+}
+
+struct GroupNormOp {
+    groups: usize,
+    eps: f32,
+    silu: bool,
+}
+
+impl GroupNormOp {
+    fn shape(&self, x: &Shape, gamma: &Shape) -> candle_core::Result<GroupShape> {
+        let channels = gamma.elem_count();
+        if x.rank() < 2 || x.dims()[1] != channels {
+            candle_core::bail!("group norm of {channels} channels got {x:?}");
+        }
+        let pixels = x.dims()[2..].iter().product();
+        Ok(GroupShape {
+            channels,
+            pixels,
+            groups: self.groups,
+            eps: self.eps,
+            silu: self.silu,
+        })
+    }
+}
+
+impl CustomOp3 for GroupNormOp {
+    fn name(&self) -> &'static str {
+        "group norm"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        lx: &Layout,
+        gamma: &CpuStorage,
+        lg: &Layout,
+        beta: &CpuStorage,
+        lb: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        let shape = self.shape(lx.shape(), lg.shape())?;
+        let y = norm::group_norm(
+            shape,
+            &floats(x, lx)?,
+            &floats(gamma, lg)?,
+            &floats(beta, lb)?,
+        );
+        Ok((store(y, x.dtype()), lx.shape().clone()))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        gamma: &Tensor,
+        beta: &Tensor,
+        _: &Tensor,
+        g: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let shape = self.shape(x.shape(), gamma.shape())?;
+        let g = g.contiguous()?;
+        let (dx, dgamma, dbeta) =
+            norm::group_norm_vjp(shape, &read(x)?, &read(gamma)?, &read(beta)?, &read(&g)?);
+        let wanted = |like: &Tensor, values: Vec<f32>| {
+            like.track_op()
+                .then(|| from_floats(values, like.shape(), like.dtype()))
+                .transpose()
+        };
+        Ok((wanted(x, dx)?, wanted(gamma, dgamma)?, wanted(beta, dbeta)?))
+    }
+}

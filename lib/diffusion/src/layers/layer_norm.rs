@@ -1,0 +1,99 @@
+//! Layer normalisation.
+
+use candle_core::backend::BackendStorage;
+use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
+
+use crate::error::Result;
+use crate::kernels::norm;
+use crate::kernels::tensor::{floats, from_floats, read, store};
+use crate::parameters::{Init, Parameters};
+
+/// Normalises the last dimension to mean 0 and variance 1 [Ba et al. 2016].
+#[derive(Debug, Clone)]
+pub struct LayerNorm {
+    gamma: Tensor,
+    beta: Tensor,
+    eps: f64,
+}
+
+impl LayerNorm {
+    /// Scale and shift [size] below `parameters`.
+    pub fn new(parameters: &Parameters, size: usize, eps: f64) -> Result<Self> {
+        let gamma = parameters.get("weight", &[size], Init::Constant(1.0))?;
+        let beta = parameters.get("bias", &[size], Init::Constant(0.0))?;
+        Ok(Self { gamma, beta, eps })
+    }
+
+    /// Applies the layer to x [..., size].
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let x = x.contiguous()?;
+        if x.device().is_cpu() {
+            return Ok(x.apply_op3(
+                &self.gamma,
+                &self.beta,
+                LayerNormOp {
+                    eps: self.eps as f32,
+                },
+            )?);
+        }
+        let last = x.rank() - 1;
+        let values = x.to_dtype(DType::F32)?;
+        let centred = values.broadcast_sub(&values.mean_keepdim(last)?)?;
+        let variance = centred.sqr()?.mean_keepdim(last)?;
+        let normalised = centred.broadcast_div(&(variance + self.eps)?.sqrt()?)?;
+        let y = normalised
+            .broadcast_mul(&self.gamma.to_dtype(DType::F32)?)?
+            .broadcast_add(&self.beta.to_dtype(DType::F32)?)?;
+        Ok(y.to_dtype(x.dtype())?)
+    }
+}
+
+struct LayerNormOp {
+    eps: f32,
+}
+
+impl CustomOp3 for LayerNormOp {
+    fn name(&self) -> &'static str {
+        "layer norm"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        lx: &Layout,
+        gamma: &CpuStorage,
+        lg: &Layout,
+        beta: &CpuStorage,
+        lb: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        if lx.dims().last() != Some(&lg.shape().elem_count()) {
+            candle_core::bail!("layer norm of {:?} got {:?}", lg.shape(), lx.shape());
+        }
+        let y = norm::layer_norm(
+            &floats(x, lx)?,
+            &floats(gamma, lg)?,
+            &floats(beta, lb)?,
+            self.eps,
+        );
+        Ok((store(y, x.dtype()), lx.shape().clone()))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        gamma: &Tensor,
+        beta: &Tensor,
+        _: &Tensor,
+        g: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let g = g.contiguous()?;
+        let (dx, dgamma, dbeta) =
+            norm::layer_norm_vjp(&read(x)?, &read(gamma)?, &read(&g)?, self.eps);
+        let wanted = |like: &Tensor, values: Vec<f32>| {
+            like.track_op()
+                .then(|| from_floats(values, like.shape(), like.dtype()))
+                .transpose()
+        };
+        Ok((wanted(x, dx)?, wanted(gamma, dgamma)?, wanted(beta, dbeta)?))
+    }
+}

@@ -1,0 +1,201 @@
+//! Fully connected layer.
+
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
+
+use crate::error::{Result, argument};
+use crate::kernels::matmul;
+use crate::kernels::tensor::{floats, from_floats, read, store};
+use crate::parameters::{Init, Parameters};
+
+/// y = x W^T + b over the last dimension.
+#[derive(Debug, Clone)]
+pub struct Linear {
+    weight: Tensor,
+    bias: Option<Tensor>,
+}
+
+impl Linear {
+    /// Weight [outputs, inputs] and bias [outputs] below `parameters`.
+    pub fn new(parameters: &Parameters, inputs: usize, outputs: usize) -> Result<Self> {
+        let weight = parameters.get("weight", &[outputs, inputs], Init::FanIn(inputs))?;
+        let bias = parameters.get("bias", &[outputs], Init::FanIn(inputs))?;
+        Ok(Self {
+            weight,
+            bias: Some(bias),
+        })
+    }
+
+    /// As [`Linear::new`] without a bias.
+    pub fn without_bias(parameters: &Parameters, inputs: usize, outputs: usize) -> Result<Self> {
+        let weight = parameters.get("weight", &[outputs, inputs], Init::FanIn(inputs))?;
+        Ok(Self { weight, bias: None })
+    }
+
+    /// From tensors; refuses a weight that is no matrix or a bias that does
+    /// not fit it.
+    pub fn from_tensors(weight: Tensor, bias: Option<Tensor>) -> Result<Self> {
+        let (outputs, _) = weight.dims2()?;
+        if let Some(bias) = &bias
+            && bias.dims() != [outputs]
+        {
+            return argument(format!(
+                "linear layer: weight {:?} and bias {:?} disagree",
+                weight.dims(),
+                bias.dims()
+            ));
+        }
+        Ok(Self { weight, bias })
+    }
+
+    /// Number of inputs.
+    pub fn inputs(&self) -> usize {
+        self.weight.dims()[1]
+    }
+
+    /// Number of outputs.
+    pub fn outputs(&self) -> usize {
+        self.weight.dims()[0]
+    }
+
+    /// The weight matrix [outputs, inputs].
+    pub fn weight(&self) -> &Tensor {
+        &self.weight
+    }
+
+    /// Applies the layer to x [..., inputs].
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let x = x.contiguous()?;
+        if !x.device().is_cpu() {
+            return self.forward_composed(&x);
+        }
+        Ok(match &self.bias {
+            Some(bias) => x.apply_op3(&self.weight, bias, LinearOp)?,
+            None => x.apply_op2(&self.weight, LinearOp)?,
+        })
+    }
+
+    fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
+        let mut shape = x.dims().to_vec();
+        let inputs = shape.pop().unwrap_or(1);
+        let y = x.reshape(((), inputs))?.matmul(&self.weight.t()?)?;
+        shape.push(self.outputs());
+        let y = y.reshape(shape)?;
+        Ok(match &self.bias {
+            Some(bias) => y.broadcast_add(bias)?,
+            None => y,
+        })
+    }
+}
+
+struct LinearOp;
+
+impl LinearOp {
+    fn run(
+        (x, lx): (&CpuStorage, &Layout),
+        (w, lw): (&CpuStorage, &Layout),
+        bias: Option<(&CpuStorage, &Layout)>,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        let (outputs, inputs) = lw.shape().dims2()?;
+        let mut shape = lx.dims().to_vec();
+        if shape.pop() != Some(inputs) {
+            candle_core::bail!("linear layer of {inputs} inputs got {:?}", lx.shape());
+        }
+        let rows = shape.iter().product();
+        shape.push(outputs);
+        let bias = bias.map(|(b, lb)| floats(b, lb)).transpose()?;
+        let y = matmul::linear(
+            rows,
+            inputs,
+            outputs,
+            &floats(x, lx)?,
+            &floats(w, lw)?,
+            bias.as_deref(),
+        );
+        Ok((store(y, x.dtype()), Shape::from(shape)))
+    }
+
+    fn vjp(
+        x: &Tensor,
+        w: &Tensor,
+        g: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
+        let (outputs, inputs) = w.dims2()?;
+        let g = g.contiguous()?;
+        let rows = g.elem_count() / outputs;
+        let g_values = read(&g)?;
+        let mut result = (None, None);
+        if x.track_op() {
+            let dx = matmul::linear_vjp_input(rows, inputs, outputs, &g_values, &read(w)?);
+            result.0 = Some(from_floats(dx, x.shape(), x.dtype())?);
+        }
+        if w.track_op() {
+            let dw = matmul::linear_vjp_weight(rows, inputs, outputs, &g_values, &read(x)?);
+            result.1 = Some(from_floats(dw, w.shape(), w.dtype())?);
+        }
+        Ok(result)
+    }
+}
+
+use candle_core::backend::BackendStorage;
+
+impl CustomOp2 for LinearOp {
+    fn name(&self) -> &'static str {
+        "linear"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        lx: &Layout,
+        w: &CpuStorage,
+        lw: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        Self::run((x, lx), (w, lw), None)
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        w: &Tensor,
+        _: &Tensor,
+        g: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
+        Self::vjp(x, w, g)
+    }
+}
+
+impl CustomOp3 for LinearOp {
+    fn name(&self) -> &'static str {
+        "linear with bias"
+    }
+
+    fn cpu_fwd(
+        &self,
+        x: &CpuStorage,
+        lx: &Layout,
+        w: &CpuStorage,
+        lw: &Layout,
+        b: &CpuStorage,
+        lb: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        Self::run((x, lx), (w, lw), Some((b, lb)))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+        _: &Tensor,
+        g: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let (dx, dw) = Self::vjp(x, w, g)?;
+        let db = if b.track_op() {
+            let sums = matmul::column_sums(&read(&g.contiguous()?)?, b.elem_count());
+            Some(from_floats(sums, b.shape(), b.dtype())?)
+        } else {
+            None
+        };
+        Ok((dx, dw, db))
+    }
+}

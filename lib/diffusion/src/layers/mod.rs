@@ -1,0 +1,25 @@
+//! Layers through which gradients pass, on the CPU through the crate's own
+//! kernels and elsewhere composed of candle's differentiable operations.
+//!
+//! candle's fused `layer_norm`, `softmax_last_dim`, `rms_norm` and rotary
+//! operations have no backward pass and cut the graph without an error: none
+//! of them is used here. Gradients of parameters that are not variables are
+//! never computed by the CPU kernels.
+
+mod activation;
+mod attention;
+mod conv2d;
+mod embedding;
+mod group_norm;
+mod layer_norm;
+mod linear;
+mod resample;
+
+pub use activation::{Activation, activate, geglu};
+pub use attention::{Attention, Causality};
+pub use conv2d::{Conv2d, Padding};
+pub use embedding::Embedding;
+pub use group_norm::{GroupNorm, NormActivation};
+pub use layer_norm::LayerNorm;
+pub use linear::Linear;
+pub use resample::upsample_nearest;

@@ -1,0 +1,281 @@
+//! LoRA files: PEFT's keys as diffusers writes them, kohya's keys as A1111
+//! and ComfyUI read them. Both are read and written.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use candle_core::{DType, Device, Tensor};
+use serde_json::{Value, json};
+
+use super::{Adapter, AdapterTarget, Lora};
+use crate::error::{Error, Result};
+use crate::weights::{Weights, write_safetensors};
+
+/// Whose keys a file has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LoraStyle {
+    /// `unet.<module>.lora_A.weight`, alpha in the header's metadata.
+    Peft,
+    /// `lora_unet_<module with _>.lora_down.weight` with an `.alpha` tensor.
+    Kohya,
+}
+
+/// Free-form facts for the header: prompts, hash of the base model...
+pub type LoraInfo = BTreeMap<String, String>;
+
+const PEFT_METADATA: &str = "lora_adapter_metadata";
+
+impl Lora {
+    /// Writes the adapters, in f32, with rank, alpha and `info` in the header.
+    pub fn save(&self, path: &Path, style: LoraStyle, info: &LoraInfo) -> Result<()> {
+        let mut tensors = BTreeMap::new();
+        for (name, adapter) in &self.adapters {
+            let (down, up) = (adapter.down().detach(), adapter.up().detach());
+            match style {
+                LoraStyle::Peft => {
+                    tensors.insert(format!("unet.{name}.lora_A.weight"), down);
+                    tensors.insert(format!("unet.{name}.lora_B.weight"), up);
+                }
+                LoraStyle::Kohya => {
+                    let module = format!("lora_unet_{}", name.replace('.', "_"));
+                    let alpha = Tensor::new(adapter.alpha() as f32, &Device::Cpu)?;
+                    tensors.insert(format!("{module}.lora_down.weight"), down);
+                    tensors.insert(format!("{module}.lora_up.weight"), up);
+                    tensors.insert(format!("{module}.alpha"), alpha);
+                }
+            }
+        }
+        let mut header = info.clone();
+        let (rank, alpha) = self
+            .adapters
+            .values()
+            .next()
+            .map_or((0, 0.0), |a| (a.rank(), a.alpha()));
+        header.insert("rank".into(), rank.to_string());
+        header.insert("alpha".into(), alpha.to_string());
+        match style {
+            LoraStyle::Peft => {
+                header.insert("format".into(), "pt".into());
+                header.insert(
+                    PEFT_METADATA.into(),
+                    self.peft_metadata(rank, alpha).to_string(),
+                );
+            }
+            LoraStyle::Kohya => {
+                header.insert("ss_network_module".into(), "networks.lora".into());
+                header.insert("ss_network_dim".into(), rank.to_string());
+                header.insert("ss_network_alpha".into(), alpha.to_string());
+            }
+        }
+        write_safetensors(path, &tensors, &header)
+    }
+
+    fn peft_metadata(&self, rank: usize, alpha: f64) -> Value {
+        let modules: Vec<&str> = self.adapters.keys().map(String::as_str).collect();
+        let mut rank_pattern = serde_json::Map::new();
+        let mut alpha_pattern = serde_json::Map::new();
+        for (name, adapter) in &self.adapters {
+            if adapter.rank() != rank {
+                rank_pattern.insert(name.clone(), json!(adapter.rank()));
+            }
+            if adapter.alpha() != alpha {
+                alpha_pattern.insert(name.clone(), json!(adapter.alpha()));
+            }
+        }
+        // PEFT wants an integer where the number is one.
+        let alpha = if alpha.fract() == 0.0 {
+            json!(alpha as i64)
+        } else {
+            json!(alpha)
+        };
+        json!({
+            "unet.r": rank,
+            "unet.lora_alpha": alpha,
+            "unet.target_modules": modules,
+            "unet.rank_pattern": rank_pattern,
+            "unet.alpha_pattern": alpha_pattern,
+        })
+    }
+
+    /// Reads a file of either style, or of diffusers before PEFT
+    /// (`.lora.down.weight`), for the layers `targets` of a UNet. The
+    /// adapters are frozen. Keys that fit no layer are errors that name them.
+    pub fn load(
+        path: &Path,
+        targets: &[AdapterTarget],
+        dtype: DType,
+        device: &Device,
+    ) -> Result<Self> {
+        let weights = Weights::open_file(path)?;
+        let mut problems = vec![];
+        let parts = sort_keys(&weights, targets, &mut problems);
+        let metadata = match weights.metadata().get(PEFT_METADATA) {
+            Some(text) => serde_json::from_str(text).map_err(|e| Error::Lora {
+                path: path.to_owned(),
+                problems: vec![format!("metadata {PEFT_METADATA:?} is not JSON: {e}")],
+            })?,
+            None => Value::Null,
+        };
+        let mut lora = Self::default();
+        for target in targets {
+            let Some(part) = parts.get(target.name.as_str()) else {
+                continue;
+            };
+            match read_adapter(&weights, target, part, &metadata, dtype, device)? {
+                Ok(adapter) => lora.insert_frozen(&target.name, adapter),
+                Err(problem) => problems.push(problem),
+            }
+        }
+        if lora.adapters.is_empty() && problems.is_empty() {
+            problems.push("it holds no adapter".into());
+        }
+        if !problems.is_empty() {
+            return Err(Error::Lora {
+                path: path.to_owned(),
+                problems,
+            });
+        }
+        Ok(lora)
+    }
+}
+
+/// The keys that belong to one layer.
+#[derive(Debug, Default)]
+struct Part {
+    down: Option<String>,
+    up: Option<String>,
+    alpha: Option<String>,
+}
+
+const DOWN: [&str; 3] = [".lora_A.weight", ".lora_down.weight", ".lora.down.weight"];
+const UP: [&str; 3] = [".lora_B.weight", ".lora_up.weight", ".lora.up.weight"];
+
+fn sort_keys<'a>(
+    weights: &Weights,
+    targets: &'a [AdapterTarget],
+    problems: &mut Vec<String>,
+) -> BTreeMap<&'a str, Part> {
+    let dotted: BTreeSet<&str> = targets.iter().map(|t| t.name.as_str()).collect();
+    let kohya: BTreeMap<String, &str> = targets
+        .iter()
+        .map(|t| (t.name.replace('.', "_"), t.name.as_str()))
+        .collect();
+    let mut parts: BTreeMap<&str, Part> = BTreeMap::new();
+    for key in weights.names() {
+        let strip = |ends: &[&'static str]| ends.iter().find_map(|end| key.strip_suffix(end));
+        let (module, which) = if let Some(module) = strip(&DOWN) {
+            (module, 0)
+        } else if let Some(module) = strip(&UP) {
+            (module, 1)
+        } else if let Some(module) = strip(&[".alpha"]) {
+            (module, 2)
+        } else {
+            problems.push(format!(
+                "key {key:?} is neither a down nor an up matrix nor an alpha"
+            ));
+            continue;
+        };
+        let layer = match module.strip_prefix("lora_unet_") {
+            Some(flat) => kohya.get(flat).copied(),
+            None => {
+                let name = module.strip_prefix("base_model.model.").unwrap_or(module);
+                let name = name.strip_prefix("unet.").unwrap_or(name);
+                // diffusers before PEFT wrote `attn1.processor.to_q_lora.down`.
+                let renamed = name
+                    .replace(".processor.to_out_lora", ".to_out.0")
+                    .replace(".processor.", ".");
+                let renamed = renamed.strip_suffix("_lora").unwrap_or(&renamed);
+                dotted.get(renamed).copied()
+            }
+        };
+        let Some(layer) = layer else {
+            let hint = if module.starts_with("lora_te") || module.starts_with("text_encoder") {
+                "adapts the text encoder, accepted are adapters of the UNet; train or export with the UNet only"
+            } else {
+                "belongs to no layer of this UNet"
+            };
+            problems.push(format!("key {key:?} {hint}"));
+            continue;
+        };
+        let part = parts.entry(layer).or_default();
+        *[&mut part.down, &mut part.up, &mut part.alpha][which] = Some(key.to_owned());
+    }
+    parts
+}
+
+fn read_adapter(
+    weights: &Weights,
+    target: &AdapterTarget,
+    part: &Part,
+    metadata: &Value,
+    dtype: DType,
+    device: &Device,
+) -> Result<Result<Adapter, String>> {
+    let (Some(down_key), Some(up_key)) = (&part.down, &part.up) else {
+        return Ok(Err(format!(
+            "layer {:?} has only one of its two matrices",
+            target.name
+        )));
+    };
+    let matrix = |key: &str| -> Result<Option<Tensor>> {
+        let tensor = weights.tensor(key, dtype, device)?;
+        Ok(match tensor {
+            // 1x1 convolutions of the same meaning.
+            Some(t) if t.rank() == 4 && t.dims()[2..] == [1, 1] => {
+                Some(t.reshape((t.dims()[0], t.dims()[1]))?)
+            }
+            other => other,
+        })
+    };
+    let (Some(down), Some(up)) = (matrix(down_key)?, matrix(up_key)?) else {
+        return Ok(Err(format!(
+            "layer {:?}: its matrices vanished",
+            target.name
+        )));
+    };
+    let fits = down.rank() == 2
+        && up.rank() == 2
+        && down.dims()[1] == target.inputs
+        && up.dims()[0] == target.outputs
+        && down.dims()[0] == up.dims()[1]
+        && down.dims()[0] > 0;
+    if !fits {
+        return Ok(Err(format!(
+            "tensors {down_key:?} {:?} and {up_key:?} {:?} do not fit the layer of {} inputs and {} outputs",
+            down.dims(),
+            up.dims(),
+            target.inputs,
+            target.outputs
+        )));
+    }
+    let rank = down.dims()[0];
+    let alpha = match &part.alpha {
+        Some(key) => match weights.tensor(key, DType::F32, &Device::Cpu)? {
+            Some(alpha) if alpha.elem_count() == 1 => {
+                alpha.flatten_all()?.to_vec1::<f32>()?[0] as f64
+            }
+            _ => return Ok(Err(format!("tensor {key:?} is not a single number"))),
+        },
+        None => peft_alpha(metadata, &target.name).unwrap_or(rank as f64),
+    };
+    Ok(Adapter::new(down, up, alpha).map_err(|e| format!("layer {:?}: {e}", target.name)))
+}
+
+/// alpha of a layer by the metadata of diffusers: an entry of the pattern
+/// whose key ends the layer's name, or the common value.
+fn peft_alpha(metadata: &Value, layer: &str) -> Option<f64> {
+    let field = |name: &str| {
+        metadata
+            .get(format!("unet.{name}"))
+            .or_else(|| metadata.get(name))
+    };
+    let by_pattern = field("alpha_pattern")
+        .and_then(Value::as_object)
+        .and_then(|pattern| {
+            pattern
+                .iter()
+                .find(|(key, _)| layer == key.as_str() || layer.ends_with(&format!(".{key}")))
+                .and_then(|(_, value)| value.as_f64())
+        });
+    by_pattern.or_else(|| field("lora_alpha").and_then(Value::as_f64))
+}

@@ -1,0 +1,138 @@
+//! A whole model: a folder in the diffusers layout.
+
+use std::path::{Path, PathBuf};
+
+use candle_core::{DType, Device, Tensor};
+
+use crate::config::ConfigFile;
+use crate::error::{Error, Result};
+use crate::parameters::Parameters;
+use crate::schedule::NoiseSchedule;
+use crate::text_encoder::{LearnedTokens, TextEncoder};
+use crate::tokenizer::Tokenizer;
+use crate::unet::{UNet, UNetConfig};
+use crate::vae::Vae;
+use crate::weights::Weights;
+
+/// Text encoder, UNet and autoencoder with their tokenizer and schedule.
+#[derive(Debug)]
+pub struct Model {
+    /// Where it came from.
+    pub folder: PathBuf,
+    /// Text to tokens.
+    pub tokenizer: Tokenizer,
+    /// Tokens to states.
+    pub text_encoder: TextEncoder,
+    /// The denoiser.
+    pub unet: UNet,
+    /// Images to latents and back.
+    pub vae: Vae,
+    /// Signal and noise by timestep.
+    pub schedule: NoiseSchedule,
+    device: Device,
+    dtype: DType,
+}
+
+impl Model {
+    /// Loads `model_index.json` and the folders `tokenizer`, `text_encoder`,
+    /// `unet`, `vae` and `scheduler`. Half-precision weights are converted to
+    /// `dtype`, which has to be f32 on the CPU. Checks that the parts fit
+    /// each other.
+    pub fn load(folder: &Path, dtype: DType, device: &Device) -> Result<Self> {
+        ConfigFile::read(&folder.join("model_index.json"))?;
+        if device.is_cpu() && dtype != DType::F32 {
+            return crate::error::argument(format!(
+                "precision {dtype:?} on the CPU: accepted is f32; half-precision files are converted while reading"
+            ));
+        }
+        let mut tokenizer = Tokenizer::load(&folder.join("tokenizer"))?;
+        let text_encoder = TextEncoder::load(&folder.join("text_encoder"), dtype, device)?;
+        let unet = load_unet(&folder.join("unet"), dtype, device)?;
+        let vae = Vae::load(&folder.join("vae"), dtype, device)?;
+        let schedule = NoiseSchedule::load(&folder.join("scheduler"))?;
+        tokenizer.limit_length(text_encoder.config().max_position_embeddings);
+        let model = Self {
+            folder: folder.to_owned(),
+            tokenizer,
+            text_encoder,
+            unet,
+            vae,
+            schedule,
+            device: device.clone(),
+            dtype,
+        };
+        model.check()?;
+        Ok(model)
+    }
+
+    fn check(&self) -> Result<()> {
+        let fail = |message: String| {
+            Err(Error::Config {
+                path: self.folder.join("model_index.json"),
+                message: format!("the parts do not fit: {message}"),
+            })
+        };
+        let (unet, text) = (self.unet.config(), self.text_encoder.config());
+        if unet.cross_attention_dim != text.hidden_size {
+            return fail(format!(
+                "unet has cross_attention_dim {}, text_encoder has hidden_size {}",
+                unet.cross_attention_dim, text.hidden_size
+            ));
+        }
+        let latent = self.vae.latent_channels();
+        if unet.out_channels != latent || ![latent, 2 * latent + 1].contains(&unet.in_channels) {
+            return fail(format!(
+                "unet takes {} channels and gives {}, vae has {latent}; accepted: {latent} or {} to {latent}",
+                unet.in_channels,
+                unet.out_channels,
+                2 * latent + 1
+            ));
+        }
+        if self.tokenizer.vocab_size() > text.vocab_size {
+            return fail(format!(
+                "tokenizer has {} tokens, text_encoder has vocab_size {}",
+                self.tokenizer.vocab_size(),
+                text.vocab_size
+            ));
+        }
+        Ok(())
+    }
+
+    /// Where the weights live.
+    pub fn device(&self) -> &Device {
+        &self.device
+    }
+
+    /// Precision of weights and activations.
+    pub fn dtype(&self) -> DType {
+        self.dtype
+    }
+
+    /// Whether the UNet takes mask and masked latents too.
+    pub fn is_inpainting(&self) -> bool {
+        self.unet.config().in_channels != self.vae.latent_channels()
+    }
+
+    /// States of prompts, [prompts, tokens, width].
+    pub fn encode_prompts(
+        &self,
+        prompts: &[&str],
+        learned: Option<&LearnedTokens>,
+    ) -> Result<Tensor> {
+        let tokens = prompts
+            .iter()
+            .map(|p| self.tokenizer.encode(p))
+            .collect::<Result<Vec<_>>>()?;
+        self.text_encoder.forward(&tokens, learned)
+    }
+}
+
+/// Loads the folder `unet/` of a model with frozen weights.
+pub fn load_unet(folder: &Path, dtype: DType, device: &Device) -> Result<UNet> {
+    let config = UNetConfig::from_file(&ConfigFile::read(&folder.join("config.json"))?)?;
+    let weights = Weights::open(folder, "diffusion_pytorch_model")?;
+    UNet::new(
+        config,
+        Parameters::from_weights(weights, dtype, device, false),
+    )
+}

@@ -1,0 +1,156 @@
+//! Activation checkpointing: a segment's inner values are dropped after the
+//! forward pass and computed again during the backward pass
+//! [Chen et al. 2016].
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use candle_core::backprop::GradStore;
+use candle_core::{CpuStorage, CudaStorage, CustomOp3, Layout, Shape, Tensor, TensorId, Var};
+
+use crate::error::Result;
+
+/// Collects the gradients that recomputed segments find for `variables`.
+///
+/// A backward pass through recomputed segments leaves the gradients of the
+/// segments' parameters here; [`Recompute::drain_into`] adds them to the
+/// gradients of the rest of the graph.
+#[derive(Debug, Clone)]
+pub struct Recompute {
+    variables: Arc<Vec<Var>>,
+    gradients: Arc<Mutex<HashMap<TensorId, Tensor>>>,
+}
+
+type Segment = dyn Fn(&Tensor, &Tensor) -> candle_core::Result<Tensor> + Send + Sync;
+
+impl Recompute {
+    /// For the parameters that are being trained.
+    pub fn new(variables: Vec<Var>) -> Self {
+        Self {
+            variables: Arc::new(variables),
+            gradients: Default::default(),
+        }
+    }
+
+    /// Runs `segment` on (x, context) without keeping its inner values. One
+    /// of the two inputs has to be part of a graph, or the gradients of the
+    /// segment's own parameters are never asked for.
+    pub fn run(
+        &self,
+        x: &Tensor,
+        context: &Tensor,
+        segment: impl Fn(&Tensor, &Tensor) -> Result<Tensor> + Send + Sync + 'static,
+    ) -> Result<Tensor> {
+        let segment: Arc<Segment> =
+            Arc::new(move |x, context| segment(x, context).map_err(candle_core::Error::wrap));
+        let y = segment(&x.detach(), &context.detach())?
+            .detach()
+            .contiguous()?;
+        let op = RecomputeOp {
+            segment,
+            owner: self.clone(),
+        };
+        Ok(x.apply_op3(context, &y, op)?)
+    }
+
+    /// Adds the collected gradients to `gradients` and forgets them.
+    pub fn drain_into(&self, gradients: &mut GradStore) -> Result<()> {
+        let mut collected = self
+            .gradients
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        for variable in self.variables.iter() {
+            if let Some(found) = collected.remove(&variable.id()) {
+                let sum = match gradients.remove(variable) {
+                    Some(other) => (other + found)?,
+                    None => found,
+                };
+                gradients.insert(variable, sum);
+            }
+        }
+        Ok(())
+    }
+
+    fn collect(&self, gradients: &mut GradStore) -> candle_core::Result<()> {
+        let mut collected = self
+            .gradients
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        for variable in self.variables.iter() {
+            if let Some(found) = gradients.remove(variable) {
+                let sum = match collected.remove(&variable.id()) {
+                    Some(other) => (other + found)?,
+                    None => found,
+                };
+                collected.insert(variable.id(), sum);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Passes the third argument, the segment's value, through; replays the
+/// segment when its gradient arrives.
+struct RecomputeOp {
+    segment: Arc<Segment>,
+    owner: Recompute,
+}
+
+impl CustomOp3 for RecomputeOp {
+    fn name(&self) -> &'static str {
+        "recompute"
+    }
+
+    fn cpu_fwd(
+        &self,
+        _: &CpuStorage,
+        _: &Layout,
+        _: &CpuStorage,
+        _: &Layout,
+        y: &CpuStorage,
+        layout: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        use candle_core::backend::BackendStorage;
+        Ok((y.try_clone(layout)?, layout.shape().clone()))
+    }
+
+    fn cuda_fwd(
+        &self,
+        _: &CudaStorage,
+        _: &Layout,
+        _: &CudaStorage,
+        _: &Layout,
+        y: &CudaStorage,
+        layout: &Layout,
+    ) -> candle_core::Result<(CudaStorage, Shape)> {
+        use candle_core::backend::BackendStorage;
+        Ok((y.try_clone(layout)?, layout.shape().clone()))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        context: &Tensor,
+        _: &Tensor,
+        _: &Tensor,
+        g: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let leaf = |t: &Tensor| -> candle_core::Result<Tensor> {
+            if t.track_op() {
+                Ok(Var::from_tensor(&t.detach())?.as_tensor().clone())
+            } else {
+                Ok(t.clone())
+            }
+        };
+        let (x_leaf, context_leaf) = (leaf(x)?, leaf(context)?);
+        let y = (self.segment)(&x_leaf, &context_leaf)?;
+        let mut gradients = (&y * &g.detach())?.sum_all()?.backward()?;
+        let (dx, dcontext) = (gradients.remove(&x_leaf), gradients.remove(&context_leaf));
+        self.owner.collect(&mut gradients)?;
+        Ok((
+            dx.filter(|_| x.track_op()),
+            dcontext.filter(|_| context.track_op()),
+            None,
+        ))
+    }
+}

@@ -1,0 +1,421 @@
+//! Noise schedules: how much signal and noise a timestep has, and what the
+//! network's output means.
+
+use std::path::Path;
+
+use candle_core::Tensor;
+use serde::{Deserialize, Serialize};
+
+use crate::config::ConfigFile;
+use crate::error::{Error, Result, argument};
+
+/// How the noise variances grow over the timesteps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum BetaSchedule {
+    /// Linear in beta [Ho et al. 2020].
+    #[serde(rename = "linear")]
+    Linear,
+    /// Linear in sqrt(beta), of latent diffusion.
+    #[serde(rename = "scaled_linear")]
+    ScaledLinear,
+    /// alpha bar is a squared cosine [Nichol & Dhariwal 2021].
+    #[serde(rename = "squaredcos_cap_v2")]
+    SquaredCosine,
+}
+
+/// What the network predicts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Prediction {
+    /// The noise.
+    #[serde(rename = "epsilon")]
+    Epsilon,
+    /// sqrt(alpha bar) noise - sqrt(1 - alpha bar) sample [Salimans & Ho 2022].
+    #[serde(rename = "v_prediction")]
+    Velocity,
+    /// The clean sample.
+    #[serde(rename = "sample")]
+    Sample,
+}
+
+/// Which timesteps a sampler visits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Spacing {
+    /// Evenly from the first to the last.
+    Linspace,
+    /// Multiples of the step, from 0 upwards.
+    Leading,
+    /// Multiples of the step, from the last downwards.
+    Trailing,
+}
+
+/// The keys of `scheduler/scheduler_config.json` that matter.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct ScheduleConfig {
+    /// Timesteps of training.
+    pub num_train_timesteps: usize,
+    /// First noise variance.
+    pub beta_start: f64,
+    /// Last noise variance.
+    pub beta_end: f64,
+    /// Curve between them.
+    pub beta_schedule: BetaSchedule,
+    /// Variances spelled out; overrules the curve.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub trained_betas: Option<Vec<f64>>,
+    /// Rescale so that the last timestep has no signal [Lin et al. 2024].
+    pub rescale_betas_zero_snr: bool,
+    /// What the network predicts.
+    pub prediction_type: Prediction,
+    /// Added to the timesteps of "leading" spacing.
+    pub steps_offset: usize,
+    /// Which timesteps a sampler visits; each has its own default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub timestep_spacing: Option<Spacing>,
+    /// Whether DDIM's last step ends at no noise at all, or at that of the
+    /// first timestep.
+    pub set_alpha_to_one: bool,
+}
+
+impl Default for ScheduleConfig {
+    /// diffusers' defaults.
+    fn default() -> Self {
+        Self {
+            num_train_timesteps: 1000,
+            beta_start: 1e-4,
+            beta_end: 0.02,
+            beta_schedule: BetaSchedule::Linear,
+            trained_betas: None,
+            rescale_betas_zero_snr: false,
+            prediction_type: Prediction::Epsilon,
+            steps_offset: 0,
+            timestep_spacing: None,
+            set_alpha_to_one: true,
+        }
+    }
+}
+
+/// Stands for "no signal" where a division by it follows, as diffusers has it.
+pub(crate) const ALMOST_NO_SIGNAL: f64 = 5.960_464_477_539_063e-8; // 2^-24
+
+/// Signal and noise by timestep.
+#[derive(Debug, Clone)]
+pub struct NoiseSchedule {
+    config: ScheduleConfig,
+    alpha_bars: Vec<f64>,
+}
+
+impl NoiseSchedule {
+    /// Reads `scheduler_config.json`; the sampler that it names is ignored.
+    pub fn load(folder: &Path) -> Result<Self> {
+        let file = ConfigFile::read(&folder.join("scheduler_config.json"))?;
+        let config: ScheduleConfig = file.parse()?;
+        Self::new(config).map_err(|e| match e {
+            Error::Argument(message) => file.error(message),
+            other => other,
+        })
+    }
+
+    /// Computes the schedule in f64. Refuses variances outside [0, 1), and a
+    /// noise prediction where the last timestep is noise alone: the sample
+    /// cannot be told from it.
+    pub fn new(config: ScheduleConfig) -> Result<Self> {
+        let betas = betas(&config)?;
+        let mut alpha_bars: Vec<f64> = betas
+            .iter()
+            .scan(1.0, |product, beta| {
+                *product *= 1.0 - beta;
+                Some(*product)
+            })
+            .collect();
+        if config.rescale_betas_zero_snr {
+            if config.prediction_type == Prediction::Epsilon {
+                return argument(
+                    "rescale_betas_zero_snr with prediction_type = \"epsilon\": a timestep of pure noise cannot give the sample; use v_prediction",
+                );
+            }
+            let (first, last) = (
+                alpha_bars[0].sqrt(),
+                alpha_bars[alpha_bars.len() - 1].sqrt(),
+            );
+            for a in &mut alpha_bars {
+                *a = ((a.sqrt() - last) * first / (first - last)).powi(2);
+            }
+        }
+        Ok(Self { config, alpha_bars })
+    }
+
+    /// The configuration.
+    pub fn config(&self) -> &ScheduleConfig {
+        &self.config
+    }
+
+    /// Timesteps of training; valid ones are 0..len.
+    pub fn len(&self) -> usize {
+        self.alpha_bars.len()
+    }
+
+    /// Never true: a schedule has at least one timestep.
+    pub fn is_empty(&self) -> bool {
+        self.alpha_bars.is_empty()
+    }
+
+    /// What the network predicts.
+    pub fn prediction(&self) -> Prediction {
+        self.config.prediction_type
+    }
+
+    /// Share of the signal's variance at `t`, in [0, 1], falling with t.
+    pub fn alpha_bar(&self, t: usize) -> Result<f64> {
+        match self.alpha_bars.get(t) {
+            Some(&a) => Ok(a),
+            None => argument(format!(
+                "timestep {t} is outside 0..{}",
+                self.alpha_bars.len()
+            )),
+        }
+    }
+
+    /// (sqrt(alpha bar), sqrt(1 - alpha bar)): factors of signal and noise.
+    pub fn signal_and_noise(&self, t: usize) -> Result<(f64, f64)> {
+        let a = self.alpha_bar(t)?;
+        Ok((a.sqrt(), (1.0 - a).sqrt()))
+    }
+
+    /// The timestep nearest to `fraction` of the schedule, 0 to 1.
+    pub fn timestep_at(&self, fraction: f64) -> usize {
+        let last = self.len() - 1;
+        ((fraction * last as f64).round().max(0.0) as usize).min(last)
+    }
+
+    /// Noisy sample: signal * x0 + noise factor * noise.
+    pub fn add_noise(&self, x0: &Tensor, noise: &Tensor, t: usize) -> Result<Tensor> {
+        let (signal, sigma) = self.signal_and_noise(t)?;
+        Ok(((x0 * signal)? + (noise * sigma)?)?)
+    }
+
+    /// As [`NoiseSchedule::add_noise`] with a timestep for each batch item.
+    pub fn add_noise_each(
+        &self,
+        x0: &Tensor,
+        noise: &Tensor,
+        timesteps: &[usize],
+    ) -> Result<Tensor> {
+        self.per_item(x0, noise, timesteps, |signal, sigma| (signal, sigma))
+    }
+
+    /// What the network should predict for these samples and this noise.
+    pub fn target(&self, x0: &Tensor, noise: &Tensor, timesteps: &[usize]) -> Result<Tensor> {
+        match self.config.prediction_type {
+            Prediction::Epsilon => Ok(noise.clone()),
+            Prediction::Sample => Ok(x0.clone()),
+            Prediction::Velocity => {
+                self.per_item(x0, noise, timesteps, |signal, sigma| (-sigma, signal))
+            }
+        }
+    }
+
+    /// a x0 + b noise with factors for each batch item.
+    fn per_item(
+        &self,
+        x0: &Tensor,
+        noise: &Tensor,
+        timesteps: &[usize],
+        factors: impl Fn(f64, f64) -> (f64, f64),
+    ) -> Result<Tensor> {
+        if x0.dims().first() != Some(&timesteps.len()) {
+            return argument(format!(
+                "{} timesteps for samples {:?}",
+                timesteps.len(),
+                x0.dims()
+            ));
+        }
+        let mut shape = vec![1; x0.rank()];
+        shape[0] = timesteps.len();
+        let (mut a, mut b) = (vec![], vec![]);
+        for &t in timesteps {
+            let (signal, sigma) = self.signal_and_noise(t)?;
+            let (of_x0, of_noise) = factors(signal, sigma);
+            a.push(of_x0 as f32);
+            b.push(of_noise as f32);
+        }
+        let column = |values: Vec<f32>| -> Result<Tensor> {
+            Ok(Tensor::from_vec(values, shape.as_slice(), x0.device())?.to_dtype(x0.dtype())?)
+        };
+        Ok((x0.broadcast_mul(&column(a)?)? + noise.broadcast_mul(&column(b)?)?)?)
+    }
+
+    /// The noise that the network's `output` at `x_t` means. Finite at both
+    /// ends of the schedule; a sample prediction at a timestep without noise
+    /// gives 0.
+    pub fn noise_of(&self, output: &Tensor, x_t: &Tensor, t: usize) -> Result<Tensor> {
+        let (signal, sigma) = self.signal_and_noise(t)?;
+        match self.config.prediction_type {
+            Prediction::Epsilon => Ok(output.clone()),
+            Prediction::Velocity => Ok(((output * signal)? + (x_t * sigma)?)?),
+            Prediction::Sample if sigma == 0.0 => Ok(x_t.zeros_like()?),
+            Prediction::Sample => Ok(((x_t - (output * signal)?)? / sigma)?),
+        }
+    }
+
+    /// The clean sample that the network's `output` at `x_t` means.
+    pub fn sample_of(&self, output: &Tensor, x_t: &Tensor, t: usize) -> Result<Tensor> {
+        let (signal, sigma) = self.signal_and_noise(t)?;
+        match self.config.prediction_type {
+            // The constructor refuses schedules in which the signal reaches 0.
+            Prediction::Epsilon => Ok(((x_t - (output * sigma)?)? / signal)?),
+            Prediction::Velocity => Ok(((x_t * signal)? - (output * sigma)?)?),
+            Prediction::Sample => Ok(output.clone()),
+        }
+    }
+}
+
+fn betas(config: &ScheduleConfig) -> Result<Vec<f64>> {
+    let n = config.num_train_timesteps;
+    if n == 0 {
+        return argument("num_train_timesteps must be at least 1");
+    }
+    let (start, end) = (config.beta_start, config.beta_end);
+    let between = |a: f64, b: f64, i: usize| {
+        if n == 1 {
+            a
+        } else {
+            a + (b - a) * i as f64 / (n - 1) as f64
+        }
+    };
+    let betas: Vec<f64> = match (&config.trained_betas, config.beta_schedule) {
+        (Some(betas), _) => betas.clone(),
+        (None, BetaSchedule::Linear) => (0..n).map(|i| between(start, end, i)).collect(),
+        (None, BetaSchedule::ScaledLinear) => (0..n)
+            .map(|i| between(start.max(0.0).sqrt(), end.max(0.0).sqrt(), i).powi(2))
+            .collect(),
+        (None, BetaSchedule::SquaredCosine) => {
+            let alpha_bar = |t: f64| {
+                ((t + 0.008) / 1.008 * std::f64::consts::FRAC_PI_2)
+                    .cos()
+                    .powi(2)
+            };
+            let at = |i: usize| alpha_bar(i as f64 / n as f64);
+            // The cap keeps the last variance below 1.
+            (0..n)
+                .map(|i| (1.0 - at(i + 1) / at(i)).min(0.999))
+                .collect()
+        }
+    };
+    if betas.len() != n {
+        return argument(format!(
+            "trained_betas has {} entries, num_train_timesteps is {n}",
+            betas.len()
+        ));
+    }
+    match betas.iter().position(|b| !(0.0..1.0).contains(b)) {
+        Some(i) => argument(format!(
+            "noise variance {i} is {}, accepted: 0 <= beta < 1; check beta_start and beta_end",
+            betas[i]
+        )),
+        None => Ok(betas),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use candle_core::Device;
+
+    fn schedule(prediction_type: Prediction, zero_snr: bool) -> NoiseSchedule {
+        NoiseSchedule::new(ScheduleConfig {
+            beta_start: 0.00085,
+            beta_end: 0.012,
+            beta_schedule: BetaSchedule::ScaledLinear,
+            rescale_betas_zero_snr: zero_snr,
+            prediction_type,
+            ..ScheduleConfig::default()
+        })
+        .expect("valid schedule")
+    }
+
+    fn vector(values: &[f32]) -> Tensor {
+        Tensor::new(values, &Device::Cpu).expect("tensor")
+    }
+
+    #[test]
+    fn the_target_of_every_prediction_gives_back_sample_and_noise_at_both_ends() {
+        let (x0, noise) = (vector(&[0.3, -1.0, 2.0]), vector(&[1.0, 0.5, -0.25]));
+        for (prediction, zero) in [
+            (Prediction::Epsilon, false),
+            (Prediction::Velocity, false),
+            (Prediction::Velocity, true),
+            (Prediction::Sample, true),
+        ] {
+            let schedule = schedule(prediction, zero);
+            for t in [0, 500, 999] {
+                let (x0, noise) = (
+                    x0.unsqueeze(0).expect("x0"),
+                    noise.unsqueeze(0).expect("noise"),
+                );
+                let x_t = schedule.add_noise(&x0, &noise, t).expect("x_t");
+                let output = schedule.target(&x0, &noise, &[t]).expect("target");
+                let close = |a: &Tensor, b: &Tensor, factor: f64| {
+                    let d = (a - b)
+                        .and_then(|d| d.abs()?.max_all()?.to_scalar::<f32>())
+                        .expect("difference");
+                    // A few ulp of values of 2, divided by the factor that
+                    // the conversion has to undo.
+                    assert!(
+                        (d as f64) < 1e-6 / factor,
+                        "{prediction:?} zero_snr={zero} t={t}: {d}"
+                    );
+                };
+                let (signal, sigma) = schedule.signal_and_noise(t).expect("factors");
+                let sample_factor = if prediction == Prediction::Epsilon {
+                    signal
+                } else {
+                    1.0
+                };
+                let noise_factor = if prediction == Prediction::Sample {
+                    sigma
+                } else {
+                    1.0
+                };
+                close(
+                    &schedule.sample_of(&output, &x_t, t).expect("sample"),
+                    &x0,
+                    sample_factor,
+                );
+                close(
+                    &schedule.noise_of(&output, &x_t, t).expect("noise"),
+                    &noise,
+                    noise_factor,
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn zero_terminal_snr_ends_in_noise_alone_and_refuses_noise_prediction() {
+        assert_eq!(
+            schedule(Prediction::Velocity, true)
+                .alpha_bar(999)
+                .expect("alpha"),
+            0.0
+        );
+        let config = ScheduleConfig {
+            rescale_betas_zero_snr: true,
+            ..ScheduleConfig::default()
+        };
+        let message = NoiseSchedule::new(config).expect_err("refused").to_string();
+        assert!(message.contains("use v_prediction"), "{message}");
+    }
+
+    #[test]
+    fn an_impossible_variance_is_named() {
+        let config = ScheduleConfig {
+            beta_end: 1.5,
+            num_train_timesteps: 3,
+            ..ScheduleConfig::default()
+        };
+        let message = NoiseSchedule::new(config).expect_err("refused").to_string();
+        assert!(message.contains("noise variance 2 is 1.5"), "{message}");
+    }
+}

@@ -1,0 +1,284 @@
+//! CLIP's tokenizer: byte-level pair encoding of lower-cased words, read
+//! from the files that a model folder carries.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+use tokenizers::models::bpe::{BPE, Merges, Vocab};
+use tokenizers::normalizers::{
+    Lowercase, NFC, Replace, Sequence as NormalizerSequence, replace::ReplacePattern,
+};
+use tokenizers::pre_tokenizers::byte_level::ByteLevel;
+use tokenizers::pre_tokenizers::sequence::Sequence as PreTokenizerSequence;
+use tokenizers::pre_tokenizers::split::{Split, SplitPattern};
+use tokenizers::{
+    NormalizerWrapper, PreTokenizerWrapper, SplitDelimiterBehavior, TokenizerBuilder,
+};
+
+use crate::config::ConfigFile;
+use crate::error::{Error, Result, io};
+
+/// Words of CLIP: the markers, English contractions, runs of letters, single
+/// digits, runs of anything else that is no space.
+const WORDS: &str =
+    r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+";
+const START: &str = "<|startoftext|>";
+const END: &str = "<|endoftext|>";
+/// Sequence length of every published CLIP, both markers included.
+const DEFAULT_LENGTH: usize = 77;
+
+type Inner = tokenizers::TokenizerImpl<
+    BPE,
+    NormalizerSequence,
+    PreTokenizerSequence,
+    tokenizers::PostProcessorWrapper,
+    tokenizers::DecoderWrapper,
+>;
+
+/// Text to token sequences of one fixed length.
+pub struct Tokenizer {
+    inner: Inner,
+    path: PathBuf,
+    start: u32,
+    end: u32,
+    pad: u32,
+    length: usize,
+    vocab_size: usize,
+    /// Placeholder words and the token that each becomes.
+    placeholders: BTreeMap<String, u32>,
+}
+
+impl std::fmt::Debug for Tokenizer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Tokenizer")
+            .field("path", &self.path)
+            .field("vocab_size", &self.vocab_size)
+            .finish()
+    }
+}
+
+impl Tokenizer {
+    /// Loads the folder `tokenizer/` of a model: `vocab.json` with
+    /// `merges.txt`, or else `tokenizer.json`.
+    pub fn load(folder: &Path) -> Result<Self> {
+        let (vocab, merges) = if folder.join("vocab.json").is_file() {
+            read_vocab_and_merges(folder)?
+        } else {
+            read_tokenizer_json(&folder.join("tokenizer.json"))?
+        };
+        let fail = |message: String| Error::Tokenizer {
+            path: folder.to_owned(),
+            message,
+        };
+        let id = |token: &str| {
+            vocab
+                .get(token)
+                .copied()
+                .ok_or_else(|| fail(format!("the vocabulary lacks the marker {token}")))
+        };
+        let (start, end) = (id(START)?, id(END)?);
+        let pad = match special(folder, "pad_token")? {
+            Some(token) => id(&token)?,
+            None => end,
+        };
+        let length = model_max_length(folder)?.unwrap_or(DEFAULT_LENGTH);
+        if length < 2 {
+            return Err(fail(format!(
+                "model_max_length = {length} has no room for both markers"
+            )));
+        }
+        let vocab_size = vocab.values().copied().max().unwrap_or(0) as usize + 1;
+        let inner = build(vocab, merges).map_err(|e| fail(e.to_string()))?;
+        Ok(Self {
+            inner,
+            path: folder.to_owned(),
+            start,
+            end,
+            pad,
+            length,
+            vocab_size,
+            placeholders: BTreeMap::new(),
+        })
+    }
+
+    /// Largest token + 1.
+    pub fn vocab_size(&self) -> usize {
+        self.vocab_size
+    }
+
+    /// Length of every sequence.
+    pub fn length(&self) -> usize {
+        self.length
+    }
+
+    /// Shortens every sequence to at most `length` tokens, at least 2.
+    pub fn limit_length(&mut self, length: usize) {
+        self.length = self.length.min(length.max(2));
+    }
+
+    /// Makes the word `word` one token of its own, e.g. one whose embedding
+    /// is learned. Words are compared in lower case.
+    pub fn add_placeholder(&mut self, word: &str, token: u32) {
+        self.placeholders.insert(word.to_lowercase(), token);
+    }
+
+    /// Tokens of `text` without markers, not cut.
+    pub fn words(&self, text: &str) -> Result<Vec<u32>> {
+        let fail = |e: tokenizers::Error| Error::Tokenizer {
+            path: self.path.clone(),
+            message: e.to_string(),
+        };
+        let encode = |text: &str| -> Result<Vec<u32>> {
+            Ok(self
+                .inner
+                .encode(text, false)
+                .map_err(fail)?
+                .get_ids()
+                .to_vec())
+        };
+        if self.placeholders.is_empty() {
+            return encode(text);
+        }
+        let mut tokens = vec![];
+        let mut pending = String::new();
+        for word in text.split_inclusive(char::is_whitespace) {
+            match self.placeholders.get(&word.trim().to_lowercase()) {
+                Some(&token) => {
+                    tokens.extend(encode(&std::mem::take(&mut pending))?);
+                    tokens.push(token);
+                }
+                None => pending.push_str(word),
+            }
+        }
+        tokens.extend(encode(&pending)?);
+        Ok(tokens)
+    }
+
+    /// Start marker, the text cut to fit, end marker, padding: always
+    /// [`Tokenizer::length`] tokens.
+    pub fn encode(&self, text: &str) -> Result<Vec<u32>> {
+        let mut tokens = vec![self.start];
+        tokens.extend(self.words(text)?.into_iter().take(self.length - 2));
+        tokens.push(self.end);
+        tokens.resize(self.length, self.pad);
+        Ok(tokens)
+    }
+}
+
+fn build(vocab: Vocab, merges: Merges) -> tokenizers::Result<Inner> {
+    let model = BPE::builder()
+        .vocab_and_merges(vocab, merges)
+        .unk_token(END.into())
+        .end_of_word_suffix("</w>".into())
+        .build()?;
+    let spaces = Replace::new(ReplacePattern::Regex(r"\s+".into()), " ")?;
+    let normalizer = NormalizerSequence::new(vec![
+        NormalizerWrapper::NFC(NFC),
+        NormalizerWrapper::Replace(spaces),
+        NormalizerWrapper::Lowercase(Lowercase),
+    ]);
+    let split = Split::new(
+        SplitPattern::Regex(WORDS.into()),
+        SplitDelimiterBehavior::Removed,
+        true,
+    )?;
+    // The words are already split: its own pattern would split them again.
+    let bytes = ByteLevel::new(false, true, true);
+    let pre_tokenizer = PreTokenizerSequence::new(vec![
+        PreTokenizerWrapper::Split(split),
+        PreTokenizerWrapper::ByteLevel(bytes),
+    ]);
+    TokenizerBuilder::new()
+        .with_model(model)
+        .with_normalizer(Some(normalizer))
+        .with_pre_tokenizer(Some(pre_tokenizer))
+        .with_post_processor(None)
+        .with_decoder(None)
+        .build()
+}
+
+fn read_vocab_and_merges(folder: &Path) -> Result<(Vocab, Merges)> {
+    let file = ConfigFile::read(&folder.join("vocab.json"))?;
+    let vocab: Vocab = file.parse()?;
+    let path = folder.join("merges.txt");
+    let text = std::fs::read_to_string(&path).map_err(io("read", &path))?;
+    let mut merges = Merges::new();
+    for (number, line) in text.lines().enumerate() {
+        if line.starts_with("#version") || line.is_empty() {
+            continue;
+        }
+        let mut parts = line.split(' ');
+        match (parts.next(), parts.next(), parts.next()) {
+            (Some(a), Some(b), None) => merges.push((a.into(), b.into())),
+            _ => {
+                let message = format!(
+                    "line {}: {line:?} is not a pair of symbols with a space between",
+                    number + 1
+                );
+                return Err(Error::Tokenizer { path, message });
+            }
+        }
+    }
+    Ok((vocab, merges))
+}
+
+fn read_tokenizer_json(path: &Path) -> Result<(Vocab, Merges)> {
+    let file = ConfigFile::read(path)?;
+    let fail = |message: &str| {
+        file.error(format!(
+            "{message}; a CLIP tokenizer has model.vocab and model.merges"
+        ))
+    };
+    let model = file.get("model").ok_or_else(|| fail("no model"))?;
+    let vocab = model.get("vocab").ok_or_else(|| fail("no model.vocab"))?;
+    let vocab: Vocab =
+        serde_json::from_value(vocab.clone()).map_err(|e| fail(&format!("model.vocab: {e}")))?;
+    let merges = model
+        .get("merges")
+        .and_then(Value::as_array)
+        .ok_or_else(|| fail("no model.merges"))?;
+    let pair = |merge: &Value| -> Option<(String, String)> {
+        match merge {
+            Value::String(text) => text.split_once(' ').map(|(a, b)| (a.into(), b.into())),
+            Value::Array(pair) if pair.len() == 2 => {
+                Some((pair[0].as_str()?.into(), pair[1].as_str()?.into()))
+            }
+            _ => None,
+        }
+    };
+    let merges = merges
+        .iter()
+        .map(|merge| pair(merge).ok_or_else(|| fail(&format!("merge {merge} is not a pair"))))
+        .collect::<Result<_>>()?;
+    Ok((vocab, merges))
+}
+
+/// A special token from `special_tokens_map.json` or `tokenizer_config.json`:
+/// a string, or an object with its `content`.
+fn special(folder: &Path, key: &str) -> Result<Option<String>> {
+    for name in ["special_tokens_map.json", "tokenizer_config.json"] {
+        let path = folder.join(name);
+        if !path.is_file() {
+            continue;
+        }
+        let file = ConfigFile::read(&path)?;
+        let value = file.get(key).map(|v| v.get("content").unwrap_or(v));
+        if let Some(token) = value.and_then(Value::as_str) {
+            return Ok(Some(token.to_owned()));
+        }
+    }
+    Ok(None)
+}
+
+fn model_max_length(folder: &Path) -> Result<Option<usize>> {
+    let path = folder.join("tokenizer_config.json");
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let length = ConfigFile::read(&path)?
+        .get("model_max_length")
+        .and_then(Value::as_u64);
+    // "No limit" is written as 10^30 by some exporters, which is no u64.
+    Ok(length.filter(|&n| n <= 1 << 20).map(|n| n as usize))
+}

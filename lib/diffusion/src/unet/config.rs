@@ -1,0 +1,224 @@
+//! Configuration of a conditional UNet, with diffusers' keys.
+
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+
+use crate::config::{ConfigFile, PerLevel};
+use crate::error::Result;
+
+/// The keys of `unet/config.json` that shape the network.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct UNetConfig {
+    /// Latent height and width of the training images.
+    pub sample_size: usize,
+    /// Channels of the input: 4, or 9 = latents, mask, masked latents.
+    pub in_channels: usize,
+    /// Channels of the prediction.
+    pub out_channels: usize,
+    /// `CrossAttnDownBlock2D` or `DownBlock2D`, finest level first.
+    pub down_block_types: Vec<String>,
+    /// `CrossAttnUpBlock2D` or `UpBlock2D`, coarsest level first.
+    pub up_block_types: Vec<String>,
+    /// Channels by level, finest first.
+    pub block_out_channels: Vec<usize>,
+    /// Residual blocks of a level on the way down; one more on the way up.
+    pub layers_per_block: usize,
+    /// Transformer blocks of each attention.
+    pub transformer_layers_per_block: PerLevel,
+    /// Number of heads, under the name that a historic mistake gave it.
+    pub attention_head_dim: PerLevel,
+    /// Number of heads; overrules `attention_head_dim`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub num_attention_heads: Option<PerLevel>,
+    /// Width of the text encoder's states.
+    pub cross_attention_dim: usize,
+    /// Linear layers instead of 1x1 convolutions around the transformers.
+    pub use_linear_projection: bool,
+    /// Groups of every group normalisation.
+    pub norm_num_groups: usize,
+    /// Added to variances in the residual blocks.
+    pub norm_eps: f64,
+    /// Zeros on each side before a downsampling convolution.
+    pub downsample_padding: usize,
+    /// Cosines before sines in the timestep embedding.
+    pub flip_sin_to_cos: bool,
+    /// Offset of the frequency exponent.
+    pub freq_shift: f64,
+    /// Prediction of the whole input minus 0.5: never, in this family.
+    pub center_input_sample: bool,
+}
+
+impl Default for UNetConfig {
+    /// diffusers' defaults, which are those of Stable Diffusion 1.
+    fn default() -> Self {
+        let attention = "CrossAttnDownBlock2D".to_owned();
+        let up = "CrossAttnUpBlock2D".to_owned();
+        Self {
+            sample_size: 64,
+            in_channels: 4,
+            out_channels: 4,
+            down_block_types: vec![
+                attention.clone(),
+                attention.clone(),
+                attention,
+                "DownBlock2D".into(),
+            ],
+            up_block_types: vec!["UpBlock2D".into(), up.clone(), up.clone(), up],
+            block_out_channels: vec![320, 640, 1280, 1280],
+            layers_per_block: 2,
+            transformer_layers_per_block: PerLevel::All(1),
+            attention_head_dim: PerLevel::All(8),
+            num_attention_heads: None,
+            cross_attention_dim: 1280,
+            use_linear_projection: false,
+            norm_num_groups: 32,
+            norm_eps: 1e-5,
+            downsample_padding: 1,
+            flip_sin_to_cos: true,
+            freq_shift: 0.0,
+            center_input_sample: false,
+        }
+    }
+}
+
+impl UNetConfig {
+    /// Reads and checks a configuration: what this implementation does not
+    /// do is refused by name instead of silently left out.
+    pub fn from_file(file: &ConfigFile) -> Result<Self> {
+        let none = [];
+        file.require("_class_name", &[json!("UNet2DConditionModel")])?;
+        file.require("mid_block_type", &[json!("UNetMidBlock2DCrossAttn")])?;
+        file.require("act_fn", &[json!("silu"), json!("swish")])?;
+        file.require("resnet_time_scale_shift", &[json!("default")])?;
+        file.require("time_embedding_type", &[json!("positional")])?;
+        file.require("attention_type", &[json!("default")])?;
+        file.require("mid_block_scale_factor", &[json!(1), json!(1.0)])?;
+        file.require("conv_in_kernel", &[json!(3)])?;
+        file.require("conv_out_kernel", &[json!(3)])?;
+        file.require("dropout", &[json!(0), json!(0.0)])?;
+        for key in [
+            "center_input_sample",
+            "only_cross_attention",
+            "mid_block_only_cross_attention",
+            "dual_cross_attention",
+            "resnet_skip_time_act",
+            "class_embeddings_concat",
+        ] {
+            file.require(key, &[json!(false)])?;
+        }
+        for key in [
+            "class_embed_type",
+            "addition_embed_type",
+            "num_class_embeds",
+            "encoder_hid_dim",
+            "encoder_hid_dim_type",
+            "time_embedding_dim",
+            "time_embedding_act_fn",
+            "timestep_post_act",
+            "time_cond_proj_dim",
+            "projection_class_embeddings_input_dim",
+            "cross_attention_norm",
+            "reverse_transformer_layers_per_block",
+        ] {
+            file.require(key, &none)?;
+        }
+        let config: Self = file.parse()?;
+        config.check().map_err(|message| file.error(message))?;
+        Ok(config)
+    }
+
+    /// Number of resolution levels.
+    pub fn levels(&self) -> usize {
+        self.block_out_channels.len()
+    }
+
+    /// Heads at `level`, finest first.
+    pub fn heads(&self, level: usize) -> usize {
+        self.num_attention_heads
+            .as_ref()
+            .unwrap_or(&self.attention_head_dim)
+            .at(level)
+            .unwrap_or(1)
+    }
+
+    /// Transformer blocks of each attention at `level`.
+    pub fn transformer_layers(&self, level: usize) -> usize {
+        self.transformer_layers_per_block.at(level).unwrap_or(1)
+    }
+
+    /// Whether level `level` has attention on the way down.
+    pub fn attends_down(&self, level: usize) -> bool {
+        self.down_block_types[level] == "CrossAttnDownBlock2D"
+    }
+
+    /// Whether level `level` (finest first) has attention on the way up.
+    pub fn attends_up(&self, level: usize) -> bool {
+        self.up_block_types[self.levels() - 1 - level] == "CrossAttnUpBlock2D"
+    }
+
+    /// Says what is impossible about this configuration.
+    pub fn check(&self) -> Result<(), String> {
+        let levels = self.levels();
+        if levels == 0 || self.layers_per_block == 0 {
+            return Err("block_out_channels and layers_per_block must not be empty or 0".into());
+        }
+        for (name, types, known) in [
+            (
+                "down_block_types",
+                &self.down_block_types,
+                ["CrossAttnDownBlock2D", "DownBlock2D"],
+            ),
+            (
+                "up_block_types",
+                &self.up_block_types,
+                ["CrossAttnUpBlock2D", "UpBlock2D"],
+            ),
+        ] {
+            if types.len() != levels {
+                return Err(format!(
+                    "{name} has {} entries, block_out_channels has {levels}",
+                    types.len()
+                ));
+            }
+            if let Some(unknown) = types.iter().find(|t| !known.contains(&t.as_str())) {
+                return Err(format!(
+                    "{name} has {unknown:?}, accepted: {}",
+                    known.join(", ")
+                ));
+            }
+        }
+        let heads = self
+            .num_attention_heads
+            .as_ref()
+            .unwrap_or(&self.attention_head_dim);
+        if !heads.fits(levels) || !self.transformer_layers_per_block.fits(levels) {
+            return Err(format!(
+                "attention_head_dim and transformer_layers_per_block need 1 or {levels} entries"
+            ));
+        }
+        for (level, &channels) in self.block_out_channels.iter().enumerate() {
+            let heads = self.heads(level);
+            if channels == 0 || self.norm_num_groups == 0 || channels % self.norm_num_groups != 0 {
+                let groups = self.norm_num_groups;
+                return Err(format!(
+                    "block_out_channels[{level}] = {channels} is no multiple of norm_num_groups = {groups}"
+                ));
+            }
+            if heads == 0 || channels % heads != 0 {
+                return Err(format!(
+                    "block_out_channels[{level}] = {channels} is no multiple of {heads} heads"
+                ));
+            }
+        }
+        if self.in_channels == 0 || self.out_channels == 0 || self.cross_attention_dim == 0 {
+            return Err(
+                "in_channels, out_channels and cross_attention_dim must be at least 1".into(),
+            );
+        }
+        if self.block_out_channels[0] % 2 != 0 {
+            return Err("block_out_channels[0] must be even: half sines, half cosines".into());
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,228 @@
+//! The step between images and latents: the autoencoder of Stable Diffusion,
+//! or an exact rearrangement of pixels for small pixel-space models.
+
+mod coder;
+mod config;
+mod unshuffle;
+
+use std::path::Path;
+
+use candle_core::{DType, Device, Tensor};
+use serde_json::json;
+
+use coder::{Decoder, Encoder};
+pub use config::AutoencoderConfig;
+pub use unshuffle::{pixel_shuffle, pixel_unshuffle};
+
+use crate::config::ConfigFile;
+use crate::error::Result;
+use crate::layers::{Conv2d, Padding};
+use crate::parameters::Parameters;
+use crate::recompute::Recompute;
+use crate::weights::Weights;
+
+/// Bounds of the encoder's log variance, as in training.
+const LOG_VARIANCE: (f64, f64) = (-30.0, 20.0);
+
+/// The normal distribution that the encoder gives for an image.
+#[derive(Debug, Clone)]
+pub struct Moments {
+    /// [batch, latent channels, h, w], not scaled.
+    pub mean: Tensor,
+    /// Log variance of the same shape.
+    pub log_variance: Tensor,
+}
+
+/// Variational autoencoder [Kingma & Welling 2014] as Stable Diffusion has it.
+#[derive(Debug)]
+pub struct AutoencoderKl {
+    config: AutoencoderConfig,
+    encoder: Encoder,
+    quantize: Option<Conv2d>,
+    decoder: Decoder,
+    unquantize: Option<Conv2d>,
+}
+
+impl AutoencoderKl {
+    /// Builds the network from parameters named as diffusers names them.
+    pub fn new(config: AutoencoderConfig, parameters: Parameters) -> Result<Self> {
+        config.check().map_err(crate::error::Error::Argument)?;
+        let latent = config.latent_channels;
+        let pointwise = |name: &str, channels| {
+            Conv2d::new(
+                &parameters.sub(name),
+                (channels, channels),
+                1,
+                1,
+                Padding::Same(0),
+            )
+        };
+        let encoder = Encoder::new(&parameters.sub("encoder"), &config)?;
+        let decoder = Decoder::new(&parameters.sub("decoder"), &config)?;
+        let quantize = config
+            .use_quant_conv
+            .then(|| pointwise("quant_conv", 2 * latent))
+            .transpose()?;
+        let unquantize = config
+            .use_post_quant_conv
+            .then(|| pointwise("post_quant_conv", latent))
+            .transpose()?;
+        parameters.finish(|_| false)?;
+        Ok(Self {
+            config,
+            encoder,
+            quantize,
+            decoder,
+            unquantize,
+        })
+    }
+
+    /// The configuration.
+    pub fn config(&self) -> &AutoencoderConfig {
+        &self.config
+    }
+
+    /// Encodes images [batch, 3, h, w] in [-1, 1].
+    pub fn encode(&self, image: &Tensor, recompute: Option<&Recompute>) -> Result<Moments> {
+        let mut h = self.encoder.forward(image, recompute)?;
+        if let Some(quantize) = &self.quantize {
+            h = quantize.forward(&h)?;
+        }
+        let parts = h.chunk(2, 1)?;
+        let log_variance = parts[1].clamp(LOG_VARIANCE.0, LOG_VARIANCE.1)?;
+        Ok(Moments {
+            mean: parts[0].contiguous()?,
+            log_variance,
+        })
+    }
+
+    /// Decodes unscaled latents to images, nominally in [-1, 1].
+    pub fn decode(&self, z: &Tensor) -> Result<Tensor> {
+        match &self.unquantize {
+            Some(unquantize) => self.decoder.forward(&unquantize.forward(z)?),
+            None => self.decoder.forward(z),
+        }
+    }
+}
+
+/// What a model folder's `vae/` holds.
+#[derive(Debug)]
+pub enum Vae {
+    /// Learned autoencoder.
+    Kl(Box<AutoencoderKl>),
+    /// `PixelUnshuffle`: `factor` x `factor` pixels to channels, exact.
+    PixelUnshuffle {
+        /// Pixels to a latent pixel, along one side.
+        factor: usize,
+        /// Channels of the image.
+        in_channels: usize,
+        /// Factor from rearranged pixels to latents.
+        scaling_factor: f64,
+    },
+}
+
+impl Vae {
+    /// Loads the folder `vae/` of a model.
+    pub fn load(folder: &Path, dtype: DType, device: &Device) -> Result<Self> {
+        let file = ConfigFile::read(&folder.join("config.json"))?;
+        file.require(
+            "_class_name",
+            &[json!("AutoencoderKL"), json!("PixelUnshuffle")],
+        )?;
+        if file.get("_class_name") != Some(&json!("PixelUnshuffle")) {
+            let config = AutoencoderConfig::from_file(&file)?;
+            let weights = Weights::open(folder, "diffusion_pytorch_model")?;
+            let parameters = Parameters::from_weights(weights, dtype, device, false);
+            return Ok(Self::Kl(Box::new(AutoencoderKl::new(config, parameters)?)));
+        }
+        #[derive(serde::Deserialize)]
+        struct Unshuffle {
+            factor: usize,
+            #[serde(default = "three")]
+            in_channels: usize,
+            #[serde(default = "one")]
+            scaling_factor: f64,
+        }
+        let three_channels: Unshuffle = file.parse()?;
+        let Unshuffle {
+            factor,
+            in_channels,
+            scaling_factor,
+        } = three_channels;
+        if factor == 0 || in_channels == 0 || !(scaling_factor > 0.0 && scaling_factor.is_finite())
+        {
+            return Err(file.error("factor, in_channels and scaling_factor must be positive"));
+        }
+        Ok(Self::PixelUnshuffle {
+            factor,
+            in_channels,
+            scaling_factor,
+        })
+    }
+
+    /// Image pixels to a latent pixel, along one side.
+    pub fn downscale(&self) -> usize {
+        match self {
+            Self::Kl(vae) => vae.config.downscale(),
+            Self::PixelUnshuffle { factor, .. } => *factor,
+        }
+    }
+
+    /// Channels of the latents.
+    pub fn latent_channels(&self) -> usize {
+        match self {
+            Self::Kl(vae) => vae.config.latent_channels,
+            Self::PixelUnshuffle {
+                factor,
+                in_channels,
+                ..
+            } => factor * factor * in_channels,
+        }
+    }
+
+    /// Scaled latents of images [batch, 3, h, w] in [-1, 1]: the mean of the
+    /// encoder's distribution. Differentiable in the image.
+    pub fn encode(&self, image: &Tensor, recompute: Option<&Recompute>) -> Result<Tensor> {
+        match self {
+            Self::Kl(vae) => Ok((vae.encode(image, recompute)?.mean * vae.config.scaling_factor)?),
+            Self::PixelUnshuffle {
+                factor,
+                scaling_factor,
+                ..
+            } => Ok((pixel_unshuffle(image, *factor)? * *scaling_factor)?),
+        }
+    }
+
+    /// Scaled latents with the encoder's own noise: mean + deviation * noise,
+    /// for `noise` of the latents' shape. Exact autoencoders ignore it.
+    pub fn encode_sampled(&self, image: &Tensor, noise: &Tensor) -> Result<Tensor> {
+        match self {
+            Self::Kl(vae) => {
+                let moments = vae.encode(image, None)?;
+                let deviation = (moments.log_variance * 0.5)?.exp()?;
+                Ok(((moments.mean + (deviation * noise)?)? * vae.config.scaling_factor)?)
+            }
+            Self::PixelUnshuffle { .. } => self.encode(image, None),
+        }
+    }
+
+    /// Images of scaled latents, nominally in [-1, 1].
+    pub fn decode(&self, latents: &Tensor) -> Result<Tensor> {
+        match self {
+            Self::Kl(vae) => vae.decode(&(latents / vae.config.scaling_factor)?),
+            Self::PixelUnshuffle {
+                factor,
+                scaling_factor,
+                ..
+            } => pixel_shuffle(&(latents / *scaling_factor)?, *factor),
+        }
+    }
+}
+
+fn three() -> usize {
+    3
+}
+
+fn one() -> f64 {
+    1.0
+}

@@ -1,0 +1,292 @@
+//! Memory-mapped safetensors: one file or several shards behind one index.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+use candle_core::{DType, Device, Tensor};
+use memmap2::Mmap;
+use safetensors::tensor::{Dtype, SafeTensors};
+use serde::Deserialize;
+
+use crate::error::{Error, Result, io};
+
+/// Where one tensor lies.
+#[derive(Debug, Clone)]
+struct Entry {
+    file: usize,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    /// Byte range in the file.
+    range: std::ops::Range<usize>,
+}
+
+/// Named tensors in memory-mapped safetensors files.
+///
+/// The headers are checked when the files are opened: lengths, offsets and
+/// shapes have to agree with each other and with the file, so that reading a
+/// tensor afterwards cannot reach outside the mapping.
+#[derive(Debug)]
+pub struct Weights {
+    path: PathBuf,
+    files: Vec<Mmap>,
+    entries: BTreeMap<String, Entry>,
+    metadata: BTreeMap<String, String>,
+}
+
+#[derive(Deserialize)]
+struct ShardIndex {
+    weight_map: BTreeMap<String, String>,
+}
+
+impl Weights {
+    /// Opens the weights called `stem` in `folder`: `stem.safetensors`, the
+    /// shards of `stem.safetensors.index.json`, or the half-precision variant
+    /// `stem.fp16.safetensors`, in this order.
+    pub fn open(folder: &Path, stem: &str) -> Result<Self> {
+        for variant in ["", ".fp16"] {
+            let single = folder.join(format!("{stem}{variant}.safetensors"));
+            if single.is_file() {
+                return Self::open_file(&single);
+            }
+            for index in [
+                format!("{stem}.safetensors.index{variant}.json"),
+                format!("{stem}{variant}.safetensors.index.json"),
+            ] {
+                let index = folder.join(index);
+                if index.is_file() {
+                    return Self::open_shards(&index);
+                }
+            }
+        }
+        let pickled = folder.join(format!("{stem}.bin"));
+        let remedy = if pickled.is_file() {
+            "only a .bin file is there: convert it with diffusers' save_pretrained(..., safe_serialization=True)"
+        } else {
+            "fetch the model's folder again with its *.safetensors files"
+        };
+        Err(Error::Weights {
+            path: folder.to_owned(),
+            problems: vec![format!(
+                "no {stem}.safetensors and no {stem}.safetensors.index.json; {remedy}"
+            )],
+        })
+    }
+
+    /// Opens a single safetensors file.
+    pub fn open_file(path: &Path) -> Result<Self> {
+        let mut weights = Self {
+            path: path.to_owned(),
+            files: vec![],
+            entries: BTreeMap::new(),
+            metadata: BTreeMap::new(),
+        };
+        weights.add(path, None)?;
+        Ok(weights)
+    }
+
+    fn open_shards(index: &Path) -> Result<Self> {
+        let bytes = std::fs::read(index).map_err(io("read", index))?;
+        let parsed: ShardIndex = serde_json::from_slice(&bytes).map_err(|e| Error::Config {
+            path: index.to_owned(),
+            message: format!("not a shard index: {e}"),
+        })?;
+        let folder = index.parent().unwrap_or(Path::new("."));
+        let mut shards: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+        for (name, file) in &parsed.weight_map {
+            if Path::new(file).components().count() != 1 || file.starts_with('.') {
+                return Err(Error::Config {
+                    path: index.to_owned(),
+                    message: format!(
+                        "shard {file:?} of tensor {name:?} is not a plain file name beside the index"
+                    ),
+                });
+            }
+            shards.entry(file).or_default().push(name);
+        }
+        let mut weights = Self {
+            path: index.to_owned(),
+            files: vec![],
+            entries: BTreeMap::new(),
+            metadata: BTreeMap::new(),
+        };
+        for (file, names) in shards {
+            weights.add(&folder.join(file), Some(&names))?;
+        }
+        Ok(weights)
+    }
+
+    fn add(&mut self, path: &Path, expected: Option<&[&str]>) -> Result<()> {
+        let file = File::open(path).map_err(io("read", path))?;
+        // SAFETY: the mapping is read-only. As with every memory-mapped file,
+        // another process that truncates it while it is in use breaks the
+        // contract; model files are not modified in place.
+        let map = unsafe { Mmap::map(&file) }.map_err(io("read", path))?;
+        let damaged = |message: String| Error::Safetensors {
+            path: path.to_owned(),
+            message,
+        };
+        let (header_len, header) =
+            SafeTensors::read_metadata(&map).map_err(|e| damaged(e.to_string()))?;
+        let base = 8 + header_len;
+        // A header may describe less than the file holds only by being wrong.
+        let parsed = SafeTensors::deserialize(&map).map_err(|e| damaged(e.to_string()))?;
+        drop(parsed);
+        for (name, info) in header.tensors() {
+            let (start, end) = info.data_offsets;
+            let entry = Entry {
+                file: self.files.len(),
+                dtype: info.dtype,
+                shape: info.shape.clone(),
+                range: base + start..base + end,
+            };
+            if self.entries.insert(name.clone(), entry).is_some() {
+                return Err(damaged(format!("tensor {name:?} is in two shards")));
+            }
+        }
+        for name in expected.unwrap_or(&[]) {
+            if !self.entries.contains_key(*name) {
+                return Err(damaged(format!(
+                    "the index places tensor {name:?} here, but it is not in this shard"
+                )));
+            }
+        }
+        if let Some(metadata) = header.metadata() {
+            self.metadata
+                .extend(metadata.iter().map(|(k, v)| (k.clone(), v.clone())));
+        }
+        self.files.push(map);
+        Ok(())
+    }
+
+    /// The file or index that was opened.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Names in byte order.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.entries.keys().map(String::as_str)
+    }
+
+    /// The free-form strings of the header.
+    pub fn metadata(&self) -> &BTreeMap<String, String> {
+        &self.metadata
+    }
+
+    /// Whether a tensor of this name exists.
+    pub fn contains(&self, name: &str) -> bool {
+        self.entries.contains_key(name)
+    }
+
+    /// Shape of a tensor, if it exists.
+    pub fn shape(&self, name: &str) -> Option<&[usize]> {
+        self.entries.get(name).map(|entry| entry.shape.as_slice())
+    }
+
+    /// Reads a tensor and converts it to `dtype` on `device`; `None` if no
+    /// tensor has this name.
+    pub fn tensor(&self, name: &str, dtype: DType, device: &Device) -> Result<Option<Tensor>> {
+        let Some(entry) = self.entries.get(name) else {
+            return Ok(None);
+        };
+        let stored = match entry.dtype {
+            Dtype::F32 => DType::F32,
+            Dtype::F16 => DType::F16,
+            Dtype::BF16 => DType::BF16,
+            Dtype::F64 => DType::F64,
+            Dtype::I64 => DType::I64,
+            Dtype::I32 => DType::I32,
+            Dtype::U8 => DType::U8,
+            other => {
+                return Err(Error::Weights {
+                    path: self.path.clone(),
+                    problems: vec![format!(
+                        "tensor {name:?} is stored as {other:?}, accepted are F32, F16 and BF16; convert the model"
+                    )],
+                });
+            }
+        };
+        let bytes = &self.files[entry.file][entry.range.clone()];
+        let tensor = Tensor::from_raw_buffer(bytes, stored, &entry.shape, &Device::Cpu)?;
+        Ok(Some(tensor.to_dtype(dtype)?.to_device(device)?))
+    }
+}
+
+/// Writes tensors and header strings to `path`, through a temporary file
+/// beside it, so that a reader never sees half a file. Names are written in
+/// byte order: the same tensors give the same bytes.
+pub fn write_safetensors(
+    path: &Path,
+    tensors: &BTreeMap<String, Tensor>,
+    metadata: &BTreeMap<String, String>,
+) -> Result<()> {
+    let bytes = serialize_safetensors(tensors, metadata)?;
+    let temporary = path.with_extension("partial");
+    std::fs::write(&temporary, bytes).map_err(io("write", &temporary))?;
+    std::fs::rename(&temporary, path).map_err(io("write", path))
+}
+
+/// The bytes that [`write_safetensors`] writes: header keys in sorted order.
+pub fn serialize_safetensors(
+    tensors: &BTreeMap<String, Tensor>,
+    metadata: &BTreeMap<String, String>,
+) -> Result<Vec<u8>> {
+    let mut header = serde_json::Map::new();
+    if !metadata.is_empty() {
+        header.insert("__metadata__".into(), serde_json::json!(metadata));
+    }
+    let mut data: Vec<u8> = vec![];
+    for (name, tensor) in tensors {
+        let start = data.len();
+        let tensor = tensor
+            .to_device(&Device::Cpu)?
+            .contiguous()?
+            .flatten_all()?;
+        let dtype = match tensor.dtype() {
+            DType::F32 => {
+                tensor
+                    .to_vec1::<f32>()?
+                    .iter()
+                    .for_each(|v| data.extend(v.to_le_bytes()));
+                "F32"
+            }
+            DType::F16 => {
+                tensor
+                    .to_vec1::<half::f16>()?
+                    .iter()
+                    .for_each(|v| data.extend(v.to_le_bytes()));
+                "F16"
+            }
+            DType::BF16 => {
+                tensor
+                    .to_vec1::<half::bf16>()?
+                    .iter()
+                    .for_each(|v| data.extend(v.to_le_bytes()));
+                "BF16"
+            }
+            DType::I64 => {
+                tensor
+                    .to_vec1::<i64>()?
+                    .iter()
+                    .for_each(|v| data.extend(v.to_le_bytes()));
+                "I64"
+            }
+            other => {
+                return crate::error::argument(format!("tensor {name:?}: cannot write {other:?}"));
+            }
+        };
+        let shape = tensors[name].dims();
+        header.insert(
+            name.clone(),
+            serde_json::json!({"dtype": dtype, "shape": shape, "data_offsets": [start, data.len()]}),
+        );
+    }
+    let mut head = serde_json::Value::Object(header).to_string().into_bytes();
+    // The format wants the data aligned to 8 bytes; spaces are allowed padding.
+    head.resize(head.len().next_multiple_of(8), b' ');
+    let mut bytes = (head.len() as u64).to_le_bytes().to_vec();
+    bytes.append(&mut head);
+    bytes.append(&mut data);
+    Ok(bytes)
+}
