@@ -1,0 +1,404 @@
+//! Gradients of every layer against central differences, half precision
+//! against f32, extreme inputs, and the same bytes for any number of threads.
+
+use std::collections::BTreeMap;
+
+use candle_core::{DType, Device, Tensor, Var};
+use dipir_diffusion::layers::{
+    Activation, Attention, Causality, Conv2d, GroupNorm, LayerNorm, Linear, NormActivation,
+    Padding, activate, geglu, upsample_nearest,
+};
+use dipir_diffusion::noise::NoiseStream;
+use dipir_diffusion::parameters::Parameters;
+
+type Outcome = Result<(), Box<dyn std::error::Error>>;
+
+fn normal(stream: u64, shape: &[usize]) -> Tensor {
+    NoiseStream::new(11, stream)
+        .normal_tensor(shape, DType::F32, &Device::Cpu)
+        .expect("tensor")
+}
+
+/// A layer as a function of all its tensors.
+type Layer<'a> = &'a dyn Fn(&[Tensor]) -> dipir_diffusion::Result<Tensor>;
+
+/// Compares the gradient of sum(layer * probe) with central differences at up
+/// to 12 elements of each input. The step is 1e-2: the differences of values
+/// of size 1 then carry rounding of 1e-7 / 1e-2 = 1e-5 and, with third
+/// derivatives of order 1, a truncation of 1e-4 / 6; sums over `probe` have
+/// size sqrt(n). 5e-3 of the largest gradient leaves room for both.
+fn assert_gradients(name: &str, inputs: &[Tensor], layer: Layer) -> Outcome {
+    let variables: Vec<Var> = inputs
+        .iter()
+        .map(Var::from_tensor)
+        .collect::<Result<_, _>>()?;
+    let tensors: Vec<Tensor> = variables.iter().map(|v| v.as_tensor().clone()).collect();
+    let y = layer(&tensors)?;
+    let probe = normal(99, y.dims());
+    let value = |tensors: &[Tensor]| -> Result<f64, Box<dyn std::error::Error>> {
+        let y = layer(tensors)?.to_dtype(DType::F64)?;
+        Ok((y * probe.to_dtype(DType::F64)?)?
+            .sum_all()?
+            .to_scalar::<f64>()?)
+    };
+    let gradients = (&y * &probe)?.sum_all()?.backward()?;
+    for (index, variable) in variables.iter().enumerate() {
+        let gradient = gradients
+            .get(variable)
+            .ok_or(format!("{name}: input {index} got no gradient"))?;
+        let gradient = gradient.flatten_all()?.to_vec1::<f32>()?;
+        let values = inputs[index].flatten_all()?.to_vec1::<f32>()?;
+        let largest = gradient.iter().fold(0f32, |m, g| m.max(g.abs()));
+        assert!(
+            largest.is_finite() && largest > 0.0,
+            "{name}: input {index}: gradient of size {largest}"
+        );
+        for element in (0..values.len()).step_by(values.len().div_ceil(12)) {
+            let at = |shift: f32| -> Result<f64, Box<dyn std::error::Error>> {
+                let mut moved = values.clone();
+                moved[element] += shift;
+                let mut all = inputs.to_vec();
+                all[index] = Tensor::from_vec(moved, inputs[index].dims(), &Device::Cpu)?;
+                value(&all)
+            };
+            let numerical = (at(1e-2)? - at(-1e-2)?) / 2e-2;
+            let error = (numerical - gradient[element] as f64).abs();
+            assert!(
+                error < 5e-3 * largest as f64,
+                "{name}: input {index}, element {element}: difference {numerical}, gradient {}",
+                gradient[element]
+            );
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn linear_layers_pass_gradients() -> Outcome {
+    let inputs = [normal(1, &[2, 5, 7]), normal(2, &[3, 7]), normal(3, &[3])];
+    assert_gradients("linear", &inputs, &|t| {
+        Linear::from_tensors(t[1].clone(), Some(t[2].clone()))?.forward(&t[0])
+    })?;
+    assert_gradients("no bias", &inputs[..2], &|t| {
+        Linear::from_tensors(t[1].clone(), None)?.forward(&t[0])
+    })
+}
+
+#[test]
+fn convolutions_of_every_kind_pass_gradients() -> Outcome {
+    for (kernel, stride, padding, size) in [
+        (3, 1, Padding::Same(1), (6, 9)),
+        (3, 1, Padding::Same(1), (1, 2)),
+        (3, 1, Padding::Same(1), (13, 12)),
+        (3, 2, Padding::Same(1), (7, 6)),
+        (3, 2, Padding::After(1), (6, 8)),
+        (1, 1, Padding::Same(0), (4, 5)),
+        (3, 1, Padding::Same(0), (5, 4)),
+        (2, 2, Padding::Same(0), (6, 6)),
+    ] {
+        let name = format!("conv {kernel} stride {stride} {padding:?} {size:?}");
+        let inputs = [
+            normal(4, &[2, 5, size.0, size.1]),
+            normal(5, &[6, 5, kernel, kernel]),
+            normal(6, &[6]),
+        ];
+        assert_gradients(&name, &inputs, &|t| {
+            Conv2d::from_tensors(t[1].clone(), t[2].clone(), stride, padding)?.forward(&t[0])
+        })?;
+    }
+    Ok(())
+}
+
+#[test]
+fn convolution_is_the_sum_of_its_definition() -> Outcome {
+    // Sizes that take the blocked and the transformed paths.
+    for (inputs, outputs, height, width) in [(3, 4, 5, 7), (16, 24, 33, 17), (40, 24, 16, 16)] {
+        let (x, w, b) = (
+            normal(7, &[1, inputs, height, width]),
+            normal(8, &[outputs, inputs, 3, 3]),
+            normal(9, &[outputs]),
+        );
+        let y = Conv2d::from_tensors(w.clone(), b.clone(), 1, Padding::Same(1))?.forward(&x)?;
+        let (xs, ws, bs) = (
+            x.flatten_all()?.to_vec1::<f32>()?,
+            w.flatten_all()?.to_vec1::<f32>()?,
+            b.to_vec1::<f32>()?,
+        );
+        let ys = y.flatten_all()?.to_vec1::<f32>()?;
+        for (index, &found) in ys.iter().enumerate().step_by(7) {
+            let (o, i, j) = (
+                index / (height * width),
+                index / width % height,
+                index % width,
+            );
+            let mut sum = bs[o] as f64;
+            let mut size = 0f64;
+            for c in 0..inputs {
+                for (ky, kx) in (0..9).map(|k| (k / 3, k % 3)) {
+                    let (yy, xx) = ((i + ky).wrapping_sub(1), (j + kx).wrapping_sub(1));
+                    if yy < height && xx < width {
+                        let term = xs[(c * height + yy) * width + xx] as f64
+                            * ws[((o * inputs + c) * 3 + ky) * 3 + kx] as f64;
+                        sum += term;
+                        size += term * term;
+                    }
+                }
+            }
+            // Rounding of a fast transformation: a few dozen ulp of the norm
+            // of the terms.
+            let tolerance = 100.0 * f32::EPSILON as f64 * (size.sqrt() + 1.0);
+            assert!(
+                (found as f64 - sum).abs() < tolerance,
+                "{inputs}->{outputs} at {index}: {found} instead of {sum}"
+            );
+        }
+    }
+    Ok(())
+}
+
+/// A norm built on tensors that the test varies.
+fn with_parameters<T>(
+    tensors: &[Tensor],
+    build: impl Fn(&Parameters) -> dipir_diffusion::Result<T>,
+) -> dipir_diffusion::Result<T> {
+    build(&Parameters::from_tensors(BTreeMap::from([
+        ("weight".to_owned(), tensors[0].clone()),
+        ("bias".to_owned(), tensors[1].clone()),
+    ])))
+}
+
+#[test]
+fn norms_pass_gradients() -> Outcome {
+    for activation in [NormActivation::None, NormActivation::Silu] {
+        let inputs = [
+            normal(10, &[2, 6, 3, 5]),
+            normal(11, &[6]),
+            normal(12, &[6]),
+        ];
+        assert_gradients("group norm", &inputs, &|t| {
+            with_parameters(&t[1..], |p| GroupNorm::new(p, 3, 6, 1e-5, activation))?.forward(&t[0])
+        })?;
+    }
+    let inputs = [normal(13, &[2, 5, 9]), normal(14, &[9]), normal(15, &[9])];
+    assert_gradients("layer norm", &inputs, &|t| {
+        with_parameters(&t[1..], |p| LayerNorm::new(p, 9, 1e-5))?.forward(&t[0])
+    })
+}
+
+#[test]
+fn attention_passes_gradients() -> Outcome {
+    for (heads, queries, keys, causality) in [
+        (1, 40, 7, Causality::Full),
+        (2, 5, 9, Causality::Full),
+        (4, 6, 6, Causality::Causal),
+    ] {
+        let inputs = [
+            normal(16, &[2, queries, 8]),
+            normal(17, &[2, keys, 8]),
+            normal(18, &[2, keys, 8]),
+        ];
+        let attention = Attention { heads, causality };
+        assert_gradients("attention", &inputs, &|t| {
+            attention.forward(&t[0], &t[1], &t[2])
+        })?;
+    }
+    Ok(())
+}
+
+#[test]
+fn activations_and_enlargement_pass_gradients() -> Outcome {
+    for f in [Activation::Silu, Activation::Gelu, Activation::QuickGelu] {
+        assert_gradients("activation", &[normal(19, &[3, 11])], &|t| {
+            activate(f, &t[0])
+        })?;
+    }
+    assert_gradients("geglu", &[normal(20, &[2, 3, 10])], &|t| geglu(&t[0]))?;
+    assert_gradients("enlargement", &[normal(21, &[2, 3, 4, 5])], &|t| {
+        upsample_nearest(&t[0], 7, 10)
+    })?;
+    // A second consumer of the input must not lose its share.
+    assert_gradients("two consumers", &[normal(22, &[1, 2, 3, 3])], &|t| {
+        Ok((upsample_nearest(&t[0], 6, 6)? + upsample_nearest(&t[0].sqr()?, 6, 6)?)?)
+    })
+}
+
+#[test]
+fn attention_survives_logits_of_3e5() -> Outcome {
+    // q k of 8 heads x 40 channels with entries of 90 gives |logits| to 3e5.
+    let (q, k, v) = (
+        normal(23, &[1, 12, 320]),
+        normal(24, &[1, 12, 320]),
+        normal(25, &[1, 12, 320]),
+    );
+    let (q, k) = ((q * 90.0)?, (k * 90.0)?);
+    let attention = Attention {
+        heads: 8,
+        causality: Causality::Full,
+    };
+    let y = attention.forward(&q, &k, &v)?;
+    // Softmax in f64 is one-hot here wherever the two largest logits differ
+    // by more than 20: compare with the value of the largest key.
+    let (qs, ks) = (q.to_dtype(DType::F64)?, k.to_dtype(DType::F64)?);
+    let mut checked = 0;
+    for head in 0..8 {
+        let part = |t: &Tensor| t.narrow(2, head * 40, 40).and_then(|t| t.squeeze(0));
+        let logits = (part(&qs)?.matmul(&part(&ks)?.t()?)? / 40f64.sqrt())?.to_vec2::<f64>()?;
+        for (query, row) in logits.iter().enumerate() {
+            let mut order: Vec<usize> = (0..row.len()).collect();
+            order.sort_by(|&a, &b| row[b].total_cmp(&row[a]));
+            if row[order[0]] - row[order[1]] < 20.0 {
+                continue;
+            }
+            let found = part(&y)?.get(query)?.to_vec1::<f32>()?;
+            let wanted = part(&v)?.get(order[0])?.to_vec1::<f32>()?;
+            for (a, b) in found.iter().zip(&wanted) {
+                assert!(
+                    (a - b).abs() < 1e-5,
+                    "head {head}, query {query}: {a} instead of {b}"
+                );
+            }
+            checked += 1;
+        }
+    }
+    assert!(checked > 50, "only {checked} rows were clear");
+    // In half precision: products beyond 65504 must not overflow.
+    for (dtype, tolerance) in [(DType::F16, 2e-3), (DType::BF16, 2e-2)] {
+        let half = |t: &Tensor| t.to_dtype(dtype);
+        let (q, k, v) = (half(&q)?, half(&k)?, half(&v)?);
+        let found = attention.forward(&q, &k, &v)?.to_dtype(DType::F32)?;
+        let exact = attention.forward(
+            &q.to_dtype(DType::F32)?,
+            &k.to_dtype(DType::F32)?,
+            &v.to_dtype(DType::F32)?,
+        )?;
+        let error = (found - exact)?.abs()?.max_all()?.to_scalar::<f32>()?;
+        // Rounding of the result alone: half an ulp of values up to 4.
+        assert!(error < tolerance * 4.0, "{dtype:?}: {error}");
+    }
+    Ok(())
+}
+
+#[test]
+fn half_precision_layers_reduce_in_f32() -> Outcome {
+    // 1e4 + small: sums of 4096 such values overflow f16, and lose the small
+    // part in bf16, unless they are taken in f32.
+    let x = ((normal(26, &[1, 8, 64, 64]) * 100.0)? + 1e4)?;
+    for dtype in [DType::F16, DType::BF16] {
+        let stored = x.to_dtype(dtype)?;
+        let layer = |t: &Tensor| -> dipir_diffusion::Result<Tensor> {
+            let ones = [
+                Tensor::ones(8, t.dtype(), &Device::Cpu)?,
+                Tensor::zeros(8, t.dtype(), &Device::Cpu)?,
+            ];
+            with_parameters(&ones, |p| {
+                GroupNorm::new(p, 2, 8, 1e-5, NormActivation::None)
+            })?
+            .forward(t)
+        };
+        let found = layer(&stored)?.to_dtype(DType::F32)?;
+        let exact = layer(&stored.to_dtype(DType::F32)?)?;
+        let error = (found - exact)?.abs()?.max_all()?.to_scalar::<f32>()?;
+        // Half an ulp of normalised values up to 8: 2^-9 or 2^-6 relative.
+        let ulp = if dtype == DType::F16 {
+            8.0 / 2048.0
+        } else {
+            8.0 / 256.0
+        };
+        assert!(error <= ulp, "{dtype:?}: {error}");
+    }
+    Ok(())
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_bytes() -> Outcome {
+    let x = normal(27, &[2, 24, 19, 23]);
+    let (w, b) = (normal(28, &[32, 24, 3, 3]), normal(29, &[32]));
+    let tokens = normal(30, &[2, 300, 64]);
+    let matrix = normal(31, &[64, 64]);
+    let run = || -> dipir_diffusion::Result<Vec<Vec<f32>>> {
+        let (x, w) = (Var::from_tensor(&x)?, Var::from_tensor(&w)?);
+        let tokens = Var::from_tensor(&tokens)?;
+        let y = Conv2d::from_tensors(w.as_tensor().clone(), b.clone(), 1, Padding::Same(1))?
+            .forward(&x)?;
+        let q = Linear::from_tensors(matrix.clone(), None)?.forward(&tokens)?;
+        let a = Attention {
+            heads: 4,
+            causality: Causality::Full,
+        }
+        .forward(&q, &tokens, &tokens)?;
+        let loss = (y.sqr()?.sum_all()? + a.sqr()?.sum_all()?)?;
+        let gradients = loss.backward()?;
+        let mut all = vec![y.flatten_all()?.to_vec1()?, a.flatten_all()?.to_vec1()?];
+        for variable in [&x, &w, &tokens] {
+            if let Some(gradient) = gradients.get(variable) {
+                all.push(gradient.flatten_all()?.to_vec1()?);
+            }
+        }
+        Ok(all)
+    };
+    let with_threads = |n: usize| -> Result<Vec<Vec<f32>>, Box<dyn std::error::Error>> {
+        Ok(rayon::ThreadPoolBuilder::new()
+            .num_threads(n)
+            .build()?
+            .install(run)?)
+    };
+    let one = with_threads(1)?;
+    assert_eq!(one.len(), 5);
+    for threads in [2, 3, 7] {
+        // Bit patterns, so that -0 and 0 differ too.
+        let bits = |v: &[Vec<f32>]| {
+            v.iter()
+                .map(|v| v.iter().map(|x| x.to_bits()).collect::<Vec<_>>())
+                .collect::<Vec<_>>()
+        };
+        assert!(
+            bits(&with_threads(threads)?) == bits(&one),
+            "{threads} threads gave other bytes than one"
+        );
+    }
+    Ok(())
+}
+
+#[test]
+fn frozen_weights_get_no_gradient() -> Outcome {
+    let x = Var::from_tensor(&normal(32, &[1, 4, 6, 6]))?;
+    let (w, b) = (normal(33, &[4, 4, 3, 3]), normal(34, &[4]));
+    let y = Conv2d::from_tensors(w.clone(), b.clone(), 1, Padding::Same(1))?.forward(&x)?;
+    let gradients = y.sum_all()?.backward()?;
+    assert!(
+        gradients.get(&x).is_some() && gradients.get(&w).is_none() && gradients.get(&b).is_none()
+    );
+    Ok(())
+}
+
+#[test]
+fn impossible_shapes_are_refused_with_both_numbers() {
+    let attention = Attention {
+        heads: 3,
+        causality: Causality::Full,
+    };
+    let x = normal(35, &[1, 4, 8]);
+    let message = attention
+        .forward(&x, &x, &x)
+        .expect_err("8 channels, 3 heads")
+        .to_string();
+    assert!(
+        message.contains("3 heads") && message.contains('8'),
+        "{message}"
+    );
+    let conv = Conv2d::from_tensors(
+        normal(36, &[2, 3, 3, 3]),
+        normal(37, &[2]),
+        1,
+        Padding::Same(1),
+    )
+    .expect("conv");
+    let message = conv
+        .forward(&normal(38, &[1, 5, 4, 4]))
+        .expect_err("5 channels")
+        .to_string();
+    assert!(
+        message.contains("3 channels") && message.contains("5 channels"),
+        "{message}"
+    );
+}
