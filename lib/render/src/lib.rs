@@ -18,4 +18,6 @@ pub mod render;
 pub mod shadow;
 pub mod shapes;
 pub mod surface;
+#[cfg(test)]
+mod testing;
 pub mod world;

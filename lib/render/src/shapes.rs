@@ -137,8 +137,8 @@ pub fn torus_knot(center: Vec3, scale: f32, tube: f32, along: u32, around: u32) 
             mesh.normals.push(normal);
             let (i1, j1) = ((i + 1) % along, (j + 1) % around);
             let at = |i: u32, j: u32| i * around + j;
-            mesh.indices.push([at(i, j), at(i1, j1), at(i1, j)]);
-            mesh.indices.push([at(i, j), at(i, j1), at(i1, j1)]);
+            mesh.indices.push([at(i, j), at(i1, j), at(i1, j1)]);
+            mesh.indices.push([at(i, j), at(i1, j1), at(i, j1)]);
         }
     }
     mesh.materials = vec![0; mesh.indices.len()];

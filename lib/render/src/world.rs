@@ -79,6 +79,18 @@ impl Geometry {
     }
 }
 
+impl Geometry {
+    /// Whether no part of the object rises above `plane`, on whose other side it blocks nothing.
+    pub fn is_below(&self, plane: &Plane) -> bool {
+        let Some(bounds) = self.bvh.bounds() else {
+            return true;
+        };
+        // The corner of the bounding box that lies farthest along the normal.
+        let top = Vec3::select(plane.normal.cmpgt(Vec3::ZERO), bounds.max, bounds.min);
+        (top - plane.point).dot(plane.normal) <= 0.0
+    }
+}
+
 /// A scene made ready for the effects of one plan.
 pub struct World<'a> {
     /// The scene.
