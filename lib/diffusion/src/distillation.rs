@@ -11,6 +11,7 @@ use crate::pass::Pass;
 use crate::sampler::guided;
 use crate::schedule::NoiseSchedule;
 use crate::unet::UNet;
+use crate::vae::Vae;
 
 /// Which difference of predictions.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,6 +59,36 @@ pub struct InpaintCondition {
 }
 
 impl InpaintCondition {
+    /// From an image [1, 3, h, w] in [-1, 1] and a mask [1, 1, h, w], 1 where
+    /// the network may paint: what is masked becomes grey before it is
+    /// encoded, the mask is read at the top left of each latent pixel.
+    pub fn new(vae: &Vae, image: &Tensor, mask: &Tensor) -> Result<Self> {
+        let (_, _, height, width) = image.dims4()?;
+        let factor = vae.downscale();
+        if mask.dims() != [1, 1, height, width] || height % factor != 0 || width % factor != 0 {
+            return argument(format!(
+                "inpainting: image {:?} and mask {:?} must have one size, a multiple of {factor}",
+                image.dims(),
+                mask.dims()
+            ));
+        }
+        // A mask is yes or no at every pixel.
+        let hard = mask.ge(0.5)?.to_dtype(image.dtype())?;
+        let masked = image.broadcast_mul(&hard.affine(-1.0, 1.0)?)?;
+        let grid = |n: usize| {
+            (0..n / factor)
+                .map(|i| (i * factor) as u32)
+                .collect::<Vec<_>>()
+        };
+        let rows = Tensor::from_vec(grid(height), height / factor, image.device())?;
+        let columns = Tensor::from_vec(grid(width), width / factor, image.device())?;
+        let mask = hard.index_select(&rows, 2)?.index_select(&columns, 3)?;
+        Ok(Self {
+            mask,
+            masked_latents: vae.encode(&masked, None)?.detach(),
+        })
+    }
+
     /// Latents, mask and masked latents side by side.
     pub fn join(&self, latents: &Tensor) -> Result<Tensor> {
         let (batch, _, h, w) = latents.dims4()?;

@@ -2,6 +2,7 @@
 //! layout, layers whose gradients pass, samplers, LoRA and score distillation.
 
 pub mod config;
+pub mod crop;
 pub mod distillation;
 pub mod error;
 mod kernels;
@@ -18,6 +19,7 @@ pub mod sampler;
 pub mod schedule;
 pub mod text_encoder;
 pub mod tokenizer;
+pub mod training;
 pub mod unet;
 pub mod vae;
 pub mod weights;

@@ -1,0 +1,438 @@
+//! Fine-tuning a LoRA, and optionally the embedding of a new word, with the
+//! denoising objective and prior preservation [Ruiz et al. 2023].
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use candle_core::{DType, Device, Tensor, Var};
+use serde::{Deserialize, Serialize};
+
+use crate::distillation::InpaintCondition;
+use crate::error::{Error, Result, argument};
+use crate::lora::Lora;
+use crate::model::Model;
+use crate::noise::NoiseStream;
+use crate::optimizer::{AdamW, AdamWConfig};
+use crate::pass::Pass;
+use crate::recompute::Recompute;
+use crate::text_encoder::LearnedTokens;
+use crate::weights::{Weights, write_safetensors};
+
+/// Settings of a fine-tuning run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrainingConfig {
+    /// Rank of the adapters.
+    pub rank: usize,
+    /// alpha of the adapters; the product is scaled by alpha / rank.
+    pub alpha: f64,
+    /// Updates of the parameters.
+    pub steps: usize,
+    /// Learning rate of the adapters after the warm-up.
+    pub learning_rate: f64,
+    /// Learning rate of the learned embedding.
+    pub token_learning_rate: f64,
+    /// Updates over which the learning rates rise linearly from 0.
+    pub warmup_steps: usize,
+    /// Examples of each kind whose gradients are averaged for one update.
+    pub accumulation: usize,
+    /// Gradients longer than this together are shortened to it.
+    pub max_gradient_norm: f64,
+    /// Weight of the class images' loss beside the picture's.
+    pub prior_weight: f64,
+    /// Lowest and highest timestep as shares of the schedule.
+    pub timesteps: (f64, f64),
+    /// Recompute activations in the backward pass: a third more time for a
+    /// fraction of the memory.
+    pub recompute: bool,
+    /// Key of all random numbers.
+    pub seed: u64,
+    /// Moments and decay.
+    pub optimizer: AdamWConfig,
+}
+
+impl Default for TrainingConfig {
+    fn default() -> Self {
+        Self {
+            rank: 4,
+            alpha: 4.0,
+            steps: 500,
+            // diffusers' default for LoRA of the UNet.
+            learning_rate: 1e-4,
+            // Embeddings have norms near 0.4 in 768 dimensions; this is what
+            // textual inversion is trained with.
+            token_learning_rate: 5e-4,
+            warmup_steps: 20,
+            accumulation: 1,
+            max_gradient_norm: 1.0,
+            prior_weight: 1.0,
+            timesteps: (0.0, 1.0),
+            recompute: true,
+            seed: 0,
+            optimizer: AdamWConfig::default(),
+        }
+    }
+}
+
+impl TrainingConfig {
+    fn check(&self) -> Result<()> {
+        let (low, high) = self.timesteps;
+        let positive = |x: f64| x > 0.0 && x.is_finite();
+        if self.accumulation == 0 || self.rank == 0 {
+            return argument("training: accumulation and rank must be at least 1");
+        }
+        if !(0.0 <= low && low <= high && high <= 1.0) {
+            return argument(format!(
+                "training: timesteps = ({low}, {high}), accepted: 0 <= low <= high <= 1"
+            ));
+        }
+        if !positive(self.learning_rate)
+            || !positive(self.max_gradient_norm)
+            || !positive(self.alpha)
+        {
+            return argument(
+                "training: learning_rate, max_gradient_norm and alpha must be positive",
+            );
+        }
+        if !(self.prior_weight >= 0.0 && self.token_learning_rate >= 0.0) {
+            return argument("training: prior_weight and token_learning_rate must not be negative");
+        }
+        Ok(())
+    }
+}
+
+/// One training example.
+#[derive(Debug, Clone)]
+pub struct Example {
+    /// Scaled latents [1, c, h, w].
+    pub latents: Tensor,
+    /// Its caption.
+    pub prompt: String,
+    /// For 9-channel networks.
+    pub inpaint: Option<InpaintCondition>,
+}
+
+/// Where examples come from. Each call gets a stream of its own, keyed by
+/// the step, so that a resumed run sees the same examples.
+pub trait TrainingData {
+    /// A crop of the picture that is personalised to.
+    fn instance(&self, stream: &mut NoiseStream) -> Result<Example>;
+    /// An image of the class; `None` trains without prior preservation.
+    fn prior(&self, stream: &mut NoiseStream) -> Result<Option<Example>>;
+}
+
+/// What one update did.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct StepReport {
+    /// Updates so far, this one included.
+    pub step: usize,
+    /// Weighted sum of both losses.
+    pub loss: f64,
+    /// Mean squared error on the picture.
+    pub instance_loss: f64,
+    /// Mean squared error on class images, 0 without them.
+    pub prior_loss: f64,
+    /// Norm of all gradients before clipping.
+    pub gradient_norm: f64,
+    /// Learning rate of the adapters.
+    pub learning_rate: f64,
+}
+
+/// The name under which the learned embedding is optimised and saved.
+const TOKEN: &str = "token";
+
+/// A fine-tuning run; [`LoraTrainer::step`] is one update.
+#[derive(Debug)]
+pub struct LoraTrainer<'a> {
+    model: &'a Model,
+    config: TrainingConfig,
+    lora: Arc<Lora>,
+    token: Option<Var>,
+    optimizer: AdamW,
+    recompute: Option<Recompute>,
+}
+
+impl<'a> LoraTrainer<'a> {
+    /// Starts from a fresh adapter. `initial_token` is the start of a learned
+    /// embedding [hidden size]: the tokenizer's placeholder token is then
+    /// `vocab_size`, see [`crate::tokenizer::Tokenizer::add_placeholder`].
+    pub fn new(
+        model: &'a Model,
+        config: TrainingConfig,
+        initial_token: Option<&Tensor>,
+    ) -> Result<Self> {
+        config.check()?;
+        let lora = Lora::new(
+            &model.unet.adapter_targets(),
+            config.rank,
+            config.alpha,
+            config.seed,
+            model.device(),
+        )?;
+        let token = initial_token
+            .map(|t| -> Result<Var> {
+                Ok(Var::from_tensor(
+                    &t.detach().to_dtype(DType::F32)?.reshape((1, ()))?,
+                )?)
+            })
+            .transpose()?;
+        let mut variables = lora.variables().clone();
+        if let Some(token) = &token {
+            variables.insert(TOKEN.into(), token.clone());
+        }
+        if variables.is_empty() {
+            return argument("training: this UNet has no attention projection to adapt");
+        }
+        let optimizer = AdamW::new(&variables, config.optimizer)?;
+        let recompute = config
+            .recompute
+            .then(|| Recompute::new(variables.into_values().collect()));
+        Ok(Self {
+            model,
+            config,
+            lora: Arc::new(lora),
+            token,
+            optimizer,
+            recompute,
+        })
+    }
+
+    /// The adapter as it is now.
+    pub fn lora(&self) -> &Arc<Lora> {
+        &self.lora
+    }
+
+    /// The learned embedding as it is now, [1, hidden size].
+    pub fn learned(&self) -> Option<LearnedTokens> {
+        self.token.as_ref().map(|t| LearnedTokens {
+            embeddings: t.as_tensor().clone(),
+        })
+    }
+
+    /// Updates taken.
+    pub fn steps(&self) -> usize {
+        self.optimizer.steps() as usize
+    }
+
+    /// One update: accumulate, clip, step. An error leaves the parameters as
+    /// they were.
+    pub fn step(&mut self, data: &dyn TrainingData) -> Result<StepReport> {
+        let step = self.steps();
+        let mut sum: Option<BTreeMap<String, Tensor>> = None;
+        let (mut instance_loss, mut prior_loss) = (0f64, 0f64);
+        let share = 1.0 / self.config.accumulation as f64;
+        for micro in 0..self.config.accumulation {
+            let index = (step * self.config.accumulation + micro) as u64;
+            let mut stream =
+                NoiseStream::new(self.config.seed, index.wrapping_mul(2).wrapping_add(1));
+            let (gradients, losses) = self.gradients(data, &mut stream)?;
+            instance_loss += losses.0 * share;
+            prior_loss += losses.1 * share;
+            sum = Some(match sum {
+                None => gradients,
+                Some(sum) => add(sum, &gradients)?,
+            });
+        }
+        let mut gradients = sum.unwrap_or_default();
+        for gradient in gradients.values_mut() {
+            *gradient = (&*gradient * share)?;
+        }
+        let warmup = ((step + 1) as f64 / self.config.warmup_steps.max(1) as f64).min(1.0);
+        let (rate, token_rate) = (
+            self.config.learning_rate * warmup,
+            self.config.token_learning_rate * warmup,
+        );
+        let gradient_norm =
+            self.optimizer
+                .step(&gradients, self.config.max_gradient_norm, |name| {
+                    if name == TOKEN { token_rate } else { rate }
+                })?;
+        Ok(StepReport {
+            step: step + 1,
+            loss: instance_loss + self.config.prior_weight * prior_loss,
+            instance_loss,
+            prior_loss,
+            gradient_norm,
+            learning_rate: rate,
+        })
+    }
+
+    /// Gradients of one example of each kind, and both losses.
+    fn gradients(
+        &self,
+        data: &dyn TrainingData,
+        stream: &mut NoiseStream,
+    ) -> Result<(BTreeMap<String, Tensor>, (f64, f64))> {
+        let mut examples = vec![data.instance(stream)?];
+        if self.config.prior_weight > 0.0 {
+            examples.extend(data.prior(stream)?);
+        }
+        let losses = self.losses(&examples, stream)?;
+        let total = match losses.get(1) {
+            Some(prior) => (&losses[0] + (prior * self.config.prior_weight)?)?,
+            None => losses[0].clone(),
+        };
+        let gradients = self.gradients_of(&total)?;
+        let value = |t: &Tensor| -> Result<f64> { Ok(t.to_scalar::<f32>()? as f64) };
+        let prior = losses.get(1).map(value).transpose()?.unwrap_or(0.0);
+        Ok((gradients, (value(&losses[0])?, prior)))
+    }
+
+    /// Gradients of a scalar with respect to every trained parameter, by
+    /// name; a parameter that gets none is an error.
+    pub fn gradients_of(&self, loss: &Tensor) -> Result<BTreeMap<String, Tensor>> {
+        let mut store = loss.backward()?;
+        if let Some(recompute) = &self.recompute {
+            recompute.drain_into(&mut store)?;
+        }
+        self.optimizer.collect(&store)
+    }
+
+    /// Every trained parameter by name.
+    pub fn variables(&self) -> BTreeMap<String, Var> {
+        let token = self.token.iter().map(|t| (TOKEN.to_owned(), t.clone()));
+        self.lora
+            .variables()
+            .clone()
+            .into_iter()
+            .chain(token)
+            .collect()
+    }
+
+    /// The denoising loss (eq. 1 with w = 1) of each example, as scalars in
+    /// f32 that are part of the graph. All examples share one batch.
+    pub fn losses(&self, examples: &[Example], stream: &mut NoiseStream) -> Result<Vec<Tensor>> {
+        let model = self.model;
+        let latents: Vec<&Tensor> = examples.iter().map(|e| &e.latents).collect();
+        let latents = Tensor::cat(&latents, 0)?;
+        if latents.dim(0)? != examples.len() {
+            return argument("training: every example has one image");
+        }
+        let (low, high) = self.config.timesteps;
+        let (first, last) = (
+            model.schedule.timestep_at(low),
+            model.schedule.timestep_at(high),
+        );
+        let timesteps: Vec<usize> = examples
+            .iter()
+            .map(|_| first + stream.below(last - first + 1))
+            .collect();
+        let noise = stream
+            .normal_tensor(latents.dims(), DType::F32, model.device())?
+            .to_dtype(model.dtype())?;
+        let noisy = model
+            .schedule
+            .add_noise_each(&latents, &noise, &timesteps)?;
+        let input = self.join_conditions(examples, &noisy)?;
+        let prompts: Vec<&str> = examples.iter().map(|e| e.prompt.as_str()).collect();
+        let context = model.encode_prompts(&prompts, self.learned().as_ref())?;
+        let pass = Pass {
+            recompute: self.recompute.clone(),
+            ..Pass::with_lora(&self.lora)
+        };
+        let t: Vec<f64> = timesteps.iter().map(|&t| t as f64).collect();
+        let output = model
+            .unet
+            .forward(&input, &t, &context, &pass)?
+            .to_dtype(DType::F32)?;
+        let target = model
+            .schedule
+            .target(&latents, &noise, &timesteps)?
+            .to_dtype(DType::F32)?;
+        let squares = (output - target)?.sqr()?;
+        (0..examples.len())
+            .map(|i| Ok(squares.get(i)?.mean_all()?))
+            .collect()
+    }
+
+    fn join_conditions(&self, examples: &[Example], noisy: &Tensor) -> Result<Tensor> {
+        if !self.model.is_inpainting() {
+            return Ok(noisy.clone());
+        }
+        let rows = examples
+            .iter()
+            .enumerate()
+            .map(|(i, example)| match &example.inpaint {
+                Some(condition) => condition.join(&noisy.narrow(0, i, 1)?),
+                None => argument("training: an inpainting model needs mask and masked latents with every example"),
+            })
+            .collect::<Result<Vec<_>>>()?;
+        Ok(Tensor::cat(&rows, 0)?)
+    }
+
+    /// Writes parameters, moments, step and settings: a run resumed from it
+    /// ends with the same bytes as one that was never stopped.
+    pub fn save_checkpoint(&self, path: &Path) -> Result<()> {
+        let metadata = BTreeMap::from([
+            ("steps".to_owned(), self.steps().to_string()),
+            ("config".to_owned(), self.settings()?),
+        ]);
+        write_safetensors(path, &self.optimizer.state(), &metadata)
+    }
+
+    /// Continues from a checkpoint of the same settings; only the number of
+    /// steps may differ.
+    pub fn resume(&mut self, path: &Path) -> Result<()> {
+        let weights = Weights::open_file(path)?;
+        let fail = |message: String| Error::Checkpoint {
+            path: path.to_owned(),
+            message,
+        };
+        let field = |key: &str| {
+            weights
+                .metadata()
+                .get(key)
+                .ok_or_else(|| fail(format!("its header lacks {key:?}; delete it to start anew")))
+        };
+        let steps: u64 = field("steps")?
+            .parse()
+            .map_err(|e| fail(format!("steps: {e}")))?;
+        let (theirs, ours) = (field("config")?, self.settings()?);
+        if *theirs != ours {
+            return Err(fail(format!(
+                "it was made with other settings; delete it or restore them: {theirs}, now {ours}"
+            )));
+        }
+        let device = self.model.device().clone();
+        self.optimizer
+            .restore(steps, |name| weights.tensor(name, DType::F32, &device))
+            .map_err(fail)
+    }
+
+    /// Every setting that decides the course of a run.
+    fn settings(&self) -> Result<String> {
+        let config = TrainingConfig {
+            steps: 0,
+            ..self.config.clone()
+        };
+        serde_json::to_string(&config)
+            .map_err(|e| Error::Argument(format!("training settings: {e}")))
+    }
+
+    /// Writes the learned embedding, under `word` as textual inversion files
+    /// of diffusers have it; nothing if there is none.
+    pub fn save_token(&self, path: &Path, word: &str) -> Result<()> {
+        let Some(token) = &self.token else {
+            return Ok(());
+        };
+        let row = token.as_detached_tensor().to_device(&Device::Cpu)?;
+        write_safetensors(
+            path,
+            &BTreeMap::from([(word.to_owned(), row)]),
+            &BTreeMap::new(),
+        )
+    }
+}
+
+fn add(
+    mut sum: BTreeMap<String, Tensor>,
+    other: &BTreeMap<String, Tensor>,
+) -> Result<BTreeMap<String, Tensor>> {
+    for (name, gradient) in &mut sum {
+        if let Some(more) = other.get(name) {
+            *gradient = (&*gradient + more)?;
+        }
+    }
+    Ok(sum)
+}
