@@ -284,7 +284,7 @@ impl SceneConfig {
             )
         })?;
         if let Some(t) = self.effects.tolerance
-            && !(t >= 0.0 && t <= 1.0)
+            && !(0.0..=1.0).contains(&t)
         {
             return Err(wrong(
                 "scene.effects.tolerance",

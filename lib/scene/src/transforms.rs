@@ -121,7 +121,8 @@ fn pose(rows: &[Vec<f64>], at: &str, up: WorldUp) -> Result<(DMat3, DVec3), Erro
     let scale = matrix.determinant().cbrt();
     let rotation = matrix * scale.recip();
     let error = rotation * rotation.transpose() - DMat3::IDENTITY;
-    if scale <= 0.0 || error.to_cols_array().iter().any(|e| !(e.abs() < 1e-3)) {
+    let rigid = error.to_cols_array().iter().all(|e| e.abs() < 1e-3);
+    if scale <= 0.0 || !rigid {
         return Err(wrong("does not rotate"));
     }
     let x = rotation.x_axis.normalize();

@@ -18,7 +18,10 @@ fn message_of(bytes: &[u8]) -> String {
 #[test]
 fn a_broken_glb_says_where_it_breaks() {
     let whole = Glb::triangle(json!({})).bytes();
-    assert_eq!(message_of(b""), "the file is empty; export or copy the file again");
+    assert_eq!(
+        message_of(b""),
+        "the file is empty; export or copy the file again"
+    );
     assert_eq!(
         message_of(&whole[..9]),
         "the GLB header has 12 bytes, the file only 9; export or copy the file again"
@@ -118,8 +121,14 @@ fn a_nan_position_names_its_vertex() {
 #[test]
 fn required_extensions_that_cannot_be_ignored_are_refused_by_name() {
     for (extension, remedy) in [
-        ("KHR_draco_mesh_compression", "export the object without mesh compression"),
-        ("EXT_meshopt_compression", "export the object without mesh compression"),
+        (
+            "KHR_draco_mesh_compression",
+            "export the object without mesh compression",
+        ),
+        (
+            "EXT_meshopt_compression",
+            "export the object without mesh compression",
+        ),
         ("KHR_texture_basisu", "export the textures as PNG or JPEG"),
         ("EXT_texture_webp", "export the textures as PNG or JPEG"),
         ("ACME_shapes", "export the object without it"),
@@ -133,7 +142,11 @@ fn required_extensions_that_cannot_be_ignored_are_refused_by_name() {
             )
         );
     }
-    for harmless in ["KHR_materials_specular", "KHR_materials_volume", "KHR_materials_sheen"] {
+    for harmless in [
+        "KHR_materials_specular",
+        "KHR_materials_volume",
+        "KHR_materials_sheen",
+    ] {
         let mut glb = Glb::triangle(json!({}));
         glb.json["extensionsRequired"] = json!([harmless]);
         assert!(glb.try_load().is_ok(), "{harmless}");

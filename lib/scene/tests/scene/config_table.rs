@@ -100,9 +100,7 @@ fn wrong_values_are_quoted_with_the_accepted_form() {
         message(&table("transfer = \"sgrb\"", "")),
         "scene.transfer is \"sgrb\"; accepted: \"srgb\", \"gamma22\" or \"linear\" (did you mean \"srgb\"?)"
     );
-    let object = |line: &str| {
-        format!("background = \"photo.jpg\"\n{OBJECT}{line}\n{CAMERA}")
-    };
+    let object = |line: &str| format!("background = \"photo.jpg\"\n{OBJECT}{line}\n{CAMERA}");
     assert_eq!(
         message(&object("scale = -1")),
         "scene.objects[0].scale is -1; accepted: a factor above 0, for instance scale = 1.0"
@@ -150,11 +148,15 @@ fn wrong_cameras_are_explained() {
         "scene.camera.fov_deg and scene.camera.focal_mm cannot both be given; keep one of them"
     );
     assert_eq!(
-        message(&camera("position = [0, 1, 5]\nlook_at = [0, 1, 5]\nfov_deg = 40")),
+        message(&camera(
+            "position = [0, 1, 5]\nlook_at = [0, 1, 5]\nfov_deg = 40"
+        )),
         "scene.camera.look_at is [0.0, 1.0, 5.0]; accepted: a point away from scene.camera.position"
     );
     assert_eq!(
-        message(&camera("position = [0, 5, 0]\nlook_at = [0, 0, 0]\nfov_deg = 40")),
+        message(&camera(
+            "position = [0, 5, 0]\nlook_at = [0, 0, 0]\nfov_deg = 40"
+        )),
         "scene.camera.up is [0.0, 1.0, 0.0]; accepted: a direction across the line of sight; looking straight down or up, write up = [0.0, 0.0, -1.0]"
     );
     assert_eq!(

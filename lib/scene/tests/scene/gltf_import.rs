@@ -26,7 +26,10 @@ fn normal_mapped_square(uvs: &[f32]) -> Glb {
     let uv = glb.floats("VEC2", uvs);
     let indices = glb.accessor(&[0, 1, 2, 0, 2, 3], U8, "SCALAR", 6);
     let view = glb.view(&one_texel_png([0.5, 0.5, 1.0]));
-    glb.push("images", json!({ "bufferView": view, "mimeType": "image/png" }));
+    glb.push(
+        "images",
+        json!({ "bufferView": view, "mimeType": "image/png" }),
+    );
     glb.push("textures", json!({ "source": 0 }));
     glb.push("materials", json!({ "normalTexture": { "index": 0 } }));
     let mesh = glb.mesh(json!({
@@ -71,7 +74,12 @@ fn mirrored_nodes_keep_fronts_and_flip_the_tangents_sign() {
         assert_eq!(normal_of(&mirrored, t), Vec3::Z);
     }
     assert!(mirrored.normals.iter().all(|n| *n == Vec3::Z));
-    assert!(plain.tangents.iter().all(|t| *t == Vec4::new(1.0, 0.0, 0.0, 1.0)));
+    assert!(
+        plain
+            .tangents
+            .iter()
+            .all(|t| *t == Vec4::new(1.0, 0.0, 0.0, 1.0))
+    );
     assert!(
         mirrored
             .tangents
@@ -83,7 +91,10 @@ fn mirrored_nodes_keep_fronts_and_flip_the_tangents_sign() {
 #[test]
 fn a_mesh_under_two_nodes_is_expanded_twice() {
     let mut glb = Glb::triangle(json!({}));
-    glb.push("nodes", json!({ "mesh": 0, "translation": [5.0, 0.0, 0.0] }));
+    glb.push(
+        "nodes",
+        json!({ "mesh": 0, "translation": [5.0, 0.0, 0.0] }),
+    );
     let mesh = glb.load().mesh;
     assert_eq!(mesh.indices, [[0, 1, 2], [3, 4, 5]]);
     assert_eq!(mesh.positions[3], Vec3::new(5.0, 0.0, 0.0));
@@ -148,7 +159,10 @@ fn strips_and_fans_face_the_same_way_as_triangles() {
 fn points_and_lines_are_named_and_left_out() {
     let mut glb = Glb::triangle(json!({}));
     let lines = json!({ "attributes": { "POSITION": 0 }, "mode": 1 });
-    glb.json["meshes"][0]["primitives"].as_array_mut().unwrap().push(lines);
+    glb.json["meshes"][0]["primitives"]
+        .as_array_mut()
+        .unwrap()
+        .push(lines);
     let imported = glb.load();
     assert_eq!(imported.mesh.indices.len(), 1);
     assert_eq!(
@@ -198,7 +212,10 @@ fn quantised_positions_are_read_normalised_or_plain() {
         glb.push("nodes", json!({ "mesh": 0 }));
         let mesh = glb.load().mesh;
         assert_eq!(mesh.positions[1].x, expected);
-        assert_eq!(mesh.positions[2].y, if normalized { -1.0 } else { -32768.0 });
+        assert_eq!(
+            mesh.positions[2].y,
+            if normalized { -1.0 } else { -32768.0 }
+        );
     }
 }
 
@@ -206,7 +223,10 @@ fn quantised_positions_are_read_normalised_or_plain() {
 fn sparse_accessors_replace_single_elements() {
     let mut glb = Glb::triangle(json!({}));
     let targets = glb.view(&[2]);
-    let values: Vec<u8> = [9.0f32, 8.0, 7.0].iter().flat_map(|v| v.to_le_bytes()).collect();
+    let values: Vec<u8> = [9.0f32, 8.0, 7.0]
+        .iter()
+        .flat_map(|v| v.to_le_bytes())
+        .collect();
     let values = glb.view(&values);
     glb.json["accessors"][0]["sparse"] = json!({
         "count": 1,
@@ -221,7 +241,10 @@ fn sparse_accessors_replace_single_elements() {
 #[test]
 fn the_default_scene_is_shown_and_the_others_are_not() {
     let mut glb = Glb::triangle(json!({}));
-    glb.push("nodes", json!({ "mesh": 0, "translation": [4.0, 0.0, 0.0] }));
+    glb.push(
+        "nodes",
+        json!({ "mesh": 0, "translation": [4.0, 0.0, 0.0] }),
+    );
     glb.json["scenes"] = json!([{ "nodes": [0] }, { "nodes": [1] }]);
     assert_eq!(glb.load().mesh.positions[0].x, 0.0);
     glb.json["scene"] = json!(1);
@@ -288,7 +311,10 @@ fn texture_transforms_scale_then_rotate_then_shift() {
     let imported = glb.load();
     let (texture, _) = imported.materials[0].normal_texture.unwrap();
     assert_eq!(texture.uv_set, 1);
-    assert!(imported.mesh.uvs[0].is_empty(), "a set that nobody reads is not kept");
+    assert!(
+        imported.mesh.uvs[0].is_empty(),
+        "a set that nobody reads is not kept"
+    );
     assert_eq!(imported.mesh.uvs[1].len(), 4);
     let (u, v) = (0.4f32 * 2.0, 0.7f32 * 3.0);
     let (s, c) = rotation.sin_cos();
@@ -300,7 +326,10 @@ fn texture_transforms_scale_then_rotate_then_shift() {
 #[test]
 fn samplers_arrive_and_images_are_decoded_only_on_demand() {
     let mut glb = normal_mapped_square(&[0.0; 8]);
-    glb.push("samplers", json!({ "magFilter": 9728, "wrapS": 33071, "wrapT": 33648 }));
+    glb.push(
+        "samplers",
+        json!({ "magFilter": 9728, "wrapS": 33071, "wrapT": 33648 }),
+    );
     glb.json["textures"][0]["sampler"] = json!(0);
     // The same image, read as colour, is another texture.
     glb.json["materials"][0]["pbrMetallicRoughness"] =
@@ -322,7 +351,11 @@ fn tangents_are_generated_along_u_and_split_where_maps_mirror() {
     let plain = normal_mapped_square(&[0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
     let mesh = plain.load().mesh;
     assert_eq!(mesh.positions.len(), 4);
-    assert!(mesh.tangents.iter().all(|t| *t == Vec4::new(1.0, 0.0, 0.0, 1.0)));
+    assert!(
+        mesh.tangents
+            .iter()
+            .all(|t| *t == Vec4::new(1.0, 0.0, 0.0, 1.0))
+    );
     // The second triangle (0, 2, 3) is read mirrored: u runs the other way there.
     let mirrored = normal_mapped_square(&[0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 2.0, 0.0]);
     let mesh = mirrored.load().mesh;
@@ -407,8 +440,12 @@ fn data_uris_and_percent_encoded_files_are_found() {
     let uri = format!("data:application/octet-stream;base64,{}", "A".repeat(48));
     glb.json["buffers"] = json!([{ "uri": uri, "byteLength": 36 }]);
     let text = glb.json.to_string();
-    let imported =
-        load_gltf_bytes(text.as_bytes(), &Folder::new(folder.path()), &Limits::default()).unwrap();
+    let imported = load_gltf_bytes(
+        text.as_bytes(),
+        &Folder::new(folder.path()),
+        &Limits::default(),
+    )
+    .unwrap();
     assert_eq!(imported.mesh.positions, [Vec3::ZERO; 3]);
 }
 
@@ -417,7 +454,10 @@ fn a_part_a_thousand_kilometres_out_keeps_its_micrometres() {
     let mut glb = Glb::new();
     let position = glb.floats("VEC3", &TRIANGLE.map(|v| v * 1e-6));
     glb.mesh(json!({ "attributes": { "POSITION": position } }));
-    glb.push("nodes", json!({ "mesh": 0, "translation": [1e6, 0.0, -1e6] }));
+    glb.push(
+        "nodes",
+        json!({ "mesh": 0, "translation": [1e6, 0.0, -1e6] }),
+    );
     let imported = glb.load();
     assert_eq!(imported.origin, DVec3::new(1e6, 0.0, -1e6));
     let corner = imported.mesh.positions[1].as_dvec3() + imported.origin;

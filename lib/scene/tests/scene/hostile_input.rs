@@ -22,7 +22,9 @@ fn rich() -> Glb {
     let delta = glb.floats("VEC3", &[0.1; 9]);
     let bind = glb.floats(
         "MAT4",
-        &[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+        &[
+            1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0,
+        ],
     );
     let targets = glb.view(&[1]);
     let values = glb.view(&[0; 12]);
@@ -52,7 +54,10 @@ fn rich() -> Glb {
         },
     ]);
     glb.json["scenes"] = json!([{ "nodes": [0] }]);
-    glb.push("skins", json!({ "joints": [1], "inverseBindMatrices": bind }));
+    glb.push(
+        "skins",
+        json!({ "joints": [1], "inverseBindMatrices": bind }),
+    );
     glb.push("images", json!({ "bufferView": image }));
     glb.push("samplers", json!({ "wrapS": 33071 }));
     glb.push("textures", json!({ "source": 0, "sampler": 0 }));
@@ -93,7 +98,12 @@ fn survives(bytes: &[u8]) {
         let mesh = &imported.mesh;
         let vertices = mesh.positions.len();
         assert!(mesh.first_non_finite().is_none());
-        assert!(mesh.indices.iter().flatten().all(|i| (*i as usize) < vertices));
+        assert!(
+            mesh.indices
+                .iter()
+                .flatten()
+                .all(|i| (*i as usize) < vertices)
+        );
         assert_eq!(mesh.materials.len(), mesh.indices.len());
         let materials = imported.materials.len();
         assert!(mesh.materials.iter().all(|m| (*m as usize) < materials));
@@ -121,7 +131,7 @@ fn the_rich_file_loads() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 256, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn random_bytes_never_panic(

@@ -85,7 +85,10 @@ fn a_missing_material_library_is_a_warning() {
             "material \"red\" is not defined; grey is used",
         ]
     );
-    assert_eq!(imported.materials[0].base_color, Vec4::new(0.8, 0.8, 0.8, 1.0));
+    assert_eq!(
+        imported.materials[0].base_color,
+        Vec4::new(0.8, 0.8, 0.8, 1.0)
+    );
 }
 
 #[test]
@@ -146,9 +149,8 @@ fn a_texture_that_a_library_names_must_exist() {
 
 #[test]
 fn normals_and_display_referred_vertex_colours_arrive() {
-    let imported = load(
-        "v 0 0 0 1 0.5 0\nv 1 0 0 1 0.5 0\nv 0 1 0 1 0.5 0\nvn 0 0 2\nf 1//1 2//1 3//1\n",
-    );
+    let imported =
+        load("v 0 0 0 1 0.5 0\nv 1 0 0 1 0.5 0\nv 0 1 0 1 0.5 0\nvn 0 0 2\nf 1//1 2//1 3//1\n");
     assert_eq!(imported.mesh.normals, [Vec3::Z; 3]);
     // sRGB 0.5 is ((0.5 + 0.055) / 1.055)^2.4 in linear light.
     let linear = (0.555f32 / 1.055).powf(2.4);

@@ -21,9 +21,16 @@ fn folder() -> tempfile::TempDir {
     let mut glb = Glb::new();
     let position = glb.floats(
         "VEC3",
-        &[0.0, -1.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 1.0],
+        &[
+            0.0, -1.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 1.0,
+        ],
     );
-    let indices = glb.accessor(&[0, 1, 3, 0, 2, 1, 0, 3, 2, 1, 2, 3], crate::glb::U8, "SCALAR", 12);
+    let indices = glb.accessor(
+        &[0, 1, 3, 0, 2, 1, 0, 3, 2, 1, 2, 3],
+        crate::glb::U8,
+        "SCALAR",
+        12,
+    );
     glb.mesh(json!({ "attributes": { "POSITION": position }, "indices": indices }));
     glb.push("nodes", json!({ "mesh": 0 }));
     std::fs::write(folder.path().join("tetrahedron.glb"), glb.bytes()).unwrap();
@@ -44,7 +51,9 @@ fn load(folder: &Path, object: &str, rest: &str) -> LoadedScene {
 }
 
 fn message(folder: &Path, object: &str, rest: &str) -> String {
-    Scene::load(&config(object, rest), folder).unwrap_err().to_string()
+    Scene::load(&config(object, rest), folder)
+        .unwrap_err()
+        .to_string()
 }
 
 /// A few roundings of numbers of order ten.
@@ -57,8 +66,14 @@ fn the_lowest_point_rests_at_the_position() {
     let loaded = load(folder.path(), object, "");
     let (low, high) = loaded.scene.mesh.bounds().unwrap();
     // A quarter turn counter-clockwise from above sends +x to -z and +z to +x.
-    assert!((low - Vec3::new(1.0, 0.25, -4.0)).length() < ROUNDING, "{low}");
-    assert!((high - Vec3::new(3.0, 2.25, -2.0)).length() < ROUNDING, "{high}");
+    assert!(
+        (low - Vec3::new(1.0, 0.25, -4.0)).length() < ROUNDING,
+        "{low}"
+    );
+    assert!(
+        (high - Vec3::new(3.0, 2.25, -2.0)).length() < ROUNDING,
+        "{high}"
+    );
     assert!(matches!(loaded.scene.proxy, Proxy::None));
 }
 
@@ -67,8 +82,14 @@ fn height_sets_the_extent_along_up_and_center_the_middle() {
     let folder = folder();
     let loaded = load(folder.path(), "height_m = 3.0\nanchor = \"center\"", "");
     let (low, high) = loaded.scene.mesh.bounds().unwrap();
-    assert!((low - Vec3::new(-1.5, 0.0, -1.5)).length() < ROUNDING, "{low}");
-    assert!((high - Vec3::new(1.5, 3.0, 1.5)).length() < ROUNDING, "{high}");
+    assert!(
+        (low - Vec3::new(-1.5, 0.0, -1.5)).length() < ROUNDING,
+        "{low}"
+    );
+    assert!(
+        (high - Vec3::new(1.5, 3.0, 1.5)).length() < ROUNDING,
+        "{high}"
+    );
 }
 
 #[test]
@@ -98,7 +119,11 @@ fn hovering_over_a_horizontal_plane_is_obeyed_with_a_warning() {
             "scene.objects[0] hovers 0.500 m above the proxy plane, as its position says; rest = \"proxy\" puts it there"
         ]
     );
-    let loaded = load(folder.path(), "position = [0.0, 0.5, 0.0]\nrest = \"proxy\"", plane);
+    let loaded = load(
+        folder.path(),
+        "position = [0.0, 0.5, 0.0]\nrest = \"proxy\"",
+        plane,
+    );
     assert!(loaded.scene.mesh.bounds().unwrap().0.y.abs() < ROUNDING);
     assert!(loaded.warnings.is_empty());
 }
@@ -110,7 +135,9 @@ fn objects_are_dropped_onto_a_proxy_mesh() {
     let mut glb = Glb::new();
     let position = glb.floats(
         "VEC3",
-        &[-10.0, -5.0, 10.0, 10.0, 5.0, 10.0, 10.0, 5.0, -10.0, -10.0, -5.0, -10.0],
+        &[
+            -10.0, -5.0, 10.0, 10.0, 5.0, 10.0, 10.0, 5.0, -10.0, -10.0, -5.0, -10.0,
+        ],
     );
     let indices = glb.accessor(&[0, 1, 2, 0, 2, 3], crate::glb::U8, "SCALAR", 6);
     glb.mesh(json!({ "attributes": { "POSITION": position }, "indices": indices }));
@@ -165,7 +192,11 @@ fn a_changed_object_is_noticed() {
     let mut bytes = std::fs::read(&path).unwrap();
     bytes.push(0);
     std::fs::write(&path, &bytes).unwrap();
-    let error = first.description.load(folder.path()).unwrap_err().to_string();
+    let error = first
+        .description
+        .load(folder.path())
+        .unwrap_err()
+        .to_string();
     assert_eq!(
         error,
         format!(
@@ -185,7 +216,10 @@ fn objects_of_one_file_share_its_materials() {
     assert_eq!(scene.mesh.indices.len(), 8);
     let alone = load_object(&folder.path().join("tetrahedron.glb")).unwrap();
     let n = alone.mesh.positions.len();
-    for (a, b) in scene.mesh.positions[..n].iter().zip(&scene.mesh.positions[n..]) {
+    for (a, b) in scene.mesh.positions[..n]
+        .iter()
+        .zip(&scene.mesh.positions[n..])
+    {
         assert!((*b - *a - Vec3::new(5.0, 0.0, 0.0)).length() < ROUNDING);
     }
 }
