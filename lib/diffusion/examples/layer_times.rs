@@ -1,0 +1,147 @@
+//! Times layers and small networks for tests/references/time_layers.py, which
+//! times the same in PyTorch. Prints "CASE MODE MILLISECONDS", the smallest of
+//! several runs.
+//!
+//!     layer_times CASE MODE REPETITIONS
+//!
+//! MODE is `forward`, `frozen` (forward and the gradient of the input) or
+//! `train` (the gradients of the parameters too).
+
+use std::time::Instant;
+
+use candle_core::{DType, Device, Tensor, Var};
+use dipir_diffusion::layers::{
+    Attention, Causality, Conv2d, GroupNorm, Linear, NormActivation, Padding,
+};
+use dipir_diffusion::noise::NoiseStream;
+use dipir_diffusion::parameters::Parameters;
+use dipir_diffusion::pass::Pass;
+use dipir_diffusion::unet::{UNet, UNetConfig};
+
+type Outcome<T> = Result<T, Box<dyn std::error::Error>>;
+
+fn normal(shape: &[usize]) -> Outcome<Tensor> {
+    Ok(
+        NoiseStream::new(1, shape.iter().product::<usize>() as u64).normal_tensor(
+            shape,
+            DType::F32,
+            &Device::Cpu,
+        )?,
+    )
+}
+
+/// A parameter: a variable when training.
+fn parameter(shape: &[usize], train: bool) -> Outcome<Tensor> {
+    let tensor = (normal(shape)? * 0.05)?;
+    Ok(if train {
+        Var::from_tensor(&tensor)?.as_tensor().clone()
+    } else {
+        tensor
+    })
+}
+
+type Run = Box<dyn Fn(&Tensor) -> dipir_diffusion::Result<Tensor>>;
+
+/// The input's shape and the layer.
+fn case(name: &str, train: bool) -> Outcome<(Vec<usize>, Run)> {
+    let conv = |batch, channels, side| -> Outcome<(Vec<usize>, Run)> {
+        let w = parameter(&[channels, channels, 3, 3], train)?;
+        let conv = Conv2d::from_tensors(w, parameter(&[channels], train)?, 1, Padding::Same(1))?;
+        Ok((
+            vec![batch, channels, side, side],
+            Box::new(move |x| conv.forward(x)),
+        ))
+    };
+    Ok(match name {
+        "linear" => {
+            let layer = Linear::from_tensors(
+                parameter(&[1280, 320], train)?,
+                Some(parameter(&[1280], train)?),
+            )?;
+            (vec![4096, 320], Box::new(move |x| layer.forward(x)))
+        }
+        "conv320" => conv(1, 320, 64)?,
+        "conv64" => conv(8, 64, 32)?,
+        "conv128" => conv(8, 128, 16)?,
+        "conv1280" => conv(1, 1280, 16)?,
+        "groupnorm" => {
+            let p = if train {
+                Parameters::random(1, &Device::Cpu)
+            } else {
+                Parameters::from_tensors(
+                    [
+                        (
+                            "weight".to_owned(),
+                            Tensor::ones(320, DType::F32, &Device::Cpu)?,
+                        ),
+                        (
+                            "bias".to_owned(),
+                            Tensor::zeros(320, DType::F32, &Device::Cpu)?,
+                        ),
+                    ]
+                    .into(),
+                )
+            };
+            let norm = GroupNorm::new(&p, 32, 320, 1e-5, NormActivation::Silu)?;
+            (vec![1, 320, 64, 64], Box::new(move |x| norm.forward(x)))
+        }
+        "attention" => {
+            let attention = Attention {
+                heads: 8,
+                causality: Causality::Full,
+            };
+            (
+                vec![1, 4096, 320],
+                Box::new(move |x| attention.forward(x, x, x)),
+            )
+        }
+        "unet" => {
+            let config = UNetConfig {
+                block_out_channels: vec![64, 128, 128],
+                down_block_types: [
+                    "CrossAttnDownBlock2D",
+                    "CrossAttnDownBlock2D",
+                    "DownBlock2D",
+                ]
+                .map(String::from)
+                .into(),
+                up_block_types: ["UpBlock2D", "CrossAttnUpBlock2D", "CrossAttnUpBlock2D"]
+                    .map(String::from)
+                    .into(),
+                cross_attention_dim: 64,
+                ..UNetConfig::default()
+            };
+            let parameters = Parameters::random(1, &Device::Cpu);
+            let unet = UNet::new(config, parameters)?;
+            let context = normal(&[8, 16, 64])?;
+            (
+                vec![8, 4, 32, 32],
+                Box::new(move |x| unet.forward(x, &[500.0], &context, &Pass::default())),
+            )
+        }
+        other => return Err(format!("unknown case {other}").into()),
+    })
+}
+
+fn main() -> Outcome<()> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [name, mode, repetitions] = arguments.as_slice() else {
+        return Err("usage: layer_times CASE forward|frozen|train REPETITIONS".into());
+    };
+    let (shape, layer) = case(name, mode == "train")?;
+    let x = normal(&shape)?;
+    let variable = Var::from_tensor(&x)?;
+    let mut best = f64::INFINITY;
+    for _ in 0..=repetitions.parse::<usize>()? {
+        let start = Instant::now();
+        if mode == "forward" {
+            layer(&x)?;
+        } else {
+            // The sum of squares as PyTorch's side has it.
+            layer(&variable)?.sqr()?.sum_all()?.backward()?;
+        }
+        best = best.min(start.elapsed().as_secs_f64() * 1e3);
+    }
+    println!("{name} {mode} {best:.3}");
+    Ok(())
+}
