@@ -4,13 +4,17 @@ pub mod cosine;
 pub mod environment;
 mod environment_sampler;
 pub mod error;
+pub mod fit;
+pub mod fusion;
 pub mod gaussian;
 pub mod illuminant;
+mod lbfgs;
 pub mod luminance;
 mod mixture;
 pub mod plane;
 mod quadrature;
 pub mod rasterize;
+pub mod regularizer;
 mod trigonometry;
 
 #[cfg(test)]
