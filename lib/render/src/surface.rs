@@ -469,3 +469,6 @@ pub fn visible_normal(normal: Vec3, geometric: Vec3, wo: Vec3) -> Vec3 {
     let raised = normalize_or(mirrored + geometric * (least - height), geometric);
     normalize_or(wo + raised, geometric)
 }
+
+#[cfg(test)]
+mod tests;
