@@ -1,13 +1,17 @@
 //! The bounding volume hierarchy that finds the triangles a ray meets.
+mod build;
+mod lanes;
+mod node;
+mod ray;
+pub mod traverse;
+
 use glam::{DVec3, Vec3};
-use obvhs::aabb::Aabb;
-use obvhs::bvh2::Bvh2;
-use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
 
 use crate::camera::Ray;
 use crate::mesh::TriangleMesh;
 use crate::ray_offset::{geometric_normal, interpolate};
-use crate::triangle::Shear;
+use ray::LocalRay;
+use traverse::Tree;
 
 /// Where a ray meets the mesh.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -54,19 +58,20 @@ pub struct Sphere {
     pub radius: f32,
 }
 
+/// Rays that start farther than this from the centre, in half sizes of the mesh, are moved up.
+const FAR: f64 = 8.0;
+
 /// The hierarchy over one mesh. It copies the positions that it needs.
 #[derive(Clone)]
 pub struct Bvh {
     /// Centre of the mesh; rays and vertices are relative to it inside.
     center: DVec3,
     /// Power of two that brings the mesh into the unit cube.
-    scale: f32,
+    scale: f64,
     bounds: Option<Bounds>,
     sphere: Option<Sphere>,
     clusters: Vec<Sphere>,
-    tree: Bvh2,
-    triangles: Vec<[Vec3; 3]>,
-    ids: Vec<u32>,
+    tree: Tree,
 }
 
 impl Bvh {
@@ -99,33 +104,18 @@ impl Bvh {
         let (center, scale) = bounds.map_or((DVec3::ZERO, 1.0), |b| {
             let center = (b.min.as_dvec3() + b.max.as_dvec3()) * 0.5;
             let half = (b.max.as_dvec3() - b.min.as_dvec3()).max_element() * 0.5;
-            // Clamped so that the scale and its reciprocal stay normal numbers.
             let exponent = if half > 0.0 { -half.log2().ceil() } else { 0.0 };
-            (center, exponent.clamp(-100.0, 100.0).exp2() as f32)
+            (center, exponent.exp2())
         });
         let triangles: Vec<[Vec3; 3]> = ids
             .iter()
             .map(|&t| {
                 corners(t as usize)
                     .unwrap_or_default()
-                    .map(|p| ((p.as_dvec3() - center) * scale as f64).as_vec3())
+                    .map(|p| ((p.as_dvec3() - center) * scale).as_vec3())
             })
             .collect();
-        let boxes: Vec<Aabb> = triangles
-            .iter()
-            .map(|[a, b, c]| {
-                let (min, max) = (a.min(*b).min(*c), a.max(*b).max(*c));
-                // By way of arrays: obvhs may use another version of glam.
-                Aabb::new(min.to_array().into(), max.to_array().into())
-            })
-            .collect();
-        let tree = PlocBuilder::with_capacity(boxes.len()).build(
-            PlocSearchDistance::Medium,
-            &boxes,
-            (0..boxes.len() as u32).collect(),
-            SortPrecision::U64,
-            3,
-        );
+        let tree = build::build(&triangles, &ids);
         let sphere = bounds.map(|b| Sphere {
             center: center.as_vec3(),
             radius: (center.as_vec3() - b.min)
@@ -140,8 +130,6 @@ impl Bvh {
             sphere,
             clusters: sphere.into_iter().collect(),
             tree,
-            triangles,
-            ids,
         }
     }
 
@@ -171,78 +159,46 @@ impl Bvh {
         t_max: f32,
         accept: impl Fn(u32, f32, f32) -> bool,
     ) -> Option<Hit> {
-        self.traverse(ray, t_max, accept, false)
+        let (origin, limit, skipped) = self.localize(ray, t_max)?;
+        let (triangle, hit) = self
+            .tree
+            .closest(&LocalRay::new(origin, ray.direction, limit), accept)?;
+        Some(Hit {
+            t: ((hit.t as f64 + skipped) / self.scale) as f32,
+            triangle,
+            u: hit.u,
+            v: hit.v,
+            back_face: hit.back_face,
+        })
     }
 
     /// Whether any triangle with `0 < t <= t_max` is taken by `accept(triangle, u, v)`.
     #[inline]
     pub fn occluded(&self, ray: &Ray, t_max: f32, accept: impl Fn(u32, f32, f32) -> bool) -> bool {
-        self.traverse(ray, t_max, accept, true).is_some()
+        self.localize(ray, t_max).is_some_and(|(origin, limit, _)| {
+            self.tree
+                .occluded(&LocalRay::new(origin, ray.direction, limit), accept)
+        })
     }
 
-    fn traverse(
-        &self,
-        ray: &Ray,
-        t_max: f32,
-        accept: impl Fn(u32, f32, f32) -> bool,
-        any: bool,
-    ) -> Option<Hit> {
-        if self.tree.nodes.is_empty() || !(ray.direction.length_squared() > 0.0) {
-            return None;
+    /// Origin and largest distance of the ray in the tree's coordinates, and how far along it
+    /// that origin lies; `None` if nothing can be hit.
+    #[inline(always)]
+    fn localize(&self, ray: &Ray, t_max: f32) -> Option<(Vec3, f32, f64)> {
+        let mut origin = (ray.origin.as_dvec3() - self.center) * self.scale;
+        let mut skipped = 0.0;
+        // From afar, f32 would round the origin by more than the mesh's details: start nearer.
+        // The mesh lies within sqrt(3) of the centre.
+        if origin.abs().max_element() > FAR {
+            let direction = ray.direction.as_dvec3();
+            skipped = (-origin.dot(direction) / direction.length_squared() - 0.5 * FAR).max(0.0);
+            origin += direction * skipped;
         }
-        let origin = ((ray.origin.as_dvec3() - self.center) * self.scale as f64).as_vec3();
-        let mut t_limit = t_max * self.scale;
-        let shear = Shear::new(ray.direction);
-        let d = ray.direction;
-        let safe = |x: f32| {
-            1.0 / if x.abs() < 1e-18 {
-                1e-18f32.copysign(x)
-            } else {
-                x
-            }
-        };
-        let inverse = Vec3::new(safe(d.x), safe(d.y), safe(d.z));
-        // Covers the rounding of the slab test and of the shear, both relative to the largest
-        // coordinate in play.
-        let pad = Vec3::splat(16.0 * f32::EPSILON * (origin.abs().max_element() + 1.0));
-        let mut best = None;
-        let mut stack = vec![0usize];
-        while let Some(index) = stack.pop() {
-            let node = &self.tree.nodes[index];
-            let low = (Vec3::from(node.aabb().min.to_array()) - pad - origin) * inverse;
-            let high = (Vec3::from(node.aabb().max.to_array()) + pad - origin) * inverse;
-            let near = low.min(high).max_element().max(0.0);
-            let far = low.max(high).min_element().min(t_limit);
-            if near > far {
-                continue;
-            }
-            if !node.is_leaf() {
-                stack.push(node.first_index as usize);
-                stack.push(node.first_index as usize + 1);
-                continue;
-            }
-            for slot in node.first_index..node.first_index + node.prim_count {
-                let local = self.tree.primitive_indices[slot as usize] as usize;
-                let Some(hit) = shear.intersect(origin, self.triangles[local], t_limit) else {
-                    continue;
-                };
-                if !accept(self.ids[local], hit.u, hit.v) {
-                    continue;
-                }
-                t_limit = hit.t;
-                best = Some(Hit {
-                    t: hit.t / self.scale,
-                    triangle: self.ids[local],
-                    u: hit.u,
-                    v: hit.v,
-                    back_face: hit.back_face,
-                });
-                if any {
-                    return best;
-                }
-            }
-        }
-        best
+        let limit = (t_max as f64 * self.scale - skipped) as f32;
+        // What is still far passes at a distance of sqrt(FAR^2 - FAR^2 / 4) > sqrt(3) or leads
+        // away. Comparisons with NaN, wherever it came from, fail.
+        (limit >= 0.0 && origin.abs().max_element() <= FAR && ray.direction.length_squared() > 0.0)
+            .then(|| (origin.as_vec3(), limit, skipped))
     }
 
     /// The point of `hit`, which must come from this BVH and `mesh` be what it was built from.
@@ -253,7 +209,7 @@ impl Bvh {
         // Half an ulp a component for the rounding of the position, and as much for vertices
         // and ray origin relative to the BVH's centre, whose coordinates are at most
         // 1 / scale: sqrt(3) (|p| 2^-24 + 2 * 2^-24 / scale), rounded up.
-        let error = f32::EPSILON * (position.abs().max_element() + 2.0 / self.scale);
+        let error = f32::EPSILON * (position.abs().max_element() + 2.0 / self.scale as f32);
         SurfacePoint {
             position,
             geometric_normal: geometric_normal(vertices),
@@ -263,35 +219,4 @@ impl Bvh {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn quad() -> TriangleMesh {
-        TriangleMesh {
-            positions: vec![Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y],
-            indices: vec![[0, 1, 2], [0, 2, 3]],
-            ..Default::default()
-        }
-    }
-
-    #[test]
-    fn a_ray_from_the_front_sees_the_front_face_and_weights_of_vertices_1_and_2() {
-        let bvh = Bvh::build(&quad());
-        let ray = Ray {
-            origin: Vec3::new(0.75, 0.25, 2.0),
-            direction: Vec3::NEG_Z,
-        };
-        let hit = bvh.closest(&ray, f32::INFINITY, |_, _, _| true).unwrap();
-        assert_eq!((hit.triangle, hit.t, hit.back_face), (0, 2.0, false));
-        // (0.75, 0.25) = 0.25 v0 + 0.5 v1 + 0.25 v2.
-        assert_eq!((hit.u, hit.v), (0.5, 0.25));
-        let behind = Ray {
-            origin: Vec3::new(0.75, 0.25, -2.0),
-            direction: Vec3::Z,
-        };
-        assert!(bvh.closest(&behind, 3.0, |_, _, _| true).unwrap().back_face);
-        assert!(bvh.occluded(&behind, 3.0, |_, _, _| true));
-        assert!(!bvh.occluded(&behind, 1.9, |_, _, _| true));
-        assert!(!bvh.occluded(&behind, 3.0, |_, _, _| false));
-    }
-}
+mod tests;

@@ -16,7 +16,7 @@ pub struct Shear {
     /// Axis indices; `axes[2]` is the direction's largest component.
     pub axes: [usize; 3],
     /// Shear of x and y, and the reciprocal of the largest component.
-    pub shear: [f32; 3],
+    pub factors: [f32; 3],
 }
 
 /// A hit of one triangle.
@@ -46,35 +46,41 @@ impl Shear {
     /// Prepares `direction`, which must not be zero.
     #[inline]
     pub fn new(direction: Vec3) -> Self {
+        /// Cyclic permutations with each axis last, and their mirror images: where the
+        /// direction is negative along the last axis, swapping the others keeps the winding.
+        const AXES: [[[usize; 3]; 2]; 3] = [
+            [[1, 2, 0], [2, 1, 0]],
+            [[2, 0, 1], [0, 2, 1]],
+            [[0, 1, 2], [1, 0, 2]],
+        ];
         let a = direction.abs();
-        let kz = if a.x > a.y {
-            if a.x > a.z { 0 } else { 2 }
-        } else if a.y > a.z {
-            1
-        } else {
-            2
-        };
-        let (mut kx, mut ky) = ((kz + 1) % 3, (kz + 2) % 3);
-        // The permutation must keep the winding.
-        if direction[kz] < 0.0 {
-            std::mem::swap(&mut kx, &mut ky);
-        }
-        let inverse = 1.0 / direction[kz];
-        Self {
-            axes: [kx, ky, kz],
-            shear: [direction[kx] * inverse, direction[ky] * inverse, inverse],
-        }
+        let y_or_z = if a.z > a.y { 2 } else { 1 };
+        let largest = if a.x > a.y.max(a.z) { 0 } else { y_or_z };
+        let axes = AXES[largest][(direction[largest] < 0.0) as usize];
+        let inverse = 1.0 / direction[axes[2]];
+        let factors = [
+            direction[axes[0]] * inverse,
+            direction[axes[1]] * inverse,
+            inverse,
+        ];
+        Self { axes, factors }
     }
 
     /// Intersects the triangle `vertices` with the ray from `origin`, for `0 < t <= t_max`.
     #[inline]
     pub fn intersect(&self, origin: Vec3, vertices: [Vec3; 3], t_max: f32) -> Option<TriangleHit> {
-        let [kx, ky, kz] = self.axes;
-        let [sx, sy, sz] = self.shear;
-        let [a, b, c] = vertices.map(|v| v - origin);
-        let (ax, ay) = (sheared(a[kx], sx, a[kz]), sheared(a[ky], sy, a[kz]));
-        let (bx, by) = (sheared(b[kx], sx, b[kz]), sheared(b[ky], sy, b[kz]));
-        let (cx, cy) = (sheared(c[kx], sx, c[kz]), sheared(c[ky], sy, c[kz]));
+        self.intersect_permuted(vertices.map(|v| self.axes.map(|k| v[k] - origin[k])), t_max)
+    }
+
+    /// [`intersect`](Self::intersect) with the vertices relative to the origin and their
+    /// coordinates in the order of `axes`.
+    #[inline]
+    pub fn intersect_permuted(&self, vertices: [[f32; 3]; 3], t_max: f32) -> Option<TriangleHit> {
+        let [sx, sy, sz] = self.factors;
+        let [a, b, c] = vertices;
+        let (ax, ay) = (sheared(a[0], sx, a[2]), sheared(a[1], sy, a[2]));
+        let (bx, by) = (sheared(b[0], sx, b[2]), sheared(b[1], sy, b[2]));
+        let (cx, cy) = (sheared(c[0], sx, c[2]), sheared(c[1], sy, c[2]));
         // Not fused: a fused product would break `U(a, b) = -U(b, a)`.
         let mut w0 = (cx * by - cy * bx) as f64;
         let mut w1 = (ax * cy - ay * cx) as f64;
@@ -95,7 +101,7 @@ impl Shear {
         if det == 0.0 {
             return None;
         }
-        let t = (w0 * a[kz] as f64 + w1 * b[kz] as f64 + w2 * c[kz] as f64) * sz as f64 / det;
+        let t = (w0 * a[2] as f64 + w1 * b[2] as f64 + w2 * c[2] as f64) * sz as f64 / det;
         let t32 = t as f32;
         // NaN fails the comparison.
         if !(t > 0.0 && t32 <= t_max) {
