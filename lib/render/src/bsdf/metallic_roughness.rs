@@ -92,7 +92,7 @@ impl Base {
             0.0
         };
         let diffuse_color = color * ((1.0 - metallic) * (1.0 - passing));
-        if !glossy && !(transmissive && passing > 0.0) {
+        if !(glossy || transmissive && passing > 0.0) {
             return Self::lambertian(wo, diffuse_color);
         }
 

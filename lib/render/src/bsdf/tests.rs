@@ -404,7 +404,7 @@ fn nothing_is_ever_nan_whatever_the_parameters() {
         };
         let direction = |d: u64| {
             let z = pick(d).max(1e-7) * (1.0 - 2.0 * f32::from(u(d) > 0.7 && d > 20));
-            let (s, c) = (6.283 * u(d + 1)).sin_cos();
+            let (s, c) = (std::f32::consts::TAU * u(d + 1)).sin_cos();
             let r = (1.0 - z * z).max(0.0).sqrt();
             Vec3::new(r * c, r * s, z)
         };
