@@ -2,27 +2,119 @@
 use std::sync::Arc;
 
 use glam::{Vec2, Vec3};
+use rayon::prelude::*;
 
 use crate::environment::{EnvironmentMap, direction_in_texel};
 use crate::illuminant::{Illuminant, LightSample};
 use crate::luminance::luminance;
 
+/// Entries of a cumulative distribution per slot of its guide table. Four of them share a cache
+/// line with their neighbours, and the table stays a quarter of the size.
+const PER_SLOT: usize = 4;
+
 /// An environment map that can be sampled in proportion to luminance times solid angle.
 ///
 /// A row is drawn from the marginal distribution, a column from the row's conditional one, a
-/// direction uniformly (in solid angle) from the texel. Both are monotone maps of one random
-/// number each, so that stratified points stay stratified.
+/// direction uniformly (in solid angle) from the texel. All are monotone maps of one random
+/// number each, so that stratified points stay stratified. Guide tables [Chen and Asau 1974]
+/// start the searches at most a few entries away from their end.
 #[derive(Clone, Debug)]
 pub struct EnvironmentSampler {
     map: Arc<EnvironmentMap>,
     /// `cos` of the polar angle between rows, `H + 1` of them.
     row_cos: Vec<f64>,
-    /// Cumulative probability of rows, without the leading 0.
-    rows: Vec<f32>,
-    /// Cumulative probability of columns within each row, without the leading 0.
-    columns: Vec<f32>,
+    rows: Cumulative,
+    /// The conditional distributions, row by row.
+    columns: Cumulative,
     /// One over the luminance integrated over the sphere; 0 for a black map.
     inverse_total: f64,
+}
+
+/// Cumulative distributions of equal length, one after another.
+#[derive(Clone, Debug)]
+struct Cumulative {
+    length: usize,
+    /// Running sums without the leading 0; from the last positive mass on exactly 1.
+    sums: Vec<f32>,
+    /// Per slot of `[0, 1)`, the first entry above the slot's start; then the last entry.
+    guide: Vec<u32>,
+}
+
+impl Cumulative {
+    /// `count` distributions over `length` entries, and their totals; `masses(k, into)` writes
+    /// those of distribution `k`.
+    fn new(
+        count: usize,
+        length: usize,
+        masses: impl Fn(usize, &mut [f64]) + Sync,
+    ) -> (Self, Vec<f64>) {
+        let slots = length.div_ceil(PER_SLOT);
+        let mut sums = vec![0f32; count * length];
+        let mut guide = vec![0u32; count * (slots + 1)];
+        let totals = sums
+            .par_chunks_mut(length)
+            .zip(guide.par_chunks_mut(slots + 1))
+            .enumerate()
+            .map_init(
+                || vec![0f64; length],
+                |row, (k, (sums, guide))| {
+                    masses(k, row);
+                    let total = cumulate(row, sums);
+                    fill_guide(sums, guide);
+                    total
+                },
+            )
+            .collect();
+        let tables = Self {
+            length,
+            sums,
+            guide,
+        };
+        (tables, totals)
+    }
+
+    /// In distribution `k`, the first entry above `u` and where in it `u` falls, in `[0, 1)`.
+    #[inline]
+    fn invert(&self, k: usize, u: f32) -> (usize, f32) {
+        let sums = &self.sums[k * self.length..(k + 1) * self.length];
+        let slots = self.length.div_ceil(PER_SLOT);
+        let guide = &self.guide[k * (slots + 1)..(k + 1) * (slots + 1)];
+        let slot = ((u * slots as f32) as usize).min(slots - 1);
+        let (low, high) = (guide[slot] as usize, guide[slot + 1] as usize);
+        let entry = low + sums[low..high].partition_point(|&c| c <= u);
+        let below = if entry == 0 { 0.0 } else { sums[entry - 1] };
+        let fraction = (u - below) / (sums[entry] - below);
+        (entry, fraction.clamp(0.0, 1.0 - f32::EPSILON))
+    }
+}
+
+/// Writes the normalised running sum of `masses`; returns the total.
+fn cumulate(masses: &[f64], sums: &mut [f32]) -> f64 {
+    let total: f64 = masses.iter().sum();
+    if total > 0.0 {
+        let mut sum = 0.0;
+        for (c, m) in sums.iter_mut().zip(masses) {
+            sum += m;
+            *c = (sum / total) as f32;
+        }
+        let last = masses.iter().rposition(|&m| m > 0.0).unwrap_or(0);
+        sums[last..].fill(1.0);
+    }
+    total
+}
+
+fn fill_guide(sums: &[f32], guide: &mut [u32]) {
+    let slots = guide.len() - 1;
+    let mut entry = 0;
+    for (slot, first) in guide[..slots].iter_mut().enumerate() {
+        let start = slot as f32 / slots as f32;
+        while entry + 1 < sums.len() && sums[entry] <= start {
+            entry += 1;
+        }
+        *first = entry as u32;
+    }
+    // The last slot ends at the first entry that reaches 1, not among black ones behind it.
+    guide[slots] = sums.partition_point(|&c| c < 1.0).min(sums.len() - 1) as u32;
 }
 
 impl EnvironmentSampler {
@@ -30,25 +122,25 @@ impl EnvironmentSampler {
     pub fn new(map: impl Into<Arc<EnvironmentMap>>) -> Self {
         let map = map.into();
         let (w, h) = (map.width(), map.height());
-        let mut columns = vec![0f32; w * h];
-        let mut row_mass = vec![0f64; h];
-        for i in 0..h {
-            let row: Vec<f64> = (0..w)
-                .map(|j| f64::from(luminance(map.texel(i, j))))
-                .collect();
-            row_mass[i] = cumulate(&row, &mut columns[i * w..(i + 1) * w]) * map.solid_angle(i);
-        }
-        let mut rows = vec![0f32; h];
-        let total = cumulate(&row_mass, &mut rows);
+        let (columns, totals) = Cumulative::new(h, w, |i, masses| {
+            for (j, m) in masses.iter_mut().enumerate() {
+                *m = luminance(map.texel(i, j)).into();
+            }
+        });
+        let (rows, total) = Cumulative::new(1, h, |_, masses| {
+            for (i, m) in masses.iter_mut().enumerate() {
+                *m = totals[i] * map.solid_angle(i);
+            }
+        });
         let row_cos = (0..=h)
             .map(|i| (std::f64::consts::PI * i as f64 / h as f64).cos())
             .collect();
         Self {
-            map,
             row_cos,
             rows,
             columns,
-            inverse_total: if total > 0.0 { 1.0 / total } else { 0.0 },
+            inverse_total: if total[0] > 0.0 { 1.0 / total[0] } else { 0.0 },
+            map,
         }
     }
 
@@ -70,33 +162,6 @@ impl EnvironmentSampler {
     }
 }
 
-/// Writes the normalised running sum of `masses`; returns the total. The entries from the last
-/// positive mass on are exactly 1.
-fn cumulate(masses: &[f64], cumulative: &mut [f32]) -> f64 {
-    let total: f64 = masses.iter().sum();
-    if total > 0.0 {
-        let mut sum = 0.0;
-        for (c, m) in cumulative.iter_mut().zip(masses) {
-            sum += m;
-            *c = (sum / total) as f32;
-        }
-        let last = masses.iter().rposition(|&m| m > 0.0).unwrap_or(0);
-        cumulative[last..].fill(1.0);
-    }
-    total
-}
-
-/// The first entry of `cumulative` above `u`, and where in it `u` falls, in `[0, 1)`.
-#[inline]
-fn invert(cumulative: &[f32], u: f32) -> (usize, f32) {
-    let k = cumulative
-        .partition_point(|&c| c <= u)
-        .min(cumulative.len() - 1);
-    let below = if k == 0 { 0.0 } else { cumulative[k - 1] };
-    let fraction = (u - below) / (cumulative[k] - below);
-    (k, fraction.clamp(0.0, 1.0 - f32::EPSILON))
-}
-
 impl Illuminant for EnvironmentSampler {
     fn eval(&self, direction: Vec3) -> Vec3 {
         self.map.eval(direction)
@@ -110,9 +175,8 @@ impl Illuminant for EnvironmentSampler {
                 pdf: 0.0,
             };
         }
-        let w = self.map.width();
-        let (i, v) = invert(&self.rows, u.y);
-        let (j, u) = invert(&self.columns[i * w..(i + 1) * w], u.x);
+        let (i, v) = self.rows.invert(0, u.y);
+        let (j, u) = self.columns.invert(i, u.x);
         let radiance = self.map.texel(i, j);
         let direction = direction_in_texel(&self.map, &self.row_cos, i, j, Vec2::new(u, v));
         LightSample {

@@ -148,10 +148,14 @@ impl Rasterizer {
             .enumerate();
         rows.for_each(|(task, chunk)| {
             let mut mean = vec![0f32; self.width];
+            let mut planes = [(); 3].map(|()| vec![0f32; self.width]);
             for (k, row) in chunk.chunks_mut(self.width).enumerate() {
-                row.fill(Vec3::ZERO);
+                planes.iter_mut().for_each(|p| p.fill(0.0));
                 for lobe in &placed {
-                    self.lobe_row(lobe, task * ROWS_PER_TASK + k, row, &mut mean);
+                    self.lobe_row(lobe, task * ROWS_PER_TASK + k, &mut planes, &mut mean);
+                }
+                for (j, texel) in row.iter_mut().enumerate() {
+                    *texel = Vec3::new(planes[0][j], planes[1][j], planes[2][j]);
                 }
             }
         });
@@ -287,8 +291,8 @@ impl Rasterizer {
         [start..end.min(w), 0..end.saturating_sub(w)]
     }
 
-    /// Adds the mean of `lobe` over each cell of row `i`.
-    fn lobe_row(&self, lobe: &Placed, i: usize, row: &mut [Vec3], mean: &mut [f32]) {
+    /// Adds the mean of `lobe` over each cell of row `i` to the row's three channels.
+    fn lobe_row(&self, lobe: &Placed, i: usize, planes: &mut [Vec<f32>; 3], mean: &mut [f32]) {
         let mut touched = false;
         self.latitudes(lobe, i, |latitude| {
             if !touched {
@@ -307,8 +311,10 @@ impl Rasterizer {
             }
         });
         if touched {
-            for (texel, &m) in row.iter_mut().zip(mean.iter()) {
-                *texel += lobe.radiance * m;
+            for (plane, c) in planes.iter_mut().zip(lobe.radiance.to_array()) {
+                for (p, &m) in plane.iter_mut().zip(mean.iter()) {
+                    *p += c * m;
+                }
             }
         }
     }
@@ -449,6 +455,9 @@ fn add_nodes(
     }
 }
 
+/// Columns that [`sum_nodes`] takes at once: one vector register.
+const LANES: usize = 8;
+
 /// The adjoint of [`add_nodes`]: adds to `sums`. Eight running sums each, for the vector unit.
 fn sum_nodes(
     lobe: &Placed,
@@ -458,33 +467,44 @@ fn sum_nodes(
     planes: &Planes,
     sums: &mut Sums,
 ) {
-    const LANES: usize = 8;
     let (a, b) = (latitude.a as f32, latitude.b as f32);
-    let [red, green, blue] = planes.channels.each_ref().map(|c| &c[run.clone()]);
-    let toned = &planes.toned[run.clone()];
-    let length = run.len();
+    let whole = run.start + run.len() / LANES * LANES;
     for (k, &(_, w)) in NODES[n - 1].iter().enumerate() {
         let weight = (latitude.weight * w) as f32;
-        let h = &lobe.h[n - 1][k][run.clone()];
-        let sin = &lobe.sin[n - 1][k][run.clone()];
+        let columns: [&[f32]; 6] = [
+            &lobe.h[n - 1][k],
+            &lobe.sin[n - 1][k],
+            &planes.toned,
+            &planes.channels[0],
+            &planes.channels[1],
+            &planes.channels[2],
+        ];
         let mut lanes = [[0f32; LANES]; 5];
-        let mut step = |j: usize, l: usize| {
-            let value = weight * exp_nonpositive(-(a + b * h[j]));
-            lanes[0][l] += value * red[j];
-            lanes[1][l] += value * green[j];
-            lanes[2][l] += value * blue[j];
-            let toned = value * toned[j];
-            lanes[3][l] += toned * h[j];
-            lanes[4][l] += toned * sin[j];
-        };
-        let whole = length / LANES * LANES;
-        for start in (0..whole).step_by(LANES) {
+        let mut step = |[h, sin, toned, red, green, blue]: [[f32; LANES]; 6]| {
             for l in 0..LANES {
-                step(start + l, l);
+                let value = weight * exp_nonpositive(-(a + b * h[l]));
+                lanes[0][l] += value * red[l];
+                lanes[1][l] += value * green[l];
+                lanes[2][l] += value * blue[l];
+                let toned = value * toned[l];
+                lanes[3][l] += toned * h[l];
+                lanes[4][l] += toned * sin[l];
             }
+        };
+        for start in (run.start..whole).step_by(LANES) {
+            step(columns.map(|c| {
+                let mut block = [0f32; LANES];
+                block.copy_from_slice(&c[start..start + LANES]);
+                block
+            }));
         }
-        for j in whole..length {
-            step(j, j - whole);
+        if whole < run.end {
+            // The adjoint of a missing column is 0.
+            step(columns.map(|c| {
+                let mut block = [0f32; LANES];
+                block[..run.end - whole].copy_from_slice(&c[whole..run.end]);
+                block
+            }));
         }
         let [r, g, b, h, sin] = lanes.map(|l| l.iter().map(|&x| f64::from(x)).sum::<f64>());
         sums.channels += DVec3::new(r, g, b);

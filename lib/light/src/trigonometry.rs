@@ -31,13 +31,32 @@ const EXP2: [f32; 7] = [
     0.000153458118,
 ];
 
+/// `a * b + c`, fused where the processor does that in one instruction.
+#[inline(always)]
+fn multiply_add(a: f32, b: f32, c: f32) -> f32 {
+    if cfg!(target_feature = "fma") {
+        a.mul_add(b, c)
+    } else {
+        a * b + c
+    }
+}
+
+/// Estrin's scheme: neighbouring terms in pairs, a chain of `log2 N` steps and not `N`.
 #[inline(always)]
 fn polynomial<const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
-    let mut sum = coefficients[N - 1];
-    for k in (0..N - 1).rev() {
-        sum = sum * x + coefficients[k];
+    let mut terms = *coefficients;
+    let (mut count, mut power) = (N, x);
+    while count > 1 {
+        for k in 0..count / 2 {
+            terms[k] = multiply_add(terms[2 * k + 1], power, terms[2 * k]);
+        }
+        if count % 2 == 1 {
+            terms[count / 2] = terms[count - 1];
+        }
+        count = count.div_ceil(2);
+        power *= power;
     }
-    sum
+    terms[0]
 }
 
 /// Angle of `(x, y)` in turns, in `[0, 1)`, counted from +x towards +y; 0 at the origin.
@@ -46,17 +65,16 @@ fn polynomial<const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
 pub(crate) fn atan2_turns(y: f32, x: f32) -> f32 {
     let (ax, ay) = (x.abs(), y.abs());
     let (long, short) = (ax.max(ay), ax.min(ay));
-    let slope = if long > 0.0 { short / long } else { 0.0 };
-    let mut turns = slope * polynomial(&ATAN_TURNS, slope * slope);
-    if ay > ax {
-        turns = 0.25 - turns;
-    }
-    if x < 0.0 {
-        turns = 0.5 - turns;
-    }
-    if y < 0.0 {
-        turns = 1.0 - turns;
-    }
+    // At the origin 0 / tiny is 0.
+    let slope = short / long.max(f32::MIN_POSITIVE);
+    let turns = slope * polynomial(&ATAN_TURNS, slope * slope);
+    // Reflections, as a sign and an offset each: no jumps that random directions would miss.
+    let (offset, sign) = if ay > ax { (0.25, -1.0) } else { (0.0, 1.0) };
+    let turns = offset + sign * turns;
+    let (offset, sign) = if x < 0.0 { (0.5, -1.0) } else { (0.0, 1.0) };
+    let turns = offset + sign * turns;
+    let (offset, sign) = if y < 0.0 { (1.0, -1.0) } else { (0.0, 1.0) };
+    let turns: f32 = offset + sign * turns;
     // Just below the positive x axis rounding gives 1: that still is the end of the turn.
     turns.min(1.0 - 0.5 * f32::EPSILON)
 }
@@ -69,28 +87,34 @@ pub(crate) fn sin_cos_turns(turns: f32) -> (f32, f32) {
     let x = quarters - nearest;
     let sin = x * polynomial(&SIN_QUARTER_TURNS, x * x);
     let cos = polynomial(&COS_QUARTER_TURNS, x * x);
-    match nearest as i32 & 3 {
-        0 => (sin, cos),
-        1 => (cos, -sin),
-        2 => (-sin, -cos),
-        _ => (-cos, sin),
-    }
+    let quadrant = nearest as i32 as u32;
+    let (s, c) = if quadrant & 1 == 0 {
+        (sin, cos)
+    } else {
+        (cos, sin)
+    };
+    // The sine is negative in quadrants 2 and 3, the cosine in 1 and 2.
+    let sign_s = (quadrant & 2) << 30;
+    let sign_c = (quadrant.wrapping_add(1) & 2) << 30;
+    (
+        f32::from_bits(s.to_bits() ^ sign_s),
+        f32::from_bits(c.to_bits() ^ sign_c),
+    )
 }
 
 /// `exp(x)` for `x <= 0`; 0 below -87, where f32 has no normal numbers left. Relative error
 /// below 2e-7 for `x >= -1`, growing with `|x|` as the rounding of its argument does. Free of
-/// branches and calls, so that loops over it use the whole vector unit.
+/// branches, checks and calls, so that loops over it use the whole vector unit.
 #[inline(always)]
 pub(crate) fn exp_nonpositive(x: f32) -> f32 {
     const LOG2_E: f32 = std::f32::consts::LOG2_E;
-    let clamped = x.max(-87.0);
-    let scaled = clamped * LOG2_E;
     // Adding 1.5 * 2^23 rounds to the nearest integer, and leaves it in the low bits.
     const ROUND: f32 = 12_582_912.0;
+    const BIAS: u32 = ROUND.to_bits().wrapping_sub(127);
+    let scaled = x.max(-87.0) * LOG2_E;
     let shifted = scaled + ROUND;
     let whole = shifted - ROUND;
-    let power =
-        f32::from_bits(((shifted.to_bits() as i32 - ROUND.to_bits() as i32 + 127) << 23) as u32);
+    let power = f32::from_bits(shifted.to_bits().wrapping_sub(BIAS) << 23);
     let value = polynomial(&EXP2, scaled - whole) * power;
     if x < -87.0 { 0.0 } else { value }
 }
