@@ -5,7 +5,7 @@ use std::f64::consts::{PI, TAU};
 use glam::{Vec2, Vec3};
 
 use crate::cosine::CosineWeightedMap;
-use crate::environment::direction_in_texel;
+use crate::environment::{direction_in_column, direction_in_texel, inset};
 use crate::luminance::luminance;
 
 /// A direction drawn from a cone in proportion to what it adds to a plane's irradiance.
@@ -49,8 +49,10 @@ struct Interval {
 ///
 /// A cone selects, per band of rows, the interval of columns that it touches, rounded outward
 /// to whole texels; `sample` draws a texel of these by its weight (luminance times the integral
-/// of the cosine) and a direction uniformly in solid angle from it. `restrict` costs one arc
-/// cosine per band inside the cone, `sample` a few binary searches; neither allocates.
+/// of the cosine) and a direction from it, uniformly in solid angle, or in proportion to the
+/// cosine where the plane is level, which leaves achromatic light no variance of its own.
+/// `restrict` costs one arc cosine per band inside the cone, `sample` a few binary searches;
+/// neither allocates.
 #[derive(Clone, Debug)]
 pub struct ConeSampler<'a> {
     map: &'a CosineWeightedMap,
@@ -102,7 +104,7 @@ impl<'a> ConeSampler<'a> {
         for band in self.first_band..=last {
             let half = self.half_azimuth(band, cos_a, sin_a, cos_max);
             let (start, count) = column_interval(phi_a, half, w);
-            mass += self.interval_mass(&self.band_row(band), start, count);
+            mass += self.interval_mass(self.band_row(band), start, count);
             self.intervals.push(Interval {
                 start,
                 count,
@@ -167,8 +169,20 @@ impl<'a> ConeSampler<'a> {
         }
         let (i, j, within) = self.draw_texel(u, mass);
         let map = &*self.map.map;
-        let direction = direction_in_texel(map, &self.map.row_cos, i, j, within);
         let radiance = map.texel(i, j);
+        if let Some(up) = self.map.level {
+            let direction = self.direction_by_cosine(i, j, within, up);
+            let cosine = (up as f32 * direction.y).max(0.0);
+            let per_cosine = f64::from(luminance(radiance)) / mass;
+            return ConeSample {
+                direction,
+                radiance,
+                cosine,
+                pdf: (f64::from(cosine) * per_cosine) as f32,
+                weight: radiance * (1.0 / per_cosine) as f32,
+            };
+        }
+        let direction = direction_in_texel(map, &self.map.row_cos, i, j, within);
         let cosine = self.map.normal.dot(direction).max(0.0);
         let pdf = self.density(i, j, mass);
         ConeSample {
@@ -178,6 +192,19 @@ impl<'a> ConeSampler<'a> {
             pdf: pdf as f32,
             weight: radiance * (f64::from(cosine) / pdf) as f32,
         }
+    }
+
+    /// A direction from texel `(i, j)` in proportion to its cosine to a level plane's normal,
+    /// `up` times +y: uniform in the square of its height.
+    #[inline]
+    fn direction_by_cosine(&self, i: usize, j: usize, u: Vec2, up: f64) -> Vec3 {
+        let map = &*self.map.map;
+        let inset = inset(map.width(), map.height());
+        let within = inset + u * (Vec2::ONE - 2.0 * inset);
+        let square = |y: f64| (y * up).max(0.0).powi(2);
+        let (near, far) = (square(self.map.row_cos[i]), square(self.map.row_cos[i + 1]));
+        let y = up * (near + (far - near) * f64::from(within.y)).sqrt();
+        direction_in_column(map.width(), j, within.x, y)
     }
 
     /// Density per steradian of [`sample`](Self::sample) at `direction`.
@@ -195,9 +222,17 @@ impl<'a> ConeSampler<'a> {
         if mass <= 0.0 || (j + w - interval.start) % w >= interval.count {
             return 0.0;
         }
-        self.density(i, j, mass) as f32
+        match self.map.level {
+            Some(up) => {
+                let cosine = (up as f32 * direction.y).max(0.0);
+                let per_cosine = f64::from(luminance(self.map.map.texel(i, j))) / mass;
+                (f64::from(cosine) * per_cosine) as f32
+            }
+            None => self.density(i, j, mass) as f32,
+        }
     }
 
+    /// Density per steradian over texel `(i, j)`, where positions are uniform in solid angle.
     #[inline]
     fn density(&self, i: usize, j: usize, mass: f64) -> f64 {
         let k = i * self.map.map.width() + j;
@@ -307,7 +342,7 @@ mod tests {
                         // Every other direction lies on the cone's very edge.
                         let angle = half_angle * if k % 2 == 0 { 1.0 } else { u.x };
                         let (s, c) = angle.sin_cos();
-                        let (t, b) = (u.y * 6.2831853).sin_cos();
+                        let (t, b) = (u.y * std::f32::consts::TAU).sin_cos();
                         let d = frame.to_world(Vec3::new(s * b, s * t, c)).normalize();
                         let inside =
                             axis.as_dvec3().dot(d.as_dvec3()) >= f64::from(half_angle.cos());
@@ -347,44 +382,64 @@ mod tests {
 
     #[test]
     fn samples_follow_the_density_of_the_cone() {
-        let map = CosineWeightedMap::new(speckled(16, 8), Vec3::new(0.3, 0.9, 0.1).normalize());
-        let mut cone = map.cone();
-        for (axis, half_angle) in [
-            (Vec3::Y, 0.6f32),
-            (Vec3::new(0.1, 0.4, -1.0), 0.5),
-            (Vec3::X, 3.2),
+        let tilted = Vec3::new(0.3, 0.9, 0.1).normalize();
+        for (size, normal, axis, half_angle) in [
+            ((16, 8), tilted, Vec3::Y, 0.6f32),
+            ((16, 8), tilted, Vec3::new(0.1, 0.4, -1.0), 0.5),
+            ((16, 8), Vec3::Y, Vec3::X, PI as f32),
+            ((16, 7), Vec3::Y, Vec3::new(0.1, 0.4, -1.0), 1.0),
+            ((16, 7), Vec3::NEG_Y, Vec3::new(-0.4, -0.2, 0.3), 0.7),
         ] {
-            cone.restrict(axis.normalize(), half_angle.min(3.1415927).cos());
-            let p = chi_squared(
-                (32, 16),
-                4,
-                100_000,
-                |u| cone.sample(u).direction,
-                |d| cone.pdf(d),
-                1e-3,
+            let map = CosineWeightedMap::new(speckled(size.0, size.1), normal);
+            let mut cone = map.cone();
+            cone.restrict(axis.normalize(), half_angle.cos());
+            let draw = |u| cone.sample(u).direction;
+            let grid = (2 * size.0, 2 * size.1);
+            let p = chi_squared(grid, 8, 100_000, draw, |d| cone.pdf(d), 1e-3);
+            assert!(p > 1e-4, "{size:?} {normal} {axis} {half_angle}: p = {p}");
+        }
+    }
+
+    #[test]
+    fn on_a_level_plane_achromatic_light_has_one_weight() {
+        let sky = speckled(16, 8);
+        let grey = sky.texels().iter().map(|t| Vec3::splat(t.x)).collect();
+        let map = EnvironmentMap::new(16, 8, grey).unwrap();
+        let map = CosineWeightedMap::new(map, Vec3::Y);
+        let mut cone = map.cone();
+        cone.restrict(Vec3::new(0.1, 0.9, 0.3).normalize(), 0.8);
+        for k in 0..1000 {
+            let s = cone.sample(uniform(k));
+            assert!((f64::from(s.weight.x) / cone.mass() - 1.0).abs() < 1e-6);
+            assert!(
+                (s.weight - s.radiance * s.cosine / s.pdf)
+                    .abs()
+                    .max_element()
+                    < 1e-5 * s.weight.x
             );
-            assert!(p > 1e-4, "{axis} {half_angle}: p = {p}");
         }
     }
 
     #[test]
     fn a_sample_carries_the_density_of_its_direction() {
-        let map = CosineWeightedMap::new(speckled(64, 32), Vec3::Y);
-        let mut cone = map.cone();
-        cone.restrict(Vec3::new(-0.02, 0.5, -1.0).normalize(), 0.9);
-        let corners = [0.0, 1.0 - f32::EPSILON / 2.0];
-        let corners = (0..4).map(|k| Vec2::new(corners[k / 2], corners[k % 2]));
-        for u in corners.chain((0..20_000).map(uniform)) {
-            let s = cone.sample(u);
-            assert!(s.pdf > 0.0 && s.weight.is_finite());
-            assert_eq!(cone.pdf(s.direction), s.pdf, "{u}");
-            assert_eq!(map.map().eval(s.direction), s.radiance);
+        for normal in [Vec3::Y, Vec3::new(0.0, 1.0, 0.1).normalize()] {
+            let map = CosineWeightedMap::new(speckled(64, 33), normal);
+            let mut cone = map.cone();
+            cone.restrict(Vec3::new(-0.02, 0.5, -1.0).normalize(), 0.8);
+            let corners = [0.0, 1.0 - f32::EPSILON / 2.0];
+            let corners = (0..4).map(|k| Vec2::new(corners[k / 2], corners[k % 2]));
+            for u in corners.chain((0..20_000).map(uniform)) {
+                let s = cone.sample(u);
+                assert!(s.pdf > 0.0 && s.weight.is_finite());
+                assert_eq!(cone.pdf(s.direction), s.pdf, "{u}");
+                assert_eq!(map.map().eval(s.direction), s.radiance);
+            }
         }
     }
 
     #[test]
     fn the_mean_weight_is_the_irradiance_from_the_cone() {
-        let map = CosineWeightedMap::new(speckled(32, 16), Vec3::Y);
+        let map = CosineWeightedMap::new(speckled(32, 16), Vec3::new(0.2, 0.9, 0.1).normalize());
         let mut cone = map.cone();
         cone.restrict(Vec3::new(0.2, 0.7, 0.5).normalize(), 0.8);
         let mut mean = dipir_numerics::stats::Running::default();

@@ -32,6 +32,8 @@ pub struct CosineWeightedMap {
     pub(crate) band_rows: usize,
     /// `cos` of the polar angle between rows, `H + 1` of them.
     pub(crate) row_cos: Vec<f64>,
+    /// 1 or -1 for a normal of +y or -y.
+    pub(crate) level: Option<f64>,
     irradiance: DVec3,
 }
 
@@ -71,6 +73,7 @@ impl CosineWeightedMap {
         Self {
             row_cos: (0..=h).map(|i| (PI * i as f64 / h as f64).cos()).collect(),
             irradiance: row_irradiance.iter().sum(),
+            level: (normal.x == 0.0 && normal.z == 0.0).then_some(f64::from(normal.y).signum()),
             map,
             normal,
             mean_cosine,

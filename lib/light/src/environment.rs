@@ -325,11 +325,29 @@ pub fn texel_of(direction: Vec3, width: usize, height: usize) -> (usize, usize) 
     (i.min(height - 1), j.min(width - 1))
 }
 
+/// How far inside a texel, as shares of its sides, directions are drawn: rounding then cannot
+/// carry them over an edge, and `texel_of` finds each where it was drawn.
+///
+/// `texel_of` is off by 7e-8 turns, a direction by 6e-8 rad, its azimuth `(j + x) / W` by 6e-8
+/// turns: together 1.4e-7 of the turn, 2.8e-7 of the half turn from pole to pole, and there an
+/// area's share measures up to twice the angle's. All is taken three times; no texel gives up
+/// more than a quarter. Only the place inside the texel is affected, never its probability.
+#[inline]
+pub(crate) fn inset(width: usize, height: usize) -> Vec2 {
+    Vec2::new(4.2e-7 * width as f32, 1.7e-6 * height as f32).min(Vec2::splat(0.25))
+}
+
+/// A direction in column `j` of a map of `width` columns, at the share `x` of the column's width
+/// and the height `y` (the cosine of its polar angle).
+#[inline]
+pub(crate) fn direction_in_column(width: usize, j: usize, x: f32, y: f64) -> Vec3 {
+    let (sin_phi, cos_phi) = sin_cos_turns((j as f32 + x) / width as f32);
+    let s = ((1.0 - y) * (1.0 + y)).max(0.0).sqrt() as f32;
+    Vec3::new(sin_phi * s, y as f32, -cos_phi * s)
+}
+
 /// A direction uniform in solid angle over texel `(i, j)` of `map`, from `u` in `[0, 1]^2`;
 /// `row_cos` holds `cos(pi i / H)`.
-///
-/// Rounding can carry a direction over the texel's edge; it is then pulled towards the middle
-/// until `texel_of` finds it where it was drawn.
 #[inline]
 pub(crate) fn direction_in_texel(
     map: &EnvironmentMap,
@@ -338,18 +356,10 @@ pub(crate) fn direction_in_texel(
     j: usize,
     u: Vec2,
 ) -> Vec3 {
-    let mut within = u;
-    for _ in 0..64 {
-        let (sin_phi, cos_phi) = sin_cos_turns((j as f32 + within.x) / map.width as f32);
-        let y = row_cos[i] + (row_cos[i + 1] - row_cos[i]) * f64::from(within.y);
-        let s = ((1.0 - y) * (1.0 + y)).max(0.0).sqrt() as f32;
-        let direction = Vec3::new(sin_phi * s, y as f32, -cos_phi * s);
-        if map.texel_of(direction) == (i, j) {
-            return direction;
-        }
-        within = within.lerp(Vec2::splat(0.5), 0.05);
-    }
-    map.direction_of(i, j)
+    let inset = inset(map.width, map.height);
+    let within = inset + u * (Vec2::ONE - 2.0 * inset);
+    let y = row_cos[i] + (row_cos[i + 1] - row_cos[i]) * f64::from(within.y);
+    direction_in_column(map.width, j, within.x, y)
 }
 
 #[cfg(test)]

@@ -189,6 +189,11 @@ impl Illuminant for EnvironmentSampler {
     fn pdf(&self, direction: Vec3) -> f32 {
         self.eval_pdf(direction).1
     }
+
+    #[inline]
+    fn eval_pdf(&self, direction: Vec3) -> (Vec3, f32) {
+        Self::eval_pdf(self, direction)
+    }
 }
 
 #[cfg(test)]

@@ -23,6 +23,11 @@ pub trait Illuminant: Sync {
     fn sample(&self, u: Vec2) -> LightSample;
     /// Density per steradian of `sample` at the unit vector `direction`.
     fn pdf(&self, direction: Vec3) -> f32;
+    /// [`eval`](Self::eval) and [`pdf`](Self::pdf) together, for the price of one where they
+    /// share their work.
+    fn eval_pdf(&self, direction: Vec3) -> (Vec3, f32) {
+        (self.eval(direction), self.pdf(direction))
+    }
 }
 
 impl<T: Illuminant + ?Sized> Illuminant for &T {
@@ -35,6 +40,9 @@ impl<T: Illuminant + ?Sized> Illuminant for &T {
     fn pdf(&self, direction: Vec3) -> f32 {
         (**self).pdf(direction)
     }
+    fn eval_pdf(&self, direction: Vec3) -> (Vec3, f32) {
+        (**self).eval_pdf(direction)
+    }
 }
 
 impl<T: Illuminant + Send + ?Sized> Illuminant for std::sync::Arc<T> {
@@ -46,5 +54,8 @@ impl<T: Illuminant + Send + ?Sized> Illuminant for std::sync::Arc<T> {
     }
     fn pdf(&self, direction: Vec3) -> f32 {
         (**self).pdf(direction)
+    }
+    fn eval_pdf(&self, direction: Vec3) -> (Vec3, f32) {
+        (**self).eval_pdf(direction)
     }
 }

@@ -12,11 +12,11 @@ use crate::luminance::{REC709, luminance_f64};
 /// logarithm from below by -12 where the foreground is black.
 pub const UNIFORM_SHARE: f64 = 1e-4;
 
-fn texels_with_area<'a>(
-    texels: &'a [Vec3],
+fn texels_with_area(
+    texels: &[Vec3],
     width: usize,
     height: usize,
-) -> impl Iterator<Item = (&'a Vec3, f64)> {
+) -> impl Iterator<Item = (&Vec3, f64)> {
     assert_eq!(texels.len(), width * height, "texels");
     let rows = texels.chunks(width).enumerate();
     rows.flat_map(move |(i, row)| {
