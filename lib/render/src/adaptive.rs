@@ -129,7 +129,11 @@ pub fn refine(
             }
             _ => false,
         };
-        let done = out_of_time || next.iter().zip(jobs.iter()).all(|(&n, job)| n <= job.samples);
+        let done = out_of_time
+            || next
+                .iter()
+                .zip(jobs.iter())
+                .all(|(&n, job)| n <= job.samples);
         let report = Progress {
             round,
             error,
@@ -291,5 +295,9 @@ fn fraction(
             cost / all.max(1.0)
         }
     };
-    if f.is_finite() { f.clamp(0.0, 1.0) } else { 0.0 }
+    if f.is_finite() {
+        f.clamp(0.0, 1.0)
+    } else {
+        0.0
+    }
 }

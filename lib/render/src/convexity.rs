@@ -33,7 +33,9 @@ pub fn is_convex(mesh: &TriangleMesh) -> bool {
     if points.len() + n != edges.len() + 2 || !is_connected(&triangles, &edges) {
         return false;
     }
-    let size = points.iter().fold(DVec3::ZERO, |m, p| m.max((*p - points[0]).abs()));
+    let size = points
+        .iter()
+        .fold(DVec3::ZERO, |m, p| m.max((*p - points[0]).abs()));
     let tolerance = TOLERANCE * size.max_element();
     let edge_is_convex = |(&(a, b), &(left, right)): (&(u32, u32), &(u32, u32))| {
         let [p, q, r] = triangles[left as usize].map(|i| points[i as usize]);
@@ -41,7 +43,9 @@ pub fn is_convex(mesh: &TriangleMesh) -> bool {
         let far = triangles[right as usize]
             .into_iter()
             .find(|&i| i != a && i != b);
-        far.is_some_and(|i| normal != DVec3::ZERO && normal.dot(points[i as usize] - p) <= tolerance)
+        far.is_some_and(|i| {
+            normal != DVec3::ZERO && normal.dot(points[i as usize] - p) <= tolerance
+        })
     };
     edges.iter().all(edge_is_convex) && winds_once(&triangles, &points)
 }

@@ -55,7 +55,12 @@ pub struct Job {
 
 impl Job {
     /// A job without samples. `arriving` is the plane's unshadowed light.
-    pub fn new(layer: Layer, block: Block, pixels: Vec<(u32, u32)>, arriving: Option<Vec3>) -> Self {
+    pub fn new(
+        layer: Layer,
+        block: Block,
+        pixels: Vec<(u32, u32)>,
+        arriving: Option<Vec3>,
+    ) -> Self {
         Self {
             layer,
             block,

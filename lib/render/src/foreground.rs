@@ -19,7 +19,7 @@ use crate::bsdf::Bsdf;
 use crate::bsdf::features::{EMISSION, has};
 use crate::counters::{RayCounts, RayKind};
 use crate::features::PROXY_RADIANCE;
-use crate::light::SceneLight;
+use crate::light::PathLight;
 use crate::photo::Photo;
 use crate::world::World;
 
@@ -74,7 +74,7 @@ const DIMENSIONS_PER_VERTEX: u32 = 4;
 /// Paths keep at least this chance of going on, so that survivors' weights stay bounded.
 const MIN_SURVIVAL: f32 = 0.1;
 
-impl<L: SceneLight> PathContext<'_, L> {
+impl<L: PathLight> PathContext<'_, L> {
     /// One path through the pixel whose top left corner is `corner`, in pixels.
     #[inline]
     pub fn camera_sample<const F: u32>(
@@ -189,7 +189,11 @@ impl<L: SceneLight> PathContext<'_, L> {
             if throughput.max_element() <= 0.0 {
                 break;
             }
-            sampled_pdf = if sample.delta { f32::INFINITY } else { sample.pdf };
+            sampled_pdf = if sample.delta {
+                f32::INFINITY
+            } else {
+                sample.pdf
+            };
             leaves = world.escapes && is_outward(&surface, sample.wi);
             ray = world.leave(&surface, sample.wi);
 
@@ -229,277 +233,4 @@ fn is_outward(surface: &crate::surface::SurfacePoint, direction: Vec3) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
-    use dipir_imaging::raster::Raster;
-    use dipir_light::environment::EnvironmentSampler;
-    use dipir_scene::material::AlphaMode;
-    use dipir_scene::proxy::Proxy;
-
-    use super::*;
-    use crate::features::SPECULAR;
-    use crate::render::Simulation;
-    use crate::shapes::{cuboid, icosphere, quad, torus_knot};
-    use crate::testing::{
-        camera, everything, lambertian, matte, render, scene, settings, sky, sun,
-    };
-
-    /// Mean over covered pixels of radiance over coverage, first channel, with its standard error.
-    fn mean(film: &crate::film::Film) -> (f64, f64) {
-        let (mut sum, mut variance, mut coverage) = (0.0, 0.0, 0.0);
-        for (i, &a) in film.alpha.pixels().iter().enumerate() {
-            if a == 1.0 {
-                sum += f64::from(film.object.pixels()[i].x);
-                variance += f64::from(film.object_variance.pixels()[i].x);
-                coverage += 1.0;
-            }
-        }
-        (sum / coverage, variance.sqrt() / coverage)
-    }
-
-    /// Each of a few fixed seeds must lie within this many standard errors: one test in 3 million
-    /// would fail by chance if the seeds were free.
-    const Z: f64 = 5.0;
-
-    #[test]
-    fn a_white_convex_object_under_a_constant_sky_is_one_everywhere() {
-        let mut ball = icosphere(Vec3::ZERO, 1.0, 3);
-        // Flat: smooth normals lose light below the triangle's own horizon.
-        ball.normals.clear();
-        let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 40.0, 32);
-        let s = scene(ball, matte(Vec3::ONE), view, Proxy::None);
-        for depth in [1, 4] {
-            let r = render(&s, &sky(1.0), &lambertian(depth), &settings(64, depth as u64));
-            let (mean, se) = mean(&r.film);
-            assert!((mean - 1.0).abs() < Z * se, "D {depth}: {mean} +- {se}");
-            assert!(se < 2e-3, "the test must be able to fail: {se}");
-        }
-    }
-
-    #[test]
-    fn a_white_folded_object_reflects_ever_more_up_to_one() {
-        let knot = torus_knot(Vec3::ZERO, 0.5, 0.22, 96, 12);
-        let view = camera(Vec3::new(0.0, 3.0, 3.0), Vec3::ZERO, 35.0, 24);
-        let flat = dipir_scene::mesh::TriangleMesh {
-            normals: Vec::new(),
-            ..knot
-        };
-        let s = scene(flat, matte(Vec3::ONE), view, Proxy::None);
-        let mut last = 0.0;
-        for depth in [1, 2, 4, 64] {
-            let r = render(&s, &sky(1.0), &lambertian(depth), &settings(64, 1));
-            let (mean, se) = mean(&r.film);
-            assert!(mean <= 1.0 + Z * se, "D {depth}: {mean} +- {se}");
-            assert!(mean > last - Z * se, "D {depth}: {mean} after {last}");
-            last = mean;
-        }
-        // After 64 interactions less than a thousandth of the light is still inside.
-        assert!((last - 1.0).abs() < 0.01, "{last}");
-    }
-
-    /// Radiance of a Lambertian sphere's pixel under light of irradiance `e` from `s`, averaged
-    /// over 8 x 8 positions in f64; `None` unless the whole pixel shows the lit or unlit inside.
-    fn sphere_pixel(view: &dipir_scene::camera::Camera, x: u32, y: u32, s: Vec3) -> Option<f64> {
-        let mut sum = 0.0;
-        for k in 0..64u32 {
-            let p = Vec2::new(x as f32, y as f32)
-                + (Vec2::new((k % 8) as f32, (k / 8) as f32) + 0.5) / 8.0;
-            let ray = view.ray(p);
-            let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
-            let b = o.dot(d);
-            let discriminant = b * b - (o.length_squared() - 1.0);
-            // Stay off the silhouette, where the polyhedron differs from the sphere.
-            if discriminant < 0.2 {
-                return None;
-            }
-            let n = o + d * (-b - discriminant.sqrt());
-            sum += n.dot(s.as_dvec3()).max(0.0) / 64.0;
-        }
-        Some(sum)
-    }
-
-    #[test]
-    fn a_diffuse_sphere_in_direct_sun_matches_the_closed_form() {
-        let map = sun(Vec3::new(0.6, 0.7, 0.5).normalize(), 5000.0, 0.0, 180);
-        let (i, j) = map.texel_of(Vec3::new(0.6, 0.7, 0.5).normalize());
-        let s = map.direction_of(i, j);
-        let irradiance = 5000.0 * map.solid_angle(i);
-        let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 32.0, 24);
-        let ball = icosphere(Vec3::ZERO, 1.0, 5);
-        let world = scene(ball, matte(Vec3::splat(0.8)), view, Proxy::None);
-        let light = EnvironmentSampler::new(map);
-        let (mut z_squared, mut pixels) = (0.0, 0.0);
-        let r = render(&world, &light, &lambertian(1), &settings(256, 5));
-        for y in 0..24 {
-            for x in 0..24 {
-                let Some(cosine) = sphere_pixel(&view, x, y, s) else {
-                    continue;
-                };
-                let expected = 0.8 / std::f64::consts::PI * irradiance * cosine;
-                let (x, y) = (x as usize, y as usize);
-                let found = f64::from(r.film.object.get(x, y).x);
-                let se = f64::from(r.film.object_variance.get(x, y).x).sqrt();
-                // Facets of 2 degrees bend the normal's interpolation by up to 1e-4, the sun is
-                // 1 degree wide, and 64 positions leave 1e-3 at the terminator.
-                let tolerance = 2e-3 * irradiance;
-                assert!(
-                    (found - expected).abs() < tolerance + 12.0 * se,
-                    "({x}, {y}): {found} instead of {expected}, se {se}"
-                );
-                z_squared += (found - expected) / irradiance;
-                pixels += 1.0;
-            }
-        }
-        // The mean is unbiased: noise averages out, what remains is the geometry's 1e-4.
-        assert!(pixels > 100.0 && (z_squared / pixels as f64).abs() < 5e-4, "{z_squared} {pixels}");
-    }
-
-    #[test]
-    fn a_mirror_has_an_infinite_density_and_shows_the_sky_unweakened() {
-        let mut material = matte(Vec3::ONE);
-        (material.metallic, material.roughness) = (1.0, 0.0);
-        let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 20.0, 16);
-        let s = scene(icosphere(Vec3::ZERO, 1.0, 4), material, view, Proxy::None);
-        let r = render(&s, &sky(1.0), &everything(4), &settings(16, 3));
-        let (mean, _) = mean(&r.film);
-        // White metal reflects everything at every angle; f32 rounding of weights.
-        assert!((mean - 1.0).abs() < 1e-3, "{mean}");
-    }
-
-    #[test]
-    fn a_black_light_has_no_density_anywhere_and_lights_nothing() {
-        let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 20.0, 8);
-        let s = scene(icosphere(Vec3::ZERO, 1.0, 3), matte(Vec3::ONE), view, Proxy::None);
-        let r = render(&s, &sky(0.0), &everything(4), &settings(8, 3));
-        assert!(r.film.object.pixels().iter().all(|c| *c == Vec3::ZERO));
-        assert!(r.film.alpha.pixels().contains(&1.0));
-    }
-
-    #[test]
-    fn light_densities_that_underflow_leave_bsdf_sampling_in_charge() {
-        // Next to a texel of 1e30 the density of all others, at 1, is about 1e-28 of it; at
-        // 1e-20 it underflows to 0. The bright texel lies behind the visible side.
-        for background in [1.0, 1e-20] {
-            let map = sun(-Vec3::Z, 1e30, background, 8);
-            let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 10.0, 8);
-            let quad = quad(Vec3::new(-2.0, -2.0, 0.0), Vec3::X * 4.0, Vec3::Y * 4.0);
-            let s = scene(quad, matte(Vec3::ONE), view, Proxy::None);
-            let light = EnvironmentSampler::new(map);
-            let r = render(&s, &light, &lambertian(1), &settings(64, 3));
-            let (mean, _) = mean(&r.film);
-            let relative = mean / f64::from(background);
-            assert!((relative - 1.0).abs() < 1e-3, "{background}: {mean}");
-        }
-    }
-
-    #[test]
-    fn alpha_lets_through_its_share_and_masks_cut_holes() {
-        let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 20.0, 16);
-        let sheet = quad(Vec3::new(-3.0, -3.0, 0.0), Vec3::X * 6.0, Vec3::Y * 6.0);
-        for (mode, expected) in [
-            (AlphaMode::Blend, 0.25),
-            (AlphaMode::Mask { cutoff: 0.3 }, 0.0),
-            (AlphaMode::Mask { cutoff: 0.2 }, 1.0),
-            (AlphaMode::Opaque, 1.0),
-        ] {
-            let mut material = matte(Vec3::ONE);
-            material.base_color.w = 0.25;
-            material.alpha_mode = mode;
-            let s = scene(sheet.clone(), material, view, Proxy::None);
-            let r = render(&s, &sky(1.0), &everything(2), &settings(64, 3));
-            let n = r.film.alpha.pixels().len() as f64;
-            let mean = r.film.alpha.pixels().iter().map(|&a| f64::from(a)).sum::<f64>() / n;
-            // 16384 independent draws of a quarter: standard error 0.0034.
-            assert!((mean - expected).abs() < 0.017, "{mode:?}: {mean}");
-        }
-    }
-
-    #[test]
-    fn coverage_of_an_edge_is_the_covered_share_of_the_pixel() {
-        // A sheet that ends 0.3 pixels into column 8: 16 pixels are 2 m x tan(10 deg) x 4 wide.
-        let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 20.0, 16);
-        let pixel = 2.0 * 4.0 * 10f32.to_radians().tan() / 16.0;
-        let sheet = quad(
-            Vec3::new(-3.0, -3.0, 0.0),
-            Vec3::X * (3.0 + 0.3 * pixel),
-            Vec3::Y * 6.0,
-        );
-        let s = scene(sheet, matte(Vec3::ONE), view, Proxy::None);
-        let r = render(&s, &sky(1.0), &lambertian(1), &settings(256, 3));
-        for y in 0..16 {
-            // Two stratified sequences of 128: at most one sample of each strays.
-            assert!((r.film.alpha.get(8, y) - 0.3).abs() < 0.02);
-            assert_eq!(*r.film.alpha.get(7, y), 1.0);
-            assert_eq!(*r.film.alpha.get(9, y), 0.0);
-        }
-    }
-
-    #[test]
-    fn back_faces_of_single_sided_surfaces_are_not_there() {
-        let view = camera(-Vec3::Z * 4.0, Vec3::ZERO, 20.0, 8);
-        let sheet = quad(Vec3::new(-3.0, -3.0, 0.0), Vec3::X * 6.0, Vec3::Y * 6.0);
-        let seen = |double_sided| {
-            let mut material = matte(Vec3::ONE);
-            material.double_sided = double_sided;
-            let s = scene(sheet.clone(), material, view, Proxy::None);
-            let r = render(&s, &sky(1.0), &lambertian(1), &settings(8, 3));
-            *r.film.alpha.get(4, 4)
-        };
-        assert_eq!(seen(false), 0.0);
-        assert_eq!(seen(true), 1.0);
-    }
-
-    #[test]
-    fn emission_and_unlit_colours_need_no_light() {
-        let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 20.0, 8);
-        let sheet = quad(Vec3::new(-3.0, -3.0, 0.0), Vec3::X * 6.0, Vec3::Y * 6.0);
-        let mut glowing = matte(Vec3::ONE);
-        glowing.emissive = Vec3::new(3.0, 2.0, 1.0);
-        let s = scene(sheet.clone(), glowing, view, Proxy::None);
-        let r = render(&s, &sky(0.0), &everything(0), &settings(8, 3));
-        assert_eq!(*r.film.object.get(4, 4), Vec3::new(3.0, 2.0, 1.0));
-        let mut unlit = matte(Vec3::new(0.25, 0.5, 0.75));
-        unlit.unlit = true;
-        let s = scene(sheet, unlit, view, Proxy::None);
-        let r = render(&s, &sky(7.0), &everything(4), &settings(8, 3));
-        assert_eq!(*r.film.object.get(4, 4), Vec3::new(0.25, 0.5, 0.75));
-    }
-
-    #[test]
-    fn what_is_known_costs_no_rays() {
-        let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 30.0, 16);
-        let rays = |mesh, simulation: &Simulation| {
-            let s = scene(mesh, matte(Vec3::ONE), view, Proxy::None);
-            render(&s, &sky(1.0), simulation, &settings(16, 3)).counts
-        };
-        let convex = rays(cuboid(-Vec3::ONE, Vec3::ONE), &lambertian(8));
-        assert!(convex.get(RayKind::Camera) > 0);
-        assert_eq!(convex.get(RayKind::Camera), convex.total());
-        // D = 0: no light is looked for.
-        let knot = torus_knot(Vec3::ZERO, 0.5, 0.22, 64, 8);
-        let dark = rays(knot.clone(), &lambertian(0));
-        assert_eq!(dark.get(RayKind::Camera), dark.total());
-        let lit = rays(knot, &lambertian(2));
-        assert!(lit.get(RayKind::Light) > 0 && lit.get(RayKind::Bounce) > 0);
-        assert_eq!(lit.get(RayKind::Shadow), 0);
-    }
-
-    #[test]
-    fn convex_shortcuts_change_no_picture() {
-        // The same box, once recognised as convex and once with a far speck that prevents it.
-        let view = camera(Vec3::new(3.0, 2.0, 4.0), Vec3::ZERO, 30.0, 16);
-        let mut specked = cuboid(-Vec3::ONE, Vec3::ONE);
-        let speck = quad(Vec3::Y * -500.0, Vec3::X * 1e-3, Vec3::Z * 1e-3);
-        crate::shapes::append(&mut specked, speck, 0);
-        let simulation = Simulation {
-            features: SPECULAR,
-            ..everything(4)
-        };
-        let [a, b]: [Raster<Vec3>; 2] = [cuboid(-Vec3::ONE, Vec3::ONE), specked].map(|mesh| {
-            let s = scene(mesh, matte(Vec3::splat(0.5)), view, Proxy::None);
-            render(&s, &sky(1.0), &simulation, &settings(16, 3)).film.object
-        });
-        for (a, b) in a.pixels().iter().zip(b.pixels()) {
-            assert!(a.abs_diff_eq(*b, 1e-4), "{a} {b}");
-        }
-    }
-}
+mod tests;

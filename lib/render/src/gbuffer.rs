@@ -116,7 +116,11 @@ fn pixel<const F: u32>(world: &World, (x, y): (u32, u32), object: bool, seed: u6
     Pixel {
         depth: if seen { object_depth } else { proxy_depth },
         normal: if seen { object_normal } else { proxy_normal }.normalize_or_zero(),
-        albedo: if seen { albedo / object_hits } else { Vec3::ZERO },
+        albedo: if seen {
+            albedo / object_hits
+        } else {
+            Vec3::ZERO
+        },
         object: object_hits / SAMPLES as f32,
         proxy: proxy_hits / SAMPLES as f32,
     }

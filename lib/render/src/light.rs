@@ -1,43 +1,228 @@
-//! What the renderer asks of a light beside [`Illuminant`]: how a plane receives it.
+//! How the renderer samples a light: for paths over the object, and for the proxy's plane.
+//!
+//! An environment map is split at its mean luminance into what lies above (a sun, a window) and
+//! the rest. Paths draw light samples from what lies above alone: the rest is dim and wide, and
+//! BSDF sampling, which paths do anyway, finds it better ("MIS compensation", Karlík et al. 2019).
+//! A plane receives both parts, but each is sampled by itself: how many samples fall into the sun
+//! is then no longer left to chance, which is most of a shadow's noise at low sample counts.
+use std::sync::Arc;
+
 use dipir_light::cosine::CosineWeightedMap;
-use dipir_light::environment::EnvironmentSampler;
+use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_light::gaussian::SgMixture;
-use dipir_light::illuminant::Illuminant;
+use dipir_light::illuminant::{Illuminant, LightSample};
+use dipir_light::luminance::{luminance, luminance_f64};
 use dipir_light::plane::{CosineWeightedMixture, PlaneLight};
-use glam::Vec3;
+use glam::{Vec2, Vec3};
+
+/// A light as paths over the object meet it.
+pub trait PathLight: Sync {
+    /// Radiance from the unit vector `direction`, and the density of [`Self::sample`] there: 0
+    /// where the light is left to BSDF sampling.
+    fn eval_with_pdf(&self, direction: Vec3) -> (Vec3, f32);
+    /// Draws a direction; a density of 0 means that there is none.
+    fn sample(&self, u: Vec2) -> LightSample;
+}
 
 /// A light that can light an object and a plane.
 pub trait SceneLight: Illuminant {
-    /// The light as a plane receives it.
+    /// The light as paths meet it.
+    type OnObject: PathLight;
+    /// A part of the light as a plane receives it.
     type OnPlane: PlaneLight;
-    /// Radiance from `direction` and the density of [`Illuminant::sample`] there, in one lookup.
-    fn eval_with_pdf(&self, direction: Vec3) -> (Vec3, f32);
-    /// Prepares the light for a plane with the unit normal `normal`.
-    fn on_plane(&self, normal: Vec3) -> Self::OnPlane;
+    /// Prepares the light for paths.
+    fn on_object(&self) -> Self::OnObject;
+    /// Prepares the light for a plane with the unit normal `normal`: its parts add up.
+    fn on_plane(&self, normal: Vec3) -> Vec<Self::OnPlane>;
+}
+
+/// Luminance above the mean by less than this share counts as the mean itself: rounding.
+const LEAST_EXCESS: f32 = 1e-3;
+
+/// Splits light at the mean luminance of a map.
+#[derive(Clone, Copy, Debug)]
+struct Split {
+    mean: f32,
+}
+
+impl Split {
+    fn of(map: &EnvironmentMap) -> Self {
+        let mean = luminance_f64(map.integral()) / (4.0 * std::f64::consts::PI);
+        Self { mean: mean as f32 }
+    }
+
+    /// Luminance of the bright part of light of `luminance`.
+    #[inline]
+    fn excess(self, luminance: f32) -> f32 {
+        let excess = luminance - self.mean;
+        if excess > LEAST_EXCESS * self.mean {
+            excess
+        } else {
+            0.0
+        }
+    }
+
+    /// What of `map` is bright, colours kept; the rest is the difference.
+    fn bright_part(self, map: &EnvironmentMap) -> EnvironmentMap {
+        let texels = map.texels().iter().map(|&t| {
+            let luminance = luminance(t);
+            match self.excess(luminance) {
+                0.0 => Vec3::ZERO,
+                excess => t * (excess / luminance),
+            }
+        });
+        part_of(map, texels.collect())
+    }
+}
+
+/// A map of the same size; `texels` are not negative and not larger than those of `map`.
+fn part_of(map: &EnvironmentMap, texels: Vec<Vec3>) -> EnvironmentMap {
+    EnvironmentMap::new(map.width(), map.height(), texels)
+        .unwrap_or_else(|_| EnvironmentMap::constant(map.width(), map.height(), Vec3::ZERO))
+}
+
+/// An environment map whose bright part alone is drawn.
+#[derive(Clone, Debug)]
+pub struct CompensatedMap {
+    map: Arc<EnvironmentMap>,
+    split: Split,
+    bright: EnvironmentSampler,
+    /// One over the luminance of the bright part, integrated over the sphere; 0 without one.
+    inverse_total: f32,
+}
+
+impl CompensatedMap {
+    /// Splits `map`.
+    pub fn new(map: Arc<EnvironmentMap>) -> Self {
+        let split = Split::of(&map);
+        let bright = split.bright_part(&map);
+        let total = luminance_f64(bright.integral());
+        Self {
+            map,
+            split,
+            bright: EnvironmentSampler::new(bright),
+            inverse_total: if total > 0.0 {
+                (1.0 / total) as f32
+            } else {
+                0.0
+            },
+        }
+    }
+}
+
+impl PathLight for CompensatedMap {
+    #[inline]
+    fn eval_with_pdf(&self, direction: Vec3) -> (Vec3, f32) {
+        let radiance = self.map.eval(direction);
+        let pdf = self.split.excess(luminance(radiance)) * self.inverse_total;
+        (radiance, pdf)
+    }
+
+    #[inline]
+    fn sample(&self, u: Vec2) -> LightSample {
+        let drawn = self.bright.sample(u);
+        if drawn.pdf <= 0.0 {
+            return drawn;
+        }
+        // From the bright part back to the whole, without another lookup.
+        let excess = luminance(drawn.radiance);
+        LightSample {
+            radiance: drawn.radiance * ((excess + self.split.mean) / excess),
+            ..drawn
+        }
+    }
 }
 
 impl SceneLight for EnvironmentSampler {
+    type OnObject = CompensatedMap;
     type OnPlane = CosineWeightedMap;
 
+    fn on_object(&self) -> CompensatedMap {
+        CompensatedMap::new(self.map().clone())
+    }
+
+    fn on_plane(&self, normal: Vec3) -> Vec<CosineWeightedMap> {
+        let bright = Split::of(self.map()).bright_part(self.map());
+        let texels = self.map().texels().iter().zip(bright.texels());
+        let dim = texels.map(|(&all, &b)| (all - b).max(Vec3::ZERO)).collect();
+        let dim = part_of(self.map(), dim);
+        [dim, bright]
+            .into_iter()
+            .map(|part| CosineWeightedMap::new(part, normal))
+            .filter(|part| part.luminance_irradiance() > 0.0)
+            .collect()
+    }
+}
+
+impl PathLight for SgMixture {
     #[inline]
     fn eval_with_pdf(&self, direction: Vec3) -> (Vec3, f32) {
         self.eval_pdf(direction)
     }
 
-    fn on_plane(&self, normal: Vec3) -> CosineWeightedMap {
-        CosineWeightedMap::new(self.map().clone(), normal)
+    #[inline]
+    fn sample(&self, u: Vec2) -> LightSample {
+        Illuminant::sample(self, u)
     }
 }
 
 impl SceneLight for SgMixture {
+    type OnObject = SgMixture;
     type OnPlane = CosineWeightedMixture;
 
-    #[inline]
-    fn eval_with_pdf(&self, direction: Vec3) -> (Vec3, f32) {
-        self.eval_pdf(direction)
+    fn on_object(&self) -> SgMixture {
+        self.clone()
     }
 
-    fn on_plane(&self, normal: Vec3) -> CosineWeightedMixture {
-        CosineWeightedMixture::new(self.clone(), normal)
+    fn on_plane(&self, normal: Vec3) -> Vec<CosineWeightedMixture> {
+        vec![CosineWeightedMixture::new(self.clone(), normal)]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::sun;
+    use dipir_numerics::sampler::{Sampler, Stream};
+    use dipir_numerics::warp::square_to_sphere;
+
+    #[test]
+    fn the_parts_on_a_plane_add_up_to_the_light() {
+        let map = sun(Vec3::new(0.3, 0.8, 0.2).normalize(), 500.0, 0.7, 32);
+        let whole = CosineWeightedMap::new(map.clone(), Vec3::Y).irradiance();
+        let parts = EnvironmentSampler::new(map).on_plane(Vec3::Y);
+        assert_eq!(parts.len(), 2);
+        let sum = parts[0].irradiance() + parts[1].irradiance();
+        // Each texel is split with f32 rounding.
+        assert!((sum - whole).abs().max_element() < 1e-6 * whole.max_element());
+    }
+
+    #[test]
+    fn a_constant_light_is_left_to_bsdf_sampling_and_has_one_part() {
+        let map = EnvironmentMap::constant(32, 16, Vec3::new(0.3, 0.7, 0.1));
+        let light = EnvironmentSampler::new(map);
+        let on_object = light.on_object();
+        assert_eq!(on_object.sample(Vec2::splat(0.5)).pdf, 0.0);
+        assert_eq!(on_object.eval_with_pdf(Vec3::X).1, 0.0);
+        assert_eq!(light.on_plane(Vec3::Y).len(), 1);
+    }
+
+    #[test]
+    fn densities_and_samples_agree_and_integrate_to_one() {
+        let map = sun(Vec3::new(0.3, 0.8, 0.2).normalize(), 50.0, 0.7, 8);
+        let light = EnvironmentSampler::new(map).on_object();
+        let (n, mut sum) = (1 << 16, 0.0f64);
+        for s in 0..n {
+            let mut r = Sampler::new(0, Stream::TEST, 0, s);
+            let drawn = light.sample(r.next_2d());
+            let (radiance, pdf) = light.eval_with_pdf(drawn.direction);
+            // Splitting and joining round by an ulp of the luminance, 1/1000 of the excess.
+            assert!((pdf / drawn.pdf - 1.0).abs() < 1e-3);
+            assert!(radiance.abs_diff_eq(drawn.radiance, 1e-3 * radiance.max_element()));
+            sum += f64::from(light.eval_with_pdf(square_to_sphere(r.next_2d())).1);
+        }
+        let integral = sum / f64::from(n) * 4.0 * std::f64::consts::PI;
+        // Stratified over a texel of 1/40 of the sphere's area.
+        assert!((integral - 1.0).abs() < 0.02, "{integral}");
     }
 }

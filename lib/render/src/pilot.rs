@@ -102,7 +102,11 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
         self.render_seeded(simulation, 0)
     }
 
-    fn render_seeded(&self, simulation: &Simulation, picture: u64) -> Result<Rendered, RenderError> {
+    fn render_seeded(
+        &self,
+        simulation: &Simulation,
+        picture: u64,
+    ) -> Result<Rendered, RenderError> {
         let settings = Settings {
             seed: hash_u64s(&[self.seed, u64::from(Stream::PILOT.0), picture]),
             stop: Stop::Samples(SAMPLES),
@@ -156,8 +160,8 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
         let mut squares = Running::default();
         for i in 0..reference.touched.len() {
             if reference.touched[i] {
-                let [a, b] = [0, 1]
-                    .map(|k| composites[k].pixels()[i] - reference.composites[k].pixels()[i]);
+                let [a, b] =
+                    [0, 1].map(|k| composites[k].pixels()[i] - reference.composites[k].pixels()[i]);
                 squares.push(f64::from(a.dot(b)) / 3.0);
             }
         }

@@ -4,12 +4,13 @@ use std::sync::Arc;
 
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
+use dipir_light::luminance::luminance_f64;
 use dipir_light::plane::PlaneLight;
 use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_scene::camera::Camera;
 use dipir_scene::scene::Scene;
-use glam::{Vec2, Vec3};
+use glam::{DVec3, Vec2, Vec3};
 
 use crate::adaptive::{EstimatedError, Progress, Stop, refine};
 use crate::blocker::Blocker;
@@ -19,7 +20,7 @@ use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
 use crate::film::{Film, Job, Layer, REPLICATES, Viewing};
 use crate::footprint::Footprint;
 use crate::foreground::{PathContext, PathStart};
-use crate::light::SceneLight;
+use crate::light::{PathLight, SceneLight};
 use crate::photo::Photo;
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext};
 use crate::world::{Geometry, ProxyGeometry, World};
@@ -158,17 +159,18 @@ impl<'a> Renderer<'a> {
             .background
             .filter(|_| has(simulation.features, PROXY_RADIANCE))
             .map(|image| Photo { image });
+        let on_object = light.on_object();
         let path = PathContext {
             world: &world,
-            light,
+            light: &on_object,
             photo: photo.as_ref(),
             max_depth: simulation.max_depth,
             start: PathStart::Camera,
             roulette_depth: ROULETTE_DEPTH,
         };
         let plane = match &self.geometry.proxy {
-            ProxyGeometry::Plane(plane) if simulation.shadow => Some(light.on_plane(plane.normal)),
-            _ => None,
+            ProxyGeometry::Plane(plane) if simulation.shadow => light.on_plane(plane.normal),
+            _ => Vec::new(),
         };
         let blocker = self
             .geometry
@@ -177,11 +179,16 @@ impl<'a> Renderer<'a> {
             .map(|whole| Blocker::new(whole, self.geometry.bvh.clusters()));
         let mut jobs = self.object_jobs(settings);
         if let (Some(blocker), true) = (&blocker, simulation.shadow) {
-            let arriving = plane.as_ref().map(|p| p.irradiance().as_vec3());
+            let irradiance: DVec3 = plane.iter().map(PlaneLight::irradiance).sum();
+            let arriving = match self.geometry.proxy {
+                ProxyGeometry::Plane(_) => Some(irradiance.as_vec3()),
+                _ => None,
+            };
             let shadow = ShadowContext {
                 path,
                 blocker,
-                plane: plane.as_ref(),
+                plane: &plane,
+                irradiance: luminance_f64(irradiance),
                 proxy_occlusion: simulation.proxy_occlusion,
                 light_on_proxy: simulation.light_on_proxy,
                 tolerance: settings.shadow_tolerance,
@@ -285,9 +292,9 @@ impl<'a> Renderer<'a> {
             .collect()
     }
 
-    fn shadow_jobs<L: SceneLight>(
+    fn shadow_jobs<L: PathLight, P: PlaneLight>(
         &self,
-        shadow: &ShadowContext<L, L::OnPlane>,
+        shadow: &ShadowContext<L, P>,
         arriving: Option<Vec3>,
         settings: &Settings,
     ) -> Vec<Job> {
@@ -297,12 +304,9 @@ impl<'a> Renderer<'a> {
             ProxyGeometry::Plane(_) => Layer::PlaneShadow,
             ProxyGeometry::Mesh { .. } => Layer::MeshShadow,
         };
-        let mut cone = shadow.plane.map(|p| p.cone());
+        let mut cones: Vec<P::Cone<'_>> = shadow.plane.iter().map(PlaneLight::cone).collect();
         self.blocks()
-            .filter(|&block| match &mut cone {
-                Some(cone) => shadow.may_shade(block, cone),
-                None => true,
-            })
+            .filter(|&block| layer == Layer::MeshShadow || shadow.may_shade(block, &mut cones))
             .filter_map(|block| {
                 let pixels: Vec<_> = pixels_of(block).collect();
                 let visible = pixels.iter().any(|&(x, y)| is_visible(settings, x, y));
@@ -335,11 +339,11 @@ fn sequence(seed: u64, stream: Stream, replicate: usize, (x, y): (u32, u32)) -> 
 }
 
 /// Brings `job` to `goal` samples per pixel and replicate.
-fn advance_object<L: SceneLight>(path: &PathContext<L>, seed: u64, job: &mut Job, goal: u32) {
-    with_features!(path.world.mask, F => advance_object_with::<L, F>(path, seed, job, goal))
+fn advance_object<L: PathLight>(path: &PathContext<L>, seed: u64, job: &mut Job, goal: u32) {
+    with_features!(path.world.mask, F => advance_object_with::<_, F>(path, seed, job, goal))
 }
 
-fn advance_object_with<L: SceneLight, const F: u32>(
+fn advance_object_with<L: PathLight, const F: u32>(
     path: &PathContext<L>,
     seed: u64,
     job: &mut Job,
@@ -358,15 +362,19 @@ fn advance_object_with<L: SceneLight, const F: u32>(
                 radiance += s.radiance;
                 coverage += s.coverage;
             }
-            job.add(index, replicate, &[radiance.x, radiance.y, radiance.z, coverage]);
+            job.add(
+                index,
+                replicate,
+                &[radiance.x, radiance.y, radiance.z, coverage],
+            );
         }
     }
     job.counts = counts;
     job.samples = goal;
 }
 
-fn advance_shadow<L: SceneLight>(
-    shadow: &ShadowContext<L, L::OnPlane>,
+fn advance_shadow<L: PathLight, P: PlaneLight>(
+    shadow: &ShadowContext<L, P>,
     seed: u64,
     job: &mut Job,
     goal: u32,
@@ -377,11 +385,11 @@ fn advance_shadow<L: SceneLight>(
         None if has(shadow.path.world.mask, ALPHA) => ALPHA,
         None => 0,
     };
-    with_features!(wanted, F => advance_shadow_with::<L, F>(shadow, seed, job, goal))
+    with_features!(wanted, F => advance_shadow_with::<_, _, F>(shadow, seed, job, goal))
 }
 
-fn advance_shadow_with<L: SceneLight, const F: u32>(
-    shadow: &ShadowContext<L, L::OnPlane>,
+fn advance_shadow_with<L: PathLight, P: PlaneLight, const F: u32>(
+    shadow: &ShadowContext<L, P>,
     seed: u64,
     job: &mut Job,
     goal: u32,
@@ -394,13 +402,13 @@ fn advance_shadow_with<L: SceneLight, const F: u32>(
     let block = job.block;
     for replicate in 0..REPLICATES {
         let sampler = |x, y| sequence(seed, Stream::SHADOW, replicate, (x, y));
-        if let Some(plane) = shadow.plane {
-            let mut cone = plane.cone();
+        if job.layer == Layer::PlaneShadow {
+            let mut cones: Vec<P::Cone<'_>> = shadow.plane.iter().map(PlaneLight::cone).collect();
             shadow.plane_block::<F>(
                 block,
                 range,
                 &sampler,
-                &mut cone,
+                &mut cones,
                 &mut counts,
                 &mut |x, y, blocked| {
                     let index = ((y - block.y) * block.width + (x - block.x)) as usize;
@@ -421,233 +429,4 @@ fn advance_shadow_with<L: SceneLight, const F: u32>(
 }
 
 #[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use dipir_light::environment::EnvironmentSampler;
-    use dipir_light::gaussian::{SgMixture, SphericalGaussian};
-    use dipir_light::rasterize::rasterize;
-    use dipir_scene::proxy::Proxy;
-
-    use super::*;
-    use crate::features::ALL;
-    use crate::shapes::{icosphere, torus_knot};
-    use crate::testing::{
-        camera, carry_on, everything, ground, lambertian, matte, render, scene, settings, sky, sun,
-    };
-
-    fn knot_scene(n: u32) -> Scene {
-        let view = camera(Vec3::new(0.0, 2.0, 4.0), Vec3::Y * 0.5, 40.0, n);
-        let knot = torus_knot(Vec3::Y * 0.7, 0.4, 0.15, 96, 12);
-        scene(knot, matte(Vec3::splat(0.6)), view, ground())
-    }
-
-    fn sunny() -> EnvironmentSampler {
-        let direction = Vec3::new(0.5, 0.8, 0.4).normalize();
-        EnvironmentSampler::new(sun(direction, 2000.0, 0.5, 64))
-    }
-
-    #[test]
-    fn any_number_of_threads_gives_the_same_bytes() {
-        let s = knot_scene(40);
-        let settings = Settings {
-            stop: Stop::TargetError(0.02),
-            ..settings(0, 5)
-        };
-        let with = |threads| {
-            rayon::ThreadPoolBuilder::new()
-                .num_threads(threads)
-                .build()
-                .expect("a pool")
-                .install(|| render(&s, &sunny(), &everything(3), &settings))
-        };
-        let (one, two) = (with(1), with(2));
-        assert_eq!(one.film.object, two.film.object);
-        assert_eq!(one.film.alpha, two.film.alpha);
-        assert_eq!(one.film.shadow, two.film.shadow);
-        assert_eq!(one.film.shadow_variance, two.film.shadow_variance);
-        assert_eq!((one.counts, one.rounds), (two.counts, two.rounds));
-        assert_eq!(one.error, two.error);
-    }
-
-    #[test]
-    fn the_estimated_error_is_the_real_one() {
-        // Against a converged picture, over 12 seeds: both mean squares are averages over
-        // thousands of pixels and agree within the spread of their ratio, about 5%.
-        let s = knot_scene(24);
-        let light = sunny();
-        let converged = render(&s, &light, &lambertian(2), &settings(8192, 99));
-        let (mut estimated, mut real) = (0.0, 0.0);
-        for seed in 0..12 {
-            let r = render(&s, &light, &lambertian(2), &settings(32, seed));
-            estimated += r.error.rmse.powi(2) * r.error.touched_pixels as f64;
-            for i in 0..24 * 24 {
-                let display = |r: &Rendered| {
-                    let linear = dipir_imaging::composite::composite_pixel(
-                        Vec3::splat(0.18),
-                        r.film.object.pixels()[i],
-                        r.film.alpha.pixels()[i],
-                        r.film.shadow.pixels()[i],
-                    );
-                    linear.clamp(Vec3::ZERO, Vec3::ONE)
-                };
-                real += f64::from((display(&r) - display(&converged)).length_squared()) / 3.0;
-            }
-        }
-        let ratio = (estimated / real).sqrt();
-        assert!((0.88..1.12).contains(&ratio), "{ratio}");
-    }
-
-    #[test]
-    fn a_target_error_is_met_and_costs_more_the_lower_it_is() {
-        let s = knot_scene(32);
-        let mut samples = Vec::new();
-        for target in [0.02, 0.008] {
-            let settings = Settings {
-                stop: Stop::TargetError(target),
-                transfer: Transfer::Srgb,
-                ..settings(0, 1)
-            };
-            let mut errors = Vec::new();
-            let r = Renderer::new(&s)
-                .render(&sunny(), &lambertian(2), &settings, &mut |p| {
-                    errors.push(p.error.upper_95);
-                    ControlFlow::Continue(())
-                })
-                .expect("renders");
-            assert!(r.error.upper_95 <= f64::from(target), "{:?}", r.error);
-            assert!(r.error.rmse > 0.3 * f64::from(target), "wasteful: {:?}", r.error);
-            assert_eq!(errors.len() as u32, r.rounds);
-            samples.push(r.samples);
-        }
-        assert!(samples[1] > 2 * samples[0], "{samples:?}");
-    }
-
-    #[test]
-    fn a_time_budget_ends_after_a_round_and_a_target_that_cannot_be_met_at_the_most_samples() {
-        let s = knot_scene(16);
-        let none = Settings {
-            stop: Stop::TimeBudget(Duration::ZERO),
-            ..settings(0, 1)
-        };
-        let r = render(&s, &sunny(), &lambertian(2), &none);
-        assert_eq!(r.rounds, 1);
-        let impossible = Settings {
-            stop: Stop::TargetError(1e-9),
-            max_samples: 64,
-            ..settings(0, 1)
-        };
-        let r = render(&s, &sunny(), &lambertian(2), &impossible);
-        assert!(r.error.rmse > 1e-9 && r.samples <= 2 * 64 * 256);
-    }
-
-    #[test]
-    fn progress_can_break_off() {
-        let s = knot_scene(16);
-        let result = Renderer::new(&s).render(
-            &sunny(),
-            &lambertian(1),
-            &settings(64, 1),
-            &mut |_| ControlFlow::Break(()),
-        );
-        assert!(matches!(result, Err(RenderError::Interrupted)));
-    }
-
-    #[test]
-    fn images_of_another_size_are_refused_in_words() {
-        let s = knot_scene(16);
-        let photo = LinearImage(Raster::filled(4, 3, Vec3::ONE));
-        let settings = Settings {
-            background: Some(&photo),
-            ..settings(4, 1)
-        };
-        let error = Renderer::new(&s)
-            .render(&sunny(), &lambertian(1), &settings, &mut carry_on)
-            .expect_err("sizes differ");
-        assert_eq!(
-            error.to_string(),
-            "the background is 4 x 3 pixels, the camera 16 x 16: give images of the camera's size"
-        );
-    }
-
-    #[test]
-    fn occluders_hide_object_and_shadow_and_save_their_rays() {
-        let s = knot_scene(16);
-        let mask = Raster::filled(16, 16, 1.0);
-        let hidden = Settings {
-            occluders: Some(&mask),
-            ..settings(4, 1)
-        };
-        let r = render(&s, &sunny(), &lambertian(1), &hidden);
-        assert!(r.film.alpha.pixels().iter().all(|&a| a == 0.0));
-        assert!(r.film.shadow.pixels().iter().all(|v| *v == Vec3::ONE));
-        assert_eq!(r.counts.total(), 0);
-    }
-
-    #[test]
-    fn an_empty_scene_and_a_picture_of_one_pixel_render() {
-        let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 40.0, 1);
-        let empty = scene(Default::default(), matte(Vec3::ONE), view, ground());
-        let r = render(&empty, &sky(1.0), &everything(4), &settings(4, 1));
-        assert_eq!((r.counts.total(), r.samples), (0, 0));
-        assert_eq!(r.film.shadow.pixels(), [Vec3::ONE]);
-        let ball = icosphere(Vec3::ZERO, 1.0, 2);
-        let one = scene(ball, matte(Vec3::ONE), view, Proxy::None);
-        let r = render(&one, &sky(1.0), &everything(4), &settings(16, 1));
-        assert!(r.film.alpha.pixels()[0] > 0.0);
-    }
-
-    #[test]
-    fn gaussian_lobes_and_their_fine_map_light_the_same_picture() {
-        let lobes = vec![
-            SphericalGaussian {
-                direction: Vec3::new(0.5, 0.8, 0.4).normalize(),
-                radiance: Vec3::new(60.0, 50.0, 40.0),
-                sigma: 0.05,
-            },
-            SphericalGaussian {
-                direction: Vec3::new(-0.4, 0.6, -0.3).normalize(),
-                radiance: Vec3::new(0.5, 0.7, 1.0),
-                sigma: 0.8,
-            },
-        ];
-        let s = knot_scene(16);
-        let map = EnvironmentSampler::new(rasterize(&lobes, 512, 256));
-        let mixture = SgMixture::new(lobes).expect("valid lobes");
-        let a = Renderer::new(&s)
-            .render(&mixture, &everything(2), &settings(512, 1), &mut carry_on)
-            .expect("renders");
-        let b = render(&s, &map, &everything(2), &settings(512, 1));
-        let mean = |r: &Raster<Vec3>| {
-            let sum: Vec3 = r.pixels().iter().sum();
-            sum / 256.0
-        };
-        // Standard errors of the means are below 2e-3; the map is integrated to 1%.
-        let (x, y) = (mean(&a.film.object), mean(&b.film.object));
-        assert!(x.abs_diff_eq(y, 0.01 * y.max_element() + 4e-3), "{x} {y}");
-        let (x, y) = (mean(&a.film.shadow), mean(&b.film.shadow));
-        assert!(x.abs_diff_eq(y, 4e-3), "{x} {y}");
-        assert!(x.max_element() < 0.97, "the test must be able to fail");
-    }
-
-    #[test]
-    fn superset_kernels_draw_the_same_picture() {
-        // A matte object needs only the specular lobe; the widest kernel must agree to rounding.
-        let s = knot_scene(16);
-        let light = sunny();
-        let narrow = Simulation {
-            features: crate::features::SPECULAR,
-            ..everything(2)
-        };
-        let wide = Simulation {
-            features: ALL,
-            ..everything(2)
-        };
-        let a = render(&s, &light, &narrow, &settings(16, 1)).film;
-        let b = render(&s, &light, &wide, &settings(16, 1)).film;
-        for (a, b) in a.object.pixels().iter().zip(b.object.pixels()) {
-            assert!(a.abs_diff_eq(*b, 1e-4 * (1.0 + a.max_element())), "{a} {b}");
-        }
-        assert_eq!(a.shadow, b.shadow);
-    }
-}
+mod tests;

@@ -108,7 +108,12 @@ pub fn cuboid(min: Vec3, max: Vec3) -> TriangleMesh {
 /// `edge_u x edge_v`, with texture coordinates `(s, t)`.
 pub fn quad(corner: Vec3, edge_u: Vec3, edge_v: Vec3) -> TriangleMesh {
     TriangleMesh {
-        positions: vec![corner, corner + edge_u, corner + edge_u + edge_v, corner + edge_v],
+        positions: vec![
+            corner,
+            corner + edge_u,
+            corner + edge_u + edge_v,
+            corner + edge_v,
+        ],
         indices: vec![[0, 1, 2], [0, 2, 3]],
         uvs: [vec![Vec2::ZERO, Vec2::X, Vec2::ONE, Vec2::Y], Vec::new()],
         materials: vec![0; 2],

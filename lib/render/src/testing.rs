@@ -38,7 +38,11 @@ pub fn matte(colour: Vec3) -> Material {
 /// A square picture of `n` x `n` pixels, `fov_deg` high.
 pub fn camera(position: Vec3, target: Vec3, fov_deg: f32, n: u32) -> Camera {
     let back = (position - target).normalize();
-    let up = if back.y.abs() > 0.99 { Vec3::Z } else { Vec3::Y };
+    let up = if back.y.abs() > 0.99 {
+        Vec3::Z
+    } else {
+        Vec3::Y
+    };
     let right = up.cross(back).normalize();
     let half = 0.5 * n as f32;
     Camera {

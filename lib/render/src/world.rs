@@ -26,7 +26,7 @@ pub enum ProxyGeometry {
         /// Its triangles.
         mesh: TriangleMesh,
         /// Their hierarchy.
-        bvh: Bvh,
+        bvh: Box<Bvh>,
     },
 }
 
@@ -63,15 +63,13 @@ impl Geometry {
                 None => ProxyGeometry::None,
             },
             Proxy::Mesh(mesh) => ProxyGeometry::Mesh {
-                bvh: Bvh::build(mesh),
+                bvh: Box::new(Bvh::build(mesh)),
                 mesh: mesh.clone(),
             },
         };
         let bvh = Bvh::build(&scene.mesh);
         Self {
-            extent: bvh
-                .bounds()
-                .map_or(0.0, |b| (b.max - b.min).max_element()),
+            extent: bvh.bounds().map_or(0.0, |b| (b.max - b.min).max_element()),
             bvh,
             proxy,
             convex: is_convex(&scene.mesh),
@@ -118,11 +116,11 @@ impl<'a> World<'a> {
         let surfaces = Surfaces::new(scene, mask)?;
         let transmits = scene.materials.iter().any(|m| m.transmission.is_some());
         let holes = (0..scene.mesh.indices.len() as u32).any(|t| surfaces.has_alpha(t));
-        let opaque = !(has(mask, ALPHA) && holes) && !(has(mask, TRANSMISSION) && transmits);
+        let opens = has(mask, ALPHA) && holes || has(mask, TRANSMISSION) && transmits;
         Ok(Self {
             scene,
             camera,
-            escapes: geometry.convex && opaque,
+            escapes: geometry.convex && !opens,
             geometry,
             surfaces,
             mask,
@@ -140,15 +138,10 @@ impl<'a> World<'a> {
     pub fn leave(&self, surface: &SurfacePoint, direction: Vec3) -> Ray {
         // Rounding of the position, and of vertices relative to the hierarchy's centre, whose
         // unit is at most twice half the extent; see `Bvh::surface_point`.
-        let error = f32::EPSILON
-            * (surface.position.abs().max_element() + 2.0 * self.geometry.extent);
+        let error =
+            f32::EPSILON * (surface.position.abs().max_element() + 2.0 * self.geometry.extent);
         Ray {
-            origin: spawn_origin(
-                surface.position,
-                surface.geometric_normal,
-                direction,
-                error,
-            ),
+            origin: spawn_origin(surface.position, surface.geometric_normal, direction, error),
             direction,
         }
     }
@@ -178,20 +171,15 @@ impl<'a> World<'a> {
     /// Whether the object hides the light from the proxy. Back faces do.
     #[inline]
     pub fn shades<const F: u32>(&self, ray: &Ray, alpha_key: u64) -> bool {
-        self.geometry
-            .bvh
-            .occluded(ray, f32::INFINITY, |t, u, v| {
-                self.is_covered::<F>(t, u, v, alpha_key)
-            })
+        self.geometry.bvh.occluded(ray, f32::INFINITY, |t, u, v| {
+            self.is_covered::<F>(t, u, v, alpha_key)
+        })
     }
 
     #[inline(always)]
     fn is_seen(&self, ray: &Ray, triangle: u32) -> bool {
         !self.surfaces.single_sided(triangle)
-            || ray
-                .direction
-                .dot(self.surfaces.geometric_normal(triangle))
-                <= 0.0
+            || ray.direction.dot(self.surfaces.geometric_normal(triangle)) <= 0.0
     }
 
     #[inline(always)]

@@ -1,0 +1,273 @@
+use dipir_imaging::raster::{LinearImage, Raster};
+
+use super::*;
+use crate::counters::RayKind;
+use crate::shapes::{icosphere, quad, torus_knot};
+use crate::testing::{camera, ground, matte, scene, settings, sky};
+
+fn view() -> dipir_scene::camera::Camera {
+    camera(Vec3::new(0.0, 2.0, 4.0), Vec3::Y * 0.5, 40.0, 24)
+}
+
+fn planned(scene: &Scene, config: &EffectsConfig, settings: &Settings) -> EffectsPlan {
+    plan(
+        &Renderer::new(scene),
+        &sky(1.0),
+        config,
+        settings,
+        &mut |_| ControlFlow::Continue(()),
+    )
+    .expect("plans")
+}
+
+fn find(plan: &EffectsPlan, effect: Effect) -> &PlannedEffect {
+    let found = plan.effects.iter().find(|e| e.name == effect);
+    found.expect("every effect is listed")
+}
+
+#[test]
+fn every_effect_has_a_switch_and_the_same_name_everywhere() {
+    let names: Vec<_> = EffectsConfig::default()
+        .switches()
+        .into_iter()
+        .map(|(name, _)| name)
+        .collect();
+    assert_eq!(names, Effect::ALL.map(Effect::name));
+    for effect in Effect::ALL {
+        let json = serde_json::to_string(&effect).expect("serialises");
+        assert_eq!(json, format!("\"{}\"", effect.name()));
+    }
+}
+
+#[test]
+fn a_matte_convex_object_needs_no_interreflection_and_only_what_it_has() {
+    let ball = icosphere(Vec3::Y * 0.5, 0.5, 3);
+    let s = scene(ball, matte(Vec3::splat(0.5)), view(), ground());
+    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    let e = find(&p, Effect::Interreflection);
+    assert_eq!((e.enabled, e.contribution), (false, Some(0.0)), "{e:?}");
+    assert_eq!(p.max_depth, 1);
+    assert!(p.is_enabled(Effect::Shadow));
+    for (effect, reason) in [
+        (
+            Effect::Textures,
+            "no material has textures and no vertex a colour",
+        ),
+        (Effect::NormalMapping, "no material has a normal map"),
+        (Effect::AlphaMask, "every material is opaque"),
+        (Effect::Emission, "no material emits light or is unlit"),
+        (Effect::Clearcoat, "no material has a coat"),
+        (Effect::Transmission, "no material lets light pass"),
+        (Effect::ProxyOcclusion, "a plane does not shadow itself"),
+        (
+            Effect::BounceFromProxy,
+            "there is no photograph to take the proxy's colour from",
+        ),
+        (
+            Effect::Occluders,
+            "no mask of the photo's foreground is given",
+        ),
+        (Effect::Motion, "camera and object stand still"),
+    ] {
+        let e = find(&p, effect);
+        assert_eq!((e.enabled, e.reason.as_str()), (false, reason));
+        assert_eq!(e.contribution, None);
+    }
+    assert_eq!(p.rays["proxy_occlusion"], 0);
+    assert_eq!(p.rays["bounce"], 0);
+    assert!(p.rays["shadow"] > 0);
+    assert!(p.left_out.is_some_and(|e| e <= p.tolerance), "{p:?}");
+}
+
+#[test]
+fn without_a_proxy_nothing_is_planned_for_it() {
+    let ball = icosphere(Vec3::ZERO, 0.5, 3);
+    let s = scene(ball, matte(Vec3::splat(0.5)), view(), Proxy::None);
+    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    for effect in [
+        Effect::Shadow,
+        Effect::ProxyOcclusion,
+        Effect::EmissionOnProxy,
+        Effect::BounceToProxy,
+        Effect::BounceFromProxy,
+    ] {
+        assert_eq!(find(&p, effect).reason, "the scene has no proxy");
+    }
+    assert_eq!(p.simulation().light_on_proxy, None);
+    assert_eq!(p.rays["shadow"], 0);
+}
+
+#[test]
+fn a_folded_bright_object_gets_the_depth_that_it_needs() {
+    let knot = torus_knot(Vec3::Y * 0.7, 0.4, 0.17, 96, 12);
+    let s = scene(knot, matte(Vec3::splat(0.9)), view(), ground());
+    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    assert!(p.is_enabled(Effect::Interreflection));
+    assert!((2..=MAX_DEPTH).contains(&p.max_depth), "{}", p.max_depth);
+    let coarse = EffectsConfig {
+        tolerance: Some(0.02),
+        ..EffectsConfig::default()
+    };
+    let coarse = planned(&s, &coarse, &settings(0, 1));
+    assert!(coarse.max_depth < p.max_depth);
+}
+
+#[test]
+fn what_the_user_switches_wins() {
+    let mut glowing = matte(Vec3::splat(0.5));
+    glowing.emissive = Vec3::splat(2.0);
+    let s = scene(icosphere(Vec3::Y, 0.5, 2), glowing, view(), ground());
+    let config = EffectsConfig {
+        emission: Some(EffectSwitch::Off),
+        interreflection: Some(EffectSwitch::On),
+        clearcoat: Some(EffectSwitch::On),
+        ..EffectsConfig::default()
+    };
+    let p = planned(&s, &config, &settings(0, 1));
+    let emission = find(&p, Effect::Emission);
+    assert_eq!(
+        (emission.enabled, emission.reason.as_str()),
+        (false, "switched off by the user")
+    );
+    let bounces = find(&p, Effect::Interreflection);
+    assert_eq!(
+        (bounces.enabled, bounces.reason.as_str()),
+        (true, "switched on by the user")
+    );
+    assert_eq!(p.max_depth, MAX_DEPTH);
+    // What the scene lacks cannot be switched on.
+    assert!(!p.is_enabled(Effect::Clearcoat));
+    let no_shadow = EffectsConfig {
+        shadow: Some(EffectSwitch::Off),
+        ..EffectsConfig::default()
+    };
+    let p = planned(&s, &no_shadow, &settings(0, 1));
+    assert_eq!(
+        find(&p, Effect::BounceToProxy).reason,
+        "nothing without shadow"
+    );
+    assert_eq!(p.rays["shadow"] + p.rays["light_on_proxy"], 0);
+}
+
+#[test]
+fn light_that_reaches_the_proxy_is_found_and_simulated() {
+    let mut glowing = matte(Vec3::splat(0.5));
+    glowing.emissive = Vec3::splat(4.0);
+    let s = scene(icosphere(Vec3::Y * 0.6, 0.5, 2), glowing, view(), ground());
+    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    assert!(p.is_enabled(Effect::Emission) && p.is_enabled(Effect::EmissionOnProxy));
+    assert!(p.rays["light_on_proxy"] > 0);
+}
+
+#[test]
+fn a_coloured_floor_in_the_photograph_lights_the_object() {
+    let photo = LinearImage(Raster::filled(24, 24, Vec3::new(0.9, 0.1, 0.1)));
+    let settings = Settings {
+        background: Some(&photo),
+        ..settings(0, 1)
+    };
+    let s = scene(
+        icosphere(Vec3::Y * 0.6, 0.5, 3),
+        matte(Vec3::splat(0.8)),
+        view(),
+        ground(),
+    );
+    let p = planned(&s, &EffectsConfig::default(), &settings);
+    assert!(p.is_enabled(Effect::BounceFromProxy));
+    assert!(p.rays["proxy_radiance"] > 0);
+}
+
+#[test]
+fn planned_and_everything_differ_by_no_more_than_the_tolerance() {
+    let mut shiny = matte(Vec3::new(0.9, 0.6, 0.2));
+    (shiny.metallic, shiny.roughness) = (1.0, 0.3);
+    let mut holes = matte(Vec3::splat(0.7));
+    holes.base_color.w = 0.5;
+    holes.alpha_mode = AlphaMode::Blend;
+    holes.double_sided = true;
+    let knot = || torus_knot(Vec3::Y * 0.7, 0.4, 0.15, 96, 12);
+    let sheet = quad(Vec3::new(-0.5, 0.2, 0.0), Vec3::X, Vec3::Y);
+    let scenes = [
+        scene(knot(), shiny, view(), ground()),
+        scene(knot(), matte(Vec3::splat(0.8)), view(), ground()),
+        scene(sheet, holes, view(), ground()),
+    ];
+    let (light, settings) = (sky(1.0), settings(0, 1));
+    for (i, s) in scenes.iter().enumerate() {
+        let p = planned(s, &EffectsConfig::default(), &settings);
+        let renderer = Renderer::new(s);
+        let pilot = Pilot::new(
+            &renderer,
+            &light,
+            &Settings {
+                seed: 77,
+                ..settings
+            },
+        );
+        let all = EffectsPlan::everything(s, &settings).simulation();
+        let reference = pilot.reference(&all).expect("renders");
+        let difference = pilot
+            .difference(&reference, &p.simulation())
+            .expect("renders");
+        // Fresh seeds: the difference may exceed the bound by its own standard error.
+        let allowed = p.tolerance + 2.0 * difference.std_error;
+        assert!(
+            difference.rmse <= allowed,
+            "scene {i}: {difference:?} {p:?}"
+        );
+        let counts = pilot.render(&p.simulation()).expect("renders").counts;
+        if !p.is_enabled(Effect::BounceToProxy) && !p.is_enabled(Effect::EmissionOnProxy) {
+            assert_eq!(counts.get(RayKind::LightOnProxy), 0);
+        }
+        assert_eq!(counts.get(RayKind::ProxyOcclusion), 0);
+        assert_eq!(counts.get(RayKind::ProxyRadiance), 0);
+    }
+}
+
+#[test]
+fn the_file_round_trips_and_refuses_unknown_keys() {
+    let s = scene(
+        icosphere(Vec3::Y, 0.5, 2),
+        matte(Vec3::splat(0.5)),
+        view(),
+        ground(),
+    );
+    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    let json = serde_json::to_string_pretty(&p).expect("serialises");
+    let back: EffectsPlan = serde_json::from_str(&json).expect("parses");
+    assert_eq!(back, p);
+    let broken = json.replace("max_depth", "depth");
+    assert!(serde_json::from_str::<EffectsPlan>(&broken).is_err());
+}
+
+#[test]
+fn the_same_seed_gives_the_same_plan() {
+    let ball = icosphere(Vec3::Y * 0.7, 0.4, 2);
+    let s = scene(ball, matte(Vec3::splat(0.9)), view(), ground());
+    let [a, b] = [1, 2].map(|threads| {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .expect("a pool")
+            .install(|| planned(&s, &EffectsConfig::default(), &settings(0, 1)))
+    });
+    assert_eq!(a, b);
+}
+
+#[test]
+fn planning_can_be_interrupted() {
+    let s = scene(
+        icosphere(Vec3::Y, 0.5, 2),
+        matte(Vec3::splat(0.5)),
+        view(),
+        ground(),
+    );
+    let result = plan(
+        &Renderer::new(&s),
+        &sky(1.0),
+        &EffectsConfig::default(),
+        &settings(0, 1),
+        &mut |_| ControlFlow::Break(()),
+    );
+    assert!(matches!(result, Err(RenderError::Interrupted)));
+}

@@ -1,0 +1,229 @@
+use std::time::Duration;
+
+use dipir_light::environment::EnvironmentSampler;
+use dipir_light::gaussian::{SgMixture, SphericalGaussian};
+use dipir_light::rasterize::rasterize;
+use dipir_scene::proxy::Proxy;
+
+use super::*;
+use crate::features::ALL;
+use crate::shapes::{icosphere, torus_knot};
+use crate::testing::{
+    camera, carry_on, everything, ground, lambertian, matte, render, scene, settings, sky, sun,
+};
+
+fn knot_scene(n: u32) -> Scene {
+    let view = camera(Vec3::new(0.0, 2.0, 4.0), Vec3::Y * 0.5, 40.0, n);
+    let knot = torus_knot(Vec3::Y * 0.7, 0.4, 0.15, 96, 12);
+    scene(knot, matte(Vec3::splat(0.6)), view, ground())
+}
+
+fn sunny() -> EnvironmentSampler {
+    let direction = Vec3::new(0.5, 0.8, 0.4).normalize();
+    EnvironmentSampler::new(sun(direction, 2000.0, 0.5, 64))
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_bytes() {
+    let s = knot_scene(40);
+    let settings = Settings {
+        stop: Stop::TargetError(0.02),
+        ..settings(0, 5)
+    };
+    let with = |threads| {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .expect("a pool")
+            .install(|| render(&s, &sunny(), &everything(3), &settings))
+    };
+    let (one, two) = (with(1), with(2));
+    assert_eq!(one.film.object, two.film.object);
+    assert_eq!(one.film.alpha, two.film.alpha);
+    assert_eq!(one.film.shadow, two.film.shadow);
+    assert_eq!(one.film.shadow_variance, two.film.shadow_variance);
+    assert_eq!((one.counts, one.rounds), (two.counts, two.rounds));
+    assert_eq!(one.error, two.error);
+}
+
+#[test]
+fn the_estimated_error_is_the_real_one() {
+    // Against a converged picture (whose own error is below an eighth), over 12 seeds: both mean
+    // squares average thousands of pixels and agree within the spread of their ratio, about 5%.
+    let s = knot_scene(20);
+    let light = sunny();
+    let converged = render(&s, &light, &lambertian(2), &settings(2048, 99));
+    let (mut estimated, mut real) = (0.0, 0.0);
+    for seed in 0..12 {
+        let r = render(&s, &light, &lambertian(2), &settings(32, seed));
+        estimated += r.error.rmse.powi(2) * r.error.touched_pixels as f64;
+        for i in 0..20 * 20 {
+            let display = |r: &Rendered| {
+                let linear = dipir_imaging::composite::composite_pixel(
+                    Vec3::splat(0.18),
+                    r.film.object.pixels()[i],
+                    r.film.alpha.pixels()[i],
+                    r.film.shadow.pixels()[i],
+                );
+                linear.clamp(Vec3::ZERO, Vec3::ONE)
+            };
+            real += f64::from((display(&r) - display(&converged)).length_squared()) / 3.0;
+        }
+    }
+    let ratio = (estimated / real).sqrt();
+    assert!((0.88..1.12).contains(&ratio), "{ratio}");
+}
+
+#[test]
+fn a_target_error_is_met_and_costs_more_the_lower_it_is() {
+    let s = knot_scene(32);
+    let mut samples = Vec::new();
+    for target in [0.01, 0.003] {
+        let settings = Settings {
+            stop: Stop::TargetError(target),
+            transfer: Transfer::Srgb,
+            ..settings(0, 1)
+        };
+        let mut errors = Vec::new();
+        let r = Renderer::new(&s)
+            .render(&sunny(), &lambertian(2), &settings, &mut |p| {
+                errors.push(p.error.upper_95);
+                ControlFlow::Continue(())
+            })
+            .expect("renders");
+        assert!(r.error.upper_95 <= f64::from(target), "{:?}", r.error);
+        assert!(
+            r.error.rmse > 0.3 * f64::from(target),
+            "wasteful: {:?}",
+            r.error
+        );
+        assert_eq!(errors.len() as u32, r.rounds);
+        samples.push(r.samples);
+    }
+    assert!(samples[1] > 2 * samples[0], "{samples:?}");
+}
+
+#[test]
+fn a_time_budget_ends_after_a_round_and_a_target_that_cannot_be_met_at_the_most_samples() {
+    let s = knot_scene(16);
+    let none = Settings {
+        stop: Stop::TimeBudget(Duration::ZERO),
+        ..settings(0, 1)
+    };
+    let r = render(&s, &sunny(), &lambertian(2), &none);
+    assert_eq!(r.rounds, 1);
+    let impossible = Settings {
+        stop: Stop::TargetError(1e-9),
+        max_samples: 64,
+        ..settings(0, 1)
+    };
+    let r = render(&s, &sunny(), &lambertian(2), &impossible);
+    assert!(r.error.rmse > 1e-9 && r.samples <= 2 * 64 * 256);
+}
+
+#[test]
+fn progress_can_break_off() {
+    let s = knot_scene(16);
+    let result = Renderer::new(&s).render(&sunny(), &lambertian(1), &settings(64, 1), &mut |_| {
+        ControlFlow::Break(())
+    });
+    assert!(matches!(result, Err(RenderError::Interrupted)));
+}
+
+#[test]
+fn images_of_another_size_are_refused_in_words() {
+    let s = knot_scene(16);
+    let photo = LinearImage(Raster::filled(4, 3, Vec3::ONE));
+    let settings = Settings {
+        background: Some(&photo),
+        ..settings(4, 1)
+    };
+    let error = Renderer::new(&s)
+        .render(&sunny(), &lambertian(1), &settings, &mut carry_on)
+        .expect_err("sizes differ");
+    assert_eq!(
+        error.to_string(),
+        "the background is 4 x 3 pixels, the camera 16 x 16: give images of the camera's size"
+    );
+}
+
+#[test]
+fn occluders_hide_object_and_shadow_and_save_their_rays() {
+    let s = knot_scene(16);
+    let mask = Raster::filled(16, 16, 1.0);
+    let hidden = Settings {
+        occluders: Some(&mask),
+        ..settings(4, 1)
+    };
+    let r = render(&s, &sunny(), &lambertian(1), &hidden);
+    assert!(r.film.alpha.pixels().iter().all(|&a| a == 0.0));
+    assert!(r.film.shadow.pixels().iter().all(|v| *v == Vec3::ONE));
+    assert_eq!(r.counts.total(), 0);
+}
+
+#[test]
+fn an_empty_scene_and_a_picture_of_one_pixel_render() {
+    let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 40.0, 1);
+    let empty = scene(Default::default(), matte(Vec3::ONE), view, ground());
+    let r = render(&empty, &sky(1.0), &everything(4), &settings(4, 1));
+    assert_eq!((r.counts.total(), r.samples), (0, 0));
+    assert_eq!(r.film.shadow.pixels(), [Vec3::ONE]);
+    let ball = icosphere(Vec3::ZERO, 1.0, 2);
+    let one = scene(ball, matte(Vec3::ONE), view, Proxy::None);
+    let r = render(&one, &sky(1.0), &everything(4), &settings(16, 1));
+    assert!(r.film.alpha.pixels()[0] > 0.0);
+}
+
+#[test]
+fn gaussian_lobes_and_their_fine_map_light_the_same_picture() {
+    let lobes = vec![
+        SphericalGaussian {
+            direction: Vec3::new(0.5, 0.8, 0.4).normalize(),
+            radiance: Vec3::new(60.0, 50.0, 40.0),
+            sigma: 0.05,
+        },
+        SphericalGaussian {
+            direction: Vec3::new(-0.4, 0.6, -0.3).normalize(),
+            radiance: Vec3::new(0.5, 0.7, 1.0),
+            sigma: 0.8,
+        },
+    ];
+    let s = knot_scene(16);
+    let map = EnvironmentSampler::new(rasterize(&lobes, 512, 256));
+    let mixture = SgMixture::new(lobes).expect("valid lobes");
+    let a = Renderer::new(&s)
+        .render(&mixture, &everything(2), &settings(512, 1), &mut carry_on)
+        .expect("renders");
+    let b = render(&s, &map, &everything(2), &settings(512, 1));
+    let mean = |r: &Raster<Vec3>| {
+        let sum: Vec3 = r.pixels().iter().sum();
+        sum / 256.0
+    };
+    // Standard errors of the means are below 2e-3; the map is integrated to 1%.
+    let (x, y) = (mean(&a.film.object), mean(&b.film.object));
+    assert!(x.abs_diff_eq(y, 0.01 * y.max_element() + 4e-3), "{x} {y}");
+    let (x, y) = (mean(&a.film.shadow), mean(&b.film.shadow));
+    assert!(x.abs_diff_eq(y, 4e-3), "{x} {y}");
+    assert!(x.max_element() < 0.97, "the test must be able to fail");
+}
+
+#[test]
+fn superset_kernels_draw_the_same_picture() {
+    // A matte object needs only the specular lobe; the widest kernel must agree to rounding.
+    let s = knot_scene(16);
+    let light = sunny();
+    let narrow = Simulation {
+        features: crate::features::SPECULAR,
+        ..everything(2)
+    };
+    let wide = Simulation {
+        features: ALL,
+        ..everything(2)
+    };
+    let a = render(&s, &light, &narrow, &settings(16, 1)).film;
+    let b = render(&s, &light, &wide, &settings(16, 1)).film;
+    for (a, b) in a.object.pixels().iter().zip(b.object.pixels()) {
+        assert!(a.abs_diff_eq(*b, 1e-4 * (1.0 + a.max_element())), "{a} {b}");
+    }
+    assert_eq!(a.shadow, b.shadow);
+}
