@@ -211,3 +211,50 @@ fn gradients_agree_with_central_differences_of_the_same_nodes() {
         }
     }
 }
+
+#[test]
+fn a_lobe_on_a_pole_fills_rows_and_one_on_the_seam_is_one_in_the_middle_turned() {
+    for sigma in SIGMAS {
+        for pole in [Vec3::Y, Vec3::NEG_Y] {
+            let map = rasterize(&[lobe(pole, Vec3::splat(1e6), sigma)], 12, 6);
+            for row in map.texels().chunks(12) {
+                let close = |t: &Vec3| (t.x - row[0].x).abs() <= 2e-6 * row[0].x;
+                assert!(row.iter().all(close), "sigma {sigma}, {pole}: {row:?}");
+            }
+        }
+        let height = Vec3::new(0.0, 0.3, 0.0);
+        let seam = rasterize(&[lobe(Vec3::NEG_Z + height, Vec3::ONE, sigma)], 12, 6);
+        let middle = rasterize(&[lobe(Vec3::Z + height, Vec3::ONE, sigma)], 12, 6);
+        let largest = middle.peak().1.x;
+        let pairs = seam
+            .texels()
+            .iter()
+            .zip(middle.rotated_y(PI).texels())
+            .map(|(a, b)| (a.x, b.x))
+            .collect::<Vec<_>>();
+        // Half a texel's rounding of the axis, 6e-8 rad, over sigma.
+        let tolerance = largest * (2e-6 + 2e-7 / sigma);
+        assert!(
+            pairs.iter().all(|(a, b)| (a - b).abs() < tolerance),
+            "sigma {sigma}: {pairs:?}"
+        );
+    }
+}
+
+#[test]
+fn maps_and_gradients_are_the_same_bytes_for_any_number_of_threads() {
+    let lobes: Vec<_> = directions()
+        .into_iter()
+        .enumerate()
+        .map(|(k, d)| lobe(d, Vec3::new(1.0, 2.0, 0.1), SIGMAS[k % SIGMAS.len()]))
+        .collect();
+    let y = adjoint(64 * 32);
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
+        pool.install(|| (rasterize(&lobes, 64, 32), rasterize_vjp(&lobes, 64, 32, &y)))
+    };
+    assert_eq!(run(1), run(5));
+}
