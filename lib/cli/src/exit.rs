@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use dipir_pipeline::error::ConfigError;
 
-use crate::interrupt::Interrupted;
+use crate::interrupt::{self, Interrupted};
 use crate::style::{bold_red, color_on_stderr};
 
 /// Done.
@@ -38,7 +38,7 @@ pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
                 let label = bold_red("error:", color_on_stderr());
                 eprintln!("{label} {}", describe(&error));
             } else {
-                eprintln!("interrupted; earlier results are as they were");
+                eprintln!("{}", interrupt::MESSAGE);
             }
             code
         }
@@ -58,13 +58,14 @@ pub fn code_of(error: &anyhow::Error) -> u8 {
     }
 }
 
-/// The message, then its causes. A cause that its parent quotes already is not repeated.
+/// The message, then its causes. A cause that its parent quotes already is not repeated, and the
+/// numbers of operating-system errors, which say nothing that their text does not, are left out.
 pub fn describe(error: &anyhow::Error) -> String {
     let mut text = String::new();
     let mut parent = String::new();
     for cause in error.chain() {
-        let message = cause.to_string();
-        if parent.contains(&message) {
+        let message = without_number(&cause.to_string());
+        if parent.to_lowercase().contains(&message.to_lowercase()) {
             continue;
         }
         if !text.is_empty() {
@@ -74,6 +75,16 @@ pub fn describe(error: &anyhow::Error) -> String {
         parent = message;
     }
     text
+}
+
+fn without_number(message: &str) -> String {
+    match message.split_once(" (os error ") {
+        Some((before, after)) => {
+            let after = after.split_once(')').map_or("", |(_, rest)| rest);
+            format!("{before}{after}")
+        }
+        None => message.into(),
+    }
 }
 
 #[cfg(test)]
@@ -98,6 +109,18 @@ mod tests {
         assert_eq!(
             describe(&error),
             "the scene cannot be set up\n  caused by: cannot read a.png: disk on fire"
+        );
+    }
+
+    #[test]
+    fn numbers_of_system_errors_are_left_out() {
+        let source = std::io::Error::from_raw_os_error(2);
+        let text = describe(&anyhow::anyhow!(
+            "cannot read a.png: {source}; check the path"
+        ));
+        assert!(
+            text.ends_with("; check the path") && !text.contains("os error"),
+            "{text}"
         );
     }
 

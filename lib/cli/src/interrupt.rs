@@ -1,7 +1,12 @@
-//! Ctrl-C: the first asks the work to stop cleanly, the second ends the process at once.
+//! Ctrl-C: the work is asked to stop; if it does not within a moment, the process ends anyway,
+//! its unfinished folder removed.
 use std::fmt;
+use std::path::{Path, PathBuf};
 use std::process;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::Duration;
 
 use crate::exit::INTERRUPTED;
 
@@ -19,15 +24,37 @@ impl fmt::Display for Interrupted {
 
 impl std::error::Error for Interrupted {}
 
+/// What the user is told.
+pub const MESSAGE: &str = "interrupted; earlier results are as they were";
+
+/// How long the work may take to stop by itself.
+const GRACE: Duration = Duration::from_millis(500);
+
+/// The folder to remove when the process ends early.
+static UNFINISHED: Mutex<Option<PathBuf>> = Mutex::new(None);
+
 /// Starts to listen. Stages write beside their target and swap at the end, so that ending the
 /// process at any moment leaves earlier results whole.
 pub fn listen() -> anyhow::Result<()> {
     ctrlc::set_handler(|| {
-        if ASKED.swap(true, Ordering::SeqCst) {
-            process::exit(INTERRUPTED.into());
+        ASKED.store(true, Ordering::SeqCst);
+        thread::sleep(GRACE);
+        if let Ok(mut folder) = UNFINISHED.lock()
+            && let Some(folder) = folder.take()
+        {
+            let _ = std::fs::remove_dir_all(folder);
         }
+        eprintln!("{MESSAGE}");
+        process::exit(INTERRUPTED.into());
     })?;
     Ok(())
+}
+
+/// Notes the folder to remove when the process ends early.
+pub fn unfinished(folder: &Path) {
+    if let Ok(mut noted) = UNFINISHED.lock() {
+        *noted = Some(folder.into());
+    }
 }
 
 /// Whether the user asked to stop.

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use dipir_pipeline::config::{Config, PipelineTable};
+use dipir_pipeline::error::StageError;
 use dipir_pipeline::lock::WhenLocked;
+use dipir_pipeline::stage::{StagePlan, StageWriter};
 use serde_json::Value;
 
 use crate::args::{CommonArgs, OutputArgs};
@@ -22,8 +24,7 @@ pub struct Session {
     pub pipeline: PipelineTable,
     /// Folder of all artifacts, relative to the current folder.
     pub out: PathBuf,
-    /// What to do when another run writes the same folder.
-    pub when_locked: WhenLocked,
+    when_locked: WhenLocked,
     output: OutputArgs,
 }
 
@@ -60,6 +61,14 @@ impl Session {
     /// The folder of a stage.
     pub fn stage_folder(&self, stage: &str) -> PathBuf {
         self.out.join(stage)
+    }
+
+    /// Opens the folder of the planned stage for writing.
+    pub fn begin(&self, plan: StagePlan) -> Result<StageWriter, StageError> {
+        let folder = self.stage_folder(&plan.stage);
+        let writer = StageWriter::begin(&folder, plan, self.when_locked)?;
+        interrupt::unfinished(writer.partial());
+        Ok(writer)
     }
 
     /// A path of the configuration, relative to the current folder.

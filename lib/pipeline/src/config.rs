@@ -179,12 +179,28 @@ impl Config {
         Some(node.place.clone())
     }
 
+    /// Where the dotted key, or the nearest table around it, was set.
+    pub fn nearest_place(&self, dotted: &str) -> Place {
+        let mut key = dotted;
+        loop {
+            if let Some(place) = self.place(key) {
+                return place;
+            }
+            match key.rsplit_once('.') {
+                Some((table, _)) => key = table,
+                None => {
+                    return Place::File {
+                        file: self.path.clone(),
+                    };
+                }
+            }
+        }
+    }
+
     /// An error about the value of a dotted key, found by its reader.
     pub fn invalid(&self, dotted: &str, message: impl Into<String>) -> ConfigError {
         ConfigError::Invalid {
-            at: self.place(dotted).unwrap_or_else(|| Place::File {
-                file: self.path.clone(),
-            }),
+            at: self.nearest_place(dotted),
             key: dotted.into(),
             message: message.into(),
         }
@@ -200,20 +216,15 @@ impl Config {
         &self.path
     }
 
-    /// The folder that relative paths in the file start from.
+    /// The folder that relative paths in the file start from, itself relative to the current
+    /// folder; empty if it is the current folder.
     pub fn base_dir(&self) -> PathBuf {
-        match self.path.parent() {
-            Some(folder) if !folder.as_os_str().is_empty() => folder.into(),
-            _ => PathBuf::from("."),
-        }
+        self.path.parent().unwrap_or(Path::new("")).into()
     }
 
     /// A path of the file, made relative to the current folder.
     pub fn resolve(&self, path: &Path) -> PathBuf {
-        match self.path.parent() {
-            Some(folder) => folder.join(path),
-            None => path.into(),
-        }
+        self.base_dir().join(path)
     }
 }
 

@@ -167,7 +167,10 @@ pub fn stale_reasons(plan: &StagePlan, folder: &Path) -> Result<Vec<StaleReason>
             now: plan.seed,
         });
     }
-    reasons.extend(parameter_changes(&manifest, plan));
+    reasons.extend(changes(
+        &flat(&manifest.params, &manifest.inputs),
+        &flat(&plan.params, &plan.inputs),
+    ));
     reasons.extend(input_changes(&manifest.inputs, &plan.inputs));
     let damages = manifest.damages(folder)?;
     reasons.extend(
@@ -178,17 +181,20 @@ pub fn stale_reasons(plan: &StagePlan, folder: &Path) -> Result<Vec<StaleReason>
     Ok(reasons)
 }
 
-fn parameter_changes(manifest: &Manifest, plan: &StagePlan) -> Vec<StaleReason> {
-    let was = flat(&manifest.params, &manifest.inputs);
-    let now = flat(&plan.params, &plan.inputs);
-    let mut keys: Vec<&String> = was.iter().chain(&now).map(|(key, _)| key).collect();
+/// How the parameters `now` differ from what they `was`, paths included.
+pub fn parameter_changes(was: &Value, now: &Value) -> Vec<StaleReason> {
+    changes(&flat(was, &[]), &flat(now, &[]))
+}
+
+fn changes(was: &[(String, String)], now: &[(String, String)]) -> Vec<StaleReason> {
+    let mut keys: Vec<&String> = was.iter().chain(now).map(|(key, _)| key).collect();
     keys.sort();
     keys.dedup();
     let find = |list: &[(String, String)], key: &str| {
         list.iter().find(|(k, _)| k == key).map(|(_, v)| v.clone())
     };
     keys.into_iter()
-        .map(|key| (key, find(&was, key), find(&now, key)))
+        .map(|key| (key, find(was, key), find(now, key)))
         .filter(|(_, was, now)| was != now)
         .map(|(key, was, now)| StaleReason::Parameter {
             key: key.clone(),

@@ -42,9 +42,17 @@ impl StagePlan {
         }
     }
 
-    /// Adds the file `location`, which the configuration calls `path`.
+    /// Adds the file `location`, which the configuration calls `path`. Further files of one role
+    /// are numbered: `object`, `object 2`.
     pub fn input(&mut self, role: &str, path: &Path, location: &Path) -> Result<(), StageError> {
-        self.inputs.push(Artifact::of(role, path, location)?);
+        let taken = |name: &str| self.inputs.iter().any(|a| a.role == name);
+        let mut name = role.to_string();
+        let mut number = 2;
+        while taken(&name) {
+            name = format!("{role} {number}");
+            number += 1;
+        }
+        self.inputs.push(Artifact::of(&name, path, location)?);
         Ok(())
     }
 }
@@ -89,6 +97,11 @@ impl StageWriter {
             finished: false,
             _lock: lock,
         })
+    }
+
+    /// The folder that is written to; whoever ends the process on purpose should remove it.
+    pub fn partial(&self) -> &Path {
+        &self.partial
     }
 
     /// Registers the output `name` (relative, `/` allowed) and returns where to write it.

@@ -227,11 +227,21 @@ fn paths_are_relative_to_the_file() {
     assert_eq!(config.resolve(Path::new("/x.png")), Path::new("/x.png"));
     let here = Config::parse(Path::new("pipeline.toml"), "", &[]).unwrap();
     assert_eq!(here.resolve(Path::new("x.png")), Path::new("x.png"));
-    assert_eq!(here.base_dir(), Path::new("."));
+    assert_eq!(here.base_dir(), Path::new(""));
 }
 
 #[test]
 fn unrelated_names_are_not_suggested() {
     assert_eq!(nearest("zzz", TABLES), None);
     assert_eq!(nearest("optimise", TABLES), Some("optimize".into()));
+}
+
+#[test]
+fn a_missing_key_is_placed_at_the_table_that_lacks_it() {
+    let config = parse(TEXT, &[]).unwrap();
+    let at = |key: &str| config.nearest_place(key).to_string();
+    assert_eq!(at("scene.objects.0.path"), "pipeline.toml:10");
+    assert_eq!(at("scene.objects.0.scale"), "pipeline.toml:9");
+    assert_eq!(at("scene.camera.fov_deg"), "pipeline.toml:5");
+    assert_eq!(at("composite.tone"), "pipeline.toml");
 }

@@ -174,3 +174,16 @@ fn a_parent_that_is_a_file_is_one_clear_message() {
         "{text}"
     );
 }
+
+#[test]
+fn inputs_of_one_role_are_told_apart() {
+    let out = tempfile::tempdir().unwrap();
+    let file = out.path().join("a");
+    fs::write(&file, "").unwrap();
+    let mut plan = plan(0);
+    for _ in 0..3 {
+        plan.input("object", Path::new("a"), &file).unwrap();
+    }
+    let roles: Vec<_> = plan.inputs.iter().map(|a| a.role.as_str()).collect();
+    assert_eq!(roles, ["object", "object 2", "object 3"]);
+}

@@ -1,0 +1,443 @@
+//! The composite stage: the object at full quality, its shadow, and the layers of both.
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use dipir_cli::session::{Session, duration};
+use dipir_imaging::composite::composite;
+use dipir_imaging::file::write_png;
+use dipir_imaging::layers::{Layers, Precision};
+use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_light::environment::EnvironmentSampler;
+use dipir_pipeline::config::{Config, Quality};
+use dipir_pipeline::fingerprint::{StaleReason, parameter_changes};
+use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::stage::StagePlan;
+use dipir_render::adaptive::Stop;
+use dipir_render::effects::EffectsPlan;
+use dipir_render::film::Film;
+use dipir_render::render::{Rendered, Renderer, Settings};
+use dipir_scene::config::SceneConfig;
+use dipir_scene::description::SceneDescription;
+use dipir_scene::scene::LoadedScene;
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::light::{self, Light};
+use crate::{interruption, scene};
+
+/// Name of the stage and of its folder.
+pub const STAGE: &str = "composite";
+/// Raised whenever the same inputs give other outputs.
+pub const VERSION: u32 = 1;
+
+/// The `[composite]` table.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CompositeTable {
+    /// Environment map that lights the object, HDR or EXR; else the recovered light does.
+    pub environment: Option<PathBuf>,
+    /// Stops of exposure that bring the map to the photograph's scale.
+    pub exposure_ev: f32,
+    /// Turn of the map about the vertical, degrees, counter-clockwise from above.
+    pub rotation_deg: f32,
+    /// Stop at this display-referred RMSE; the quality's by default.
+    pub target_error: Option<f32>,
+    /// Or stop after about this many seconds.
+    pub time_budget_s: Option<f64>,
+    /// Most samples in any pixel.
+    pub max_samples: Option<u32>,
+    /// Curve on the object's light before it is laid over the photograph.
+    pub tone: Tone,
+}
+
+/// A curve on the object's light.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Tone {
+    /// None: the photograph is linear light, exposed.
+    #[default]
+    None,
+    /// `x / (1 + x)` on every channel, for photographs whose highlights are compressed.
+    Reinhard,
+}
+
+/// When to stop, from the command line.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StopArgs {
+    /// Stop at this display-referred RMSE.
+    pub target_error: Option<f32>,
+    /// Stop after about this many seconds.
+    pub time_budget_s: Option<f64>,
+}
+
+/// Most samples in any pixel, unless the table says otherwise.
+const MAX_SAMPLES: u32 = 1 << 14;
+
+impl CompositeTable {
+    /// Refuses what no run can work with.
+    pub fn check(&self, config: &Config) -> anyhow::Result<()> {
+        let wrong = |key: &str, message: String| {
+            Err(anyhow::Error::new(
+                config.invalid(&format!("composite.{key}"), message),
+            ))
+        };
+        if let Some(e) = self.target_error
+            && !(e > 0.0 && e <= 1.0)
+        {
+            let range = "a display-referred RMSE above 0, at most 1, as in 0.004";
+            return wrong(
+                "target_error",
+                format!("{e} is out of range; accepted: {range}"),
+            );
+        }
+        if let Some(t) = self.time_budget_s
+            && !(t > 0.0 && t < 1e9)
+        {
+            return wrong(
+                "time_budget_s",
+                format!("{t} is out of range; accepted: seconds above 0"),
+            );
+        }
+        if self.target_error.is_some() && self.time_budget_s.is_some() {
+            return wrong(
+                "time_budget_s",
+                "excludes target_error; keep one of the two".into(),
+            );
+        }
+        if self.max_samples == Some(0) {
+            return wrong(
+                "max_samples",
+                "0 is out of range; accepted: 1 or more".into(),
+            );
+        }
+        if !(self.exposure_ev.abs() <= 64.0) {
+            return wrong(
+                "exposure_ev",
+                format!(
+                    "{} is out of range; accepted: stops from -64 to 64",
+                    self.exposure_ev
+                ),
+            );
+        }
+        if !self.rotation_deg.is_finite() {
+            return wrong("rotation_deg", "must be a finite angle in degrees".into());
+        }
+        Ok(())
+    }
+
+    fn stop(&self, quality: Quality) -> Stop {
+        match (self.target_error, self.time_budget_s) {
+            (Some(error), _) => Stop::TargetError(error),
+            (None, Some(seconds)) => Stop::TimeBudget(Duration::from_secs_f64(seconds)),
+            (None, None) => Stop::TargetError(match quality {
+                Quality::Draft => 0.02,
+                // About half an 8-bit step, and a quarter of one.
+                Quality::Standard => 0.004,
+                Quality::High => 0.001,
+            }),
+        }
+    }
+}
+
+/// What the stage did.
+pub struct Done {
+    folder: PathBuf,
+    manifest: Manifest,
+    samples: u64,
+    rays: u64,
+    error: f64,
+    target: Stop,
+}
+
+/// Everything that the stage reads.
+struct Inputs {
+    scene_folder: PathBuf,
+    loaded: LoadedScene,
+    effects: EffectsPlan,
+    gbuffer: Layers,
+}
+
+/// Runs the stage.
+pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
+    let mut table: CompositeTable = session.config.table("composite")?;
+    if args.target_error.is_some() || args.time_budget_s.is_some() {
+        table.target_error = args.target_error;
+        table.time_budget_s = args.time_budget_s;
+    }
+    table.check(&session.config)?;
+    let inputs = read(session)?;
+    let light = match light::known(session, &table)? {
+        Some(light) => light,
+        None => {
+            return Err(light::missing(
+                &session.stage_folder("light").join("lighting.json"),
+            ));
+        }
+    };
+    let stop = table.stop(session.pipeline.quality);
+    let plan = stage_plan(session, &table, stop, &inputs, &light)?;
+    let folder = session.stage_folder(STAGE);
+    let mut writer = session.begin(plan)?;
+    let rendered = render(session, &table, stop, &inputs, &light)?;
+    let layers = Composite::new(&inputs, rendered.film, table.tone)?;
+    let png = writer.output("picture", "composite.png")?;
+    write_png(png, &inputs.loaded.photo.transfer.encode(&layers.beauty))?;
+    let exr = writer.output("layers", "composite.exr")?;
+    layers.to_layers(&inputs.gbuffer)?.write_exr(exr)?;
+    writer.set_estimated_error(rendered.error.upper_95);
+    let manifest = writer.finish()?;
+    Ok(Done {
+        folder,
+        manifest,
+        samples: rendered.samples,
+        rays: rendered.counts.total(),
+        error: rendered.error.upper_95,
+        target: stop,
+    })
+}
+
+/// Reads what the scene stage wrote and the files that it names.
+fn read(session: &Session) -> anyhow::Result<Inputs> {
+    let scene_folder = session.stage_folder(scene::STAGE);
+    let manifest = Manifest::read(&scene_folder, scene::EXECUTABLE)?;
+    warn_of_other_settings(session, &manifest)?;
+    let description = SceneDescription::read(&manifest.output(&scene_folder, "scene")?)?;
+    let effects: EffectsPlan = read_json(&manifest.output(&scene_folder, "effects")?)?;
+    let gbuffer = Layers::read_exr(manifest.output(&scene_folder, "gbuffer")?)?;
+    let loaded = description.load(&session.config.base_dir())?;
+    Ok(Inputs {
+        scene_folder,
+        loaded,
+        effects,
+        gbuffer,
+    })
+}
+
+/// The scene's folder may have been made before the last edit of `[scene]`.
+fn warn_of_other_settings(session: &Session, manifest: &Manifest) -> anyhow::Result<()> {
+    let config: SceneConfig = session.config.table("scene")?;
+    let was = json!({"scene": manifest.params["scene"]});
+    let now = json!({"scene": serde_json::to_value(config)?});
+    let changes: Vec<String> = parameter_changes(&was, &now)
+        .iter()
+        .map(StaleReason::to_string)
+        .collect();
+    if !changes.is_empty() {
+        session.warn(&format!(
+            "the scene was set up with other settings ({}); run dipir-scene again to use the new ones",
+            changes.join(", ")
+        ));
+    }
+    Ok(())
+}
+
+fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> anyhow::Result<T> {
+    let text = std::fs::read_to_string(path)?;
+    serde_json::from_str(&text).map_err(|e| {
+        anyhow::anyhow!(
+            "{}: {e}; it was written by another version: run {} again",
+            path.display(),
+            scene::EXECUTABLE
+        )
+    })
+}
+
+fn stage_plan(
+    session: &Session,
+    table: &CompositeTable,
+    stop: Stop,
+    inputs: &Inputs,
+    light: &Light,
+) -> anyhow::Result<StagePlan> {
+    let params = json!({
+        "light": light.params,
+        "tone": table.tone,
+        "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
+        "stop": match stop {
+            Stop::Samples(n) => json!({"samples": n}),
+            Stop::TargetError(e) => json!({"target_error": e}),
+            Stop::TimeBudget(t) => json!({"time_budget_s": t.as_secs_f64()}),
+        },
+    });
+    let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
+    for name in ["scene.json", "effects.json", "gbuffer.exr"] {
+        let location = inputs.scene_folder.join(name);
+        let role = name.split('.').next().unwrap_or(name);
+        plan.input(role, &Path::new(scene::STAGE).join(name), &location)?;
+    }
+    for input in &inputs.loaded.inputs {
+        plan.input(&input.role, &input.path, &input.location)?;
+    }
+    if let Some((path, location)) = &light.file {
+        plan.input("environment", path, location)?;
+    }
+    Ok(plan)
+}
+
+fn render(
+    session: &Session,
+    table: &CompositeTable,
+    stop: Stop,
+    inputs: &Inputs,
+    light: &Light,
+) -> anyhow::Result<Rendered> {
+    let photo = &inputs.loaded.photo;
+    let settings = Settings {
+        seed: session.pipeline.seed,
+        stop,
+        max_samples: table.max_samples.unwrap_or(MAX_SAMPLES),
+        background: Some(&photo.image),
+        transfer: photo.transfer,
+        occluders: inputs.loaded.occluders.as_ref(),
+        ..Settings::default()
+    };
+    let renderer = Renderer::new(&inputs.loaded.scene);
+    let progress = session.progress("composite");
+    let rendered = renderer
+        .render(
+            &EnvironmentSampler::new(light.map.clone()),
+            &inputs.effects.simulation(),
+            &settings,
+            &mut |state| {
+                progress.set(state.fraction);
+                let goal = match stop {
+                    Stop::TargetError(target) => format!(" -> {target}"),
+                    _ => String::new(),
+                };
+                progress.say(format!("error {:.5}{goal}", state.error.upper_95));
+                session.remark(|| {
+                    format!(
+                        "round {}: error {:.5} (95% bound {:.5}), {} samples, {} rays, {}",
+                        state.round,
+                        state.error.rmse,
+                        state.error.upper_95,
+                        state.samples,
+                        state.rays,
+                        duration(state.elapsed.as_secs_f64())
+                    )
+                });
+                interruption()
+            },
+        )
+        .map_err(crate::render_error)?;
+    progress.done();
+    Ok(rendered)
+}
+
+/// The picture and its layers, linear.
+struct Composite<'a> {
+    background: &'a LinearImage,
+    object: LinearImage,
+    alpha: Raster<f32>,
+    shadow: LinearImage,
+    beauty: LinearImage,
+}
+
+impl<'a> Composite<'a> {
+    fn new(inputs: &'a Inputs, film: Film, tone: Tone) -> anyhow::Result<Self> {
+        let background = &inputs.loaded.photo.image;
+        let object = match tone {
+            Tone::None => film.object,
+            Tone::Reinhard => toned(&film.object, &film.alpha),
+        };
+        // Stored in half precision: rounded before they are put together, so that whoever does it
+        // again from the file gets the same picture.
+        let object = LinearImage(object.map(|v| half_vec(*v)));
+        let alpha = film.alpha.map(|a| half::f16::from_f32(*a).to_f32());
+        let shadow = LinearImage(film.shadow.map(|v| half_vec(*v)));
+        let beauty = composite(background, &object, &alpha, &shadow)?;
+        Ok(Self {
+            background,
+            object,
+            alpha,
+            shadow,
+            beauty,
+        })
+    }
+
+    fn to_layers(&self, gbuffer: &Layers) -> anyhow::Result<Layers> {
+        let (width, height) = (self.alpha.width(), self.alpha.height());
+        let mut layers = Layers::new(width, height);
+        layers.insert_rgb("", Precision::Half, &self.beauty.0)?;
+        layers.insert("A", Precision::Half, Raster::filled(width, height, 1.0))?;
+        layers.insert_rgb("object", Precision::Half, &self.object.0)?;
+        layers.insert("object.A", Precision::Half, self.alpha.clone())?;
+        layers.insert_rgb("shadow", Precision::Half, &self.shadow.0)?;
+        layers.insert_rgb("background", Precision::Half, &self.background.0)?;
+        layers.insert(
+            "depth.Z",
+            Precision::Full,
+            gbuffer.channel("depth.Z")?.clone(),
+        )?;
+        layers.insert_xyz("normal", Precision::Half, &gbuffer.xyz("normal")?)?;
+        layers.insert_rgb("albedo", Precision::Half, &gbuffer.rgb("albedo")?)?;
+        Ok(layers)
+    }
+}
+
+fn half_vec(v: Vec3) -> Vec3 {
+    let half = |x: f32| half::f16::from_f32(x).to_f32();
+    Vec3::new(half(v.x), half(v.y), half(v.z))
+}
+
+/// Reinhard's curve on the object's own colour, which is `rgb / alpha`.
+fn toned(object: &Raster<Vec3>, alpha: &Raster<f32>) -> Raster<Vec3> {
+    let pixels = object.pixels().iter().zip(alpha.pixels());
+    let toned = pixels.map(|(&rgb, &a)| match a > 0.0 {
+        true => {
+            let c = rgb / a;
+            a * c / (1.0 + c)
+        }
+        false => Vec3::ZERO,
+    });
+    Raster::from_pixels(object.width(), object.height(), toned.collect())
+}
+
+impl Done {
+    /// For programs.
+    pub fn to_json(&self) -> Value {
+        json!({
+            "folder": self.folder,
+            "picture": self.folder.join("composite.png"),
+            "layers": self.folder.join("composite.exr"),
+            "estimated_error": self.error,
+            "samples": self.samples,
+            "rays": self.rays,
+            "elapsed_s": self.manifest.elapsed_s,
+            "peak_rss_bytes": self.manifest.peak_rss_bytes,
+        })
+    }
+
+    fn missed_target(&self) -> Option<f32> {
+        match self.target {
+            Stop::TargetError(target) if self.error > f64::from(target) => Some(target),
+            _ => None,
+        }
+    }
+}
+
+impl fmt::Display for Done {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "wrote {} in {}",
+            self.folder.display(),
+            duration(self.manifest.elapsed_s)
+        )?;
+        write!(
+            f,
+            "  estimated error {:.5} (display-referred RMSE, 95% bound), {:.1} million rays",
+            self.error,
+            self.rays as f64 * 1e-6
+        )?;
+        if let Some(target) = self.missed_target() {
+            write!(
+                f,
+                "\n  the target of {target} was not reached: raise composite.max_samples"
+            )?;
+        }
+        Ok(())
+    }
+}

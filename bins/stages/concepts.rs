@@ -1,0 +1,216 @@
+//! The concepts stage: images of the object's class, made by the un-adapted model.
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use candle_core::{DType, Device, Tensor};
+use dipir_cli::interrupt;
+use dipir_cli::session::{Session, duration};
+use dipir_diffusion::concepts::{Concept, class_prompt, concept};
+use dipir_diffusion::generate::{GenerateSettings, generate};
+use dipir_diffusion::model::Model;
+use dipir_diffusion::pass::Pass;
+use dipir_diffusion::sampler::Solver;
+use dipir_diffusion::weights::{Weights, write_safetensors};
+use dipir_imaging::file::write_png;
+use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::stage::{StagePlan, StageWriter};
+use dipir_scene::config::SceneConfig;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::model::{self, ModelTable};
+
+/// Name of the stage and of its folder.
+pub const STAGE: &str = "concepts";
+/// The executable that runs it.
+pub const EXECUTABLE: &str = "dipir-concepts";
+/// Raised whenever the same inputs give other outputs.
+pub const VERSION: u32 = 1;
+
+/// The `[concepts]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ConceptsTable {
+    /// Images; 0 switches concept preservation off.
+    pub count: usize,
+    /// Steps of the sampler.
+    pub steps: usize,
+    /// Classifier-free guidance scale, 1 for none.
+    pub guidance: f64,
+    /// Side of the images in pixels; the model's own by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub size: Option<usize>,
+    /// Folder of finished images that scenes of one class and model share, and in which an
+    /// interrupted run goes on; `concepts-cache` in the folder of artifacts by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cache: Option<PathBuf>,
+}
+
+impl Default for ConceptsTable {
+    fn default() -> Self {
+        Self {
+            count: 32,
+            // DPM-Solver++ changes little beyond 20 to 30 steps.
+            steps: 25,
+            guidance: 7.5,
+            size: None,
+            cache: None,
+        }
+    }
+}
+
+/// One entry of `concepts.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ConceptEntry {
+    /// Relative to the stage's folder.
+    pub image: PathBuf,
+    /// What was asked for, and the key of its noise.
+    #[serde(flatten)]
+    pub concept: Concept,
+}
+
+/// `concepts.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ConceptList {
+    /// The class.
+    pub class: String,
+    /// The caption under which the images are trained.
+    pub class_prompt: String,
+    /// In the order of `latents.safetensors`.
+    pub concepts: Vec<ConceptEntry>,
+}
+
+/// What the stage did.
+pub struct Done {
+    folder: PathBuf,
+    manifest: Manifest,
+    made: usize,
+    reused: usize,
+}
+
+/// Runs the stage.
+pub fn run(session: &Session) -> anyhow::Result<Done> {
+    let table: ConceptsTable = session.config.table("concepts")?;
+    let model_table: ModelTable = session.config.table("model")?;
+    let scene: SceneConfig = session.config.table("scene")?;
+    let class = scene.class.unwrap_or_else(|| "object".into());
+    if table.steps == 0 || !(table.guidance >= 0.0 && table.guidance.is_finite()) {
+        return Err(session
+            .config
+            .invalid("concepts.steps", "steps must be at least 1 and guidance not negative")
+            .into());
+    }
+    let cache_setting = ConceptsTable { cache: None, ..table.clone() };
+    let params = json!({"concepts": cache_setting, "class": class, "precision": model_table.precision});
+    let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
+    plan.device = session.pipeline.device.clone();
+    model::inputs(session, &model_table, &mut plan)?;
+    let cache = cache_folder(session, &table, &plan, &class)?;
+    let folder = session.stage_folder(STAGE);
+    let mut writer = StageWriter::begin(&folder, plan, session.when_locked)?;
+    let model = model::load(session, &model_table)?;
+    let side = table.size.unwrap_or_else(|| model::native_size(&model));
+
+    let mut list = ConceptList { class_prompt: class_prompt(&class), class, concepts: vec![] };
+    let (mut latents, mut made) = (vec![], 0);
+    let progress = session.progress("concepts");
+    for index in 0..table.count {
+        interrupt::check()?;
+        let concept = concept(&list.class, index, session.pipeline.seed);
+        let stem = format!("{index:04}");
+        let (png, tensor) = (cache.join(format!("{stem}.png")), cache.join(format!("{stem}.safetensors")));
+        // The latents are written last: their presence says that both are whole.
+        if !tensor.is_file() || !png.is_file() {
+            let settings = GenerateSettings {
+                solver: Solver::DpmSolver2M,
+                steps: table.steps,
+                guidance: table.guidance,
+                size: (side, side),
+                seed: concept.seed,
+            };
+            let share = |part: f64| (index as f64 + part) / table.count as f64;
+            make(&model, &concept, &settings, &png, &tensor, |part| progress.set(share(part)))?;
+            made += 1;
+        }
+        latents.push(read_latents(&tensor)?);
+        let name = PathBuf::from(format!("images/{stem}.png"));
+        let target = writer.output("image", &name)?;
+        std::fs::copy(&png, &target).with_context(|| format!("cannot copy {}", png.display()))?;
+        list.concepts.push(ConceptEntry { image: name, concept });
+    }
+    progress.done();
+    if !latents.is_empty() {
+        let path = writer.output("latents", "latents.safetensors")?;
+        let all = BTreeMap::from([("latents".to_owned(), Tensor::cat(&latents, 0)?)]);
+        write_safetensors(&path, &all, &BTreeMap::new())?;
+    }
+    writer.write_json("concepts", "concepts.json", &list)?;
+    let manifest = writer.finish()?;
+    Ok(Done { folder, manifest, made, reused: table.count - made })
+}
+
+/// The cache of this class, model and settings: named by what decides an image, not by how many
+/// there are.
+fn cache_folder(session: &Session, table: &ConceptsTable, plan: &StagePlan, class: &str) -> anyhow::Result<PathBuf> {
+    let root = match &table.cache {
+        Some(path) => session.resolve(path),
+        None => session.out.join("concepts-cache"),
+    };
+    let setting = json!({
+        "version": VERSION, "class": class, "steps": table.steps, "guidance": table.guidance, "size": table.size,
+        "seed": plan.seed, "device": plan.device, "precision": plan.params["precision"],
+        "model": plan.inputs.iter().map(|i| &i.blake3).collect::<Vec<_>>(),
+    });
+    let key = blake3::hash(setting.to_string().as_bytes()).to_hex();
+    let folder = root.join(&key.as_str()[..16]);
+    model::create_folder(&folder)?;
+    Ok(folder)
+}
+
+fn make(
+    model: &Model,
+    concept: &Concept,
+    settings: &GenerateSettings,
+    png: &Path,
+    tensor: &Path,
+    mut progress: impl FnMut(f64),
+) -> anyhow::Result<()> {
+    let outcome = generate(model, &concept.prompt, settings, &Pass::default(), None, |part| {
+        progress(part);
+        !interrupt::asked()
+    });
+    interrupt::check()?;
+    let generated = outcome?;
+    let partial = png.with_extension("partial.png");
+    write_png(&partial, &model::to_display(&generated.image)?)?;
+    std::fs::rename(&partial, png).with_context(|| format!("cannot write {}", png.display()))?;
+    let latents = generated.latents.to_device(&Device::Cpu)?.to_dtype(DType::F32)?;
+    write_safetensors(tensor, &BTreeMap::from([("latents".to_owned(), latents)]), &BTreeMap::new())?;
+    Ok(())
+}
+
+/// The tensor `latents` of a file of this stage.
+pub fn read_latents(path: &Path) -> anyhow::Result<Tensor> {
+    Weights::open_file(path)?
+        .tensor("latents", DType::F32, &Device::Cpu)?
+        .with_context(|| format!("{} holds no tensor \"latents\"; delete it and run {EXECUTABLE} again", path.display()))
+}
+
+impl Done {
+    /// For programs.
+    pub fn to_json(&self) -> Value {
+        json!({
+            "folder": self.folder, "made": self.made, "reused": self.reused,
+            "elapsed_s": self.manifest.elapsed_s, "peak_rss_bytes": self.manifest.peak_rss_bytes,
+        })
+    }
+}
+
+impl fmt::Display for Done {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "wrote {} in {}", self.folder.display(), duration(self.manifest.elapsed_s))?;
+        write!(f, "  {} images made, {} from the cache", self.made, self.reused)
+    }
+}

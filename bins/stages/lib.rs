@@ -1,0 +1,26 @@
+//! The stages behind the executables: each a function from a session to a folder of artifacts.
+pub mod background;
+pub mod composite;
+pub mod light;
+pub mod scene;
+
+use std::ops::ControlFlow;
+
+use dipir_cli::interrupt::{self, Interrupted};
+use dipir_render::error::RenderError;
+
+/// Whether a long computation goes on.
+fn interruption() -> ControlFlow<()> {
+    match interrupt::asked() {
+        true => ControlFlow::Break(()),
+        false => ControlFlow::Continue(()),
+    }
+}
+
+/// A renderer's error; its interruption is the user's.
+fn render_error(error: RenderError) -> anyhow::Error {
+    match error {
+        RenderError::Interrupted => Interrupted.into(),
+        other => other.into(),
+    }
+}

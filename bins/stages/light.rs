@@ -1,0 +1,121 @@
+//! Which light a stage works under.
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::Context;
+use dipir_cli::session::Session;
+use dipir_light::environment::EnvironmentMap;
+use glam::Vec3;
+use serde_json::{Value, json};
+
+use crate::composite::CompositeTable;
+
+/// A light and where it came from.
+pub struct Light {
+    /// Radiance from everywhere, on the photograph's scale.
+    pub map: Arc<EnvironmentMap>,
+    /// The file, as the configuration names it and where it is; `None` for a built-in light.
+    pub file: Option<(PathBuf, PathBuf)>,
+    /// What decides the light beside the file's content.
+    pub params: Value,
+}
+
+/// The map of `[composite] environment`, exposed and turned; `None` if the key is not set.
+pub fn known(session: &Session, table: &CompositeTable) -> anyhow::Result<Option<Light>> {
+    let Some(path) = &table.environment else {
+        return Ok(None);
+    };
+    let location = session.resolve(path);
+    let map = EnvironmentMap::read(&location)
+        .with_context(|| format!("cannot use composite.environment = \"{}\"", path.display()))?;
+    let largest = map
+        .texels()
+        .iter()
+        .fold(0.0, |m: f32, t| m.max(t.max_element()));
+    let exposure = table.exposure_ev.exp2();
+    if !(largest * exposure).is_finite() {
+        return Err(session
+            .config
+            .invalid(
+                "composite.exposure_ev",
+                format!(
+                    "{} stops take the map's largest radiance, {largest}, beyond what 32-bit \
+                     numbers hold; expose it less",
+                    table.exposure_ev
+                ),
+            )
+            .into());
+    }
+    let map = map
+        .scaled(exposure)
+        .rotated_y(f64::from(table.rotation_deg).to_radians());
+    Ok(Some(Light {
+        map: Arc::new(map),
+        file: Some((path.clone(), location)),
+        params: json!({
+            "environment": path,
+            "exposure_ev": table.exposure_ev,
+            "rotation_deg": table.rotation_deg,
+        }),
+    }))
+}
+
+/// Irradiance of the pilot light's sun on a surface that faces it; with the sky's, a white
+/// horizontal surface has a radiance of about 1.
+const PILOT_SUN_IRRADIANCE: f32 = 2.8;
+/// Radiance of the pilot light's sky.
+const PILOT_SKY: f32 = 0.35;
+/// Radiance of the ground below the pilot light's horizon.
+const PILOT_GROUND: f32 = 0.2;
+
+/// The light under which effects are planned as long as no other is known: a grey sky with a sun
+/// at 45 degrees, to the left of and behind a camera that looks down -z. Grey and sharp at once,
+/// it shows every effect of materials and shadows without favouring a colour.
+pub fn pilot() -> Light {
+    const WIDTH: usize = 128;
+    const HEIGHT: usize = WIDTH / 2;
+    let sun = Vec3::new(-0.5, std::f32::consts::FRAC_1_SQRT_2, 0.5);
+    let mut texels: Vec<Vec3> = (0..WIDTH * HEIGHT)
+        .map(|n| {
+            Vec3::splat(if n / WIDTH < HEIGHT / 2 {
+                PILOT_SKY
+            } else {
+                PILOT_GROUND
+            })
+        })
+        .collect();
+    let map = EnvironmentMap::constant(WIDTH, HEIGHT, Vec3::ZERO);
+    let (row, column) = map.texel_of(sun);
+    texels[row * WIDTH + column] += PILOT_SUN_IRRADIANCE / map.solid_angle(row) as f32;
+    let map = EnvironmentMap::new(WIDTH, HEIGHT, texels).unwrap_or(map);
+    Light {
+        map: Arc::new(map),
+        file: None,
+        params: json!("pilot: sun and sky"),
+    }
+}
+
+/// The error of a stage that needs a light where there is none.
+pub fn missing(recovered: &Path) -> anyhow::Error {
+    anyhow::anyhow!(
+        "there is no light: [composite] environment is not set and {} is missing; name a map, as \
+         in --set composite.environment=sky.hdr, or run dipir-optimize first",
+        recovered.display()
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_light::cosine::CosineWeightedMap;
+
+    use super::*;
+
+    #[test]
+    fn the_pilot_light_shows_a_white_floor_at_a_radiance_of_about_one() {
+        let light = pilot();
+        let irradiance = CosineWeightedMap::new(light.map, Vec3::Y).irradiance();
+        // Sun: 2.8 cos 45 = 1.98 (to the texel's extent); sky: 0.35 pi = 1.10; over pi: 0.98.
+        assert!((irradiance.x / std::f64::consts::PI - 0.98).abs() < 0.03);
+        assert_eq!(irradiance.x, irradiance.y);
+    }
+}

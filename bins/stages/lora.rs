@@ -1,0 +1,440 @@
+//! The LoRA stage: personalises the model to the photograph, keeping the object's class.
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use candle_core::Tensor;
+use dipir_cli::interrupt;
+use dipir_cli::session::{Session, duration};
+use dipir_diffusion::crop::{CropBox, resample};
+use dipir_diffusion::distillation::InpaintCondition;
+use dipir_diffusion::generate::{GenerateSettings, generate};
+use dipir_diffusion::lora::{LoraInfo, LoraStyle};
+use dipir_diffusion::model::Model;
+use dipir_diffusion::noise::NoiseStream;
+use dipir_diffusion::pass::Pass;
+use dipir_diffusion::sampler::Solver;
+use dipir_diffusion::training::{Example, LoraTrainer, StepReport, TrainingConfig, TrainingData};
+use dipir_imaging::file::{read_photo, write_png};
+use dipir_imaging::transfer::Transfer;
+use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::stage::{StagePlan, StageWriter};
+use dipir_scene::config::SceneConfig;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::concepts::{self, ConceptList, read_latents};
+use crate::model::{self, ModelTable};
+
+/// Name of the stage and of its folder.
+pub const STAGE: &str = "lora";
+/// The executable that runs it.
+pub const EXECUTABLE: &str = "dipir-lora";
+/// Raised whenever the same inputs give other outputs.
+pub const VERSION: u32 = 1;
+
+/// The `[lora]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LoraTable {
+    /// Rank of the adapters.
+    pub rank: usize,
+    /// Scale times rank; the rank by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alpha: Option<f64>,
+    /// Updates.
+    pub steps: usize,
+    /// Learning rate of the adapters.
+    pub learning_rate: f64,
+    /// Updates over which it rises from 0.
+    pub warmup_steps: usize,
+    /// Examples of each kind for one update.
+    pub accumulation: usize,
+    /// Weight of the concept images' loss.
+    pub prior_weight: f64,
+    /// Smallest crop of the photograph, as a share of its shorter side.
+    pub min_crop: f64,
+    /// The word that stands for the photograph's light.
+    pub word: String,
+    /// Learn an embedding for that word, too.
+    pub learn_word: bool,
+    /// Learning rate of the embedding.
+    pub word_learning_rate: f64,
+    /// Recompute activations: less memory, a third more time.
+    pub recompute: bool,
+    /// Updates between checkpoints; 0 for none.
+    pub checkpoint_every: usize,
+    /// Updates between sample images; 0 for none.
+    pub sample_every: usize,
+}
+
+impl Default for LoraTable {
+    fn default() -> Self {
+        let training = TrainingConfig::default();
+        Self {
+            rank: training.rank,
+            alpha: None,
+            steps: training.steps,
+            learning_rate: training.learning_rate,
+            warmup_steps: training.warmup_steps,
+            accumulation: training.accumulation,
+            prior_weight: training.prior_weight,
+            min_crop: 0.5,
+            word: "sks".into(),
+            learn_word: false,
+            word_learning_rate: training.token_learning_rate,
+            recompute: training.recompute,
+            checkpoint_every: 50,
+            sample_every: 0,
+        }
+    }
+}
+
+impl LoraTable {
+    fn training(&self, seed: u64) -> TrainingConfig {
+        TrainingConfig {
+            rank: self.rank,
+            alpha: self.alpha.unwrap_or(self.rank as f64),
+            steps: self.steps,
+            learning_rate: self.learning_rate,
+            token_learning_rate: self.word_learning_rate,
+            warmup_steps: self.warmup_steps,
+            accumulation: self.accumulation,
+            prior_weight: self.prior_weight,
+            recompute: self.recompute,
+            seed,
+            ..TrainingConfig::default()
+        }
+    }
+
+    /// The caption of the photograph's crops.
+    fn instance_prompt(&self) -> String {
+        format!("a scene in the style of {} rendering", self.word)
+    }
+}
+
+/// What the stage did.
+pub struct Done {
+    folder: PathBuf,
+    manifest: Manifest,
+    history: Vec<StepReport>,
+    resumed_at: usize,
+}
+
+/// Crops of the photograph and images of the class.
+struct Data<'a> {
+    model: &'a Model,
+    photo: Tensor,
+    size: usize,
+    min_crop: f64,
+    prompt: String,
+    class_prompt: String,
+    concepts: Option<Tensor>,
+}
+
+impl Data<'_> {
+    fn place(&self, tensor: &Tensor) -> dipir_diffusion::Result<Tensor> {
+        Ok(tensor.to_device(self.model.device())?.to_dtype(self.model.dtype())?)
+    }
+
+    /// A rectangle to paint, of 0.3 to 0.9 of each side, for inpainting models.
+    fn mask(&self, image: &Tensor, stream: &mut NoiseStream) -> dipir_diffusion::Result<Option<InpaintCondition>> {
+        if !self.model.is_inpainting() {
+            return Ok(None);
+        }
+        let (_, _, height, width) = image.dims4()?;
+        let mut span = |n: usize| {
+            let length = ((0.3 + 0.6 * stream.uniform()) * n as f64) as usize;
+            let first = stream.below(n - length + 1);
+            first..first + length
+        };
+        let (rows, columns) = (span(height), span(width));
+        let values: Vec<f32> = (0..height * width)
+            .map(|i| if rows.contains(&(i / width)) && columns.contains(&(i % width)) { 1.0 } else { 0.0 })
+            .collect();
+        let mask = self.place(&Tensor::from_vec(values, (1, 1, height, width), image.device())?)?;
+        Ok(Some(InpaintCondition::new(&self.model.vae, image, &mask)?))
+    }
+}
+
+impl TrainingData for Data<'_> {
+    fn instance(&self, stream: &mut NoiseStream) -> dipir_diffusion::Result<Example> {
+        let (_, height, width) = self.photo.dims3()?;
+        let region = CropBox::random(width, height, self.min_crop, stream);
+        let image = self.place(&resample(&self.photo, region, self.size)?)?;
+        let inpaint = self.mask(&image, stream)?;
+        Ok(Example { latents: self.model.vae.encode(&image, None)?.detach(), prompt: self.prompt.clone(), inpaint })
+    }
+
+    fn prior(&self, stream: &mut NoiseStream) -> dipir_diffusion::Result<Option<Example>> {
+        let Some(concepts) = &self.concepts else { return Ok(None) };
+        let index = stream.below(concepts.dim(0)?);
+        let latents = self.place(&concepts.narrow(0, index, 1)?)?;
+        let inpaint = match self.model.is_inpainting() {
+            true => self.mask(&self.model.vae.decode(&latents)?.detach(), stream)?,
+            false => None,
+        };
+        Ok(Some(Example { latents, prompt: self.class_prompt.clone(), inpaint }))
+    }
+}
+
+/// Runs the stage.
+pub fn run(session: &Session) -> anyhow::Result<Done> {
+    let table: LoraTable = session.config.table("lora")?;
+    let model_table: ModelTable = session.config.table("model")?;
+    let scene: SceneConfig = session.config.table("scene")?;
+    let background = scene
+        .background
+        .as_ref()
+        .ok_or_else(|| session.config.invalid("scene.background", "is missing: name the photograph"))?;
+    let transfer: Transfer = match scene.transfer.as_deref() {
+        None | Some("srgb") => Transfer::Srgb,
+        Some("gamma22") => Transfer::Gamma22,
+        Some("linear") => Transfer::Linear,
+        Some(_) => {
+            return Err(session.config.invalid("scene.transfer", "accepted: srgb, gamma22, linear").into());
+        }
+    };
+    if !(table.min_crop > 0.0 && table.min_crop <= 1.0) {
+        return Err(session.config.invalid("lora.min_crop", "accepted: above 0, up to 1").into());
+    }
+    let photo_file = session.resolve(background);
+    let (list, concept_files) = read_concepts(session, &table)?;
+
+    let params = json!({
+        "lora": table, "transfer": scene.transfer, "precision": model_table.precision,
+    });
+    let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
+    plan.device = session.pipeline.device.clone();
+    plan.input("background", background, &photo_file)?;
+    for (name, location) in &concept_files {
+        plan.input("concepts", Path::new(name), location)?;
+    }
+    model::inputs(session, &model_table, &mut plan)?;
+    let base_hash = plan.inputs.iter().find(|i| i.path.to_string_lossy().contains("unet/diffusion")).map(|i| i.blake3.clone());
+    let folder = session.stage_folder(STAGE);
+    let fingerprint = blake3::hash(serde_json::to_string(&json!([plan.inputs, without_steps(&table)]))?.as_bytes());
+    let mut writer = StageWriter::begin(&folder, plan, session.when_locked)?;
+
+    let mut model = model::load(session, &model_table)?;
+    let start = table.learn_word.then(|| learnable(&mut model, &table.word)).transpose()?;
+    let photo = read_photo(&photo_file, transfer)?;
+    let data = Data {
+        photo: model::from_display(&photo.transfer.encode(&photo.image))?,
+        size: model::native_size(&model),
+        min_crop: table.min_crop,
+        prompt: table.instance_prompt(),
+        class_prompt: list.as_ref().map(|l| l.class_prompt.clone()).unwrap_or_default(),
+        concepts: match concept_files.get(1) {
+            Some((_, location)) => Some(read_latents(location)?),
+            None => None,
+        },
+        model: &model,
+    };
+    let mut trainer = LoraTrainer::new(&model, table.training(session.pipeline.seed), start.as_ref())?;
+    let resume = Resume::open(session, fingerprint.to_hex().as_str())?;
+    let mut history = resume.restore(session, &mut trainer, table.steps);
+    let resumed_at = trainer.steps();
+    if resumed_at > 0 {
+        session.remark(|| format!("continuing after update {resumed_at}"));
+    }
+    let progress = session.progress("lora");
+    while trainer.steps() < table.steps {
+        if interrupt::asked() {
+            resume.save(&trainer, &history)?;
+            interrupt::check()?;
+        }
+        let report = trainer.step(&data).context("fine-tuning stopped")?;
+        progress.set(report.step as f64 / table.steps as f64);
+        progress.say(format!("loss {:.4}", report.loss));
+        history.push(report);
+        if table.sample_every > 0 && report.step % table.sample_every == 0 {
+            show(&model, &trainer, &data, &mut writer, report.step)?;
+        }
+        if table.checkpoint_every > 0 && report.step % table.checkpoint_every == 0 {
+            resume.save(&trainer, &history)?;
+        }
+    }
+    progress.done();
+    write_results(session, &table, &trainer, &data, base_hash, &history, &mut writer)?;
+    let manifest = writer.finish()?;
+    resume.remove();
+    Ok(Done { folder, manifest, history, resumed_at })
+}
+
+/// What decides the course of a run; how long it is does not.
+fn without_steps(table: &LoraTable) -> LoraTable {
+    LoraTable { steps: 0, checkpoint_every: 0, sample_every: 0, ..table.clone() }
+}
+
+/// Gives `word` a token of its own and returns the embedding that it starts from: the mean of
+/// the tokens that the word had.
+fn learnable(model: &mut Model, word: &str) -> anyhow::Result<Tensor> {
+    let tokens = model.tokenizer.words(word)?;
+    let rows = tokens.iter().map(|&t| model.text_encoder.embedding(t)).collect::<Result<Vec<_>, _>>()?;
+    anyhow::ensure!(!rows.is_empty(), "lora.word = \"{word}\" has no token; name a word");
+    let token = model.text_encoder.config().vocab_size as u32;
+    model.tokenizer.add_placeholder(word, token);
+    Ok(Tensor::stack(&rows, 0)?.mean(0)?)
+}
+
+/// The concept list and its two files, unless concept preservation is off.
+#[allow(clippy::type_complexity)]
+fn read_concepts(
+    session: &Session,
+    table: &LoraTable,
+) -> anyhow::Result<(Option<ConceptList>, Vec<(String, PathBuf)>)> {
+    let concepts: concepts::ConceptsTable = session.config.table("concepts")?;
+    if concepts.count == 0 || table.prior_weight == 0.0 {
+        return Ok((None, vec![]));
+    }
+    let folder = session.stage_folder(concepts::STAGE);
+    Manifest::read(&folder, concepts::EXECUTABLE)?;
+    let path = folder.join("concepts.json");
+    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    let list: ConceptList = serde_json::from_str(&text).with_context(|| {
+        format!("{} is damaged; run {} again", path.display(), concepts::EXECUTABLE)
+    })?;
+    if list.concepts.is_empty() {
+        return Ok((None, vec![]));
+    }
+    let named = |name: &str| (format!("concepts/{name}"), folder.join(name));
+    Ok((Some(list), vec![named("concepts.json"), named("latents.safetensors")]))
+}
+
+/// Where an interrupted run goes on.
+struct Resume {
+    folder: PathBuf,
+}
+
+impl Resume {
+    fn open(session: &Session, fingerprint: &str) -> anyhow::Result<Self> {
+        let folder = session.out.join("lora-checkpoints").join(&fingerprint[..16]);
+        model::create_folder(&folder)?;
+        Ok(Self { folder })
+    }
+
+    /// Loads the last checkpoint, if there is a usable one; returns its history.
+    fn restore(&self, session: &Session, trainer: &mut LoraTrainer, steps: usize) -> Vec<StepReport> {
+        let path = self.folder.join("checkpoint.safetensors");
+        let history = std::fs::read(self.folder.join("history.json"))
+            .ok()
+            .and_then(|text| serde_json::from_slice::<Vec<StepReport>>(&text).ok())
+            .unwrap_or_default();
+        if !path.is_file() {
+            return vec![];
+        }
+        let usable = trainer.resume(&path).map_err(anyhow::Error::from).and_then(|()| {
+            anyhow::ensure!(trainer.steps() <= steps, "it has {} updates, {steps} are wanted", trainer.steps());
+            anyhow::ensure!(history.len() >= trainer.steps(), "its history is incomplete");
+            Ok(())
+        });
+        match usable {
+            Ok(()) => history[..trainer.steps()].to_vec(),
+            Err(e) => {
+                session.warn(&format!("{} is not used: {e}", path.display()));
+                if trainer.steps() > 0 {
+                    let _ = trainer.reset();
+                }
+                vec![]
+            }
+        }
+    }
+
+    /// The history first: it may be longer than the checkpoint, never shorter.
+    fn save(&self, trainer: &LoraTrainer, history: &[StepReport]) -> anyhow::Result<()> {
+        let path = self.folder.join("history.json");
+        let partial = self.folder.join("history.partial");
+        std::fs::write(&partial, serde_json::to_vec(history)?)
+            .and_then(|()| std::fs::rename(&partial, &path))
+            .with_context(|| format!("cannot write {}", path.display()))?;
+        trainer.save_checkpoint(&self.folder.join("checkpoint.safetensors"))?;
+        Ok(())
+    }
+
+    fn remove(&self) {
+        let _ = std::fs::remove_dir_all(&self.folder);
+        // Only if nothing else is in it.
+        let _ = self.folder.parent().map(std::fs::remove_dir);
+    }
+}
+
+/// A sample under the photograph's caption.
+fn show(
+    model: &Model,
+    trainer: &LoraTrainer,
+    data: &Data,
+    writer: &mut StageWriter,
+    step: usize,
+) -> anyhow::Result<()> {
+    let settings =
+        GenerateSettings { solver: Solver::DpmSolver2M, steps: 20, guidance: 5.0, size: (data.size, data.size), seed: 1 };
+    let pass = Pass::with_lora(trainer.lora());
+    let generated = generate(model, &data.prompt, &settings, &pass, trainer.learned().as_ref(), |_| !interrupt::asked());
+    interrupt::check()?;
+    let path = writer.output("sample", format!("samples/{step:06}.png"))?;
+    write_png(&path, &model::to_display(&generated?.image)?)?;
+    Ok(())
+}
+
+fn write_results(
+    session: &Session,
+    table: &LoraTable,
+    trainer: &LoraTrainer,
+    data: &Data,
+    base_hash: Option<String>,
+    history: &[StepReport],
+    writer: &mut StageWriter,
+) -> anyhow::Result<()> {
+    let info = LoraInfo::from([
+        ("instance_prompt".to_owned(), data.prompt.clone()),
+        ("class_prompt".to_owned(), data.class_prompt.clone()),
+        ("base_model_blake3".to_owned(), base_hash.unwrap_or_default()),
+        ("steps".to_owned(), trainer.steps().to_string()),
+    ]);
+    trainer.lora().save(&writer.output("lora", "lora.safetensors")?, LoraStyle::Peft, &info)?;
+    trainer.lora().save(&writer.output("lora_kohya", "lora_kohya.safetensors")?, LoraStyle::Kohya, &info)?;
+    if table.learn_word {
+        trainer.save_token(&writer.output("word", "word.safetensors")?, &table.word)?;
+    }
+    let training = json!({
+        "settings": table.training(session.pipeline.seed), "word": table.word,
+        "instance_prompt": data.prompt, "class_prompt": data.class_prompt, "history": history,
+    });
+    writer.write_json("training", "training.json", &training)?;
+    Ok(())
+}
+
+impl Done {
+    /// Mean loss over a tenth of the run, at its end or its start.
+    fn loss(&self, at_end: bool) -> f64 {
+        let n = self.history.len().div_ceil(10).max(1);
+        let reports: Vec<f64> = match at_end {
+            true => self.history.iter().rev().take(n).map(|r| r.loss).collect(),
+            false => self.history.iter().take(n).map(|r| r.loss).collect(),
+        };
+        reports.iter().sum::<f64>() / reports.len().max(1) as f64
+    }
+
+    /// For programs.
+    pub fn to_json(&self) -> Value {
+        json!({
+            "folder": self.folder, "steps": self.history.len(), "resumed_at": self.resumed_at,
+            "loss_at_start": self.loss(false), "loss_at_end": self.loss(true),
+            "elapsed_s": self.manifest.elapsed_s, "peak_rss_bytes": self.manifest.peak_rss_bytes,
+        })
+    }
+}
+
+impl fmt::Display for Done {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "wrote {} in {}", self.folder.display(), duration(self.manifest.elapsed_s))?;
+        write!(
+            f,
+            "  {} updates, loss {:.4} at the start, {:.4} at the end (means of a tenth)",
+            self.history.len(),
+            self.loss(false),
+            self.loss(true)
+        )
+    }
+}

@@ -1,0 +1,125 @@
+//! The diffusion model of the `[model]` table.
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use candle_core::{DType, Device, Tensor};
+use dipir_cli::exit::Usage;
+use dipir_cli::session::Session;
+use dipir_diffusion::model::Model;
+use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_pipeline::stage::StagePlan;
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+/// The `[model]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ModelTable {
+    /// A folder in the diffusers layout.
+    pub path: PathBuf,
+    /// `f32`, or on a GPU `bf16` or `f16`.
+    pub precision: String,
+}
+
+impl Default for ModelTable {
+    fn default() -> Self {
+        Self {
+            path: "data/prior".into(),
+            precision: "f32".into(),
+        }
+    }
+}
+
+/// Loads the model onto the session's device.
+pub fn load(session: &Session, table: &ModelTable) -> anyhow::Result<Model> {
+    let device = device(&session.pipeline.device)?;
+    let dtype = match table.precision.as_str() {
+        "f32" => DType::F32,
+        "bf16" => DType::BF16,
+        "f16" => DType::F16,
+        other => {
+            let message = format!("\"{other}\" is no precision; accepted: f32, bf16, f16");
+            return Err(session.config.invalid("model.precision", message).into());
+        }
+    };
+    let folder = session.resolve(&table.path);
+    Model::load(&folder, dtype, &device)
+        .with_context(|| format!("cannot use model.path = \"{}\"", table.path.display()))
+}
+
+fn device(name: &str) -> anyhow::Result<Device> {
+    match name.split_once(':') {
+        None if name == "cpu" => Ok(Device::Cpu),
+        None if name == "auto" => Ok(if candle_core::utils::cuda_is_available() {
+            Device::new_cuda(0)?
+        } else {
+            Device::Cpu
+        }),
+        Some(("cuda", number)) if number.parse::<usize>().is_ok() => {
+            if !candle_core::utils::cuda_is_available() {
+                let message = format!(
+                    "pipeline.device = \"{name}\": this build has no CUDA; use \"cpu\", or build with --features cuda"
+                );
+                return Err(Usage(message).into());
+            }
+            Ok(Device::new_cuda(number.parse()?)?)
+        }
+        _ => {
+            let message = format!("pipeline.device = \"{name}\"; accepted: cpu, cuda:N, auto");
+            Err(Usage(message).into())
+        }
+    }
+}
+
+/// Enters every file of the model into the plan of a stage.
+pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> anyhow::Result<()> {
+    let folder = session.resolve(&table.path);
+    for part in ["", "unet", "vae", "text_encoder", "tokenizer", "scheduler"] {
+        let mut names: Vec<PathBuf> = match std::fs::read_dir(folder.join(part)) {
+            Ok(entries) => entries
+                .filter_map(|e| e.ok().map(|e| PathBuf::from(e.file_name())))
+                .collect(),
+            Err(_) => continue, // loading says what is missing
+        };
+        names.sort();
+        for name in names {
+            let used = name.extension().is_some_and(|e| e == "json" || e == "safetensors" || e == "txt");
+            let location = folder.join(part).join(&name);
+            if used && location.is_file() {
+                let path = table.path.join(part).join(&name);
+                plan.input("model", &path, &location)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// An image tensor [1, 3, h, w] in [-1, 1] as display values.
+pub fn to_display(image: &Tensor) -> anyhow::Result<DisplayImage> {
+    let (_, _, height, width) = image.dims4()?;
+    let planes = image.to_device(&Device::Cpu)?.to_dtype(DType::F32)?.flatten_all()?.to_vec1::<f32>()?;
+    let n = height * width;
+    let at = |i: usize| (planes[i] * 0.5 + 0.5).clamp(0.0, 1.0);
+    let pixels = (0..n).map(|i| Vec3::new(at(i), at(n + i), at(2 * n + i))).collect();
+    Ok(DisplayImage(Raster::from_pixels(width, height, pixels)))
+}
+
+/// Display values as an image tensor [3, h, w] in [-1, 1].
+pub fn from_display(image: &DisplayImage) -> anyhow::Result<Tensor> {
+    let raster = &image.0;
+    let mut planes = Vec::with_capacity(3 * raster.pixels().len());
+    for channel in 0..3 {
+        planes.extend(raster.pixels().iter().map(|p| p[channel] * 2.0 - 1.0));
+    }
+    Ok(Tensor::from_vec(planes, (3, raster.height(), raster.width()), &Device::Cpu)?)
+}
+
+/// The side of the images that the model was trained on, in pixels.
+pub fn native_size(model: &Model) -> usize {
+    model.unet.config().sample_size * model.vae.downscale()
+}
+
+/// Creates a folder and its parents.
+pub fn create_folder(path: &Path) -> anyhow::Result<()> {
+    std::fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))
+}

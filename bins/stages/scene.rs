@@ -1,0 +1,178 @@
+//! The scene stage: reads everything once, decides what to simulate, and writes down both.
+use std::fmt;
+use std::path::PathBuf;
+
+use dipir_cli::exit::Usage;
+use dipir_cli::interrupt;
+use dipir_cli::session::{Session, duration};
+use dipir_light::environment::EnvironmentSampler;
+use dipir_pipeline::config::Config;
+use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::stage::StagePlan;
+use dipir_render::effects::{EffectsPlan, plan};
+use dipir_render::gbuffer::GBuffer;
+use dipir_render::render::{Renderer, Settings};
+use dipir_scene::config::SceneConfig;
+use dipir_scene::scene::{LoadedScene, Scene};
+use serde_json::{Value, json};
+
+use crate::composite::CompositeTable;
+use crate::interruption;
+use crate::light::{self, Light};
+
+/// Name of the stage and of its folder.
+pub const STAGE: &str = "scene";
+/// The executable that runs it.
+pub const EXECUTABLE: &str = "dipir-scene";
+/// Raised whenever the same inputs give other outputs.
+pub const VERSION: u32 = 1;
+
+/// What the stage did.
+pub struct Done {
+    folder: PathBuf,
+    manifest: Manifest,
+    effects: EffectsPlan,
+    triangles: usize,
+    materials: usize,
+    resolution: [u32; 2],
+}
+
+/// Runs the stage.
+pub fn run(session: &Session) -> anyhow::Result<Done> {
+    let config: SceneConfig = session.config.table("scene")?;
+    let composite: CompositeTable = session.config.table("composite")?;
+    composite.check(&session.config)?;
+    let mut loaded = Scene::load(&config, &session.config.base_dir())
+        .map_err(|e| with_place(e, &session.config))?;
+    for warning in &loaded.warnings {
+        session.warn(warning);
+    }
+    let light = light::known(session, &composite)?.unwrap_or_else(light::pilot);
+    let stage_plan = stage_plan(session, &config, &loaded, &light)?;
+    let folder = session.stage_folder(STAGE);
+    let mut writer = session.begin(stage_plan)?;
+
+    let settings = Settings {
+        seed: session.pipeline.seed,
+        background: Some(&loaded.photo.image),
+        transfer: loaded.photo.transfer,
+        occluders: loaded.occluders.as_ref(),
+        ..Settings::default()
+    };
+    let renderer = Renderer::new(&loaded.scene);
+    let progress = session.progress("effects");
+    let effects = plan(
+        &renderer,
+        &EnvironmentSampler::new(light.map.clone()),
+        &config.effects,
+        &settings,
+        &mut |fraction| {
+            progress.set(fraction);
+            interruption()
+        },
+    )
+    .map_err(crate::render_error)?;
+    progress.done();
+    writer.write_json("effects", "effects.json", &effects)?;
+    loaded.description.seed = session.pipeline.seed;
+    writer.write_json("scene", "scene.json", &loaded.description)?;
+    let gbuffer = GBuffer::new(&renderer, session.pipeline.seed).map_err(crate::render_error)?;
+    interrupt::check()?;
+    let path = writer.output("gbuffer", "gbuffer.exr")?;
+    gbuffer.to_layers()?.write_exr(path)?;
+    if let Some(left_out) = effects.left_out {
+        writer.set_estimated_error(left_out);
+    }
+    let manifest = writer.finish()?;
+    Ok(Done {
+        folder,
+        manifest,
+        effects,
+        triangles: loaded.scene.mesh.indices.len(),
+        materials: loaded.scene.materials.len(),
+        resolution: loaded.scene.camera.resolution,
+    })
+}
+
+fn stage_plan(
+    session: &Session,
+    config: &SceneConfig,
+    loaded: &LoadedScene,
+    light: &Light,
+) -> anyhow::Result<StagePlan> {
+    let params = json!({"scene": serde_json::to_value(config)?, "light": light.params});
+    let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
+    for input in &loaded.inputs {
+        plan.input(&input.role, &input.path, &input.location)?;
+    }
+    if let Some((path, location)) = &light.file {
+        plan.input("environment", path, location)?;
+    }
+    Ok(plan)
+}
+
+/// An error about a key says where the key stands, and is the configuration's fault.
+fn with_place(error: dipir_scene::Error, config: &Config) -> anyhow::Error {
+    use dipir_scene::Error::{Conflict, Missing};
+    let key = match &error {
+        dipir_scene::Error::Config { key, .. } | Missing { key, .. } => key,
+        Conflict { first, .. } => first,
+        _ => return anyhow::Error::new(error).context("the scene cannot be set up"),
+    };
+    let dotted = key.replace('[', ".").replace(']', "");
+    Usage(format!("{}: {error}", config.nearest_place(&dotted))).into()
+}
+
+impl Done {
+    /// For programs.
+    pub fn to_json(&self) -> Value {
+        json!({
+            "folder": self.folder,
+            "triangles": self.triangles,
+            "materials": self.materials,
+            "resolution": self.resolution,
+            "effects": self.effects.effects,
+            "max_depth": self.effects.max_depth,
+            "elapsed_s": self.manifest.elapsed_s,
+            "peak_rss_bytes": self.manifest.peak_rss_bytes,
+            "estimated_error": self.manifest.estimated_error,
+        })
+    }
+}
+
+impl fmt::Display for Done {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let on: Vec<&str> = self
+            .effects
+            .effects
+            .iter()
+            .filter(|e| e.enabled)
+            .map(|e| e.name.name())
+            .collect();
+        let [width, height] = self.resolution;
+        writeln!(
+            f,
+            "wrote {} in {}",
+            self.folder.display(),
+            duration(self.manifest.elapsed_s)
+        )?;
+        writeln!(
+            f,
+            "  {} triangles, {} materials, {width} x {height} pixels",
+            self.triangles, self.materials
+        )?;
+        write!(
+            f,
+            "  effects: {} (depth {})",
+            match on.is_empty() {
+                true => "none".into(),
+                false => on.join(", "),
+            },
+            self.effects.max_depth
+        )?;
+        if let Some(error) = self.manifest.estimated_error {
+            write!(f, "\n  left out: {error:.5} of display-referred RMSE")?;
+        }
+        Ok(())
+    }
+}

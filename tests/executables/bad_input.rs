@@ -1,0 +1,215 @@
+//! What users get wrong, and the exact words that tell them.
+use crate::project::*;
+
+#[track_caller]
+fn scene_fails(project: &Project, set: &str, code: i32, message: &str) {
+    project
+        .run(SCENE, &["--set", set])
+        .expect_error(code, message);
+    assert!(!project.path("out/scene").exists(), "nothing was written");
+}
+
+#[test]
+fn a_misspelt_key_is_named_with_its_line() {
+    let project = Project::new();
+    project.write(
+        "pipeline.toml",
+        "[scene]\nbackgruond = \"background.png\"\n",
+    );
+    project.run(SCENE, &[]).expect_error(
+        2,
+        "error: pipeline.toml:2: unknown key \"scene.backgruond\" (did you mean \"background\"?); \
+         [scene] accepts: background, transfer, class, occluders, objects, camera, proxy, effects",
+    );
+}
+
+#[test]
+fn a_wrong_type_is_told_with_the_accepted_one() {
+    let project = Project::new();
+    scene_fails(
+        &project,
+        "scene.camera.fov_deg=wide",
+        2,
+        "error: --set scene.camera.fov_deg=wide: scene.camera.fov_deg is the string \"wide\", \
+         accepted: a number",
+    );
+}
+
+#[test]
+fn a_value_out_of_range_is_told_with_its_line() {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write(
+        "pipeline.toml",
+        text.replace("fov_deg = 40.0", "fov_deg = 200.0"),
+    );
+    project.run(SCENE, &[]).expect_error(
+        2,
+        "error: pipeline.toml:12: scene.camera.fov_deg is 200; accepted: a vertical field of view \
+         between 0 and 180 degrees, for instance fov_deg = 40.0",
+    );
+}
+
+#[test]
+fn composite_keys_are_checked_before_anything_is_read() {
+    let project = Project::new();
+    scene_fails(
+        &project,
+        "composite.tone=filmic",
+        2,
+        "error: --set composite.tone=filmic: composite.tone is \"filmic\", accepted: \"none\", \
+         \"reinhard\"",
+    );
+    scene_fails(
+        &project,
+        "composite.time_budget_s=3",
+        2,
+        "error: --set composite.time_budget_s=3: composite.time_budget_s: excludes target_error; \
+         keep one of the two",
+    );
+}
+
+#[test]
+fn a_missing_configuration_points_at_the_option() {
+    let project = Project::new();
+    project.run(SCENE, &["-p", "none.toml"]).expect_error(
+        2,
+        "error: cannot read none.toml: no such file or directory; name another file with --pipeline",
+    );
+}
+
+#[test]
+fn a_missing_object_is_named() {
+    scene_fails(
+        &Project::new(),
+        "scene.objects.0.path=none.glb",
+        1,
+        "error: the scene cannot be set up\n  caused by: cannot read the object \"none.glb\": No \
+         such file or directory",
+    );
+}
+
+#[test]
+fn a_photo_of_zero_bytes_is_named() {
+    let project = Project::new();
+    project.write("zero.png", "");
+    scene_fails(
+        &project,
+        "scene.background=zero.png",
+        1,
+        "error: the scene cannot be set up\n  caused by: `zero.png` is empty (0 bytes); expected a \
+         PNG, JPEG, OpenEXR or Radiance HDR image: export the file again",
+    );
+}
+
+#[test]
+fn a_missing_texture_is_named_with_the_material_file() {
+    let project = Project::new();
+    project.write("object.obj", format!("mtllib a.mtl\nusemtl m\n{OBJECT}"));
+    project.write("a.mtl", "newmtl m\nmap_Kd lost.png\n");
+    scene_fails(
+        &project,
+        "scene.class=toy",
+        1,
+        "error: the scene cannot be set up\n  caused by: \"object.obj\": \"a.mtl\": cannot read the \
+         texture \"lost.png\": No such file or directory",
+    );
+}
+
+#[test]
+fn a_glb_that_is_cut_short_is_told_with_both_lengths() {
+    let project = Project::new();
+    let mut glb = b"glTF".to_vec();
+    glb.extend(2u32.to_le_bytes());
+    glb.extend(5000u32.to_le_bytes());
+    glb.extend([0; 12]);
+    project.write("cut.glb", glb);
+    scene_fails(
+        &project,
+        "scene.objects.0.path=cut.glb",
+        1,
+        "error: the scene cannot be set up\n  caused by: \"cut.glb\": the GLB header announces 5000 \
+         bytes, the file has 24: it is cut short; export or copy the file again",
+    );
+}
+
+#[test]
+fn an_index_out_of_range_is_told_with_its_line() {
+    let project = Project::new();
+    project.write("object.obj", OBJECT.replace("f 2 3 4", "f 2 3 9"));
+    scene_fails(
+        &project,
+        "scene.class=toy",
+        1,
+        "error: the scene cannot be set up\n  caused by: \"object.obj\": line 7: a face refers to \
+         9, but there are 4 vertices (v) so far; export the file again",
+    );
+}
+
+#[test]
+fn positions_that_are_not_numbers_are_told_with_their_vertex() {
+    let project = Project::new();
+    project.write("object.obj", OBJECT.replace("v 0.6 0 0.5", "v nan 0 0.5"));
+    scene_fails(
+        &project,
+        "scene.class=toy",
+        1,
+        "error: the scene cannot be set up\n  caused by: \"object.obj\": vertices (v), element 2 is \
+         (NaN, 0, 0.5), which is not finite; repair the mesh and export it again",
+    );
+}
+
+#[test]
+fn a_required_extension_that_cannot_be_ignored_is_named() {
+    let project = Project::new();
+    project.write(
+        "packed.gltf",
+        r#"{"asset": {"version": "2.0"}, "extensionsUsed": ["KHR_draco_mesh_compression"],
+            "extensionsRequired": ["KHR_draco_mesh_compression"]}"#,
+    );
+    scene_fails(
+        &project,
+        "scene.objects.0.path=packed.gltf",
+        1,
+        "error: the scene cannot be set up\n  caused by: \"packed.gltf\": the file requires the glTF \
+         extension KHR_draco_mesh_compression, which is not supported; export the object without \
+         mesh compression",
+    );
+}
+
+#[test]
+fn a_photo_is_no_environment_map() {
+    scene_fails(
+        &Project::new(),
+        "composite.environment=background.png",
+        1,
+        "error: cannot use composite.environment = \"background.png\"\n  caused by: \
+         `background.png` is a PNG image (display-referred); expected an OpenEXR or Radiance HDR \
+         image (linear light): convert the file",
+    );
+}
+
+#[test]
+fn a_stage_that_lacks_its_predecessor_names_it() {
+    Project::new().run(COMPOSITE, &[]).expect_error(
+        1,
+        "error: out/scene/stage.json is missing: run dipir-scene first",
+    );
+}
+
+#[test]
+fn a_composite_without_any_light_says_where_to_get_one() {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write(
+        "pipeline.toml",
+        text.replace("environment = \"sky.exr\"", ""),
+    );
+    project.run(SCENE, &[]).expect_success();
+    project.run(COMPOSITE, &[]).expect_error(
+        1,
+        "error: there is no light: [composite] environment is not set and out/light/lighting.json \
+         is missing; name a map, as in --set composite.environment=sky.hdr, or run dipir-optimize \
+         first",
+    );
+}

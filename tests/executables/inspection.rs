@@ -1,0 +1,198 @@
+//! `dipir-inspect` on what the stages write and on what is broken.
+use std::collections::HashMap;
+
+use safetensors::tensor::{Dtype, TensorView, serialize};
+use serde_json::Value;
+
+use crate::project::*;
+
+fn json(project: &Project, path: &str) -> Value {
+    let run = project.run(INSPECT, &["--json", path]);
+    run.expect_success();
+    serde_json::from_str(&run.stdout).unwrap()
+}
+
+#[test]
+fn a_stage_folder_is_checked_by_hash() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    assert_eq!(json(&project, "out/scene")["whole"], true);
+    let mut bytes = project.read("out/scene/effects.json");
+    bytes.push(b' ');
+    project.write("out/scene/effects.json", bytes);
+    let run = project.run(INSPECT, &["out/scene"]);
+    assert_eq!(run.code, Some(1));
+    assert!(
+        run.stderr
+            .starts_with("error: out/scene/effects.json: damaged: "),
+        "{}",
+        run.stderr
+    );
+    assert!(
+        run.stdout.contains("gbuffer.exr"),
+        "the rest is shown: {}",
+        run.stdout
+    );
+}
+
+#[test]
+fn effects_are_shown_as_a_table() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let run = project.run(INSPECT, &["out/scene/effects.json"]);
+    run.expect_success();
+    assert!(
+        run.stdout.contains("every material is opaque"),
+        "{}",
+        run.stdout
+    );
+}
+
+#[test]
+fn an_environment_map_names_its_peak_and_gets_a_ring() {
+    let project = Project::new();
+    let run = project.run(INSPECT, &["--json", "sky.exr", "--png", "sky.png"]);
+    run.expect_success();
+    let value: Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!(
+        value["environment"]["peak_radiance"],
+        serde_json::json!([20.0, 20.0, 20.0])
+    );
+    assert_eq!(json(&project, "sky.png")["width"], 16);
+}
+
+#[test]
+fn objects_show_their_size_and_materials() {
+    let project = Project::new();
+    let value = json(&project, "object.obj");
+    assert_eq!(value["triangles"], 4);
+    assert_eq!(value["max_m"], serde_json::json!([0.6f32, 1.1f32, 0.5]));
+}
+
+#[test]
+fn tensors_show_shapes_types_and_what_is_not_a_number() {
+    let project = Project::new();
+    let floats: Vec<u8> = [1.0f32, -2.0, f32::NAN, 4.0]
+        .iter()
+        .flat_map(|v| v.to_le_bytes())
+        .collect();
+    let halves: Vec<u8> = [1.5f32, 2.5]
+        .iter()
+        .flat_map(|&v| half::f16::from_f32(v).to_le_bytes())
+        .collect();
+    let tensors = HashMap::from([
+        (
+            "a.weight",
+            TensorView::new(Dtype::F32, vec![2, 2], &floats).unwrap(),
+        ),
+        ("b", TensorView::new(Dtype::F16, vec![2], &halves).unwrap()),
+    ]);
+    let metadata = HashMap::from([("rank".to_string(), "4".to_string())]);
+    project.write(
+        "lora.safetensors",
+        serialize(tensors, Some(metadata)).unwrap(),
+    );
+    let value = json(&project, "lora.safetensors");
+    let a = &value["tensors"]["a.weight"];
+    assert_eq!(
+        (&a["min"], &a["max"], &a["mean"]),
+        (&(-2.0).into(), &4.0.into(), &1.0.into())
+    );
+    assert_eq!(
+        (&a["nan"], &a["shape"]),
+        (&1.into(), &serde_json::json!([2, 2]))
+    );
+    assert_eq!(value["tensors"]["b"]["mean"], 2.0);
+    assert_eq!(value["metadata"]["rank"], "4");
+}
+
+#[test]
+fn hostile_tensor_headers_are_refused() {
+    let project = Project::new();
+    let file = |header: &str, length: u64, data: &[u8]| {
+        [&length.to_le_bytes()[..], header.as_bytes(), data].concat()
+    };
+    let sized = |header: &str, data: &[u8]| file(header, header.len() as u64, data);
+    for (name, bytes) in [
+        ("a header of 2^63 bytes", file("{}", 1 << 63, &[])),
+        ("a header beyond the end", file("{}", 1000, &[])),
+        ("no header", vec![1, 2, 3]),
+        ("not JSON", sized("nonsense", &[])),
+        (
+            "offsets past the data",
+            sized(
+                r#"{"a":{"dtype":"F32","shape":[4],"data_offsets":[0,16]}}"#,
+                &[0; 8],
+            ),
+        ),
+        (
+            "a shape that overflows",
+            sized(
+                r#"{"a":{"dtype":"F32","shape":[4294967296,4294967296,4],"data_offsets":[0,16]}}"#,
+                &[0; 16],
+            ),
+        ),
+        (
+            "a shape that does not fit its bytes",
+            sized(
+                r#"{"a":{"dtype":"F32","shape":[3],"data_offsets":[0,16]}}"#,
+                &[0; 16],
+            ),
+        ),
+        (
+            "offsets that run backwards",
+            sized(
+                r#"{"a":{"dtype":"F32","shape":[4],"data_offsets":[16,0]}}"#,
+                &[0; 16],
+            ),
+        ),
+        (
+            "bytes that no tensor owns",
+            sized(
+                r#"{"a":{"dtype":"F32","shape":[1],"data_offsets":[0,4]}}"#,
+                &[0; 16],
+            ),
+        ),
+    ] {
+        project.write("x.safetensors", bytes);
+        let run = project.run(INSPECT, &["x.safetensors"]);
+        assert_eq!(run.code, Some(1), "{name}");
+        let start = "error: x.safetensors: not a valid safetensors file: ";
+        assert!(run.stderr.starts_with(start), "{name}: {}", run.stderr);
+    }
+}
+
+#[test]
+fn what_is_no_artifact_is_told() {
+    let project = Project::new();
+    project.write("zero.png", "");
+    project
+        .run(INSPECT, &["zero.png"])
+        .expect_error(1, "error: zero.png is empty (0 bytes); make it anew");
+    project
+        .run(INSPECT, &["none.exr"])
+        .expect_error(1, "error: cannot read none.exr: no such file or directory");
+    project.run(INSPECT, &["pipeline.toml"]).expect_error(
+        1,
+        "error: pipeline.toml is of no kind known here; accepted: PNG, JPEG, HDR, EXR, GLB, glTF, \
+         OBJ, JSON, safetensors, or a stage's folder",
+    );
+    project.run(INSPECT, &["."]).expect_error(
+        1,
+        "error: . holds no stage.json, so it is not the folder of a finished stage; name one, as in \
+         out/scene, or a single file",
+    );
+}
+
+#[test]
+fn a_reader_that_goes_away_is_no_error() {
+    let project = Project::new();
+    let mut child = project.command(INSPECT, &["sky.exr"]).spawn().unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+}

@@ -1,0 +1,120 @@
+//! Runs that end early, and runs at the same time.
+use std::fs::File;
+use std::process::Child;
+#[cfg(unix)]
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use crate::project::*;
+
+/// Renders for as long as nobody stops it.
+const ENDLESS: [&str; 4] = [
+    "--set",
+    "composite.target_error=1e-9",
+    "--set",
+    "composite.max_samples=4000000000",
+];
+
+/// Starts a composite and waits until it writes its folder.
+fn start_endless(project: &Project) -> Child {
+    let mut child = project.command(COMPOSITE, &ENDLESS).spawn().unwrap();
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while !project.path("out/.composite.partial").exists() {
+        let ended = child.try_wait().unwrap();
+        assert!(
+            ended.is_none() && Instant::now() < deadline,
+            "it did not start: {ended:?}"
+        );
+        std::thread::yield_now();
+    }
+    child
+}
+
+#[test]
+fn a_killed_run_leaves_earlier_results_and_the_next_one_ends_as_if_undisturbed() {
+    let project = Project::new();
+    project.run_both(&[]);
+    let before = project.artifacts("out/composite");
+    let manifest = project.read("out/composite/stage.json");
+    let mut child = start_endless(&project);
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(project.artifacts("out/composite") == before);
+    assert_eq!(project.read("out/composite/stage.json"), manifest);
+    project.run(COMPOSITE, &[]).expect_success();
+    assert!(project.artifacts("out/composite") == before);
+    assert!(!project.path("out/.composite.partial").exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn control_c_ends_with_130_and_leaves_nothing_half_written() {
+    let project = Project::new();
+    project.run_both(&[]);
+    let before = project.artifacts("out/composite");
+    let child = start_endless(&project);
+    let pid = child.id().to_string();
+    assert!(
+        Command::new("kill")
+            .args(["-INT", &pid])
+            .status()
+            .unwrap()
+            .success()
+    );
+    let run: Run = child.wait_with_output().unwrap().into();
+    run.expect_error(130, "interrupted; earlier results are as they were");
+    assert!(project.artifacts("out/composite") == before);
+    assert!(!project.path("out/.composite.partial").exists());
+}
+
+#[test]
+fn a_second_run_at_the_same_time_is_refused() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let mut child = start_endless(&project);
+    let run = project.run(COMPOSITE, &[]);
+    child.kill().unwrap();
+    child.wait().unwrap();
+    run.expect_error(
+        1,
+        &format!(
+            "error: out/composite is being written by process {}; wait for it to end, pass --wait, \
+             or choose another folder with --out",
+            child.id()
+        ),
+    );
+}
+
+#[test]
+fn a_second_run_waits_if_asked_to() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let mut first = start_endless(&project);
+    let second = project.command(COMPOSITE, &["--wait"]).spawn().unwrap();
+    first.kill().unwrap();
+    first.wait().unwrap();
+    Run::from(second.wait_with_output().unwrap()).expect_success();
+    assert!(project.path("out/composite/composite.png").exists());
+}
+
+#[test]
+fn a_folder_that_no_stage_wrote_is_not_replaced() {
+    let project = Project::new();
+    std::fs::create_dir_all(project.path("out/scene")).unwrap();
+    project.write("out/scene/thesis.tex", "years of work");
+    project.run(SCENE, &[]).expect_error(
+        1,
+        "error: out/scene is there already and holds no stage.json, so no stage wrote it and it is \
+         left alone; move it away or choose another folder with --out",
+    );
+    assert_eq!(project.read("out/scene/thesis.tex"), b"years of work");
+}
+
+#[test]
+fn an_output_folder_that_is_a_file_is_one_message() {
+    let project = Project::new();
+    File::create(project.path("out")).unwrap();
+    let run = project.run(SCENE, &[]);
+    assert_eq!(run.code, Some(1));
+    assert_eq!(run.stderr, "error: cannot create out: file exists\n");
+}

@@ -1,0 +1,8 @@
+//! The executables as a user runs them: on files, by exit code and by what they print.
+mod bad_input;
+mod inspection;
+mod interruption;
+mod project;
+mod reproducibility;
+mod stages;
+mod usage;

@@ -1,0 +1,162 @@
+//! A small project in a folder of its own, and the executables run in it.
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+use dipir_imaging::file::write_png;
+use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_light::environment::EnvironmentMap;
+use glam::Vec3;
+use tempfile::TempDir;
+
+/// `dipir-scene`.
+pub const SCENE: &str = env!("CARGO_BIN_EXE_dipir-scene");
+/// `dipir-composite`.
+pub const COMPOSITE: &str = env!("CARGO_BIN_EXE_dipir-composite");
+/// `dipir-inspect`.
+pub const INSPECT: &str = env!("CARGO_BIN_EXE_dipir-inspect");
+
+/// A tetrahedron that stands on y = 0.
+pub const OBJECT: &str = "v -0.6 0 0.5\nv 0.6 0 0.5\nv 0 0 -0.6\nv 0 1.1 0\n\
+                          f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n";
+
+const PIPELINE: &str = r#"# A tetrahedron on a floor.
+[scene]
+background = "background.png"
+class = "toy"
+
+[[scene.objects]]
+path = "object.obj"
+
+[scene.camera]
+position = [0.0, 1.2, 4.0]
+look_at = [0.0, 0.4, 0.0]
+fov_deg = 40.0
+
+[scene.proxy]
+plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }
+
+[composite]
+environment = "sky.exr"
+target_error = 0.05
+"#;
+
+/// A folder with everything that the stages need.
+pub struct Project {
+    folder: TempDir,
+}
+
+/// What a run left behind.
+#[derive(Debug)]
+pub struct Run {
+    /// Exit code; `None` if a signal ended it.
+    pub code: Option<i32>,
+    /// Standard output.
+    pub stdout: String,
+    /// Standard error.
+    pub stderr: String,
+}
+
+impl Project {
+    /// A photo of 36 x 24 pixels, a tetrahedron, a sky with a sun.
+    pub fn new() -> Self {
+        let project = Self {
+            folder: tempfile::tempdir().unwrap(),
+        };
+        let (width, height) = (36, 24);
+        let pixels = (0..width * height)
+            .map(|n| {
+                let (x, y) = ((n % width) as f32 / 36.0, (n / width) as f32 / 24.0);
+                Vec3::new(0.4 + 0.3 * x, 0.5 + 0.2 * y, 0.55)
+            })
+            .collect();
+        let photo = DisplayImage(Raster::from_pixels(width, height, pixels));
+        write_png(project.path("background.png"), &photo).unwrap();
+        let mut texels = vec![Vec3::splat(0.4); 16 * 8];
+        texels[2 * 16 + 5] = Vec3::splat(20.0);
+        let sky = EnvironmentMap::new(16, 8, texels).unwrap();
+        sky.write(project.path("sky.exr")).unwrap();
+        project.write("object.obj", OBJECT);
+        project.write("pipeline.toml", PIPELINE);
+        project
+    }
+
+    /// A file of the project.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Writes a file.
+    pub fn write(&self, name: &str, content: impl AsRef<[u8]>) {
+        fs::write(self.path(name), content).unwrap();
+    }
+
+    /// Reads a file.
+    pub fn read(&self, name: &str) -> Vec<u8> {
+        fs::read(self.path(name)).unwrap()
+    }
+
+    /// A command in the project's folder, its output caught.
+    pub fn command(&self, executable: &str, args: &[&str]) -> Command {
+        let mut command = Command::new(executable);
+        command
+            .args(args)
+            .current_dir(self.folder.path())
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped());
+        command
+    }
+
+    /// Runs an executable to its end.
+    pub fn run(&self, executable: &str, args: &[&str]) -> Run {
+        self.command(executable, args).output().unwrap().into()
+    }
+
+    /// Runs `dipir-scene` and `dipir-composite`, which must succeed.
+    pub fn run_both(&self, args: &[&str]) {
+        self.run(SCENE, args).expect_success();
+        self.run(COMPOSITE, args).expect_success();
+    }
+
+    /// Every file of a stage but `stage.json`, which holds times, with its bytes.
+    pub fn artifacts(&self, stage: &str) -> Vec<(String, Vec<u8>)> {
+        let mut files: Vec<_> = fs::read_dir(self.path(stage))
+            .unwrap()
+            .map(|e| e.unwrap().path())
+            .filter(|p| p.file_name().unwrap() != "stage.json")
+            .map(|p| (name(&p), fs::read(&p).unwrap()))
+            .collect();
+        files.sort();
+        files
+    }
+}
+
+fn name(path: &Path) -> String {
+    path.file_name().unwrap().to_string_lossy().into_owned()
+}
+
+impl From<Output> for Run {
+    fn from(output: Output) -> Self {
+        Self {
+            code: output.status.code(),
+            stdout: String::from_utf8(output.stdout).unwrap(),
+            stderr: String::from_utf8(output.stderr).unwrap(),
+        }
+    }
+}
+
+impl Run {
+    /// Asserts exit code 0.
+    #[track_caller]
+    pub fn expect_success(&self) {
+        assert_eq!(self.code, Some(0), "{}", self.stderr);
+    }
+
+    /// Asserts the exit code, an empty standard output and the whole of standard error.
+    #[track_caller]
+    pub fn expect_error(&self, code: i32, message: &str) {
+        assert_eq!(self.stderr.trim_end(), message);
+        assert_eq!((self.code, self.stdout.as_str()), (Some(code), ""));
+    }
+}

@@ -1,0 +1,172 @@
+//! What the stages write, and how they hand over to each other.
+use dipir_imaging::layers::Layers;
+use dipir_pipeline::manifest::Manifest;
+use serde_json::Value;
+
+use crate::project::*;
+
+fn json(project: &Project, name: &str) -> Value {
+    serde_json::from_slice(&project.read(name)).unwrap()
+}
+
+#[test]
+fn layers_rebuild_the_beauty_to_half_precision() {
+    let project = Project::new();
+    project.run_both(&[]);
+    let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
+    let get = |layer: &str| layers.rgb(layer).unwrap();
+    let (beauty, object) = (get(""), get("object"));
+    let (shadow, background) = (get("shadow"), get("background"));
+    let alpha = layers.channel("object.A").unwrap();
+    let mut touched = 0;
+    for n in 0..36 * 24 {
+        let a = alpha.pixels()[n];
+        let rebuilt = background.pixels()[n] * shadow.pixels()[n] * (1.0 - a) + object.pixels()[n];
+        // Half precision rounds the background and the beauty by at most 2^-11 each; values
+        // below 2^-14 are stored in steps of 2^-24.
+        let bound = 2.0 * rebuilt.abs() / 2048.0 + 2f32.powi(-24);
+        let difference = (rebuilt - beauty.pixels()[n]).abs();
+        assert!(
+            difference.cmple(bound).all(),
+            "pixel {n}: {difference} above {bound}"
+        );
+        touched += usize::from(a > 0.0);
+    }
+    assert!(touched > 20, "the object is in the picture");
+    for name in [
+        "A", "depth.Z", "normal.X", "normal.Z", "albedo.R", "shadow.B",
+    ] {
+        assert!(layers.contains(name), "{name}");
+    }
+    let depth = layers.channel("depth.Z").unwrap().get(18, 12);
+    assert!(
+        (2.0..5.0).contains(depth),
+        "the object is about 4 m away, not {depth}"
+    );
+}
+
+#[test]
+fn the_scene_stage_writes_what_the_others_read() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let effects = json(&project, "out/scene/effects.json");
+    let names: Vec<&str> = effects["effects"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|e| e["name"].as_str().unwrap())
+        .collect();
+    assert_eq!(names.len(), 15);
+    assert!(effects["max_depth"].is_u64() && effects["rays"]["camera"].is_u64());
+    let gbuffer = Layers::read_exr(project.path("out/scene/gbuffer.exr")).unwrap();
+    for name in ["depth.Z", "normal.Y", "albedo.G", "object.A", "proxy.A"] {
+        assert!(gbuffer.contains(name), "{name}");
+    }
+    let manifest = Manifest::read(&project.path("out/scene"), "").unwrap();
+    let roles: Vec<&str> = manifest.inputs.iter().map(|a| a.role.as_str()).collect();
+    assert!(
+        roles.contains(&"background") && roles.contains(&"object"),
+        "{roles:?}"
+    );
+    assert!(roles.contains(&"environment"), "{roles:?}");
+    assert!(manifest.elapsed_s > 0.0);
+    assert_eq!(manifest.damages(&project.path("out/scene")).unwrap(), []);
+}
+
+#[test]
+fn an_effect_that_is_switched_off_costs_no_ray() {
+    let project = Project::new();
+    project
+        .run(SCENE, &["--set", "scene.effects.shadow=off"])
+        .expect_success();
+    let effects = json(&project, "out/scene/effects.json");
+    assert_eq!(effects["rays"]["shadow"], 0);
+    project.run(COMPOSITE, &[]).expect_success();
+    let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
+    assert!(
+        layers
+            .channel("shadow.G")
+            .unwrap()
+            .pixels()
+            .iter()
+            .all(|&s| s == 1.0)
+    );
+}
+
+#[test]
+fn a_scene_set_up_with_other_settings_is_warned_of() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let run = project.run(COMPOSITE, &["--set", "scene.camera.fov_deg=50"]);
+    run.expect_success();
+    assert_eq!(
+        run.stderr.trim_end(),
+        "warning: the scene was set up with other settings (scene.camera.fov_deg changed from 40.0 \
+         to 50.0); run dipir-scene again to use the new ones"
+    );
+}
+
+#[test]
+fn an_input_that_changed_since_the_scene_was_set_up_is_refused() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    project.write("object.obj", OBJECT.replace("1.1", "1.3"));
+    let run = project.run(COMPOSITE, &[]);
+    assert_eq!(run.code, Some(1));
+    assert!(
+        run.stderr
+            .contains("object.obj\" changed since the scene was set up"),
+        "{}",
+        run.stderr
+    );
+    assert!(
+        run.stderr.contains("run dipir-scene again"),
+        "{}",
+        run.stderr
+    );
+}
+
+#[test]
+fn a_damaged_artifact_is_named_before_it_is_used() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let mut bytes = project.read("out/scene/gbuffer.exr");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    project.write("out/scene/gbuffer.exr", bytes);
+    let run = project.run(COMPOSITE, &[]);
+    assert_eq!(run.code, Some(1));
+    let start = "error: out/scene/gbuffer.exr: damaged: its BLAKE3 hash is ";
+    assert!(run.stderr.starts_with(start), "{}", run.stderr);
+    assert!(
+        run.stderr.contains("run the stage \"scene\" again"),
+        "{}",
+        run.stderr
+    );
+}
+
+#[test]
+fn reinhards_curve_darkens_the_object_and_leaves_the_photo() {
+    let project = Project::new();
+    project.run_both(&[]);
+    let plain = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
+    project
+        .run(COMPOSITE, &["--set", "composite.tone=reinhard"])
+        .expect_success();
+    let toned = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
+    let sum = |layers: &Layers, name: &str| -> f32 {
+        layers.channel(name).unwrap().pixels().iter().sum()
+    };
+    assert!(sum(&toned, "object.G") < 0.9 * sum(&plain, "object.G"));
+    assert_eq!(sum(&toned, "shadow.G"), sum(&plain, "shadow.G"));
+}
+
+#[test]
+fn a_mask_of_the_photos_foreground_hides_the_object() {
+    let project = Project::new();
+    let white = dipir_imaging::raster::Raster::filled(36, 24, 1.0);
+    dipir_imaging::file::write_png_mask(project.path("mask.png"), &white).unwrap();
+    project.run_both(&["--set", "scene.occluders=mask.png"]);
+    let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
+    assert_eq!(layers.rgb("").unwrap(), layers.rgb("background").unwrap());
+}
