@@ -63,15 +63,17 @@ impl Difference {
     }
 }
 
-/// Effort beside rays of a path's interactions, in rays: what a material's parts cost to look up
-/// and evaluate, as measured with one part at a time on a sphere.
+/// Effort of an image sample beside its rays, in rays: what a material's parts cost to look up and
+/// evaluate. Measured with one part at a time on a sphere under a 1024 x 512 map, where a camera
+/// ray with a Lambertian surface took 0.5 us, the specular lobe 0.1 us more and a coat 0.25 us;
+/// the parts that only look textures up are set like one random memory access, 0.05 us.
 fn shading_weight(mask: u32) -> f64 {
     let parts = [
-        (SPECULAR, 0.6),
-        (TEXTURES, 0.3),
-        (NORMAL_MAPPING, 0.3),
-        (CLEARCOAT, 0.4),
-        (TRANSMISSION, 0.3),
+        (SPECULAR, 0.2),
+        (TEXTURES, 0.1),
+        (NORMAL_MAPPING, 0.1),
+        (CLEARCOAT, 0.5),
+        (TRANSMISSION, 0.2),
     ];
     0.5 + parts
         .into_iter()

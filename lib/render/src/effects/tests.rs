@@ -177,51 +177,136 @@ fn a_coloured_floor_in_the_photograph_lights_the_object() {
     assert!(p.rays["proxy_radiance"] > 0);
 }
 
+/// Plans `scene` and compares what was planned with everything, under fresh seeds; then the rays
+/// of every kind that belongs to what was left out must not exist. Returns the plan.
+fn assert_plan_keeps_the_picture(scene: &Scene, settings: &Settings) -> EffectsPlan {
+    let light = sky(1.0);
+    let p = planned(scene, &EffectsConfig::default(), settings);
+    let renderer = Renderer::new(scene);
+    let fresh = Settings {
+        seed: 77,
+        ..*settings
+    };
+    let pilot = Pilot::new(&renderer, &light, &fresh);
+    let all = EffectsPlan::everything(scene, settings).simulation();
+    let reference = pilot.reference(&all).expect("renders");
+    let planned = p.simulation();
+    let difference = pilot.difference(&reference, &planned).expect("renders");
+    // The measurement itself is uncertain by its standard error.
+    let allowed = p.tolerance + 2.0 * difference.std_error;
+    assert!(difference.rmse <= allowed, "{difference:?} {p:?}");
+    let counts = pilot.render(&planned).expect("renders").counts;
+    let kinds = [
+        (RayKind::Shadow, p.is_enabled(Effect::Shadow)),
+        (RayKind::Bounce, planned.max_depth > 0),
+        (
+            RayKind::ProxyOcclusion,
+            p.is_enabled(Effect::ProxyOcclusion),
+        ),
+        (RayKind::LightOnProxy, planned.light_on_proxy.is_some()),
+        (
+            RayKind::ProxyRadiance,
+            p.is_enabled(Effect::BounceFromProxy),
+        ),
+    ];
+    for (kind, enabled) in kinds {
+        assert!(enabled || counts.get(kind) == 0, "{kind:?}: {counts:?}");
+    }
+    p
+}
+
+fn knot() -> dipir_scene::mesh::TriangleMesh {
+    torus_knot(Vec3::Y * 0.7, 0.4, 0.15, 96, 12)
+}
+
+fn ball() -> dipir_scene::mesh::TriangleMesh {
+    icosphere(Vec3::Y * 0.6, 0.5, 3)
+}
+
 #[test]
-fn planned_and_everything_differ_by_no_more_than_the_tolerance() {
-    let mut shiny = matte(Vec3::new(0.9, 0.6, 0.2));
-    (shiny.metallic, shiny.roughness) = (1.0, 0.3);
+fn the_plan_of_a_matte_convex_object_keeps_the_picture() {
+    let s = scene(ball(), matte(Vec3::splat(0.6)), view(), ground());
+    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    assert_eq!(p.max_depth, 1);
+}
+
+#[test]
+fn the_plan_of_a_concave_object_keeps_the_picture() {
+    let s = scene(knot(), matte(Vec3::splat(0.8)), view(), ground());
+    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    assert!(p.is_enabled(Effect::Interreflection));
+}
+
+#[test]
+fn the_plan_of_a_metal_keeps_the_picture() {
+    let mut metal = matte(Vec3::new(0.9, 0.6, 0.2));
+    (metal.metallic, metal.roughness) = (1.0, 0.3);
+    let s = scene(knot(), metal, view(), ground());
+    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    assert!(p.is_enabled(Effect::Specular));
+}
+
+#[test]
+fn the_plan_of_a_coloured_surface_keeps_the_picture() {
+    let mut mesh = ball();
+    mesh.colors = mesh.normals.iter().map(|n| n.abs().extend(1.0)).collect();
+    let s = scene(mesh, matte(Vec3::splat(0.9)), view(), ground());
+    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    assert!(p.is_enabled(Effect::Textures));
+}
+
+#[test]
+fn the_plan_of_an_emitter_keeps_the_picture() {
+    let mut glowing = matte(Vec3::splat(0.5));
+    glowing.emissive = Vec3::new(0.5, 0.3, 0.1);
+    let s = scene(ball(), glowing, view(), ground());
+    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    assert!(p.is_enabled(Effect::Emission));
+}
+
+#[test]
+fn the_plan_of_a_half_transparent_sheet_keeps_the_picture() {
     let mut holes = matte(Vec3::splat(0.7));
     holes.base_color.w = 0.5;
     holes.alpha_mode = AlphaMode::Blend;
     holes.double_sided = true;
-    let knot = || torus_knot(Vec3::Y * 0.7, 0.4, 0.15, 96, 12);
     let sheet = quad(Vec3::new(-0.5, 0.2, 0.0), Vec3::X, Vec3::Y);
-    let scenes = [
-        scene(knot(), shiny, view(), ground()),
-        scene(knot(), matte(Vec3::splat(0.8)), view(), ground()),
-        scene(sheet, holes, view(), ground()),
-    ];
-    let (light, settings) = (sky(1.0), settings(0, 1));
-    for (i, s) in scenes.iter().enumerate() {
-        let p = planned(s, &EffectsConfig::default(), &settings);
-        let renderer = Renderer::new(s);
-        let pilot = Pilot::new(
-            &renderer,
-            &light,
-            &Settings {
-                seed: 77,
-                ..settings
-            },
-        );
-        let all = EffectsPlan::everything(s, &settings).simulation();
-        let reference = pilot.reference(&all).expect("renders");
-        let difference = pilot
-            .difference(&reference, &p.simulation())
-            .expect("renders");
-        // Fresh seeds: the difference may exceed the bound by its own standard error.
-        let allowed = p.tolerance + 2.0 * difference.std_error;
-        assert!(
-            difference.rmse <= allowed,
-            "scene {i}: {difference:?} {p:?}"
-        );
-        let counts = pilot.render(&p.simulation()).expect("renders").counts;
-        if !p.is_enabled(Effect::BounceToProxy) && !p.is_enabled(Effect::EmissionOnProxy) {
-            assert_eq!(counts.get(RayKind::LightOnProxy), 0);
-        }
-        assert_eq!(counts.get(RayKind::ProxyOcclusion), 0);
-        assert_eq!(counts.get(RayKind::ProxyRadiance), 0);
-    }
+    let s = scene(sheet, holes, view(), ground());
+    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    assert!(p.is_enabled(Effect::AlphaMask));
+}
+
+#[test]
+fn the_plan_of_glass_keeps_the_picture() {
+    let mut glass = matte(Vec3::splat(0.9));
+    glass.roughness = 0.05;
+    glass.transmission = Some(dipir_scene::material::Transmission {
+        factor: 1.0,
+        texture: None,
+    });
+    let s = scene(ball(), glass, view(), ground());
+    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    assert!(p.is_enabled(Effect::Transmission));
+}
+
+#[test]
+fn the_plan_without_a_proxy_keeps_the_picture() {
+    let s = scene(knot(), matte(Vec3::splat(0.5)), view(), Proxy::None);
+    assert_plan_keeps_the_picture(&s, &settings(0, 1));
+}
+
+#[test]
+fn the_plan_of_a_folded_proxy_mesh_keeps_the_picture() {
+    let mut floor = quad(
+        Vec3::new(-9.0, 0.0, 9.0),
+        Vec3::X * 18.0,
+        Vec3::NEG_Z * 18.0,
+    );
+    let wall = quad(Vec3::new(-9.0, 0.0, -1.5), Vec3::X * 18.0, Vec3::Y * 4.0);
+    crate::shapes::append(&mut floor, wall, 0);
+    let s = scene(ball(), matte(Vec3::splat(0.5)), view(), Proxy::Mesh(floor));
+    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    assert!(p.simulation().shadow);
 }
 
 #[test]
