@@ -1,10 +1,12 @@
 //! Latent diffusion models at any size: model folders in the diffusers
 //! layout, layers whose gradients pass, samplers, LoRA and score distillation.
 
+pub mod concepts;
 pub mod config;
 pub mod crop;
 pub mod distillation;
 pub mod error;
+pub mod generate;
 mod kernels;
 pub mod layers;
 pub mod lora;

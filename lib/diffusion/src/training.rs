@@ -149,6 +149,7 @@ pub struct LoraTrainer<'a> {
     config: TrainingConfig,
     lora: Arc<Lora>,
     token: Option<Var>,
+    initial_token: Option<Tensor>,
     optimizer: AdamW,
     recompute: Option<Recompute>,
 }
@@ -193,6 +194,7 @@ impl<'a> LoraTrainer<'a> {
             config,
             lora: Arc::new(lora),
             token,
+            initial_token: initial_token.cloned(),
             optimizer,
             recompute,
         })
@@ -398,6 +400,13 @@ impl<'a> LoraTrainer<'a> {
         self.optimizer
             .restore(steps, |name| weights.tensor(name, DType::F32, &device))
             .map_err(fail)
+    }
+
+    /// Starts anew, as after [`LoraTrainer::new`].
+    pub fn reset(&mut self) -> Result<()> {
+        let initial = self.initial_token.clone();
+        *self = Self::new(self.model, self.config.clone(), initial.as_ref())?;
+        Ok(())
     }
 
     /// Every setting that decides the course of a run.

@@ -402,3 +402,43 @@ fn impossible_shapes_are_refused_with_both_numbers() {
         "{message}"
     );
 }
+
+/// <conv(x), g> = <x, conv^T(g)>, in f64, at sizes that take every path: the
+/// transformed, the blocked, the strided and the pointwise one.
+#[test]
+fn adjoints_of_large_convolutions_are_adjoint() -> Outcome {
+    for (channels, outputs, kernel, stride, padding, side) in [
+        (32, 48, 3, 1, Padding::Same(1), 26),
+        (17, 33, 3, 1, Padding::Same(1), 31),
+        (24, 24, 3, 1, Padding::Same(0), 30),
+        (8, 12, 3, 1, Padding::Same(1), 40),
+        (24, 16, 3, 2, Padding::Same(1), 33),
+        (24, 16, 3, 2, Padding::After(1), 32),
+        (24, 40, 1, 1, Padding::Same(0), 27),
+    ] {
+        let name = format!("{channels}->{outputs} kernel {kernel} stride {stride} {padding:?}");
+        let x = Var::from_tensor(&normal(40, &[2, channels, side, side]))?;
+        let w = Var::from_tensor(&normal(41, &[outputs, channels, kernel, kernel]))?;
+        let b = Tensor::zeros(outputs, DType::F32, &Device::Cpu)?;
+        let y = Conv2d::from_tensors(w.as_tensor().clone(), b, stride, padding)?.forward(&x)?;
+        let g = normal(42, y.dims());
+        let gradients = (&y * &g)?.sum_all()?.backward()?;
+        let dot = |a: &Tensor, b: &Tensor| -> Result<f64, Box<dyn std::error::Error>> {
+            let (a, b) = (a.to_dtype(DType::F64)?, b.to_dtype(DType::F64)?);
+            Ok((a * b)?.sum_all()?.to_scalar::<f64>()?)
+        };
+        let wanted = dot(&y, &g)?;
+        let norms = (dot(&y, &y)? * dot(&g, &g)?).sqrt();
+        for (what, variable) in [("input", &x), ("weight", &w)] {
+            let gradient = gradients.get(variable).ok_or("no gradient")?;
+            let found = dot(variable, gradient)?;
+            // Rounding of single elements, a few ulp, averages out over
+            // thousands: 1e-6 of the product of the norms is far above.
+            assert!(
+                (found - wanted).abs() < 1e-6 * norms,
+                "{name}: {what}: {found} instead of {wanted}"
+            );
+        }
+    }
+    Ok(())
+}

@@ -4,9 +4,9 @@
 
 use rayon::prelude::*;
 
-use super::SharedMut;
 use super::matmul::{Threads, View, product, product_at};
-use super::simd::{exp, sum_of, sum_of_2, vectorized};
+use super::simd::{exp, sum_of_2, vectorized};
+use super::{SharedMut, with_scratch};
 
 /// Shape of an attention: q [batch, queries, heads * head_dim] and k, v
 /// [batch, keys, heads * head_dim].
@@ -57,15 +57,17 @@ impl AttentionShape {
 }
 
 vectorized! {
-    /// Softmax of each row in place; entries past `visible(row)` become 0.
-    fn softmax_rows(scores: &mut [f32], keys: usize, first_visible: usize) {
+    /// exp(score - largest of the row) in place, and 1 / the row's sum into
+    /// `inverse`; entries past `visible(row)` become 0.
+    fn exponentials(scores: &mut [f32], keys: usize, first_visible: usize, inverse: &mut [f32]) {
+        const LANES: usize = 32;
         for (row, scores) in scores.chunks_exact_mut(keys).enumerate() {
             let visible = if first_visible == usize::MAX { keys } else { (first_visible + row).min(keys) };
             let (seen, hidden) = scores.split_at_mut(visible);
-            let mut lanes = [f32::NEG_INFINITY; 16];
-            let mut blocks = seen.chunks_exact(16);
+            let mut lanes = [f32::NEG_INFINITY; LANES];
+            let mut blocks = seen.chunks_exact(LANES);
             for block in &mut blocks {
-                for i in 0..16 {
+                for i in 0..LANES {
                     lanes[i] = if block[i] > lanes[i] { block[i] } else { lanes[i] };
                 }
             }
@@ -73,80 +75,129 @@ vectorized! {
             for &v in blocks.remainder().iter().chain(&lanes) {
                 max = if v > max { v } else { max };
             }
-            // Below -87 `exp` would return its clamp of 1e-38 instead of 0;
-            // against a largest term of 1 neither is seen.
-            for v in seen.iter_mut() {
+            // Below -87 `exp` returns its clamp of 1e-38 instead of 0;
+            // against a largest term of 1 neither is seen. Each lane sums at
+            // most keys / 32 terms of at most 1.
+            let mut sums = [0f32; LANES];
+            let mut blocks = seen.chunks_exact_mut(LANES);
+            for block in &mut blocks {
+                for i in 0..LANES {
+                    block[i] = exp(block[i] - max);
+                    sums[i] += block[i];
+                }
+            }
+            let mut total: f64 = sums.iter().map(|&v| v as f64).sum();
+            for v in blocks.into_remainder() {
                 *v = exp(*v - max);
+                total += *v as f64;
             }
-            let inverse = (1.0 / sum_of(seen, |v| v)) as f32;
-            for v in seen.iter_mut() {
-                *v *= inverse;
-            }
+            inverse[row] = (1.0 / total) as f32;
             hidden.fill(0.0);
         }
     }
 }
 
+vectorized! {
+    fn scale_rows(rows: &mut [f32], width: usize, factors: &[f32]) {
+        for (row, &factor) in rows.chunks_exact_mut(width).zip(factors) {
+            for v in row {
+                *v *= factor;
+            }
+        }
+    }
+}
+
+/// Keys or values with each head's matrix transposed: [batch, heads, head_dim,
+/// keys], so that blocks of queries find rows to copy.
+fn transposed_heads(shape: AttentionShape, data: &[f32]) -> Vec<f32> {
+    let mut out = vec![0.0; data.len()];
+    out.par_chunks_mut(shape.head_dim * shape.keys)
+        .enumerate()
+        .for_each(|(pair, out)| {
+            let (item, head) = (pair / shape.heads, pair % shape.heads);
+            let source = shape.head(data, shape.keys, item, head, 0);
+            for key in 0..shape.keys {
+                for (channel, &v) in source.data[key * source.row..][..shape.head_dim]
+                    .iter()
+                    .enumerate()
+                {
+                    out[channel * shape.keys + key] = v;
+                }
+            }
+        });
+    out
+}
+
 impl AttentionShape {
-    /// Probabilities of `rows` queries from `first` into `scores`.
+    /// The transposed matrix of one head in what [`transposed_heads`] made.
+    fn transposed<'a>(&self, data: &'a [f32], item: usize, head: usize) -> View<'a> {
+        let len = self.head_dim * self.keys;
+        View::rows(&data[(item * self.heads + head) * len..][..len], self.keys)
+    }
+
+    /// Probabilities of `rows` queries from `first` into `scores`, up to the
+    /// factor of each row that goes into `inverse`.
     fn probabilities(
         &self,
         scores: &mut [f32],
         (item, head, first, rows): (usize, usize, usize, usize),
         q: &[f32],
-        k: &[f32],
+        keys: &[f32],
+        inverse: &mut [f32],
         threads: Threads,
     ) {
         let q = self.head(q, self.queries, item, head, first);
-        let k = self.head(k, self.keys, item, head, 0).transposed();
+        let keys = self.transposed(keys, item, head);
         // SAFETY: `scores` holds rows * keys elements and is borrowed exclusively.
         unsafe {
             let (shape, out) = ((rows, self.keys, self.head_dim), scores.as_mut_ptr());
-            product_at(shape, out, self.keys, 0.0, self.scale, q, k, threads);
+            product_at(shape, out, self.keys, 0.0, self.scale, q, keys, threads);
         }
-        softmax_rows(
-            scores,
-            self.keys,
-            if self.causal { first + 1 } else { usize::MAX },
-        );
+        let visible = if self.causal { first + 1 } else { usize::MAX };
+        exponentials(scores, self.keys, visible, inverse);
     }
 }
 
 /// softmax(scale q k^T) v, heads side by side in the last dimension.
 pub(crate) fn attention(shape: AttentionShape, q: &[f32], k: &[f32], v: &[f32]) -> Vec<f32> {
     let mut out = vec![0.0; q.len()];
-    let block = shape.block();
+    let (block, width) = (shape.block(), shape.width());
     let blocks = shape.queries.div_ceil(block);
+    let keys = transposed_heads(shape, k);
     let target = SharedMut::new(&mut out);
     (0..shape.batch * shape.heads * blocks)
         .into_par_iter()
-        .for_each_init(
-            || vec![0f32; block * shape.keys],
-            |scores, job| {
-                let (first, rest) = (job % blocks * block, job / blocks);
-                let (item, head) = (rest / shape.heads, rest % shape.heads);
-                let rows = block.min(shape.queries - first);
-                let scores = &mut scores[..rows * shape.keys];
-                shape.probabilities(scores, (item, head, first, rows), q, k, Threads::One);
-                let offset = (item * shape.queries + first) * shape.width() + head * shape.head_dim;
+        .for_each(|job| {
+            let (first, rest) = (job % blocks * block, job / blocks);
+            let (item, head) = (rest / shape.heads, rest % shape.heads);
+            let rows = block.min(shape.queries - first);
+            let mut inverse = vec![0f32; rows];
+            with_scratch(rows * shape.keys, |scores| {
+                shape.probabilities(
+                    scores,
+                    (item, head, first, rows),
+                    q,
+                    &keys,
+                    &mut inverse,
+                    Threads::One,
+                );
+                let offset = (item * shape.queries + first) * width + head * shape.head_dim;
                 let v = shape.head(v, shape.keys, item, head, 0);
+                let size = (rows, shape.head_dim, shape.keys);
+                let p = View::rows(scores, shape.keys);
                 // SAFETY: each job writes its own rows and head columns of `out`.
                 unsafe {
-                    let size = (rows, shape.head_dim, shape.keys);
-                    let p = View::rows(scores, shape.keys);
-                    product_at(
-                        size,
-                        target.at(offset),
-                        shape.width(),
-                        0.0,
-                        1.0,
-                        p,
-                        v,
-                        Threads::One,
-                    );
+                    product_at(size, target.at(offset), width, 0.0, 1.0, p, v, Threads::One);
+                    for (row, &factor) in inverse.iter().enumerate() {
+                        let row = std::slice::from_raw_parts_mut(
+                            target.at(offset + row * width),
+                            shape.head_dim,
+                        );
+                        row.iter_mut().for_each(|v| *v *= factor);
+                    }
                 }
-            },
-        );
+            });
+        });
     out
 }
 
@@ -171,7 +222,8 @@ pub(crate) fn attention_vjp(
     g: &[f32],
 ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let (mut dq, mut dk, mut dv) = (vec![0.0; q.len()], vec![0.0; k.len()], vec![0.0; v.len()]);
-    let block = shape.block();
+    let (block, width) = (shape.block(), shape.width());
+    let (keys, values) = (transposed_heads(shape, k), transposed_heads(shape, v));
     let targets = (
         SharedMut::new(&mut dq),
         SharedMut::new(&mut dk),
@@ -185,69 +237,80 @@ pub(crate) fn attention_vjp(
     } else {
         Threads::One
     };
-    let run = |pair: usize| {
-        let (item, head) = (pair / shape.heads, pair % shape.heads);
-        let mut p = vec![0f32; block * shape.keys];
-        let mut dp = vec![0f32; block * shape.keys];
-        let width = shape.width();
+    let step = |(item, head, first): (usize, usize, usize), p: &mut [f32], dp: &mut [f32]| {
+        let rows = p.len() / shape.keys;
+        let mut inverse = vec![0f32; rows];
+        shape.probabilities(
+            p,
+            (item, head, first, rows),
+            q,
+            &keys,
+            &mut inverse,
+            threads,
+        );
+        scale_rows(p, shape.keys, &inverse);
+        let g = shape.head(g, shape.queries, item, head, first);
+        product(
+            (rows, shape.keys, shape.head_dim),
+            dp,
+            0.0,
+            g,
+            shape.transposed(&values, item, head),
+            threads,
+        );
+        let keep = if first == 0 { 0.0 } else { 1.0 };
         let key_offset = item * shape.keys * width + head * shape.head_dim;
-        for first in (0..shape.queries).step_by(block) {
-            let rows = block.min(shape.queries - first);
-            let (p, dp) = (&mut p[..rows * shape.keys], &mut dp[..rows * shape.keys]);
-            shape.probabilities(p, (item, head, first, rows), q, k, threads);
-            let g = shape.head(g, shape.queries, item, head, first);
-            product(
-                (rows, shape.keys, shape.head_dim),
-                dp,
-                0.0,
+        let query_offset = (item * shape.queries + first) * width + head * shape.head_dim;
+        let (size_k, size_q) = (
+            (shape.keys, shape.head_dim, rows),
+            (rows, shape.head_dim, shape.keys),
+        );
+        // SAFETY: each job writes the columns of its own head and item.
+        unsafe {
+            let weights = View::rows(p, shape.keys).transposed();
+            product_at(
+                size_k,
+                targets.2.at(key_offset),
+                width,
+                keep,
+                1.0,
+                weights,
                 g,
-                shape.head(v, shape.keys, item, head, 0).transposed(),
                 threads,
             );
-            let keep = if first == 0 { 0.0 } else { 1.0 };
-            let query_offset = (item * shape.queries + first) * width + head * shape.head_dim;
-            let (size_k, size_q) = (
-                (shape.keys, shape.head_dim, rows),
-                (rows, shape.head_dim, shape.keys),
+            softmax_rows_vjp(p, dp, shape.keys);
+            let ds = View::rows(dp, shape.keys);
+            let k = shape.head(k, shape.keys, item, head, 0);
+            product_at(
+                size_q,
+                targets.0.at(query_offset),
+                width,
+                0.0,
+                shape.scale,
+                ds,
+                k,
+                threads,
             );
-            // SAFETY: each job writes the columns of its own head and item.
-            unsafe {
-                let weights = View::rows(p, shape.keys).transposed();
-                product_at(
-                    size_k,
-                    targets.2.at(key_offset),
-                    width,
-                    keep,
-                    1.0,
-                    weights,
-                    g,
-                    threads,
-                );
-                softmax_rows_vjp(p, dp, shape.keys);
-                let ds = View::rows(dp, shape.keys);
-                let k = shape.head(k, shape.keys, item, head, 0);
-                product_at(
-                    size_q,
-                    targets.0.at(query_offset),
-                    width,
-                    0.0,
-                    shape.scale,
-                    ds,
-                    k,
-                    threads,
-                );
-                let q = shape.head(q, shape.queries, item, head, first);
-                product_at(
-                    size_k,
-                    targets.1.at(key_offset),
-                    width,
-                    keep,
-                    shape.scale,
-                    ds.transposed(),
-                    q,
-                    threads,
-                );
-            }
+            let q = shape.head(q, shape.queries, item, head, first);
+            product_at(
+                size_k,
+                targets.1.at(key_offset),
+                width,
+                keep,
+                shape.scale,
+                ds.transposed(),
+                q,
+                threads,
+            );
+        }
+    };
+    let run = |pair: usize| {
+        let (item, head) = (pair / shape.heads, pair % shape.heads);
+        for first in (0..shape.queries).step_by(block) {
+            let len = block.min(shape.queries - first) * shape.keys;
+            with_scratch(len, |p| {
+                with_scratch(len, |dp| step((item, head, first), p, dp))
+            });
         }
     };
     if pairs == 1 {

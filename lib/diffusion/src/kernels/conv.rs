@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use super::SharedMut;
 use super::matmul::{Threads, View, product, product_at};
+use super::winograd;
 
 /// Shape of a convolution of x [batch, inputs, height, width] with w
 /// [outputs, inputs, kernel, kernel].
@@ -107,6 +108,10 @@ pub(crate) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], bias: Option<&[f32]
             .enumerate()
             .for_each(|(row, out)| out.fill(bias[row % shape.outputs]));
     }
+    if winograd::suits(shape) {
+        winograd::conv2d(shape, x, w, winograd::Weights::AsStored, &mut out);
+        return out;
+    }
     let keep = if bias.is_some() { 1.0 } else { 0.0 };
     let depth = shape.depth();
     let weights = View::rows(w, depth);
@@ -208,6 +213,11 @@ pub(crate) fn conv2d_vjp_input(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f3
             pad_after: shape.kernel - 1 - shape.pad_after,
             ..shape
         };
+        if winograd::suits(adjoint) {
+            let mut dx = vec![0.0; shape.batch * image_len];
+            winograd::conv2d(adjoint, g, w, winograd::Weights::Adjoint, &mut dx);
+            return dx;
+        }
         return conv2d(adjoint, g, &turned(shape, w), None);
     }
     fold_product(shape, g, w)

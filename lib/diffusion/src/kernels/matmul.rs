@@ -1,6 +1,9 @@
-//! Matrix products over `gemm`, with the strides spelled out.
+//! Matrix products with the strides spelled out: packed panels where the
+//! processor has AVX-512, the `gemm` crate elsewhere.
 
 use gemm::{Parallelism, gemm};
+
+use super::packed;
 
 /// A row-major view: element (i, j) at `i * row + j * column`.
 #[derive(Clone, Copy)]
@@ -64,6 +67,10 @@ pub(crate) unsafe fn product_at(
 ) {
     a.check(m, k);
     b.check(k, n);
+    if packed::available() {
+        // SAFETY: both views were checked, `out` is the caller's contract.
+        return unsafe { packed::product((m, n, k), out, out_row, keep, scale, a, b, threads) };
+    }
     let parallelism = match threads {
         Threads::One => Parallelism::None,
         Threads::All => Parallelism::Rayon(rayon::current_num_threads()),

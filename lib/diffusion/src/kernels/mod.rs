@@ -8,9 +8,46 @@ pub(crate) mod attention;
 pub(crate) mod conv;
 pub(crate) mod matmul;
 pub(crate) mod norm;
+mod packed;
 pub(crate) mod pointwise;
 pub(crate) mod simd;
 pub(crate) mod tensor;
+mod winograd;
+
+use std::sync::{Mutex, PoisonError};
+
+/// Buffers that kernels left behind: fresh pages cost as much time as the
+/// arithmetic on them.
+static POOL: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
+/// Buffers that are kept, and the floats of the largest one (256 MiB).
+const POOL_BUFFERS: usize = 6;
+const POOL_FLOATS: usize = 64 << 20;
+
+/// Runs `f` on a buffer of `len` floats of unspecified content.
+pub(crate) fn with_scratch<R>(len: usize, f: impl FnOnce(&mut [f32]) -> R) -> R {
+    let pool = || POOL.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut buffer = {
+        let mut pool = pool();
+        // The smallest that is large enough, else a new one.
+        let fitting = (0..pool.len())
+            .filter(|&i| pool[i].len() >= len)
+            .min_by_key(|&i| pool[i].len());
+        fitting.map(|i| pool.swap_remove(i)).unwrap_or_default()
+    };
+    if buffer.len() < len {
+        buffer = vec![0.0; len];
+    }
+    let result = f(&mut buffer[..len]);
+    if buffer.len() <= POOL_FLOATS {
+        let mut pool = pool();
+        pool.push(buffer);
+        if pool.len() > POOL_BUFFERS {
+            let smallest = (0..pool.len()).min_by_key(|&i| pool[i].len()).unwrap_or(0);
+            pool.swap_remove(smallest);
+        }
+    }
+    result
+}
 
 /// A pointer that may cross threads: every user writes disjoint elements.
 #[derive(Clone, Copy)]

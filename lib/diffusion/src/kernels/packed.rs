@@ -1,0 +1,417 @@
+//! Matrix product of packed panels for AVX-512 [Goto & van de Geijn 2008]:
+//! panels of B stay in L1, blocks of A in L2, and 14 x 32 sums in registers.
+//!
+//! Jobs are blocks of rows and columns fixed by the shape; each element of the
+//! result is summed in one order whatever the number of threads.
+
+use rayon::prelude::*;
+
+use super::matmul::{Threads, View};
+use super::{SharedMut, with_scratch};
+
+/// Rows of the register tile: 14 x 2 registers of sums, 2 of B, of 32.
+const MR: usize = 14;
+/// Columns of the register tile, two registers.
+const NR: usize = 32;
+/// Depth of a panel: a panel of B, 32 KiB, and one of A, 14 KiB, fit L1.
+const KC: usize = 256;
+/// Rows of a block of A: 336 KiB, a part of L2.
+const MC: usize = 24 * MR;
+/// Columns of a packed block of B: 4 MiB.
+const NC: usize = 128 * NR;
+/// Columns of one job.
+const JOB_COLUMNS: usize = 16 * NR;
+/// Below this many columns A is used once or twice: packing it does not pay.
+const UNPACKED_COLUMNS: usize = 128;
+/// Products below this many multiplications run on one thread.
+const SMALL: usize = 1 << 18;
+
+/// Whether this processor can run [`product`].
+pub(super) fn available() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    {
+        is_x86_feature_detected!("avx512f")
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    {
+        false
+    }
+}
+
+/// `out = keep * out + scale * a b`.
+///
+/// # Safety
+/// [`available`] is true; `out` is valid for writes of m rows of n elements
+/// at stride `out_row` (and reads, if `keep` is not 0), used by nobody else
+/// meanwhile; the views cover m x k and k x n elements.
+pub(super) unsafe fn product(
+    (m, n, k): (usize, usize, usize),
+    out: *mut f32,
+    out_row: usize,
+    keep: f32,
+    scale: f32,
+    a: View,
+    b: View,
+    threads: Threads,
+) {
+    if m == 0 || n == 0 {
+        return;
+    }
+    let parallel = threads == Threads::All && m * n * k >= SMALL;
+    let target = SharedMut(out);
+    for first_column in (0..n).step_by(NC) {
+        let columns = NC.min(n - first_column);
+        // An empty sum still has to write keep * out.
+        for first_depth in (0..k.max(1)).step_by(KC) {
+            let depth = KC.min(k - first_depth);
+            let keep = if first_depth == 0 { keep } else { 1.0 };
+            let panels = columns.div_ceil(NR);
+            with_scratch(panels * NR * KC, |packed_b| {
+                let pack = |(panel, target): (usize, &mut [f32])| {
+                    let first = first_column + panel * NR;
+                    pack_columns(b, first_depth, depth, first, NR.min(n - first), target);
+                };
+                let chunks = packed_b[..panels * NR * depth.max(1)].chunks_mut(NR * depth.max(1));
+                if parallel {
+                    chunks.enumerate().par_bridge().for_each(pack);
+                } else {
+                    chunks.enumerate().for_each(pack);
+                }
+                let packed_b: &[f32] = packed_b;
+                let (row_jobs, column_jobs) = (m.div_ceil(MC), columns.div_ceil(JOB_COLUMNS));
+                let job = |job: usize| {
+                    let (first_row, first) =
+                        (job / column_jobs * MC, job % column_jobs * JOB_COLUMNS);
+                    let rows = MC.min(m - first_row);
+                    let block = Block {
+                        rows,
+                        columns: JOB_COLUMNS.min(columns - first),
+                        depth,
+                        keep,
+                        scale,
+                        out_row,
+                    };
+                    let packed_b = &packed_b[first * depth..];
+                    // SAFETY: the rows and columns of this job are its own.
+                    let out = unsafe { target.at(first_row * out_row + first_column + first) };
+                    if n <= UNPACKED_COLUMNS {
+                        let start = first_row * a.row + first_depth * a.column;
+                        let rest = Rows::Strided {
+                            data: &a.data[start.min(a.data.len())..],
+                            row: a.row,
+                            column: a.column,
+                        };
+                        // SAFETY: as above.
+                        unsafe { block.run(rest, packed_b, out) };
+                        return;
+                    }
+                    with_scratch(rows.div_ceil(MR) * MR * KC, |packed_a| {
+                        pack_rows(a, first_row, rows, first_depth, depth, packed_a);
+                        // SAFETY: as above.
+                        unsafe { block.run(Rows::Packed(packed_a), packed_b, out) };
+                    });
+                };
+                if parallel {
+                    (0..row_jobs * column_jobs).into_par_iter().for_each(job);
+                } else {
+                    (0..row_jobs * column_jobs).for_each(job);
+                }
+            });
+        }
+    }
+}
+
+/// Packs `count` columns of B, `depth` deep: depth rows of NR elements.
+fn pack_columns(
+    b: View,
+    first_depth: usize,
+    depth: usize,
+    first: usize,
+    count: usize,
+    target: &mut [f32],
+) {
+    if count < NR {
+        target.fill(0.0);
+    }
+    if b.column == 1 {
+        for (p, target) in target.chunks_exact_mut(NR).enumerate().take(depth) {
+            let start = (first_depth + p) * b.row + first;
+            target[..count].copy_from_slice(&b.data[start..start + count]);
+        }
+        return;
+    }
+    for j in 0..count {
+        let start = (first + j) * b.column + first_depth * b.row;
+        for p in 0..depth {
+            target[p * NR + j] = b.data[start + p * b.row];
+        }
+    }
+}
+
+/// Packs rows of A in panels of MR: for each panel depth columns of MR.
+fn pack_rows(
+    a: View,
+    first: usize,
+    rows: usize,
+    first_depth: usize,
+    depth: usize,
+    target: &mut [f32],
+) {
+    for (panel, target) in target
+        .chunks_mut(MR * depth.max(1))
+        .enumerate()
+        .take(rows.div_ceil(MR))
+    {
+        let top = panel * MR;
+        let count = MR.min(rows - top);
+        if count < MR {
+            target.fill(0.0);
+        }
+        if a.row == 1 {
+            for p in 0..depth {
+                let start = first + top + (first_depth + p) * a.column;
+                target[p * MR..p * MR + count].copy_from_slice(&a.data[start..start + count]);
+            }
+            continue;
+        }
+        for i in 0..count {
+            let start = (first + top + i) * a.row + first_depth * a.column;
+            for p in 0..depth {
+                target[p * MR + i] = a.data[start + p * a.column];
+            }
+        }
+    }
+}
+
+/// Rows of A as a job reads them.
+#[derive(Clone, Copy)]
+enum Rows<'a> {
+    /// Panels of MR rows, depth by depth.
+    Packed(&'a [f32]),
+    /// As they lie.
+    Strided {
+        data: &'a [f32],
+        row: usize,
+        column: usize,
+    },
+}
+
+/// One job: a block of rows and columns over one depth.
+struct Block {
+    rows: usize,
+    columns: usize,
+    depth: usize,
+    keep: f32,
+    scale: f32,
+    out_row: usize,
+}
+
+impl Block {
+    /// # Safety
+    /// `out` is the block's first element, valid as [`product`] demands; A
+    /// and the packed B cover the block; AVX-512 is there.
+    unsafe fn run(&self, a: Rows, packed_b: &[f32], out: *mut f32) {
+        for first in (0..self.columns).step_by(NR) {
+            let b = &packed_b[first * self.depth..][..NR * self.depth];
+            let columns = NR.min(self.columns - first);
+            for top in (0..self.rows).step_by(MR) {
+                let rows = MR.min(self.rows - top);
+                // SAFETY: by the caller's contract.
+                #[cfg(target_arch = "x86_64")]
+                unsafe {
+                    let out = out.add(top * self.out_row + first);
+                    match (a, columns > 16) {
+                        (Rows::Packed(a), true) => {
+                            tile::<2, true>(
+                                &a[top * self.depth..],
+                                1,
+                                MR,
+                                b,
+                                self,
+                                (rows, columns),
+                                out,
+                            );
+                        }
+                        (Rows::Packed(a), false) => {
+                            tile::<1, true>(
+                                &a[top * self.depth..],
+                                1,
+                                MR,
+                                b,
+                                self,
+                                (rows, columns),
+                                out,
+                            );
+                        }
+                        (Rows::Strided { data, row, column }, true) => {
+                            tile::<2, false>(
+                                &data[top * row..],
+                                row,
+                                column,
+                                b,
+                                self,
+                                (rows, columns),
+                                out,
+                            );
+                        }
+                        (Rows::Strided { data, row, column }, false) => {
+                            tile::<1, false>(
+                                &data[top * row..],
+                                row,
+                                column,
+                                b,
+                                self,
+                                (rows, columns),
+                                out,
+                            );
+                        }
+                    }
+                }
+                #[cfg(not(target_arch = "x86_64"))]
+                let _ = (a, b, rows, columns, out);
+            }
+        }
+    }
+}
+
+/// MR x 16 HALVES sums over the depth, of which `rows` x `columns` are stored.
+/// A's element (i, p) is at `i * a_row + p * a_column`; where it is PACKED
+/// these are 1 and MR.
+///
+/// # Safety
+/// As [`Block::run`]; `b` holds `depth` rows of NR elements, `a` reaches to
+/// its last row and depth.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+unsafe fn tile<const HALVES: usize, const PACKED: bool>(
+    a: &[f32],
+    a_row: usize,
+    a_column: usize,
+    b: &[f32],
+    block: &Block,
+    (rows, columns): (usize, usize),
+    out: *mut f32,
+) {
+    use std::arch::x86_64::*;
+    let mut sums = [[_mm512_setzero_ps(); HALVES]; MR];
+    let (a, b) = (a.as_ptr(), b.as_ptr());
+    // SAFETY: rows past the last read the last one again, and are not stored;
+    // masked loads and stores touch `rows` x `columns` elements of `out` only.
+    unsafe {
+        let starts: [*const f32; MR] = std::array::from_fn(|i| a.add(i.min(rows - 1) * a_row));
+        for p in 0..block.depth {
+            let row = b.add(p * NR);
+            let panel: [__m512; HALVES] =
+                std::array::from_fn(|half| _mm512_loadu_ps(row.add(16 * half)));
+            for i in 0..MR {
+                let element = if PACKED {
+                    *a.add(p * MR + i)
+                } else {
+                    *starts[i].add(p * a_column)
+                };
+                let element = _mm512_set1_ps(element);
+                for half in 0..HALVES {
+                    sums[i][half] = _mm512_fmadd_ps(element, panel[half], sums[i][half]);
+                }
+            }
+        }
+        let mask = |count: usize| -> __mmask16 {
+            if count >= 16 {
+                0xffff
+            } else {
+                (1u16 << count) - 1
+            }
+        };
+        let (keep, scale) = (_mm512_set1_ps(block.keep), _mm512_set1_ps(block.scale));
+        for i in 0..MR {
+            if i >= rows {
+                break;
+            }
+            for half in 0..HALVES {
+                let mask = mask(columns.saturating_sub(16 * half));
+                let at = out.add(i * block.out_row).wrapping_add(16 * half);
+                let mut value = _mm512_mul_ps(sums[i][half], scale);
+                // What is not kept may be anything, NaN too.
+                if block.keep != 0.0 {
+                    let old = _mm512_maskz_loadu_ps(mask, at);
+                    value = _mm512_fmadd_ps(old, keep, value);
+                }
+                _mm512_mask_storeu_ps(at, mask, value);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::matmul::product as either;
+    use super::*;
+
+    /// Against sums in f64, for sizes at and off every block's border, all
+    /// four orders of storage, and both ways of treating what was there.
+    #[test]
+    fn products_match_f64_for_odd_sizes_and_strides() {
+        let value = |i: usize| ((i * 2_654_435_761) % 1000) as f32 / 500.0 - 1.0;
+        for (m, n, k) in [
+            (1, 1, 1),
+            (14, 32, 256),
+            (15, 33, 257),
+            (3, 700, 40),
+            (350, 5, 7),
+            (40, 40, 600),
+            (2, 3, 0),
+        ] {
+            let a: Vec<f32> = (0..m * k).map(value).collect();
+            let b: Vec<f32> = (0..n * k).map(|i| value(i + 7)).collect();
+            for (a_row, a_column, b_row, b_column) in
+                [(k, 1, n, 1), (1, m, n, 1), (k, 1, 1, k), (1, m, 1, k)]
+            {
+                for keep in [0.0, 1.0, 0.5] {
+                    let start: Vec<f32> = if keep == 0.0 {
+                        vec![f32::NAN; m * n]
+                    } else {
+                        (0..m * n).map(value).collect()
+                    };
+                    for threads in [Threads::One, Threads::All] {
+                        let mut out = start.clone();
+                        let a_view = View {
+                            data: &a,
+                            row: a_row,
+                            column: a_column,
+                        };
+                        let b_view = View {
+                            data: &b,
+                            row: b_row,
+                            column: b_column,
+                        };
+                        either((m, n, k), &mut out, keep, a_view, b_view, threads);
+                        for i in 0..m {
+                            for j in 0..n {
+                                let mut sum = if keep == 0.0 {
+                                    0.0
+                                } else {
+                                    keep as f64 * start[i * n + j] as f64
+                                };
+                                let mut size = sum.abs();
+                                for p in 0..k {
+                                    let term = a[i * a_row + p * a_column] as f64
+                                        * b[p * b_row + j * b_column] as f64;
+                                    sum += term;
+                                    size += term.abs();
+                                }
+                                // The bound of any order of summation [Higham 2002, 4.4].
+                                let tolerance = (k + 3) as f64 * (-24f64).exp2() * size + 1e-30;
+                                let error = (out[i * n + j] as f64 - sum).abs();
+                                assert!(
+                                    error <= tolerance,
+                                    "{m}x{n}x{k} at {i},{j}: {} not {sum}",
+                                    out[i * n + j]
+                                );
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
