@@ -2,51 +2,22 @@
 //! without a branch an element.
 use std::borrow::Cow;
 
-use super::document::{Accessor, Document};
+use gltf::json::accessor::{ComponentType, GenericComponentType, IndexComponentType, Type};
+use gltf::json::validation::Checked;
+use gltf::json::{Accessor, Index, buffer};
+
+use super::document::Document;
 use crate::error::Error;
 
 const EXPORT: &str = "export the file again";
 
 /// The buffers of a document.
 pub(super) struct Buffers<'a> {
-    document: &'a Document,
+    document: &'a Document<'a>,
     /// `None`: not to be had; an error once it is needed.
     bytes: Vec<Option<Cow<'a, [u8]>>>,
     /// Most elements that an accessor may have.
     max_count: u64,
-}
-
-/// What the components of an accessor are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Component {
-    I8,
-    U8,
-    I16,
-    U16,
-    U32,
-    F32,
-}
-
-impl Component {
-    fn of(code: u32) -> Option<Self> {
-        Some(match code {
-            5120 => Self::I8,
-            5121 => Self::U8,
-            5122 => Self::I16,
-            5123 => Self::U16,
-            5125 => Self::U32,
-            5126 => Self::F32,
-            _ => return None,
-        })
-    }
-
-    fn size(self) -> usize {
-        match self {
-            Self::I8 | Self::U8 => 1,
-            Self::I16 | Self::U16 => 2,
-            Self::U32 | Self::F32 => 4,
-        }
-    }
 }
 
 /// A checked run of elements: `bytes[i * stride..][..size]` is element `i`.
@@ -65,7 +36,11 @@ impl<'a> Run<'a> {
 }
 
 impl<'a> Buffers<'a> {
-    pub fn new(document: &'a Document, bytes: Vec<Option<Cow<'a, [u8]>>>, max_count: u64) -> Self {
+    pub fn new(
+        document: &'a Document<'a>,
+        bytes: Vec<Option<Cow<'a, [u8]>>>,
+        max_count: u64,
+    ) -> Self {
         Self {
             document,
             bytes,
@@ -74,36 +49,33 @@ impl<'a> Buffers<'a> {
     }
 
     /// The accessor that `place` refers to.
-    pub fn accessor(&self, index: usize, place: &str) -> Result<&'a Accessor, Error> {
-        get(&self.document.accessors, index, place, "accessors")
+    pub fn accessor(&self, index: Index<Accessor>, place: &str) -> Result<&'a Accessor, Error> {
+        get(&self.document.accessors, index.value(), place, "accessors")
     }
 
     /// All bytes of a buffer view, and its stride.
-    pub fn view(&self, index: usize, place: &str) -> Result<(&[u8], Option<u64>), Error> {
-        let view = get(&self.document.buffer_views, index, place, "buffer views")?;
+    pub fn view(
+        &self,
+        index: Index<buffer::View>,
+        place: &str,
+    ) -> Result<(&[u8], Option<usize>), Error> {
+        let views = &self.document.buffer_views;
+        let view = get(views, index.value(), place, "buffer views")?;
         let at = format!("bufferViews[{index}]");
-        get(
-            &self.document.buffers,
-            view.buffer,
-            &format!("{at}.buffer"),
-            "buffers",
-        )?;
-        let buffer = self.bytes[view.buffer].as_deref().ok_or_else(|| {
-            Error::malformed(
-                format!("buffers[{}] has no data in the file", view.buffer),
-                EXPORT,
-            )
+        let owner = view.buffer.value();
+        let buffers = &self.document.buffers;
+        get(buffers, owner, &format!("{at}.buffer"), "buffers")?;
+        let buffer = self.bytes[owner].as_deref().ok_or_else(|| {
+            Error::malformed(format!("buffers[{owner}] has no data in the file"), EXPORT)
         })?;
-        let end = view.byte_offset.checked_add(view.byte_length);
-        end.and_then(|end| buffer.get(view.byte_offset as usize..usize::try_from(end).ok()?))
-            .map(|bytes| (bytes, view.byte_stride))
+        let (offset, length) = (view.byte_offset.unwrap_or_default().0, view.byte_length.0);
+        let end = offset.checked_add(length);
+        end.and_then(|end| buffer.get(offset as usize..usize::try_from(end).ok()?))
+            .map(|bytes| (bytes, view.byte_stride.map(|stride| stride.0)))
             .ok_or_else(|| {
                 Error::malformed(
                     format!(
-                        "{at} wants {} bytes from byte {}, but buffers[{}] has {}",
-                        view.byte_length,
-                        view.byte_offset,
-                        view.buffer,
+                        "{at} wants {length} bytes from byte {offset}, but buffers[{owner}] has {}",
                         buffer.len()
                     ),
                     EXPORT,
@@ -113,7 +85,7 @@ impl<'a> Buffers<'a> {
 
     fn run(
         &self,
-        view: usize,
+        view: Index<buffer::View>,
         view_place: &str,
         offset: u64,
         size: usize,
@@ -121,8 +93,8 @@ impl<'a> Buffers<'a> {
         what: &str,
     ) -> Result<Run<'_>, Error> {
         let (bytes, stride) = self.view(view, view_place)?;
-        let stride = stride.unwrap_or(size as u64);
-        if stride < size as u64 {
+        let stride = stride.unwrap_or(size);
+        if stride < size {
             return Err(Error::malformed(
                 format!(
                     "bufferViews[{view}].byteStride is {stride}, but an element of {what} has {size} bytes"
@@ -132,13 +104,13 @@ impl<'a> Buffers<'a> {
         }
         let needed = count
             .saturating_sub(1)
-            .checked_mul(stride)
+            .checked_mul(stride as u64)
             .and_then(|n| n.checked_add(offset))
             .and_then(|n| n.checked_add(if count == 0 { 0 } else { size as u64 }));
         match needed {
             Some(needed) if needed <= bytes.len() as u64 => Ok(Run {
                 bytes: &bytes[offset as usize..],
-                stride: stride as usize,
+                stride,
                 size,
                 count: count as usize,
             }),
@@ -152,13 +124,33 @@ impl<'a> Buffers<'a> {
         }
     }
 
-    fn component(code: u32, what: &str) -> Result<Component, Error> {
-        Component::of(code).ok_or_else(|| {
-            Error::malformed(
-                format!("{what}.componentType is {code}; accepted: 5120 to 5123, 5125, 5126"),
+    fn component(&self, index: Index<Accessor>) -> Result<ComponentType, Error> {
+        match self.document.accessors[index.value()].component_type {
+            Checked::Valid(GenericComponentType(component)) => Ok(component),
+            Checked::Invalid => Err(Error::malformed(
+                format!(
+                    "accessors[{index}].componentType is {}; accepted: 5120 to 5123, 5125, 5126",
+                    self.document
+                        .quoted(&format!("/accessors/{index}/componentType"))
+                ),
                 EXPORT,
-            )
-        })
+            )),
+        }
+    }
+
+    /// Components of an element.
+    pub fn components(&self, index: Index<Accessor>) -> Result<usize, Error> {
+        match self.document.accessors[index.value()].type_ {
+            // Columns of smaller matrices are padded, and nothing that is read has such elements.
+            Checked::Valid(Type::Mat2 | Type::Mat3) | Checked::Invalid => Err(Error::malformed(
+                format!(
+                    "accessors[{index}].type is {}; accepted: SCALAR, VEC2, VEC3, VEC4, MAT4",
+                    self.document.quoted(&format!("/accessors/{index}/type"))
+                ),
+                EXPORT,
+            )),
+            Checked::Valid(kind) => Ok(kind.multiplicity()),
+        }
     }
 
     fn bounded(&self, count: u64, what: &str) -> Result<(), Error> {
@@ -175,14 +167,14 @@ impl<'a> Buffers<'a> {
     /// accessor (or `normalize`) says so, else the float of the same value (`KHR_mesh_quantization`).
     pub fn floats<const N: usize, T>(
         &self,
-        index: usize,
+        index: Index<Accessor>,
         place: &str,
         normalize: bool,
         map: impl Fn([f32; N]) -> T,
     ) -> Result<Vec<T>, Error> {
         let accessor = self.accessor(index, place)?;
         let what = format!("accessors[{index}]");
-        let components = components_of(&accessor.kind, &what)?;
+        let components = self.components(index)?;
         if components != N {
             return Err(Error::malformed(
                 format!(
@@ -191,8 +183,8 @@ impl<'a> Buffers<'a> {
                 EXPORT,
             ));
         }
-        self.bounded(accessor.count, &what)?;
-        let component = Self::component(accessor.component_type, &what)?;
+        self.bounded(accessor.count.0, &what)?;
+        let component = self.component(index)?;
         let normalize = normalize || accessor.normalized;
         let size = component.size() * N;
         let mut out = match accessor.buffer_view {
@@ -200,25 +192,25 @@ impl<'a> Buffers<'a> {
                 self.run(
                     view,
                     &format!("{what}.bufferView"),
-                    accessor.byte_offset,
+                    accessor.byte_offset.unwrap_or_default().0,
                     size,
-                    accessor.count,
+                    accessor.count.0,
                     &what,
                 )?,
                 component,
                 normalize,
                 &map,
             ),
-            None => (0..accessor.count).map(|_| map([0.0; N])).collect(),
+            None => (0..accessor.count.0).map(|_| map([0.0; N])).collect(),
         };
         if let Some(sparse) = &accessor.sparse {
-            let targets = self.sparse_targets(accessor, &what)?;
+            let targets = self.sparse_targets(index, accessor)?;
             let values = self.run(
                 sparse.values.buffer_view,
                 &format!("{what}.sparse.values.bufferView"),
-                sparse.values.byte_offset,
+                sparse.values.byte_offset.0,
                 size,
-                sparse.count,
+                sparse.count.0,
                 &format!("{what}.sparse.values"),
             )?;
             for (target, value) in targets
@@ -232,27 +224,40 @@ impl<'a> Buffers<'a> {
     }
 
     /// Which elements a sparse accessor replaces, all in range.
-    fn sparse_targets(&self, accessor: &Accessor, what: &str) -> Result<Vec<u32>, Error> {
+    fn sparse_targets(
+        &self,
+        index: Index<Accessor>,
+        accessor: &Accessor,
+    ) -> Result<Vec<u32>, Error> {
         let Some(sparse) = &accessor.sparse else {
             return Ok(Vec::new());
         };
-        let at = format!("{what}.sparse.indices");
-        self.bounded(sparse.count, &at)?;
-        let component = Self::component(sparse.indices.component_type, &at)?;
+        let at = format!("accessors[{index}].sparse.indices");
+        self.bounded(sparse.count.0, &at)?;
+        let Checked::Valid(IndexComponentType(component)) = sparse.indices.component_type else {
+            let pointer = format!("/accessors/{index}/sparse/indices/componentType");
+            return Err(Error::malformed(
+                format!(
+                    "{at}.componentType is {}; accepted: 5121, 5123, 5125",
+                    self.document.quoted(&pointer)
+                ),
+                EXPORT,
+            ));
+        };
         let run = self.run(
             sparse.indices.buffer_view,
             &format!("{at}.bufferView"),
-            sparse.indices.byte_offset,
+            sparse.indices.byte_offset.0,
             component.size(),
-            sparse.count,
+            sparse.count.0,
             &at,
         )?;
         let targets = decode_unsigned(run, component, &at)?;
-        match targets.iter().find(|t| u64::from(**t) >= accessor.count) {
+        match targets.iter().find(|t| u64::from(**t) >= accessor.count.0) {
             Some(bad) => Err(Error::Dangling {
                 place: at,
                 index: u64::from(*bad),
-                count: accessor.count,
+                count: accessor.count.0,
                 things: "elements to replace",
             }),
             None => Ok(targets),
@@ -260,43 +265,43 @@ impl<'a> Buffers<'a> {
     }
 
     /// Unsigned integers, for indices and joints of one component.
-    pub fn unsigned(&self, index: usize, place: &str) -> Result<Vec<u32>, Error> {
+    pub fn unsigned(&self, index: Index<Accessor>, place: &str) -> Result<Vec<u32>, Error> {
         let accessor = self.accessor(index, place)?;
         let what = format!("accessors[{index}]");
-        if accessor.kind != "SCALAR" {
+        if accessor.type_ != Checked::Valid(Type::Scalar) {
             return Err(Error::malformed(
                 format!(
                     "{place} refers to {what}, which is {}; accepted: SCALAR",
-                    accessor.kind
+                    self.document.quoted(&format!("/accessors/{index}/type"))
                 ),
                 EXPORT,
             ));
         }
-        self.bounded(accessor.count, &what)?;
-        let component = Self::component(accessor.component_type, &what)?;
+        self.bounded(accessor.count.0, &what)?;
+        let component = self.component(index)?;
         let mut out = match accessor.buffer_view {
             Some(view) => {
                 let run = self.run(
                     view,
                     &format!("{what}.bufferView"),
-                    accessor.byte_offset,
+                    accessor.byte_offset.unwrap_or_default().0,
                     component.size(),
-                    accessor.count,
+                    accessor.count.0,
                     &what,
                 )?;
                 decode_unsigned(run, component, &what)?
             }
-            None => vec![0; accessor.count as usize],
+            None => vec![0; accessor.count.0 as usize],
         };
         if let Some(sparse) = &accessor.sparse {
-            let targets = self.sparse_targets(accessor, &what)?;
+            let targets = self.sparse_targets(index, accessor)?;
             let at = format!("{what}.sparse.values");
             let run = self.run(
                 sparse.values.buffer_view,
                 &format!("{at}.bufferView"),
-                sparse.values.byte_offset,
+                sparse.values.byte_offset.0,
                 component.size(),
-                sparse.count,
+                sparse.count.0,
                 &at,
             )?;
             for (target, value) in targets
@@ -325,26 +330,9 @@ pub(super) fn get<'a, T>(
     })
 }
 
-/// Components of an element.
-pub(super) fn components_of(kind: &str, what: &str) -> Result<usize, Error> {
-    Ok(match kind {
-        "SCALAR" => 1,
-        "VEC2" => 2,
-        "VEC3" => 3,
-        "VEC4" => 4,
-        "MAT4" => 16,
-        other => {
-            return Err(Error::malformed(
-                format!("{what}.type is \"{other}\"; accepted: SCALAR, VEC2, VEC3, VEC4, MAT4"),
-                EXPORT,
-            ));
-        }
-    })
-}
-
 fn decode<const N: usize, T>(
     run: Run,
-    component: Component,
+    component: ComponentType,
     normalize: bool,
     map: impl Fn([f32; N]) -> T,
 ) -> Vec<T> {
@@ -364,37 +352,37 @@ fn decode<const N: usize, T>(
     // glTF 2.0, 3.6.2.2: the most negative integers clamp to -1.
     let floor = if normalize { -1.0 } else { f32::NEG_INFINITY };
     match component {
-        Component::F32 => each(run, map, f32::from_le_bytes),
-        Component::U8 => {
+        ComponentType::F32 => each(run, map, f32::from_le_bytes),
+        ComponentType::U8 => {
             let k = if normalize { 255.0 } else { 1.0 };
             each(run, map, |[b]: [u8; 1]| f32::from(b) / k)
         }
-        Component::U16 => {
+        ComponentType::U16 => {
             let k = if normalize { 65535.0 } else { 1.0 };
             each(run, map, |b| f32::from(u16::from_le_bytes(b)) / k)
         }
-        Component::I8 => {
+        ComponentType::I8 => {
             let k = if normalize { 127.0 } else { 1.0 };
             each(run, map, |[b]: [u8; 1]| (f32::from(b as i8) / k).max(floor))
         }
-        Component::I16 => {
+        ComponentType::I16 => {
             let k = if normalize { 32767.0 } else { 1.0 };
             each(run, map, |b| {
                 (f32::from(i16::from_le_bytes(b)) / k).max(floor)
             })
         }
-        Component::U32 => each(run, map, |b| u32::from_le_bytes(b) as f32),
+        ComponentType::U32 => each(run, map, |b| u32::from_le_bytes(b) as f32),
     }
 }
 
-fn decode_unsigned(run: Run, component: Component, what: &str) -> Result<Vec<u32>, Error> {
+fn decode_unsigned(run: Run, component: ComponentType, what: &str) -> Result<Vec<u32>, Error> {
     Ok(match component {
-        Component::U8 => run.elements().map(|e| u32::from(e[0])).collect(),
-        Component::U16 => run
+        ComponentType::U8 => run.elements().map(|e| u32::from(e[0])).collect(),
+        ComponentType::U16 => run
             .elements()
             .map(|e| u32::from(u16::from_le_bytes([e[0], e[1]])))
             .collect(),
-        Component::U32 => run
+        ComponentType::U32 => run
             .elements()
             .map(|e| u32::from_le_bytes([e[0], e[1], e[2], e[3]]))
             .collect(),

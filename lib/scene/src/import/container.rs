@@ -1,4 +1,5 @@
 //! The GLB container, data URIs, and where files that a document names are found.
+use std::borrow::Cow;
 use std::cell::RefCell;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -168,9 +169,10 @@ fn base64_decoded(text: &str) -> Option<Vec<u8>> {
     Some(out)
 }
 
+const COPY: &str = "export or copy the file again";
+
 /// The JSON text of a glTF file and the binary chunk behind it, if it is a GLB.
 pub(super) fn split(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), Error> {
-    const COPY: &str = "export or copy the file again";
     if !bytes.starts_with(b"glTF") {
         let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
         return match text.iter().find(|b| !b.is_ascii_whitespace()) {
@@ -182,12 +184,17 @@ pub(super) fn split(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), Error> {
             )),
         };
     }
-    let word = |at: usize| -> Option<u32> {
-        Some(u32::from_le_bytes(
-            bytes.get(at..at.checked_add(4)?)?.try_into().ok()?,
-        ))
-    };
-    let (Some(version), Some(length)) = (word(4), word(8)) else {
+    match gltf::Glb::from_slice(whole(bytes)?) {
+        Ok(glb) => Ok((borrowed(glb.json), glb.bin.map(borrowed))),
+        Err(gltf::Error::Binary(error)) => split_failed(bytes, error),
+        Err(error) => Err(Error::malformed(format!("the GLB file: {error}"), COPY)),
+    }
+}
+
+/// The bytes that a GLB header announces; the reader takes more for chunks and subtracts the
+/// header's size unchecked.
+fn whole(bytes: &[u8]) -> Result<&[u8], Error> {
+    let (Some(version), Some(length)) = (word(bytes, 4), word(bytes, 8)) else {
         return Err(Error::malformed(
             format!("the GLB header has 12 bytes, the file only {}", bytes.len()),
             COPY,
@@ -199,34 +206,55 @@ pub(super) fn split(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), Error> {
             "export the file as glTF 2.0",
         ));
     }
-    if length as usize > bytes.len() {
-        return Err(Error::malformed(
+    if length < 12 {
+        return Err(Error::malformed("the GLB file has no JSON chunk", COPY));
+    }
+    bytes.get(..length as usize).ok_or_else(|| {
+        Error::malformed(
             format!(
                 "the GLB header announces {length} bytes, the file has {}: it is cut short",
                 bytes.len()
             ),
             COPY,
+        )
+    })
+}
+
+fn split_failed(bytes: &[u8], error: gltf::binary::Error) -> Result<(&[u8], Option<&[u8]>), Error> {
+    use gltf::binary::{ChunkType, Error as Glb};
+    let json_size = word(bytes, 12).unwrap_or(0) as usize;
+    if let Glb::ChunkLength {
+        ty,
+        length,
+        length_read,
+    } = error
+    {
+        let at = match ty {
+            ChunkType::Json => 12,
+            ChunkType::Bin => 20 + json_size,
+        };
+        return Err(Error::malformed(
+            format!("the GLB chunk at byte {at} announces {length} bytes, {length_read} are left"),
+            COPY,
         ));
     }
-    let mut chunks = Vec::new();
-    let mut at = 12;
-    while at + 8 <= length as usize && chunks.len() < 2 {
-        let (size, kind) = (word(at).unwrap_or(0) as usize, word(at + 4).unwrap_or(0));
-        let Some(chunk) = bytes.get(at + 8..at + 8 + size) else {
-            return Err(Error::malformed(
-                format!(
-                    "the GLB chunk at byte {at} announces {size} bytes, {} are left",
-                    bytes.len() - at - 8
-                ),
-                COPY,
-            ));
-        };
-        chunks.push((kind, chunk));
-        at += 8 + size;
-    }
-    match chunks[..] {
-        [(0x4E4F_534A, json), (0x004E_4942, binary), ..] => Ok((json, Some(binary))),
-        [(0x4E4F_534A, json), ..] => Ok((json, None)),
+    // Chunks of unknown kinds and stray bytes behind the JSON are to be passed over (glTF 2.0,
+    // 4.4.3.1); the reader stops there.
+    match bytes.get(20..20 + json_size) {
+        Some(json) if bytes[16..20] == *b"JSON" => Ok((json, None)),
         _ => Err(Error::malformed("the GLB file has no JSON chunk", COPY)),
+    }
+}
+
+fn word(bytes: &[u8], at: usize) -> Option<u32> {
+    let word = bytes.get(at..at + 4)?;
+    Some(u32::from_le_bytes(word.try_into().ok()?))
+}
+
+/// A part of a slice, which the reader does not copy.
+fn borrowed(part: Cow<'_, [u8]>) -> &[u8] {
+    match part {
+        Cow::Borrowed(slice) => slice,
+        Cow::Owned(_) => &[],
     }
 }

@@ -1,281 +1,292 @@
-//! The part of a glTF 2.0 JSON document that the importer reads.
+//! A glTF document: the `gltf` crate's model of the JSON, and beside it the little that the model
+//! cannot say.
 //!
-//! Indices are plain numbers here; whoever follows one checks it (glTF 2.0 specification, section 5,
-//! and the Khronos extension registry for the rest).
+//! Nothing is validated as a whole, for a file may use extensions that the crate does not know.
+//! Whoever follows an index checks it.
 use std::collections::BTreeMap;
+use std::fmt;
+use std::ops::Deref;
 
+use gltf::json as model;
 use serde::Deserialize;
-use serde::de::IgnoredAny;
+use serde::de::{DeserializeSeed, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde_json::{Map, Value, json};
 
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct Document {
-    pub asset: Asset,
-    pub scene: Option<usize>,
-    pub scenes: Vec<SceneRoots>,
-    pub nodes: Vec<Node>,
-    pub meshes: Vec<Mesh>,
-    pub skins: Vec<Skin>,
-    pub accessors: Vec<Accessor>,
-    pub buffer_views: Vec<BufferView>,
-    pub buffers: Vec<Buffer>,
-    pub materials: Vec<Material>,
-    pub textures: Vec<Texture>,
-    pub images: Vec<Image>,
-    pub samplers: Vec<Sampler>,
-    pub animations: Vec<IgnoredAny>,
-    pub extensions_required: Vec<String>,
+use crate::error::Error;
+
+const EXPORT: &str = "export the file again";
+
+/// Dereferences to the model.
+#[derive(Debug)]
+pub(super) struct Document<'a> {
+    text: &'a [u8],
+    root: model::Root,
+    beside: Beside,
 }
 
+/// What the model leaves out.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-pub(super) struct Asset {
-    pub version: Option<String>,
+struct Beside {
+    nodes: Vec<Placement>,
+    materials: Vec<Presence>,
 }
 
-#[derive(Debug, Default, Deserialize)]
+/// A node's transform as written: the model rounds it to single precision, a millimetre every ten
+/// kilometres.
+#[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-pub(super) struct SceneRoots {
-    pub nodes: Vec<usize>,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default)]
-pub(super) struct Node {
-    pub mesh: Option<usize>,
-    pub skin: Option<usize>,
-    pub children: Vec<usize>,
+pub(super) struct Placement {
     pub matrix: Option<[f64; 16]>,
     pub translation: Option<[f64; 3]>,
     pub rotation: Option<[f64; 4]>,
     pub scale: Option<[f64; 3]>,
-    pub weights: Option<Vec<f64>>,
-    pub extensions: NodeExtensions,
 }
 
 #[derive(Debug, Default, Deserialize)]
-#[serde(default)]
-pub(super) struct NodeExtensions {
-    #[serde(rename = "EXT_mesh_gpu_instancing")]
-    pub instancing: Option<Instancing>,
+#[serde(default, rename_all = "camelCase")]
+struct Presence {
+    pbr_metallic_roughness: Option<IgnoredAny>,
 }
 
+/// `EXT_mesh_gpu_instancing` of a node.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(super) struct Instancing {
-    pub attributes: BTreeMap<String, usize>,
+    pub attributes: BTreeMap<String, model::Index<model::Accessor>>,
 }
 
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct Skin {
-    pub joints: Vec<usize>,
-    pub inverse_bind_matrices: Option<usize>,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default)]
-pub(super) struct Mesh {
-    pub primitives: Vec<Primitive>,
-    pub weights: Option<Vec<f64>>,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default)]
-pub(super) struct Primitive {
-    pub attributes: BTreeMap<String, usize>,
-    pub indices: Option<usize>,
-    pub material: Option<usize>,
-    pub mode: Option<u32>,
-    pub targets: Vec<BTreeMap<String, usize>>,
-    pub extensions: BTreeMap<String, IgnoredAny>,
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "camelCase")]
-pub(super) struct Accessor {
-    pub buffer_view: Option<usize>,
-    #[serde(default)]
-    pub byte_offset: u64,
-    pub component_type: u32,
-    #[serde(default)]
-    pub normalized: bool,
-    pub count: u64,
-    #[serde(rename = "type")]
-    pub kind: String,
-    pub sparse: Option<Sparse>,
-}
-
-#[derive(Debug, Deserialize)]
-pub(super) struct Sparse {
-    pub count: u64,
-    pub indices: SparseIndices,
-    pub values: SparseValues,
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "camelCase")]
-pub(super) struct SparseIndices {
-    pub buffer_view: usize,
-    #[serde(default)]
-    pub byte_offset: u64,
-    pub component_type: u32,
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "camelCase")]
-pub(super) struct SparseValues {
-    pub buffer_view: usize,
-    #[serde(default)]
-    pub byte_offset: u64,
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "camelCase")]
-pub(super) struct BufferView {
-    pub buffer: usize,
-    #[serde(default)]
-    pub byte_offset: u64,
-    pub byte_length: u64,
-    pub byte_stride: Option<u64>,
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "camelCase")]
-pub(super) struct Buffer {
-    pub uri: Option<String>,
-    pub byte_length: u64,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct Image {
-    pub name: Option<String>,
-    pub uri: Option<String>,
-    pub buffer_view: Option<usize>,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct Sampler {
-    pub mag_filter: Option<u32>,
-    pub wrap_s: Option<u32>,
-    pub wrap_t: Option<u32>,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default)]
-pub(super) struct Texture {
-    pub sampler: Option<usize>,
-    pub source: Option<usize>,
-    pub extensions: BTreeMap<String, IgnoredAny>,
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "camelCase")]
-pub(super) struct TextureInfo {
-    pub index: usize,
-    #[serde(default)]
-    pub tex_coord: u32,
-    /// Of normal maps.
-    pub scale: Option<f32>,
-    #[serde(default)]
-    pub extensions: TextureInfoExtensions,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default)]
-pub(super) struct TextureInfoExtensions {
-    #[serde(rename = "KHR_texture_transform")]
-    pub transform: Option<TextureTransform>,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct TextureTransform {
-    pub offset: Option<[f32; 2]>,
-    pub rotation: f32,
-    pub scale: Option<[f32; 2]>,
-    pub tex_coord: Option<u32>,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct Material {
-    pub name: Option<String>,
-    pub pbr_metallic_roughness: Option<MetallicRoughness>,
-    pub normal_texture: Option<TextureInfo>,
-    pub emissive_texture: Option<TextureInfo>,
-    pub emissive_factor: Option<[f32; 3]>,
-    pub alpha_mode: Option<String>,
-    pub alpha_cutoff: Option<f32>,
-    pub double_sided: bool,
-    pub extensions: MaterialExtensions,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct MetallicRoughness {
-    pub base_color_factor: Option<[f32; 4]>,
-    pub base_color_texture: Option<TextureInfo>,
-    pub metallic_factor: Option<f32>,
-    pub roughness_factor: Option<f32>,
-    pub metallic_roughness_texture: Option<TextureInfo>,
-}
-
-#[derive(Debug, Default, Deserialize)]
-#[serde(default)]
-pub(super) struct MaterialExtensions {
-    #[serde(rename = "KHR_materials_clearcoat")]
-    pub clearcoat: Option<Clearcoat>,
-    #[serde(rename = "KHR_materials_transmission")]
-    pub transmission: Option<Transmission>,
-    #[serde(rename = "KHR_materials_ior")]
-    pub ior: Option<Ior>,
-    #[serde(rename = "KHR_materials_unlit")]
-    pub unlit: Option<IgnoredAny>,
-    #[serde(rename = "KHR_materials_emissive_strength")]
-    pub emissive_strength: Option<EmissiveStrength>,
-    #[serde(rename = "KHR_materials_pbrSpecularGlossiness")]
-    pub specular_glossiness: Option<SpecularGlossiness>,
-    /// Extensions that are not read; they are named in a warning.
-    #[serde(flatten)]
-    pub others: BTreeMap<String, IgnoredAny>,
-}
-
+/// `KHR_materials_clearcoat` of a material.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default, rename_all = "camelCase")]
 pub(super) struct Clearcoat {
     pub clearcoat_factor: f32,
-    pub clearcoat_texture: Option<TextureInfo>,
+    pub clearcoat_texture: Option<model::texture::Info>,
     pub clearcoat_roughness_factor: f32,
-    pub clearcoat_roughness_texture: Option<TextureInfo>,
-    pub clearcoat_normal_texture: Option<TextureInfo>,
+    pub clearcoat_roughness_texture: Option<model::texture::Info>,
+    pub clearcoat_normal_texture: Option<model::material::NormalTexture>,
 }
 
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct Transmission {
-    pub transmission_factor: f32,
-    pub transmission_texture: Option<TextureInfo>,
+impl Deref for Document<'_> {
+    type Target = model::Root;
+
+    fn deref(&self) -> &model::Root {
+        &self.root
+    }
 }
 
-#[derive(Debug, Default, Deserialize)]
-#[serde(default)]
-pub(super) struct Ior {
-    pub ior: Option<f32>,
+impl<'a> Document<'a> {
+    /// Reads the JSON text of a file.
+    pub fn read(text: &'a [u8]) -> Result<Self, Error> {
+        let unreadable = |e| Error::malformed(format!("the glTF JSON cannot be read: {e}"), EXPORT);
+        let root = match serde_json::from_slice(text) {
+            Ok(root) => root,
+            Err(strict) => read_leniently(text, strict).map_err(unreadable)?,
+        };
+        let mut indices = serde_json::Deserializer::from_slice(text);
+        IndexGuard::Elsewhere
+            .deserialize(&mut indices)
+            .map_err(unreadable)?;
+        Ok(Self {
+            text,
+            root,
+            beside: serde_json::from_slice(text).map_err(unreadable)?,
+        })
+    }
+
+    /// The transform of `nodes[index]`.
+    pub fn placement(&self, index: usize) -> Placement {
+        self.beside.nodes.get(index).cloned().unwrap_or_default()
+    }
+
+    /// Whether `materials[index]` has `pbrMetallicRoughness`, which the model fills in otherwise.
+    pub fn has_metallic_roughness(&self, index: usize) -> bool {
+        let presence = self.beside.materials.get(index);
+        presence.is_some_and(|m| m.pbr_metallic_roughness.is_some())
+    }
+
+    /// What the file says at a JSON `pointer`, for messages about values that the model only calls
+    /// invalid.
+    pub fn quoted(&self, pointer: &str) -> String {
+        let whole: Option<Value> = serde_json::from_slice(self.text).ok();
+        let value = whole.as_ref().and_then(|v| v.pointer(pointer));
+        value.map_or_else(|| "missing".into(), Value::to_string)
+    }
 }
 
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct EmissiveStrength {
-    pub emissive_strength: Option<f32>,
+/// The contents of an extension that the model keeps as plain JSON; `at` is where it stands.
+pub(super) fn raw_extension<T: serde::de::DeserializeOwned>(
+    others: &Map<String, Value>,
+    name: &str,
+    at: &str,
+) -> Result<Option<T>, Error> {
+    others
+        .get(name)
+        .filter(|v| !v.is_null())
+        .map(|v| T::deserialize(v))
+        .transpose()
+        .map_err(|e| {
+            Error::malformed(
+                format!("{at}.extensions.{name} cannot be read: {e}"),
+                EXPORT,
+            )
+        })
 }
 
-#[derive(Debug, Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub(super) struct SpecularGlossiness {
-    pub diffuse_factor: Option<[f32; 4]>,
-    pub diffuse_texture: Option<TextureInfo>,
-    pub glossiness_factor: Option<f32>,
+/// Reads a document that is legal, or nearly so, although the model refuses it: it insists on the
+/// roots of every scene and on the targets of animations, and on what only cameras say.
+fn read_leniently(
+    text: &[u8],
+    strict: serde_json::Error,
+) -> Result<model::Root, serde_json::Error> {
+    let Ok(Value::Object(mut members)) = serde_json::from_slice(text) else {
+        return Err(strict);
+    };
+    if let Value::Object(asset) = members.entry("asset").or_insert_with(|| json!({})) {
+        asset.entry("version").or_insert_with(|| json!("2.0"));
+    }
+    members.remove("cameras");
+    let mut each = |list: &str, change: &dyn Fn(&mut Map<String, Value>)| {
+        let list = members.get_mut(list).and_then(Value::as_array_mut);
+        let maps = list.into_iter().flatten().filter_map(Value::as_object_mut);
+        maps.for_each(change);
+    };
+    for (list, required) in [
+        ("scenes", "nodes"),
+        ("skins", "joints"),
+        ("meshes", "primitives"),
+    ] {
+        each(list, &|map| {
+            map.entry(required).or_insert_with(|| json!([]));
+        });
+    }
+    // Only their number matters.
+    each("animations", &|map| {
+        map.insert("channels".into(), json!([]));
+        map.insert("samplers".into(), json!([]));
+    });
+    serde_json::from_value(Value::Object(members)).map_err(|lenient| {
+        // The same complaint, but with line and column.
+        if strict.to_string().starts_with(&lenient.to_string()) {
+            strict
+        } else {
+            lenient
+        }
+    })
+}
+
+/// Walks a document and refuses indices and codes beyond 32 bits, whose upper half the model would
+/// drop: 2^32 would pass for index 0.
+#[derive(Clone, Copy)]
+enum IndexGuard {
+    /// Numbers are indices or codes.
+    Index,
+    /// Members of maps are indices.
+    Attributes,
+    /// Members of maps are extensions.
+    Extensions,
+    Elsewhere,
+}
+
+impl IndexGuard {
+    /// What the member `key` of a map is, `None` for what is not read.
+    fn member(self, key: &str) -> Option<Self> {
+        match (self, key) {
+            (Self::Attributes, _) => Some(Self::Index),
+            (
+                Self::Extensions,
+                "EXT_mesh_gpu_instancing"
+                | "KHR_materials_clearcoat"
+                | "KHR_materials_pbrSpecularGlossiness"
+                | "KHR_materials_transmission",
+            ) => Some(Self::Elsewhere),
+            (Self::Extensions, _) | (_, "extras") => None,
+            (_, "extensions") => Some(Self::Extensions),
+            (_, "attributes" | "targets") => Some(Self::Attributes),
+            (
+                _,
+                "buffer"
+                | "bufferView"
+                | "children"
+                | "componentType"
+                | "index"
+                | "indices"
+                | "inverseBindMatrices"
+                | "joints"
+                | "magFilter"
+                | "material"
+                | "mesh"
+                | "mode"
+                | "nodes"
+                | "sampler"
+                | "scene"
+                | "skin"
+                | "source"
+                | "wrapS"
+                | "wrapT",
+            ) => Some(Self::Index),
+            _ => Some(Self::Elsewhere),
+        }
+    }
+}
+
+impl<'de> DeserializeSeed<'de> for IndexGuard {
+    type Value = ();
+
+    fn deserialize<D: serde::Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for IndexGuard {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("a glTF document")
+    }
+
+    fn visit_u64<E: serde::de::Error>(self, value: u64) -> Result<(), E> {
+        // The model marks an absent texture source by the largest index.
+        if matches!(self, Self::Index) && value >= u64::from(u32::MAX) {
+            return Err(E::custom(format!("{value} is no index or code of 32 bits")));
+        }
+        Ok(())
+    }
+
+    fn visit_bool<E>(self, _: bool) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_i64<E>(self, _: i64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_f64<E>(self, _: f64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_str<E>(self, _: &str) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_unit<E>(self) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<(), A::Error> {
+        while list.next_element_seed(self)?.is_some() {}
+        Ok(())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
+        while let Some(key) = map.next_key::<String>()? {
+            match self.member(&key) {
+                Some(member) => map.next_value_seed(member)?,
+                None => {
+                    map.next_value::<IgnoredAny>()?;
+                }
+            }
+        }
+        Ok(())
+    }
 }

@@ -1,5 +1,6 @@
 //! glTF 2.0 and GLB files.
 //!
+//! The `gltf` crate opens the container and parses the JSON; its readers of accessors are not used.
 //! Nothing in a file is trusted: every index, length and offset is checked before it is followed,
 //! so that any bytes end in an object or in one error that says where the file is wrong.
 use std::borrow::Cow;
@@ -9,7 +10,10 @@ use glam::{DMat4, DQuat, DVec3};
 
 use super::accessor::{Buffers, get};
 use super::container::{self, Resolver};
-use super::document::{Document, Node};
+use gltf::json::mesh::{Mode, Semantic};
+use gltf::json::validation::Checked;
+
+use super::document::{Document, Instancing, Placement, raw_extension};
 use super::gltf_material::{IMAGE_EXTENSIONS, MaterialReader, PLAIN_IMAGES};
 use super::gltf_mesh::MeshReader;
 use super::{Imported, Limits};
@@ -19,10 +23,12 @@ use crate::mesh::TriangleMesh;
 
 const EXPORT: &str = "export the file again";
 
+const INSTANCING: &str = "EXT_mesh_gpu_instancing";
+
 /// Extensions that a file may require; those of materials that are not read change the look, not
 /// the shape, and are warned about.
 const ACCEPTED: [&str; 8] = [
-    "EXT_mesh_gpu_instancing",
+    INSTANCING,
     "EXT_texture_transform",
     "KHR_animation_pointer",
     "KHR_lights_punctual",
@@ -32,7 +38,7 @@ const ACCEPTED: [&str; 8] = [
     "KHR_node_visibility",
 ];
 
-/// Beyond this many copies of a mesh a file is broken or hostile.
+/// Beyond this many copies in all a file is broken or hostile.
 const MAX_INSTANCES: u64 = 1 << 22;
 
 /// Reads a glTF or GLB file from memory; `resolver` finds the files that it names.
@@ -42,8 +48,7 @@ pub fn load_gltf_bytes(
     limits: &Limits,
 ) -> Result<Imported, Error> {
     let (json, binary) = container::split(bytes)?;
-    let document: Document = serde_json::from_slice(json)
-        .map_err(|e| Error::malformed(format!("the glTF JSON cannot be read: {e}"), EXPORT))?;
+    let document = Document::read(json)?;
     check_header(&document)?;
     let data = buffer_data(&document, binary, resolver)?;
     // A quantity per vertex or three indices a triangle: no honest accessor is longer.
@@ -89,9 +94,8 @@ pub fn load_gltf_bytes(
 }
 
 fn check_header(document: &Document) -> Result<(), Error> {
-    if let Some(version) = &document.asset.version
-        && !version.starts_with("2.")
-    {
+    let version = &document.asset.version;
+    if !version.starts_with("2.") {
         return Err(Error::malformed(
             format!("asset.version is \"{version}\"; accepted: 2.0"),
             "export the file as glTF 2.0",
@@ -136,12 +140,12 @@ fn buffer_data<'a>(
             })),
         };
         if let Some(data) = &data
-            && (data.len() as u64) < buffer.byte_length
+            && (data.len() as u64) < buffer.byte_length.0
         {
             return Err(Error::malformed(
                 format!(
                     "{at}.byteLength is {}, but only {} bytes are there",
-                    buffer.byte_length,
+                    buffer.byte_length.0,
                     data.len()
                 ),
                 "export or copy the file again",
@@ -159,8 +163,8 @@ fn global_transforms(document: &Document) -> Result<Vec<Option<DMat4>>, Error> {
     match document.scene {
         None if document.scenes.is_empty() => {
             let mut is_child = vec![false; document.nodes.len()];
-            for &child in document.nodes.iter().flat_map(|n| &n.children) {
-                if let Some(flag) = is_child.get_mut(child) {
+            for child in document.nodes.iter().flat_map(|n| &n.children).flatten() {
+                if let Some(flag) = is_child.get_mut(child.value()) {
                     *flag = true;
                 }
             }
@@ -169,11 +173,11 @@ fn global_transforms(document: &Document) -> Result<Vec<Option<DMat4>>, Error> {
             }
         }
         index => {
-            let index = index.unwrap_or(0);
+            let index = index.map_or(0, |i| i.value());
             let scene = get(&document.scenes, index, "scene", "scenes")?;
             let place = format!("scenes[{index}].nodes");
-            for &root in scene.nodes.iter().rev() {
-                stack.push((root, DMat4::IDENTITY, place.clone()));
+            for root in scene.nodes.iter().rev() {
+                stack.push((root.value(), DMat4::IDENTITY, place.clone()));
             }
         }
     }
@@ -185,7 +189,7 @@ fn global_transforms(document: &Document) -> Result<Vec<Option<DMat4>>, Error> {
                 EXPORT,
             ));
         }
-        let global = parent * local_transform(node);
+        let global = parent * local_transform(&document.placement(index));
         if !global.is_finite() {
             return Err(Error::NotFinite {
                 place: "node transforms".into(),
@@ -194,14 +198,14 @@ fn global_transforms(document: &Document) -> Result<Vec<Option<DMat4>>, Error> {
             });
         }
         globals[index] = Some(global);
-        for &child in node.children.iter().rev() {
-            stack.push((child, global, format!("nodes[{index}].children")));
+        for child in node.children.iter().flatten().rev() {
+            stack.push((child.value(), global, format!("nodes[{index}].children")));
         }
     }
     Ok(globals)
 }
 
-fn local_transform(node: &Node) -> DMat4 {
+fn local_transform(node: &Placement) -> DMat4 {
     if let Some(matrix) = &node.matrix {
         return DMat4::from_cols_array(matrix);
     }
@@ -234,23 +238,26 @@ fn instances(
     globals: &[Option<DMat4>],
 ) -> Result<Vec<Group>, Error> {
     let mut groups: BTreeMap<(usize, Option<usize>), Vec<DMat4>> = BTreeMap::new();
+    let mut copies = 0;
     for (i, node) in document.nodes.iter().enumerate() {
         let (Some(global), Some(mesh)) = (globals[i], node.mesh) else {
             continue;
         };
-        get(
-            &document.meshes,
-            mesh,
-            &format!("nodes[{i}].mesh"),
-            "meshes",
-        )?;
+        let mesh = mesh.value();
+        let place = format!("nodes[{i}].mesh");
+        get(&document.meshes, mesh, &place, "meshes")?;
         let own_shape = node.weights.is_some() || node.skin.is_some();
+        let instancing = match &node.extensions {
+            Some(e) => raw_extension(&e.others, INSTANCING, &format!("nodes[{i}]"))?,
+            None => None,
+        };
         let transforms = groups.entry((mesh, own_shape.then_some(i))).or_default();
         if node.skin.is_some() {
             // The joints alone place a skinned mesh (glTF 2.0, 3.7.3.3).
             transforms.push(DMat4::IDENTITY);
-        } else if node.extensions.instancing.is_some() {
-            let local = gpu_instances(node, i, buffers)?;
+        } else if let Some(instancing) = instancing {
+            let local = gpu_instances(&instancing, i, buffers, MAX_INSTANCES - copies)?;
+            copies += local.len() as u64;
             transforms.extend(local.iter().map(|m| global * *m));
         } else {
             transforms.push(global);
@@ -266,18 +273,23 @@ fn instances(
         .collect())
 }
 
-/// `EXT_mesh_gpu_instancing`: the copies' transforms relative to the node.
-fn gpu_instances(node: &Node, index: usize, buffers: &Buffers) -> Result<Vec<DMat4>, Error> {
-    let Some(instancing) = &node.extensions.instancing else {
-        return Ok(vec![DMat4::IDENTITY]);
-    };
-    let at = format!("nodes[{index}].extensions.EXT_mesh_gpu_instancing.attributes");
+/// `EXT_mesh_gpu_instancing`: the copies' transforms relative to the node, `most` of them.
+fn gpu_instances(
+    instancing: &Instancing,
+    index: usize,
+    buffers: &Buffers,
+    most: u64,
+) -> Result<Vec<DMat4>, Error> {
+    let at = format!("nodes[{index}].extensions.{INSTANCING}.attributes");
     let mut count = None;
     for (name, &accessor) in &instancing.attributes {
-        let n = buffers.accessor(accessor, &format!("{at}.{name}"))?.count;
-        if n > MAX_INSTANCES {
+        let n = buffers.accessor(accessor, &format!("{at}.{name}"))?.count.0;
+        if n > most {
             return Err(Error::TooLarge {
-                what: format!("{at} has {n} copies"),
+                what: format!(
+                    "{at} has {n} copies, with those before {}",
+                    MAX_INSTANCES - most + n
+                ),
                 limit: MAX_INSTANCES,
             });
         }
@@ -341,16 +353,18 @@ fn assemble(
         let copies = group.transforms.len() as u64;
         for (p, primitive) in document.meshes[group.mesh].primitives.iter().enumerate() {
             let at = format!("meshes[{}].primitives[{p}]", group.mesh);
-            let Some(&position) = primitive.attributes.get("POSITION") else {
+            let positions = Checked::Valid(Semantic::Positions);
+            let Some(&position) = primitive.attributes.get(&positions) else {
                 continue;
             };
-            let count = buffers.accessor(position, &format!("{at}.POSITION"))?.count;
+            let position = buffers.accessor(position, &format!("{at}.POSITION"))?;
+            let count = position.count.0;
             let corners = match primitive.indices {
-                Some(i) => buffers.accessor(i, &format!("{at}.indices"))?.count,
+                Some(i) => buffers.accessor(i, &format!("{at}.indices"))?.count.0,
                 None => count,
             };
-            let faces = match primitive.mode.unwrap_or(4) {
-                4 => corners / 3,
+            let faces = match primitive.mode {
+                Checked::Valid(Mode::Triangles) => corners / 3,
                 _ => corners.saturating_sub(2),
             };
             vertices = vertices.saturating_add(count.saturating_mul(copies));

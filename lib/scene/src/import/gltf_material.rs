@@ -3,10 +3,15 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use glam::{Mat3, Vec2, Vec3, Vec4};
+use gltf::json::extensions::texture::TextureTransform;
+use gltf::json::material::NormalTexture;
+use gltf::json::texture::{Info, MagFilter, Sampler, WrappingMode};
+use gltf::json::validation::Checked;
+use gltf::json::{self, Index};
 
 use super::accessor::{Buffers, get};
 use super::container::{self, Resolver};
-use super::document::{self, Document, TextureInfo};
+use super::document::{self, Document, raw_extension};
 use crate::error::Error;
 use crate::material::{AlphaMode, Clearcoat, Material, TextureRef, Transmission};
 use crate::texture::{Encoding, Filter, ImageSource, Texture, Wrap};
@@ -24,9 +29,11 @@ pub(super) const IMAGE_EXTENSIONS: [&str; 4] = [
 /// Remedy for those.
 pub(super) const PLAIN_IMAGES: &str = "export the textures as PNG or JPEG";
 
+const CLEARCOAT: &str = "KHR_materials_clearcoat";
+
 /// Collects what materials refer to.
 pub(super) struct MaterialReader<'a> {
-    document: &'a Document,
+    document: &'a Document<'a>,
     buffers: &'a Buffers<'a>,
     resolver: &'a dyn Resolver,
     images: HashMap<usize, ImageSource>,
@@ -38,7 +45,7 @@ pub(super) struct MaterialReader<'a> {
 
 impl<'a> MaterialReader<'a> {
     pub fn new(
-        document: &'a Document,
+        document: &'a Document<'a>,
         buffers: &'a Buffers<'a>,
         resolver: &'a dyn Resolver,
     ) -> Self {
@@ -57,42 +64,57 @@ impl<'a> MaterialReader<'a> {
     pub fn read(&mut self, index: usize) -> Result<Material, Error> {
         let at = format!("materials[{index}]");
         let source = &self.document.materials[index];
-        let extensions = &source.extensions;
-        if !extensions.others.is_empty() {
-            let names: Vec<&str> = extensions.others.keys().map(String::as_str).collect();
+        let extensions = source.extensions.as_ref();
+        let mut unread: Vec<&str> = extensions
+            .iter()
+            .flat_map(|e| e.others.keys())
+            .map(String::as_str)
+            .filter(|name| *name != CLEARCOAT)
+            .collect();
+        unread.sort_unstable();
+        if !unread.is_empty() {
             self.warnings.push(format!(
                 "{at}: {} not supported and left out",
-                names.join(", ")
+                unread.join(", ")
             ));
         }
         let mut material = Material {
             name: source.name.clone().unwrap_or_default(),
             double_sided: source.double_sided,
-            unlit: extensions.unlit.is_some(),
+            unlit: extensions.is_some_and(|e| e.unlit.is_some()),
             ..Material::default()
         };
-        self.read_base(source, &at, &mut material)?;
+        self.read_base(index, &at, &mut material)?;
         material.normal_texture = self.normal_map(&source.normal_texture, &at, "normalTexture")?;
         self.read_emission(source, &at, &mut material)?;
-        let cutoff = source.alpha_cutoff.unwrap_or(0.5);
-        material.alpha_mode = match source.alpha_mode.as_deref() {
-            None | Some("OPAQUE") => AlphaMode::Opaque,
-            Some("MASK") => AlphaMode::Mask {
-                cutoff: self.factor(cutoff, f32::MAX, 0.5, &at, "alphaCutoff"),
-            },
-            Some("BLEND") => AlphaMode::Blend,
-            Some(other) => {
+        material.alpha_mode = match source.alpha_mode {
+            Checked::Valid(json::material::AlphaMode::Opaque) => AlphaMode::Opaque,
+            Checked::Valid(json::material::AlphaMode::Mask) => {
+                let cutoff = source.alpha_cutoff.unwrap_or_default().0;
+                AlphaMode::Mask {
+                    cutoff: self.factor(cutoff, f32::MAX, 0.5, &at, "alphaCutoff"),
+                }
+            }
+            Checked::Valid(json::material::AlphaMode::Blend) => AlphaMode::Blend,
+            Checked::Invalid => {
+                let pointer = format!("/materials/{index}/alphaMode");
                 return Err(Error::malformed(
-                    format!("{at}.alphaMode is \"{other}\"; accepted: OPAQUE, MASK, BLEND"),
+                    format!(
+                        "{at}.alphaMode is {}; accepted: OPAQUE, MASK, BLEND",
+                        self.document.quoted(&pointer)
+                    ),
                     EXPORT,
                 ));
             }
         };
-        if let Some(coat) = &extensions.clearcoat {
-            material.clearcoat = self.clearcoat(coat, &at)?;
+        let Some(extensions) = extensions else {
+            return Ok(material);
+        };
+        if let Some(coat) = raw_extension(&extensions.others, CLEARCOAT, &at)? {
+            material.clearcoat = self.clearcoat(&coat, &at)?;
         }
         if let Some(transmission) = &extensions.transmission {
-            let factor = transmission.transmission_factor;
+            let factor = transmission.transmission_factor.0;
             let factor = self.factor(factor, 1.0, 0.0, &at, "transmissionFactor");
             if factor > 0.0 {
                 material.transmission = Some(Transmission {
@@ -106,7 +128,7 @@ impl<'a> MaterialReader<'a> {
                 });
             }
         }
-        if let Some(ior) = extensions.ior.as_ref().and_then(|e| e.ior) {
+        if let Some(ior) = extensions.ior.as_ref().map(|e| e.ior.0) {
             // 0 is the extension's name for "reflects like a mirror everywhere": large enough.
             let ior = if ior == 0.0 { 1e4 } else { ior };
             material.ior = self.factor(ior, 1e4, 1.5, &at, "ior").max(1.0);
@@ -114,60 +136,55 @@ impl<'a> MaterialReader<'a> {
         Ok(material)
     }
 
-    fn read_base(
-        &mut self,
-        source: &document::Material,
-        at: &str,
-        material: &mut Material,
-    ) -> Result<(), Error> {
+    fn read_base(&mut self, index: usize, at: &str, material: &mut Material) -> Result<(), Error> {
+        let source = &self.document.materials[index];
+        let old = source.extensions.as_ref();
+        let old = old.and_then(|e| e.pbr_specular_glossiness.as_ref());
         let unit = |s: &mut Self, v, name| s.factor(v, 1.0, 1.0, at, name);
         let color = |s: &mut Self, c: [f32; 4]| {
             Vec4::from_array(c.map(|v| s.factor(v, 1.0, 1.0, at, "baseColorFactor")))
         };
-        if let Some(pbr) = &source.pbr_metallic_roughness {
-            material.base_color = color(self, pbr.base_color_factor.unwrap_or([1.0; 4]));
-            material.metallic = unit(self, pbr.metallic_factor.unwrap_or(1.0), "metallicFactor");
-            material.roughness = unit(self, pbr.roughness_factor.unwrap_or(1.0), "roughnessFactor");
-            material.base_color_texture = self.texture(
-                &pbr.base_color_texture,
-                at,
-                "baseColorTexture",
-                Encoding::Srgb,
-            )?;
-            material.metallic_roughness_texture = self.texture(
-                &pbr.metallic_roughness_texture,
-                at,
-                "metallicRoughnessTexture",
-                Encoding::Linear,
-            )?;
-        } else if let Some(old) = &source.extensions.specular_glossiness {
+        if let Some(old) = old.filter(|_| !self.document.has_metallic_roughness(index)) {
             self.warnings.push(format!(
                 "{at}: KHR_materials_pbrSpecularGlossiness is read as a dielectric; its specular colour is left out"
             ));
-            material.base_color = color(self, old.diffuse_factor.unwrap_or([1.0; 4]));
+            material.base_color = color(self, old.diffuse_factor.0);
             material.metallic = 0.0;
-            material.roughness = 1.0
-                - unit(
-                    self,
-                    old.glossiness_factor.unwrap_or(1.0),
-                    "glossinessFactor",
-                );
+            material.roughness = 1.0 - unit(self, old.glossiness_factor.0, "glossinessFactor");
             material.base_color_texture =
                 self.texture(&old.diffuse_texture, at, "diffuseTexture", Encoding::Srgb)?;
+            return Ok(());
         }
+        let pbr = &source.pbr_metallic_roughness;
+        material.base_color = color(self, pbr.base_color_factor.0);
+        material.metallic = unit(self, pbr.metallic_factor.0, "metallicFactor");
+        material.roughness = unit(self, pbr.roughness_factor.0, "roughnessFactor");
+        material.base_color_texture = self.texture(
+            &pbr.base_color_texture,
+            at,
+            "baseColorTexture",
+            Encoding::Srgb,
+        )?;
+        material.metallic_roughness_texture = self.texture(
+            &pbr.metallic_roughness_texture,
+            at,
+            "metallicRoughnessTexture",
+            Encoding::Linear,
+        )?;
         Ok(())
     }
 
     fn read_emission(
         &mut self,
-        source: &document::Material,
+        source: &json::Material,
         at: &str,
         material: &mut Material,
     ) -> Result<(), Error> {
-        let strength = source.extensions.emissive_strength.as_ref();
-        let strength = strength.and_then(|e| e.emissive_strength).unwrap_or(1.0);
+        let extensions = source.extensions.as_ref();
+        let strength = extensions.and_then(|e| e.emissive_strength.as_ref());
+        let strength = strength.map_or(1.0, |e| e.emissive_strength.0);
         let strength = self.factor(strength, 1e12, 1.0, at, "emissiveStrength");
-        let factor = source.emissive_factor.unwrap_or_default();
+        let factor = source.emissive_factor.0;
         let factor = factor.map(|v| self.factor(v, 1e12, 0.0, at, "emissiveFactor"));
         material.emissive = Vec3::from_array(factor) * strength;
         // A texture times zero is no reason to decode it.
@@ -231,19 +248,32 @@ impl<'a> MaterialReader<'a> {
 
     fn normal_map(
         &mut self,
-        info: &Option<TextureInfo>,
+        source: &Option<NormalTexture>,
         at: &str,
         name: &str,
     ) -> Result<Option<(TextureRef, f32)>, Error> {
-        let scale = info.as_ref().and_then(|i| i.scale).unwrap_or(1.0);
-        let scale = if scale.is_finite() { scale } else { 1.0 };
-        let texture = self.texture(info, at, name, Encoding::Linear)?;
-        Ok(texture.map(|t| (t, scale)))
+        let Some(source) = source else {
+            return Ok(None);
+        };
+        let transform: Option<TextureTransform> = match &source.extensions {
+            Some(e) => raw_extension(&e.others, "KHR_texture_transform", &format!("{at}.{name}"))?,
+            None => None,
+        };
+        let scale = Some(source.scale).filter(|s| s.is_finite());
+        let texture = self.texture_ref(
+            source.index,
+            source.tex_coord,
+            transform.as_ref(),
+            at,
+            name,
+            Encoding::Linear,
+        )?;
+        Ok(texture.map(|t| (t, scale.unwrap_or(1.0))))
     }
 
     fn texture(
         &mut self,
-        info: &Option<TextureInfo>,
+        info: &Option<Info>,
         at: &str,
         name: &str,
         encoding: Encoding,
@@ -251,15 +281,26 @@ impl<'a> MaterialReader<'a> {
         let Some(info) = info else {
             return Ok(None);
         };
+        let transform = info.extensions.as_ref();
+        let transform = transform.and_then(|e| e.texture_transform.as_ref());
+        self.texture_ref(info.index, info.tex_coord, transform, at, name, encoding)
+    }
+
+    fn texture_ref(
+        &mut self,
+        index: Index<json::Texture>,
+        tex_coord: u32,
+        transform: Option<&TextureTransform>,
+        at: &str,
+        name: &str,
+        encoding: Encoding,
+    ) -> Result<Option<TextureRef>, Error> {
         let place = format!("{at}.{name}.index");
-        get(&self.document.textures, info.index, &place, "textures")?;
-        let Some(texture) = self.texture_index(info.index, encoding)? else {
+        get(&self.document.textures, index.value(), &place, "textures")?;
+        let Some(texture) = self.texture_index(index.value(), encoding)? else {
             return Ok(None);
         };
-        let transform = info.extensions.transform.as_ref();
-        let set = transform
-            .and_then(|t| t.tex_coord)
-            .unwrap_or(info.tex_coord);
+        let set = transform.and_then(|t| t.tex_coord).unwrap_or(tex_coord);
         if set > 1 {
             self.warnings.push(format!(
                 "{at}: {name} reads TEXCOORD_{set}; two sets are supported, TEXCOORD_0 is used"
@@ -279,11 +320,13 @@ impl<'a> MaterialReader<'a> {
         }
         let source = &self.document.textures[index];
         let at = format!("textures[{index}]");
-        let Some(image) = source.source else {
-            return match IMAGE_EXTENSIONS
-                .iter()
-                .find(|e| source.extensions.contains_key(**e))
-            {
+        // The model's way of saying that there is none.
+        if source.source.value() == u32::MAX as usize {
+            let known = |e: &&&str| {
+                let extensions = source.extensions.as_ref();
+                extensions.is_some_and(|all| all.others.contains_key(**e))
+            };
+            return match IMAGE_EXTENSIONS.iter().find(known) {
                 Some(extension) => Err(Error::UnsupportedExtension {
                     extension: (*extension).into(),
                     remedy: PLAIN_IMAGES,
@@ -294,15 +337,16 @@ impl<'a> MaterialReader<'a> {
                     Ok(None)
                 }
             };
-        };
+        }
         let (wrap, filter) = match source.sampler {
             None => Default::default(),
             Some(sampler) => {
                 let place = format!("{at}.sampler");
-                lookup(get(&self.document.samplers, sampler, &place, "samplers")?)
+                let samplers = &self.document.samplers;
+                lookup(get(samplers, sampler.value(), &place, "samplers")?)
             }
         };
-        let image = self.image(image, &format!("{at}.source"))?;
+        let image = self.image(source.source.value(), &format!("{at}.source"))?;
         self.textures.push(Texture {
             image,
             encoding,
@@ -354,10 +398,9 @@ impl<'a> MaterialReader<'a> {
 }
 
 /// `KHR_texture_transform`: scale, then rotate counter-clockwise in the image, then offset.
-fn uv_transform(t: &document::TextureTransform) -> Mat3 {
-    let scale = Vec2::from_array(t.scale.unwrap_or([1.0; 2]));
-    let offset = Vec2::from_array(t.offset.unwrap_or_default());
-    let (sin, cos) = t.rotation.sin_cos();
+fn uv_transform(t: &TextureTransform) -> Mat3 {
+    let (scale, offset) = (Vec2::from_array(t.scale.0), Vec2::from_array(t.offset.0));
+    let (sin, cos) = t.rotation.0.sin_cos();
     let all = Mat3::from_cols(
         Vec3::new(cos, -sin, 0.0) * scale.x,
         Vec3::new(sin, cos, 0.0) * scale.y,
@@ -366,15 +409,15 @@ fn uv_transform(t: &document::TextureTransform) -> Mat3 {
     if all.is_finite() { all } else { Mat3::IDENTITY }
 }
 
-/// glTF's codes, which are OpenGL's. There are no mipmaps here: only the magnification filter counts.
-fn lookup(sampler: &document::Sampler) -> ([Wrap; 2], Filter) {
-    let wrap = |code: Option<u32>| match code {
-        Some(33071) => Wrap::ClampToEdge,
-        Some(33648) => Wrap::MirroredRepeat,
+/// There are no mipmaps here: only the magnification filter counts. Unknown codes mean the default.
+fn lookup(sampler: &Sampler) -> ([Wrap; 2], Filter) {
+    let wrap = |mode: Checked<WrappingMode>| match mode {
+        Checked::Valid(WrappingMode::ClampToEdge) => Wrap::ClampToEdge,
+        Checked::Valid(WrappingMode::MirroredRepeat) => Wrap::MirroredRepeat,
         _ => Wrap::Repeat,
     };
     let filter = match sampler.mag_filter {
-        Some(9728) => Filter::Nearest,
+        Some(Checked::Valid(MagFilter::Nearest)) => Filter::Nearest,
         _ => Filter::Linear,
     };
     ([wrap(sampler.wrap_s), wrap(sampler.wrap_t)], filter)

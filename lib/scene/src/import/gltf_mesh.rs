@@ -1,8 +1,12 @@
 //! Mesh primitives of a glTF document.
 use glam::{DMat3, DMat4, DVec3, Vec2, Vec3, Vec4};
 
-use super::accessor::{Buffers, components_of, get};
-use super::document::{Document, Primitive};
+use gltf::json::mesh::{Mode, Primitive, Semantic};
+use gltf::json::validation::Checked;
+use gltf::json::{Accessor, Index};
+
+use super::accessor::{Buffers, get};
+use super::document::Document;
 use super::gltf::Group;
 use super::tangents;
 use crate::error::Error;
@@ -13,7 +17,7 @@ const EXPORT: &str = "export the file again";
 
 /// Reads primitives; remembers what had to be ignored or repaired.
 pub(super) struct MeshReader<'a> {
-    document: &'a Document,
+    document: &'a Document<'a>,
     buffers: &'a Buffers<'a>,
     /// By node.
     globals: &'a [Option<DMat4>],
@@ -25,7 +29,7 @@ pub(super) struct MeshReader<'a> {
 
 impl<'a> MeshReader<'a> {
     pub fn new(
-        document: &'a Document,
+        document: &'a Document<'a>,
         buffers: &'a Buffers<'a>,
         globals: &'a [Option<DMat4>],
         materials: &'a [Material],
@@ -34,7 +38,7 @@ impl<'a> MeshReader<'a> {
             .meshes
             .iter()
             .flat_map(|m| &m.primitives)
-            .any(|p| p.attributes.contains_key("NORMAL"));
+            .any(|p| attribute(p, Semantic::Normals).is_some());
         Self {
             document,
             buffers,
@@ -51,33 +55,35 @@ impl<'a> MeshReader<'a> {
     pub fn read(&mut self, group: &Group, index: usize) -> Result<Option<TriangleMesh>, Error> {
         let primitive = &self.document.meshes[group.mesh].primitives[index];
         let at = format!("meshes[{}].primitives[{index}]", group.mesh);
-        let mode = primitive.mode.unwrap_or(4);
-        match mode {
-            0..=3 => {
-                let what = if mode == 0 { "points" } else { "lines" };
-                self.warnings
-                    .push(format!("{at} is made of {what}, which are not drawn"));
+        let mode = match primitive.mode {
+            Checked::Valid(Mode::Points) => {
+                self.undrawn("points", &at);
                 return Ok(None);
             }
-            4..=6 => {}
-            _ => {
+            Checked::Valid(Mode::Lines | Mode::LineLoop | Mode::LineStrip) => {
+                self.undrawn("lines", &at);
+                return Ok(None);
+            }
+            Checked::Valid(mode) => mode,
+            Checked::Invalid => {
+                let pointer = format!("/meshes/{}/primitives/{index}/mode", group.mesh);
                 return Err(Error::malformed(
-                    format!("{at}.mode is {mode}; accepted: 0 to 6"),
+                    format!(
+                        "{at}.mode is {}; accepted: 0 to 6",
+                        self.document.quoted(&pointer)
+                    ),
                     EXPORT,
                 ));
             }
-        }
-        if let Some(name) = primitive
-            .extensions
-            .keys()
-            .find(|n| n.contains("compression"))
-        {
+        };
+        let extensions = primitive.extensions.iter().flat_map(|e| e.others.keys());
+        if let Some(name) = extensions.into_iter().find(|n| n.contains("compression")) {
             // The uncompressed copy that an optional extension promises, if there is one.
             self.warnings.push(format!(
                 "{at}: {name} is not read, its uncompressed copy is"
             ));
         }
-        let Some(&positions) = primitive.attributes.get("POSITION") else {
+        let Some(positions) = attribute(primitive, Semantic::Positions) else {
             self.warnings
                 .push(format!("{at} has no positions and is left out"));
             return Ok(None);
@@ -104,8 +110,14 @@ impl<'a> MeshReader<'a> {
         if mesh.indices.is_empty() {
             return Ok(None);
         }
-        mesh.normals =
-            self.vertex_floats(primitive, "NORMAL", &at, &mesh, true, Vec3::from_array)?;
+        mesh.normals = self.vertex_floats(
+            primitive,
+            Semantic::Normals,
+            &at,
+            &mesh,
+            true,
+            Vec3::from_array,
+        )?;
         self.apply_morph(group, primitive, &at, &mut mesh)?;
         self.read_shading(primitive, material, &at, &mut mesh)?;
         if let Some(node) = group.shaped_by {
@@ -116,9 +128,15 @@ impl<'a> MeshReader<'a> {
         Ok(Some(mesh))
     }
 
+    fn undrawn(&mut self, what: &str, at: &str) {
+        self.warnings
+            .push(format!("{at} is made of {what}, which are not drawn"));
+    }
+
     fn material(&mut self, primitive: &Primitive, at: &str) -> Result<usize, Error> {
         match primitive.material {
             Some(m) => {
+                let m = m.value();
                 get(self.materials, m, &format!("{at}.material"), "materials")?;
                 Ok(m)
             }
@@ -133,25 +151,26 @@ impl<'a> MeshReader<'a> {
     fn vertex_floats<const N: usize, T>(
         &self,
         primitive: &Primitive,
-        name: &str,
+        name: Semantic,
         at: &str,
         mesh: &TriangleMesh,
         normalize: bool,
         map: impl Fn([f32; N]) -> T,
     ) -> Result<Vec<T>, Error> {
-        let Some(&accessor) = primitive.attributes.get(name) else {
+        let place = format!("{at}.attributes.{}", name.to_string());
+        let Some(accessor) = attribute(primitive, name) else {
             return Ok(Vec::new());
         };
-        let place = format!("{at}.attributes.{name}");
-        let values = self.buffers.floats(accessor, &place, normalize, map)?;
-        same_count(&place, values.len(), mesh.positions.len())?;
-        Ok(values)
+        // Before anything is read: an accessor without bytes behind it may claim any length.
+        let count = self.buffers.accessor(accessor, &place)?.count.0;
+        same_count(&place, count, mesh.positions.len())?;
+        self.buffers.floats(accessor, &place, normalize, map)
     }
 
     fn triangles(
         &mut self,
         primitive: &Primitive,
-        mode: u32,
+        mode: Mode,
         vertices: usize,
         at: &str,
     ) -> Result<Vec<[u32; 3]>, Error> {
@@ -173,20 +192,20 @@ impl<'a> MeshReader<'a> {
         };
         let count = indices.as_ref().map_or(vertices, Vec::len);
         let corner = |k: usize| indices.as_ref().map_or(k as u32, |i| i[k]);
-        if mode == 4 && !count.is_multiple_of(3) {
+        if mode == Mode::Triangles && !count.is_multiple_of(3) {
             self.warnings.push(format!(
                 "{at} has {count} corners, not a multiple of 3; the last {} are left out",
                 count % 3
             ));
         }
         let triangles = match mode {
-            4 => count / 3,
+            Mode::Triangles => count / 3,
             _ => count.saturating_sub(2),
         };
         let mut list: Vec<[u32; 3]> = Vec::with_capacity(triangles);
         list.extend((0..triangles).map(|t| match mode {
-            4 => [corner(3 * t), corner(3 * t + 1), corner(3 * t + 2)],
-            5 => [corner(t), corner(t + 1 + t % 2), corner(t + 2 - t % 2)],
+            Mode::Triangles => [corner(3 * t), corner(3 * t + 1), corner(3 * t + 2)],
+            Mode::TriangleStrip => [corner(t), corner(t + 1 + t % 2), corner(t + 2 - t % 2)],
             _ => [corner(t + 1), corner(t + 2), corner(0)],
         }));
         // Strips are joined by triangles that name a vertex twice.
@@ -206,23 +225,24 @@ impl<'a> MeshReader<'a> {
             .shaped_by
             .and_then(|n| self.document.nodes[n].weights.as_ref());
         let weights = of_node.or(self.document.meshes[group.mesh].weights.as_ref());
-        for (t, target) in primitive.targets.iter().enumerate() {
-            let weight = weights.and_then(|w| w.get(t)).copied().unwrap_or(0.0) as f32;
+        for (t, target) in primitive.targets.iter().flatten().enumerate() {
+            let weight = weights.and_then(|w| w.get(t)).copied().unwrap_or(0.0);
             if weight == 0.0 || !weight.is_finite() {
                 continue;
             }
-            for (name, values) in [
-                ("POSITION", &mut mesh.positions),
-                ("NORMAL", &mut mesh.normals),
+            for (name, accessor, values) in [
+                ("POSITION", target.positions, &mut mesh.positions),
+                ("NORMAL", target.normals, &mut mesh.normals),
             ] {
-                let Some(&accessor) = target.get(name).filter(|_| !values.is_empty()) else {
+                let Some(accessor) = accessor.filter(|_| !values.is_empty()) else {
                     continue;
                 };
                 let place = format!("{at}.targets[{t}].{name}");
+                let count = self.buffers.accessor(accessor, &place)?.count.0;
+                same_count(&place, count, values.len())?;
                 let deltas =
                     self.buffers
                         .floats(accessor, &place, name == "NORMAL", Vec3::from_array)?;
-                same_count(&place, deltas.len(), values.len())?;
                 for (value, delta) in values.iter_mut().zip(deltas) {
                     *value += weight * delta;
                 }
@@ -240,26 +260,27 @@ impl<'a> MeshReader<'a> {
         mesh: &mut TriangleMesh,
     ) -> Result<(), Error> {
         for set in 0..2 {
-            let used = self.material_uses(material, |t| usize::from(t.uv_set) == set);
+            let used = self.material_uses(material, |t| u32::from(t.uv_set) == set);
             if !used {
                 continue;
             }
-            let name = format!("TEXCOORD_{set}");
+            let name = Semantic::TexCoords(set);
             let finite = |uv| {
                 let uv = Vec2::from_array(uv);
                 if uv.is_finite() { uv } else { Vec2::ZERO }
             };
-            mesh.uvs[set] = self.vertex_floats(primitive, &name, at, mesh, false, finite)?;
-            if mesh.uvs[set].is_empty() {
+            let uvs = self.vertex_floats(primitive, name, at, mesh, false, finite)?;
+            mesh.uvs[set as usize] = uvs;
+            if mesh.uvs[set as usize].is_empty() {
                 self.warnings.push(format!(
-                    "{at} has no {name}, which its material reads; (0, 0) is used"
+                    "{at} has no TEXCOORD_{set}, which its material reads; (0, 0) is used"
                 ));
-                mesh.uvs[set] = vec![Vec2::ZERO; mesh.positions.len()];
+                mesh.uvs[set as usize] = vec![Vec2::ZERO; mesh.positions.len()];
             }
         }
-        if let Some(&accessor) = primitive.attributes.get("COLOR_0") {
-            let place = format!("{at}.attributes.COLOR_0");
-            let kind = &self.buffers.accessor(accessor, &place)?.kind;
+        if let Some(accessor) = attribute(primitive, Semantic::Colors(0)) {
+            self.buffers
+                .accessor(accessor, &format!("{at}.attributes.COLOR_0"))?;
             let clean = |c: Vec4| {
                 if c.is_finite() {
                     c.max(Vec4::ZERO)
@@ -267,12 +288,12 @@ impl<'a> MeshReader<'a> {
                     Vec4::ONE
                 }
             };
-            mesh.colors = if components_of(kind, &place)? == 3 {
+            mesh.colors = if self.buffers.components(accessor)? == 3 {
                 let map = |[r, g, b]: [f32; 3]| clean(Vec4::new(r, g, b, 1.0));
-                self.vertex_floats(primitive, "COLOR_0", at, mesh, true, map)?
+                self.vertex_floats(primitive, Semantic::Colors(0), at, mesh, true, map)?
             } else {
                 let map = |c: [f32; 4]| clean(Vec4::from_array(c));
-                self.vertex_floats(primitive, "COLOR_0", at, mesh, true, map)?
+                self.vertex_floats(primitive, Semantic::Colors(0), at, mesh, true, map)?
             };
         }
         if self.normal_map(material).is_some() && !mesh.normals.is_empty() {
@@ -281,7 +302,8 @@ impl<'a> MeshReader<'a> {
                 let direction = direction.normalize_or_zero().as_vec3();
                 direction.extend(if w < 0.0 { -1.0 } else { 1.0 })
             };
-            mesh.tangents = self.vertex_floats(primitive, "TANGENT", at, mesh, true, unit)?;
+            mesh.tangents =
+                self.vertex_floats(primitive, Semantic::Tangents, at, mesh, true, unit)?;
         }
         Ok(())
     }
@@ -313,6 +335,7 @@ impl<'a> MeshReader<'a> {
         let Some(skin_index) = self.document.nodes[node].skin else {
             return Ok(());
         };
+        let skin_index = skin_index.value();
         let skin_at = format!("skins[{skin_index}]");
         let skin = get(
             &self.document.skins,
@@ -323,11 +346,22 @@ impl<'a> MeshReader<'a> {
         let mut joints = Vec::with_capacity(skin.joints.len());
         for &joint in &skin.joints {
             let place = format!("{skin_at}.joints");
-            let global = get(self.globals, joint, &place, "nodes")?;
+            let global = get(self.globals, joint.value(), &place, "nodes")?;
             joints.push(global.unwrap_or(DMat4::IDENTITY));
         }
         if let Some(accessor) = skin.inverse_bind_matrices {
             let place = format!("{skin_at}.inverseBindMatrices");
+            if self
+                .buffers
+                .accessor(accessor, &place)?
+                .buffer_view
+                .is_none()
+            {
+                return Err(Error::malformed(
+                    format!("{place} refers to accessors[{accessor}], which has no bufferView"),
+                    EXPORT,
+                ));
+            }
             let inverse = self
                 .buffers
                 .floats(accessor, &place, false, |m: [f32; 16]| {
@@ -335,12 +369,22 @@ impl<'a> MeshReader<'a> {
                 })?;
             joints.iter_mut().zip(inverse).for_each(|(j, i)| *j *= i);
         }
-        let indices =
-            self.vertex_floats(primitive, "JOINTS_0", at, mesh, false, |j: [f32; 4]| {
-                j.map(|v| v as usize)
-            })?;
-        let weights =
-            self.vertex_floats(primitive, "WEIGHTS_0", at, mesh, true, |w: [f32; 4]| w)?;
+        let indices = self.vertex_floats(
+            primitive,
+            Semantic::Joints(0),
+            at,
+            mesh,
+            false,
+            |j: [f32; 4]| j.map(|v| v as usize),
+        )?;
+        let weights = self.vertex_floats(
+            primitive,
+            Semantic::Weights(0),
+            at,
+            mesh,
+            true,
+            |w: [f32; 4]| w,
+        )?;
         if indices.is_empty() || weights.is_empty() {
             self.warnings.push(format!(
                 "{at} is skinned but has no joints or weights; it is left as stored"
@@ -418,12 +462,16 @@ impl<'a> MeshReader<'a> {
     }
 }
 
-fn same_count(place: &str, found: usize, vertices: usize) -> Result<(), Error> {
-    if found == vertices {
+fn same_count(place: &str, found: u64, vertices: usize) -> Result<(), Error> {
+    if found == vertices as u64 {
         return Ok(());
     }
     Err(Error::malformed(
         format!("{place} has {found} elements, but there are {vertices} positions"),
         EXPORT,
     ))
+}
+
+fn attribute(primitive: &Primitive, name: Semantic) -> Option<Index<Accessor>> {
+    primitive.attributes.get(&Checked::Valid(name)).copied()
 }

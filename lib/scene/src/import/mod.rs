@@ -13,8 +13,8 @@ use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 
+pub use self::gltf::load_gltf_bytes;
 pub use container::{Folder, NoFiles, Resolver};
-pub use gltf::load_gltf_bytes;
 pub use obj::load_obj_bytes;
 
 use crate::error::Error;

@@ -40,6 +40,12 @@ fn a_broken_glb_says_where_it_breaks() {
         message_of(&old),
         "the GLB header says version 1; accepted: 2; export the file as glTF 2.0"
     );
+    let mut short = whole.clone();
+    short[8..12].copy_from_slice(&11u32.to_le_bytes());
+    assert_eq!(
+        message_of(&short),
+        "the GLB file has no JSON chunk; export or copy the file again"
+    );
     let mut long_chunk = whole.clone();
     long_chunk[14] = 1;
     let size = u32::from_le_bytes(long_chunk[12..16].try_into().unwrap());
@@ -83,6 +89,57 @@ fn an_index_out_of_range_names_itself() {
 }
 
 #[test]
+fn an_index_beyond_32_bits_does_not_pass_for_a_small_one() {
+    for (path, key) in [("/nodes/0", "mesh"), ("/accessors/0", "bufferView")] {
+        let mut glb = Glb::triangle(json!({}));
+        glb.json.pointer_mut(path).unwrap()[key] = json!(1u64 << 32);
+        let text = message(&glb);
+        assert!(
+            text.starts_with(
+                "the glTF JSON cannot be read: 4294967296 is no index or code of 32 bits at line 1 column "
+            ),
+            "{text}"
+        );
+    }
+    // What is not read may say anything.
+    let mut glb = Glb::triangle(json!({}));
+    glb.json["nodes"][0]["extras"] = json!({ "mesh": 1u64 << 32 });
+    glb.json["extensions"] = json!({ "ACME_things": { "index": 1u64 << 40 } });
+    assert!(glb.try_load().is_ok());
+}
+
+#[test]
+fn unknown_codes_are_quoted() {
+    let mut component = Glb::triangle(json!({}));
+    component.json["accessors"][0]["componentType"] = json!(5124);
+    let mut kind = Glb::triangle(json!({}));
+    kind.json["accessors"][0]["type"] = json!("VEC7");
+    let mode = Glb::triangle(json!({ "mode": 7 }));
+    let mut alpha = Glb::triangle(json!({ "material": 0 }));
+    alpha.push("materials", json!({ "alphaMode": "GLASS" }));
+    for (glb, expected) in [
+        (
+            component,
+            "accessors[0].componentType is 5124; accepted: 5120 to 5123, 5125, 5126; export the file again",
+        ),
+        (
+            kind,
+            "accessors[0].type is \"VEC7\"; accepted: SCALAR, VEC2, VEC3, VEC4, MAT4; export the file again",
+        ),
+        (
+            mode,
+            "meshes[0].primitives[0].mode is 7; accepted: 0 to 6; export the file again",
+        ),
+        (
+            alpha,
+            "materials[0].alphaMode is \"GLASS\"; accepted: OPAQUE, MASK, BLEND; export the file again",
+        ),
+    ] {
+        assert_eq!(message(&glb), expected);
+    }
+}
+
+#[test]
 fn an_accessor_that_overruns_its_view_is_refused() {
     let mut glb = Glb::triangle(json!({}));
     glb.json["accessors"][0]["count"] = json!(4);
@@ -101,6 +158,41 @@ fn an_accessor_that_overruns_its_view_is_refused() {
     assert_eq!(
         message(&glb),
         "the object has 1099511627776 vertices: more than the limit of 268435456; simplify the object"
+    );
+}
+
+#[test]
+fn lengths_without_bytes_behind_them_are_refused_before_memory_is_taken() {
+    let huge = |kind: &str| json!({ "componentType": 5126, "type": kind, "count": 700_000_000 });
+    let mut color = Glb::triangle(json!({}));
+    let accessor = color.push("accessors", huge("VEC4"));
+    color.json["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = json!(accessor);
+    assert_eq!(
+        message(&color),
+        "meshes[0].primitives[0].attributes.COLOR_0 has 700000000 elements, but there are 3 positions; export the file again"
+    );
+    let mut skin = Glb::triangle(json!({}));
+    let accessor = skin.push("accessors", huge("MAT4"));
+    skin.push(
+        "skins",
+        json!({ "joints": [0], "inverseBindMatrices": accessor }),
+    );
+    skin.json["nodes"][0]["skin"] = json!(0);
+    assert_eq!(
+        message(&skin),
+        "skins[0].inverseBindMatrices refers to accessors[1], which has no bufferView; export the file again"
+    );
+    let mut copies = Glb::triangle(json!({}));
+    let accessor = copies.push(
+        "accessors",
+        json!({ "componentType": 5126, "type": "VEC3", "count": 4_000_000 }),
+    );
+    let extension = json!({ "EXT_mesh_gpu_instancing": { "attributes": { "SCALE": accessor } } });
+    copies.json["nodes"][0]["extensions"] = extension.clone();
+    copies.push("nodes", json!({ "mesh": 0, "extensions": extension }));
+    assert_eq!(
+        message(&copies),
+        "nodes[1].extensions.EXT_mesh_gpu_instancing.attributes has 4000000 copies, with those before 8000000: more than the limit of 4194304; simplify the object"
     );
 }
 

@@ -252,6 +252,83 @@ fn the_default_scene_is_shown_and_the_others_are_not() {
 }
 
 #[test]
+fn legal_files_with_little_in_them_are_read() {
+    let mut glb = Glb::triangle(json!({}));
+    // A scene needs no nodes, a channel that points elsewhere no node; extras are anything.
+    glb.json["scenes"] = json!([{ "name": "empty" }, { "nodes": [0], "extras": 5 }]);
+    glb.json["scene"] = json!(1);
+    glb.json["extensionsRequired"] = json!(["KHR_animation_pointer"]);
+    glb.json["animations"] = json!([{
+        "samplers": [{ "input": 0, "output": 0 }],
+        "channels": [{ "sampler": 0, "target": {
+            "path": "pointer",
+            "extensions": { "KHR_animation_pointer": { "pointer": "/materials/0/alphaCutoff" } },
+        } }],
+    }]);
+    let imported = glb.load();
+    assert_eq!(imported.mesh.indices, [[0, 1, 2]]);
+    assert_eq!(
+        imported.warnings,
+        ["animations are ignored: the object stands still in its rest pose"]
+    );
+    // An error behind them is still the one that is reported.
+    glb.json["samplers"] = json!([{ "wrapS": "wide" }]);
+    assert_eq!(
+        glb.try_load().unwrap_err().to_string(),
+        "the glTF JSON cannot be read: invalid type: string \"wide\", expected any of: [33071, 33648, 10497]; export the file again"
+    );
+}
+
+#[test]
+fn chunks_of_unknown_kinds_are_passed_over() {
+    let glb = Glb::triangle(json!({}));
+    let mut whole = glb.bytes();
+    whole.extend([4, 0, 0, 0, b'A', b'C', b'M', b'E', 1, 2, 3, 4]);
+    let length = (whole.len() as u32).to_le_bytes();
+    whole[8..12].copy_from_slice(&length);
+    let load = |bytes: &[u8]| load_gltf_bytes(bytes, &Folder::new(""), &Limits::default());
+    assert_eq!(load(&whole).unwrap().mesh.indices, [[0, 1, 2]]);
+
+    // Directly behind the JSON, where only a binary chunk would be read.
+    let mut alone = glb.clone();
+    let payload = format!("data:application/octet-stream;base64,{}", "A".repeat(48));
+    alone.json["buffers"] = json!([{ "uri": payload, "byteLength": 36 }]);
+    let mut bytes = alone.bytes();
+    let json_size = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
+    bytes[20 + json_size + 4..][..4].copy_from_slice(b"ACME");
+    assert_eq!(load(&bytes).unwrap().mesh.positions, [Vec3::ZERO; 3]);
+}
+
+#[test]
+fn node_transforms_keep_double_precision() {
+    let mut glb = Glb::triangle(json!({}));
+    // Single precision knows only multiples of 4 here.
+    glb.json["nodes"] = json!([
+        { "mesh": 0, "translation": [4e7 + 1.0, 0.0, 0.0] },
+        { "mesh": 0, "translation": [4e7 + 2.5, 0.0, 0.0] },
+    ]);
+    let imported = glb.load();
+    assert_eq!(imported.origin, DVec3::new(4e7 + 1.0, 0.0, 0.0));
+    assert_eq!(imported.mesh.positions[3], Vec3::new(1.5, 0.0, 0.0));
+}
+
+#[test]
+fn specular_glossiness_stands_in_only_for_a_missing_model() {
+    let old = json!({ "KHR_materials_pbrSpecularGlossiness": {
+        "diffuseFactor": [0.1, 0.2, 0.3, 1.0], "glossinessFactor": 0.75
+    } });
+    let mut glb = Glb::triangle(json!({ "material": 0 }));
+    glb.push("materials", json!({ "extensions": old }));
+    let material = &glb.load().materials[0];
+    assert_eq!(material.base_color, Vec4::new(0.1, 0.2, 0.3, 1.0));
+    assert_eq!((material.metallic, material.roughness), (0.0, 0.25));
+    glb.json["materials"][0]["pbrMetallicRoughness"] = json!({});
+    let material = &glb.load().materials[0];
+    assert_eq!(material.base_color, Vec4::ONE);
+    assert_eq!((material.metallic, material.roughness), (1.0, 1.0));
+}
+
+#[test]
 fn material_parameters_and_extensions_arrive() {
     let mut glb = Glb::triangle(json!({ "material": 0 }));
     glb.push(
