@@ -394,7 +394,7 @@ fn leave_out<L: SceneLight>(
         .collect();
     let everything = plan.clone();
     let reference = pilot.reference(&everything.simulation())?;
-    let steps = open.len() as f64 + f64::from(MAX_DEPTH);
+    let steps = open.len() as f64 + f64::from(MAX_DEPTH.ilog2());
     let mut done = 0.0;
     let mut step = || {
         done += 1.0;
@@ -446,16 +446,21 @@ fn leave_out<L: SceneLight>(
     if !plan.is_enabled(Effect::Interreflection) {
         plan.max_depth = 1;
     } else if switch(config, Effect::Interreflection) == EffectSwitch::Auto {
-        for depth in 2..MAX_DEPTH {
+        // What is lost falls with depth, so the least sufficient one is found by halving.
+        let (mut least, mut most) = (2, MAX_DEPTH);
+        while least < most {
+            let depth = (least + most) / 2;
             let mut shallow = everything.clone();
             shallow.max_depth = depth;
             let difference = pilot.difference(&reference, &shallow.simulation())?;
             step()?;
             if spent + difference.upper_95() <= tolerance {
-                plan.max_depth = depth;
-                break;
+                most = depth;
+            } else {
+                least = depth + 1;
             }
         }
+        plan.max_depth = most;
     }
     plan.left_out = Some(pilot.difference(&reference, &plan.simulation())?.rmse);
     Ok(())

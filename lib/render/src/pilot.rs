@@ -20,11 +20,11 @@ use crate::render::{Rendered, Renderer, Settings, Simulation};
 
 /// Pixels of the object that a pilot render aims at: enough that a mean over them is precise to a
 /// few per cent.
-const OBJECT_PIXELS: f32 = 2048.0;
+const OBJECT_PIXELS: f32 = 1024.0;
 /// Most pixels of a pilot render.
-const MAX_PIXELS: f32 = 65536.0;
+const MAX_PIXELS: f32 = 16384.0;
 /// Samples per pixel of each of the two pictures.
-const SAMPLES: u32 = 32;
+const SAMPLES: u32 = 16;
 
 /// A scene at low resolution, under one light.
 pub struct Pilot<'a, L> {
