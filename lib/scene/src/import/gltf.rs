@@ -7,12 +7,11 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use glam::{DMat4, DQuat, DVec3};
-
-use super::accessor::{Buffers, get};
-use super::container::{self, Resolver};
 use gltf::json::mesh::{Mode, Semantic};
 use gltf::json::validation::Checked;
 
+use super::accessor::{Buffers, get};
+use super::container::{self, Resolver};
 use super::document::{Document, Instancing, Placement, raw_extension};
 use super::gltf_material::{IMAGE_EXTENSIONS, MaterialReader, PLAIN_IMAGES};
 use super::gltf_mesh::MeshReader;

@@ -1,6 +1,5 @@
 //! Mesh primitives of a glTF document.
 use glam::{DMat3, DMat4, DVec3, Vec2, Vec3, Vec4};
-
 use gltf::json::mesh::{Mode, Primitive, Semantic};
 use gltf::json::validation::Checked;
 use gltf::json::{Accessor, Index};
@@ -76,8 +75,8 @@ impl<'a> MeshReader<'a> {
                 ));
             }
         };
-        let extensions = primitive.extensions.iter().flat_map(|e| e.others.keys());
-        if let Some(name) = extensions.into_iter().find(|n| n.contains("compression")) {
+        let mut extensions = primitive.extensions.iter().flat_map(|e| e.others.keys());
+        if let Some(name) = extensions.find(|n| n.contains("compression")) {
             // The uncompressed copy that an optional extension promises, if there is one.
             self.warnings.push(format!(
                 "{at}: {name} is not read, its uncompressed copy is"

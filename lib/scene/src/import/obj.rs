@@ -3,7 +3,7 @@
 //! Read line by line, so that an error names its line; polygons become fans of triangles, texture
 //! coordinates are turned to glTF's convention (v down).
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use dipir_imaging::transfer::Transfer;
 use glam::{DVec3, Mat3, Vec2, Vec3, Vec4};
@@ -87,6 +87,8 @@ struct Reader {
     vertices: HashMap<Corner, u32>,
     corners: Vec<u32>,
     library: Library,
+    /// Names of those read; naming one again adds nothing.
+    libraries: HashSet<String>,
     material: Option<u32>,
     /// Whether some corner names a texture coordinate, a normal.
     has: [bool; 2],
@@ -223,6 +225,9 @@ impl Reader {
     }
 
     fn read_library(&mut self, name: &str, resolver: &dyn Resolver) -> Result<(), Problem> {
+        if !self.libraries.insert(name.to_owned()) {
+            return Ok(());
+        }
         match resolver.read(&name.replace('\\', "/")) {
             Ok(bytes) => {
                 let path = container::named(name);
@@ -256,7 +261,7 @@ impl Reader {
         self.gather(&materials);
         let mut warnings = self.warnings;
         warnings.append(&mut self.library.warnings);
-        let mut seen = std::collections::HashSet::new();
+        let mut seen = HashSet::new();
         warnings.retain(|w| seen.insert(w.clone()));
         Ok(Imported {
             mesh: self.mesh,

@@ -133,6 +133,18 @@ fn material_statements_become_metallic_roughness() {
 }
 
 #[test]
+fn a_library_named_for_every_group_is_read_once() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("m.mtl"), "newmtl a\n").unwrap();
+    let path = folder.path().join("m.obj");
+    let group = "mtllib m.mtl\nusemtl a\nf 1 2 3\n";
+    std::fs::write(&path, format!("{SQUARE}{group}{group}")).unwrap();
+    let imported = load_object(&path).unwrap();
+    assert_eq!(imported.materials.len(), 1);
+    assert_eq!(imported.mesh.materials, [0, 0]);
+}
+
+#[test]
 fn a_texture_that_a_library_names_must_exist() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("m.mtl"), "newmtl a\nmap_Kd gone.png\n").unwrap();
@@ -155,4 +167,69 @@ fn normals_and_display_referred_vertex_colours_arrive() {
     // sRGB 0.5 is ((0.5 + 0.055) / 1.055)^2.4 in linear light.
     let linear = (0.555f32 / 1.055).powf(2.4);
     assert!((imported.mesh.colors[0].y - linear).abs() < 4.0 * f32::EPSILON);
+}
+
+#[test]
+fn comments_foreign_letters_and_blanks_do_no_harm() {
+    let imported = load("v 0 0 0 # corner\nv\t1 0 0\r\nv 1 1 0\nf 1 2 3 # face\n");
+    assert_eq!(imported.mesh.indices, [[0, 1, 2]]);
+    // Latin-1, as old exporters write it.
+    let latin = [
+        b"# caf\xe9\nusemtl caf\xe9\n",
+        format!("{SQUARE}f 1 2 3\n").as_bytes(),
+    ]
+    .concat();
+    let imported = load_obj_bytes(&latin, &NoFiles, &Limits::default()).unwrap();
+    assert_eq!(imported.mesh.indices, [[0, 1, 2]]);
+}
+
+#[test]
+fn corners_without_coordinates_take_none_from_others() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("p.png"), one_texel_png([1.0; 3])).unwrap();
+    std::fs::write(folder.path().join("m.mtl"), "newmtl a\nmap_Kd p.png\n").unwrap();
+    let path = folder.path().join("m.obj");
+    std::fs::write(
+        &path,
+        format!("mtllib m.mtl\nusemtl a\n{SQUARE}vt 0.25 1\nvt 0.5 1\nf 1/1 2 3/2\n"),
+    )
+    .unwrap();
+    let imported = load_object(&path).unwrap();
+    assert_eq!(
+        imported.mesh.uvs[0],
+        [Vec2::new(0.25, 0.0), Vec2::ZERO, Vec2::new(0.5, 0.0)]
+    );
+}
+
+#[test]
+fn vertices_without_colour_are_white_and_weights_are_passed_over() {
+    let imported = load("v 0 0 0\nv 2 0 0 1\nv 0 1 0 0 0 0\nv 0 2 0 1 0 0 0\nf 1 2 3 4\n");
+    assert_eq!(imported.mesh.positions[1], Vec3::new(2.0, 0.0, 0.0));
+    let [black, red] = [0.0, 1.0].map(|r| Vec4::new(r, 0.0, 0.0, 1.0));
+    assert_eq!(imported.mesh.colors, [Vec4::ONE, Vec4::ONE, black, red]);
+}
+
+#[test]
+fn one_number_is_a_grey_and_alpha_may_have_a_halo() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    std::fs::write(file("m.mtl"), "newmtl a\nKd 0.5 # grey\nd -halo 0.25\n").unwrap();
+    std::fs::write(
+        file("m.obj"),
+        format!("mtllib m.mtl\nusemtl a\n{SQUARE}f 1 2 3\n"),
+    )
+    .unwrap();
+    let imported = load_object(&file("m.obj")).unwrap();
+    assert_eq!(
+        imported.materials[0].base_color,
+        Vec4::new(0.5, 0.5, 0.5, 0.25)
+    );
+    std::fs::write(file("m.mtl"), "newmtl a\n\nKd 0.5 blue 0\n").unwrap();
+    assert_eq!(
+        load_object(&file("m.obj")).unwrap_err().to_string(),
+        format!(
+            "\"{}\": \"m.mtl\": line 3: \"blue\" is not a finite number; export the material library again",
+            file("m.obj").display()
+        )
+    );
 }
