@@ -1,5 +1,7 @@
 //! Any bytes end in an object or in an error, never in a panic or in unbounded memory.
-use dipir_scene::import::{Limits, NoFiles, load_gltf_bytes, load_obj_bytes};
+use std::path::Path;
+
+use dipir_scene::import::{Limits, NoFiles, Resolver, load_gltf_bytes, load_obj_bytes};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
@@ -128,6 +130,34 @@ fn the_rich_file_loads() {
     // One skinned triangle and three copies.
     assert_eq!(imported.mesh.indices.len(), 4);
     survives(&rich().bytes());
+}
+
+/// Every file that an OBJ names is the OBJ itself.
+struct Itself<'a>(&'a [u8]);
+
+impl Resolver for Itself<'_> {
+    fn read(&self, _uri: &str) -> std::io::Result<Vec<u8>> {
+        Ok(self.0.to_vec())
+    }
+}
+
+/// The valid files that fuzzing starts from.
+fn seeds(kind: &str) -> Vec<Vec<u8>> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/seeds");
+    let entries = std::fs::read_dir(folder.join(kind)).unwrap();
+    entries
+        .map(|e| std::fs::read(e.unwrap().path()).unwrap())
+        .collect()
+}
+
+#[test]
+fn the_seeds_of_the_fuzz_targets_load() {
+    for bytes in seeds("gltf") {
+        load_gltf_bytes(&bytes, &NoFiles, &SMALL).unwrap();
+    }
+    for bytes in seeds("obj") {
+        load_obj_bytes(&bytes, &Itself(&bytes), &SMALL).unwrap();
+    }
 }
 
 proptest! {
