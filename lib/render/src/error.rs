@@ -34,6 +34,36 @@ pub enum RenderError {
         /// The most similar one.
         nearest: String,
     },
+    /// A light that cannot be used.
+    #[error(transparent)]
+    Light(#[from] dipir_light::error::LightError),
+    /// An environment that transport cannot be recorded for.
+    #[error(
+        "transport cannot be recorded for an environment of {width} x {height} texels: give 1 to \
+         {limit} texels, or single precision for more than 65536"
+    )]
+    EnvironmentSize {
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+        /// Most texels.
+        limit: usize,
+    },
+    /// More weights than a record can count.
+    #[error(
+        "the light transport has more than 4294967295 weights: record fewer samples or a smaller \
+         picture"
+    )]
+    TransportTooLarge,
+    /// A file of recorded transport that cannot be used.
+    #[error("the transport file {} {problem}: record it again with dipir-scene", path.display())]
+    Transport {
+        /// The file.
+        path: std::path::PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
     /// The caller asked to stop.
     #[error("rendering was interrupted")]
     Interrupted,

@@ -68,6 +68,28 @@ pub struct PathSample {
     pub coverage: f32,
 }
 
+/// What becomes of the light that paths find: a pixel's sum, or a record of where it came from.
+/// One loop serves both, so that they cannot drift.
+pub trait Gather {
+    /// Light of `radiance` from the unit vector `direction`, infinitely far away, that arrives
+    /// with `throughput * weight`.
+    fn distant(&mut self, direction: Vec3, throughput: Vec3, radiance: Vec3, weight: f32);
+    /// Radiance that arrives from the scene itself: emission, unlit surfaces, the photograph.
+    fn local(&mut self, radiance: Vec3);
+}
+
+impl Gather for Vec3 {
+    #[inline(always)]
+    fn distant(&mut self, _: Vec3, throughput: Vec3, radiance: Vec3, weight: f32) {
+        *self += throughput * radiance * weight;
+    }
+
+    #[inline(always)]
+    fn local(&mut self, radiance: Vec3) {
+        *self += radiance;
+    }
+}
+
 /// Dimension pairs per vertex: light, lobe, direction, roulette.
 const DIMENSIONS_PER_VERTEX: u32 = 4;
 
@@ -83,10 +105,25 @@ impl<L: PathLight> PathContext<'_, L> {
         sampler: &mut Sampler,
         counts: &mut RayCounts,
     ) -> PathSample {
+        let mut radiance = Vec3::ZERO;
+        let coverage = self.camera_trace::<F, _>(corner, sampler, counts, &mut radiance);
+        PathSample { radiance, coverage }
+    }
+
+    /// Like [`camera_sample`](Self::camera_sample), with the light going to `gather`; returns the
+    /// coverage.
+    #[inline]
+    pub fn camera_trace<const F: u32, G: Gather>(
+        &self,
+        corner: Vec2,
+        sampler: &mut Sampler,
+        counts: &mut RayCounts,
+        gather: &mut G,
+    ) -> f32 {
         let ray = self.world.camera().ray(corner + sampler.next_2d());
         let alpha_key = sampler.next_u64();
         counts.add(RayKind::Camera);
-        self.radiance::<F>(&ray, alpha_key, sampler, counts)
+        self.trace::<F, G>(&ray, alpha_key, sampler, counts, gather)
     }
 
     /// Radiance along `ray` from the object. Draws from the sampler's current dimension on.
@@ -97,11 +134,24 @@ impl<L: PathLight> PathContext<'_, L> {
         sampler: &mut Sampler,
         counts: &mut RayCounts,
     ) -> PathSample {
+        let mut radiance = Vec3::ZERO;
+        let coverage = self.trace::<F, _>(ray, alpha_key, sampler, counts, &mut radiance);
+        PathSample { radiance, coverage }
+    }
+
+    /// Like [`radiance`](Self::radiance), with the light going to `gather`; returns the coverage.
+    pub fn trace<const F: u32, G: Gather>(
+        &self,
+        ray: &Ray,
+        alpha_key: u64,
+        sampler: &mut Sampler,
+        counts: &mut RayCounts,
+        gather: &mut G,
+    ) -> f32 {
         let world = self.world;
         // Loop state.
         let mut ray = *ray; //                       the segment that is traced next
         let mut throughput = Vec3::ONE; //           product of BSDF weights so far
-        let mut radiance = Vec3::ZERO; //            light gathered so far
         let mut sampled_pdf = f32::INFINITY; //      density of the segment's direction, infinite
         //                                           if the light could not have drawn it
         let mut leaves = false; //                   the segment is known to miss the object
@@ -130,11 +180,14 @@ impl<L: PathLight> PathContext<'_, L> {
             // ---- Escape: the light, as found by BSDF sampling -------------------------------
             let Some(hit) = hit else {
                 if depth == 0 {
-                    return PathSample::default();
+                    return 0.0;
                 }
                 let (light, light_pdf) = self.light.eval_with_pdf(ray.direction);
-                let seen = self.seen_beyond::<F>(&ray, light, counts);
-                radiance += throughput * seen * balance_heuristic(sampled_pdf, light_pdf);
+                let weight = balance_heuristic(sampled_pdf, light_pdf);
+                match self.photo_beyond::<F>(&ray, counts) {
+                    Some(seen) => gather.local(throughput * seen * weight),
+                    None => gather.distant(ray.direction, throughput, light, weight),
+                }
                 break;
             };
 
@@ -145,12 +198,12 @@ impl<L: PathLight> PathContext<'_, L> {
             if has(F, EMISSION) {
                 if surface.unlit {
                     if depth > 0 || self.start == PathStart::Camera {
-                        radiance += throughput * surface.base_color;
+                        gather.local(throughput * surface.base_color);
                     }
                     break;
                 }
                 if depth > 0 || self.start != (PathStart::Proxy { emission: false }) {
-                    radiance += throughput * surface.emission;
+                    gather.local(throughput * surface.emission);
                 }
             }
             if depth == self.max_depth {
@@ -174,9 +227,14 @@ impl<L: PathLight> PathContext<'_, L> {
                         counts.add(RayKind::Light);
                     }
                     if known || !world.hides_light::<F>(&shadow, !alpha_key) {
-                        let seen = self.seen_beyond::<F>(&shadow, light.radiance, counts);
                         let weight = balance_heuristic(light.pdf, bsdf_pdf) / light.pdf;
-                        radiance += throughput * value * seen * weight;
+                        let arriving = throughput * value;
+                        match self.photo_beyond::<F>(&shadow, counts) {
+                            Some(seen) => gather.local(arriving * seen * weight),
+                            None => {
+                                gather.distant(light.direction, arriving, light.radiance, weight);
+                            }
+                        }
                     }
                 }
             }
@@ -206,23 +264,17 @@ impl<L: PathLight> PathContext<'_, L> {
                 throughput /= survival;
             }
         }
-        PathSample {
-            radiance,
-            coverage: 1.0,
-        }
+        1.0
     }
 
-    /// Radiance along a ray that is known to miss the object: `light`, unless it meets the part
-    /// of the proxy that the photograph shows.
+    /// What the photograph shows along a ray that is known to miss the object; `None` where it
+    /// meets the light instead.
     #[inline(always)]
-    fn seen_beyond<const F: u32>(&self, ray: &Ray, light: Vec3, counts: &mut RayCounts) -> Vec3 {
+    fn photo_beyond<const F: u32>(&self, ray: &Ray, counts: &mut RayCounts) -> Option<Vec3> {
         if !has(F, PROXY_RADIANCE) {
-            return light;
+            return None;
         }
-        match self.photo {
-            Some(photo) => photo.seen_along(self.world, ray, counts).unwrap_or(light),
-            None => light,
-        }
+        self.photo?.seen_along(self.world, ray, counts)
     }
 }
 

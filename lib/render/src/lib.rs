@@ -20,4 +20,5 @@ pub mod shapes;
 pub mod surface;
 #[cfg(test)]
 mod testing;
+pub mod transport;
 pub mod world;

@@ -22,7 +22,7 @@ use crate::footprint::Footprint;
 use crate::foreground::{PathContext, PathStart};
 use crate::light::{PathLight, SceneLight};
 use crate::photo::Photo;
-use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext};
+use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowSums};
 use crate::world::{Geometry, ProxyGeometry, World};
 
 /// Which phenomena are simulated: what remains of an effects plan for the kernels.
@@ -96,7 +96,7 @@ const BLOCK: u32 = 8;
 
 /// Interactions after which Russian roulette may end a path. Earlier, the rays that it saves
 /// are outweighed by its variance: most paths of opaque objects have left by then.
-const ROULETTE_DEPTH: u32 = 4;
+pub(crate) const ROULETTE_DEPTH: u32 = 4;
 
 /// A scene with its hierarchies built, to be rendered under lights and plans.
 #[derive(Clone)]
@@ -153,7 +153,7 @@ impl<'a> Renderer<'a> {
         settings: &Settings,
         progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
     ) -> Result<Rendered, RenderError> {
-        self.check_sizes(settings)?;
+        self.check_images(settings.background, settings.occluders)?;
         let world = self.world(simulation.features)?;
         let photo = settings
             .background
@@ -240,7 +240,12 @@ impl<'a> Renderer<'a> {
         })
     }
 
-    fn check_sizes(&self, settings: &Settings) -> Result<(), RenderError> {
+    /// Whether images have the camera's size.
+    pub(crate) fn check_images(
+        &self,
+        background: Option<&LinearImage>,
+        occluders: Option<&Raster<f32>>,
+    ) -> Result<(), RenderError> {
         let [camera_width, camera_height] = self.camera.resolution.map(|n| n as usize);
         let check = |what, width, height| {
             if (width, height) == (camera_width, camera_height) {
@@ -254,10 +259,10 @@ impl<'a> Renderer<'a> {
                 camera_height,
             })
         };
-        if let Some(image) = settings.background {
+        if let Some(image) = background {
             check("background", image.0.width(), image.0.height())?;
         }
-        if let Some(mask) = settings.occluders {
+        if let Some(mask) = occluders {
             check("occluder mask", mask.width(), mask.height())?;
         }
         Ok(())
@@ -404,21 +409,22 @@ fn advance_shadow_with<L: PathLight, P: PlaneLight, const F: u32>(
         let sampler = |x, y| sequence(seed, Stream::SHADOW, replicate, (x, y));
         if job.layer == Layer::PlaneShadow {
             let mut cones: Vec<P::Cone<'_>> = shadow.plane.iter().map(PlaneLight::cone).collect();
-            shadow.plane_block::<F>(
+            shadow.plane_block::<F, ShadowSums>(
                 block,
                 range,
                 &sampler,
                 &mut cones,
                 &mut counts,
-                &mut |x, y, blocked| {
+                &mut |x, y, sums| {
                     let index = ((y - block.y) * block.width + (x - block.x)) as usize;
-                    job.add(index, replicate, &blocked.to_array());
+                    job.add(index, replicate, &sums.blocked.to_array());
                 },
             );
         } else {
             for index in 0..job.pixels.len() {
                 let (x, y) = job.pixels[index];
-                let s = shadow.mesh_pixel::<F>((x, y), range, &sampler(x, y), &mut counts);
+                let s: ShadowSums =
+                    shadow.mesh_pixel::<F, _>((x, y), range, &sampler(x, y), &mut counts);
                 let (b, a) = (s.blocked, s.arriving);
                 job.add(index, replicate, &[b.x, b.y, b.z, a.x, a.y, a.z, s.hits]);
             }

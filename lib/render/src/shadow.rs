@@ -63,6 +63,42 @@ pub struct ShadowSums {
     pub hits: f32,
 }
 
+/// What becomes of the samples of a pixel on the proxy: sums, or a record of where the light came
+/// from. One loop serves both, so that they cannot drift.
+pub trait ShadowGather: Default {
+    /// A sample meets the proxy.
+    fn hit(&mut self);
+    /// Radiance times cosine over density, from the unit vector `direction`, that arrives without
+    /// the object; only told on proxy meshes.
+    fn arriving(&mut self, direction: Vec3, light: Vec3);
+    /// As much light from `direction` is blocked.
+    fn blocked(&mut self, direction: Vec3, light: Vec3);
+    /// Irradiance that the object sends to the proxy.
+    fn sent(&mut self, light: Vec3);
+}
+
+impl ShadowGather for ShadowSums {
+    #[inline(always)]
+    fn hit(&mut self) {
+        self.hits += 1.0;
+    }
+
+    #[inline(always)]
+    fn arriving(&mut self, _: Vec3, light: Vec3) {
+        self.arriving += light;
+    }
+
+    #[inline(always)]
+    fn blocked(&mut self, _: Vec3, light: Vec3) {
+        self.blocked += light;
+    }
+
+    #[inline(always)]
+    fn sent(&mut self, light: Vec3) {
+        self.blocked -= light;
+    }
+}
+
 /// The ratio from sums over `samples` samples, `arriving` being the light per sample that meets
 /// the proxy, if known. Samples beside the proxy count as unshadowed, and so does every channel in
 /// which no light arrives at all.
@@ -115,16 +151,16 @@ pub struct SampleRange {
 }
 
 impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
-    /// Adds `samples` samples to the sums of every pixel of `block` on a plane.
-    /// `sampler(x, y)` is the pixel's sequence; `add(x, y, blocked)` takes one pixel's new sum.
-    pub fn plane_block<const F: u32>(
+    /// Gathers `samples` samples of every pixel of `block` on a plane. `sampler(x, y)` is the
+    /// pixel's sequence; `add(x, y, gathered)` takes what one pixel's new samples found.
+    pub fn plane_block<const F: u32, G: ShadowGather>(
         &self,
         block: Block,
         samples: SampleRange,
         sampler: &impl Fn(u32, u32) -> Sampler,
         cones: &mut [P::Cone<'p>],
         counts: &mut RayCounts,
-        add: &mut dyn FnMut(u32, u32, Vec3),
+        add: &mut dyn FnMut(u32, u32, G),
     ) {
         let single = block.width == 1 && block.height == 1;
         let corners = self.corners_on_plane(block);
@@ -137,7 +173,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                 for y in block.y..block.y + block.height {
                     for x in block.x..block.x + block.width {
                         let base = sampler(x, y);
-                        let sum = self.plane_pixel::<F>(
+                        let found = self.plane_pixel::<F, G>(
                             (x, y),
                             samples,
                             &base,
@@ -145,7 +181,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                             cones,
                             counts,
                         );
-                        add(x, y, sum);
+                        add(x, y, found);
                     }
                 }
                 return;
@@ -154,16 +190,16 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
         if single {
             // The pixel straddles the horizon: no footprint, so every sample has its own cone.
             let base = sampler(block.x, block.y);
-            let sum =
-                self.plane_pixel::<F>((block.x, block.y), samples, &base, None, cones, counts);
-            add(block.x, block.y, sum);
+            let found =
+                self.plane_pixel::<F, G>((block.x, block.y), samples, &base, None, cones, counts);
+            add(block.x, block.y, found);
             return;
         }
         if corners.is_none() && self.is_above_horizon(block) {
             return;
         }
         for part in quarters(block) {
-            self.plane_block::<F>(part, samples, sampler, cones, counts, add);
+            self.plane_block::<F, G>(part, samples, sampler, cones, counts, add);
         }
     }
 
@@ -176,8 +212,8 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
         !self.is_above_horizon(block)
     }
 
-    /// Blocked light, summed over `samples` samples of the pixel `(x, y)`.
-    fn plane_pixel<const F: u32>(
+    /// Gathers the light that is blocked in `samples` samples of the pixel `(x, y)`.
+    fn plane_pixel<const F: u32, G: ShadowGather>(
         &self,
         (x, y): (u32, u32),
         samples: SampleRange,
@@ -185,10 +221,10 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
         cone: Option<&Cone>,
         cones: &mut [P::Cone<'p>],
         counts: &mut RayCounts,
-    ) -> Vec3 {
+    ) -> G {
         let world = self.path.world;
         let corner = Vec2::new(x as f32, y as f32);
-        let mut blocked = Vec3::ZERO;
+        let mut gather = G::default();
         for index in samples.first..samples.first + samples.count {
             let mut sampler = base.with_sample(index);
             let view = world.camera().ray(corner + sampler.next_2d());
@@ -210,34 +246,34 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                 if light.weight != Vec3::ZERO {
                     counts.add(RayKind::Shadow);
                     if world.shades::<F>(&point.ray(light.direction), alpha_key) {
-                        blocked += light.weight;
+                        gather.blocked(light.direction, light.weight);
                     }
                 }
             }
             if self.light_on_proxy.is_some() {
-                blocked -= self.light_sent::<F>(&point, cone, &mut sampler, counts);
+                gather.sent(self.light_sent::<F>(&point, cone, &mut sampler, counts));
             }
         }
-        blocked
+        gather
     }
 
-    /// Adds `samples` samples to the sums of the pixel `(x, y)` on a proxy mesh.
+    /// Gathers `samples` samples of the pixel `(x, y)` on a proxy mesh.
     ///
     /// Half of the directions come from the light, half from the cosine; both ratio parts use all
     /// of them with the balance heuristic's weights.
-    pub fn mesh_pixel<const F: u32>(
+    pub fn mesh_pixel<const F: u32, G: ShadowGather>(
         &self,
         (x, y): (u32, u32),
         samples: SampleRange,
         base: &Sampler,
         counts: &mut RayCounts,
-    ) -> ShadowSums {
+    ) -> G {
         let world = self.path.world;
+        let mut gather = G::default();
         let ProxyGeometry::Mesh { bvh, .. } = &world.geometry.proxy else {
-            return ShadowSums::default();
+            return gather;
         };
         let corner = Vec2::new(x as f32, y as f32);
-        let mut sums = ShadowSums::default();
         for index in samples.first..samples.first + samples.count {
             let mut sampler = base.with_sample(index);
             let view = world.camera().ray(corner + sampler.next_2d());
@@ -246,7 +282,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
             let Some(point) = world.proxy_point(&view) else {
                 continue;
             };
-            sums.hits += 1.0;
+            gather.hit();
             let cone = self.blocker.cone(point.position, 0.0);
             let alpha_key = sampler.next_u64();
             for technique in 0..2 {
@@ -262,20 +298,20 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                         continue;
                     }
                 }
-                sums.arriving += weight;
+                gather.arriving(direction, weight);
                 if direction.dot(cone.axis) < cone.cos_half_angle {
                     continue;
                 }
                 counts.add(RayKind::Shadow);
                 if world.shades::<F>(&ray, alpha_key) {
-                    sums.blocked += weight;
+                    gather.blocked(direction, weight);
                 }
             }
             if self.light_on_proxy.is_some() {
-                sums.blocked -= self.light_sent::<F>(&point, &cone, &mut sampler, counts);
+                gather.sent(self.light_sent::<F>(&point, &cone, &mut sampler, counts));
             }
         }
-        sums
+        gather
     }
 
     /// A direction drawn from the light (`technique` 0) or the cosine (1), with its share of

@@ -1,0 +1,568 @@
+//! Recording: the renderer's own loops, with rows of weights in the place of pixel sums.
+use std::ops::ControlFlow;
+
+use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_light::cosine::{CosineCells, CosineWeightedMap};
+use dipir_light::environment::{EnvironmentMap, EnvironmentSampler, solid_angle, texel_of};
+use dipir_light::luminance::{luminance, luminance_f64};
+use dipir_light::plane::PlaneLight;
+use dipir_numerics::hashing::hash_u64s;
+use dipir_numerics::sampler::{Sampler, Stream};
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+
+use super::rows::{Entry, Part, RowBuilder, Rows};
+use super::unit_light::{UnitLight, UnitOnPlane};
+use super::{Header, Precision, RowSet, Shadow, ShadowKind, Transport, Weights};
+use crate::blocker::Blocker;
+use crate::counters::RayCounts;
+use crate::error::RenderError;
+use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
+use crate::footprint::Footprint;
+use crate::foreground::{Gather, PathContext, PathStart};
+use crate::photo::Photo;
+use crate::render::{ROULETTE_DEPTH, Renderer, Simulation};
+use crate::shadow::{Block, SampleRange, ShadowContext, ShadowGather};
+use crate::world::{ProxyGeometry, World};
+
+/// How transport is recorded.
+#[derive(Clone, Debug)]
+pub struct RecordSettings<'a> {
+    /// Columns and rows of the environments that the record takes.
+    pub environment: [usize; 2],
+    /// Paths per pixel of the object; powers of two are stratified best.
+    pub samples: u32,
+    /// Samples per pixel of the shadow.
+    pub shadow_samples: u32,
+    /// How weights are stored.
+    pub precision: Precision,
+    /// Seed of all random numbers.
+    pub seed: u64,
+    /// A light like those that the record will be replayed under, of any size.
+    pub light: Option<&'a EnvironmentMap>,
+    /// Share of a plane's shadow samples that are uniform over the sphere, in (0, 1]; the others
+    /// follow `light`. 1 without a light.
+    pub uniform_share: f32,
+    /// Which phenomena are simulated; light of the object on the proxy is left out.
+    pub simulation: Simulation,
+    /// The photograph, linear, of the camera's size: what the proxy looks like from the object.
+    pub background: Option<&'a LinearImage>,
+    /// 1 where the photograph's own foreground hides the object, 0 where it does not.
+    pub occluders: Option<&'a Raster<f32>>,
+    /// What the caller knows the scene by; kept in the file.
+    pub scene_hash: String,
+}
+
+impl RecordSettings<'_> {
+    /// Settings for a first record, before anything is known of the light.
+    pub fn new(simulation: Simulation) -> Self {
+        Self {
+            // 2.8 degrees a texel: the lobes that guidance can recover are wider.
+            environment: [128, 64],
+            samples: 128,
+            shadow_samples: 128,
+            precision: Precision::Half,
+            seed: 0,
+            light: None,
+            // With a light, half of the samples keep an eye on where it may go.
+            uniform_share: 0.5,
+            simulation,
+            background: None,
+            occluders: None,
+            scene_hash: String::new(),
+        }
+    }
+
+    fn texels(&self) -> usize {
+        self.environment[0] * self.environment[1]
+    }
+
+    /// `light` on the record's grid; black if there is none.
+    fn light_here(&self) -> EnvironmentMap {
+        let [width, height] = self.environment;
+        match self.light {
+            Some(map) => map.resampled(width, height),
+            None => EnvironmentMap::constant(width, height, Vec3::ZERO),
+        }
+    }
+
+    /// Density per steradian of the light samples of paths, by texel: in proportion to what is
+    /// brighter than the mean. The rest is dim and wide, and BSDF sampling finds it better.
+    fn bright_density(&self, light: &EnvironmentMap) -> Vec<f32> {
+        let mean = luminance_f64(light.integral()) / SPHERE;
+        let excess = |t: &Vec3| {
+            let excess = f64::from(luminance(*t)) - mean;
+            if excess > LEAST_EXCESS * mean {
+                excess
+            } else {
+                0.0
+            }
+        };
+        let [width, height] = self.environment;
+        let texels = light.texels().iter().enumerate();
+        let total: f64 = texels
+            .map(|(k, t)| excess(t) * solid_angle(width, height, k / width))
+            .sum();
+        let scale = if total > 0.0 { 1.0 / total } else { 0.0 };
+        light
+            .texels()
+            .iter()
+            .map(|t| (excess(t) * scale) as f32)
+            .collect()
+    }
+
+    /// Density per steradian, up to a factor, before the cosine and the cone, of light samples
+    /// of a plane: a mixture of `light` and uniform, because nothing else would look elsewhere.
+    fn plane_density(&self, light: &EnvironmentMap) -> Vec<f32> {
+        let total = luminance_f64(light.integral());
+        if total <= 0.0 {
+            return vec![1.0; self.texels()];
+        }
+        let uniform = f64::from(self.uniform_share.clamp(LEAST_UNIFORM_SHARE, 1.0));
+        let density =
+            |t: &Vec3| uniform + (1.0 - uniform) * SPHERE * f64::from(luminance(*t)) / total;
+        light.texels().iter().map(|t| density(t) as f32).collect()
+    }
+}
+
+const SPHERE: f64 = 4.0 * std::f64::consts::PI;
+
+/// Luminance above the mean by less than this share counts as the mean itself: rounding.
+const LEAST_EXCESS: f64 = 1e-3;
+
+/// The record of a shadow must be able to see light wherever it appears.
+const LEAST_UNIFORM_SHARE: f32 = 0.01;
+
+fn grey_map([width, height]: [usize; 2], values: &[f32]) -> Result<EnvironmentMap, RenderError> {
+    let texels = values.iter().map(|&v| Vec3::splat(v)).collect();
+    Ok(EnvironmentMap::new(width, height, texels)?)
+}
+
+/// Side of the blocks of pixels that are recorded as one task.
+const BLOCK: u32 = 8;
+
+/// Blocks between two reports of progress.
+const BATCH: usize = 64;
+
+/// Puts the light that paths find into rows.
+struct RowGather<'a> {
+    row: &'a mut RowBuilder,
+    environment: [usize; 2],
+    local: Vec3,
+}
+
+fn texel_index(direction: Vec3, [width, height]: [usize; 2]) -> usize {
+    let (i, j) = texel_of(direction, width, height);
+    i * width + j
+}
+
+impl Gather for RowGather<'_> {
+    #[inline]
+    fn distant(&mut self, direction: Vec3, throughput: Vec3, radiance: Vec3, weight: f32) {
+        let texel = texel_index(direction, self.environment);
+        self.row.add(texel, throughput * radiance * weight);
+    }
+
+    #[inline]
+    fn local(&mut self, radiance: Vec3) {
+        self.local += radiance;
+    }
+}
+
+/// The samples of a pixel on the proxy.
+#[derive(Default)]
+struct ShadowRow {
+    /// Direction, weight, and whether the object blocks it.
+    found: Vec<(Vec3, f32, bool)>,
+    hits: f32,
+}
+
+impl ShadowGather for ShadowRow {
+    #[inline]
+    fn hit(&mut self) {
+        self.hits += 1.0;
+    }
+
+    #[inline]
+    fn arriving(&mut self, direction: Vec3, light: Vec3) {
+        self.found.push((direction, light.x, false));
+    }
+
+    #[inline]
+    fn blocked(&mut self, direction: Vec3, light: Vec3) {
+        self.found.push((direction, light.x, true));
+    }
+
+    fn sent(&mut self, _: Vec3) {}
+}
+
+/// What one task needs.
+struct Recorder<'a> {
+    world: &'a World<'a>,
+    path: PathContext<'a, UnitLight>,
+    shadow: Option<ShadowContext<'a, UnitLight, UnitOnPlane>>,
+    footprint: Footprint,
+    settings: &'a RecordSettings<'a>,
+}
+
+/// What one task finds.
+struct Recorded<C, G> {
+    object: Part<C>,
+    /// Pixel, base, coverage.
+    seen: Vec<(u32, Vec3, f32)>,
+    blocked: Part<G>,
+    arriving: Part<G>,
+    /// Pixel, share that shows the proxy.
+    share: Vec<(u32, f32)>,
+}
+
+impl<C, G> Default for Recorded<C, G> {
+    fn default() -> Self {
+        Self {
+            object: Part::default(),
+            seen: Vec::new(),
+            blocked: Part::default(),
+            arriving: Part::default(),
+            share: Vec::new(),
+        }
+    }
+}
+
+impl Transport {
+    /// Traces the paths of every pixel of `renderer`'s picture and keeps what they found.
+    /// `progress` is told the share that is done and may break off. The result does not depend
+    /// on the number of threads.
+    pub fn record(
+        renderer: &Renderer,
+        settings: &RecordSettings,
+        progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
+    ) -> Result<Self, RenderError> {
+        let [width, height] = settings.environment;
+        let limit = match settings.precision {
+            Precision::Half => 1 << 16,
+            Precision::Single => 1 << 26,
+        };
+        if width == 0 || height == 0 || width.saturating_mul(height) > limit {
+            return Err(RenderError::EnvironmentSize {
+                width,
+                height,
+                limit,
+            });
+        }
+        renderer.check_images(settings.background, settings.occluders)?;
+        let here = settings.light_here();
+        let density = settings.bright_density(&here);
+        let light = UnitLight {
+            sampler: EnvironmentSampler::new(grey_map(settings.environment, &density)?),
+        };
+        let simulation = settings.simulation;
+        let world = renderer.world(simulation.features)?;
+        let photo = settings
+            .background
+            .filter(|_| has(simulation.features, PROXY_RADIANCE))
+            .map(|image| Photo { image });
+        let path = PathContext {
+            world: &world,
+            light: &light,
+            photo: photo.as_ref(),
+            max_depth: simulation.max_depth,
+            start: PathStart::Camera,
+            roulette_depth: ROULETTE_DEPTH,
+        };
+        let geometry = &world.geometry;
+        let plane: Vec<UnitOnPlane> = match &geometry.proxy {
+            ProxyGeometry::Plane(plane) => {
+                let map = grey_map(settings.environment, &settings.plane_density(&here))?;
+                vec![UnitOnPlane(CosineWeightedMap::new(map, plane.normal))]
+            }
+            _ => Vec::new(),
+        };
+        let blocker = geometry
+            .bvh
+            .bounding_sphere()
+            .map(|whole| Blocker::new(whole, geometry.bvh.clusters()));
+        let catches = match &geometry.proxy {
+            ProxyGeometry::None => false,
+            ProxyGeometry::Plane(plane) => !geometry.is_below(plane),
+            ProxyGeometry::Mesh { .. } => true,
+        };
+        let shadow = blocker
+            .as_ref()
+            .filter(|_| simulation.shadow && catches)
+            .map(|blocker| ShadowContext {
+                path,
+                blocker,
+                plane: &plane,
+                irradiance: std::f64::consts::PI,
+                proxy_occlusion: simulation.proxy_occlusion,
+                light_on_proxy: None,
+                tolerance: 0.0,
+            });
+        let recorder = Recorder {
+            footprint: Footprint::new(
+                world.camera(),
+                geometry.bvh.bounds(),
+                geometry.bvh.clusters(),
+            ),
+            world: &world,
+            path,
+            shadow,
+            settings,
+        };
+        match settings.precision {
+            Precision::Half => recorder.transport(density, Weights::Half, progress),
+            Precision::Single => recorder.transport(density, Weights::Single, progress),
+        }
+    }
+}
+
+impl Recorder<'_> {
+    fn transport<C: Entry, G: Entry>(
+        &self,
+        density: Vec<f32>,
+        weights: impl Fn(RowSet<C, G>) -> Weights,
+        progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
+    ) -> Result<Transport, RenderError> {
+        let [width, height] = self.world.camera().resolution;
+        let parts = self.all_blocks::<C, G>(progress)?;
+        let pixels = width as usize * height as usize;
+        let mut base = Raster::filled(width as usize, height as usize, Vec3::ZERO);
+        let mut coverage = Raster::filled(width as usize, height as usize, 0.0);
+        let mut share = vec![0f32; pixels];
+        let (mut object, mut blocked, mut arriving) = (Vec::new(), Vec::new(), Vec::new());
+        for part in parts {
+            for (p, local, covered) in part.seen {
+                base.pixels_mut()[p as usize] = local;
+                coverage.pixels_mut()[p as usize] = covered;
+            }
+            for (p, s) in part.share {
+                share[p as usize] = s;
+            }
+            object.push(part.object);
+            blocked.push(part.blocked);
+            arriving.push(part.arriving);
+        }
+        let object = Rows::assemble(pixels, &object).ok_or(RenderError::TransportTooLarge)?;
+        let blocked = Rows::assemble(pixels, &blocked).ok_or(RenderError::TransportTooLarge)?;
+        let (kind, shadow) = match (&self.shadow, &self.world.geometry.proxy) {
+            (Some(_), ProxyGeometry::Plane(plane)) => {
+                let cosine = self.texel_cosines(plane.normal);
+                (ShadowKind::Plane, Shadow::Plane { blocked, cosine })
+            }
+            (Some(_), ProxyGeometry::Mesh { .. }) => {
+                let arriving =
+                    Rows::assemble(pixels, &arriving).ok_or(RenderError::TransportTooLarge)?;
+                let shadow = Shadow::Mesh {
+                    blocked,
+                    arriving,
+                    share,
+                };
+                (ShadowKind::Mesh, shadow)
+            }
+            _ => (ShadowKind::None, Shadow::None),
+        };
+        Ok(Transport {
+            header: self.header(kind),
+            base,
+            coverage,
+            density,
+            weights: weights(RowSet { object, shadow }),
+        })
+    }
+
+    fn header(&self, shadow: ShadowKind) -> Header {
+        let s = self.settings;
+        Header {
+            size: self.world.camera().resolution.map(|n| n as usize),
+            environment: s.environment,
+            samples: s.samples,
+            shadow_samples: s.shadow_samples,
+            precision: s.precision,
+            shadow,
+            uniform_share: match s.light {
+                Some(_) => s.uniform_share.clamp(LEAST_UNIFORM_SHARE, 1.0),
+                None => 1.0,
+            },
+            seed: s.seed,
+            max_depth: s.simulation.max_depth,
+            features: s.simulation.features,
+            scene_hash: s.scene_hash.clone(),
+        }
+    }
+
+    fn texel_cosines(&self, normal: Vec3) -> Vec<f32> {
+        let [width, height] = self.settings.environment;
+        let cells = CosineCells::new(width, height, normal);
+        (0..height)
+            .flat_map(|i| cells.row(i).map(|e| e as f32).collect::<Vec<_>>())
+            .collect()
+    }
+
+    fn all_blocks<C: Entry, G: Entry>(
+        &self,
+        progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
+    ) -> Result<Vec<Recorded<C, G>>, RenderError> {
+        let [width, height] = self.world.camera().resolution;
+        let blocks: Vec<Block> = (0..height.div_ceil(BLOCK))
+            .flat_map(|j| (0..width.div_ceil(BLOCK)).map(move |i| (i * BLOCK, j * BLOCK)))
+            .map(|(x, y)| Block {
+                x,
+                y,
+                width: BLOCK.min(width - x),
+                height: BLOCK.min(height - y),
+            })
+            .collect();
+        let texels = self.settings.texels();
+        let mut parts = Vec::with_capacity(blocks.len());
+        for batch in blocks.chunks(BATCH) {
+            let mut found: Vec<Recorded<C, G>> = batch
+                .par_iter()
+                .map_init(
+                    || RowBuilder::new(texels),
+                    |row, &block| {
+                        let mut out = Recorded::default();
+                        self.object_block(block, row, &mut out);
+                        self.shadow_block(block, row, &mut out);
+                        out
+                    },
+                )
+                .collect();
+            parts.append(&mut found);
+            if progress(parts.len() as f64 / blocks.len() as f64).is_break() {
+                return Err(RenderError::Interrupted);
+            }
+        }
+        Ok(parts)
+    }
+
+    /// Index of a pixel, and how much of it the photograph's own foreground leaves.
+    fn pixel(&self, x: u32, y: u32) -> (u32, f32) {
+        let index = y * self.world.camera().resolution[0] + x;
+        let hidden = self
+            .settings
+            .occluders
+            .map_or(0.0, |mask| mask.get(x as usize, y as usize).clamp(0.0, 1.0));
+        (index, 1.0 - hidden)
+    }
+
+    fn sampler(&self, layer: u64, (x, y): (u32, u32)) -> Sampler {
+        let seed = hash_u64s(&[self.settings.seed, layer]);
+        Sampler::new(seed, Stream::RECORD, (y << 16) | (x & 0xffff), 0)
+    }
+
+    fn object_block<C: Entry, G>(
+        &self,
+        block: Block,
+        row: &mut RowBuilder,
+        out: &mut Recorded<C, G>,
+    ) {
+        with_features!(self.world.mask, F => {
+            for (x, y) in pixels_of(block).filter(|&(x, y)| self.footprint.holds(x, y)) {
+                let (pixel, seen) = self.pixel(x, y);
+                if seen > 0.0 {
+                    let (local, covered) = self.object_pixel::<F>((x, y), row);
+                    let scale = seen / self.settings.samples as f32;
+                    if covered > 0.0 {
+                        out.seen.push((pixel, local * scale, covered * scale));
+                        out.object.push(pixel, row, scale);
+                    }
+                }
+            }
+        });
+    }
+
+    /// Light that does not come from the environment, and coverage, summed over the samples.
+    fn object_pixel<const F: u32>(&self, (x, y): (u32, u32), row: &mut RowBuilder) -> (Vec3, f32) {
+        let corner = Vec2::new(x as f32, y as f32);
+        let base = self.sampler(0, (x, y));
+        let mut gather = RowGather {
+            row,
+            environment: self.settings.environment,
+            local: Vec3::ZERO,
+        };
+        let mut counts = RayCounts::default();
+        let mut covered = 0.0;
+        for sample in 0..self.settings.samples {
+            let mut sampler = base.with_sample(sample);
+            covered +=
+                self.path
+                    .camera_trace::<F, _>(corner, &mut sampler, &mut counts, &mut gather);
+        }
+        (gather.local, covered)
+    }
+
+    fn shadow_block<C, G: Entry>(
+        &self,
+        block: Block,
+        row: &mut RowBuilder,
+        out: &mut Recorded<C, G>,
+    ) {
+        let Some(shadow) = &self.shadow else {
+            return;
+        };
+        // Blocking asks nothing of a surface but its coverage.
+        let wanted = if has(self.world.mask, ALPHA) {
+            ALPHA
+        } else {
+            0
+        };
+        let range = SampleRange {
+            first: 0,
+            count: self.settings.shadow_samples,
+        };
+        let mut counts = RayCounts::default();
+        let sampler = |x, y| self.sampler(1, (x, y));
+        with_features!(wanted, F => if shadow.plane.is_empty() {
+            for (x, y) in pixels_of(block) {
+                let base = sampler(x, y);
+                let found = shadow.mesh_pixel::<F, ShadowRow>((x, y), range, &base, &mut counts);
+                self.keep((x, y), &found, row, out);
+            }
+        } else {
+            let mut cones: Vec<_> = shadow.plane.iter().map(PlaneLight::cone).collect();
+            shadow.plane_block::<F, ShadowRow>(
+                block,
+                range,
+                &sampler,
+                &mut cones,
+                &mut counts,
+                &mut |x, y, found| self.keep((x, y), &found, row, out),
+            );
+        });
+    }
+
+    /// Makes rows of the samples of one pixel on the proxy.
+    fn keep<C, G: Entry>(
+        &self,
+        (x, y): (u32, u32),
+        found: &ShadowRow,
+        row: &mut RowBuilder,
+        out: &mut Recorded<C, G>,
+    ) {
+        let (pixel, seen) = self.pixel(x, y);
+        if seen <= 0.0 {
+            return;
+        }
+        let samples = self.settings.shadow_samples as f32;
+        let mut push = |part: &mut Part<G>, blocked: bool, scale: f32| {
+            for &(direction, weight, _) in found.found.iter().filter(|f| f.2 == blocked) {
+                let texel = texel_index(direction, self.settings.environment);
+                row.add(texel, Vec3::splat(weight));
+            }
+            part.push(pixel, row, scale);
+        };
+        if let ProxyGeometry::Plane(_) = self.world.geometry.proxy {
+            push(&mut out.blocked, true, seen / samples);
+        } else {
+            // The hidden share of the pixel is not shadowed.
+            out.share.push((pixel, seen * found.hits / samples));
+            push(&mut out.blocked, true, 1.0 / samples);
+            push(&mut out.arriving, false, 1.0 / samples);
+        }
+    }
+}
+
+fn pixels_of(block: Block) -> impl Iterator<Item = (u32, u32)> {
+    (block.y..block.y + block.height)
+        .flat_map(move |y| (block.x..block.x + block.width).map(move |x| (x, y)))
+}

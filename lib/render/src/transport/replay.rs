@@ -1,0 +1,187 @@
+//! Products of recorded rows with an environment, and their transposes.
+//!
+//! `product` gathers: a pixel is the sum of weight times texel over its row. `product_vjp`
+//! scatters: every entry adds weight times the pixel's gradient to its texel. Both read each entry
+//! once, from memory, and hold the environment (16 bytes a texel) in cache.
+//!
+//! Texels and sums are four wide and multiplications are fused, one rounding each, on every
+//! machine: with or without SIMD instructions the bytes are the same. They are also the same for
+//! any number of threads: a row is summed by one thread in a fixed order, and the transposed
+//! product scatters fixed runs of pixels, whose sums are added from first to last.
+use std::ops::Range;
+
+use dipir_light::luminance::luminance;
+use glam::{Vec3, Vec4};
+use rayon::prelude::*;
+
+use super::rows::{Entry, Rows, merged_count, power_of_two};
+
+/// Runs of pixels that are multiplied as one task: enough for many threads.
+const GATHER_PARTS: usize = 64;
+/// Most runs of pixels with a gradient of their own: each costs a pass over the environment.
+const SCATTER_PARTS: usize = 16;
+/// A run of pixels must have this many entries per texel, or adding its gradient up costs as
+/// much as finding it.
+const ENTRIES_PER_TEXEL: usize = 4;
+
+/// Texels as the kernels read them: the fourth number is 0, so whatever an entry has there is
+/// harmless.
+pub fn padded(texels: &[Vec3]) -> Vec<Vec4> {
+    texels.iter().map(|t| t.extend(0.0)).collect()
+}
+
+impl<E: Entry> Rows<E> {
+    /// At most `parts` runs of pixels with about the same number of entries; a function of the
+    /// record alone.
+    fn runs(&self, parts: usize) -> Vec<Range<usize>> {
+        let offsets = &*self.offsets;
+        let pixels = self.pixels();
+        let total = offsets[pixels] as u64;
+        let mut bounds: Vec<usize> = (0..=parts as u64)
+            .map(|k| offsets.partition_point(|&o| u64::from(o) < total * k / parts as u64))
+            .map(|p| p.min(pixels))
+            .collect();
+        bounds[0] = 0;
+        bounds[parts] = pixels;
+        bounds.windows(2).map(|w| w[0]..w[1]).collect()
+    }
+
+    /// What `finish` makes of each pixel and its `rows * light`.
+    pub fn product(
+        &self,
+        light: &[Vec4],
+        finish: &(impl Fn(usize, Vec3) -> Vec3 + Sync),
+    ) -> Vec<Vec3> {
+        let (offsets, exponents, entries) = (&*self.offsets, &*self.exponents, &*self.entries);
+        let mut pixels = vec![Vec3::ZERO; self.pixels()];
+        let mut rest = &mut pixels[..];
+        let mut tasks = Vec::with_capacity(GATHER_PARTS);
+        for run in self.runs(GATHER_PARTS) {
+            let (own, others) = rest.split_at_mut(run.len());
+            tasks.push((run.start, own));
+            rest = others;
+        }
+        tasks.into_par_iter().for_each(|(first, pixels)| {
+            for (p, pixel) in (first..).zip(pixels) {
+                let (start, end) = (offsets[p] as usize, offsets[p + 1] as usize);
+                let scaled = row_sum(&entries[start..end], light).truncate();
+                *pixel = finish(p, scaled * inverse_scale(exponents[p]));
+            }
+        });
+        pixels
+    }
+
+    /// Adjoint of [`product`](Self::product): `rows^T * gradient` of each of `texels` texels,
+    /// from each pixel's gradient.
+    pub fn product_vjp(
+        &self,
+        texels: usize,
+        gradient: &(impl Fn(usize) -> Vec3 + Sync),
+    ) -> Vec<Vec3> {
+        let (offsets, exponents, entries) = (&*self.offsets, &*self.exponents, &*self.entries);
+        let parts = entries.len() / (ENTRIES_PER_TEXEL * texels.max(1));
+        let runs = self.runs(parts.clamp(1, SCATTER_PARTS));
+        let partial: Vec<Vec<Vec4>> = runs
+            .into_par_iter()
+            .map(|run| {
+                let mut sums = vec![Vec4::ZERO; texels];
+                for p in run {
+                    let (start, end) = (offsets[p] as usize, offsets[p + 1] as usize);
+                    if start == end {
+                        continue;
+                    }
+                    let gradient = gradient(p);
+                    if gradient != Vec3::ZERO {
+                        let scaled = gradient * inverse_scale(exponents[p]);
+                        row_scatter(&entries[start..end], scaled.extend(0.0), &mut sums);
+                    }
+                }
+                sums
+            })
+            .collect();
+        (0..texels)
+            .into_par_iter()
+            .with_min_len(1024)
+            .map(|t| partial.iter().map(|sums| sums[t].truncate()).sum())
+            .collect()
+    }
+
+    /// Kish's effective number of the samples behind every pixel's sum under `light`, by
+    /// luminance: `(sum w)^2 / sum w^2`. Samples merged into an entry are told apart by their
+    /// recorded count; samples that reached several texels count once for each. 0 for pixels
+    /// without light.
+    pub fn effective_sample_size(&self, light: &[Vec4]) -> Vec<f32> {
+        (0..self.pixels())
+            .into_par_iter()
+            .with_min_len(256)
+            .map(|p| {
+                let row = self.offsets[p] as usize..self.offsets[p + 1] as usize;
+                let (mut sum, mut squares) = (0f32, 0f32);
+                for (entry, &count) in self.entries[row.clone()].iter().zip(&self.merged[row]) {
+                    let y = luminance((entry.weight() * light[entry.texel()]).truncate());
+                    sum += y;
+                    squares += y * y / merged_count(count);
+                }
+                if squares > 0.0 {
+                    sum * sum / squares
+                } else {
+                    0.0
+                }
+            })
+            .collect()
+    }
+}
+
+/// One over the scale of a row; exact, as is the product with it short of underflow.
+#[inline(always)]
+fn inverse_scale(exponent: i8) -> f32 {
+    power_of_two(-exponent)
+}
+
+/// Sum of weight times texel over a row: four running sums hide the latency of additions.
+#[inline(always)]
+fn row_sum<E: Entry>(entries: &[E], light: &[Vec4]) -> Vec4 {
+    let mut sums = [Vec4::ZERO; 4];
+    let mut fours = entries.chunks_exact(4);
+    for four in &mut fours {
+        for (sum, entry) in sums.iter_mut().zip(four) {
+            *sum = entry.weight().mul_add(light[entry.texel()], *sum);
+        }
+    }
+    for (sum, entry) in sums.iter_mut().zip(fours.remainder()) {
+        *sum = entry.weight().mul_add(light[entry.texel()], *sum);
+    }
+    (sums[0] + sums[1]) + (sums[2] + sums[3])
+}
+
+/// Adds weight times `gradient` to every texel of a row.
+#[inline(always)]
+fn row_scatter<E: Entry>(entries: &[E], gradient: Vec4, sums: &mut [Vec4]) {
+    for entry in entries {
+        let sum = &mut sums[entry.texel()];
+        *sum = entry.weight().mul_add(gradient, *sum);
+    }
+}
+
+/// The ratio `1 - share blocked / arriving` of one channel, clamped at 0; 1 where nothing arrives.
+/// Sampling noise alone can bring it below 0.
+#[inline]
+pub fn ratio(blocked: f32, arriving: f32, share: f32) -> f32 {
+    if arriving > 0.0 {
+        (1.0 - share * (blocked / arriving)).clamp(0.0, 1.0)
+    } else {
+        1.0
+    }
+}
+
+/// Adjoint of [`ratio`]: the gradients of `blocked` and `arriving`, from the ratio and its
+/// gradient. 0 where it is clamped and where nothing arrives.
+#[inline]
+pub fn ratio_vjp(ratio: f32, arriving: f32, share: f32, gradient: f32) -> (f32, f32) {
+    if !(arriving > 0.0) || ratio <= 0.0 {
+        return (0.0, 0.0);
+    }
+    // d(1 - s b / a) = -s / a db + s b / a^2 da, and s b / a is 1 - ratio.
+    let slope = gradient / arriving;
+    (-slope * share, slope * (1.0 - ratio))
+}

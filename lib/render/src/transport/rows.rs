@@ -1,0 +1,438 @@
+//! Sparse rows of weights: which texels of the environment a pixel sees, and how much of each.
+//!
+//! Compressed rows (CSR): `offsets[p]..offsets[p + 1]` are the entries of pixel `p`, by ascending
+//! texel. In half precision every row has its own power of two, so that its largest weight lies
+//! in `[2^14, 2^15)`: weights down to `2^-28` of the row's largest keep all eleven bits, and a
+//! weight's relative rounding error is at most `2^-11`.
+use std::fmt::Debug;
+use std::ops::{Deref, Range};
+use std::sync::Arc;
+
+use bytemuck::{Pod, Zeroable};
+use dipir_light::luminance::luminance;
+use glam::{Vec3, Vec4};
+use half::f16;
+use memmap2::Mmap;
+
+/// A weight and the texel that it belongs to.
+pub trait Entry: Pod + Send + Sync + Debug + PartialEq {
+    /// Whether rows are scaled so that their weights fit the format.
+    const SCALED: bool;
+    /// Numbers in an entry, as files count them.
+    const NUMBERS: usize;
+    /// Packs `weight`, of which one-channel formats keep the first.
+    fn new(texel: usize, weight: Vec3) -> Self;
+    /// Index of the texel, row by row from the top of the map.
+    fn texel(&self) -> usize;
+    /// The weight of each channel; the fourth number means nothing and may be NaN.
+    fn weight(&self) -> Vec4;
+}
+
+/// Three half-precision weights and one of at most 65536 texels: 8 bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct ColourHalf([u16; 4]);
+
+/// Three single-precision weights and a texel: 16 bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct ColourSingle([u32; 4]);
+
+/// One half-precision weight for all channels and one of at most 65536 texels: 4 bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct GreyHalf([u16; 2]);
+
+/// One single-precision weight for all channels and a texel: 8 bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct GreySingle([u32; 2]);
+
+impl Entry for ColourHalf {
+    const SCALED: bool = true;
+    const NUMBERS: usize = 4;
+
+    fn new(texel: usize, weight: Vec3) -> Self {
+        let [r, g, b] = weight.to_array().map(|w| f16::from_f32(w).to_bits());
+        Self([r, g, b, texel as u16])
+    }
+
+    #[inline(always)]
+    fn texel(&self) -> usize {
+        self.0[3] as usize
+    }
+
+    #[inline(always)]
+    fn weight(&self) -> Vec4 {
+        widen(self.0)
+    }
+}
+
+impl Entry for ColourSingle {
+    const SCALED: bool = false;
+    const NUMBERS: usize = 4;
+
+    fn new(texel: usize, weight: Vec3) -> Self {
+        let [r, g, b] = weight.to_array().map(f32::to_bits);
+        Self([r, g, b, texel as u32])
+    }
+
+    #[inline(always)]
+    fn texel(&self) -> usize {
+        self.0[3] as usize
+    }
+
+    #[inline(always)]
+    fn weight(&self) -> Vec4 {
+        Vec4::from_array(self.0.map(f32::from_bits))
+    }
+}
+
+impl Entry for GreyHalf {
+    const SCALED: bool = true;
+    const NUMBERS: usize = 2;
+
+    fn new(texel: usize, weight: Vec3) -> Self {
+        Self([f16::from_f32(weight.x).to_bits(), texel as u16])
+    }
+
+    #[inline(always)]
+    fn texel(&self) -> usize {
+        self.0[1] as usize
+    }
+
+    #[inline(always)]
+    fn weight(&self) -> Vec4 {
+        widen([self.0[0]; 4])
+    }
+}
+
+impl Entry for GreySingle {
+    const SCALED: bool = false;
+    const NUMBERS: usize = 2;
+
+    fn new(texel: usize, weight: Vec3) -> Self {
+        Self([weight.x.to_bits(), texel as u32])
+    }
+
+    #[inline(always)]
+    fn texel(&self) -> usize {
+        self.0[1] as usize
+    }
+
+    #[inline(always)]
+    fn weight(&self) -> Vec4 {
+        Vec4::splat(f32::from_bits(self.0[0]))
+    }
+}
+
+/// Four halves as floats. Exact, so both versions give the same bits.
+#[inline(always)]
+fn widen(halves: [u16; 4]) -> Vec4 {
+    #[cfg(all(target_arch = "x86_64", target_feature = "f16c"))]
+    {
+        use std::arch::x86_64::{_mm_cvtph_ps, _mm_cvtsi64_si128};
+        let bits: u64 = bytemuck::cast(halves);
+        // SAFETY: the instruction sets are enabled at compile time.
+        unsafe { _mm_cvtph_ps(_mm_cvtsi64_si128(bits as i64)) }.into()
+    }
+    #[cfg(not(all(target_arch = "x86_64", target_feature = "f16c")))]
+    Vec4::from_array(halves.map(|h| f16::from_bits(h).to_f32()))
+}
+
+/// Numbers in memory or in a mapped file.
+#[derive(Clone, Debug)]
+pub enum Store<T> {
+    /// In memory.
+    Owned(Vec<T>),
+    /// In a file: its bytes `range`, which were checked to be whole, aligned `T`.
+    Mapped {
+        /// The file.
+        file: Arc<Mmap>,
+        /// Where in it.
+        range: Range<usize>,
+    },
+}
+
+impl<T: Pod> Deref for Store<T> {
+    type Target = [T];
+
+    fn deref(&self) -> &[T] {
+        match self {
+            Store::Owned(values) => values,
+            Store::Mapped { file, range } => bytemuck::cast_slice(&file[range.clone()]),
+        }
+    }
+}
+
+/// The rows of all pixels.
+#[derive(Clone, Debug)]
+pub struct Rows<E> {
+    /// Where each pixel's entries begin, and the end: one more than there are pixels.
+    pub offsets: Store<u32>,
+    /// Stored weights are `2^exponent` times the true ones.
+    pub exponents: Store<i8>,
+    /// Texels and weights.
+    pub entries: Store<E>,
+    /// How many samples each entry is worth, see [`merged_count`].
+    pub merged: Store<u8>,
+}
+
+/// The number of samples that a code of [`Rows::merged`] stands for, to 4%: the squared sum of
+/// the weights that were merged over the sum of their squares.
+pub fn merged_count(code: u8) -> f32 {
+    (f32::from(code) / MERGED_STEPS).exp2()
+}
+
+/// Codes per doubling: 255 of them reach 3.9e9 samples.
+const MERGED_STEPS: f32 = 8.0;
+
+fn merged_code(count: f32) -> u8 {
+    // A count below 1 is rounding, and NaN the underflow of squares.
+    (count.max(1.0).log2() * MERGED_STEPS).round() as u8
+}
+
+impl<E: Entry> Rows<E> {
+    /// The number of pixels.
+    pub fn pixels(&self) -> usize {
+        self.exponents.len()
+    }
+
+    /// Bytes that a product with these rows reads of them.
+    pub fn bytes(&self) -> usize {
+        size_of_val(&*self.offsets) + size_of_val(&*self.exponents) + size_of_val(&*self.entries)
+    }
+
+    /// Puts rows in the order of their pixels; `None` if they exceed 2^32 - 1 entries.
+    pub fn assemble(pixels: usize, parts: &[Part<E>]) -> Option<Self> {
+        let mut lengths = vec![0u64; pixels + 1];
+        let mut exponents = vec![0i8; pixels];
+        for row in parts.iter().flat_map(|p| &p.rows) {
+            lengths[row.pixel as usize + 1] = row.length as u64;
+            exponents[row.pixel as usize] = row.exponent;
+        }
+        let mut total = 0u64;
+        let mut offsets = Vec::with_capacity(pixels + 1);
+        for length in lengths {
+            total += length;
+            offsets.push(u32::try_from(total).ok()?);
+        }
+        let mut entries = vec![E::zeroed(); total as usize];
+        let mut merged = vec![0u8; total as usize];
+        for part in parts {
+            let mut first = 0;
+            for row in &part.rows {
+                let (from, to) = (
+                    first..first + row.length,
+                    offsets[row.pixel as usize] as usize,
+                );
+                entries[to..to + row.length].copy_from_slice(&part.entries[from.clone()]);
+                merged[to..to + row.length].copy_from_slice(&part.merged[from]);
+                first += row.length;
+            }
+        }
+        Some(Self {
+            offsets: Store::Owned(offsets),
+            exponents: Store::Owned(exponents),
+            entries: Store::Owned(entries),
+            merged: Store::Owned(merged),
+        })
+    }
+}
+
+/// Rows of some pixels, while they are recorded.
+#[derive(Clone, Debug)]
+pub struct Part<E> {
+    rows: Vec<RowHead>,
+    entries: Vec<E>,
+    merged: Vec<u8>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct RowHead {
+    pixel: u32,
+    length: usize,
+    exponent: i8,
+}
+
+impl<E> Default for Part<E> {
+    fn default() -> Self {
+        Self {
+            rows: Vec::new(),
+            entries: Vec::new(),
+            merged: Vec::new(),
+        }
+    }
+}
+
+impl<E: Entry> Part<E> {
+    /// Adds the row of `pixel`, all weights times `scale`, and leaves `builder` empty.
+    pub fn push(&mut self, pixel: u32, builder: &mut RowBuilder, scale: f32) {
+        builder.touched.sort_unstable();
+        let first = self.entries.len();
+        let largest = builder
+            .touched
+            .iter()
+            .map(|&t| builder.cells[t as usize].truncate().max_element())
+            .fold(0f32, f32::max);
+        let exponent = if E::SCALED {
+            exponent_for(largest * scale)
+        } else {
+            0
+        };
+        let factor = scale * power_of_two(exponent);
+        for &texel in &builder.touched {
+            let cell = std::mem::take(&mut builder.cells[texel as usize]);
+            let entry = E::new(texel as usize, cell.truncate() * factor);
+            if entry.weight().truncate() != Vec3::ZERO {
+                let sum = luminance(cell.truncate());
+                self.entries.push(entry);
+                self.merged.push(merged_code(sum * sum / cell.w));
+            }
+        }
+        builder.touched.clear();
+        self.rows.push(RowHead {
+            pixel,
+            length: self.entries.len() - first,
+            exponent,
+        });
+    }
+}
+
+/// The exponent that brings `largest` into `[2^14, 2^15)`, the top of half precision but one, so
+/// that rounding cannot overflow.
+fn exponent_for(largest: f32) -> i8 {
+    let biased = ((largest.to_bits() >> 23) & 0xff) as i32;
+    (14 - (biased - 127)).clamp(-126, 126) as i8
+}
+
+/// `2^exponent`, exactly, for exponents from -126 to 127.
+#[inline(always)]
+pub fn power_of_two(exponent: i8) -> f32 {
+    f32::from_bits(((i32::from(exponent) + 127) as u32) << 23)
+}
+
+/// Sums the weights of one row, texel by texel.
+#[derive(Clone, Debug)]
+pub struct RowBuilder {
+    /// Per texel: sum of the weights, and sum of their squared luminance.
+    cells: Vec<Vec4>,
+    touched: Vec<u32>,
+}
+
+impl RowBuilder {
+    /// For environments of `texels` texels.
+    pub fn new(texels: usize) -> Self {
+        Self {
+            cells: vec![Vec4::ZERO; texels],
+            touched: Vec::new(),
+        }
+    }
+
+    /// Adds a sample's weight for one texel.
+    #[inline]
+    pub fn add(&mut self, texel: usize, weight: Vec3) {
+        if weight == Vec3::ZERO {
+            return;
+        }
+        let cell = &mut self.cells[texel];
+        if cell.truncate() == Vec3::ZERO {
+            self.touched.push(texel as u32);
+        }
+        let y = luminance(weight);
+        *cell += weight.extend(y * y);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row<E: Entry>(weights: &[(usize, Vec3)], scale: f32) -> Rows<E> {
+        let mut builder = RowBuilder::new(1 << 16);
+        for &(texel, weight) in weights {
+            builder.add(texel, weight);
+        }
+        let mut part = Part::default();
+        part.push(1, &mut builder, scale);
+        assert!(builder.cells.iter().all(|c| *c == Vec4::ZERO) && builder.touched.is_empty());
+        Rows::assemble(3, &[part]).expect("small")
+    }
+
+    #[test]
+    fn entries_have_the_sizes_that_files_state() {
+        assert_eq!(size_of::<ColourHalf>(), 2 * ColourHalf::NUMBERS);
+        assert_eq!(size_of::<GreyHalf>(), 2 * GreyHalf::NUMBERS);
+        assert_eq!(size_of::<ColourSingle>(), 4 * ColourSingle::NUMBERS);
+        assert_eq!(size_of::<GreySingle>(), 4 * GreySingle::NUMBERS);
+    }
+
+    #[test]
+    fn half_weights_over_eight_decades_keep_eleven_bits_at_any_scale() {
+        for scale in [1e-30, 1e-6, 1.0, 1e6, 1e30] {
+            let weights: Vec<(usize, Vec3)> = (0..65536)
+                .step_by(977)
+                .map(|t| {
+                    let w = (-18.0 * t as f32 / 65536.0).exp();
+                    (t, Vec3::new(w, 0.7 * w, 0.3 * w))
+                })
+                .collect();
+            let rows = row::<ColourHalf>(&weights, scale);
+            assert_eq!(&*rows.offsets, [0, 0, 68, 68]);
+            let unit = 1.0 / f64::from(power_of_two(rows.exponents[1]));
+            for (entry, (texel, weight)) in rows.entries.iter().zip(&weights) {
+                assert_eq!(entry.texel(), *texel);
+                let found = entry.weight().truncate().as_dvec3() * unit;
+                let expected = weight.as_dvec3() * f64::from(scale);
+                // Half a unit in the eleventh bit, and the product's own f32 rounding.
+                let error = ((found - expected) / expected).abs().max_element();
+                assert!(error <= 2f64.powi(-11) * 1.001, "{scale} {texel}: {error}");
+            }
+        }
+    }
+
+    #[test]
+    fn single_precision_keeps_weights_as_they_are() {
+        let weights = [(70, Vec3::new(0.1, 1e-20, 3e20)), (5, Vec3::X)];
+        let rows = row::<ColourSingle>(&weights, 0.5);
+        assert_eq!(rows.entries[0], ColourSingle::new(5, 0.5 * Vec3::X));
+        assert_eq!(rows.entries[1].weight().truncate(), 0.5 * weights[0].1);
+        assert_eq!(&*rows.exponents, [0; 3]);
+    }
+
+    #[test]
+    fn equal_texels_merge_and_tell_how_many_samples_they_were() {
+        let rows = row::<GreySingle>(
+            &[(9, Vec3::ONE), (9, Vec3::ONE), (4, Vec3::splat(2.0))],
+            1.0,
+        );
+        assert_eq!(rows.entries.len(), 2);
+        assert_eq!(rows.entries[1].texel(), 9);
+        assert_eq!(rows.entries[1].weight().x, 2.0);
+        let counts: Vec<f32> = rows.merged.iter().map(|&c| merged_count(c)).collect();
+        assert_eq!(counts, [1.0, 2.0]);
+        // One large and one tiny sample are worth one.
+        let rows = row::<GreySingle>(&[(9, Vec3::ONE), (9, Vec3::splat(1e-6))], 1.0);
+        assert_eq!(merged_count(rows.merged[0]), 1.0);
+    }
+
+    #[test]
+    fn counts_keep_four_per_cent_up_to_billions() {
+        for n in [1.0f32, 1.5, 7.0, 1000.0, 1e6, 3e9] {
+            let found = merged_count(merged_code(n));
+            // Half a step of an eighth of a doubling.
+            assert!(
+                (found / n).log2().abs() <= 0.5 / MERGED_STEPS + 1e-5,
+                "{n}: {found}"
+            );
+        }
+        assert_eq!(merged_code(f32::NAN), 0);
+    }
+
+    #[test]
+    fn rows_of_zeros_are_empty() {
+        let rows = row::<ColourHalf>(&[(3, Vec3::ZERO)], 1.0);
+        assert_eq!(rows.entries.len(), 0);
+        assert_eq!(rows.pixels(), 3);
+    }
+}

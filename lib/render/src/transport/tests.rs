@@ -1,0 +1,618 @@
+//! Replay against path tracing, adjoints, files.
+use std::ops::ControlFlow;
+
+use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
+use dipir_numerics::sampler::{Sampler, Stream};
+use dipir_numerics::stats::Running;
+use dipir_scene::material::Material;
+use dipir_scene::proxy::Proxy;
+use dipir_scene::scene::Scene;
+use glam::{DVec3, Vec3};
+
+use super::*;
+use crate::error::RenderError;
+use crate::render::{Renderer, Simulation};
+use crate::shapes::{quad, torus_knot};
+use crate::testing::{camera, everything, ground, lambertian, matte, render, scene, settings, sun};
+
+const ENVIRONMENT: [usize; 2] = [32, 16];
+
+fn record(scene: &Scene, settings: &RecordSettings) -> Transport {
+    Transport::record(&Renderer::new(scene), settings, &mut |_| {
+        ControlFlow::Continue(())
+    })
+    .expect("records")
+}
+
+fn small(simulation: Simulation) -> RecordSettings<'static> {
+    RecordSettings {
+        environment: ENVIRONMENT,
+        samples: 16,
+        shadow_samples: 16,
+        ..RecordSettings::new(simulation)
+    }
+}
+
+/// A knot on the ground, which shadows itself and the ground.
+fn knot(material: Material, proxy: Proxy) -> Scene {
+    let view = camera(Vec3::new(0.0, 3.0, 4.0), Vec3::Y * 0.5, 35.0, 12);
+    scene(
+        torus_knot(Vec3::Y * 0.8, 0.5, 0.2, 48, 8),
+        material,
+        view,
+        proxy,
+    )
+}
+
+fn sheet() -> Proxy {
+    Proxy::Mesh(quad(
+        Vec3::new(-20.0, 0.0, 20.0),
+        Vec3::X * 40.0,
+        Vec3::NEG_Z * 40.0,
+    ))
+}
+
+fn glossy() -> Material {
+    Material {
+        roughness: 0.3,
+        metallic: 0.5,
+        base_color: Vec3::new(0.9, 0.5, 0.2).extend(1.0),
+        ..matte(Vec3::ONE)
+    }
+}
+
+fn mirror() -> Material {
+    Material {
+        roughness: 0.0,
+        metallic: 1.0,
+        ..glossy()
+    }
+}
+
+/// Texels between 0 and 1, none equal to another.
+fn random_vectors(n: usize, seed: u64) -> Vec<Vec3> {
+    (0..n as u32)
+        .map(|k| {
+            let mut s = Sampler::new(seed, Stream::TEST, k, 0);
+            Vec3::new(s.next_1d(), s.next_1d(), s.next_1d())
+        })
+        .collect()
+}
+
+fn dot(a: &[Vec3], b: &[Vec3]) -> f64 {
+    a.iter()
+        .zip(b)
+        .map(|(a, b)| a.as_dvec3().dot(b.as_dvec3()))
+        .sum()
+}
+
+fn constant() -> EnvironmentMap {
+    EnvironmentMap::constant(ENVIRONMENT[0], ENVIRONMENT[1], Vec3::new(0.5, 1.0, 0.7))
+}
+
+/// 0.5 degrees wide at this height of map: a texel of 360 rows.
+fn fine_sun() -> EnvironmentMap {
+    sun(Vec3::new(0.4, 0.8, 0.5).normalize(), 2e4, 0.3, 360)
+}
+
+/// Mean over seeds of the sums of both layers over the picture, by replay and by path tracing.
+fn replay_and_render(
+    material: Material,
+    light: &EnvironmentMap,
+    proxy: Proxy,
+) -> [[Running; 2]; 2] {
+    let scene = knot(material, proxy);
+    let sampler = EnvironmentSampler::new(light.clone());
+    let mut found = [[Running::default(); 2]; 2];
+    for seed in 0..8 {
+        let transport = record(
+            &scene,
+            &RecordSettings {
+                environment: [light.width(), light.height()],
+                precision: Precision::Single,
+                light: Some(light),
+                seed,
+                ..small(everything(3))
+            },
+        );
+        let traced = render(&scene, &sampler, &everything(3), &settings(16, 100 + seed)).film;
+        let layers = [
+            [
+                transport.foreground(light.texels()),
+                transport.shadow(light.texels()),
+            ],
+            [traced.object, traced.shadow],
+        ];
+        for (found, layers) in found.iter_mut().zip(layers) {
+            for (found, layer) in found.iter_mut().zip(layers) {
+                let sum: DVec3 = layer.pixels().iter().map(|p| p.as_dvec3()).sum();
+                found.push(sum.dot(DVec3::new(1.0, 1.1, 0.9)) / layer.pixels().len() as f64);
+            }
+        }
+    }
+    found
+}
+
+/// Asserts that the means agree within 4.5 standard errors, which `least` bounds from above so
+/// that the test can fail: one of twenty comparisons would exceed that by chance in 7000 sets of
+/// seeds, and the seeds are fixed.
+fn assert_agree(name: &str, [replayed, traced]: [Running; 2], largest_error: f64) {
+    let error = replayed.std_error().hypot(traced.std_error());
+    let difference = (replayed.mean() - traced.mean()).abs();
+    let mean = traced.mean();
+    // Beside noise: sums of f32, a few ulp.
+    assert!(
+        difference < 4.5 * error + 1e-6 * mean,
+        "{name}: {} instead of {mean} +- {error}",
+        replayed.mean()
+    );
+    assert!(
+        error < largest_error * mean,
+        "{name}: error {error} of {mean}"
+    );
+}
+
+#[test]
+fn replay_is_unbiased_for_matte_glossy_and_mirror_under_a_constant_sky() {
+    for (name, material) in [
+        ("matte", matte(Vec3::splat(0.8))),
+        ("glossy", glossy()),
+        ("mirror", mirror()),
+    ] {
+        let [replayed, traced] = replay_and_render(material, &constant(), ground());
+        assert_agree(name, [replayed[0], traced[0]], 0.02);
+        assert_agree(name, [replayed[1], traced[1]], 0.02);
+    }
+}
+
+#[test]
+fn replay_is_unbiased_for_matte_glossy_and_mirror_under_a_half_degree_sun() {
+    // A mirror that small meets the sun in few pixels and seeds: its error is large.
+    let cases = [
+        ("matte", matte(Vec3::splat(0.8)), 0.02),
+        ("glossy", glossy(), 0.03),
+        ("mirror", mirror(), 0.5),
+    ];
+    for (name, material, largest_error) in cases {
+        let [replayed, traced] = replay_and_render(material, &fine_sun(), ground());
+        assert_agree(name, [replayed[0], traced[0]], largest_error);
+        assert_agree(name, [replayed[1], traced[1]], 0.02);
+    }
+}
+
+#[test]
+fn a_proxy_mesh_replays_as_it_renders() {
+    let [replayed, traced] = replay_and_render(matte(Vec3::ONE), &constant(), sheet());
+    assert_agree("shadow", [replayed[1], traced[1]], 0.02);
+}
+
+#[test]
+fn emission_and_coverage_need_no_light() {
+    let mut material = matte(Vec3::ONE);
+    material.emissive = Vec3::new(3.0, 2.0, 1.0);
+    let transport = record(&knot(material, ground()), &small(everything(1)));
+    let dark = vec![Vec3::ZERO; 512];
+    let picture = transport.foreground(&dark);
+    assert_eq!(&picture, transport.base());
+    let mut lit = 0;
+    for (radiance, &coverage) in picture.pixels().iter().zip(transport.coverage().pixels()) {
+        // One interaction sees emission where the path begins, and at the end of one bounce.
+        assert!(radiance.x >= 3.0 * coverage * (1.0 - 1e-6));
+        lit += usize::from(coverage == 1.0);
+    }
+    assert!(lit > 5, "{lit} pixels are covered");
+    // Nothing arrives: nothing is taken.
+    assert!(
+        transport
+            .shadow(&dark)
+            .pixels()
+            .iter()
+            .all(|r| *r == Vec3::ONE)
+    );
+    let gradient = transport.shadow_vjp(&dark, &transport.shadow(&dark), &random_vectors(144, 1));
+    assert!(gradient.iter().all(|g| *g == Vec3::ZERO));
+}
+
+/// Transports of all kinds of proxy and both precisions.
+fn transports() -> Vec<Transport> {
+    let mut all = Vec::new();
+    for precision in [Precision::Half, Precision::Single] {
+        for proxy in [Proxy::None, ground(), sheet()] {
+            let scene = knot(glossy(), proxy);
+            let settings = RecordSettings {
+                precision,
+                ..small(everything(2))
+            };
+            all.push(record(&scene, &settings));
+        }
+    }
+    all
+}
+
+#[test]
+fn the_transposed_product_is_the_transpose() {
+    for transport in transports() {
+        let light = random_vectors(512, 1);
+        let y = random_vectors(144, 2);
+        let image = transport.foreground(&light);
+        let forward = dot(image.pixels(), &y) - dot(transport.base().pixels(), &y);
+        let backward = dot(&light, &transport.foreground_vjp(&y));
+        // All terms are positive: rows of up to 500 f32 sums keep more than 6 digits.
+        assert!(
+            (forward / backward - 1.0).abs() < 1e-6,
+            "{forward} {backward}"
+        );
+        assert!(forward > 1.0);
+    }
+}
+
+#[test]
+fn gradients_of_the_shadow_ratio_equal_central_differences() {
+    let mut compared = 0;
+    for transport in transports() {
+        let light = random_vectors(512, 3);
+        let y = random_vectors(144, 4);
+        let ratio = transport.shadow(&light);
+        let gradient = transport.shadow_vjp(&light, &ratio, &y);
+        for seed in 5..9 {
+            // Along a random direction; the loss is smooth as no ratio is clamped.
+            let direction: Vec<Vec3> = random_vectors(512, seed).iter().map(|v| *v - 0.5).collect();
+            let loss = |h: f64| {
+                let moved = reference_shadow(&transport, &light, &direction, h);
+                moved
+                    .iter()
+                    .zip(&y)
+                    .map(|(r, y)| r.dot(y.as_dvec3()))
+                    .sum::<f64>()
+            };
+            // f64 and a step of 1e-4 of the light: truncation and rounding are both below 1e-7.
+            let expected = (loss(1e-4) - loss(-1e-4)) / 2e-4;
+            let found = dot(&gradient, &direction);
+            if transport.header().shadow == ShadowKind::None {
+                assert_eq!(found, 0.0);
+                continue;
+            }
+            let scale: f64 = gradient
+                .iter()
+                .map(|g| g.as_dvec3().length_squared())
+                .sum::<f64>()
+                .sqrt();
+            assert!(
+                (found - expected).abs() < 1e-4 * expected.abs() + 1e-6 * scale,
+                "{found} instead of {expected}, {:?}",
+                transport.header()
+            );
+            compared += 1;
+        }
+    }
+    assert_eq!(compared, 16);
+}
+
+/// The ratios under `light + h direction`, in f64 from the stored weights.
+fn reference_shadow(
+    transport: &Transport,
+    light: &[Vec3],
+    direction: &[Vec3],
+    h: f64,
+) -> Vec<DVec3> {
+    let light: Vec<DVec3> = light
+        .iter()
+        .zip(direction)
+        .map(|(l, d)| l.as_dvec3() + d.as_dvec3() * h)
+        .collect();
+    fn product<E: Entry>(rows: &Rows<E>, light: &[DVec3]) -> Vec<DVec3> {
+        (0..rows.pixels())
+            .map(|p| {
+                let row = rows.offsets[p] as usize..rows.offsets[p + 1] as usize;
+                let scale = 2f64.powi(-i32::from(rows.exponents[p]));
+                let terms = rows.entries[row].iter();
+                terms
+                    .map(|e| e.weight().truncate().as_dvec3() * light[e.texel()] * scale)
+                    .sum()
+            })
+            .collect()
+    }
+    let ratio = |b: DVec3, a: DVec3, s: f32| {
+        let ratio = DVec3::ONE - f64::from(s) * b / a;
+        DVec3::select(a.cmpgt(DVec3::ZERO), ratio, DVec3::ONE).max(DVec3::ZERO)
+    };
+    with_rows!(&transport.weights, set => match &set.shadow {
+        Shadow::None => vec![DVec3::ONE; set.object.pixels()],
+        Shadow::Plane { blocked, cosine } => {
+            let e: DVec3 = cosine.iter().zip(&light).map(|(&e, l)| *l * f64::from(e)).sum();
+            product(blocked, &light).into_iter().map(|b| ratio(b, e, 1.0)).collect()
+        }
+        Shadow::Mesh { blocked, arriving, share } => product(blocked, &light)
+            .into_iter()
+            .zip(product(arriving, &light))
+            .zip(share)
+            .map(|((b, a), &s)| ratio(b, a, s))
+            .collect(),
+    })
+}
+
+#[test]
+fn a_clamped_ratio_has_no_gradient() {
+    assert_eq!(ratio(2.0, 1.0, 1.0), 0.0);
+    assert_eq!(ratio_vjp(0.0, 1.0, 1.0, 5.0), (0.0, 0.0));
+    assert_eq!(ratio(0.0, 0.0, 1.0), 1.0);
+    assert_eq!(ratio_vjp(1.0, 0.0, 1.0, 5.0), (0.0, 0.0));
+    assert_eq!(ratio(1.0, 4.0, 0.5), 0.875);
+    assert_eq!(ratio_vjp(0.875, 4.0, 0.5, 8.0), (-1.0, 0.25));
+}
+
+#[test]
+fn one_and_three_threads_give_the_same_bytes() {
+    let scene = knot(glossy(), sheet());
+    let run = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        pool.expect("threads").install(|| {
+            let transport = record(&scene, &small(everything(2)));
+            let light = random_vectors(512, 1);
+            let ratio = transport.shadow(&light);
+            let y = random_vectors(144, 2);
+            let file = tempfile::NamedTempFile::new().expect("a file");
+            transport.save(file.path()).expect("saves");
+            (
+                std::fs::read(file.path()).expect("reads"),
+                transport.foreground(&light),
+                transport.foreground_vjp(&y),
+                transport.shadow_vjp(&light, &ratio, &y),
+                ratio,
+            )
+        })
+    };
+    assert!(run(1) == run(3));
+}
+
+#[test]
+fn half_precision_differs_by_its_rounding_alone() {
+    let scene = knot(glossy(), ground());
+    let [half, single] = [Precision::Half, Precision::Single].map(|precision| {
+        let settings = RecordSettings {
+            precision,
+            ..small(everything(2))
+        };
+        record(&scene, &settings)
+    });
+    assert_eq!(half.entries(), single.entries());
+    assert!(half.bytes().0 < single.bytes().0);
+    let light = random_vectors(512, 1);
+    let pairs = [
+        (half.foreground(&light), single.foreground(&light)),
+        (half.shadow(&light), single.shadow(&light)),
+    ];
+    for (a, b) in pairs {
+        for (a, b) in a.pixels().iter().zip(b.pixels()) {
+            // Every weight is off by at most 2^-11 of itself, and all are positive.
+            assert!(
+                (*a - *b).abs().max_element() <= 4.9e-4 * b.max_element().max(1.0),
+                "{a} {b}"
+            );
+        }
+    }
+}
+
+#[test]
+fn effective_samples_are_most_under_a_constant_sky_and_few_under_an_unforeseen_sun() {
+    let scene = knot(matte(Vec3::ONE), ground());
+    let transport = record(&scene, &small(lambertian(1)));
+    let even = constant();
+    let unforeseen = sun(Vec3::new(0.4, 0.8, 0.5).normalize(), 1e4, 1.0, 16);
+    let sizes = transport.effective_sample_size(even.texels());
+    let covered: Vec<f64> = (0..144)
+        .filter(|&p| transport.coverage().pixels()[p] == 1.0)
+        .map(|p| f64::from(sizes.pixels()[p]))
+        .collect();
+    // Of 16 paths some are occluded, none counts for much more than another.
+    let mean = covered.iter().sum::<f64>() / covered.len() as f64;
+    assert!(mean > 8.0 && covered.iter().all(|&n| n < 17.0), "{mean}");
+    // Where one path found the sun by chance, the picture hangs on it.
+    let mut sunny = Vec::new();
+    for seed in 0..6 {
+        let chance = record(
+            &scene,
+            &RecordSettings {
+                seed,
+                ..small(lambertian(1))
+            },
+        );
+        let picture = chance.foreground(unforeseen.texels());
+        let sizes = chance.effective_sample_size(unforeseen.texels());
+        let found = picture.pixels().iter().zip(sizes.pixels());
+        sunny.extend(
+            found
+                .filter(|(radiance, _)| radiance.y > 100.0)
+                .map(|(_, &n)| n),
+        );
+    }
+    assert!(
+        !sunny.is_empty() && sunny.iter().all(|&n| n < 4.5),
+        "{sunny:?}"
+    );
+    // The others lack it, which only the light itself can tell.
+    assert!((transport.light_sample_size(even.texels()) - 16.0).abs() < 1e-3);
+    assert!(transport.light_sample_size(unforeseen.texels()) < 0.5);
+    let prepared = record(
+        &scene,
+        &RecordSettings {
+            light: Some(&unforeseen),
+            ..small(lambertian(1))
+        },
+    );
+    assert!(prepared.light_sample_size(unforeseen.texels()) > 12.0);
+}
+
+#[test]
+fn occluders_hide_object_and_shadow_in_proportion() {
+    let scene = knot(matte(Vec3::ONE), ground());
+    let mask = Raster::filled(12, 12, 0.25f32);
+    let light = random_vectors(512, 1);
+    let seen = record(&scene, &small(lambertian(2)));
+    let hidden = record(
+        &scene,
+        &RecordSettings {
+            occluders: Some(&mask),
+            ..small(lambertian(2))
+        },
+    );
+    let pairs = [
+        (seen.foreground(&light), hidden.foreground(&light), 0.0),
+        (seen.shadow(&light), hidden.shadow(&light), 1.0),
+    ];
+    for (all, part, base) in pairs {
+        for (a, b) in all.pixels().iter().zip(part.pixels()) {
+            let expected = (*a - base) * 0.75 + base;
+            // Half precision rounds both.
+            assert!((*b - expected).abs().max_element() < 1e-3 * expected.max_element().max(1.0));
+        }
+    }
+}
+
+#[test]
+fn a_file_replays_as_the_record_did() {
+    for transport in transports() {
+        let file = tempfile::NamedTempFile::new().expect("a file");
+        transport.save(file.path()).expect("saves");
+        let loaded = Transport::load(file.path()).expect("loads");
+        assert_eq!(loaded.header(), transport.header());
+        let light = random_vectors(512, 1);
+        let y = random_vectors(144, 2);
+        assert_eq!(loaded.foreground(&light), transport.foreground(&light));
+        assert_eq!(loaded.shadow(&light), transport.shadow(&light));
+        assert_eq!(loaded.foreground_vjp(&y), transport.foreground_vjp(&y));
+        assert_eq!(loaded.coverage(), transport.coverage());
+        assert_eq!(
+            loaded.effective_sample_size(&light),
+            transport.effective_sample_size(&light)
+        );
+        assert_eq!(
+            loaded.light_sample_size(&light),
+            transport.light_sample_size(&light)
+        );
+    }
+}
+
+/// Saves, lets `damage` change the bytes, and returns what loading says.
+fn damaged(damage: impl FnOnce(&mut Vec<u8>)) -> Result<Transport, RenderError> {
+    let transport = record(&knot(glossy(), ground()), &small(lambertian(1)));
+    let file = tempfile::NamedTempFile::new().expect("a file");
+    transport.save(file.path()).expect("saves");
+    let mut bytes = std::fs::read(file.path()).expect("reads");
+    damage(&mut bytes);
+    std::fs::write(file.path(), bytes).expect("writes");
+    Transport::load(file.path())
+}
+
+/// Where the bytes of tensor `name` begin.
+fn tensor_start(bytes: &[u8], name: &str) -> usize {
+    let header = u64::from_le_bytes(bytes[..8].try_into().expect("8 bytes")) as usize;
+    let json: serde_json::Value = serde_json::from_slice(&bytes[8..8 + header]).expect("JSON");
+    8 + header + json[name]["data_offsets"][0].as_u64().expect("a number") as usize
+}
+
+fn replace(bytes: &mut Vec<u8>, from: &str, to: &str) {
+    assert_eq!(from.len(), to.len());
+    let at = bytes
+        .windows(from.len())
+        .position(|w| w == from.as_bytes())
+        .expect("is there");
+    bytes[at..at + from.len()].copy_from_slice(to.as_bytes());
+}
+
+#[test]
+fn damaged_files_are_refused_by_what_is_wrong() {
+    assert!(damaged(|_| ()).is_ok());
+    type Damage = fn(&mut Vec<u8>);
+    let cases: [(Damage, &str); 9] = [
+        (|b| b.clear(), "is not safetensors"),
+        (|b| b.truncate(b.len() - 1), "is not safetensors"),
+        (|b| b[..8].fill(0xff), "is not safetensors"),
+        (
+            |b| replace(b, "dipir_transport_1", "dipir_transport_9"),
+            "has no metadata \"dipir_transport_1\"",
+        ),
+        (
+            |b| replace(b, "\\\"size\\\":[12,12]", "\\\"size\\\":[12,99]"),
+            "instead of",
+        ),
+        (
+            |b| {
+                replace(
+                    b,
+                    "\\\"environment\\\":[32,16]",
+                    "\\\"environment\\\":[32,00]",
+                )
+            },
+            "damaged header",
+        ),
+        (
+            |b| {
+                let at = tensor_start(b, "object.offsets");
+                b[at..at + 4].fill(0xff);
+            },
+            "has decreasing \"object.offsets\"",
+        ),
+        (
+            |b| {
+                // The texel of the first entry.
+                let at = tensor_start(b, "shadow.blocked.entries") + 2;
+                b[at..at + 2].fill(0xff);
+            },
+            "for texel 65535 of 512",
+        ),
+        (
+            |b| {
+                let at = tensor_start(b, "coverage");
+                b[at..at + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+            },
+            "has NaN at index 0 of \"coverage\"",
+        ),
+    ];
+    for (damage, expected) in cases {
+        let error = damaged(damage).map(|_| ()).expect_err(expected).to_string();
+        assert!(error.contains(expected), "{error}");
+        assert!(
+            error.ends_with("record it again with dipir-scene"),
+            "{error}"
+        );
+    }
+    let missing = Transport::load("/nonexistent/transport.safetensors").map(|_| ());
+    assert!(
+        missing
+            .expect_err("is missing")
+            .to_string()
+            .contains("cannot be opened")
+    );
+}
+
+#[test]
+fn sizes_that_do_not_fit_are_refused() {
+    let scene = knot(glossy(), ground());
+    let refused = |settings: RecordSettings| {
+        Transport::record(&Renderer::new(&scene), &settings, &mut |_| {
+            ControlFlow::Continue(())
+        })
+        .map(|_| ())
+        .expect_err("is refused")
+        .to_string()
+    };
+    let mut settings = small(lambertian(1));
+    settings.environment = [512, 256];
+    assert!(refused(settings.clone()).contains("512 x 256"));
+    settings.environment = [0, 16];
+    assert!(refused(settings.clone()).contains("0 x 16"));
+    let mask = Raster::filled(3, 3, 0.0f32);
+    settings = small(lambertian(1));
+    settings.occluders = Some(&mask);
+    assert!(refused(settings).contains("occluder mask"));
+}
+
+#[test]
+fn recording_can_be_broken_off() {
+    let scene = knot(glossy(), ground());
+    let stopped = Transport::record(&Renderer::new(&scene), &small(lambertian(1)), &mut |_| {
+        ControlFlow::Break(())
+    });
+    assert!(matches!(stopped, Err(RenderError::Interrupted)));
+}
