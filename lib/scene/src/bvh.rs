@@ -1,15 +1,18 @@
 //! The bounding volume hierarchy that finds the triangles a ray meets.
 mod build;
+mod enclosing;
 mod lanes;
 mod node;
 mod ray;
 pub mod traverse;
 
-use glam::{DVec3, Vec3};
+use glam::{DVec3, Vec3, Vec3A};
 
 use crate::camera::Ray;
 use crate::mesh::TriangleMesh;
 use crate::ray_offset::{geometric_normal, interpolate};
+use crate::triangle::TriangleHit;
+use enclosing::enclosing_sphere;
 use ray::LocalRay;
 use traverse::Tree;
 
@@ -58,6 +61,9 @@ pub struct Sphere {
     pub radius: f32,
 }
 
+/// Balls that [`Bvh::clusters`] returns at most.
+const MAX_CLUSTERS: usize = 16;
+
 /// Rays that start farther than this from the centre, in half sizes of the mesh, are moved up.
 const FAR: f64 = 8.0;
 
@@ -68,6 +74,8 @@ pub struct Bvh {
     center: DVec3,
     /// Power of two that brings the mesh into the unit cube.
     scale: f64,
+    /// Its reciprocal.
+    unscale: f64,
     bounds: Option<Bounds>,
     sphere: Option<Sphere>,
     clusters: Vec<Sphere>,
@@ -75,7 +83,7 @@ pub struct Bvh {
 }
 
 impl Bvh {
-    /// Builds the hierarchy. Triangles with an index out of range or a position that is not
+    /// Builds the hierarchy, on all threads of the current pool. Triangles with an index out of range or a position that is not
     /// finite are left out: nothing can hit them.
     pub fn build(mesh: &TriangleMesh) -> Self {
         let corners = |t: usize| -> Option<[Vec3; 3]> {
@@ -116,19 +124,23 @@ impl Bvh {
             })
             .collect();
         let tree = build::build(&triangles, &ids);
-        let sphere = bounds.map(|b| Sphere {
-            center: center.as_vec3(),
-            radius: (center.as_vec3() - b.min)
-                .max(b.max - center.as_vec3())
-                .length()
-                .next_up(),
-        });
+        let points = |ids: &[u32]| -> Vec<Vec3> {
+            ids.iter()
+                .flat_map(|&t| corners(t as usize))
+                .flatten()
+                .collect()
+        };
         Self {
             center,
             scale,
+            unscale: 1.0 / scale,
             bounds,
-            sphere,
-            clusters: sphere.into_iter().collect(),
+            sphere: enclosing_sphere(points(&ids).iter().copied()),
+            clusters: tree
+                .parts(MAX_CLUSTERS)
+                .iter()
+                .filter_map(|part| enclosing_sphere(points(part).iter().copied()))
+                .collect(),
             tree,
         }
     }
@@ -159,46 +171,48 @@ impl Bvh {
         t_max: f32,
         accept: impl Fn(u32, f32, f32) -> bool,
     ) -> Option<Hit> {
+        let root = self.tree.root?;
         let (origin, limit, skipped) = self.localize(ray, t_max)?;
-        let (triangle, hit) = self
-            .tree
-            .closest(&LocalRay::new(origin, ray.direction, limit), accept)?;
-        Some(Hit {
-            t: ((hit.t as f64 + skipped) / self.scale) as f32,
-            triangle,
-            u: hit.u,
-            v: hit.v,
-            back_face: hit.back_face,
-        })
+        let local = LocalRay::new(origin, ray.direction.into());
+        let (triangle, hit) = self.tree.closest(root, &local, limit, accept)?;
+        Some(self.globalize(triangle, hit, skipped))
     }
 
     /// Whether any triangle with `0 < t <= t_max` is taken by `accept(triangle, u, v)`.
     #[inline]
     pub fn occluded(&self, ray: &Ray, t_max: f32, accept: impl Fn(u32, f32, f32) -> bool) -> bool {
-        self.localize(ray, t_max).is_some_and(|(origin, limit, _)| {
-            self.tree
-                .occluded(&LocalRay::new(origin, ray.direction, limit), accept)
-        })
+        let (Some(root), Some((origin, limit, _))) = (self.tree.root, self.localize(ray, t_max))
+        else {
+            return false;
+        };
+        let local = LocalRay::new(origin, ray.direction.into());
+        self.tree.occluded(root, &local, limit, accept)
+    }
+
+    /// A hit in world units.
+    #[inline(always)]
+    fn globalize(&self, triangle: u32, hit: TriangleHit, skipped: f64) -> Hit {
+        Hit {
+            t: ((hit.t as f64 + skipped) * self.unscale) as f32,
+            triangle,
+            u: hit.u,
+            v: hit.v,
+            back_face: hit.back_face,
+        }
     }
 
     /// Origin and largest distance of the ray in the tree's coordinates, and how far along it
     /// that origin lies; `None` if nothing can be hit.
     #[inline(always)]
-    fn localize(&self, ray: &Ray, t_max: f32) -> Option<(Vec3, f32, f64)> {
-        let mut origin = (ray.origin.as_dvec3() - self.center) * self.scale;
-        let mut skipped = 0.0;
-        // From afar, f32 would round the origin by more than the mesh's details: start nearer.
-        // The mesh lies within sqrt(3) of the centre.
-        if origin.abs().max_element() > FAR {
-            let direction = ray.direction.as_dvec3();
-            skipped = (-origin.dot(direction) / direction.length_squared() - 0.5 * FAR).max(0.0);
-            origin += direction * skipped;
+    fn localize(&self, ray: &Ray, t_max: f32) -> Option<(Vec3A, f32, f64)> {
+        let exact = (ray.origin.as_dvec3() - self.center) * self.scale;
+        let limit = t_max as f64 * self.scale;
+        let origin = exact.as_vec3a();
+        // Comparisons with NaN, wherever it came from, fail.
+        if origin.abs().cmple(Vec3A::splat(FAR as f32)).all() && limit >= 0.0 {
+            return Some((origin, limit as f32, 0.0));
         }
-        let limit = (t_max as f64 * self.scale - skipped) as f32;
-        // What is still far passes at a distance of sqrt(FAR^2 - FAR^2 / 4) > sqrt(3) or leads
-        // away. Comparisons with NaN, wherever it came from, fail.
-        (limit >= 0.0 && origin.abs().max_element() <= FAR && ray.direction.length_squared() > 0.0)
-            .then(|| (origin.as_vec3(), limit, skipped))
+        move_up(exact, ray.direction.as_dvec3(), limit)
     }
 
     /// The point of `hit`, which must come from this BVH and `mesh` be what it was built from.
@@ -209,13 +223,27 @@ impl Bvh {
         // Half an ulp a component for the rounding of the position, and as much for vertices
         // and ray origin relative to the BVH's centre, whose coordinates are at most
         // 1 / scale: sqrt(3) (|p| 2^-24 + 2 * 2^-24 / scale), rounded up.
-        let error = f32::EPSILON * (position.abs().max_element() + 2.0 / self.scale as f32);
+        let error = f32::EPSILON * (position.abs().max_element() + 2.0 * self.unscale as f32);
         SurfacePoint {
             position,
             geometric_normal: geometric_normal(vertices),
             error,
         }
     }
+}
+
+/// [`Bvh::localize`] for origins so far from the mesh that f32 would round them by more than its
+/// details: starts nearer.
+#[cold]
+fn move_up(origin: DVec3, direction: DVec3, limit: f64) -> Option<(Vec3A, f32, f64)> {
+    let closest = -origin.dot(direction) / direction.length_squared();
+    let skipped = (closest - 0.5 * FAR).max(0.0);
+    let origin = (origin + direction * skipped).as_vec3a();
+    let limit = limit - skipped;
+    // The mesh lies within sqrt(3) of the centre: what is still far leads away or passes at
+    // a distance of sqrt(FAR^2 - FAR^2 / 4) > sqrt(3). NaN is not near.
+    let near = origin.abs().cmple(Vec3A::splat(FAR as f32)).all();
+    (near && limit >= 0.0).then_some((origin, limit as f32, skipped))
 }
 
 #[cfg(test)]

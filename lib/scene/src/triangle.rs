@@ -7,7 +7,7 @@
 //! exact. A vertex is sheared by the same arithmetic whichever triangle it belongs to, hence
 //! two triangles that share an edge agree on which side of it a ray passes: no ray slips
 //! through between them.
-use glam::Vec3;
+use glam::Vec3A;
 
 /// What of a ray is the same for every triangle: the permutation that makes the direction's
 /// largest component the last, and the shear along it.
@@ -43,9 +43,9 @@ fn sheared(a: f32, s: f32, b: f32) -> f32 {
 }
 
 impl Shear {
-    /// Prepares `direction`, which must not be zero.
-    #[inline]
-    pub fn new(direction: Vec3) -> Self {
+    /// Prepares `direction`, given the size and the reciprocal of each component.
+    #[inline(always)]
+    pub fn new(direction: Vec3A, size: Vec3A, inverse: Vec3A) -> Self {
         /// Cyclic permutations with each axis last, and their mirror images: where the
         /// direction is negative along the last axis, swapping the others keeps the winding.
         const AXES: [[[usize; 3]; 2]; 3] = [
@@ -53,29 +53,21 @@ impl Shear {
             [[2, 0, 1], [0, 2, 1]],
             [[0, 1, 2], [1, 0, 2]],
         ];
-        let a = direction.abs();
-        let y_or_z = if a.z > a.y { 2 } else { 1 };
-        let largest = if a.x > a.y.max(a.z) { 0 } else { y_or_z };
-        let axes = AXES[largest][(direction[largest] < 0.0) as usize];
-        let inverse = 1.0 / direction[axes[2]];
-        let factors = [
-            direction[axes[0]] * inverse,
-            direction[axes[1]] * inverse,
-            inverse,
-        ];
-        Self { axes, factors }
+        let y_or_z = if size.z > size.y { 2 } else { 1 };
+        let largest = if size.x > size.y.max(size.z) { 0 } else { y_or_z };
+        let (direction, inverse) = (direction.to_array(), inverse.to_array());
+        let axes = AXES[largest][(inverse[largest] < 0.0) as usize];
+        let inverse = inverse[largest];
+        Self {
+            axes,
+            factors: [direction[axes[0]] * inverse, direction[axes[1]] * inverse, inverse],
+        }
     }
 
-    /// Intersects the triangle `vertices` with the ray from `origin`, for `0 < t <= t_max`.
+    /// Intersects a triangle, its vertices relative to the ray's origin and their coordinates
+    /// in the order of `axes`, for `0 < t <= t_max`.
     #[inline]
-    pub fn intersect(&self, origin: Vec3, vertices: [Vec3; 3], t_max: f32) -> Option<TriangleHit> {
-        self.intersect_permuted(vertices.map(|v| self.axes.map(|k| v[k] - origin[k])), t_max)
-    }
-
-    /// [`intersect`](Self::intersect) with the vertices relative to the origin and their
-    /// coordinates in the order of `axes`.
-    #[inline]
-    pub fn intersect_permuted(&self, vertices: [[f32; 3]; 3], t_max: f32) -> Option<TriangleHit> {
+    pub fn intersect(&self, vertices: [[f32; 3]; 3], t_max: f32) -> Option<TriangleHit> {
         let [sx, sy, sz] = self.factors;
         let [a, b, c] = vertices;
         let (ax, ay) = (sheared(a[0], sx, a[2]), sheared(a[1], sy, a[2]));

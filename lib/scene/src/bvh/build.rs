@@ -163,7 +163,7 @@ impl Costs {
                 && costs.fits[right as usize]
                 && costs.counts[i] <= LANES as u32
                 && {
-                    let mut pack = PackBuilder::default();
+                    let mut pack = PackBuilder::EMPTY;
                     binary.for_each_triangle(node, |t| pack.push(&triangles[t as usize]))
                 };
             costs.table[i][0] = if costs.fits[i] {
@@ -345,7 +345,7 @@ impl Emitter<'_> {
     }
 
     fn pack(&mut self, list: &[u32]) -> ChildRef {
-        let mut pack = PackBuilder::default();
+        let mut pack = PackBuilder::EMPTY;
         let mut ids = [u32::MAX; LANES];
         for (id, &triangle) in ids.iter_mut().zip(list) {
             let fits = pack.push(&self.triangles[triangle as usize]);

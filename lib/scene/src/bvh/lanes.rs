@@ -15,6 +15,22 @@ pub struct Row(pub [f32; LANES]);
 #[repr(C, align(32))]
 pub struct Words(pub [u32; LANES]);
 
+/// Asks for the cache lines of `items[index]` ahead of use, where the target knows how.
+#[inline(always)]
+pub fn prefetch<T>(items: &[T], index: usize) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        let start: *const i8 = items.as_ptr().wrapping_add(index).cast();
+        for line in (0..size_of::<T>()).step_by(64) {
+            // SAFETY: SSE is part of x86-64, and a prefetch of any address is harmless.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(start.wrapping_add(line)) };
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (items, index);
+}
+
 #[cfg(all(
     target_arch = "x86_64",
     target_feature = "avx2",
@@ -59,12 +75,6 @@ mod imp {
         pub fn shift_right<const N: i32>(self) -> Self {
             // SAFETY: as above.
             Self(unsafe { _mm256_srli_epi32::<N>(self.0) })
-        }
-        /// The highest bit of each lane.
-        #[inline(always)]
-        pub fn high_bits(self) -> u32 {
-            // SAFETY: as above.
-            unsafe { _mm256_movemask_ps(_mm256_castsi256_ps(self.0)) as u32 }
         }
     }
 
@@ -113,16 +123,6 @@ mod imp {
             // SAFETY: as above.
             Self(unsafe { _mm256_fnmadd_ps(self.0, b.0, c.0) })
         }
-        #[inline(always)]
-        pub fn min(self, b: Self) -> Self {
-            // SAFETY: as above.
-            Self(unsafe { _mm256_min_ps(self.0, b.0) })
-        }
-        #[inline(always)]
-        pub fn max(self, b: Self) -> Self {
-            // SAFETY: as above.
-            Self(unsafe { _mm256_max_ps(self.0, b.0) })
-        }
         /// The larger, of its bits as integers: that of floats unless both are negative.
         #[inline(always)]
         pub fn max_bits(self, b: Self) -> Self {
@@ -145,29 +145,52 @@ mod imp {
                 ))
             })
         }
-        /// One bit a lane where `self <= b`, of their bits as integers.
-        #[inline(always)]
-        pub fn le_bits(self, b: Self) -> u32 {
-            // SAFETY: as above.
-            !unsafe {
-                _mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpgt_epi32(
-                    _mm256_castps_si256(self.0),
-                    _mm256_castps_si256(b.0),
-                )))
-            } as u32
-                & 255
-        }
         /// The lanes that the low three bits of `lanes` name.
         #[inline(always)]
         pub fn select(self, lanes: U32x8) -> Self {
             // SAFETY: as above; the instruction ignores the other bits.
             Self(unsafe { _mm256_permutevar8x32_ps(self.0, lanes.0) })
         }
-        /// One bit a lane where `self <= b`; comparisons with NaN are false.
+        /// All bits of a lane where `self > b`, of their bits as integers, else none.
         #[inline(always)]
-        pub fn le(self, b: Self) -> u32 {
+        pub fn gt_bits(self, b: Self) -> Self {
             // SAFETY: as above.
-            unsafe { _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LE_OQ>(self.0, b.0)) as u32 }
+            Self(unsafe {
+                _mm256_castsi256_ps(_mm256_cmpgt_epi32(
+                    _mm256_castps_si256(self.0),
+                    _mm256_castps_si256(b.0),
+                ))
+            })
+        }
+        /// The opposite sign.
+        #[inline(always)]
+        pub fn negate(self) -> Self {
+            // SAFETY: as above.
+            Self(unsafe { _mm256_xor_ps(self.0, _mm256_set1_ps(-0.0)) })
+        }
+        /// Bits that both have.
+        #[inline(always)]
+        pub fn and(self, b: Self) -> Self {
+            // SAFETY: as above.
+            Self(unsafe { _mm256_and_ps(self.0, b.0) })
+        }
+        /// Bits that either has.
+        #[inline(always)]
+        pub fn or(self, b: Self) -> Self {
+            // SAFETY: as above.
+            Self(unsafe { _mm256_or_ps(self.0, b.0) })
+        }
+        /// The numbers with the bits `b`.
+        #[inline(always)]
+        pub fn from_bits(b: U32x8) -> Self {
+            // SAFETY: as above.
+            Self(unsafe { _mm256_castsi256_ps(b.0) })
+        }
+        /// The sign bit of each lane.
+        #[inline(always)]
+        pub fn signs(self) -> u32 {
+            // SAFETY: as above.
+            unsafe { _mm256_movemask_ps(self.0) as u32 }
         }
     }
 }
@@ -191,10 +214,6 @@ mod imp {
         pub fn load(words: &Words) -> Self {
             Self(words.0)
         }
-        #[inline(always)]
-        pub fn shift_right<const N: i32>(self) -> Self {
-            Self(self.0.map(|x| x >> N))
-        }
         /// Zero-extends the bytes of `x`, the lowest first.
         #[inline(always)]
         pub fn from_bytes(x: u64) -> Self {
@@ -210,10 +229,9 @@ mod imp {
         pub fn store_uninit(self, to: &mut [MaybeUninit<u32>; 8]) {
             *to = self.0.map(MaybeUninit::new);
         }
-        /// The highest bit of each lane.
         #[inline(always)]
-        pub fn high_bits(self) -> u32 {
-            (0..8).fold(0, |m, i| m | (self.0[i] >> 31) << i)
+        pub fn shift_right<const N: i32>(self) -> Self {
+            Self(self.0.map(|x| x >> N))
         }
     }
 
@@ -225,6 +243,12 @@ mod imp {
         #[inline(always)]
         fn zip(self, b: Self, f: impl Fn(f32, f32) -> f32) -> Self {
             Self(from_fn(|i| f(self.0[i], b.0[i])))
+        }
+        #[inline(always)]
+        fn zip_bits(self, b: Self, f: impl Fn(i32, i32) -> i32) -> Self {
+            self.zip(b, |a, b| {
+                f32::from_bits(f(a.to_bits() as i32, b.to_bits() as i32) as u32)
+            })
         }
         #[inline(always)]
         pub fn splat(x: f32) -> Self {
@@ -256,38 +280,50 @@ mod imp {
         pub fn mul_from(self, b: Self, c: Self) -> Self {
             c.sub(self.mul(b))
         }
-        #[inline(always)]
-        pub fn min(self, b: Self) -> Self {
-            self.zip(b, |a, b| if a < b { a } else { b })
-        }
-        #[inline(always)]
-        pub fn max(self, b: Self) -> Self {
-            self.zip(b, |a, b| if a > b { a } else { b })
-        }
         /// The larger, of its bits as integers: that of floats unless both are negative.
         #[inline(always)]
         pub fn max_bits(self, b: Self) -> Self {
-            self.max(b)
+            self.zip_bits(b, i32::max)
         }
         /// The smaller, of its bits as integers: that of floats unless both are negative.
         #[inline(always)]
         pub fn min_bits(self, b: Self) -> Self {
-            self.min(b)
-        }
-        /// One bit a lane where `self <= b`, of their bits as integers.
-        #[inline(always)]
-        pub fn le_bits(self, b: Self) -> u32 {
-            self.le(b)
+            self.zip_bits(b, i32::min)
         }
         /// The lanes that the low three bits of `lanes` name.
         #[inline(always)]
         pub fn select(self, lanes: U32x8) -> Self {
             Self(from_fn(|i| self.0[lanes.0[i] as usize & 7]))
         }
-        /// One bit a lane where `self <= b`; comparisons with NaN are false.
+        /// All bits of a lane where `self > b`, of their bits as integers, else none.
         #[inline(always)]
-        pub fn le(self, b: Self) -> u32 {
-            (0..8).fold(0, |m, i| m | ((self.0[i] <= b.0[i]) as u32) << i)
+        pub fn gt_bits(self, b: Self) -> Self {
+            self.zip_bits(b, |a, b| -((a > b) as i32))
+        }
+        /// The opposite sign.
+        #[inline(always)]
+        pub fn negate(self) -> Self {
+            Self(self.0.map(|x| -x))
+        }
+        /// Bits that both have.
+        #[inline(always)]
+        pub fn and(self, b: Self) -> Self {
+            self.zip_bits(b, |a, b| a & b)
+        }
+        /// Bits that either has.
+        #[inline(always)]
+        pub fn or(self, b: Self) -> Self {
+            self.zip_bits(b, |a, b| a | b)
+        }
+        /// The numbers with the bits `b`.
+        #[inline(always)]
+        pub fn from_bits(b: U32x8) -> Self {
+            Self(b.0.map(f32::from_bits))
+        }
+        /// The sign bit of each lane.
+        #[inline(always)]
+        pub fn signs(self) -> u32 {
+            (0..8).fold(0, |m, i| m | (self.0[i].to_bits() >> 31) << i)
         }
     }
 }

@@ -1,6 +1,6 @@
 //! The two kinds of record that a ray visits: inner nodes with eight boxes, and packs of eight
 //! triangles.
-use glam::Vec3;
+use glam::{Vec3, Vec3A};
 
 pub use super::lanes::LANES;
 use super::lanes::{F32x8, Row, U32x8, Words};
@@ -12,6 +12,8 @@ use crate::triangle::TriangleHit;
 pub struct ChildRef(pub u32);
 
 impl ChildRef {
+    /// No child.
+    pub const NONE: Self = Self(u32::MAX);
     const PACK: u32 = 1 << 31;
 
     /// The node `index`.
@@ -52,13 +54,25 @@ impl Node {
             let high = Row([f32::NEG_INFINITY; LANES]);
             [low, high, low, high, low, high]
         },
-        children: Words([0; LANES]),
+        children: Words([ChildRef::NONE.0; LANES]),
     };
 
     /// Child `slot`.
     #[inline(always)]
     pub fn child(&self, slot: usize) -> ChildRef {
         ChildRef(self.children.0[slot & (LANES - 1)])
+    }
+
+    /// The children, with half the area of their boxes.
+    pub fn half_areas(&self) -> impl Iterator<Item = (f32, ChildRef)> {
+        let extent =
+            |axis: usize, i: usize| self.bounds[2 * axis + 1].0[i] - self.bounds[2 * axis].0[i];
+        (0..LANES)
+            .filter(move |&i| extent(0, i) >= 0.0)
+            .map(move |i| {
+                let (x, y, z) = (extent(0, i), extent(1, i), extent(2, i));
+                (x * y + y * z + z * x, self.child(i))
+            })
     }
 
     /// Sets child `slot`.
@@ -88,13 +102,12 @@ impl BoxRay {
     /// Prepares `ray`.
     #[inline(always)]
     pub fn new(ray: &LocalRay) -> Self {
-        let pad = Vec3::splat(ray.pad()).copysign(ray.inverse);
-        let near = (ray.origin + pad) * ray.inverse;
-        let far = (ray.origin - pad) * ray.inverse;
+        let pad = Vec3A::splat(ray.pad).copysign(ray.inverse);
+        let splat = |v: Vec3A| [F32x8::splat(v.x), F32x8::splat(v.y), F32x8::splat(v.z)];
         Self {
-            inverse: [0, 1, 2].map(|k| F32x8::splat(ray.inverse[k])),
-            near_origin: [0, 1, 2].map(|k| F32x8::splat(near[k])),
-            far_origin: [0, 1, 2].map(|k| F32x8::splat(far[k])),
+            inverse: splat(ray.inverse),
+            near_origin: splat((ray.origin + pad) * ray.inverse),
+            far_origin: splat((ray.origin - pad) * ray.inverse),
             near_row: [0, 1, 2].map(|k| 2 * k + (ray.octant >> k & 1)),
         }
     }
@@ -116,7 +129,7 @@ impl BoxRay {
             .max_bits(near(1))
             .max_bits(near(2).max_bits(F32x8::splat(0.0)));
         let leave = far(0).min_bits(far(1)).min_bits(far(2).min_bits(t_max));
-        (enter.le_bits(leave), enter)
+        (!enter.gt_bits(leave).signs() & 255, enter)
     }
 }
 
@@ -130,7 +143,7 @@ pub struct Pack {
     /// The vertices, coordinate by coordinate.
     pub vertices: [Row; 3],
     /// The triangles: vertices 0, 1, 2 in three bits each from the lowest up; the highest bit
-    /// is set if there is a triangle.
+    /// is set where there is no triangle.
     pub corners: Words,
 }
 
@@ -146,12 +159,12 @@ impl Pack {
                 .map(|axis| self.vertices[axis].0[i] - ray.origin[axis])
         };
         ray.shear
-            .intersect_permuted([vertex(0), vertex(3), vertex(6)], t_max)
+            .intersect([vertex(0), vertex(3), vertex(6)], t_max)
     }
 }
 
 /// Collects triangles for a [`Pack`].
-#[derive(Clone, Default)]
+#[derive(Clone)]
 pub struct PackBuilder {
     vertices: [Vec3; LANES],
     vertex_count: usize,
@@ -160,12 +173,20 @@ pub struct PackBuilder {
 }
 
 impl PackBuilder {
+    /// No triangles.
+    pub const EMPTY: Self = Self {
+        vertices: [Vec3::ZERO; LANES],
+        vertex_count: 0,
+        corners: [1 << 31; LANES],
+        triangle_count: 0,
+    };
+
     /// Adds a triangle; false if there is no room.
     pub fn push(&mut self, triangle: &[Vec3; 3]) -> bool {
         if self.triangle_count == LANES {
             return false;
         }
-        let mut word = 1 << 31;
+        let mut word = 0;
         for (j, vertex) in triangle.iter().enumerate() {
             let known = &self.vertices[..self.vertex_count];
             let index = known
@@ -206,17 +227,21 @@ impl PackRay {
     /// Prepares `ray`.
     #[inline(always)]
     pub fn new(ray: &LocalRay) -> Self {
+        let origin = ray.origin.to_array();
         Self {
-            origin: ray.shear.axes.map(|k| F32x8::splat(ray.origin[k])),
+            origin: ray.shear.axes.map(|k| F32x8::splat(origin[k])),
             shear: ray.shear.factors.map(F32x8::splat),
             axes: ray.shear.axes,
         }
     }
 
     /// A superset of the triangles that the ray meets between 0 and `t_max`, one bit each:
-    /// [`Pack::intersect`], whose arithmetic this repeats, has the last word. Edge functions
-    /// of zero, which that one settles in f64, pass. Distances are compared vertex by vertex:
-    /// a hit lies between the nearest and the farthest, however thin the triangle.
+    /// [`Pack::intersect`], whose arithmetic this repeats, has the last word.
+    ///
+    /// Edge functions of zero, which that one settles in f64, pass. Distances are compared
+    /// vertex by vertex: a hit lies between the nearest and the farthest, however thin the
+    /// triangle. Integer maxima order floats rightly but for two negative ones, of which all
+    /// that is asked here is that they are negative.
     #[inline(always)]
     pub fn candidates(&self, pack: &Pack, t_max: F32x8) -> u32 {
         let [sx, sy, sz] = self.shear;
@@ -238,8 +263,19 @@ impl PackRay {
         let v = ax.mul(cy).sub(ay.mul(cx));
         let w = bx.mul(ay).sub(by.mul(ax));
         let zero = F32x8::splat(0.0);
-        let inside = zero.le(u.min(v).min(w)) | u.max(v).max(w).le(zero);
-        let in_range = at.min(bt).min(ct).le(t_max) & zero.le(at.max(bt).max(ct));
-        inside & in_range & corner_0.high_bits()
+        let some_positive = u.max_bits(v).max_bits(w).gt_bits(zero);
+        let some_negative = u
+            .negate()
+            .max_bits(v.negate())
+            .max_bits(w.negate())
+            .gt_bits(zero);
+        let too_far = at.min_bits(bt).min_bits(ct).gt_bits(t_max);
+        let behind = at.max_bits(bt).max_bits(ct);
+        let rejected = some_positive
+            .and(some_negative)
+            .or(too_far)
+            .or(behind)
+            .or(F32x8::from_bits(corner_0));
+        !rejected.signs() & 255
     }
 }

@@ -590,3 +590,41 @@ fn a_ray_that_enters_a_closed_surface_meets_its_other_side() {
         assert_eq!(leaks, 0, "{size} m at {offset} m");
     }
 }
+
+#[test]
+fn the_bounding_sphere_and_the_clusters_hold_every_vertex() {
+    let mut m = sphere(16, 0.2);
+    // A second ball far off, and a vertex that no triangle uses.
+    let count = m.positions.len() as u32;
+    m.positions.extend(
+        sphere(16, 0.2)
+            .positions
+            .iter()
+            .map(|p| *p + 20.0 * Vec3::X),
+    );
+    m.indices
+        .extend(sphere(16, 0.2).indices.iter().map(|t| t.map(|i| i + count)));
+    m.positions.push(Vec3::splat(1e3));
+    let bvh = Bvh::build(&m);
+    let whole = bvh.bounding_sphere().unwrap();
+    // Centres 20 apart, radii at most 1.2.
+    assert!(whole.radius <= 11.3 && whole.radius >= 10.7, "{whole:?}");
+    let inside =
+        |s: &Sphere, p: Vec3| s.center.as_dvec3().distance(p.as_dvec3()) <= s.radius as f64;
+    for t in 0..m.indices.len() as u32 {
+        let corners = corners(&m, t);
+        assert!(corners.iter().all(|p| inside(&whole, *p)));
+        assert!(
+            bvh.clusters()
+                .iter()
+                .any(|s| corners.iter().all(|p| inside(s, *p)))
+        );
+    }
+    assert!(bvh.clusters().len() <= 16);
+    // No cluster spans the gap.
+    assert!(
+        bvh.clusters().iter().all(|s| s.radius < 1.3),
+        "{:?}",
+        bvh.clusters()
+    );
+}

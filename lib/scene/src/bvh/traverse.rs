@@ -7,7 +7,7 @@
 //! order that depends on the octant of the direction alone.
 use std::mem::MaybeUninit;
 
-use super::lanes::{F32x8, LANES, U32x8};
+use super::lanes::{self, F32x8, LANES, U32x8};
 use super::node::{BoxRay, ChildRef, Node, Pack, PackRay};
 use super::ray::LocalRay;
 use crate::triangle::TriangleHit;
@@ -32,59 +32,9 @@ pub struct Tree {
     pub root: Option<ChildRef>,
 }
 
-/// Children still to visit. An entry holds the distance of its box in the upper half and the
-/// child in the lower, so that entries compare by distance: non-negative floats order as
-/// their bits do.
-struct Stack {
-    entries: [MaybeUninit<u64>; STACK],
-    len: usize,
-}
-
-impl Stack {
-    #[inline(always)]
-    fn new() -> Self {
-        Self {
-            entries: [const { MaybeUninit::uninit() }; STACK],
-            len: 0,
-        }
-    }
-
-    #[inline(always)]
-    fn push(&mut self, entry: u64) {
-        debug_assert!(self.len < STACK);
-        // SAFETY: a node pushes at most seven entries more than it popped, and a hierarchy has
-        // at most `MAX_DEPTH` levels of nodes, so `len < STACK`.
-        unsafe { self.entries.get_unchecked_mut(self.len) }.write(entry);
-        self.len += 1;
-    }
-
-    #[inline(always)]
-    fn pop(&mut self) -> Option<u64> {
-        self.len = self.len.checked_sub(1)?;
-        // SAFETY: entries below the old `len` were written by `push`, and `len <= STACK`.
-        Some(unsafe { self.entries.get_unchecked(self.len).assume_init() })
-    }
-
-    /// Sorts the entries from `start`, so that the nearest is popped first.
-    #[inline(always)]
-    fn sort_from(&mut self, start: usize) {
-        // SAFETY: entries below `len` were written by `push`.
-        let new = unsafe { self.entries[start..self.len].assume_init_mut() };
-        for i in 1..new.len() {
-            let entry = new[i];
-            let mut j = i;
-            while j > 0 && new[j - 1] < entry {
-                new[j] = new[j - 1];
-                j -= 1;
-            }
-            new[j] = entry;
-        }
-    }
-}
-
-/// For each octant of directions and each set of hit slots: those slots, farthest first, a byte
-/// each. A slot's bits say on which side of its node it lies, so `slot ^ octant` grows with
-/// distance.
+/// For each octant of directions and each set of hit slots: the nearest slot in the highest
+/// byte, the others from the lowest byte up, farthest first. A slot's bits say on which side
+/// of its node it lies, so `slot ^ octant` grows with distance.
 static ORDER: [[u64; 256]; 8] = {
     let mut table = [[0; 256]; 8];
     let mut octant = 0;
@@ -98,7 +48,12 @@ static ORDER: [[u64; 256]; 8] = {
                 rank -= 1;
                 let slot = rank ^ octant;
                 if hits >> slot & 1 == 1 {
-                    bytes |= (slot as u64) << (8 * n);
+                    // The last one found is the nearest: it moves to the top.
+                    let farther = bytes >> 56;
+                    bytes = bytes << 8 >> 8 | (slot as u64) << 56;
+                    if n > 0 {
+                        bytes |= farther << (8 * (n - 1));
+                    }
                     n += 1;
                 }
             }
@@ -111,6 +66,7 @@ static ORDER: [[u64; 256]; 8] = {
 };
 
 impl Tree {
+    /// The node that `child` is.
     #[inline(always)]
     fn node(&self, child: ChildRef) -> &Node {
         debug_assert!(!child.is_pack());
@@ -126,21 +82,68 @@ impl Tree {
         unsafe { self.packs.get_unchecked(child.index()) }
     }
 
-    /// The nearest hit with `0 < t <= t_max` that `accept(triangle, u, v)` takes, and its
-    /// triangle.
+    /// Asks for the memory of `child` ahead of its visit.
+    #[inline(always)]
+    fn prefetch(&self, child: ChildRef) {
+        if child.is_pack() {
+            lanes::prefetch(&self.packs, child.index());
+        } else {
+            lanes::prefetch(&self.nodes, child.index());
+        }
+    }
+
+    /// Mesh indices of the triangles, grouped into at most `count` neighbourhoods.
+    pub fn parts(&self, count: usize) -> Vec<Vec<u32>> {
+        // Half areas of boxes, and what they hold.
+        let mut parts: Vec<(f32, ChildRef)> = self
+            .root
+            .map(|root| (f32::INFINITY, root))
+            .into_iter()
+            .collect();
+        // The largest box is opened until no node is left that may be.
+        while let Some(i) = (0..parts.len())
+            .filter(|&i| !parts[i].1.is_pack() && parts.len() + LANES - 1 <= count)
+            .max_by(|&i, &j| parts[i].0.total_cmp(&parts[j].0))
+        {
+            let (_, node) = parts.swap_remove(i);
+            parts.extend(self.node(node).half_areas());
+        }
+        parts
+            .iter()
+            .map(|&(_, part)| {
+                let mut ids = Vec::new();
+                let mut stack = vec![part];
+                while let Some(child) = stack.pop() {
+                    if child.is_pack() {
+                        let ids_of_pack = self.triangles[child.index()];
+                        ids.extend(ids_of_pack.iter().filter(|&&id| id != u32::MAX));
+                    } else {
+                        stack.extend(self.node(child).half_areas().map(|(_, c)| c));
+                    }
+                }
+                ids
+            })
+            .collect()
+    }
+
+    /// The nearest hit in `subtree` with `0 < t <= t_max` that `accept(triangle, u, v)` takes,
+    /// and its triangle.
     #[inline]
     pub fn closest(
         &self,
+        subtree: ChildRef,
         ray: &LocalRay,
+        t_max: f32,
         accept: impl Fn(u32, f32, f32) -> bool,
     ) -> Option<(u32, TriangleHit)> {
         let box_ray = BoxRay::new(ray);
         let pack_ray = PackRay::new(ray);
-        let mut limit = ray.t_max;
+        let mut limit = t_max;
         let mut limits = F32x8::splat(limit);
         let mut best = None;
-        let mut stack = Stack::new();
-        let mut current = self.root?;
+        let mut stack = [const { MaybeUninit::<u64>::uninit() }; STACK];
+        let mut len = 0;
+        let mut current = subtree;
         loop {
             if current.is_pack() {
                 let pack = self.pack(current);
@@ -170,29 +173,45 @@ impl Tree {
                     }
                     let enter = enter.to_array();
                     let entry = |slot: usize| {
-                        (enter[slot].to_bits() as u64) << 32 | node.child(slot).0 as u64
+                        let child = node.child(slot);
+                        self.prefetch(child);
+                        (enter[slot].to_bits() as u64) << 32 | child.0 as u64
                     };
-                    let (a, b) = (entry(first), entry(hits.trailing_zeros() as usize));
-                    hits &= hits - 1;
-                    if hits == 0 {
-                        stack.push(a.max(b));
-                        current = ChildRef(a.min(b) as u32);
-                        continue;
-                    }
-                    let start = stack.len;
-                    stack.push(a);
-                    stack.push(b);
+                    let mut nearest = entry(first);
+                    let start = len;
+                    debug_assert!(len + LANES <= STACK);
                     while hits != 0 {
-                        stack.push(entry(hits.trailing_zeros() as usize));
+                        // Insertion, the nearest kept out.
+                        let next = entry(hits.trailing_zeros() as usize);
                         hits &= hits - 1;
+                        let farther = nearest.max(next);
+                        nearest = nearest.min(next);
+                        let mut i = len;
+                        while i > start {
+                            let below = unsafe { stack.get_unchecked(i - 1).assume_init() };
+                            if below >= farther {
+                                break;
+                            }
+                            unsafe {
+                                stack.get_unchecked_mut(i).write(below);
+                            }
+                            i -= 1;
+                        }
+                        unsafe {
+                            stack.get_unchecked_mut(i).write(farther);
+                        }
+                        len += 1;
                     }
-                    stack.sort_from(start);
+                    current = ChildRef(nearest as u32);
+                    continue;
                 }
             }
             current = loop {
-                let Some(entry) = stack.pop() else {
+                if len == 0 {
                     return best;
-                };
+                }
+                len -= 1;
+                let entry = unsafe { stack.get_unchecked(len).assume_init() };
                 if f32::from_bits((entry >> 32) as u32) <= limit {
                     break ChildRef(entry as u32);
                 }
@@ -200,48 +219,66 @@ impl Tree {
         }
     }
 
-    /// Whether `accept(triangle, u, v)` takes any hit with `0 < t <= t_max`.
+    /// Whether `accept(triangle, u, v)` takes any hit in `subtree` within the ray's range.
     #[inline]
-    pub fn occluded(&self, ray: &LocalRay, accept: impl Fn(u32, f32, f32) -> bool) -> bool {
-        let Some(mut current) = self.root else {
-            return false;
-        };
+    pub fn occluded(
+        &self,
+        subtree: ChildRef,
+        ray: &LocalRay,
+        t_max: f32,
+        accept: impl Fn(u32, f32, f32) -> bool,
+    ) -> bool {
         let box_ray = BoxRay::new(ray);
         let pack_ray = PackRay::new(ray);
-        let limits = F32x8::splat(ray.t_max);
+        let limits = F32x8::splat(t_max);
         let order = &ORDER[ray.octant & 7];
         let mut stack = [const { MaybeUninit::<u32>::uninit() }; STACK];
-        let mut len = 0;
+        // Popped last, it ends the walk.
+        stack[0].write(ChildRef::NONE.0);
+        let mut len = 1;
+        let mut current = subtree;
         loop {
-            if current.is_pack() {
-                let pack = self.pack(current);
-                let mut lanes = pack_ray.candidates(pack, limits);
-                while lanes != 0 {
-                    let lane = lanes.trailing_zeros() as usize;
-                    lanes &= lanes - 1;
-                    if let Some(hit) = pack.intersect(lane, ray, ray.t_max)
-                        && accept(self.triangles[current.index()][lane], hit.u, hit.v)
-                    {
-                        return true;
-                    }
-                }
-            } else {
+            if !current.is_pack() {
+                debug_assert!((1..=STACK - LANES).contains(&len));
+                // SAFETY: what was pushed was written, and `NONE` lies below it.
+                let top = ChildRef(unsafe { stack.get_unchecked(len - 1).assume_init() });
                 let node = self.node(current);
                 let (hits, _) = box_ray.test(node, limits);
-                let order = U32x8::from_bytes(order[hits as usize & 255]);
-                debug_assert!(len + LANES <= STACK);
+                let order = order[hits as usize & 255];
                 // SAFETY: `len` grows by at most seven a level, so eight more entries fit
                 // (`STACK`); the cast keeps the element's size and alignment.
-                let top =
-                    unsafe { &mut *stack.as_mut_ptr().add(len).cast::<[MaybeUninit<u32>; 8]>() };
-                U32x8::load(&node.children).select(order).store_uninit(top);
-                len += hits.count_ones() as usize;
+                let free = unsafe {
+                    &mut *stack
+                        .as_mut_ptr()
+                        .add(len)
+                        .cast::<[MaybeUninit<u32>; LANES]>()
+                };
+                U32x8::load(&node.children)
+                    .select(U32x8::from_bytes(order))
+                    .store_uninit(free);
+                // All but the nearest are pushed; without hits, the top is popped.
+                len = len + hits.count_ones() as usize - 1;
+                let nearest = node.child((order >> 56) as usize);
+                current = if hits == 0 { top } else { nearest };
+                continue;
             }
-            if len == 0 {
+            if current == ChildRef::NONE {
                 return false;
             }
+            let pack = self.pack(current);
+            let mut lanes = pack_ray.candidates(pack, limits);
+            while lanes != 0 {
+                let lane = lanes.trailing_zeros() as usize;
+                lanes &= lanes - 1;
+                if let Some(hit) = pack.intersect(lane, ray, t_max)
+                    && accept(self.triangles[current.index()][lane], hit.u, hit.v)
+                {
+                    return true;
+                }
+            }
+            debug_assert!((1..STACK).contains(&len));
             len -= 1;
-            // SAFETY: the stores above wrote every entry below the old `len`.
+            // SAFETY: as above.
             current = ChildRef(unsafe { stack.get_unchecked(len).assume_init() });
         }
     }
