@@ -13,7 +13,7 @@ use dipir_light::gaussian::SgMixture;
 use dipir_light::illuminant::{Illuminant, LightSample};
 use dipir_light::luminance::{luminance, luminance_f64};
 use dipir_light::plane::{CosineWeightedMixture, PlaneLight};
-use glam::{Vec2, Vec3};
+use glam::{DVec3, Vec2, Vec3};
 
 /// A light as paths over the object meet it.
 pub trait PathLight: Sync {
@@ -25,15 +25,80 @@ pub trait PathLight: Sync {
 }
 
 /// A light that can light an object and a plane.
-pub trait SceneLight: Illuminant {
-    /// The light as paths meet it.
-    type OnObject: PathLight;
-    /// A part of the light as a plane receives it.
-    type OnPlane: PlaneLight;
+///
+/// Preparing takes about as long as a picture of a few thousand pixels: [`PreparedLight`] does it
+/// once for many pictures.
+pub trait SceneLight: Sync {
+    /// The light as paths meet it; cheap to clone.
+    type OnObject: PathLight + Clone;
+    /// A part of the light as a plane receives it; cheap to clone.
+    type OnPlane: PlaneLight + Clone;
     /// Prepares the light for paths.
     fn on_object(&self) -> Self::OnObject;
     /// Prepares the light for a plane with the unit normal `normal`: its parts add up.
     fn on_plane(&self, normal: Vec3) -> Vec<Self::OnPlane>;
+}
+
+/// A part of a light on a plane, behind a counted reference.
+#[derive(Debug)]
+pub struct SharedPlane<P>(Arc<P>);
+
+impl<P> Clone for SharedPlane<P> {
+    fn clone(&self) -> Self {
+        Self(self.0.clone())
+    }
+}
+
+impl<P: PlaneLight + Send> PlaneLight for SharedPlane<P> {
+    type Cone<'a>
+        = P::Cone<'a>
+    where
+        Self: 'a;
+
+    fn normal(&self) -> Vec3 {
+        self.0.normal()
+    }
+
+    fn irradiance(&self) -> DVec3 {
+        self.0.irradiance()
+    }
+
+    fn cone(&self) -> P::Cone<'_> {
+        self.0.cone()
+    }
+}
+
+/// A light that was prepared once for many pictures of the same scene.
+#[derive(Clone, Debug)]
+pub struct PreparedLight<L: SceneLight> {
+    on_object: L::OnObject,
+    normal: Vec3,
+    on_plane: Vec<L::OnPlane>,
+}
+
+impl<L: SceneLight> PreparedLight<L> {
+    /// Prepares `light` for paths and, if there is one, a plane with the unit normal `normal`.
+    pub fn new(light: &L, normal: Option<Vec3>) -> Self {
+        Self {
+            on_object: light.on_object(),
+            normal: normal.unwrap_or(Vec3::Y),
+            on_plane: normal.map_or_else(Vec::new, |n| light.on_plane(n)),
+        }
+    }
+}
+
+impl<L: SceneLight> SceneLight for PreparedLight<L> {
+    type OnObject = L::OnObject;
+    type OnPlane = L::OnPlane;
+
+    fn on_object(&self) -> L::OnObject {
+        self.on_object.clone()
+    }
+
+    fn on_plane(&self, normal: Vec3) -> Vec<L::OnPlane> {
+        debug_assert_eq!(normal, self.normal, "prepared for another plane");
+        self.on_plane.clone()
+    }
 }
 
 /// Luminance above the mean by less than this share counts as the mean itself: rounding.
@@ -86,7 +151,7 @@ fn part_of(map: &EnvironmentMap, texels: Vec<Vec3>) -> EnvironmentMap {
 pub struct CompensatedMap {
     map: Arc<EnvironmentMap>,
     split: Split,
-    bright: EnvironmentSampler,
+    bright: Arc<EnvironmentSampler>,
     /// One over the luminance of the bright part, integrated over the sphere; 0 without one.
     inverse_total: f32,
 }
@@ -100,7 +165,7 @@ impl CompensatedMap {
         Self {
             map,
             split,
-            bright: EnvironmentSampler::new(bright),
+            bright: Arc::new(EnvironmentSampler::new(bright)),
             inverse_total: if total > 0.0 {
                 (1.0 / total) as f32
             } else {
@@ -135,13 +200,13 @@ impl PathLight for CompensatedMap {
 
 impl SceneLight for EnvironmentSampler {
     type OnObject = CompensatedMap;
-    type OnPlane = CosineWeightedMap;
+    type OnPlane = SharedPlane<CosineWeightedMap>;
 
     fn on_object(&self) -> CompensatedMap {
         CompensatedMap::new(self.map().clone())
     }
 
-    fn on_plane(&self, normal: Vec3) -> Vec<CosineWeightedMap> {
+    fn on_plane(&self, normal: Vec3) -> Vec<Self::OnPlane> {
         let bright = Split::of(self.map()).bright_part(self.map());
         let texels = self.map().texels().iter().zip(bright.texels());
         let dim = texels.map(|(&all, &b)| (all - b).max(Vec3::ZERO)).collect();
@@ -150,6 +215,7 @@ impl SceneLight for EnvironmentSampler {
             .into_iter()
             .map(|part| CosineWeightedMap::new(part, normal))
             .filter(|part| part.luminance_irradiance() > 0.0)
+            .map(|part| SharedPlane(Arc::new(part)))
             .collect()
     }
 }
@@ -168,14 +234,15 @@ impl PathLight for SgMixture {
 
 impl SceneLight for SgMixture {
     type OnObject = SgMixture;
-    type OnPlane = CosineWeightedMixture;
+    type OnPlane = SharedPlane<CosineWeightedMixture>;
 
     fn on_object(&self) -> SgMixture {
         self.clone()
     }
 
-    fn on_plane(&self, normal: Vec3) -> Vec<CosineWeightedMixture> {
-        vec![CosineWeightedMixture::new(self.clone(), normal)]
+    fn on_plane(&self, normal: Vec3) -> Vec<Self::OnPlane> {
+        let light = CosineWeightedMixture::new(self.clone(), normal);
+        vec![SharedPlane(Arc::new(light))]
     }
 }
 

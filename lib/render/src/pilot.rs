@@ -15,8 +15,9 @@ use crate::error::RenderError;
 use crate::features::{CLEARCOAT, NORMAL_MAPPING, SPECULAR, TEXTURES, TRANSMISSION, has};
 use crate::film::Viewing;
 use crate::footprint::Footprint;
-use crate::light::SceneLight;
+use crate::light::{PreparedLight, SceneLight};
 use crate::render::{Rendered, Renderer, Settings, Simulation};
+use crate::world::ProxyGeometry;
 
 /// Pixels of the object that a pilot render aims at: enough that a mean over them is precise to a
 /// few per cent.
@@ -27,9 +28,9 @@ const MAX_PIXELS: f32 = 16384.0;
 const SAMPLES: u32 = 16;
 
 /// A scene at low resolution, under one light.
-pub struct Pilot<'a, L> {
+pub struct Pilot<'a, L: SceneLight> {
     renderer: Renderer<'a>,
-    light: &'a L,
+    light: PreparedLight<L>,
     seed: u64,
     transfer: Transfer,
     background: Option<LinearImage>,
@@ -84,12 +85,16 @@ fn shading_weight(mask: u32) -> f64 {
 
 impl<'a, L: SceneLight> Pilot<'a, L> {
     /// Prepares the renderer's scene, with the photograph and mask of `settings` scaled down.
-    pub fn new(renderer: &Renderer<'a>, light: &'a L, settings: &Settings) -> Self {
+    pub fn new(renderer: &Renderer<'a>, light: &L, settings: &Settings) -> Self {
         let camera = pilot_camera(renderer);
         let size = camera.resolution.map(|n| n as usize);
+        let normal = match &renderer.geometry().proxy {
+            ProxyGeometry::Plane(plane) => Some(plane.normal),
+            _ => None,
+        };
         Self {
             renderer: renderer.with_camera(camera),
-            light,
+            light: PreparedLight::new(light, normal),
             seed: settings.seed,
             transfer: settings.transfer,
             background: settings
@@ -118,7 +123,7 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
             ..Settings::default()
         };
         self.renderer
-            .render(self.light, simulation, &settings, &mut |_| {
+            .render(&self.light, simulation, &settings, &mut |_| {
                 ControlFlow::Continue(())
             })
     }
