@@ -1,0 +1,351 @@
+//! The loop.
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::time::Instant;
+
+use dipir_imaging::raster::DisplayImage;
+use dipir_imaging::tone::ToneCurves;
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::gaussian::LobeParameters;
+
+use crate::checkpoint::State;
+use crate::crop::{CropSampler, Framing, View};
+use crate::error::OptimizeError;
+use crate::guidance::{Guidance, Guided, Step};
+use crate::history::{Row, stands_still};
+use crate::lighting::Lighting;
+use crate::objective::{Forward, Objective};
+use crate::parameters::{Bounds, Parameters};
+use crate::settings::Settings;
+use crate::tensors::Tensors;
+use crate::transport::Recorder;
+
+/// Steps in a row that may be skipped because something was not finite. A guidance with noise
+/// may stumble; one that stumbles this often will not recover.
+const MOST_BAD_IN_A_ROW: usize = 5;
+/// Iterations between two looks at how well the record samples the light.
+const RECORD_EVERY: usize = 50;
+/// The light is recorded anew when it makes use of less than this share of the samples: the noise
+/// is then more than twice what it could be.
+const LEAST_EFFICIENCY: f64 = 0.2;
+/// Times that the light is recorded anew at most, so that recording stays a small part of the run.
+const MOST_RECORDS: usize = 3;
+
+/// An optimisation.
+pub struct Optimization<'a> {
+    /// From parameters to picture and back.
+    pub objective: Objective,
+    /// What judges the picture.
+    pub guidance: &'a mut dyn Guidance,
+    /// Records transport anew; without it the first record serves to the end.
+    pub recorder: Option<&'a mut dyn Recorder>,
+    /// All numbers that can be chosen.
+    pub settings: Settings,
+    /// Where it starts.
+    pub start: Parameters,
+    /// Where it is kept between iterations, and goes on if the file is there.
+    pub checkpoint: Option<&'a Path>,
+}
+
+/// What is told while it runs.
+#[derive(Debug)]
+pub enum Event<'a> {
+    /// An iteration is done.
+    Step(&'a Row),
+    /// The picture at the start of an iteration.
+    Preview {
+        /// From 0; the number of iterations for the final picture.
+        iteration: usize,
+        /// Display values.
+        picture: &'a DisplayImage,
+    },
+}
+
+/// What was found.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    /// The light.
+    pub lighting: Lighting,
+    /// The tone curves.
+    pub tone: ToneCurves,
+    /// The picture under them.
+    pub picture: DisplayImage,
+    /// The parameters, both light sets apart.
+    pub parameters: Parameters,
+    /// One row per iteration.
+    pub history: Vec<Row>,
+    /// Whether the loss stood still before the last iteration.
+    pub stopped_early: bool,
+}
+
+impl Outcome {
+    /// Steps that were skipped because something was not finite.
+    pub fn skipped(&self) -> usize {
+        self.history.iter().filter(|r| r.skipped.is_some()).count()
+    }
+}
+
+impl Optimization<'_> {
+    /// Runs to the end, or until `watch` breaks off: then the state is kept in the checkpoint and
+    /// the error is [`OptimizeError::Interrupted`].
+    ///
+    /// Everything but the seconds in the history is a function of the inputs: neither the number
+    /// of threads nor an interruption shows in it.
+    pub fn run(
+        mut self,
+        watch: &mut dyn FnMut(Event) -> ControlFlow<()>,
+    ) -> Result<Outcome, OptimizeError> {
+        let settings = self.settings.clone();
+        let (_, rows) = self.objective.transport().environment_size();
+        let bounds = Bounds::for_map(rows);
+        let crops = CropSampler::new(self.objective.transport().coverage());
+        let mut state = self.resume()?;
+        let mut stopped_early = false;
+        while state.iteration < settings.iterations && !stopped_early {
+            let clock = Instant::now();
+            let iteration = state.iteration;
+
+            // Schedule.
+            let fusion = settings.fusion(iteration);
+            let rate = settings.rate(iteration);
+            let step = Step {
+                iteration,
+                iterations: settings.iterations,
+                seed: settings.seed,
+            };
+
+            // Transport.
+            let recorded = self.record_again(&mut state)?;
+
+            // Forwards, judgement, and backwards.
+            let parameters = state.parameters.to_tensors();
+            let forward = self.objective.forward(&state.parameters, fusion);
+            let view = self.view(&crops, step);
+            let judged = match bad_before_guidance(&parameters, &forward) {
+                Some(bad) => Err(bad.to_string()),
+                None => {
+                    let shown = view.apply(&forward.picture.0);
+                    let guided = self.guidance.gradient(&shown, &view, step)?;
+                    self.gradient(&state.parameters, &forward, &view, guided)
+                }
+            };
+
+            // Previews show what the step starts from.
+            if settings.preview_every > 0 && iteration.is_multiple_of(settings.preview_every) {
+                let picture = &forward.picture;
+                if watch(Event::Preview { iteration, picture }).is_break() {
+                    return self.interrupt(&state);
+                }
+            }
+
+            // Step, or count what could not be taken.
+            let mut row = Row {
+                iteration,
+                loss: None,
+                guidance: None,
+                consistency: Some(forward.consistency).filter(|v| v.is_finite()),
+                regularizer: Some(forward.regularizer).filter(|v| v.is_finite()),
+                gradient_norm: None,
+                t: None,
+                fusion,
+                rate,
+                skipped: None,
+                recorded,
+                seconds: 0.0,
+            };
+            match judged {
+                Ok(judged) => {
+                    let mut moved = parameters;
+                    let rates = |group| rate * settings.base_rate(group);
+                    state.adam.step(&mut moved, &judged.gradient, rates)?;
+                    state.parameters = Parameters::from_tensors(&moved);
+                    state.parameters.retract(&bounds);
+                    state.bad_in_a_row = 0;
+                    row.loss = Some(judged.loss + forward.consistency + forward.regularizer);
+                    row.guidance = Some(judged.loss);
+                    row.gradient_norm = Some(judged.gradient.norm());
+                    row.t = judged.timestep;
+                }
+                Err(tensor) => {
+                    state.bad_in_a_row += 1;
+                    if state.bad_in_a_row >= MOST_BAD_IN_A_ROW {
+                        return Err(OptimizeError::NotFinite {
+                            tensor,
+                            iteration,
+                            in_a_row: state.bad_in_a_row,
+                        });
+                    }
+                    row.skipped = Some(tensor);
+                }
+            }
+
+            // History, checkpoint, early stop.
+            row.seconds = clock.elapsed().as_secs_f64();
+            let go_on = watch(Event::Step(&row));
+            state.history.push(row);
+            state.iteration += 1;
+            if go_on.is_break() {
+                return self.interrupt(&state);
+            }
+            let every = settings.checkpoint_every;
+            if every > 0 && state.iteration.is_multiple_of(every) {
+                self.keep(&state)?;
+            }
+            let fused = (settings.fused_after * settings.iterations as f64).ceil() as usize;
+            stopped_early = stands_still(&state.history, settings.patience, fused);
+        }
+        self.outcome(state, stopped_early, watch)
+    }
+
+    /// The state of the checkpoint, or that of the start; with the transport that it had.
+    fn resume(&mut self) -> Result<State, OptimizeError> {
+        let kept = match self.checkpoint {
+            Some(path) => State::read(path, &self.settings, &self.start)?,
+            None => None,
+        };
+        let state = kept.unwrap_or_else(|| State::new(self.start.clone()));
+        if let Some(light) = &state.record_light {
+            self.record(light.clone())?;
+        }
+        Ok(state)
+    }
+
+    /// Records transport for the current light if the record samples it badly.
+    fn record_again(&mut self, state: &mut State) -> Result<bool, OptimizeError> {
+        let due = state.iteration > 0
+            && state.iteration.is_multiple_of(RECORD_EVERY)
+            && state.records < MOST_RECORDS
+            && self.recorder.is_some();
+        if !due {
+            return Ok(false);
+        }
+        let fusion = self.settings.fusion(state.iteration);
+        let light = self
+            .objective
+            .forward(&state.parameters, fusion)
+            .fused
+            .foreground;
+        if light.iter().any(|t| !t.is_finite())
+            || self.objective.transport().efficiency(&light) >= LEAST_EFFICIENCY
+        {
+            return Ok(false);
+        }
+        self.record(light.clone())?;
+        state.record_light = Some(light);
+        state.records += 1;
+        Ok(true)
+    }
+
+    fn record(&mut self, light: Vec<glam::Vec3>) -> Result<(), OptimizeError> {
+        let Some(recorder) = &mut self.recorder else {
+            return Ok(());
+        };
+        let (width, height) = self.objective.transport().environment_size();
+        let map = EnvironmentMap::new(width, height, light)
+            .map_err(|e| OptimizeError::Record(e.into()))?;
+        self.objective.set_transport(recorder.record(&map)?);
+        Ok(())
+    }
+
+    fn view(&self, crops: &CropSampler, step: Step) -> View {
+        match self.guidance.framing() {
+            Framing::Whole => View::whole(),
+            Framing::Crops { side } => {
+                let crop = crops.crop(step.seed, step.iteration);
+                View::of(self.objective.transport().size(), crop, side)
+            }
+        }
+    }
+
+    /// The gradient of all parameters, or what was not finite on the way back.
+    fn gradient(
+        &self,
+        parameters: &Parameters,
+        forward: &Forward,
+        view: &View,
+        guided: Guided,
+    ) -> Result<Judged, String> {
+        if !guided.loss.is_finite() {
+            return Err("loss of the guidance".into());
+        }
+        if guided.gradient.pixels().iter().any(|g| !g.is_finite()) {
+            return Err("gradient of the guidance".into());
+        }
+        let on_picture = view.apply_vjp(guided.gradient);
+        let gradient = self
+            .objective
+            .vjp(parameters, forward, &on_picture)
+            .to_tensors();
+        match gradient.first_not_finite() {
+            Some(tensor) => Err(format!("gradient of {tensor}")),
+            None => Ok(Judged {
+                loss: guided.loss,
+                timestep: guided.timestep,
+                gradient,
+            }),
+        }
+    }
+
+    fn keep(&self, state: &State) -> Result<(), OptimizeError> {
+        match self.checkpoint {
+            Some(path) => state.write(path, &self.settings),
+            None => Ok(()),
+        }
+    }
+
+    fn interrupt(&self, state: &State) -> Result<Outcome, OptimizeError> {
+        self.keep(state)?;
+        Err(OptimizeError::Interrupted)
+    }
+
+    /// The fused light as lobes, and the picture under it.
+    fn outcome(
+        self,
+        state: State,
+        stopped_early: bool,
+        watch: &mut dyn FnMut(Event) -> ControlFlow<()>,
+    ) -> Result<Outcome, OptimizeError> {
+        let (width, height) = self.objective.transport().environment_size();
+        let lighting = Lighting::of(&state.parameters, width, height);
+        let set: Vec<_> = lighting.lobes.iter().map(LobeParameters::of).collect();
+        let delivered = Parameters {
+            foreground: set.clone(),
+            shadow: set,
+            tone: state.parameters.tone,
+            log_exposure: 0.0,
+        };
+        let picture = self.objective.forward(&delivered, 1.0).picture;
+        let last = Event::Preview {
+            iteration: state.iteration,
+            picture: &picture,
+        };
+        if self.settings.preview_every > 0 && watch(last).is_break() {
+            return self.interrupt(&state);
+        }
+        Ok(Outcome {
+            lighting,
+            tone: state.parameters.tone.curves(),
+            picture,
+            parameters: state.parameters,
+            history: state.history,
+            stopped_early,
+        })
+    }
+}
+
+/// The guidance's answer, carried back to the parameters.
+struct Judged {
+    loss: f64,
+    timestep: Option<f64>,
+    gradient: Tensors,
+}
+
+fn bad_before_guidance(parameters: &Tensors, forward: &Forward) -> Option<&'static str> {
+    parameters
+        .first_not_finite()
+        .or_else(|| forward.first_not_finite())
+}
+
+#[cfg(test)]
+#[path = "optimization_tests.rs"]
+mod tests;

@@ -1,0 +1,361 @@
+//! The `[optimize]` table and what follows from it.
+use std::f64::consts::PI;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::objective::Weights;
+use crate::tensors::Group;
+
+/// Where the gradient of the picture comes from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum GuidanceKind {
+    /// Score distillation with a personalised diffusion model [DiPIR, eq. 8].
+    #[default]
+    Lds,
+    /// Score distillation sampling [DiPIR, eq. 7].
+    Sds,
+    /// Classifier score distillation.
+    Csd,
+    /// A picture that the composite should equal.
+    Reference,
+}
+
+/// The `[optimize]` table.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OptimizeTable {
+    /// Steps of the optimiser; the quality's by default.
+    pub iterations: Option<usize>,
+    /// What judges the picture.
+    pub guidance: GuidanceKind,
+    /// With `guidance = "reference"`: the picture that the composite should equal, EXR or HDR
+    /// (linear), PNG or JPEG (as the photograph is encoded), of the photograph's size.
+    pub reference: Option<PathBuf>,
+    /// Lobes of each light set; the quality's by default.
+    pub lobes: Option<usize>,
+    /// Columns and rows of the environment; those of the recorded transport, or the quality's.
+    pub environment: Option<[usize; 2]>,
+    /// Paths per pixel of the record; the quality's by default.
+    pub samples: Option<u32>,
+    /// How far each parameter moves per step.
+    pub learning_rates: LearningRates,
+    /// Weight of the consistency of both light sets.
+    pub consistency: Option<f64>,
+    /// Weight of the regulariser of the shadow's light.
+    pub regularizer: Option<f64>,
+    /// Share of the iterations after which both light sets are fused, in (0, 1].
+    pub fused_after: Option<f64>,
+    /// Whether a reference is compared on random crops, as a diffusion model sees the picture,
+    /// instead of as a whole.
+    pub crops: bool,
+    /// Whether the light is optimised.
+    pub light: Option<bool>,
+    /// Whether the tone curves are optimised.
+    pub tone: Option<bool>,
+    /// Iterations between previews; 0 for none.
+    pub preview_every: Option<usize>,
+    /// Iterations between checkpoints; 0 for none.
+    pub checkpoint_every: Option<usize>,
+    /// Stop when the loss has not fallen by a thousandth over this many iterations; 0 never.
+    pub patience: usize,
+    /// Key of every random number; the pipeline's by default.
+    pub seed: Option<u64>,
+}
+
+/// How far each parameter moves in one of the first steps. Adam's steps have the size of the rate,
+/// whatever the scale of the gradient; the rates fall along a cosine.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LearningRates {
+    /// Of log-radiance: 5% a step. 600 steps at half of it on average reach a factor of e^15, the
+    /// sun from a candidate lobe, and the last steps still settle within a display step.
+    pub radiance: f64,
+    /// Of directions, about radians: .6 degrees a step, so that a lobe crosses the gap to its
+    /// neighbour in 45 steps but cannot skip a sun's width in one.
+    pub direction: f64,
+    /// Of log sigma: 2% a step, slower than radiance, whose product with sigma^2 is what
+    /// a narrow lobe sends: brightness settles first.
+    pub sigma: f64,
+    /// Of tone parameters: slower than the light, which should explain what it can.
+    pub tone: f64,
+    /// Of the log of the exposure: as radiance.
+    pub exposure: f64,
+}
+
+impl Default for LearningRates {
+    fn default() -> Self {
+        Self {
+            radiance: 0.05,
+            direction: 0.01,
+            sigma: 0.02,
+            tone: 0.003,
+            exposure: 0.02,
+        }
+    }
+}
+
+/// How much work is done where the table does not say.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Preset {
+    /// Quick looks.
+    Draft,
+    /// Results.
+    #[default]
+    Standard,
+    /// Final frames.
+    High,
+}
+
+/// A value of the table that no run can work with.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{message}")]
+pub struct BadSetting {
+    /// The key, without its table: `learning_rates.tone`.
+    pub key: &'static str,
+    /// What is wrong, and what is accepted.
+    pub message: String,
+}
+
+/// The table with everything filled in and checked.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Settings {
+    /// Steps of the optimiser.
+    pub iterations: usize,
+    /// Lobes of each light set.
+    pub lobes: usize,
+    /// Columns and rows of the environment.
+    pub environment: [usize; 2],
+    /// Paths per pixel of the record.
+    pub samples: u32,
+    /// Rates of the first step.
+    pub learning_rates: LearningRates,
+    /// Weight of the consistency of both light sets.
+    pub consistency: f64,
+    /// Weight of the regulariser of the shadow's light.
+    pub regularizer: f64,
+    /// Share of the iterations after which both light sets are fused.
+    pub fused_after: f64,
+    /// Whether a reference is compared on random crops.
+    pub crops: bool,
+    /// Whether the light is optimised.
+    pub light: bool,
+    /// Whether the tone curves are optimised.
+    pub tone: bool,
+    /// Iterations between previews; 0 for none.
+    pub preview_every: usize,
+    /// Iterations between checkpoints; 0 for none.
+    pub checkpoint_every: usize,
+    /// Iterations without progress before the end; 0 for all of them.
+    pub patience: usize,
+    /// Key of every random number.
+    pub seed: u64,
+}
+
+/// Share of the first step's learning rates that the last one has: small enough that the result
+/// does not hang on the last step's noise.
+const LAST_RATE: f64 = 0.02;
+
+impl OptimizeTable {
+    /// The settings: what the table says, else what `preset` says. `seed` is the pipeline's.
+    pub fn settings(&self, preset: Preset, seed: u64) -> Result<Settings, BadSetting> {
+        let (iterations, lobes, environment, samples) = match preset {
+            // A texel of 5.6 degrees, and candidates 37 degrees apart.
+            Preset::Draft => (200, 16, [64, 32], 64),
+            // The paper's iterations; 2.8 degrees, 26 degrees apart.
+            Preset::Standard => (600, 32, [128, 64], 128),
+            // 1.4 degrees: half-degree suns get their due.
+            Preset::High => (600, 48, [256, 128], 512),
+        };
+        let settings = Settings {
+            iterations: self.iterations.unwrap_or(iterations),
+            lobes: self.lobes.unwrap_or(lobes),
+            environment: self.environment.unwrap_or(environment),
+            samples: self.samples.unwrap_or(samples),
+            learning_rates: self.learning_rates,
+            // [DiPIR, section 4.3].
+            consistency: self.consistency.unwrap_or(0.03),
+            regularizer: self.regularizer.unwrap_or(0.01),
+            // The paper's s reaches 1 in the last step; here the last quarter optimises exactly
+            // what is delivered.
+            fused_after: self.fused_after.unwrap_or(0.75),
+            crops: self.crops,
+            light: self.light.unwrap_or(true),
+            tone: self.tone.unwrap_or(true),
+            preview_every: self.preview_every.unwrap_or(50),
+            checkpoint_every: self.checkpoint_every.unwrap_or(25),
+            patience: self.patience,
+            seed: self.seed.unwrap_or(seed),
+        };
+        settings.check()?;
+        Ok(settings)
+    }
+}
+
+impl Settings {
+    /// Refuses what no run can work with.
+    pub fn check(&self) -> Result<(), BadSetting> {
+        let wrong = |key, message: String| Err(BadSetting { key, message });
+        let counts = [
+            ("iterations", self.iterations, 1_000_000),
+            ("lobes", self.lobes, 1024),
+            ("samples", self.samples as usize, 1 << 20),
+        ];
+        for (key, value, most) in counts {
+            if !(1..=most).contains(&value) {
+                return wrong(
+                    key,
+                    format!("{value} is out of range; accepted: 1 to {most}"),
+                );
+            }
+        }
+        let [width, height] = self.environment;
+        if !(2..=2048).contains(&width) || !(1..=1024).contains(&height) {
+            let message = format!(
+                "[{width}, {height}] is out of range; accepted: columns from 2 to 2048 and rows from 1 \
+                 to 1024, as in [128, 64]"
+            );
+            return wrong("environment", message);
+        }
+        let r = &self.learning_rates;
+        let rates = [
+            ("learning_rates.radiance", r.radiance),
+            ("learning_rates.direction", r.direction),
+            ("learning_rates.sigma", r.sigma),
+            ("learning_rates.tone", r.tone),
+            ("learning_rates.exposure", r.exposure),
+        ];
+        for (key, value) in rates {
+            if !(0.0..=1.0).contains(&value) {
+                return wrong(key, format!("{value} is out of range; accepted: 0 to 1"));
+            }
+        }
+        let weights = [
+            ("consistency", self.consistency),
+            ("regularizer", self.regularizer),
+        ];
+        for (key, value) in weights {
+            if !(0.0..=1e6).contains(&value) {
+                return wrong(key, format!("{value} is out of range; accepted: 0 to 1e6"));
+            }
+        }
+        if !(self.fused_after > 0.0 && self.fused_after <= 1.0) {
+            let message = format!(
+                "{} is out of range; accepted: above 0, at most 1",
+                self.fused_after
+            );
+            return wrong("fused_after", message);
+        }
+        if !self.light && !self.tone {
+            let message = "light and tone are both off, so nothing is optimised; switch one on";
+            return wrong("light", message.into());
+        }
+        Ok(())
+    }
+
+    /// How far both light sets are fused in an iteration, s of the supplement's eqs. 17 and 18:
+    /// linear from 0 in the first to 1 at [`fused_after`](Self::fused_after).
+    pub fn fusion(&self, iteration: usize) -> f32 {
+        let whole = self.fused_after * (self.iterations.max(2) - 1) as f64;
+        (iteration as f64 / whole).min(1.0) as f32
+    }
+
+    /// Factor on every learning rate: a cosine from 1 to [`LAST_RATE`].
+    pub fn rate(&self, iteration: usize) -> f64 {
+        let share = iteration as f64 / (self.iterations.max(2) - 1) as f64;
+        LAST_RATE + (1.0 - LAST_RATE) * 0.5 * (1.0 + (PI * share.min(1.0)).cos())
+    }
+
+    /// The rate of a group's first step; 0 for what is not optimised. The exposure scales the
+    /// light and rests with it.
+    pub fn base_rate(&self, group: Group) -> f64 {
+        let r = &self.learning_rates;
+        let on = |on, rate| if on { rate } else { 0.0 };
+        match group {
+            Group::Radiance => on(self.light, r.radiance),
+            Group::Direction => on(self.light, r.direction),
+            Group::Sigma => on(self.light, r.sigma),
+            Group::Exposure => on(self.light, r.exposure),
+            Group::Tone => on(self.tone, r.tone),
+        }
+    }
+
+    /// Weights of the terms beside the guidance.
+    pub fn weights(&self) -> Weights {
+        Weights {
+            consistency: self.consistency,
+            regularizer: self.regularizer,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_pass_their_own_check_and_the_table_goes_first() {
+        let mut table = OptimizeTable::default();
+        for preset in [Preset::Draft, Preset::Standard, Preset::High] {
+            assert!(table.settings(preset, 0).is_ok());
+        }
+        assert_eq!(table.settings(Preset::Standard, 7).unwrap().seed, 7);
+        table.lobes = Some(3);
+        table.seed = Some(1);
+        let settings = table.settings(Preset::High, 7).unwrap();
+        assert_eq!(
+            (settings.lobes, settings.seed, settings.iterations),
+            (3, 1, 600)
+        );
+    }
+
+    #[test]
+    fn impossible_settings_are_refused_by_key() {
+        let refused = |change: &dyn Fn(&mut OptimizeTable)| {
+            let mut table = OptimizeTable::default();
+            change(&mut table);
+            table.settings(Preset::Standard, 0).unwrap_err()
+        };
+        let error = refused(&|t| t.iterations = Some(0));
+        assert_eq!(error.key, "iterations");
+        assert_eq!(
+            error.to_string(),
+            "0 is out of range; accepted: 1 to 1000000"
+        );
+        assert_eq!(refused(&|t| t.lobes = Some(0)).key, "lobes");
+        assert_eq!(
+            refused(&|t| t.environment = Some([1, 1])).key,
+            "environment"
+        );
+        assert_eq!(
+            refused(&|t| t.learning_rates.tone = f64::NAN).key,
+            "learning_rates.tone"
+        );
+        assert_eq!(refused(&|t| t.consistency = Some(-1.0)).key, "consistency");
+        assert_eq!(refused(&|t| t.fused_after = Some(0.0)).key, "fused_after");
+        assert_eq!(
+            refused(&|t| (t.light, t.tone) = (Some(false), Some(false))).key,
+            "light"
+        );
+    }
+
+    #[test]
+    fn fusion_and_rates_run_from_start_to_end() {
+        let s = OptimizeTable::default()
+            .settings(Preset::Standard, 0)
+            .unwrap();
+        assert_eq!((s.fusion(0), s.fusion(450), s.fusion(599)), (0.0, 1.0, 1.0));
+        assert!((s.fusion(225) - 0.5).abs() < 2e-3);
+        assert_eq!(s.rate(0), 1.0);
+        assert!((s.rate(599) - LAST_RATE).abs() < 1e-12);
+        assert!((1..600).all(|i| s.rate(i) < s.rate(i - 1)));
+        let one = OptimizeTable {
+            iterations: Some(1),
+            ..Default::default()
+        };
+        let one = one.settings(Preset::Draft, 0).unwrap();
+        assert_eq!((one.fusion(0), one.rate(0)), (0.0, 1.0));
+    }
+}

@@ -1,0 +1,86 @@
+//! Parameters, gradients and moments as flat lists of numbers with names, so that optimiser,
+//! checkpoints and errors can speak of them without knowing what they mean.
+
+/// What a parameter stands for: all of a group share a learning rate.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Group {
+    /// Logarithms of lobe radiance.
+    Radiance,
+    /// Directions of lobes.
+    Direction,
+    /// Logarithms of lobe widths.
+    Sigma,
+    /// Tone curves.
+    Tone,
+    /// Logarithm of the exposure.
+    Exposure,
+}
+
+/// A named list of numbers.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tensor {
+    /// As in `foreground.direction`.
+    pub name: &'static str,
+    /// Whose learning rate it takes.
+    pub group: Group,
+    /// The numbers.
+    pub values: Vec<f64>,
+}
+
+/// Named lists of numbers in a fixed order.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Tensors(pub Vec<Tensor>);
+
+impl Tensors {
+    /// The tensor called `name`.
+    pub fn get(&self, name: &str) -> Option<&Tensor> {
+        self.0.iter().find(|t| t.name == name)
+    }
+
+    /// The first tensor with a NaN or an infinity.
+    pub fn first_not_finite(&self) -> Option<&'static str> {
+        let bad = |t: &&Tensor| t.values.iter().any(|v| !v.is_finite());
+        self.0.iter().find(bad).map(|t| t.name)
+    }
+
+    /// Euclidean norm of all numbers together, which neither overflows nor underflows before
+    /// its result does.
+    pub fn norm(&self) -> f64 {
+        let all = || self.0.iter().flat_map(|t| &t.values);
+        norm(all)
+    }
+
+    /// The same names and sizes, filled with zeros.
+    pub fn zeros_like(&self) -> Self {
+        let zeroed = self.0.iter().map(|t| Tensor {
+            values: vec![0.0; t.values.len()],
+            ..*t
+        });
+        Self(zeroed.collect())
+    }
+}
+
+/// Euclidean norm, scaled by the largest magnitude so that squares of 1e200 do no harm.
+pub(crate) fn norm<'a, I: Iterator<Item = &'a f64>>(values: impl Fn() -> I) -> f64 {
+    let largest = values().fold(0f64, |m, v| m.max(v.abs()));
+    if largest == 0.0 || !largest.is_finite() {
+        return largest;
+    }
+    let squares = values().map(|v| (v / largest).powi(2)).sum::<f64>();
+    largest * squares.sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn norms_of_huge_and_tiny_numbers_are_right() {
+        for scale in [1e-200, 1.0, 1e200] {
+            let values = [3.0 * scale, -4.0 * scale];
+            assert!((norm(|| values.iter()) / (5.0 * scale) - 1.0).abs() < 1e-15);
+        }
+        assert_eq!(norm(|| [0.0].iter()), 0.0);
+        assert_eq!(Tensors::default().norm(), 0.0);
+    }
+}
