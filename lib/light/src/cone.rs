@@ -41,8 +41,6 @@ struct Interval {
     start: usize,
     /// Columns from `start` on, wrapping around.
     count: usize,
-    /// Mass of this and all earlier bands.
-    cumulative: f64,
 }
 
 /// Samples a [`CosineWeightedMap`] inside one cone after another.
@@ -51,13 +49,16 @@ struct Interval {
 /// to whole texels; `sample` draws a texel of these by its weight (luminance times the integral
 /// of the cosine) and a direction from it, uniformly in solid angle, or in proportion to the
 /// cosine where the plane is level, which leaves achromatic light no variance of its own.
-/// `restrict` costs one arc cosine per band inside the cone, `sample` a few binary searches;
-/// neither allocates.
+/// `restrict` costs one arc cosine per band and two look-ups per row inside the cone; `sample`
+/// one binary search over these rows and a short one from a guide table over columns. Neither
+/// allocates.
 #[derive(Clone, Debug)]
 pub struct ConeSampler<'a> {
     map: &'a CosineWeightedMap,
     first_band: usize,
     intervals: Vec<Interval>,
+    /// Mass up to and with each row of these bands.
+    rows: Vec<f64>,
     /// `cos`, `sin` of the polar angle between bands.
     band_edges: Vec<(f64, f64)>,
 }
@@ -75,6 +76,7 @@ impl<'a> ConeSampler<'a> {
             map,
             first_band: 0,
             intervals: Vec::with_capacity(bands),
+            rows: Vec::with_capacity(h),
             band_edges: (0..=bands).map(edge).collect(),
         }
     }
@@ -99,17 +101,18 @@ impl<'a> ConeSampler<'a> {
         self.first_band = band_of(theta_a - alpha);
         let last = band_of(theta_a + alpha);
         self.intervals.clear();
-        let w = self.map.map.width();
+        self.rows.clear();
+        let (w, h) = (self.map.map.width(), self.map.map.height());
         let mut mass = 0.0;
         for band in self.first_band..=last {
             let half = self.half_azimuth(band, cos_a, sin_a, cos_max);
             let (start, count) = column_interval(phi_a, half, w);
-            mass += self.interval_mass(self.band_row(band), start, count);
-            self.intervals.push(Interval {
-                start,
-                count,
-                cumulative: mass,
-            });
+            self.intervals.push(Interval { start, count });
+            let first = band * self.map.band_rows;
+            for i in first..(first + self.map.band_rows).min(h) {
+                mass += interval_mass(self.map.row_prefix(i), start, count);
+                self.rows.push(mass);
+            }
         }
     }
 
@@ -141,24 +144,9 @@ impl<'a> ConeSampler<'a> {
         }
     }
 
-    fn band_row(&self, band: usize) -> &'a [f64] {
-        let n = self.map.map.width() + 1;
-        &self.map.band_prefix[band * n..(band + 1) * n]
-    }
-
-    fn interval_mass(&self, prefix: &[f64], start: usize, count: usize) -> f64 {
-        let w = prefix.len() - 1;
-        let end = start + count;
-        if end <= w {
-            prefix[end] - prefix[start]
-        } else {
-            (prefix[w] - prefix[start]) + prefix[end - w]
-        }
-    }
-
     /// Luminance of the irradiance that the selected texels give; 0 for no light.
     pub fn mass(&self) -> f64 {
-        self.intervals.last().map_or(0.0, |i| i.cumulative)
+        self.rows.last().copied().unwrap_or(0.0)
     }
 
     /// Draws a direction from two uniform numbers in `[0, 1)`; [`ConeSample::NONE`] without light.
@@ -241,47 +229,36 @@ impl<'a> ConeSampler<'a> {
     }
 
     /// Row, column and position inside the texel.
+    #[inline]
     fn draw_texel(&self, u: Vec2, mass: f64) -> (usize, usize, Vec2) {
-        let w = self.map.map.width();
         let target = f64::from(u.y) * mass;
-        let k = self
-            .intervals
-            .partition_point(|i| i.cumulative <= target)
-            .min(self.intervals.len() - 1);
-        let below = if k == 0 {
-            0.0
-        } else {
-            self.intervals[k - 1].cumulative
-        };
-        let Interval { start, count, .. } = self.intervals[k];
-        // The row inside the band. Rounding may leave the target past the last row with light.
-        let first = (self.first_band + k) * self.map.band_rows;
-        let end = (first + self.map.band_rows).min(self.map.map.height());
-        let mut rest = target - below;
-        let (mut row, mut row_mass) = (first, 0.0);
-        for i in first..end {
-            let m = self.interval_mass(self.row_prefix(i), start, count);
-            if m > 0.0 {
-                (row, row_mass) = (i, m);
-                if rest < m {
-                    break;
-                }
-                rest -= m;
-            }
+        let mut k = self.rows.partition_point(|&m| m <= target);
+        // Past the end by rounding: the last row that has any light.
+        k = k.min(self.rows.len() - 1);
+        let below = |k: usize| if k == 0 { 0.0 } else { self.rows[k - 1] };
+        while self.rows[k] <= below(k) {
+            k -= 1;
         }
-        let v = (rest / row_mass).clamp(0.0, 1.0);
-        let (column, x) = pick_column(
-            self.row_prefix(row),
-            start,
-            count,
-            f64::from(u.x) * row_mass,
-        );
-        (row, column % w, Vec2::new(x, v as f32))
+        let row_mass = self.rows[k] - below(k);
+        let v = ((target - below(k)) / row_mass).clamp(0.0, 1.0);
+        let i = self.first_band * self.map.band_rows + k;
+        let Interval { start, count } = self.intervals[k / self.map.band_rows];
+        let (j, x) = self
+            .map
+            .pick_column(i, start, count, f64::from(u.x) * row_mass);
+        (i, j, Vec2::new(x, v as f32))
     }
+}
 
-    fn row_prefix(&self, i: usize) -> &'a [f64] {
-        let n = self.map.map.width() + 1;
-        &self.map.row_prefix[i * n..(i + 1) * n]
+/// The running sum `prefix` over `count` columns from `start`, wrapping around.
+#[inline]
+fn interval_mass(prefix: &[f64], start: usize, count: usize) -> f64 {
+    let w = prefix.len() - 1;
+    let end = start + count;
+    if end <= w {
+        prefix[end] - prefix[start]
+    } else {
+        (prefix[w] - prefix[start]) + prefix[end - w]
     }
 }
 
@@ -300,26 +277,6 @@ fn column_interval(phi: f64, half: f64, width: usize) -> (usize, usize) {
         return (0, width);
     }
     ((low as i64).rem_euclid(width as i64) as usize, count)
-}
-
-/// The column of the wrapped interval where the running sum from its start passes `target`, and
-/// where in it, in `[0, 1)`.
-fn pick_column(prefix: &[f64], start: usize, count: usize, target: f64) -> (usize, f32) {
-    let w = prefix.len() - 1;
-    let mut target = prefix[start] + target;
-    let (mut low, mut high) = (start, (start + count).min(w));
-    if start + count > w && target >= prefix[w] {
-        target -= prefix[w];
-        (low, high) = (0, start + count - w);
-    }
-    let passed = prefix[low + 1..=high].partition_point(|&p| p <= target);
-    let mut column = (low + passed).min(high - 1);
-    // Past the end by rounding: the last column that has any light.
-    while column > low && prefix[column + 1] <= prefix[column] {
-        column -= 1;
-    }
-    let fraction = (target - prefix[column]) / (prefix[column + 1] - prefix[column]);
-    (column, fraction.clamp(0.0, 1.0) as f32)
 }
 
 #[cfg(test)]

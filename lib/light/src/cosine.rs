@@ -18,6 +18,9 @@ use crate::quadrature::integrate_pieces;
 /// a band, and finer bands would no longer fit a cone of a few degrees better.
 const MAX_BANDS: usize = 64;
 
+/// Columns per slot of a row's guide table: few enough to share a cache line or two.
+const PER_SLOT: usize = 4;
+
 /// An environment map seen by a plane: texel weights `luminance * integral of max(0, n . w)`.
 #[derive(Clone, Debug)]
 pub struct CosineWeightedMap {
@@ -27,8 +30,9 @@ pub struct CosineWeightedMap {
     pub(crate) mean_cosine: Vec<f32>,
     /// Per row, running sums of the weight: `W + 1` entries, the first 0.
     pub(crate) row_prefix: Vec<f64>,
-    /// Per band of `band_rows` rows, the sum of their running sums.
-    pub(crate) band_prefix: Vec<f64>,
+    /// Per row, guide tables into its running sums: per slot, the first column that ends above
+    /// the slot's start; then the last column.
+    guide: Vec<u32>,
     pub(crate) band_rows: usize,
     /// `cos` of the polar angle between rows, `H + 1` of them.
     pub(crate) row_cos: Vec<f64>,
@@ -63,13 +67,12 @@ impl CosineWeightedMap {
                 sum
             })
             .collect();
-        let band_rows = h.div_ceil(MAX_BANDS);
-        let mut band_prefix = vec![0f64; (w + 1) * h.div_ceil(band_rows)];
-        for (i, row) in row_prefix.chunks(w + 1).enumerate() {
-            let band = i / band_rows;
-            let sums = &mut band_prefix[band * (w + 1)..(band + 1) * (w + 1)];
-            sums.iter_mut().zip(row).for_each(|(s, r)| *s += r);
-        }
+        let slots = w.div_ceil(PER_SLOT);
+        let mut guide = vec![0u32; (slots + 1) * h];
+        guide
+            .par_chunks_mut(slots + 1)
+            .zip(row_prefix.par_chunks(w + 1))
+            .for_each(|(guide, prefix)| fill_guide(prefix, guide));
         Self {
             row_cos: (0..=h).map(|i| (PI * i as f64 / h as f64).cos()).collect(),
             irradiance: row_irradiance.iter().sum(),
@@ -78,8 +81,8 @@ impl CosineWeightedMap {
             normal,
             mean_cosine,
             row_prefix,
-            band_prefix,
-            band_rows,
+            guide,
+            band_rows: h.div_ceil(MAX_BANDS),
         }
     }
 
@@ -104,10 +107,63 @@ impl CosineWeightedMap {
         luminance_f64(self.irradiance)
     }
 
+    #[inline]
+    pub(crate) fn row_prefix(&self, i: usize) -> &[f64] {
+        let n = self.map.width() + 1;
+        &self.row_prefix[i * n..(i + 1) * n]
+    }
+
+    /// The column of row `i` where the running sum over `count` columns from `start`, wrapping
+    /// around, passes `target`, and where in it, in `[0, 1]`. The interval must hold light.
+    #[inline]
+    pub(crate) fn pick_column(
+        &self,
+        i: usize,
+        start: usize,
+        count: usize,
+        target: f64,
+    ) -> (usize, f32) {
+        let prefix = self.row_prefix(i);
+        let w = prefix.len() - 1;
+        let slots = w.div_ceil(PER_SLOT);
+        let guide = &self.guide[i * (slots + 1)..(i + 1) * (slots + 1)];
+        let mut target = prefix[start] + target;
+        let (mut low, mut high) = (start, (start + count).min(w));
+        if start + count > w && target >= prefix[w] {
+            target -= prefix[w];
+            (low, high) = (0, start + count - w);
+        }
+        let slot = ((target / prefix[w] * slots as f64) as usize).min(slots - 1);
+        let from = (guide[slot] as usize).clamp(low, high - 1);
+        let to = (guide[slot + 1] as usize).clamp(from, high - 1);
+        let mut column = from + prefix[from + 1..=to].partition_point(|&p| p <= target);
+        // Past the end by rounding: the last column that has any light.
+        while column > low && prefix[column + 1] <= prefix[column] {
+            column -= 1;
+        }
+        let fraction = (target - prefix[column]) / (prefix[column + 1] - prefix[column]);
+        (column, fraction.clamp(0.0, 1.0) as f32)
+    }
+
     /// A sampler over this map, to be restricted to one cone after another without allocating.
     pub fn cone(&self) -> ConeSampler<'_> {
         ConeSampler::new(self)
     }
+}
+
+/// Fills the guide table of one row's running sums.
+fn fill_guide(prefix: &[f64], guide: &mut [u32]) {
+    let (w, slots) = (prefix.len() - 1, guide.len() - 1);
+    let mut column = 0;
+    for (slot, first) in guide[..slots].iter_mut().enumerate() {
+        let start = prefix[w] * slot as f64 / slots as f64;
+        while column + 1 < w && prefix[column + 1] <= start {
+            column += 1;
+        }
+        *first = column as u32;
+    }
+    let lit = prefix.partition_point(|&p| p < prefix[w]);
+    guide[slots] = lit.saturating_sub(1) as u32;
 }
 
 /// Integrals of `max(0, n . w)` over the cells of a latitude-longitude grid.
