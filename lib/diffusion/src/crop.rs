@@ -35,7 +35,7 @@ impl CropBox {
 /// that it interpolates when enlarging and averages when shrinking.
 pub fn resample(image: &Tensor, region: CropBox, size: usize) -> Result<Tensor> {
     let (channels, height, width) = image.dims3()?;
-    if size == 0 || !(region.side > 0.0) || height == 0 || width == 0 {
+    if size == 0 || region.side.is_nan() || region.side <= 0.0 || height == 0 || width == 0 {
         return argument(format!(
             "crop: cannot resample {region:?} of {width}x{height} to {size} pixels"
         ));

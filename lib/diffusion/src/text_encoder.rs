@@ -61,7 +61,9 @@ impl TextEncoderConfig {
     }
 
     fn check(&self) -> Result<Activation, String> {
-        if self.num_attention_heads == 0 || self.hidden_size % self.num_attention_heads != 0 {
+        if self.num_attention_heads == 0
+            || !self.hidden_size.is_multiple_of(self.num_attention_heads)
+        {
             return Err(format!(
                 "hidden_size = {} is no multiple of num_attention_heads = {}",
                 self.hidden_size, self.num_attention_heads

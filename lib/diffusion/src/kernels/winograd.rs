@@ -244,7 +244,7 @@ vectorized! {
                     }
                 }
             }
-            let t = both_ways(&d, |column| tile_column(column));
+            let t = both_ways(&d, tile_column);
             for point in 0..POINTS {
                 let offset = (point * shape.inputs + channel) * count + group;
                 // SAFETY: each channel owns its row of every point; `count`
@@ -283,7 +283,7 @@ vectorized! {
                     g[tap / 3][tap % 3][lane] = kernel[from];
                 }
             }
-            let t = both_ways(&g, |column| weight_column(column));
+            let t = both_ways(&g, weight_column);
             for point in 0..POINTS {
                 let offset = (point * outputs + output) * inputs + first;
                 // SAFETY: each output owns its row of every point.
@@ -314,7 +314,7 @@ vectorized! {
                 let offset = (point * shape.outputs + output) * count + group;
                 d[point / PATCH][point % PATCH].copy_from_slice(&m[offset..offset + LANES]);
             }
-            let y = both_ways(&d, |column| output_column(column));
+            let y = both_ways(&d, output_column);
             for lane in 0..LANES {
                 let tile = first + group + lane;
                 if tile >= tiles.all {

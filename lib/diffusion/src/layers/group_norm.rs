@@ -37,7 +37,7 @@ impl GroupNorm {
         eps: f64,
         activation: NormActivation,
     ) -> Result<Self> {
-        if groups == 0 || channels % groups != 0 {
+        if groups == 0 || !channels.is_multiple_of(groups) {
             return argument(format!(
                 "group norm {:?}: {channels} channels do not divide into {groups} groups",
                 parameters.path()

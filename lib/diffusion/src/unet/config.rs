@@ -216,7 +216,7 @@ impl UNetConfig {
                 "in_channels, out_channels and cross_attention_dim must be at least 1".into(),
             );
         }
-        if self.block_out_channels[0] % 2 != 0 {
+        if !self.block_out_channels[0].is_multiple_of(2) {
             return Err("block_out_channels[0] must be even: half sines, half cosines".into());
         }
         Ok(())
