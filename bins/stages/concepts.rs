@@ -15,7 +15,7 @@ use dipir_diffusion::sampler::Solver;
 use dipir_diffusion::weights::{Weights, write_safetensors};
 use dipir_imaging::file::write_png;
 use dipir_pipeline::manifest::Manifest;
-use dipir_pipeline::stage::{StagePlan, StageWriter};
+use dipir_pipeline::stage::StagePlan;
 use dipir_scene::config::SceneConfig;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -99,28 +99,42 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     if table.steps == 0 || !(table.guidance >= 0.0 && table.guidance.is_finite()) {
         return Err(session
             .config
-            .invalid("concepts.steps", "steps must be at least 1 and guidance not negative")
+            .invalid(
+                "concepts.steps",
+                "steps must be at least 1 and guidance not negative",
+            )
             .into());
     }
-    let cache_setting = ConceptsTable { cache: None, ..table.clone() };
-    let params = json!({"concepts": cache_setting, "class": class, "precision": model_table.precision});
+    let cache_setting = ConceptsTable {
+        cache: None,
+        ..table.clone()
+    };
+    let params =
+        json!({"concepts": cache_setting, "class": class, "precision": model_table.precision});
     let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
     plan.device = session.pipeline.device.clone();
     model::inputs(session, &model_table, &mut plan)?;
     let cache = cache_folder(session, &table, &plan, &class)?;
     let folder = session.stage_folder(STAGE);
-    let mut writer = StageWriter::begin(&folder, plan, session.when_locked)?;
+    let mut writer = session.begin(plan)?;
     let model = model::load(session, &model_table)?;
     let side = table.size.unwrap_or_else(|| model::native_size(&model));
 
-    let mut list = ConceptList { class_prompt: class_prompt(&class), class, concepts: vec![] };
+    let mut list = ConceptList {
+        class_prompt: class_prompt(&class),
+        class,
+        concepts: vec![],
+    };
     let (mut latents, mut made) = (vec![], 0);
     let progress = session.progress("concepts");
     for index in 0..table.count {
         interrupt::check()?;
         let concept = concept(&list.class, index, session.pipeline.seed);
         let stem = format!("{index:04}");
-        let (png, tensor) = (cache.join(format!("{stem}.png")), cache.join(format!("{stem}.safetensors")));
+        let (png, tensor) = (
+            cache.join(format!("{stem}.png")),
+            cache.join(format!("{stem}.safetensors")),
+        );
         // The latents are written last: their presence says that both are whole.
         if !tensor.is_file() || !png.is_file() {
             let settings = GenerateSettings {
@@ -131,14 +145,19 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
                 seed: concept.seed,
             };
             let share = |part: f64| (index as f64 + part) / table.count as f64;
-            make(&model, &concept, &settings, &png, &tensor, |part| progress.set(share(part)))?;
+            make(&model, &concept, &settings, &png, &tensor, |part| {
+                progress.set(share(part))
+            })?;
             made += 1;
         }
         latents.push(read_latents(&tensor)?);
         let name = PathBuf::from(format!("images/{stem}.png"));
         let target = writer.output("image", &name)?;
         std::fs::copy(&png, &target).with_context(|| format!("cannot copy {}", png.display()))?;
-        list.concepts.push(ConceptEntry { image: name, concept });
+        list.concepts.push(ConceptEntry {
+            image: name,
+            concept,
+        });
     }
     progress.done();
     if !latents.is_empty() {
@@ -148,12 +167,22 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     }
     writer.write_json("concepts", "concepts.json", &list)?;
     let manifest = writer.finish()?;
-    Ok(Done { folder, manifest, made, reused: table.count - made })
+    Ok(Done {
+        folder,
+        manifest,
+        made,
+        reused: table.count - made,
+    })
 }
 
 /// The cache of this class, model and settings: named by what decides an image, not by how many
 /// there are.
-fn cache_folder(session: &Session, table: &ConceptsTable, plan: &StagePlan, class: &str) -> anyhow::Result<PathBuf> {
+fn cache_folder(
+    session: &Session,
+    table: &ConceptsTable,
+    plan: &StagePlan,
+    class: &str,
+) -> anyhow::Result<PathBuf> {
     let root = match &table.cache {
         Some(path) => session.resolve(path),
         None => session.out.join("concepts-cache"),
@@ -177,17 +206,31 @@ fn make(
     tensor: &Path,
     mut progress: impl FnMut(f64),
 ) -> anyhow::Result<()> {
-    let outcome = generate(model, &concept.prompt, settings, &Pass::default(), None, |part| {
-        progress(part);
-        !interrupt::asked()
-    });
+    let outcome = generate(
+        model,
+        &concept.prompt,
+        settings,
+        &Pass::default(),
+        None,
+        |part| {
+            progress(part);
+            !interrupt::asked()
+        },
+    );
     interrupt::check()?;
     let generated = outcome?;
     let partial = png.with_extension("partial.png");
     write_png(&partial, &model::to_display(&generated.image)?)?;
     std::fs::rename(&partial, png).with_context(|| format!("cannot write {}", png.display()))?;
-    let latents = generated.latents.to_device(&Device::Cpu)?.to_dtype(DType::F32)?;
-    write_safetensors(tensor, &BTreeMap::from([("latents".to_owned(), latents)]), &BTreeMap::new())?;
+    let latents = generated
+        .latents
+        .to_device(&Device::Cpu)?
+        .to_dtype(DType::F32)?;
+    write_safetensors(
+        tensor,
+        &BTreeMap::from([("latents".to_owned(), latents)]),
+        &BTreeMap::new(),
+    )?;
     Ok(())
 }
 
@@ -195,7 +238,12 @@ fn make(
 pub fn read_latents(path: &Path) -> anyhow::Result<Tensor> {
     Weights::open_file(path)?
         .tensor("latents", DType::F32, &Device::Cpu)?
-        .with_context(|| format!("{} holds no tensor \"latents\"; delete it and run {EXECUTABLE} again", path.display()))
+        .with_context(|| {
+            format!(
+                "{} holds no tensor \"latents\"; delete it and run {EXECUTABLE} again",
+                path.display()
+            )
+        })
 }
 
 impl Done {
@@ -210,7 +258,16 @@ impl Done {
 
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "wrote {} in {}", self.folder.display(), duration(self.manifest.elapsed_s))?;
-        write!(f, "  {} images made, {} from the cache", self.made, self.reused)
+        writeln!(
+            f,
+            "wrote {} in {}",
+            self.folder.display(),
+            duration(self.manifest.elapsed_s)
+        )?;
+        write!(
+            f,
+            "  {} images made, {} from the cache",
+            self.made, self.reused
+        )
     }
 }

@@ -134,11 +134,17 @@ struct Data<'a> {
 
 impl Data<'_> {
     fn place(&self, tensor: &Tensor) -> dipir_diffusion::Result<Tensor> {
-        Ok(tensor.to_device(self.model.device())?.to_dtype(self.model.dtype())?)
+        Ok(tensor
+            .to_device(self.model.device())?
+            .to_dtype(self.model.dtype())?)
     }
 
     /// A rectangle to paint, of 0.3 to 0.9 of each side, for inpainting models.
-    fn mask(&self, image: &Tensor, stream: &mut NoiseStream) -> dipir_diffusion::Result<Option<InpaintCondition>> {
+    fn mask(
+        &self,
+        image: &Tensor,
+        stream: &mut NoiseStream,
+    ) -> dipir_diffusion::Result<Option<InpaintCondition>> {
         if !self.model.is_inpainting() {
             return Ok(None);
         }
@@ -150,9 +156,19 @@ impl Data<'_> {
         };
         let (rows, columns) = (span(height), span(width));
         let values: Vec<f32> = (0..height * width)
-            .map(|i| if rows.contains(&(i / width)) && columns.contains(&(i % width)) { 1.0 } else { 0.0 })
+            .map(|i| {
+                if rows.contains(&(i / width)) && columns.contains(&(i % width)) {
+                    1.0
+                } else {
+                    0.0
+                }
+            })
             .collect();
-        let mask = self.place(&Tensor::from_vec(values, (1, 1, height, width), image.device())?)?;
+        let mask = self.place(&Tensor::from_vec(
+            values,
+            (1, 1, height, width),
+            image.device(),
+        )?)?;
         Ok(Some(InpaintCondition::new(&self.model.vae, image, &mask)?))
     }
 }
@@ -163,18 +179,28 @@ impl TrainingData for Data<'_> {
         let region = CropBox::random(width, height, self.min_crop, stream);
         let image = self.place(&resample(&self.photo, region, self.size)?)?;
         let inpaint = self.mask(&image, stream)?;
-        Ok(Example { latents: self.model.vae.encode(&image, None)?.detach(), prompt: self.prompt.clone(), inpaint })
+        Ok(Example {
+            latents: self.model.vae.encode(&image, None)?.detach(),
+            prompt: self.prompt.clone(),
+            inpaint,
+        })
     }
 
     fn prior(&self, stream: &mut NoiseStream) -> dipir_diffusion::Result<Option<Example>> {
-        let Some(concepts) = &self.concepts else { return Ok(None) };
+        let Some(concepts) = &self.concepts else {
+            return Ok(None);
+        };
         let index = stream.below(concepts.dim(0)?);
         let latents = self.place(&concepts.narrow(0, index, 1)?)?;
         let inpaint = match self.model.is_inpainting() {
             true => self.mask(&self.model.vae.decode(&latents)?.detach(), stream)?,
             false => None,
         };
-        Ok(Some(Example { latents, prompt: self.class_prompt.clone(), inpaint }))
+        Ok(Some(Example {
+            latents,
+            prompt: self.class_prompt.clone(),
+            inpaint,
+        }))
     }
 }
 
@@ -183,20 +209,27 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let table: LoraTable = session.config.table("lora")?;
     let model_table: ModelTable = session.config.table("model")?;
     let scene: SceneConfig = session.config.table("scene")?;
-    let background = scene
-        .background
-        .as_ref()
-        .ok_or_else(|| session.config.invalid("scene.background", "is missing: name the photograph"))?;
+    let background = scene.background.as_ref().ok_or_else(|| {
+        session
+            .config
+            .invalid("scene.background", "is missing: name the photograph")
+    })?;
     let transfer: Transfer = match scene.transfer.as_deref() {
         None | Some("srgb") => Transfer::Srgb,
         Some("gamma22") => Transfer::Gamma22,
         Some("linear") => Transfer::Linear,
         Some(_) => {
-            return Err(session.config.invalid("scene.transfer", "accepted: srgb, gamma22, linear").into());
+            return Err(session
+                .config
+                .invalid("scene.transfer", "accepted: srgb, gamma22, linear")
+                .into());
         }
     };
     if !(table.min_crop > 0.0 && table.min_crop <= 1.0) {
-        return Err(session.config.invalid("lora.min_crop", "accepted: above 0, up to 1").into());
+        return Err(session
+            .config
+            .invalid("lora.min_crop", "accepted: above 0, up to 1")
+            .into());
     }
     let photo_file = session.resolve(background);
     let (list, concept_files) = read_concepts(session, &table)?;
@@ -211,27 +244,43 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         plan.input("concepts", Path::new(name), location)?;
     }
     model::inputs(session, &model_table, &mut plan)?;
-    let base_hash = plan.inputs.iter().find(|i| i.path.to_string_lossy().contains("unet/diffusion")).map(|i| i.blake3.clone());
+    let base_hash = plan
+        .inputs
+        .iter()
+        .find(|i| i.path.to_string_lossy().contains("unet/diffusion"))
+        .map(|i| i.blake3.clone());
     let folder = session.stage_folder(STAGE);
-    let fingerprint = blake3::hash(serde_json::to_string(&json!([plan.inputs, without_steps(&table)]))?.as_bytes());
-    let mut writer = StageWriter::begin(&folder, plan, session.when_locked)?;
+    let fingerprint = blake3::hash(
+        serde_json::to_string(&json!([plan.inputs, without_steps(&table)]))?.as_bytes(),
+    );
+    let mut writer = session.begin(plan)?;
 
     let mut model = model::load(session, &model_table)?;
-    let start = table.learn_word.then(|| learnable(&mut model, &table.word)).transpose()?;
+    let start = table
+        .learn_word
+        .then(|| learnable(&mut model, &table.word))
+        .transpose()?;
     let photo = read_photo(&photo_file, transfer)?;
     let data = Data {
         photo: model::from_display(&photo.transfer.encode(&photo.image))?,
         size: model::native_size(&model),
         min_crop: table.min_crop,
         prompt: table.instance_prompt(),
-        class_prompt: list.as_ref().map(|l| l.class_prompt.clone()).unwrap_or_default(),
+        class_prompt: list
+            .as_ref()
+            .map(|l| l.class_prompt.clone())
+            .unwrap_or_default(),
         concepts: match concept_files.get(1) {
             Some((_, location)) => Some(read_latents(location)?),
             None => None,
         },
         model: &model,
     };
-    let mut trainer = LoraTrainer::new(&model, table.training(session.pipeline.seed), start.as_ref())?;
+    let mut trainer = LoraTrainer::new(
+        &model,
+        table.training(session.pipeline.seed),
+        start.as_ref(),
+    )?;
     let resume = Resume::open(session, fingerprint.to_hex().as_str())?;
     let mut history = resume.restore(session, &mut trainer, table.steps);
     let resumed_at = trainer.steps();
@@ -256,23 +305,47 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         }
     }
     progress.done();
-    write_results(session, &table, &trainer, &data, base_hash, &history, &mut writer)?;
+    write_results(
+        session,
+        &table,
+        &trainer,
+        &data,
+        base_hash,
+        &history,
+        &mut writer,
+    )?;
     let manifest = writer.finish()?;
     resume.remove();
-    Ok(Done { folder, manifest, history, resumed_at })
+    Ok(Done {
+        folder,
+        manifest,
+        history,
+        resumed_at,
+    })
 }
 
 /// What decides the course of a run; how long it is does not.
 fn without_steps(table: &LoraTable) -> LoraTable {
-    LoraTable { steps: 0, checkpoint_every: 0, sample_every: 0, ..table.clone() }
+    LoraTable {
+        steps: 0,
+        checkpoint_every: 0,
+        sample_every: 0,
+        ..table.clone()
+    }
 }
 
 /// Gives `word` a token of its own and returns the embedding that it starts from: the mean of
 /// the tokens that the word had.
 fn learnable(model: &mut Model, word: &str) -> anyhow::Result<Tensor> {
     let tokens = model.tokenizer.words(word)?;
-    let rows = tokens.iter().map(|&t| model.text_encoder.embedding(t)).collect::<Result<Vec<_>, _>>()?;
-    anyhow::ensure!(!rows.is_empty(), "lora.word = \"{word}\" has no token; name a word");
+    let rows = tokens
+        .iter()
+        .map(|&t| model.text_encoder.embedding(t))
+        .collect::<Result<Vec<_>, _>>()?;
+    anyhow::ensure!(
+        !rows.is_empty(),
+        "lora.word = \"{word}\" has no token; name a word"
+    );
     let token = model.text_encoder.config().vocab_size as u32;
     model.tokenizer.add_placeholder(word, token);
     Ok(Tensor::stack(&rows, 0)?.mean(0)?)
@@ -291,15 +364,23 @@ fn read_concepts(
     let folder = session.stage_folder(concepts::STAGE);
     Manifest::read(&folder, concepts::EXECUTABLE)?;
     let path = folder.join("concepts.json");
-    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    let text = std::fs::read_to_string(&path)
+        .with_context(|| format!("cannot read {}", path.display()))?;
     let list: ConceptList = serde_json::from_str(&text).with_context(|| {
-        format!("{} is damaged; run {} again", path.display(), concepts::EXECUTABLE)
+        format!(
+            "{} is damaged; run {} again",
+            path.display(),
+            concepts::EXECUTABLE
+        )
     })?;
     if list.concepts.is_empty() {
         return Ok((None, vec![]));
     }
     let named = |name: &str| (format!("concepts/{name}"), folder.join(name));
-    Ok((Some(list), vec![named("concepts.json"), named("latents.safetensors")]))
+    Ok((
+        Some(list),
+        vec![named("concepts.json"), named("latents.safetensors")],
+    ))
 }
 
 /// Where an interrupted run goes on.
@@ -309,13 +390,21 @@ struct Resume {
 
 impl Resume {
     fn open(session: &Session, fingerprint: &str) -> anyhow::Result<Self> {
-        let folder = session.out.join("lora-checkpoints").join(&fingerprint[..16]);
+        let folder = session
+            .out
+            .join("lora-checkpoints")
+            .join(&fingerprint[..16]);
         model::create_folder(&folder)?;
         Ok(Self { folder })
     }
 
     /// Loads the last checkpoint, if there is a usable one; returns its history.
-    fn restore(&self, session: &Session, trainer: &mut LoraTrainer, steps: usize) -> Vec<StepReport> {
+    fn restore(
+        &self,
+        session: &Session,
+        trainer: &mut LoraTrainer,
+        steps: usize,
+    ) -> Vec<StepReport> {
         let path = self.folder.join("checkpoint.safetensors");
         let history = std::fs::read(self.folder.join("history.json"))
             .ok()
@@ -324,11 +413,21 @@ impl Resume {
         if !path.is_file() {
             return vec![];
         }
-        let usable = trainer.resume(&path).map_err(anyhow::Error::from).and_then(|()| {
-            anyhow::ensure!(trainer.steps() <= steps, "it has {} updates, {steps} are wanted", trainer.steps());
-            anyhow::ensure!(history.len() >= trainer.steps(), "its history is incomplete");
-            Ok(())
-        });
+        let usable = trainer
+            .resume(&path)
+            .map_err(anyhow::Error::from)
+            .and_then(|()| {
+                anyhow::ensure!(
+                    trainer.steps() <= steps,
+                    "it has {} updates, {steps} are wanted",
+                    trainer.steps()
+                );
+                anyhow::ensure!(
+                    history.len() >= trainer.steps(),
+                    "its history is incomplete"
+                );
+                Ok(())
+            });
         match usable {
             Ok(()) => history[..trainer.steps()].to_vec(),
             Err(e) => {
@@ -367,10 +466,22 @@ fn show(
     writer: &mut StageWriter,
     step: usize,
 ) -> anyhow::Result<()> {
-    let settings =
-        GenerateSettings { solver: Solver::DpmSolver2M, steps: 20, guidance: 5.0, size: (data.size, data.size), seed: 1 };
+    let settings = GenerateSettings {
+        solver: Solver::DpmSolver2M,
+        steps: 20,
+        guidance: 5.0,
+        size: (data.size, data.size),
+        seed: 1,
+    };
     let pass = Pass::with_lora(trainer.lora());
-    let generated = generate(model, &data.prompt, &settings, &pass, trainer.learned().as_ref(), |_| !interrupt::asked());
+    let generated = generate(
+        model,
+        &data.prompt,
+        &settings,
+        &pass,
+        trainer.learned().as_ref(),
+        |_| !interrupt::asked(),
+    );
     interrupt::check()?;
     let path = writer.output("sample", format!("samples/{step:06}.png"))?;
     write_png(&path, &model::to_display(&generated?.image)?)?;
@@ -389,11 +500,22 @@ fn write_results(
     let info = LoraInfo::from([
         ("instance_prompt".to_owned(), data.prompt.clone()),
         ("class_prompt".to_owned(), data.class_prompt.clone()),
-        ("base_model_blake3".to_owned(), base_hash.unwrap_or_default()),
+        (
+            "base_model_blake3".to_owned(),
+            base_hash.unwrap_or_default(),
+        ),
         ("steps".to_owned(), trainer.steps().to_string()),
     ]);
-    trainer.lora().save(&writer.output("lora", "lora.safetensors")?, LoraStyle::Peft, &info)?;
-    trainer.lora().save(&writer.output("lora_kohya", "lora_kohya.safetensors")?, LoraStyle::Kohya, &info)?;
+    trainer.lora().save(
+        &writer.output("lora", "lora.safetensors")?,
+        LoraStyle::Peft,
+        &info,
+    )?;
+    trainer.lora().save(
+        &writer.output("lora_kohya", "lora_kohya.safetensors")?,
+        LoraStyle::Kohya,
+        &info,
+    )?;
     if table.learn_word {
         trainer.save_token(&writer.output("word", "word.safetensors")?, &table.word)?;
     }
@@ -428,7 +550,12 @@ impl Done {
 
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "wrote {} in {}", self.folder.display(), duration(self.manifest.elapsed_s))?;
+        writeln!(
+            f,
+            "wrote {} in {}",
+            self.folder.display(),
+            duration(self.manifest.elapsed_s)
+        )?;
         write!(
             f,
             "  {} updates, loss {:.4} at the start, {:.4} at the end (means of a tenth)",

@@ -83,7 +83,9 @@ pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> an
         };
         names.sort();
         for name in names {
-            let used = name.extension().is_some_and(|e| e == "json" || e == "safetensors" || e == "txt");
+            let used = name
+                .extension()
+                .is_some_and(|e| e == "json" || e == "safetensors" || e == "txt");
             let location = folder.join(part).join(&name);
             if used && location.is_file() {
                 let path = table.path.join(part).join(&name);
@@ -97,10 +99,16 @@ pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> an
 /// An image tensor [1, 3, h, w] in [-1, 1] as display values.
 pub fn to_display(image: &Tensor) -> anyhow::Result<DisplayImage> {
     let (_, _, height, width) = image.dims4()?;
-    let planes = image.to_device(&Device::Cpu)?.to_dtype(DType::F32)?.flatten_all()?.to_vec1::<f32>()?;
+    let planes = image
+        .to_device(&Device::Cpu)?
+        .to_dtype(DType::F32)?
+        .flatten_all()?
+        .to_vec1::<f32>()?;
     let n = height * width;
     let at = |i: usize| (planes[i] * 0.5 + 0.5).clamp(0.0, 1.0);
-    let pixels = (0..n).map(|i| Vec3::new(at(i), at(n + i), at(2 * n + i))).collect();
+    let pixels = (0..n)
+        .map(|i| Vec3::new(at(i), at(n + i), at(2 * n + i)))
+        .collect();
     Ok(DisplayImage(Raster::from_pixels(width, height, pixels)))
 }
 
@@ -111,7 +119,11 @@ pub fn from_display(image: &DisplayImage) -> anyhow::Result<Tensor> {
     for channel in 0..3 {
         planes.extend(raster.pixels().iter().map(|p| p[channel] * 2.0 - 1.0));
     }
-    Ok(Tensor::from_vec(planes, (3, raster.height(), raster.width()), &Device::Cpu)?)
+    Ok(Tensor::from_vec(
+        planes,
+        (3, raster.height(), raster.width()),
+        &Device::Cpu,
+    )?)
 }
 
 /// The side of the images that the model was trained on, in pixels.

@@ -6,6 +6,7 @@ use dipir_scene::mesh::TriangleMesh;
 use glam::{Vec2, Vec3};
 
 use crate::mesher::{Field, Side, mesh};
+use crate::seams::ribbon;
 use crate::simplify::simplify;
 use crate::solids::*;
 
@@ -309,6 +310,46 @@ fn part_mesh(field: Field, low: Vec3, high: Vec3, step: f32, side: Side) -> Tria
     simplify(mesh(field, low, high, step, side), field, step)
 }
 
+/// Gaps around doors and bonnet, on the half with `x >= 0`.
+fn seams() -> TriangleMesh {
+    let side = |corners: &[(f32, f32)]| {
+        let corners: Vec<Vec3> = corners.iter().map(|&(z, y)| v3(0.0, y, z)).collect();
+        ribbon(&shell, &corners, Vec3::X)
+    };
+    let top = |corners: &[(f32, f32)]| {
+        let corners: Vec<Vec3> = corners.iter().map(|&(x, z)| v3(x, 0.0, z)).collect();
+        ribbon(&shell, &corners, Vec3::Y)
+    };
+    let lines = [
+        // Front edge of the front door, sill, rear edge of the rear door.
+        side(&[
+            (0.82, 0.955),
+            (0.84, 0.80),
+            (0.80, 0.55),
+            (0.74, 0.34),
+            (0.66, 0.295),
+        ]),
+        side(&[
+            (0.66, 0.295),
+            (-0.40, 0.285),
+            (-0.78, 0.295),
+            (-0.84, 0.36),
+            (-0.90, 0.56),
+        ]),
+        side(&[(-0.90, 0.56), (-1.04, 0.72), (-1.28, 0.84), (-1.42, 0.97)]),
+        // Between the doors.
+        side(&[(-0.40, 0.975), (-0.40, 0.60), (-0.39, 0.285)]),
+        // Bonnet.
+        top(&[(0.67, 1.02), (0.70, 1.30), (0.66, 1.62), (0.52, 1.86)]),
+        top(&[(0.52, 1.86), (0.30, 1.935), (0.0, 1.955)]),
+    ];
+    let mut seams = TriangleMesh::default();
+    for line in lines {
+        dipir_render::shapes::append(&mut seams, line, 0);
+    }
+    seams
+}
+
 /// The parts that make the body; `step` is the size of their details, metres.
 pub fn body(step: f32) -> Vec<Part> {
     let low = v3(0.0, 0.10, -2.20);
@@ -342,6 +383,10 @@ pub fn body(step: f32) -> Vec<Part> {
         half(CarMaterial::Lamp, &lamps, step),
         half(CarMaterial::TailLamp, &tail, step),
         half(CarMaterial::Plate, &plate, step),
+        Part {
+            material: CarMaterial::Trim,
+            mesh: seams(),
+        },
     ]
 }
 

@@ -7,6 +7,7 @@ mod glb;
 mod mesher;
 mod noise;
 mod place;
+mod seams;
 mod simplify;
 mod sky;
 mod solids;
@@ -14,6 +15,7 @@ mod solids;
 use std::path::PathBuf;
 
 use dipir_imaging::file::write_png;
+use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::transfer::Transfer;
 use glam::{Mat3, Vec3};
 use place::Place;
@@ -53,7 +55,11 @@ fn main() -> anyhow::Result<()> {
     )?;
     println!("background.png");
     let light = camera::panorama(&place, &sky, PROBE, 512, samples.div_ceil(4))?;
-    light.write(folder.join("environment.exr"))?;
+    // Half precision: the noise of a rendered map is above its rounding.
+    let mut layers = Layers::new(light.width(), light.height());
+    layers.latlong = true;
+    layers.insert_rgb("", Precision::Half, &light.to_image().0)?;
+    layers.write_exr(folder.join("environment.exr"))?;
     println!("environment.exr");
     Ok(())
 }

@@ -8,17 +8,18 @@ use glam::{DMat3, DVec3, Vec3};
 
 use crate::mesher::{Field, normal, project};
 
-/// Root mean square distance to the original faces that a vertex may have, metres.
-const TOLERANCE_M: f64 = 3e-4;
+/// Root mean square distance that a vertex may have from the planes of the faces that it stands
+/// for, metres. Vertices lie on the surface, so that its error is a fraction of this.
+const TOLERANCE_M: f64 = 6e-4;
 /// Longest edge, metres: shading interpolates normals along it.
 const LONGEST_M: f32 = 0.16;
 /// Least cosine between the normals of vertices that are merged: creases stay.
-const LEAST_AGREEMENT: f32 = 0.90;
+const LEAST_AGREEMENT: f32 = 0.96;
 /// Least cosine between a face's own normal and its vertices'.
 const LEAST_FACING: f32 = 0.75;
 
 /// Squared distance to a set of planes, and how many they are.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy)]
 struct Quadric {
     a: DMat3,
     b: DVec3,
@@ -27,6 +28,13 @@ struct Quadric {
 }
 
 impl Quadric {
+    const ZERO: Self = Self {
+        a: DMat3::ZERO,
+        b: DVec3::ZERO,
+        c: 0.0,
+        planes: 0.0,
+    };
+
     fn of_plane(normal: DVec3, point: DVec3) -> Self {
         let d = -normal.dot(point);
         Self {
@@ -102,7 +110,7 @@ pub fn simplify(mesh: TriangleMesh, field: Field, step: f32) -> TriangleMesh {
         step,
         positions: mesh.positions,
         normals: mesh.normals,
-        quadrics: vec![Quadric::default(); count],
+        quadrics: vec![Quadric::ZERO; count],
         versions: vec![0; count],
         faces: mesh.indices.iter().copied().map(Some).collect(),
         around: vec![Vec::new(); count],

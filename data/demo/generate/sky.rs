@@ -21,7 +21,7 @@ pub struct Sky {
 impl Default for Sky {
     fn default() -> Self {
         Self {
-            sun: Vec3::new(-0.70, 0.62, -0.20).normalize(),
+            sun: Vec3::new(-0.68, 0.60, 0.16).normalize(),
             sun_irradiance: Vec3::new(4.3, 3.9, 3.2),
             sun_radius_rad: 0.0075,
             brightness: 0.16,

@@ -171,22 +171,20 @@ impl Bvh {
         t_max: f32,
         accept: impl Fn(u32, f32, f32) -> bool,
     ) -> Option<Hit> {
-        let root = self.tree.root?;
         let (origin, limit, skipped) = self.localize(ray, t_max)?;
         let local = LocalRay::new(origin, ray.direction.into());
-        let (triangle, hit) = self.tree.closest(root, &local, limit, accept)?;
+        let (triangle, hit) = self.tree.closest(&local, limit, accept)?;
         Some(self.globalize(triangle, hit, skipped))
     }
 
     /// Whether any triangle with `0 < t <= t_max` is taken by `accept(triangle, u, v)`.
     #[inline]
     pub fn occluded(&self, ray: &Ray, t_max: f32, accept: impl Fn(u32, f32, f32) -> bool) -> bool {
-        let (Some(root), Some((origin, limit, _))) = (self.tree.root, self.localize(ray, t_max))
-        else {
+        let Some((origin, limit, _)) = self.localize(ray, t_max) else {
             return false;
         };
         let local = LocalRay::new(origin, ray.direction.into());
-        self.tree.occluded(root, &local, limit, accept)
+        self.tree.occluded(&local, limit, accept)
     }
 
     /// A hit in world units.

@@ -54,13 +54,21 @@ impl Shear {
             [[0, 1, 2], [1, 0, 2]],
         ];
         let y_or_z = if size.z > size.y { 2 } else { 1 };
-        let largest = if size.x > size.y.max(size.z) { 0 } else { y_or_z };
+        let largest = if size.x > size.y.max(size.z) {
+            0
+        } else {
+            y_or_z
+        };
         let (direction, inverse) = (direction.to_array(), inverse.to_array());
         let axes = AXES[largest][(inverse[largest] < 0.0) as usize];
         let inverse = inverse[largest];
         Self {
             axes,
-            factors: [direction[axes[0]] * inverse, direction[axes[1]] * inverse, inverse],
+            factors: [
+                direction[axes[0]] * inverse,
+                direction[axes[1]] * inverse,
+                inverse,
+            ],
         }
     }
 

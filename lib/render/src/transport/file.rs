@@ -140,17 +140,17 @@ fn push_rows<'a, E: Entry>(tensors: &mut Vec<(String, Tensor<'a>)>, name: &str, 
     let mut push = |part: &str, tensor| tensors.push((format!("{name}.{part}"), tensor));
     push(
         "offsets",
-        Tensor::new(Dtype::U32, &[rows.offsets.len()], &*rows.offsets),
+        Tensor::new(Dtype::U32, &[rows.offsets.len()], &rows.offsets),
     );
     push(
         "exponents",
-        Tensor::new(Dtype::I8, &[rows.pixels()], &*rows.exponents),
+        Tensor::new(Dtype::I8, &[rows.pixels()], &rows.exponents),
     );
     push(
         "entries",
-        Tensor::new(entry_dtype::<E>(), &[n, E::NUMBERS], &*rows.entries),
+        Tensor::new(entry_dtype::<E>(), &[n, E::NUMBERS], &rows.entries),
     );
-    push("merged", Tensor::new(Dtype::U8, &[n], &*rows.merged));
+    push("merged", Tensor::new(Dtype::U8, &[n], &rows.merged));
 }
 
 /// An open file.

@@ -142,13 +142,14 @@ fn inverse_scale(exponent: i8) -> f32 {
 #[inline(always)]
 fn row_sum<E: Entry>(entries: &[E], light: &[Vec4]) -> Vec4 {
     let mut sums = [Vec4::ZERO; 4];
-    let mut fours = entries.chunks_exact(4);
-    for four in &mut fours {
-        for (sum, entry) in sums.iter_mut().zip(four) {
-            *sum = entry.weight().mul_add(light[entry.texel()], *sum);
+    let (fours, rest) = entries.as_chunks::<4>();
+    for four in fours {
+        let weights = E::weights(four);
+        for k in 0..4 {
+            sums[k] = weights[k].mul_add(light[four[k].texel()], sums[k]);
         }
     }
-    for (sum, entry) in sums.iter_mut().zip(fours.remainder()) {
+    for (sum, entry) in sums.iter_mut().zip(rest) {
         *sum = entry.weight().mul_add(light[entry.texel()], *sum);
     }
     (sums[0] + sums[1]) + (sums[2] + sums[3])
@@ -157,7 +158,15 @@ fn row_sum<E: Entry>(entries: &[E], light: &[Vec4]) -> Vec4 {
 /// Adds weight times `gradient` to every texel of a row.
 #[inline(always)]
 fn row_scatter<E: Entry>(entries: &[E], gradient: Vec4, sums: &mut [Vec4]) {
-    for entry in entries {
+    let (fours, rest) = entries.as_chunks::<4>();
+    for four in fours {
+        let weights = E::weights(four);
+        for k in 0..4 {
+            let sum = &mut sums[four[k].texel()];
+            *sum = weights[k].mul_add(gradient, *sum);
+        }
+    }
+    for entry in rest {
         let sum = &mut sums[entry.texel()];
         *sum = entry.weight().mul_add(gradient, *sum);
     }

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
 use dipir_light::luminance::luminance;
-use glam::{Vec3, Vec4};
+use glam::{Vec3, Vec4, Vec4Swizzles};
 use half::f16;
 use memmap2::Mmap;
 
@@ -26,6 +26,11 @@ pub trait Entry: Pod + Send + Sync + Debug + PartialEq {
     fn texel(&self) -> usize;
     /// The weight of each channel; the fourth number means nothing and may be NaN.
     fn weight(&self) -> Vec4;
+    /// [`weight`](Self::weight) of four entries at once.
+    #[inline(always)]
+    fn weights(four: &[Self; 4]) -> [Vec4; 4] {
+        four.map(|entry| entry.weight())
+    }
 }
 
 /// Three half-precision weights and one of at most 65536 texels: 8 bytes.
@@ -104,6 +109,12 @@ impl Entry for GreyHalf {
     #[inline(always)]
     fn weight(&self) -> Vec4 {
         widen([self.0[0]; 4])
+    }
+
+    #[inline(always)]
+    fn weights(four: &[Self; 4]) -> [Vec4; 4] {
+        let w = widen(four.map(|entry| entry.0[0]));
+        [w.xxxx(), w.yyyy(), w.zzzz(), w.wwww()]
     }
 }
 

@@ -65,7 +65,7 @@ pub fn build(triangles: &[[Vec3; 3]], ids: &[u32]) -> Tree {
         nodes: Vec::new(),
         packs: Vec::new(),
         triangles: Vec::new(),
-        root: None,
+        root: ChildRef::NONE,
     };
     if triangles.is_empty() {
         return tree;
@@ -80,7 +80,7 @@ pub fn build(triangles: &[[Vec3; 3]], ids: &[u32]) -> Tree {
         tree: &mut tree,
     };
     let root = emitter.emit();
-    tree.root = Some(root);
+    tree.root = root;
     tree
 }
 

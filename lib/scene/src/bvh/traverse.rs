@@ -28,8 +28,27 @@ pub struct Tree {
     pub packs: Vec<Pack>,
     /// Mesh indices of the packs' triangles: apart, as only hits need them.
     pub triangles: Vec<[u32; LANES]>,
-    /// `None` if there is nothing to hit.
-    pub root: Option<ChildRef>,
+    /// [`ChildRef::NONE`] if there is nothing to hit.
+    pub root: ChildRef,
+}
+
+/// Entry `i` of a stack, which must have been written.
+///
+/// A node leaves at most seven entries behind for each of at most [`MAX_DEPTH`] levels, so every
+/// index in use is below [`STACK`]; the walks read only below their `len`, where they wrote.
+#[inline(always)]
+fn read<T: Copy>(stack: &[MaybeUninit<T>; STACK], i: usize) -> T {
+    debug_assert!(i < STACK);
+    // SAFETY: see above.
+    unsafe { stack.get_unchecked(i).assume_init() }
+}
+
+/// Writes entry `i` of a stack, which must be at most its `len`; see [`read`].
+#[inline(always)]
+fn write<T>(stack: &mut [MaybeUninit<T>; STACK], i: usize, entry: T) {
+    debug_assert!(i < STACK);
+    // SAFETY: see `read`.
+    unsafe { stack.get_unchecked_mut(i) }.write(entry);
 }
 
 /// For each octant of directions and each set of hit slots: the nearest slot in the highest
@@ -95,11 +114,10 @@ impl Tree {
     /// Mesh indices of the triangles, grouped into at most `count` neighbourhoods.
     pub fn parts(&self, count: usize) -> Vec<Vec<u32>> {
         // Half areas of boxes, and what they hold.
-        let mut parts: Vec<(f32, ChildRef)> = self
-            .root
-            .map(|root| (f32::INFINITY, root))
-            .into_iter()
-            .collect();
+        let mut parts = match self.root {
+            ChildRef::NONE => Vec::new(),
+            root => vec![(f32::INFINITY, root)],
+        };
         // The largest box is opened until no node is left that may be.
         while let Some(i) = (0..parts.len())
             .filter(|&i| !parts[i].1.is_pack() && parts.len() + LANES - 1 <= count)
@@ -126,12 +144,11 @@ impl Tree {
             .collect()
     }
 
-    /// The nearest hit in `subtree` with `0 < t <= t_max` that `accept(triangle, u, v)` takes,
+    /// The nearest hit with `0 < t <= t_max` that `accept(triangle, u, v)` takes,
     /// and its triangle.
     #[inline]
     pub fn closest(
         &self,
-        subtree: ChildRef,
         ray: &LocalRay,
         t_max: f32,
         accept: impl Fn(u32, f32, f32) -> bool,
@@ -143,7 +160,10 @@ impl Tree {
         let mut best = None;
         let mut stack = [const { MaybeUninit::<u64>::uninit() }; STACK];
         let mut len = 0;
-        let mut current = subtree;
+        let mut current = self.root;
+        if current == ChildRef::NONE {
+            return None;
+        }
         loop {
             if current.is_pack() {
                 let pack = self.pack(current);
@@ -177,29 +197,21 @@ impl Tree {
                         self.prefetch(child);
                         (enter[slot].to_bits() as u64) << 32 | child.0 as u64
                     };
+                    // The nearest is visited next; the others are inserted, farthest first.
                     let mut nearest = entry(first);
                     let start = len;
-                    debug_assert!(len + LANES <= STACK);
                     while hits != 0 {
-                        // Insertion, the nearest kept out.
                         let next = entry(hits.trailing_zeros() as usize);
                         hits &= hits - 1;
                         let farther = nearest.max(next);
                         nearest = nearest.min(next);
                         let mut i = len;
-                        while i > start {
-                            let below = unsafe { stack.get_unchecked(i - 1).assume_init() };
-                            if below >= farther {
-                                break;
-                            }
-                            unsafe {
-                                stack.get_unchecked_mut(i).write(below);
-                            }
+                        while i > start && read(&stack, i - 1) < farther {
+                            let nearer = read(&stack, i - 1);
+                            write(&mut stack, i, nearer);
                             i -= 1;
                         }
-                        unsafe {
-                            stack.get_unchecked_mut(i).write(farther);
-                        }
+                        write(&mut stack, i, farther);
                         len += 1;
                     }
                     current = ChildRef(nearest as u32);
@@ -211,7 +223,7 @@ impl Tree {
                     return best;
                 }
                 len -= 1;
-                let entry = unsafe { stack.get_unchecked(len).assume_init() };
+                let entry = read(&stack, len);
                 if f32::from_bits((entry >> 32) as u32) <= limit {
                     break ChildRef(entry as u32);
                 }
@@ -219,11 +231,10 @@ impl Tree {
         }
     }
 
-    /// Whether `accept(triangle, u, v)` takes any hit in `subtree` within the ray's range.
+    /// Whether `accept(triangle, u, v)` takes any hit with `0 < t <= t_max`.
     #[inline]
     pub fn occluded(
         &self,
-        subtree: ChildRef,
         ray: &LocalRay,
         t_max: f32,
         accept: impl Fn(u32, f32, f32) -> bool,
@@ -236,12 +247,11 @@ impl Tree {
         // Popped last, it ends the walk.
         stack[0].write(ChildRef::NONE.0);
         let mut len = 1;
-        let mut current = subtree;
+        let mut current = self.root;
         loop {
             if !current.is_pack() {
                 debug_assert!((1..=STACK - LANES).contains(&len));
-                // SAFETY: what was pushed was written, and `NONE` lies below it.
-                let top = ChildRef(unsafe { stack.get_unchecked(len - 1).assume_init() });
+                let top = ChildRef(read(&stack, len - 1));
                 let node = self.node(current);
                 let (hits, _) = box_ray.test(node, limits);
                 let order = order[hits as usize & 255];
@@ -276,10 +286,8 @@ impl Tree {
                     return true;
                 }
             }
-            debug_assert!((1..STACK).contains(&len));
             len -= 1;
-            // SAFETY: as above.
-            current = ChildRef(unsafe { stack.get_unchecked(len).assume_init() });
+            current = ChildRef(read(&stack, len));
         }
     }
 }

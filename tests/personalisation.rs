@@ -1,0 +1,209 @@
+//! `dipir-concepts` and `dipir-lora` as a user runs them, on a small model in
+//! the layout of Stable Diffusion.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use dipir_imaging::file::write_png;
+use dipir_imaging::raster::{DisplayImage, Raster};
+use glam::Vec3;
+use serde_json::Value;
+use tempfile::TempDir;
+
+const CONCEPTS: &str = env!("CARGO_BIN_EXE_dipir-concepts");
+const LORA: &str = env!("CARGO_BIN_EXE_dipir-lora");
+
+/// A photograph and a configuration for the model `family`.
+fn project(family: &str) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let (width, height) = (36, 24);
+    let pixels = (0..width * height)
+        .map(|n| Vec3::new((n % width) as f32 / 36.0, (n / width) as f32 / 24.0, 0.5))
+        .collect();
+    let photo = DisplayImage(Raster::from_pixels(width, height, pixels));
+    write_png(folder.path().join("background.png"), &photo).unwrap();
+    let model = PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+        .join("lib/diffusion/tests/references")
+        .join(family);
+    let config = format!(
+        "[model]\npath = {model:?}\n\
+         [scene]\nbackground = \"background.png\"\nclass = \"toy\"\n\
+         [concepts]\ncount = 3\nsteps = 2\n\
+         [lora]\nsteps = 3\nlearn_word = true\nrecompute = false\n"
+    );
+    fs::write(folder.path().join("pipeline.toml"), config).unwrap();
+    folder
+}
+
+fn command(folder: &Path, executable: &str, args: &[&str]) -> Command {
+    let mut command = Command::new(executable);
+    command
+        .args(args)
+        .current_dir(folder)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
+    command
+}
+
+/// Runs to the end and returns what `--json` printed.
+#[track_caller]
+fn run(folder: &Path, executable: &str, args: &[&str]) -> Value {
+    let output: Output = command(folder, executable, args)
+        .arg("--json")
+        .output()
+        .unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{stderr}");
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// Every file below a stage's folder but `stage.json`, which holds times.
+fn artifacts(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut files = vec![];
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            files.extend(artifacts(&path));
+        } else if path.file_name().unwrap() != "stage.json" {
+            files.push((path.clone(), fs::read(&path).unwrap()));
+        }
+    }
+    files.sort();
+    files
+}
+
+#[test]
+fn concepts_and_lora_run_on_every_kind_of_model() {
+    for family in ["sd15", "sd21", "inpaint"] {
+        let folder = project(family);
+        let path = |name: &str| folder.path().join("out").join(name);
+        assert_eq!(run(folder.path(), CONCEPTS, &[])["made"], 3);
+        let list: Value =
+            serde_json::from_slice(&fs::read(path("concepts/concepts.json")).unwrap()).unwrap();
+        assert_eq!(list["concepts"].as_array().unwrap().len(), 3);
+        assert!(
+            list["concepts"][0]["prompt"]
+                .as_str()
+                .unwrap()
+                .contains("toy")
+        );
+        for name in [
+            "concepts/images/0002.png",
+            "concepts/latents.safetensors",
+            "concepts/stage.json",
+        ] {
+            assert!(path(name).is_file(), "{family}: {name}");
+        }
+        let done = run(folder.path(), LORA, &["--set", "lora.sample_every=3"]);
+        assert_eq!(
+            (&done["steps"], &done["resumed_at"]),
+            (&3.into(), &0.into())
+        );
+        for name in [
+            "lora/lora.safetensors",
+            "lora/lora_kohya.safetensors",
+            "lora/word.safetensors",
+            "lora/training.json",
+            "lora/samples/000003.png",
+            "lora/stage.json",
+        ] {
+            assert!(path(name).is_file(), "{family}: {name}");
+        }
+        assert!(
+            !path("lora-checkpoints").exists(),
+            "checkpoints go when the result is there"
+        );
+    }
+}
+
+#[test]
+fn more_concepts_begin_with_the_earlier_ones_and_take_them_from_the_cache() {
+    let folder = project("sd15");
+    run(folder.path(), CONCEPTS, &[]);
+    let first = artifacts(&folder.path().join("out/concepts/images"));
+    let done = run(folder.path(), CONCEPTS, &["--set", "concepts.count=5"]);
+    assert_eq!((&done["made"], &done["reused"]), (&2.into(), &3.into()));
+    let all = artifacts(&folder.path().join("out/concepts/images"));
+    assert_eq!(all[..3], first[..]);
+    // An image that is missing from the cache, as after a kill, comes back the same.
+    let cache = fs::read_dir(folder.path().join("out/concepts-cache"))
+        .unwrap()
+        .next()
+        .unwrap()
+        .unwrap();
+    fs::remove_file(cache.path().join("0001.safetensors")).unwrap();
+    let done = run(folder.path(), CONCEPTS, &["--set", "concepts.count=5"]);
+    assert_eq!((&done["made"], &done["reused"]), (&1.into(), &4.into()));
+    assert_eq!(artifacts(&folder.path().join("out/concepts/images")), all);
+    // Another seed is another cache.
+    assert_eq!(run(folder.path(), CONCEPTS, &["--seed", "1"])["reused"], 0);
+}
+
+#[test]
+fn a_killed_lora_run_resumes_to_the_same_bytes() {
+    let folder = project("sd15");
+    run(folder.path(), CONCEPTS, &[]);
+    let args = ["--set", "lora.steps=60", "--set", "lora.checkpoint_every=1"];
+    let mut child = command(folder.path(), LORA, &args).spawn().unwrap();
+    let checkpoints = folder.path().join("out/lora-checkpoints");
+    let deadline = Instant::now() + Duration::from_secs(60);
+    let written = || {
+        let mut folders = fs::read_dir(&checkpoints).into_iter().flatten().flatten();
+        folders.any(|f| f.path().join("checkpoint.safetensors").is_file())
+    };
+    while !written() {
+        assert!(Instant::now() < deadline && child.try_wait().unwrap().is_none());
+        std::thread::yield_now();
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!folder.path().join("out/lora").exists());
+    let done = run(folder.path(), LORA, &args);
+    assert!(done["resumed_at"].as_u64().unwrap() > 0, "{done}");
+    let resumed = artifacts(&folder.path().join("out/lora"));
+    let done = run(folder.path(), LORA, &args);
+    assert_eq!(done["resumed_at"], 0);
+    assert!(
+        artifacts(&folder.path().join("out/lora")) == resumed,
+        "the resumed run has other bytes"
+    );
+}
+
+#[test]
+fn what_is_missing_or_impossible_is_said_with_a_remedy() {
+    let folder = project("sd15");
+    let fails = |executable: &str, args: &[&str], code: i32, part: &str| {
+        let output = command(folder.path(), executable, args).output().unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(code), "{stderr}");
+        assert!(stderr.contains(part), "{part:?} is not in: {stderr}");
+        assert!(output.stdout.is_empty());
+    };
+    fails(LORA, &[], 1, "dipir-concepts");
+    fails(
+        CONCEPTS,
+        &["--set", "model.path=nowhere"],
+        1,
+        "model.path = \"nowhere\"",
+    );
+    fails(
+        CONCEPTS,
+        &["--set", "model.precision=f8"],
+        2,
+        "f32, bf16, f16",
+    );
+    fails(CONCEPTS, &["--set", "concepts.guidence=3"], 2, "guidance");
+    fails(CONCEPTS, &["--set", "concepts.size=15"], 1, "multiples of");
+    fails(
+        CONCEPTS,
+        &["--set", "pipeline.device=tpu"],
+        2,
+        "cpu, cuda:N, auto",
+    );
+    fails(LORA, &["--set", "lora.min_crop=0"], 2, "above 0, up to 1");
+    // Without concept preservation no concepts are needed.
+    run(folder.path(), LORA, &["--set", "concepts.count=0"]);
+}
