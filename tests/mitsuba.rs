@@ -19,6 +19,7 @@ use dipir_render::adaptive::Stop;
 use dipir_render::bsdf::features::{PLAIN_GGX, SPECULAR};
 use dipir_render::counters::RayCounts;
 use dipir_render::foreground::{PathContext, PathStart};
+use dipir_render::light::SceneLight;
 use dipir_render::render::{Renderer, Settings, Simulation};
 
 use dipir_scene::camera::Camera;
@@ -104,9 +105,10 @@ fn foreground<const F: u32>(
     samples: u32,
 ) -> Raster<Vec4> {
     let world = renderer.world(F).unwrap();
+    let light = light.on_object();
     let path = PathContext {
         world: &world,
-        light,
+        light: &light,
         photo: None,
         max_depth: DEPTH,
         start: PathStart::Camera,

@@ -1,7 +1,10 @@
 //! The stages behind the executables: each a function from a session to a folder of artifacts.
 pub mod background;
 pub mod composite;
+pub mod concepts;
 pub mod light;
+pub mod lora;
+pub mod model;
 pub mod scene;
 
 use std::ops::ControlFlow;

@@ -511,7 +511,7 @@ fn tensor_start(bytes: &[u8], name: &str) -> usize {
     8 + header + json[name]["data_offsets"][0].as_u64().expect("a number") as usize
 }
 
-fn replace(bytes: &mut Vec<u8>, from: &str, to: &str) {
+fn replace(bytes: &mut [u8], from: &str, to: &str) {
     assert_eq!(from.len(), to.len());
     let at = bytes
         .windows(from.len())
