@@ -107,7 +107,7 @@ mod tests {
         table.row(["long".into(), "1234567".into()]);
         assert_eq!(
             table.render(),
-            "  name    count\n  a             1\n  long    1234567\n"
+            "  name    count\n  a           1\n  long  1234567\n"
         );
     }
 }

@@ -340,7 +340,7 @@ pub fn plan<L: SceneLight>(
 ) -> Result<EffectsPlan, RenderError> {
     let scene = renderer.scene();
     let mut plan = EffectsPlan::everything(scene, settings);
-    plan.tolerance = f64::from(config.tolerance());
+    plan.tolerance = config.tolerance();
     for effect in Effect::ALL {
         if absence(scene, settings, effect).is_none() {
             match switch(config, effect) {

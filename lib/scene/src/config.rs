@@ -149,7 +149,7 @@ macro_rules! effects_config {
             pub mode: EffectsMode,
             /// Display-referred RMSE that may be left out, 0.002 by default.
             #[serde(skip_serializing_if = "Option::is_none")]
-            pub tolerance: Option<f32>,
+            pub tolerance: Option<f64>,
             $(
                 #[doc = $what]
                 #[serde(skip_serializing_if = "Option::is_none")]
@@ -187,10 +187,10 @@ effects_config! {
 
 impl EffectsConfig {
     /// Default of [`tolerance`](Self::tolerance): half an 8-bit step.
-    pub const DEFAULT_TOLERANCE: f32 = 0.002;
+    pub const DEFAULT_TOLERANCE: f64 = 0.002;
 
     /// Display-referred RMSE that may be left out.
-    pub fn tolerance(&self) -> f32 {
+    pub fn tolerance(&self) -> f64 {
         self.tolerance.unwrap_or(Self::DEFAULT_TOLERANCE)
     }
 }
