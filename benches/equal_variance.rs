@@ -2,8 +2,8 @@
 //! which runs the same scene through Mitsuba 3.
 //!
 //! `export DIR` writes the scene's mesh and sky for the other renderer; `render SAMPLES SEEDS
-//! MATERIAL` prints one line of JSON: seconds of each render and the mean variance of the two
-//! layers. Without arguments (plain `cargo bench`) it renders a few seeds.
+//! MATERIAL` prints one line of JSON: seconds of each render, by the clock and of all cores together,
+//! and the mean variance of the two layers. Without arguments (plain `cargo bench`) it renders a few seeds.
 use std::f32::consts::PI;
 use std::io::Write;
 use std::ops::ControlFlow;
@@ -124,6 +124,16 @@ fn variance(films: &[Film], layer: impl Fn(&Film, usize) -> Vec3) -> f64 {
     (0..pixels).map(of_pixel).sum::<f64>() / pixels as f64
 }
 
+/// Processor time of this process so far, of all threads, in seconds; other load on the machine
+/// hardly shows in it. Linux only.
+fn cpu_time() -> f64 {
+    let text = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // Fields 14 and 15, user and system time in hundredths; field 2 is the name in parentheses.
+    let fields = text.rsplit(')').next().unwrap_or("").split_whitespace();
+    let ticks = fields.skip(11).take(2).map(|f| f.parse().unwrap_or(f64::NAN));
+    ticks.sum::<f64>() / 100.0
+}
+
 fn render(samples: u32, seeds: u64, material: &str) {
     let scene = scene(material == "metal");
     let renderer = Renderer::new(&scene);
@@ -135,24 +145,26 @@ fn render(samples: u32, seeds: u64, material: &str) {
         proxy_occlusion: false,
         light_on_proxy: None,
     };
-    let (mut films, mut seconds) = (Vec::new(), Vec::new());
+    let (mut films, mut seconds, mut cpu_seconds) = (Vec::new(), Vec::new(), Vec::new());
     for seed in 0..seeds {
         let settings = Settings {
             seed,
             stop: Stop::Samples(samples),
             ..Default::default()
         };
-        let start = Instant::now();
+        let (start, cpu_start) = (Instant::now(), cpu_time());
         let mut go_on = |_: &Progress| ControlFlow::Continue(());
         let rendered = renderer
             .render(&light, &simulation, &settings, &mut go_on)
             .expect("a valid scene renders");
         seconds.push(start.elapsed().as_secs_f64());
+        cpu_seconds.push(cpu_time() - cpu_start);
         films.push(rendered.film);
     }
     println!(
-        "{{\"seconds\": {:.4}, \"foreground\": {:e}, \"shadow\": {:e}}}",
+        "{{\"seconds\": {:.4}, \"cpu_seconds\": {:.4}, \"foreground\": {:e}, \"shadow\": {:e}}}",
         median(&seconds).unwrap_or(f64::NAN),
+        cpu_seconds.iter().sum::<f64>() / seeds as f64,
         variance(&films, |f, p| f.object.pixels()[p]),
         variance(&films, |f, p| f.shadow.pixels()[p]
             * (1.0 - f.alpha.pixels()[p])),

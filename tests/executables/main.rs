@@ -2,6 +2,7 @@
 mod bad_input;
 mod inspection;
 mod interruption;
+mod large;
 mod project;
 mod reproducibility;
 mod stages;
