@@ -130,7 +130,10 @@ fn cpu_time() -> f64 {
     let text = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
     // Fields 14 and 15, user and system time in hundredths; field 2 is the name in parentheses.
     let fields = text.rsplit(')').next().unwrap_or("").split_whitespace();
-    let ticks = fields.skip(11).take(2).map(|f| f.parse().unwrap_or(f64::NAN));
+    let ticks = fields
+        .skip(11)
+        .take(2)
+        .map(|f| f.parse().unwrap_or(f64::NAN));
     ticks.sum::<f64>() / 100.0
 }
 

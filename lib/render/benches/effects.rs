@@ -1,16 +1,18 @@
-//! What planning saves: nine kinds of scene with everything and as planned, as a table in
-//! Markdown. `cargo bench -p dipir-render --bench effects`
+//! What planning saves: ten kinds of scene with every effect simulated, whether the scene has it or
+//! not, and as planned, as a table in Markdown. `cargo bench -p dipir-render --bench effects`
 use std::ops::ControlFlow;
 use std::time::Instant;
 
 use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_render::adaptive::Stop;
 use dipir_render::effects::{EffectsPlan, plan};
-use dipir_render::render::{Rendered, Renderer, Settings};
+use dipir_render::features::ALL;
+use dipir_render::render::{Rendered, Renderer, Settings, Simulation};
+use dipir_render::shadow::LightOnProxy;
 use dipir_render::shapes::{append, icosphere, quad, torus_knot};
 use dipir_scene::camera::Camera;
 use dipir_scene::config::EffectsConfig;
-use dipir_scene::material::{AlphaMode, Material, Transmission};
+use dipir_scene::material::{AlphaMode, Clearcoat, Material, Transmission};
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
@@ -18,7 +20,7 @@ use glam::{Mat3, Vec2, Vec3, Vec4};
 
 const SIZE: u32 = 256;
 const SAMPLES: u32 = 32;
-const REPEATS: usize = 5;
+const REPEATS: usize = 3;
 
 fn camera() -> Camera {
     let position = Vec3::new(0.0, 2.0, 4.0);
@@ -104,6 +106,17 @@ fn scenes() -> Vec<(&'static str, Scene)> {
         }),
         ..matte(0.9)
     };
+    let faint = Material {
+        emissive: Vec3::splat(1e-3),
+        clearcoat: Some(Clearcoat {
+            factor: 0.01,
+            factor_texture: None,
+            roughness: 0.1,
+            roughness_texture: None,
+            normal_texture: None,
+        }),
+        ..matte(0.2)
+    };
     let sheet = quad(Vec3::new(-0.5, 0.2, 0.0), Vec3::X, Vec3::Y);
     let mut room = quad(
         Vec3::new(-9.0, 0.0, 9.0),
@@ -121,12 +134,17 @@ fn scenes() -> Vec<(&'static str, Scene)> {
         ("half-transparent", scene(sheet, veil, ground())),
         ("glass", scene(ball(), glass, ground())),
         ("no proxy", scene(knot(), matte(0.5), Proxy::None)),
+        ("faint coat and glow", scene(knot(), faint, ground())),
         ("proxy mesh", scene(ball(), matte(0.5), Proxy::Mesh(room))),
     ]
 }
 
 /// The best time of a few, in seconds, and the picture.
-fn render(renderer: &Renderer, light: &EnvironmentSampler, plan: &EffectsPlan) -> (f64, Rendered) {
+fn render(
+    renderer: &Renderer,
+    light: &EnvironmentSampler,
+    simulation: &Simulation,
+) -> (f64, Rendered) {
     let settings = Settings {
         stop: Stop::Samples(SAMPLES),
         ..Settings::default()
@@ -135,7 +153,7 @@ fn render(renderer: &Renderer, light: &EnvironmentSampler, plan: &EffectsPlan) -
     for _ in 0..REPEATS {
         let start = Instant::now();
         let rendered = renderer
-            .render(light, &plan.simulation(), &settings, &mut |_| {
+            .render(light, simulation, &settings, &mut |_| {
                 ControlFlow::Continue(())
             })
             .expect("renders");
@@ -163,9 +181,18 @@ fn main() {
         )
         .expect("plans");
         let planning = start.elapsed().as_secs_f64();
-        let everything = EffectsPlan::everything(&scene, &settings);
+        let everything = Simulation {
+            features: ALL,
+            shadow: true,
+            proxy_occlusion: true,
+            light_on_proxy: Some(LightOnProxy {
+                emission: true,
+                bounce: true,
+            }),
+            ..EffectsPlan::everything(&scene, &settings).simulation()
+        };
         let (slow, all) = render(&renderer, &light, &everything);
-        let (fast, few) = render(&renderer, &light, &planned);
+        let (fast, few) = render(&renderer, &light, &planned.simulation());
         println!(
             "| {name} | {} | {:.5} | {planning:.2} | {slow:.3} | {fast:.3} | {:.0}% | {:.0}% |",
             planned.simulation().max_depth,

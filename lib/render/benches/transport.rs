@@ -6,9 +6,15 @@
 //! the same numbers in `FILE.csv`. Errors of pictures come from a small picture of the scene,
 //! against a record with many more samples and texels and other random numbers. Times, bytes and
 //! the gradient's noise come from 384 x 256 pixels; the noise is half the squared difference of
-//! two records, so it lacks what a coarse map leaves out. Without `--bench`, as tests run it, one small row proves that it works.
+//! two records, so it lacks what a coarse map leaves out. Without `--bench`, as tests run it, one
+//! small row proves that it works.
+//!
+//! `export DIR` and `iteration` serve `benches/iteration.py`, which times an iteration of Mitsuba 3
+//! beside ours.
 use std::fmt::Write as _;
+use std::io::Write as _;
 use std::ops::ControlFlow;
+use std::path::Path;
 use std::time::Instant;
 
 use dipir_light::environment::EnvironmentMap;
@@ -108,6 +114,10 @@ struct Outcome {
 }
 
 fn record(scene: &Scene, row: &Row, seed: u64) -> Transport {
+    record_with(scene, row, seed, simulation())
+}
+
+fn record_with(scene: &Scene, row: &Row, seed: u64, simulation: Simulation) -> Transport {
     let light = light(row.environment);
     let settings = RecordSettings {
         environment: row.environment,
@@ -116,7 +126,7 @@ fn record(scene: &Scene, row: &Row, seed: u64) -> Transport {
         precision: row.precision,
         seed,
         light: row.foreseen.then_some(&light),
-        ..RecordSettings::new(simulation())
+        ..RecordSettings::new(simulation)
     };
     Transport::record(&Renderer::new(scene), &settings, &mut |_| {
         ControlFlow::Continue(())
@@ -231,6 +241,64 @@ fn measure(row: &Row, timed: [u32; 2], reference: &Judged) -> Outcome {
     }
 }
 
+/// The scene of `iteration.py`: the same, but diffuse, which both renderers agree about.
+fn diffuse_scene() -> Scene {
+    let mut scene = scene(TIMED);
+    scene.materials[0].metallic = 0.0;
+    scene.materials[0].roughness = 1.0;
+    scene
+}
+
+/// Writes the mesh and the light for the other renderer.
+fn export(folder: &Path) -> std::io::Result<()> {
+    let mesh = diffuse_scene().mesh;
+    let mut out = std::io::BufWriter::new(std::fs::File::create(folder.join("mesh.obj"))?);
+    for p in &mesh.positions {
+        writeln!(out, "v {} {} {}", p.x, p.y, p.z)?;
+    }
+    for n in &mesh.normals {
+        writeln!(out, "vn {} {} {}", n.x, n.y, n.z)?;
+    }
+    for [a, b, c] in mesh.indices {
+        let [a, b, c] = [a + 1, b + 1, c + 1];
+        writeln!(out, "f {a}//{a} {b}//{b} {c}//{c}")?;
+    }
+    out.flush()?;
+    light(ENVIRONMENT)
+        .write(folder.join("light.exr"))
+        .map_err(std::io::Error::other)
+}
+
+/// Prints as JSON what an iteration on the diffuse scene costs and how noisy its gradient is.
+fn iteration(samples: u32) {
+    let row = Row {
+        samples,
+        environment: ENVIRONMENT,
+        precision: Precision::Half,
+        foreseen: true,
+    };
+    let simulation = Simulation {
+        features: 0,
+        ..simulation()
+    };
+    let scene = diffuse_scene();
+    let start = Instant::now();
+    let transport = record_with(&scene, &row, 1, simulation);
+    let record_s = start.elapsed().as_secs_f64();
+    let one = judge(&transport).gradient;
+    let other = judge(&record_with(&scene, &row, 3, simulation)).gradient;
+    let noise = |a: &[Vec3], b: &[Vec3]| relative_error(a, b) / 2f64.sqrt();
+    let regions = |gradient: &[Vec3]| coarser(gradient, ENVIRONMENT, [16, 8]);
+    let milliseconds = time(|| judge(&transport));
+    println!(
+        "{{\"record_s\": {record_s:.3}, \"iteration_ms\": {milliseconds:.3}, \"bytes\": {}, \
+         \"texel_noise\": {:e}, \"region_noise\": {:e}}}",
+        transport.bytes().0 + transport.bytes().1,
+        noise(&one, &other),
+        noise(&regions(&one), &regions(&other)),
+    );
+}
+
 fn rows() -> Vec<Row> {
     let row = |samples, environment, precision, foreseen| Row {
         samples,
@@ -253,6 +321,16 @@ fn rows() -> Vec<Row> {
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let words: Vec<&str> = arguments
+        .iter()
+        .map(String::as_str)
+        .filter(|a| *a != "--bench")
+        .collect();
+    match words.as_slice() {
+        ["export", folder] => return export(Path::new(folder)).expect("a writable folder"),
+        ["iteration", samples] => return iteration(samples.parse().expect("samples per pixel")),
+        _ => (),
+    }
     let timing = arguments.iter().any(|a| a == "--bench");
     let file = arguments.iter().find(|a| a.ends_with(".csv"));
     let (converged, fine, timed) = match timing {

@@ -98,9 +98,9 @@ const DIMENSIONS_PER_VERTEX: u32 = 4;
 
 /// Surfaces are at least this rough to paths that begin on the proxy. A light of half a degree that
 /// a polished surface throws onto the ground is found by one path in thousands, which leaves
-/// specks; blurred over about 20 degrees the same energy arrives without them. Known as path
-/// regularisation [Kaplanyan and Dachsbacher 2013].
-pub const MIN_CAUSTIC_ROUGHNESS: f32 = 0.35;
+/// specks; blurred by a lobe whose peak is no more than a few times a diffuse surface's, the same
+/// energy arrives without them. Known as path regularisation [Kaplanyan and Dachsbacher 2013].
+pub const MIN_CAUSTIC_ROUGHNESS: f32 = 0.6;
 
 /// Paths keep at least this chance of going on, so that survivors' weights stay bounded.
 const MIN_SURVIVAL: f32 = 0.1;

@@ -424,9 +424,9 @@ fn a_mirror_ball_in_the_sun_throws_its_light_onto_the_ground_without_specks() {
             });
         }
     }
-    // The ball is not infinitely far away: it reflects from up to r / d = 7% nearer, and a
-    // roughness of 0.35 blurs a pattern that is nearly even.
-    assert!((found / wanted - 1.1).abs() < 0.1, "{found} {wanted}");
+    // The ball is not infinitely far away: it reflects from up to r / d = 7% nearer, which is 14%
+    // more. A roughness of 0.6 moves light within the pattern, which is even only for a mirror.
+    assert!((found / wanted - 1.14).abs() < 0.2, "{found} {wanted}");
 }
 
 #[test]
