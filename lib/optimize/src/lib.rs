@@ -22,6 +22,7 @@ pub mod lighting;
 pub mod objective;
 pub mod optimization;
 pub mod parameters;
+pub mod recorder;
 pub mod settings;
 pub mod tensors;
 pub mod transport;

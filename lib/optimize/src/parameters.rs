@@ -1,8 +1,11 @@
 //! What is optimised: two sets of lobes, the tone curves and an exposure.
 use std::f64::consts::{PI, TAU};
 
+use dipir_imaging::raster::LinearImage;
 use dipir_imaging::tone::{TONE_PARAMETERS, ToneParameters};
 use dipir_light::gaussian::{LobeGradient, LobeParameters, SphericalGaussian};
+use dipir_light::luminance::luminance_f64;
+use dipir_numerics::sum::Neumaier;
 use glam::DVec3;
 
 use crate::tensors::{Group, Tensor, Tensors};
@@ -236,6 +239,22 @@ fn lobes_vjp(
         .map(|(l, g)| exposed(l, log_exposure).lobe_vjp(g))
         .collect()
 }
+
+/// Share of light that surfaces of everyday scenes reflect, about: mid-grey is .18, white paper
+/// .8, and more of a photograph is dark than white.
+const USUAL_ALBEDO: f64 = 0.3;
+
+/// The radiance of uniform light under which a scene like `background` would look as bright as
+/// it does on average: what is known before anything is optimised.
+pub fn ambient_of(background: &LinearImage) -> f64 {
+    let pixels = background.0.pixels();
+    let sum: Neumaier = pixels.iter().map(|p| luminance_f64(p.as_dvec3())).collect();
+    (sum.total() / pixels.len().max(1) as f64 / USUAL_ALBEDO).max(LEAST_AMBIENT)
+}
+
+/// An all but black photograph still needs light to start from: gradients of logarithms vanish
+/// with the light.
+const LEAST_AMBIENT: f64 = 1e-3;
 
 /// `integral of exp(-(1 - cos) / sigma^2)` over the sphere.
 fn solid_angle(sigma: f64) -> f64 {

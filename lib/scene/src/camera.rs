@@ -48,6 +48,21 @@ impl Camera {
     }
 }
 
+impl Camera {
+    /// The same view with `resolution` pixels, which need not have the same shape: the whole image
+    /// is stretched.
+    pub fn scaled(&self, resolution: [u32; 2]) -> Self {
+        let side = |k: usize| resolution[k] as f32 / self.resolution[k] as f32;
+        let scale = Vec2::new(side(0), side(1));
+        Self {
+            focal_px: self.focal_px * scale,
+            principal_px: self.principal_px * scale,
+            resolution,
+            ..*self
+        }
+    }
+}
+
 /// How wide the camera sees.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FieldOfView {
