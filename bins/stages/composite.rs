@@ -1,6 +1,6 @@
 //! The composite stage: the object at full quality, its shadow, and the layers of both.
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use dipir_cli::session::{Session, duration};
@@ -8,29 +8,27 @@ use dipir_imaging::composite::composite;
 use dipir_imaging::file::write_png;
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentSampler;
 use dipir_pipeline::config::{Config, Quality};
-use dipir_pipeline::fingerprint::{StaleReason, parameter_changes};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_render::adaptive::Stop;
-use dipir_render::effects::EffectsPlan;
 use dipir_render::film::Film;
+use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings};
-use dipir_scene::config::SceneConfig;
-use dipir_scene::description::SceneDescription;
-use dipir_scene::scene::LoadedScene;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::light::{self, Light};
-use crate::{interruption, scene};
+use crate::interruption;
+use crate::light::{self, Light, Recovered};
+use crate::scene_folder::SceneFolder;
 
 /// Name of the stage and of its folder.
 pub const STAGE: &str = "composite";
 /// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// The `[composite]` table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -48,16 +46,16 @@ pub struct CompositeTable {
     pub time_budget_s: Option<f64>,
     /// Most samples in any pixel.
     pub max_samples: Option<u32>,
-    /// Curve on the object's light before it is laid over the photograph.
-    pub tone: Tone,
+    /// Curve on the object's light before it is laid over the photograph. By default the recovered
+    /// curves with the recovered light, and none with a map.
+    pub tone: Option<Tone>,
 }
 
 /// A curve on the object's light.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Tone {
     /// None: the photograph is linear light, exposed.
-    #[default]
     None,
     /// `x / (1 + x)` on every channel, for photographs whose highlights are compressed.
     Reinhard,
@@ -153,10 +151,16 @@ pub struct Done {
 
 /// Everything that the stage reads.
 struct Inputs {
-    scene_folder: PathBuf,
-    loaded: LoadedScene,
-    effects: EffectsPlan,
+    scene: SceneFolder,
     gbuffer: Layers,
+}
+
+/// What lights the object.
+enum Source {
+    /// The map of `[composite] environment`.
+    Map(Light),
+    /// The lobes that the light stage recovered.
+    Recovered(Recovered),
 }
 
 /// Runs the stage.
@@ -169,21 +173,20 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     table.check(&session.config)?;
     let inputs = read(session)?;
     let light = match light::known(session, &table)? {
-        Some(light) => light,
-        None => {
-            return Err(light::missing(
-                &session.stage_folder("light").join("lighting.json"),
-            ));
-        }
+        Some(light) => Source::Map(light),
+        None => Source::Recovered(light::recovered(session, &table, &inputs.scene.manifest)?),
     };
     let stop = table.stop(session.pipeline.quality);
     let plan = stage_plan(session, &table, stop, &inputs, &light)?;
     let folder = session.stage_folder(STAGE);
     let mut writer = session.begin(plan)?;
     let rendered = render(session, &table, stop, &inputs, &light)?;
-    let layers = Composite::new(&inputs, rendered.film, table.tone)?;
+    let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light))?;
     let png = writer.output("picture", "composite.png")?;
-    write_png(png, &inputs.loaded.photo.transfer.encode(&layers.beauty))?;
+    write_png(
+        png,
+        &inputs.scene.loaded.photo.transfer.encode(&layers.beauty),
+    )?;
     let exr = writer.output("layers", "composite.exr")?;
     layers.to_layers(&inputs.gbuffer)?.write_exr(exr)?;
     writer.set_estimated_error(rendered.error.upper_95);
@@ -200,48 +203,9 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
 
 /// Reads what the scene stage wrote and the files that it names.
 fn read(session: &Session) -> anyhow::Result<Inputs> {
-    let scene_folder = session.stage_folder(scene::STAGE);
-    let manifest = Manifest::read(&scene_folder, scene::EXECUTABLE)?;
-    warn_of_other_settings(session, &manifest)?;
-    let description = SceneDescription::read(&manifest.output(&scene_folder, "scene")?)?;
-    let effects: EffectsPlan = read_json(&manifest.output(&scene_folder, "effects")?)?;
-    let gbuffer = Layers::read_exr(manifest.output(&scene_folder, "gbuffer")?)?;
-    let loaded = description.load(&session.config.base_dir())?;
-    Ok(Inputs {
-        scene_folder,
-        loaded,
-        effects,
-        gbuffer,
-    })
-}
-
-/// The scene's folder may have been made before the last edit of `[scene]`.
-fn warn_of_other_settings(session: &Session, manifest: &Manifest) -> anyhow::Result<()> {
-    let config: SceneConfig = session.config.table("scene")?;
-    let was = json!({"scene": manifest.params["scene"]});
-    let now = json!({"scene": serde_json::to_value(config)?});
-    let changes: Vec<String> = parameter_changes(&was, &now)
-        .iter()
-        .map(StaleReason::to_string)
-        .collect();
-    if !changes.is_empty() {
-        session.warn(&format!(
-            "the scene was set up with other settings ({}); run dipir-scene again to use the new ones",
-            changes.join(", ")
-        ));
-    }
-    Ok(())
-}
-
-fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> anyhow::Result<T> {
-    let text = std::fs::read_to_string(path)?;
-    serde_json::from_str(&text).map_err(|e| {
-        anyhow::anyhow!(
-            "{}: {e}; it was written by another version: run {} again",
-            path.display(),
-            scene::EXECUTABLE
-        )
-    })
+    let scene = SceneFolder::read(session)?;
+    let gbuffer = Layers::read_exr(scene.manifest.output(&scene.folder, "gbuffer")?)?;
+    Ok(Inputs { scene, gbuffer })
 }
 
 fn stage_plan(
@@ -249,10 +213,14 @@ fn stage_plan(
     table: &CompositeTable,
     stop: Stop,
     inputs: &Inputs,
-    light: &Light,
+    light: &Source,
 ) -> anyhow::Result<StagePlan> {
+    let light_params = match light {
+        Source::Map(light) => &light.params,
+        Source::Recovered(light) => &light.params,
+    };
     let params = json!({
-        "light": light.params,
+        "light": light_params,
         "tone": table.tone,
         "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
         "stop": match stop {
@@ -262,16 +230,19 @@ fn stage_plan(
         },
     });
     let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
-    for name in ["scene.json", "effects.json", "gbuffer.exr"] {
-        let location = inputs.scene_folder.join(name);
-        let role = name.split('.').next().unwrap_or(name);
-        plan.input(role, &Path::new(scene::STAGE).join(name), &location)?;
-    }
-    for input in &inputs.loaded.inputs {
-        plan.input(&input.role, &input.path, &input.location)?;
-    }
-    if let Some((path, location)) = &light.file {
-        plan.input("environment", path, location)?;
+    let files = ["scene.json", "effects.json", "gbuffer.exr"];
+    inputs.scene.add_inputs(&mut plan, &files)?;
+    match light {
+        Source::Map(light) => {
+            if let Some((path, location)) = &light.file {
+                plan.input("environment", path, location)?;
+            }
+        }
+        Source::Recovered(light) => {
+            for (role, path, location) in &light.files {
+                plan.input(role, path, location)?;
+            }
+        }
     }
     Ok(plan)
 }
@@ -281,24 +252,41 @@ fn render(
     table: &CompositeTable,
     stop: Stop,
     inputs: &Inputs,
-    light: &Light,
+    light: &Source,
 ) -> anyhow::Result<Rendered> {
-    let photo = &inputs.loaded.photo;
+    match light {
+        Source::Map(light) => {
+            let map = EnvironmentSampler::new(light.map.clone());
+            render_under(session, table, stop, inputs, &map)
+        }
+        Source::Recovered(light) => render_under(session, table, stop, inputs, &light.lobes),
+    }
+}
+
+fn render_under<L: SceneLight>(
+    session: &Session,
+    table: &CompositeTable,
+    stop: Stop,
+    inputs: &Inputs,
+    light: &L,
+) -> anyhow::Result<Rendered> {
+    let loaded = &inputs.scene.loaded;
+    let photo = &loaded.photo;
     let settings = Settings {
         seed: session.pipeline.seed,
         stop,
         max_samples: table.max_samples.unwrap_or(MAX_SAMPLES),
         background: Some(&photo.image),
         transfer: photo.transfer,
-        occluders: inputs.loaded.occluders.as_ref(),
+        occluders: loaded.occluders.as_ref(),
         ..Settings::default()
     };
-    let renderer = Renderer::new(&inputs.loaded.scene);
+    let renderer = Renderer::new(&loaded.scene);
     let progress = session.progress("composite");
     let rendered = renderer
         .render(
-            &EnvironmentSampler::new(light.map.clone()),
-            &inputs.effects.simulation(),
+            light,
+            &inputs.scene.effects.simulation(),
             &settings,
             &mut |state| {
                 progress.set(state.fraction);
@@ -336,17 +324,14 @@ struct Composite<'a> {
 }
 
 impl<'a> Composite<'a> {
-    fn new(inputs: &'a Inputs, film: Film, tone: Tone) -> anyhow::Result<Self> {
-        let background = &inputs.loaded.photo.image;
-        let object = match tone {
-            Tone::None => film.object,
-            Tone::Reinhard => toned(&film.object, &film.alpha),
-        };
+    fn new(inputs: &'a Inputs, film: Film, curve: &Curve) -> anyhow::Result<Self> {
+        let background = &inputs.scene.loaded.photo.image;
+        let (object, shadow) = curve.apply(film.object, &film.alpha, film.shadow);
         // Stored in half precision: rounded before they are put together, so that whoever does it
         // again from the file gets the same picture.
         let object = LinearImage(object.map(|v| half_vec(*v)));
         let alpha = film.alpha.map(|a| half::f16::from_f32(*a).to_f32());
-        let shadow = LinearImage(film.shadow.map(|v| half_vec(*v)));
+        let shadow = LinearImage(shadow.map(|v| half_vec(*v)));
         let beauty = composite(background, &object, &alpha, &shadow)?;
         Ok(Self {
             background,
@@ -382,17 +367,45 @@ fn half_vec(v: Vec3) -> Vec3 {
     Vec3::new(half(v.x), half(v.y), half(v.z))
 }
 
-/// Reinhard's curve on the object's own colour, which is `rgb / alpha`.
-fn toned(object: &Raster<Vec3>, alpha: &Raster<f32>) -> Raster<Vec3> {
-    let pixels = object.pixels().iter().zip(alpha.pixels());
-    let toned = pixels.map(|(&rgb, &a)| match a > 0.0 {
-        true => {
-            let c = rgb / a;
-            a * c / (1.0 + c)
+/// What is done to the light of the object and to the shadow before they are laid over the
+/// photograph.
+enum Curve {
+    None,
+    /// On the object's own colour, which is `rgb / alpha`.
+    Reinhard,
+    /// Reinhard and a spline on the object, a spline per channel on the shadow.
+    Recovered(ToneCurves),
+}
+
+impl Curve {
+    /// The table's, else the one that was recovered with the light, else none.
+    fn of(tone: Option<Tone>, light: &Source) -> Self {
+        match (tone, light) {
+            (Some(Tone::None), _) | (None, Source::Map(_)) => Self::None,
+            (Some(Tone::Reinhard), _) => Self::Reinhard,
+            (None, Source::Recovered(light)) => Self::Recovered(light.tone),
         }
-        false => Vec3::ZERO,
-    });
-    Raster::from_pixels(object.width(), object.height(), toned.collect())
+    }
+
+    fn apply(
+        &self,
+        object: Raster<Vec3>,
+        alpha: &Raster<f32>,
+        shadow: Raster<Vec3>,
+    ) -> (Raster<Vec3>, Raster<Vec3>) {
+        let object = LinearImage(object);
+        match self {
+            Self::None => (object.0, shadow),
+            Self::Reinhard => {
+                let curves = ToneCurves::identity();
+                (curves.apply_object(&object, alpha).0, shadow)
+            }
+            Self::Recovered(curves) => (
+                curves.apply_object(&object, alpha).0,
+                curves.apply_shadow(&LinearImage(shadow)).0,
+            ),
+        }
+    }
 }
 
 impl Done {

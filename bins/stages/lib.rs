@@ -5,7 +5,10 @@ pub mod concepts;
 pub mod light;
 pub mod lora;
 pub mod model;
+pub mod optimize;
 pub mod scene;
+pub mod scene_folder;
+pub mod transport;
 
 use std::ops::ControlFlow;
 

@@ -4,11 +4,16 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use dipir_cli::session::Session;
+use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentMap;
-use glam::Vec3;
+use dipir_light::gaussian::{SgMixture, SphericalGaussian};
+use dipir_optimize::lighting::Lighting;
+use dipir_pipeline::manifest::{FILE_NAME, Manifest};
+use glam::{Quat, Vec3};
 use serde_json::{Value, json};
 
 use crate::composite::CompositeTable;
+use crate::optimize;
 
 /// A light and where it came from.
 pub struct Light {
@@ -58,6 +63,77 @@ pub fn known(session: &Session, table: &CompositeTable) -> anyhow::Result<Option
             "rotation_deg": table.rotation_deg,
         }),
     }))
+}
+
+/// A light that the light stage recovered.
+pub struct Recovered {
+    /// The lobes, on the photograph's scale.
+    pub lobes: SgMixture,
+    /// The tone curves that were recovered with it.
+    pub tone: ToneCurves,
+    /// Roles and files, as they are known and where they are.
+    pub files: Vec<(&'static str, PathBuf, PathBuf)>,
+    /// What decides the light beside the files' content.
+    pub params: Value,
+}
+
+/// What the light stage left, exposed and turned; an error that says what to do if there is
+/// nothing. `scene` is the manifest of the scene that is lit.
+pub fn recovered(
+    session: &Session,
+    table: &CompositeTable,
+    scene: &Manifest,
+) -> anyhow::Result<Recovered> {
+    let folder = session.stage_folder(optimize::STAGE);
+    if !folder.join(FILE_NAME).exists() {
+        return Err(missing(&folder.join("lighting.json")));
+    }
+    let manifest = Manifest::read(&folder, optimize::EXECUTABLE)?;
+    warn_of_another_scene(session, &manifest, scene);
+    let lighting_file = manifest.output(&folder, "lighting")?;
+    let tone_file = manifest.output(&folder, "tone")?;
+    let exposure = table.exposure_ev.exp2();
+    let turn = Quat::from_rotation_y(table.rotation_deg.to_radians());
+    let lobes = Lighting::read(&lighting_file)?.exposed_lobes();
+    let lobes = lobes.into_iter().map(|lobe| SphericalGaussian {
+        direction: turn * lobe.direction,
+        radiance: lobe.radiance * exposure,
+        ..lobe
+    });
+    let known_as = |name: &str| Path::new(optimize::STAGE).join(name);
+    Ok(Recovered {
+        lobes: SgMixture::new(lobes.collect()).map_err(|e| {
+            let message = format!(
+                "{} stops make a light that cannot be used: {e}",
+                table.exposure_ev
+            );
+            session.config.invalid("composite.exposure_ev", message)
+        })?,
+        tone: ToneCurves::read_json(&tone_file)?,
+        files: vec![
+            ("lighting", known_as("lighting.json"), lighting_file),
+            ("tone", known_as("tone.json"), tone_file),
+        ],
+        params: json!({
+            "recovered": true,
+            "exposure_ev": table.exposure_ev,
+            "rotation_deg": table.rotation_deg,
+        }),
+    })
+}
+
+/// The light may have been recovered before the scene was set up anew.
+fn warn_of_another_scene(session: &Session, light: &Manifest, scene: &Manifest) {
+    let of = |list: &[dipir_pipeline::manifest::Artifact]| {
+        let found = list.iter().find(|a| a.role == "scene");
+        found.map(|a| a.blake3.clone())
+    };
+    if of(&light.inputs) != of(&scene.outputs) {
+        session.warn(
+            "the light was recovered for another set-up of the scene; run dipir-optimize again to \
+             recover it for this one",
+        );
+    }
 }
 
 /// Irradiance of the pilot light's sun on a surface that faces it; with the sky's, a white

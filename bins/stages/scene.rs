@@ -1,17 +1,20 @@
 //! The scene stage: reads everything once, decides what to simulate, and writes down both.
 use std::fmt;
 use std::path::PathBuf;
+use std::time::Instant;
 
 use dipir_cli::exit::Usage;
 use dipir_cli::interrupt;
-use dipir_cli::session::{Session, duration};
+use dipir_cli::session::{Session, duration, size};
 use dipir_light::environment::EnvironmentSampler;
+use dipir_optimize::settings::{OptimizeTable, Settings as OptimizeSettings};
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_render::effects::{EffectsPlan, plan};
 use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
+use dipir_render::transport::Transport;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::scene::{LoadedScene, Scene};
 use serde_json::{Value, json};
@@ -19,13 +22,14 @@ use serde_json::{Value, json};
 use crate::composite::CompositeTable;
 use crate::interruption;
 use crate::light::{self, Light};
+use crate::transport::{self, Frame};
 
 /// Name of the stage and of its folder.
 pub const STAGE: &str = "scene";
 /// The executable that runs it.
 pub const EXECUTABLE: &str = "dipir-scene";
 /// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// What the stage did.
 pub struct Done {
@@ -35,6 +39,30 @@ pub struct Done {
     triangles: usize,
     materials: usize,
     resolution: [u32; 2],
+    /// Absent where the light is given.
+    record: Option<Record>,
+}
+
+/// The light transport that was recorded.
+struct Record {
+    size: [usize; 2],
+    environment: [usize; 2],
+    samples: u32,
+    bytes: usize,
+    seconds: f64,
+}
+
+impl Record {
+    fn of(transport: &Transport, seconds: f64) -> Self {
+        let (object, shadow) = transport.bytes();
+        Self {
+            size: transport.size(),
+            environment: transport.environment_size(),
+            samples: transport.header().samples,
+            bytes: object + shadow,
+            seconds,
+        }
+    }
 }
 
 /// Runs the stage.
@@ -47,8 +75,13 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     for warning in &loaded.warnings {
         session.warn(warning);
     }
-    let light = light::known(session, &composite)?.unwrap_or_else(light::pilot);
-    let stage_plan = stage_plan(session, &config, &loaded, &light)?;
+    let optimize: OptimizeTable = session.config.table("optimize")?;
+    let optimize = transport::settings(session, &optimize)?;
+    let known = light::known(session, &composite)?;
+    // Where the light is given, nothing is recovered: the record would be made for nobody.
+    let recorded = known.is_none().then_some(&optimize);
+    let light = known.unwrap_or_else(light::pilot);
+    let stage_plan = stage_plan(session, &config, &loaded, &light, recorded)?;
     let folder = session.stage_folder(STAGE);
     let mut writer = session.begin(stage_plan)?;
 
@@ -80,6 +113,17 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     interrupt::check()?;
     let path = writer.output("gbuffer", "gbuffer.exr")?;
     gbuffer.to_layers()?.write_exr(path)?;
+    let record = match recorded {
+        Some(settings) => {
+            let clock = Instant::now();
+            let record = record(session, &loaded, &renderer, &effects, settings)?;
+            record.save(writer.output(transport::ROLE, transport::FILE)?)?;
+            let seconds = clock.elapsed().as_secs_f64();
+            writer.set_timing("transport", seconds);
+            Some(Record::of(&record, seconds))
+        }
+        None => None,
+    };
     if let Some(left_out) = effects.left_out {
         writer.set_estimated_error(left_out);
     }
@@ -91,7 +135,24 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         triangles: loaded.scene.mesh.indices.len(),
         materials: loaded.scene.materials.len(),
         resolution: loaded.scene.camera.resolution,
+        record,
     })
+}
+
+/// Traces how light reaches the picture, for the light stage.
+fn record(
+    session: &Session,
+    loaded: &LoadedScene,
+    renderer: &Renderer,
+    effects: &EffectsPlan,
+    settings: &OptimizeSettings,
+) -> anyhow::Result<Transport> {
+    let frame = Frame::new(loaded, settings.size);
+    let simulation = effects.simulation();
+    let hash = transport::scene_hash(loaded, &simulation)?;
+    let renderer = renderer.with_camera(frame.camera);
+    let record_settings = frame.record_settings(settings, simulation, hash);
+    transport::record(session, &renderer, &record_settings)
 }
 
 fn stage_plan(
@@ -99,8 +160,17 @@ fn stage_plan(
     config: &SceneConfig,
     loaded: &LoadedScene,
     light: &Light,
+    recorded: Option<&OptimizeSettings>,
 ) -> anyhow::Result<StagePlan> {
-    let params = json!({"scene": serde_json::to_value(config)?, "light": light.params});
+    let transport = recorded.map(|s| {
+        json!({
+            "size": s.size, "environment": s.environment, "samples": s.samples,
+            "precision": s.precision, "seed": s.seed,
+        })
+    });
+    let params = json!({
+        "scene": serde_json::to_value(config)?, "light": light.params, "transport": transport,
+    });
     let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
     for input in &loaded.inputs {
         plan.input(&input.role, &input.path, &input.location)?;
@@ -133,6 +203,10 @@ impl Done {
             "resolution": self.resolution,
             "effects": self.effects.effects,
             "max_depth": self.effects.max_depth,
+            "transport": self.record.as_ref().map(|r| json!({
+                "size": r.size, "environment": r.environment, "samples": r.samples,
+                "bytes": r.bytes, "seconds": r.seconds,
+            })),
             "elapsed_s": self.manifest.elapsed_s,
             "peak_rss_bytes": self.manifest.peak_rss_bytes,
             "estimated_error": self.manifest.estimated_error,
@@ -173,6 +247,22 @@ impl fmt::Display for Done {
         if let Some(error) = self.manifest.estimated_error {
             write!(f, "\n  left out: {error:.5} of display-referred RMSE")?;
         }
-        Ok(())
+        match &self.record {
+            Some(r) => write!(
+                f,
+                "\n  light transport: {} x {} pixels, {} x {} texels, {} paths a pixel, {} in {}",
+                r.size[0],
+                r.size[1],
+                r.environment[0],
+                r.environment[1],
+                r.samples,
+                size(r.bytes as u64),
+                duration(r.seconds)
+            ),
+            None => write!(
+                f,
+                "\n  light transport: not recorded, for [composite] environment gives the light"
+            ),
+        }
     }
 }

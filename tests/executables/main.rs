@@ -4,6 +4,7 @@ mod inspection;
 mod interruption;
 mod large;
 mod project;
+mod recovery;
 mod reproducibility;
 mod stages;
 mod usage;

@@ -13,6 +13,8 @@ use tempfile::TempDir;
 pub const SCENE: &str = env!("CARGO_BIN_EXE_dipir-scene");
 /// `dipir-composite`.
 pub const COMPOSITE: &str = env!("CARGO_BIN_EXE_dipir-composite");
+/// `dipir-optimize`.
+pub const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-optimize");
 /// `dipir-inspect`.
 pub const INSPECT: &str = env!("CARGO_BIN_EXE_dipir-inspect");
 
@@ -119,21 +121,27 @@ impl Project {
         self.run(COMPOSITE, args).expect_success();
     }
 
-    /// Every file of a stage but `stage.json`, which holds times, with its bytes.
+    /// Every file of a stage but `stage.json`, which holds times, with its bytes; names are
+    /// relative to the stage's folder.
     pub fn artifacts(&self, stage: &str) -> Vec<(String, Vec<u8>)> {
-        let mut files: Vec<_> = fs::read_dir(self.path(stage))
-            .unwrap()
-            .map(|e| e.unwrap().path())
-            .filter(|p| p.file_name().unwrap() != "stage.json")
-            .map(|p| (name(&p), fs::read(&p).unwrap()))
-            .collect();
+        let mut files = Vec::new();
+        collect(&self.path(stage), "", &mut files);
+        files.retain(|(name, _)| name != "stage.json");
         files.sort();
         files
     }
 }
 
-fn name(path: &Path) -> String {
-    path.file_name().unwrap().to_string_lossy().into_owned()
+fn collect(folder: &Path, prefix: &str, files: &mut Vec<(String, Vec<u8>)>) {
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let name = format!("{prefix}{}", path.file_name().unwrap().to_string_lossy());
+        if path.is_dir() {
+            collect(&path, &format!("{name}/"), files);
+        } else {
+            files.push((name, fs::read(&path).unwrap()));
+        }
+    }
 }
 
 impl From<Output> for Run {

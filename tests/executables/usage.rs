@@ -4,7 +4,7 @@ use crate::project::*;
 #[test]
 fn help_of_every_executable_shows_examples_and_exit_codes() {
     let project = Project::new();
-    for executable in [SCENE, COMPOSITE, INSPECT] {
+    for executable in [SCENE, OPTIMIZE, COMPOSITE, INSPECT] {
         let run = project.run(executable, &["--help"]);
         run.expect_success();
         assert!(run.stdout.contains("Usage:"), "{}", run.stdout);

@@ -156,16 +156,16 @@ fn windows() -> (Truth, Vec3) {
             360.0 * (j as f32 + 0.5) / width as f32,
             180.0 * (i as f32 + 0.5) / height as f32,
         );
-        let inside = |a: f32, b: f32| (a..b).contains(&phi) && (35.0..65.0).contains(&theta);
+        let inside = |a: f32, b: f32| (a..b).contains(&phi) && (42.0..56.0).contains(&theta);
         let wall = 0.12 + 0.05 * (phi.to_radians() * 3.0).sin();
         let lamp = grid
             .direction_of(i, j)
             .distance(Vec3::new(0.6, 0.7, 0.4).normalize())
             < 0.08;
-        if inside(225.0, 245.0) {
-            Vec3::new(11.0, 12.0, 14.0)
-        } else if inside(255.0, 270.0) {
-            Vec3::new(7.0, 7.5, 8.5)
+        if inside(230.0, 242.0) {
+            Vec3::new(38.0, 42.0, 49.0)
+        } else if inside(262.0, 270.0) {
+            Vec3::new(24.0, 26.0, 30.0)
         } else if lamp {
             Vec3::new(9.0, 7.0, 4.0)
         } else if theta > 110.0 {
@@ -177,8 +177,8 @@ fn windows() -> (Truth, Vec3) {
     let map = EnvironmentMap::new(width, height, texels.collect()).expect("a map");
     // The middle of the brighter window.
     let middle = grid.direction_of(
-        (50.0 / 180.0 * height as f32) as usize,
-        (235.0 / 360.0 * width as f32) as usize,
+        (49.0 / 180.0 * height as f32) as usize,
+        (236.0 / 360.0 * width as f32) as usize,
     );
     (Truth::Map(EnvironmentSampler::new(map)), middle)
 }

@@ -2,6 +2,7 @@
 use std::f64::consts::PI;
 use std::path::PathBuf;
 
+use dipir_render::transport::Precision;
 use serde::{Deserialize, Serialize};
 
 use crate::objective::Weights;
@@ -35,10 +36,15 @@ pub struct OptimizeTable {
     pub reference: Option<PathBuf>,
     /// Lobes of each light set; the quality's by default.
     pub lobes: Option<usize>,
-    /// Columns and rows of the environment; those of the recorded transport, or the quality's.
+    /// Longest side, in pixels, of the picture that is optimised: the photograph is scaled down to
+    /// it, never up. The quality's by default.
+    pub size: Option<usize>,
+    /// Columns and rows of the environment; the quality's by default.
     pub environment: Option<[usize; 2]>,
     /// Paths per pixel of the record; the quality's by default.
     pub samples: Option<u32>,
+    /// How the record stores its weights; half where the environment has few enough texels.
+    pub precision: Option<Precision>,
     /// How far each parameter moves per step.
     pub learning_rates: LearningRates,
     /// Weight of the consistency of both light sets.
@@ -126,10 +132,14 @@ pub struct Settings {
     pub iterations: usize,
     /// Lobes of each light set.
     pub lobes: usize,
+    /// Longest side of the picture that is optimised, pixels.
+    pub size: usize,
     /// Columns and rows of the environment.
     pub environment: [usize; 2],
     /// Paths per pixel of the record.
     pub samples: u32,
+    /// How the record stores its weights.
+    pub precision: Precision,
     /// Rates of the first step.
     pub learning_rates: LearningRates,
     /// Weight of the consistency of both light sets.
@@ -158,22 +168,32 @@ pub struct Settings {
 /// does not hang on the last step's noise.
 const LAST_RATE: f64 = 0.02;
 
+/// Entries of a record in half precision number their texel in 16 bits.
+const MOST_TEXELS_IN_HALF: usize = 1 << 16;
+
 impl OptimizeTable {
     /// The settings: what the table says, else what `preset` says. `seed` is the pipeline's.
     pub fn settings(&self, preset: Preset, seed: u64) -> Result<Settings, BadSetting> {
-        let (iterations, lobes, environment, samples) = match preset {
+        let (iterations, lobes, environment, samples, size) = match preset {
             // A texel of 5.6 degrees, and candidates 37 degrees apart.
-            Preset::Draft => (200, 16, [64, 32], 64),
+            Preset::Draft => (200, 16, [64, 32], 64, 192),
             // The paper's iterations; 2.8 degrees, 26 degrees apart.
-            Preset::Standard => (600, 32, [128, 64], 128),
+            Preset::Standard => (600, 32, [128, 64], 128, 384),
             // 1.4 degrees: half-degree suns get their due.
-            Preset::High => (600, 48, [256, 128], 512),
+            Preset::High => (600, 48, [256, 128], 512, 512),
         };
+        let environment = self.environment.unwrap_or(environment);
+        let fits_half = environment[0].saturating_mul(environment[1]) <= MOST_TEXELS_IN_HALF;
         let settings = Settings {
             iterations: self.iterations.unwrap_or(iterations),
             lobes: self.lobes.unwrap_or(lobes),
-            environment: self.environment.unwrap_or(environment),
+            size: self.size.unwrap_or(size),
+            environment,
             samples: self.samples.unwrap_or(samples),
+            precision: self.precision.unwrap_or(match fits_half {
+                true => Precision::Half,
+                false => Precision::Single,
+            }),
             learning_rates: self.learning_rates,
             // [DiPIR, section 4.3].
             consistency: self.consistency.unwrap_or(0.03),
@@ -201,6 +221,7 @@ impl Settings {
         let counts = [
             ("iterations", self.iterations, 1_000_000),
             ("lobes", self.lobes, 1024),
+            ("size", self.size, 1 << 14),
             ("samples", self.samples as usize, 1 << 20),
         ];
         for (key, value, most) in counts {
@@ -218,6 +239,14 @@ impl Settings {
                  to 1024, as in [128, 64]"
             );
             return wrong("environment", message);
+        }
+        if self.precision == Precision::Half && width * height > MOST_TEXELS_IN_HALF {
+            let message = format!(
+                "\"half\" holds environments of at most {MOST_TEXELS_IN_HALF} texels, and [{width}, \
+                 {height}] has {}; accepted: \"single\", or a smaller environment",
+                width * height
+            );
+            return wrong("precision", message);
         }
         let r = &self.learning_rates;
         let rates = [
@@ -325,6 +354,19 @@ mod tests {
             "0 is out of range; accepted: 1 to 1000000"
         );
         assert_eq!(refused(&|t| t.lobes = Some(0)).key, "lobes");
+        assert_eq!(refused(&|t| t.size = Some(0)).key, "size");
+        let too_fine = refused(&|t| {
+            t.environment = Some([512, 256]);
+            t.precision = Some(Precision::Half);
+        });
+        assert_eq!(
+            (too_fine.key, too_fine.message.as_str()),
+            (
+                "precision",
+                "\"half\" holds environments of at most 65536 texels, and [512, 256] has 131072; \
+                 accepted: \"single\", or a smaller environment"
+            )
+        );
         assert_eq!(
             refused(&|t| t.environment = Some([1, 1])).key,
             "environment"

@@ -1,4 +1,5 @@
 //! `stage.json`: what a stage read, with which settings, and what it wrote.
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
@@ -83,6 +84,10 @@ pub struct Manifest {
     pub outputs: Vec<Artifact>,
     /// Wall time, seconds.
     pub elapsed_s: f64,
+    /// Where the time went, if the stage says: seconds by the stage's own names. All that differs
+    /// from run to run is kept in this file, so that outputs can be compared byte by byte.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub timings_s: BTreeMap<String, f64>,
     /// Largest resident memory of the process, where the operating system tells.
     pub peak_rss_bytes: Option<u64>,
     /// The stage's own estimate of its error, in the unit that its documentation names.

@@ -3,6 +3,7 @@
 //! A stage writes into `.NAME.partial` beside its target under a lock. When it is done, its files
 //! are flushed to disk, `stage.json` is written last, and the two folders change places in one
 //! step. Killed at any instant, the target holds either the earlier result or the new one.
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -65,6 +66,7 @@ pub struct StageWriter {
     plan: StagePlan,
     outputs: Vec<(String, PathBuf)>,
     estimated_error: Option<f64>,
+    timings_s: BTreeMap<String, f64>,
     started: Instant,
     finished: bool,
     _lock: FolderLock,
@@ -93,6 +95,7 @@ impl StageWriter {
             plan,
             outputs: Vec::new(),
             estimated_error: None,
+            timings_s: BTreeMap::new(),
             started,
             finished: false,
             _lock: lock,
@@ -132,6 +135,11 @@ impl StageWriter {
         self.estimated_error = Some(error);
     }
 
+    /// How long a part of the work took, for `stage.json`.
+    pub fn set_timing(&mut self, name: &str, seconds: f64) {
+        self.timings_s.insert(name.into(), seconds);
+    }
+
     /// Seconds since [`begin`](Self::begin).
     pub fn elapsed_s(&self) -> f64 {
         self.started.elapsed().as_secs_f64()
@@ -156,6 +164,7 @@ impl StageWriter {
             inputs: plan.inputs,
             outputs,
             elapsed_s: self.elapsed_s(),
+            timings_s: self.timings_s.clone(),
             peak_rss_bytes: peak_rss_bytes(),
             estimated_error: self.estimated_error,
         };

@@ -1,0 +1,433 @@
+//! The light stage: recovers the light and the tone curves under which the object looks as the
+//! guidance wants it to.
+use std::fmt;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::Context;
+use dipir_cli::interrupt::Interrupted;
+use dipir_cli::session::{Session, duration};
+use dipir_imaging::file::{read_photo, write_png};
+use dipir_imaging::raster::DisplayImage;
+use dipir_optimize::OptimizeError;
+use dipir_optimize::checkpoint::State;
+use dipir_optimize::crop::Framing;
+use dipir_optimize::guidance::{Reference, rmse, touched};
+use dipir_optimize::history::Row;
+use dipir_optimize::objective::Objective;
+use dipir_optimize::optimization::{Event, Optimization, Outcome};
+use dipir_optimize::parameters::{Parameters, ambient_of};
+use dipir_optimize::recorder::SceneRecorder;
+use dipir_optimize::settings::{GuidanceKind, OptimizeTable, Settings};
+use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::stage::{StagePlan, StageWriter};
+use dipir_render::render::Renderer;
+use dipir_render::transport::{RecordSettings, Transport};
+use glam::Vec3;
+use serde_json::{Value, json};
+
+use crate::scene_folder::SceneFolder;
+use crate::transport::{self, Frame};
+use crate::{interruption, model};
+
+/// Name of the stage and of its folder.
+pub const STAGE: &str = "light";
+/// The executable that runs it.
+pub const EXECUTABLE: &str = "dipir-optimize";
+/// Raised whenever the same inputs give other outputs.
+pub const VERSION: u32 = 1;
+
+/// Side of the crops of a reference, when it is compared on crops.
+const CROP_SIDE: usize = 128;
+
+/// What the stage did.
+pub struct Done {
+    folder: PathBuf,
+    manifest: Manifest,
+    outcome: Outcome,
+    size: [u32; 2],
+    resumed_at: usize,
+    /// Display-referred RMSE against the reference, over what the object or its shadow touches.
+    rmse: f64,
+}
+
+/// Runs the stage.
+pub fn run(session: &Session) -> anyhow::Result<Done> {
+    let table: OptimizeTable = session.config.table("optimize")?;
+    let settings = transport::settings(session, &table)?;
+    let (reference_path, reference_file) = reference_of(session, &table)?;
+    let scene = SceneFolder::read(session)?;
+    let frame = Frame::new(&scene.loaded, settings.size);
+    let reference = read_reference(session, &scene, &frame, &reference_file)?;
+
+    let mut plan = StagePlan::new(STAGE, VERSION, params(&settings), session.pipeline.seed);
+    scene.add_inputs(&mut plan, &["scene.json", "effects.json"])?;
+    plan.input("reference", &reference_path, &reference_file)?;
+    let fingerprint = fingerprint(&plan, &settings)?;
+    let folder = session.stage_folder(STAGE);
+    let mut writer = session.begin(plan)?;
+
+    let simulation = scene.effects.simulation();
+    let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
+    let hash = transport::scene_hash(&scene.loaded, &simulation)?;
+    let record = frame.record_settings(&settings, simulation, hash);
+    let clock = Instant::now();
+    let recorded = recorded(session, &scene, &renderer, &record)?;
+    writer.set_timing("transport", clock.elapsed().as_secs_f64());
+
+    let start = Parameters::neutral(settings.lobes, ambient_of(&frame.background));
+    let resume = Resume::open(session, &fingerprint)?;
+    let resumed_at = resume.restored(session, &settings, &start)?;
+    let objective = Objective::new(
+        Box::new(recorded),
+        frame.background.clone(),
+        scene.loaded.photo.transfer,
+        settings.weights(),
+    )?;
+    let mask = touched(&objective);
+    let framing = match settings.crops {
+        true => Framing::Crops { side: CROP_SIDE },
+        false => Framing::Whole,
+    };
+    let mut guidance = Reference::new(reference.clone(), &objective, framing)?;
+    let mut go_on = |_: f64| interruption();
+    let mut recorder = SceneRecorder {
+        renderer: &renderer,
+        settings: record,
+        progress: &mut go_on,
+    };
+    let clock = Instant::now();
+    let optimization = Optimization {
+        objective,
+        guidance: &mut guidance,
+        recorder: Some(&mut recorder),
+        settings: settings.clone(),
+        start,
+        checkpoint: Some(&resume.checkpoint()),
+    };
+    let outcome = follow(session, &settings, &resume, optimization)?;
+    writer.set_timing("optimization", clock.elapsed().as_secs_f64());
+    write_results(&settings, &outcome, &resume, &mut writer)?;
+    let rmse = rmse(&outcome.picture, &reference, &mask, None);
+    writer.set_estimated_error(rmse);
+    let manifest = writer.finish()?;
+    resume.remove();
+    Ok(Done {
+        folder,
+        manifest,
+        outcome,
+        size: frame.camera.resolution,
+        resumed_at,
+        rmse,
+    })
+}
+
+/// The reference, as the configuration names it and where it is.
+fn reference_of(session: &Session, table: &OptimizeTable) -> anyhow::Result<(PathBuf, PathBuf)> {
+    let name = match table.guidance {
+        GuidanceKind::Reference => None,
+        GuidanceKind::Lds => Some("lds"),
+        GuidanceKind::Sds => Some("sds"),
+        GuidanceKind::Csd => Some("csd"),
+    };
+    if let Some(name) = name {
+        let message = format!(
+            "guidance = \"{name}\" is not built in yet; accepted: \"reference\", with reference = \
+             \"image.exr\""
+        );
+        return Err(session.config.invalid("optimize.guidance", message).into());
+    }
+    let path = table.reference.clone().ok_or_else(|| {
+        let message = "is missing: name the picture that the composite should equal, as in \
+                       reference = \"image.exr\"";
+        session.config.invalid("optimize.reference", message)
+    })?;
+    let file = session.resolve(&path);
+    Ok((path, file))
+}
+
+/// The reference at the size of `frame`, as it is displayed.
+fn read_reference(
+    session: &Session,
+    scene: &SceneFolder,
+    frame: &Frame,
+    file: &Path,
+) -> anyhow::Result<DisplayImage> {
+    let transfer = scene.loaded.photo.transfer;
+    let image = read_photo(file, transfer)?.image;
+    let found = [image.0.width() as u32, image.0.height() as u32];
+    let expected = scene.loaded.scene.camera.resolution;
+    if found != expected {
+        let message = format!(
+            "\"{}\" has {} x {} pixels; accepted: a picture of the photograph's size, {} x {}",
+            file.display(),
+            found[0],
+            found[1],
+            expected[0],
+            expected[1]
+        );
+        return Err(session.config.invalid("optimize.reference", message).into());
+    }
+    Ok(transfer.encode(&frame.scale(&image)))
+}
+
+/// What decides the outputs; how often the state is kept does not.
+fn params(settings: &Settings) -> Value {
+    let settings = Settings {
+        checkpoint_every: 0,
+        ..settings.clone()
+    };
+    json!({"optimize": settings, "guidance": GuidanceKind::Reference})
+}
+
+/// Tells one run from another, so that a checkpoint is found by the run that it belongs to alone.
+fn fingerprint(plan: &StagePlan, settings: &Settings) -> anyhow::Result<String> {
+    let all = json!([plan.version, plan.inputs, settings]);
+    let hash = blake3::hash(serde_json::to_string(&all)?.as_bytes());
+    Ok(hash.to_hex()[..16].to_owned())
+}
+
+/// The scene stage's record if it was made for these settings, else a new one.
+fn recorded(
+    session: &Session,
+    scene: &SceneFolder,
+    renderer: &Renderer,
+    settings: &RecordSettings,
+) -> anyhow::Result<Transport> {
+    let listed = scene.manifest.outputs.iter();
+    if listed.into_iter().any(|o| o.role == transport::ROLE) {
+        let path = scene.manifest.output(&scene.folder, transport::ROLE)?;
+        let found = Transport::load(path)?;
+        if transport::is_current(&found, settings, renderer.camera()) {
+            return Ok(found);
+        }
+        session.remark(|| "the scene's record was made with other settings: recording anew".into());
+    }
+    transport::record(session, renderer, settings)
+}
+
+/// Runs the loop, showing how far it is and keeping its previews.
+fn follow(
+    session: &Session,
+    settings: &Settings,
+    resume: &Resume,
+    optimization: Optimization,
+) -> anyhow::Result<Outcome> {
+    let progress = session.progress("light");
+    let mut unwritten: Option<anyhow::Error> = None;
+    let mut watch = |event: Event| -> ControlFlow<()> {
+        match event {
+            Event::Step(row) => {
+                progress.set((row.iteration + 1) as f64 / settings.iterations as f64);
+                match (row.loss, &row.skipped) {
+                    (Some(loss), _) => progress.say(format!("loss {loss:.4}")),
+                    (None, bad) => progress.say(format!("skipped: {bad:?}")),
+                }
+                if row.recorded {
+                    session.remark(|| format!("iteration {}: recorded anew", row.iteration));
+                }
+            }
+            Event::Preview { iteration, picture } => {
+                if let Err(e) = write_png(resume.preview(iteration), picture) {
+                    unwritten = Some(e.into());
+                    return ControlFlow::Break(());
+                }
+            }
+        }
+        interruption()
+    };
+    let outcome = optimization.run(&mut watch);
+    if let Some(e) = unwritten {
+        return Err(e);
+    }
+    progress.done();
+    match outcome {
+        Err(OptimizeError::Interrupted) => Err(Interrupted.into()),
+        other => Ok(other?),
+    }
+}
+
+fn write_results(
+    settings: &Settings,
+    outcome: &Outcome,
+    resume: &Resume,
+    writer: &mut StageWriter,
+) -> anyhow::Result<()> {
+    writer.write_json("lighting", "lighting.json", &outcome.lighting)?;
+    let [columns, rows] = settings.environment;
+    let path = writer.output("environment", "environment.exr")?;
+    outcome.lighting.map(columns, rows).write(path)?;
+    writer.write_json("tone", "tone.json", &outcome.tone)?;
+    writer.write_json("history", "history.json", &rows_without_times(outcome)?)?;
+    for name in resume.previews()? {
+        let path = writer.output("preview", Path::new("previews").join(&name))?;
+        let kept = resume.folder.join("previews").join(&name);
+        std::fs::copy(&kept, path).with_context(|| format!("cannot copy {}", kept.display()))?;
+    }
+    Ok(())
+}
+
+/// The history without the seconds, which differ from run to run: they are in `stage.json`.
+fn rows_without_times(outcome: &Outcome) -> anyhow::Result<Vec<Value>> {
+    let row = |row: &Row| {
+        let mut value = serde_json::to_value(row)?;
+        if let Some(row) = value.as_object_mut() {
+            row.shift_remove("seconds");
+        }
+        Ok(value)
+    };
+    outcome.history.iter().map(row).collect()
+}
+
+/// Where an interrupted run goes on: a folder beside the stage's own.
+struct Resume {
+    folder: PathBuf,
+}
+
+impl Resume {
+    fn open(session: &Session, fingerprint: &str) -> anyhow::Result<Self> {
+        let folder = session.out.join("light-checkpoints").join(fingerprint);
+        model::create_folder(&folder.join("previews"))?;
+        Ok(Self { folder })
+    }
+
+    fn checkpoint(&self) -> PathBuf {
+        self.folder.join("checkpoint.safetensors")
+    }
+
+    fn preview(&self, iteration: usize) -> PathBuf {
+        self.folder
+            .join("previews")
+            .join(format!("{iteration:06}.png"))
+    }
+
+    /// The iteration at which the checkpoint stands; 0 without one. A damaged one is removed.
+    fn restored(
+        &self,
+        session: &Session,
+        settings: &Settings,
+        start: &Parameters,
+    ) -> anyhow::Result<usize> {
+        let path = self.checkpoint();
+        match State::read(&path, settings, start) {
+            Ok(None) => Ok(0),
+            Ok(Some(state)) => {
+                session.remark(|| format!("continuing with iteration {}", state.iteration));
+                Ok(state.iteration)
+            }
+            Err(e) => {
+                session.warn(&format!("{e}; starting from the beginning"));
+                std::fs::remove_file(&path)
+                    .with_context(|| format!("cannot remove {}", path.display()))?;
+                Ok(0)
+            }
+        }
+    }
+
+    /// Names of the pictures that were kept, in the order of their iterations.
+    fn previews(&self) -> anyhow::Result<Vec<String>> {
+        let folder = self.folder.join("previews");
+        let failed = || format!("cannot read {}", folder.display());
+        let mut names = Vec::new();
+        for entry in std::fs::read_dir(&folder).with_context(failed)? {
+            let name = entry.with_context(failed)?.file_name();
+            names.push(name.to_string_lossy().into_owned());
+        }
+        names.sort();
+        Ok(names)
+    }
+
+    fn remove(&self) {
+        let _ = std::fs::remove_dir_all(&self.folder);
+        // Only if nothing else is in it.
+        let _ = self.folder.parent().map(std::fs::remove_dir);
+    }
+}
+
+/// Degrees above the horizon, and counter-clockwise from +z seen from above.
+fn angles_deg(direction: Vec3) -> [f32; 2] {
+    let elevation = direction.y.clamp(-1.0, 1.0).asin();
+    let azimuth = direction.x.atan2(direction.z);
+    [elevation.to_degrees(), azimuth.to_degrees()]
+}
+
+impl Done {
+    fn records(&self) -> usize {
+        self.outcome.history.iter().filter(|r| r.recorded).count()
+    }
+
+    fn guidance(&self, row: Option<&Row>) -> Option<f64> {
+        row.and_then(|r| r.guidance)
+    }
+
+    /// For programs.
+    pub fn to_json(&self) -> Value {
+        let history = &self.outcome.history;
+        json!({
+            "folder": self.folder,
+            "size": self.size,
+            "iterations": history.len(),
+            "resumed_at": self.resumed_at,
+            "skipped": self.outcome.skipped(),
+            "stopped_early": self.outcome.stopped_early,
+            "recorded_anew": self.records(),
+            "guidance_at_start": self.guidance(history.first()),
+            "guidance_at_end": self.guidance(history.last()),
+            "rmse": self.rmse,
+            "peak_direction": self.outcome.lighting.peak_direction(),
+            "fusion_residual": self.outcome.lighting.fusion_residual,
+            "elapsed_s": self.manifest.elapsed_s,
+            "timings_s": self.manifest.timings_s,
+            "peak_rss_bytes": self.manifest.peak_rss_bytes,
+        })
+    }
+}
+
+impl fmt::Display for Done {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "wrote {} in {}",
+            self.folder.display(),
+            duration(self.manifest.elapsed_s)
+        )?;
+        write!(
+            f,
+            "  {} iterations on {} x {} pixels, {:.5} of display-referred RMSE from the reference",
+            self.outcome.history.len(),
+            self.size[0],
+            self.size[1],
+            self.rmse
+        )?;
+        if let Some(peak) = self.outcome.lighting.peak_direction() {
+            let [elevation, azimuth] = angles_deg(peak);
+            write!(
+                f,
+                "\n  most light comes from {elevation:.1} degrees above the horizon, {azimuth:.1} \
+                 degrees from +z towards +x"
+            )?;
+        }
+        let skipped = self.outcome.skipped();
+        if skipped > 0 {
+            write!(
+                f,
+                "\n  {skipped} steps were skipped, because something was not finite"
+            )?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn directions_are_told_as_heights_and_turns() {
+        assert_eq!(angles_deg(Vec3::Y)[0], 90.0);
+        assert_eq!(angles_deg(Vec3::Z), [0.0, 0.0]);
+        assert_eq!(angles_deg(Vec3::X), [0.0, 90.0]);
+        assert_eq!(angles_deg(Vec3::NEG_X), [0.0, -90.0]);
+    }
+}

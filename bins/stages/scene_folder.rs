@@ -1,0 +1,87 @@
+//! What the scene stage left for the stages that render.
+use std::path::{Path, PathBuf};
+
+use dipir_cli::session::Session;
+use dipir_pipeline::fingerprint::{StaleReason, parameter_changes};
+use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::stage::StagePlan;
+use dipir_render::effects::EffectsPlan;
+use dipir_scene::config::SceneConfig;
+use dipir_scene::description::SceneDescription;
+use dipir_scene::scene::LoadedScene;
+use serde::Deserialize;
+use serde_json::json;
+
+use crate::scene;
+
+/// The scene stage's folder, its files checked by hash, and the scene that they describe.
+pub struct SceneFolder {
+    /// Where it is.
+    pub folder: PathBuf,
+    /// Its `stage.json`.
+    pub manifest: Manifest,
+    /// The scene, rebuilt from the files that it was made of.
+    pub loaded: LoadedScene,
+    /// What to simulate.
+    pub effects: EffectsPlan,
+}
+
+impl SceneFolder {
+    /// Reads what the scene stage wrote and the files that it names.
+    pub fn read(session: &Session) -> anyhow::Result<Self> {
+        let folder = session.stage_folder(scene::STAGE);
+        let manifest = Manifest::read(&folder, scene::EXECUTABLE)?;
+        warn_of_other_settings(session, &manifest)?;
+        let description = SceneDescription::read(&manifest.output(&folder, "scene")?)?;
+        let effects: EffectsPlan = read_json(&manifest.output(&folder, "effects")?)?;
+        let loaded = description.load(&session.config.base_dir())?;
+        Ok(Self {
+            folder,
+            manifest,
+            loaded,
+            effects,
+        })
+    }
+
+    /// Notes the files `names` of the folder, and those that the scene was made of, as inputs.
+    pub fn add_inputs(&self, plan: &mut StagePlan, names: &[&str]) -> anyhow::Result<()> {
+        for name in names {
+            let role = name.split('.').next().unwrap_or(name);
+            let location = self.folder.join(name);
+            plan.input(role, &Path::new(scene::STAGE).join(name), &location)?;
+        }
+        for input in &self.loaded.inputs {
+            plan.input(&input.role, &input.path, &input.location)?;
+        }
+        Ok(())
+    }
+}
+
+/// The scene's folder may have been made before the last edit of `[scene]`.
+fn warn_of_other_settings(session: &Session, manifest: &Manifest) -> anyhow::Result<()> {
+    let config: SceneConfig = session.config.table("scene")?;
+    let was = json!({"scene": manifest.params["scene"]});
+    let now = json!({"scene": serde_json::to_value(config)?});
+    let changes: Vec<String> = parameter_changes(&was, &now)
+        .iter()
+        .map(StaleReason::to_string)
+        .collect();
+    if !changes.is_empty() {
+        session.warn(&format!(
+            "the scene was set up with other settings ({}); run dipir-scene again to use the new ones",
+            changes.join(", ")
+        ));
+    }
+    Ok(())
+}
+
+fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> anyhow::Result<T> {
+    let text = std::fs::read_to_string(path)?;
+    serde_json::from_str(&text).map_err(|e| {
+        anyhow::anyhow!(
+            "{}: {e}; it was written by another version: run {} again",
+            path.display(),
+            scene::EXECUTABLE
+        )
+    })
+}

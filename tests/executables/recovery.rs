@@ -1,0 +1,294 @@
+//! Light and tone recovered from a picture, from the photograph to the composite.
+use std::process::Child;
+use std::time::{Duration, Instant};
+
+use dipir_imaging::file::read_photo;
+use dipir_imaging::metrics::rmse;
+use dipir_imaging::tone::ToneCurves;
+use dipir_imaging::transfer::Transfer;
+use dipir_light::environment::EnvironmentMap;
+use dipir_numerics::hashing::mix64;
+use dipir_optimize::lighting::Lighting;
+use dipir_pipeline::manifest::Manifest;
+use serde_json::Value;
+
+use crate::project::*;
+
+const OPTIMIZE_TABLE: &str = r#"
+[optimize]
+guidance = "reference"
+reference = "reference.exr"
+iterations = 150
+lobes = 12
+environment = [32, 16]
+samples = 32
+preview_every = 60
+
+[composite]
+target_error = 0.02
+"#;
+
+/// A project without a light, and what the object looks like under one: `reference.exr`, path
+/// traced under `sky.exr`.
+fn project() -> Project {
+    let project = Project::new();
+    project.run_both(&["-o", "truth", "--set", "composite.tone=reinhard"]);
+    project.write("reference.exr", project.read("truth/composite/composite.exr"));
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let (scene, _) = text.split_once("[composite]").unwrap();
+    project.write("pipeline.toml", format!("{scene}{OPTIMIZE_TABLE}"));
+    project
+}
+
+fn json(project: &Project, name: &str) -> Value {
+    serde_json::from_slice(&project.read(name)).unwrap()
+}
+
+#[test]
+fn light_is_recovered_from_a_picture_and_lights_the_composite() {
+    let project = project();
+    project.run(SCENE, &[]).expect_success();
+    assert!(project.path("out/scene/transport.safetensors").exists());
+    let run = project.run(OPTIMIZE, &["--json"]);
+    run.expect_success();
+    assert_eq!(run.stderr, "");
+    let done: Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!((&done["iterations"], &done["resumed_at"]), (&150.into(), &0.into()));
+    project.run(COMPOSITE, &[]).expect_success();
+
+    // What was written, and that others can read it.
+    let light = Lighting::read(&project.path("out/light/lighting.json")).unwrap();
+    assert_eq!((light.lobes.len(), light.exposure), (12, 1.0));
+    let map = EnvironmentMap::read(project.path("out/light/environment.exr")).unwrap();
+    assert_eq!((map.width(), map.height()), (32, 16));
+    ToneCurves::read_json(project.path("out/light/tone.json")).unwrap();
+    let history = json(&project, "out/light/history.json");
+    let rows = history.as_array().unwrap();
+    assert_eq!(rows.len(), 150);
+    for key in ["loss", "guidance", "consistency", "regularizer", "gradient_norm"] {
+        assert!(rows[149][key].is_f64(), "{key}");
+    }
+    assert!(rows[0].get("t").is_some() && rows[0].get("seconds").is_none());
+    let names: Vec<String> = project.artifacts("out/light").into_iter().map(|a| a.0).collect();
+    assert_eq!(
+        names,
+        [
+            "environment.exr",
+            "history.json",
+            "lighting.json",
+            "previews/000000.png",
+            "previews/000060.png",
+            "previews/000120.png",
+            "previews/000150.png",
+            "tone.json",
+        ]
+    );
+    assert!(!project.path("out/light-checkpoints").exists(), "nothing is left of a run that ended");
+    let manifest = Manifest::read(&project.path("out/light"), "").unwrap();
+    assert_eq!(manifest.damages(&project.path("out/light")).unwrap(), []);
+    assert!(manifest.timings_s["optimization"] > 0.0);
+    let composite = Manifest::read(&project.path("out/composite"), "").unwrap();
+    let roles: Vec<&str> = composite.inputs.iter().map(|a| a.role.as_str()).collect();
+    assert!(roles.contains(&"lighting") && roles.contains(&"tone"), "{roles:?}");
+
+    // And that it is the light.
+    let first = rows[0]["guidance"].as_f64().unwrap();
+    let last = rows[149]["guidance"].as_f64().unwrap();
+    assert!(last < 0.1 * first, "the loss fell from {first} to {last}");
+    let picture = |name: &str| read_photo(project.path(name), Transfer::Srgb).unwrap().image;
+    let apart = |name: &str| {
+        let (a, b) = (picture(name), picture("reference.exr"));
+        rmse(&Transfer::Srgb.encode(&a).0, &Transfer::Srgb.encode(&b).0)
+    };
+    let (found, before) = (apart("out/composite/composite.png"), apart("background.png"));
+    // Path tracing stops at .02 and .05; the photograph alone is several times as far.
+    assert!(found < 0.03 && found < 0.3 * before, "{found}, {before} without the object");
+}
+
+#[test]
+fn one_thread_and_two_recover_the_same_bytes() {
+    let project = project();
+    for (threads, out) in [("1", "one"), ("2", "two")] {
+        for executable in [SCENE, OPTIMIZE, COMPOSITE] {
+            project.run(executable, &["-j", threads, "-o", out]).expect_success();
+        }
+    }
+    for stage in ["scene", "light", "composite"] {
+        let one = project.artifacts(&format!("one/{stage}"));
+        assert!(one == project.artifacts(&format!("two/{stage}")), "{stage}");
+    }
+}
+
+#[test]
+fn a_scene_without_a_record_is_recorded_when_light_is_recovered() {
+    let project = project();
+    project.run(SCENE, &[]).expect_success();
+    project.run(OPTIMIZE, &[]).expect_success();
+    let known = ["--set", "composite.environment=sky.exr", "-o", "known"];
+    let run = project.run(SCENE, &known);
+    run.expect_success();
+    assert!(!project.path("known/scene/transport.safetensors").exists());
+    assert!(
+        run.stdout.contains("light transport: not recorded, for [composite] environment gives the light"),
+        "{}",
+        run.stdout
+    );
+    // The effects are planned under another light; here they come out the same.
+    project.run(OPTIMIZE, &["-o", "known"]).expect_success();
+    let effects = |out: &str| json(&project, &format!("{out}/scene/effects.json"))["max_depth"].clone();
+    if effects("out") == effects("known") {
+        let lighting = |out: &str| project.read(&format!("{out}/light/lighting.json"));
+        assert!(lighting("out") == lighting("known"));
+    }
+}
+
+/// Starts a long recovery and waits until its checkpoint has been replaced `changes` times.
+fn start_and_wait(project: &Project, args: &[&str], changes: u32) -> Child {
+    let mut child = project.command(OPTIMIZE, args).spawn().unwrap();
+    let deadline = Instant::now() + Duration::from_secs(60);
+    let (mut seen, mut last) = (0, None);
+    while seen < changes {
+        let ended = child.try_wait().unwrap();
+        assert!(ended.is_none() && Instant::now() < deadline, "no checkpoint: {ended:?}");
+        let now = checkpoint_time(project);
+        if now.is_some() && now != last {
+            (seen, last) = (seen + 1, now);
+        }
+        std::thread::yield_now();
+    }
+    child
+}
+
+fn checkpoint_time(project: &Project) -> Option<std::time::SystemTime> {
+    let folder = std::fs::read_dir(project.path("out/light-checkpoints")).ok()?;
+    let run = folder.filter_map(Result::ok).next()?;
+    let file = run.path().join("checkpoint.safetensors");
+    file.metadata().and_then(|m| m.modified()).ok()
+}
+
+#[test]
+fn killed_at_a_random_iteration_and_run_again_the_light_is_the_same_bytes() {
+    let project = project();
+    let long = ["--set", "optimize.iterations=400", "--set", "optimize.checkpoint_every=7"];
+    project.run(SCENE, &[]).expect_success();
+    project.run(OPTIMIZE, &long).expect_success();
+    let whole = project.artifacts("out/light");
+    std::fs::remove_dir_all(project.path("out/light")).unwrap();
+    for k in 0..2 {
+        let changes = 1 + (mix64(k) % 20) as u32;
+        let mut child = start_and_wait(&project, &long, changes);
+        child.kill().unwrap();
+        child.wait().unwrap();
+        assert!(!project.path("out/light/stage.json").exists(), "killed before its end");
+        let run = project.run(OPTIMIZE, &[&long[..], &["--json"]].concat());
+        run.expect_success();
+        let done: Value = serde_json::from_str(&run.stdout).unwrap();
+        assert!(done["resumed_at"].as_u64().unwrap() >= 7, "{done}");
+        assert!(project.artifacts("out/light") == whole, "killed after checkpoint {changes}");
+        std::fs::remove_dir_all(project.path("out/light")).unwrap();
+    }
+}
+
+#[test]
+fn a_damaged_checkpoint_is_told_and_the_run_starts_from_the_beginning() {
+    let project = project();
+    let long = ["--set", "optimize.iterations=400", "--set", "optimize.checkpoint_every=7"];
+    project.run(SCENE, &[]).expect_success();
+    let mut child = start_and_wait(&project, &long, 1);
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let folder = std::fs::read_dir(project.path("out/light-checkpoints")).unwrap();
+    let run = folder.map(|e| e.unwrap().path()).next().unwrap();
+    std::fs::write(run.join("checkpoint.safetensors"), "torn").unwrap();
+    let run = project.run(OPTIMIZE, &[&long[..], &["--json"]].concat());
+    run.expect_success();
+    assert!(
+        run.stderr.starts_with("warning: `out/light-checkpoints/")
+            && run.stderr.trim_end().ends_with("starting from the beginning"),
+        "{}",
+        run.stderr
+    );
+    let done: Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!(done["resumed_at"], 0);
+}
+
+#[track_caller]
+fn optimize_fails(project: &Project, set: &[&str], code: i32, message: &str) {
+    let args: Vec<&str> = set.iter().flat_map(|s| ["--set", s]).collect();
+    project.run(OPTIMIZE, &args).expect_error(code, message);
+    assert!(!project.path("out/light").exists(), "nothing was written");
+}
+
+#[test]
+fn what_cannot_be_optimised_is_refused_with_the_way_out() {
+    let project = project();
+    optimize_fails(
+        &project,
+        &["optimize.guidance=lds"],
+        2,
+        "error: --set optimize.guidance=lds: optimize.guidance: guidance = \"lds\" is not built in \
+         yet; accepted: \"reference\", with reference = \"image.exr\"",
+    );
+    optimize_fails(
+        &project,
+        &["optimize.guidance=magic"],
+        2,
+        "error: --set optimize.guidance=magic: optimize.guidance is \"magic\", accepted: \"lds\", \
+         \"sds\", \"csd\", \"reference\"",
+    );
+    optimize_fails(
+        &project,
+        &["optimize.lobes=0"],
+        2,
+        "error: --set optimize.lobes=0: optimize.lobes: 0 is out of range; accepted: 1 to 1024",
+    );
+    optimize_fails(
+        &project,
+        &[],
+        1,
+        "error: out/scene/stage.json does not exist; run dipir-scene first",
+    );
+    project.run(SCENE, &[]).expect_success();
+    let small = dipir_imaging::raster::Raster::filled(3, 2, glam::Vec3::splat(0.5));
+    let small = dipir_imaging::raster::DisplayImage(small);
+    dipir_imaging::file::write_png(project.path("small.png"), &small).unwrap();
+    optimize_fails(
+        &project,
+        &["optimize.reference=small.png"],
+        2,
+        "error: --set optimize.reference=small.png: optimize.reference: \"small.png\" has 3 x 2 \
+         pixels; accepted: a picture of the photograph's size, 36 x 24",
+    );
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write("pipeline.toml", text.replace("reference = \"reference.exr\"\n", ""));
+    optimize_fails(
+        &project,
+        &[],
+        2,
+        "error: pipeline.toml:20: optimize.reference: is missing: name the picture that the \
+         composite should equal, as in reference = \"image.exr\"",
+    );
+    project.run(COMPOSITE, &[]).expect_error(
+        1,
+        "error: there is no light: [composite] environment is not set and out/light/lighting.json \
+         is missing; name a map, as in --set composite.environment=sky.hdr, or run dipir-optimize \
+         first",
+    );
+}
+
+#[test]
+fn light_that_was_recovered_for_another_scene_is_warned_of() {
+    let project = project();
+    let turned = ["--set", "scene.objects.0.yaw_deg=90"];
+    for executable in [SCENE, OPTIMIZE] {
+        project.run(executable, &[]).expect_success();
+    }
+    project.run(SCENE, &turned).expect_success();
+    let run = project.run(COMPOSITE, &turned);
+    run.expect_success();
+    assert_eq!(
+        run.stderr.trim_end(),
+        "warning: the light was recovered for another set-up of the scene; run dipir-optimize again \
+         to recover it for this one"
+    );
+}
