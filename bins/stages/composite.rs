@@ -160,7 +160,7 @@ enum Source {
     /// The map of `[composite] environment`.
     Map(Light),
     /// The lobes that the light stage recovered.
-    Recovered(Recovered),
+    Recovered(Box<Recovered>),
 }
 
 /// Runs the stage.
@@ -174,7 +174,11 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let inputs = read(session)?;
     let light = match light::known(session, &table)? {
         Some(light) => Source::Map(light),
-        None => Source::Recovered(light::recovered(session, &table, &inputs.scene.manifest)?),
+        None => Source::Recovered(Box::new(light::recovered(
+            session,
+            &table,
+            &inputs.scene.manifest,
+        )?)),
     };
     let stop = table.stop(session.pipeline.quality);
     let plan = stage_plan(session, &table, stop, &inputs, &light)?;
@@ -374,7 +378,7 @@ enum Curve {
     /// On the object's own colour, which is `rgb / alpha`.
     Reinhard,
     /// Reinhard and a spline on the object, a spline per channel on the shadow.
-    Recovered(ToneCurves),
+    Recovered(Box<ToneCurves>),
 }
 
 impl Curve {
@@ -383,7 +387,7 @@ impl Curve {
         match (tone, light) {
             (Some(Tone::None), _) | (None, Source::Map(_)) => Self::None,
             (Some(Tone::Reinhard), _) => Self::Reinhard,
-            (None, Source::Recovered(light)) => Self::Recovered(light.tone),
+            (None, Source::Recovered(light)) => Self::Recovered(Box::new(light.tone)),
         }
     }
 

@@ -349,7 +349,7 @@ fn what_cannot_be_optimised_is_refused_with_the_way_out() {
         &project,
         &[],
         2,
-        "error: pipeline.toml:20: optimize.reference: is missing: name the picture that the \
+        "error: pipeline.toml:18: optimize.reference: is missing: name the picture that the \
          composite should equal, as in reference = \"image.exr\"",
     );
     project.run(COMPOSITE, &[]).expect_error(

@@ -8,7 +8,8 @@
 //! Run with `cargo test -p dipir-optimize --bench recovery -- --bench [OBJECT/LIGHT...] [key=value...]`:
 //! prints the table of `docs/recovery.md`. Names pick scenes; keys are `iterations`, `lobes`,
 //! `samples`, `columns` (of the environment), `width` (of the picture), `tone` (0 holds the tone
-//! curves). Without `--bench`, as tests run it, one small scene proves that it works.
+//! curves), `consistency`, `regularizer`; `show` prints how the loss fell and the brightest lobes.
+//! Without `--bench`, as tests run it, one small scene proves that it works.
 use std::ops::ControlFlow;
 use std::time::Instant;
 
@@ -48,6 +49,8 @@ struct Knobs {
     table: OptimizeTable,
     width: u32,
     target: f32,
+    /// Print how the loss fell and the brightest lobes.
+    show: bool,
 }
 
 fn simulation() -> Simulation {
@@ -260,7 +263,7 @@ fn recover(object: &str, light: &str, knobs: &Knobs) -> Row {
     let lobes = SgMixture::new(outcome.lighting.exposed_lobes()).expect("lobes");
     let again = (SEEDS[2], knobs.target);
     let picture = traced(&renderer, &lobes, &outcome.tone, &background, again);
-    if std::env::var_os("RECOVERY_SHOW").is_some() {
+    if knobs.show {
         show(&outcome, peak);
     }
     let everything = Raster::filled(mask.width(), mask.height(), 1.0);
@@ -367,8 +370,8 @@ fn show(outcome: &Outcome, peak: Vec3) {
 
 fn knobs(arguments: &[String], timing: bool) -> Knobs {
     let value = |key: &str| {
-        let found = arguments.iter().filter_map(|a| a.split_once('='));
-        let last = found.filter(|(k, _)| *k == key).last();
+        let mut pairs = arguments.iter().filter_map(|a| a.split_once('='));
+        let last = pairs.rfind(|(k, _)| *k == key);
         last.map(|(_, v)| {
             v.parse::<f64>()
                 .unwrap_or_else(|_| panic!("{key}={v} is no number"))
@@ -395,6 +398,7 @@ fn knobs(arguments: &[String], timing: bool) -> Knobs {
         table,
         width: value("width").map_or(if timing { 192 } else { 36 }, |v| v as u32),
         target: if timing { CONVERGED } else { 0.02 },
+        show: arguments.iter().any(|a| a == "show"),
     }
 }
 

@@ -25,10 +25,11 @@ use crate::transport::Recorder;
 const MOST_BAD_IN_A_ROW: usize = 5;
 /// Iterations between two looks at how well the record samples the light.
 const RECORD_EVERY: usize = 50;
-/// The light is recorded anew when it makes use of less than this share of the samples. A lobe
-/// that narrows soon rests on few samples, and their noise, to which the optimiser would fit,
-/// keeps it from narrowing further: the record has to go ahead of it.
-const LEAST_EFFICIENCY: f64 = 0.5;
+/// The light is recorded anew when a sample is worth less than this many samples drawn for it. 1
+/// is what a record for that very light reaches, so a lobe that narrows is followed closely: it
+/// would soon rest on few samples, and their noise, to which the optimiser then fits, keeps it
+/// from narrowing further.
+const LEAST_EFFICIENCY: f64 = 1.0;
 /// Times that the light is recorded anew at most, so that recording stays a small part of the run.
 const MOST_RECORDS: usize = 8;
 
