@@ -33,7 +33,7 @@ def main(table, picture):
         axis.plot(xs, ys, dash, marker="o", markersize=4, color=colour, label=label)
         for r, a, b in zip(group, xs, ys):
             if names:
-                axis.annotate(names(r), (a, b), textcoords="offset points", xytext=(4, 5), color=GREY)
+                axis.annotate(names(r), (a, b), textcoords="offset points", xytext=(0, 7), ha="center", color=GREY)
 
     count = lambda r: r["samples"]
     for axis, what in ((axes[0], "object_error"), (axes[1], "region_gradient_error")):
@@ -47,15 +47,20 @@ def main(table, picture):
     halves = [r for r in sizes if r["precision"] == "Half"]
     singles = [r for r in sizes if r["precision"] == "Single"]
     name = lambda r: f"{r['columns']}x{r['rows']}"
+    halves.sort(key=lambda r: r["mb"])
     sweep(axes[2], halves, "mb", "object_error", ORANGE, "half precision", names=name)
-    sweep(axes[2], singles, "mb", "object_error", BLUE, "single precision", names=name)
+    sweep(axes[2], singles, "mb", "object_error", BLUE, "single precision")
     axes[2].set_xlabel("size of the record, MB (128 samples)")
     axes[2].set_ylabel("relative error of the object")
     axes[2].legend(frameon=False)
-    for axis in axes:
+    axes[2].set_xlim(0, 55)
+    axes[2].set_ylim(0, 0.15)
+    for axis in axes[:2]:
         axis.set_xscale("log")
         axis.set_yscale("log")
-        axis.margins(x=0.2, y=0.15)
+    for axis in axes:
+        if axis is not axes[2]:
+            axis.margins(x=0.2, y=0.15)
         axis.grid(True, which="both", color="#dddddd", linewidth=0.5)
         axis.set_axisbelow(True)
     # White behind it, so that it can be read on a dark page too.
