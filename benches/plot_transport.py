@@ -46,11 +46,11 @@ def main(table, picture):
     sizes.sort(key=lambda r: (r["precision"], int(r["columns"])))
     halves = [r for r in sizes if r["precision"] == "Half"]
     singles = [r for r in sizes if r["precision"] == "Single"]
-    name = lambda r: f"{r['columns']}x{r['rows']}"
+    name = lambda r: r["columns"]
     halves.sort(key=lambda r: r["mb"])
     sweep(axes[2], halves, "mb", "object_error", ORANGE, "half precision", names=name)
     sweep(axes[2], singles, "mb", "object_error", BLUE, "single precision")
-    axes[2].set_xlabel("size of the record, MB (128 samples)")
+    axes[2].set_xlabel("size of the record, MB (numbers: columns of the map)")
     axes[2].set_ylabel("relative error of the object")
     axes[2].legend(frameon=False)
     axes[2].set_xlim(0, 55)
