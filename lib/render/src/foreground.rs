@@ -15,15 +15,17 @@
 use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::Sampler;
 use dipir_numerics::warp::balance_heuristic;
+use dipir_scene::bvh::Hit;
 use dipir_scene::camera::Ray;
 use glam::{Vec2, Vec3};
 
-use crate::bsdf::Bsdf;
 use crate::bsdf::features::{EMISSION, has};
+use crate::bsdf::{Bsdf, BsdfSample};
 use crate::counters::{RayCounts, RayKind};
 use crate::features::PROXY_RADIANCE;
 use crate::light::PathLight;
 use crate::photo::Photo;
+use crate::surface::{SurfacePoint, Surfaces};
 use crate::world::World;
 
 /// Where paths begin.
@@ -79,6 +81,68 @@ pub trait Gather {
     fn distant(&mut self, direction: Vec3, throughput: Vec3, radiance: Vec3, weight: f32);
     /// Radiance that arrives from the scene itself: emission, unlit surfaces, the photograph.
     fn local(&mut self, radiance: Vec3);
+
+    /// Whether a vertex that returns no light is of interest, for its derivative may not be 0.
+    const DERIVATIVES: bool = false;
+
+    /// What the photograph shows, `seen`, that arrives with `throughput * weight`.
+    #[inline(always)]
+    fn photographed(&mut self, throughput: Vec3, seen: Vec3, weight: f32) {
+        self.local(throughput * seen * weight);
+    }
+
+    /// What the surface at `vertex` sheds by itself arrives with `throughput`.
+    #[inline(always)]
+    fn emitted<const F: u32>(&mut self, vertex: &Vertex, throughput: Vec3) {
+        let surface = vertex.surface;
+        self.local(match surface.unlit {
+            true => throughput * surface.base_color,
+            false => throughput * surface.emission,
+        });
+    }
+
+    /// The light that is reported next was sampled at `vertex`: it arrives from `wi` there, by
+    /// way of `throughput`, and is scattered by `value`.
+    #[inline(always)]
+    fn lit<const F: u32>(
+        &mut self,
+        _bsdf: &Bsdf<F>,
+        _vertex: &Vertex,
+        _throughput: Vec3,
+        _wi: Vec3,
+        _value: Vec3,
+    ) {
+    }
+
+    /// The path, which came to `vertex` with `throughput`, goes on along `sample`, drawn with the
+    /// number `u_lobe`.
+    #[inline(always)]
+    fn scattered<const F: u32>(
+        &mut self,
+        _bsdf: &Bsdf<F>,
+        _vertex: &Vertex,
+        _throughput: Vec3,
+        _u_lobe: f32,
+        _sample: &BsdfSample,
+    ) {
+    }
+
+    /// The path survived Russian roulette, and its throughput grows by `scale`.
+    #[inline(always)]
+    fn survived(&mut self, _scale: f32) {}
+}
+
+/// Where a path meets the object.
+#[derive(Clone, Copy)]
+pub struct Vertex<'a> {
+    /// All surfaces.
+    pub surfaces: &'a Surfaces<'a>,
+    /// Unit vector along the path.
+    pub direction: Vec3,
+    /// What is met.
+    pub hit: &'a Hit,
+    /// And its material there.
+    pub surface: &'a SurfacePoint,
 }
 
 impl Gather for Vec3 {
@@ -194,7 +258,7 @@ impl<L: PathLight> PathContext<'_, L> {
                 let (light, light_pdf) = self.light.eval_with_pdf(ray.direction);
                 let weight = balance_heuristic(sampled_pdf, light_pdf);
                 match self.photo_beyond::<F>(&ray, counts) {
-                    Some(seen) => gather.local(throughput * seen * weight),
+                    Some(seen) => gather.photographed(throughput, seen, weight),
                     None => gather.distant(ray.direction, throughput, light, weight),
                 }
                 break;
@@ -209,15 +273,21 @@ impl<L: PathLight> PathContext<'_, L> {
                 surface.roughness = surface.roughness.max(MIN_CAUSTIC_ROUGHNESS);
                 surface.coat.roughness = surface.coat.roughness.max(MIN_CAUSTIC_ROUGHNESS);
             }
+            let vertex = Vertex {
+                surfaces: &world.surfaces,
+                direction: ray.direction,
+                hit: &hit,
+                surface: &surface,
+            };
             if has(F, EMISSION) {
                 if surface.unlit {
                     if depth > 0 || self.start == PathStart::Camera {
-                        gather.local(throughput * surface.base_color);
+                        gather.emitted::<F>(&vertex, throughput);
                     }
                     break;
                 }
                 if depth > 0 || self.start != (PathStart::Proxy { emission: false }) {
-                    gather.local(throughput * surface.emission);
+                    gather.emitted::<F>(&vertex, throughput);
                 }
             }
             if depth == self.max_depth {
@@ -234,7 +304,8 @@ impl<L: PathLight> PathContext<'_, L> {
                 let light = self.light.sample(light_numbers);
                 let (value, bsdf_pdf) = bsdf.eval_pdf(light.direction);
                 // Both densities may underflow to 0: then there is no such sample.
-                if light.pdf > 0.0 && value != Vec3::ZERO && light.radiance != Vec3::ZERO {
+                let returns = value != Vec3::ZERO || G::DERIVATIVES;
+                if light.pdf > 0.0 && returns && light.radiance != Vec3::ZERO {
                     let shadow = world.leave(&surface, light.direction);
                     let known = world.escapes && is_outward(&surface, light.direction);
                     if !known {
@@ -243,8 +314,9 @@ impl<L: PathLight> PathContext<'_, L> {
                     if known || !world.hides_light::<F>(&shadow, !alpha_key) {
                         let weight = balance_heuristic(light.pdf, bsdf_pdf) / light.pdf;
                         let arriving = throughput * value;
+                        gather.lit(&bsdf, &vertex, throughput, light.direction, value);
                         match self.photo_beyond::<F>(&shadow, counts) {
-                            Some(seen) => gather.local(arriving * seen * weight),
+                            Some(seen) => gather.photographed(arriving, seen, weight),
                             None => {
                                 gather.distant(light.direction, arriving, light.radiance, weight);
                             }
@@ -257,6 +329,7 @@ impl<L: PathLight> PathContext<'_, L> {
             let Some(sample) = bsdf.sample(lobe_number, direction_numbers) else {
                 break;
             };
+            gather.scattered(&bsdf, &vertex, throughput, lobe_number, &sample);
             throughput *= sample.weight;
             if throughput.max_element() <= 0.0 {
                 break;
@@ -276,6 +349,7 @@ impl<L: PathLight> PathContext<'_, L> {
                     break;
                 }
                 throughput /= survival;
+                gather.survived(1.0 / survival);
             }
         }
         1.0

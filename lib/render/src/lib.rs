@@ -12,6 +12,7 @@ pub mod footprint;
 pub mod foreground;
 pub mod gbuffer;
 pub mod light;
+pub mod material_gradient;
 pub mod photo;
 pub mod pilot;
 pub mod render;

@@ -124,6 +124,18 @@ impl<'a> Renderer<'a> {
         }
     }
 
+    /// The same shapes with the materials of `scene`, whose mesh and proxy must be this one's;
+    /// the hierarchies are shared.
+    pub fn with_materials_of<'b>(&self, scene: &'b Scene) -> Renderer<'b> {
+        let shapes = |s: &Scene| (s.mesh.positions.len(), s.mesh.indices.len());
+        assert_eq!(shapes(scene), shapes(self.scene), "the same shapes");
+        Renderer {
+            scene,
+            camera: self.camera,
+            geometry: self.geometry.clone(),
+        }
+    }
+
     /// The camera that renders.
     pub fn camera(&self) -> &Camera {
         &self.camera
@@ -268,7 +280,7 @@ impl<'a> Renderer<'a> {
         Ok(())
     }
 
-    fn blocks(&self) -> impl Iterator<Item = Block> {
+    pub(crate) fn blocks(&self) -> impl Iterator<Item = Block> {
         let [width, height] = self.camera.resolution;
         (0..height.div_ceil(BLOCK)).flat_map(move |j| {
             (0..width.div_ceil(BLOCK)).map(move |i| {
@@ -327,14 +339,14 @@ fn is_visible(settings: &Settings, x: u32, y: u32) -> bool {
         .is_none_or(|mask| *mask.get(x as usize, y as usize) < 1.0)
 }
 
-fn pixels_of(block: Block) -> impl Iterator<Item = (u32, u32)> {
+pub(crate) fn pixels_of(block: Block) -> impl Iterator<Item = (u32, u32)> {
     (block.y..block.y + block.height)
         .flat_map(move |y| (block.x..block.x + block.width).map(move |x| (x, y)))
 }
 
 /// The sequence of one replicate of one pixel. Rows are padded to 2^16 columns, so that a crop or
 /// another resolution keeps a pixel's numbers.
-fn sequence(seed: u64, stream: Stream, replicate: usize, (x, y): (u32, u32)) -> Sampler {
+pub(crate) fn sequence(seed: u64, stream: Stream, replicate: usize, (x, y): (u32, u32)) -> Sampler {
     Sampler::new(
         hash_u64s(&[seed, replicate as u64]),
         stream,

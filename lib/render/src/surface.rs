@@ -70,6 +70,19 @@ pub struct SurfacePoint {
     pub unlit: bool,
 }
 
+/// Derivatives of a [`SurfacePoint`] with respect to the factors of its material.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FactorSlopes {
+    /// Of the base colour, a channel at a time.
+    pub base_color: Vec3,
+    /// Of the metalness.
+    pub metallic: f32,
+    /// Of the roughness.
+    pub roughness: f32,
+    /// Of the emission with respect to the emissive factor, a channel at a time.
+    pub emission: Vec3,
+}
+
 impl SurfacePoint {
     /// A flat, white, rough, opaque dielectric at the origin that faces `normal`.
     pub fn facing(normal: Vec3) -> Self {
@@ -327,6 +340,42 @@ impl<'a> Surfaces<'a> {
             emission,
             unlit: m.unlit,
         }
+    }
+
+    /// Derivatives of what [`interact`](Self::interact) says of a material's factors, at
+    /// barycentric weights `u`, `v` on `triangle`: the textures and colours that multiply them.
+    pub fn slopes<const F: u32>(&self, triangle: u32, u: f32, v: f32) -> FactorSlopes {
+        let m = self.material(triangle);
+        let mut slopes = FactorSlopes {
+            base_color: Vec3::ONE,
+            metallic: 1.0,
+            roughness: 1.0,
+            emission: Vec3::ONE,
+        };
+        if has(F, TEXTURES) {
+            let point = self.barycentric(triangle, u, v);
+            if let Some(t) = &m.base_color_texture {
+                slopes.base_color *= self.lookup(t, &point).truncate();
+            }
+            if self.has_colors {
+                let colors = point.interpolate(&self.mesh.colors, Vec4::ZERO);
+                slopes.base_color *= colors.truncate();
+            }
+            if let Some(t) = &m.metallic_roughness_texture {
+                let value = self.lookup(t, &point);
+                slopes.roughness *= value.y;
+                slopes.metallic *= value.z;
+            }
+            if let Some(t) = &m.emissive_texture {
+                slopes.emission *= self.lookup(t, &point).truncate();
+            }
+        }
+        // Beyond 1 the products are clamped and no longer change.
+        let color = m.base_color.truncate() * slopes.base_color;
+        slopes.base_color = Vec3::select(color.cmple(Vec3::ONE), slopes.base_color, Vec3::ZERO);
+        slopes.metallic *= f32::from(m.metallic * slopes.metallic <= 1.0);
+        slopes.roughness *= f32::from(m.roughness * slopes.roughness <= 1.0);
+        slopes
     }
 
     fn transmission_at<const F: u32>(&self, t: &Transmission, point: &Barycentric) -> f32 {

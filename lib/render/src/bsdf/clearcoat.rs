@@ -16,14 +16,14 @@ use glam::Vec3;
 use super::energy::LobeEnergy;
 use super::fresnel::schlick_weight;
 use super::ggx::Ggx;
-use super::metallic_roughness::{Base, Facet};
+use super::metallic_roughness::{Base, BaseSlopes, Facet};
 use crate::surface::CoatPoint;
 
 /// Reflectance of the coat at normal incidence: index of refraction 1.5.
 const F0: f32 = 0.04;
 
 /// Nodes and weights on [0, 1] of Gauss and Legendre's rule with six points.
-const GAUSS: [(f32, f32); 6] = [
+pub(super) const GAUSS: [(f32, f32); 6] = [
     (0.033_765_243, 0.085_662_25),
     (0.169_395_31, 0.180_380_79),
     (0.380_690_41, 0.233_956_97),
@@ -125,6 +125,32 @@ impl Coat {
             both += left * self.passing(mu);
         }
         one / both
+    }
+
+    /// Logarithmic derivative of [`Self::over_diffuse`] with respect to the roughness of the base.
+    pub fn log_over_diffuse_slope(&self, base: &Base, slopes: &BaseSlopes) -> f32 {
+        if self.diffuse <= 0.0 {
+            return 0.0;
+        }
+        let (mut one, mut both) = (0.0, 0.0);
+        let (mut one_slope, mut both_slope) = (0.0, 0.0);
+        for (mu, weight) in GAUSS {
+            let (loss, share) = (base.energy.loss(mu), base.energy.share(mu));
+            let left = weight * mu * (1.0 - base.dielectric_albedo(loss, share));
+            let slope = -weight
+                * mu
+                * base.dielectric_albedo_slope(
+                    slopes,
+                    (loss, base.energy.loss_slope(mu)),
+                    (share, base.energy.share_slope(mu)),
+                );
+            let passing = self.passing(mu);
+            one += left;
+            both += left * passing;
+            one_slope += slope;
+            both_slope += slope * passing;
+        }
+        one_slope / one - both_slope / both
     }
 
     /// Attenuation of specular and transmitted lobes below at a `wi` with `passing`.

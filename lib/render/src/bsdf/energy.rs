@@ -132,6 +132,75 @@ impl LobeEnergy {
         bilinear(&SHARE, self.share_row, cell(x, SHARE_COLUMNS - 1)) * SHARE_SCALE
     }
 
+    /// The perceptual roughness, the square root of alpha.
+    #[inline]
+    fn roughness(&self) -> f32 {
+        self.alpha.sqrt()
+    }
+
+    /// Derivative of [`Self::loss`] with respect to the roughness; 0 for a mirror. The table is
+    /// piecewise linear: on a row or column the slope is that of the cell that is looked up.
+    pub fn loss_slope(&self, mu: f32) -> f32 {
+        if self.alpha == 0.0 || mu == 0.0 {
+            return 0.0;
+        }
+        let (alpha, sum) = (self.alpha, mu + self.alpha);
+        let (s, w) = (mu / sum, alpha / sum);
+        let ratio = mu / alpha;
+        let column = octaves(ratio) - grid::LOSS_FIRST_OCTAVE as f32;
+        let x = column * (grid::LOSS_PER_OCTAVE as f32);
+        let last = (LOSS_COLUMNS - 1) as f32;
+        let inside = x > 0.0 && x < last;
+        let (cell, fraction) = split(x.clamp(0.0, last), LOSS_COLUMNS - 1);
+        let q = bilinear(&LOSS, self.loss_row, (cell, fraction));
+        let (row, _) = self.loss_row;
+        let (low, high) = ((row, 0.0), (row, 1.0));
+        let by_row =
+            bilinear(&LOSS, high, (cell, fraction)) - bilinear(&LOSS, low, (cell, fraction));
+        let by_column = bilinear(&LOSS, self.loss_row, (cell, 1.0))
+            - bilinear(&LOSS, self.loss_row, (cell, 0.0));
+        // Within an octave its coordinate grows by ratio / 2^floor(log2 ratio), and the ratio
+        // falls as 1 / alpha.
+        let octave = f32::from_bits(ratio.to_bits() & 0x7f80_0000);
+        let column_slope = match inside {
+            true => -(grid::LOSS_PER_OCTAVE as f32) * (ratio / octave) / alpha,
+            false => 0.0,
+        };
+        let alpha_slope = 2.0 * self.roughness();
+        let q_slope = by_row * (LOSS_ROWS - 1) as f32 + by_column * column_slope * alpha_slope;
+        let shape = s * w * w;
+        let shape_slope = shape * (2.0 / alpha - 3.0 / sum) * alpha_slope;
+        LOSS_SCALE * (q_slope * shape + q * shape_slope)
+    }
+
+    /// Derivative of [`Self::share`] with respect to the roughness; 0 for a mirror.
+    pub fn share_slope(&self, mu: f32) -> f32 {
+        if self.alpha == 0.0 {
+            return 0.0;
+        }
+        let column = cell(mu.min(1.0).sqrt(), SHARE_COLUMNS - 1);
+        let (row, _) = self.share_row;
+        let rise = bilinear(&SHARE, (row, 1.0), column) - bilinear(&SHARE, (row, 0.0), column);
+        rise * SHARE_SCALE * (SHARE_ROWS - 1) as f32
+    }
+
+    /// Derivatives of [`mean_loss`](Self::mean_loss) and [`mean_e5`](Self::mean_e5) with respect
+    /// to the roughness; 0 for a mirror.
+    pub fn mean_slopes(&self) -> (f32, f32) {
+        if self.alpha == 0.0 {
+            return (0.0, 0.0);
+        }
+        let r = self.roughness();
+        let (i, f) = cell(r, MEAN_ROWS - 1);
+        let rise = |t: &[f32; MEAN_ROWS]| (t[i + 1] - t[i]) * (MEAN_ROWS - 1) as f32;
+        let loss = MEAN_LOSS[i] + (MEAN_LOSS[i + 1] - MEAN_LOSS[i]) * f;
+        let alpha2 = self.alpha * self.alpha;
+        (
+            4.0 * r * self.alpha * loss + alpha2 * rise(&MEAN_LOSS),
+            rise(&MEAN_SHARE),
+        )
+    }
+
     /// Draws a direction for further bounces: the light that they return, `loss(mu) mu`, is
     /// spread evenly over the logarithm of `mu` down to alpha, so the cosine has the density
     /// `1 / ((mu + alpha) ln(1 + 1 / alpha))`. The cosine-weighted density would give rare
@@ -174,6 +243,19 @@ impl LobeEnergy {
     pub fn further_fresnel(&self, f0: f32) -> f32 {
         let mean = f0 + (1.0 - f0) * MEAN_SCHLICK;
         mean * mean * (1.0 - self.mean_loss) / (1.0 - mean * self.mean_loss)
+    }
+
+    /// Derivatives of [`Self::further_fresnel`] with respect to `f0` and to the roughness.
+    pub fn further_fresnel_slopes(&self, f0: f32) -> (f32, f32) {
+        let mean = f0 + (1.0 - f0) * MEAN_SCHLICK;
+        let loss = self.mean_loss;
+        let below = 1.0 - mean * loss;
+        let by_mean = mean * (1.0 - loss) * (2.0 - mean * loss) / (below * below);
+        let by_loss = mean * mean * (mean - 1.0) / (below * below);
+        (
+            by_mean * (1.0 - MEAN_SCHLICK),
+            by_loss * self.mean_slopes().0,
+        )
     }
 }
 

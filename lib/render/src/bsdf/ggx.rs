@@ -60,6 +60,33 @@ impl Ggx {
         1.0 / ((wo_z + wo_length) * (wi_z + wi_length))
     }
 
+    /// Derivative of [`Self::stretched_length`] with respect to alpha, of a vector with that
+    /// `length`.
+    #[inline]
+    pub fn stretched_length_slope(&self, w: Vec3, length: f32) -> f32 {
+        self.alpha * (w.x * w.x + w.y * w.y) / length
+    }
+
+    /// Logarithmic derivative of [`Self::d`] with respect to alpha.
+    #[inline]
+    pub fn log_d_slope(&self, h: Vec3) -> f32 {
+        let t = (h.x * h.x + h.y * h.y) / (self.alpha * self.alpha);
+        // d ln(1 / (a^2 e^2)) with e = t + z^2 and dt/da = -2 t / a.
+        (2.0 / self.alpha) * (2.0 * t / (t + h.z * h.z) - 1.0)
+    }
+
+    /// Logarithmic derivative of [`Self::visibility`] where the lengths have the slopes
+    /// `wo_slope` and `wi_slope`.
+    #[inline]
+    pub fn log_visibility_slope(
+        wo_z: f32,
+        (wo_length, wo_slope): (f32, f32),
+        wi_z: f32,
+        (wi_length, wi_slope): (f32, f32),
+    ) -> f32 {
+        -(wi_z * wo_slope + wo_z * wi_slope) / (wi_z * wo_length + wo_z * wi_length)
+    }
+
     /// Density per steradian of the direction that [`Self::sample`] reflects `wo` to, where
     /// `d` is [`Self::d`] of their half vector: `G1(wo) D(h) / (4 cos_o)`.
     #[inline]

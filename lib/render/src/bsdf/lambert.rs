@@ -10,3 +10,10 @@ pub(super) fn coupling(mean: f32) -> f32 {
     let left = 1.0 - mean;
     if left > 0.0 { FRAC_1_PI / left } else { 0.0 }
 }
+
+/// Logarithmic derivative of [`coupling`] with respect to the mean.
+#[inline]
+pub(super) fn log_coupling_slope(mean: f32) -> f32 {
+    let left = 1.0 - mean;
+    if left > 0.0 { 1.0 / left } else { 0.0 }
+}

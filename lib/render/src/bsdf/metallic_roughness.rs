@@ -21,6 +21,7 @@ use super::features::{PLAIN_GGX, SPECULAR, TRANSMISSION, has};
 use super::fresnel::{f0_from_ior, schlick, schlick_weight};
 use super::ggx::Ggx;
 use super::lambert;
+use super::slopes::MaterialSlopes;
 use super::transmission::Transmitted;
 use crate::surface::SurfacePoint;
 
@@ -194,6 +195,106 @@ impl Base {
             + self.further_dielectric * self.energy.mean_loss
     }
 
+    /// Derivatives of what [`Self::new`] prepares, for the `surface` that it was given.
+    pub fn slopes<const F: u32>(&self, surface: &SurfacePoint) -> BaseSlopes {
+        let glossy = has(F, SPECULAR);
+        let passing = match has(F, TRANSMISSION) {
+            true => surface.transmission,
+            false => 0.0,
+        };
+        let (color, metallic) = (surface.base_color, surface.metallic);
+        let diffuse_share = (1.0 - metallic) * (1.0 - passing);
+        if !(glossy || has(F, TRANSMISSION) && passing > 0.0) {
+            return BaseSlopes {
+                diffuse: MaterialSlopes {
+                    base_color: Vec3::splat(diffuse_share * FRAC_1_PI),
+                    metallic: color * (-(1.0 - passing) * FRAC_1_PI),
+                    roughness: Vec3::ZERO,
+                },
+                ..BaseSlopes::default()
+            };
+        }
+        let energy = &self.energy;
+        let (loss, share) = (energy.loss(self.wo.z), energy.share(self.wo.z));
+        let (loss_slope, share_slope) =
+            (energy.loss_slope(self.wo.z), energy.share_slope(self.wo.z));
+        let (mean_loss_slope, mean_e5_slope) = energy.mean_slopes();
+        let mut slopes = BaseSlopes {
+            alpha: self.ggx.map_or(0.0, |g| 2.0 * g.alpha.sqrt()),
+            wo_length: self
+                .ggx
+                .map_or(0.0, |g| g.stretched_length_slope(self.wo, self.wo_length)),
+            ..BaseSlopes::default()
+        };
+        let inverse = energy.inverse_mean_loss();
+        let broad = loss * inverse * FRAC_1_PI;
+        let broad_slope = (loss_slope - loss * mean_loss_slope * inverse) * inverse * FRAC_1_PI;
+        // Coupling and left-over of the diffuse lobe; 1 / pi and constant without an interface.
+        let (mut seen, mut seen_slope) = (FRAC_1_PI, 0.0);
+        if glossy {
+            let f0 = self.f0_dielectric;
+            slopes.f0_base_color = metallic;
+            slopes.f0_metallic = color - Vec3::splat(f0);
+            slopes.further_dielectric = energy.further_fresnel_slopes(f0).1;
+            let of_metal = color.to_array().map(|c| energy.further_fresnel_slopes(c));
+            let metal = Vec3::from(color.to_array().map(|c| energy.further_fresnel(c)));
+            let metal_by_f0 = Vec3::from(of_metal.map(|s| s.0));
+            let metal_by_roughness = Vec3::from(of_metal.map(|s| s.1));
+            let dielectric = Vec3::splat(self.further_dielectric);
+            let by_roughness =
+                Vec3::splat(slopes.further_dielectric).lerp(metal_by_roughness, metallic);
+            slopes.further = MaterialSlopes {
+                base_color: metal_by_f0 * (metallic * broad),
+                metallic: (metal - dielectric) * broad,
+                roughness: by_roughness * broad + dielectric.lerp(metal, metallic) * broad_slope,
+            };
+            let left = 1.0 - self.dielectric_albedo(loss, share);
+            let left_slope =
+                -self.dielectric_albedo_slope(&slopes, (loss, loss_slope), (share, share_slope));
+            let mean = self.mean_dielectric_albedo();
+            let mean_slope = -f0 * mean_loss_slope
+                + (1.0 - f0) * mean_e5_slope
+                + slopes.further_dielectric * energy.mean_loss
+                + self.further_dielectric * mean_loss_slope;
+            let coupling = lambert::coupling(mean);
+            seen = left * coupling;
+            seen_slope =
+                coupling * left_slope + seen * lambert::log_coupling_slope(mean) * mean_slope;
+        }
+        slopes.diffuse = MaterialSlopes {
+            base_color: Vec3::splat(diffuse_share * seen),
+            metallic: color * (-(1.0 - passing) * seen),
+            roughness: color * (diffuse_share * seen_slope),
+        };
+        if has(F, TRANSMISSION) {
+            let below = 1.0 - self.further_dielectric;
+            let share = (1.0 - metallic) * passing;
+            slopes.transmitted_base_color = share;
+            slopes.transmitted_metallic = color * -passing;
+            slopes.transmitted_further = MaterialSlopes {
+                base_color: Vec3::splat(share * below * broad),
+                metallic: color * (-passing * below * broad),
+                roughness: color
+                    * (share * (below * broad_slope - slopes.further_dielectric * broad)),
+            };
+        }
+        slopes
+    }
+
+    /// Derivative of [`Self::dielectric_albedo`] with respect to the roughness, from `loss` and
+    /// `share` with their slopes.
+    #[inline]
+    pub fn dielectric_albedo_slope(
+        &self,
+        slopes: &BaseSlopes,
+        (loss, loss_slope): (f32, f32),
+        (share, share_slope): (f32, f32),
+    ) -> f32 {
+        (self.f90 - self.f0_dielectric) * share_slope * (1.0 - loss)
+            + (self.further_dielectric - self.dielectric_fresnel(share)) * loss_slope
+            + slopes.further_dielectric * loss
+    }
+
     /// The reflecting lobes at `wi`, which lies above the surface; delta lobes left out. `sum`
     /// is `wo + wi`.
     #[inline]
@@ -237,6 +338,90 @@ impl Base {
         }
         result
     }
+
+    /// Derivatives of the values of [`Self::reflected`], specular and diffuse.
+    pub fn reflected_slopes<const F: u32>(
+        &self,
+        slopes: &BaseSlopes,
+        wi: Vec3,
+        sum: Vec3,
+    ) -> (MaterialSlopes, MaterialSlopes) {
+        if !has(F, SPECULAR) {
+            return (MaterialSlopes::ZERO, slopes.diffuse.times(wi.z));
+        }
+        let mut specular = MaterialSlopes::ZERO;
+        if let Some(ggx) = self.ggx {
+            let facet = Facet::new(&ggx, wi, sum);
+            let weight = schlick_weight(facet.cosine);
+            let v = Ggx::visibility(self.wo.z, self.wo_length, wi.z, facet.wi_length);
+            let lobe = facet.d * v * wi.z;
+            let by_f0 = (1.0 - weight) * lobe;
+            let log_slope = self.log_lobe_slope(slopes, &ggx, &facet, wi, sum);
+            specular = MaterialSlopes {
+                base_color: Vec3::splat(slopes.f0_base_color * by_f0),
+                metallic: slopes.f0_metallic * by_f0,
+                roughness: schlick(self.f0, weight) * (lobe * log_slope),
+            };
+        }
+        let (loss, loss_slope) = (self.energy.loss(wi.z), self.energy.loss_slope(wi.z));
+        specular += slopes.further.times(loss * wi.z);
+        specular.roughness += self.further * (loss_slope * wi.z);
+        let (share, share_slope) = (self.energy.share(wi.z), self.energy.share_slope(wi.z));
+        let left = 1.0 - self.dielectric_albedo(loss, share);
+        let left_slope =
+            -self.dielectric_albedo_slope(slopes, (loss, loss_slope), (share, share_slope));
+        let mut diffuse = slopes.diffuse.times(left * wi.z);
+        diffuse.roughness += self.diffuse * (left_slope * wi.z);
+        (specular, diffuse)
+    }
+
+    /// Logarithmic derivative with respect to the roughness of density times visibility.
+    pub fn log_lobe_slope(
+        &self,
+        slopes: &BaseSlopes,
+        ggx: &Ggx,
+        facet: &Facet,
+        wi: Vec3,
+        sum: Vec3,
+    ) -> f32 {
+        let wi_slope = ggx.stretched_length_slope(wi, facet.wi_length);
+        let visibility = Ggx::log_visibility_slope(
+            self.wo.z,
+            (self.wo_length, slopes.wo_length),
+            wi.z,
+            (facet.wi_length, wi_slope),
+        );
+        slopes.alpha * (ggx.log_d_slope(sum / sum.length()) + visibility)
+    }
+
+    /// Derivatives of the reflectance of a mirror, `schlick(f0, weight)`.
+    pub fn mirror_slopes(&self, slopes: &BaseSlopes, weight: f32) -> MaterialSlopes {
+        MaterialSlopes {
+            base_color: Vec3::splat(slopes.f0_base_color * (1.0 - weight)),
+            metallic: slopes.f0_metallic * (1.0 - weight),
+            roughness: Vec3::ZERO,
+        }
+    }
+}
+
+/// Derivatives of [`Base`] for one `wo`.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct BaseSlopes {
+    /// Of alpha with respect to the roughness; 0 for a mirror.
+    pub alpha: f32,
+    /// Of `wo_length` with respect to alpha.
+    pub wo_length: f32,
+    /// Of the reflectance at normal incidence.
+    pub f0_base_color: f32,
+    pub f0_metallic: Vec3,
+    /// Of `further_dielectric` with respect to the roughness.
+    pub further_dielectric: f32,
+    pub further: MaterialSlopes,
+    pub diffuse: MaterialSlopes,
+    /// Of `transmitted.color`.
+    pub transmitted_base_color: f32,
+    pub transmitted_metallic: Vec3,
+    pub transmitted_further: MaterialSlopes,
 }
 
 /// The microfacet that reflects `wo` to `wi`.

@@ -11,6 +11,7 @@ pub mod fresnel;
 pub mod ggx;
 mod lambert;
 mod metallic_roughness;
+pub mod slopes;
 mod transmission;
 
 #[cfg(test)]

@@ -9,7 +9,8 @@ use glam::Vec3;
 
 use super::fresnel::schlick_weight;
 use super::ggx::Ggx;
-use super::metallic_roughness::{Base, Facet};
+use super::metallic_roughness::{Base, BaseSlopes, Facet};
+use super::slopes::MaterialSlopes;
 
 /// What the transmitted lobes need beside the reflected ones.
 #[derive(Clone, Copy, Debug, Default)]
@@ -36,5 +37,29 @@ impl Base {
             pdf = Ggx::reflection_pdf(facet.d, self.wo.z, self.wo_length);
         }
         (value, pdf)
+    }
+
+    /// Derivatives of the value of [`Self::transmitted`].
+    pub fn transmitted_slopes(&self, slopes: &BaseSlopes, wi: Vec3, sum: Vec3) -> MaterialSlopes {
+        let mirrored = Vec3::new(wi.x, wi.y, -wi.z);
+        let (loss, loss_slope) = (
+            self.energy.loss(mirrored.z),
+            self.energy.loss_slope(mirrored.z),
+        );
+        let mut result = slopes.transmitted_further.times(loss * mirrored.z);
+        result.roughness += self.transmitted.further * (loss_slope * mirrored.z);
+        if let Some(ggx) = self.ggx {
+            let facet = Facet::new(&ggx, mirrored, sum);
+            let v = Ggx::visibility(self.wo.z, self.wo_length, mirrored.z, facet.wi_length);
+            let passing = 1.0 - self.dielectric_fresnel(schlick_weight(facet.cosine));
+            let lobe = passing * facet.d * v * mirrored.z;
+            let log_slope = self.log_lobe_slope(slopes, &ggx, &facet, mirrored, sum);
+            result += MaterialSlopes {
+                base_color: Vec3::splat(slopes.transmitted_base_color * lobe),
+                metallic: slopes.transmitted_metallic * lobe,
+                roughness: self.transmitted.color * (lobe * log_slope),
+            };
+        }
+        result
     }
 }
