@@ -74,6 +74,9 @@ pub enum OptimizeError {
     /// The light's transport could not be recorded.
     #[error("cannot record how light reaches the picture")]
     Record(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// The object could not be rendered.
+    #[error("cannot render the object")]
+    Render(#[source] dipir_render::error::RenderError),
     /// The guidance failed.
     #[error("the guidance failed in iteration {iteration}")]
     Guidance {

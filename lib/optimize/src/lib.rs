@@ -19,6 +19,7 @@ pub mod error;
 pub mod guidance;
 pub mod history;
 pub mod lighting;
+pub mod materials;
 pub mod objective;
 pub mod optimization;
 pub mod parameters;

@@ -308,6 +308,8 @@ impl Settings {
             Group::Sigma => on(self.light, r.sigma),
             Group::Exposure => on(self.light, r.exposure),
             Group::Tone => on(self.tone, r.tone),
+            // Materials have a loop of their own.
+            Group::Material => 0.0,
         }
     }
 

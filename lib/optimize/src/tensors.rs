@@ -14,6 +14,8 @@ pub enum Group {
     Tone,
     /// Logarithm of the exposure.
     Exposure,
+    /// Factors of materials.
+    Material,
 }
 
 /// A named list of numbers.
