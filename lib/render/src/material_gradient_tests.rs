@@ -19,7 +19,8 @@ fn pair(roughness: f32) -> Scene {
         1,
     );
     let mut ball = matte(Vec3::new(0.7, 0.5, 0.3));
-    ball.roughness = roughness;
+    // Inside its range: beyond an end, values are clamped.
+    (ball.metallic, ball.roughness) = (0.2, roughness);
     ball.emissive = Vec3::new(0.2, 0.1, 0.3);
     let mut brick = matte(Vec3::new(0.3, 0.6, 0.8));
     (brick.metallic, brick.roughness) = (0.6, roughness);
