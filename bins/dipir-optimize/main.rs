@@ -12,10 +12,12 @@ Examples:
   dipir-optimize --set optimize.reference=shot.png --set optimize.guidance=reference
                                                  light under which the object looks as in shot.png
   dipir-optimize --set optimize.light=false      tone curves alone
+  dipir-optimize --set 'optimize.materials=[\"paint\"]'
+                                                 a material, under [composite] environment
   dipir-optimize --set pipeline.quality=high     finer environment, more lobes
 
 Reads OUT/scene/, which dipir-scene writes. Writes OUT/light/: lighting.json environment.exr
-tone.json history.json previews/ stage.json.
+tone.json history.json previews/ stage.json; for materials, materials.json history.json stage.json.
 An interrupted run goes on where it stopped and ends with the same bytes.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 
@@ -33,6 +35,11 @@ struct Cli {
 fn main() -> ExitCode {
     exit::run(|| {
         let session = Session::start(&Cli::parse().common)?;
+        if dipir::materials::are_asked_for(&session)? {
+            let done = dipir::materials::run(&session)?;
+            session.result(|| done.to_string(), || done.to_json());
+            return Ok(());
+        }
         let done = dipir::optimize::run(&session)?;
         session.result(|| done.to_string(), || done.to_json());
         Ok(())

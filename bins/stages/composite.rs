@@ -23,6 +23,7 @@ use serde_json::{Value, json};
 
 use crate::interruption;
 use crate::light::{self, Light, Recovered};
+use crate::materials;
 use crate::scene_folder::SceneFolder;
 
 /// Name of the stage and of its folder.
@@ -171,7 +172,8 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         table.time_budget_s = args.time_budget_s;
     }
     table.check(&session.config)?;
-    let inputs = read(session)?;
+    let mut inputs = read(session)?;
+    let materials = materials::recovered(session, &mut inputs.scene)?;
     let light = match light::known(session, &table)? {
         Some(light) => Source::Map(light),
         None => Source::Recovered(Box::new(light::recovered(
@@ -181,7 +183,10 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         )?)),
     };
     let stop = table.stop(session.pipeline.quality);
-    let plan = stage_plan(session, &table, stop, &inputs, &light)?;
+    let mut plan = stage_plan(session, &table, stop, &inputs, &light)?;
+    if let Some((known_as, location)) = &materials {
+        plan.input("materials", known_as, location)?;
+    }
     let folder = session.stage_folder(STAGE);
     let mut writer = session.begin(plan)?;
     let rendered = render(session, &table, stop, &inputs, &light)?;

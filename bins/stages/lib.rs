@@ -4,6 +4,7 @@ pub mod composite;
 pub mod concepts;
 pub mod light;
 pub mod lora;
+pub mod materials;
 pub mod model;
 pub mod optimize;
 pub mod scene;

@@ -123,7 +123,7 @@ pub fn recovered(
 }
 
 /// The light may have been recovered before the scene was set up anew.
-fn warn_of_another_scene(session: &Session, light: &Manifest, scene: &Manifest) {
+pub fn warn_of_another_scene(session: &Session, light: &Manifest, scene: &Manifest) {
     let of = |list: &[dipir_pipeline::manifest::Artifact]| {
         let found = list.iter().find(|a| a.role == "scene");
         found.map(|a| a.blake3.clone())

@@ -124,7 +124,10 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
 }
 
 /// The reference, as the configuration names it and where it is.
-fn reference_of(session: &Session, table: &OptimizeTable) -> anyhow::Result<(PathBuf, PathBuf)> {
+pub fn reference_of(
+    session: &Session,
+    table: &OptimizeTable,
+) -> anyhow::Result<(PathBuf, PathBuf)> {
     let name = match table.guidance {
         GuidanceKind::Reference => None,
         GuidanceKind::Lds => Some("lds"),
@@ -148,7 +151,7 @@ fn reference_of(session: &Session, table: &OptimizeTable) -> anyhow::Result<(Pat
 }
 
 /// The reference at the size of `frame`, as it is displayed.
-fn read_reference(
+pub fn read_reference(
     session: &Session,
     scene: &SceneFolder,
     frame: &Frame,

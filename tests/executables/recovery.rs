@@ -376,3 +376,42 @@ fn light_that_was_recovered_for_another_scene_is_warned_of() {
          to recover it for this one"
     );
 }
+
+#[test]
+fn a_material_is_recovered_under_a_known_light_and_used_by_the_composite() {
+    let project = Project::new();
+    let object = format!("mtllib object.mtl\nusemtl paint\n{OBJECT}");
+    project.write("object.obj", object);
+    let paint = |color: &str| project.write("object.mtl", format!("newmtl paint\nKd {color}\n"));
+    paint("0.6 0.3 0.1");
+    let thorough = ["-s", "composite.target_error=0.005"];
+    project.run_both(&[&["-o", "truth"][..], &thorough].concat());
+    project.write(
+        "reference.exr",
+        project.read("truth/composite/composite.exr"),
+    );
+    paint("0.5 0.5 0.5");
+    let table = "\n[optimize]\nguidance = \"reference\"\nreference = \"reference.exr\"\n\
+                 materials = [\"paint\"]\niterations = 150\n";
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write("pipeline.toml", text + table);
+    project.run(SCENE, &[]).expect_success();
+    project.run(OPTIMIZE, &[]).expect_success();
+    let found = &json(&project, "out/light/materials.json")[0];
+    assert_eq!(found["name"], "paint");
+    project.run(COMPOSITE, &thorough).expect_success();
+    let picture = |name: &str| read_photo(project.path(name), Transfer::Linear).unwrap();
+    let [truth, composite] = ["truth", "out"]
+        .map(|o| picture(&format!("{o}/composite/composite.png")))
+        .map(|p| p.image);
+    let apart = rmse(&truth.0, &composite.0);
+    // Both pictures stop at .005; grey instead of paint is ten times that.
+    assert!(apart < 0.012, "{apart} with {found}");
+
+    project
+        .run(OPTIMIZE, &["-s", r#"optimize.materials=["pant"]"#])
+        .expect_error(
+            2,
+            "error: --set optimize.materials=[\"pant\"]: optimize.materials: the scene has no material \"pant\"; it has: \"paint\"",
+        );
+}

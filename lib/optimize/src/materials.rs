@@ -110,8 +110,8 @@ pub struct MaterialOptimization<'a, L> {
     pub light: &'a L,
     /// What is simulated; the shadow is left out, for it does not depend on materials.
     pub simulation: Simulation,
-    /// The tone curves.
-    pub tone: ToneCurves,
+    /// The tone curves on the object; none where it is laid over the photograph as it is.
+    pub tone: Option<ToneCurves>,
     /// The photograph behind the object, times the toned shadow ratio.
     pub background: &'a LinearImage,
     /// From linear to display values.
@@ -223,7 +223,10 @@ impl<L: SceneLight> MaterialOptimization<'_, L> {
     /// The mean of Charbonnier's loss over the object's pixels, and its derivative with respect to
     /// the premultiplied object.
     fn loss(&self, object: &LinearImage, alpha: &Raster<f32>) -> (f64, Raster<Vec3>) {
-        let toned = self.tone.apply_object(object, alpha);
+        let toned = match &self.tone {
+            Some(tone) => tone.apply_object(object, alpha),
+            None => object.clone(),
+        };
         let count = alpha.pixels().iter().filter(|&&a| a > 0.0).count();
         let share = 1.0 / (3.0 * count.max(1) as f64);
         let mut loss = Neumaier::default();
@@ -247,7 +250,10 @@ impl<L: SceneLight> MaterialOptimization<'_, L> {
             composite_pixel_vjp(behind, a, Vec3::ONE, Vec3::new(x.1, y.1, z.1)).object
         });
         let gradient = Raster::from_pixels(alpha.width(), alpha.height(), pixels.collect());
-        let (gradient, _) = self.tone.apply_object_vjp(object, alpha, &gradient);
+        let gradient = match &self.tone {
+            Some(tone) => tone.apply_object_vjp(object, alpha, &gradient).0,
+            None => gradient,
+        };
         (loss.total(), gradient)
     }
 

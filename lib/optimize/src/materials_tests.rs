@@ -97,7 +97,7 @@ fn recover(truth: &Material) -> MaterialOutcome {
         renderer: &renderer,
         light: &light,
         simulation: simulation(),
-        tone,
+        tone: Some(tone),
         background: &background,
         transfer: Transfer::Srgb,
         reference: &reference,

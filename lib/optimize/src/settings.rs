@@ -56,6 +56,9 @@ pub struct OptimizeTable {
     /// Whether a reference is compared on random crops, as a diffusion model sees the picture,
     /// instead of as a whole.
     pub crops: bool,
+    /// Names of materials to recover from the reference instead of the light, under the known light
+    /// of `[composite] environment`: base colour, metalness, roughness and strength of emission.
+    pub materials: Vec<String>,
     /// Whether the light is optimised.
     pub light: Option<bool>,
     /// Whether the tone curves are optimised.

@@ -1,0 +1,247 @@
+//! Recovering materials under a known light, and using what was recovered.
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use dipir_cli::interrupt::Interrupted;
+use dipir_cli::session::{Session, duration};
+use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_imaging::tone::ToneCurves;
+use dipir_light::environment::EnvironmentSampler;
+use dipir_optimize::OptimizeError;
+use dipir_optimize::materials::{
+    MaterialOptimization, MaterialOutcome, MaterialSettings, RecoveredMaterial,
+};
+use dipir_optimize::settings::OptimizeTable;
+use dipir_pipeline::manifest::{FILE_NAME, Manifest};
+use dipir_pipeline::stage::StagePlan;
+use dipir_render::adaptive::{Progress, Stop};
+use dipir_render::render::{Renderer, Settings, Simulation};
+use dipir_scene::material::Material;
+use serde_json::{Value, json};
+
+use crate::composite::{CompositeTable, Tone};
+use crate::light;
+use crate::scene_folder::SceneFolder;
+use crate::transport::{self, Frame};
+use crate::{interruption, optimize};
+
+/// Role of the file among the light stage's outputs.
+const ROLE: &str = "materials";
+/// Name of the file.
+const FILE: &str = "materials.json";
+/// Error at which the shadow around the object is known well enough.
+const SHADOW_ERROR: f32 = 0.004;
+
+/// What the stage did.
+pub struct Done {
+    folder: PathBuf,
+    manifest: Manifest,
+    outcome: MaterialOutcome,
+}
+
+/// Whether `[optimize] materials` names any.
+pub fn are_asked_for(session: &Session) -> anyhow::Result<bool> {
+    let table: OptimizeTable = session.config.table("optimize")?;
+    Ok(!table.materials.is_empty())
+}
+
+/// Recovers the materials of `[optimize] materials` from the reference.
+pub fn run(session: &Session) -> anyhow::Result<Done> {
+    let table: OptimizeTable = session.config.table("optimize")?;
+    let composite: CompositeTable = session.config.table("composite")?;
+    composite.check(&session.config)?;
+    let settings = transport::settings(session, &table)?;
+    let (reference_path, reference_file) = optimize::reference_of(session, &table)?;
+    let Some(light) = light::known(session, &composite)? else {
+        let message = "needs a known light, for a picture alone does not tell a dark material from a \
+                       dim light; name a map, as in --set composite.environment=sky.hdr";
+        return Err(session.config.invalid("optimize.materials", message).into());
+    };
+    let scene = SceneFolder::read(session)?;
+    let materials = indices(session, &scene.loaded.scene.materials, &table.materials)?;
+    let frame = Frame::new(&scene.loaded, settings.size);
+    let reference = optimize::read_reference(session, &scene, &frame, &reference_file)?;
+    let material_settings = MaterialSettings {
+        iterations: table
+            .iterations
+            .unwrap_or(MaterialSettings::default().iterations),
+        seed: settings.seed,
+        ..MaterialSettings::default()
+    };
+
+    let params = json!({
+        "materials": table.materials,
+        "iterations": material_settings.iterations,
+        "size": settings.size,
+        "seed": settings.seed,
+        "light": light.params,
+        "tone": composite.tone,
+    });
+    let mut plan = StagePlan::new(
+        optimize::STAGE,
+        optimize::VERSION,
+        params,
+        session.pipeline.seed,
+    );
+    scene.add_inputs(&mut plan, &["scene.json", "effects.json"])?;
+    plan.input("reference", &reference_path, &reference_file)?;
+    if let Some((path, location)) = &light.file {
+        plan.input("environment", path, location)?;
+    }
+    let folder = session.stage_folder(optimize::STAGE);
+    let mut writer = session.begin(plan)?;
+    let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
+    let sampler = EnvironmentSampler::new(light.map.clone());
+    let simulation = scene.effects.simulation();
+    let background = shadowed(&renderer, &sampler, &simulation, &scene, &frame)?;
+    let progress = session.progress("materials");
+    let outcome = MaterialOptimization {
+        renderer: &renderer,
+        light: &sampler,
+        simulation,
+        tone: (composite.tone == Some(Tone::Reinhard)).then(ToneCurves::identity),
+        background: &background,
+        transfer: scene.loaded.photo.transfer,
+        reference: &reference,
+        materials,
+        settings: material_settings,
+    }
+    .run(&mut |share| {
+        progress.set(share);
+        interruption()
+    });
+    progress.done();
+    let outcome = match outcome {
+        Err(OptimizeError::Interrupted) => return Err(Interrupted.into()),
+        other => other?,
+    };
+    writer.write_json(ROLE, FILE, &outcome.materials)?;
+    writer.write_json("history", "history.json", &outcome.losses)?;
+    let manifest = writer.finish()?;
+    Ok(Done {
+        folder,
+        manifest,
+        outcome,
+    })
+}
+
+/// The photograph as the object shades it, at the frame's size.
+fn shadowed(
+    renderer: &Renderer,
+    light: &EnvironmentSampler,
+    simulation: &Simulation,
+    scene: &SceneFolder,
+    frame: &Frame,
+) -> anyhow::Result<LinearImage> {
+    let settings = Settings {
+        stop: Stop::TargetError(SHADOW_ERROR),
+        background: Some(&frame.background),
+        transfer: scene.loaded.photo.transfer,
+        occluders: frame.occluders.as_ref(),
+        ..Settings::default()
+    };
+    let rendered = renderer
+        .render(light, simulation, &settings, &mut |_: &Progress| {
+            interruption()
+        })
+        .map_err(crate::render_error)?;
+    let pixels = frame.background.0.pixels().iter();
+    let shaded = pixels
+        .zip(rendered.film.shadow.pixels())
+        .map(|(&photo, &ratio)| photo * ratio)
+        .collect();
+    let (width, height) = (frame.background.0.width(), frame.background.0.height());
+    Ok(LinearImage(Raster::from_pixels(width, height, shaded)))
+}
+
+/// Where materials of these names stand; several may share one.
+fn indices(
+    session: &Session,
+    materials: &[Material],
+    names: &[String],
+) -> anyhow::Result<Vec<usize>> {
+    let mut found = Vec::new();
+    for name in names {
+        let before = found.len();
+        found.extend((0..materials.len()).filter(|&m| materials[m].name == *name));
+        if found.len() == before {
+            let known: Vec<String> = materials.iter().map(|m| format!("{:?}", m.name)).collect();
+            let message = format!(
+                "the scene has no material {name:?}; it has: {}",
+                known.join(", ")
+            );
+            return Err(session.config.invalid("optimize.materials", message).into());
+        }
+    }
+    found.sort_unstable();
+    found.dedup();
+    Ok(found)
+}
+
+/// Puts what the light stage recovered of the materials into `scene`; the file that it is in, as
+/// it is known and where it is, or `None` without one.
+pub fn recovered(
+    session: &Session,
+    scene: &mut SceneFolder,
+) -> anyhow::Result<Option<(PathBuf, PathBuf)>> {
+    let folder = session.stage_folder(optimize::STAGE);
+    if !folder.join(FILE_NAME).exists() {
+        return Ok(None);
+    }
+    let manifest = Manifest::read(&folder, optimize::EXECUTABLE)?;
+    if !manifest.outputs.iter().any(|o| o.role == ROLE) {
+        return Ok(None);
+    }
+    light::warn_of_another_scene(session, &manifest, &scene.manifest);
+    let file = manifest.output(&folder, ROLE)?;
+    let text = std::fs::read_to_string(&file)?;
+    let found: Vec<RecoveredMaterial> = serde_json::from_str(&text).map_err(|e| {
+        let tool = optimize::EXECUTABLE;
+        anyhow::anyhow!(
+            "{}: {e}; it was written by another version: run {tool} again",
+            file.display()
+        )
+    })?;
+    for material in &mut scene.loaded.scene.materials {
+        if let Some(f) = found.iter().find(|f| f.name == material.name) {
+            f.apply(material);
+        }
+    }
+    Ok(Some((Path::new(optimize::STAGE).join(FILE), file)))
+}
+
+impl Done {
+    /// For programs.
+    pub fn to_json(&self) -> Value {
+        json!({
+            "folder": self.folder,
+            "materials": self.outcome.materials,
+            "iterations": self.outcome.losses.len(),
+            "loss_at_start": self.outcome.losses.first(),
+            "loss_at_end": self.outcome.losses.last(),
+            "elapsed_s": self.manifest.elapsed_s,
+            "peak_rss_bytes": self.manifest.peak_rss_bytes,
+        })
+    }
+}
+
+impl fmt::Display for Done {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "wrote {} in {}",
+            self.folder.display(),
+            duration(self.manifest.elapsed_s)
+        )?;
+        for m in &self.outcome.materials {
+            let [r, g, b] = m.base_color;
+            write!(
+                f,
+                "\n  {:?}: base colour {r:.3} {g:.3} {b:.3}, metallic {:.3}, roughness {:.3}, emission \
+                 x {:.3}",
+                m.name, m.metallic, m.roughness, m.emissive_strength
+            )?;
+        }
+        Ok(())
+    }
+}
