@@ -19,6 +19,8 @@ mod energy_quadrature;
 #[cfg(test)]
 mod harness;
 #[cfg(test)]
+pub mod reference;
+#[cfg(test)]
 mod tests;
 
 use dipir_numerics::warp::{Frame, square_to_cosine_hemisphere};
