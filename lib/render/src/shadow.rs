@@ -18,15 +18,17 @@ use dipir_numerics::warp::{
     square_to_cosine_hemisphere,
 };
 use glam::{Vec2, Vec3};
+use serde::{Deserialize, Serialize};
 
 use crate::blocker::{Blocker, Cone};
 use crate::counters::{RayCounts, RayKind};
-use crate::foreground::{PathContext, PathStart};
+use crate::foreground::{Gather, PathContext, PathStart};
 use crate::light::PathLight;
 use crate::world::{ProxyGeometry, ProxyPoint};
 
 /// Which light of the object counts on the proxy.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct LightOnProxy {
     /// Light that the object emits.
     pub emission: bool,
@@ -66,6 +68,8 @@ pub struct ShadowSums {
 /// What becomes of the samples of a pixel on the proxy: sums, or a record of where the light came
 /// from. One loop serves both, so that they cannot drift.
 pub trait ShadowGather: Default {
+    /// Follows a path of light that the object sends to the proxy.
+    type Path: Gather + Default;
     /// A sample meets the proxy.
     fn hit(&mut self);
     /// Radiance times cosine over density, from the unit vector `direction`, that arrives without
@@ -73,11 +77,13 @@ pub trait ShadowGather: Default {
     fn arriving(&mut self, direction: Vec3, light: Vec3);
     /// As much light from `direction` is blocked.
     fn blocked(&mut self, direction: Vec3, light: Vec3);
-    /// Irradiance that the object sends to the proxy.
-    fn sent(&mut self, light: Vec3);
+    /// The object sends the light of `path` to the proxy; times `weight`, it is irradiance.
+    fn sent(&mut self, path: Self::Path, weight: f32);
 }
 
 impl ShadowGather for ShadowSums {
+    type Path = Vec3;
+
     #[inline(always)]
     fn hit(&mut self) {
         self.hits += 1.0;
@@ -94,8 +100,8 @@ impl ShadowGather for ShadowSums {
     }
 
     #[inline(always)]
-    fn sent(&mut self, light: Vec3) {
-        self.blocked -= light;
+    fn sent(&mut self, path: Vec3, weight: f32) {
+        self.blocked -= path * weight;
     }
 }
 
@@ -251,7 +257,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                 }
             }
             if self.light_on_proxy.is_some() {
-                gather.sent(self.light_sent::<F>(&point, cone, &mut sampler, counts));
+                self.light_sent::<F, G>(&point, cone, &mut sampler, counts, &mut gather);
             }
         }
         gather
@@ -308,7 +314,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                 }
             }
             if self.light_on_proxy.is_some() {
-                gather.sent(self.light_sent::<F>(&point, &cone, &mut sampler, counts));
+                self.light_sent::<F, G>(&point, &cone, &mut sampler, counts, &mut gather);
             }
         }
         gather
@@ -345,23 +351,28 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
         (direction, radiance * (cosine * weight))
     }
 
-    /// Irradiance that the object sends to `point`: one path through a uniform direction of the
-    /// cone.
-    fn light_sent<const F: u32>(
+    /// Gathers the light that the object sends to `point`: one path through a uniform direction of
+    /// the cone, or, far from the object, sometimes one that stands for many.
+    fn light_sent<const F: u32, G: ShadowGather>(
         &self,
         point: &ProxyPoint,
         cone: &Cone,
         sampler: &mut Sampler,
         counts: &mut RayCounts,
-    ) -> Vec3 {
+        gather: &mut G,
+    ) {
         let Some(sent) = self.light_on_proxy else {
-            return Vec3::ZERO;
+            return;
         };
+        let chance = chance_of_sent_light(cone.cos_half_angle);
+        if sampler.next_1d() >= chance {
+            return;
+        }
         let local = square_to_cone(sampler.next_2d(), cone.cos_half_angle);
         let direction = Frame::from_normal(cone.axis).to_world(local);
         let cosine = direction.dot(point.normal);
         if cosine <= 0.0 {
-            return Vec3::ZERO;
+            return;
         }
         counts.add(RayKind::LightOnProxy);
         let path = PathContext {
@@ -373,8 +384,15 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
             ..self.path
         };
         let alpha_key = hash_u64s(&[sampler.next_u64(), 1]);
-        let sent = path.radiance::<F>(&point.ray(direction), alpha_key, sampler, counts);
-        sent.radiance * (cosine / cone_pdf(cone.cos_half_angle))
+        let mut found = G::Path::default();
+        path.trace::<F, _>(
+            &point.ray(direction),
+            alpha_key,
+            sampler,
+            counts,
+            &mut found,
+        );
+        gather.sent(found, cosine / (chance * cone_pdf(cone.cos_half_angle)));
     }
 
     /// Restricts the parts of the light to `cone`. Whether anything noticeable is there.
@@ -421,6 +439,17 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
             })
     }
 }
+
+/// Chance that a sample asks for the light that the object sends through a cone. What arrives there is
+/// at most the share of the plane's light that the cone's solid angle is of pi, for an object as
+/// bright as the plane, so fewer paths do where that is little: the noise that they leave is at most
+/// that of one part in [`PATHS_OF_SENT_LIGHT`] of the plane's light, once in many samples.
+fn chance_of_sent_light(cos_half_angle: f32) -> f32 {
+    (2.0 * PATHS_OF_SENT_LIGHT * (1.0 - cos_half_angle)).min(1.0)
+}
+
+/// Paths of light from the object, times the share of a plane's light that they can bring at most.
+const PATHS_OF_SENT_LIGHT: f32 = 8.0;
 
 /// Splits a block in halves along its sides longer than one pixel.
 fn quarters(block: Block) -> impl Iterator<Item = Block> {

@@ -5,8 +5,9 @@
 //! `shadow.arriving` its `offsets` (H W + 1), u32, `exponents` (H W), i8, `entries` (n, numbers
 //! an entry), u16 or u32, and `merged` (n), u8. An entry is one weight per channel of the object, one
 //! for all channels of the shadow, and a texel; weights are the bits of halves or floats. A plane
-//! has `shadow.cosine` (rows, columns), a proxy mesh `shadow.share` (H, W), both f32. Metadata: one
-//! entry, [`FORMAT`], whose value is the [`Header`] as JSON.
+//! has `shadow.cosine` (rows, columns), a proxy mesh `shadow.share` (H, W), both f32. Where the
+//! object sends light to the proxy there is a row set `sent` with entries like the object's, and
+//! `sent.base` (H, W, 3), f32. Metadata: one entry, [`FORMAT`], whose value is the [`Header`] as JSON.
 //!
 //! A file is checked when it is opened: shapes against the header, offsets monotone, texels in
 //! range, weights finite. After that it is trusted, and must not be changed while it is in use.
@@ -25,11 +26,11 @@ use rayon::prelude::*;
 use safetensors::tensor::{Dtype, SafeTensors, View};
 
 use super::rows::{Entry, Rows, Store};
-use super::{Header, Precision, RowSet, Shadow, ShadowKind, Transport, Weights, with_rows};
+use super::{Header, Precision, RowSet, Sent, Shadow, ShadowKind, Transport, Weights, with_rows};
 use crate::error::RenderError;
 
 /// The key of the header, and the version of everything in the file.
-const FORMAT: &str = "dipir_transport_1";
+const FORMAT: &str = "dipir_transport_2";
 
 /// Pictures and environments may have this many pixels or texels; more is a damaged header.
 const MOST_PIXELS: usize = 1 << 30;
@@ -46,6 +47,15 @@ impl<'a> Tensor<'a> {
             dtype,
             shape: shape.to_vec(),
             bytes: Cow::Borrowed(bytemuck::cast_slice(values)),
+        }
+    }
+
+    fn vectors(shape: &[usize], values: &[Vec3]) -> Self {
+        let numbers: Vec<[f32; 3]> = values.iter().map(Vec3::to_array).collect();
+        Self {
+            dtype: Dtype::F32,
+            shape: shape.to_vec(),
+            bytes: Cow::Owned(bytemuck::cast_slice(&numbers).to_vec()),
         }
     }
 }
@@ -77,11 +87,10 @@ impl Transport {
         let path = path.as_ref();
         let [width, height] = self.header.size;
         let [columns, rows] = self.header.environment;
-        let base: Vec<[f32; 3]> = self.base.pixels().iter().map(Vec3::to_array).collect();
         let mut tensors = vec![
             (
                 "base".to_owned(),
-                Tensor::new(Dtype::F32, &[height, width, 3], &base),
+                Tensor::vectors(&[height, width, 3], self.base.pixels()),
             ),
             (
                 "coverage".to_owned(),
@@ -107,6 +116,11 @@ impl Transport {
                     let share = Tensor::new(Dtype::F32, &[height, width], share);
                     tensors.push(("shadow.share".to_owned(), share));
                 }
+            }
+            if let Some(sent) = &set.sent {
+                push_rows(&mut tensors, "sent", &sent.rows);
+                let base = Tensor::vectors(&[height, width, 3], &sent.base);
+                tensors.push(("sent.base".to_owned(), base));
             }
         });
         let refuse = |problem: String| RenderError::Transport {
@@ -192,8 +206,7 @@ impl Source<'_> {
     fn transport(self, weights: Weights) -> Result<Transport, String> {
         let [width, height] = self.header.size;
         let [columns, rows] = self.header.environment;
-        let base = self.numbers("base", &[height, width, 3])?;
-        let base = base.chunks_exact(3).map(Vec3::from_slice).collect();
+        let base = self.vectors("base", &[height, width, 3])?;
         let coverage = self.numbers("coverage", &[height, width])?;
         let density = self
             .numbers("environment.density", &[rows, columns])?
@@ -222,9 +235,17 @@ impl Source<'_> {
                 share: self.numbers("shadow.share", &[height, width])?.to_vec(),
             },
         };
+        let sent = match self.header.light_on_proxy {
+            None => None,
+            Some(_) => Some(Sent {
+                rows: self.rows("sent")?,
+                base: self.vectors("sent.base", &[height, width, 3])?,
+            }),
+        };
         Ok(RowSet {
             object: self.rows("object")?,
             shadow,
+            sent,
         })
     }
 
@@ -265,6 +286,12 @@ impl Source<'_> {
             offsets,
             entries,
         })
+    }
+
+    /// Finite vectors.
+    fn vectors(&self, name: &str, shape: &[usize]) -> Result<Vec<Vec3>, String> {
+        let numbers = self.numbers(name, shape)?;
+        Ok(numbers.chunks_exact(3).map(Vec3::from_slice).collect())
     }
 
     /// Finite numbers.

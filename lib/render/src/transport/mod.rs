@@ -13,7 +13,8 @@
 //! for lights like the one in the mixture.
 //!
 //! What is recorded is what the samples saw: the noise of a record is frozen, the same in every
-//! replay. What it leaves out: light that the object sends to the proxy.
+//! replay. Light that the object sends to the proxy is a third set of rows, `S`, and with what it
+//! emits the ratio is `1 - (B L - S L - emitted) / (E L)`.
 use std::ops::Range;
 
 use dipir_imaging::raster::Raster;
@@ -32,6 +33,8 @@ mod tests;
 mod unit_light;
 
 pub use record::RecordSettings;
+
+use crate::shadow::LightOnProxy;
 
 use replay::{padded, ratio, ratio_vjp};
 use rows::{ColourHalf, ColourSingle, Entry, GreyHalf, GreySingle, Rows};
@@ -78,6 +81,8 @@ pub struct Header {
     /// Share of a plane's shadow samples that were uniform over the sphere; the others followed
     /// the light.
     pub uniform_share: f32,
+    /// Light of the object on the proxy, if it was simulated.
+    pub light_on_proxy: Option<LightOnProxy>,
     /// Seed of all random numbers.
     pub seed: u64,
     /// Most interactions of a path with the object.
@@ -110,6 +115,16 @@ enum Weights {
 struct RowSet<C, G> {
     object: Rows<C>,
     shadow: Shadow<G>,
+    sent: Option<Sent<C>>,
+}
+
+/// Light that the object sends to the proxy.
+#[derive(Clone, Debug)]
+struct Sent<C> {
+    /// Irradiance by texel of the environment.
+    rows: Rows<C>,
+    /// Irradiance of every pixel that does not come from the environment.
+    base: Vec<Vec3>,
 }
 
 #[derive(Clone, Debug)]
@@ -166,14 +181,21 @@ impl Transport {
         &self.base
     }
 
-    /// Weights of the object and of the shadow.
+    /// Weights of the object and of the shadow, light of the object on the proxy included.
     pub fn entries(&self) -> (usize, usize) {
-        with_rows!(&self.weights, w => (w.object.entries.len(), w.shadow.entries()))
+        with_rows!(&self.weights, w => {
+            let sent = w.sent.as_ref().map_or(0, |s| s.rows.entries.len());
+            (w.object.entries.len(), w.shadow.entries() + sent)
+        })
     }
 
     /// Bytes of weights that the products of the object and of the shadow read, each.
     pub fn bytes(&self) -> (usize, usize) {
-        with_rows!(&self.weights, w => (w.object.bytes(), w.shadow.bytes()))
+        with_rows!(&self.weights, w => {
+            let sent = w.sent.as_ref();
+            let sent = sent.map_or(0, |s| s.rows.bytes() + size_of_val(&s.base[..]));
+            (w.object.bytes(), w.shadow.bytes() + sent)
+        })
     }
 
     /// Premultiplied radiance of the object under `light`: `W * H` texels, row by row from the
@@ -194,12 +216,16 @@ impl Transport {
         with_rows!(&self.weights, w => w.object.product_vjp(texels, &|p| gradient[p]))
     }
 
-    /// Light that reaches the proxy with the object over light without it, per channel, in
-    /// [0, 1]; 1 where there is no proxy and where no light arrives. Panics on another number of
-    /// texels than [`environment_size`](Self::environment_size) says.
+    /// Light that reaches the proxy with the object over light without it, per channel, at least
+    /// 0, and at most 1 unless the object sends light there; 1 where there is no proxy and where
+    /// no light arrives. Panics on another number of texels than
+    /// [`environment_size`](Self::environment_size) says.
     pub fn shadow(&self, light: &[Vec3]) -> Raster<Vec3> {
         let light = self.checked(light);
-        let ratios = with_rows!(&self.weights, w => w.shadow.ratios(&light, self.pixels()));
+        let pixels = self.pixels();
+        let ratios = with_rows!(&self.weights, w => {
+            w.shadow.ratios(&light, pixels, w.sent.as_ref().map(|s| s.arriving(&light)))
+        });
         self.raster(ratios)
     }
 
@@ -209,7 +235,9 @@ impl Transport {
         self.check_pixels(gradient.len());
         self.check_pixels(ratio.pixels().len());
         let light = self.checked(light);
-        with_rows!(&self.weights, w => w.shadow.ratios_vjp(&light, ratio.pixels(), gradient))
+        with_rows!(&self.weights, w => {
+            w.shadow.ratios_vjp(&light, ratio.pixels(), gradient, w.sent.as_ref())
+        })
     }
 
     /// Kish's effective number of samples behind every pixel of the object under `light`: few
@@ -281,6 +309,13 @@ impl Transport {
 /// Pixels whose gradients are summed as one task; a constant, because it fixes the rounding.
 const PIXELS_PER_SUM: usize = 1 << 13;
 
+impl<C: Entry> Sent<C> {
+    /// Irradiance of every pixel under `light`.
+    fn arriving(&self, light: &[Vec4]) -> Vec<Vec3> {
+        self.rows.product(light, &|p, sum| sum + self.base[p])
+    }
+}
+
 impl<G: Entry> Shadow<G> {
     fn entries(&self) -> usize {
         match self {
@@ -304,12 +339,17 @@ impl<G: Entry> Shadow<G> {
         }
     }
 
-    fn ratios(&self, light: &[Vec4], pixels: usize) -> Vec<Vec3> {
+    /// The ratios of all pixels; `sent` is the irradiance that the object sends to each.
+    fn ratios(&self, light: &[Vec4], pixels: usize, sent: Option<Vec<Vec3>>) -> Vec<Vec3> {
+        let missing = |p: usize, blocked: Vec3| match &sent {
+            Some(sent) => blocked - sent[p],
+            None => blocked,
+        };
         match self {
             Shadow::None => vec![Vec3::ONE; pixels],
             Shadow::Plane { blocked, cosine } => {
                 let arriving = irradiance(cosine, light);
-                blocked.product(light, &|_, b| ratio3(b, arriving, 1.0))
+                blocked.product(light, &|p, b| ratio3(missing(p, b), arriving, 1.0))
             }
             Shadow::Mesh {
                 blocked,
@@ -317,12 +357,25 @@ impl<G: Entry> Shadow<G> {
                 share,
             } => {
                 let arriving = arriving.product(light, &|_, a| a);
-                blocked.product(light, &|p, b| ratio3(b, arriving[p], share[p]))
+                blocked.product(light, &|p, b| ratio3(missing(p, b), arriving[p], share[p]))
             }
         }
     }
 
-    fn ratios_vjp(&self, light: &[Vec4], ratios: &[Vec3], gradient: &[Vec3]) -> Vec<Vec3> {
+    fn ratios_vjp<C: Entry>(
+        &self,
+        light: &[Vec4],
+        ratios: &[Vec3],
+        gradient: &[Vec3],
+        sent: Option<&Sent<C>>,
+    ) -> Vec<Vec3> {
+        // What is sent is missing less.
+        let add_sent = |sums: &mut [Vec3], missing: &(dyn Fn(usize) -> Vec3 + Sync)| {
+            if let Some(sent) = sent {
+                let more = sent.rows.product_vjp(light.len(), &|p| -missing(p));
+                sums.iter_mut().zip(more).for_each(|(sum, m)| *sum += m);
+            }
+        };
         match self {
             Shadow::None => vec![Vec3::ZERO; light.len()],
             Shadow::Plane { blocked, cosine } => {
@@ -336,6 +389,7 @@ impl<G: Entry> Shadow<G> {
                 sums.iter_mut()
                     .zip(cosine)
                     .for_each(|(sum, &e)| *sum += total * e);
+                add_sent(&mut sums, &|p| at(p).0);
                 sums
             }
             Shadow::Mesh {
@@ -350,6 +404,7 @@ impl<G: Entry> Shadow<G> {
                 sums.iter_mut()
                     .zip(others)
                     .for_each(|(sum, other)| *sum += other);
+                add_sent(&mut sums, &|p| at(p).0);
                 sums
             }
         }

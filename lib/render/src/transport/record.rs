@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use super::rows::{Entry, Part, RowBuilder, Rows};
 use super::unit_light::{UnitLight, UnitOnPlane};
-use super::{Header, Precision, RowSet, Shadow, ShadowKind, Transport, Weights};
+use super::{Header, Precision, RowSet, Sent, Shadow, ShadowKind, Transport, Weights};
 use crate::blocker::Blocker;
 use crate::counters::RayCounts;
 use crate::error::RenderError;
@@ -22,7 +22,7 @@ use crate::footprint::Footprint;
 use crate::foreground::{Gather, PathContext, PathStart};
 use crate::photo::Photo;
 use crate::render::{ROULETTE_DEPTH, Renderer, Simulation};
-use crate::shadow::{Block, SampleRange, ShadowContext, ShadowGather};
+use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowGather};
 use crate::world::{ProxyGeometry, World};
 
 /// How transport is recorded.
@@ -43,7 +43,7 @@ pub struct RecordSettings<'a> {
     /// Share of a plane's shadow samples that are uniform over the sphere, in (0, 1]; the others
     /// follow `light`. 1 without a light.
     pub uniform_share: f32,
-    /// Which phenomena are simulated; light of the object on the proxy is left out.
+    /// Which phenomena are simulated.
     pub simulation: Simulation,
     /// The photograph, linear, of the camera's size: what the proxy looks like from the object.
     pub background: Option<&'a LinearImage>,
@@ -174,10 +174,36 @@ impl Gather for RowGather<'_> {
 struct ShadowRow {
     /// Direction, weight, and whether the object blocks it.
     found: Vec<(Vec3, f32, bool)>,
+    /// Direction and weight of light that comes by way of the object.
+    sent: Vec<(Vec3, Vec3)>,
+    /// Light of the object's own.
+    local: Vec3,
     hits: f32,
 }
 
+/// A path of light from the object to the proxy.
+#[derive(Default)]
+struct SentPath {
+    distant: Vec<(Vec3, Vec3)>,
+    local: Vec3,
+}
+
+impl Gather for SentPath {
+    #[inline]
+    fn distant(&mut self, direction: Vec3, throughput: Vec3, radiance: Vec3, weight: f32) {
+        self.distant
+            .push((direction, throughput * radiance * weight));
+    }
+
+    #[inline]
+    fn local(&mut self, radiance: Vec3) {
+        self.local += radiance;
+    }
+}
+
 impl ShadowGather for ShadowRow {
+    type Path = SentPath;
+
     #[inline]
     fn hit(&mut self) {
         self.hits += 1.0;
@@ -193,7 +219,13 @@ impl ShadowGather for ShadowRow {
         self.found.push((direction, light.x, true));
     }
 
-    fn sent(&mut self, _: Vec3) {}
+    #[inline]
+    fn sent(&mut self, path: SentPath, weight: f32) {
+        let distant = path.distant.into_iter();
+        self.sent
+            .extend(distant.map(|(d, light)| (d, light * weight)));
+        self.local += path.local * weight;
+    }
 }
 
 /// What one task needs.
@@ -214,6 +246,9 @@ struct Recorded<C, G> {
     arriving: Part<G>,
     /// Pixel, share that shows the proxy.
     share: Vec<(u32, f32)>,
+    sent: Part<C>,
+    /// Pixel, irradiance that the object emits there.
+    emitted: Vec<(u32, Vec3)>,
 }
 
 impl<C, G> Default for Recorded<C, G> {
@@ -224,6 +259,8 @@ impl<C, G> Default for Recorded<C, G> {
             blocked: Part::default(),
             arriving: Part::default(),
             share: Vec::new(),
+            sent: Part::default(),
+            emitted: Vec::new(),
         }
     }
 }
@@ -295,7 +332,7 @@ impl Transport {
                 plane: &plane,
                 irradiance: std::f64::consts::PI,
                 proxy_occlusion: simulation.proxy_occlusion,
-                light_on_proxy: None,
+                light_on_proxy: simulation.light_on_proxy,
                 tolerance: 0.0,
             });
         let recorder = Recorder {
@@ -329,8 +366,14 @@ impl Recorder<'_> {
         let mut base = Raster::filled(width as usize, height as usize, Vec3::ZERO);
         let mut coverage = Raster::filled(width as usize, height as usize, 0.0);
         let mut share = vec![0f32; pixels];
-        let (mut object, mut blocked, mut arriving) = (Vec::new(), Vec::new(), Vec::new());
+        let mut emitted = vec![Vec3::ZERO; pixels];
+        let (mut object, mut blocked) = (Vec::new(), Vec::new());
+        let (mut arriving, mut sent) = (Vec::new(), Vec::new());
         for part in parts {
+            for (p, irradiance) in part.emitted {
+                emitted[p as usize] = irradiance;
+            }
+            sent.push(part.sent);
             for (p, local, covered) in part.seen {
                 base.pixels_mut()[p as usize] = local;
                 coverage.pixels_mut()[p as usize] = covered;
@@ -361,13 +404,29 @@ impl Recorder<'_> {
             }
             _ => (ShadowKind::None, Shadow::None),
         };
+        let sent = match self.sends_light() {
+            Some(_) => Some(Sent {
+                rows: Rows::assemble(pixels, &sent).ok_or(RenderError::TransportTooLarge)?,
+                base: emitted,
+            }),
+            None => None,
+        };
         Ok(Transport {
             header: self.header(kind),
             base,
             coverage,
             density,
-            weights: weights(RowSet { object, shadow }),
+            weights: weights(RowSet {
+                object,
+                shadow,
+                sent,
+            }),
         })
+    }
+
+    /// Which light of the object counts on the proxy.
+    fn sends_light(&self) -> Option<LightOnProxy> {
+        self.shadow.as_ref().and_then(|s| s.light_on_proxy)
     }
 
     fn header(&self, shadow: ShadowKind) -> Header {
@@ -383,6 +442,7 @@ impl Recorder<'_> {
                 Some(_) => s.uniform_share.clamp(LEAST_UNIFORM_SHARE, 1.0),
                 None => 1.0,
             },
+            light_on_proxy: self.sends_light(),
             seed: s.seed,
             max_depth: s.simulation.max_depth,
             features: s.simulation.features,
@@ -491,7 +551,7 @@ impl Recorder<'_> {
         (gather.local, covered)
     }
 
-    fn shadow_block<C, G: Entry>(
+    fn shadow_block<C: Entry, G: Entry>(
         &self,
         block: Block,
         row: &mut RowBuilder,
@@ -500,11 +560,11 @@ impl Recorder<'_> {
         let Some(shadow) = &self.shadow else {
             return;
         };
-        // Blocking asks nothing of a surface but its coverage.
-        let wanted = if has(self.world.mask, ALPHA) {
-            ALPHA
-        } else {
-            0
+        // Blocking alone asks nothing of a surface but its coverage.
+        let wanted = match shadow.light_on_proxy {
+            Some(_) => self.world.mask,
+            None if has(self.world.mask, ALPHA) => ALPHA,
+            None => 0,
         };
         let range = SampleRange {
             first: 0,
@@ -532,7 +592,7 @@ impl Recorder<'_> {
     }
 
     /// Makes rows of the samples of one pixel on the proxy.
-    fn keep<C, G: Entry>(
+    fn keep<C: Entry, G: Entry>(
         &self,
         (x, y): (u32, u32),
         found: &ShadowRow,
@@ -558,6 +618,17 @@ impl Recorder<'_> {
             out.share.push((pixel, seen * found.hits / samples));
             push(&mut out.blocked, true, 1.0 / samples);
             push(&mut out.arriving, false, 1.0 / samples);
+        }
+        if self.sends_light().is_some() {
+            let scale = match self.world.geometry.proxy {
+                ProxyGeometry::Plane(_) => seen / samples,
+                _ => 1.0 / samples,
+            };
+            for &(direction, weight) in &found.sent {
+                row.add(texel_index(direction, self.settings.environment), weight);
+            }
+            out.sent.push(pixel, row, scale);
+            out.emitted.push((pixel, found.local * scale));
         }
     }
 }

@@ -172,25 +172,27 @@ fn row_scatter<E: Entry>(entries: &[E], gradient: Vec4, sums: &mut [Vec4]) {
     }
 }
 
-/// The ratio `1 - share blocked / arriving` of one channel, clamped at 0; 1 where nothing arrives.
-/// Sampling noise alone can bring it below 0.
+/// The ratio `1 - share missing / arriving` of one channel, clamped at 0; 1 where nothing arrives.
+/// Sampling noise alone can bring it below 0; above 1, where `missing` is negative, the object sends
+/// more than it blocks.
 #[inline]
-pub fn ratio(blocked: f32, arriving: f32, share: f32) -> f32 {
+pub fn ratio(missing: f32, arriving: f32, share: f32) -> f32 {
     if arriving > 0.0 {
-        (1.0 - share * (blocked / arriving)).clamp(0.0, 1.0)
+        let ratio = 1.0 - share * (missing / arriving);
+        if ratio < 0.0 { 0.0 } else { ratio }
     } else {
         1.0
     }
 }
 
-/// Adjoint of [`ratio`]: the gradients of `blocked` and `arriving`, from the ratio and its
+/// Adjoint of [`ratio`]: the gradients of `missing` and `arriving`, from the ratio and its
 /// gradient. 0 where it is clamped and where nothing arrives.
 #[inline]
 pub fn ratio_vjp(ratio: f32, arriving: f32, share: f32, gradient: f32) -> (f32, f32) {
     if !(arriving > 0.0) || ratio <= 0.0 {
         return (0.0, 0.0);
     }
-    // d(1 - s b / a) = -s / a db + s b / a^2 da, and s b / a is 1 - ratio.
+    // d(1 - s m / a) = -s / a dm + s m / a^2 da, and s m / a is 1 - ratio.
     let slope = gradient / arriving;
     (-slope * share, slope * (1.0 - ratio))
 }

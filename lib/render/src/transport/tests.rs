@@ -95,11 +95,23 @@ fn fine_sun() -> EnvironmentMap {
     sun(Vec3::new(0.4, 0.8, 0.5).normalize(), 2e4, 0.3, 360)
 }
 
+/// Everything that reaches the ground by way of the object, too.
+fn with_light_on_proxy(max_depth: u32) -> Simulation {
+    Simulation {
+        light_on_proxy: Some(LightOnProxy {
+            emission: true,
+            bounce: true,
+        }),
+        ..everything(max_depth)
+    }
+}
+
 /// Mean over seeds of the sums of both layers over the picture, by replay and by path tracing.
 fn replay_and_render(
     material: Material,
     light: &EnvironmentMap,
     proxy: Proxy,
+    simulation: Simulation,
 ) -> [[Running; 2]; 2] {
     let scene = knot(material, proxy);
     let sampler = EnvironmentSampler::new(light.clone());
@@ -112,10 +124,10 @@ fn replay_and_render(
                 precision: Precision::Single,
                 light: Some(light),
                 seed,
-                ..small(everything(3))
+                ..small(simulation)
             },
         );
-        let traced = render(&scene, &sampler, &everything(3), &settings(16, 100 + seed)).film;
+        let traced = render(&scene, &sampler, &simulation, &settings(16, 100 + seed)).film;
         let layers = [
             [
                 transport.foreground(light.texels()),
@@ -159,7 +171,7 @@ fn replay_is_unbiased_for_matte_glossy_and_mirror_under_a_constant_sky() {
         ("glossy", glossy()),
         ("mirror", mirror()),
     ] {
-        let [replayed, traced] = replay_and_render(material, &constant(), ground());
+        let [replayed, traced] = replay_and_render(material, &constant(), ground(), everything(3));
         assert_agree(name, [replayed[0], traced[0]], 0.02);
         assert_agree(name, [replayed[1], traced[1]], 0.02);
     }
@@ -174,7 +186,7 @@ fn replay_is_unbiased_for_matte_glossy_and_mirror_under_a_half_degree_sun() {
         ("mirror", mirror(), 0.5),
     ];
     for (name, material, largest_error) in cases {
-        let [replayed, traced] = replay_and_render(material, &fine_sun(), ground());
+        let [replayed, traced] = replay_and_render(material, &fine_sun(), ground(), everything(3));
         assert_agree(name, [replayed[0], traced[0]], largest_error);
         assert_agree(name, [replayed[1], traced[1]], 0.02);
     }
@@ -182,8 +194,32 @@ fn replay_is_unbiased_for_matte_glossy_and_mirror_under_a_half_degree_sun() {
 
 #[test]
 fn a_proxy_mesh_replays_as_it_renders() {
-    let [replayed, traced] = replay_and_render(matte(Vec3::ONE), &constant(), sheet());
+    let [replayed, traced] =
+        replay_and_render(matte(Vec3::ONE), &constant(), sheet(), everything(3));
     assert_agree("shadow", [replayed[1], traced[1]], 0.02);
+}
+
+#[test]
+fn light_that_the_object_sends_to_the_proxy_replays_as_it_renders() {
+    let mut material = glossy();
+    material.emissive = Vec3::new(0.3, 0.2, 0.1);
+    let sunny = sun(Vec3::new(0.4, 0.8, 0.5).normalize(), 50.0, 0.3, 32);
+    for (name, proxy, light) in [
+        ("plane, constant", ground(), constant()),
+        ("plane, sun", ground(), sunny),
+        ("mesh, constant", sheet(), constant()),
+    ] {
+        let mut simulation = with_light_on_proxy(2);
+        let [replayed, traced] =
+            replay_and_render(material.clone(), &light, proxy.clone(), simulation);
+        assert_agree(name, [replayed[1], traced[1]], 0.02);
+        // It is there to be seen: more than the error by which the means agree.
+        simulation.light_on_proxy = None;
+        let [without, _] = replay_and_render(material.clone(), &light, proxy, simulation);
+        let error = replayed[1].std_error().hypot(traced[1].std_error());
+        let more = replayed[1].mean() - without[1].mean();
+        assert!(more > 9.0 * error, "{name}: {more} +- {error}");
+    }
 }
 
 #[test]
@@ -213,17 +249,23 @@ fn emission_and_coverage_need_no_light() {
     assert!(gradient.iter().all(|g| *g == Vec3::ZERO));
 }
 
-/// Transports of all kinds of proxy and both precisions.
+/// Transports of all kinds of proxy, with and without light of the object on it, and both precisions.
 fn transports() -> Vec<Transport> {
     let mut all = Vec::new();
     for precision in [Precision::Half, Precision::Single] {
         for proxy in [Proxy::None, ground(), sheet()] {
-            let scene = knot(glossy(), proxy);
-            let settings = RecordSettings {
-                precision,
-                ..small(everything(2))
-            };
-            all.push(record(&scene, &settings));
+            for simulation in [everything(2), with_light_on_proxy(2)] {
+                let mut material = glossy();
+                if simulation.light_on_proxy.is_some() {
+                    material.emissive = Vec3::new(0.3, 0.2, 0.1);
+                }
+                let scene = knot(material, proxy.clone());
+                let settings = RecordSettings {
+                    precision,
+                    ..small(simulation)
+                };
+                all.push(record(&scene, &settings));
+            }
         }
     }
     all
@@ -285,7 +327,7 @@ fn gradients_of_the_shadow_ratio_equal_central_differences() {
             compared += 1;
         }
     }
-    assert_eq!(compared, 16);
+    assert_eq!(compared, 32);
 }
 
 /// The ratios under `light + h direction`, in f64 from the stored weights.
@@ -316,18 +358,27 @@ fn reference_shadow(
         let ratio = DVec3::ONE - f64::from(s) * b / a;
         DVec3::select(a.cmpgt(DVec3::ZERO), ratio, DVec3::ONE).max(DVec3::ZERO)
     };
-    with_rows!(&transport.weights, set => match &set.shadow {
-        Shadow::None => vec![DVec3::ONE; set.object.pixels()],
-        Shadow::Plane { blocked, cosine } => {
-            let e: DVec3 = cosine.iter().zip(&light).map(|(&e, l)| *l * f64::from(e)).sum();
-            product(blocked, &light).into_iter().map(|b| ratio(b, e, 1.0)).collect()
+    with_rows!(&transport.weights, set => {
+        let sent = match &set.sent {
+            Some(sent) => {
+                let base = sent.base.iter().map(|b| b.as_dvec3());
+                base.zip(product(&sent.rows, &light)).map(|(b, s)| b + s).collect()
+            }
+            None => vec![DVec3::ZERO; set.object.pixels()],
+        };
+        let missing = |blocked| product(blocked, &light).into_iter().zip(sent).map(|(b, s)| b - s);
+        match &set.shadow {
+            Shadow::None => vec![DVec3::ONE; set.object.pixels()],
+            Shadow::Plane { blocked, cosine } => {
+                let e: DVec3 = cosine.iter().zip(&light).map(|(&e, l)| *l * f64::from(e)).sum();
+                missing(blocked).map(|b| ratio(b, e, 1.0)).collect()
+            }
+            Shadow::Mesh { blocked, arriving, share } => missing(blocked)
+                .zip(product(arriving, &light))
+                .zip(share)
+                .map(|((b, a), &s)| ratio(b, a, s))
+                .collect(),
         }
-        Shadow::Mesh { blocked, arriving, share } => product(blocked, &light)
-            .into_iter()
-            .zip(product(arriving, &light))
-            .zip(share)
-            .map(|((b, a), &s)| ratio(b, a, s))
-            .collect(),
     })
 }
 
@@ -529,8 +580,8 @@ fn damaged_files_are_refused_by_what_is_wrong() {
         (|b| b.truncate(b.len() - 1), "is not safetensors"),
         (|b| b[..8].fill(0xff), "is not safetensors"),
         (
-            |b| replace(b, "dipir_transport_1", "dipir_transport_9"),
-            "has no metadata \"dipir_transport_1\"",
+            |b| replace(b, "dipir_transport_2", "dipir_transport_9"),
+            "has no metadata \"dipir_transport_2\"",
         ),
         (
             |b| replace(b, "\\\"size\\\":[12,12]", "\\\"size\\\":[12,99]"),
