@@ -291,6 +291,7 @@ fn optimize(
         environment: settings.environment,
         samples: settings.samples,
         shadow_samples: settings.samples,
+        precision: settings.precision,
         seed: settings.seed,
         background: Some(background),
         ..RecordSettings::new(simulation())

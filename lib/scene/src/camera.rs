@@ -170,3 +170,43 @@ pub enum CameraSettings {
         up: WorldUp,
     },
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scaled_camera_sees_the_same_directions_at_scaled_pixels() {
+        let mut camera = Camera::look_at(
+            Vec3::new(1.0, 2.0, 3.0),
+            Vec3::new(-0.4, 0.3, 0.1),
+            Vec3::Y,
+            FieldOfView::Vertical(0.7),
+            [640, 427],
+        );
+        // An optical axis off the middle and pixels that are not square.
+        camera.principal_px += Vec2::new(13.0, -7.0);
+        camera.focal_px.x *= 1.25;
+        // Smaller, larger, of another shape, a single pixel.
+        for resolution in [[320, 214], [1280, 854], [200, 900], [1, 1], [640, 427]] {
+            let scaled = camera.scaled(resolution);
+            assert_eq!(scaled.resolution, resolution);
+            let scale = Vec2::new(resolution[0] as f32 / 640.0, resolution[1] as f32 / 427.0);
+            for share in [Vec2::ZERO, Vec2::ONE, Vec2::new(0.3, 0.8)] {
+                let pixel = share * Vec2::new(640.0, 427.0);
+                let (own, other) = (camera.ray(pixel), scaled.ray(pixel * scale));
+                // Roundings of a few pixels' coordinates, over focal lengths of their size.
+                assert!(
+                    own.direction.distance(other.direction) < 1e-6,
+                    "{resolution:?}"
+                );
+                assert_eq!(own.origin, other.origin);
+            }
+            let point = Vec3::new(0.2, 0.5, -0.3);
+            let (own, other) = (camera.project(point), scaled.project(point));
+            let apart = own.expect("in front") * scale - other.expect("in front");
+            let size = Vec2::new(resolution[0] as f32, resolution[1] as f32);
+            assert!((apart / size).abs().max_element() < 1e-6, "{apart}");
+        }
+    }
+}

@@ -1,0 +1,246 @@
+//! The light of panoramas, recovered from a picture through the executables, for
+//! `docs/recovery.md`.
+//!
+//! Of every panorama a photograph is cut out, three objects are put into it under the panorama
+//! itself, and `dipir-optimize` gets to see the composite alone. A sum of lobes cannot be a panorama,
+//! so the same is done under lobes that were fitted to it: a truth that can be found.
+//!
+//! Run with `cargo test --bench hdri_recovery -- --bench MAP... [yaw=DEG] [iterations=N]`, maps as HDR
+//! or EXR. Without `--bench`, as tests run it, one object under a small generated map proves that
+//! it works.
+use std::fmt::Write as _;
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use dipir_imaging::layers::Layers;
+use dipir_imaging::transfer::Transfer;
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::fit::fit;
+use dipir_light::rasterize::rasterize;
+use dipir_optimize::lighting::Lighting;
+use dipir_render::shapes::torus_knot;
+use glam::Vec3;
+use serde_json::Value;
+
+/// Lobes that are fitted to a panorama: as many as the optimiser has.
+const LOBES: usize = 32;
+/// Columns and rows on which the direction of most light is looked for: 2.8 degrees, so that a
+/// texel of a lamp does not outshine a sun behind clouds.
+const PEAK_GRID: [usize; 2] = [128, 64];
+
+/// Name, and the material as an MTL file has it.
+const OBJECTS: [(&str, &str); 3] = [
+    ("matte knot", "Kd 0.7 0.65 0.6\nPr 1.0\nPm 0.0"),
+    ("glossy knot", "Kd 0.8 0.4 0.2\nPr 0.3\nPm 0.0"),
+    ("metal knot", "Kd 0.9 0.85 0.75\nPr 0.25\nPm 1.0"),
+];
+
+struct Knobs {
+    yaw_deg: f64,
+    iterations: u32,
+    size: &'static str,
+    target_error: f64,
+    more: &'static str,
+}
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let value = |key: &str| {
+        let mut pairs = arguments.iter().filter_map(|a| a.split_once('='));
+        pairs.rfind(|(k, _)| *k == key).map(|(_, v)| {
+            v.parse::<f64>()
+                .unwrap_or_else(|_| panic!("{key}={v} is no number"))
+        })
+    };
+    println!(
+        "| map | truth | object | peak, degrees | RMSE touched | RMSE all | recorded RMSE | optimise, s |"
+    );
+    println!("|---|---|---|--:|--:|--:|--:|--:|");
+    if !arguments.iter().any(|a| a == "--bench") {
+        let knobs = Knobs {
+            yaw_deg: 0.0,
+            iterations: 20,
+            size: "36x24",
+            target_error: 0.02,
+            more: "environment = [32, 16]\nlobes = 8\nsamples = 8\n",
+        };
+        return recover_all("generated", &generated(), &OBJECTS[..1], &knobs);
+    }
+    let knobs = Knobs {
+        yaw_deg: value("yaw").unwrap_or(0.0),
+        iterations: value("iterations").unwrap_or(600.0) as u32,
+        size: "192x128",
+        target_error: 0.002,
+        more: "",
+    };
+    for path in arguments
+        .iter()
+        .filter(|a| !a.starts_with("--") && !a.contains('='))
+    {
+        let map = EnvironmentMap::read(path).unwrap_or_else(|e| panic!("{e}"));
+        let name = Path::new(path).file_stem().unwrap_or_default();
+        recover_all(&name.to_string_lossy(), &map, &OBJECTS, &knobs);
+    }
+}
+
+/// A bright patch in a sky over a darker ground.
+fn generated() -> EnvironmentMap {
+    let texels = (0..64 * 32).map(|k| match (k / 64, k % 64) {
+        (8..=9, 20..=22) => Vec3::splat(30.0),
+        (0..=15, _) => Vec3::new(0.4, 0.5, 0.7),
+        _ => Vec3::new(0.3, 0.25, 0.2),
+    });
+    EnvironmentMap::new(64, 32, texels.collect()).expect("a map")
+}
+
+/// Runs an executable in `folder` and returns what it prints as JSON.
+fn run(executable: &str, folder: &Path, arguments: &[&str]) -> Value {
+    let output = Command::new(executable)
+        .args(arguments)
+        .arg("--json")
+        .current_dir(folder)
+        .stdin(Stdio::null())
+        .output()
+        .unwrap_or_else(|e| panic!("{executable}: {e}"));
+    assert!(
+        output.status.success(),
+        "{executable} {arguments:?}: {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    serde_json::from_slice(&output.stdout).expect("JSON")
+}
+
+const SCENE: &str = env!("CARGO_BIN_EXE_dipir-scene");
+const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-optimize");
+const COMPOSITE: &str = env!("CARGO_BIN_EXE_dipir-composite");
+
+/// A row of the table for every truth and object.
+fn recover_all(name: &str, map: &EnvironmentMap, objects: &[(&str, &str)], knobs: &Knobs) {
+    let project = tempfile::tempdir().expect("a folder");
+    let folder = project.path();
+    map.write(folder.join("map.exr")).expect("writes");
+    // Lobes narrower than a texel of the panorama would lose their shape on its grid.
+    let lobes = fit(map, LOBES).lobes;
+    let fitted = rasterize(&lobes, map.width().max(512), map.height().max(256));
+    fitted.write(folder.join("lobes.exr")).expect("writes");
+    let yaw = knobs.yaw_deg.to_string();
+    let cut = [
+        "background",
+        "--from",
+        "map.exr",
+        "--fov",
+        "40",
+        "--pitch",
+        "-14",
+        "--yaw",
+        &yaw,
+        "--size",
+        knobs.size,
+        "photo.png",
+    ];
+    let photo = run(SCENE, folder, &cut);
+    fs::write(folder.join("knot.obj"), knot()).expect("writes");
+    for truth in ["map", "lobes"] {
+        for (object, material) in objects {
+            let mtl = format!("newmtl skin\n{material}\n");
+            fs::write(folder.join("knot.mtl"), mtl).expect("writes");
+            let row = recover(folder, truth, &photo, knobs);
+            println!("| {name} | {truth} | {object} | {row} |");
+        }
+    }
+}
+
+/// One recovery; the numbers of its row.
+fn recover(folder: &Path, truth: &str, photo: &Value, knobs: &Knobs) -> String {
+    let number = |v: &Value| v.as_f64().expect("a number");
+    let forward = [0, 1, 2].map(|k| number(&photo["forward"][k]));
+    let exposure = number(&photo["exposure_ev"]);
+    // Four metres in front of the object, wherever the camera looks.
+    let across = forward[0].hypot(forward[2]);
+    let stand = [-4.2 * forward[0] / across, 1.75, -4.2 * forward[2] / across];
+    let look_at = [0, 1, 2].map(|k| stand[k] + forward[k]);
+    let pipeline = format!(
+        "[scene]\nbackground = \"photo.png\"\nclass = \"knot\"\n[[scene.objects]]\npath = \"knot.obj\"\n\
+         [scene.camera]\nposition = {stand:?}\nlook_at = {look_at:?}\nfov_deg = 40.0\n\
+         [scene.proxy]\nplane = {{ point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }}\n\
+         [optimize]\nguidance = \"reference\"\nreference = \"truth/composite/composite.exr\"\n\
+         iterations = {}\npreview_every = 0\n{}[composite]\ntarget_error = {}\n",
+        knobs.iterations, knobs.more, knobs.target_error
+    );
+    fs::write(folder.join("pipeline.toml"), pipeline).expect("writes");
+    let environment = format!("composite.environment=\"{truth}.exr\"");
+    let exposed = format!("composite.exposure_ev={exposure}");
+    let lit = [
+        "-o",
+        "truth",
+        "-s",
+        &environment,
+        "-s",
+        &exposed,
+        "-s",
+        "composite.tone=reinhard",
+    ];
+    run(SCENE, folder, &lit);
+    run(COMPOSITE, folder, &lit);
+    run(SCENE, folder, &[]);
+    let optimized = run(OPTIMIZE, folder, &[]);
+    run(COMPOSITE, folder, &["-s", "pipeline.seed=1"]);
+
+    let map = EnvironmentMap::read(folder.join(format!("{truth}.exr"))).expect("reads");
+    let [columns, rows] = PEAK_GRID;
+    let (peak, _) = map.resampled(columns, rows).peak();
+    let light = Lighting::read(&folder.join("out/light/lighting.json")).expect("reads");
+    let found = light.map(columns, rows).peak().0;
+    let half = 0.5 * f64::from(found.distance(peak));
+    let (touched, all) = apart(folder);
+    format!(
+        "{:.2} | {touched:.4} | {all:.4} | {:.4} | {:.1}",
+        (2.0 * half.min(1.0).asin()).to_degrees(),
+        number(&optimized["rmse"]),
+        number(&optimized["elapsed_s"]),
+    )
+}
+
+/// Display-referred RMSE of both composites, over what object or shadow touch, and over all.
+fn apart(folder: &Path) -> (f64, f64) {
+    let layers = |out: &str| {
+        Layers::read_exr(folder.join(out).join("composite/composite.exr")).expect("reads")
+    };
+    let (truth, found) = (layers("truth"), layers("out"));
+    let picture = |l: &Layers| l.rgb("").expect("a picture");
+    let (a, b) = (picture(&truth), picture(&found));
+    let alpha = truth.channel("object.A").expect("coverage");
+    let shadow = truth.rgb("shadow").expect("a shadow");
+    let (mut touched, mut all, mut count) = (0.0, 0.0, 0.0);
+    for k in 0..a.pixels().len() {
+        let shown = |p: Vec3| p.to_array().map(|v| Transfer::Srgb.encode_scalar(v));
+        let (x, y) = (shown(a.pixels()[k]), shown(b.pixels()[k]));
+        let square: f64 = (0..3).map(|c| f64::from(x[c] - y[c]).powi(2)).sum::<f64>() / 3.0;
+        all += square;
+        if alpha.pixels()[k] > 0.0 || shadow.pixels()[k].min_element() < 0.999 {
+            touched += square;
+            count += 1.0;
+        }
+    }
+    let root = |sum: f64, n: f64| (sum / n.max(1.0)).sqrt();
+    (root(touched, count), root(all, a.pixels().len() as f64))
+}
+
+/// A torus knot that stands on y = 0, as an OBJ file.
+fn knot() -> String {
+    let mesh = torus_knot(Vec3::Y * 0.75, 0.45, 0.17, 256, 24);
+    let mut text = String::from("mtllib knot.mtl\nusemtl skin\n");
+    for (p, n) in mesh.positions.iter().zip(&mesh.normals) {
+        let _ = writeln!(
+            text,
+            "v {} {} {}\nvn {} {} {}",
+            p.x, p.y, p.z, n.x, n.y, n.z
+        );
+    }
+    for [a, b, c] in &mesh.indices {
+        let (a, b, c) = (a + 1, b + 1, c + 1);
+        let _ = writeln!(text, "f {a}//{a} {b}//{b} {c}//{c}");
+    }
+    text
+}
