@@ -29,7 +29,7 @@ use crate::scene_folder::SceneFolder;
 /// Name of the stage and of its folder.
 pub const STAGE: &str = "composite";
 /// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 
 /// The `[composite]` table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

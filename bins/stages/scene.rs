@@ -29,7 +29,7 @@ pub const STAGE: &str = "scene";
 /// The executable that runs it.
 pub const EXECUTABLE: &str = "dipir-scene";
 /// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 
 /// What the stage did.
 pub struct Done {
