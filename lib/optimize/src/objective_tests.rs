@@ -2,7 +2,7 @@ use super::*;
 use crate::crop::View;
 use crate::guidance::{PHOTOMETRIC_SCALE, charbonnier};
 use crate::tensors::Group;
-use crate::testing::{DenseTransport, WEIGHTS, objective};
+use crate::testing::{DenseTransport, WEIGHTS, objective, recorded};
 use dipir_imaging::resize::PixelBox;
 use dipir_imaging::spline::Curve;
 use dipir_imaging::tone::{TONE_PARAMETERS, ToneParameters, reinhard};
@@ -234,24 +234,49 @@ fn the_gradients_of_both_maps_agree_with_differences_in_f64_texel_by_texel() {
 
 #[test]
 fn the_gradient_of_every_tensor_agrees_with_differences_of_the_chain_in_f64() {
-    let scene = DenseTransport::ball(PICTURE, MAP);
-    let objective = objective(scene.clone(), WEIGHTS);
+    // Scene by scene and tensor by tensor.
+    let ball = DenseTransport::ball(PICTURE, MAP);
+    assert_gradients(
+        "closed form",
+        &objective(ball.clone(), WEIGHTS),
+        &ball,
+        &CASES,
+    );
+    for (name, roughness, metallic) in [
+        ("matte", 1.0, 0.0),
+        ("glossy", 0.3, 0.5),
+        ("mirror", 0.0, 1.0),
+    ] {
+        let record = recorded(PICTURE, MAP, roughness, metallic);
+        let scene = DenseTransport::of(&record);
+        assert_gradients(name, &objective(record, WEIGHTS), &scene, &CASES[2..]);
+    }
+}
+
+/// Compares the gradient of every tensor with differences in f64 of the chain through `scene`.
+fn assert_gradients(
+    name: &str,
+    objective: &Objective,
+    scene: &DenseTransport,
+    cases: &[(f32, Option<PixelBox>)],
+) {
     let p = start();
-    for (s, crop) in CASES {
-        let (_, forward, gradient) = judged(&objective, &p, s, crop);
+    for &(s, crop) in cases {
+        let (_, forward, gradient) = judged(objective, &p, s, crop);
         let gradient = objective.vjp(&p, &forward, &gradient).to_tensors();
         let at = p.to_tensors();
         for (t, tensor) in at.0.iter().enumerate() {
             // Lobes and texels are rounded to f32. One entry alone would hardly show above that
             // (a lobe of sigma 10 does not care where it points), so differences are taken along
             // random directions in which all entries move at once: 6e-8 of a loss of 1e2 to 1e3
-            // against 2e-2 of a gradient of 1e1 to 1e3, 5e-5 at worst; the fourth order leaves 1e-6.
+            // against 4e-2 of a gradient of 1e1 to 1e3, 6e-5 at worst; the fourth order leaves 1e-5.
+            // The exposure moves every texel by its step: half of it, for a gradient above 1e3.
             // Tone parameters stay f64, but the second derivative of their curve jumps at knots,
             // where only the step's size helps.
-            let h = if tensor.group == Group::Tone {
-                1e-4
-            } else {
-                2e-2
+            let h = match tensor.group {
+                Group::Tone => 1e-4,
+                Group::Exposure => 2e-2,
+                _ => 4e-2,
             };
             let ours = &gradient.0[t].values;
             let norm = crate::tensors::norm(|| ours.iter());
@@ -263,7 +288,7 @@ fn the_gradient_of_every_tensor_agrees_with_differences_of_the_chain_in_f64() {
                     values.for_each(|(v, d)| *v += step * d);
                     let q = Parameters::from_tensors(&q);
                     let [f, h] = maps(&q);
-                    reference_loss(&scene, [&f, &h], &q.tone, s.into(), crop)
+                    reference_loss(scene, [&f, &h], &q.tone, s.into(), crop)
                 };
                 let numeric = derivative(moved, h);
                 let along: f64 = ours.iter().zip(&direction).map(|(g, d)| g * d).sum();
@@ -271,8 +296,8 @@ fn the_gradient_of_every_tensor_agrees_with_differences_of_the_chain_in_f64() {
                 let error = relative_error(along, numeric, 0.25 * norm);
                 assert!(
                     error < 1e-4,
-                    "{} along {draw} at s = {s}, {crop:?}: ours {along}, numeric {numeric}, error \
-                     {error:e}",
+                    "{name}, {} along {draw} at s = {s}, {crop:?}: ours {along}, numeric {numeric}, \
+                     error {error:e}",
                     tensor.name
                 );
             }

@@ -1,10 +1,20 @@
-//! A small scene whose transport is known in closed form: a glossy ball on a plane, as dense
-//! matrices.
+//! Small scenes as dense matrices: a glossy ball on a plane, whose transport is known in closed
+//! form, and whatever was recorded.
 use std::f32::consts::PI;
+use std::ops::ControlFlow;
 
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
+use dipir_light::cosine::CosineCells;
 use dipir_light::environment::EnvironmentMap;
+use dipir_render::features::SPECULAR;
+use dipir_render::render::{Renderer, Simulation};
+use dipir_render::shapes::torus_knot;
+use dipir_render::transport::{RecordSettings, Transport};
+use dipir_scene::camera::{Camera, FieldOfView};
+use dipir_scene::material::Material;
+use dipir_scene::proxy::{Plane, Proxy};
+use dipir_scene::scene::Scene;
 use glam::Vec3;
 
 use crate::objective::{Objective, Weights};
@@ -104,6 +114,48 @@ impl DenseTransport {
         }
     }
 
+    /// What a record holds, read off its pictures under single texels. Its plane is y = 0.
+    pub fn of(record: &Transport) -> Self {
+        let ([width, height], [columns, rows]) = (record.size(), record.environment_size());
+        let cells = CosineCells::new(columns, rows, Vec3::Y);
+        let arriving: Vec<f32> = (0..rows)
+            .flat_map(|i| cells.row(i).map(|e| e as f32).collect::<Vec<_>>())
+            .collect();
+        let (pixels, texels) = (width * height, columns * rows);
+        let mut object = vec![vec![Vec3::ZERO; texels]; pixels];
+        let mut blocked = vec![vec![0.0; texels]; pixels];
+        let white = vec![Vec3::ONE; texels];
+        let all: f64 = arriving.iter().map(|&e| f64::from(e)).sum();
+        let shaded = record.shadow(&white);
+        for t in 0..texels {
+            let mut light = vec![Vec3::ZERO; texels];
+            light[t] = Vec3::ONE;
+            let picture = record.foreground(&light);
+            // A texel more beside white light, whose ratio does not touch 0.
+            let e = f64::from(arriving[t]);
+            let more = 0.1 * all / e.max(1e-3 * all);
+            light = white.clone();
+            light[t] += more as f32;
+            let more = f64::from(light[t].x) - 1.0;
+            let ratio = record.shadow(&light);
+            for p in 0..pixels {
+                object[p][t] = picture.pixels()[p];
+                let lost = |r: &Raster<Vec3>| 1.0 - f64::from(r.pixels()[p].x);
+                let both = lost(&ratio) * (all + more * e);
+                blocked[p][t] = ((both - lost(&shaded) * all) / more) as f32;
+            }
+        }
+        Self {
+            size: (width, height),
+            environment: (columns, rows),
+            coverage: record.coverage().clone(),
+            object,
+            blocked,
+            arriving,
+            efficiency: 1.0,
+        }
+    }
+
     fn arriving(&self, light: &[Vec3]) -> Vec3 {
         light.iter().zip(&self.arriving).map(|(l, e)| *l * *e).sum()
     }
@@ -111,6 +163,52 @@ impl DenseTransport {
     fn raster(&self, pixels: Vec<Vec3>) -> Raster<Vec3> {
         Raster::from_pixels(self.size.0, self.size.1, pixels)
     }
+}
+
+/// A knot of a material above y = 0, recorded.
+pub fn recorded(
+    (width, height): (usize, usize),
+    (columns, rows): (usize, usize),
+    roughness: f32,
+    metallic: f32,
+) -> Transport {
+    let scene = Scene {
+        mesh: torus_knot(Vec3::Y * 0.9, 0.45, 0.17, 64, 10),
+        materials: vec![Material {
+            base_color: Vec3::new(0.8, 0.6, 0.4).extend(1.0),
+            roughness,
+            metallic,
+            ..Material::default()
+        }],
+        textures: Vec::new(),
+        camera: Camera::look_at(
+            Vec3::new(0.0, 2.0, 4.0),
+            Vec3::Y * 0.5,
+            Vec3::Y,
+            FieldOfView::Vertical(0.6),
+            [width as u32, height as u32],
+        ),
+        proxy: Proxy::Plane(Plane {
+            point: Vec3::ZERO,
+            normal: Vec3::Y,
+        }),
+    };
+    let settings = RecordSettings {
+        environment: [columns, rows],
+        samples: 64,
+        shadow_samples: 64,
+        ..RecordSettings::new(Simulation {
+            features: SPECULAR,
+            max_depth: 3,
+            shadow: true,
+            proxy_occlusion: false,
+            light_on_proxy: None,
+        })
+    };
+    Transport::record(&Renderer::new(&scene), &settings, &mut |_| {
+        ControlFlow::Continue(())
+    })
+    .unwrap()
 }
 
 fn texel_directions(map: &EnvironmentMap) -> Vec<Vec<Vec3>> {
@@ -237,7 +335,7 @@ pub const WEIGHTS: Weights = Weights {
 };
 
 /// The ball over [`background`], displayed through sRGB.
-pub fn objective(transport: DenseTransport, weights: Weights) -> Objective {
-    let background = background(transport.size);
+pub fn objective(transport: impl LinearTransport + 'static, weights: Weights) -> Objective {
+    let background = background(transport.size());
     Objective::new(Box::new(transport), background, Transfer::Srgb, weights).unwrap()
 }
