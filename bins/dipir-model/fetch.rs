@@ -1,0 +1,181 @@
+//! `dipir-model fetch`.
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use candle_core::{DType, Device};
+use clap::ValueEnum;
+use dipir_cli::args::OutputArgs;
+use dipir_cli::exit::Usage;
+use dipir_cli::interrupt::{self, Interrupted};
+use dipir_cli::progress::Progress;
+use dipir_diffusion::model::Model;
+use dipir_hub::{Error, Hub, Outcome, Revision, SOURCE_FILE, Source, Variant};
+use dipir_pipeline::lock::{FolderLock, WhenLocked};
+use serde_json::json;
+
+/// Where models are if nothing else is said.
+const ENDPOINT: &str = "https://huggingface.co";
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// The repository, owner/name
+    #[arg(value_name = "REPO")]
+    repo: String,
+
+    /// Branch, tag or commit
+    #[arg(long, default_value = "main")]
+    revision: String,
+
+    /// The folder to make [default: the repository's name, in the current folder]
+    #[arg(long, value_name = "DIR")]
+    to: Option<PathBuf>,
+
+    /// Which of the published weights; full precision where there are both
+    #[arg(long, value_enum, default_value_t = Precision::Full)]
+    variant: Precision,
+
+    /// Address of the hub [default: HF_ENDPOINT, or https://huggingface.co]
+    #[arg(long, value_name = "URL")]
+    endpoint: Option<String>,
+
+    /// How often a broken connection is taken up again, for each file
+    #[arg(long, value_name = "N", default_value_t = 5)]
+    retries: u32,
+
+    #[command(flatten)]
+    output: OutputArgs,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Precision {
+    Full,
+    Fp16,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    interrupt::listen()?;
+    let set = |name: &str| env::var(name).ok().filter(|v| !v.is_empty());
+    let endpoint = args.endpoint.clone().or_else(|| set("HF_ENDPOINT"));
+    let hub = Hub::new(endpoint.as_deref().unwrap_or(ENDPOINT), set("HF_TOKEN")).map_err(usage)?;
+    let revision = hub.revision(&args.repo, &args.revision).map_err(usage)?;
+    let variant = match args.variant {
+        Precision::Full => Variant::Full,
+        Precision::Fp16 => Variant::Half,
+    };
+    let files = dipir_hub::select(&revision, variant)?;
+    let target = target(args)?;
+    if let Some(parent) = target.parent().filter(|p| !p.as_os_str().is_empty()) {
+        fs::create_dir_all(parent)
+            .with_context(|| format!("cannot create {}", parent.display()))?;
+    }
+    let _lock = FolderLock::take(&target, WhenLocked::Refuse)?;
+    if occupied(&target, &revision, files.iter().map(|f| f.path.as_str()))? {
+        dipir_hub::verify(&files, &target)?;
+        return finish(args, &target, &revision, Outcome::default());
+    }
+    let partial = hidden(&target, "partial");
+    let progress = Progress::new("fetching", args.output.quiet);
+    let outcome = dipir_hub::fetch(&hub, &revision, &files, &partial, args.retries, |p| {
+        progress.set(p.done as f64 / p.total.max(1) as f64);
+        progress.say(p.path);
+        !interrupt::asked()
+    });
+    progress.done();
+    let outcome = match outcome {
+        Err(Error::Interrupted) => return Err(Interrupted.into()),
+        other => other?,
+    };
+    // Loading needs every tensor of every part, and that the parts fit.
+    Model::load(&partial, DType::F32, &Device::Cpu)
+        .with_context(|| format!("{} was fetched whole, but it does not load", args.repo))?;
+    if target.is_dir() {
+        // Empty, or there would have been an error above.
+        fs::remove_dir(&target).with_context(|| format!("cannot write {}", target.display()))?;
+    }
+    fs::rename(&partial, &target).with_context(|| format!("cannot write {}", target.display()))?;
+    finish(args, &target, &revision, outcome)
+}
+
+/// What only the command line can mend counts as wrong usage.
+fn usage(error: Error) -> anyhow::Error {
+    match error {
+        Error::Name { .. } => Usage(error.to_string()).into(),
+        other => other.into(),
+    }
+}
+
+fn target(args: &Args) -> anyhow::Result<PathBuf> {
+    let target = match &args.to {
+        Some(to) => to.clone(),
+        None => PathBuf::from(args.repo.rsplit('/').next().unwrap_or_default()),
+    };
+    match target.file_name() {
+        Some(_) => Ok(target),
+        None => Err(Usage(format!(
+            "--to {}: name the folder that is to be made",
+            target.display()
+        ))
+        .into()),
+    }
+}
+
+/// `.NAME.SUFFIX` beside the folder.
+fn hidden(target: &Path, suffix: &str) -> PathBuf {
+    let name = target.file_name().unwrap_or_default().to_string_lossy();
+    target.with_file_name(format!(".{name}.{suffix}"))
+}
+
+/// Whether `target` holds this very model already; an error if it holds anything else.
+fn occupied<'a>(
+    target: &Path,
+    revision: &Revision,
+    files: impl Iterator<Item = &'a str>,
+) -> anyhow::Result<bool> {
+    match fs::read_dir(target).map(|mut entries| entries.next().is_none()) {
+        Ok(true) => return Ok(false),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(false),
+        _ => {}
+    }
+    let source = fs::read(target.join(SOURCE_FILE)).ok();
+    let source = source.and_then(|text| serde_json::from_slice::<Source>(&text).ok());
+    let same = source.is_some_and(|s| {
+        s.repo == revision.repo && s.commit == revision.commit && s.files.iter().eq(files)
+    });
+    if same {
+        return Ok(true);
+    }
+    let message = format!(
+        "{} is there already and is not {} at {}; name another folder with --to, or remove it",
+        target.display(),
+        revision.repo,
+        revision.commit
+    );
+    Err(Usage(message).into())
+}
+
+fn finish(args: &Args, target: &Path, revision: &Revision, outcome: Outcome) -> anyhow::Result<()> {
+    let there = outcome.files == 0;
+    let folder = target.display();
+    args.output.result(
+        || match there {
+            true => format!("{folder} is there already, and whole"),
+            false => format!(
+                "wrote {folder}: {} files, {:.1} MB, {:.1} MB of them received now\n  \
+                 it loads; use it with [model] path = \"{folder}\"",
+                outcome.files,
+                outcome.bytes as f64 / 1e6,
+                outcome.received as f64 / 1e6
+            ),
+        },
+        || {
+            json!({
+                "folder": target, "repo": revision.repo, "commit": revision.commit,
+                "already_there": there, "files": outcome.files, "bytes": outcome.bytes,
+                "received": outcome.received,
+            })
+        },
+    );
+    Ok(())
+}
