@@ -25,13 +25,17 @@ fn main() -> Outcome<()> {
     println!("{} token sequences differ {wrong:?}", wrong.len());
     let mut worst = 0f64;
     let mut report = |name: &str, start: Instant, errors: Errors| {
-        let part = errors.iter().map(|(_, e)| *e).fold(0.0, f64::max);
+        let mut errors = errors;
+        errors.sort_by(|a, b| b.1.total_cmp(&a.1));
         println!(
-            "{name}: {} values, largest relative error {part:.2e}, {:.1} s",
+            "{name}: {} values, {:.1} s; the largest relative errors:",
             errors.len(),
             start.elapsed().as_secs_f64()
         );
-        worst = worst.max(part);
+        for (what, error) in errors.iter().take(4) {
+            println!("  {error:.2e} {what}");
+        }
+        worst = worst.max(errors.first().map_or(0.0, |(_, e)| *e));
     };
     let start = Instant::now();
     report(

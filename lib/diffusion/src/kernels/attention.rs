@@ -4,7 +4,7 @@
 
 use rayon::prelude::*;
 
-use super::matmul::{Threads, View, product, product_at};
+use super::matmul::{Columns, Threads, View, product_at, product_columns};
 use super::simd::{exp, sum_of_2, vectorized};
 use super::{SharedMut, with_scratch};
 
@@ -87,10 +87,15 @@ vectorized! {
                 }
             }
             let mut total: f64 = sums.iter().map(|&v| v as f64).sum();
-            for v in blocks.into_remainder() {
+            // The rest as one more block, so that it is vectorised, too.
+            let rest = blocks.into_remainder();
+            let mut last = [max; LANES];
+            last[..rest.len()].copy_from_slice(rest);
+            for v in &mut last {
                 *v = exp(*v - max);
-                total += *v as f64;
             }
+            rest.copy_from_slice(&last[..rest.len()]);
+            total += rest.iter().map(|&v| v as f64).sum::<f64>();
             inverse[row] = (1.0 / total) as f32;
             hidden.fill(0.0);
         }
@@ -107,54 +112,39 @@ vectorized! {
     }
 }
 
-/// Keys or values with each head's matrix transposed: [batch, heads, head_dim,
-/// keys], so that blocks of queries find rows to copy.
-fn transposed_heads(shape: AttentionShape, data: &[f32]) -> Vec<f32> {
-    let mut out = vec![0.0; data.len()];
-    out.par_chunks_mut(shape.head_dim * shape.keys)
-        .enumerate()
-        .for_each(|(pair, out)| {
-            let (item, head) = (pair / shape.heads, pair % shape.heads);
-            let source = shape.head(data, shape.keys, item, head, 0);
-            for key in 0..shape.keys {
-                for (channel, &v) in source.data[key * source.row..][..shape.head_dim]
-                    .iter()
-                    .enumerate()
-                {
-                    out[channel * shape.keys + key] = v;
-                }
-            }
-        });
-    out
-}
-
 impl AttentionShape {
-    /// The transposed matrix of one head in what [`transposed_heads`] made.
-    fn transposed<'a>(&self, data: &'a [f32], item: usize, head: usize) -> View<'a> {
-        let len = self.head_dim * self.keys;
-        View::rows(&data[(item * self.heads + head) * len..][..len], self.keys)
-    }
-
     /// Probabilities of `rows` queries from `first` into `scores`, up to the
-    /// factor of each row that goes into `inverse`.
+    /// factor of each row that goes into `inverse`; `keys` are the head's
+    /// transposed keys.
     fn probabilities(
         &self,
         scores: &mut [f32],
         (item, head, first, rows): (usize, usize, usize, usize),
         q: &[f32],
-        keys: &[f32],
+        keys: &Columns,
         inverse: &mut [f32],
         threads: Threads,
     ) {
         let q = self.head(q, self.queries, item, head, first);
-        let keys = self.transposed(keys, item, head);
         // SAFETY: `scores` holds rows * keys elements and is borrowed exclusively.
         unsafe {
             let (shape, out) = ((rows, self.keys, self.head_dim), scores.as_mut_ptr());
-            product_at(shape, out, self.keys, 0.0, self.scale, q, keys, threads);
+            product_columns(shape, out, self.keys, 0.0, self.scale, q, keys, threads);
         }
         let visible = if self.causal { first + 1 } else { usize::MAX };
         exponentials(scores, self.keys, visible, inverse);
+    }
+
+    /// One head's matrix of `data`, keys or values: as it is, [keys, head_dim].
+    fn columns<'a>(&self, data: &'a [f32], item: usize, head: usize) -> Columns<'a> {
+        let view = self.head(data, self.keys, item, head, 0);
+        Columns::new(view, (self.keys, self.head_dim))
+    }
+
+    /// The same matrix transposed, [head_dim, keys].
+    fn columns_transposed<'a>(&self, data: &'a [f32], item: usize, head: usize) -> Columns<'a> {
+        let view = self.head(data, self.keys, item, head, 0).transposed();
+        Columns::new(view, (self.head_dim, self.keys))
     }
 }
 
@@ -163,31 +153,35 @@ pub(crate) fn attention(shape: AttentionShape, q: &[f32], k: &[f32], v: &[f32]) 
     let mut out = vec![0.0; q.len()];
     let (block, width) = (shape.block(), shape.width());
     let blocks = shape.queries.div_ceil(block);
-    let keys = transposed_heads(shape, k);
+    let heads: Vec<(Columns, Columns)> = (0..shape.batch * shape.heads)
+        .into_par_iter()
+        .map(|pair| {
+            let (item, head) = (pair / shape.heads, pair % shape.heads);
+            (
+                shape.columns_transposed(k, item, head),
+                shape.columns(v, item, head),
+            )
+        })
+        .collect();
     let target = SharedMut::new(&mut out);
     (0..shape.batch * shape.heads * blocks)
         .into_par_iter()
         .for_each(|job| {
-            let (first, rest) = (job % blocks * block, job / blocks);
-            let (item, head) = (rest / shape.heads, rest % shape.heads);
+            let (first, pair) = (job % blocks * block, job / blocks);
+            let (item, head) = (pair / shape.heads, pair % shape.heads);
+            let (keys, values) = &heads[pair];
             let rows = block.min(shape.queries - first);
             let mut inverse = vec![0f32; rows];
             with_scratch(rows * shape.keys, |scores| {
-                shape.probabilities(
-                    scores,
-                    (item, head, first, rows),
-                    q,
-                    &keys,
-                    &mut inverse,
-                    Threads::One,
-                );
+                let place = (item, head, first, rows);
+                shape.probabilities(scores, place, q, keys, &mut inverse, Threads::One);
                 let offset = (item * shape.queries + first) * width + head * shape.head_dim;
-                let v = shape.head(v, shape.keys, item, head, 0);
                 let size = (rows, shape.head_dim, shape.keys);
                 let p = View::rows(scores, shape.keys);
                 // SAFETY: each job writes its own rows and head columns of `out`.
                 unsafe {
-                    product_at(size, target.at(offset), width, 0.0, 1.0, p, v, Threads::One);
+                    let out = target.at(offset);
+                    product_columns(size, out, width, 0.0, 1.0, p, values, Threads::One);
                     for (row, &factor) in inverse.iter().enumerate() {
                         let row = std::slice::from_raw_parts_mut(
                             target.at(offset + row * width),
@@ -223,7 +217,6 @@ pub(crate) fn attention_vjp(
 ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let (mut dq, mut dk, mut dv) = (vec![0.0; q.len()], vec![0.0; k.len()], vec![0.0; v.len()]);
     let (block, width) = (shape.block(), shape.width());
-    let (keys, values) = (transposed_heads(shape, k), transposed_heads(shape, v));
     let targets = (
         SharedMut::new(&mut dq),
         SharedMut::new(&mut dk),
@@ -237,79 +230,52 @@ pub(crate) fn attention_vjp(
     } else {
         Threads::One
     };
-    let step = |(item, head, first): (usize, usize, usize), p: &mut [f32], dp: &mut [f32]| {
+    // The head's keys and values transposed, and its keys.
+    type Shared<'a> = (Columns<'a>, Columns<'a>, Columns<'a>);
+    let step = |place: (usize, usize, usize), shared: &Shared, p: &mut [f32], dp: &mut [f32]| {
+        let (item, head, first) = place;
+        let (keys_t, values_t, keys) = shared;
         let rows = p.len() / shape.keys;
         let mut inverse = vec![0f32; rows];
-        shape.probabilities(
-            p,
-            (item, head, first, rows),
-            q,
-            &keys,
-            &mut inverse,
-            threads,
-        );
+        let place = (item, head, first, rows);
+        shape.probabilities(p, place, q, keys_t, &mut inverse, threads);
         scale_rows(p, shape.keys, &inverse);
         let g = shape.head(g, shape.queries, item, head, first);
-        product(
-            (rows, shape.keys, shape.head_dim),
-            dp,
-            0.0,
-            g,
-            shape.transposed(&values, item, head),
-            threads,
-        );
+        let q = shape.head(q, shape.queries, item, head, first);
         let keep = if first == 0 { 0.0 } else { 1.0 };
         let key_offset = item * shape.keys * width + head * shape.head_dim;
         let query_offset = (item * shape.queries + first) * width + head * shape.head_dim;
-        let (size_k, size_q) = (
-            (shape.keys, shape.head_dim, rows),
-            (rows, shape.head_dim, shape.keys),
-        );
-        // SAFETY: each job writes the columns of its own head and item.
+        let scores = (rows, shape.keys, shape.head_dim);
+        let by_key = (shape.keys, shape.head_dim, rows);
+        let by_query = (rows, shape.head_dim, shape.keys);
+        // SAFETY: each job writes the columns of its own head and item, and
+        // `dp` holds rows * keys elements.
         unsafe {
+            let out = dp.as_mut_ptr();
+            product_columns(scores, out, shape.keys, 0.0, 1.0, g, values_t, threads);
             let weights = View::rows(p, shape.keys).transposed();
-            product_at(
-                size_k,
-                targets.2.at(key_offset),
-                width,
-                keep,
-                1.0,
-                weights,
-                g,
-                threads,
-            );
+            let out = targets.2.at(key_offset);
+            product_at(by_key, out, width, keep, 1.0, weights, g, threads);
             softmax_rows_vjp(p, dp, shape.keys);
             let ds = View::rows(dp, shape.keys);
-            let k = shape.head(k, shape.keys, item, head, 0);
-            product_at(
-                size_q,
-                targets.0.at(query_offset),
-                width,
-                0.0,
-                shape.scale,
-                ds,
-                k,
-                threads,
-            );
-            let q = shape.head(q, shape.queries, item, head, first);
-            product_at(
-                size_k,
-                targets.1.at(key_offset),
-                width,
-                keep,
-                shape.scale,
-                ds.transposed(),
-                q,
-                threads,
-            );
+            let out = targets.0.at(query_offset);
+            product_columns(by_query, out, width, 0.0, shape.scale, ds, keys, threads);
+            let out = targets.1.at(key_offset);
+            let ds = ds.transposed();
+            product_at(by_key, out, width, keep, shape.scale, ds, q, threads);
         }
     };
     let run = |pair: usize| {
         let (item, head) = (pair / shape.heads, pair % shape.heads);
+        let shared = (
+            shape.columns_transposed(k, item, head),
+            shape.columns_transposed(v, item, head),
+            shape.columns(k, item, head),
+        );
         for first in (0..shape.queries).step_by(block) {
             let len = block.min(shape.queries - first) * shape.keys;
             with_scratch(len, |p| {
-                with_scratch(len, |dp| step((item, head, first), p, dp))
+                with_scratch(len, |dp| step((item, head, first), &shared, p, dp))
             });
         }
     };

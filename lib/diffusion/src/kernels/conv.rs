@@ -3,9 +3,9 @@
 
 use rayon::prelude::*;
 
-use super::SharedMut;
 use super::matmul::{Threads, View, product, product_at};
 use super::winograd;
+use super::{SharedMut, with_scratch};
 
 /// Shape of a convolution of x [batch, inputs, height, width] with w
 /// [outputs, inputs, kernel, kernel].
@@ -26,6 +26,11 @@ pub(crate) struct ConvShape {
 
 /// Floats of one block of unfolded pixels: 1 MiB, half of a usual L2.
 const BLOCK: usize = 256 * 1024;
+/// Floats that one thread fills at a time.
+const FILL: usize = 64 * 1024;
+/// Pixels of a block at least, if there are as many: every block reads all the
+/// weights, which for hundreds of channels do not fit a cache.
+const BLOCK_PIXELS: usize = 256;
 
 impl ConvShape {
     pub(crate) fn out_height(&self) -> usize {
@@ -51,7 +56,10 @@ impl ConvShape {
 
     /// Output rows of one block, from the shape alone.
     fn block_rows(&self) -> usize {
-        (BLOCK / (self.depth() * self.out_width()).max(1)).clamp(1, self.out_height())
+        let width = self.out_width().max(1);
+        (BLOCK / (self.depth() * width).max(1))
+            .max(BLOCK_PIXELS / width)
+            .clamp(1, self.out_height())
     }
 
     fn blocks(&self) -> usize {
@@ -104,7 +112,8 @@ pub(crate) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], bias: Option<&[f32]
     let pixels = shape.out_pixels();
     let mut out = vec![0.0; shape.batch * shape.outputs * pixels];
     if let Some(bias) = bias {
-        out.chunks_exact_mut(pixels)
+        out.par_chunks_exact_mut(pixels)
+            .with_min_len(FILL.div_ceil(pixels))
             .enumerate()
             .for_each(|(row, out)| out.fill(bias[row % shape.outputs]));
     }
@@ -140,17 +149,15 @@ pub(crate) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], bias: Option<&[f32]
         Threads::One
     };
     let target = SharedMut::new(&mut out);
-    let run = |columns: &mut Vec<f32>, job: usize| {
+    let run = |job: usize, columns: &mut [f32]| {
         let (item, first) = (job / blocks, job % blocks * block_rows);
         let rows = block_rows.min(shape.out_height() - first);
         let columns = &mut columns[..depth * rows * out_width];
-        unfold(
-            shape,
-            &x[item * image_len..][..image_len],
-            first,
-            rows,
-            columns,
-        );
+        let image = &x[item * image_len..][..image_len];
+        match threads {
+            Threads::One => unfold(shape, image, first, rows, columns),
+            Threads::All => unfold_parallel(shape, image, first, rows, columns),
+        }
         let offset = item * shape.outputs * pixels + first * out_width;
         // SAFETY: each job writes its own pixels of its own image.
         unsafe {
@@ -168,11 +175,14 @@ pub(crate) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], bias: Option<&[f32]
             );
         }
     };
-    let scratch = || vec![0f32; depth * block_rows * out_width];
+    let run = |job: usize| {
+        let len = depth * block_rows * out_width;
+        with_scratch(len, |columns| run(job, columns));
+    };
     if jobs == 1 {
-        run(&mut scratch(), 0);
+        run(0);
     } else {
-        (0..jobs).into_par_iter().for_each_init(scratch, run);
+        (0..jobs).into_par_iter().for_each(run);
     }
     out
 }

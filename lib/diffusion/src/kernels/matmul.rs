@@ -2,8 +2,9 @@
 //! processor has AVX-512, the `gemm` crate elsewhere.
 
 use gemm::{Parallelism, gemm};
+use rayon::prelude::*;
 
-use super::packed;
+use super::packed::{self, PackedColumns};
 
 /// A row-major view: element (i, j) at `i * row + j * column`.
 #[derive(Clone, Copy)]
@@ -101,6 +102,52 @@ pub(crate) unsafe fn product_at(
     }
 }
 
+/// A right-hand matrix that several products share, packed ahead where that
+/// pays.
+pub(crate) enum Columns<'a> {
+    Packed(PackedColumns),
+    View(View<'a>),
+}
+
+impl<'a> Columns<'a> {
+    /// The k x n elements of `b`.
+    pub(crate) fn new(b: View<'a>, (k, n): (usize, usize)) -> Self {
+        b.check(k, n);
+        if packed::available() {
+            Self::Packed(PackedColumns::new(b, (k, n)))
+        } else {
+            Self::View(b)
+        }
+    }
+}
+
+/// [`product_at`] with shared columns; the same bytes.
+///
+/// # Safety
+/// As [`product_at`]; `b` was made for this n and k.
+pub(crate) unsafe fn product_columns(
+    (m, n, k): (usize, usize, usize),
+    out: *mut f32,
+    out_row: usize,
+    keep: f32,
+    scale: f32,
+    a: View,
+    b: &Columns,
+    threads: Threads,
+) {
+    match b {
+        Columns::Packed(b) => {
+            a.check(m, k);
+            // SAFETY: `a` was checked here and `b` when it was packed.
+            unsafe { packed::product_packed(m, out, out_row, keep, scale, a, b, threads) }
+        }
+        // SAFETY: by the caller's contract.
+        Columns::View(b) => unsafe {
+            product_at((m, n, k), out, out_row, keep, scale, a, *b, threads)
+        },
+    }
+}
+
 /// [`product_at`] into a contiguous slice.
 pub(crate) fn product(
     (m, n, k): (usize, usize, usize),
@@ -124,10 +171,12 @@ pub(crate) fn linear(
     w: &[f32],
     bias: Option<&[f32]>,
 ) -> Vec<f32> {
-    let mut y = match bias {
-        Some(bias) => bias.repeat(rows),
-        None => vec![0.0; rows * outputs],
-    };
+    let mut y = vec![0.0; rows * outputs];
+    if let Some(bias) = bias {
+        y.par_chunks_exact_mut(outputs)
+            .with_min_len(64)
+            .for_each(|y| y.copy_from_slice(bias));
+    }
     let keep = if bias.is_some() { 1.0 } else { 0.0 };
     let (a, b) = (View::rows(x, inputs), View::rows(w, inputs).transposed());
     product((rows, outputs, inputs), &mut y, keep, a, b, Threads::All);

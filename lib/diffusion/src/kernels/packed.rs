@@ -13,14 +13,18 @@ use super::{SharedMut, with_scratch};
 const MR: usize = 14;
 /// Columns of the register tile, two registers.
 const NR: usize = 32;
-/// Depth of a panel: a panel of B, 32 KiB, and one of A, 14 KiB, fit L1.
-const KC: usize = 256;
-/// Rows of a block of A: 336 KiB, a part of L2.
+/// Depth of a panel at most: a panel of B takes 40 KiB of L1, while A and the
+/// result stream by; 320, 640 and 1280 channels divide evenly.
+const KC: usize = 320;
+/// Rows of a block of A: 420 KiB, a part of L2.
 const MC: usize = 24 * MR;
-/// Columns of a packed block of B: 4 MiB.
+/// Columns of a packed block of B: 5 MiB.
 const NC: usize = 128 * NR;
-/// Columns of one job.
+/// Columns of one job, where there are few rows.
 const JOB_COLUMNS: usize = 16 * NR;
+/// Blocks of rows from which on these alone are the jobs, so that each block
+/// of A is packed only once.
+const MANY_BLOCKS: usize = 8;
 /// Below this many columns A is used once or twice: packing it does not pay.
 const UNPACKED_COLUMNS: usize = 128;
 /// Products below this many multiplications run on one thread.
@@ -36,6 +40,54 @@ pub(super) fn available() -> bool {
     {
         false
     }
+}
+
+/// Depth of each pass over a product of depth `k`: even parts of at most KC.
+fn depth_of_pass(k: usize) -> usize {
+    k.div_ceil(k.div_ceil(KC).max(1)).max(1)
+}
+
+/// A whole right-hand matrix of k x n elements in panels, for products that
+/// share it: all panels of one pass, then all of the next.
+pub(crate) struct PackedColumns {
+    panels: Vec<f32>,
+    n: usize,
+    k: usize,
+}
+
+impl PackedColumns {
+    pub(super) fn new(b: View, (k, n): (usize, usize)) -> Self {
+        let width = n.div_ceil(NR) * NR;
+        let mut panels = vec![0.0; width * k];
+        let pass = depth_of_pass(k);
+        for (index, target) in panels.chunks_mut((width * pass).max(1)).enumerate() {
+            let first_depth = index * pass;
+            pack_pass(b, (first_depth, pass.min(k - first_depth)), (0, n), target);
+        }
+        Self { panels, n, k }
+    }
+}
+
+/// Packs `count` columns from `first`, `depth` deep, panel by panel.
+fn pack_pass(
+    b: View,
+    (first_depth, depth): (usize, usize),
+    (first, count): (usize, usize),
+    target: &mut [f32],
+) {
+    for (panel, target) in target.chunks_mut(NR * depth.max(1)).enumerate() {
+        let (left, end) = (first + panel * NR, first + count);
+        pack_columns(b, first_depth, depth, left, NR.min(end - left), target);
+    }
+}
+
+/// Where a product goes, and how.
+#[derive(Clone, Copy)]
+struct Output {
+    target: SharedMut,
+    row: usize,
+    keep: f32,
+    scale: f32,
 }
 
 /// `out = keep * out + scale * a b`.
@@ -58,66 +110,140 @@ pub(super) unsafe fn product(
         return;
     }
     let parallel = threads == Threads::All && m * n * k >= SMALL;
-    let target = SharedMut(out);
+    let pass = depth_of_pass(k);
     for first_column in (0..n).step_by(NC) {
         let columns = NC.min(n - first_column);
         // An empty sum still has to write keep * out.
-        for first_depth in (0..k.max(1)).step_by(KC) {
-            let depth = KC.min(k - first_depth);
-            let keep = if first_depth == 0 { keep } else { 1.0 };
+        for first_depth in (0..k.max(1)).step_by(pass) {
+            let depth = pass.min(k - first_depth);
             let panels = columns.div_ceil(NR);
             with_scratch(panels * NR * KC, |packed_b| {
-                let pack = |(panel, target): (usize, &mut [f32])| {
-                    let first = first_column + panel * NR;
-                    pack_columns(b, first_depth, depth, first, NR.min(n - first), target);
-                };
-                let chunks = packed_b[..panels * NR * depth.max(1)].chunks_mut(NR * depth.max(1));
+                let packed_b = &mut packed_b[..panels * NR * depth];
                 if parallel {
-                    chunks.enumerate().par_bridge().for_each(pack);
+                    let panel = NR * depth.max(1);
+                    packed_b
+                        .par_chunks_mut(panel)
+                        .with_min_len(4)
+                        .enumerate()
+                        .for_each(|(index, target)| {
+                            let left = first_column + index * NR;
+                            pack_columns(b, first_depth, depth, left, NR.min(n - left), target);
+                        });
                 } else {
-                    chunks.enumerate().for_each(pack);
+                    pack_pass(b, (first_depth, depth), (first_column, columns), packed_b);
                 }
-                let packed_b: &[f32] = packed_b;
-                let (row_jobs, column_jobs) = (m.div_ceil(MC), columns.div_ceil(JOB_COLUMNS));
-                let job = |job: usize| {
-                    let (first_row, first) =
-                        (job / column_jobs * MC, job % column_jobs * JOB_COLUMNS);
-                    let rows = MC.min(m - first_row);
-                    let block = Block {
-                        rows,
-                        columns: JOB_COLUMNS.min(columns - first),
-                        depth,
-                        keep,
-                        scale,
-                        out_row,
-                    };
-                    let packed_b = &packed_b[first * depth..];
-                    // SAFETY: the rows and columns of this job are its own.
-                    let out = unsafe { target.at(first_row * out_row + first_column + first) };
-                    if n <= UNPACKED_COLUMNS {
-                        let start = first_row * a.row + first_depth * a.column;
-                        let rest = Rows::Strided {
-                            data: &a.data[start.min(a.data.len())..],
-                            row: a.row,
-                            column: a.column,
-                        };
-                        // SAFETY: as above.
-                        unsafe { block.run(rest, packed_b, out) };
-                        return;
-                    }
-                    with_scratch(rows.div_ceil(MR) * MR * KC, |packed_a| {
-                        pack_rows(a, first_row, rows, first_depth, depth, packed_a);
-                        // SAFETY: as above.
-                        unsafe { block.run(Rows::Packed(packed_a), packed_b, out) };
-                    });
+                let output = Output {
+                    target: SharedMut(out.wrapping_add(first_column)),
+                    row: out_row,
+                    keep: if first_depth == 0 { keep } else { 1.0 },
+                    scale,
                 };
-                if parallel {
-                    (0..row_jobs * column_jobs).into_par_iter().for_each(job);
-                } else {
-                    (0..row_jobs * column_jobs).for_each(job);
-                }
+                let size = (m, columns, depth);
+                // SAFETY: by the caller's contract.
+                unsafe { one_pass(size, n, output, a, first_depth, packed_b, parallel) };
             });
         }
+    }
+}
+
+/// [`product`] with a right-hand matrix that is packed already.
+///
+/// # Safety
+/// As [`product`], for the n and k of `b`.
+pub(super) unsafe fn product_packed(
+    m: usize,
+    out: *mut f32,
+    out_row: usize,
+    keep: f32,
+    scale: f32,
+    a: View,
+    b: &PackedColumns,
+    threads: Threads,
+) {
+    if m == 0 || b.n == 0 {
+        return;
+    }
+    let parallel = threads == Threads::All && m * b.n * b.k >= SMALL;
+    let (pass, width) = (depth_of_pass(b.k), b.n.div_ceil(NR) * NR);
+    for first_depth in (0..b.k.max(1)).step_by(pass) {
+        let depth = pass.min(b.k - first_depth);
+        let output = Output {
+            target: SharedMut(out),
+            row: out_row,
+            keep: if first_depth == 0 { keep } else { 1.0 },
+            scale,
+        };
+        let panels = &b.panels[width * first_depth..][..width * depth];
+        // SAFETY: by the caller's contract.
+        unsafe {
+            one_pass(
+                (m, b.n, depth),
+                b.n,
+                output,
+                a,
+                first_depth,
+                panels,
+                parallel,
+            )
+        };
+    }
+}
+
+/// One pass over `columns` of the `n` columns, whose panels are packed.
+///
+/// # Safety
+/// As [`product`].
+unsafe fn one_pass(
+    (m, columns, depth): (usize, usize, usize),
+    n: usize,
+    output: Output,
+    a: View,
+    first_depth: usize,
+    packed_b: &[f32],
+    parallel: bool,
+) {
+    let row_jobs = m.div_ceil(MC);
+    let job_columns = if row_jobs >= MANY_BLOCKS || !parallel {
+        columns.next_multiple_of(NR)
+    } else {
+        JOB_COLUMNS
+    };
+    let column_jobs = columns.div_ceil(job_columns);
+    let job = |job: usize| {
+        let (first_row, first) = (job / column_jobs * MC, job % column_jobs * job_columns);
+        let rows = MC.min(m - first_row);
+        let block = Block {
+            rows,
+            columns: job_columns.min(columns - first),
+            depth,
+            keep: output.keep,
+            scale: output.scale,
+            out_row: output.row,
+        };
+        let packed_b = &packed_b[first * depth..];
+        // SAFETY: the rows and columns of this job are its own.
+        let out = unsafe { output.target.at(first_row * output.row + first) };
+        if n <= UNPACKED_COLUMNS {
+            let start = first_row * a.row + first_depth * a.column;
+            let rest = Rows::Strided {
+                data: &a.data[start.min(a.data.len())..],
+                row: a.row,
+                column: a.column,
+            };
+            // SAFETY: as above.
+            unsafe { block.run(rest, packed_b, out) };
+            return;
+        }
+        with_scratch(rows.div_ceil(MR) * MR * KC, |packed_a| {
+            pack_rows(a, first_row, rows, first_depth, depth, packed_a);
+            // SAFETY: as above.
+            unsafe { block.run(Rows::Packed(packed_a), packed_b, out) };
+        });
+    };
+    if parallel {
+        (0..row_jobs * column_jobs).into_par_iter().for_each(job);
+    } else {
+        (0..row_jobs * column_jobs).for_each(job);
     }
 }
 
@@ -344,7 +470,7 @@ unsafe fn tile<const HALVES: usize, const PACKED: bool>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::matmul::product as either;
+    use super::super::matmul::{Columns, product as either, product_columns};
     use super::*;
 
     /// Against sums in f64, for sizes at and off every block's border, all
@@ -359,6 +485,7 @@ mod tests {
             (3, 700, 40),
             (350, 5, 7),
             (40, 40, 600),
+            (30, 33, 641),
             (2, 3, 0),
         ] {
             let a: Vec<f32> = (0..m * k).map(value).collect();
@@ -385,6 +512,27 @@ mod tests {
                             column: b_column,
                         };
                         either((m, n, k), &mut out, keep, a_view, b_view, threads);
+                        let mut again = start.clone();
+                        let columns = Columns::new(b_view, (k, n));
+                        // SAFETY: `again` holds m rows of n elements.
+                        unsafe {
+                            product_columns(
+                                (m, n, k),
+                                again.as_mut_ptr(),
+                                n,
+                                keep,
+                                1.0,
+                                a_view,
+                                &columns,
+                                threads,
+                            );
+                        }
+                        assert!(
+                            out.iter()
+                                .zip(&again)
+                                .all(|(a, b)| a.to_bits() == b.to_bits()),
+                            "{m}x{n}x{k}: packed ahead gives other bytes"
+                        );
                         for i in 0..m {
                             for j in 0..n {
                                 let mut sum = if keep == 0.0 {
