@@ -143,6 +143,26 @@ fn more_concepts_begin_with_the_earlier_ones_and_take_them_from_the_cache() {
 }
 
 #[test]
+fn scenes_of_one_class_share_a_cache() {
+    let cache = tempfile::tempdir().unwrap();
+    let setting = format!("concepts.cache={:?}", cache.path());
+    let images = |class: &str, seed: &str| {
+        let folder = project("sd15");
+        let class = format!("scene.class={class}");
+        let args = ["--set", &setting, "--set", &class, "--seed", seed];
+        let done = run(folder.path(), CONCEPTS, &args);
+        (
+            done["made"].clone(),
+            artifacts(&folder.path().join("out/concepts/images")).len(),
+        )
+    };
+    assert_eq!(images("toy", "0"), (3.into(), 3));
+    assert_eq!(images("toy", "0"), (0.into(), 3), "another scene");
+    assert_eq!(images("car", "0"), (3.into(), 3), "another class");
+    assert_eq!(images("toy", "7"), (3.into(), 3), "other noise");
+}
+
+#[test]
 fn a_killed_lora_run_resumes_to_the_same_bytes() {
     let folder = project("sd15");
     run(folder.path(), CONCEPTS, &[]);

@@ -135,20 +135,26 @@ fn shards_give_the_same_prediction_as_one_file() -> Outcome {
 #[test]
 fn half_precision_files_are_read_as_f32() -> Outcome {
     let tensors = unet_tensors()?;
-    for dtype in [DType::F16, DType::BF16] {
-        let halves = tensors
+    let x = Tensor::ones((1, 4, 8, 8), DType::F32, &Device::Cpu)?;
+    let context = Tensor::ones((1, 3, 24), DType::F32, &Device::Cpu)?;
+    let predict = |dtype: DType| -> Result<Vec<f32>, Box<dyn std::error::Error>> {
+        let stored = tensors
             .iter()
             .map(|(k, v)| Ok((k.clone(), v.to_dtype(dtype)?)))
             .collect::<Result<_, Error>>()?;
-        let folder = unet_folder(&halves)?;
+        let folder = unet_folder(&stored)?;
         let unet = load_unet(folder.path(), DType::F32, &Device::Cpu)?;
-        let x = Tensor::ones((1, 4, 8, 8), DType::F32, &Device::Cpu)?;
-        let context = Tensor::ones((1, 3, 24), DType::F32, &Device::Cpu)?;
-        assert_eq!(
-            unet.forward(&x, &[10.0], &context, &Pass::default())?
-                .dtype(),
-            DType::F32
-        );
+        let y = unet.forward(&x, &[10.0], &context, &Pass::default())?;
+        Ok(y.flatten_all()?.to_vec1()?)
+    };
+    let exact = predict(DType::F32)?;
+    // The reference's weights are numbers of f16 ...
+    assert_eq!(predict(DType::F16)?, exact);
+    // ... and bf16 rounds each by up to 2^-9, of which a few dozen layers
+    // make some hundredths.
+    let size = exact.iter().fold(0f32, |m, v| m.max(v.abs()));
+    for (a, b) in predict(DType::BF16)?.iter().zip(&exact) {
+        assert!((a - b).abs() < 0.05 * size, "{a} instead of {b}");
     }
     Ok(())
 }
@@ -445,6 +451,55 @@ fn foreign_lora_keys_are_named() -> Outcome {
             .expect_err(part)
             .to_string();
         assert!(message.contains(part), "{message}");
+    }
+    Ok(())
+}
+
+#[test]
+fn lora_files_of_older_tools_mean_the_same() -> Outcome {
+    let unet = load_unet(&family().join("unet"), DType::F32, &Device::Cpu)?;
+    let targets = unet.adapter_targets();
+    let load = |path: &Path| Lora::load(path, &targets, DType::F32, &Device::Cpu);
+    let known = family().join("lora_peft.safetensors");
+    let wanted = load(&known)?;
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("lora.safetensors");
+    let metadata = Weights::open_file(&known)?.metadata().clone();
+    type Rename = fn(&str) -> String;
+    let styles: [(&str, Rename); 3] = [
+        // peft on its own.
+        ("peft", |key| key.replace("unet.", "base_model.model.")),
+        // diffusers before it used peft: the projections' names differ, too.
+        ("processor", |key| {
+            key.replace(".to_out.0.", ".processor.to_out_lora.")
+                .replace(".to_q.", ".processor.to_q_lora.")
+                .replace(".to_k.", ".processor.to_k_lora.")
+                .replace(".to_v.", ".processor.to_v_lora.")
+                .replace("lora_A", "down")
+                .replace("lora_B", "up")
+        }),
+        ("lora.down", |key| {
+            key.replace("lora_A", "lora.down")
+                .replace("lora_B", "lora.up")
+        }),
+    ];
+    for (style, rename) in styles {
+        let renamed = tensors(&known)?
+            .into_iter()
+            .map(|(key, tensor)| (rename(&key), tensor))
+            .collect();
+        write_safetensors(&path, &renamed, &metadata)?;
+        let found = load(&path).map_err(|e| format!("{style}: {e}"))?;
+        assert_eq!(found.adapters().len(), wanted.adapters().len(), "{style}");
+        for (name, adapter) in wanted.adapters() {
+            let other = found.adapter(name).ok_or(format!("{style}: {name}"))?;
+            assert_eq!(other.alpha(), adapter.alpha(), "{style}: {name}");
+            assert_eq!(
+                other.down().to_vec2::<f32>()?,
+                adapter.down().to_vec2::<f32>()?
+            );
+            assert_eq!(other.up().to_vec2::<f32>()?, adapter.up().to_vec2::<f32>()?);
+        }
     }
     Ok(())
 }

@@ -44,11 +44,16 @@ pub fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
     if x.device().is_cpu() {
         return Ok(x.apply_op1(ActivationOp(f))?);
     }
+    activate_composed(f, &x)
+}
+
+/// [`activate`] of candle's operations, for other devices.
+pub(super) fn activate_composed(f: Activation, x: &Tensor) -> Result<Tensor> {
     Ok(match f {
         Activation::Silu => x.silu()?,
         Activation::Gelu => x.gelu_erf()?,
         // x sigmoid(a x) = silu(a x) / a
-        Activation::QuickGelu => ((&x * 1.702)?.silu()? / 1.702)?,
+        Activation::QuickGelu => ((x * 1.702)?.silu()? / 1.702)?,
     })
 }
 
@@ -66,6 +71,11 @@ pub fn geglu(x: &Tensor) -> Result<Tensor> {
     if x.device().is_cpu() {
         return Ok(x.apply_op1(GegluOp)?);
     }
+    geglu_composed(&x)
+}
+
+/// [`geglu`] of candle's operations, for other devices.
+pub(super) fn geglu_composed(x: &Tensor) -> Result<Tensor> {
     let halves = x.chunk(2, D::Minus1)?;
     Ok((&halves[0] * halves[1].gelu_erf()?)?)
 }

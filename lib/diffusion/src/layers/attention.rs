@@ -37,6 +37,17 @@ impl Attention {
         if q.device().is_cpu() {
             return Ok(q.apply_op3(&k, &v, AttentionOp(*self))?);
         }
+        self.forward_composed(&q, &k, &v, shape)
+    }
+
+    /// [`Attention::forward`] of candle's operations, for other devices.
+    pub(super) fn forward_composed(
+        &self,
+        q: &Tensor,
+        k: &Tensor,
+        v: &Tensor,
+        shape: AttentionShape,
+    ) -> Result<Tensor> {
         let split = |t: &Tensor| -> candle_core::Result<Tensor> {
             let (batch, length, width) = t.dims3()?;
             t.reshape((batch, length, self.heads, width / self.heads))?
@@ -49,9 +60,9 @@ impl Attention {
         } else {
             DType::F32
         };
-        let scaled = (split(&q)?.to_dtype(wide)? * shape.scale as f64)?;
+        let scaled = (split(q)?.to_dtype(wide)? * shape.scale as f64)?;
         let logits = scaled
-            .matmul(&split(&k)?.to_dtype(wide)?.t()?)?
+            .matmul(&split(k)?.to_dtype(wide)?.t()?)?
             .to_dtype(DType::F32)?;
         let logits = match self.causality {
             Causality::Full => logits,
@@ -66,11 +77,11 @@ impl Attention {
         let p = shifted
             .broadcast_div(&shifted.sum_keepdim(D::Minus1)?)?
             .to_dtype(q.dtype())?;
-        let out = p.matmul(&split(&v)?)?;
+        let out = p.matmul(&split(v)?)?;
         Ok(out.transpose(1, 2)?.reshape(q.shape())?)
     }
 
-    fn shape(&self, q: &Shape, k: &Shape, v: &Shape) -> Result<AttentionShape> {
+    pub(super) fn shape(&self, q: &Shape, k: &Shape, v: &Shape) -> Result<AttentionShape> {
         let (batch, queries, width) = q.dims3()?;
         let (key_batch, keys, key_width) = k.dims3()?;
         if k != v

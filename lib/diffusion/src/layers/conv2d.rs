@@ -92,6 +92,16 @@ impl Conv2d {
                 },
             )?);
         }
+        self.forward_composed(&x, before, after)
+    }
+
+    /// [`Conv2d::forward`] of candle's operations, for other devices.
+    pub(super) fn forward_composed(
+        &self,
+        x: &Tensor,
+        before: usize,
+        after: usize,
+    ) -> Result<Tensor> {
         let y = if before == after {
             x.conv2d(&self.weight, before, self.stride, 1, 1)?
         } else {

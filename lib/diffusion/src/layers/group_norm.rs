@@ -66,6 +66,11 @@ impl GroupNorm {
             };
             return Ok(x.apply_op3(&self.gamma, &self.beta, op)?);
         }
+        self.forward_composed(&x)
+    }
+
+    /// [`GroupNorm::forward`] of candle's operations, for other devices.
+    pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let (batch, channels) = (x.dims()[0], x.dims()[1]);
         let grouped = x.to_dtype(DType::F32)?.reshape((batch, self.groups, ()))?;
         let centred = grouped.broadcast_sub(&grouped.mean_keepdim(2)?)?;

@@ -36,6 +36,11 @@ impl LayerNorm {
                 },
             )?);
         }
+        self.forward_composed(&x)
+    }
+
+    /// [`LayerNorm::forward`] of candle's operations, for other devices.
+    pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let last = x.rank() - 1;
         let values = x.to_dtype(DType::F32)?;
         let centred = values.broadcast_sub(&values.mean_keepdim(last)?)?;

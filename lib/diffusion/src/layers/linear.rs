@@ -74,7 +74,8 @@ impl Linear {
         })
     }
 
-    fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
+    /// [`Linear::forward`] of candle's operations, for other devices.
+    pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let mut shape = x.dims().to_vec();
         let inputs = shape.pop().unwrap_or(1);
         let y = x.reshape(((), inputs))?.matmul(&self.weight.t()?)?;

@@ -8,6 +8,8 @@
 
 mod activation;
 mod attention;
+#[cfg(test)]
+mod composed;
 mod conv2d;
 mod embedding;
 mod group_norm;

@@ -17,6 +17,11 @@ pub fn upsample_nearest(x: &Tensor, height: usize, width: usize) -> Result<Tenso
     if x.device().is_cpu() {
         return Ok(x.apply_op1(NearestOp { height, width })?);
     }
+    upsample_composed(&x, height, width)
+}
+
+/// [`upsample_nearest`] of candle's operations, for other devices.
+pub(super) fn upsample_composed(x: &Tensor, height: usize, width: usize) -> Result<Tensor> {
     let (_, _, h, w) = x.dims4()?;
     let rows = Tensor::from_vec(sources(h, height), height, x.device())?;
     let columns = Tensor::from_vec(sources(w, width), width, x.device())?;

@@ -147,8 +147,18 @@ struct Part {
     alpha: Option<String>,
 }
 
-const DOWN: [&str; 3] = [".lora_A.weight", ".lora_down.weight", ".lora.down.weight"];
-const UP: [&str; 3] = [".lora_B.weight", ".lora_up.weight", ".lora.up.weight"];
+const DOWN: [&str; 4] = [
+    ".lora_A.weight",
+    ".lora_down.weight",
+    ".lora.down.weight",
+    "_lora.down.weight",
+];
+const UP: [&str; 4] = [
+    ".lora_B.weight",
+    ".lora_up.weight",
+    ".lora.up.weight",
+    "_lora.up.weight",
+];
 
 fn sort_keys<'a>(
     weights: &Weights,
@@ -180,12 +190,12 @@ fn sort_keys<'a>(
             None => {
                 let name = module.strip_prefix("base_model.model.").unwrap_or(module);
                 let name = name.strip_prefix("unet.").unwrap_or(name);
-                // diffusers before PEFT wrote `attn1.processor.to_q_lora.down`.
-                let renamed = name
-                    .replace(".processor.to_out_lora", ".to_out.0")
-                    .replace(".processor.", ".");
-                let renamed = renamed.strip_suffix("_lora").unwrap_or(&renamed);
-                dotted.get(renamed).copied()
+                // diffusers before PEFT wrote `attn1.processor.to_out_lora.down`.
+                let mut renamed = name.replace(".processor.", ".");
+                if renamed.ends_with(".to_out") {
+                    renamed.push_str(".0");
+                }
+                dotted.get(renamed.as_str()).copied()
             }
         };
         let Some(layer) = layer else {
