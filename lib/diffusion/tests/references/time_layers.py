@@ -10,7 +10,6 @@ machine disturbs less.
 """
 
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -68,17 +67,12 @@ def best_of(layer, x, mode, repetitions):
 
 
 def ours_of(program, name, mode, repetitions):
-    """Wall time as the program reports it, or processor time of many runs less that of one."""
-    def run(n):
-        environment = dict(os.environ, RAYON_NUM_THREADS="1") if PROCESSOR else None
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        out = subprocess.run([program, name, mode, str(n)], capture_output=True, text=True, check=True, env=environment)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        return float(out.stdout.split()[2]), 1e3 * seconds
-    if not PROCESSOR:
-        return run(repetitions)[0]
-    return (run(repetitions)[1] - run(0)[1]) / repetitions
+    environment = dict(os.environ)
+    if PROCESSOR:
+        environment |= dict(RAYON_NUM_THREADS="1", CANDLE_NUM_THREADS="1")
+    out = subprocess.run([program, name, mode, str(repetitions)], capture_output=True, text=True, check=True, env=environment)
+    wall, processor = map(float, out.stdout.split()[2:])
+    return processor if PROCESSOR else wall
 
 
 def main():
