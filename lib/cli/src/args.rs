@@ -38,6 +38,11 @@ pub struct CommonArgs {
     #[arg(long)]
     pub wait: bool,
 
+    /// Stop as on Ctrl-C when standard input ends, as it does when the process that started this
+    /// one is gone
+    #[arg(long, hide = true)]
+    pub supervised: bool,
+
     #[command(flatten)]
     #[allow(missing_docs)]
     pub output: OutputArgs,

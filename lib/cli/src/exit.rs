@@ -1,5 +1,6 @@
 //! From an error to a message and an exit code.
 use std::fmt;
+use std::io::{Write, stderr};
 use std::process::ExitCode;
 
 use dipir_pipeline::error::ConfigError;
@@ -28,18 +29,36 @@ impl fmt::Display for Usage {
 
 impl std::error::Error for Usage {}
 
+/// Ends with this exit code and prints nothing: a child process has said it already.
+#[derive(Debug)]
+pub struct Said(pub u8);
+
+impl fmt::Display for Said {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "exit code {}", self.0)
+    }
+}
+
+impl std::error::Error for Said {}
+
 /// Runs `main`, prints what went wrong with all its causes, and picks the exit code.
 pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
     let code = match main() {
         Ok(()) => DONE,
         Err(error) => {
             let code = code_of(&error);
-            if code != INTERRUPTED {
-                let label = bold_red("error:", color_on_stderr());
-                eprintln!("{label} {}", describe(&error));
-            } else {
-                eprintln!("{}", interrupt::MESSAGE);
+            if error.is::<Said>() {
+                return ExitCode::from(code);
             }
+            let text = match code {
+                INTERRUPTED => interrupt::MESSAGE.into(),
+                _ => {
+                    let label = bold_red("error:", color_on_stderr());
+                    format!("{label} {}", describe(&error))
+                }
+            };
+            // A reader that went away is no reason to end otherwise.
+            let _ = writeln!(stderr(), "{text}");
             code
         }
     };
@@ -48,6 +67,9 @@ pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
 
 /// The exit code of an error.
 pub fn code_of(error: &anyhow::Error) -> u8 {
+    if let Some(Said(code)) = error.downcast_ref() {
+        return *code;
+    }
     let is = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
     if is(|e| e.is::<Interrupted>()) {
         INTERRUPTED
@@ -131,6 +153,7 @@ mod tests {
         assert_eq!(code_of(&Usage("bad flag".into()).into()), USAGE);
         assert_eq!(code_of(&anyhow::Error::new(Interrupted)), INTERRUPTED);
         assert_eq!(code_of(&anyhow::anyhow!("broken")), FAILED);
+        assert_eq!(code_of(&anyhow::Error::new(Said(7))), 7);
         let wrapped = Err::<(), _>(Interrupted).context("while rendering");
         assert_eq!(code_of(&wrapped.unwrap_err()), INTERRUPTED);
     }

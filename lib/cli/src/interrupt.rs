@@ -1,6 +1,7 @@
 //! Ctrl-C: the work is asked to stop; if it does not within a moment, the process ends anyway,
 //! its unfinished folder removed.
 use std::fmt;
+use std::io::{Read, Write, stderr, stdin};
 use std::path::{Path, PathBuf};
 use std::process;
 use std::sync::Mutex;
@@ -36,18 +37,38 @@ static UNFINISHED: Mutex<Option<PathBuf>> = Mutex::new(None);
 /// Starts to listen. Stages write beside their target and swap at the end, so that ending the
 /// process at any moment leaves earlier results whole.
 pub fn listen() -> anyhow::Result<()> {
-    ctrlc::set_handler(|| {
-        ASKED.store(true, Ordering::SeqCst);
-        thread::sleep(GRACE);
-        if let Ok(mut folder) = UNFINISHED.lock()
-            && let Some(folder) = folder.take()
-        {
-            let _ = std::fs::remove_dir_all(folder);
-        }
-        eprintln!("{MESSAGE}");
-        process::exit(INTERRUPTED.into());
-    })?;
+    ctrlc::set_handler(stop)?;
     Ok(())
+}
+
+/// Starts to listen without ever ending the process: for work that waits for others to stop.
+pub fn listen_patiently() -> anyhow::Result<()> {
+    ctrlc::set_handler(|| ASKED.store(true, Ordering::SeqCst))?;
+    Ok(())
+}
+
+/// Takes the end of standard input for Ctrl-C. Whoever started this process holds the other end,
+/// so the work stops when that process does, however it ends.
+pub fn follow_standard_input() {
+    thread::spawn(|| {
+        let mut buffer = [0; 64];
+        let mut input = stdin().lock();
+        while input.read(&mut buffer).is_ok_and(|n| n > 0) {}
+        stop();
+    });
+}
+
+fn stop() {
+    ASKED.store(true, Ordering::SeqCst);
+    thread::sleep(GRACE);
+    if let Ok(mut folder) = UNFINISHED.lock()
+        && let Some(folder) = folder.take()
+    {
+        let _ = std::fs::remove_dir_all(folder);
+    }
+    // Whoever read this may be gone, which is no reason to stay.
+    let _ = writeln!(stderr(), "{MESSAGE}");
+    process::exit(INTERRUPTED.into());
 }
 
 /// Notes the folder to remove when the process ends early.

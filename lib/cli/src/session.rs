@@ -31,6 +31,17 @@ pub struct Session {
 impl Session {
     /// Reads the configuration, starts the worker threads and listens for Ctrl-C.
     pub fn start(args: &CommonArgs) -> anyhow::Result<Self> {
+        let session = Self::open(args)?;
+        start_threads(session.pipeline.threads)?;
+        interrupt::listen()?;
+        if args.supervised {
+            interrupt::follow_standard_input();
+        }
+        Ok(session)
+    }
+
+    /// Reads the configuration alone.
+    pub fn open(args: &CommonArgs) -> anyhow::Result<Self> {
         let config = Config::read(&args.pipeline, &args.set)?;
         let mut pipeline = config.pipeline()?;
         pipeline.seed = args.seed.unwrap_or(pipeline.seed);
@@ -44,8 +55,6 @@ impl Session {
                 Usage("the folder of artifacts is empty: name one with --out".into()).into(),
             );
         }
-        start_threads(pipeline.threads)?;
-        interrupt::listen()?;
         Ok(Self {
             config,
             pipeline,
@@ -66,7 +75,15 @@ impl Session {
     /// Opens the folder of the planned stage for writing.
     pub fn begin(&self, plan: StagePlan) -> Result<StageWriter, StageError> {
         let folder = self.stage_folder(&plan.stage);
-        let writer = StageWriter::begin(&folder, plan, self.when_locked)?;
+        let writer = match StageWriter::begin(&folder, plan.clone(), WhenLocked::Refuse) {
+            Err(StageError::Locked { holder, .. }) if self.when_locked == WhenLocked::Wait => {
+                if !self.output.quiet {
+                    eprintln!("waiting for {holder}, which writes {}", folder.display());
+                }
+                StageWriter::begin(&folder, plan, WhenLocked::Wait)?
+            }
+            other => other?,
+        };
         interrupt::unfinished(writer.partial());
         Ok(writer)
     }

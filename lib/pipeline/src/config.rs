@@ -18,7 +18,7 @@ use crate::error::{ConfigError, plain};
 use tree::{Node, Value};
 
 /// The tables that a `pipeline.toml` may hold.
-pub const TABLES: [&str; 7] = [
+pub const TABLES: [&str; 8] = [
     "pipeline",
     "model",
     "scene",
@@ -26,6 +26,7 @@ pub const TABLES: [&str; 7] = [
     "lora",
     "optimize",
     "composite",
+    "report",
 ];
 
 /// Where a value was written.

@@ -72,8 +72,15 @@ impl Fingerprint {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "reason", rename_all = "snake_case")]
 pub enum StaleReason {
-    /// It never ran here, or its manifest cannot be read.
+    /// It never ran here.
     NeverRun,
+    /// Its `stage.json` cannot be read, so nothing is known of its outputs.
+    ManifestDamaged {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        message: String,
+    },
     /// The stage's code is newer.
     Version {
         /// Version that made the outputs.
@@ -128,6 +135,7 @@ impl fmt::Display for StaleReason {
         let shown = |v: &Option<String>| v.clone().unwrap_or_else(|| "unset".into());
         match self {
             Self::NeverRun => write!(f, "it has not run yet"),
+            Self::ManifestDamaged { path, message } => write!(f, "{}: {message}", path.display()),
             Self::Version { was, now } => {
                 write!(f, "its code changed from version {was} to {now}")
             }
@@ -149,8 +157,9 @@ impl fmt::Display for StaleReason {
 pub fn stale_reasons(plan: &StagePlan, folder: &Path) -> Result<Vec<StaleReason>, StageError> {
     let manifest = match Manifest::read(folder, "") {
         Ok(m) if m.stage == plan.stage => m,
-        Ok(_) | Err(StageError::NotRun { .. } | StageError::Manifest { .. }) => {
-            return Ok(vec![StaleReason::NeverRun]);
+        Ok(_) | Err(StageError::NotRun { .. }) => return Ok(vec![StaleReason::NeverRun]),
+        Err(StageError::Manifest { path, message }) => {
+            return Ok(vec![StaleReason::ManifestDamaged { path, message }]);
         }
         Err(e) => return Err(e),
     };

@@ -6,9 +6,15 @@
 //! - [`manifest`]: `stage.json`, the last file that a stage writes.
 //! - [`fingerprint`]: why a stage has to run again, in words.
 //! - [`lock`]: one writer a folder.
+//! - [`graph`]: which stage reads what another wrote.
+//! - [`status`]: which stages are up to date, and why the others are not.
+//! - [`runner`]: the stages' executables as child processes, in order.
 pub mod config;
 pub mod error;
 pub mod fingerprint;
+pub mod graph;
 pub mod lock;
 pub mod manifest;
+pub mod runner;
 pub mod stage;
+pub mod status;

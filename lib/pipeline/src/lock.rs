@@ -28,18 +28,32 @@ pub struct FolderLock {
 impl FolderLock {
     /// Takes the lock of `folder`, which need not exist, though its parent must.
     pub fn take(folder: &Path, when_locked: WhenLocked) -> Result<Self, StageError> {
-        let path = lock_path(folder);
+        Self::take_file(&lock_path(folder), folder, when_locked)
+    }
+
+    /// Takes the lock called `name` inside `folder`, which is made if it is not there: for what
+    /// concerns all that is in it.
+    pub fn take_inside(
+        folder: &Path,
+        name: &str,
+        when_locked: WhenLocked,
+    ) -> Result<Self, StageError> {
+        create_folder(folder)?;
+        Self::take_file(&lock_path(&folder.join(name)), folder, when_locked)
+    }
+
+    fn take_file(path: &Path, folder: &Path, when_locked: WhenLocked) -> Result<Self, StageError> {
         let mut file = OpenOptions::new()
             .read(true)
             .write(true)
             .create(true)
             .truncate(false)
-            .open(&path)
-            .map_err(|e| StageError::io("write", &path, e))?;
+            .open(path)
+            .map_err(|e| StageError::io("write", path, e))?;
         match file.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) if when_locked == WhenLocked::Wait => {
-                file.lock().map_err(|e| StageError::io("lock", &path, e))?;
+                file.lock().map_err(|e| StageError::io("lock", path, e))?;
             }
             Err(TryLockError::WouldBlock) => {
                 return Err(StageError::Locked {
@@ -47,12 +61,12 @@ impl FolderLock {
                     holder: holder(&mut file),
                 });
             }
-            Err(TryLockError::Error(e)) => return Err(StageError::io("lock", &path, e)),
+            Err(TryLockError::Error(e)) => return Err(StageError::io("lock", path, e)),
         }
         file.set_len(0)
             .and_then(|()| file.rewind())
             .and_then(|()| writeln!(file, "{}", std::process::id()))
-            .map_err(|e| StageError::io("write", &path, e))?;
+            .map_err(|e| StageError::io("write", path, e))?;
         Ok(Self { _file: file })
     }
 }

@@ -1,4 +1,7 @@
 //! `stage.json`: what a stage read, with which settings, and what it wrote.
+//!
+//! The file ends with a checksum of all that stands before it, so that a damaged manifest is told
+//! from a whole one as surely as the files that it lists.
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::Read;
@@ -9,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Damage, StageError, plain};
 
 /// Version of the manifest's own layout.
-pub const SCHEMA: u32 = 1;
+pub const SCHEMA: u32 = 2;
 /// The manifest's file name in a stage's folder.
 pub const FILE_NAME: &str = "stage.json";
 
@@ -98,8 +101,8 @@ impl Manifest {
     /// Reads the manifest in a stage's `folder`; `executable` is named if it is not there.
     pub fn read(folder: &Path, executable: &str) -> Result<Self, StageError> {
         let path = folder.join(FILE_NAME);
-        let text = match fs::read_to_string(&path) {
-            Ok(text) => text,
+        let bytes = match fs::read(&path) {
+            Ok(bytes) => bytes,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
                 return Err(StageError::NotRun {
                     path,
@@ -108,7 +111,13 @@ impl Manifest {
             }
             Err(e) => return Err(StageError::io("read", path, e)),
         };
-        Self::parse(&text, &path)
+        match String::from_utf8(bytes) {
+            Ok(text) => Self::parse(&text, &path),
+            Err(_) => Err(StageError::Manifest {
+                path,
+                message: "damaged: it is not text".into(),
+            }),
+        }
     }
 
     /// Reads a manifest from its text; `path` is for messages.
@@ -117,6 +126,7 @@ impl Manifest {
             path: path.into(),
             message,
         };
+        check_sum(text).map_err(wrong)?;
         let manifest: Self = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
         if manifest.schema != SCHEMA {
             return Err(wrong(format!(
@@ -128,6 +138,14 @@ impl Manifest {
             check_inside(&artifact.path)?;
         }
         Ok(manifest)
+    }
+
+    /// The file's text, its checksum last.
+    pub fn to_text(&self) -> serde_json::Result<String> {
+        let text = serde_json::to_string_pretty(self)?;
+        let body = text.strip_suffix("\n}").unwrap_or(&text);
+        let hash = blake3::hash(body.as_bytes()).to_hex();
+        Ok(format!("{body}{CHECKSUM}{hash}{END}"))
     }
 
     /// Every output that no longer has the bytes that were written.
@@ -142,16 +160,18 @@ impl Manifest {
         Ok(damages)
     }
 
+    /// The entry of the output with the given role; `folder` is for the message without one.
+    pub fn artifact(&self, role: &str, folder: &Path) -> Result<&Artifact, StageError> {
+        let listed = self.outputs.iter().find(|a| a.role == role);
+        listed.ok_or_else(|| StageError::Manifest {
+            path: folder.join(FILE_NAME),
+            message: format!("it lists no output \"{role}\""),
+        })
+    }
+
     /// The output with the given role, checked against its hash.
     pub fn output(&self, folder: &Path, role: &str) -> Result<PathBuf, StageError> {
-        let artifact = self
-            .outputs
-            .iter()
-            .find(|a| a.role == role)
-            .ok_or_else(|| StageError::Manifest {
-                path: folder.join(FILE_NAME),
-                message: format!("it lists no output \"{role}\""),
-            })?;
+        let artifact = self.artifact(role, folder)?;
         let path = folder.join(&artifact.path);
         match artifact.damage(&path)? {
             None => Ok(path),
@@ -161,6 +181,24 @@ impl Manifest {
                 damage,
             }),
         }
+    }
+}
+
+/// What stands between the body of the file and its checksum.
+const CHECKSUM: &str = ",\n  \"checksum\": \"";
+/// What stands behind the checksum.
+const END: &str = "\"\n}\n";
+
+fn check_sum(text: &str) -> Result<(), String> {
+    let written = text
+        .strip_suffix(END)
+        .and_then(|t| t.rsplit_once(CHECKSUM))
+        .ok_or("damaged: it does not end with its checksum")?;
+    let (body, written) = written;
+    let found = blake3::hash(body.as_bytes()).to_hex();
+    match found.as_str() == written {
+        true => Ok(()),
+        false => Err("damaged: its checksum does not fit its content".into()),
     }
 }
 

@@ -56,6 +56,19 @@ impl StagePlan {
         self.inputs.push(Artifact::of(&name, path, location)?);
         Ok(())
     }
+
+    /// Adds outputs of an earlier stage by their roles, known by `STAGE/file`, with the hashes
+    /// that its manifest states. Whoever reads them checks them with [`Manifest::output`].
+    pub fn outputs_of(&mut self, earlier: &Manifest, roles: &[&str]) -> Result<(), StageError> {
+        for role in roles {
+            let output = earlier.artifact(role, Path::new(&earlier.stage))?;
+            self.inputs.push(Artifact {
+                path: Path::new(&earlier.stage).join(&output.path),
+                ..output.clone()
+            });
+        }
+        Ok(())
+    }
 }
 
 /// An output folder being written. Dropped unfinished, it leaves nothing behind.
@@ -169,7 +182,9 @@ impl StageWriter {
             estimated_error: self.estimated_error,
         };
         let path = self.partial.join(FILE_NAME);
-        write_json(&path, &manifest)?;
+        let text = manifest.to_text();
+        let text = text.map_err(|e| StageError::io("write", &path, e.into()))?;
+        fs::write(&path, text).map_err(|e| StageError::io("write", &path, e))?;
         flush(&path)?;
         flush(&self.partial)?;
         swap(&self.partial, &self.target)?;

@@ -113,7 +113,7 @@ fn an_unknown_table_is_an_error() {
     assert_eq!(
         parse("[scnee]\n", &[]).unwrap_err().to_string(),
         "pipeline.toml:1: unknown key \"scnee\" (did you mean \"scene\"?); the top level accepts: \
-         pipeline, model, scene, concepts, lora, optimize, composite"
+         pipeline, model, scene, concepts, lora, optimize, composite, report"
     );
 }
 

@@ -144,6 +144,28 @@ fn a_flipped_bit_a_cut_and_a_lost_file_are_told_apart() {
 }
 
 #[test]
+fn any_flipped_byte_of_the_manifest_is_found() {
+    let out = tempfile::tempdir().unwrap();
+    let target = out.path().join("scene");
+    run(&target, "pixels");
+    let file = target.join(FILE_NAME);
+    let whole = fs::read(&file).unwrap();
+    for k in 0..whole.len() {
+        let mut flipped = whole.clone();
+        flipped[k] ^= 1;
+        fs::write(&file, flipped).unwrap();
+        let error = Manifest::read(&target, "").unwrap_err().to_string();
+        assert!(
+            error.starts_with(&format!(
+                "{}: not a stage manifest: damaged",
+                file.display()
+            )),
+            "byte {k}: {error}"
+        );
+    }
+}
+
+#[test]
 fn a_stage_that_has_not_run_is_named() {
     let error = Manifest::read(Path::new("out/scene"), "dipir-scene").unwrap_err();
     assert_eq!(
