@@ -1,42 +1,12 @@
 //! `dipir-composite`: the object in the photograph, with its layers.
+mod cli;
+
 use std::process::ExitCode;
 
 use clap::Parser;
-use dipir_cli::args::CommonArgs;
+use cli::Cli;
 use dipir_cli::exit;
 use dipir_cli::session::Session;
-
-const EXAMPLES: &str = "\
-Examples:
-  dipir-composite                                      composite [scene] of ./pipeline.toml
-  dipir-composite --set composite.environment=sky.hdr  light by another map (the path is
-                                                       relative to pipeline.toml)
-  dipir-composite --target-error 0.01                  stop at a display-referred RMSE of 0.01
-  dipir-composite --time-budget 20                     or after 20 seconds
-
-Reads OUT/scene, which dipir-scene writes. Writes OUT/composite/: composite.png, composite.exr
-(layers: R G B A, object, shadow, background, depth, normal, albedo), stage.json.
-Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
-
-/// Render the objects and their shadow at full quality and lay them over the photograph
-///
-/// Reads the [composite] table. The light is [composite] environment if given, else what the
-/// light stage recovered.
-#[derive(Parser)]
-#[command(name = "dipir-composite", version, after_help = EXAMPLES)]
-struct Cli {
-    #[command(flatten)]
-    common: CommonArgs,
-
-    /// Stop when the estimated error of the composite is at most this display-referred RMSE;
-    /// short for --set composite.target_error=RMSE
-    #[arg(long, value_name = "RMSE", conflicts_with = "time_budget")]
-    target_error: Option<f32>,
-
-    /// Stop after about this many seconds; short for --set composite.time_budget_s=SECONDS
-    #[arg(long, value_name = "SECONDS")]
-    time_budget: Option<f64>,
-}
 
 fn main() -> ExitCode {
     exit::run(|| {

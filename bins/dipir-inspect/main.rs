@@ -1,4 +1,5 @@
 //! `dipir-inspect`: shows any artifact, and whether it is whole.
+mod cli;
 mod folder;
 mod json;
 mod model;
@@ -9,47 +10,21 @@ mod view;
 
 use std::fs::File;
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use clap::Parser;
-use dipir_cli::args::OutputArgs;
+use cli::{Cli, ViewArgs};
 use dipir_cli::exit::{self, Usage};
 use dipir_cli::style::{bold, color_on_stdout};
 use report::Report;
-use view::ViewArgs;
-
-const EXAMPLES: &str = "\
-Examples:
-  dipir-inspect out/scene                      a stage's folder, its files checked by hash
-  dipir-inspect out/composite/composite.exr    layers, ranges, NaNs
-  dipir-inspect sky.hdr --png sky.png          an environment map, its peak marked
-  dipir-inspect out/composite/composite.exr --png shadow.png --layer shadow
-  dipir-inspect --json out/scene/effects.json  the same for a program
-
-Exit codes: 0 whole, 1 damaged or unreadable, 2 wrong usage.";
-
-/// Show any artifact: images, stage folders, JSON, safetensors, 3D objects
-#[derive(Parser)]
-#[command(name = "dipir-inspect", version, after_help = EXAMPLES)]
-struct Args {
-    /// Files or stage folders
-    #[arg(required = true, value_name = "PATH")]
-    paths: Vec<PathBuf>,
-
-    #[command(flatten)]
-    view: ViewArgs,
-
-    #[command(flatten)]
-    output: OutputArgs,
-}
 
 fn main() -> ExitCode {
-    exit::run(|| run(&Args::parse()))
+    exit::run(|| run(&Cli::parse()))
 }
 
-fn run(args: &Args) -> anyhow::Result<()> {
+fn run(args: &Cli) -> anyhow::Result<()> {
     if args.view.png.is_some() && args.paths.len() != 1 {
         return Err(Usage("--png shows one image: give one PATH".into()).into());
     }
@@ -66,7 +41,7 @@ fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-fn print(args: &Args, reports: &[Report]) {
+fn print(args: &Cli, reports: &[Report]) {
     let text = || {
         let color = color_on_stdout();
         let shown: Vec<String> = reports

@@ -11,8 +11,9 @@ use dipir_numerics::sum::sum_f32;
 use serde_json::{Value, json};
 
 use crate::Kind;
+use crate::cli::ViewArgs;
 use crate::report::{Report, Table, number};
-use crate::view::{self, ViewArgs};
+use crate::view;
 
 /// Least, mean and largest of the finite values, and how many are not finite.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -24,10 +24,12 @@ use serde_json::{Value, json};
 use crate::interruption;
 use crate::light::{self, Light, Recovered};
 use crate::materials;
-use crate::scene_folder::SceneFolder;
+use crate::scene_folder::{self, SceneFolder};
 
 /// Name of the stage and of its folder.
 pub const STAGE: &str = "composite";
+/// The executable that runs it.
+pub const EXECUTABLE: &str = "dipir-composite";
 /// Raised whenever the same inputs give other outputs.
 pub const VERSION: u32 = 3;
 
@@ -173,7 +175,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     }
     table.check(&session.config)?;
     let mut inputs = read(session)?;
-    let materials = materials::recovered(session, &mut inputs.scene)?;
+    materials::use_recovered(session, &mut inputs.scene)?;
     let light = match light::known(session, &table)? {
         Some(light) => Source::Map(light),
         None => Source::Recovered(Box::new(light::recovered(
@@ -183,12 +185,8 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         )?)),
     };
     let stop = table.stop(session.pipeline.quality);
-    let mut plan = stage_plan(session, &table, stop, &inputs, &light)?;
-    if let Some((known_as, location)) = &materials {
-        plan.input("materials", known_as, location)?;
-    }
     let folder = session.stage_folder(STAGE);
-    let mut writer = session.begin(plan)?;
+    let mut writer = session.begin(plan(session, &table)?)?;
     let rendered = render(session, &table, stop, &inputs, &light)?;
     let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light))?;
     let png = writer.output("picture", "composite.png")?;
@@ -217,42 +215,28 @@ fn read(session: &Session) -> anyhow::Result<Inputs> {
     Ok(Inputs { scene, gbuffer })
 }
 
-fn stage_plan(
-    session: &Session,
-    table: &CompositeTable,
-    stop: Stop,
-    inputs: &Inputs,
-    light: &Source,
-) -> anyhow::Result<StagePlan> {
-    let light_params = match light {
-        Source::Map(light) => &light.params,
-        Source::Recovered(light) => &light.params,
-    };
+/// What a run would be, from the configuration and the manifests of the stages that it reads.
+pub fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> {
+    table.check(&session.config)?;
+    let scene = scene_folder::manifest(session)?;
+    let known = light::known_params(table);
     let params = json!({
-        "light": light_params,
+        "light": known.as_ref().map_or_else(|| light::recovered_params(table), |k| k.0.clone()),
         "tone": table.tone,
         "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
-        "stop": match stop {
+        "stop": match table.stop(session.pipeline.quality) {
             Stop::Samples(n) => json!({"samples": n}),
             Stop::TargetError(e) => json!({"target_error": e}),
             Stop::TimeBudget(t) => json!({"time_budget_s": t.as_secs_f64()}),
         },
     });
     let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
-    let files = ["scene.json", "effects.json", "gbuffer.exr"];
-    inputs.scene.add_inputs(&mut plan, &files)?;
-    match light {
-        Source::Map(light) => {
-            if let Some((path, location)) = &light.file {
-                plan.input("environment", path, location)?;
-            }
-        }
-        Source::Recovered(light) => {
-            for (role, path, location) in &light.files {
-                plan.input(role, path, location)?;
-            }
-        }
+    scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
+    match known {
+        Some((_, path)) => plan.input("environment", path, &session.resolve(path))?,
+        None => plan.outputs_of(&light::manifest(session)?, &["lighting", "tone"])?,
     }
+    materials::add_input(session, &mut plan)?;
     Ok(plan)
 }
 

@@ -14,7 +14,8 @@ use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
 use dipir_diffusion::weights::{Weights, write_safetensors};
 use dipir_imaging::file::write_png;
-use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::error::StageError;
+use dipir_pipeline::manifest::{Manifest, hash_file};
 use dipir_pipeline::stage::StagePlan;
 use dipir_scene::config::SceneConfig;
 use serde::{Deserialize, Serialize};
@@ -90,12 +91,10 @@ pub struct Done {
     reused: usize,
 }
 
-/// Runs the stage.
-pub fn run(session: &Session) -> anyhow::Result<Done> {
+/// What a run would be, from the configuration.
+pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let table: ConceptsTable = session.config.table("concepts")?;
     let model_table: ModelTable = session.config.table("model")?;
-    let scene: SceneConfig = session.config.table("scene")?;
-    let class = scene.class.unwrap_or_else(|| "object".into());
     if table.steps == 0 || !(table.guidance >= 0.0 && table.guidance.is_finite()) {
         return Err(session
             .config
@@ -105,15 +104,30 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
             )
             .into());
     }
-    let cache_setting = ConceptsTable {
+    let without_cache = ConceptsTable {
         cache: None,
-        ..table.clone()
+        ..table
     };
-    let params =
-        json!({"concepts": cache_setting, "class": class, "precision": model_table.precision});
+    let params = json!({
+        "concepts": without_cache, "class": class(session)?, "precision": model_table.precision,
+    });
     let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
     plan.device = session.pipeline.device.clone();
     model::inputs(session, &model_table, &mut plan)?;
+    Ok(plan)
+}
+
+fn class(session: &Session) -> anyhow::Result<String> {
+    let scene: SceneConfig = session.config.table("scene")?;
+    Ok(scene.class.unwrap_or_else(|| "object".into()))
+}
+
+/// Runs the stage.
+pub fn run(session: &Session) -> anyhow::Result<Done> {
+    let table: ConceptsTable = session.config.table("concepts")?;
+    let model_table: ModelTable = session.config.table("model")?;
+    let class = class(session)?;
+    let plan = plan(session)?;
     let cache = cache_folder(session, &table, &plan, &class)?;
     let folder = session.stage_folder(STAGE);
     let mut writer = session.begin(plan)?;
@@ -135,8 +149,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
             cache.join(format!("{stem}.png")),
             cache.join(format!("{stem}.safetensors")),
         );
-        // The latents are written last: their presence says that both are whole.
-        if !tensor.is_file() || !png.is_file() {
+        let seal = cache.join(format!("{stem}.blake3"));
+        if !is_whole(&seal, &png, &tensor) {
             let settings = GenerateSettings {
                 solver: Solver::DpmSolver2M,
                 steps: table.steps,
@@ -148,6 +162,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
             make(&model, &concept, &settings, &png, &tensor, |part| {
                 progress.set(share(part))
             })?;
+            write_seal(&seal, &png, &tensor)?;
             made += 1;
         }
         latents.push(read_latents(&tensor)?);
@@ -196,6 +211,25 @@ fn cache_folder(
     let folder = root.join(&key.as_str()[..16]);
     model::create_folder(&folder)?;
     Ok(folder)
+}
+
+/// Whether both files of an image are there with the hashes that were noted when they were made.
+fn is_whole(seal: &Path, png: &Path, tensor: &Path) -> bool {
+    let noted = std::fs::read_to_string(seal).ok();
+    noted.is_some() && noted == hashes(png, tensor).ok()
+}
+
+/// Notes the hashes of both files of an image: written last, it says that they are whole.
+fn write_seal(seal: &Path, png: &Path, tensor: &Path) -> anyhow::Result<()> {
+    let text = hashes(png, tensor)?;
+    let partial = seal.with_extension("partial");
+    std::fs::write(&partial, text)
+        .and_then(|()| std::fs::rename(&partial, seal))
+        .with_context(|| format!("cannot write {}", seal.display()))
+}
+
+fn hashes(png: &Path, tensor: &Path) -> Result<String, StageError> {
+    Ok(format!("{}\n{}\n", hash_file(png)?.1, hash_file(tensor)?.1))
 }
 
 fn make(

@@ -7,9 +7,13 @@ pub mod lora;
 pub mod materials;
 pub mod model;
 pub mod optimize;
+pub mod pipeline;
+pub mod preview;
+pub mod report;
 pub mod scene;
 pub mod scene_folder;
 pub mod transport;
+pub mod truth;
 
 use std::ops::ControlFlow;
 

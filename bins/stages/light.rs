@@ -1,5 +1,5 @@
 //! Which light a stage works under.
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context;
@@ -15,19 +15,36 @@ use serde_json::{Value, json};
 use crate::composite::CompositeTable;
 use crate::optimize;
 
-/// A light and where it came from.
+/// A light that is a map.
 pub struct Light {
     /// Radiance from everywhere, on the photograph's scale.
     pub map: Arc<EnvironmentMap>,
-    /// The file, as the configuration names it and where it is; `None` for a built-in light.
-    pub file: Option<(PathBuf, PathBuf)>,
-    /// What decides the light beside the file's content.
-    pub params: Value,
+}
+
+/// What decides the light of `[composite] environment`, and its file, as the configuration names it;
+/// `None` if the key is not set.
+pub fn known_params(table: &CompositeTable) -> Option<(Value, &Path)> {
+    let path = table.environment.as_deref()?;
+    let params = json!({
+        "environment": path,
+        "exposure_ev": table.exposure_ev,
+        "rotation_deg": table.rotation_deg,
+    });
+    Some((params, path))
+}
+
+/// What decides the recovered light beside the light stage's files.
+pub fn recovered_params(table: &CompositeTable) -> Value {
+    json!({
+        "recovered": true,
+        "exposure_ev": table.exposure_ev,
+        "rotation_deg": table.rotation_deg,
+    })
 }
 
 /// The map of `[composite] environment`, exposed and turned; `None` if the key is not set.
 pub fn known(session: &Session, table: &CompositeTable) -> anyhow::Result<Option<Light>> {
-    let Some(path) = &table.environment else {
+    let Some((_, path)) = known_params(table) else {
         return Ok(None);
     };
     let location = session.resolve(path);
@@ -54,15 +71,7 @@ pub fn known(session: &Session, table: &CompositeTable) -> anyhow::Result<Option
     let map = map
         .scaled(exposure)
         .rotated_y(f64::from(table.rotation_deg).to_radians());
-    Ok(Some(Light {
-        map: Arc::new(map),
-        file: Some((path.clone(), location)),
-        params: json!({
-            "environment": path,
-            "exposure_ev": table.exposure_ev,
-            "rotation_deg": table.rotation_deg,
-        }),
-    }))
+    Ok(Some(Light { map: Arc::new(map) }))
 }
 
 /// A light that the light stage recovered.
@@ -71,10 +80,6 @@ pub struct Recovered {
     pub lobes: SgMixture,
     /// The tone curves that were recovered with it.
     pub tone: ToneCurves,
-    /// Roles and files, as they are known and where they are.
-    pub files: Vec<(&'static str, PathBuf, PathBuf)>,
-    /// What decides the light beside the files' content.
-    pub params: Value,
 }
 
 /// What the light stage left, exposed and turned; an error that says what to do if there is
@@ -85,10 +90,7 @@ pub fn recovered(
     scene: &Manifest,
 ) -> anyhow::Result<Recovered> {
     let folder = session.stage_folder(optimize::STAGE);
-    if !folder.join(FILE_NAME).exists() {
-        return Err(missing(&folder.join("lighting.json")));
-    }
-    let manifest = Manifest::read(&folder, optimize::EXECUTABLE)?;
+    let manifest = manifest(session)?;
     warn_of_another_scene(session, &manifest, scene);
     let lighting_file = manifest.output(&folder, "lighting")?;
     let tone_file = manifest.output(&folder, "tone")?;
@@ -100,7 +102,6 @@ pub fn recovered(
         radiance: lobe.radiance * exposure,
         ..lobe
     });
-    let known_as = |name: &str| Path::new(optimize::STAGE).join(name);
     Ok(Recovered {
         lobes: SgMixture::new(lobes.collect()).map_err(|e| {
             let message = format!(
@@ -110,16 +111,16 @@ pub fn recovered(
             session.config.invalid("composite.exposure_ev", message)
         })?,
         tone: ToneCurves::read_json(&tone_file)?,
-        files: vec![
-            ("lighting", known_as("lighting.json"), lighting_file),
-            ("tone", known_as("tone.json"), tone_file),
-        ],
-        params: json!({
-            "recovered": true,
-            "exposure_ev": table.exposure_ev,
-            "rotation_deg": table.rotation_deg,
-        }),
     })
+}
+
+/// The manifest of the light stage; an error that says what to do if it has not run.
+pub fn manifest(session: &Session) -> anyhow::Result<Manifest> {
+    let folder = session.stage_folder(optimize::STAGE);
+    if !folder.join(FILE_NAME).exists() {
+        return Err(missing(&folder.join("lighting.json")));
+    }
+    Ok(Manifest::read(&folder, optimize::EXECUTABLE)?)
 }
 
 /// The light may have been recovered before the scene was set up anew.
@@ -164,11 +165,12 @@ pub fn pilot() -> Light {
     let (row, column) = map.texel_of(sun);
     texels[row * WIDTH + column] += PILOT_SUN_IRRADIANCE / map.solid_angle(row) as f32;
     let map = EnvironmentMap::new(WIDTH, HEIGHT, texels).unwrap_or(map);
-    Light {
-        map: Arc::new(map),
-        file: None,
-        params: json!("pilot: sun and sky"),
-    }
+    Light { map: Arc::new(map) }
+}
+
+/// What stands for the pilot light among a stage's parameters.
+pub fn pilot_params() -> Value {
+    json!("pilot: sun and sky")
 }
 
 /// The error of a stage that needs a light where there is none.

@@ -204,55 +204,84 @@ impl TrainingData for Data<'_> {
     }
 }
 
-/// Runs the stage.
-pub fn run(session: &Session) -> anyhow::Result<Done> {
+/// What a run would be, from the configuration and the concept stage's manifest.
+pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let table: LoraTable = session.config.table("lora")?;
     let model_table: ModelTable = session.config.table("model")?;
-    let scene: SceneConfig = session.config.table("scene")?;
-    let background = scene.background.as_ref().ok_or_else(|| {
-        session
-            .config
-            .invalid("scene.background", "is missing: name the photograph")
-    })?;
-    let transfer: Transfer = match scene.transfer.as_deref() {
-        None | Some("srgb") => Transfer::Srgb,
-        Some("gamma22") => Transfer::Gamma22,
-        Some("linear") => Transfer::Linear,
-        Some(_) => {
-            return Err(session
-                .config
-                .invalid("scene.transfer", "accepted: srgb, gamma22, linear")
-                .into());
-        }
-    };
     if !(table.min_crop > 0.0 && table.min_crop <= 1.0) {
         return Err(session
             .config
             .invalid("lora.min_crop", "accepted: above 0, up to 1")
             .into());
     }
-    let photo_file = session.resolve(background);
-    let (list, concept_files) = read_concepts(session, &table)?;
-
+    let (background, transfer) = photo_of(session)?;
+    // How often the state is kept does not show in the result.
+    let table = LoraTable {
+        checkpoint_every: 0,
+        ..table
+    };
     let params = json!({
-        "lora": table, "transfer": scene.transfer, "precision": model_table.precision,
+        "lora": table, "transfer": transfer, "precision": model_table.precision,
     });
     let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
     plan.device = session.pipeline.device.clone();
-    plan.input("background", background, &photo_file)?;
-    for (name, location) in &concept_files {
-        plan.input("concepts", Path::new(name), location)?;
+    plan.input("background", &background, &session.resolve(&background))?;
+    if preserves_concepts(session)? {
+        let folder = session.stage_folder(concepts::STAGE);
+        let concepts = Manifest::read(&folder, concepts::EXECUTABLE)?;
+        plan.outputs_of(&concepts, &["concepts", "latents"])?;
     }
     model::inputs(session, &model_table, &mut plan)?;
+    Ok(plan)
+}
+
+/// Whether concept images are trained on beside the photograph.
+pub fn preserves_concepts(session: &Session) -> anyhow::Result<bool> {
+    let table: LoraTable = session.config.table("lora")?;
+    let concepts: concepts::ConceptsTable = session.config.table("concepts")?;
+    Ok(concepts.count > 0 && table.prior_weight != 0.0)
+}
+
+/// The photograph, as the configuration names it, and how it is encoded.
+fn photo_of(session: &Session) -> anyhow::Result<(PathBuf, Transfer)> {
+    let scene: SceneConfig = session.config.table("scene")?;
+    let wrong = |key, message: &str| anyhow::Error::new(session.config.invalid(key, message));
+    let transfer = match scene.transfer.as_deref() {
+        None | Some("srgb") => Transfer::Srgb,
+        Some("gamma22") => Transfer::Gamma22,
+        Some("linear") => Transfer::Linear,
+        Some(_) => return Err(wrong("scene.transfer", "accepted: srgb, gamma22, linear")),
+    };
+    match scene.background {
+        Some(path) => Ok((path, transfer)),
+        None => Err(wrong("scene.background", "is missing: name the photograph")),
+    }
+}
+
+/// Runs the stage.
+pub fn run(session: &Session) -> anyhow::Result<Done> {
+    let table: LoraTable = session.config.table("lora")?;
+    let model_table: ModelTable = session.config.table("model")?;
+    let (background, transfer) = photo_of(session)?;
+    let photo_file = session.resolve(&background);
+    let (list, latents) = read_concepts(session)?.unzip();
+    let plan = plan(session)?;
     let base_hash = plan
         .inputs
         .iter()
         .find(|i| i.path.to_string_lossy().contains("unet/diffusion"))
         .map(|i| i.blake3.clone());
     let folder = session.stage_folder(STAGE);
-    let fingerprint = blake3::hash(
-        serde_json::to_string(&json!([plan.inputs, without_steps(&table)]))?.as_bytes(),
-    );
+    let decides = json!([
+        plan.version,
+        plan.seed,
+        plan.device,
+        plan.inputs,
+        without_steps(&table),
+        transfer,
+        model_table.precision
+    ]);
+    let fingerprint = blake3::hash(decides.to_string().as_bytes());
     let mut writer = session.begin(plan)?;
 
     let mut model = model::load(session, &model_table)?;
@@ -270,10 +299,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
             .as_ref()
             .map(|l| l.class_prompt.clone())
             .unwrap_or_default(),
-        concepts: match concept_files.get(1) {
-            Some((_, location)) => Some(read_latents(location)?),
-            None => None,
-        },
+        concepts: latents.as_deref().map(read_latents).transpose()?,
         model: &model,
     };
     let mut trainer = LoraTrainer::new(
@@ -298,13 +324,21 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         progress.say(format!("loss {:.4}", report.loss));
         history.push(report);
         if table.sample_every > 0 && report.step % table.sample_every == 0 {
-            show(&model, &trainer, &data, &mut writer, report.step)?;
+            show(&model, &trainer, &data, &resume.sample(report.step))?;
         }
         if table.checkpoint_every > 0 && report.step % table.checkpoint_every == 0 {
             resume.save(&trainer, &history)?;
         }
     }
     progress.done();
+    for step in 1..=table.steps {
+        if table.sample_every > 0 && step % table.sample_every == 0 {
+            let kept = resume.sample(step);
+            let target = writer.output("sample", format!("samples/{step:06}.png"))?;
+            std::fs::copy(&kept, &target)
+                .with_context(|| format!("cannot copy {}", kept.display()))?;
+        }
+    }
     write_results(
         session,
         &table,
@@ -329,7 +363,6 @@ fn without_steps(table: &LoraTable) -> LoraTable {
     LoraTable {
         steps: 0,
         checkpoint_every: 0,
-        sample_every: 0,
         ..table.clone()
     }
 }
@@ -351,36 +384,24 @@ fn learnable(model: &mut Model, word: &str) -> anyhow::Result<Tensor> {
     Ok(Tensor::stack(&rows, 0)?.mean(0)?)
 }
 
-/// The concept list and its two files, unless concept preservation is off.
-#[allow(clippy::type_complexity)]
-fn read_concepts(
-    session: &Session,
-    table: &LoraTable,
-) -> anyhow::Result<(Option<ConceptList>, Vec<(String, PathBuf)>)> {
-    let concepts: concepts::ConceptsTable = session.config.table("concepts")?;
-    if concepts.count == 0 || table.prior_weight == 0.0 {
-        return Ok((None, vec![]));
+/// The concept list and the file of latents, checked by hash, unless concept preservation is off.
+fn read_concepts(session: &Session) -> anyhow::Result<Option<(ConceptList, PathBuf)>> {
+    if !preserves_concepts(session)? {
+        return Ok(None);
     }
     let folder = session.stage_folder(concepts::STAGE);
-    Manifest::read(&folder, concepts::EXECUTABLE)?;
-    let path = folder.join("concepts.json");
+    let manifest = Manifest::read(&folder, concepts::EXECUTABLE)?;
+    let path = manifest.output(&folder, "concepts")?;
     let text = std::fs::read_to_string(&path)
         .with_context(|| format!("cannot read {}", path.display()))?;
     let list: ConceptList = serde_json::from_str(&text).with_context(|| {
         format!(
-            "{} is damaged; run {} again",
+            "{} was written by another version; run {} again",
             path.display(),
             concepts::EXECUTABLE
         )
     })?;
-    if list.concepts.is_empty() {
-        return Ok((None, vec![]));
-    }
-    let named = |name: &str| (format!("concepts/{name}"), folder.join(name));
-    Ok((
-        Some(list),
-        vec![named("concepts.json"), named("latents.safetensors")],
-    ))
+    Ok(Some((list, manifest.output(&folder, "latents")?)))
 }
 
 /// Where an interrupted run goes on.
@@ -396,6 +417,11 @@ impl Resume {
             .join(&fingerprint[..16]);
         model::create_folder(&folder)?;
         Ok(Self { folder })
+    }
+
+    /// Where the sample after an update is kept until the end.
+    fn sample(&self, step: usize) -> PathBuf {
+        self.folder.join(format!("sample-{step:06}.png"))
     }
 
     /// Loads the last checkpoint, if there is a usable one; returns its history.
@@ -459,13 +485,7 @@ impl Resume {
 }
 
 /// A sample under the photograph's caption.
-fn show(
-    model: &Model,
-    trainer: &LoraTrainer,
-    data: &Data,
-    writer: &mut StageWriter,
-    step: usize,
-) -> anyhow::Result<()> {
+fn show(model: &Model, trainer: &LoraTrainer, data: &Data, path: &Path) -> anyhow::Result<()> {
     let settings = GenerateSettings {
         solver: Solver::DpmSolver2M,
         steps: 20,
@@ -483,9 +503,10 @@ fn show(
         |_| !interrupt::asked(),
     );
     interrupt::check()?;
-    let path = writer.output("sample", format!("samples/{step:06}.png"))?;
-    write_png(&path, &model::to_display(&generated?.image)?)?;
-    Ok(())
+    // Beside its place and renamed: a sample that is there is whole.
+    let partial = path.with_extension("partial.png");
+    write_png(&partial, &model::to_display(&generated?.image)?)?;
+    std::fs::rename(&partial, path).with_context(|| format!("cannot write {}", path.display()))
 }
 
 fn write_results(

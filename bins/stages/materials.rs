@@ -1,6 +1,6 @@
 //! Recovering materials under a known light, and using what was recovered.
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use dipir_cli::interrupt::Interrupted;
 use dipir_cli::session::{Session, duration};
@@ -12,7 +12,7 @@ use dipir_optimize::materials::{
     MaterialOptimization, MaterialOutcome, MaterialSettings, RecoveredMaterial,
 };
 use dipir_optimize::settings::OptimizeTable;
-use dipir_pipeline::manifest::{FILE_NAME, Manifest};
+use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_render::adaptive::{Progress, Stop};
 use dipir_render::render::{Renderer, Settings, Simulation};
@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 
 use crate::composite::{CompositeTable, Tone};
 use crate::light;
-use crate::scene_folder::SceneFolder;
+use crate::scene_folder::{self, SceneFolder};
 use crate::transport::{self, Frame};
 use crate::{interruption, optimize};
 
@@ -51,43 +51,14 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
     let settings = transport::settings(session, &table)?;
-    let (reference_path, reference_file) = optimize::reference_of(session, &table)?;
-    let Some(light) = light::known(session, &composite)? else {
-        let message = "needs a known light, for a picture alone does not tell a dark material from a \
-                       dim light; name a map, as in --set composite.environment=sky.hdr";
-        return Err(session.config.invalid("optimize.materials", message).into());
-    };
+    let (_, reference_file) = optimize::reference_of(session, &table)?;
+    let light = light::known(session, &composite)?.ok_or_else(|| needs_light(session))?;
     let scene = SceneFolder::read(session)?;
     let materials = indices(session, &scene.loaded.scene.materials, &table.materials)?;
     let frame = Frame::new(&scene.loaded, settings.size);
     let reference = optimize::read_reference(session, &scene, &frame, &reference_file)?;
-    let material_settings = MaterialSettings {
-        iterations: table
-            .iterations
-            .unwrap_or(MaterialSettings::default().iterations),
-        seed: settings.seed,
-        ..MaterialSettings::default()
-    };
-
-    let params = json!({
-        "materials": table.materials,
-        "iterations": material_settings.iterations,
-        "size": settings.size,
-        "seed": settings.seed,
-        "light": light.params,
-        "tone": composite.tone,
-    });
-    let mut plan = StagePlan::new(
-        optimize::STAGE,
-        optimize::VERSION,
-        params,
-        session.pipeline.seed,
-    );
-    scene.add_inputs(&mut plan, &["scene.json", "effects.json"])?;
-    plan.input("reference", &reference_path, &reference_file)?;
-    if let Some((path, location)) = &light.file {
-        plan.input("environment", path, location)?;
-    }
+    let material_settings = settings_of(&table, settings.seed);
+    let plan = plan(session)?;
     let folder = session.stage_folder(optimize::STAGE);
     let mut writer = session.begin(plan)?;
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
@@ -123,6 +94,47 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         manifest,
         outcome,
     })
+}
+
+/// What a run would be, from the configuration and the scene stage's manifest.
+pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
+    let table: OptimizeTable = session.config.table("optimize")?;
+    let composite: CompositeTable = session.config.table("composite")?;
+    composite.check(&session.config)?;
+    let settings = transport::settings(session, &table)?;
+    let (reference_path, reference_file) = optimize::reference_of(session, &table)?;
+    let (light, environment) =
+        light::known_params(&composite).ok_or_else(|| needs_light(session))?;
+    let params = json!({
+        "materials": table.materials,
+        "iterations": settings_of(&table, settings.seed).iterations,
+        "size": settings.size,
+        "seed": settings.seed,
+        "light": light,
+        "tone": composite.tone,
+    });
+    let (stage, version) = (optimize::STAGE, optimize::VERSION);
+    let mut plan = StagePlan::new(stage, version, params, session.pipeline.seed);
+    let scene = scene_folder::manifest(session)?;
+    scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
+    plan.input("reference", &reference_path, &reference_file)?;
+    plan.input("environment", environment, &session.resolve(environment))?;
+    Ok(plan)
+}
+
+fn settings_of(table: &OptimizeTable, seed: u64) -> MaterialSettings {
+    let default = MaterialSettings::default();
+    MaterialSettings {
+        iterations: table.iterations.unwrap_or(default.iterations),
+        seed,
+        ..default
+    }
+}
+
+fn needs_light(session: &Session) -> anyhow::Error {
+    let message = "needs a known light, for a picture alone does not tell a dark material from a \
+                   dim light; name a map, as in --set composite.environment=sky.hdr";
+    session.config.invalid("optimize.materials", message).into()
 }
 
 /// The photograph as the object shades it, at the frame's size.
@@ -178,22 +190,31 @@ fn indices(
     Ok(found)
 }
 
-/// Puts what the light stage recovered of the materials into `scene`; the file that it is in, as
-/// it is known and where it is, or `None` without one.
-pub fn recovered(
-    session: &Session,
-    scene: &mut SceneFolder,
-) -> anyhow::Result<Option<(PathBuf, PathBuf)>> {
+/// The manifest of the light stage, if the configuration asks for recovered materials.
+fn recovery(session: &Session) -> anyhow::Result<Option<Manifest>> {
+    if !are_asked_for(session)? {
+        return Ok(None);
+    }
     let folder = session.stage_folder(optimize::STAGE);
-    if !folder.join(FILE_NAME).exists() {
-        return Ok(None);
+    Ok(Some(Manifest::read(&folder, optimize::EXECUTABLE)?))
+}
+
+/// Notes the recovered materials as an input, if the configuration asks for them.
+pub fn add_input(session: &Session, plan: &mut StagePlan) -> anyhow::Result<()> {
+    match recovery(session)? {
+        Some(manifest) => Ok(plan.outputs_of(&manifest, &[ROLE])?),
+        None => Ok(()),
     }
-    let manifest = Manifest::read(&folder, optimize::EXECUTABLE)?;
-    if !manifest.outputs.iter().any(|o| o.role == ROLE) {
-        return Ok(None);
-    }
+}
+
+/// Puts what the light stage recovered of the materials into `scene`, if the configuration asks
+/// for it.
+pub fn use_recovered(session: &Session, scene: &mut SceneFolder) -> anyhow::Result<()> {
+    let Some(manifest) = recovery(session)? else {
+        return Ok(());
+    };
     light::warn_of_another_scene(session, &manifest, &scene.manifest);
-    let file = manifest.output(&folder, ROLE)?;
+    let file = manifest.output(&session.stage_folder(optimize::STAGE), ROLE)?;
     let text = std::fs::read_to_string(&file)?;
     let found: Vec<RecoveredMaterial> = serde_json::from_str(&text).map_err(|e| {
         let tool = optimize::EXECUTABLE;
@@ -207,7 +228,7 @@ pub fn recovered(
             f.apply(material);
         }
     }
-    Ok(Some((Path::new(optimize::STAGE).join(FILE), file)))
+    Ok(())
 }
 
 impl Done {

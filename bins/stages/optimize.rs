@@ -27,7 +27,7 @@ use dipir_render::transport::{RecordSettings, Transport};
 use glam::Vec3;
 use serde_json::{Value, json};
 
-use crate::scene_folder::SceneFolder;
+use crate::scene_folder::{self, SceneFolder};
 use crate::transport::{self, Frame};
 use crate::{interruption, model};
 
@@ -56,14 +56,12 @@ pub struct Done {
 pub fn run(session: &Session) -> anyhow::Result<Done> {
     let table: OptimizeTable = session.config.table("optimize")?;
     let settings = transport::settings(session, &table)?;
-    let (reference_path, reference_file) = reference_of(session, &table)?;
+    let (_, reference_file) = reference_of(session, &table)?;
     let scene = SceneFolder::read(session)?;
     let frame = Frame::new(&scene.loaded, settings.size);
     let reference = read_reference(session, &scene, &frame, &reference_file)?;
 
-    let mut plan = StagePlan::new(STAGE, VERSION, params(&settings), session.pipeline.seed);
-    scene.add_inputs(&mut plan, &["scene.json", "effects.json"])?;
-    plan.input("reference", &reference_path, &reference_file)?;
+    let plan = plan(session)?;
     let fingerprint = fingerprint(&plan, &settings)?;
     let folder = session.stage_folder(STAGE);
     let mut writer = session.begin(plan)?;
@@ -121,6 +119,18 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         resumed_at,
         rmse,
     })
+}
+
+/// What a run would be, from the configuration and the scene stage's manifest.
+pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
+    let table: OptimizeTable = session.config.table("optimize")?;
+    let settings = transport::settings(session, &table)?;
+    let (reference_path, reference_file) = reference_of(session, &table)?;
+    let mut plan = StagePlan::new(STAGE, VERSION, params(&settings), session.pipeline.seed);
+    let scene = scene_folder::manifest(session)?;
+    scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
+    plan.input("reference", &reference_path, &reference_file)?;
+    Ok(plan)
 }
 
 /// The reference, as the configuration names it and where it is.

@@ -1,6 +1,6 @@
 //! The scene stage: reads everything once, decides what to simulate, and writes down both.
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use dipir_cli::exit::Usage;
@@ -11,7 +11,7 @@ use dipir_optimize::settings::{OptimizeTable, Settings as OptimizeSettings};
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
-use dipir_render::effects::{EffectsPlan, plan};
+use dipir_render::effects::{self, EffectsPlan};
 use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 
 use crate::composite::CompositeTable;
 use crate::interruption;
-use crate::light::{self, Light};
+use crate::light;
 use crate::transport::{self, Frame};
 
 /// Name of the stage and of its folder.
@@ -29,7 +29,7 @@ pub const STAGE: &str = "scene";
 /// The executable that runs it.
 pub const EXECUTABLE: &str = "dipir-scene";
 /// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 
 /// What the stage did.
 pub struct Done {
@@ -78,12 +78,15 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let optimize: OptimizeTable = session.config.table("optimize")?;
     let optimize = transport::settings(session, &optimize)?;
     let known = light::known(session, &composite)?;
-    // Where the light is given, nothing is recovered: the record would be made for nobody.
     let recorded = known.is_none().then_some(&optimize);
     let light = known.unwrap_or_else(light::pilot);
-    let stage_plan = stage_plan(session, &config, &loaded, &light, recorded)?;
+    let read = loaded.inputs.iter();
+    let plan_of_this = plan_with(
+        session,
+        read.map(|i| (i.role.as_str(), i.path.as_path(), i.location.as_path())),
+    )?;
     let folder = session.stage_folder(STAGE);
-    let mut writer = session.begin(stage_plan)?;
+    let mut writer = session.begin(plan_of_this)?;
 
     let settings = Settings {
         seed: session.pipeline.seed,
@@ -94,7 +97,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     };
     let renderer = Renderer::new(&loaded.scene);
     let progress = session.progress("effects");
-    let effects = plan(
+    let effects = effects::plan(
         &renderer,
         &EnvironmentSampler::new(light.map.clone()),
         &config.effects,
@@ -155,28 +158,97 @@ fn record(
     transport::record(session, &renderer, &record_settings)
 }
 
-fn stage_plan(
+/// What a run would be. Which files an object consists of is known only when it has been read: the
+/// manifest of the last run has them, and as long as the object is the same, so are they.
+pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
+    let config: SceneConfig = session.config.table("scene")?;
+    let recorded = match Manifest::read(&session.stage_folder(STAGE), EXECUTABLE) {
+        Ok(manifest) => manifest.inputs,
+        Err(_) => Vec::new(),
+    };
+    let parts = recorded.iter().filter(|a| a.role.starts_with("part of "));
+    let named = named_files(&config);
+    let files = named
+        .iter()
+        .map(|(role, path)| (*role, path.as_path()))
+        .chain(parts.map(|a| (unnumbered(&a.role), a.path.as_path())));
+    let files: Vec<_> = files
+        .map(|(role, path)| (role, path, session.resolve(path)))
+        .collect();
+    plan_with(
+        session,
+        files
+            .iter()
+            .map(|(role, path, at)| (*role, *path, at.as_path())),
+    )
+}
+
+/// The keys of `[scene]` that decide what the stage writes: what the object is called concerns the
+/// stages that ask a model.
+pub fn settings(session: &Session) -> anyhow::Result<SceneConfig> {
+    Ok(SceneConfig {
+        class: None,
+        ..session.config.table("scene")?
+    })
+}
+
+/// The files that the configuration itself names, every one once.
+fn named_files(config: &SceneConfig) -> Vec<(&'static str, PathBuf)> {
+    let camera = config.camera.as_ref().and_then(|c| c.transforms.clone());
+    let proxy = config.proxy.as_ref().and_then(|p| p.mesh.clone());
+    let single = [
+        ("background", config.background.clone()),
+        ("occluders", config.occluders.clone()),
+        ("camera", camera),
+        ("proxy", proxy),
+    ];
+    let objects = config.objects.iter().map(|o| ("object", o.path.clone()));
+    let mut files: Vec<(&str, PathBuf)> = Vec::new();
+    for (role, path) in single.into_iter().chain(objects) {
+        if let Some(path) = path
+            && !files.contains(&(role, path.clone()))
+        {
+            files.push((role, path));
+        }
+    }
+    files
+}
+
+/// `part of object 2` is another `part of object`.
+fn unnumbered(role: &str) -> &str {
+    role.trim_end_matches(|c: char| c.is_ascii_digit())
+        .trim_end()
+}
+
+fn plan_with<'a>(
     session: &Session,
-    config: &SceneConfig,
-    loaded: &LoadedScene,
-    light: &Light,
-    recorded: Option<&OptimizeSettings>,
+    files: impl Iterator<Item = (&'a str, &'a Path, &'a Path)>,
 ) -> anyhow::Result<StagePlan> {
-    let transport = recorded.map(|s| {
+    let config = settings(session)?;
+    let composite: CompositeTable = session.config.table("composite")?;
+    let optimize: OptimizeTable = session.config.table("optimize")?;
+    let optimize = transport::settings(session, &optimize)?;
+    let known = light::known_params(&composite);
+    // Where the light is given, nothing is recovered: the record would be made for nobody.
+    let transport = known.is_none().then(|| {
         json!({
-            "size": s.size, "environment": s.environment, "samples": s.samples,
-            "precision": s.precision, "seed": s.seed,
+            "size": optimize.size, "environment": optimize.environment,
+            "samples": optimize.samples, "precision": optimize.precision,
+            "seed": optimize.seed,
         })
     });
+    let light = known
+        .as_ref()
+        .map_or_else(light::pilot_params, |k| k.0.clone());
     let params = json!({
-        "scene": serde_json::to_value(config)?, "light": light.params, "transport": transport,
+        "scene": serde_json::to_value(&config)?, "light": light, "transport": transport,
     });
     let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
-    for input in &loaded.inputs {
-        plan.input(&input.role, &input.path, &input.location)?;
+    for (role, path, location) in files {
+        plan.input(role, path, location)?;
     }
-    if let Some((path, location)) = &light.file {
-        plan.input("environment", path, location)?;
+    if let Some((_, path)) = known {
+        plan.input("environment", path, &session.resolve(path))?;
     }
     Ok(plan)
 }

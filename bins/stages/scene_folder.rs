@@ -2,11 +2,11 @@
 use std::path::{Path, PathBuf};
 
 use dipir_cli::session::Session;
+use dipir_pipeline::error::StageError;
 use dipir_pipeline::fingerprint::{StaleReason, parameter_changes};
-use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::manifest::{Artifact, Manifest};
 use dipir_pipeline::stage::StagePlan;
 use dipir_render::effects::EffectsPlan;
-use dipir_scene::config::SceneConfig;
 use dipir_scene::description::SceneDescription;
 use dipir_scene::scene::LoadedScene;
 use serde::Deserialize;
@@ -30,7 +30,7 @@ impl SceneFolder {
     /// Reads what the scene stage wrote and the files that it names.
     pub fn read(session: &Session) -> anyhow::Result<Self> {
         let folder = session.stage_folder(scene::STAGE);
-        let manifest = Manifest::read(&folder, scene::EXECUTABLE)?;
+        let manifest = manifest(session)?;
         warn_of_other_settings(session, &manifest)?;
         let description = SceneDescription::read(&manifest.output(&folder, "scene")?)?;
         let effects: EffectsPlan = read_json(&manifest.output(&folder, "effects")?)?;
@@ -42,24 +42,27 @@ impl SceneFolder {
             effects,
         })
     }
+}
 
-    /// Notes the files `names` of the folder, and those that the scene was made of, as inputs.
-    pub fn add_inputs(&self, plan: &mut StagePlan, names: &[&str]) -> anyhow::Result<()> {
-        for name in names {
-            let role = name.split('.').next().unwrap_or(name);
-            let location = self.folder.join(name);
-            plan.input(role, &Path::new(scene::STAGE).join(name), &location)?;
-        }
-        for input in &self.loaded.inputs {
-            plan.input(&input.role, &input.path, &input.location)?;
-        }
-        Ok(())
-    }
+/// The manifest of the scene stage.
+pub fn manifest(session: &Session) -> Result<Manifest, StageError> {
+    Manifest::read(&session.stage_folder(scene::STAGE), scene::EXECUTABLE)
+}
+
+/// Notes the scene stage's outputs of the given roles, and the files that the scene is made of, as
+/// inputs: with the hashes of the manifest, against which they are checked when they are read.
+pub fn add_inputs(plan: &mut StagePlan, scene: &Manifest, roles: &[&str]) -> anyhow::Result<()> {
+    plan.outputs_of(scene, roles)?;
+    // The camera's file is in scene.json, the light's has a role of its own.
+    let made_of = |a: &&Artifact| a.role != "camera" && a.role != "environment";
+    plan.inputs
+        .extend(scene.inputs.iter().filter(made_of).cloned());
+    Ok(())
 }
 
 /// The scene's folder may have been made before the last edit of `[scene]`.
 fn warn_of_other_settings(session: &Session, manifest: &Manifest) -> anyhow::Result<()> {
-    let config: SceneConfig = session.config.table("scene")?;
+    let config = scene::settings(session)?;
     let was = json!({"scene": manifest.params["scene"]});
     let now = json!({"scene": serde_json::to_value(config)?});
     let changes: Vec<String> = parameter_changes(&was, &now)

@@ -80,8 +80,6 @@ pub struct SceneDescription {
     pub schema: String,
     /// Of every random number.
     pub seed: u64,
-    /// What the object is called in prompts.
-    pub class: String,
     /// The photo.
     pub background: PhotoRecord,
     /// Mask of the photo's own foreground.
@@ -98,7 +96,7 @@ pub struct SceneDescription {
 
 impl SceneDescription {
     /// Name and version of the format.
-    pub const SCHEMA: &str = "dipir.scene.v1";
+    pub const SCHEMA: &str = "dipir.scene.v2";
 
     /// Writes the description as JSON.
     pub fn write(&self, path: &Path) -> Result<(), Error> {

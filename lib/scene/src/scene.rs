@@ -118,7 +118,6 @@ impl Scene {
             description: SceneDescription {
                 schema: SceneDescription::SCHEMA.into(),
                 seed: 0,
-                class: settings.class,
                 background,
                 occluders: occluders_record,
                 objects,

@@ -1,0 +1,27 @@
+//! The command line.
+use clap::Parser;
+use dipir_cli::args::CommonArgs;
+
+const EXAMPLES: &str = "\
+Examples:
+  dipir-lora                                [lora] of ./pipeline.toml
+  dipir-lora --set lora.steps=1000          train longer
+  dipir-lora --set lora.learn_word=true     learn an embedding for the word, too
+  dipir-lora --set lora.sample_every=100    look at samples on the way
+  dipir-lora --set concepts.count=0         without concept preservation
+
+Reads OUT/concepts/, which dipir-concepts writes. Writes OUT/lora/: lora.safetensors (diffusers,
+PEFT) lora_kohya.safetensors (A1111, ComfyUI) training.json stage.json.
+An interrupted run goes on where it stopped and ends with the same bytes.
+Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
+
+/// Fine-tune a LoRA of the diffusion model on the photograph
+///
+/// Reads the tables [model], [concepts] and [lora] and the keys scene.background and
+/// scene.transfer.
+#[derive(Parser)]
+#[command(name = "dipir-lora", version, after_help = EXAMPLES)]
+pub struct Cli {
+    #[command(flatten)]
+    pub common: CommonArgs,
+}

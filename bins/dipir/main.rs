@@ -1,0 +1,65 @@
+//! `dipir`: all stages with one command, each only if it has to run.
+mod clean;
+mod manual;
+mod project;
+mod report;
+mod run;
+mod status;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use dipir_cli::exit;
+
+const EXAMPLES: &str = "\
+Examples:
+  dipir run                                 what ./pipeline.toml says, as far as it is not done yet
+  dipir run photo/pipeline.toml             another project
+  dipir run --set optimize.iterations=50    a key set for this run; only what it concerns runs
+  dipir run --until lora                    that stage and what it needs
+  dipir run --from light --force            that stage and all that read it, once more
+  dipir status                              what would run, and why
+  dipir report                              show the run as one page, out/report.html
+  dipir clean                               remove what the stages wrote
+
+Stages: scene concepts lora light composite. Each is an executable of its own and can be run by
+itself; dipir runs them in order, leaves out what is up to date, and goes on where it was stopped.
+Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
+
+/// Put a 3D object into a photograph: all stages, each only if it has to run
+#[derive(Parser)]
+#[command(name = manual::DIPIR, version, after_help = EXAMPLES)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Run what is not up to date
+    Run(run::RunArgs),
+    /// Say of each stage whether it is up to date, and if not, why
+    Status(status::StatusArgs),
+    /// Show which stage reads which
+    Graph(status::GraphArgs),
+    /// Show what the stages wrote as one page, complete in itself
+    Report(report::ReportArgs),
+    /// Remove what stages wrote
+    Clean(clean::CleanArgs),
+    /// Print what makes a shell complete the options of an executable
+    Completions(manual::CompletionsArgs),
+    /// Print the manual page of an executable, or write those of all
+    Man(manual::ManArgs),
+}
+
+fn main() -> ExitCode {
+    exit::run(|| match Cli::parse().command {
+        Command::Run(args) => run::run(&args),
+        Command::Status(args) => status::run(&args),
+        Command::Graph(args) => status::graph(&args),
+        Command::Report(args) => report::run(&args),
+        Command::Clean(args) => clean::run(&args),
+        Command::Completions(args) => manual::completions(&args),
+        Command::Man(args) => manual::man(&args),
+    })
+}

@@ -1,0 +1,106 @@
+//! `dipir completions` and `dipir man`, for all executables.
+use std::fs;
+use std::io::{Write, stdout};
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::{Args, Command, CommandFactory, ValueEnum};
+use clap_complete::Shell;
+use clap_mangen::Man;
+use dipir_cli::session::print_line;
+
+// Of these command lines only what they say of themselves is used here.
+#[allow(dead_code)]
+#[path = "../dipir-composite/cli.rs"]
+mod composite;
+#[allow(dead_code)]
+#[path = "../dipir-concepts/cli.rs"]
+mod concepts;
+#[allow(dead_code)]
+#[path = "../dipir-inspect/cli.rs"]
+mod inspect;
+#[allow(dead_code)]
+#[path = "../dipir-lora/cli.rs"]
+mod lora;
+#[allow(dead_code)]
+#[path = "../dipir-optimize/cli.rs"]
+mod optimize;
+#[allow(dead_code)]
+#[path = "../dipir-scene/cli.rs"]
+mod scene;
+
+/// Name of this executable.
+pub const DIPIR: &str = "dipir";
+
+#[derive(Args)]
+pub struct CompletionsArgs {
+    /// The shell
+    #[arg(value_name = "SHELL")]
+    shell: Shell,
+
+    /// The executable whose options are completed
+    #[arg(long = "of", value_name = "EXECUTABLE", default_value = DIPIR)]
+    executable: Executable,
+}
+
+#[derive(Args)]
+pub struct ManArgs {
+    /// The executable whose page is printed
+    #[arg(long = "of", value_name = "EXECUTABLE", default_value = DIPIR)]
+    executable: Executable,
+
+    /// Write the pages of all executables into this folder instead
+    #[arg(long, value_name = "DIR")]
+    dir: Option<PathBuf>,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Executable {
+    Dipir,
+    DipirScene,
+    DipirConcepts,
+    DipirLora,
+    DipirOptimize,
+    DipirComposite,
+    DipirInspect,
+}
+
+impl Executable {
+    fn command(self) -> Command {
+        match self {
+            Self::Dipir => crate::Cli::command(),
+            Self::DipirScene => scene::Cli::command(),
+            Self::DipirConcepts => concepts::Cli::command(),
+            Self::DipirLora => lora::Cli::command(),
+            Self::DipirOptimize => optimize::Cli::command(),
+            Self::DipirComposite => composite::Cli::command(),
+            Self::DipirInspect => inspect::Cli::command(),
+        }
+    }
+}
+
+pub fn completions(args: &CompletionsArgs) -> anyhow::Result<()> {
+    let mut command = args.executable.command();
+    let name = command.get_name().to_string();
+    let mut text = Vec::new();
+    clap_complete::generate(args.shell, &mut command, name, &mut text);
+    // A reader that went away, as head does, is no error.
+    let _ = stdout().write_all(&text);
+    Ok(())
+}
+
+pub fn man(args: &ManArgs) -> anyhow::Result<()> {
+    let Some(folder) = &args.dir else {
+        let mut text = Vec::new();
+        Man::new(args.executable.command()).render(&mut text)?;
+        let _ = stdout().write_all(&text);
+        return Ok(());
+    };
+    fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
+    for executable in Executable::value_variants() {
+        clap_mangen::generate_to(executable.command(), folder)
+            .with_context(|| format!("cannot write to {}", folder.display()))?;
+    }
+    print_line(&format!("wrote the pages to {}", folder.display()));
+    Ok(())
+}

@@ -1,0 +1,101 @@
+//! What all subcommands start from: a configuration, its graph, and names of stages.
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use dipir::pipeline;
+use dipir::report::quoted;
+use dipir::{composite, concepts, lora, optimize, scene};
+use dipir_cli::args::{CommonArgs, OutputArgs};
+use dipir_cli::session::Session;
+use dipir_pipeline::graph::Graph;
+
+#[derive(Args, Clone, Debug)]
+pub struct ProjectArgs {
+    /// The file that configures all stages; relative paths in it start from its folder
+    #[arg(value_name = "FILE", default_value = "pipeline.toml")]
+    pub file: PathBuf,
+
+    /// Set a key of the file, as in --set scene.class=car; may be repeated, the last one wins
+    #[arg(long = "set", short = 's', value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+
+    /// Folder of all artifacts, relative to the current folder [default: [pipeline] out]
+    #[arg(long, short = 'o', value_name = "DIR")]
+    pub out: Option<PathBuf>,
+
+    /// Seed of every random number [default: [pipeline] seed]
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
+impl ProjectArgs {
+    /// The same for the executables of the stages.
+    pub fn common(&self) -> CommonArgs {
+        CommonArgs {
+            pipeline: self.file.clone(),
+            set: self.set.clone(),
+            out: self.out.clone(),
+            threads: None,
+            seed: self.seed,
+            wait: false,
+            supervised: false,
+            output: self.output,
+        }
+    }
+
+    /// The options that repeat this on the command line of a stage's executable, for a shell.
+    pub fn options(&self) -> Vec<String> {
+        let mut words = Vec::new();
+        if self.file != std::path::Path::new("pipeline.toml") {
+            words.extend(["--pipeline".to_string(), self.file.display().to_string()]);
+        }
+        for set in &self.set {
+            words.extend(["--set".to_string(), set.clone()]);
+        }
+        if let Some(out) = &self.out {
+            words.extend(["--out".to_string(), out.display().to_string()]);
+        }
+        if let Some(seed) = self.seed {
+            words.extend(["--seed".to_string(), seed.to_string()]);
+        }
+        words.iter().map(|w| quoted(w)).collect()
+    }
+
+    /// Reads the configuration and draws the graph.
+    pub fn open(&self) -> anyhow::Result<(Session, Graph)> {
+        let session = Session::open(&self.common())?;
+        let graph = pipeline::graph(&session)?;
+        Ok((session, graph))
+    }
+}
+
+/// A stage, on the command line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Stage {
+    /// Photo, objects, camera, and which effects to simulate
+    Scene,
+    /// Images of the object's class
+    Concepts,
+    /// The model, personalised to the photograph
+    Lora,
+    /// The light and the tone curves
+    Light,
+    /// The picture and its layers
+    Composite,
+}
+
+impl Stage {
+    /// Name of the stage and of its folder.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Scene => scene::STAGE,
+            Self::Concepts => concepts::STAGE,
+            Self::Lora => lora::STAGE,
+            Self::Light => optimize::STAGE,
+            Self::Composite => composite::STAGE,
+        }
+    }
+}

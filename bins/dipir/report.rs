@@ -1,0 +1,64 @@
+//! `dipir report`, and the page that `dipir run` leaves.
+use std::path::PathBuf;
+
+use clap::Args;
+use dipir::pipeline;
+use dipir::report::Report;
+use dipir::truth::{self, Truth};
+use dipir_cli::exit::{Usage, describe};
+use dipir_cli::session::Session;
+use dipir_pipeline::graph::{Graph, Node};
+use serde_json::json;
+
+use crate::project::ProjectArgs;
+
+#[derive(Args)]
+pub struct ReportArgs {
+    #[command(flatten)]
+    project: ProjectArgs,
+}
+
+pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
+    let (session, graph) = args.project.open()?;
+    if !session.out.is_dir() {
+        let message = "no stage has run yet, so there is nothing to show; run dipir run first";
+        return Err(Usage(message.into()).into());
+    }
+    let needed = graph.up_to(pipeline::LAST);
+    let (path, truth) = write(&args.project, &session, &graph, &needed)?;
+    session.result(
+        || in_words(&path, truth.as_ref()),
+        || json!({"report": path, "truth": truth}),
+    );
+    Ok(())
+}
+
+/// Writes the page; where it is, and the comparison with the true light, if that is known.
+pub fn write(
+    args: &ProjectArgs,
+    session: &Session,
+    graph: &Graph,
+    needed: &[&Node],
+) -> anyhow::Result<(PathBuf, Option<Truth>)> {
+    let status = pipeline::assess(session, graph, needed)?;
+    let truth = truth::compare(session).unwrap_or_else(|e| {
+        session.warn(&format!(
+            "not compared with the true light: {}",
+            describe(&e)
+        ));
+        None
+    });
+    let report = Report {
+        session,
+        status: &status,
+        options: &args.options(),
+        truth: truth.as_ref(),
+    };
+    Ok((report.write()?, truth))
+}
+
+/// The lines that end a run.
+pub fn in_words(path: &std::path::Path, truth: Option<&Truth>) -> String {
+    let truth = truth.map_or_else(String::new, |t| format!("{}\n", t.in_words()));
+    format!("{truth}wrote {}", path.display())
+}

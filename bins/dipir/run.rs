@@ -1,0 +1,315 @@
+//! `dipir run`: the stages' executables in order, those left out that have nothing to do.
+use std::io::{self, Read};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::thread::{self, JoinHandle};
+
+use anyhow::Context;
+use clap::Args;
+use dipir::pipeline;
+use dipir::truth::Truth;
+use dipir_cli::exit::{self, Said, Usage};
+use dipir_cli::interrupt::{self, Interrupted};
+use dipir_cli::session::Session;
+use dipir_cli::style::{bold, color_on_stderr};
+use dipir_pipeline::error::StageError;
+use dipir_pipeline::graph::{Graph, Node};
+use dipir_pipeline::lock::{FolderLock, WhenLocked};
+use dipir_pipeline::runner::{self, Stopped, Work};
+use dipir_pipeline::status::State;
+use serde_json::{Value, json};
+
+use crate::project::{ProjectArgs, Stage};
+use crate::report;
+
+#[derive(Args)]
+pub struct RunArgs {
+    #[command(flatten)]
+    project: ProjectArgs,
+
+    /// Begin with this stage, and take what earlier ones wrote as it is
+    #[arg(long, value_name = "STAGE")]
+    from: Option<Stage>,
+
+    /// End with this stage: run it and what it needs, even if the picture gets by without it
+    #[arg(long, value_name = "STAGE")]
+    until: Option<Stage>,
+
+    /// Run every stage that is asked for, up to date or not
+    #[arg(long)]
+    force: bool,
+
+    /// Stages that may run at the same time, such as scene and concepts
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    jobs: usize,
+
+    /// Worker threads of each stage, 0 for one a core; the results do not depend on it
+    /// [default: [pipeline] threads]
+    #[arg(long, short = 'j', value_name = "N")]
+    threads: Option<usize>,
+
+    /// Wait for another run in the same folder instead of refusing
+    #[arg(long)]
+    wait: bool,
+}
+
+/// Runs what is not up to date.
+pub fn run(args: &RunArgs) -> anyhow::Result<()> {
+    if args.jobs == 0 {
+        return Err(Usage("--jobs 0: accepted: 1 or more".into()).into());
+    }
+    let (session, graph) = args.project.open()?;
+    let nodes = selected(args, &graph)?;
+    let mut work = Pipeline::new(args, &session)?;
+    let all_fresh = all_fresh(&session, &graph, &nodes)?;
+    if args.force || !all_fresh {
+        interrupt::listen_patiently()?;
+        let when_locked = match args.wait {
+            true => WhenLocked::Wait,
+            false => WhenLocked::Refuse,
+        };
+        let _lock = lock_when(&session, when_locked)?;
+        runner::run(&nodes, args.jobs, &mut work).map_err(stopped)?;
+    }
+    let report = match dipir::report::is_current(&session) {
+        true => None,
+        false => page(args, &session, &graph, &nodes),
+    };
+    work.conclude(&nodes, report);
+    Ok(())
+}
+
+/// The page that shows the run. What the stages wrote stands without it, so that it cannot be
+/// written is no failure of the run.
+fn page(args: &RunArgs, session: &Session, graph: &Graph, nodes: &[&Node]) -> Option<Page> {
+    match report::write(&args.project, session, graph, nodes) {
+        Ok(page) => Some(page),
+        Err(e) => {
+            session.warn(&format!("there is no report: {}", exit::describe(&e)));
+            None
+        }
+    }
+}
+
+/// Where the page is, and the comparison with the true light.
+type Page = (PathBuf, Option<Truth>);
+
+/// The stages that are asked for, in order.
+fn selected<'a>(args: &RunArgs, graph: &'a Graph) -> anyhow::Result<Vec<&'a Node>> {
+    let until = args.until.map_or(pipeline::LAST, Stage::name);
+    let mut nodes = graph.up_to(until);
+    if let Some(from) = args.from {
+        let from = from.name();
+        if !nodes.iter().any(|n| n.stage == from) {
+            let why = graph.node(from).and_then(|n| n.unneeded);
+            let message = match why {
+                Some(why) => format!("--from {from}: the stage is not needed: {why}"),
+                None => format!("--from {from}: {until} does not need that stage"),
+            };
+            return Err(Usage(message).into());
+        }
+        let reached = graph.from(from);
+        nodes.retain(|n| reached.contains(n));
+    }
+    Ok(nodes)
+}
+
+fn all_fresh(session: &Session, graph: &Graph, nodes: &[&Node]) -> anyhow::Result<bool> {
+    let states = pipeline::assess(session, graph, nodes)?;
+    let fresh = |s: &State| matches!(s, State::Fresh | State::Unneeded { .. });
+    // Stages that were not asked for count as up to date, whatever they are.
+    let asked = states
+        .iter()
+        .filter(|s| nodes.iter().any(|n| n.stage == s.stage));
+    Ok(asked.into_iter().all(|s| fresh(&s.state)))
+}
+
+/// One run at a time in a folder of artifacts.
+pub fn lock(session: &Session) -> Result<FolderLock, StageError> {
+    lock_when(session, WhenLocked::Refuse)
+}
+
+fn lock_when(session: &Session, when_locked: WhenLocked) -> Result<FolderLock, StageError> {
+    FolderLock::take_inside(&session.out, "run", when_locked)
+}
+
+/// What the runner asks.
+struct Pipeline<'a> {
+    args: &'a RunArgs,
+    session: &'a Session,
+    /// Folder of the stages' executables.
+    programs: PathBuf,
+    /// What the stages printed, with `--json`.
+    results: Vec<Value>,
+    /// What they are about to print, by stage.
+    printed: Vec<(&'static str, JoinHandle<io::Result<String>>)>,
+    ran: Vec<&'static str>,
+}
+
+impl<'a> Pipeline<'a> {
+    fn new(args: &'a RunArgs, session: &'a Session) -> anyhow::Result<Self> {
+        let own =
+            std::env::current_exe().context("cannot tell where the stages' executables are")?;
+        Ok(Self {
+            args,
+            session,
+            programs: own.parent().map(PathBuf::from).unwrap_or_default(),
+            results: Vec::new(),
+            printed: Vec::new(),
+            ran: Vec::new(),
+        })
+    }
+
+    fn say(&self, node: &Node, text: &str) {
+        if !self.args.project.output.quiet {
+            eprintln!("{}: {text}", bold(node.stage, color_on_stderr()));
+        }
+    }
+
+    /// Says how it went.
+    fn conclude(self, nodes: &[&Node], page: Option<Page>) {
+        let names: Vec<&str> = nodes.iter().map(|n| n.stage).collect();
+        let ran = self.ran;
+        self.session.result(
+            || {
+                let done = match ran.is_empty() {
+                    true => format!("nothing to do: {} up to date", listed(&names)),
+                    false => format!("ran {}", ran.join(", ")),
+                };
+                match &page {
+                    None => done,
+                    Some((path, truth)) => {
+                        format!("{done}\n{}", report::in_words(path, truth.as_ref()))
+                    }
+                }
+            },
+            || {
+                let (path, truth) = page.clone().unzip();
+                json!({
+                    "stages": names, "ran": ran, "results": self.results, "report": path,
+                    "truth": truth.flatten(),
+                })
+            },
+        );
+    }
+}
+
+fn listed(names: &[&str]) -> String {
+    match names {
+        [one] => format!("{one} is"),
+        _ => format!("{} are", names.join(", ")),
+    }
+}
+
+impl Work for Pipeline<'_> {
+    type Error = anyhow::Error;
+
+    fn command(&mut self, node: &Node) -> anyhow::Result<Option<Command>> {
+        let state = pipeline::state_of(self.session, node.stage)?;
+        match &state {
+            State::Fresh if !self.args.force => {
+                self.say(node, "up to date");
+                return Ok(None);
+            }
+            State::Fresh => self.say(node, "runs: --force"),
+            // Its executable says what is wrong better than the plan can.
+            State::Blocked { .. } => {}
+            other => {
+                let why = other.to_string();
+                self.say(
+                    node,
+                    &format!("runs: {}", why.trim_start_matches("stale: ")),
+                );
+            }
+        }
+        let name = format!("{}{}", node.executable, std::env::consts::EXE_SUFFIX);
+        let mut command = Command::new(self.programs.join(name));
+        let project = &self.args.project;
+        command.arg("--pipeline").arg(&project.file);
+        for set in &project.set {
+            command.arg("--set").arg(set);
+        }
+        if let Some(out) = &project.out {
+            command.arg("--out").arg(out);
+        }
+        if let Some(seed) = project.seed {
+            command.args(["--seed", &seed.to_string()]);
+        }
+        if let Some(threads) = self.args.threads {
+            command.args(["--threads", &threads.to_string()]);
+        }
+        // A child of a run that was killed may take a moment to notice.
+        command.args(["--wait", "--supervised"]);
+        for (on, flag) in [
+            (project.output.quiet, "--quiet"),
+            (project.output.verbose, "--verbose"),
+            (project.output.json, "--json"),
+        ] {
+            if on {
+                command.arg(flag);
+            }
+        }
+        if project.output.json {
+            command.stdout(Stdio::piped());
+        }
+        Ok(Some(command))
+    }
+
+    fn started(&mut self, node: &Node, child: &mut Child) {
+        if let Some(mut output) = child.stdout.take() {
+            // Read at once, or a child with much to say would wait for ever.
+            let reader = thread::spawn(move || {
+                let mut text = String::new();
+                output.read_to_string(&mut text).map(|_| text)
+            });
+            self.printed.push((node.stage, reader));
+        }
+    }
+
+    fn done(&mut self, node: &Node) -> anyhow::Result<()> {
+        self.ran.push(node.stage);
+        if let Some(k) = self.printed.iter().position(|p| p.0 == node.stage) {
+            let text = match self.printed.swap_remove(k).1.join() {
+                Ok(text) => text,
+                Err(panic) => std::panic::resume_unwind(panic),
+            };
+            let text =
+                text.with_context(|| format!("cannot read what {} printed", node.executable))?;
+            let result: Value = serde_json::from_str(&text).unwrap_or(Value::String(text));
+            self.results
+                .push(json!({"stage": node.stage, "result": result}));
+        }
+        Ok(())
+    }
+
+    fn interrupted(&self) -> bool {
+        interrupt::asked()
+    }
+}
+
+fn stopped(stopped: Stopped<anyhow::Error>) -> anyhow::Error {
+    match stopped {
+        Stopped::Work(e) => e,
+        Stopped::Interrupted => Interrupted.into(),
+        Stopped::Start {
+            stage,
+            program,
+            source,
+        } => {
+            let reason = dipir_pipeline::manifest::plain_reason(&source);
+            anyhow::anyhow!(
+                "the stage \"{stage}\" cannot be started: {program}: {reason}; install the \
+                 executables of all stages in one folder"
+            )
+        }
+        Stopped::Failed { stage, status } => match status.code() {
+            Some(code) if code == i32::from(exit::INTERRUPTED) => Interrupted.into(),
+            // The stage has printed what was wrong.
+            Some(code) => Said(u8::try_from(code).unwrap_or(exit::FAILED)).into(),
+            None => anyhow::anyhow!(
+                "the stage \"{stage}\" was ended by the system ({status}), for want of memory \
+                 perhaps; run again to go on where it was"
+            ),
+        },
+    }
+}

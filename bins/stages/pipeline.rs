@@ -1,0 +1,121 @@
+//! All stages together: which ones a configuration needs, what each reads, and what a run of each
+//! would be.
+use std::cell::RefCell;
+
+use dipir_cli::exit::{self, describe};
+use dipir_cli::session::Session;
+use dipir_optimize::settings::{GuidanceKind, OptimizeTable};
+use dipir_pipeline::error::StageError;
+use dipir_pipeline::graph::{Graph, Node};
+use dipir_pipeline::stage::StagePlan;
+use dipir_pipeline::status::{self, StageStatus, State};
+use dipir_scene::config::SceneConfig;
+
+use crate::composite::CompositeTable;
+use crate::model::ModelTable;
+use crate::truth::ReportTable;
+use crate::{composite, concepts, lora, materials, optimize, scene};
+
+/// The stage that everything leads to.
+pub const LAST: &str = composite::STAGE;
+
+/// The graph of the session's configuration.
+pub fn graph(session: &Session) -> anyhow::Result<Graph> {
+    let optimize: OptimizeTable = session.config.table("optimize")?;
+    let composite: CompositeTable = session.config.table("composite")?;
+    // Read here so that a slip in them is told before anything runs.
+    let _: (SceneConfig, ModelTable, ReportTable) = (
+        session.config.table("scene")?,
+        session.config.table("model")?,
+        session.config.table("report")?,
+    );
+    let materials = materials::are_asked_for(session)?;
+    let light_is_given = composite.environment.is_some() && !materials;
+    let is_guided_by_model = optimize.guidance != GuidanceKind::Reference;
+
+    let no_model = match (light_is_given, is_guided_by_model) {
+        (true, _) => Some("[composite] environment gives the light"),
+        (false, false) => Some("[optimize] guidance = \"reference\" asks no diffusion model"),
+        (false, true) => None,
+    };
+    let no_concepts = match lora::preserves_concepts(session)? {
+        true => no_model,
+        false => no_model.or(Some("concepts.count or lora.prior_weight is 0")),
+    };
+    let chosen = |stages: &[(&'static str, bool)]| -> Vec<&'static str> {
+        let chosen = stages.iter().filter(|(_, on)| *on);
+        chosen.map(|(stage, _)| *stage).collect()
+    };
+    let node = |stage, executable, reads, unneeded| Node {
+        stage,
+        executable,
+        reads,
+        unneeded,
+    };
+    Ok(Graph::new(vec![
+        node(scene::STAGE, scene::EXECUTABLE, vec![], None),
+        node(concepts::STAGE, concepts::EXECUTABLE, vec![], no_concepts),
+        node(
+            lora::STAGE,
+            lora::EXECUTABLE,
+            chosen(&[(concepts::STAGE, lora::preserves_concepts(session)?)]),
+            no_model,
+        ),
+        node(
+            optimize::STAGE,
+            optimize::EXECUTABLE,
+            chosen(&[(scene::STAGE, true), (lora::STAGE, is_guided_by_model)]),
+            light_is_given.then_some("[composite] environment gives the light"),
+        ),
+        node(
+            composite::STAGE,
+            composite::EXECUTABLE,
+            chosen(&[(scene::STAGE, true), (optimize::STAGE, !light_is_given)]),
+            None,
+        ),
+    ]))
+}
+
+/// What a run of the stage would be, from the configuration, the files that it names, and the
+/// manifests of the stages that it reads.
+pub fn plan(session: &Session, stage: &str) -> anyhow::Result<StagePlan> {
+    match stage {
+        scene::STAGE => scene::plan(session),
+        concepts::STAGE => concepts::plan(session),
+        lora::STAGE => lora::plan(session),
+        optimize::STAGE if materials::are_asked_for(session)? => materials::plan(session),
+        optimize::STAGE => optimize::plan(session),
+        composite::STAGE => composite::plan(session, &session.config.table("composite")?),
+        other => anyhow::bail!("there is no stage \"{other}\""),
+    }
+}
+
+/// The states of all stages, as far as `needed` asks for them; an error if the configuration is
+/// wrong for one of them.
+pub fn assess(
+    session: &Session,
+    graph: &Graph,
+    needed: &[&Node],
+) -> anyhow::Result<Vec<StageStatus>> {
+    let wrong = RefCell::new(None);
+    let plan = |stage: &str| {
+        plan(session, stage).map_err(|e| {
+            let message = describe(&e);
+            if exit::code_of(&e) == exit::USAGE {
+                wrong.borrow_mut().get_or_insert(e);
+            }
+            message
+        })
+    };
+    let states = status::assess(graph, needed, plan, |stage| session.stage_folder(stage))?;
+    match wrong.take() {
+        Some(e) => Err(e),
+        None => Ok(states),
+    }
+}
+
+/// The state of one stage, when everything that it reads is there.
+pub fn state_of(session: &Session, stage: &str) -> Result<State, StageError> {
+    let plan = plan(session, stage).map_err(|e| describe(&e));
+    status::state_of(plan, &session.stage_folder(stage))
+}

@@ -1,0 +1,191 @@
+//! `report.html`: one page that shows a run, complete in itself.
+//!
+//! Whatever stages there are is shown; what cannot be read is said where it would stand.
+mod html;
+mod learning;
+mod lighting;
+mod picture;
+mod plot;
+mod result;
+mod stages;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use dipir_cli::exit::describe;
+use dipir_cli::session::Session;
+use dipir_pipeline::manifest::{FILE_NAME, Manifest};
+use dipir_pipeline::status::StageStatus;
+use dipir_scene::config::SceneConfig;
+
+use crate::truth::Truth;
+use html::Html;
+pub use stages::quoted;
+
+/// Name of the file in the folder of artifacts.
+pub const FILE: &str = "report.html";
+/// Raised whenever the same artifacts give another page.
+const VERSION: u32 = 1;
+
+/// What the page says beside what the artifacts hold.
+pub struct Report<'a> {
+    /// The configuration and the folder of artifacts.
+    pub session: &'a Session,
+    /// The state of every stage.
+    pub status: &'a [StageStatus],
+    /// Options that repeat this run on the command line of any executable.
+    pub options: &'a [String],
+    /// The comparison with the true light, where that is known.
+    pub truth: Option<&'a Truth>,
+}
+
+/// A section: its markup, nothing without its artifacts, or why it cannot be shown.
+type Section = anyhow::Result<Option<Html>>;
+
+impl Report<'_> {
+    /// Writes the page and returns where it is.
+    pub fn write(&self) -> anyhow::Result<PathBuf> {
+        let path = self.session.out.join(FILE);
+        let partial = self.session.out.join(format!(".{FILE}.partial"));
+        std::fs::write(&partial, self.page()?)
+            .and_then(|()| std::fs::rename(&partial, &path))
+            .map_err(|e| {
+                let _ = std::fs::remove_file(&partial);
+                let reason = dipir_pipeline::manifest::plain_reason(&e);
+                anyhow::anyhow!("cannot write {}: {reason}", path.display())
+            })?;
+        Ok(path)
+    }
+
+    fn page(&self) -> anyhow::Result<String> {
+        let scene: SceneConfig = self.session.config.table("scene")?;
+        let class = scene.class.as_deref().unwrap_or("object");
+        let photo = scene.background.unwrap_or_default();
+        let title = format!("{class} in {}", photo.display());
+        let sections: [(&str, Section); 8] = [
+            ("", result::before_and_after(self)),
+            ("Against the true light", Ok(self.truth.map(result::truth))),
+            ("Stages", stages::table(self)),
+            ("Layers", result::layers(self)),
+            ("Light and tone", lighting::section(self)),
+            ("Personalisation", learning::section(self)),
+            ("Effects", stages::effects(self)),
+            ("Run a stage again", Ok(Some(stages::commands(self)))),
+        ];
+        let body = sections.into_iter().filter_map(|(name, section)| {
+            let content = match section {
+                Ok(content) => content?,
+                Err(e) => Html::element(
+                    "p",
+                    &[("class", "soft")],
+                    [Html::text(format!("Not shown: {}", describe(&e)))],
+                ),
+            };
+            let head = (!name.is_empty()).then(|| Html::of("h2", name));
+            Some(Html::all(head.into_iter().chain([content])))
+        });
+        let head = [
+            Html::element("meta", &[("charset", "utf-8")], []),
+            Html::element(
+                "meta",
+                &[
+                    ("name", "viewport"),
+                    ("content", "width=device-width, initial-scale=1"),
+                ],
+                [],
+            ),
+            Html::element(
+                "meta",
+                &[("name", KEY), ("content", &key(self.session)?)],
+                [],
+            ),
+            Html::of("title", format!("{title} – dipir")),
+            Html::code("style", include_str!("report/style.css")),
+        ];
+        let intro = [
+            Html::of("h1", &title),
+            Html::element(
+                "p",
+                &[("class", "soft")],
+                [Html::text(format!(
+                    "{}, seed {}, {:?} quality, dipir {}",
+                    self.session.config.path().display(),
+                    self.session.pipeline.seed,
+                    self.session.pipeline.quality,
+                    env!("CARGO_PKG_VERSION"),
+                ))],
+            ),
+        ];
+        let script = Html::code("script", include_str!("report/script.js"));
+        let page = Html::element(
+            "html",
+            &[("lang", "en")],
+            [
+                Html::element("head", &[], head),
+                Html::element("body", &[], intro.into_iter().chain(body).chain([script])),
+            ],
+        );
+        Ok(format!("<!doctype html>\n{}\n", page.into_string()))
+    }
+
+    /// A stage's folder and manifest, if it has run.
+    fn stage(&self, stage: &str) -> anyhow::Result<Option<(PathBuf, Manifest)>> {
+        let folder = self.session.stage_folder(stage);
+        if !folder.join(FILE_NAME).is_file() {
+            return Ok(None);
+        }
+        let manifest = Manifest::read(&folder, "")?;
+        Ok(Some((folder, manifest)))
+    }
+}
+
+/// The page's own name for what it was made of.
+const KEY: &str = "dipir-made-of";
+
+/// Whether the page that is there shows the artifacts that are there.
+pub fn is_current(session: &Session) -> bool {
+    let page = std::fs::read_to_string(session.out.join(FILE));
+    match (page, key(session)) {
+        (Ok(page), Ok(key)) => page.contains(&format!("name=\"{KEY}\" content=\"{key}\"")),
+        _ => false,
+    }
+}
+
+/// A hash of what the page is made of: every stage's manifest, which names its files by hash, and
+/// what is compared with.
+fn key(session: &Session) -> anyhow::Result<String> {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(format!("report {VERSION}").as_bytes());
+    for stage in ["scene", "concepts", "lora", "light", "composite"] {
+        let manifest = std::fs::read(session.stage_folder(stage).join(FILE_NAME));
+        hasher.update(&manifest.unwrap_or_default());
+        hasher.update(b"|");
+    }
+    hasher.update(&serde_json::to_vec(&crate::truth::key(session)?)?);
+    Ok(hasher.finalize().to_hex()[..32].to_string())
+}
+
+/// A stage's JSON, checked by hash.
+fn json<T: serde::de::DeserializeOwned>(
+    (folder, manifest): &(PathBuf, Manifest),
+    role: &str,
+) -> anyhow::Result<T> {
+    let path = manifest.output(folder, role)?;
+    let text = std::fs::read_to_string(&path)
+        .with_context(|| format!("cannot read {}", path.display()))?;
+    serde_json::from_str(&text).with_context(|| format!("cannot understand {}", path.display()))
+}
+
+/// Every output of a role, in the order of the manifest: its name and where it is.
+fn outputs((folder, manifest): &(PathBuf, Manifest), role: &str) -> Vec<(String, PathBuf)> {
+    let found = manifest.outputs.iter().filter(|a| a.role == role);
+    let stem = |p: &Path| {
+        p.file_stem()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned()
+    };
+    found
+        .map(|a| (stem(&a.path), folder.join(&a.path)))
+        .collect()
+}

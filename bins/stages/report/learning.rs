@@ -1,0 +1,92 @@
+//! Concept images, and how the model was personalised.
+use dipir_imaging::file::read_photo;
+use dipir_imaging::transfer::Transfer;
+use serde_json::Value;
+
+use super::html::Html;
+use super::picture::figure;
+use super::plot::{Mark, Plot, Series, running_mean};
+use super::{Report, Section, json, outputs};
+use crate::concepts::ConceptList;
+use crate::{concepts, lora};
+
+/// Longest side of a concept image.
+const CONCEPT: usize = 128;
+/// Longest side of a sample.
+const SAMPLE: usize = 256;
+/// Concept images that are shown at most.
+const MOST_CONCEPTS: usize = 64;
+
+/// Concept images, the course of the loss, samples.
+pub fn section(report: &Report) -> Section {
+    let mut parts = Vec::new();
+    if let Some(run) = report.stage(concepts::STAGE)? {
+        let list: ConceptList = json(&run, "concepts")?;
+        let mut figures = Vec::new();
+        for entry in list.concepts.iter().take(MOST_CONCEPTS) {
+            let photo = read_photo(run.0.join(&entry.image), Transfer::Srgb)?;
+            let shown = Transfer::Srgb.encode(&photo.image);
+            figures.push(figure(&shown, CONCEPT, &entry.concept.prompt)?);
+        }
+        let note = format!(
+            "{} images of \"{}\", which keep the class in memory",
+            list.concepts.len(),
+            list.class
+        );
+        parts.push(Html::element("p", &[("class", "soft")], [Html::text(note)]));
+        parts.push(Html::element("div", &[("class", "grid-of small")], figures));
+    }
+    if let Some(run) = report.stage(lora::STAGE)? {
+        let training: Value = json(&run, "training")?;
+        let plots = losses(&training).into_iter().filter_map(|p| p.render());
+        parts.push(Html::element("div", &[("class", "plots")], plots));
+        let mut samples = Vec::new();
+        for (name, path) in outputs(&run, "sample") {
+            let shown = Transfer::Srgb.encode(&read_photo(path, Transfer::Srgb)?.image);
+            let caption = format!("after {} updates", name.trim_start_matches('0'));
+            samples.push(figure(&shown, SAMPLE, &caption)?);
+        }
+        parts.push(Html::element("div", &[("class", "grid-of")], samples));
+    }
+    Ok((!parts.is_empty()).then(|| Html::all(parts)))
+}
+
+fn losses(training: &Value) -> Vec<Plot> {
+    let none = Vec::new();
+    let history = training["history"].as_array().unwrap_or(&none);
+    let window = (history.len() / 20).max(1);
+    let noisy = |key: &str, name: &str, color| {
+        let at = |row: &Value| Some((row["step"].as_f64()?, row[key].as_f64()?));
+        let points: Vec<_> = history.iter().filter_map(at).collect();
+        let mean = running_mean(&points, window);
+        let of = |name: String, mark, points| Series {
+            name,
+            color,
+            mark,
+            points,
+        };
+        [
+            of(String::new(), Mark::Faint, points),
+            of(format!("{name}, mean of {window}"), Mark::Line, mean),
+        ]
+    };
+    let plot = |title: &str, series: Vec<Series>| Plot {
+        title: title.into(),
+        x_label: "update".into(),
+        log_y: true,
+        series,
+        ..Plot::default()
+    };
+    let photograph = noisy("instance_loss", "the photograph", 0);
+    let class = noisy("prior_loss", "the class", 1);
+    vec![
+        plot(
+            "Loss of the personalisation",
+            photograph.into_iter().chain(class).collect(),
+        ),
+        plot(
+            "Norm of its gradient",
+            noisy("gradient_norm", "all", 2).into(),
+        ),
+    ]
+}

@@ -1,0 +1,319 @@
+//! The light with its lobes, the tone curves, and how both were found.
+use dipir_imaging::file::read_photo;
+use dipir_imaging::spline::Knots;
+use dipir_imaging::tone::ToneCurves;
+use dipir_imaging::transfer::Transfer;
+use dipir_light::environment::{EnvironmentMap, texel_of};
+use dipir_light::gaussian::SphericalGaussian;
+use dipir_light::luminance::luminance_f64;
+use dipir_optimize::lighting::Lighting;
+use glam::Vec3;
+use serde_json::Value;
+
+use super::html::{Html, table};
+use super::picture::{figure, image};
+use super::plot::{Mark, Plot, Series, number, running_mean};
+use super::{Report, Section, json, outputs};
+use crate::preview::environment;
+use crate::{composite, light, optimize};
+
+/// Columns of the map as it is shown.
+const MAP_WIDTH: usize = 512;
+/// Lobes in the table, and drawn: the strongest.
+const MOST_LOBES: usize = 12;
+/// Longest side of a preview.
+const PREVIEW: usize = 256;
+
+/// The light that was recovered, else the one that was given.
+pub fn section(report: &Report) -> Section {
+    let Some(run) = report.stage(optimize::STAGE)? else {
+        return given(report);
+    };
+    if !run.1.outputs.iter().any(|o| o.role == "lighting") {
+        return materials(&run);
+    }
+    let lighting = Lighting::read(&run.1.output(&run.0, "lighting")?)?;
+    let curves = ToneCurves::read_json(run.1.output(&run.0, "tone")?)?;
+    let history: Vec<Value> = json(&run, "history")?;
+    let mut parts = vec![map(
+        &lighting.map(MAP_WIDTH, MAP_WIDTH / 2),
+        &strongest(&lighting.exposed_lobes()),
+        report.truth.and_then(|t| t.peak),
+        "the recovered light: latitude and longitude, +z in the middle, +x to its left",
+    )?];
+    parts.push(lobes(&strongest(&lighting.exposed_lobes())));
+    let plots = [tone(&curves)]
+        .into_iter()
+        .chain(losses(&history))
+        .filter_map(|p| p.render());
+    parts.push(Html::element("div", &[("class", "plots")], plots));
+    let mut previews = Vec::new();
+    for (name, path) in outputs(&run, "preview") {
+        let shown = Transfer::Srgb.encode(&read_photo(path, Transfer::Srgb)?.image);
+        let iteration = name.trim_start_matches('0');
+        let caption = format!(
+            "iteration {}",
+            if iteration.is_empty() { "0" } else { iteration }
+        );
+        previews.push(figure(&shown, PREVIEW, &caption)?);
+    }
+    parts.push(Html::element("div", &[("class", "grid-of")], previews));
+    Ok(Some(Html::all(parts)))
+}
+
+/// The map of `[composite] environment`.
+fn given(report: &Report) -> Section {
+    let table = report.session.config.table("composite")?;
+    let table: composite::CompositeTable = table;
+    let Some(known) = light::known(report.session, &table)? else {
+        return Ok(None);
+    };
+    let shown = known.map.resampled(MAP_WIDTH, MAP_WIDTH / 2);
+    Ok(Some(map(&shown, &[], None, "the light that was given")?))
+}
+
+/// What was recovered of materials.
+fn materials(run: &(std::path::PathBuf, dipir_pipeline::manifest::Manifest)) -> Section {
+    let found: Vec<Value> = json(run, "materials")?;
+    let rows = found.iter().map(|m| {
+        let text = |key: &str| match &m[key] {
+            Value::String(text) => text.clone(),
+            Value::Array(items) => {
+                let items = items.iter().filter_map(Value::as_f64).map(number);
+                items.collect::<Vec<_>>().join(" ")
+            }
+            other => other.as_f64().map_or_else(String::new, number),
+        };
+        let keys = [
+            "name",
+            "base_color",
+            "metallic",
+            "roughness",
+            "emissive_strength",
+        ];
+        keys.map(|key| Html::text(text(key))).into()
+    });
+    let heads = [
+        "material",
+        "base colour",
+        ">metallic",
+        ">roughness",
+        ">emission",
+    ];
+    let losses: Vec<f64> = json(run, "history")?;
+    let points = losses.iter().enumerate();
+    let plot = Plot {
+        title: "Loss of the materials".into(),
+        x_label: "iteration".into(),
+        log_y: true,
+        series: vec![series("", 0, points.map(|(k, &l)| (k as f64, l)).collect())],
+        ..Plot::default()
+    };
+    let plot = plot.render().into_iter();
+    Ok(Some(Html::all(
+        [table(&heads, rows.collect())].into_iter().chain(plot),
+    )))
+}
+
+/// The strongest lobes by the light that they send, with their share of all of it.
+fn strongest(lobes: &[SphericalGaussian]) -> Vec<(SphericalGaussian, f64)> {
+    let energy = |l: &SphericalGaussian| luminance_f64(l.integral());
+    let total: f64 = lobes.iter().map(energy).sum();
+    let mut sorted: Vec<_> = lobes
+        .iter()
+        .map(|l| (*l, energy(l) / total.max(f64::MIN_POSITIVE)))
+        .collect();
+    sorted.sort_by(|a, b| b.1.total_cmp(&a.1));
+    sorted.truncate(MOST_LOBES);
+    sorted
+}
+
+/// Degrees above the horizon, and counter-clockwise from +z seen from above.
+fn angles_deg(direction: Vec3) -> [f32; 2] {
+    let elevation = direction.y.clamp(-1.0, 1.0).asin();
+    [elevation, direction.x.atan2(direction.z)].map(f32::to_degrees)
+}
+
+/// Angle from a lobe's axis at which it has half its radiance, degrees.
+fn half_width_deg(lobe: &SphericalGaussian) -> f64 {
+    let sigma = f64::from(lobe.sigma);
+    let cos = 1.0 - sigma * sigma * std::f64::consts::LN_2;
+    cos.max(-1.0).acos().to_degrees()
+}
+
+/// The map with the lobes' half widths drawn over it, and the true peak.
+fn map(
+    map: &EnvironmentMap,
+    lobes: &[(SphericalGaussian, f64)],
+    truth: Option<Vec3>,
+    caption: &str,
+) -> anyhow::Result<Html> {
+    let around = |direction: Vec3, radius_deg: f64, class: &str, opacity: f64| {
+        // Fine enough for a place in degrees to a tenth.
+        let (row, column) = texel_of(direction, 3600, 1800);
+        let wide = radius_deg / f64::from(direction.y.clamp(-0.999, 0.999).acos().sin());
+        let values = [
+            f64::from(column as u32) / 10.0,
+            f64::from(row as u32) / 10.0,
+            wide.min(360.0),
+            radius_deg,
+            opacity,
+        ]
+        .map(|v| format!("{v:.2}"));
+        let names = ["cx", "cy", "rx", "ry", "opacity"];
+        let mut attributes = vec![("class", class)];
+        attributes.extend(names.into_iter().zip(values.iter().map(String::as_str)));
+        Html::element("ellipse", &attributes, [])
+    };
+    let drawn = lobes
+        .iter()
+        .filter(|(lobe, _)| half_width_deg(lobe) < 60.0)
+        .map(|(lobe, share)| {
+            let radius = half_width_deg(lobe).max(1.0);
+            around(
+                lobe.direction,
+                radius,
+                "lobe",
+                (0.25 + share.sqrt()).min(1.0),
+            )
+        });
+    let drawn = drawn.chain(truth.map(|peak| around(peak, 4.0, "truth", 1.0)));
+    let overlay = [
+        ("viewBox", "0 0 360 180"),
+        ("preserveAspectRatio", "none"),
+        ("aria-hidden", "true"),
+    ];
+    let shown = [
+        image(&environment(map, 1.0), MAP_WIDTH, caption)?,
+        Html::element("svg", &overlay, drawn),
+    ];
+    let legend = match (lobes.is_empty(), truth) {
+        (true, _) => String::new(),
+        (false, None) => "; rings: the strongest lobes at half their radiance".into(),
+        (false, Some(_)) => {
+            "; rings: the strongest lobes at half their radiance; dashed: the true peak".into()
+        }
+    };
+    Ok(Html::element(
+        "figure",
+        &[],
+        [
+            Html::of("figcaption", format!("{caption}{legend}")),
+            Html::element("div", &[("class", "map")], shown),
+        ],
+    ))
+}
+
+fn lobes(lobes: &[(SphericalGaussian, f64)]) -> Html {
+    let rows = lobes.iter().enumerate().map(|(k, (lobe, share))| {
+        let [elevation, azimuth] = angles_deg(lobe.direction);
+        let radiance = lobe.radiance.to_array().map(|v| number(v.into())).join(" ");
+        let cells = [
+            (k + 1).to_string(),
+            format!("{elevation:.1}°"),
+            format!("{azimuth:.1}°"),
+            format!("{:.1}°", half_width_deg(lobe)),
+            radiance,
+            format!("{:.1}%", 100.0 * share),
+        ];
+        cells.map(Html::text).into()
+    });
+    let heads = [
+        "lobe",
+        ">above the horizon",
+        ">from +z towards +x",
+        ">half width",
+        ">radiance",
+        ">share of all light",
+    ];
+    table(&heads, rows.collect())
+}
+
+fn series(name: &str, color: usize, points: Vec<(f64, f64)>) -> Series {
+    Series {
+        name: name.into(),
+        color,
+        mark: Mark::Line,
+        points,
+    }
+}
+
+fn tone(curves: &ToneCurves) -> Plot {
+    let sampled = |knots: &Knots| {
+        let curve = knots.curve();
+        (0..=64)
+            .map(|k| f64::from(k) / 64.0)
+            .map(|x| (x, curve.eval(x)))
+            .collect()
+    };
+    let [red, green, blue] = &curves.shadow;
+    Plot {
+        title: "Tone curves, on [0, 1]: object after x / (1 + x), shadow ratio by channel".into(),
+        x_label: "before".into(),
+        y_range: Some((0.0, 1.0)),
+        series: vec![
+            series("shadow, red", 1, sampled(red)),
+            series("shadow, green", 2, sampled(green)),
+            series("shadow, blue", 0, sampled(blue)),
+            series("object", 3, sampled(&curves.foreground)),
+        ],
+        ..Plot::default()
+    }
+}
+
+/// One term of every iteration, where it is a number.
+fn column(history: &[Value], key: &str) -> Vec<(f64, f64)> {
+    let at = |row: &Value| Some((row["iteration"].as_f64()?, row[key].as_f64()?));
+    history.iter().filter_map(at).collect()
+}
+
+fn losses(history: &[Value]) -> Vec<Plot> {
+    let plot = |title: &str, log_y: bool, series: Vec<Series>| Plot {
+        title: title.into(),
+        x_label: "iteration".into(),
+        log_y,
+        series,
+        ..Plot::default()
+    };
+    // Wide enough to see a trend through the noise of distillation, narrow against the run.
+    let window = (history.len() / 20).max(1);
+    let noisy = |key: &str| {
+        let raw = column(history, key);
+        let mean = running_mean(&raw, window);
+        let raw = Series {
+            mark: Mark::Faint,
+            ..series("", 0, raw)
+        };
+        vec![raw, series(&format!("mean of {window}"), 0, mean)]
+    };
+    let timesteps = Series {
+        mark: Mark::Dots,
+        ..series("", 3, column(history, "t"))
+    };
+    let light = ["irradiance", "elevation_deg", "azimuth_deg"];
+    let names = [
+        "Light over iterations: irradiance on a horizontal plane",
+        "Light over iterations: height of the peak above the horizon, degrees",
+        "Light over iterations: azimuth of the peak, degrees",
+    ];
+    let light = light
+        .iter()
+        .zip(names)
+        .map(|(key, name)| plot(name, false, vec![series("", 1, column(history, key))]));
+    [
+        plot("Guidance", true, noisy("guidance")),
+        plot(
+            "Consistency and regulariser, weighted",
+            true,
+            vec![
+                series("consistency", 1, column(history, "consistency")),
+                series("regulariser", 2, column(history, "regularizer")),
+            ],
+        ),
+        plot("Norm of the gradient", true, noisy("gradient_norm")),
+        plot("Timestep of the diffusion model", false, vec![timesteps]),
+    ]
+    .into_iter()
+    .chain(light)
+    .collect()
+}

@@ -1,0 +1,145 @@
+//! The picture, its layers, and how it compares with the true light.
+use dipir_imaging::file::read_photo;
+use dipir_imaging::layers::Layers;
+use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
+use dipir_imaging::transfer::Transfer;
+use glam::Vec3;
+
+use super::html::{Html, table};
+use super::picture::{figure, image};
+use super::plot::number;
+use super::{Report, Section};
+use crate::composite;
+use crate::preview::{normals, stretched};
+use crate::truth::Truth;
+
+/// Longest side of the large pictures: a full screen's width of page.
+const LARGE: usize = 1152;
+/// Longest side of a layer.
+const LAYER: usize = 480;
+
+/// The photograph and the picture, one over the other.
+pub fn before_and_after(report: &Report) -> Section {
+    let Some((folder, manifest)) = report.stage(composite::STAGE)? else {
+        return Ok(None);
+    };
+    let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
+    let picture = manifest.output(&folder, "picture")?;
+    let after = Transfer::Srgb.encode(&read_photo(picture, Transfer::Srgb)?.image);
+    let before = Transfer::Srgb.encode(&LinearImage(layers.rgb("background")?));
+    let before = Html::element(
+        "div",
+        &[("class", "before")],
+        [image(&before, LARGE, "the photograph")?],
+    );
+    let slider = [
+        ("type", "range"),
+        ("min", "0"),
+        ("max", "100"),
+        ("value", "50"),
+        ("aria-label", "share of the photograph without the object"),
+    ];
+    let parts = [
+        image(&after, LARGE, "the picture with the object")?,
+        before,
+        Html::element("div", &[("class", "edge")], []),
+        Html::element("input", &slider, []),
+    ];
+    Ok(Some(Html::all([
+        Html::element("div", &[("class", "compare")], parts),
+        Html::element(
+            "p",
+            &[("class", "soft")],
+            [Html::text(
+                "Left of the line the photograph, right of it the picture: drag the line.",
+            )],
+        ),
+    ])))
+}
+
+/// The layers that a compositor gets.
+pub fn layers(report: &Report) -> Section {
+    let Some((folder, manifest)) = report.stage(composite::STAGE)? else {
+        return Ok(None);
+    };
+    let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
+    let shown = |raster: Raster<Vec3>| Transfer::Srgb.encode(&LinearImage(raster));
+    let grey = |name: &str| -> anyhow::Result<DisplayImage> {
+        Ok(DisplayImage(layers.channel(name)?.map(|&a| Vec3::splat(a))))
+    };
+    // Depth is infinite where there is nothing; nearer is brighter.
+    let nearness = layers.channel("depth.Z")?;
+    let nearness = nearness.map(|&z| match z.is_finite() && z > 0.0 {
+        true => 1.0 / z,
+        false => f32::NAN,
+    });
+    let figures = [
+        figure(
+            &shown(layers.rgb("object")?),
+            LAYER,
+            "object (premultiplied)",
+        )?,
+        figure(&grey("object.A")?, LAYER, "object.A (coverage)")?,
+        figure(
+            &DisplayImage(layers.rgb("shadow")?),
+            LAYER,
+            "shadow (ratio)",
+        )?,
+        figure(&shown(layers.rgb("albedo")?), LAYER, "albedo")?,
+        figure(&normals(&layers.xyz("normal")?), LAYER, "normal")?,
+        figure(&stretched(&nearness), LAYER, "depth.Z (nearer is brighter)")?,
+    ];
+    let formula = Html::all([
+        Html::text("All in "),
+        Html::of("code", folder.join("composite.exr").display().to_string()),
+        Html::text(", linear: "),
+        Html::of("code", "background * shadow * (1 - object.A) + object.RGB"),
+        Html::text(" rebuilds the picture."),
+    ]);
+    Ok(Some(Html::all([
+        Html::element("div", &[("class", "grid-of")], figures),
+        Html::element("p", &[("class", "soft")], [formula]),
+    ])))
+}
+
+/// How far the recovered light is from the true one.
+pub fn truth(truth: &Truth) -> Html {
+    let degrees = |angle: Option<f64>| match angle {
+        Some(angle) => format!("{angle:.1}°"),
+        None => "–".into(),
+    };
+    let row = |name: &str, angle: String, rmse: f64| {
+        vec![
+            Html::text(name),
+            Html::text(angle),
+            Html::text(number(rmse)),
+        ]
+    };
+    let rows = vec![
+        row(
+            "recovered light",
+            degrees(truth.sun_error_deg),
+            truth.rmse_recovered,
+        ),
+        row("neutral light", "–".into(), truth.rmse_neutral),
+    ];
+    Html::all([
+        table(
+            &[
+                "",
+                ">direction of most light is off by",
+                ">RMSE of the picture",
+            ],
+            rows,
+        ),
+        Html::element("p", &[], [Html::text(truth.in_words())]),
+        Html::element(
+            "p",
+            &[("class", "soft")],
+            [Html::text(
+                "Display-referred RMSE against the picture under the true light, over what the \
+                 object or its shadow touches; all three lit through the recorded transport.",
+            )],
+        ),
+    ])
+}

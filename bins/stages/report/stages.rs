@@ -1,0 +1,150 @@
+//! What ran, what it cost, what was simulated, and how to run it again.
+use dipir_cli::session::{duration, size};
+use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::status::State;
+use dipir_render::effects::EffectsPlan;
+
+use super::html::{self, Html};
+use super::plot::number;
+use super::{Report, Section, json};
+use crate::{composite, optimize, scene};
+
+/// Every stage with its state, error, time and memory.
+pub fn table(report: &Report) -> Section {
+    let mut rows = Vec::new();
+    for status in report.status {
+        let run = report.stage(status.stage).ok().flatten();
+        let manifest = run.as_ref().map(|(_, m)| m);
+        let cell = |f: &dyn Fn(&Manifest) -> Option<String>| {
+            Html::text(manifest.and_then(f).unwrap_or_else(|| "–".into()))
+        };
+        let class = match status.state {
+            State::Unneeded { .. } => "off",
+            _ => "",
+        };
+        let state = Html::element(
+            "span",
+            &[("class", class)],
+            [Html::text(status.state.to_string())],
+        );
+        rows.push(vec![
+            Html::of("strong", status.stage),
+            state,
+            cell(&|m| Some(error_in_words(status.stage, m.estimated_error?))),
+            cell(&|m| Some(duration(m.elapsed_s))),
+            cell(&|m| m.peak_rss_bytes.map(size)),
+            cell(&|m| Some(m.device.clone())),
+        ]);
+    }
+    let heads = [
+        "stage",
+        "state",
+        "estimated error",
+        ">time",
+        ">memory",
+        "device",
+    ];
+    Ok(Some(Html::all([
+        html::table(&heads, rows),
+        Html::element(
+            "p",
+            &[("class", "soft")],
+            [Html::text(
+                "Time and largest resident memory of the process that wrote the outputs; a stage \
+                 that was resumed counts from there on.",
+            )],
+        ),
+    ])))
+}
+
+/// What a stage's error is an error of.
+fn error_in_words(stage: &str, error: f64) -> String {
+    let unit = match stage {
+        scene::STAGE => "left out",
+        optimize::STAGE => "from the guidance's reference",
+        composite::STAGE => "95% bound",
+        _ => "",
+    };
+    format!("{} RMSE {unit}", number(error)).trim_end().into()
+}
+
+/// What is simulated, and why.
+pub fn effects(report: &Report) -> Section {
+    let Some(run) = report.stage(scene::STAGE)? else {
+        return Ok(None);
+    };
+    let plan: EffectsPlan = json(&run, "effects")?;
+    let optional = |value: Option<f64>| value.map_or_else(|| "–".into(), number);
+    let rows = plan.effects.iter().map(|e| {
+        let contribution = match (e.contribution, e.contribution_se) {
+            (Some(c), Some(se)) => format!("{} ± {}", number(c), number(se)),
+            (c, _) => optional(c),
+        };
+        let share = match e.time_share {
+            Some(share) => format!("{:.0}%", 100.0 * share),
+            None => "–".into(),
+        };
+        vec![
+            Html::text(e.name.name().replace('_', " ")),
+            Html::text(if e.enabled { "on" } else { "off" }),
+            Html::text(contribution),
+            Html::text(share),
+            Html::text(&e.reason),
+        ]
+    });
+    let heads = [
+        "effect",
+        "",
+        ">contribution (RMSE)",
+        ">share of the work",
+        "why",
+    ];
+    let rays: Vec<String> = plan.rays.iter().map(|(k, n)| format!("{k} {n}")).collect();
+    let note = format!(
+        "Paths of at most {} interactions. Rays of the pilot render: {}.",
+        plan.max_depth,
+        rays.join(", ")
+    );
+    Ok(Some(Html::all([
+        html::table(&heads, rows.collect()),
+        Html::element("p", &[("class", "soft")], [Html::text(note)]),
+    ])))
+}
+
+/// A command for every stage.
+pub fn commands(report: &Report) -> Html {
+    let options = report.options.join(" ");
+    let lines: Vec<String> = report
+        .status
+        .iter()
+        .map(|s| format!("{} {options}", s.executable))
+        .chain([format!("dipir run {options}")])
+        .map(|line| {
+            line.trim_end()
+                .replace("dipir run --pipeline ", "dipir run ")
+        })
+        .collect();
+    Html::element("pre", &[], [Html::text(lines.join("\n"))])
+}
+
+/// A word of a command as a shell takes it.
+pub fn quoted(word: &str) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+@".contains(c);
+    match !word.is_empty() && word.chars().all(plain) {
+        true => word.into(),
+        false => format!("'{}'", word.replace('\'', r"'\''")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_are_quoted_for_the_shell() {
+        assert_eq!(quoted("scene.class=car"), "scene.class=car");
+        assert_eq!(quoted("a b"), "'a b'");
+        assert_eq!(quoted("it's"), r"'it'\''s'");
+        assert_eq!(quoted(""), "''");
+    }
+}
