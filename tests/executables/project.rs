@@ -9,6 +9,8 @@ use dipir_light::environment::EnvironmentMap;
 use glam::Vec3;
 use tempfile::TempDir;
 
+/// `dipir`.
+pub const DIPIR: &str = env!("CARGO_BIN_EXE_dipir");
 /// `dipir-scene`.
 pub const SCENE: &str = env!("CARGO_BIN_EXE_dipir-scene");
 /// `dipir-composite`.

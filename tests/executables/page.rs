@@ -1,0 +1,107 @@
+//! `dipir report`: the page that shows a run.
+use crate::project::*;
+use crate::whole::{self, run_all};
+
+fn page(project: &Project) -> String {
+    String::from_utf8(project.read("out/report.html")).unwrap()
+}
+
+/// Every element is closed by the element that was opened last.
+#[track_caller]
+fn assert_well_formed(page: &str) {
+    let (head, rest) = page.split_once("<style>").unwrap();
+    let (_, rest) = rest.split_once("</style>").unwrap();
+    let (body, end) = rest.split_once("<script>").unwrap();
+    let (_, end) = end.split_once("</script>").unwrap();
+    let markup = format!("{head}{body}{end}");
+    let mut open = Vec::new();
+    for tag in markup.split('<').skip(1) {
+        let (tag, _) = tag.split_once('>').expect("a tag that does not end");
+        let name = tag.split_whitespace().next().unwrap();
+        match name.strip_prefix('/') {
+            Some(name) => assert_eq!(open.pop(), Some(name), "<{tag}>"),
+            None if ["!doctype", "meta", "img", "input"].contains(&name) => {}
+            None => open.push(name),
+        }
+    }
+    assert!(open.is_empty(), "{open:?}");
+}
+
+#[test]
+fn the_page_shows_every_stage_and_needs_no_other_file() {
+    let project = whole::project();
+    run_all(&project, &[]);
+    project
+        .run(DIPIR, &["report", "--set", "report.truth=sky.exr"])
+        .expect_success();
+    let page = page(&project);
+    assert_well_formed(&page);
+    for part in [
+        "class=\"compare\"",
+        "Against the true light",
+        "object (premultiplied)",
+        "share of all light",
+        "Tone curves",
+        "Guidance",
+        "iteration 15",
+        " toy ",
+        "Loss of the personalisation",
+        "after 3 updates",
+        "every material is opaque",
+        "dipir-optimize --set report.truth=sky.exr",
+    ] {
+        assert!(page.contains(part), "{part}");
+    }
+    // Nothing is fetched: all pictures are in the page.
+    for part in ["src=\"http", "href=", "url(", "@import"] {
+        assert!(!page.contains(part), "{part}");
+    }
+    let pictures = page.matches("<img ").count();
+    assert_eq!(
+        pictures,
+        page.matches("src=\"data:image/png;base64,").count()
+    );
+    assert!(pictures > 10, "{pictures}");
+}
+
+#[test]
+fn the_page_shows_whatever_there_is() {
+    let project = whole::project();
+    project.run(DIPIR, &["report"]).expect_error(
+        2,
+        "error: no stage has run yet, so there is nothing to show; run dipir run first",
+    );
+    project
+        .run(DIPIR, &["run", "-q", "--until", "scene"])
+        .expect_success();
+    let first = page(&project);
+    assert_well_formed(&first);
+    assert!(first.contains("Effects") && !first.contains("class=\"compare\""));
+    project.run(DIPIR, &["run", "-q"]).expect_success();
+    let mut bytes = project.read("out/composite/composite.exr");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    project.write("out/composite/composite.exr", bytes);
+    project.run(DIPIR, &["report"]).expect_success();
+    let damaged = page(&project);
+    assert_well_formed(&damaged);
+    assert!(damaged.contains("Not shown: out/composite/composite.exr: damaged"));
+    assert!(damaged.contains("Effects"));
+}
+
+#[test]
+fn every_string_on_the_page_is_text() {
+    let project = Project::new();
+    let evil = "<script>alert(1)</script>";
+    let set = format!("scene.class={evil}");
+    let object = "a'b&<i>.obj";
+    project.write(object, OBJECT);
+    let path = format!("scene.objects.0.path={object}");
+    project
+        .run(DIPIR, &["run", "-q", "--set", &set, "--set", &path])
+        .expect_success();
+    let page = page(&project);
+    assert_well_formed(&page);
+    assert!(!page.contains(evil) && !page.contains("<i>"));
+    assert!(page.contains("&lt;script&gt;alert(1)&lt;/script&gt; in background.png"));
+}
