@@ -2,8 +2,9 @@
 //!
 //!     model_times FOLDER
 //!
-//! Prints "forward SECONDS", "step SECONDS" (a LoRA step with recomputation,
-//! one example) and "peak_mib MEBIBYTES" of the whole process.
+//! Prints wall and processor seconds of "forward", "text" (the text encoder)
+//! and "step" (a LoRA step with recomputation, one example, its text encoded),
+//! and "peak_mib", the mebibytes of the whole process.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -62,6 +63,10 @@ fn main() -> Outcome<()> {
         model
             .unet
             .forward(&latents, &[500.0], &context, &Pass::default())?;
+        Ok(())
+    })?;
+    report("text", &mut || {
+        model.encode_prompts(&["a photo of a car"], None)?;
         Ok(())
     })?;
     let data = OneExample(Example {
