@@ -133,7 +133,10 @@ def lora_files(unet, folder, generator, results, inputs, small):
     with torch.no_grad():
         for name, p in sorted(unet.named_parameters()):
             if "lora_" in name:
-                p.copy_(torch.randn(p.shape, generator=generator) * 0.2)
+                # As large as the small models' at any size: .2 = 1/sqrt(25). Larger ones saturate every
+                # softmax, and then f32 does not hold the gradients to 1e-4, PyTorch's own included.
+                scale = 0.2 if small or "lora_B" in name else 1 / math.sqrt(p[0].numel())
+                p.copy_(torch.randn(p.shape, generator=generator) * scale)
     sample, t, context, noise = inputs
     out = unet(sample, t, context).sample
     results["lora_output"] = out.detach()
