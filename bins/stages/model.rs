@@ -42,6 +42,7 @@ pub fn load(session: &Session, table: &ModelTable) -> anyhow::Result<Model> {
             return Err(session.config.invalid("model.precision", message).into());
         }
     };
+    dipir_diffusion::memory::keep_freed();
     let folder = session.resolve(&table.path);
     Model::load(&folder, dtype, &device)
         .with_context(|| format!("cannot use model.path = \"{}\"", table.path.display()))

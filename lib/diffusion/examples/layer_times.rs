@@ -135,6 +135,7 @@ fn processor_ms() -> Option<f64> {
 }
 
 fn main() -> Outcome<()> {
+    dipir_diffusion::memory::keep_freed();
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [name, mode, repetitions] = arguments.as_slice() else {
         return Err("usage: layer_times CASE forward|frozen|train REPETITIONS".into());

@@ -43,6 +43,7 @@ fn processor_seconds() -> Outcome<f64> {
 }
 
 fn main() -> Outcome<()> {
+    dipir_diffusion::memory::keep_freed();
     let folder = PathBuf::from(std::env::args().nth(1).ok_or("usage: model_times FOLDER")?);
     let model = Model::load(&folder, DType::F32, &Device::Cpu)?;
     let latents =

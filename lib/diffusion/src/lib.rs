@@ -10,6 +10,7 @@ pub mod generate;
 mod kernels;
 pub mod layers;
 pub mod lora;
+pub mod memory;
 pub mod model;
 pub mod noise;
 pub mod optimizer;

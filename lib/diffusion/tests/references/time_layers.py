@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from diffusers import UNet2DConditionModel
 
 CASES = ["linear", "conv320", "conv64", "conv128", "conv1280", "groupnorm", "attention", "unet"]
-TURNS = 2
+TURNS = int(os.environ.get("TURNS", "2"))
 
 
 def case(name, train):

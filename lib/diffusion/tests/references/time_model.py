@@ -4,7 +4,7 @@
     cargo build --release -p dipir-diffusion --example model_times
     python time_model.py ../../../../target/release/examples/model_times FOLDER
 
-Prints wall and processor seconds of both, the smaller of two turns each, taken
+Prints wall and processor seconds of both, the smaller of TURNS (2) turns each, taken
 alternately, and the peak memory. With PROCESSOR=1 in the environment both use
 one thread: then processor time is the figure to compare, and other work on
 the machine disturbs it least.
@@ -23,7 +23,7 @@ from peft import LoraConfig
 
 
 PROCESSOR = os.environ.get("PROCESSOR") == "1"
-TURNS = 2
+TURNS = int(os.environ.get("TURNS", "2"))
 
 
 def ours_of(program, folder):
