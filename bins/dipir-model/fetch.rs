@@ -5,8 +5,6 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use candle_core::{DType, Device};
-use clap::ValueEnum;
-use dipir_cli::args::OutputArgs;
 use dipir_cli::exit::Usage;
 use dipir_cli::interrupt::{self, Interrupted};
 use dipir_cli::progress::Progress;
@@ -15,46 +13,12 @@ use dipir_hub::{Error, Hub, Outcome, Revision, SOURCE_FILE, Source, Variant};
 use dipir_pipeline::lock::{FolderLock, WhenLocked};
 use serde_json::json;
 
+use crate::cli::{FetchArgs, Precision};
+
 /// Where models are if nothing else is said.
 const ENDPOINT: &str = "https://huggingface.co";
 
-#[derive(clap::Args)]
-pub struct Args {
-    /// The repository, owner/name
-    #[arg(value_name = "REPO")]
-    repo: String,
-
-    /// Branch, tag or commit
-    #[arg(long, default_value = "main")]
-    revision: String,
-
-    /// The folder to make [default: the repository's name, in the current folder]
-    #[arg(long, value_name = "DIR")]
-    to: Option<PathBuf>,
-
-    /// Which of the published weights; full precision where there are both
-    #[arg(long, value_enum, default_value_t = Precision::Full)]
-    variant: Precision,
-
-    /// Address of the hub [default: HF_ENDPOINT, or https://huggingface.co]
-    #[arg(long, value_name = "URL")]
-    endpoint: Option<String>,
-
-    /// How often a broken connection is taken up again, for each file
-    #[arg(long, value_name = "N", default_value_t = 5)]
-    retries: u32,
-
-    #[command(flatten)]
-    output: OutputArgs,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum Precision {
-    Full,
-    Fp16,
-}
-
-pub fn run(args: &Args) -> anyhow::Result<()> {
+pub fn run(args: &FetchArgs) -> anyhow::Result<()> {
     interrupt::listen()?;
     let set = |name: &str| env::var(name).ok().filter(|v| !v.is_empty());
     let endpoint = args.endpoint.clone().or_else(|| set("HF_ENDPOINT"));
@@ -106,7 +70,7 @@ fn usage(error: Error) -> anyhow::Error {
     }
 }
 
-fn target(args: &Args) -> anyhow::Result<PathBuf> {
+fn target(args: &FetchArgs) -> anyhow::Result<PathBuf> {
     let target = match &args.to {
         Some(to) => to.clone(),
         None => PathBuf::from(args.repo.rsplit('/').next().unwrap_or_default()),
@@ -155,7 +119,12 @@ fn occupied<'a>(
     Err(Usage(message).into())
 }
 
-fn finish(args: &Args, target: &Path, revision: &Revision, outcome: Outcome) -> anyhow::Result<()> {
+fn finish(
+    args: &FetchArgs,
+    target: &Path,
+    revision: &Revision,
+    outcome: Outcome,
+) -> anyhow::Result<()> {
     let there = outcome.files == 0;
     let folder = target.display();
     args.output.result(

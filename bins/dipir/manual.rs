@@ -23,6 +23,9 @@ mod inspect;
 #[path = "../dipir-lora/cli.rs"]
 mod lora;
 #[allow(dead_code)]
+#[path = "../dipir-model/cli.rs"]
+mod model;
+#[allow(dead_code)]
 #[path = "../dipir-optimize/cli.rs"]
 mod optimize;
 #[allow(dead_code)]
@@ -63,6 +66,7 @@ enum Executable {
     DipirOptimize,
     DipirComposite,
     DipirInspect,
+    DipirModel,
 }
 
 impl Executable {
@@ -75,6 +79,7 @@ impl Executable {
             Self::DipirOptimize => optimize::Cli::command(),
             Self::DipirComposite => composite::Cli::command(),
             Self::DipirInspect => inspect::Cli::command(),
+            Self::DipirModel => model::Cli::command(),
         }
     }
 }

@@ -5,6 +5,7 @@ mod inspection;
 mod interruption;
 mod kills;
 mod large;
+mod manual;
 mod page;
 mod pipeline;
 mod project;
