@@ -25,7 +25,7 @@ pub use stages::quoted;
 /// Name of the file in the folder of artifacts.
 pub const FILE: &str = "report.html";
 /// Raised whenever the same artifacts give another page.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// What the page says beside what the artifacts hold.
 pub struct Report<'a> {
@@ -108,10 +108,10 @@ impl Report<'_> {
                 "p",
                 &[("class", "soft")],
                 [Html::text(format!(
-                    "{}, seed {}, {:?} quality, dipir {}",
+                    "{}, seed {}, {} quality, dipir {}",
                     self.session.config.path().display(),
                     self.session.pipeline.seed,
-                    self.session.pipeline.quality,
+                    format!("{:?}", self.session.pipeline.quality).to_lowercase(),
                     env!("CARGO_PKG_VERSION"),
                 ))],
             ),

@@ -1,31 +1,38 @@
 //! How far the recovered light is from the true one, where that is known.
 //!
-//! The picture under the recovered light, under a neutral one and under the true one are made from
-//! the scene stage's recorded transport, three products of a sparse matrix: they share their random
-//! numbers, and no path is traced.
+//! The picture is compared with the one that the true light makes, path traced at the size at which
+//! light is optimised. The recorded transport would not do: it samples a sun that nobody knew when
+//! it was recorded too rarely. For the neutral light, which has no peak, it does.
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use anyhow::Context;
 use dipir_cli::session::Session;
-use dipir_imaging::composite::composite;
-use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
+use dipir_imaging::composite::composite as over;
+use dipir_imaging::layers::Layers;
+use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
-use dipir_light::environment::EnvironmentMap;
+use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_optimize::guidance::{rmse, touched};
 use dipir_optimize::lighting::Lighting;
 use dipir_optimize::objective::{Objective, Weights};
 use dipir_optimize::parameters::ambient_of;
-use dipir_optimize::transport::LinearTransport;
 use dipir_pipeline::manifest::{FILE_NAME, Manifest, hash_file};
+use dipir_render::adaptive::Stop;
+use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::composite::Tone;
+use crate::composite::{CompositeTable, Tone};
 use crate::scene_folder::SceneFolder;
 use crate::transport::{self, Frame};
-use crate::{optimize, scene};
+use crate::{composite, interruption, optimize, scene};
+
+/// Display-referred RMSE, as a 95% bound, to which the picture under the true light is rendered: in
+/// quadrature, a small part of any difference worth telling.
+const ERROR: f32 = 0.01;
 
 /// The `[report]` table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -46,8 +53,8 @@ pub struct ReportTable {
 pub struct Truth {
     /// Between the directions of most light, recovered and true; absent if nothing was recovered.
     pub sun_error_deg: Option<f64>,
-    /// Display-referred RMSE of the picture under the recovered light, over what the object or its
-    /// shadow touches.
+    /// Display-referred RMSE of the composite stage's picture, over what the object or its shadow
+    /// touches.
     pub rmse_recovered: f64,
     /// The same under a constant light of the photograph's mean radiance.
     pub rmse_neutral: f64,
@@ -65,20 +72,21 @@ pub fn key(session: &Session) -> anyhow::Result<Value> {
     Ok(json!([table, hash]))
 }
 
-/// Compares, if `[report] truth` is set and the light was recovered.
+/// Compares, if `[report] truth` is set and the picture was made under the recovered light.
 pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
     let table: ReportTable = session.config.table("report")?;
     let Some(path) = &table.truth else {
         return Ok(None);
     };
-    let light = session.stage_folder(optimize::STAGE);
+    let lit: CompositeTable = session.config.table("composite")?;
     let is_there = |stage: &str| session.stage_folder(stage).join(FILE_NAME).is_file();
-    if !is_there(optimize::STAGE) || !is_there(scene::STAGE) {
+    let needed = [scene::STAGE, optimize::STAGE, composite::STAGE];
+    if lit.environment.is_some() || !needed.into_iter().all(is_there) {
         return Ok(None);
     }
-    let manifest = Manifest::read(&light, optimize::EXECUTABLE)?;
-    let recovered = Lighting::read(&manifest.output(&light, "lighting")?)?;
-    let curves = ToneCurves::read_json(manifest.output(&light, "tone")?)?;
+    let folder = session.stage_folder(optimize::STAGE);
+    let manifest = Manifest::read(&folder, optimize::EXECUTABLE)?;
+    let recovered = Lighting::read(&manifest.output(&folder, "lighting")?)?;
     let truth = EnvironmentMap::read(session.resolve(path))
         .with_context(|| format!("cannot use report.truth = \"{}\"", path.display()))?
         .scaled(table.truth_exposure_ev.exp2())
@@ -93,28 +101,16 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
         consistency: 0.0,
         regularizer: 0.0,
     };
-    let objective = Objective::new(
-        Box::new(record),
-        frame.background.clone(),
-        transfer,
-        no_weights,
-    )?;
-    let (columns, rows) = objective.transport().environment_size();
-    let shown = |map: &EnvironmentMap, tone: &Curve| -> anyhow::Result<DisplayImage> {
-        let linear = under(objective.transport(), map, tone, &frame.background)?;
-        Ok(transfer.encode(&linear))
-    };
-    let plain = Curve::of(table.truth_tone);
-    let wanted = shown(&truth.resampled(columns, rows), &plain)?;
-    let found = shown(
-        &recovered.map(columns, rows),
-        &Curve::Recovered(Box::new(curves)),
-    )?;
-    let ambient = Vec3::splat(ambient_of(&frame.background) as f32);
-    let neutral = shown(&EnvironmentMap::constant(columns, rows, ambient), &plain)?;
-    let mask = touched(&objective);
-    let apart = |picture: &DisplayImage| rmse(picture, &wanted, &mask, None);
+    let background = frame.background.clone();
+    let objective = Objective::new(Box::new(record), background, transfer, no_weights)?;
+
     let peak = truth.peak().0;
+    let wanted = under_truth(session, &scene, &frame, truth, table.truth_tone)?;
+    let found = picture(session, &frame)?;
+    let neutral = under_neutral(&objective, &frame, table.truth_tone)?;
+    let mask = touched(&objective);
+    let wanted = transfer.encode(&wanted);
+    let apart = |linear: &LinearImage| rmse(&transfer.encode(linear), &wanted, &mask, None);
     let sun_error = |d: Vec3| f64::from(d.angle_between(peak).to_degrees());
     Ok(Some(Truth {
         sun_error_deg: recovered.peak_direction().map(sun_error),
@@ -124,41 +120,73 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
     }))
 }
 
-/// What is done to the object and the shadow.
-enum Curve {
-    None,
-    Reinhard,
-    Recovered(Box<ToneCurves>),
+/// The composite stage's picture, linear.
+fn picture(session: &Session, frame: &Frame) -> anyhow::Result<LinearImage> {
+    let folder = session.stage_folder(composite::STAGE);
+    let manifest = Manifest::read(&folder, composite::EXECUTABLE)?;
+    let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
+    Ok(frame.scale(&LinearImage(layers.rgb("")?)))
 }
 
-impl Curve {
-    fn of(tone: Option<Tone>) -> Self {
-        match tone {
-            None | Some(Tone::None) => Self::None,
-            Some(Tone::Reinhard) => Self::Reinhard,
-        }
-    }
-}
-
-/// The picture under a light of the record's size, linear.
-fn under(
-    transport: &dyn LinearTransport,
-    light: &EnvironmentMap,
-    curve: &Curve,
-    background: &LinearImage,
+/// The picture under the true light, path traced, linear.
+fn under_truth(
+    session: &Session,
+    scene: &SceneFolder,
+    frame: &Frame,
+    truth: EnvironmentMap,
+    tone: Option<Tone>,
 ) -> anyhow::Result<LinearImage> {
+    let settings = Settings {
+        seed: session.pipeline.seed,
+        stop: Stop::TargetError(ERROR),
+        background: Some(&frame.background),
+        transfer: scene.loaded.photo.transfer,
+        occluders: frame.occluders.as_ref(),
+        ..Settings::default()
+    };
+    let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
+    let light = EnvironmentSampler::new(Arc::new(truth));
+    let progress = session.progress("true light");
+    let rendered = renderer
+        .render(
+            &light,
+            &scene.effects.simulation(),
+            &settings,
+            &mut |state| {
+                progress.set(state.fraction);
+                interruption()
+            },
+        )
+        .map_err(crate::render_error)?;
+    progress.done();
+    let film = rendered.film;
+    let object = toned(LinearImage(film.object), &film.alpha, tone);
+    let shadow = LinearImage(film.shadow);
+    Ok(over(&frame.background, &object, &film.alpha, &shadow)?)
+}
+
+/// The picture under a constant light of the photograph's mean radiance, linear.
+fn under_neutral(
+    objective: &Objective,
+    frame: &Frame,
+    tone: Option<Tone>,
+) -> anyhow::Result<LinearImage> {
+    let transport = objective.transport();
+    let (columns, rows) = transport.environment_size();
+    let ambient = Vec3::splat(ambient_of(&frame.background) as f32);
+    let light = EnvironmentMap::constant(columns, rows, ambient);
+    let alpha: &Raster<f32> = transport.coverage();
     let object = LinearImage(transport.foreground(light.texels()));
     let shadow = LinearImage(transport.shadow(light.texels()));
-    let alpha: &Raster<f32> = transport.coverage();
-    let (object, shadow) = match curve {
-        Curve::None => (object, shadow),
-        Curve::Reinhard => (ToneCurves::identity().apply_object(&object, alpha), shadow),
-        Curve::Recovered(curves) => (
-            curves.apply_object(&object, alpha),
-            curves.apply_shadow(&shadow),
-        ),
-    };
-    Ok(composite(background, &object, alpha, &shadow)?)
+    let object = toned(object, alpha, tone);
+    Ok(over(&frame.background, &object, alpha, &shadow)?)
+}
+
+fn toned(object: LinearImage, alpha: &Raster<f32>, tone: Option<Tone>) -> LinearImage {
+    match tone {
+        None | Some(Tone::None) => object,
+        Some(Tone::Reinhard) => ToneCurves::identity().apply_object(&object, alpha),
+    }
 }
 
 impl Truth {

@@ -138,7 +138,7 @@ pub fn truth(truth: &Truth) -> Html {
             &[("class", "soft")],
             [Html::text(
                 "Display-referred RMSE against the picture under the true light, over what the \
-                 object or its shadow touches; all three lit through the recorded transport.",
+                 object or its shadow touches, at the size at which light is optimised.",
             )],
         ),
     ])
