@@ -264,8 +264,9 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let model_table: ModelTable = session.config.table("model")?;
     let (background, transfer) = photo_of(session)?;
     let photo_file = session.resolve(&background);
-    let (list, latents) = read_concepts(session)?.unzip();
+    // First, for it checks the configuration.
     let plan = plan(session)?;
+    let (list, latents) = read_concepts(session)?.unzip();
     let base_hash = plan
         .inputs
         .iter()
