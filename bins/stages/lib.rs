@@ -2,6 +2,7 @@
 pub mod background;
 pub mod composite;
 pub mod concepts;
+pub mod distillation;
 pub mod light;
 pub mod lora;
 pub mod materials;
@@ -9,6 +10,7 @@ pub mod model;
 pub mod optimize;
 pub mod pipeline;
 pub mod preview;
+pub mod reading;
 pub mod report;
 pub mod scene;
 pub mod scene_folder;

@@ -14,7 +14,9 @@ use dipir_diffusion::model::Model;
 use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
+use dipir_diffusion::text_encoder::LearnedTokens;
 use dipir_diffusion::training::{Example, LoraTrainer, StepReport, TrainingConfig, TrainingData};
+use dipir_diffusion::weights::Weights;
 use dipir_imaging::file::{read_photo, write_png};
 use dipir_imaging::transfer::Transfer;
 use dipir_pipeline::manifest::Manifest;
@@ -383,6 +385,22 @@ fn learnable(model: &mut Model, word: &str) -> anyhow::Result<Tensor> {
     let token = model.text_encoder.config().vocab_size as u32;
     model.tokenizer.add_placeholder(word, token);
     Ok(Tensor::stack(&rows, 0)?.mean(0)?)
+}
+
+/// The embedding that a run learned for `word`; the word becomes a token of its own.
+pub fn learned_word(model: &mut Model, word: &str, path: &Path) -> anyhow::Result<LearnedTokens> {
+    let weights = Weights::open_file(path)?;
+    let embeddings = weights
+        .tensor(word, model.dtype(), model.device())?
+        .with_context(|| {
+            format!(
+                "{} holds no embedding of lora.word = \"{word}\"; run {EXECUTABLE} again",
+                path.display()
+            )
+        })?;
+    let token = model.text_encoder.config().vocab_size as u32;
+    model.tokenizer.add_placeholder(word, token);
+    Ok(LearnedTokens { embeddings })
 }
 
 /// The concept list and the file of latents, checked by hash, unless concept preservation is off.

@@ -21,6 +21,7 @@ use serde_json::{Value, json};
 
 use crate::composite::{CompositeTable, Tone};
 use crate::light;
+use crate::optimize::Resume;
 use crate::scene_folder::{self, SceneFolder};
 use crate::transport::{self, Frame};
 use crate::{interruption, optimize};
@@ -37,6 +38,7 @@ pub struct Done {
     folder: PathBuf,
     manifest: Manifest,
     outcome: MaterialOutcome,
+    resumed_at: usize,
 }
 
 /// Whether `[optimize] materials` names any.
@@ -57,16 +59,22 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let materials = indices(session, &scene.loaded.scene.materials, &table.materials)?;
     let frame = Frame::new(&scene.loaded, settings.size);
     let reference = optimize::read_reference(session, &scene, &frame, &reference_file)?;
-    let material_settings = settings_of(&table, settings.seed);
+    let material_settings = MaterialSettings {
+        checkpoint_every: settings.checkpoint_every,
+        ..settings_of(&table, settings.seed)
+    };
     let plan = plan(session)?;
+    let decisive = settings_of(&table, settings.seed);
+    let fingerprint = optimize::run_fingerprint(&plan, &json!(decisive))?;
     let folder = session.stage_folder(optimize::STAGE);
     let mut writer = session.begin(plan)?;
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
     let sampler = EnvironmentSampler::new(light.map.clone());
     let simulation = scene.effects.simulation();
     let background = shadowed(&renderer, &sampler, &simulation, &scene, &frame)?;
-    let progress = session.progress("materials");
-    let outcome = MaterialOptimization {
+    let resume = Resume::open(session, &fingerprint)?;
+    let checkpoint = resume.checkpoint();
+    let optimization = MaterialOptimization {
         renderer: &renderer,
         light: &sampler,
         simulation,
@@ -76,8 +84,12 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         reference: &reference,
         materials,
         settings: material_settings,
-    }
-    .run(&mut |share| {
+        checkpoint: Some(&checkpoint),
+    };
+    let kept = optimization.restored(&checkpoint);
+    let resumed_at = resume.resumed_at(session, kept.map(|s| s.map(|s| s.iteration)))?;
+    let progress = session.progress("materials");
+    let outcome = optimization.run(&mut |share| {
         progress.set(share);
         interruption()
     });
@@ -89,10 +101,12 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     writer.write_json(ROLE, FILE, &outcome.materials)?;
     writer.write_json("history", "history.json", &outcome.losses)?;
     let manifest = writer.finish()?;
+    resume.remove();
     Ok(Done {
         folder,
         manifest,
         outcome,
+        resumed_at,
     })
 }
 
@@ -238,6 +252,7 @@ impl Done {
             "folder": self.folder,
             "materials": self.outcome.materials,
             "iterations": self.outcome.losses.len(),
+            "resumed_at": self.resumed_at,
             "loss_at_start": self.outcome.losses.first(),
             "loss_at_end": self.outcome.losses.last(),
             "elapsed_s": self.manifest.elapsed_s,

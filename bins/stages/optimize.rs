@@ -8,28 +8,35 @@ use std::time::Instant;
 use anyhow::Context;
 use dipir_cli::interrupt::Interrupted;
 use dipir_cli::session::{Session, duration};
+use dipir_diffusion::model::Model;
 use dipir_imaging::file::{read_photo, write_png};
-use dipir_imaging::raster::DisplayImage;
+use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_optimize::OptimizeError;
 use dipir_optimize::checkpoint::State;
-use dipir_optimize::crop::Framing;
-use dipir_optimize::guidance::{Reference, rmse, touched};
+use dipir_optimize::crop::{Framing, USUAL_SCALE, bounding_box};
+use dipir_optimize::guidance::{Guidance, Reference, rmse, touched};
 use dipir_optimize::history::Row;
+use dipir_optimize::lighting::Lighting;
 use dipir_optimize::objective::Objective;
 use dipir_optimize::optimization::{Event, Optimization, Outcome};
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::recorder::SceneRecorder;
-use dipir_optimize::settings::{GuidanceKind, OptimizeTable, Settings};
+use dipir_optimize::settings::{GuidanceKind, LearningRates, OptimizeTable, Settings, Start};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
+use dipir_prior::reader::{ReaderSettings, Reading};
 use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
+use dipir_scene::config::SceneConfig;
 use glam::Vec3;
 use serde_json::{Value, json};
 
+use crate::distillation::{Adapter, Distillation, DistillationSettings};
+use crate::model::ModelTable;
+use crate::reading::Place;
 use crate::scene_folder::{self, SceneFolder};
 use crate::transport::{self, Frame};
-use crate::{interruption, model};
+use crate::{interruption, model, reading};
 
 /// Name of the stage and of its folder.
 pub const STAGE: &str = "light";
@@ -49,17 +56,39 @@ pub struct Done {
     size: [u32; 2],
     resumed_at: usize,
     /// Display-referred RMSE against the reference, over what the object or its shadow touches.
-    rmse: f64,
+    rmse: Option<f64>,
+    reading: Option<Reading>,
+}
+
+/// What judges the picture, as far as files go.
+enum Judge {
+    Reference {
+        /// As the configuration names it.
+        path: PathBuf,
+        file: PathBuf,
+    },
+    Diffusion {
+        table: ModelTable,
+        settings: DistillationSettings,
+        class: String,
+        reads: bool,
+    },
 }
 
 /// Runs the stage.
 pub fn run(session: &Session) -> anyhow::Result<Done> {
-    let table: OptimizeTable = session.config.table("optimize")?;
-    let settings = transport::settings(session, &table)?;
-    let (_, reference_file) = reference_of(session, &table)?;
+    let Asked {
+        table,
+        settings,
+        judge,
+    } = Asked::of(session)?;
+    let first = first_light(session, &table)?;
     let scene = SceneFolder::read(session)?;
     let frame = Frame::new(&scene.loaded, settings.size);
-    let reference = read_reference(session, &scene, &frame, &reference_file)?;
+    let reference = match &judge {
+        Judge::Reference { file, .. } => Some(read_reference(session, &scene, &frame, file)?),
+        Judge::Diffusion { .. } => None,
+    };
 
     let plan = plan(session)?;
     let fingerprint = fingerprint(&plan, &settings)?;
@@ -74,21 +103,51 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let recorded = recorded(session, &scene, &renderer, &record)?;
     writer.set_timing("transport", clock.elapsed().as_secs_f64());
 
-    let start = Parameters::neutral(settings.lobes, ambient_of(&frame.background));
-    let resume = Resume::open(session, &fingerprint)?;
-    let resumed_at = resume.restored(session, &settings, &start)?;
+    let neutral = Parameters::neutral(settings.lobes, ambient_of(&frame.background));
+    let transfer = scene.loaded.photo.transfer;
+    let coverage = recorded.coverage().clone();
     let objective = Objective::new(
         Box::new(recorded),
         frame.background.clone(),
-        scene.loaded.photo.transfer,
+        transfer,
         settings.weights(),
     )?;
     let mask = touched(&objective);
-    let framing = match settings.crops {
-        true => Framing::Crops { side: CROP_SIDE },
-        false => Framing::Whole,
+    let shown = transfer.encode(&frame.background);
+    let clock = Instant::now();
+    let mut guide = Guide::open(session, &judge)?;
+    let reading = guide.read(session, &judge, &shown, &renderer, &coverage, settings.seed)?;
+    writer.set_timing("reading", clock.elapsed().as_secs_f64());
+    let start = match (&first, &reading) {
+        (Some((_, _, light)), _) => Parameters::of_lobes(&light.exposed_lobes()),
+        (None, Some(reading)) => reading::start(&reading.light, &frame.camera, settings.lobes),
+        (None, None) => neutral,
     };
-    let mut guidance = Reference::new(reference.clone(), &objective, framing)?;
+    let resume = Resume::open(session, &fingerprint)?;
+    let resumed_at = resume.restored(session, &settings, &start)?;
+    let mut guidance: Box<dyn Guidance> = match (&judge, &reference) {
+        (_, Some(reference)) => {
+            let framing = match settings.crops {
+                true => Framing::Crops {
+                    side: CROP_SIDE,
+                    scale: USUAL_SCALE,
+                },
+                false => Framing::Whole,
+            };
+            Box::new(Reference::new(reference.clone(), &objective, framing)?)
+        }
+        (Judge::Reference { .. }, None) => anyhow::bail!("the reference was not read"),
+        (
+            Judge::Diffusion {
+                settings, class, ..
+            },
+            None,
+        ) => {
+            // A model that knows light sees the ground on which the shadow will fall.
+            let paint = if reading.is_some() { &coverage } else { &mask };
+            Box::new(guide.distillation(settings, class, reading.as_ref(), &shown, paint)?)
+        }
+    };
     let mut go_on = |_: f64| interruption();
     let mut recorder = SceneRecorder {
         renderer: &renderer,
@@ -98,7 +157,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let clock = Instant::now();
     let optimization = Optimization {
         objective,
-        guidance: &mut guidance,
+        guidance: &mut *guidance,
         recorder: Some(&mut recorder),
         settings: settings.clone(),
         start,
@@ -107,8 +166,13 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let outcome = follow(session, &settings, &resume, optimization)?;
     writer.set_timing("optimization", clock.elapsed().as_secs_f64());
     write_results(&settings, &outcome, &resume, &mut writer)?;
-    let rmse = rmse(&outcome.picture, &reference, &mask, None);
-    writer.set_estimated_error(rmse);
+    if let Some(reading) = &reading {
+        writer.write_json("reading", "reading.json", reading)?;
+    }
+    let rmse = reference.map(|reference| rmse(&outcome.picture, &reference, &mask, None));
+    if let Some(rmse) = rmse {
+        writer.set_estimated_error(rmse);
+    }
     let manifest = writer.finish()?;
     resume.remove();
     Ok(Done {
@@ -118,19 +182,211 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         size: frame.camera.resolution,
         resumed_at,
         rmse,
+        reading,
     })
 }
 
-/// What a run would be, from the configuration and the scene stage's manifest.
+/// What a run would be, from the configuration and the manifests of the stages that it reads.
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
-    let table: OptimizeTable = session.config.table("optimize")?;
-    let settings = transport::settings(session, &table)?;
-    let (reference_path, reference_file) = reference_of(session, &table)?;
-    let mut plan = StagePlan::new(STAGE, VERSION, params(&settings), session.pipeline.seed);
+    let Asked {
+        table,
+        settings,
+        judge,
+    } = Asked::of(session)?;
+    let mut plan = StagePlan::new(
+        STAGE,
+        VERSION,
+        params(&settings, &judge),
+        session.pipeline.seed,
+    );
     let scene = scene_folder::manifest(session)?;
     scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
-    plan.input("reference", &reference_path, &reference_file)?;
+    match &judge {
+        Judge::Reference { path, file } => plan.input("reference", path, file)?,
+        Judge::Diffusion {
+            table, settings, ..
+        } => {
+            plan.device = session.pipeline.device.clone();
+            model::inputs(session, table, &mut plan)?;
+            if settings.adapt {
+                Adapter::add_inputs(session, &mut plan)?;
+            }
+        }
+    }
+    if let Start::File(path) = &table.start {
+        plan.input("start", path, &session.resolve(path))?;
+    }
     Ok(plan)
+}
+
+/// What the configuration asks for.
+struct Asked {
+    table: OptimizeTable,
+    settings: Settings,
+    judge: Judge,
+}
+
+impl Asked {
+    fn of(session: &Session) -> anyhow::Result<Self> {
+        let table: OptimizeTable = session.config.table("optimize")?;
+        let mut settings = transport::settings(session, &table)?;
+        let judge = match table.guidance {
+            GuidanceKind::Reference => {
+                let (path, file) = reference_of(session, &table)?;
+                Judge::Reference { path, file }
+            }
+            _ => diffusion(session, &table)?,
+        };
+        if let Judge::Diffusion { reads: true, .. } = &judge {
+            refine(&table, &mut settings);
+        }
+        Ok(Self {
+            table,
+            settings,
+            judge,
+        })
+    }
+}
+
+/// Iterations that refine a light that was read off the photograph.
+const REFINEMENT: usize = 50;
+/// Their learning rates beside those that find a light from a neutral start: difference of two
+/// predictions pulls what the caption does not say away from where it was read (docs/prior.md).
+const REFINEMENT_RATE: f64 = 0.1;
+
+/// What `table` leaves open, for a start that is near.
+fn refine(table: &OptimizeTable, settings: &mut Settings) {
+    settings.iterations = table.iterations.unwrap_or(REFINEMENT);
+    if table.learning_rates == LearningRates::default() {
+        settings.learning_rates = settings.learning_rates.scaled(REFINEMENT_RATE);
+    }
+}
+
+/// The model that guides and how it is asked.
+fn diffusion(session: &Session, table: &OptimizeTable) -> anyhow::Result<Judge> {
+    let model_table: ModelTable = session.config.table("model")?;
+    let scene: SceneConfig = session.config.table("scene")?;
+    let folder = session.resolve(&model_table.path);
+    let knows_light = folder.join(dipir_prior::encoder::FILE).is_file();
+    let reads = match &table.start {
+        Start::Auto => knows_light,
+        Start::Neutral | Start::File(_) => false,
+        Start::Read if knows_light => true,
+        Start::Read => {
+            let message = format!(
+                "\"read\" needs a model that knows light, and {} has no {}; accepted: auto, neutral, or \
+                 a lighting.json",
+                folder.display(),
+                dipir_prior::encoder::FILE
+            );
+            return Err(session.config.invalid("optimize.start", message).into());
+        }
+    };
+    Ok(Judge::Diffusion {
+        settings: DistillationSettings::new(session, table, reads)?,
+        class: scene.class.unwrap_or_else(|| "object".into()),
+        table: model_table,
+        reads,
+    })
+}
+
+/// The loaded model, if a model guides.
+struct Guide {
+    model: Option<Model>,
+    adapter: Option<Adapter>,
+}
+
+impl Guide {
+    fn open(session: &Session, judge: &Judge) -> anyhow::Result<Self> {
+        let Judge::Diffusion {
+            table,
+            settings,
+            reads,
+            ..
+        } = judge
+        else {
+            return Ok(Self {
+                model: None,
+                adapter: None,
+            });
+        };
+        let mut model = model::load(session, table)?;
+        let adapter = settings
+            .adapt
+            .then(|| Adapter::load(session, &mut model))
+            .transpose()?;
+        if *reads {
+            dipir_prior::student::add_placeholders(&mut model.tokenizer);
+        }
+        Ok(Self {
+            model: Some(model),
+            adapter,
+        })
+    }
+
+    /// What the model reads off the photograph, if it can.
+    fn read(
+        &self,
+        session: &Session,
+        judge: &Judge,
+        photo: &DisplayImage,
+        renderer: &Renderer,
+        coverage: &Raster<f32>,
+        seed: u64,
+    ) -> anyhow::Result<Option<Reading>> {
+        let (Some(model), Judge::Diffusion { reads: true, .. }) = (&self.model, judge) else {
+            return Ok(None);
+        };
+        let object = bounding_box(coverage).context(
+            "no pixel shows the object, so nothing can be guided; move it into the picture",
+        )?;
+        let progress = session.progress("reading");
+        let settings = ReaderSettings::default();
+        let report = |share: f64| progress.set(share);
+        let place = Place {
+            camera: renderer.camera(),
+            proxy: &renderer.scene().proxy,
+            object,
+        };
+        let reading = reading::read_light(model, photo, &place, &settings, seed, &report)?;
+        progress.done();
+        Ok(reading)
+    }
+
+    fn distillation(
+        &mut self,
+        settings: &DistillationSettings,
+        class: &str,
+        reading: Option<&Reading>,
+        photo: &DisplayImage,
+        paint: &Raster<f32>,
+    ) -> anyhow::Result<Distillation<'_>> {
+        let model = self.model.as_ref().context("no model is loaded")?;
+        let (settings, adapter) = (settings.clone(), self.adapter.as_ref());
+        Distillation::new(model, settings, adapter, class, reading, photo, paint)
+    }
+}
+
+/// The light of `[optimize] start`: its file as the configuration names it, where it is, and what it
+/// holds.
+fn first_light(
+    session: &Session,
+    table: &OptimizeTable,
+) -> anyhow::Result<Option<(PathBuf, PathBuf, Lighting)>> {
+    let Start::File(path) = &table.start else {
+        return Ok(None);
+    };
+    let file = session.resolve(path);
+    let light = Lighting::read(&file)
+        .with_context(|| format!("cannot use optimize.start = \"{}\"", path.display()))?;
+    if light.lobes.is_empty() {
+        let message = format!(
+            "\"{}\" holds no lobes; accepted: a lighting.json that holds some",
+            path.display()
+        );
+        return Err(session.config.invalid("optimize.start", message).into());
+    }
+    Ok(Some((path.clone(), file, light)))
 }
 
 /// The reference, as the configuration names it and where it is.
@@ -138,19 +394,6 @@ pub fn reference_of(
     session: &Session,
     table: &OptimizeTable,
 ) -> anyhow::Result<(PathBuf, PathBuf)> {
-    let name = match table.guidance {
-        GuidanceKind::Reference => None,
-        GuidanceKind::Lds => Some("lds"),
-        GuidanceKind::Sds => Some("sds"),
-        GuidanceKind::Csd => Some("csd"),
-    };
-    if let Some(name) = name {
-        let message = format!(
-            "guidance = \"{name}\" is not built in yet; accepted: \"reference\", with reference = \
-             \"image.exr\""
-        );
-        return Err(session.config.invalid("optimize.guidance", message).into());
-    }
     let path = table.reference.clone().ok_or_else(|| {
         let message = "is missing: name the picture that the composite should equal, as in \
                        reference = \"image.exr\"";
@@ -186,17 +429,35 @@ pub fn read_reference(
 }
 
 /// What decides the outputs; how often the state is kept does not.
-fn params(settings: &Settings) -> Value {
+fn params(settings: &Settings, judge: &Judge) -> Value {
     let settings = Settings {
         checkpoint_every: 0,
         ..settings.clone()
     };
-    json!({"optimize": settings, "guidance": GuidanceKind::Reference})
+    match judge {
+        Judge::Reference { .. } => {
+            json!({"optimize": settings, "guidance": GuidanceKind::Reference})
+        }
+        Judge::Diffusion {
+            table,
+            settings: distillation,
+            class,
+            reads,
+        } => json!({
+            "optimize": settings, "guidance": distillation, "class": class,
+            "precision": table.precision, "read": reads,
+        }),
+    }
 }
 
 /// Tells one run from another, so that a checkpoint is found by the run that it belongs to alone.
 fn fingerprint(plan: &StagePlan, settings: &Settings) -> anyhow::Result<String> {
-    let all = json!([plan.version, plan.inputs, settings]);
+    run_fingerprint(plan, &serde_json::to_value(settings)?)
+}
+
+/// As [`fingerprint`], for settings of any kind.
+pub(crate) fn run_fingerprint(plan: &StagePlan, settings: &Value) -> anyhow::Result<String> {
+    let all = json!([plan.version, plan.inputs, plan.params, settings]);
     let hash = blake3::hash(serde_json::to_string(&all)?.as_bytes());
     Ok(hash.to_hex()[..16].to_owned())
 }
@@ -294,18 +555,18 @@ fn rows_without_times(outcome: &Outcome) -> anyhow::Result<Vec<Value>> {
 }
 
 /// Where an interrupted run goes on: a folder beside the stage's own.
-struct Resume {
+pub(crate) struct Resume {
     folder: PathBuf,
 }
 
 impl Resume {
-    fn open(session: &Session, fingerprint: &str) -> anyhow::Result<Self> {
+    pub(crate) fn open(session: &Session, fingerprint: &str) -> anyhow::Result<Self> {
         let folder = session.out.join("light-checkpoints").join(fingerprint);
         model::create_folder(&folder.join("previews"))?;
         Ok(Self { folder })
     }
 
-    fn checkpoint(&self) -> PathBuf {
+    pub(crate) fn checkpoint(&self) -> PathBuf {
         self.folder.join("checkpoint.safetensors")
     }
 
@@ -323,14 +584,25 @@ impl Resume {
         start: &Parameters,
     ) -> anyhow::Result<usize> {
         let path = self.checkpoint();
-        match State::read(&path, settings, start) {
+        let read = State::read(&path, settings, start);
+        self.resumed_at(session, read.map(|s| s.map(|s| s.iteration)))
+    }
+
+    /// The iteration of a checkpoint that was read. A damaged one is removed.
+    pub(crate) fn resumed_at(
+        &self,
+        session: &Session,
+        read: Result<Option<usize>, OptimizeError>,
+    ) -> anyhow::Result<usize> {
+        match read {
             Ok(None) => Ok(0),
-            Ok(Some(state)) => {
-                session.remark(|| format!("continuing with iteration {}", state.iteration));
-                Ok(state.iteration)
+            Ok(Some(iteration)) => {
+                session.remark(|| format!("continuing with iteration {iteration}"));
+                Ok(iteration)
             }
             Err(e) => {
                 session.warn(&format!("{e}; starting from the beginning"));
+                let path = self.checkpoint();
                 std::fs::remove_file(&path)
                     .with_context(|| format!("cannot remove {}", path.display()))?;
                 Ok(0)
@@ -351,7 +623,7 @@ impl Resume {
         Ok(names)
     }
 
-    fn remove(&self) {
+    pub(crate) fn remove(&self) {
         let _ = std::fs::remove_dir_all(&self.folder);
         // Only if nothing else is in it.
         let _ = self.folder.parent().map(std::fs::remove_dir);
@@ -388,6 +660,7 @@ impl Done {
             "guidance_at_start": self.guidance(history.first()),
             "guidance_at_end": self.guidance(history.last()),
             "rmse": self.rmse,
+            "reading": self.reading,
             "peak_direction": self.outcome.lighting.peak_direction(),
             "fusion_residual": self.outcome.lighting.fusion_residual,
             "elapsed_s": self.manifest.elapsed_s,
@@ -407,12 +680,14 @@ impl fmt::Display for Done {
         )?;
         write!(
             f,
-            "  {} iterations on {} x {} pixels, {:.5} of display-referred RMSE from the reference",
+            "  {} iterations on {} x {} pixels",
             self.outcome.history.len(),
             self.size[0],
-            self.size[1],
-            self.rmse
+            self.size[1]
         )?;
+        if let Some(rmse) = self.rmse {
+            write!(f, ", {rmse:.5} of display-referred RMSE from the reference")?;
+        }
         if let Some(peak) = self.outcome.lighting.peak_direction() {
             let [elevation, azimuth] = angles_deg(peak);
             write!(

@@ -32,10 +32,12 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
     let materials = materials::are_asked_for(session)?;
     let light_is_given = composite.environment.is_some() && !materials;
     let is_guided_by_model = optimize.guidance != GuidanceKind::Reference;
+    let is_adapted = optimize.adapt.unwrap_or(true);
 
     let no_model = match (light_is_given, is_guided_by_model) {
         (true, _) => Some("[composite] environment gives the light"),
         (false, false) => Some("[optimize] guidance = \"reference\" asks no diffusion model"),
+        (false, true) if !is_adapted => Some("[optimize] adapt = false uses the model as it is"),
         (false, true) => None,
     };
     let no_concepts = match lora::preserves_concepts(session)? {
@@ -64,7 +66,10 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
         node(
             optimize::STAGE,
             optimize::EXECUTABLE,
-            chosen(&[(scene::STAGE, true), (lora::STAGE, is_guided_by_model)]),
+            chosen(&[
+                (scene::STAGE, true),
+                (lora::STAGE, is_guided_by_model && is_adapted),
+            ]),
             light_is_given.then_some("[composite] environment gives the light"),
         ),
         node(

@@ -1,8 +1,9 @@
 //! The text encoder of CLIP [Radford et al. 2021].
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Device, Tensor, Var};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
@@ -157,6 +158,7 @@ pub struct TextEncoder {
     positions: Tensor,
     layers: Vec<Layer>,
     norm: LayerNorm,
+    variables: BTreeMap<String, Var>,
 }
 
 impl TextEncoder {
@@ -194,14 +196,26 @@ impl TextEncoder {
         let norm = LayerNorm::new(&p.sub("final_layer_norm"), width, config.layer_norm_eps)?;
         // A buffer of 0, 1, 2... that older files carry, and the projection
         // of files exported together with one.
-        root.finish(|name| name.ends_with("position_ids") || name == "text_projection.weight")?;
+        let variables =
+            root.finish(|name| name.ends_with("position_ids") || name == "text_projection.weight")?;
         Ok(Self {
             config,
             tokens,
             positions,
             layers,
             norm,
+            variables,
         })
+    }
+
+    /// Trainable parameters by name; empty if the weights are frozen.
+    pub fn variables(&self) -> &BTreeMap<String, Var> {
+        &self.variables
+    }
+
+    /// Embeddings of the vocabulary, [vocab_size, hidden_size].
+    pub fn table(&self) -> &Tensor {
+        self.tokens.table()
     }
 
     /// The configuration.

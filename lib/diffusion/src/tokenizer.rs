@@ -143,10 +143,15 @@ impl Tokenizer {
         let mut tokens = vec![];
         let mut pending = String::new();
         for word in text.split_inclusive(char::is_whitespace) {
-            match self.placeholders.get(&word.trim().to_lowercase()) {
+            // Punctuation may stand around a placeholder as around any word.
+            let bare = word.trim_matches(|c: char| !c.is_alphanumeric());
+            match self.placeholders.get(&bare.to_lowercase()) {
                 Some(&token) => {
+                    let start = word.find(bare).unwrap_or(0);
+                    pending.push_str(&word[..start]);
                     tokens.extend(encode(&std::mem::take(&mut pending))?);
                     tokens.push(token);
+                    pending.push_str(&word[start + bare.len()..]);
                 }
                 None => pending.push_str(word),
             }

@@ -95,6 +95,25 @@ impl SplineParameters {
         }
     }
 
+    /// The parameters of `knots`, the inverse of [`knots`](Self::knots) as far as no width, height
+    /// or slope is at its least value.
+    pub fn of(knots: &Knots) -> Self {
+        // Logits are free up to a constant: equal shares have 0.
+        let logits = |edges: &[f64; KNOTS], least: f64| {
+            std::array::from_fn(|k| {
+                let share = (edges[k + 1] - edges[k] - least) / (1.0 - BINS as f64 * least);
+                (share.max(1e-9) * BINS as f64).ln()
+            })
+        };
+        Self {
+            widths: logits(&knots.x, MIN_BIN_WIDTH),
+            heights: logits(&knots.y, MIN_BIN_HEIGHT),
+            slopes: knots
+                .slopes
+                .map(|d| (d - MIN_SLOPE).max(1e-9).exp_m1().ln() - slope_shift()),
+        }
+    }
+
     /// Gradient with respect to the parameters, given that with respect to [`knots`](Self::knots).
     pub fn knots_vjp(&self, gradient: &KnotGradient) -> Self {
         let mut slopes = [0.0; KNOTS];
@@ -386,6 +405,21 @@ impl Bin {
 
 #[cfg(test)]
 mod tests {
+    #[test]
+    fn parameters_of_knots_give_the_knots() {
+        let mut all = [0.0; PARAMETERS];
+        for (k, p) in all.iter_mut().enumerate() {
+            *p = (k as f64 * 1.7).sin();
+        }
+        let knots = SplineParameters::from_array(all).knots();
+        let again = SplineParameters::of(&knots).knots();
+        for k in 0..KNOTS {
+            assert!((knots.x[k] - again.x[k]).abs() < 1e-12);
+            assert!((knots.y[k] - again.y[k]).abs() < 1e-12);
+            assert!((knots.slopes[k] - again.slopes[k]).abs() < 1e-12);
+        }
+    }
+
     use super::*;
     use dipir_numerics::gradcheck::{central_difference, relative_error};
     use proptest::prelude::*;

@@ -3,7 +3,7 @@
 use crate::{
     error::ImagingError,
     raster::{LinearImage, Raster},
-    spline::{Curve, KnotGradient, Knots, PARAMETERS, SplineParameters},
+    spline::{Curve, KNOTS, KnotGradient, Knots, PARAMETERS, SplineParameters},
 };
 use dipir_numerics::sum::par_reduce;
 use glam::Vec3;
@@ -77,6 +77,26 @@ impl ToneGradient {
 }
 
 impl ToneParameters {
+    /// What a camera makes of light, Reinhard undone: straight in the shadows, half-way between a
+    /// clip and a film's roll-off `1 - exp(-x)` in the lights. The start where radiance is known
+    /// on the photograph's scale; the shadow is left as it is.
+    pub fn camera() -> Self {
+        let x = [0.0, 0.2, 0.35, 0.5, 0.65, 1.0];
+        // At u = x / (1 + x): the curve, and its slope dy/dx (1 + x)^2.
+        let (mut y, mut slopes) = ([0.0; KNOTS], [0.0; KNOTS]);
+        for (k, u) in x.into_iter().enumerate() {
+            let light = u / f64::max(1.0 - u, 1e-9);
+            y[k] = 0.5 * (light.min(1.0) + 1.0 - (-light).exp());
+            let below: f64 = if light < 1.0 { 1.0 } else { 0.0 };
+            let rise = 0.5 * (below + (-light).exp()) * (1.0 + light).powi(2);
+            slopes[k] = rise.clamp(0.1, 3.0);
+        }
+        Self {
+            foreground: SplineParameters::of(&Knots { x, y, slopes }),
+            ..Self::default()
+        }
+    }
+
     /// The curves.
     pub fn curves(&self) -> ToneCurves {
         ToneCurves {

@@ -1,15 +1,9 @@
 //! What a killed run needs to go on to the same bytes: one file, replaced in one step.
 //!
-//! Tensors in safetensors (f64, so that nothing is rounded), everything else as JSON in its header.
 //! Random numbers are functions of seed and iteration, so the iteration is their position.
-use std::collections::{BTreeMap, HashMap};
-use std::fs::{self, File};
-use std::io::Write;
 use std::path::Path;
 
 use glam::Vec3;
-use safetensors::SafeTensors;
-use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
 
 use crate::adam::Adam;
@@ -17,7 +11,7 @@ use crate::error::OptimizeError;
 use crate::history::Row;
 use crate::parameters::Parameters;
 use crate::settings::Settings;
-use crate::tensors::Tensors;
+use crate::snapshot::{Snapshot, SnapshotFile};
 
 /// The state between two iterations.
 #[derive(Clone, Debug, PartialEq)]
@@ -71,16 +65,6 @@ impl State {
     /// Writes the state beside `path`, flushes it and renames it into place: a crash leaves the
     /// earlier checkpoint or this one.
     pub fn write(&self, path: &Path, settings: &Settings) -> Result<(), OptimizeError> {
-        let failed = |e| OptimizeError::io("write", path, e);
-        let bytes = self.to_bytes(settings).map_err(failed)?;
-        let partial = path.with_extension("partial");
-        let mut file = File::create(&partial).map_err(failed)?;
-        file.write_all(&bytes).map_err(failed)?;
-        file.sync_all().map_err(failed)?;
-        fs::rename(&partial, path).map_err(failed)
-    }
-
-    fn to_bytes(&self, settings: &Settings) -> std::io::Result<Vec<u8>> {
         let header = Header {
             schema: SCHEMA,
             settings: settings.clone(),
@@ -90,39 +74,14 @@ impl State {
             records: self.records,
             history: self.history.clone(),
         };
-        let metadata = HashMap::from([("state".to_string(), serde_json::to_string(&header)?)]);
-        let mut data = BTreeMap::new();
-        let parameters = self.parameters.to_tensors();
-        let sets = [
-            ("parameters", &parameters),
-            ("first", &self.adam.first),
-            ("second", &self.adam.second),
-        ];
-        for (set, tensors) in sets {
-            for t in &tensors.0 {
-                let bytes: Vec<u8> = t.values.iter().flat_map(|v| v.to_le_bytes()).collect();
-                data.insert(
-                    format!("{set}.{}", t.name),
-                    (Dtype::F64, vec![t.values.len()], bytes),
-                );
-            }
-        }
+        let mut snapshot = Snapshot::new(&header);
+        snapshot.add_set("parameters", &self.parameters.to_tensors());
+        snapshot.add_set("first", &self.adam.first);
+        snapshot.add_set("second", &self.adam.second);
         if let Some(light) = &self.record_light {
-            let numbers = light.iter().flat_map(|t| t.to_array());
-            let bytes: Vec<u8> = numbers.flat_map(f32::to_le_bytes).collect();
-            data.insert(
-                "record_light".into(),
-                (Dtype::F32, vec![light.len(), 3], bytes),
-            );
+            snapshot.add_colors("record_light", light);
         }
-        let views: Result<Vec<_>, _> = data
-            .iter()
-            .map(|(name, (dtype, shape, bytes))| {
-                TensorView::new(*dtype, shape.clone(), bytes).map(|view| (name, view))
-            })
-            .collect();
-        let views = views.map_err(std::io::Error::other)?;
-        safetensors::serialize(views, Some(metadata)).map_err(std::io::Error::other)
+        snapshot.write(path)
     }
 
     /// Reads a checkpoint of a run with these settings and parameters of the same shape as
@@ -132,89 +91,38 @@ impl State {
         settings: &Settings,
         start: &Parameters,
     ) -> Result<Option<Self>, OptimizeError> {
-        let bytes = match fs::read(path) {
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            read => read.map_err(|e| OptimizeError::io("read", path, e))?,
+        let Some(file) = SnapshotFile::read(path)? else {
+            return Ok(None);
         };
-        let bad = |detail: String| OptimizeError::BadFile {
-            path: path.into(),
-            detail,
-            remedy: "delete it to start from the beginning",
-        };
-        let damaged = |e: &dyn std::fmt::Display| bad(format!("is damaged: {e}"));
-        let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(|e| damaged(&e))?;
-        let text = metadata.metadata().as_ref().and_then(|m| m.get("state"));
-        let text = text.ok_or_else(|| bad("is no checkpoint of an optimisation".into()))?;
-        let header: Header = serde_json::from_str(text)
-            .map_err(|e| bad(format!("was written by another version: {e}")))?;
-        if header.schema != SCHEMA {
-            return Err(bad(format!("has schema {}, not {SCHEMA}", header.schema)));
-        }
+        let header: Header = file.header()?;
+        file.check_schema(header.schema, SCHEMA)?;
         if header.settings != *settings {
-            return Err(bad("belongs to a run with other settings".into()));
+            return Err(file.refused("belongs to a run with other settings".into()));
         }
-        let tensors = SafeTensors::deserialize(&bytes).map_err(|e| damaged(&e))?;
         let shape = start.to_tensors();
-        let load = |set: &str| load_set(&tensors, set, &shape).map_err(bad);
         let adam = Adam {
-            first: load("first")?,
-            second: load("second")?,
+            first: file.set("first", &shape)?,
+            second: file.set("second", &shape)?,
             steps: header.steps,
         };
         Ok(Some(Self {
             iteration: header.iteration,
-            parameters: Parameters::from_tensors(&load("parameters")?),
+            parameters: Parameters::from_tensors(&file.set("parameters", &shape)?),
             adam,
             bad_in_a_row: header.bad_in_a_row,
             records: header.records,
-            record_light: load_light(&tensors).map_err(bad)?,
+            record_light: file.colors("record_light")?,
             history: header.history,
         }))
     }
 }
 
-fn load_set(file: &SafeTensors, set: &str, shape: &Tensors) -> Result<Tensors, String> {
-    let mut loaded = shape.clone();
-    for t in &mut loaded.0 {
-        let name = format!("{set}.{}", t.name);
-        let view = file
-            .tensor(&name)
-            .map_err(|_| format!("holds no tensor \"{name}\""))?;
-        if view.dtype() != Dtype::F64 || view.shape() != [t.values.len()] {
-            return Err(format!(
-                "holds \"{name}\" as {:?} {:?}; expected F64 [{}]",
-                view.dtype(),
-                view.shape(),
-                t.values.len()
-            ));
-        }
-        let numbers = view.data().as_chunks::<8>().0.iter();
-        t.values = numbers.map(|b| f64::from_le_bytes(*b)).collect();
-        if t.values.iter().any(|v| !v.is_finite()) {
-            return Err(format!("holds a NaN or an infinity in \"{name}\""));
-        }
-    }
-    Ok(loaded)
-}
-
-fn load_light(file: &SafeTensors) -> Result<Option<Vec<Vec3>>, String> {
-    let Ok(view) = file.tensor("record_light") else {
-        return Ok(None);
-    };
-    if view.dtype() != Dtype::F32 || view.shape().len() != 2 || view.shape()[1] != 3 {
-        return Err("holds a \"record_light\" that is no list of colours".into());
-    }
-    let texel = |b: &[u8; 12]| {
-        let at = |k: usize| f32::from_le_bytes([b[k], b[k + 1], b[k + 2], b[k + 3]]);
-        Vec3::new(at(0), at(4), at(8))
-    };
-    Ok(Some(
-        view.data().as_chunks::<12>().0.iter().map(texel).collect(),
-    ))
-}
-
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
+    use safetensors::tensor::TensorView;
+
     use super::*;
     use crate::settings::{OptimizeTable, Preset};
 

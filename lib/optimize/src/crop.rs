@@ -5,7 +5,7 @@ use dipir_numerics::sampler::{Sampler, Stream};
 use glam::Vec3;
 
 /// What the guidance asks to see.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Framing {
     /// Every pixel, as it is.
     Whole,
@@ -13,6 +13,8 @@ pub enum Framing {
     Crops {
         /// Side in pixels after resizing.
         side: usize,
+        /// Smallest and largest side of the square, in longer sides of the object's box.
+        scale: [f32; 2],
     },
 }
 
@@ -58,10 +60,9 @@ impl View {
     }
 }
 
-/// The longer side of the object's box times this gives the smallest crop: details of the object.
-const SMALLEST: f32 = 0.75;
-/// And the largest: the object's surroundings, its shadow among them.
-const LARGEST: f32 = 3.0;
+/// The usual [`Framing::Crops::scale`]: from details of the object to its surroundings, its shadow
+/// among them.
+pub const USUAL_SCALE: [f32; 2] = [0.75, 3.0];
 
 /// Draws crops around the object.
 #[derive(Clone, Copy, Debug)]
@@ -86,11 +87,12 @@ impl CropSampler {
     }
 
     /// The square of one iteration, a function of `seed` and `iteration` alone: its side drawn
-    /// log-uniformly between [`SMALLEST`] and [`LARGEST`] of the object's, at most the picture's
+    /// log-uniformly from `scale`, in sides of the object's box, at most the picture's
     /// shorter side, its middle inside the object's box as far as the picture's edges let it.
-    pub fn crop(&self, seed: u64, iteration: usize) -> PixelBox {
+    pub fn crop(&self, seed: u64, iteration: usize, scale: [f32; 2]) -> PixelBox {
         let mut sampler = Sampler::new(seed, Stream::OPTIMIZE, 0, iteration as u32);
-        let scale = SMALLEST * (LARGEST / SMALLEST).powf(sampler.next_1d());
+        let [smallest, largest] = scale;
+        let scale = smallest * (largest / smallest).powf(sampler.next_1d());
         let middle = sampler.next_2d();
         let object = &self.object;
         let longer = object.width.max(object.height) as f32;
@@ -110,8 +112,8 @@ impl CropSampler {
     }
 }
 
-/// The smallest box around all covered pixels.
-fn bounding_box(coverage: &Raster<f32>) -> Option<PixelBox> {
+/// The smallest box around all covered pixels; `None` if there are none.
+pub fn bounding_box(coverage: &Raster<f32>) -> Option<PixelBox> {
     let mut range: Option<[usize; 4]> = None;
     for y in 0..coverage.height() {
         for (x, &a) in coverage.row(y).iter().enumerate() {
@@ -161,18 +163,20 @@ mod tests {
             ((1, 1), boxed(0, 0, 1, 1)),
         ] {
             let sampler = CropSampler::new(&coverage(size.0, size.1, object));
-            let crops: Vec<_> = (0..256).map(|k| sampler.crop(7, k)).collect();
+            let crops: Vec<_> = (0..256).map(|k| sampler.crop(7, k, USUAL_SCALE)).collect();
             for c in &crops {
                 assert!(c.x + c.width <= size.0 && c.y + c.height <= size.1, "{c:?}");
                 assert_eq!(c.width, c.height);
                 let apart = c.x >= object.x + object.width || object.x >= c.x + c.width;
                 assert!(!apart, "{c:?} shows nothing of {object:?}");
             }
-            let again = sampler.crop(7, 100);
+            let again = sampler.crop(7, 100, USUAL_SCALE);
             assert_eq!(again, crops[100]);
         }
         let sampler = CropSampler::new(&coverage(96, 64, boxed(40, 20, 16, 12)));
-        let sides: Vec<_> = (0..256).map(|k| sampler.crop(0, k).width).collect();
+        let sides: Vec<_> = (0..256)
+            .map(|k| sampler.crop(0, k, USUAL_SCALE).width)
+            .collect();
         // 16 pixels times .75 to 3.
         assert_eq!(sides.iter().min(), Some(&12));
         assert!(sides.iter().all(|s| *s <= 48) && sides.contains(&47));
@@ -181,6 +185,6 @@ mod tests {
     #[test]
     fn an_object_out_of_sight_leaves_the_whole_picture() {
         let sampler = CropSampler::new(&Raster::filled(10, 6, 0.0));
-        assert!((0..32).all(|k| sampler.crop(0, k).width <= 6));
+        assert!((0..32).all(|k| sampler.crop(0, k, USUAL_SCALE).width <= 6));
     }
 }

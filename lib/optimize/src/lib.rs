@@ -19,12 +19,14 @@ pub mod error;
 pub mod guidance;
 pub mod history;
 pub mod lighting;
+pub mod material_checkpoint;
 pub mod materials;
 pub mod objective;
 pub mod optimization;
 pub mod parameters;
 pub mod recorder;
 pub mod settings;
+mod snapshot;
 pub mod tensors;
 pub mod transport;
 

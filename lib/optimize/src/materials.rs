@@ -13,6 +13,7 @@
 //! optimised as a logarithm. What is returned is the mean over the last quarter of the steps, whose
 //! noise is smaller than that of the last one.
 use std::ops::ControlFlow;
+use std::path::Path;
 
 use dipir_imaging::composite::{composite_pixel, composite_pixel_vjp};
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
@@ -30,9 +31,9 @@ use dipir_scene::scene::Scene;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use crate::adam::Adam;
 use crate::error::OptimizeError;
 use crate::guidance::{PHOTOMETRIC_SCALE, charbonnier};
+use crate::material_checkpoint::MaterialState;
 use crate::tensors::{Group, Tensor, Tensors};
 
 /// Least base colour: at 0 a diffuse lobe is never sampled and could not come back.
@@ -75,7 +76,8 @@ impl RecoveredMaterial {
 }
 
 /// How materials are recovered.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct MaterialSettings {
     /// Steps.
     pub iterations: usize,
@@ -85,6 +87,8 @@ pub struct MaterialSettings {
     pub gradient_samples: u32,
     /// How far a parameter moves in the first steps; falls along a cosine.
     pub rate: f64,
+    /// Steps between checkpoints; 0 for none.
+    pub checkpoint_every: usize,
     /// Key of every random number.
     pub seed: u64,
 }
@@ -97,6 +101,7 @@ impl Default for MaterialSettings {
             gradient_samples: 16,
             // From one end of a range to the other in 40 steps.
             rate: 0.025,
+            checkpoint_every: 25,
             seed: 0,
         }
     }
@@ -122,6 +127,8 @@ pub struct MaterialOptimization<'a, L> {
     pub materials: Vec<usize>,
     /// How.
     pub settings: MaterialSettings,
+    /// Where the state is kept between steps, and goes on if the file is there.
+    pub checkpoint: Option<&'a Path>,
 }
 
 /// Recovered materials and how the loss fell.
@@ -134,7 +141,10 @@ pub struct MaterialOutcome {
 }
 
 impl<L: SceneLight> MaterialOptimization<'_, L> {
-    /// Runs all steps. `progress` hears the share that is done and may break off.
+    /// Runs all steps, from the checkpoint on if the file is there. `progress` hears the share
+    /// that is done and may break off: then the state is kept and the error is
+    /// [`OptimizeError::Interrupted`]. The result is a function of the inputs: an interruption
+    /// does not show in it.
     pub fn run(
         &self,
         progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
@@ -142,17 +152,20 @@ impl<L: SceneLight> MaterialOptimization<'_, L> {
         let settings = &self.settings;
         let start = self.renderer.scene();
         let mut scene = start.clone();
-        let mut parameters = self.parameters(start);
-        let mut adam = Adam::new(&parameters);
-        let mut mean = parameters.zeros_like();
+        let mut state = match self.checkpoint {
+            Some(path) => self.restored(path)?,
+            None => None,
+        }
+        .unwrap_or_else(|| MaterialState::new(self.parameters(start)));
         let first_averaged = ((1.0 - AVERAGED) * settings.iterations as f64) as usize;
-        let mut losses = Vec::new();
-        for iteration in 0..settings.iterations {
+        while state.iteration < settings.iterations {
+            let iteration = state.iteration;
             let share = iteration as f64 / settings.iterations as f64;
             if progress(share).is_break() {
+                self.keep(&state)?;
                 return Err(OptimizeError::Interrupted);
             }
-            self.apply(&parameters, start, &mut scene);
+            self.apply(&state.parameters, start, &mut scene);
             let (loss, gradients) = self.step(&scene, iteration)?;
             let gradient = self.gradient(&scene, &gradients);
             if !loss.is_finite() || gradient.first_not_finite().is_some() {
@@ -162,25 +175,45 @@ impl<L: SceneLight> MaterialOptimization<'_, L> {
                     in_a_row: 1,
                 });
             }
-            losses.push(loss);
+            state.losses.push(loss);
             let cosine = 0.5 * (1.0 + (std::f64::consts::PI * share).cos());
             let rate = settings.rate * (LAST_RATE + (1.0 - LAST_RATE) * cosine);
-            adam.step(&mut parameters, &gradient, |_| rate)?;
-            clamp(&mut parameters);
+            state
+                .adam
+                .step(&mut state.parameters, &gradient, |_| rate)?;
+            clamp(&mut state.parameters);
             if iteration >= first_averaged {
                 let weight = 1.0 / (settings.iterations - first_averaged) as f64;
-                for (m, p) in mean.0.iter_mut().zip(&parameters.0) {
+                for (m, p) in state.mean.0.iter_mut().zip(&state.parameters.0) {
                     m.values
                         .iter_mut()
                         .zip(&p.values)
                         .for_each(|(m, p)| *m += weight * p);
                 }
             }
+            state.iteration += 1;
+            let every = settings.checkpoint_every;
+            if every > 0 && state.iteration.is_multiple_of(every) {
+                self.keep(&state)?;
+            }
         }
         Ok(MaterialOutcome {
-            materials: self.recovered(&mean, start),
-            losses,
+            materials: self.recovered(&state.mean, start),
+            losses: state.losses,
         })
+    }
+
+    /// The state that a checkpoint holds; `None` if there is no file.
+    pub fn restored(&self, path: &Path) -> Result<Option<MaterialState>, OptimizeError> {
+        let shape = self.parameters(self.renderer.scene());
+        MaterialState::read(path, &self.materials, &self.settings, &shape)
+    }
+
+    fn keep(&self, state: &MaterialState) -> Result<(), OptimizeError> {
+        match self.checkpoint {
+            Some(path) => state.write(path, &self.materials, &self.settings),
+            None => Ok(()),
+        }
     }
 
     /// Loss of a picture of `scene`, and an estimate of its derivatives.

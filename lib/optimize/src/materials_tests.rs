@@ -61,57 +61,84 @@ fn material(color: [f32; 3], metallic: f32, roughness: f32) -> Material {
     }
 }
 
-/// Recovers `truth` from a picture traced with another seed, starting from a half-metallic grey.
-fn recover(truth: &Material) -> MaterialOutcome {
-    let (light, background) = (light(), Raster::filled(SIDE, SIDE, Vec3::splat(0.2)));
-    let background = LinearImage(background);
-    let scene = ball(truth.clone());
-    let start = ball(Material {
-        base_color: Vec3::splat(0.5).extend(1.0),
-        metallic: 0.5,
-        roughness: 0.5,
-        ..truth.clone()
-    });
-    let tone = ToneCurves::identity();
-    let rendering = Settings {
-        seed: 77,
-        stop: Stop::Samples(1024),
-        background: Some(&background),
-        ..Settings::default()
-    };
-    let film = Renderer::new(&scene)
-        .render(&light, &simulation(), &rendering, &mut |_| {
-            ControlFlow::Continue(())
-        })
-        .unwrap()
-        .film;
-    let toned = tone.apply_object(&LinearImage(film.object), &film.alpha);
-    let pixels = (0..SIDE * SIDE).map(|p| {
-        let (behind, front) = (background.0.pixels()[p], toned.0.pixels()[p]);
-        composite_pixel(behind, front, film.alpha.pixels()[p], Vec3::ONE)
-    });
-    let linear = LinearImage(Raster::from_pixels(SIDE, SIDE, pixels.collect()));
-    let reference = Transfer::Srgb.encode(&linear);
-    let renderer = Renderer::new(&start);
-    MaterialOptimization {
-        renderer: &renderer,
-        light: &light,
-        simulation: simulation(),
-        tone: Some(tone),
-        background: &background,
-        transfer: Transfer::Srgb,
-        reference: &reference,
-        materials: vec![0],
-        settings: MaterialSettings {
-            iterations: 400,
-            picture_samples: 64,
-            gradient_samples: 16,
-            rate: 0.04,
-            seed: 5,
-        },
+/// What a material is recovered from: the ball in a half-metallic grey, and a picture of it in
+/// `truth`, traced with another seed.
+struct Case {
+    start: Scene,
+    background: LinearImage,
+    reference: DisplayImage,
+    light: EnvironmentSampler,
+}
+
+impl Case {
+    fn new(truth: &Material) -> Self {
+        let (light, background) = (light(), Raster::filled(SIDE, SIDE, Vec3::splat(0.2)));
+        let background = LinearImage(background);
+        let rendering = Settings {
+            seed: 77,
+            stop: Stop::Samples(1024),
+            background: Some(&background),
+            ..Settings::default()
+        };
+        let film = Renderer::new(&ball(truth.clone()))
+            .render(&light, &simulation(), &rendering, &mut |_| {
+                ControlFlow::Continue(())
+            })
+            .unwrap()
+            .film;
+        let toned = ToneCurves::identity().apply_object(&LinearImage(film.object), &film.alpha);
+        let pixels = (0..SIDE * SIDE).map(|p| {
+            let (behind, front) = (background.0.pixels()[p], toned.0.pixels()[p]);
+            composite_pixel(behind, front, film.alpha.pixels()[p], Vec3::ONE)
+        });
+        let linear = LinearImage(Raster::from_pixels(SIDE, SIDE, pixels.collect()));
+        Self {
+            start: ball(Material {
+                base_color: Vec3::splat(0.5).extend(1.0),
+                metallic: 0.5,
+                roughness: 0.5,
+                ..truth.clone()
+            }),
+            background,
+            reference: Transfer::Srgb.encode(&linear),
+            light,
+        }
     }
-    .run(&mut |_| ControlFlow::Continue(()))
-    .unwrap()
+
+    fn run(
+        &self,
+        settings: MaterialSettings,
+        checkpoint: Option<&Path>,
+        progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
+    ) -> Result<MaterialOutcome, OptimizeError> {
+        MaterialOptimization {
+            renderer: &Renderer::new(&self.start),
+            light: &self.light,
+            simulation: simulation(),
+            tone: Some(ToneCurves::identity()),
+            background: &self.background,
+            transfer: Transfer::Srgb,
+            reference: &self.reference,
+            materials: vec![0],
+            settings,
+            checkpoint,
+        }
+        .run(progress)
+    }
+}
+
+const SETTINGS: MaterialSettings = MaterialSettings {
+    iterations: 400,
+    picture_samples: 64,
+    gradient_samples: 16,
+    rate: 0.04,
+    checkpoint_every: 0,
+    seed: 5,
+};
+
+fn recover(truth: &Material) -> MaterialOutcome {
+    let go_on = &mut |_| ControlFlow::Continue(());
+    Case::new(truth).run(SETTINGS, None, go_on).unwrap()
 }
 
 fn assert_recovered(truth: &Material) {
@@ -153,7 +180,66 @@ fn a_metal_balls_material_is_recovered_from_its_picture() {
 fn the_strength_of_emission_alone_is_recovered() {
     let mut truth = material([0.5, 0.5, 0.5], 0.5, 0.5);
     truth.emissive = Vec3::new(0.4, 0.3, 0.2);
-    let outcome = recover(&truth);
+    let mut case = Case::new(&truth);
+    case.start.materials[0].emissive *= 0.5;
+    let settings = MaterialSettings {
+        iterations: 120,
+        ..SETTINGS
+    };
+    let go_on = &mut |_| ControlFlow::Continue(());
+    let outcome = case.run(settings, None, go_on).unwrap();
     let strength = outcome.materials[0].emissive_strength;
-    assert!((strength - 1.0).abs() < 0.05, "{strength}");
+    assert!((strength - 2.0).abs() < 0.1, "{strength}");
+}
+
+#[test]
+fn killed_at_any_step_and_started_again_the_material_is_the_same_bytes() {
+    let case = Case::new(&material([0.9, 0.7, 0.4], 1.0, 0.35));
+    let settings = MaterialSettings {
+        iterations: 20,
+        picture_samples: 8,
+        gradient_samples: 4,
+        checkpoint_every: 6,
+        ..SETTINGS
+    };
+    let go_on = &mut |_: f64| ControlFlow::Continue(());
+    let whole = case.run(settings, None, go_on).unwrap();
+    // Before the mean begins at step 15, and after.
+    for at in [1, 7, 13, 17] {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint.safetensors");
+        let mut until = |share: f64| match share * 20.0 > f64::from(at) - 0.5 {
+            true => ControlFlow::Break(()),
+            false => ControlFlow::Continue(()),
+        };
+        // Interrupted: nothing is lost.
+        let stopped = case.run(settings, Some(&path), &mut until);
+        assert!(matches!(stopped, Err(OptimizeError::Interrupted)));
+        let resumed = case.run(settings, Some(&path), go_on).unwrap();
+        assert_eq!(resumed, whole, "interrupted at {at}");
+        // Killed: the file is that of the last regular checkpoint.
+        std::fs::remove_file(&path).unwrap();
+        let regular = at / 6 * 6;
+        if regular > 0 {
+            let mut until = |share: f64| match share * 20.0 > f64::from(regular) - 0.5 {
+                true => ControlFlow::Break(()),
+                false => ControlFlow::Continue(()),
+            };
+            assert!(case.run(settings, Some(&path), &mut until).is_err());
+        }
+        let resumed = case.run(settings, Some(&path), go_on).unwrap();
+        assert_eq!(resumed, whole, "killed at {at}");
+        // Another run's file is refused.
+        let other = MaterialSettings {
+            seed: 6,
+            ..settings
+        };
+        let refused = case.run(other, Some(&path), go_on).unwrap_err().to_string();
+        assert!(
+            refused.ends_with(
+                "belongs to a run with other settings; delete it to start from the beginning"
+            ),
+            "{refused}"
+        );
+    }
 }

@@ -99,7 +99,10 @@ impl Optimization<'_> {
     ) -> Result<Outcome, OptimizeError> {
         let settings = self.settings.clone();
         let (_, rows) = self.objective.transport().environment_size();
-        let bounds = Bounds::for_map(rows);
+        let bounds = match settings.light {
+            true => Bounds::for_map(rows),
+            false => Bounds::for_map(rows).of_tone_alone(),
+        };
         let crops = CropSampler::new(self.objective.transport().coverage());
         let mut state = self.resume()?;
         let mut stopped_early = false;
@@ -252,8 +255,8 @@ impl Optimization<'_> {
     fn view(&self, crops: &CropSampler, step: Step) -> View {
         match self.guidance.framing() {
             Framing::Whole => View::whole(),
-            Framing::Crops { side } => {
-                let crop = crops.crop(step.seed, step.iteration);
+            Framing::Crops { side, scale } => {
+                let crop = crops.crop(step.seed, step.iteration, scale);
                 View::of(self.objective.transport().size(), crop, side)
             }
         }

@@ -125,7 +125,10 @@ fn a_sun_and_a_sky_are_recovered_from_a_picture_and_a_neutral_start() {
 #[test]
 fn random_crops_lead_to_the_same_sun() {
     let mut case = Case::new(300);
-    case.framing = Framing::Crops { side: 12 };
+    case.framing = Framing::Crops {
+        side: 12,
+        scale: crate::crop::USUAL_SCALE,
+    };
     let outcome = case.run().unwrap();
     let angle = degrees_between(outcome.lighting.peak_direction().unwrap(), SUN);
     assert!(angle < 5.0, "{angle} degrees off");
@@ -427,7 +430,10 @@ impl Recorder for Again {
 #[test]
 fn killed_at_any_iteration_and_started_again_the_result_is_the_same_bytes() {
     let mut case = Case::new(130);
-    case.framing = Framing::Crops { side: 8 };
+    case.framing = Framing::Crops {
+        side: 8,
+        scale: crate::crop::USUAL_SCALE,
+    };
     case.scene.efficiency = 0.05;
     case.settings.checkpoint_every = 17;
     let again = || Again {

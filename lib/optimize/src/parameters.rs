@@ -6,7 +6,7 @@ use dipir_imaging::tone::{TONE_PARAMETERS, ToneParameters};
 use dipir_light::gaussian::{LobeGradient, LobeParameters, SphericalGaussian};
 use dipir_light::luminance::luminance_f64;
 use dipir_numerics::sum::Neumaier;
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 
 use crate::tensors::{Group, Tensor, Tensors};
 
@@ -48,12 +48,25 @@ impl Bounds {
     pub fn for_map(height: usize) -> Self {
         let narrowest = 0.25 * PI / height as f64;
         Self {
-            log_radiance: (1e-6f64.ln(), 1e6f64.ln()),
+            log_radiance: (LEAST_RADIANCE.ln(), 1e6f64.ln()),
             log_sigma: (narrowest.ln(), 10f64.ln()),
             tone: 8.0,
         }
     }
+
+    /// The same without bounds on lobes, for a light that is not to change.
+    pub fn of_tone_alone(self) -> Self {
+        let any = (f64::NEG_INFINITY, f64::INFINITY);
+        Self {
+            log_radiance: any,
+            log_sigma: any,
+            ..self
+        }
+    }
 }
+
+/// Radiance that no display shows.
+const LEAST_RADIANCE: f64 = 1e-6;
 
 /// Share of the neutral light's radiance that comes from everywhere alike; the candidates for a
 /// sun hold the rest.
@@ -74,6 +87,59 @@ impl Parameters {
     /// default of 32 lobes they are 26 degrees apart.
     pub fn neutral(lobes: usize, radiance: f64) -> Self {
         let set = neutral_lobes(lobes.max(1), radiance);
+        Self {
+            foreground: set.clone(),
+            shadow: set,
+            tone: ToneParameters::default(),
+            log_exposure: 0.0,
+        }
+    }
+
+    /// A start for a light of which something is known: sky and ground of these radiances with
+    /// candidates as in [`neutral`](Self::neutral), and `sun` beside them; the object's tone is
+    /// [`ToneParameters::camera`], since the radiance is meant on the photograph's scale.
+    pub fn from_light(
+        lobes: usize,
+        sky: DVec3,
+        ground: DVec3,
+        sun: Option<&SphericalGaussian>,
+    ) -> Self {
+        let mut set = neutral_lobes(lobes.max(2) - usize::from(sun.is_some()), 1.0);
+        let common = sky.min(ground);
+        let ambient = if set.len() > 2 { AMBIENT_SHARE } else { 1.0 };
+        for lobe in &mut set {
+            let factor = if lobe.log_sigma == AMBIENT_SIGMA.ln() {
+                common
+            } else {
+                let all = if lobe.direction == DVec3::NEG_Y {
+                    ground
+                } else {
+                    sky
+                };
+                (all - common * ambient) / (1.0 - ambient).max(0.1)
+            };
+            lobe.log_radiance += factor.max(DVec3::splat(1e-4)).map(f64::ln);
+        }
+        set.extend(sun.map(LobeParameters::of));
+        Self {
+            foreground: set.clone(),
+            shadow: set,
+            tone: ToneParameters::camera(),
+            log_exposure: 0.0,
+        }
+    }
+
+    /// A light that is known or guessed, for both sets, and no change of tone. Light below 1e-6,
+    /// which no display shows, becomes that: the logarithm of none would never come back.
+    pub fn of_lobes(lobes: &[SphericalGaussian]) -> Self {
+        let lobe = |lobe: &SphericalGaussian| {
+            let least = LEAST_RADIANCE as f32;
+            LobeParameters::of(&SphericalGaussian {
+                radiance: lobe.radiance.max(Vec3::splat(least)),
+                ..*lobe
+            })
+        };
+        let set: Vec<_> = lobes.iter().map(lobe).collect();
         Self {
             foreground: set.clone(),
             shadow: set,
@@ -263,7 +329,7 @@ fn solid_angle(sigma: f64) -> f64 {
 }
 
 fn neutral_lobes(count: usize, radiance: f64) -> Vec<LobeParameters> {
-    let log = |c: f64| DVec3::splat(c.max(1e-6).ln());
+    let log = |c: f64| DVec3::splat(c.max(LEAST_RADIANCE).ln());
     let candidates = count.saturating_sub(2);
     let ambient = if candidates == 0 { 1.0 } else { AMBIENT_SHARE };
     let mut lobes = vec![LobeParameters {
@@ -336,6 +402,35 @@ mod tests {
                 assert!(lean.abs().max_element() < 0.03, "{lean}");
             }
         }
+    }
+
+    #[test]
+    fn a_known_light_comes_back_as_it_is_and_no_light_as_next_to_none() {
+        let lobe = |direction, radiance, sigma| SphericalGaussian {
+            direction,
+            radiance,
+            sigma,
+        };
+        let light = [
+            lobe(Vec3::X, Vec3::new(1e5, 20.0, 0.3), 0.0033),
+            lobe(Vec3::new(0.0, 0.6, -0.8), Vec3::ZERO, 0.5),
+        ];
+        let mut p = Parameters::of_lobes(&light);
+        // A light that is not to change is not moved to where the optimiser would keep it.
+        p.retract(&Bounds::for_map(64).of_tone_alone());
+        for lobes in [p.foreground_lobes(), p.shadow_lobes()] {
+            assert_eq!(lobes.len(), 2);
+            assert!(
+                (lobes[0].radiance / light[0].radiance - 1.0)
+                    .abs()
+                    .max_element()
+                    < 1e-6
+            );
+            assert!((lobes[0].sigma / 0.0033 - 1.0).abs() < 1e-6);
+            assert!(lobes[1].direction.distance(light[1].direction) < 1e-6);
+            assert!((lobes[1].radiance.x / 1e-6 - 1.0).abs() < 1e-5);
+        }
+        assert_eq!(p.to_tensors().first_not_finite(), None);
     }
 
     #[test]

@@ -23,6 +23,43 @@ pub enum GuidanceKind {
     Reference,
 }
 
+/// Where the optimisation starts: one of the words below, or a file.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "String", into = "String")]
+pub enum Start {
+    /// `"auto"`: `"read"` where the model can read light, else `"neutral"`.
+    #[default]
+    Auto,
+    /// `"read"`: what a model that knows light reads off the photograph.
+    Read,
+    /// `"neutral"`: nearly uniform light as bright as the photograph.
+    Neutral,
+    /// Anything else: a `lighting.json`.
+    File(PathBuf),
+}
+
+impl From<String> for Start {
+    fn from(text: String) -> Self {
+        match text.as_str() {
+            "auto" => Self::Auto,
+            "read" => Self::Read,
+            "neutral" => Self::Neutral,
+            _ => Self::File(text.into()),
+        }
+    }
+}
+
+impl From<Start> for String {
+    fn from(start: Start) -> Self {
+        match start {
+            Start::Auto => "auto".into(),
+            Start::Read => "read".into(),
+            Start::Neutral => "neutral".into(),
+            Start::File(path) => path.to_string_lossy().into_owned(),
+        }
+    }
+}
+
 /// The `[optimize]` table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -34,7 +71,23 @@ pub struct OptimizeTable {
     /// With `guidance = "reference"`: the picture that the composite should equal, EXR or HDR
     /// (linear), PNG or JPEG (as the photograph is encoded), of the photograph's size.
     pub reference: Option<PathBuf>,
-    /// Lobes of each light set; the quality's by default.
+    /// Where the optimisation starts, and what `light = false` keeps: `"auto"`, `"read"`,
+    /// `"neutral"`, or a `lighting.json`.
+    pub start: Start,
+    /// With a diffusion model: least and largest noise that it is asked at, as shares of its
+    /// timesteps. A second pair is reached linearly in the last iteration. The model's own by
+    /// default.
+    pub timesteps: Option<Vec<[f64; 2]>>,
+    /// With a diffusion model: what the picture should show. From class, word and light by
+    /// default.
+    pub prompt: Option<String>,
+    /// With a diffusion model: draws of noise for each iteration.
+    pub draws: Option<usize>,
+    /// With `guidance = "sds"`: scale of classifier-free guidance.
+    pub guidance_scale: Option<f64>,
+    /// Whether the LoRA adapts the model that guides; it does by default.
+    pub adapt: Option<bool>,
+    /// Lobes of each light set, where `start` does not say; the quality's by default.
     pub lobes: Option<usize>,
     /// Longest side, in pixels, of the picture that is optimised: the photograph is scaled down to
     /// it, never up. The quality's by default.
@@ -101,6 +154,19 @@ impl Default for LearningRates {
             sigma: 0.02,
             tone: 0.003,
             exposure: 0.02,
+        }
+    }
+}
+
+impl LearningRates {
+    /// All rates times `factor`.
+    pub fn scaled(&self, factor: f64) -> Self {
+        Self {
+            radiance: self.radiance * factor,
+            direction: self.direction * factor,
+            sigma: self.sigma * factor,
+            tone: self.tone * factor,
+            exposure: self.exposure * factor,
         }
     }
 }

@@ -45,6 +45,11 @@ pub struct UNetConfig {
     pub flip_sin_to_cos: bool,
     /// Offset of the frequency exponent.
     pub freq_shift: f64,
+    /// `"text"`: pooled text states join the timestep embedding.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub addition_embed_type: Option<String>,
+    /// Heads of that pooling.
+    pub addition_embed_type_num_heads: usize,
     /// Prediction of the whole input minus 0.5: never, in this family.
     pub center_input_sample: bool,
 }
@@ -77,6 +82,8 @@ impl Default for UNetConfig {
             downsample_padding: 1,
             flip_sin_to_cos: true,
             freq_shift: 0.0,
+            addition_embed_type: None,
+            addition_embed_type_num_heads: 64,
             center_input_sample: false,
         }
     }
@@ -109,7 +116,6 @@ impl UNetConfig {
         }
         for key in [
             "class_embed_type",
-            "addition_embed_type",
             "num_class_embeds",
             "encoder_hid_dim",
             "encoder_hid_dim_type",
@@ -123,6 +129,7 @@ impl UNetConfig {
         ] {
             file.require(key, &none)?;
         }
+        file.require("addition_embed_type", &[json!("text")])?;
         let config: Self = file.parse()?;
         config.check().map_err(|message| file.error(message))?;
         Ok(config)
@@ -215,6 +222,15 @@ impl UNetConfig {
             return Err(
                 "in_channels, out_channels and cross_attention_dim must be at least 1".into(),
             );
+        }
+        let heads = self.addition_embed_type_num_heads;
+        if self.addition_embed_type.is_some()
+            && (heads == 0 || !self.cross_attention_dim.is_multiple_of(heads))
+        {
+            let width = self.cross_attention_dim;
+            return Err(format!(
+                "cross_attention_dim = {width} is no multiple of addition_embed_type_num_heads = {heads}"
+            ));
         }
         if !self.block_out_channels[0].is_multiple_of(2) {
             return Err("block_out_channels[0] must be even: half sines, half cosines".into());

@@ -2,6 +2,7 @@
 //! variants and smaller models of the same layout.
 
 mod config;
+mod pooled_text;
 mod projection;
 mod timestep;
 mod transformer;
@@ -12,6 +13,7 @@ use std::sync::Arc;
 use candle_core::{Tensor, Var};
 
 pub use config::UNetConfig;
+use pooled_text::PooledText;
 use timestep::TimestepEmbedding;
 pub use timestep::sinusoids;
 use transformer::SpatialTransformer;
@@ -76,6 +78,7 @@ struct UpLevel {
 pub struct UNet {
     config: UNetConfig,
     time: TimestepEmbedding,
+    pooled_text: Option<PooledText>,
     conv_in: Conv2d,
     down: Vec<DownLevel>,
     middle: [Arc<Stage>; 2],
@@ -128,10 +131,16 @@ impl UNet {
         )?;
         let conv_out = Conv2d::new(&p.sub("conv_out"), (first, config.out_channels), 3, 1, same)?;
         let time = TimestepEmbedding::new(p, &config)?;
+        let pooled_text = config
+            .addition_embed_type
+            .is_some()
+            .then(|| PooledText::new(p, &config))
+            .transpose()?;
         let variables = parameters.finish(|_| false)?;
         Ok(Self {
             config,
             time,
+            pooled_text,
             conv_in,
             down,
             middle,
@@ -179,7 +188,22 @@ impl UNet {
         pass: &Pass,
     ) -> Result<Tensor> {
         let timesteps = self.check(sample, timesteps, context)?;
-        let time = self.time.forward(&timesteps, sample.dtype())?;
+        // Recomputed segments take the timestep vector as a constant, which
+        // it is not where text is part of it.
+        let whole = pass.inside_segment();
+        let pass = if self.pooled_text.is_some() {
+            &whole
+        } else {
+            pass
+        };
+        let text = self
+            .pooled_text
+            .as_ref()
+            .map(|pool| pool.forward(context))
+            .transpose()?;
+        let time = self
+            .time
+            .forward(&timesteps, sample.dtype(), text.as_ref())?;
         let mut x = self.conv_in.forward(sample)?;
         if pass.recompute.is_some() && !x.track_op() && !context.track_op() {
             // A segment is replayed only if one of its inputs asks for a gradient.

@@ -57,13 +57,22 @@ impl TimestepEmbedding {
         })
     }
 
-    pub(super) fn forward(&self, timesteps: &[f64], dtype: DType) -> Result<Tensor> {
+    /// One row for each timestep; `text` [timesteps, 4 size] joins it.
+    pub(super) fn forward(
+        &self,
+        timesteps: &[f64],
+        dtype: DType,
+        text: Option<&Tensor>,
+    ) -> Result<Tensor> {
         let device = self.linear_1.weight().device();
         let values = sinusoids(timesteps, self.size, self.flip, self.shift);
         let x = Tensor::from_vec(values, (timesteps.len(), self.size), device)?.to_dtype(dtype)?;
         let x = self
             .linear_2
             .forward(&activate(Activation::Silu, &self.linear_1.forward(&x)?)?)?;
-        activate(Activation::Silu, &x)
+        match text {
+            Some(text) => activate(Activation::Silu, &(x + text)?),
+            None => activate(Activation::Silu, &x),
+        }
     }
 }

@@ -1,0 +1,314 @@
+//! Guidance by a diffusion model: what it would change about the composite, as a gradient.
+use std::sync::Arc;
+
+use anyhow::Context;
+use candle_core::{DType, Tensor, Var};
+use dipir_cli::session::Session;
+use dipir_diffusion::distillation::{
+    Guidance as Kind, InpaintCondition, ScoreDistillation, Weighting,
+};
+use dipir_diffusion::lora::Lora;
+use dipir_diffusion::model::Model;
+use dipir_diffusion::noise::NoiseStream;
+use dipir_diffusion::text_encoder::LearnedTokens;
+use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_optimize::OptimizeError;
+use dipir_optimize::crop::{Framing, USUAL_SCALE, View};
+use dipir_optimize::guidance::{Guidance, Guided, Step};
+use dipir_optimize::settings::{GuidanceKind, OptimizeTable};
+use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::stage::StagePlan;
+use dipir_prior::energy::states;
+use dipir_prior::reader::Reading;
+use dipir_prior::words::Caption;
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+use crate::lora::{self, LoraTable};
+use crate::model;
+
+/// The mean square of a picture's gradient is of order 1 / pixels times this: beside the
+/// regularisers it weighs as much as a reference does.
+const STRENGTH: f64 = 100.0;
+/// Crops of a model that knows light, in sides of the object's box: as it was trained.
+const LIGHT_SCALE: [f32; 2] = [2.2, 3.0];
+
+/// What of `[optimize]` is about the model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DistillationSettings {
+    /// Which difference of predictions.
+    pub guidance: GuidanceKind,
+    /// Least and largest noise at the start and at the end.
+    pub timesteps: [[f64; 2]; 2],
+    /// Draws of noise for an iteration.
+    pub draws: usize,
+    /// Classifier-free guidance of SDS.
+    pub guidance_scale: f64,
+    /// What the picture should show; from class, word and light if not given.
+    pub prompt: Option<String>,
+    /// Whether a LoRA is used.
+    pub adapt: bool,
+}
+
+impl DistillationSettings {
+    /// What `table` says, else what is good for a model that knows light or does not.
+    pub fn new(
+        session: &Session,
+        table: &OptimizeTable,
+        knows_light: bool,
+    ) -> anyhow::Result<Self> {
+        let timesteps = match table.timesteps.as_deref() {
+            None if knows_light => [[0.5, 0.9]; 2],
+            // [DiPIR, section 4.3].
+            None => [[0.02, 0.6], [0.02, 0.3]],
+            Some([one]) => [*one; 2],
+            Some([first, last]) => [*first, *last],
+            Some(_) => {
+                let message = "accepted: one pair, or two of which the second is reached at the end, as in [[0.02, 0.6], [0.02, 0.3]]";
+                return Err(session.config.invalid("optimize.timesteps", message).into());
+            }
+        };
+        if timesteps
+            .iter()
+            .any(|[low, high]| !(0.0 <= *low && low <= high && *high <= 1.0))
+        {
+            let message = "accepted: pairs of a lower and a higher share, from 0 to 1";
+            return Err(session.config.invalid("optimize.timesteps", message).into());
+        }
+        let draws = table.draws.unwrap_or(if knows_light { 2 } else { 1 });
+        if !(1..=64).contains(&draws) {
+            let message = format!("{draws} is out of range; accepted: 1 to 64");
+            return Err(session.config.invalid("optimize.draws", message).into());
+        }
+        Ok(Self {
+            guidance: table.guidance,
+            timesteps,
+            draws,
+            guidance_scale: table.guidance_scale.unwrap_or(7.5),
+            prompt: table.prompt.clone(),
+            adapt: table.adapt.unwrap_or(true),
+        })
+    }
+}
+
+/// The LoRA stage's result.
+pub struct Adapter {
+    lora: Arc<Lora>,
+    learned: Option<LearnedTokens>,
+    word: String,
+}
+
+impl Adapter {
+    /// Enters what the LoRA stage wrote into the plan.
+    pub fn add_inputs(session: &Session, plan: &mut StagePlan) -> anyhow::Result<()> {
+        let folder = session.stage_folder(lora::STAGE);
+        let manifest = Manifest::read(&folder, lora::EXECUTABLE)?;
+        let mut roles = vec!["lora"];
+        if manifest.outputs.iter().any(|o| o.role == "word") {
+            roles.push("word");
+        }
+        Ok(plan.outputs_of(&manifest, &roles)?)
+    }
+
+    /// Reads what the LoRA stage wrote; gives its word, if it learned one, a token of its own.
+    pub fn load(session: &Session, model: &mut Model) -> anyhow::Result<Self> {
+        let table: LoraTable = session.config.table("lora")?;
+        let folder = session.stage_folder(lora::STAGE);
+        let manifest = Manifest::read(&folder, lora::EXECUTABLE)?;
+        let targets = model.unet.adapter_targets();
+        let path = manifest.output(&folder, "lora")?;
+        let lora = Lora::load(&path, &targets, model.dtype(), model.device())?;
+        let learned = match manifest.outputs.iter().any(|o| o.role == "word") {
+            true => {
+                let path = manifest.output(&folder, "word")?;
+                Some(lora::learned_word(model, &table.word, &path)?)
+            }
+            false => None,
+        };
+        Ok(Self {
+            lora: Arc::new(lora),
+            learned,
+            word: table.word,
+        })
+    }
+}
+
+/// Score distillation on crops of the composite.
+pub struct Distillation<'a> {
+    model: &'a Model,
+    settings: DistillationSettings,
+    lora: Option<Arc<Lora>>,
+    conditional: Tensor,
+    unconditional: Tensor,
+    background: Raster<Vec3>,
+    paint: Raster<Vec3>,
+    side: usize,
+    knows_light: bool,
+}
+
+impl<'a> Distillation<'a> {
+    /// Guides towards what `reading` and the class say; `background` is the photograph, `paint` 1
+    /// where an inpainting model may paint.
+    pub fn new(
+        model: &'a Model,
+        settings: DistillationSettings,
+        adapter: Option<&Adapter>,
+        class: &str,
+        reading: Option<&Reading>,
+        background: &DisplayImage,
+        paint: &Raster<f32>,
+    ) -> anyhow::Result<Self> {
+        let word = adapter.map(|a| a.word.as_str());
+        let learned = adapter.and_then(|a| a.learned.as_ref());
+        let (conditional, unconditional) = match (reading, &settings.prompt) {
+            (Some(reading), None) => {
+                let known = model.tokenizer.words(class)?.len() == 1;
+                let class = if known { class } else { "object" };
+                let caption = Caption::new(class, Some(&reading.light.words));
+                let both = states(model, &[Some(caption), None])?;
+                (both.narrow(0, 0, 1)?, both.narrow(0, 1, 1)?)
+            }
+            (_, prompt) => {
+                let own = match word {
+                    Some(word) => format!("a photo of a {class} in the style of {word} rendering"),
+                    None => format!("a photo of a {class}"),
+                };
+                let prompt = prompt.clone().unwrap_or(own);
+                (
+                    model.encode_prompts(&[&prompt], learned)?,
+                    model.encode_prompts(&[""], None)?,
+                )
+            }
+        };
+        Ok(Self {
+            model,
+            lora: adapter.map(|a| a.lora.clone()),
+            conditional: conditional.detach(),
+            unconditional: unconditional.detach(),
+            background: background.0.clone(),
+            paint: paint.map(|&a| Vec3::splat(a)),
+            side: model::native_size(model),
+            knows_light: reading.is_some(),
+            settings,
+        })
+    }
+
+    /// Planes [1, 3, side, side] in [-1, 1].
+    fn tensor(&self, picture: &Raster<Vec3>) -> anyhow::Result<Tensor> {
+        let image = model::from_display(&DisplayImage(picture.clone()))?;
+        let image = image.unsqueeze(0)?.to_device(self.model.device())?;
+        Ok(image.to_dtype(self.model.dtype())?)
+    }
+
+    fn condition(&self, view: &View) -> anyhow::Result<Option<InpaintCondition>> {
+        if !self.model.is_inpainting() {
+            return Ok(None);
+        }
+        let shown = self.tensor(&view.apply(&self.background))?;
+        let side = self.side;
+        let mask: Vec<f32> = view
+            .apply(&self.paint)
+            .pixels()
+            .iter()
+            .map(|p| f32::from(p.x > 0.02))
+            .collect();
+        let mask = Tensor::from_vec(mask, (1, 1, side, side), self.model.device())?;
+        let mask = mask.to_dtype(self.model.dtype())?;
+        Ok(Some(InpaintCondition::new(&self.model.vae, &shown, &mask)?))
+    }
+
+    fn judge(&self, picture: &Raster<Vec3>, view: &View, step: Step) -> anyhow::Result<Guided> {
+        let image = Var::from_tensor(&self.tensor(picture)?)?;
+        let latents = self.model.vae.encode(&image, None)?;
+        let condition = self.condition(view)?;
+        let guidance = match self.settings.guidance {
+            GuidanceKind::Sds => Kind::Sds {
+                scale: self.settings.guidance_scale,
+            },
+            GuidanceKind::Csd => Kind::Csd,
+            _ => Kind::Lds,
+        };
+        let distillation = ScoreDistillation {
+            unet: &self.model.unet,
+            schedule: &self.model.schedule,
+            guidance,
+            weighting: Weighting::NoiseVariance,
+            lora: self.lora.as_ref(),
+            conditional: &self.conditional,
+            unconditional: &self.unconditional,
+            inpaint: condition.as_ref(),
+        };
+        let mut stream = NoiseStream::new(step.seed ^ 0xd15711, step.iteration as u64);
+        let share = step.iteration as f64 / (step.iterations.max(2) - 1) as f64;
+        let [first, last] = self.settings.timesteps;
+        let bound = |k: usize| first[k] + (last[k] - first[k]) * share;
+        let (low, high) = (bound(0), bound(1));
+        let draws = self.settings.draws;
+        let mut sum: Option<Tensor> = None;
+        let (mut size, mut mean_t) = (0.0, 0.0);
+        for draw in 0..draws {
+            // Stratified over the draws.
+            let u = (draw as f64 + stream.uniform()) / draws as f64;
+            let at = low + (high - low) * u;
+            let t = self.model.schedule.timestep_at(at);
+            let noise = stream
+                .normal_tensor(latents.dims(), DType::F32, self.model.device())?
+                .to_dtype(self.model.dtype())?;
+            let found = distillation.gradient(&latents, t, &noise)?;
+            size += found.difference / draws as f64;
+            mean_t += at / draws as f64;
+            sum = Some(match sum {
+                None => found.gradient,
+                Some(sum) => (sum + found.gradient)?,
+            });
+        }
+        let sum = sum.context("no draw of noise")?.detach();
+        let scale = STRENGTH / (draws * latents.elem_count()) as f64;
+        // The gradient is injected at the latents and carried back to the picture.
+        let injected = (&latents * &sum)?.sum_all()?;
+        let gradients = injected.backward()?;
+        let at_image = gradients
+            .get(&image)
+            .context("the autoencoder cuts the graph")?;
+        let at_image = (at_image.to_dtype(DType::F32)? * (2.0 * scale))?;
+        let values = at_image
+            .to_device(&candle_core::Device::Cpu)?
+            .flatten_all()?
+            .to_vec1::<f32>()?;
+        let n = self.side * self.side;
+        let pixels = (0..n)
+            .map(|i| Vec3::new(values[i], values[n + i], values[2 * n + i]))
+            .collect();
+        Ok(Guided {
+            loss: size,
+            gradient: Raster::from_pixels(self.side, self.side, pixels),
+            timestep: Some(mean_t),
+        })
+    }
+}
+
+impl Guidance for Distillation<'_> {
+    fn framing(&self) -> Framing {
+        Framing::Crops {
+            side: self.side,
+            scale: if self.knows_light {
+                LIGHT_SCALE
+            } else {
+                USUAL_SCALE
+            },
+        }
+    }
+
+    fn gradient(
+        &mut self,
+        picture: &Raster<Vec3>,
+        view: &View,
+        step: Step,
+    ) -> Result<Guided, OptimizeError> {
+        self.judge(picture, view, step)
+            .map_err(|e| OptimizeError::Guidance {
+                iteration: step.iteration,
+                source: e.into(),
+            })
+    }
+}

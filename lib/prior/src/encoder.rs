@@ -1,0 +1,239 @@
+//! A small network that reads the light off a photograph: a start for
+//! guidance, and a prior for inversion.
+
+use std::collections::BTreeMap;
+use std::ops::ControlFlow;
+use std::path::Path;
+
+use candle_core::{DType, Device, Tensor, Var};
+use dipir_diffusion::layers::{Conv2d, GroupNorm, Linear, NormActivation, Padding};
+use dipir_diffusion::noise::NoiseStream;
+use dipir_diffusion::optimizer::{AdamW, AdamWConfig};
+use dipir_diffusion::parameters::Parameters;
+use dipir_diffusion::weights::{Weights, write_safetensors};
+use serde::{Deserialize, Serialize};
+
+use crate::dataset::Dataset;
+use crate::error::{Error, Result};
+use crate::examples::{Lens, SIZE, Tone, Window};
+use crate::lights::Light;
+use crate::record::Layer;
+use crate::words::LightWords;
+
+/// File of the encoder in a model folder.
+pub const FILE: &str = "light_encoder.safetensors";
+/// Numbers that it tells.
+const OUTPUTS: usize = 7;
+const CHANNELS: [usize; 4] = [3, 32, 64, 96];
+
+/// What a photograph says about its light.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct LightEstimate {
+    /// Azimuth, elevation and share of the sun.
+    pub words: LightWords,
+    /// How sure it is of the azimuth, 0 to about 1.
+    pub confidence: f32,
+    /// Irradiance of open ground on the photograph's linear scale.
+    pub irradiance: f32,
+    /// Log of red over blue of the sun's light.
+    pub warmth: f32,
+    /// Log of red over blue of the sky's light.
+    pub sky_warmth: f32,
+}
+
+/// The network.
+#[derive(Debug)]
+pub struct LightEncoder {
+    convolutions: Vec<Conv2d>,
+    norms: Vec<GroupNorm>,
+    hidden: Linear,
+    out: Linear,
+    variables: BTreeMap<String, Var>,
+}
+
+impl LightEncoder {
+    fn new(parameters: Parameters) -> Result<Self> {
+        let mut convolutions = vec![];
+        let mut norms = vec![];
+        for (i, pair) in CHANNELS.windows(2).enumerate() {
+            let p = parameters.sub(format!("levels.{i}"));
+            convolutions.push(Conv2d::new(
+                &p.sub("conv"),
+                (pair[0], pair[1]),
+                3,
+                2,
+                Padding::Same(1),
+            )?);
+            norms.push(GroupNorm::new(
+                &p.sub("norm"),
+                8,
+                pair[1],
+                1e-5,
+                NormActivation::Silu,
+            )?);
+        }
+        let side = SIZE >> (CHANNELS.len() - 1);
+        let flat = CHANNELS[CHANNELS.len() - 1] * side * side;
+        let hidden = Linear::new(&parameters.sub("hidden"), flat, 128)?;
+        let out = Linear::new(&parameters.sub("out"), 128, OUTPUTS)?;
+        Ok(Self {
+            convolutions,
+            norms,
+            hidden,
+            out,
+            variables: parameters.finish(|_| false)?,
+        })
+    }
+
+    /// Reads [`FILE`] of a model folder; `None` if it has none.
+    pub fn load(folder: &Path) -> Result<Option<Self>> {
+        let path = folder.join(FILE);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let weights = Weights::open_file(&path)?;
+        let parameters = Parameters::from_weights(weights, DType::F32, &Device::Cpu, false);
+        Self::new(parameters).map(Some)
+    }
+
+    /// Outputs [batch, OUTPUTS] for pictures [batch, 3, SIZE, SIZE] in [-1, 1].
+    fn forward(&self, pictures: &Tensor) -> Result<Tensor> {
+        let mut x = pictures.clone();
+        for (conv, norm) in self.convolutions.iter().zip(&self.norms) {
+            x = norm.forward(&conv.forward(&x)?)?;
+        }
+        let h = self.hidden.forward(&x.flatten_from(1)?)?;
+        Ok(self.out.forward(&h.silu()?)?)
+    }
+
+    /// Reads the light off pictures [3, SIZE, SIZE] in [0, 1] of one place,
+    /// each and its mirror image, and averages. Azimuths are relative to the
+    /// camera.
+    pub fn estimate(&self, pictures: &[Vec<f32>]) -> Result<LightEstimate> {
+        if pictures.is_empty() {
+            return Err(Error::Argument("the light encoder needs a picture".into()));
+        }
+        let mut sum = [0f32; OUTPUTS];
+        for mirrored in [false, true] {
+            let values = pictures.iter().flat_map(|p| {
+                p.chunks_exact(SIZE).flat_map(move |row| {
+                    (0..SIZE).map(move |x| row[if mirrored { SIZE - 1 - x } else { x }])
+                })
+            });
+            let shape = (pictures.len(), 3, SIZE, SIZE);
+            let x = Tensor::from_vec(values.collect::<Vec<f32>>(), shape, &Device::Cpu)?;
+            for row in self.forward(&x.affine(2.0, -1.0)?)?.to_vec2::<f32>()? {
+                for (i, (sum, v)) in sum.iter_mut().zip(row).enumerate() {
+                    // The mirror swaps left and right.
+                    *sum += if mirrored && i == 1 { -v } else { v };
+                }
+            }
+        }
+        let mean = sum.map(|v| v / (2 * pictures.len()) as f32);
+        Ok(LightEstimate {
+            words: LightWords {
+                azimuth: mean[1].atan2(mean[0]),
+                elevation: (mean[2] + 0.75).clamp(0.15, 1.4),
+                sun_share: (mean[3] + 0.6).clamp(0.0, 0.97),
+            },
+            confidence: mean[0].hypot(mean[1]),
+            irradiance: mean[4].exp(),
+            warmth: mean[5],
+            sky_warmth: mean[6],
+        })
+    }
+}
+
+/// What the network should say about a light.
+fn target(light: &Light, words: &LightWords, exposure: f32) -> [f32; OUTPUTS] {
+    let seen = if words.is_overcast() { 0.0 } else { 1.0 };
+    let (s, c) = words.azimuth.sin_cos();
+    let sky = (light.horizon + 2.0 * light.zenith) * (std::f32::consts::PI / 3.0);
+    let ground = light.sun_color * words.elevation.sin() + sky;
+    let ratio = |v: glam::Vec3| (v.x.max(1e-4) / v.z.max(1e-4)).ln();
+    [
+        c * seen,
+        s * seen,
+        words.elevation - 0.75,
+        light.share - 0.6,
+        (ground.element_sum() / 3.0 * exposure).ln(),
+        ratio(light.sun_color) * seen,
+        ratio(sky),
+    ]
+}
+
+/// A batch of places without the inserted object, and their lights.
+fn batch(
+    data: &Dataset,
+    count: usize,
+    stream: &mut NoiseStream,
+) -> Result<(Tensor, Tensor, Tensor)> {
+    let (mut pictures, mut targets): (Vec<f32>, Vec<f32>) = (vec![], vec![]);
+    let mut weights: Vec<f32> = vec![];
+    for _ in 0..count {
+        let window = Window::draw(stream);
+        let lens = Lens::new(data.scene(stream.below(data.len())), window);
+        let light = Light::draw(lens.suns(), stream);
+        // The whole picture has one more object in it.
+        let layer = if stream.below(2) == 0 {
+            Layer::Background
+        } else {
+            Layer::Whole
+        };
+        let tone = Tone::draw(stream);
+        let mut picture = lens.layer(layer, &light);
+        tone.apply(&mut picture);
+        let words = window.words(light.words(lens.suns()));
+        pictures.extend(picture.iter().map(|v| 2.0 * v - 1.0));
+        targets.extend(target(&light, &words, tone.exposure));
+        let seen = if words.is_overcast() { 0.0 } else { 1.0 };
+        weights.extend([1.0, 1.0, 2.0 * seen, 2.0, 1.0, 0.3 * seen, 0.3]);
+    }
+    Ok((
+        Tensor::from_vec(pictures, (count, 3, SIZE, SIZE), &Device::Cpu)?,
+        Tensor::from_vec(targets, (count, OUTPUTS), &Device::Cpu)?,
+        Tensor::from_vec(weights, (count, OUTPUTS), &Device::Cpu)?,
+    ))
+}
+
+/// Trains an encoder on `samples` pictures and writes [`FILE`] into `folder`
+/// in f16. `report` is told samples and loss and may stop; whether it
+/// was finished is returned.
+pub fn train(
+    data: &Dataset,
+    samples: usize,
+    seed: u64,
+    folder: &Path,
+    report: &mut dyn FnMut(usize, f64) -> ControlFlow<()>,
+) -> Result<bool> {
+    const BATCH: usize = 64;
+    let encoder = LightEncoder::new(Parameters::random(seed, &Device::Cpu))?;
+    let config = AdamWConfig {
+        weight_decay: 0.02,
+        ..AdamWConfig::default()
+    };
+    let mut optimizer = AdamW::new(&encoder.variables, config)?;
+    let steps = samples.div_ceil(BATCH);
+    for step in 0..steps {
+        let mut stream = NoiseStream::new(seed ^ 0xec0de, step as u64);
+        let (pictures, targets, weights) = batch(data, BATCH, &mut stream)?;
+        let error = ((encoder.forward(&pictures)? - targets)?.sqr()? * weights)?;
+        let loss = error.mean_all()?;
+        let gradients = optimizer.collect(&loss.backward()?)?;
+        let done = step as f64 / steps as f64;
+        let rate = 1.5e-3 * ((step + 1) as f64 / 100.0).min(1.0);
+        let rate = rate * 0.5 * (1.0 + (std::f64::consts::PI * done).cos());
+        optimizer.step(&gradients, 1.0, |_| rate)?;
+        let loss = loss.to_scalar::<f32>()? as f64;
+        if report((step + 1) * BATCH, loss).is_break() {
+            return Ok(false);
+        }
+    }
+    let tensors = encoder
+        .variables
+        .iter()
+        .map(|(n, v)| Ok((n.clone(), v.to_dtype(DType::F16)?)))
+        .collect::<Result<BTreeMap<_, _>>>()?;
+    write_safetensors(&folder.join(FILE), &tensors, &BTreeMap::new())?;
+    Ok(true)
+}

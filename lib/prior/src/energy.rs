@@ -1,0 +1,134 @@
+//! How well the model explains a picture under a caption: its denoising
+//! error at high noise, with the same noise for every caption.
+
+use candle_core::{DType, Device, Tensor};
+use dipir_diffusion::model::Model;
+use dipir_diffusion::noise::NoiseStream;
+use dipir_diffusion::pass::Pass;
+use dipir_diffusion::vae::pixel_unshuffle;
+
+use crate::blueprint::FACTOR;
+use crate::error::Result;
+use crate::examples::{SIZE, dilate};
+use crate::student::{Spoken, condition_of, latents_of};
+use crate::words::Caption;
+
+/// Timesteps, as shares of all, at which light is recognised.
+pub const SHARES: [f64; 4] = [0.5, 0.6, 0.7, 0.8];
+
+/// A picture of an object and what surrounds it.
+#[derive(Debug, Clone)]
+pub struct Observation {
+    /// Scaled latents [1, c, h, w].
+    pub latents: Tensor,
+    /// Mask and masked latents [1, 1 + c, h, w].
+    pub condition: Tensor,
+    /// Weights of latent values, [1, c, h, w], that sum to 1.
+    pub weights: Tensor,
+}
+
+impl Observation {
+    /// Of `image` and what is `shown` around `mask`: pictures [3, SIZE, SIZE]
+    /// in [0, 1]. The error counts near `focus`, [SIZE, SIZE], at most.
+    pub fn new(image: &[f32], shown: &[f32], mask: &[f32], focus: &[f32]) -> Result<Self> {
+        let weight: Vec<f32> = dilate(focus, 5).iter().map(|m| 0.15 + m).collect();
+        let weight = Tensor::from_vec(weight, (1, 1, SIZE, SIZE), &Device::Cpu)?;
+        let weight = pixel_unshuffle(&weight, FACTOR)?;
+        let weights = Tensor::cat(&[&weight, &weight, &weight], 1)?;
+        let total = weights.sum_all()?.to_scalar::<f32>()? as f64;
+        Ok(Self {
+            latents: latents_of(image.to_vec())?,
+            condition: condition_of(shown.to_vec(), &[mask.to_vec()])?,
+            weights: (weights / total)?,
+        })
+    }
+}
+
+/// States of captions under `model`, [captions, tokens, width].
+pub fn states(model: &Model, captions: &[Option<Caption>]) -> Result<Tensor> {
+    Spoken::new(&model.tokenizer, captions)?.states(&model.text_encoder)
+}
+
+/// Noise predictions [contexts, c, h, w] for one noisy latent under many
+/// contexts.
+fn predictions(
+    model: &Model,
+    observation: &Observation,
+    noisy: &Tensor,
+    t: usize,
+    contexts: &Tensor,
+) -> Result<Tensor> {
+    let count = contexts.dims()[0];
+    let input = Tensor::cat(&[noisy, &observation.condition], 1)?;
+    let (_, c, h, w) = input.dims4()?;
+    let input = input.broadcast_as((count, c, h, w))?.contiguous()?;
+    Ok(model
+        .unet
+        .forward(&input, &[t as f64], contexts, &Pass::default())?)
+}
+
+/// Mean squared error of the noise under each context, averaged over
+/// `shares` of the timesteps and `draws` of noise.
+pub fn energies(
+    model: &Model,
+    observation: &Observation,
+    contexts: &Tensor,
+    shares: &[f64],
+    draws: usize,
+    stream: &mut NoiseStream,
+) -> Result<Vec<f64>> {
+    let mut sums = vec![0f64; contexts.dims()[0]];
+    for &share in shares {
+        let t = model.schedule.timestep_at(share);
+        for _ in 0..draws {
+            let noise =
+                stream.normal_tensor(observation.latents.dims(), DType::F32, &Device::Cpu)?;
+            let noisy = model.schedule.add_noise(&observation.latents, &noise, t)?;
+            let output = predictions(model, observation, &noisy, t, contexts)?;
+            let predicted = model.schedule.noise_of(
+                &output,
+                &noisy.broadcast_as(output.shape())?.contiguous()?,
+                t,
+            )?;
+            let error = predicted.broadcast_sub(&noise)?.sqr()?;
+            let error = error.broadcast_mul(&observation.weights)?;
+            let each = error.flatten_from(1)?.sum(1)?.to_vec1::<f32>()?;
+            let share = 1.0 / (shares.len() * draws) as f64;
+            sums.iter_mut()
+                .zip(each)
+                .for_each(|(s, e)| *s += e as f64 * share);
+        }
+    }
+    Ok(sums)
+}
+
+/// Mean over `draws` of the difference of the noise predictions under the
+/// first and the second context: what LDS would change, [1, c, h, w].
+pub fn difference(
+    model: &Model,
+    observation: &Observation,
+    contexts: &Tensor,
+    shares: &[f64],
+    draws: usize,
+    stream: &mut NoiseStream,
+) -> Result<Tensor> {
+    let mut sum = observation.latents.zeros_like()?;
+    let weight = 1.0 / (shares.len() * draws) as f64;
+    for &share in shares {
+        let t = model.schedule.timestep_at(share);
+        for _ in 0..draws {
+            let noise =
+                stream.normal_tensor(observation.latents.dims(), DType::F32, &Device::Cpu)?;
+            let noisy = model.schedule.add_noise(&observation.latents, &noise, t)?;
+            let output = predictions(model, observation, &noisy, t, contexts)?;
+            let predicted = model.schedule.noise_of(
+                &output,
+                &noisy.broadcast_as(output.shape())?.contiguous()?,
+                t,
+            )?;
+            let difference = (predicted.narrow(0, 0, 1)? - predicted.narrow(0, 1, 1)?)?;
+            sum = (sum + (difference * weight)?)?;
+        }
+    }
+    Ok(sum)
+}

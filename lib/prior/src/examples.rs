@@ -1,0 +1,332 @@
+//! Training examples: a recorded scene under a drawn light, cropped, with
+//! what the model is shown of it.
+
+use std::f32::consts::PI;
+
+use dipir_diffusion::noise::NoiseStream;
+use glam::Vec3;
+use half::f16;
+
+use crate::dataset::{RECORD_SIZE, SceneView};
+use crate::lights::{Light, Sun};
+use crate::record::{BASIS, Layer, PLANES, SHADOW, first_plane, shadow_weights, weights};
+use crate::studio::SUNS;
+use crate::words::{Caption, LightWords};
+
+/// Pixels on a side of an example.
+pub const SIZE: usize = 32;
+const PIXELS: usize = SIZE * SIZE;
+
+/// A picture [3, SIZE, SIZE], linear or in [0, 1].
+pub type Picture = Vec<f32>;
+
+/// A crop of a record, perhaps mirrored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Window {
+    /// First column in the record.
+    pub x: usize,
+    /// First row.
+    pub y: usize,
+    /// Left and right swapped.
+    pub mirrored: bool,
+}
+
+impl Window {
+    /// The middle of the record.
+    pub const MIDDLE: Self = Self {
+        x: (RECORD_SIZE - SIZE) / 2,
+        y: (RECORD_SIZE - SIZE) / 2,
+        mirrored: false,
+    };
+
+    /// Anywhere.
+    pub fn draw(stream: &mut NoiseStream) -> Self {
+        Self {
+            x: stream.below(RECORD_SIZE - SIZE + 1),
+            y: stream.below(RECORD_SIZE - SIZE + 1),
+            mirrored: stream.below(2) == 1,
+        }
+    }
+
+    /// What the mirror makes of a light.
+    pub fn words(&self, words: LightWords) -> LightWords {
+        LightWords {
+            azimuth: if self.mirrored {
+                -words.azimuth
+            } else {
+                words.azimuth
+            },
+            ..words
+        }
+    }
+}
+
+/// A scene seen through a window.
+#[derive(Debug, Clone)]
+pub struct Lens<'a> {
+    scene: SceneView<'a>,
+    window: Window,
+}
+
+impl<'a> Lens<'a> {
+    /// `scene` through `window`.
+    pub fn new(scene: SceneView<'a>, window: Window) -> Self {
+        Self { scene, window }
+    }
+
+    /// The scene's suns.
+    pub fn suns(&self) -> &[Sun] {
+        &self.scene.suns
+    }
+
+    fn row(&self, plane: usize, row: usize) -> &[f16] {
+        let start = (plane * RECORD_SIZE + self.window.y + row) * RECORD_SIZE + self.window.x;
+        &self.scene.planes[start..start + SIZE]
+    }
+
+    /// Adds `weight` times a plane to `out`.
+    fn add(&self, plane: usize, weight: f32, out: &mut [f32]) {
+        if weight == 0.0 {
+            return;
+        }
+        for (row, out) in out.chunks_exact_mut(SIZE).enumerate() {
+            let values = self.row(plane, row);
+            if self.window.mirrored {
+                let values = values.iter().rev();
+                out.iter_mut()
+                    .zip(values)
+                    .for_each(|(o, v)| *o += weight * v.to_f32());
+            } else {
+                out.iter_mut()
+                    .zip(values)
+                    .for_each(|(o, v)| *o += weight * v.to_f32());
+            }
+        }
+    }
+
+    /// Linear picture of a layer under `light`.
+    pub fn layer(&self, layer: Layer, light: &Light) -> Picture {
+        let mut out = vec![0.0; 3 * PIXELS];
+        for (b, weight) in weights(light).iter().enumerate().take(BASIS) {
+            for c in 0..3 {
+                let plane = first_plane(layer) + b * 3 + c;
+                self.add(plane, weight[c], &mut out[c * PIXELS..][..PIXELS]);
+            }
+        }
+        out
+    }
+
+    /// What of the ground's light the object leaves, [3, SIZE, SIZE].
+    pub fn shadow(&self, light: &Light) -> Picture {
+        let mut out = vec![0.0; 3 * PIXELS];
+        let weights: [Vec3; SHADOW] = shadow_weights(light, &self.scene.suns);
+        for (b, weight) in weights.iter().enumerate() {
+            for c in 0..3 {
+                self.add(9 * BASIS + b, weight[c], &mut out[c * PIXELS..][..PIXELS]);
+            }
+        }
+        out
+    }
+
+    /// Coverage of the main object, [SIZE, SIZE].
+    pub fn coverage(&self) -> Vec<f32> {
+        let mut out = vec![0.0; PIXELS];
+        self.add(PLANES - 1, 1.0, &mut out);
+        out
+    }
+
+    /// The main object under `light` in the place under `place`, linear.
+    pub fn composite(&self, place: &Light, light: &Light) -> Picture {
+        let mut out = self.layer(Layer::Background, place);
+        let object = self.layer(Layer::Object, light);
+        let (shadow, coverage) = (self.shadow(light), self.coverage());
+        for (i, value) in out.iter_mut().enumerate() {
+            *value = *value * shadow[i] * (1.0 - coverage[i % PIXELS]) + object[i];
+        }
+        out
+    }
+}
+
+/// From linear light to a picture in [0, 1].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tone {
+    /// Factor on linear light.
+    pub exposure: f32,
+    /// 0: clipped at white; 1: rolled off as 1 - exp(-x).
+    pub shoulder: f32,
+}
+
+impl Tone {
+    /// A camera's choice.
+    pub fn draw(stream: &mut NoiseStream) -> Self {
+        Self {
+            exposure: (0.35 * (2.0 * stream.uniform() - 1.0)).exp() as f32,
+            shoulder: stream.uniform() as f32,
+        }
+    }
+
+    /// Encodes a linear picture for display (sRGB).
+    pub fn apply(&self, linear: &mut [f32]) {
+        for v in linear {
+            let x = (*v * self.exposure).max(0.0);
+            let soft = 1.0 - (-x).exp();
+            let x = x.min(1.0) + (soft - x.min(1.0)) * self.shoulder;
+            *v = if x <= 0.003_130_8 {
+                12.92 * x
+            } else {
+                1.055 * x.powf(1.0 / 2.4) - 0.055
+            };
+        }
+    }
+}
+
+/// What the model sees of one example, and what it should make of it.
+#[derive(Debug, Clone)]
+pub struct Example {
+    /// The picture in [0, 1].
+    pub image: Picture,
+    /// What is shown around the mask, in [0, 1].
+    pub shown: Picture,
+    /// 1 where the model may paint, [SIZE, SIZE].
+    pub mask: Vec<f32>,
+    /// Weight of each pixel in the loss, [SIZE, SIZE].
+    pub weight: Vec<f32>,
+    /// What is said.
+    pub caption: Option<Caption>,
+}
+
+/// Shares of what examples show; each is one ingredient of the recipe.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Recipe {
+    /// Captions that name the light.
+    pub light_words: f64,
+    /// Examples that show the place around the object.
+    pub background: f64,
+    /// Composites under a light other than the place's, with their own
+    /// light in the caption.
+    pub foreign_light: f64,
+}
+
+impl Default for Recipe {
+    fn default() -> Self {
+        Self {
+            light_words: 0.85,
+            background: 0.85,
+            foreign_light: 0.5,
+        }
+    }
+}
+
+/// The largest value within `radius` pixels (a square).
+pub fn dilate(mask: &[f32], radius: usize) -> Vec<f32> {
+    let pass = |input: &[f32], stride: usize, other: usize| -> Vec<f32> {
+        let mut out = vec![0f32; PIXELS];
+        for line in 0..SIZE {
+            for i in 0..SIZE {
+                let low = i.saturating_sub(radius);
+                let high = (i + radius).min(SIZE - 1);
+                out[line * other + i * stride] = (low..=high)
+                    .map(|j| input[line * other + j * stride])
+                    .fold(0.0, f32::max);
+            }
+        }
+        out
+    };
+    pass(&pass(mask, 1, SIZE), SIZE, 1)
+}
+
+/// 1 inside the smallest box around `mask`, grown by `margin` of its sides.
+fn boxed(mask: &[f32], margin: [f32; 4]) -> Vec<f32> {
+    let on = |i: usize| mask[i] > 0.02;
+    let (mut x, mut y) = ([SIZE, 0], [SIZE, 0]);
+    for i in (0..PIXELS).filter(|&i| on(i)) {
+        x = [x[0].min(i % SIZE), x[1].max(i % SIZE + 1)];
+        y = [y[0].min(i / SIZE), y[1].max(i / SIZE + 1)];
+    }
+    if x[0] >= x[1] {
+        return vec![0.0; PIXELS];
+    }
+    let side = (x[1] - x[0]).max(y[1] - y[0]) as f32;
+    let low = |v: usize, m: f32| (v as f32 - m * side).max(0.0) as usize;
+    let high = |v: usize, m: f32| ((v as f32 + m * side).ceil() as usize).min(SIZE);
+    let (x, y) = (
+        [low(x[0], margin[0]), high(x[1], margin[1])],
+        [low(y[0], margin[2]), high(y[1], margin[3])],
+    );
+    (0..PIXELS)
+        .map(|i| {
+            let inside = (x[0]..x[1]).contains(&(i % SIZE)) && (y[0]..y[1]).contains(&(i / SIZE));
+            f32::from(inside)
+        })
+        .collect()
+}
+
+impl Example {
+    /// Draws an example of `scene`.
+    pub fn draw(scene: SceneView<'_>, recipe: &Recipe, stream: &mut NoiseStream) -> Self {
+        let window = Window::draw(stream);
+        let (class, color) = (scene.class, scene.color);
+        let lens = Lens::new(scene, window);
+        let place = Light::draw(lens.suns(), stream);
+        let kind = stream.uniform();
+        let foreign = kind < recipe.foreign_light;
+        let light = if foreign {
+            Light::draw(lens.suns(), stream)
+        } else {
+            place
+        };
+        let mut image = if kind > 0.8 {
+            lens.layer(Layer::Whole, &light)
+        } else {
+            lens.composite(&place, &light)
+        };
+        let tone = Tone::draw(stream);
+        tone.apply(&mut image);
+        let coverage = lens.coverage();
+        let hard: Vec<f32> = coverage.iter().map(|&c| f32::from(c > 0.02)).collect();
+        let view = stream.uniform();
+        let (mask, shown) = if view >= recipe.background {
+            (vec![1.0; PIXELS], image.clone())
+        } else if view < 0.25 * recipe.background && !foreign {
+            // As in inpainting: the picture itself around a box.
+            let margin = std::array::from_fn(|_| 0.7 * stream.uniform() as f32);
+            (boxed(&coverage, margin), image.clone())
+        } else {
+            let mut clean = lens.layer(Layer::Background, &place);
+            tone.apply(&mut clean);
+            (dilate(&hard, stream.below(2)), clean)
+        };
+        let weight = dilate(&hard, 5).iter().map(|m| 0.15 + m).collect();
+        let named = foreign || stream.uniform() < recipe.light_words;
+        let said = stream.uniform();
+        let class = match said {
+            x if x < 0.25 => "object".to_owned(),
+            x if x < 0.6 => format!("{color} {class}"),
+            _ => class.to_owned(),
+        };
+        let words = window.words(light.words(lens.suns()));
+        let caption = if named {
+            Some(Caption::new(&class, Some(&words)))
+        } else if stream.uniform() < 0.5 {
+            Some(Caption::new(&class, None))
+        } else {
+            None
+        };
+        Self {
+            image,
+            shown,
+            mask,
+            weight,
+            caption,
+        }
+    }
+}
+
+/// The difference of two angles, radians in [0, pi].
+pub fn angle_between(a: f32, b: f32) -> f32 {
+    let d = (a - b).rem_euclid(2.0 * PI);
+    d.min(2.0 * PI - d)
+}
+
+/// Number of suns that every scene has.
+pub const LIGHTS: usize = SUNS;

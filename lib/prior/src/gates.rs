@@ -1,0 +1,298 @@
+//! What the model must be able to tell before it is trusted to guide,
+//! measured on scenes and solids that training never showed.
+
+use std::f32::consts::{FRAC_PI_4, PI, TAU};
+use std::ops::ControlFlow;
+
+use candle_core::Tensor;
+use dipir_diffusion::model::Model;
+use dipir_diffusion::noise::NoiseStream;
+use half::f16;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::dataset::{RECORD_SIZE, SceneView};
+use crate::energy::{Observation, SHARES, difference, energies, states};
+use crate::error::Result;
+use crate::examples::{Example, Lens, Tone, Window, angle_between, dilate};
+use crate::lights::{Light, Sun};
+use crate::record::{Layer, Record};
+use crate::student::latents_of;
+use crate::studio::{Kinds, Stage, View};
+use crate::words::{Caption, LightWords};
+
+/// Key of the scenes on which gates are measured; training uses others.
+pub const HELD_OUT_SEED: u64 = 0x6a7e5;
+/// Azimuths of the search.
+const AZIMUTHS: usize = 16;
+/// Offsets from the true azimuth that every scene is recorded for, degrees;
+/// the mirror image is the last.
+const OFFSETS: [f32; 7] = [0.0, 25.0, 35.0, -25.0, -35.0, 45.0, -45.0];
+
+/// Shares of right answers and errors, over scenes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Gates {
+    /// Scenes that were looked at.
+    pub scenes: usize,
+    /// LDS 25 degrees off the truth points back to it.
+    pub gradient_sign: f64,
+    /// The true light explains the picture better than its mirror image.
+    pub over_mirror: f64,
+    /// ... than a light 45 degrees off.
+    pub over_45: f64,
+    /// Median distance of the best azimuth from the true one, degrees.
+    pub azimuth_median: f64,
+    /// Share of best azimuths within 30 degrees.
+    pub within_30: f64,
+}
+
+/// A scene recorded for a true sun and others around it.
+pub struct Trial {
+    planes: Vec<f16>,
+    class: &'static str,
+    suns: Vec<Sun>,
+    light: Light,
+}
+
+impl Trial {
+    /// Trial number `index`.
+    pub fn draw(index: u64) -> Self {
+        let mut stage = Stage::draw(
+            HELD_OUT_SEED,
+            index,
+            RECORD_SIZE as u32,
+            Kinds::HeldOut,
+            View::Close,
+        );
+        let mut stream = NoiseStream::new(HELD_OUT_SEED ^ 1, index);
+        let sun = Sun {
+            azimuth: stream.uniform() as f32 * TAU,
+            elevation: (18.0 + 47.0 * stream.uniform() as f32).to_radians(),
+            sharpness: stage.suns[0].sharpness,
+        };
+        let offsets = OFFSETS.map(|o| sun.azimuth + o.to_radians());
+        stage.suns = offsets
+            .into_iter()
+            .chain([-sun.azimuth])
+            .map(|azimuth| Sun { azimuth, ..sun })
+            .collect();
+        let record = Record::trace(&stage, HELD_OUT_SEED, index);
+        let share = 0.6 + 0.33 * stream.uniform() as f32;
+        let total = PI * (0.5 + 0.5 * stream.uniform() as f32);
+        let tints = (0.5 * stream.uniform() as f32, 0.5 * stream.uniform() as f32);
+        let light = Light::new(0, sun.elevation, (total, share), tints, 1.0);
+        Self {
+            planes: record.planes.iter().map(|&v| f16::from_f32(v)).collect(),
+            class: stage.shape.word(),
+            suns: stage.suns,
+            light,
+        }
+    }
+
+    fn lens(&self) -> Lens<'_> {
+        let scene = SceneView {
+            planes: &self.planes,
+            class: self.class,
+            color: "white",
+            suns: self.suns.clone(),
+        };
+        Lens::new(scene, Window::MIDDLE)
+    }
+
+    /// The composite under the sun at `OFFSETS[sun]`, seen as in guidance.
+    fn observe(&self, sun: usize, tone: &Tone) -> Result<(Vec<f32>, Observation)> {
+        let lens = self.lens();
+        let light = Light { sun, ..self.light };
+        let mut image = lens.composite(&self.light, &light);
+        let mut clean = lens.layer(Layer::Background, &self.light);
+        tone.apply(&mut image);
+        tone.apply(&mut clean);
+        let hard: Vec<f32> = lens
+            .coverage()
+            .iter()
+            .map(|&c| f32::from(c > 0.02))
+            .collect();
+        let mask = dilate(&hard, 1);
+        let observation = Observation::new(&image, &clean, &mask, &hard)?;
+        Ok((image, observation))
+    }
+
+    fn words(&self, azimuth: f32) -> LightWords {
+        LightWords {
+            azimuth,
+            ..self.light.words(&self.suns)
+        }
+    }
+
+    fn caption(&self, azimuth: f32) -> Option<Caption> {
+        Some(Caption::new(self.class, Some(&self.words(azimuth))))
+    }
+}
+
+struct Answer {
+    signs: [bool; 2],
+    mirror: bool,
+    beside: [bool; 2],
+    azimuth_error: f64,
+}
+
+fn ask(model: &Model, index: u64, draws: usize) -> Result<Answer> {
+    let trial = Trial::draw(index);
+    let mut stream = NoiseStream::new(HELD_OUT_SEED ^ 2, index);
+    let tone = Tone {
+        exposure: 1.0,
+        shoulder: 0.5,
+    };
+    let truth = trial.suns[0].azimuth;
+    let (_, observation) = trial.observe(0, &tone)?;
+    let around = (0..AZIMUTHS).map(|k| truth + TAU * k as f32 / AZIMUTHS as f32);
+    let captions: Vec<_> = around
+        .chain([-truth, truth + FRAC_PI_4, truth - FRAC_PI_4])
+        .map(|a| trial.caption(a))
+        .collect();
+    let contexts = states(model, &captions)?;
+    let e = energies(model, &observation, &contexts, &SHARES, draws, &mut stream)?;
+    let best = minimum_around(&e[..AZIMUTHS]);
+    let pair = states(model, &[trial.caption(truth), None])?;
+    let sign = |near: usize, far: usize, stream: &mut NoiseStream| -> Result<bool> {
+        let (image, observation) = trial.observe(near, &tone)?;
+        let (further, _) = trial.observe(far, &tone)?;
+        let step = (latents_of(further)? - latents_of(image)?)?;
+        let lds = difference(model, &observation, &pair, &SHARES, draws, stream)?;
+        // Going further away must go against what LDS asks for.
+        Ok((step * lds)?.sum_all()?.to_scalar::<f32>()? > 0.0)
+    };
+    Ok(Answer {
+        signs: [sign(1, 2, &mut stream)?, sign(3, 4, &mut stream)?],
+        mirror: e[0] < e[AZIMUTHS],
+        beside: [e[0] < e[AZIMUTHS + 1], e[0] < e[AZIMUTHS + 2]],
+        azimuth_error: best.to_degrees() as f64,
+    })
+}
+
+/// Where a function on evenly spaced angles, the first of them 0, has its
+/// minimum: the first four harmonics on a fine grid. The distance from 0.
+fn minimum_around(values: &[f64]) -> f32 {
+    let angle = minimum_angle(values);
+    angle_between(angle, 0.0)
+}
+
+/// The angle of the minimum of samples at 2 pi k / n, smoothed to four
+/// harmonics.
+pub fn minimum_angle(values: &[f64]) -> f32 {
+    let n = values.len() as f64;
+    let harmonics: Vec<(f64, f64)> = (1..=4)
+        .map(|h| {
+            let at = |k: usize| h as f64 * k as f64 / n * std::f64::consts::TAU;
+            let sum = |f: fn(f64) -> f64| -> f64 {
+                values.iter().enumerate().map(|(k, v)| v * f(at(k))).sum()
+            };
+            (sum(f64::cos) * 2.0 / n, sum(f64::sin) * 2.0 / n)
+        })
+        .collect();
+    let value = |a: f64| -> f64 {
+        let terms = harmonics.iter().zip(1..);
+        terms
+            .map(|((c, s), h)| c * (h as f64 * a).cos() + s * (h as f64 * a).sin())
+            .sum()
+    };
+    let grid = (0..720).map(|i| i as f64 / 720.0 * std::f64::consts::TAU);
+    grid.min_by(|a, b| value(*a).total_cmp(&value(*b)))
+        .unwrap_or(0.0) as f32
+}
+
+/// Measures the gates on `scenes` scenes with `draws` of noise at each
+/// timestep. `progress` is told how many are done and may stop.
+pub fn measure(
+    model: &Model,
+    scenes: usize,
+    draws: usize,
+    progress: &(dyn Fn(usize) -> ControlFlow<()> + Sync),
+) -> Result<Gates> {
+    let done = std::sync::atomic::AtomicUsize::new(0);
+    let answers: Vec<Answer> = (0..scenes as u64)
+        .into_par_iter()
+        .map(|i| {
+            let answer = ask(model, i, draws)?;
+            let n = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
+            Ok((progress(n).is_continue()).then_some(answer))
+        })
+        .collect::<Result<Vec<Option<_>>>>()?
+        .into_iter()
+        .flatten()
+        .collect();
+    let share = |count: usize, of: usize| count as f64 / of.max(1) as f64;
+    let n = answers.len();
+    let mut errors: Vec<f64> = answers.iter().map(|a| a.azimuth_error).collect();
+    errors.sort_by(f64::total_cmp);
+    let both = |pair: fn(&Answer) -> [bool; 2]| {
+        let right = answers.iter().flat_map(pair).filter(|r| *r).count();
+        share(right, 2 * n)
+    };
+    Ok(Gates {
+        scenes: n,
+        gradient_sign: both(|a| a.signs),
+        over_mirror: share(answers.iter().filter(|a| a.mirror).count(), n),
+        over_45: both(|a| a.beside),
+        azimuth_median: errors.get(n / 2).copied().unwrap_or(f64::NAN),
+        within_30: share(errors.iter().filter(|e| **e <= 30.0).count(), n),
+    })
+}
+
+/// An example as it would be trained on, for pictures of the data.
+pub fn show(scene: SceneView<'_>, stream: &mut NoiseStream) -> Example {
+    Example::draw(scene, &crate::examples::Recipe::default(), stream)
+}
+
+/// Latents as pictures [3, SIZE, SIZE] in [0, 1], for contact sheets.
+pub fn picture_of(latents: &Tensor) -> Result<Vec<f32>> {
+    let x = (latents / crate::blueprint::SCALING)?;
+    let x = dipir_diffusion::vae::pixel_shuffle(&x, crate::blueprint::FACTOR)?;
+    Ok(x.affine(0.5, 0.5)?
+        .clamp(0.0, 1.0)?
+        .flatten_all()?
+        .to_vec1()?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_minimum_of_a_shifted_cosine_is_found() {
+        for shift in [0.1f64, 2.0, 5.5] {
+            let values: Vec<f64> = (0..16)
+                .map(|k| -(k as f64 / 16.0 * std::f64::consts::TAU - shift).cos())
+                .collect();
+            assert!(angle_between(minimum_angle(&values), shift as f32) < 0.01);
+        }
+    }
+
+    #[test]
+    fn shadows_fall_away_from_the_sun() {
+        // The sun from the right: the shadow darkens the ground on the left.
+        let mut stage = Stage::draw(3, 1, RECORD_SIZE as u32, Kinds::Trained, View::Close);
+        for sun in &mut stage.suns {
+            *sun = Sun {
+                azimuth: PI / 2.0,
+                elevation: 0.6,
+                sharpness: 300.0,
+            };
+        }
+        let record = Record::trace(&stage, 1, 1);
+        let n = RECORD_SIZE * RECORD_SIZE;
+        let plane = 9 * crate::record::BASIS;
+        let shadow = &record.planes[plane * n..][..n];
+        let coverage = &record.planes[(crate::record::PLANES - 1) * n..][..n];
+        let mean_x = |w: &dyn Fn(usize) -> f32| {
+            let total: f32 = (0..n).map(w).sum();
+            (0..n).map(|i| w(i) * (i % RECORD_SIZE) as f32).sum::<f32>() / total
+        };
+        let shade = mean_x(&|i| (1.0 - shadow[i]).max(0.0));
+        let object = mean_x(&|i| coverage[i]);
+        assert!(
+            shade < object - 1.0,
+            "shadow at {shade}, object at {object}"
+        );
+    }
+}

@@ -1,0 +1,149 @@
+//! Lights of training scenes: a sun over a sky that is graded from horizon
+//! to zenith, and what the ground throws back.
+
+use dipir_diffusion::noise::NoiseStream;
+use glam::Vec3;
+
+use crate::words::LightWords;
+
+/// Direction to a sun at `azimuth` (from -z towards +x) and `elevation`,
+/// radians; the camera looks along -z.
+pub fn sun_direction(azimuth: f32, elevation: f32) -> Vec3 {
+    let (s, c) = azimuth.sin_cos();
+    let (up, out) = elevation.sin_cos();
+    Vec3::new(s * out, up, -c * out)
+}
+
+/// Azimuth and elevation of a direction, the inverse of [`sun_direction`].
+pub fn sun_angles(direction: Vec3) -> (f32, f32) {
+    let d = direction.normalize_or(Vec3::Y);
+    (d.x.atan2(-d.z), d.y.clamp(-1.0, 1.0).asin())
+}
+
+/// A sun's place and size.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sun {
+    /// From the camera's forward direction towards its right, radians.
+    pub azimuth: f32,
+    /// Above the ground, radians.
+    pub elevation: f32,
+    /// Its radiance falls as exp(sharpness (cos - 1)).
+    pub sharpness: f32,
+}
+
+/// The light on a scene, linear in every colour.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Light {
+    /// Which of the scene's suns.
+    pub sun: usize,
+    /// Irradiance of the sun on a surface that faces it.
+    pub sun_color: Vec3,
+    /// Radiance at the horizon.
+    pub horizon: Vec3,
+    /// Radiance at the zenith.
+    pub zenith: Vec3,
+    /// Radiance from below.
+    pub bounce: Vec3,
+    /// Share of the sun in the irradiance of the ground.
+    pub share: f32,
+}
+
+/// Albedo of the ground in the light that comes from below.
+const BOUNCE_ALBEDO: f32 = 0.35;
+
+impl Light {
+    /// A light whose irradiance on the ground is `total`, of which `share`
+    /// comes from a sun at `elevation`; `warm` and `blue` in [0, 1] tint sun
+    /// and sky, `graded` is the horizon's radiance over the mean.
+    pub fn new(
+        sun: usize,
+        elevation: f32,
+        (total, share): (f32, f32),
+        (warm, blue): (f32, f32),
+        graded: f32,
+    ) -> Self {
+        let tint = |v: Vec3| v / v.element_sum() * 3.0;
+        let sun_tint = tint(Vec3::new(1.0, 1.0 - 0.35 * warm, 1.0 - 0.75 * warm));
+        let sky_tint = tint(Vec3::new(1.0 - 0.6 * blue, 1.0 - 0.2 * blue, 1.0));
+        let sun_color = sun_tint * (share * total / elevation.sin().max(0.1));
+        let mean = (1.0 - share) * total / std::f32::consts::PI;
+        // Irradiance of h (1 - y) + z y is pi (h / 3 + 2 z / 3).
+        let horizon = mean * graded;
+        let zenith = ((mean - horizon / 3.0) * 1.5).max(0.05 * mean);
+        let ground = sun_color * elevation.sin() + std::f32::consts::PI * mean * sky_tint;
+        Self {
+            sun,
+            sun_color,
+            horizon: horizon * sky_tint,
+            zenith: zenith * sky_tint,
+            bounce: ground * (BOUNCE_ALBEDO / std::f32::consts::PI),
+            share,
+        }
+    }
+
+    /// A light with one of `suns`, one in ten without sun.
+    pub fn draw(suns: &[Sun], stream: &mut NoiseStream) -> Self {
+        let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+        let sun = (range(0.0, suns.len() as f64) as usize).min(suns.len().saturating_sub(1));
+        let overcast = range(0.0, 1.0) < 0.1;
+        let share = if overcast { 0.0 } else { range(0.45, 0.93) };
+        let total = std::f32::consts::PI * range(0.5, 1.05);
+        let tints = (range(0.0, 0.5), range(0.0, 0.5));
+        let elevation = suns.get(sun).map_or(0.7, |s| s.elevation);
+        Self::new(sun, elevation, (total, share), tints, range(0.6, 1.5))
+    }
+
+    /// What a caption says about it.
+    pub fn words(&self, suns: &[Sun]) -> LightWords {
+        let sun = suns[self.sun];
+        LightWords {
+            azimuth: sun.azimuth,
+            elevation: sun.elevation,
+            sun_share: self.share,
+        }
+    }
+}
+
+/// `count` suns spread around the sky.
+pub fn draw_suns(count: usize, stream: &mut NoiseStream) -> Vec<Sun> {
+    let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+    let start = range(0.0, 1.0);
+    let turn = range(0.0, 1.0);
+    (0..count)
+        .map(|k| {
+            let at = (k as f32 + start + range(-0.4, 0.4)) / count as f32;
+            // A golden-ratio sequence spreads the heights.
+            let height = (turn + k as f32 * 0.618_034).fract();
+            Sun {
+                azimuth: at * std::f32::consts::TAU,
+                elevation: (13.0 + 60.0 * height).to_radians(),
+                sharpness: range(100f64.ln(), 500f64.ln()).exp(),
+            }
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn directions_and_angles_are_inverse() {
+        for (azimuth, elevation) in [(0.3, 0.2), (-2.0, 1.2), (3.0, 0.7)] {
+            let (a, e) = sun_angles(sun_direction(azimuth, elevation));
+            assert!((a - azimuth).abs() < 1e-5 && (e - elevation).abs() < 1e-5);
+        }
+        // Three o'clock is to the camera's right.
+        assert!(sun_direction(std::f32::consts::FRAC_PI_2, 0.0).x > 0.99);
+    }
+
+    #[test]
+    fn irradiance_of_the_ground_is_what_was_asked_for() {
+        let light = Light::new(0, 0.6, (2.0, 0.7), (0.3, 0.4), 1.1);
+        let sky = std::f32::consts::PI * (light.horizon / 3.0 + 2.0 * light.zenith / 3.0);
+        let ground = light.sun_color * 0.6f32.sin() + sky;
+        assert!((ground.element_sum() / 3.0 - 2.0).abs() < 1e-4);
+        let sun = light.sun_color.element_sum() / 3.0 * 0.6f32.sin();
+        assert!((sun / 2.0 - 0.7).abs() < 1e-4);
+    }
+}

@@ -1,0 +1,344 @@
+//! The model while it is trained: networks whose weights are variables, and
+//! the loss of a batch of examples.
+
+use std::collections::BTreeMap;
+
+use candle_core::{DType, Device, Tensor, Var};
+use dipir_diffusion::noise::NoiseStream;
+use dipir_diffusion::parameters::Parameters;
+use dipir_diffusion::pass::Pass;
+use dipir_diffusion::schedule::NoiseSchedule;
+use dipir_diffusion::text_encoder::{LearnedTokens, TextEncoder};
+use dipir_diffusion::tokenizer::Tokenizer;
+use dipir_diffusion::unet::UNet;
+use dipir_diffusion::vae::pixel_unshuffle;
+
+use crate::blueprint::{Blueprint, FACTOR, SCALING};
+use crate::error::{Error, Result};
+use crate::examples::{Example, SIZE};
+use crate::words::{CLOCK, Caption, HEIGHTS, PLACEHOLDERS, SKIES};
+
+/// Networks and variables.
+#[derive(Debug)]
+pub struct Student {
+    unet: UNet,
+    text: TextEncoder,
+    tokenizer: Tokenizer,
+    schedule: NoiseSchedule,
+    variables: BTreeMap<String, Var>,
+}
+
+/// Captions as the text encoder takes them.
+pub struct Spoken {
+    tokens: Vec<Vec<u32>>,
+    /// [mixtures of all captions, vocab_size]
+    mixing: Option<Tensor>,
+}
+
+/// Registers the placeholders of [`Caption`] with a tokenizer.
+pub fn add_placeholders(tokenizer: &mut Tokenizer) {
+    let first = tokenizer.vocab_size() as u32;
+    for (i, word) in PLACEHOLDERS.iter().enumerate() {
+        tokenizer.add_placeholder(word, first + i as u32);
+    }
+}
+
+impl Spoken {
+    /// Tokens of `captions` and the mixtures of embeddings in them. The
+    /// tokenizer knows the placeholders.
+    pub fn new(tokenizer: &Tokenizer, captions: &[Option<Caption>]) -> Result<Self> {
+        let vocab = tokenizer.vocab_size();
+        let mut rows: Vec<f32> = vec![];
+        let mut tokens = vec![];
+        for caption in captions {
+            let Some(caption) = caption else {
+                tokens.push(tokenizer.encode("")?);
+                continue;
+            };
+            let shift = (rows.len() / vocab) as u32;
+            for mixture in &caption.mixtures {
+                let start = rows.len();
+                rows.resize(start + vocab, 0.0);
+                for (word, weight) in mixture {
+                    let ids = tokenizer.words(word)?;
+                    let [id] = ids[..] else {
+                        return Err(Error::Argument(format!(
+                            "the model's tokenizer does not know {word:?} as one word; light words need the model of data/prior or one trained by dipir-pretrain"
+                        )));
+                    };
+                    rows[start + id as usize] += weight;
+                }
+            }
+            let ids = tokenizer.encode(&caption.text)?;
+            let moved = ids
+                .iter()
+                .map(|&t| if t as usize >= vocab { t + shift } else { t });
+            tokens.push(moved.collect());
+        }
+        let count = rows.len() / vocab;
+        let mixing = (count > 0)
+            .then(|| Tensor::from_vec(rows, (count, vocab), &Device::Cpu))
+            .transpose()?;
+        Ok(Self { tokens, mixing })
+    }
+
+    /// States [captions, tokens, width].
+    pub fn states(&self, text: &TextEncoder) -> Result<Tensor> {
+        let learned = self
+            .mixing
+            .as_ref()
+            .map(|m| -> Result<_> {
+                Ok(LearnedTokens {
+                    embeddings: m.matmul(text.table())?,
+                })
+            })
+            .transpose()?;
+        Ok(text.forward(&self.tokens, learned.as_ref())?)
+    }
+}
+
+/// A batch as tensors.
+pub struct Batch {
+    /// Latents of the pictures, [batch, c, h, w].
+    pub latents: Tensor,
+    /// Mask and masked latents, [batch, 1 + c, h, w].
+    pub condition: Tensor,
+    /// Weights of latent values.
+    pub weights: Tensor,
+    /// What is said.
+    pub captions: Vec<Option<Caption>>,
+}
+
+/// Scaled latents of pictures in [0, 1], each [3, SIZE, SIZE].
+pub fn latents_of(pictures: Vec<f32>) -> Result<Tensor> {
+    let count = pictures.len() / (3 * SIZE * SIZE);
+    let x = Tensor::from_vec(pictures, (count, 3, SIZE, SIZE), &Device::Cpu)?;
+    let x = x.affine(2.0, -1.0)?;
+    Ok((pixel_unshuffle(&x, FACTOR)? * SCALING)?)
+}
+
+/// Mask and masked latents, [batch, 1 + c, h, w], from pictures in [0, 1]
+/// and masks.
+pub fn condition_of(shown: Vec<f32>, masks: &[Vec<f32>]) -> Result<Tensor> {
+    let mut blanked = shown;
+    let pixels = SIZE * SIZE;
+    for (i, v) in blanked.iter_mut().enumerate() {
+        let (item, pixel) = (i / (3 * pixels), i % pixels);
+        if masks[item][pixel] >= 0.5 {
+            *v = 0.5;
+        }
+    }
+    let side = SIZE / FACTOR;
+    // A latent pixel is masked as its top left pixel is.
+    let small: Vec<f32> = masks
+        .iter()
+        .flat_map(|m| {
+            (0..side * side).map(|i| {
+                let (x, y) = (i % side * FACTOR, i / side * FACTOR);
+                f32::from(m[y * SIZE + x] >= 0.5)
+            })
+        })
+        .collect();
+    let mask = Tensor::from_vec(small, (masks.len(), 1, side, side), &Device::Cpu)?;
+    Ok(Tensor::cat(&[&mask, &latents_of(blanked)?], 1)?)
+}
+
+impl Batch {
+    /// Puts examples together.
+    pub fn new(examples: Vec<Example>) -> Result<Self> {
+        let weights: Vec<f32> = examples
+            .iter()
+            .flat_map(|e| e.weight.iter().copied())
+            .collect();
+        let weights = Tensor::from_vec(weights, (examples.len(), 1, SIZE, SIZE), &Device::Cpu)?;
+        let weights = pixel_unshuffle(&weights, FACTOR)?;
+        let masks: Vec<Vec<f32>> = examples.iter().map(|e| e.mask.clone()).collect();
+        let shown = examples
+            .iter()
+            .flat_map(|e| e.shown.iter().copied())
+            .collect();
+        Ok(Self {
+            latents: latents_of(
+                examples
+                    .iter()
+                    .flat_map(|e| e.image.iter().copied())
+                    .collect(),
+            )?,
+            condition: condition_of(shown, &masks)?,
+            weights: Tensor::cat(&[&weights, &weights, &weights], 1)?,
+            captions: examples.into_iter().map(|e| e.caption).collect(),
+        })
+    }
+}
+
+/// Timesteps of training: one in four anywhere, the others where light is
+/// recognised.
+pub fn draw_timestep(steps: usize, stream: &mut NoiseStream) -> usize {
+    let share = if stream.uniform() < 0.25 {
+        0.01 + 0.98 * stream.uniform()
+    } else {
+        0.37 + 0.6 * stream.uniform()
+    };
+    ((share * steps as f64) as usize).min(steps - 1)
+}
+
+impl Student {
+    /// Fresh networks; `folder` holds the configurations and the tokenizer.
+    pub fn new(blueprint: &Blueprint, folder: &std::path::Path, seed: u64) -> Result<Self> {
+        let mut tokenizer = Tokenizer::load(&folder.join("tokenizer"))?;
+        let vocab = tokenizer.vocab_size();
+        add_placeholders(&mut tokenizer);
+        let text = TextEncoder::new(
+            blueprint.text(vocab),
+            Parameters::random(seed, &Device::Cpu),
+        )?;
+        let unet = UNet::new(
+            blueprint.unet(),
+            Parameters::random(seed ^ 0xa11, &Device::Cpu),
+        )?;
+        let name = |prefix: &str, v: &BTreeMap<String, Var>| -> Vec<(String, Var)> {
+            v.iter()
+                .map(|(n, v)| (format!("{prefix}{n}"), v.clone()))
+                .collect()
+        };
+        let mut variables: BTreeMap<_, _> = name("unet.", unet.variables()).into_iter().collect();
+        variables.extend(name("text.", text.variables()));
+        let student = Self {
+            unet,
+            text,
+            tokenizer,
+            schedule: NoiseSchedule::new(blueprint.schedule())?,
+            variables,
+        };
+        student.prepare()?;
+        Ok(student)
+    }
+
+    /// Residual branches start at nothing, words of one scale in its order.
+    fn prepare(&self) -> Result<()> {
+        for (name, variable) in &self.variables {
+            let ends = [
+                ".conv2.weight",
+                ".conv2.bias",
+                ".proj_out.weight",
+                ".proj_out.bias",
+            ];
+            if ends.iter().any(|e| name.ends_with(e)) || name.starts_with("unet.conv_out.") {
+                variable.set(&variable.zeros_like()?)?;
+            }
+        }
+        let name = "text.text_model.embeddings.token_embedding.weight";
+        let Some(table) = self.variables.get(name) else {
+            return Err(Error::Argument(format!("the text encoder has no {name}")));
+        };
+        let width = table.dims()[1];
+        let mut rows = table.to_vec2::<f32>()?;
+        let scale = 0.15;
+        let mut place = |word: &str, at: usize, values: &[f32]| -> Result<()> {
+            if let [id] = self.tokenizer.words(word)?[..] {
+                for (i, v) in values.iter().enumerate() {
+                    if at + i < width {
+                        rows[id as usize][at + i] += scale * v;
+                    }
+                }
+            }
+            Ok(())
+        };
+        for (hour, word) in CLOCK.iter().enumerate() {
+            let a = hour as f32 / 12.0 * std::f32::consts::TAU;
+            let harmonics = [a.cos(), a.sin(), (2.0 * a).cos(), (2.0 * a).sin()];
+            place(word, 0, &harmonics)?;
+        }
+        for (scale, at) in [(HEIGHTS, 4), (SKIES, 6)] {
+            for (i, (word, _)) in scale.iter().enumerate() {
+                let x = i as f32 - 1.0;
+                place(word, at, &[x, x * x - 0.5])?;
+            }
+        }
+        table.set(&Tensor::new(rows, &Device::Cpu)?)?;
+        Ok(())
+    }
+
+    /// Everything that is trained, by name.
+    pub fn variables(&self) -> &BTreeMap<String, Var> {
+        &self.variables
+    }
+
+    /// Weighted mean squared error of the velocity, in the graph.
+    pub fn loss(&self, batch: &Batch, stream: &mut NoiseStream) -> Result<Tensor> {
+        let count = batch.latents.dims()[0];
+        let steps = self.schedule.len();
+        let timesteps: Vec<usize> = (0..count).map(|_| draw_timestep(steps, stream)).collect();
+        let noise = stream.normal_tensor(batch.latents.dims(), DType::F32, &Device::Cpu)?;
+        let noisy = self
+            .schedule
+            .add_noise_each(&batch.latents, &noise, &timesteps)?;
+        let target = self.schedule.target(&batch.latents, &noise, &timesteps)?;
+        let input = Tensor::cat(&[&noisy, &batch.condition], 1)?;
+        let context = Spoken::new(&self.tokenizer, &batch.captions)?.states(&self.text)?;
+        let t: Vec<f64> = timesteps.iter().map(|&t| t as f64).collect();
+        let output = self.unet.forward(&input, &t, &context, &Pass::default())?;
+        let error = ((output - target)?.sqr()? * &batch.weights)?.sum_all()?;
+        let total = batch.weights.sum_all()?.to_scalar::<f32>()? as f64;
+        Ok((error / total)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::words::LightWords;
+
+    fn caption(azimuth: f32) -> Option<Caption> {
+        let light = LightWords {
+            azimuth,
+            elevation: 0.5,
+            sun_share: 0.8,
+        };
+        Some(Caption::new("red car", Some(&light)))
+    }
+
+    #[test]
+    fn captions_carry_each_number_of_the_light() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let blueprint = Blueprint::default();
+        blueprint.write_configs(folder.path()).expect("written");
+        let student = Student::new(&blueprint, folder.path(), 1).expect("built");
+        let spoken = |captions: &[Option<Caption>]| {
+            let spoken = Spoken::new(&student.tokenizer, captions).expect("tokens");
+            let vocab = student.tokenizer.vocab_size() as u32;
+            let mixed = spoken
+                .tokens
+                .iter()
+                .flatten()
+                .filter(|t| **t >= vocab)
+                .count();
+            (spoken.states(&student.text).expect("states"), mixed)
+        };
+        let (states, mixed) = spoken(&[caption(0.1), caption(2.0), None]);
+        assert_eq!(mixed, 6, "three places in each of two captions");
+        let row = |i: usize| states.get(i).expect("row").flatten_all().expect("flat");
+        let apart = |i: usize, j: usize| {
+            let d = (row(i) - row(j)).expect("difference");
+            d.abs()
+                .expect("abs")
+                .max_all()
+                .expect("max")
+                .to_scalar::<f32>()
+                .expect("value")
+        };
+        assert!(apart(0, 1) > 1e-2 && apart(0, 2) > 1e-2);
+        // The same caption means the same wherever it stands in a batch.
+        let (alone, _) = spoken(&[caption(2.0)]);
+        let d = (alone.get(0).expect("row").flatten_all().expect("flat") - row(1)).expect("d");
+        assert!(
+            d.abs()
+                .expect("abs")
+                .max_all()
+                .expect("max")
+                .to_scalar::<f32>()
+                .expect("v")
+                < 1e-5
+        );
+    }
+}

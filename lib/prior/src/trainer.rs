@@ -1,0 +1,365 @@
+//! Pretraining: AdamW on batches of drawn examples, an average of the
+//! weights, checkpoints.
+
+use std::collections::BTreeMap;
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::time::Instant;
+
+use candle_core::{DType, Device, Tensor};
+use dipir_diffusion::noise::NoiseStream;
+use dipir_diffusion::optimizer::{AdamW, AdamWConfig};
+use dipir_diffusion::weights::{Weights, write_safetensors};
+use serde::{Deserialize, Serialize};
+
+use crate::blueprint::Blueprint;
+use crate::dataset::Dataset;
+use crate::error::{Error, Result};
+use crate::examples::{Example, Recipe};
+use crate::student::{Batch, Student};
+
+/// Settings of a training run.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TrainerSettings {
+    /// Examples in all; the learning rate falls to 0 over them.
+    pub samples: usize,
+    /// Examples of an update.
+    pub batch: usize,
+    /// Learning rate after the warm-up.
+    pub learning_rate: f64,
+    /// Key of all random numbers.
+    pub seed: u64,
+}
+
+impl Default for TrainerSettings {
+    fn default() -> Self {
+        Self {
+            samples: 400_000,
+            batch: 64,
+            learning_rate: 5e-4,
+            seed: 1,
+        }
+    }
+}
+
+/// Parts of a batch that are worked on side by side. Fixed, so that the sums
+/// and with them the weights are the same on any machine.
+const SHARDS: usize = 2;
+/// Updates over which the learning rate rises.
+const WARMUP: f64 = 200.0;
+
+/// What one update did.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Update {
+    /// Examples so far.
+    pub seen: usize,
+    /// Loss of this batch.
+    pub loss: f64,
+    /// Norm of the gradient before clipping.
+    pub gradient_norm: f64,
+    /// Seconds that it took.
+    pub seconds: f64,
+}
+
+/// A training run.
+pub struct Trainer {
+    settings: TrainerSettings,
+    recipe: Recipe,
+    student: Student,
+    optimizer: AdamW,
+    average: BTreeMap<String, Tensor>,
+    pools: Vec<rayon::ThreadPool>,
+}
+
+impl Trainer {
+    /// Starts afresh; `folder` holds configurations and tokenizer.
+    pub fn new(
+        blueprint: &Blueprint,
+        folder: &Path,
+        settings: TrainerSettings,
+        recipe: Recipe,
+    ) -> Result<Self> {
+        if settings.batch == 0 || !settings.batch.is_multiple_of(SHARDS) {
+            return Err(Error::Argument(format!(
+                "batch = {}: accepted are even numbers from {SHARDS}",
+                settings.batch
+            )));
+        }
+        let student = Student::new(blueprint, folder, settings.seed)?;
+        let config = AdamWConfig {
+            beta1: 0.9,
+            beta2: 0.99,
+            weight_decay: 0.01,
+            ..AdamWConfig::default()
+        };
+        let optimizer = AdamW::new(student.variables(), config)?;
+        let average = student
+            .variables()
+            .iter()
+            .map(|(n, v)| Ok((n.clone(), v.as_detached_tensor().copy()?)))
+            .collect::<Result<_>>()?;
+        let pools = (0..SHARDS)
+            .map(|_| rayon::ThreadPoolBuilder::new().num_threads(1).build())
+            .collect::<Result<_, _>>()
+            .map_err(|e| Error::Argument(format!("cannot start threads: {e}")))?;
+        Ok(Self {
+            settings,
+            recipe,
+            student,
+            optimizer,
+            average,
+            pools,
+        })
+    }
+
+    /// Examples so far.
+    pub fn seen(&self) -> usize {
+        self.optimizer.steps() as usize * self.settings.batch
+    }
+
+    /// The averaged weights, by name.
+    pub fn average(&self) -> &BTreeMap<String, Tensor> {
+        &self.average
+    }
+
+    fn learning_rate(&self) -> f64 {
+        let step = self.optimizer.steps() as f64;
+        let done = self.seen() as f64 / self.settings.samples.max(1) as f64;
+        let rise = ((step + 1.0) / WARMUP).min(1.0);
+        let fall = 0.5 * (1.0 + (std::f64::consts::PI * done.min(1.0)).cos());
+        self.settings.learning_rate * rise * fall.max(0.005)
+    }
+
+    /// One update from `data`.
+    pub fn step(&mut self, data: &Dataset) -> Result<Update> {
+        let start = Instant::now();
+        let step = self.optimizer.steps();
+        let shards: Vec<Result<(BTreeMap<String, Tensor>, f64)>> = std::thread::scope(|scope| {
+            let this = &*self;
+            let threads: Vec<_> = (0..SHARDS)
+                .map(|shard| {
+                    scope.spawn(move || this.pools[shard].install(|| this.shard(data, step, shard)))
+                })
+                .collect();
+            threads
+                .into_iter()
+                .map(|t| match t.join() {
+                    Ok(result) => result,
+                    Err(panic) => std::panic::resume_unwind(panic),
+                })
+                .collect()
+        });
+        let mut sum: Option<BTreeMap<String, Tensor>> = None;
+        let mut loss = 0.0;
+        for shard in shards {
+            let (gradients, shard_loss) = shard?;
+            loss += shard_loss / SHARDS as f64;
+            sum = Some(match sum {
+                None => gradients,
+                Some(mut sum) => {
+                    for (name, gradient) in gradients {
+                        let entry = sum
+                            .get_mut(&name)
+                            .ok_or_else(|| Error::Argument(format!("no gradient of {name}")))?;
+                        *entry = (&*entry + gradient)?;
+                    }
+                    sum
+                }
+            });
+        }
+        let mut gradients = sum.unwrap_or_default();
+        for gradient in gradients.values_mut() {
+            *gradient = (&*gradient * (1.0 / SHARDS as f64))?;
+        }
+        let rate = self.learning_rate();
+        let gradient_norm = self.optimizer.step(&gradients, 1.0, |_| rate)?;
+        let step = self.optimizer.steps() as f64;
+        let keep = (1.0 - 1.0 / (0.1 * step + 2.0)).min(0.999);
+        for (name, variable) in self.student.variables() {
+            // Detached, or the average would hold the graph of every update.
+            let value = variable.as_detached_tensor();
+            let average = ((&self.average[name] * keep)? + (value * (1.0 - keep))?)?;
+            self.average.insert(name.clone(), average.detach());
+        }
+        Ok(Update {
+            seen: self.seen(),
+            loss,
+            gradient_norm,
+            seconds: start.elapsed().as_secs_f64(),
+        })
+    }
+
+    fn shard(
+        &self,
+        data: &Dataset,
+        step: u64,
+        shard: usize,
+    ) -> Result<(BTreeMap<String, Tensor>, f64)> {
+        let key = step * SHARDS as u64 + shard as u64;
+        let mut stream = NoiseStream::new(self.settings.seed ^ 0x7eac4, key);
+        let examples = (0..self.settings.batch / SHARDS)
+            .map(|_| {
+                let scene = data.scene(stream.below(data.len()));
+                Example::draw(scene, &self.recipe, &mut stream)
+            })
+            .collect();
+        let loss = self.student.loss(&Batch::new(examples)?, &mut stream)?;
+        let gradients = self.optimizer.collect(&loss.backward()?)?;
+        Ok((gradients, loss.to_scalar::<f32>()? as f64))
+    }
+
+    /// Trains to the end; `report` sees every update and may stop.
+    pub fn run(
+        &mut self,
+        data: &Dataset,
+        report: &mut dyn FnMut(&Self, &Update) -> Result<ControlFlow<()>>,
+    ) -> Result<()> {
+        while self.seen() < self.settings.samples {
+            let update = self.step(data)?;
+            if report(self, &update)?.is_break() {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes everything that a resumed run needs.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let mut tensors = self.optimizer.state();
+        for (name, tensor) in &self.average {
+            tensors.insert(format!("average.{name}"), tensor.clone());
+        }
+        let metadata = BTreeMap::from([
+            ("steps".to_owned(), self.optimizer.steps().to_string()),
+            (
+                "settings".to_owned(),
+                serde_json::json!(self.settings).to_string(),
+            ),
+        ]);
+        Ok(write_safetensors(path, &tensors, &metadata)?)
+    }
+
+    /// Goes on from what [`Trainer::save`] wrote.
+    pub fn resume(&mut self, path: &Path) -> Result<()> {
+        let weights = Weights::open_file(path)?;
+        let fail = |message: String| Error::Content {
+            path: path.to_owned(),
+            message,
+        };
+        let found = weights
+            .metadata()
+            .get("settings")
+            .cloned()
+            .unwrap_or_default();
+        let expected = serde_json::json!(self.settings).to_string();
+        // A run may be made longer or shorter on the way.
+        let made = serde_json::from_str::<TrainerSettings>(&found).ok();
+        let made = made.map(|made| TrainerSettings {
+            samples: self.settings.samples,
+            ..made
+        });
+        if made != Some(self.settings) {
+            return Err(fail(format!(
+                "the checkpoint was made with {found}, this run has {expected}; delete it or use its settings"
+            )));
+        }
+        let steps = weights.metadata().get("steps").and_then(|s| s.parse().ok());
+        let steps = steps.ok_or_else(|| fail("the number of steps is missing".into()))?;
+        let get = |name: &str| weights.tensor(name, DType::F32, &Device::Cpu);
+        self.optimizer.restore(steps, get).map_err(&fail)?;
+        for (name, tensor) in &mut self.average {
+            *tensor = get(&format!("average.{name}"))?
+                .ok_or_else(|| fail(format!("average.{name} is missing")))?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::DatasetSettings;
+    use crate::studio::Kinds;
+
+    fn scenes(folder: &Path) -> Dataset {
+        let settings = DatasetSettings {
+            seed: 5,
+            scenes: 1,
+            kinds: Kinds::Trained,
+        };
+        Dataset::make(folder, &settings, &mut |_| ControlFlow::Continue(()))
+            .unwrap()
+            .unwrap()
+    }
+
+    fn small(folder: &Path, samples: usize) -> Trainer {
+        let blueprint = Blueprint {
+            channels: vec![8, 16],
+            text_width: 16,
+        };
+        blueprint.write_configs(folder).unwrap();
+        let settings = TrainerSettings {
+            samples,
+            batch: 4,
+            learning_rate: 1e-3,
+            seed: 2,
+        };
+        Trainer::new(&blueprint, folder, settings, Recipe::default()).unwrap()
+    }
+
+    fn train(trainer: &mut Trainer, data: &Dataset, until: usize) {
+        let mut watch = |_: &Trainer, update: &Update| {
+            Ok(match update.seen < until {
+                true => ControlFlow::Continue(()),
+                false => ControlFlow::Break(()),
+            })
+        };
+        trainer.run(data, &mut watch).unwrap();
+    }
+
+    #[test]
+    fn a_training_that_was_stopped_ends_in_the_same_weights() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = scenes(&folder.path().join("scenes"));
+        let checkpoint = folder.path().join("checkpoint.safetensors");
+        let mut whole = small(folder.path(), 24);
+        train(&mut whole, &data, 24);
+        let mut first = small(folder.path(), 24);
+        train(&mut first, &data, 12);
+        first.save(&checkpoint).unwrap();
+        let mut second = small(folder.path(), 24);
+        second.resume(&checkpoint).unwrap();
+        assert_eq!(second.seen(), 12);
+        train(&mut second, &data, 24);
+        let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let mut moved = 0.0f32;
+        for (name, tensor) in whole.average() {
+            assert!(values(tensor) == values(&second.average()[name]), "{name}");
+            let before = values(&first.average()[name]);
+            let change = values(tensor)
+                .into_iter()
+                .zip(before)
+                .map(|(a, b)| (a - b).abs());
+            moved = change.fold(moved, f32::max);
+        }
+        assert!(moved > 1e-6, "the second half did something: {moved}");
+
+        // A checkpoint of another run is not taken for this one's.
+        let mut other = small(folder.path(), 24);
+        other.settings.seed = 3;
+        let error = other.resume(&checkpoint).unwrap_err().to_string();
+        assert!(error.contains("\"seed\":3"), "{error}");
+    }
+
+    #[test]
+    fn scenes_that_were_cut_off_are_refused_with_what_to_do() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = scenes(folder.path());
+        assert_eq!(data.len(), crate::dataset::BLOCK);
+        let path = folder.path().join("scenes-00000.safetensors");
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+        let error = Dataset::open(folder.path(), 1).unwrap_err().to_string();
+        assert!(error.contains("scenes-00000.safetensors"), "{error}");
+    }
+}
