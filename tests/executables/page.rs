@@ -1,4 +1,6 @@
 //! `dipir report`: the page that shows a run.
+use serde_json::Value;
+
 use crate::project::*;
 use crate::whole::{self, run_all};
 
@@ -104,4 +106,46 @@ fn every_string_on_the_page_is_text() {
     assert_well_formed(&page);
     assert!(!page.contains(evil) && !page.contains("<i>"));
     assert!(page.contains("&lt;script&gt;alert(1)&lt;/script&gt; in background.png"));
+}
+
+#[test]
+fn the_recovered_light_is_compared_with_the_true_one_once() {
+    let project = whole::project();
+    // What was recovered is declared the truth: light and picture agree to noise and a texel.
+    let settings = [
+        "optimize.learning_rates.tone=0",
+        "composite.target_error=0.005",
+        "report.truth=known.exr",
+        "report.truth_tone=reinhard",
+    ];
+    let mut args = vec!["run", "--json"];
+    args.extend(settings.iter().flat_map(|s| ["--set", s]));
+    let compared = |args: &[&str]| -> Value {
+        let run = project.run(DIPIR, args);
+        run.expect_success();
+        let value: Value = serde_json::from_str(&run.stdout).unwrap();
+        value["truth"].clone()
+    };
+    project.write("known.exr", project.read("sky.exr"));
+    assert!(compared(&args)["rmse_recovered"].is_f64());
+    project.write("known.exr", project.read("out/light/environment.exr"));
+    let truth = compared(&args);
+    let number = |truth: &Value, key: &str| truth[key].as_f64().unwrap();
+    assert!(
+        number(&truth, "rmse_recovered") < 0.5 * number(&truth, "rmse_neutral"),
+        "{truth}"
+    );
+    // Texels of that map are 22.5 degrees wide.
+    assert!(number(&truth, "sun_error_deg") < 22.5, "{truth}");
+    // The page says it; nothing is rendered to say it again.
+    assert!(page(&project).contains("Against the true light"));
+    assert_eq!(compared(&args), Value::Null);
+    // A stop brighter it is another light from the same side.
+    let brighter = [&args[..], &["--set", "report.truth_exposure_ev=1"]].concat();
+    let brighter = compared(&brighter);
+    assert!(
+        number(&brighter, "rmse_recovered") > number(&truth, "rmse_recovered") + 0.01,
+        "{truth} {brighter}"
+    );
+    assert_eq!(brighter["sun_error_deg"], truth["sun_error_deg"]);
 }
