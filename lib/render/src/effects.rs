@@ -166,9 +166,8 @@ pub struct EffectsPlan {
     pub rays: BTreeMap<String, u64>,
 }
 
-/// Most interactions that are ever simulated; an albedo of 0.8 leaves 17% of the light after
-/// eight.
-pub const MAX_DEPTH: u32 = 8;
+/// Most interactions that are ever simulated.
+pub const MAX_DEPTH: u32 = EffectsConfig::MOST_DEPTH;
 
 impl EffectsPlan {
     /// Whether `effect` is simulated.
@@ -358,6 +357,9 @@ pub fn plan<L: SceneLight>(
     if config.mode == EffectsMode::Planned {
         leave_out(&mut plan, &pilot, config, progress)?;
     }
+    if let Some(depth) = config.max_depth {
+        plan.max_depth = depth;
+    }
     plan.rays = pilot
         .render(&plan.simulation())?
         .counts
@@ -445,7 +447,9 @@ fn leave_out<L: SceneLight>(
     // ---- The smallest depth that suffices ---------------------------------------------------
     if !plan.is_enabled(Effect::Interreflection) {
         plan.max_depth = 1;
-    } else if switch(config, Effect::Interreflection) == EffectSwitch::Auto {
+    } else if config.max_depth.is_none()
+        && switch(config, Effect::Interreflection) == EffectSwitch::Auto
+    {
         // What is lost falls with depth, so the least sufficient one is found by halving.
         let (mut least, mut most) = (2, MAX_DEPTH);
         while least < most {
@@ -461,6 +465,9 @@ fn leave_out<L: SceneLight>(
             }
         }
         plan.max_depth = most;
+    }
+    if let Some(depth) = config.max_depth {
+        plan.max_depth = depth;
     }
     plan.left_out = Some(pilot.difference(&reference, &plan.simulation())?.rmse);
     Ok(())

@@ -110,6 +110,14 @@ fn a_folded_bright_object_gets_the_depth_that_it_needs() {
     };
     let coarse = planned(&s, &coarse, &settings(0, 1));
     assert!(coarse.max_depth < p.max_depth);
+    // A depth that the user gives stands, and what it costs is said.
+    let shallow = EffectsConfig {
+        max_depth: Some(1),
+        ..EffectsConfig::default()
+    };
+    let shallow = planned(&s, &shallow, &settings(0, 1));
+    assert_eq!((shallow.max_depth, shallow.simulation().max_depth), (1, 1));
+    assert!(shallow.left_out > p.left_out);
 }
 
 #[test]

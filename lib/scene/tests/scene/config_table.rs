@@ -125,6 +125,10 @@ fn wrong_values_are_quoted_with_the_accepted_form() {
         message(&table("", "[effects]\ntolerance = 2")),
         "scene.effects.tolerance is 2; accepted: a display-referred error from 0 to 1, for instance tolerance = 0.002"
     );
+    assert_eq!(
+        message(&table("", "[effects]\nmax_depth = 9")),
+        "scene.effects.max_depth is 9; accepted: interactions from 1 to 8, for instance max_depth = 3"
+    );
 }
 
 #[test]
