@@ -24,7 +24,8 @@ pub enum Stop {
     Samples(u32),
     /// When the 95% bound of the estimated error is at most this display-referred RMSE.
     TargetError(f32),
-    /// After the last round that was expected to end in time.
+    /// When this time is over, counted from the call that renders; the last round is as large as
+    /// is expected to fit.
     TimeBudget(Duration),
 }
 
@@ -36,9 +37,18 @@ const FIRST_ROUND: u32 = 8;
 /// uncertain.
 const MAX_GROWTH: f64 = 4.0;
 
-/// Under a time budget the total cost grows by this factor a round: small enough that at most a
-/// third of the time goes unused.
+/// The first round under a time budget, small, because nobody knows yet what a sample takes.
+const FIRST_TIMED_ROUND: u32 = 4;
+
+/// Under a time budget the total cost grows at most by this factor a round, so that how long the
+/// last one takes is foreseen from rounds much like it.
 const TIMED_GROWTH: f64 = 1.5;
+
+/// Share of the time left that the last round is planned to take: rounds differ.
+const LAST_ROUND: f64 = 0.97;
+
+/// A round that would add less than this share of the cost so far is not worth its overhead.
+const LEAST_GROWTH: f64 = 0.03;
 
 /// The estimated error of the composite.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -84,17 +94,17 @@ pub struct Refined {
 }
 
 /// Draws samples until `stop`. `advance(job, n)` brings a job to `n` samples per pixel and
-/// replicate; `progress` may break off after any round.
+/// replicate; `progress` may break off after any round. A time budget counts from `start`.
 pub fn refine(
     size: (usize, usize),
     jobs: &mut [Job],
     stop: Stop,
+    start: Instant,
     max_samples: u32,
     viewing: &Viewing,
     advance: &(impl Fn(&mut Job, u32) + Sync),
     progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
 ) -> Result<Refined, RenderError> {
-    let start = Instant::now();
     let limit = max_samples.div_ceil(REPLICATES as u32).max(1);
     let mut film = Film::new(size.0, size.1);
     let mut goals = vec![first_goal(stop, limit); jobs.len()];
@@ -120,15 +130,16 @@ pub fn refine(
             .collect();
         let error = total_error(&errors, &film, viewing);
         let cost: f64 = jobs.iter().map(Job::cost).sum();
-        let next = next_goals(stop, limit, jobs, &errors, &error, cost);
-        let out_of_time = match stop {
+        let growth = match stop {
             Stop::TimeBudget(budget) => {
                 let rate = round_start.elapsed().as_secs_f64() / (cost - cost_before).max(1.0);
-                let expected = rate * cost * (TIMED_GROWTH - 1.0);
-                start.elapsed().as_secs_f64() + expected > budget.as_secs_f64()
+                let left = budget.as_secs_f64() - start.elapsed().as_secs_f64();
+                timed_growth(left, rate * cost)
             }
-            _ => false,
+            _ => 0.0,
         };
+        let next = next_goals(stop, limit, jobs, &errors, &error, cost * growth);
+        let out_of_time = matches!(stop, Stop::TimeBudget(_)) && growth == 0.0;
         let done = out_of_time
             || next
                 .iter()
@@ -171,7 +182,21 @@ fn first_goal(stop: Stop, limit: u32) -> u32 {
             let n = n.div_ceil(REPLICATES as u32).max(1);
             if n >= 4 * FIRST_ROUND { n / 4 } else { n }
         }
-        _ => FIRST_ROUND.min(limit),
+        Stop::TargetError(_) => FIRST_ROUND.min(limit),
+        Stop::TimeBudget(_) => FIRST_TIMED_ROUND.min(limit),
+    }
+}
+
+/// By which share of the cost so far the next round adds to it, `left` seconds before the end, when
+/// all of it again would take `again` seconds; 0 to stop. A last but one round leaves enough for
+/// the last.
+fn timed_growth(left: f64, again: f64) -> f64 {
+    let affordable = LAST_ROUND * left / again.max(1e-9);
+    let most = TIMED_GROWTH - 1.0;
+    match affordable {
+        a if a < LEAST_GROWTH => 0.0,
+        a if a <= most => a,
+        a => most.min(0.5 * a),
     }
 }
 
@@ -199,14 +224,15 @@ fn total_error(errors: &[SquaredError], film: &Film, viewing: &Viewing) -> Estim
     }
 }
 
-/// Samples per pixel and replicate that every job should reach in the next round.
+/// Samples per pixel and replicate that every job should reach in the next round, which under a time
+/// budget may cost `allowance`.
 fn next_goals(
     stop: Stop,
     limit: u32,
     jobs: &[Job],
     errors: &[SquaredError],
     error: &EstimatedError,
-    cost: f64,
+    allowance: f64,
 ) -> Vec<u32> {
     let unchanged = || jobs.iter().map(|job| job.samples).collect();
     match stop {
@@ -222,6 +248,7 @@ fn next_goals(
             goals(jobs, errors, scale, limit)
         }
         Stop::TimeBudget(_) => {
+            let spent_already: f64 = jobs.iter().map(Job::cost).sum();
             let per_scale = spread(jobs, errors).map(|(root, c)| root * c).sum::<f64>();
             if per_scale == 0.0 {
                 return unchanged();
@@ -235,16 +262,17 @@ fn next_goals(
                     .map(|(&n, job)| job.cost() * f64::from(n) / f64::from(job.samples.max(1)))
                     .sum()
             };
-            let (mut low, mut high) = (cost / per_scale * 0.5, cost / per_scale * 8.0);
-            for _ in 0..24 {
+            let whole = spent_already + allowance;
+            let (mut low, mut high) = (0.0, whole / per_scale * 8.0);
+            for _ in 0..32 {
                 let middle = 0.5 * (low + high);
-                if spent(middle) < cost * TIMED_GROWTH {
+                if spent(middle) <= whole {
                     low = middle;
                 } else {
                     high = middle;
                 }
             }
-            goals(jobs, errors, high, limit)
+            goals(jobs, errors, low, limit)
         }
     }
 }
@@ -299,5 +327,25 @@ fn fraction(
         f.clamp(0.0, 1.0)
     } else {
         0.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rounds_under_a_time_budget_grow_and_the_last_one_fills_what_is_left() {
+        // Ten times as long is left: as much as a round may grow.
+        assert_eq!(timed_growth(10.0, 1.0), TIMED_GROWTH - 1.0);
+        // All that is left fits into one round.
+        assert!((timed_growth(0.4, 1.0) - 0.4 * LAST_ROUND).abs() < 1e-12);
+        // Two rounds: neither so small that it is not worth it.
+        let growth = timed_growth(0.6, 1.0);
+        assert!((growth - 0.3 * LAST_ROUND).abs() < 1e-12);
+        assert!(timed_growth(0.6 - growth, 1.0 + growth) > LEAST_GROWTH);
+        for over in [(0.0, 1.0), (-1.0, 1.0), (0.01, 1.0)] {
+            assert_eq!(timed_growth(over.0, over.1), 0.0);
+        }
     }
 }

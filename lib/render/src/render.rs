@@ -1,6 +1,7 @@
 //! From a scene, a light and a plan to the layers of a composite.
 use std::ops::ControlFlow;
 use std::sync::Arc;
+use std::time::Instant;
 
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
@@ -165,6 +166,7 @@ impl<'a> Renderer<'a> {
         settings: &Settings,
         progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
     ) -> Result<Rendered, RenderError> {
+        let start = Instant::now();
         self.check_images(settings.background, settings.occluders)?;
         let world = self.world(simulation.features)?;
         let photo = settings
@@ -210,11 +212,11 @@ impl<'a> Renderer<'a> {
                 Layer::Object => advance_object(&path, settings.seed, job, goal),
                 _ => advance_shadow(&shadow, settings.seed, job, goal),
             };
-            self.run(jobs, settings, &advance, progress)
+            self.run(jobs, settings, start, &advance, progress)
         } else {
             let advance =
                 |job: &mut Job, goal: u32| advance_object(&path, settings.seed, job, goal);
-            self.run(jobs, settings, &advance, progress)
+            self.run(jobs, settings, start, &advance, progress)
         }
     }
 
@@ -222,6 +224,7 @@ impl<'a> Renderer<'a> {
         &self,
         mut jobs: Vec<Job>,
         settings: &Settings,
+        start: Instant,
         advance: &(impl Fn(&mut Job, u32) + Sync),
         progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
     ) -> Result<Rendered, RenderError> {
@@ -234,6 +237,7 @@ impl<'a> Renderer<'a> {
             (width, height),
             &mut jobs,
             settings.stop,
+            start,
             settings.max_samples,
             &viewing,
             advance,

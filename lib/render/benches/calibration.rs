@@ -1,0 +1,147 @@
+//! Whether the error that a render states is its error, whether a target is met, and whether a time
+//! budget is kept, as tables in Markdown.
+//!
+//! Ten kinds of scene, five seeds each. The true error of a render is its display-referred RMSE from a
+//! reference with a tenth of the target's error, less the reference's own.
+//!
+//! Run with `cargo test -p dipir-render --bench calibration -- --bench [target=RMSE] [size=PIXELS]`.
+//! Without `--bench`, as tests run it, one small scene proves that it works.
+mod gallery;
+
+use std::ops::ControlFlow;
+use std::time::{Duration, Instant};
+
+use dipir_imaging::composite::composite_pixel;
+use dipir_imaging::transfer::Transfer;
+use dipir_numerics::stats::median;
+use dipir_render::adaptive::Stop;
+use dipir_render::effects::EffectsPlan;
+use dipir_render::film::Film;
+use dipir_render::render::{Rendered, Renderer, Settings, Simulation};
+use glam::Vec3;
+
+const SEEDS: u64 = 5;
+/// What is behind everything where there is no photograph.
+const GREY: Vec3 = Vec3::splat(0.18);
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let value = |key: &str, default: f64| {
+        let mut pairs = arguments.iter().filter_map(|a| a.split_once('='));
+        pairs
+            .rfind(|(k, _)| *k == key)
+            .map_or(default, |(_, v)| v.parse().expect("a number"))
+    };
+    let whole = arguments.iter().any(|a| a == "--bench");
+    let size = value("size", if whole { 48.0 } else { 12.0 }) as u32;
+    let target = value("target", if whole { 0.008 } else { 0.03 }) as f32;
+    let scenes = gallery::scenes(size)
+        .into_iter()
+        .take(if whole { 10 } else { 1 });
+    let light = gallery::sky();
+    println!(
+        "| scene | stated, median | 95% bound, median | true, root mean square | true / target | within the bound |"
+    );
+    println!("|---|--:|--:|--:|--:|--:|");
+    let (mut all_within, mut count, mut ratios) = (0, 0, Vec::new());
+    let mut budgets = Vec::new();
+    for (name, scene) in scenes {
+        let renderer = Renderer::new(&scene);
+        let simulation = EffectsPlan::everything(&scene, &Settings::default()).simulation();
+        let render = |stop, seed| render(&renderer, &light, &simulation, stop, seed);
+        let reference = render(Stop::TargetError(target / 10.0), 1 << 40);
+        let (mut stated, mut bounds, mut squares, mut within) = (vec![], vec![], 0.0, 0);
+        for seed in 0..SEEDS {
+            let found = render(Stop::TargetError(target), seed);
+            let square = squared_difference(&found.film, &reference.film)
+                - reference.error.rmse * reference.error.rmse;
+            squares += square.max(0.0) / SEEDS as f64;
+            within += u32::from(square.max(0.0).sqrt() <= found.error.upper_95);
+            stated.push(found.error.rmse);
+            bounds.push(found.error.upper_95);
+        }
+        let error = squares.sqrt();
+        ratios.push(error / f64::from(target));
+        all_within += within;
+        count += SEEDS;
+        println!(
+            "| {name} | {:.5} | {:.5} | {error:.5} | {:.2} | {within} of {SEEDS} |",
+            median(&stated).expect("some"),
+            median(&bounds).expect("some"),
+            ratios.last().expect("one"),
+        );
+        if whole {
+            budgets.push((
+                name,
+                [0.3, 1.0, 3.0].map(|s| spent(&renderer, &light, &simulation, s)),
+            ));
+        }
+    }
+    let (least, most) = ratios
+        .iter()
+        .fold((f64::INFINITY, 0f64), |(l, m), &r| (l.min(r), m.max(r)));
+    println!(
+        "\nwithin the 95% bound: {all_within} of {count}; true over target: {least:.2} to {most:.2}\n"
+    );
+    if whole {
+        println!("| scene | of 0.3 s | of 1 s | of 3 s |\n|---|--:|--:|--:|");
+        for (name, shares) in budgets {
+            let cells = shares.map(|s| format!("{:.0}%", 100.0 * s));
+            println!("| {name} | {} |", cells.join(" | "));
+        }
+    }
+}
+
+fn render(
+    renderer: &Renderer,
+    light: &dipir_light::environment::EnvironmentSampler,
+    simulation: &Simulation,
+    stop: Stop,
+    seed: u64,
+) -> Rendered {
+    let settings = Settings {
+        seed,
+        stop,
+        max_samples: 1 << 20,
+        ..Settings::default()
+    };
+    let go_on = &mut |_: &_| ControlFlow::Continue(());
+    renderer
+        .render(light, simulation, &settings, go_on)
+        .expect("renders")
+}
+
+/// The share of a budget that a render with it takes.
+fn spent(
+    renderer: &Renderer,
+    light: &dipir_light::environment::EnvironmentSampler,
+    simulation: &Simulation,
+    seconds: f64,
+) -> f64 {
+    let clock = Instant::now();
+    let stop = Stop::TimeBudget(Duration::from_secs_f64(seconds));
+    render(renderer, light, simulation, stop, 0);
+    clock.elapsed().as_secs_f64() / seconds
+}
+
+/// Mean squared display-referred difference over the pixels that `reference` touches.
+fn squared_difference(found: &Film, reference: &Film) -> f64 {
+    let shown = |film: &Film, k: usize| {
+        let (object, alpha) = (film.object.pixels()[k], film.alpha.pixels()[k]);
+        let linear = composite_pixel(GREY, object, alpha, film.shadow.pixels()[k]);
+        linear
+            .to_array()
+            .map(|v| f64::from(Transfer::Srgb.encode_scalar(v.max(0.0)).clamp(0.0, 1.0)))
+    };
+    let bare = Transfer::Srgb.encode_scalar(GREY.x);
+    let (mut sum, mut count) = (0.0, 0.0);
+    for k in 0..reference.alpha.pixels().len() {
+        let (a, b) = (shown(found, k), shown(reference, k));
+        let changed = b.iter().any(|v| (v - f64::from(bare)).abs() > 0.5 / 255.0);
+        if reference.alpha.pixels()[k] > 0.0 || changed {
+            sum += (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>() / 3.0;
+            count += 1.0;
+        }
+    }
+    sum / f64::max(count, 1.0)
+}
