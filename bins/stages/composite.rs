@@ -1,7 +1,7 @@
 //! The composite stage: the object at full quality, its shadow, and the layers of both.
 use std::fmt;
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use dipir_cli::session::{Session, duration};
 use dipir_imaging::composite::composite;
@@ -24,6 +24,7 @@ use serde_json::{Value, json};
 use crate::interruption;
 use crate::light::{self, Light, Recovered};
 use crate::materials;
+use crate::presets::{self, Outlook};
 use crate::scene_folder::{self, SceneFolder};
 
 /// Name of the stage and of its folder.
@@ -132,12 +133,7 @@ impl CompositeTable {
         match (self.target_error, self.time_budget_s) {
             (Some(error), _) => Stop::TargetError(error),
             (None, Some(seconds)) => Stop::TimeBudget(Duration::from_secs_f64(seconds)),
-            (None, None) => Stop::TargetError(match quality {
-                Quality::Draft => 0.02,
-                // About half an 8-bit step, and a quarter of one.
-                Quality::Standard => 0.004,
-                Quality::High => 0.001,
-            }),
+            (None, None) => Stop::TargetError(presets::of(quality).composite.target_error),
         }
     }
 }
@@ -150,7 +146,23 @@ pub struct Done {
     rays: u64,
     error: f64,
     target: Stop,
+    /// From the start of the run to its end.
+    seconds: f64,
+    outlook: Outlook,
 }
+
+/// How a render went.
+struct Course {
+    rendered: Rendered,
+    /// Seconds to the end of its first round, without which there is no picture.
+    first_round_s: f64,
+    /// Seconds in all.
+    seconds: f64,
+}
+
+/// Seconds of putting the layers together and writing them, for each pixel: kept back of a time
+/// budget.
+const WRITING_S_PER_PIXEL: f64 = 1e-6;
 
 /// Everything that the stage reads.
 struct Inputs {
@@ -168,6 +180,7 @@ enum Source {
 
 /// Runs the stage.
 pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
+    let clock = Instant::now();
     let mut table: CompositeTable = session.config.table("composite")?;
     if args.target_error.is_some() || args.time_budget_s.is_some() {
         table.target_error = args.target_error;
@@ -187,7 +200,14 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let stop = table.stop(session.pipeline.quality);
     let folder = session.stage_folder(STAGE);
     let mut writer = session.begin(plan(session, &table)?)?;
-    let rendered = render(session, &table, stop, &inputs, &light)?;
+    let course = render(
+        session,
+        &table,
+        within(stop, clock, &inputs),
+        &inputs,
+        &light,
+    )?;
+    let Course { rendered, .. } = course;
     let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light))?;
     let png = writer.output("picture", "composite.png")?;
     write_png(
@@ -198,14 +218,34 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     layers.to_layers(&inputs.gbuffer)?.write_exr(exr)?;
     writer.set_estimated_error(rendered.error.upper_95);
     let manifest = writer.finish()?;
+    let seconds = clock.elapsed().as_secs_f64();
+    let error = rendered.error.upper_95;
+    // Squared error falls with the time spent on samples; the rest stays.
+    let at_target = |target: f64| {
+        let sampling = course.seconds * (error / target).powi(2);
+        seconds - course.seconds + sampling.max(course.first_round_s)
+    };
     Ok(Done {
         folder,
         manifest,
         samples: rendered.samples,
         rays: rendered.counts.total(),
-        error: rendered.error.upper_95,
+        error,
         target: stop,
+        seconds,
+        outlook: Outlook::around_error(error, at_target),
     })
+}
+
+/// Of a time budget, what is left for sampling: it began with `clock`, and the result has to be
+/// written.
+fn within(stop: Stop, clock: Instant, inputs: &Inputs) -> Stop {
+    let Stop::TimeBudget(budget) = stop else {
+        return stop;
+    };
+    let pixels = inputs.scene.loaded.photo.image.0.pixels().len();
+    let writing = Duration::from_secs_f64(WRITING_S_PER_PIXEL * pixels as f64);
+    Stop::TimeBudget(budget.saturating_sub(clock.elapsed() + writing))
 }
 
 /// Reads what the scene stage wrote and the files that it names.
@@ -246,7 +286,7 @@ fn render(
     stop: Stop,
     inputs: &Inputs,
     light: &Source,
-) -> anyhow::Result<Rendered> {
+) -> anyhow::Result<Course> {
     match light {
         Source::Map(light) => {
             let map = EnvironmentSampler::new(light.map.clone());
@@ -262,7 +302,9 @@ fn render_under<L: SceneLight>(
     stop: Stop,
     inputs: &Inputs,
     light: &L,
-) -> anyhow::Result<Rendered> {
+) -> anyhow::Result<Course> {
+    let clock = Instant::now();
+    let mut first_round_s = None;
     let loaded = &inputs.scene.loaded;
     let photo = &loaded.photo;
     let settings = Settings {
@@ -282,6 +324,7 @@ fn render_under<L: SceneLight>(
             &inputs.scene.effects.simulation(),
             &settings,
             &mut |state| {
+                first_round_s.get_or_insert_with(|| clock.elapsed().as_secs_f64());
                 progress.set(state.fraction);
                 let goal = match stop {
                     Stop::TargetError(target) => format!(" -> {target}"),
@@ -304,7 +347,12 @@ fn render_under<L: SceneLight>(
         )
         .map_err(crate::render_error)?;
     progress.done();
-    Ok(rendered)
+    let seconds = clock.elapsed().as_secs_f64();
+    Ok(Course {
+        rendered,
+        first_round_s: first_round_s.unwrap_or(seconds),
+        seconds,
+    })
 }
 
 /// The picture and its layers, linear.
@@ -412,6 +460,8 @@ impl Done {
             "samples": self.samples,
             "rays": self.rays,
             "elapsed_s": self.manifest.elapsed_s,
+            "seconds": self.seconds,
+            "other_presets": self.outlook.to_json(),
             "peak_rss_bytes": self.manifest.peak_rss_bytes,
         })
     }
@@ -438,6 +488,19 @@ impl fmt::Display for Done {
             self.error,
             self.rays as f64 * 1e-6
         )?;
+        if let Stop::TimeBudget(budget) = self.target {
+            let (budget, share) = (budget.as_secs_f64(), self.seconds / budget.as_secs_f64());
+            write!(
+                f,
+                "\n  {} in all, {:.0}% of the budget of {}",
+                duration(self.seconds),
+                100.0 * share,
+                duration(budget)
+            )?;
+        }
+        if !self.outlook.0.is_empty() {
+            write!(f, "\n  {}", self.outlook.text())?;
+        }
         if let Some(target) = self.missed_target() {
             write!(
                 f,

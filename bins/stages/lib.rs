@@ -1,5 +1,6 @@
 //! The stages behind the executables: each a function from a session to a folder of artifacts.
 pub mod background;
+pub mod children;
 pub mod composite;
 pub mod concepts;
 pub mod distillation;
@@ -9,6 +10,7 @@ pub mod materials;
 pub mod model;
 pub mod optimize;
 pub mod pipeline;
+pub mod presets;
 pub mod preview;
 pub mod reading;
 pub mod report;

@@ -1,10 +1,10 @@
 //! `report.html`: one page that shows a run, complete in itself.
 //!
 //! Whatever stages there are is shown; what cannot be read is said where it would stand.
-mod html;
+pub mod html;
 mod learning;
 mod lighting;
-mod picture;
+pub mod picture;
 mod plot;
 mod result;
 mod stages;

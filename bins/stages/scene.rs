@@ -22,6 +22,7 @@ use serde_json::{Value, json};
 use crate::composite::CompositeTable;
 use crate::interruption;
 use crate::light;
+use crate::presets::Outlook;
 use crate::transport::{self, Frame};
 
 /// Name of the stage and of its folder.
@@ -41,6 +42,8 @@ pub struct Done {
     resolution: [u32; 2],
     /// Absent where the light is given.
     record: Option<Record>,
+    /// Other qualities differ in the record alone.
+    outlook: Outlook,
 }
 
 /// The light transport that was recorded.
@@ -131,14 +134,33 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         writer.set_estimated_error(left_out);
     }
     let manifest = writer.finish()?;
+    let resolution = loaded.scene.camera.resolution;
+    let outlook = record
+        .as_ref()
+        .map(|r| outlook(session, r, resolution, manifest.elapsed_s));
     Ok(Done {
         folder,
         manifest,
         effects,
         triangles: loaded.scene.mesh.indices.len(),
         materials: loaded.scene.materials.len(),
-        resolution: loaded.scene.camera.resolution,
+        resolution,
         record,
+        outlook: outlook.unwrap_or_default(),
+    })
+}
+
+/// What the presets beside this one would have cost: recording takes time in proportion to paths.
+fn outlook(session: &Session, record: &Record, resolution: [u32; 2], elapsed_s: f64) -> Outlook {
+    let longest = resolution[0].max(resolution[1]) as usize;
+    let paths = |samples: u32, side: usize| f64::from(samples) * (side.min(longest) as f64).powi(2);
+    let here = paths(record.samples, record.size[0].max(record.size[1]));
+    Outlook::beside(session.pipeline.quality, |p| {
+        let there = paths(p.optimize.samples, p.optimize.size);
+        Some((
+            elapsed_s - record.seconds + record.seconds * there / here,
+            None,
+        ))
     })
 }
 
@@ -282,6 +304,7 @@ impl Done {
             "elapsed_s": self.manifest.elapsed_s,
             "peak_rss_bytes": self.manifest.peak_rss_bytes,
             "estimated_error": self.manifest.estimated_error,
+            "other_presets": self.outlook.to_json(),
         })
     }
 }
@@ -318,6 +341,9 @@ impl fmt::Display for Done {
         )?;
         if let Some(error) = self.manifest.estimated_error {
             write!(f, "\n  left out: {error:.5} of display-referred RMSE")?;
+        }
+        if !self.outlook.0.is_empty() {
+            write!(f, "\n  {}", self.outlook.text())?;
         }
         match &self.record {
             Some(r) => write!(

@@ -9,14 +9,13 @@ use dipir_cli::session::Session;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::resize::{Filter, resize};
 use dipir_optimize::settings::{OptimizeTable, Preset, Settings};
-use dipir_pipeline::config::Quality;
 use dipir_render::error::RenderError;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
 use dipir_scene::camera::Camera;
 use dipir_scene::scene::LoadedScene;
 
-use crate::interruption;
+use crate::{interruption, presets};
 
 /// Name of the file.
 pub const FILE: &str = "transport.safetensors";
@@ -25,12 +24,8 @@ pub const ROLE: &str = "transport";
 
 /// The `[optimize]` table with the quality's values for what it leaves open.
 pub fn settings(session: &Session, table: &OptimizeTable) -> anyhow::Result<Settings> {
-    let preset = match session.pipeline.quality {
-        Quality::Draft => Preset::Draft,
-        Quality::Standard => Preset::Standard,
-        Quality::High => Preset::High,
-    };
-    let settings = table.settings(preset, session.pipeline.seed);
+    let filled = presets::of(session.pipeline.quality).optimize.fill(table);
+    let settings = filled.settings(Preset::Standard, session.pipeline.seed);
     settings.map_err(|e| {
         let key = format!("optimize.{}", e.key);
         session.config.invalid(&key, e.message).into()

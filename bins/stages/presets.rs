@@ -1,0 +1,341 @@
+//! What `[pipeline] quality` stands for, as data: `presets.json`, read off what `dipir-tradeoff`
+//! measured, with the day of the measurement. And what the presets beside a run would have cost.
+use std::sync::OnceLock;
+
+use dipir_cli::session::duration;
+use dipir_optimize::settings::OptimizeTable;
+use dipir_pipeline::config::Quality;
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+/// The file.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Presets {
+    /// The day, as in 2026-11-21; absent where a preset is an assumption.
+    pub measured: Option<String>,
+    /// What measured it.
+    pub command: Option<String>,
+    /// From the cheapest to the best.
+    pub presets: [Preset; 3],
+}
+
+/// What one quality sets where nothing else does.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Preset {
+    /// Which.
+    pub quality: Quality,
+    /// Of `[composite]`.
+    pub composite: CompositePreset,
+    /// Of `[optimize]`.
+    pub optimize: OptimizePreset,
+    /// What recovering light was measured to cost.
+    pub light: Option<Measured>,
+}
+
+/// Of `[composite]`.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CompositePreset {
+    /// Display-referred RMSE at which sampling stops.
+    pub target_error: f32,
+}
+
+/// Of `[optimize]`; see its table for what each is.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct OptimizePreset {
+    pub iterations: usize,
+    pub lobes: usize,
+    pub environment: [usize; 2],
+    pub samples: u32,
+    pub size: usize,
+}
+
+/// Means over the measured scenes.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Measured {
+    /// Processor seconds of recording and optimising; only ratios mean something elsewhere.
+    pub cost_s: f64,
+    /// Display-referred RMSE of the composite under the recovered light.
+    pub error: f64,
+}
+
+impl OptimizePreset {
+    /// Fills what `table` leaves open.
+    pub fn fill(&self, table: &OptimizeTable) -> OptimizeTable {
+        OptimizeTable {
+            iterations: table.iterations.or(Some(self.iterations)),
+            lobes: table.lobes.or(Some(self.lobes)),
+            environment: table.environment.or(Some(self.environment)),
+            samples: table.samples.or(Some(self.samples)),
+            size: table.size.or(Some(self.size)),
+            ..table.clone()
+        }
+    }
+}
+
+/// All presets.
+pub fn all() -> &'static Presets {
+    static PRESETS: OnceLock<Presets> = OnceLock::new();
+    PRESETS.get_or_init(|| {
+        serde_json::from_str(include_str!("presets.json")).expect("a test reads the built-in file")
+    })
+}
+
+/// What `quality` stands for.
+pub fn of(quality: Quality) -> &'static Preset {
+    let [draft, standard, high] = &all().presets;
+    match quality {
+        Quality::Draft => draft,
+        Quality::Standard => standard,
+        Quality::High => high,
+    }
+}
+
+/// Name of a quality, as the configuration has it.
+pub fn name(quality: Quality) -> &'static str {
+    match quality {
+        Quality::Draft => "draft",
+        Quality::Standard => "standard",
+        Quality::High => "high",
+    }
+}
+
+/// What a run would have cost with another preset.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Estimate {
+    /// Which preset.
+    pub quality: Quality,
+    /// About so many seconds.
+    pub seconds: f64,
+    /// The error that it is made for, display-referred RMSE.
+    pub error: Option<f64>,
+}
+
+/// The next cheaper and the next better preset.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Outlook(pub Vec<Estimate>);
+
+impl Outlook {
+    /// The presets next to `quality`, estimated by `estimate`: seconds and error.
+    pub fn beside(
+        quality: Quality,
+        estimate: impl Fn(&Preset) -> Option<(f64, Option<f64>)>,
+    ) -> Self {
+        let presets = &all().presets;
+        let here = presets
+            .iter()
+            .position(|p| p.quality == quality)
+            .unwrap_or(1);
+        let next = [here.checked_sub(1), Some(here + 1)];
+        let next = next.into_iter().flatten().filter_map(|k| presets.get(k));
+        let estimated = |p: &Preset| {
+            estimate(p).map(|(seconds, error)| Estimate {
+                quality: p.quality,
+                seconds,
+                error,
+            })
+        };
+        Self(next.filter_map(estimated).collect())
+    }
+
+    /// For composites: the presets next to a display-referred error, and seconds for each target.
+    pub fn around_error(error: f64, seconds: impl Fn(f64) -> f64) -> Self {
+        // Nearer targets are no other choice.
+        const APART: f64 = 1.2;
+        let target = |p: &&Preset| f64::from(p.composite.target_error);
+        let presets = all().presets.iter();
+        let cheaper = presets.clone().rfind(|p| target(p) > error * APART);
+        let better = presets.clone().find(|p| target(p) * APART < error);
+        let chosen = cheaper.into_iter().chain(better);
+        let estimate = |p: &Preset| Estimate {
+            quality: p.quality,
+            seconds: seconds(target(&p)),
+            error: Some(target(&p)),
+        };
+        Self(chosen.map(estimate).collect())
+    }
+
+    /// A sentence; empty without an estimate.
+    pub fn text(&self) -> String {
+        let one = |e: &Estimate| {
+            let error = e
+                .error
+                .map_or(String::new(), |e| format!(" (error {e:.3})"));
+            format!("{} about {}{error}", name(e.quality), duration(e.seconds))
+        };
+        match self.0.is_empty() {
+            true => String::new(),
+            false => {
+                let all: Vec<String> = self.0.iter().map(one).collect();
+                format!("other presets would have taken: {}", all.join(", "))
+            }
+        }
+    }
+
+    /// For programs.
+    pub fn to_json(&self) -> Value {
+        let one = |e: &Estimate| json!({"quality": name(e.quality), "seconds": e.seconds, "error": e.error});
+        self.0.iter().map(one).collect()
+    }
+}
+
+/// A run of the light stage, to tell from it what another preset would have taken.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LightRun {
+    /// Steps.
+    pub iterations: usize,
+    /// Paths per pixel of the record.
+    pub samples: u32,
+    /// Longest side of the picture, pixels.
+    pub side: usize,
+    /// Longest side of the photograph, beyond which no preset goes.
+    pub photo_side: usize,
+    /// Seconds of the first record.
+    pub record_s: f64,
+    /// Seconds of the optimisation.
+    pub optimization_s: f64,
+    /// Whether a model judged the pictures: then its time is that of the steps, whatever the record.
+    pub by_model: bool,
+}
+
+/// An iteration's time grows with this power of a record's samples, as `docs/transport.md` measures: a
+/// record of 64 times the samples takes 6.6 times as long to replay, because they meet texels that a
+/// row has already.
+const REPLAY_POWER: f64 = 0.45;
+
+impl LightRun {
+    /// About how long it would have taken with `preset`.
+    pub fn seconds_with(&self, preset: &OptimizePreset) -> f64 {
+        let side = preset.size.min(self.photo_side);
+        let pixels = (side as f64 / self.side.max(1) as f64).powi(2);
+        let samples = f64::from(preset.samples) / f64::from(self.samples.max(1));
+        let iterations = preset.iterations as f64 / self.iterations.max(1) as f64;
+        let replay = match self.by_model {
+            true => 1.0,
+            false => pixels * samples.powf(REPLAY_POWER),
+        };
+        self.record_s * pixels * samples + self.optimization_s * iterations * replay
+    }
+
+    /// The presets beside `quality`.
+    pub fn outlook(&self, quality: Quality) -> Outlook {
+        let error = |p: &Preset| p.light.map(|l| l.error);
+        Outlook::beside(quality, |p| {
+            Some((self.seconds_with(&p.optimize), error(p)))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_optimize::settings::{Preset as LibraryPreset, Settings};
+
+    use super::*;
+
+    #[test]
+    fn the_file_reads_and_presets_go_from_cheap_to_good() {
+        let [draft, standard, high] = &all().presets;
+        assert_eq!(
+            [draft.quality, standard.quality, high.quality],
+            [Quality::Draft, Quality::Standard, Quality::High]
+        );
+        assert!(draft.composite.target_error > standard.composite.target_error);
+        assert!(standard.composite.target_error > high.composite.target_error);
+        assert!(draft.optimize.samples <= standard.optimize.samples);
+    }
+
+    #[test]
+    fn the_library_s_own_presets_are_these() {
+        let table = OptimizeTable::default();
+        for (quality, preset) in [
+            (Quality::Draft, LibraryPreset::Draft),
+            (Quality::Standard, LibraryPreset::Standard),
+            (Quality::High, LibraryPreset::High),
+        ] {
+            let library: Settings = table.settings(preset, 0).unwrap();
+            let filled = of(quality).optimize.fill(&table);
+            assert_eq!(
+                filled.settings(LibraryPreset::Standard, 0).unwrap(),
+                library
+            );
+        }
+    }
+
+    #[test]
+    fn what_the_table_says_goes_first() {
+        let table = OptimizeTable {
+            samples: Some(7),
+            ..OptimizeTable::default()
+        };
+        let filled = of(Quality::Draft).optimize.fill(&table);
+        assert_eq!(filled.samples, Some(7));
+        assert_eq!(
+            filled.iterations,
+            Some(of(Quality::Draft).optimize.iterations)
+        );
+    }
+
+    #[test]
+    fn the_presets_beside_a_run_are_named_with_their_cost() {
+        let cost = |p: &Preset| Some((1.0 / f64::from(p.composite.target_error), Some(0.5)));
+        let names = |o: &Outlook| o.0.iter().map(|e| name(e.quality)).collect::<Vec<_>>();
+        assert_eq!(names(&Outlook::beside(Quality::Draft, cost)), ["standard"]);
+        assert_eq!(
+            names(&Outlook::beside(Quality::Standard, cost)),
+            ["draft", "high"]
+        );
+        assert_eq!(names(&Outlook::beside(Quality::High, cost)), ["standard"]);
+        assert_eq!(Outlook::beside(Quality::High, |_| None).text(), "");
+
+        let targets = all()
+            .presets
+            .each_ref()
+            .map(|p| f64::from(p.composite.target_error));
+        let around = |e: f64| Outlook::around_error(e, |target| (e / target).powi(2));
+        assert_eq!(names(&around(targets[1])), ["draft", "high"]);
+        assert_eq!(names(&around(2.0 * targets[0])), ["draft"]);
+        assert_eq!(names(&around(0.5 * targets[2])), ["high"]);
+        let high = around(targets[1]).0[1];
+        assert!((high.seconds - (targets[1] / targets[2]).powi(2)).abs() < 1e-9);
+        assert!(
+            around(targets[1])
+                .text()
+                .starts_with("other presets would have taken: draft about")
+        );
+    }
+    #[test]
+    fn a_light_run_costs_what_its_steps_and_paths_cost() {
+        let here = of(Quality::Standard).optimize;
+        let run = LightRun {
+            iterations: here.iterations,
+            samples: here.samples,
+            side: here.size,
+            photo_side: 4096,
+            record_s: 2.0,
+            optimization_s: 10.0,
+            by_model: false,
+        };
+        assert!((run.seconds_with(&here) - 12.0).abs() < 1e-9);
+        let more = OptimizePreset {
+            samples: 64 * here.samples,
+            ..here
+        };
+        // 64 times the paths; 6.5 times the replay.
+        assert!((run.seconds_with(&more) - 128.0 - 65.0).abs() < 0.5);
+        let model = LightRun {
+            by_model: true,
+            ..run
+        };
+        let half = OptimizePreset {
+            iterations: here.iterations / 2,
+            ..more
+        };
+        assert!((model.seconds_with(&half) - 128.0 - 5.0).abs() < 1e-9);
+        assert_eq!(run.outlook(Quality::Standard).0.len(), 2);
+    }
+}
