@@ -17,6 +17,9 @@ mod composite;
 #[path = "../dipir-concepts/cli.rs"]
 mod concepts;
 #[allow(dead_code)]
+#[path = "../dipir-evaluate/cli.rs"]
+mod evaluate;
+#[allow(dead_code)]
 #[path = "../dipir-inspect/cli.rs"]
 mod inspect;
 #[allow(dead_code)]
@@ -31,6 +34,9 @@ mod optimize;
 #[allow(dead_code)]
 #[path = "../dipir-scene/cli.rs"]
 mod scene;
+#[allow(dead_code)]
+#[path = "../dipir-tradeoff/cli.rs"]
+mod tradeoff;
 
 /// Name of this executable.
 pub const DIPIR: &str = "dipir";
@@ -67,6 +73,8 @@ enum Executable {
     DipirComposite,
     DipirInspect,
     DipirModel,
+    DipirEvaluate,
+    DipirTradeoff,
 }
 
 impl Executable {
@@ -80,6 +88,8 @@ impl Executable {
             Self::DipirComposite => composite::Cli::command(),
             Self::DipirInspect => inspect::Cli::command(),
             Self::DipirModel => model::Cli::command(),
+            Self::DipirEvaluate => evaluate::Cli::command(),
+            Self::DipirTradeoff => tradeoff::Cli::command(),
         }
     }
 }

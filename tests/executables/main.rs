@@ -1,6 +1,7 @@
 //! The executables as a user runs them: on files, by exit code and by what they print.
 mod bad_input;
 mod disk;
+mod evaluation;
 mod guidance;
 mod inspection;
 mod interruption;
@@ -14,5 +15,6 @@ mod recovery;
 mod reproducibility;
 mod stages;
 mod staleness;
+mod tradeoff;
 mod usage;
 mod whole;

@@ -17,6 +17,10 @@ pub const SCENE: &str = env!("CARGO_BIN_EXE_dipir-scene");
 pub const COMPOSITE: &str = env!("CARGO_BIN_EXE_dipir-composite");
 /// `dipir-optimize`.
 pub const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-optimize");
+/// `dipir-tradeoff`.
+pub const TRADEOFF: &str = env!("CARGO_BIN_EXE_dipir-tradeoff");
+/// `dipir-evaluate`.
+pub const EVALUATE: &str = env!("CARGO_BIN_EXE_dipir-evaluate");
 /// `dipir-inspect`.
 pub const INSPECT: &str = env!("CARGO_BIN_EXE_dipir-inspect");
 

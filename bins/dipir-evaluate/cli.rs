@@ -1,0 +1,191 @@
+//! The command line of `dipir-evaluate`.
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+use dipir_cli::args::OutputArgs;
+
+const EXAMPLES: &str = "\
+Examples:
+  dipir-evaluate make --hdri maps/ --models glb/ --count 20    20 scenes with their true light
+  dipir-evaluate run --method neutral --method fitted          some of the methods
+  dipir-evaluate run --model path/to/model --jobs 4            all of them, four scenes at a time
+  dipir-evaluate run --environment-from estimates/             another estimator: estimates/SCENE.exr
+  dipir-evaluate report                                        tables and a page of what is there
+  dipir-evaluate study page --method ours                      a page that asks people
+  dipir-evaluate study count answers/*.json                    what they said
+
+Everything is in one folder, ./evaluation unless --out says otherwise: scenes/, runs/, report.*.
+Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
+
+/// Measure how good the light of a method is, on scenes whose true light is known
+#[derive(Parser)]
+#[command(name = "dipir-evaluate", version, after_help = EXAMPLES)]
+pub struct Cli {
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+#[derive(Subcommand)]
+pub enum Command {
+    /// Make scenes with a known light from panoramas and models
+    Make(MakeArgs),
+    /// Run methods on all scenes, as far as that is not done yet
+    Run(RunArgs),
+    /// Write tables and a page of all scores
+    Report(ReportArgs),
+    /// Ask people which of two results looks more real
+    #[command(subcommand)]
+    Study(StudyCommand),
+    /// List the methods
+    Methods(MethodsArgs),
+}
+
+#[derive(Args)]
+pub struct Folder {
+    /// Folder of the evaluation
+    #[arg(long, short = 'o', value_name = "DIR", default_value = "evaluation")]
+    pub out: PathBuf,
+
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub output: OutputArgs,
+}
+
+#[derive(Args)]
+pub struct MakeArgs {
+    #[command(flatten)]
+    pub folder: Folder,
+
+    /// Folder of panoramas, HDR or EXR, latitude-longitude
+    #[arg(long, value_name = "DIR")]
+    pub hdri: Option<PathBuf>,
+
+    /// Folder of models, GLB, glTF or OBJ [default: a matte, a glossy and a metal knot]
+    #[arg(long, value_name = "DIR")]
+    pub models: Option<PathBuf>,
+
+    /// Scenes to make; panoramas and models take turns, views and turns are drawn
+    #[arg(long, value_name = "N", default_value_t = 10)]
+    pub count: u64,
+
+    /// Seed of views and turns
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+
+    /// Width and height of the photographs
+    #[arg(long, value_name = "WxH", default_value = "192x128", value_parser = parse_size)]
+    pub size: [usize; 2],
+}
+
+#[derive(Args)]
+pub struct RunArgs {
+    #[command(flatten)]
+    pub folder: Folder,
+
+    /// Only these methods, by name; may be repeated
+    #[arg(long, value_name = "NAME")]
+    pub method: Vec<String>,
+
+    /// More methods, in a file like that which `methods --toml` prints
+    #[arg(long, value_name = "FILE")]
+    pub methods: Option<PathBuf>,
+
+    /// Maps that another estimator made, DIR/SCENE.exr or .hdr, on the photograph's scale: a method
+    /// called like the folder; may be repeated
+    #[arg(long, value_name = "DIR")]
+    pub environment_from: Vec<PathBuf>,
+
+    /// Only these scenes, by name; may be repeated
+    #[arg(long, value_name = "NAME")]
+    pub scene: Vec<String>,
+
+    /// The diffusion model of the methods that need one; without it they are left out
+    #[arg(long, value_name = "DIR")]
+    pub model: Option<PathBuf>,
+
+    /// Set a key for every method, as in --set optimize.iterations=100; may be repeated
+    #[arg(long = "set", short = 's', value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+
+    /// Display-referred RMSE of every composite
+    #[arg(long, value_name = "RMSE", default_value_t = 0.004)]
+    pub target_error: f64,
+
+    /// Scenes at a time
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub jobs: usize,
+
+    /// Worker threads in all, 0 for one a core
+    #[arg(long, short = 'j', value_name = "N", default_value_t = 0)]
+    pub threads: usize,
+}
+
+#[derive(Args)]
+pub struct ReportArgs {
+    #[command(flatten)]
+    pub folder: Folder,
+
+    /// The method that others are compared with, scene by scene [default: ours, if there]
+    #[arg(long, value_name = "NAME")]
+    pub baseline: Option<String>,
+}
+
+#[derive(Args)]
+pub struct MethodsArgs {
+    /// Print the table itself, to start one of your own from
+    #[arg(long)]
+    pub toml: bool,
+
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub output: OutputArgs,
+}
+
+#[derive(Subcommand)]
+pub enum StudyCommand {
+    /// Write the page, complete in itself, that shows pairs and keeps the choices
+    Page(StudyPageArgs),
+    /// Count the choices: majorities, intervals, chances
+    Count(StudyCountArgs),
+}
+
+#[derive(Args)]
+pub struct StudyPageArgs {
+    #[command(flatten)]
+    pub folder: Folder,
+
+    /// The method that is compared with others
+    #[arg(long, value_name = "NAME", default_value = "ours")]
+    pub method: String,
+
+    /// The others [default: every method that ran]; may be repeated
+    #[arg(long, value_name = "NAME")]
+    pub against: Vec<String>,
+
+    /// Seed of the order and the sides; another one for every participant
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+}
+
+#[derive(Args)]
+pub struct StudyCountArgs {
+    /// Files that the page saved
+    #[arg(required = true, value_name = "FILE")]
+    pub answers: Vec<PathBuf>,
+
+    /// The method that is asked about
+    #[arg(long, value_name = "NAME", default_value = "ours")]
+    pub method: String,
+
+    #[command(flatten)]
+    #[allow(missing_docs)]
+    pub output: OutputArgs,
+}
+
+fn parse_size(text: &str) -> Result<[usize; 2], String> {
+    let sides = text.split_once(['x', 'X']).and_then(|(w, h)| {
+        let side = |s: &str| s.parse::<usize>().ok().filter(|n| (8..=8192).contains(n));
+        Some([side(w)?, side(h)?])
+    });
+    sides.ok_or_else(|| "accepted: WIDTHxHEIGHT, each 8 to 8192 pixels, as in 192x128".into())
+}

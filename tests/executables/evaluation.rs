@@ -1,0 +1,135 @@
+//! `dipir-evaluate`: scenes, runs, report, study.
+use std::fs;
+
+use dipir_light::environment::EnvironmentMap;
+use glam::Vec3;
+use serde_json::{Value, json};
+
+use crate::project::{EVALUATE, OBJECT, Project};
+
+/// A project with a folder of panoramas and one of models.
+fn evaluation() -> Project {
+    let project = Project::new();
+    fs::create_dir(project.path("maps")).unwrap();
+    fs::create_dir(project.path("models")).unwrap();
+    let texels = (0..64 * 32).map(|k| match (k / 64, k % 64) {
+        (8..=9, 20..=22) => Vec3::splat(30.0),
+        (0..=15, _) => Vec3::new(0.4, 0.5, 0.7),
+        _ => Vec3::new(0.3, 0.25, 0.2),
+    });
+    let map = EnvironmentMap::new(64, 32, texels.collect()).unwrap();
+    map.write(project.path("maps/square.exr")).unwrap();
+    project.write("models/toy.obj", OBJECT);
+    let make = [
+        "make", "--hdri", "maps", "--models", "models", "--count", "1", "--size", "24x16",
+    ];
+    project.run(EVALUATE, &make).expect_success();
+    project
+}
+
+#[test]
+fn methods_run_once_and_are_reported_and_asked_about() {
+    let project = evaluation();
+    let run = [
+        "run",
+        "--target-error",
+        "0.05",
+        "--method",
+        "neutral",
+        "--method",
+        "projected",
+    ];
+    project.run(EVALUATE, &run).expect_success();
+    let score = "evaluation/runs/neutral/000-square-toy/score.json";
+    let first = project.read(score);
+    project.run(EVALUATE, &run).expect_success();
+    // Seconds differ from run to run: the same bytes mean that it did not run again.
+    assert_eq!(project.read(score), first);
+    let first: Value = serde_json::from_slice(&first).unwrap();
+    assert!(
+        first["picture"]["rmse_touched"].as_f64().unwrap() > 0.01,
+        "{first}"
+    );
+
+    project.run(EVALUATE, &["report"]).expect_success();
+    let report: Value = serde_json::from_slice(&project.read("evaluation/report.json")).unwrap();
+    assert_eq!(report["methods"].as_array().unwrap().len(), 2);
+    let page = String::from_utf8(project.read("evaluation/report.html")).unwrap();
+    // The photograph, the truth, and both methods.
+    assert_eq!(page.matches("data:image/png;base64,").count(), 4);
+    assert!(page.contains("Photograph projected") && !page.contains("http"));
+
+    project
+        .run(EVALUATE, &["study", "page", "--method", "projected"])
+        .expect_success();
+    let page = String::from_utf8(project.read("evaluation/study.html")).unwrap();
+    assert!(page.contains("\"scene\":\"000-square-toy\""));
+    let choice = json!({"scene": "000-square-toy", "preferred": "projected", "over": "neutral"});
+    let answers = json!({"participant": "a", "seed": 1, "choices": [choice]});
+    project.write("answers.json", answers.to_string());
+    let count = [
+        "study",
+        "count",
+        "answers.json",
+        "--method",
+        "projected",
+        "--json",
+    ];
+    let counted = project.run(EVALUATE, &count);
+    counted.expect_success();
+    let counted: Value = serde_json::from_str(&counted.stdout).unwrap();
+    assert_eq!(counted["verdicts"][0]["preferred"], 1.0);
+}
+
+#[test]
+fn another_estimator_s_maps_are_a_method_and_the_truth_itself_is_the_best() {
+    let project = evaluation();
+    fs::create_dir(project.path("estimates")).unwrap();
+    // What the truth is, on the photograph's scale.
+    let info = project.read("evaluation/scenes/000-square-toy/scene.json");
+    let info: Value = serde_json::from_slice(&info).unwrap();
+    let scale = info["exposure_ev"].as_f64().unwrap().exp2() as f32;
+    let map = EnvironmentMap::read(project.path("maps/square.exr"))
+        .unwrap()
+        .scaled(scale);
+    map.write(project.path("estimates/000-square-toy.exr"))
+        .unwrap();
+    let run = [
+        "run",
+        "--target-error",
+        "0.02",
+        "--environment-from",
+        "estimates",
+    ];
+    project.run(EVALUATE, &run).expect_success();
+    let score = project.read("evaluation/runs/estimates/000-square-toy/score.json");
+    let score: Value = serde_json::from_slice(&score).unwrap();
+    // Noise of both pictures, the method's and the truth's.
+    assert!(
+        score["picture"]["rmse_touched"].as_f64().unwrap() < 0.03,
+        "{score}"
+    );
+    assert!(
+        score["light"]["peak_deg"].as_f64().unwrap() < 0.1,
+        "{score}"
+    );
+}
+
+#[test]
+fn what_cannot_be_done_is_said_in_one_sentence() {
+    let project = Project::new();
+    let run = |arguments: &[&str]| project.run(EVALUATE, arguments);
+    run(&["make"]).expect_error(
+        2,
+        "error: there is nothing to make scenes from: name a folder of panoramas with --hdri",
+    );
+    run(&["run"]).expect_error(
+        1,
+        "error: there is no scene in evaluation/scenes; make some with dipir-evaluate make",
+    );
+    fs::create_dir(project.path("empty")).unwrap();
+    run(&["make", "--hdri", "empty"]).expect_error(
+        2,
+        "error: there are no panoramas in empty; accepted: .hdr, .exr",
+    );
+}
