@@ -65,6 +65,11 @@ fn inpainting_model_agrees_with_diffusers() -> Outcome<()> {
 }
 
 #[test]
+fn model_whose_timestep_hears_the_pooled_text_agrees_with_diffusers() -> Outcome<()> {
+    compare("pooled")
+}
+
+#[test]
 fn every_sampler_step_agrees_with_diffusers() -> Outcome<()> {
     let cases: Vec<serde_json::Value> =
         serde_json::from_slice(&std::fs::read(references().join("schedulers.json"))?)?;

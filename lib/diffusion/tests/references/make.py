@@ -2,6 +2,7 @@
 
     pip install torch diffusers transformers peft safetensors open_clip_torch
     python make.py                        # the small models that the tests read
+    python make.py --only pooled          # one of them
     python make.py --full sd21 FOLDER     # one model at its real size, for
                                           # `cargo run --release --example parity FOLDER`
 
@@ -65,6 +66,12 @@ FAMILIES = {
         prediction="epsilon",
         full_unet=dict(sample_size=64, in_channels=9, attention_head_dim=[5, 10, 20, 20], cross_attention_dim=1024, use_linear_projection=True),
         full_text=dict(hidden_size=1024, intermediate_size=4096, num_hidden_layers=23, num_attention_heads=16, hidden_act="gelu"),
+    ),
+    # Pooled text states that join the timestep: small models only.
+    "pooled": dict(
+        unet=dict(in_channels=4, attention_head_dim=4, cross_attention_dim=24, addition_embed_type="text", addition_embed_type_num_heads=4),
+        text=dict(hidden_size=24, hidden_act="quick_gelu"),
+        prediction="v_prediction",
     ),
 }
 
@@ -264,9 +271,13 @@ def schedulers():
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--full", nargs=2, metavar=("FAMILY", "FOLDER"))
+    parser.add_argument("--only", choices=FAMILIES)
     arguments = parser.parse_args()
     if arguments.full:
         make(arguments.full[0], pathlib.Path(arguments.full[1]), True)
+        return
+    if arguments.only:
+        make(arguments.only, HERE / arguments.only, False)
         return
     for name in FAMILIES:
         make(name, HERE / name, False)
