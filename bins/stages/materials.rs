@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 
 use crate::composite::{CompositeTable, Tone};
 use crate::light;
-use crate::optimize::Resume;
+use crate::resume::{self, Resume};
 use crate::scene_folder::{self, SceneFolder};
 use crate::transport::{self, Frame};
 use crate::{interruption, optimize};
@@ -65,7 +65,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     };
     let plan = plan(session)?;
     let decisive = settings_of(&table, settings.seed);
-    let fingerprint = optimize::run_fingerprint(&plan, &json!(decisive))?;
+    let fingerprint = resume::run_fingerprint(&plan, &json!(decisive))?;
     let folder = session.stage_folder(optimize::STAGE);
     let mut writer = session.begin(plan)?;
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);

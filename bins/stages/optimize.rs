@@ -8,12 +8,10 @@ use std::time::Instant;
 use anyhow::Context;
 use dipir_cli::interrupt::Interrupted;
 use dipir_cli::session::{Session, duration};
-use dipir_diffusion::model::Model;
 use dipir_imaging::file::{read_photo, write_png};
-use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_imaging::raster::DisplayImage;
 use dipir_optimize::OptimizeError;
-use dipir_optimize::checkpoint::State;
-use dipir_optimize::crop::{Framing, USUAL_SCALE, bounding_box};
+use dipir_optimize::crop::{Framing, USUAL_SCALE};
 use dipir_optimize::guidance::{Guidance, Reference, rmse, touched};
 use dipir_optimize::history::Row;
 use dipir_optimize::lighting::Lighting;
@@ -21,19 +19,18 @@ use dipir_optimize::objective::Objective;
 use dipir_optimize::optimization::{Event, Optimization, Outcome};
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::recorder::SceneRecorder;
-use dipir_optimize::settings::{GuidanceKind, LearningRates, OptimizeTable, Settings, Start};
+use dipir_optimize::settings::{GuidanceKind, OptimizeTable, Settings, Start};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
-use dipir_prior::reader::{ReaderSettings, Reading};
+use dipir_prior::reader::Reading;
 use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
-use dipir_scene::config::SceneConfig;
 use glam::Vec3;
 use serde_json::{Value, json};
 
-use crate::distillation::{Adapter, Distillation, DistillationSettings};
-use crate::model::ModelTable;
-use crate::reading::Place;
+use crate::distillation::Adapter;
+use crate::guide::{Asked, Guide, Judge};
+use crate::resume::{Resume, fingerprint};
 use crate::scene_folder::{self, SceneFolder};
 use crate::transport::{self, Frame};
 use crate::{interruption, model, reading};
@@ -58,21 +55,6 @@ pub struct Done {
     /// Display-referred RMSE against the reference, over what the object or its shadow touches.
     rmse: Option<f64>,
     reading: Option<Reading>,
-}
-
-/// What judges the picture, as far as files go.
-enum Judge {
-    Reference {
-        /// As the configuration names it.
-        path: PathBuf,
-        file: PathBuf,
-    },
-    Diffusion {
-        table: ModelTable,
-        settings: DistillationSettings,
-        class: String,
-        reads: bool,
-    },
 }
 
 /// Runs the stage.
@@ -219,154 +201,6 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     Ok(plan)
 }
 
-/// What the configuration asks for.
-struct Asked {
-    table: OptimizeTable,
-    settings: Settings,
-    judge: Judge,
-}
-
-impl Asked {
-    fn of(session: &Session) -> anyhow::Result<Self> {
-        let table: OptimizeTable = session.config.table("optimize")?;
-        let mut settings = transport::settings(session, &table)?;
-        let judge = match table.guidance {
-            GuidanceKind::Reference => {
-                let (path, file) = reference_of(session, &table)?;
-                Judge::Reference { path, file }
-            }
-            _ => diffusion(session, &table)?,
-        };
-        if let Judge::Diffusion { reads: true, .. } = &judge {
-            refine(&table, &mut settings);
-        }
-        Ok(Self {
-            table,
-            settings,
-            judge,
-        })
-    }
-}
-
-/// Iterations that refine a light that was read off the photograph.
-const REFINEMENT: usize = 50;
-/// Their learning rates beside those that find a light from a neutral start: difference of two
-/// predictions pulls what the caption does not say away from where it was read (docs/prior.md).
-const REFINEMENT_RATE: f64 = 0.1;
-
-/// What `table` leaves open, for a start that is near.
-fn refine(table: &OptimizeTable, settings: &mut Settings) {
-    settings.iterations = table.iterations.unwrap_or(REFINEMENT);
-    if table.learning_rates == LearningRates::default() {
-        settings.learning_rates = settings.learning_rates.scaled(REFINEMENT_RATE);
-    }
-}
-
-/// The model that guides and how it is asked.
-fn diffusion(session: &Session, table: &OptimizeTable) -> anyhow::Result<Judge> {
-    let model_table: ModelTable = session.config.table("model")?;
-    let scene: SceneConfig = session.config.table("scene")?;
-    let folder = session.resolve(&model_table.path);
-    let knows_light = folder.join(dipir_prior::encoder::FILE).is_file();
-    let reads = match &table.start {
-        Start::Auto => knows_light,
-        Start::Neutral | Start::File(_) => false,
-        Start::Read if knows_light => true,
-        Start::Read => {
-            let message = format!(
-                "\"read\" needs a model that knows light, and {} has no {}; accepted: auto, neutral, or \
-                 a lighting.json",
-                folder.display(),
-                dipir_prior::encoder::FILE
-            );
-            return Err(session.config.invalid("optimize.start", message).into());
-        }
-    };
-    Ok(Judge::Diffusion {
-        settings: DistillationSettings::new(session, table, reads)?,
-        class: scene.class.unwrap_or_else(|| "object".into()),
-        table: model_table,
-        reads,
-    })
-}
-
-/// The loaded model, if a model guides.
-struct Guide {
-    model: Option<Model>,
-    adapter: Option<Adapter>,
-}
-
-impl Guide {
-    fn open(session: &Session, judge: &Judge) -> anyhow::Result<Self> {
-        let Judge::Diffusion {
-            table,
-            settings,
-            reads,
-            ..
-        } = judge
-        else {
-            return Ok(Self {
-                model: None,
-                adapter: None,
-            });
-        };
-        let mut model = model::load(session, table)?;
-        let adapter = settings
-            .adapt
-            .then(|| Adapter::load(session, &mut model))
-            .transpose()?;
-        if *reads {
-            dipir_prior::student::add_placeholders(&mut model.tokenizer);
-        }
-        Ok(Self {
-            model: Some(model),
-            adapter,
-        })
-    }
-
-    /// What the model reads off the photograph, if it can.
-    fn read(
-        &self,
-        session: &Session,
-        judge: &Judge,
-        photo: &DisplayImage,
-        renderer: &Renderer,
-        coverage: &Raster<f32>,
-        seed: u64,
-    ) -> anyhow::Result<Option<Reading>> {
-        let (Some(model), Judge::Diffusion { reads: true, .. }) = (&self.model, judge) else {
-            return Ok(None);
-        };
-        let object = bounding_box(coverage).context(
-            "no pixel shows the object, so nothing can be guided; move it into the picture",
-        )?;
-        let progress = session.progress("reading");
-        let settings = ReaderSettings::default();
-        let report = |share: f64| progress.set(share);
-        let place = Place {
-            camera: renderer.camera(),
-            proxy: &renderer.scene().proxy,
-            object,
-        };
-        let reading = reading::read_light(model, photo, &place, &settings, seed, &report)?;
-        progress.done();
-        Ok(reading)
-    }
-
-    fn distillation(
-        &mut self,
-        settings: &DistillationSettings,
-        class: &str,
-        reading: Option<&Reading>,
-        photo: &DisplayImage,
-        paint: &Raster<f32>,
-    ) -> anyhow::Result<Distillation<'_>> {
-        let model = self.model.as_ref().context("no model is loaded")?;
-        let (settings, adapter) = (settings.clone(), self.adapter.as_ref());
-        Distillation::new(model, settings, adapter, class, reading, photo, paint)
-    }
-}
-
 /// The light of `[optimize] start`: its file as the configuration names it, where it is, and what it
 /// holds.
 fn first_light(
@@ -448,18 +282,6 @@ fn params(settings: &Settings, judge: &Judge) -> Value {
             "precision": table.precision, "read": reads,
         }),
     }
-}
-
-/// Tells one run from another, so that a checkpoint is found by the run that it belongs to alone.
-fn fingerprint(plan: &StagePlan, settings: &Settings) -> anyhow::Result<String> {
-    run_fingerprint(plan, &serde_json::to_value(settings)?)
-}
-
-/// As [`fingerprint`], for settings of any kind.
-pub(crate) fn run_fingerprint(plan: &StagePlan, settings: &Value) -> anyhow::Result<String> {
-    let all = json!([plan.version, plan.inputs, plan.params, settings]);
-    let hash = blake3::hash(serde_json::to_string(&all)?.as_bytes());
-    Ok(hash.to_hex()[..16].to_owned())
 }
 
 /// The scene stage's record if it was made for these settings, else a new one.
@@ -552,82 +374,6 @@ fn rows_without_times(outcome: &Outcome) -> anyhow::Result<Vec<Value>> {
         Ok(value)
     };
     outcome.history.iter().map(row).collect()
-}
-
-/// Where an interrupted run goes on: a folder beside the stage's own.
-pub(crate) struct Resume {
-    folder: PathBuf,
-}
-
-impl Resume {
-    pub(crate) fn open(session: &Session, fingerprint: &str) -> anyhow::Result<Self> {
-        let folder = session.out.join("light-checkpoints").join(fingerprint);
-        model::create_folder(&folder.join("previews"))?;
-        Ok(Self { folder })
-    }
-
-    pub(crate) fn checkpoint(&self) -> PathBuf {
-        self.folder.join("checkpoint.safetensors")
-    }
-
-    fn preview(&self, iteration: usize) -> PathBuf {
-        self.folder
-            .join("previews")
-            .join(format!("{iteration:06}.png"))
-    }
-
-    /// The iteration at which the checkpoint stands; 0 without one. A damaged one is removed.
-    fn restored(
-        &self,
-        session: &Session,
-        settings: &Settings,
-        start: &Parameters,
-    ) -> anyhow::Result<usize> {
-        let path = self.checkpoint();
-        let read = State::read(&path, settings, start);
-        self.resumed_at(session, read.map(|s| s.map(|s| s.iteration)))
-    }
-
-    /// The iteration of a checkpoint that was read. A damaged one is removed.
-    pub(crate) fn resumed_at(
-        &self,
-        session: &Session,
-        read: Result<Option<usize>, OptimizeError>,
-    ) -> anyhow::Result<usize> {
-        match read {
-            Ok(None) => Ok(0),
-            Ok(Some(iteration)) => {
-                session.remark(|| format!("continuing with iteration {iteration}"));
-                Ok(iteration)
-            }
-            Err(e) => {
-                session.warn(&format!("{e}; starting from the beginning"));
-                let path = self.checkpoint();
-                std::fs::remove_file(&path)
-                    .with_context(|| format!("cannot remove {}", path.display()))?;
-                Ok(0)
-            }
-        }
-    }
-
-    /// Names of the pictures that were kept, in the order of their iterations.
-    fn previews(&self) -> anyhow::Result<Vec<String>> {
-        let folder = self.folder.join("previews");
-        let failed = || format!("cannot read {}", folder.display());
-        let mut names = Vec::new();
-        for entry in std::fs::read_dir(&folder).with_context(failed)? {
-            let name = entry.with_context(failed)?.file_name();
-            names.push(name.to_string_lossy().into_owned());
-        }
-        names.sort();
-        Ok(names)
-    }
-
-    pub(crate) fn remove(&self) {
-        let _ = std::fs::remove_dir_all(&self.folder);
-        // Only if nothing else is in it.
-        let _ = self.folder.parent().map(std::fs::remove_dir);
-    }
 }
 
 /// Degrees above the horizon, and counter-clockwise from +z seen from above.

@@ -67,6 +67,31 @@ fn predictions(
         .forward(&input, &[t as f64], contexts, &Pass::default())?)
 }
 
+/// Calls `each` with the noise and with what is predicted of it under every context, [contexts, c, h, w],
+/// for `draws` of noise at each of the `shares` of the timesteps.
+fn for_each_draw(
+    model: &Model,
+    observation: &Observation,
+    contexts: &Tensor,
+    shares: &[f64],
+    draws: usize,
+    stream: &mut NoiseStream,
+    mut each: impl FnMut(&Tensor, &Tensor) -> Result<()>,
+) -> Result<()> {
+    for &share in shares {
+        let t = model.schedule.timestep_at(share);
+        for _ in 0..draws {
+            let noise =
+                stream.normal_tensor(observation.latents.dims(), DType::F32, &Device::Cpu)?;
+            let noisy = model.schedule.add_noise(&observation.latents, &noise, t)?;
+            let output = predictions(model, observation, &noisy, t, contexts)?;
+            let shown = noisy.broadcast_as(output.shape())?.contiguous()?;
+            each(&noise, &model.schedule.noise_of(&output, &shown, t)?)?;
+        }
+    }
+    Ok(())
+}
+
 /// Mean squared error of the noise under each context, averaged over
 /// `shares` of the timesteps and `draws` of noise.
 pub fn energies(
@@ -78,27 +103,17 @@ pub fn energies(
     stream: &mut NoiseStream,
 ) -> Result<Vec<f64>> {
     let mut sums = vec![0f64; contexts.dims()[0]];
-    for &share in shares {
-        let t = model.schedule.timestep_at(share);
-        for _ in 0..draws {
-            let noise =
-                stream.normal_tensor(observation.latents.dims(), DType::F32, &Device::Cpu)?;
-            let noisy = model.schedule.add_noise(&observation.latents, &noise, t)?;
-            let output = predictions(model, observation, &noisy, t, contexts)?;
-            let predicted = model.schedule.noise_of(
-                &output,
-                &noisy.broadcast_as(output.shape())?.contiguous()?,
-                t,
-            )?;
-            let error = predicted.broadcast_sub(&noise)?.sqr()?;
-            let error = error.broadcast_mul(&observation.weights)?;
-            let each = error.flatten_from(1)?.sum(1)?.to_vec1::<f32>()?;
-            let share = 1.0 / (shares.len() * draws) as f64;
-            sums.iter_mut()
-                .zip(each)
-                .for_each(|(s, e)| *s += e as f64 * share);
-        }
-    }
+    let weight = 1.0 / (shares.len() * draws) as f64;
+    let add = |noise: &Tensor, predicted: &Tensor| {
+        let error = predicted.broadcast_sub(noise)?.sqr()?;
+        let error = error.broadcast_mul(&observation.weights)?;
+        let errors = error.flatten_from(1)?.sum(1)?.to_vec1::<f32>()?;
+        sums.iter_mut()
+            .zip(errors)
+            .for_each(|(s, e)| *s += e as f64 * weight);
+        Ok(())
+    };
+    for_each_draw(model, observation, contexts, shares, draws, stream, add)?;
     Ok(sums)
 }
 
@@ -114,21 +129,11 @@ pub fn difference(
 ) -> Result<Tensor> {
     let mut sum = observation.latents.zeros_like()?;
     let weight = 1.0 / (shares.len() * draws) as f64;
-    for &share in shares {
-        let t = model.schedule.timestep_at(share);
-        for _ in 0..draws {
-            let noise =
-                stream.normal_tensor(observation.latents.dims(), DType::F32, &Device::Cpu)?;
-            let noisy = model.schedule.add_noise(&observation.latents, &noise, t)?;
-            let output = predictions(model, observation, &noisy, t, contexts)?;
-            let predicted = model.schedule.noise_of(
-                &output,
-                &noisy.broadcast_as(output.shape())?.contiguous()?,
-                t,
-            )?;
-            let difference = (predicted.narrow(0, 0, 1)? - predicted.narrow(0, 1, 1)?)?;
-            sum = (sum + (difference * weight)?)?;
-        }
-    }
+    let add = |_: &Tensor, predicted: &Tensor| {
+        let difference = (predicted.narrow(0, 0, 1)? - predicted.narrow(0, 1, 1)?)?;
+        sum = (&sum + (difference * weight)?)?;
+        Ok(())
+    };
+    for_each_draw(model, observation, contexts, shares, draws, stream, add)?;
     Ok(sum)
 }
