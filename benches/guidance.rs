@@ -12,20 +12,17 @@
 //! bootstrap intervals. Without `--bench`, as tests run it, it does nothing: what it measures takes
 //! minutes.
 use std::collections::BTreeMap;
-use std::f32::consts::{PI, TAU};
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use candle_core::{DType, Device};
 use dipir::distillation::{Distillation, DistillationSettings};
-use dipir::reading::{Place, read_light, start};
+use dipir::reading::{self, read_light, start};
 use dipir_diffusion::model::Model;
-use dipir_diffusion::noise::NoiseStream;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::{EnvironmentMap, direction_at};
-use dipir_light::gaussian::{LobeParameters, SphericalGaussian};
-use dipir_light::rasterize::rasterize;
+use dipir_light::gaussian::LobeParameters;
 use dipir_numerics::stats::{bootstrap_median_interval, median};
 use dipir_optimize::crop::bounding_box;
 use dipir_optimize::guidance::touched;
@@ -35,11 +32,11 @@ use dipir_optimize::optimization::Optimization;
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::settings::{GuidanceKind, OptimizeTable, Preset, Settings};
 use dipir_prior::examples::{Tone, angle_between};
-use dipir_prior::lights::{Light, Sun, sun_angles, sun_direction};
+use dipir_prior::lights::sun_angles;
+use dipir_prior::place::Place;
 use dipir_prior::reader::{ReaderSettings, Reading, combine};
-use dipir_prior::record::{Layer, Record, first_plane, weights};
 use dipir_prior::student::add_placeholders;
-use dipir_prior::studio::{Kinds, Paint, Stage, View};
+use dipir_prior::studio::Paint;
 use dipir_render::features::SPECULAR;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
@@ -56,9 +53,7 @@ const SIZE: u32 = 96;
 const MAP: [usize; 2] = [128, 64];
 
 struct Trial {
-    stage: Stage,
-    light: Light,
-    tone: Tone,
+    place: Place,
     photo: DisplayImage,
     linear: LinearImage,
     transport: Transport,
@@ -82,34 +77,9 @@ fn ground() -> Proxy {
 
 impl Trial {
     fn draw(index: u64, samples: u32) -> anyhow::Result<Self> {
-        let mut stage = Stage::draw(SEED, index, SIZE, Kinds::HeldOut, View::Wide);
-        let mut stream = NoiseStream::new(SEED ^ 1, index);
-        let mut range = |low: f32, high: f32| low + (high - low) * stream.uniform() as f32;
-        let sun = Sun {
-            azimuth: range(0.0, TAU),
-            elevation: range(18.0, 66.0).to_radians(),
-            sharpness: range(110.0, 400.0),
-        };
-        stage.suns = vec![sun; stage.suns.len()];
-        let share = range(0.55, 0.93);
-        let total = PI * range(0.5, 1.05);
-        let tints = (range(0.0, 0.5), range(0.0, 0.5));
-        let light = Light::new(0, sun.elevation, (total, share), tints, range(0.6, 1.5));
-        let tone = Tone {
-            exposure: range(0.75, 1.35),
-            shoulder: range(0.0, 1.0),
-        };
-        let record = Record::trace(&stage, SEED, index);
-        let n = (SIZE * SIZE) as usize;
-        let mut pixels = vec![Vec3::ZERO; n];
-        for (b, weight) in weights(&light).iter().enumerate() {
-            for (p, pixel) in pixels.iter_mut().enumerate() {
-                let plane = |c: usize| (first_plane(Layer::Background) + 3 * b + c) * n;
-                let response = Vec3::from_array([0, 1, 2].map(|c| record.planes[plane(c) + p]));
-                *pixel += *weight * response;
-            }
-        }
-        let mut shown: Vec<f32> = pixels.iter().flat_map(|p| p.to_array()).collect();
+        let place = Place::draw(SEED, index, SIZE);
+        let (stage, tone) = (&place.stage, place.tone);
+        let mut shown: Vec<f32> = place.radiance.iter().flat_map(|p| p.to_array()).collect();
         tone.apply(&mut shown);
         // As a file would hold it.
         let shown = shown.chunks_exact(3).map(|p| {
@@ -144,51 +114,17 @@ impl Trial {
         let transport =
             Transport::record(&renderer, &settings, &mut |_| ControlFlow::Continue(()))?;
         Ok(Self {
-            stage,
-            light,
-            tone,
+            place,
             photo,
             linear,
             transport,
         })
     }
 
-    fn sun(&self) -> Sun {
-        self.stage.suns[0]
-    }
-
-    /// The true light as a map: sun, graded sky, and what the ground throws back.
-    fn map(&self) -> EnvironmentMap {
-        let sun = self.sun();
-        let lobe = SphericalGaussian {
-            direction: sun_direction(sun.azimuth, sun.elevation),
-            radiance: Vec3::ONE,
-            sigma: sun.sharpness.powf(-0.5),
-        };
-        let lobe = SphericalGaussian {
-            radiance: self.light.sun_color / lobe.solid_angle() as f32,
-            ..lobe
-        };
-        let mut map = rasterize(&[lobe], MAP[0], MAP[1]);
-        let mut texels = map.texels().to_vec();
-        for (k, texel) in texels.iter_mut().enumerate() {
-            let y = map.direction_of(k / MAP[0], k % MAP[0]).y;
-            *texel += if y > 0.0 {
-                self.light.horizon * (1.0 - y) + self.light.zenith * y
-            } else {
-                self.light.bounce
-            };
-        }
-        if let Ok(full) = EnvironmentMap::new(MAP[0], MAP[1], texels) {
-            map = full;
-        }
-        map
-    }
-
     /// The photograph seen in the directions that it shows, mirrored behind the camera and drawn
     /// out at its borders: light without any model.
     fn projected(&self) -> anyhow::Result<EnvironmentMap> {
-        let camera = &self.stage.camera;
+        let camera = &self.place.stage.camera;
         let back = camera.rotation.z_axis;
         let last = (SIZE - 1) as f32;
         let texels = (0..MAP[0] * MAP[1]).map(|k| {
@@ -210,8 +146,9 @@ impl Trial {
     }
 
     /// The composite under the true light with the photograph's own tone.
-    fn truth(&self, objective: &Objective) -> DisplayImage {
-        self.under(&self.map(), objective, Some(&self.tone))
+    fn truth(&self, objective: &Objective) -> anyhow::Result<DisplayImage> {
+        let map = self.place.map(MAP[0], MAP[1])?;
+        Ok(self.under(&map, objective, Some(&self.place.tone)))
     }
 
     /// The composite under `map`, the object through `tone`.
@@ -271,7 +208,7 @@ fn judge(
 ) -> Answer {
     let mask = touched(objective);
     let (azimuth, elevation) = peak.map_or((f32::NAN, f32::NAN), sun_angles);
-    let sun = trial.sun();
+    let sun = trial.place.sun();
     Answer {
         azimuth: angle_between(azimuth, sun.azimuth).to_degrees(),
         elevation: (elevation - sun.elevation).abs().to_degrees(),
@@ -318,7 +255,7 @@ fn run(
         Transfer::Srgb,
         settings.weights(),
     )?;
-    let truth = trial.truth(&objective);
+    let truth = trial.truth(&objective)?;
     let mut found = BTreeMap::new();
     let neutral = Parameters::neutral(lobes, ambient_of(&trial.linear));
     found.insert("1 neutral", answer(&trial, &objective, &neutral, &truth));
@@ -334,9 +271,9 @@ fn run(
     let Some(object) = bounding_box(&coverage) else {
         return Ok(found);
     };
-    let camera = &trial.stage.camera;
+    let camera = &trial.place.stage.camera;
     let proxy = ground();
-    let place = Place {
+    let place = reading::Place {
         camera,
         proxy: &proxy,
         object,
@@ -347,8 +284,8 @@ fn run(
     };
     readings.push(serde_json::json!({
         "scene": index, "reading": reading, "truth": {
-            "azimuth": trial.sun().azimuth, "elevation": trial.sun().elevation,
-            "share": trial.light.share,
+            "azimuth": trial.place.sun().azimuth, "elevation": trial.place.sun().elevation,
+            "share": trial.place.light.share,
         },
     }));
     let seen = start(&reading.encoder, camera, lobes);
@@ -356,13 +293,13 @@ fn run(
     let read = start(&reading.light, camera, lobes);
     found.insert("4 inversion", answer(&trial, &objective, &read, &truth));
     let mut known = reading.light;
-    known.words.azimuth = trial.sun().azimuth;
+    known.words.azimuth = trial.place.sun().azimuth;
     let turned = start(&known, camera, lobes);
     found.insert(
         "6 true azimuth",
         answer(&trial, &objective, &turned, &truth),
     );
-    known.words.elevation = trial.sun().elevation;
+    known.words.elevation = trial.place.sun().elevation;
     let turned = start(&known, camera, lobes);
     found.insert(
         "7 true direction",
@@ -487,7 +424,7 @@ fn guided(
         light: said,
         ..reading.clone()
     };
-    let class = trial.stage.shape.word();
+    let class = trial.place.stage.shape.word();
     let coverage = trial.transport.coverage().clone();
     let paint = match variant.background {
         true => coverage,
@@ -518,7 +455,7 @@ fn guided(
         )
     };
     let start = match variant.read_start {
-        true => start(&said, &trial.stage.camera, lobes),
+        true => start(&said, &trial.place.stage.camera, lobes),
         false => {
             let ambient = glam::DVec3::splat(ambient_of(&trial.linear));
             Parameters::from_light(lobes, ambient, ambient * 0.3, None)

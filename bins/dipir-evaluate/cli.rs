@@ -7,6 +7,7 @@ use dipir_cli::args::OutputArgs;
 const EXAMPLES: &str = "\
 Examples:
   dipir-evaluate make --hdri maps/ --models glb/ --count 20    20 scenes with their true light
+  dipir-evaluate make --generated 20 --size 96x96              20 scenes of the project's generator
   dipir-evaluate run --method neutral --method fitted          some of the methods
   dipir-evaluate run --model path/to/model --jobs 4            all of them, four scenes at a time
   dipir-evaluate run --environment-from estimates/             another estimator: estimates/SCENE.exr
@@ -27,7 +28,7 @@ pub struct Cli {
 
 #[derive(Subcommand)]
 pub enum Command {
-    /// Make scenes with a known light from panoramas and models
+    /// Make scenes with a known light, from panoramas and models or by the project's generator
     Make(MakeArgs),
     /// Run methods on all scenes, as far as that is not done yet
     Run(RunArgs),
@@ -64,11 +65,16 @@ pub struct MakeArgs {
     #[arg(long, value_name = "DIR")]
     pub models: Option<PathBuf>,
 
-    /// Scenes to make; panoramas and models take turns, views and turns are drawn
+    /// Scenes to make of panoramas; they and models take turns, views and turns are drawn
     #[arg(long, value_name = "N", default_value_t = 10)]
     pub count: u64,
 
-    /// Seed of views and turns
+    /// Scenes to make of the project's own generator: a capsule or a pyramid among other solids under a
+    /// sun, square
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub generated: u64,
+
+    /// Seed of what is drawn
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
 

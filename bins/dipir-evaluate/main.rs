@@ -1,6 +1,7 @@
 //! `dipir-evaluate`: how good the light of a method is, where the truth is known.
 mod bench;
 mod cli;
+mod generated;
 mod lights;
 mod make;
 mod methods;

@@ -1,6 +1,5 @@
 //! Scenes whose true light is known: a photograph cut out of a panorama, a model put into it, lit by
 //! that panorama.
-use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -20,6 +19,7 @@ use serde_json::json;
 
 use crate::bench::{Bench, SceneInfo, Tone, write, write_json};
 use crate::cli::MakeArgs;
+use crate::generated;
 
 /// Vertical field of view of every photograph, degrees.
 const FOV_DEG: f32 = 40.0;
@@ -47,19 +47,46 @@ const BUILT_IN: [(&str, &str); 3] = [
 /// Makes scenes; those that are there already stay.
 pub fn run(args: &MakeArgs) -> anyhow::Result<()> {
     let bench = Bench::new(&args.folder.out);
-    let panoramas = match &args.hdri {
-        Some(folder) => files(folder, &["hdr", "exr"], "panoramas")?,
-        None => {
-            let text =
-                "there is nothing to make scenes from: name a folder of panoramas with --hdri";
-            return Err(Usage(text.into()).into());
-        }
-    };
+    if args.hdri.is_none() && args.generated == 0 {
+        let text = "there is nothing to make scenes from: name a folder of panoramas with --hdri, or a \
+                    number of generated places with --generated";
+        return Err(Usage(text.into()).into());
+    }
+    let progress = Progress::new("make", args.folder.output.quiet);
+    let mut made = Vec::new();
+    if let Some(folder) = &args.hdri {
+        made = of_panoramas(args, &bench, folder, &progress)?;
+    }
+    for n in 0..args.generated {
+        progress.set(n as f64 / args.generated as f64);
+        made.push(generated::make(&bench, args.seed, n, args.size[1])?);
+    }
+    progress.done();
+    args.folder.output.result(
+        || {
+            format!(
+                "{} scenes in {}",
+                made.len(),
+                bench.root().join("scenes").display()
+            )
+        },
+        || json!({"scenes": made, "folder": bench.root()}),
+    );
+    Ok(())
+}
+
+/// Scenes of the panoramas in `folder`; their names.
+fn of_panoramas(
+    args: &MakeArgs,
+    bench: &Bench,
+    folder: &Path,
+    progress: &Progress,
+) -> anyhow::Result<Vec<String>> {
+    let panoramas = files(folder, &["hdr", "exr"], "panoramas")?;
     let models = match &args.models {
         Some(folder) => files(folder, &["glb", "gltf", "obj"], "models")?,
-        None => built_in(&bench)?,
+        None => built_in(bench)?,
     };
-    let progress = Progress::new("make", args.folder.output.quiet);
     let mut made = Vec::new();
     let mut kept: Option<(PathBuf, EnvironmentMap)> = None;
     for n in 0..args.count {
@@ -75,23 +102,12 @@ pub fn run(args: &MakeArgs) -> anyhow::Result<()> {
                 kept = Some((panorama.clone(), read_map(panorama)?));
             }
             if let Some((_, map)) = &kept {
-                make(&bench, args, n, &name, panorama, map, model)?;
+                make(bench, args, n, &name, panorama, map, model)?;
             }
         }
         made.push(name);
     }
-    progress.done();
-    args.folder.output.result(
-        || {
-            format!(
-                "{} scenes in {}",
-                made.len(),
-                bench.root().join("scenes").display()
-            )
-        },
-        || json!({"scenes": made, "folder": bench.root()}),
-    );
-    Ok(())
+    Ok(made)
 }
 
 fn make(
@@ -236,29 +252,12 @@ fn built_in(bench: &Bench) -> anyhow::Result<Vec<PathBuf>> {
                 &folder.join(format!("{name}.mtl")),
                 format!("newmtl skin\n{material}\n"),
             )?;
-            write(&path, knot(name))?;
+            let mesh = torus_knot(Vec3::Y * 0.75, 0.45, 0.17, 256, 24);
+            write(&path, generated::obj(&mesh, name))?;
         }
         paths.push(path);
     }
     Ok(paths)
-}
-
-/// A torus knot as an OBJ file.
-fn knot(name: &str) -> String {
-    let mesh = torus_knot(Vec3::Y * 0.75, 0.45, 0.17, 256, 24);
-    let mut text = format!("mtllib {name}.mtl\nusemtl skin\n");
-    for (p, n) in mesh.positions.iter().zip(&mesh.normals) {
-        let _ = writeln!(
-            text,
-            "v {} {} {}\nvn {} {} {}",
-            p.x, p.y, p.z, n.x, n.y, n.z
-        );
-    }
-    for [a, b, c] in &mesh.indices {
-        let (a, b, c) = (a + 1, b + 1, c + 1);
-        let _ = writeln!(text, "f {a}//{a} {b}//{b} {c}//{c}");
-    }
-    text
 }
 
 fn stem(path: &Path) -> String {

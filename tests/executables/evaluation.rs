@@ -121,7 +121,8 @@ fn what_cannot_be_done_is_said_in_one_sentence() {
     let run = |arguments: &[&str]| project.run(EVALUATE, arguments);
     run(&["make"]).expect_error(
         2,
-        "error: there is nothing to make scenes from: name a folder of panoramas with --hdri",
+        "error: there is nothing to make scenes from: name a folder of panoramas with --hdri, \
+         or a number of generated places with --generated",
     );
     run(&["run"]).expect_error(
         1,
@@ -131,5 +132,40 @@ fn what_cannot_be_done_is_said_in_one_sentence() {
     run(&["make", "--hdri", "empty"]).expect_error(
         2,
         "error: there are no panoramas in empty; accepted: .hdr, .exr",
+    );
+}
+
+#[test]
+fn a_generated_place_is_lit_by_the_map_beside_it() {
+    let project = Project::new();
+    let make = ["make", "--generated", "1", "--size", "24x24"];
+    project.run(EVALUATE, &make).expect_success();
+    let scenes: Vec<_> = fs::read_dir(project.path("evaluation/scenes"))
+        .unwrap()
+        .map(|e| e.unwrap().file_name().into_string().unwrap())
+        .collect();
+    let [name] = &scenes[..] else {
+        panic!("{scenes:?}");
+    };
+    let run = [
+        "run",
+        "--target-error",
+        "0.05",
+        "--method",
+        "neutral",
+        "--method",
+        "fitted",
+    ];
+    project.run(EVALUATE, &run).expect_success();
+    let rmse = |method: &str| {
+        let score = project.read(&format!("evaluation/runs/{method}/{name}/score.json"));
+        let score: Value = serde_json::from_slice(&score).unwrap();
+        score["picture"]["rmse_touched"].as_f64().unwrap()
+    };
+    assert!(
+        rmse("fitted") < 0.5 * rmse("neutral"),
+        "{} beside {}",
+        rmse("fitted"),
+        rmse("neutral")
     );
 }

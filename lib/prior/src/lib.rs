@@ -9,6 +9,7 @@ pub mod error;
 pub mod examples;
 pub mod gates;
 pub mod lights;
+pub mod place;
 pub mod reader;
 pub mod record;
 pub mod shapes;

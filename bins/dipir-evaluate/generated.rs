@@ -1,0 +1,90 @@
+//! Scenes of the project's own generator, of kinds that the small model never saw in training: a place
+//! with several solids under a sun and a sky, and one more solid to be put into it.
+use std::fmt::Write as _;
+use std::path::Path;
+
+use dipir_imaging::file::write_png;
+use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_imaging::transfer::Transfer;
+use dipir_prior::place::Place;
+use dipir_scene::mesh::TriangleMesh;
+
+use crate::bench::{Bench, SceneInfo, Tone, write, write_json};
+
+/// Columns and rows of the true light.
+const MAP: [usize; 2] = [512, 256];
+/// Keeps these places apart from those that are trained on, tuned with and tested for the gates.
+const SEED: u64 = 0xeba1_5ce2;
+
+/// Makes the scene number `index` under `seed`, `side` pixels high and wide, unless it is there; its name.
+pub fn make(bench: &Bench, seed: u64, index: u64, side: usize) -> anyhow::Result<String> {
+    let place = Place::draw(SEED ^ seed, index, side as u32);
+    let stage = &place.stage;
+    let class = stage.shape.word();
+    let name = format!("generated-{index:03}-{class}");
+    let folder = bench.scene(&name);
+    if folder.join("scene.json").is_file() {
+        return Ok(name);
+    }
+    let exposure = place.tone.exposure;
+    let exposed = place.radiance.iter().map(|p| *p * exposure).collect();
+    let photo = LinearImage(Raster::from_pixels(side, side, exposed));
+    let paint = stage.main_paint;
+    let metal = if paint.metallic { 1.0 } else { 0.0 };
+    let [r, g, b] = paint.color.to_array();
+    let material = format!(
+        "newmtl skin\nKd {r} {g} {b}\nPr {}\nPm {metal}\n",
+        paint.roughness
+    );
+    write(&folder.join("object.obj"), obj(&stage.main, "object"))?;
+    write(&folder.join("object.mtl"), material)?;
+    write_png(folder.join("photo.png"), &Transfer::Srgb.encode(&photo))?;
+    place.map(MAP[0], MAP[1])?.write(folder.join("map.exr"))?;
+    let camera = &stage.camera;
+    let ahead = camera.position - camera.rotation.z_axis;
+    let fov_deg = 2.0 * (0.5 * side as f32 / camera.focal_px.y).atan().to_degrees();
+    let text = format!(
+        "# Made by dipir-evaluate: a place of the generator.\n\
+         [scene]\nbackground = \"photo.png\"\nclass = \"{class}\"\n\n\
+         [[scene.objects]]\npath = \"object.obj\"\n\n\
+         [scene.camera]\nposition = {:?}\nlook_at = {:?}\nfov_deg = {fov_deg:?}\n\n\
+         [scene.proxy]\nplane = {{ point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }}\n",
+        camera.position.to_array(),
+        ahead.to_array(),
+    );
+    write(&folder.join("pipeline.toml"), text)?;
+    let info = SceneInfo {
+        name: name.clone(),
+        made_from: format!(
+            "a place with {} solids, a {} {class}, the sun {:.0} degrees high",
+            stage.paints.len(),
+            paint.word,
+            place.sun().elevation.to_degrees()
+        ),
+        map: Path::new("map.exr").into(),
+        exposure_ev: f64::from(exposure.log2()),
+        tone: Tone::None,
+    };
+    // Last: it stands for all of them.
+    write_json(&folder.join("scene.json"), &info)?;
+    Ok(name)
+}
+
+/// The mesh as an OBJ file with one material.
+pub fn obj(mesh: &TriangleMesh, library: &str) -> String {
+    let mut text = format!("mtllib {library}.mtl\nusemtl skin\n");
+    for p in &mesh.positions {
+        let _ = writeln!(text, "v {} {} {}", p.x, p.y, p.z);
+    }
+    for n in &mesh.normals {
+        let _ = writeln!(text, "vn {} {} {}", n.x, n.y, n.z);
+    }
+    for [a, b, c] in &mesh.indices {
+        let (a, b, c) = (a + 1, b + 1, c + 1);
+        let _ = match mesh.normals.is_empty() {
+            true => writeln!(text, "f {a} {b} {c}"),
+            false => writeln!(text, "f {a}//{a} {b}//{b} {c}//{c}"),
+        };
+    }
+    text
+}
