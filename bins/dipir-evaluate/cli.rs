@@ -105,7 +105,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "NAME")]
     pub scene: Vec<String>,
 
-    /// The diffusion model of the methods that need one; without it they are left out
+    /// The diffusion model of the methods that ask one [default: the embedded one]
     #[arg(long, value_name = "DIR")]
     pub model: Option<PathBuf>,
 

@@ -31,7 +31,7 @@ fn main() -> ExitCode {
 fn list(args: &MethodsArgs) -> anyhow::Result<()> {
     let methods = methods::read(None)?;
     let line = |m: &methods::Method| {
-        let needs = if m.model { ", needs a model" } else { "" };
+        let needs = if m.model { ", asks a model" } else { "" };
         format!("{:12} {}{needs}", m.name, m.title)
     };
     args.output.result(

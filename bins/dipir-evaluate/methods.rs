@@ -78,7 +78,7 @@ pub struct Method {
     /// Keys and values, `table.key=value`.
     #[serde(default)]
     pub set: Vec<String>,
-    /// Whether a diffusion model is needed.
+    /// Whether a diffusion model is asked.
     #[serde(default)]
     pub model: bool,
 }

@@ -157,20 +157,14 @@ fn chosen_scenes(bench: &Bench, args: &RunArgs) -> anyhow::Result<Vec<SceneInfo>
 fn chosen_methods(args: &RunArgs) -> anyhow::Result<Vec<(Method, Option<PathBuf>)>> {
     let all = methods::read(args.methods.as_deref())?;
     for name in &args.method {
-        let Some(method) = all.iter().find(|m| m.name == *name) else {
+        if !all.iter().any(|m| m.name == *name) {
             let names: Vec<&str> = all.iter().map(|m| m.name.as_str()).collect();
             return Err(Usage(format!("--method {name}: accepted: {}", names.join(", "))).into());
         };
-        if method.model && args.model.is_none() {
-            let text =
-                format!("--method {name} needs a diffusion model: name its folder with --model");
-            return Err(Usage(text).into());
-        }
     }
     let mut chosen: Vec<_> = all
         .into_iter()
         .filter(|m| args.method.is_empty() || args.method.contains(&m.name))
-        .filter(|m| !m.model || args.model.is_some())
         .map(|m| (m, None))
         .collect();
     if !args.environment_from.is_empty() && args.method.is_empty() {

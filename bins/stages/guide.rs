@@ -4,7 +4,6 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use dipir_cli::session::Session;
-use dipir_diffusion::model::Model;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_optimize::crop::bounding_box;
 use dipir_optimize::settings::{GuidanceKind, LearningRates, OptimizeTable, Settings, Start};
@@ -13,7 +12,7 @@ use dipir_render::render::Renderer;
 use dipir_scene::config::SceneConfig;
 
 use crate::distillation::{Adapter, Distillation, DistillationSettings};
-use crate::model::ModelTable;
+use crate::model::{Loaded, ModelTable};
 use crate::optimize::reference_of;
 use crate::reading::Place;
 use crate::{model, reading, transport};
@@ -80,8 +79,7 @@ fn refine(table: &OptimizeTable, settings: &mut Settings) {
 fn diffusion(session: &Session, table: &OptimizeTable) -> anyhow::Result<Judge> {
     let model_table: ModelTable = session.config.table("model")?;
     let scene: SceneConfig = session.config.table("scene")?;
-    let folder = session.resolve(&model_table.path);
-    let knows_light = folder.join(dipir_prior::encoder::FILE).is_file();
+    let knows_light = model_table.knows_light(session);
     let reads = match &table.start {
         Start::Auto => knows_light,
         Start::Neutral | Start::File(_) => false,
@@ -90,7 +88,7 @@ fn diffusion(session: &Session, table: &OptimizeTable) -> anyhow::Result<Judge> 
             let message = format!(
                 "\"read\" needs a model that knows light, and {} has no {}; accepted: auto, neutral, or \
                  a lighting.json",
-                folder.display(),
+                model_table.name(),
                 dipir_prior::encoder::FILE
             );
             return Err(session.config.invalid("optimize.start", message).into());
@@ -106,7 +104,7 @@ fn diffusion(session: &Session, table: &OptimizeTable) -> anyhow::Result<Judge> 
 
 /// The loaded model, if a model guides.
 pub(crate) struct Guide {
-    model: Option<Model>,
+    model: Option<Loaded>,
     adapter: Option<Adapter>,
 }
 

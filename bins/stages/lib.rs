@@ -4,6 +4,7 @@ pub mod children;
 pub mod composite;
 pub mod concepts;
 pub mod distillation;
+mod embedded;
 mod guide;
 pub mod light;
 pub mod lora;

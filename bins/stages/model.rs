@@ -1,4 +1,5 @@
 //! The diffusion model of the `[model]` table.
+use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -8,15 +9,19 @@ use dipir_cli::session::Session;
 use dipir_diffusion::model::Model;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_pipeline::stage::StagePlan;
+use dipir_prior::encoder;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use tempfile::TempDir;
+
+use crate::embedded;
 
 /// The `[model]` table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModelTable {
-    /// A folder in the diffusers layout.
-    pub path: PathBuf,
+    /// A folder in the diffusers layout; the embedded model if there is none.
+    pub path: Option<PathBuf>,
     /// `f32`, or on a GPU `bf16` or `f16`.
     pub precision: String,
 }
@@ -24,14 +29,51 @@ pub struct ModelTable {
 impl Default for ModelTable {
     fn default() -> Self {
         Self {
-            path: "data/prior".into(),
+            path: None,
             precision: "f32".into(),
         }
     }
 }
 
+impl ModelTable {
+    /// Whether the model reads light off photographs.
+    pub fn knows_light(&self, session: &Session) -> bool {
+        self.path
+            .as_ref()
+            .is_none_or(|path| session.resolve(path).join(encoder::FILE).is_file())
+    }
+
+    /// The model as errors call it.
+    pub fn name(&self) -> String {
+        self.path.as_ref().map_or("the embedded model".into(), |p| {
+            format!("model.path = \"{}\"", p.display())
+        })
+    }
+}
+
+/// A model and the folder that it lies in.
+pub struct Loaded {
+    model: Model,
+    /// Of the embedded model.
+    _unpacked: Option<TempDir>,
+}
+
+impl Deref for Loaded {
+    type Target = Model;
+
+    fn deref(&self) -> &Model {
+        &self.model
+    }
+}
+
+impl DerefMut for Loaded {
+    fn deref_mut(&mut self) -> &mut Model {
+        &mut self.model
+    }
+}
+
 /// Loads the model onto the session's device.
-pub fn load(session: &Session, table: &ModelTable) -> anyhow::Result<Model> {
+pub fn load(session: &Session, table: &ModelTable) -> anyhow::Result<Loaded> {
     let device = device(&session.pipeline.device)?;
     let dtype = match table.precision.as_str() {
         "f32" => DType::F32,
@@ -43,9 +85,19 @@ pub fn load(session: &Session, table: &ModelTable) -> anyhow::Result<Model> {
         }
     };
     dipir_diffusion::memory::keep_freed();
-    let folder = session.resolve(&table.path);
-    Model::load(&folder, dtype, &device)
-        .with_context(|| format!("cannot use model.path = \"{}\"", table.path.display()))
+    let (folder, unpacked) = match &table.path {
+        Some(path) => (session.resolve(path), None),
+        None => {
+            let unpacked = embedded::unpack()?;
+            (unpacked.path().to_owned(), Some(unpacked))
+        }
+    };
+    let model = Model::load(&folder, dtype, &device)
+        .with_context(|| format!("cannot use {}", table.name()))?;
+    Ok(Loaded {
+        model,
+        _unpacked: unpacked,
+    })
 }
 
 fn device(name: &str) -> anyhow::Result<Device> {
@@ -74,7 +126,11 @@ fn device(name: &str) -> anyhow::Result<Device> {
 
 /// Enters every file of the model into the plan of a stage.
 pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> anyhow::Result<()> {
-    let folder = session.resolve(&table.path);
+    let Some(path) = &table.path else {
+        embedded::inputs(plan);
+        return Ok(());
+    };
+    let folder = session.resolve(path);
     for part in ["", "unet", "vae", "text_encoder", "tokenizer", "scheduler"] {
         let mut names: Vec<PathBuf> = match std::fs::read_dir(folder.join(part)) {
             Ok(entries) => entries
@@ -89,7 +145,7 @@ pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> an
                 .is_some_and(|e| e == "json" || e == "safetensors" || e == "txt");
             let location = folder.join(part).join(&name);
             if used && location.is_file() {
-                let path = table.path.join(part).join(&name);
+                let path = path.join(part).join(&name);
                 plan.input("model", &path, &location)?;
             }
         }

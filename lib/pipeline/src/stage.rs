@@ -46,6 +46,22 @@ impl StagePlan {
     /// Adds the file `location`, which the configuration calls `path`. Further files of one role
     /// are numbered: `object`, `object 2`.
     pub fn input(&mut self, role: &str, path: &Path, location: &Path) -> Result<(), StageError> {
+        let artifact = Artifact::of(&self.free_role(role), path, location)?;
+        self.inputs.push(artifact);
+        Ok(())
+    }
+
+    /// As [`StagePlan::input`], for what is no file: `content`, to be known as `path`.
+    pub fn input_of_bytes(&mut self, role: &str, path: &Path, content: &[u8]) {
+        self.inputs.push(Artifact {
+            role: self.free_role(role),
+            path: path.into(),
+            bytes: content.len() as u64,
+            blake3: blake3::hash(content).to_hex().to_string(),
+        });
+    }
+
+    fn free_role(&self, role: &str) -> String {
         let taken = |name: &str| self.inputs.iter().any(|a| a.role == name);
         let mut name = role.to_string();
         let mut number = 2;
@@ -53,8 +69,7 @@ impl StagePlan {
             name = format!("{role} {number}");
             number += 1;
         }
-        self.inputs.push(Artifact::of(&name, path, location)?);
-        Ok(())
+        name
     }
 
     /// Adds outputs of an earlier stage by their roles, known by `STAGE/file`, with the hashes
