@@ -3,6 +3,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
+use dipir_cli::exit::Usage;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
@@ -101,6 +102,22 @@ impl Bench {
             .iter()
             .map(|n| read_json(&folder.join(n).join("scene.json")))
             .collect()
+    }
+
+    /// The scenes whose names begin with one of `prefixes`, all without any; an error that names them
+    /// if one of `prefixes` begins none.
+    pub fn chosen(&self, prefixes: &[String]) -> anyhow::Result<Vec<SceneInfo>> {
+        let all = self.scenes()?;
+        for prefix in prefixes {
+            if !all.iter().any(|s| s.name.starts_with(prefix)) {
+                let names: Vec<&str> = all.iter().map(|s| s.name.as_str()).collect();
+                let text = format!("--scene {prefix}: accepted: {}", names.join(", "));
+                return Err(Usage(text).into());
+            }
+        }
+        let wanted = |s: &SceneInfo| prefixes.iter().any(|p| s.name.starts_with(p));
+        let chosen = all.into_iter().filter(|s| prefixes.is_empty() || wanted(s));
+        Ok(chosen.collect())
     }
 
     /// Names of the methods that ran, by name.

@@ -12,6 +12,7 @@ Examples:
   dipir-evaluate run --model path/to/model --jobs 4            all of them, four scenes at a time
   dipir-evaluate run --environment-from estimates/             another estimator: estimates/SCENE.exr
   dipir-evaluate report                                        tables and a page of what is there
+  dipir-evaluate report --scene generated                      of some scenes
   dipir-evaluate study page --method ours                      a page that asks people
   dipir-evaluate study count answers/*.json                    what they said
 
@@ -101,7 +102,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "DIR")]
     pub environment_from: Vec<PathBuf>,
 
-    /// Only these scenes, by name; may be repeated
+    /// Only scenes whose names begin like this; may be repeated
     #[arg(long, value_name = "NAME")]
     pub scene: Vec<String>,
 
@@ -134,6 +135,10 @@ pub struct ReportArgs {
     /// The method that others are compared with, scene by scene [default: ours, if there]
     #[arg(long, value_name = "NAME")]
     pub baseline: Option<String>,
+
+    /// Only scenes whose names begin like this; may be repeated
+    #[arg(long, value_name = "NAME")]
+    pub scene: Vec<String>,
 }
 
 #[derive(Args)]

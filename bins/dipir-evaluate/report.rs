@@ -8,7 +8,7 @@ use dipir_cli::exit::Usage;
 use dipir_evaluation::summary::Summary;
 use serde_json::{Value, json};
 
-use crate::bench::{Bench, read_json, write, write_json};
+use crate::bench::{Bench, SceneInfo, read_json, write, write_json};
 use crate::cli::ReportArgs;
 use crate::methods;
 use crate::page::{Page, image, text};
@@ -90,7 +90,8 @@ struct Column {
 /// Writes the report.
 pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
     let bench = Bench::new(&args.folder.out);
-    let columns = read(&bench)?;
+    let scenes = bench.chosen(&args.scene)?;
+    let columns = read(&bench, &scenes)?;
     let baseline = baseline(args, &columns)?;
     let files = ["json", "csv", "md", "html"].map(|e| bench.root().join(format!("report.{e}")));
     let summaries = summaries(&columns, baseline);
@@ -98,7 +99,10 @@ pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
     write(&files[1], csv(&columns))?;
     let table = markdown(&columns, &summaries, baseline);
     write(&files[2], &table)?;
-    write(&files[3], html(&bench, &columns, &summaries, baseline)?)?;
+    write(
+        &files[3],
+        html(&bench, &scenes, &columns, &summaries, baseline)?,
+    )?;
     args.folder.output.result(
         || {
             let names: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
@@ -110,12 +114,11 @@ pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
 }
 
 /// Scores of all methods, in the order of the table of methods, others behind.
-fn read(bench: &Bench) -> anyhow::Result<Vec<Column>> {
-    let scenes = bench.scenes()?;
+fn read(bench: &Bench, scenes: &[SceneInfo]) -> anyhow::Result<Vec<Column>> {
     let mut columns = Vec::new();
     for name in bench.methods()?.into_iter().filter(|n| n != TRUTH) {
         let mut scores = BTreeMap::new();
-        for scene in &scenes {
+        for scene in scenes {
             let file = bench.run(&name, &scene.name).join("score.json");
             if file.is_file() {
                 let score: Score = read_json(&file)?;
@@ -256,12 +259,12 @@ fn markdown(columns: &[Column], rows: &[Row], baseline: Option<usize>) -> String
 
 fn html(
     bench: &Bench,
+    scenes: &[SceneInfo],
     columns: &[Column],
     rows: &[Row],
     baseline: Option<usize>,
 ) -> anyhow::Result<String> {
     let mut page = Page::new("Evaluation");
-    let scenes = bench.scenes()?;
     page.push(&format!(
         "<p class=\"soft\">Medians over scenes with 95% bootstrap intervals; {} scenes.</p>",
         scenes.len()
@@ -308,7 +311,7 @@ fn html(
         ));
     }
     page.push("</ul>");
-    for scene in &scenes {
+    for scene in scenes {
         page.push(&format!(
             "<h2>{}</h2><p class=\"soft\">{}</p><div class=\"grid\">",
             text(&scene.name),

@@ -71,7 +71,7 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
     }
     interrupt::listen()?;
     let bench = Bench::new(&args.folder.out);
-    let scenes = chosen_scenes(&bench, args)?;
+    let scenes = bench.chosen(&args.scene)?;
     let methods = chosen_methods(args)?;
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
     let threads = if args.threads == 0 {
@@ -137,20 +137,6 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
         || json!({"scenes": scenes.len(), "methods": runner.methods.len(), "folder": runner.bench.root()}),
     );
     Ok(())
-}
-
-fn chosen_scenes(bench: &Bench, args: &RunArgs) -> anyhow::Result<Vec<SceneInfo>> {
-    let all = bench.scenes()?;
-    for name in &args.scene {
-        if !all.iter().any(|s| s.name == *name) {
-            let names: Vec<&str> = all.iter().map(|s| s.name.as_str()).collect();
-            return Err(Usage(format!("--scene {name}: accepted: {}", names.join(", "))).into());
-        }
-    }
-    Ok(all
-        .into_iter()
-        .filter(|s| args.scene.is_empty() || args.scene.contains(&s.name))
-        .collect())
 }
 
 /// Methods with the folder of their maps, if they are imported ones.

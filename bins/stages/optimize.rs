@@ -30,6 +30,7 @@ use serde_json::{Value, json};
 
 use crate::distillation::Adapter;
 use crate::guide::{Asked, Guide, Judge};
+use crate::presets::{LightRun, Outlook};
 use crate::resume::{Resume, fingerprint};
 use crate::scene_folder::{self, SceneFolder};
 use crate::transport::{self, Frame};
@@ -55,6 +56,8 @@ pub struct Done {
     /// Display-referred RMSE against the reference, over what the object or its shadow touches.
     rmse: Option<f64>,
     reading: Option<Reading>,
+    /// What other presets would have taken; empty for a run that went on from a checkpoint.
+    outlook: Outlook,
 }
 
 /// Runs the stage.
@@ -157,6 +160,11 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     }
     let manifest = writer.finish()?;
     resume.remove();
+    let outlook = match resumed_at {
+        0 => light_run(&scene, &settings, &judge, &manifest)
+            .outlook(session.pipeline.quality, &table),
+        _ => Outlook::default(),
+    };
     Ok(Done {
         folder,
         manifest,
@@ -165,7 +173,32 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         resumed_at,
         rmse,
         reading,
+        outlook,
     })
+}
+
+/// What took how long.
+fn light_run(
+    scene: &SceneFolder,
+    settings: &Settings,
+    judge: &Judge,
+    manifest: &Manifest,
+) -> LightRun {
+    let seconds = |manifest: &Manifest, name: &str| manifest.timings_s.get(name).copied();
+    let resolution = scene.loaded.scene.camera.resolution;
+    let photo_side = resolution[0].max(resolution[1]) as usize;
+    let refines = matches!(judge, Judge::Diffusion { reads: true, .. });
+    LightRun {
+        iterations: (!refines).then_some(settings.iterations),
+        samples: settings.samples,
+        side: settings.size.min(photo_side),
+        photo_side,
+        record_s: seconds(&scene.manifest, "transport")
+            .or(seconds(manifest, "transport"))
+            .unwrap_or(0.0),
+        optimization_s: seconds(manifest, "optimization").unwrap_or(0.0),
+        by_model: matches!(judge, Judge::Diffusion { .. }),
+    }
 }
 
 /// What a run would be, from the configuration and the manifests of the stages that it reads.
@@ -407,6 +440,7 @@ impl Done {
             "guidance_at_end": self.guidance(history.last()),
             "rmse": self.rmse,
             "reading": self.reading,
+            "other_presets": self.outlook.to_json(),
             "peak_direction": self.outcome.lighting.peak_direction(),
             "fusion_residual": self.outcome.lighting.fusion_residual,
             "elapsed_s": self.manifest.elapsed_s,
@@ -448,6 +482,9 @@ impl fmt::Display for Done {
                 f,
                 "\n  {skipped} steps were skipped, because something was not finite"
             )?;
+        }
+        if !self.outlook.0.is_empty() {
+            write!(f, "\n  {}", self.outlook.text())?;
         }
         Ok(())
     }

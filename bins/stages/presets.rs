@@ -187,8 +187,8 @@ impl Outlook {
 /// A run of the light stage, to tell from it what another preset would have taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LightRun {
-    /// Steps.
-    pub iterations: usize,
+    /// Steps; absent where no preset says how many.
+    pub iterations: Option<usize>,
     /// Paths per pixel of the record.
     pub samples: u32,
     /// Longest side of the picture, pixels.
@@ -214,7 +214,9 @@ impl LightRun {
         let side = preset.size.min(self.photo_side);
         let pixels = (side as f64 / self.side.max(1) as f64).powi(2);
         let samples = f64::from(preset.samples) / f64::from(self.samples.max(1));
-        let iterations = preset.iterations as f64 / self.iterations.max(1) as f64;
+        let iterations = self
+            .iterations
+            .map_or(1.0, |n| preset.iterations as f64 / n.max(1) as f64);
         let replay = match self.by_model {
             true => 1.0,
             false => pixels * samples.powf(REPLAY_POWER),
@@ -222,11 +224,17 @@ impl LightRun {
         self.record_s * pixels * samples + self.optimization_s * iterations * replay
     }
 
-    /// The presets beside `quality`.
-    pub fn outlook(&self, quality: Quality) -> Outlook {
+    /// The presets beside `quality`, as far as `table` leaves to them.
+    pub fn outlook(&self, quality: Quality, table: &OptimizeTable) -> Outlook {
         let error = |p: &Preset| p.light.map(|l| l.error);
         Outlook::beside(quality, |p| {
-            Some((self.seconds_with(&p.optimize), error(p)))
+            let there = OptimizePreset {
+                iterations: table.iterations.unwrap_or(p.optimize.iterations),
+                samples: table.samples.unwrap_or(p.optimize.samples),
+                size: table.size.unwrap_or(p.optimize.size),
+                ..p.optimize
+            };
+            Some((self.seconds_with(&there), error(p)))
         })
     }
 }
@@ -308,11 +316,12 @@ mod tests {
                 .starts_with("other presets would have taken: draft about")
         );
     }
+
     #[test]
     fn a_light_run_costs_what_its_steps_and_paths_cost() {
         let here = of(Quality::Standard).optimize;
         let run = LightRun {
-            iterations: here.iterations,
+            iterations: Some(here.iterations),
             samples: here.samples,
             side: here.size,
             photo_side: 4096,
@@ -336,6 +345,23 @@ mod tests {
             ..more
         };
         assert!((model.seconds_with(&half) - 128.0 - 5.0).abs() < 1e-9);
-        assert_eq!(run.outlook(Quality::Standard).0.len(), 2);
+        let refined = LightRun {
+            iterations: None,
+            ..model
+        };
+        assert!((refined.seconds_with(&half) - 128.0 - 10.0).abs() < 1e-9);
+        let open = run.outlook(Quality::Standard, &OptimizeTable::default()).0;
+        assert_eq!(open.len(), 2);
+        assert!(open[0].seconds < open[1].seconds);
+        let table = OptimizeTable {
+            iterations: Some(here.iterations),
+            samples: Some(here.samples),
+            size: Some(here.size),
+            ..OptimizeTable::default()
+        };
+        // Nothing is left to a preset.
+        for estimate in run.outlook(Quality::Standard, &table).0 {
+            assert!((estimate.seconds - 12.0).abs() < 1e-9);
+        }
     }
 }

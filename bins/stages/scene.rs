@@ -100,6 +100,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     };
     let renderer = Renderer::new(&loaded.scene);
     let progress = session.progress("effects");
+    let clock = Instant::now();
     let effects = effects::plan(
         &renderer,
         &EnvironmentSampler::new(light.map.clone()),
@@ -112,6 +113,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     )
     .map_err(crate::render_error)?;
     progress.done();
+    writer.set_timing("effects", clock.elapsed().as_secs_f64());
     writer.write_json("effects", "effects.json", &effects)?;
     loaded.description.seed = session.pipeline.seed;
     writer.write_json("scene", "scene.json", &loaded.description)?;
