@@ -91,10 +91,8 @@ fn of_panoramas(
     let mut kept: Option<(PathBuf, EnvironmentMap)> = None;
     for n in 0..args.count {
         progress.set(n as f64 / args.count as f64);
-        // All models of a panorama one after the other would need all panoramas for few scenes.
-        let panorama = &panoramas[n as usize % panoramas.len()];
-        let round = n as usize / panoramas.len();
-        let model = &models[(n as usize + round) % models.len()];
+        let (p, m) = pair(n as usize, panoramas.len(), models.len());
+        let (panorama, model) = (&panoramas[p], &models[m]);
         let name = format!("{:03}-{}-{}", n, stem(panorama), stem(model));
         let done = bench.scene(&name).join("scene.json");
         if !done.is_file() {
@@ -108,6 +106,13 @@ fn of_panoramas(
         made.push(name);
     }
     Ok(made)
+}
+
+/// Panorama and model of the scene number `n`: both change from scene to scene, and every pair comes once
+/// before one comes again.
+fn pair(n: usize, panoramas: usize, models: usize) -> (usize, usize) {
+    let (p, round) = (n % panoramas, n / panoramas);
+    (p, (p + round) % models)
 }
 
 fn make(
@@ -298,6 +303,17 @@ mod tests {
         assert!((x / (1.0 + x) - MID_GREY).abs() < 1e-6);
         let black = LinearImage(Raster::filled(2, 2, Vec3::ZERO));
         assert_eq!(exposure_ev(&black), 0.0);
+    }
+
+    #[test]
+    fn every_pair_comes_before_one_comes_again() {
+        for (panoramas, models) in [(3, 6), (6, 3), (4, 4), (1, 5), (5, 1)] {
+            let all: std::collections::BTreeSet<_> = (0..panoramas * models)
+                .map(|n| pair(n, panoramas, models))
+                .collect();
+            assert_eq!(all.len(), panoramas * models, "{panoramas} x {models}");
+        }
+        assert_eq!([0, 1, 2].map(|n| pair(n, 3, 6)), [(0, 0), (1, 1), (2, 2)]);
     }
 
     #[test]
