@@ -9,7 +9,8 @@ Examples:
   dipir-evaluate make --hdri maps/ --models glb/ --count 20    20 scenes with their true light
   dipir-evaluate make --generated 20 --size 96x96              20 scenes of the project's generator
   dipir-evaluate run --method neutral --method fitted          some of the methods
-  dipir-evaluate run --model path/to/model --jobs 4            all of them, four scenes at a time
+  dipir-evaluate run --jobs 4                                  all of them, four scenes at a time
+  dipir-evaluate run --model path/to/model                     with another diffusion model
   dipir-evaluate run --environment-from estimates/             another estimator: estimates/SCENE.exr
   dipir-evaluate report                                        tables and a page of what is there
   dipir-evaluate report --scene generated                      of some scenes

@@ -60,6 +60,8 @@ struct Runner<'a> {
     executables: Executables,
     args: &'a RunArgs,
     methods: Vec<(Method, Option<PathBuf>)>,
+    /// Hash of the diffusion model.
+    model: String,
     threads: usize,
 }
 
@@ -84,6 +86,7 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
         executables: Executables::beside_this()?,
         args,
         methods,
+        model: dipir::model::digest(args.model.as_deref())?,
         threads: (threads / args.jobs).max(1),
     };
     let total = scenes.len() * runner.methods.len();
@@ -236,7 +239,7 @@ impl Runner<'_> {
         let score_file = folder.join("score.json");
         let imported = maps.map(|f| map_in(f, &scene.name)).transpose()?;
         let decides = json!({
-            "method": method, "model": self.args.model.as_ref().filter(|_| method.model),
+            "method": method, "model": method.model.then_some(&self.model),
             "map": imported.as_deref().map(hash).transpose()?,
         });
         let key = self.key(scene, &decides)?;
@@ -254,7 +257,7 @@ impl Runner<'_> {
             shared,
             method.stages.len() > 2,
             self.args.set,
-            self.args.model.as_ref().filter(|_| method.model)
+            method.model.then_some(&self.model)
         ]);
         let shared = self.key(scene, &shared)?;
         let work = self.bench.work(&scene.name, &shared[..16]);
@@ -345,6 +348,10 @@ impl Runner<'_> {
         for file in ["pipeline.toml", "photo.png"] {
             hasher.update(hash(&folder.join(file))?.as_bytes());
         }
+        hasher.update(hash(&folder.join(&scene.map))?.as_bytes());
+        for object in objects(&folder.join("pipeline.toml"))? {
+            hasher.update(hash(&object)?.as_bytes());
+        }
         let decides = json!([
             VERSION,
             env!("CARGO_PKG_VERSION"),
@@ -353,6 +360,8 @@ impl Runner<'_> {
             self.args.set,
             self.args.target_error,
             dipir::scene::VERSION,
+            dipir::concepts::VERSION,
+            dipir::lora::VERSION,
             dipir::optimize::VERSION,
             dipir::composite::VERSION,
         ]);
@@ -401,6 +410,22 @@ fn quoted(path: &Path) -> anyhow::Result<String> {
         .replace('\\', "\\\\")
         .replace('"', "\\\"");
     Ok(format!("\"{text}\""))
+}
+
+/// The files of the objects that `pipeline` names.
+fn objects(pipeline: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let text = fs::read_to_string(pipeline)
+        .with_context(|| format!("cannot read {}", pipeline.display()))?;
+    let table: toml::Table =
+        toml::from_str(&text).with_context(|| format!("cannot read {}", pipeline.display()))?;
+    let objects = table.get("scene").and_then(|s| s.get("objects"));
+    let paths = objects
+        .and_then(|o| o.as_array())
+        .into_iter()
+        .flatten()
+        .filter_map(|o| o.get("path")?.as_str());
+    let folder = pipeline.parent().unwrap_or(Path::new(""));
+    Ok(paths.map(|p| folder.join(p)).collect())
 }
 
 /// One run of stages in one folder.

@@ -11,7 +11,8 @@ Examples:
   dipir-lora --set concepts.count=0         without concept preservation
 
 Reads OUT/concepts/, which dipir-concepts writes. Writes OUT/lora/: lora.safetensors (diffusers,
-PEFT) lora_kohya.safetensors (A1111, ComfyUI) training.json stage.json.
+PEFT) lora_kohya.safetensors (A1111, ComfyUI) word.safetensors (with lora.learn_word) samples/
+training.json stage.json.
 An interrupted run goes on where it stopped and ends with the same bytes.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 

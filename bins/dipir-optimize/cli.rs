@@ -12,8 +12,8 @@ Examples:
                                                  a material, under [composite] environment
   dipir-optimize --set pipeline.quality=high     finer environment, more lobes
 
-Reads OUT/scene/, which dipir-scene writes. Writes OUT/light/: lighting.json environment.exr
-tone.json history.json previews/ stage.json; for materials, materials.json history.json stage.json.
+Reads OUT/scene/, which dipir-scene writes. Writes OUT/light/: reading.json (of a model that knows
+light) lighting.json environment.exr tone.json history.json previews/ stage.json; for materials, materials.json history.json stage.json.
 An interrupted run goes on where it stopped and ends with the same bytes.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 

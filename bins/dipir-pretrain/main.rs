@@ -1,12 +1,15 @@
 //! `dipir-pretrain`: trains the small model that knows light, and measures it.
+mod cli;
+
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 use std::time::Instant;
 
 use anyhow::Context;
 use candle_core::{DType, Device};
-use clap::{Args, Parser, Subcommand};
+use clap::Parser;
+use cli::{Cli, Command, Data, Encoder, Gates, Sheet, Train};
 use dipir_cli::args::OutputArgs;
 use dipir_cli::exit::{self, Usage};
 use dipir_cli::interrupt::{self, Interrupted};
@@ -28,108 +31,6 @@ use dipir_prior::studio::Kinds;
 use dipir_prior::trainer::{Trainer, TrainerSettings};
 use glam::Vec3;
 use serde_json::json;
-
-const EXAMPLES: &str = "\
-Examples:
-  dipir-pretrain train --out model --cache scenes      render scenes, train, write a model folder
-  dipir-pretrain encoder --out model --cache scenes    train its light encoder
-  dipir-pretrain gates model                           what it can tell, on scenes it never saw
-  dipir-pretrain sheet model sheet.png                 pictures of its light words
-
-Training goes on from CACHE/checkpoint.safetensors where it stopped. The model of data/prior was
-made with the defaults; its card says what came out.
-Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted.";
-
-/// Train the small model that knows light, and measure what it can tell
-#[derive(Parser)]
-#[command(name = "dipir-pretrain", version, after_help = EXAMPLES)]
-struct Cli {
-    #[command(subcommand)]
-    command: Command,
-    #[command(flatten)]
-    output: OutputArgs,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    /// Render training scenes and train text encoder and UNet
-    Train(Train),
-    /// Train the light encoder of a model
-    Encoder(Encoder),
-    /// Measure the gates on held-out scenes
-    Gates(Gates),
-    /// Sample pictures under light words
-    Sheet(Sheet),
-}
-
-#[derive(Args)]
-struct Data {
-    /// Where the model folder is written
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
-    /// Where scenes and checkpoints are kept
-    #[arg(long, value_name = "DIR")]
-    cache: PathBuf,
-    /// Scenes to render, 350 kB each
-    #[arg(long, default_value_t = 6144)]
-    scenes: usize,
-}
-
-#[derive(Args)]
-struct Train {
-    #[command(flatten)]
-    data: Data,
-    /// Examples to train on
-    #[arg(long, default_value_t = TrainerSettings::default().samples)]
-    samples: usize,
-    /// Examples of one update
-    #[arg(long, default_value_t = TrainerSettings::default().batch)]
-    batch: usize,
-    /// Key of all random numbers
-    #[arg(long, default_value_t = TrainerSettings::default().seed)]
-    seed: u64,
-    /// Share of captions that name the light
-    #[arg(long, default_value_t = Recipe::default().light_words)]
-    light_words: f64,
-    /// Share of examples that show the place around the object
-    #[arg(long, default_value_t = Recipe::default().background)]
-    background: f64,
-    /// Updates between checkpoints
-    #[arg(long, default_value_t = 200)]
-    checkpoint_every: usize,
-}
-
-#[derive(Args)]
-struct Encoder {
-    #[command(flatten)]
-    data: Data,
-    /// Pictures to train on
-    #[arg(long, default_value_t = 300_000)]
-    samples: usize,
-    /// Key of all random numbers
-    #[arg(long, default_value_t = 3)]
-    seed: u64,
-}
-
-#[derive(Args)]
-struct Gates {
-    /// Folder of the model
-    model: PathBuf,
-    /// Held-out scenes
-    #[arg(long, default_value_t = 100)]
-    scenes: usize,
-    /// Draws of noise at each timestep
-    #[arg(long, default_value_t = 4)]
-    draws: usize,
-}
-
-#[derive(Args)]
-struct Sheet {
-    /// Folder of the model
-    model: PathBuf,
-    /// The picture to write
-    png: PathBuf,
-}
 
 fn main() -> ExitCode {
     exit::run(|| {

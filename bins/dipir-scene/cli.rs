@@ -7,13 +7,14 @@ use dipir_cli::args::{CommonArgs, OutputArgs};
 const EXAMPLES: &str = "\
 Examples:
   dipir-scene                                      set up [scene] of ./pipeline.toml
-  dipir-scene -p photo/pipeline.toml -o /tmp/try   another file, another folder
+  dipir-scene -p photo/pipeline.toml -o photo/try   another file, another folder
   dipir-scene --set scene.objects.0.yaw_deg=90     turn the first object
   dipir-scene --set scene.effects.mode=all         simulate everything
   dipir-scene background --from sky.hdr --fov 50 --yaw 120 --size 960x640 photo.png
                                                    a photograph out of a panorama
 
-Writes OUT/scene/: scene.json effects.json gbuffer.exr stage.json.
+Writes OUT/scene/: scene.json effects.json gbuffer.exr stage.json, and transport.safetensors
+where the light is not given.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 
 /// Set up the scene: read photo, objects, camera and proxy, and plan which effects to simulate

@@ -32,6 +32,9 @@ mod model;
 #[path = "../dipir-optimize/cli.rs"]
 mod optimize;
 #[allow(dead_code)]
+#[path = "../dipir-pretrain/cli.rs"]
+mod pretrain;
+#[allow(dead_code)]
 #[path = "../dipir-scene/cli.rs"]
 mod scene;
 #[allow(dead_code)]
@@ -75,6 +78,7 @@ enum Executable {
     DipirModel,
     DipirEvaluate,
     DipirTradeoff,
+    DipirPretrain,
 }
 
 impl Executable {
@@ -90,6 +94,7 @@ impl Executable {
             Self::DipirModel => model::Cli::command(),
             Self::DipirEvaluate => evaluate::Cli::command(),
             Self::DipirTradeoff => tradeoff::Cli::command(),
+            Self::DipirPretrain => pretrain::Cli::command(),
         }
     }
 }

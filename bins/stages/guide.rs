@@ -28,7 +28,8 @@ pub(crate) enum Judge {
         table: ModelTable,
         settings: DistillationSettings,
         class: String,
-        reads: bool,
+        /// How light is read off the photograph, if it is.
+        reads: Option<ReaderSettings>,
     },
 }
 
@@ -50,7 +51,7 @@ impl Asked {
             }
             _ => diffusion(session, &table)?,
         };
-        if let Judge::Diffusion { reads: true, .. } = &judge {
+        if let Judge::Diffusion { reads: Some(_), .. } = &judge {
             refine(&table, &mut settings);
         }
         Ok(Self {
@@ -81,21 +82,26 @@ fn diffusion(session: &Session, table: &OptimizeTable) -> anyhow::Result<Judge> 
     let scene: SceneConfig = session.config.table("scene")?;
     let knows_light = model_table.knows_light(session);
     let reads = match &table.start {
-        Start::Auto => knows_light,
-        Start::Neutral | Start::File(_) => false,
-        Start::Read if knows_light => true,
-        Start::Read => {
+        Start::Auto => knows_light.then(ReaderSettings::default),
+        Start::Neutral | Start::File(_) => None,
+        Start::Read | Start::Encoder if !knows_light => {
             let message = format!(
-                "\"read\" needs a model that knows light, and {} has no {}; accepted: auto, neutral, or \
+                "\"{}\" needs a model that knows light, and {} has no {}; accepted: auto, neutral, or \
                  a lighting.json",
+                String::from(table.start.clone()),
                 model_table.name(),
                 dipir_prior::encoder::FILE
             );
             return Err(session.config.invalid("optimize.start", message).into());
         }
+        Start::Read => Some(ReaderSettings::default()),
+        Start::Encoder => Some(ReaderSettings {
+            draws: 0,
+            ..ReaderSettings::default()
+        }),
     };
     Ok(Judge::Diffusion {
-        settings: DistillationSettings::new(session, table, reads)?,
+        settings: DistillationSettings::new(session, table, reads.is_some())?,
         class: scene.class.unwrap_or_else(|| "object".into()),
         table: model_table,
         reads,
@@ -127,7 +133,7 @@ impl Guide {
             .adapt
             .then(|| Adapter::load(session, &mut model))
             .transpose()?;
-        if *reads {
+        if reads.is_some() {
             dipir_prior::student::add_placeholders(&mut model.tokenizer);
         }
         Ok(Self {
@@ -146,21 +152,27 @@ impl Guide {
         coverage: &Raster<f32>,
         seed: u64,
     ) -> anyhow::Result<Option<Reading>> {
-        let (Some(model), Judge::Diffusion { reads: true, .. }) = (&self.model, judge) else {
+        let (
+            Some(model),
+            Judge::Diffusion {
+                reads: Some(settings),
+                ..
+            },
+        ) = (&self.model, judge)
+        else {
             return Ok(None);
         };
         let object = bounding_box(coverage).context(
             "no pixel shows the object, so nothing can be guided; move it into the picture",
         )?;
         let progress = session.progress("reading");
-        let settings = ReaderSettings::default();
         let report = |share: f64| progress.set(share);
         let place = Place {
             camera: renderer.camera(),
             proxy: &renderer.scene().proxy,
             object,
         };
-        let reading = reading::read_light(model, photo, &place, &settings, seed, &report)?;
+        let reading = reading::read_light(model, photo, &place, settings, seed, &report)?;
         progress.done();
         Ok(reading)
     }

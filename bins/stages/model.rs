@@ -12,6 +12,7 @@ use dipir_pipeline::stage::StagePlan;
 use dipir_prior::encoder;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::embedded;
@@ -126,11 +127,17 @@ fn device(name: &str) -> anyhow::Result<Device> {
 
 /// Enters every file of the model into the plan of a stage.
 pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> anyhow::Result<()> {
-    let Some(path) = &table.path else {
-        embedded::inputs(plan);
-        return Ok(());
-    };
-    let folder = session.resolve(path);
+    match &table.path {
+        Some(path) => files(path, &session.resolve(path), plan),
+        None => {
+            embedded::inputs(plan);
+            Ok(())
+        }
+    }
+}
+
+/// Enters the files of the model in `folder`, which the configuration calls `path`.
+fn files(path: &Path, folder: &Path, plan: &mut StagePlan) -> anyhow::Result<()> {
     for part in ["", "unet", "vae", "text_encoder", "tokenizer", "scheduler"] {
         let mut names: Vec<PathBuf> = match std::fs::read_dir(folder.join(part)) {
             Ok(entries) => entries
@@ -145,12 +152,25 @@ pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> an
                 .is_some_and(|e| e == "json" || e == "safetensors" || e == "txt");
             let location = folder.join(part).join(&name);
             if used && location.is_file() {
-                let path = path.join(part).join(&name);
-                plan.input("model", &path, &location)?;
+                plan.input("model", &path.join(part).join(&name), &location)?;
             }
         }
     }
     Ok(())
+}
+
+/// One hash of all files of the model in `folder`, or of the embedded one.
+pub fn digest(folder: Option<&Path>) -> anyhow::Result<String> {
+    let mut plan = StagePlan::new("model", 0, Value::Null, 0);
+    match folder {
+        Some(folder) => files(Path::new(""), folder, &mut plan)?,
+        None => embedded::inputs(&mut plan),
+    }
+    let mut hasher = blake3::Hasher::new();
+    for input in &plan.inputs {
+        hasher.update(input.blake3.as_bytes());
+    }
+    Ok(hasher.finalize().to_hex().to_string())
 }
 
 /// An image tensor [1, 3, h, w] in [-1, 1] as display values.

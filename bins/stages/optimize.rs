@@ -22,7 +22,7 @@ use dipir_optimize::recorder::SceneRecorder;
 use dipir_optimize::settings::{GuidanceKind, OptimizeTable, Settings, Start};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
-use dipir_prior::reader::Reading;
+use dipir_prior::reader::{ReaderSettings, Reading};
 use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
 use glam::Vec3;
@@ -187,7 +187,7 @@ fn light_run(
     let seconds = |manifest: &Manifest, name: &str| manifest.timings_s.get(name).copied();
     let resolution = scene.loaded.scene.camera.resolution;
     let photo_side = resolution[0].max(resolution[1]) as usize;
-    let refines = matches!(judge, Judge::Diffusion { reads: true, .. });
+    let refines = matches!(judge, Judge::Diffusion { reads: Some(_), .. });
     LightRun {
         iterations: (!refines).then_some(settings.iterations),
         samples: settings.samples,
@@ -295,6 +295,14 @@ pub fn read_reference(
     Ok(transfer.encode(&frame.scale(&image)))
 }
 
+/// How light is read, as far as it decides.
+fn read_param(reads: &Option<ReaderSettings>) -> Value {
+    match reads {
+        Some(settings) if settings.draws == 0 => json!("encoder"),
+        other => json!(other.is_some()),
+    }
+}
+
 /// What decides the outputs; how often the state is kept does not.
 fn params(settings: &Settings, judge: &Judge) -> Value {
     let settings = Settings {
@@ -312,7 +320,7 @@ fn params(settings: &Settings, judge: &Judge) -> Value {
             reads,
         } => json!({
             "optimize": settings, "guidance": distillation, "class": class,
-            "precision": table.precision, "read": reads,
+            "precision": table.precision, "read": read_param(reads),
         }),
     }
 }

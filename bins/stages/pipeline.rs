@@ -31,10 +31,11 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
     );
     let materials = materials::are_asked_for(session)?;
     let light_is_given = composite.environment.is_some() && !materials;
-    let is_guided_by_model = optimize.guidance != GuidanceKind::Reference;
+    let is_guided_by_model = optimize.guidance != GuidanceKind::Reference && !materials;
     let is_adapted = optimize.adapt.unwrap_or(true);
 
     let no_model = match (light_is_given, is_guided_by_model) {
+        _ if materials => Some("[optimize] materials asks no diffusion model"),
         (true, _) => Some("[composite] environment gives the light"),
         (false, false) => Some("[optimize] guidance = \"reference\" asks no diffusion model"),
         (false, true) if !is_adapted => Some("[optimize] adapt = false uses the model as it is"),

@@ -32,6 +32,8 @@ pub enum Start {
     Auto,
     /// `"read"`: what a model that knows light reads off the photograph.
     Read,
+    /// `"encoder"`: what that model's light encoder sees, without asking the model itself.
+    Encoder,
     /// `"neutral"`: nearly uniform light as bright as the photograph.
     Neutral,
     /// Anything else: a `lighting.json`.
@@ -43,6 +45,7 @@ impl From<String> for Start {
         match text.as_str() {
             "auto" => Self::Auto,
             "read" => Self::Read,
+            "encoder" => Self::Encoder,
             "neutral" => Self::Neutral,
             _ => Self::File(text.into()),
         }
@@ -54,6 +57,7 @@ impl From<Start> for String {
         match start {
             Start::Auto => "auto".into(),
             Start::Read => "read".into(),
+            Start::Encoder => "encoder".into(),
             Start::Neutral => "neutral".into(),
             Start::File(path) => path.to_string_lossy().into_owned(),
         }

@@ -1,0 +1,109 @@
+//! The command line of `dipir-pretrain`.
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+use dipir_cli::args::OutputArgs;
+use dipir_prior::examples::Recipe;
+use dipir_prior::trainer::TrainerSettings;
+
+const EXAMPLES: &str = "\
+Examples:
+  dipir-pretrain train --out model --cache scenes      render scenes, train, write a model folder
+  dipir-pretrain encoder --out model --cache scenes    train its light encoder
+  dipir-pretrain gates model                           what it can tell, on scenes it never saw
+  dipir-pretrain sheet model sheet.png                 pictures of its light words
+
+Training goes on from CACHE/checkpoint.safetensors where it stopped. The card of
+data/prior says how that model was made, and what came out.
+Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted.";
+
+/// Train the small model that knows light, and measure what it can tell
+#[derive(Parser)]
+#[command(name = "dipir-pretrain", version, after_help = EXAMPLES)]
+pub struct Cli {
+    #[command(subcommand)]
+    pub command: Command,
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
+#[derive(Subcommand)]
+pub enum Command {
+    /// Render training scenes and train text encoder and UNet
+    Train(Train),
+    /// Train the light encoder of a model
+    Encoder(Encoder),
+    /// Measure the gates on held-out scenes
+    Gates(Gates),
+    /// Sample pictures under light words
+    Sheet(Sheet),
+}
+
+#[derive(Args)]
+pub struct Data {
+    /// Where the model folder is written
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Where scenes and checkpoints are kept
+    #[arg(long, value_name = "DIR")]
+    pub cache: PathBuf,
+    /// Scenes to render, 350 kB each
+    #[arg(long, default_value_t = 6144)]
+    pub scenes: usize,
+}
+
+#[derive(Args)]
+pub struct Train {
+    #[command(flatten)]
+    pub data: Data,
+    /// Examples to train on
+    #[arg(long, default_value_t = TrainerSettings::default().samples)]
+    pub samples: usize,
+    /// Examples of one update
+    #[arg(long, default_value_t = TrainerSettings::default().batch)]
+    pub batch: usize,
+    /// Key of all random numbers
+    #[arg(long, default_value_t = TrainerSettings::default().seed)]
+    pub seed: u64,
+    /// Share of captions that name the light
+    #[arg(long, default_value_t = Recipe::default().light_words)]
+    pub light_words: f64,
+    /// Share of examples that show the place around the object
+    #[arg(long, default_value_t = Recipe::default().background)]
+    pub background: f64,
+    /// Updates between checkpoints
+    #[arg(long, default_value_t = 200)]
+    pub checkpoint_every: usize,
+}
+
+#[derive(Args)]
+pub struct Encoder {
+    #[command(flatten)]
+    pub data: Data,
+    /// Pictures to train on
+    #[arg(long, default_value_t = 300_000)]
+    pub samples: usize,
+    /// Key of all random numbers
+    #[arg(long, default_value_t = 3)]
+    pub seed: u64,
+}
+
+#[derive(Args)]
+pub struct Gates {
+    /// Folder of the model
+    pub model: PathBuf,
+    /// Held-out scenes
+    #[arg(long, default_value_t = 100)]
+    pub scenes: usize,
+    /// Draws of noise at each timestep
+    #[arg(long, default_value_t = 4)]
+    pub draws: usize,
+}
+
+#[derive(Args)]
+pub struct Sheet {
+    /// Folder of the model
+    pub model: PathBuf,
+    /// The picture to write
+    pub png: PathBuf,
+}
