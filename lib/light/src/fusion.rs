@@ -235,4 +235,58 @@ mod tests {
             }
         );
     }
+
+    #[test]
+    fn black_texels_have_the_limits_of_the_papers_formula() {
+        // Black in the foreground, in the shadow, in neither, in both.
+        let f = [
+            Vec3::ZERO,
+            Vec3::new(0.5, 1.0, 2.0),
+            Vec3::splat(4.0),
+            Vec3::ZERO,
+        ];
+        let h = [Vec3::new(1.0, 3.0, 2.0), Vec3::ZERO, Vec3::ONE, Vec3::ZERO];
+        let y = Fused {
+            foreground: texels(4, 2000),
+            shadow: texels(4, 3000),
+        };
+        let weights = flat(&y.foreground, &y.shadow);
+        // There the paper's formula is 0 / 0, so it is taken beside: 1e-6 of light for none, which
+        // moves values, and derivatives of slopes of up to 6, by as many millionths.
+        let beside: Vec<f64> = flat(&f, &h).iter().map(|v| v.max(1e-6)).collect();
+        for s in [0.25f32, 1.0] {
+            let ours = fuse(&f, &h, s);
+            let limits = literal(&beside, s.into());
+            for (a, b) in flat(&ours.foreground, &ours.shadow).iter().zip(limits) {
+                assert!((a - b).abs() < 1e-5, "{s}: {a} for {b}");
+            }
+            let ours = fuse_vjp(&f, &h, s, &y);
+            for (k, ours) in flat(&ours.foreground, &ours.shadow).iter().enumerate() {
+                let loss = |v: f64| {
+                    let mut moved = beside.clone();
+                    moved[k] = v;
+                    let terms = literal(&moved, s.into());
+                    terms.iter().zip(&weights).map(|(a, b)| a * b).sum()
+                };
+                // The step is a hundredth of the least texel: truncation 1e-11, rounding of a sum
+                // of about 100 over it 1e-6.
+                let numeric = central_difference(loss, beside[k], 1e-8);
+                assert!(
+                    (ours - numeric).abs() < 2e-5 * numeric.abs().max(1.0),
+                    "{s} {k}: {ours} for {numeric}"
+                );
+            }
+        }
+        // Nothing in the foreground: the shadow fades by s, and nothing is scaled.
+        let (black, s) = ([Vec3::ZERO; 4], 0.25);
+        let (fused, back) = (fuse(&black, &h, s), fuse_vjp(&black, &h, s, &y));
+        assert_eq!(fused.foreground, black);
+        // A few roundings of numbers up to 4.
+        let close = |a: Vec3, b: Vec3| a.abs_diff_eq(b, 2e-6);
+        for k in 0..4 {
+            assert!(close(fused.shadow[k], h[k] * (1.0 - s)));
+            assert!(close(back.foreground[k], y.foreground[k] + y.shadow[k] * s));
+            assert!(close(back.shadow[k], y.shadow[k] * (1.0 - s)));
+        }
+    }
 }

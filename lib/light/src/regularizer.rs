@@ -227,4 +227,50 @@ mod tests {
         assert_eq!(consistency(&sun, &black, W, H), 0.0);
         assert_eq!(cauchy(&black, W, H), 0.0);
     }
+
+    #[test]
+    fn black_texels_and_maps_have_the_value_and_slope_of_the_definition() {
+        let (mut f, mut s) = maps();
+        for k in [0, 9, 31] {
+            f[k] = Vec3::ZERO;
+        }
+        for k in [9, 17] {
+            s[k] = Vec3::ZERO;
+        }
+        let wide = |x: &[Vec3]| x.iter().map(|t| t.as_dvec3()).collect::<Vec<_>>();
+        let (fd, sd) = (wide(&f), wide(&s));
+        assert!((consistency(&f, &s, W, H) / losses(&fd, &sd).0 - 1.0).abs() < 1e-12);
+        let ours = consistency_vjp(&f, &s, W, H, 0.03);
+        for k in [0, 9, 31] {
+            for c in 0..3 {
+                let moved = |v: f64| {
+                    let mut x = fd.clone();
+                    x[k][c] = v;
+                    losses(&x, &sd).0
+                };
+                // The step moves a density of 8e-6 by up to 2e-8: a third of the squared quotient,
+                // 2e-6, is truncated. Rounding is 1e-15 over the step, times the weight.
+                let numeric = 0.03 * central_difference(moved, 0.0, 1e-7);
+                let close = (f64::from(ours[k][c]) - numeric).abs() < 1e-5 * numeric.abs() + 1e-9;
+                assert!(
+                    close,
+                    "texel {k} channel {c}: {} against {numeric}",
+                    ours[k][c]
+                );
+            }
+        }
+        // A black foreground is uniform; where it is black, the uniform share is all there is.
+        let black = vec![Vec3::ZERO; W * H];
+        let (mut sun, mut other) = (black.clone(), black.clone());
+        (sun[5], other[20]) = (Vec3::splat(1e6), Vec3::splat(1e6));
+        let sphere = (4.0 * PI).ln();
+        assert!((consistency(&black, &s, W, H) - sphere).abs() < 1e-12);
+        let apart = sphere - UNIFORM_SHARE.ln();
+        assert!((consistency(&sun, &other, W, H) - apart).abs() < 1e-12 * apart);
+        assert!(
+            cauchy_vjp(&black, W, H, 1.0)
+                .iter()
+                .all(|g| *g == Vec3::ZERO)
+        );
+    }
 }

@@ -265,7 +265,7 @@ impl Viewing<'_> {
             if squared.is_finite() {
                 total.sum += squared;
                 // Each is sigma^2 chi^2_{K-1} / (K - 1), so E[v^2] 2 / (K + 1) is its variance.
-                total.variance += squared * squared * 2.0 / (REPLICATES as f64 + 1.0);
+                total.variance += squared * squared * 4.0 / (REPLICATES as f64 + 1.0);
             }
         }
         total

@@ -443,3 +443,87 @@ fn a_tilted_plane_is_a_plane() {
     let found = r.film.shadow.get(4, 4).x;
     assert!((found - (1.0 - 0.8 * 0.8 / 1.44)).abs() < 0.02, "{found}");
 }
+
+#[test]
+fn a_sphere_that_touches_the_plane_or_is_half_below_it_blocks_its_form_factor() {
+    // Touching, it is above the horizon of every point: beta = 1 - r^3 / d^3, 0 at the contact.
+    let view = camera(Vec3::new(0.0, 7.0, 3.0), Vec3::new(0.8, 0.0, 0.0), 20.0, 16);
+    let r = shadow_of(ball(Vec3::Y * 0.8, 0.8), view, &sky(1.0), 256);
+    let touching = |p: glam::DVec3| {
+        let d = (glam::DVec3::Y * 0.8 - p).length();
+        1.0 - (0.8 / d).powi(3)
+    };
+    // The polyhedron is smaller by up to 1.6e-4 of the radius, twice that in what it blocks, and
+    // leaves a gap as high at the contact.
+    compare(&r, &view, touching, 1e-3, 0.1);
+    assert_is_ratio(&r);
+
+    // Half below: of a cap around a direction in the plane the upper half is seen, which projects
+    // onto the disk of directions as a circular segment: beta = 1 - (a - sin a cos a) / pi.
+    let view = camera(
+        Vec3::new(1.35, 6.0, 0.1),
+        Vec3::new(1.35, 0.0, 0.0),
+        6.0,
+        16,
+    );
+    let r = shadow_of(ball(Vec3::ZERO, 0.8), view, &sky(1.0), 256);
+    let half = |p: glam::DVec3| {
+        let a = (0.8 / p.length()).asin();
+        1.0 - (a - a.sin() * a.cos()) / std::f64::consts::PI
+    };
+    compare(&r, &view, half, 1e-3, 0.1);
+    assert_is_ratio(&r);
+}
+
+#[test]
+fn a_lobe_that_peaks_below_the_plane_casts_the_shadow_of_what_shines_above_it() {
+    use crate::render::Renderer;
+    use crate::testing::carry_on;
+    use dipir_light::gaussian::{SgMixture, SphericalGaussian};
+    let view = camera(
+        Vec3::new(1.35, 6.0, 0.1),
+        Vec3::new(1.35, 0.0, 0.0),
+        6.0,
+        16,
+    );
+    let under = |sigma: f32| {
+        let down = SphericalGaussian {
+            direction: Vec3::NEG_Y,
+            radiance: Vec3::ONE,
+            sigma,
+        };
+        let light = SgMixture::new(vec![down]).expect("a valid lobe");
+        let s = scene(ball(Vec3::ZERO, 0.8), matte(Vec3::ONE), view, ground());
+        Renderer::new(&s)
+            .render(&light, &lambertian(1), &settings(256, 11), &mut carry_on)
+            .expect("renders")
+    };
+    // What arrives, 2 pi sigma^4 exp(-1 / sigma^2), is less than half of the least f32: 0 / 0.
+    for sigma in [1e-3, 0.03, 0.0999, 0.1] {
+        let r = under(sigma);
+        assert!(
+            r.film.shadow.pixels().iter().all(|v| *v == Vec3::ONE),
+            "{sigma}"
+        );
+    }
+    // Here it is 8e-7 and 0.6: y exp(-y / sigma^2) of it from height y, of which the ball takes
+    // the azimuths up to acos(cos a / sqrt(1 - y^2)) on either side. Midpoints: below 1e-4.
+    for sigma in [0.3, 1.0] {
+        let s2 = f64::from(sigma).powi(2);
+        let expected = |p: glam::DVec3| {
+            let edge = (0.8 / p.length()).asin().cos();
+            let (mut blocked, mut all) = (0.0, 0.0);
+            for k in 0..400 {
+                let y = (f64::from(k) + 0.5) / 400.0;
+                let light = y * (-y / s2).exp();
+                let half_turn = (edge / (1.0 - y * y).sqrt()).min(1.0).acos();
+                blocked += light * half_turn / std::f64::consts::PI;
+                all += light;
+            }
+            1.0 - blocked / all
+        };
+        let r = under(sigma);
+        compare(&r, &view, expected, 1e-3, 0.15);
+        assert_is_ratio(&r);
+    }
+}
