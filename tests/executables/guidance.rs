@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use dipir_optimize::lighting::Lighting;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::project::*;
 
@@ -85,4 +85,29 @@ fn what_cannot_guide_is_refused_with_what_to_do() {
         assert!(run.stderr.contains(says), "{set}: {}", run.stderr);
         assert!(!project.path("out/light").exists(), "{set}");
     }
+}
+
+#[test]
+fn without_a_path_the_embedded_model_reads_the_light() {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let (scene, _) = text.split_once("[composite]").unwrap();
+    let table = "[optimize]\nstart = \"encoder\"\niterations = 1\nlobes = 6\n\
+                 environment = [16, 8]\nsamples = 16\nadapt = false\n";
+    project.write("pipeline.toml", format!("{scene}{table}"));
+    project.run(SCENE, &[]).expect_success();
+    project.run(OPTIMIZE, &[]).expect_success();
+    let reading: Value = serde_json::from_slice(&project.read("out/light/reading.json")).unwrap();
+    assert_eq!(reading["light"], reading["encoder"]);
+    assert_eq!(reading["energies"], json!([]));
+    let stage: Value = serde_json::from_slice(&project.read("out/light/stage.json")).unwrap();
+    let inputs = stage["inputs"].as_array().unwrap();
+    let unet = "embedded/unet/diffusion_pytorch_model.safetensors";
+    assert!(inputs.iter().any(|i| i["path"] == unet), "{inputs:?}");
+    // The same files in a folder are the same model.
+    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("data/prior");
+    let set = format!("model.path={folder:?}");
+    let light = project.read("out/light/lighting.json");
+    project.run(OPTIMIZE, &["-s", &set]).expect_success();
+    assert_eq!(project.read("out/light/lighting.json"), light);
 }

@@ -49,6 +49,8 @@ fn the_page_shows_every_stage_and_needs_no_other_file() {
         " toy ",
         "Loss of the personalisation",
         "after 3 updates",
+        ">memory</th",
+        " MiB",
         "every material is opaque",
         "dipir-optimize --set report.truth=sky.exr",
     ] {

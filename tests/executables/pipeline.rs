@@ -33,6 +33,24 @@ fn one_command_runs_what_is_needed_and_the_next_one_nothing() {
 }
 
 #[test]
+fn the_demo_of_the_readme_is_complete_and_runs_all_five_stages() {
+    let project = Project::new();
+    let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("pipeline.toml");
+    let run = project.run(DIPIR, &["status", demo.to_str().unwrap(), "-o", "demo"]);
+    run.expect_success();
+    // Whatever it reads is there and valid, or this would be an error.
+    assert_eq!(
+        run.stdout,
+        "scene      stale: it has not run yet\n\
+         concepts   stale: it has not run yet\n\
+         lora       waits for concepts, and runs if that changes\n\
+         light      waits for scene, lora, and runs if that changes\n\
+         composite  waits for scene, light, and runs if that changes\n"
+    );
+    assert!(!project.path("demo").exists());
+}
+
+#[test]
 fn status_says_what_would_run_and_why() {
     let project = Project::new();
     let status = |args: &[&str]| {

@@ -89,15 +89,6 @@ fn main() {
             let cells = shares.map(|s| format!("{:.0}%", 100.0 * s));
             println!("| {name} | {} |", cells.join(" | "));
         }
-        assert!(
-            least > 1.0 / 1.5 && most < 1.5,
-            "true over target: {least} to {most}"
-        );
-        // Of 50 at 95%, fewer than 43 come 3 times in 1000.
-        assert!(
-            all_within >= 43,
-            "within the bound: {all_within} of {count}"
-        );
     }
 }
 
