@@ -5,8 +5,8 @@
 //! itself, and `dipir-optimize` gets to see the composite alone. A sum of lobes cannot be a panorama,
 //! so the same is done under lobes that were fitted to it: a truth that can be found.
 //!
-//! Run with `cargo test --bench hdri_recovery -- --bench MAP... [yaw=DEG] [iterations=N]`, maps as HDR
-//! or EXR. Without `--bench`, as tests run it, one object under a small generated map proves that
+//! Run with `cargo test --bench hdri_recovery -- --bench MAP... [yaw=DEG] [iterations=N] [samples=N]
+//! [columns=N]`, maps as HDR or EXR. Without `--bench`, as tests run it, one object under a small generated map proves that
 //! it works.
 use std::fmt::Write as _;
 use std::fs;
@@ -41,7 +41,8 @@ struct Knobs {
     iterations: u32,
     size: &'static str,
     target_error: f64,
-    more: &'static str,
+    /// Further lines of `[optimize]`.
+    more: String,
 }
 
 fn main() {
@@ -63,16 +64,23 @@ fn main() {
             iterations: 20,
             size: "36x24",
             target_error: 0.02,
-            more: "environment = [32, 16]\nlobes = 8\nsamples = 8\n",
+            more: "environment = [32, 16]\nlobes = 8\nsamples = 8\n".into(),
         };
         return recover_all("generated", &generated(), &OBJECTS[..1], &knobs);
+    }
+    let mut more = String::new();
+    if let Some(samples) = value("samples") {
+        more += &format!("samples = {samples}\n");
+    }
+    if let Some(columns) = value("columns") {
+        more += &format!("environment = [{columns}, {}]\n", columns / 2.0);
     }
     let knobs = Knobs {
         yaw_deg: value("yaw").unwrap_or(0.0),
         iterations: value("iterations").unwrap_or(600.0) as u32,
         size: "192x128",
         target_error: 0.002,
-        more: "",
+        more,
     };
     for path in arguments
         .iter()
