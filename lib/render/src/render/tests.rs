@@ -46,6 +46,20 @@ fn any_number_of_threads_gives_the_same_bytes() {
     assert_eq!(one.error, two.error);
 }
 
+/// Mean squared difference of pixel `i` over the channels, as it is displayed on grey.
+fn squared_difference(a: &Rendered, b: &Rendered, i: usize) -> f64 {
+    let display = |r: &Rendered| {
+        let linear = dipir_imaging::composite::composite_pixel(
+            Vec3::splat(0.18),
+            r.film.object.pixels()[i],
+            r.film.alpha.pixels()[i],
+            r.film.shadow.pixels()[i],
+        );
+        linear.clamp(Vec3::ZERO, Vec3::ONE)
+    };
+    f64::from((display(a) - display(b)).length_squared()) / 3.0
+}
+
 #[test]
 fn the_estimated_error_is_the_real_one() {
     // Against a converged picture (whose own error is below an eighth), over 12 seeds: both mean
@@ -58,16 +72,7 @@ fn the_estimated_error_is_the_real_one() {
         let r = render(&s, &light, &lambertian(2), &settings(32, seed));
         estimated += r.error.rmse.powi(2) * r.error.touched_pixels as f64;
         for i in 0..20 * 20 {
-            let display = |r: &Rendered| {
-                let linear = dipir_imaging::composite::composite_pixel(
-                    Vec3::splat(0.18),
-                    r.film.object.pixels()[i],
-                    r.film.alpha.pixels()[i],
-                    r.film.shadow.pixels()[i],
-                );
-                linear.clamp(Vec3::ZERO, Vec3::ONE)
-            };
-            real += f64::from((display(&r) - display(&converged)).length_squared()) / 3.0;
+            real += squared_difference(&r, &converged, i);
         }
     }
     let ratio = (estimated / real).sqrt();
@@ -246,20 +251,11 @@ fn the_stated_interval_holds_the_true_error_as_often_as_stated() {
             )
             .expect("renders")
     };
-    let display = |r: &Rendered, i: usize| {
-        let linear = dipir_imaging::composite::composite_pixel(
-            Vec3::splat(0.18),
-            r.film.object.pixels()[i],
-            r.film.alpha.pixels()[i],
-            r.film.shadow.pixels()[i],
-        );
-        linear.clamp(Vec3::ZERO, Vec3::ONE)
-    };
     let converged = rendered(2048, 999);
     let is_missed = |seed: &u64| {
         let r = rendered(16, *seed);
         let squares: f64 = (0..32 * 32)
-            .map(|i| f64::from((display(&r, i) - display(&converged, i)).length_squared()) / 3.0)
+            .map(|i| squared_difference(&r, &converged, i))
             .sum();
         (squares / r.error.touched_pixels as f64).sqrt() > r.error.upper_95
     };
