@@ -17,11 +17,12 @@ use std::path::PathBuf;
 
 use candle_core::{DType, Device};
 use dipir::distillation::{Distillation, DistillationSettings};
+use dipir::light;
 use dipir::reading::{self, read_light, start};
 use dipir_diffusion::model::Model;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
-use dipir_light::environment::{EnvironmentMap, direction_at};
+use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::LobeParameters;
 use dipir_numerics::stats::{bootstrap_median_interval, median};
 use dipir_optimize::crop::bounding_box;
@@ -43,7 +44,7 @@ use dipir_render::transport::{RecordSettings, Transport};
 use dipir_scene::material::Material;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
-use glam::{Vec2, Vec3};
+use glam::Vec3;
 
 /// Key of these scenes; training and gates have others.
 const SEED: u64 = 0x5ce7e5;
@@ -119,30 +120,6 @@ impl Trial {
             linear,
             transport,
         })
-    }
-
-    /// The photograph seen in the directions that it shows, mirrored behind the camera and drawn
-    /// out at its borders: light without any model.
-    fn projected(&self) -> anyhow::Result<EnvironmentMap> {
-        let camera = &self.place.stage.camera;
-        let back = camera.rotation.z_axis;
-        let last = (SIZE - 1) as f32;
-        let texels = (0..MAP[0] * MAP[1]).map(|k| {
-            let (row, column) = (k / MAP[0], k % MAP[0]);
-            let d = direction_at(
-                (column as f32 + 0.5) / MAP[0] as f32,
-                (row as f32 + 0.5) / MAP[1] as f32,
-            );
-            // Into the view: mirrored at the plane of the picture, and never parallel to it.
-            let depth = d.dot(back);
-            let ahead = d - back * (depth + depth.abs().max(1e-3));
-            let pixel = camera
-                .project(camera.position + ahead)
-                .unwrap_or(camera.principal_px);
-            let pixel = pixel.clamp(Vec2::ZERO, Vec2::splat(last)).as_usizevec2();
-            self.linear.0.pixels()[pixel.y * SIZE as usize + pixel.x]
-        });
-        Ok(EnvironmentMap::new(MAP[0], MAP[1], texels.collect())?)
     }
 
     /// The composite under the true light with the photograph's own tone.
@@ -265,7 +242,11 @@ fn run(
         "2 neutral, camera's tone",
         answer(&trial, &objective, &plain, &truth),
     );
-    let projected = trial.under(&trial.projected()?, &objective, None);
+    let projected = trial.under(
+        &light::projected(&trial.linear, &trial.place.stage.camera, MAP)?,
+        &objective,
+        None,
+    );
     let unknown = judge(&trial, &objective, &projected, None, &truth);
     found.insert("2b photograph projected", unknown);
     let Some(object) = bounding_box(&coverage) else {

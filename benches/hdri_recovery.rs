@@ -8,7 +8,6 @@
 //! Run with `cargo test --bench hdri_recovery -- --bench MAP... [yaw=DEG] [iterations=N] [samples=N]
 //! [columns=N]`, maps as HDR or EXR. Without `--bench`, as tests run it, one object under a small generated map proves that
 //! it works.
-use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -20,6 +19,7 @@ use dipir_light::fit::fit;
 use dipir_light::rasterize::rasterize;
 use dipir_optimize::lighting::Lighting;
 use dipir_render::shapes::torus_knot;
+use dipir_scene::export::to_obj;
 use glam::Vec3;
 use serde_json::Value;
 
@@ -151,7 +151,7 @@ fn recover_all(name: &str, map: &EnvironmentMap, objects: &[(&str, &str)], knobs
     fs::write(folder.join("knot.obj"), knot()).expect("writes");
     for truth in ["map", "lobes"] {
         for (object, material) in objects {
-            let mtl = format!("newmtl skin\n{material}\n");
+            let mtl = format!("newmtl m0\n{material}\n");
             fs::write(folder.join("knot.mtl"), mtl).expect("writes");
             let row = recover(folder, truth, &photo, knobs);
             println!("| {name} | {truth} | {object} | {row} |");
@@ -237,18 +237,5 @@ fn apart(folder: &Path) -> (f64, f64) {
 
 /// A torus knot that stands on y = 0, as an OBJ file.
 fn knot() -> String {
-    let mesh = torus_knot(Vec3::Y * 0.75, 0.45, 0.17, 256, 24);
-    let mut text = String::from("mtllib knot.mtl\nusemtl skin\n");
-    for (p, n) in mesh.positions.iter().zip(&mesh.normals) {
-        let _ = writeln!(
-            text,
-            "v {} {} {}\nvn {} {} {}",
-            p.x, p.y, p.z, n.x, n.y, n.z
-        );
-    }
-    for [a, b, c] in &mesh.indices {
-        let (a, b, c) = (a + 1, b + 1, c + 1);
-        let _ = writeln!(text, "f {a}//{a} {b}//{b} {c}//{c}");
-    }
-    text
+    to_obj(&torus_knot(Vec3::Y * 0.75, 0.45, 0.17, 256, 24), "knot")
 }

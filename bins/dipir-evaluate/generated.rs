@@ -1,13 +1,12 @@
 //! Scenes of the project's own generator, of kinds that the small model never saw in training: a place
 //! with several solids under a sun and a sky, and one more solid to be put into it.
-use std::fmt::Write as _;
 use std::path::Path;
 
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_prior::place::Place;
-use dipir_scene::mesh::TriangleMesh;
+use dipir_scene::export::to_obj;
 
 use crate::bench::{Bench, SceneInfo, Tone, write, write_json};
 
@@ -33,10 +32,10 @@ pub fn make(bench: &Bench, seed: u64, index: u64, side: usize) -> anyhow::Result
     let metal = if paint.metallic { 1.0 } else { 0.0 };
     let [r, g, b] = paint.color.to_array();
     let material = format!(
-        "newmtl skin\nKd {r} {g} {b}\nPr {}\nPm {metal}\n",
+        "newmtl m0\nKd {r} {g} {b}\nPr {}\nPm {metal}\n",
         paint.roughness
     );
-    write(&folder.join("object.obj"), obj(&stage.main, "object"))?;
+    write(&folder.join("object.obj"), to_obj(&stage.main, "object"))?;
     write(&folder.join("object.mtl"), material)?;
     write_png(folder.join("photo.png"), &Transfer::Srgb.encode(&photo))?;
     place.map(MAP[0], MAP[1])?.write(folder.join("map.exr"))?;
@@ -68,23 +67,4 @@ pub fn make(bench: &Bench, seed: u64, index: u64, side: usize) -> anyhow::Result
     // Last: it stands for all of them.
     write_json(&folder.join("scene.json"), &info)?;
     Ok(name)
-}
-
-/// The mesh as an OBJ file with one material.
-pub fn obj(mesh: &TriangleMesh, library: &str) -> String {
-    let mut text = format!("mtllib {library}.mtl\nusemtl skin\n");
-    for p in &mesh.positions {
-        let _ = writeln!(text, "v {} {} {}", p.x, p.y, p.z);
-    }
-    for n in &mesh.normals {
-        let _ = writeln!(text, "vn {} {} {}", n.x, n.y, n.z);
-    }
-    for [a, b, c] in &mesh.indices {
-        let (a, b, c) = (a + 1, b + 1, c + 1);
-        let _ = match mesh.normals.is_empty() {
-            true => writeln!(text, "f {a} {b} {c}"),
-            false => writeln!(text, "f {a}//{a} {b}//{b} {c}//{c}"),
-        };
-    }
-    text
 }

@@ -1,10 +1,10 @@
 //! Maps of methods that need no optimisation, on the photograph's scale.
+use dipir::light;
 use dipir_imaging::raster::LinearImage;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::fit::fit;
 use dipir_light::rasterize::rasterize;
 use dipir_scene::camera::Camera;
-use glam::{Vec2, Vec3};
 
 use crate::bench::Tone;
 
@@ -26,33 +26,14 @@ pub fn neutral(photo: &LinearImage, tone: Tone) -> EnvironmentMap {
     EnvironmentMap::constant(8, 4, mean)
 }
 
-/// The photograph in the directions that it shows, mirrored behind the camera, its borders drawn out:
-/// a light without any model.
+/// The photograph in the directions that it shows: a light without any model.
 pub fn projected(
     photo: &LinearImage,
     tone: Tone,
     camera: &Camera,
 ) -> anyhow::Result<EnvironmentMap> {
-    let [width, height] = PROJECTED;
-    let empty = EnvironmentMap::constant(width, height, Vec3::ZERO);
-    let back = camera.rotation.z_axis;
-    let last = Vec2::new((photo.0.width() - 1) as f32, (photo.0.height() - 1) as f32);
-    let texel = |k: usize| {
-        let direction = empty.direction_of(k / width, k % width);
-        // Into the view: mirrored at the plane of the picture, and never parallel to it.
-        let depth = direction.dot(back);
-        let ahead = direction - back * (depth + depth.abs().max(1e-3));
-        let pixel = camera
-            .project(camera.position + ahead)
-            .unwrap_or(camera.principal_px);
-        let pixel = pixel.clamp(Vec2::ZERO, last);
-        tone.undone(*photo.0.get(pixel.x as usize, pixel.y as usize))
-    };
-    Ok(EnvironmentMap::new(
-        width,
-        height,
-        (0..width * height).map(texel).collect(),
-    )?)
+    let exposed = LinearImage(photo.0.map(|p| tone.undone(*p)));
+    light::projected(&exposed, camera, PROJECTED)
 }
 
 /// The truth as lobes: the best that the representation can do.
@@ -68,6 +49,7 @@ fn of_lobes(truth: &EnvironmentMap, count: usize, [width, height]: [usize; 2]) -
 mod tests {
     use dipir_imaging::raster::Raster;
     use dipir_scene::camera::FieldOfView;
+    use glam::Vec3;
 
     use super::*;
 

@@ -4,16 +4,16 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dipir::background::View;
+use dipir::background::{MID_GREY, View, exposure_ev_to};
 use dipir_cli::exit::Usage;
 use dipir_cli::progress::Progress;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
-use dipir_light::luminance::luminance;
 use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_render::shapes::torus_knot;
+use dipir_scene::export::to_obj;
 use glam::Vec3;
 use serde_json::json;
 
@@ -34,8 +34,6 @@ const AWAY_M: f32 = 4.2;
 const OBJECT_M: f32 = 1.1;
 /// Columns of the true light that are kept at most.
 const MOST_COLUMNS: usize = 1024;
-/// Display-referred mid-grey, to which the log-average of every photograph is exposed.
-const MID_GREY: f64 = 0.18;
 
 /// An object of the built-in ones: name, and material as an MTL file has it.
 const BUILT_IN: [(&str, &str); 3] = [
@@ -199,19 +197,7 @@ fn make(
 
 /// Stops after which the log-average is displayed as mid-grey, `x / (1 + x)` coming after them.
 fn exposure_ev(image: &LinearImage) -> f64 {
-    let logs: Vec<f64> = image
-        .0
-        .pixels()
-        .iter()
-        .map(|&p| f64::from(luminance(p)))
-        .filter(|l| *l > 0.0)
-        .map(f64::ln)
-        .collect();
-    if logs.is_empty() {
-        return 0.0;
-    }
-    let average = (logs.iter().sum::<f64>() / logs.len() as f64).exp();
-    (MID_GREY / (1.0 - MID_GREY) / average).log2()
+    exposure_ev_to(image, MID_GREY / (1.0 - MID_GREY))
 }
 
 fn read_map(path: &Path) -> anyhow::Result<EnvironmentMap> {
@@ -255,10 +241,10 @@ fn built_in(bench: &Bench) -> anyhow::Result<Vec<PathBuf>> {
         if !path.is_file() {
             write(
                 &folder.join(format!("{name}.mtl")),
-                format!("newmtl skin\n{material}\n"),
+                format!("newmtl m0\n{material}\n"),
             )?;
             let mesh = torus_knot(Vec3::Y * 0.75, 0.45, 0.17, 256, 24);
-            write(&path, generated::obj(&mesh, name))?;
+            write(&path, to_obj(&mesh, name))?;
         }
         paths.push(path);
     }

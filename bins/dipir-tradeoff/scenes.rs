@@ -1,6 +1,5 @@
 //! The scenes that are measured: three that differ, made here, or projects of the user's.
 use std::f32::consts::{PI, TAU};
-use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -11,6 +10,7 @@ use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
 use dipir_render::shapes::{append, icosphere, torus_knot};
+use dipir_scene::export::to_obj;
 use dipir_scene::mesh::TriangleMesh;
 use glam::{Vec2, Vec3};
 
@@ -64,7 +64,7 @@ pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<S
             (mesh, materials, hazy())
         }
     };
-    fs::write(folder.join("object.obj"), obj(&mesh)).with_context(failed)?;
+    fs::write(folder.join("object.obj"), to_obj(&mesh, "object")).with_context(failed)?;
     fs::write(folder.join("object.mtl"), materials).with_context(failed)?;
     map.write(folder.join("map.exr"))?;
     let view = View {
@@ -213,34 +213,6 @@ fn bowl() -> TriangleMesh {
     }
     mesh.materials = vec![0; mesh.indices.len()];
     mesh
-}
-
-/// The mesh as an OBJ file with materials `m0`, `m1`, ….
-fn obj(mesh: &TriangleMesh) -> String {
-    let mut text = String::from("mtllib object.mtl\n");
-    let mut line = |args: std::fmt::Arguments| {
-        let _ = text.write_fmt(args);
-        text.push('\n');
-    };
-    for p in &mesh.positions {
-        line(format_args!("v {} {} {}", p.x, p.y, p.z));
-    }
-    for n in &mesh.normals {
-        line(format_args!("vn {} {} {}", n.x, n.y, n.z));
-    }
-    let mut material = None;
-    for (triangle, m) in mesh.indices.iter().zip(&mesh.materials) {
-        if material != Some(*m) {
-            line(format_args!("usemtl m{m}"));
-            material = Some(*m);
-        }
-        let [a, b, c] = triangle.map(|i| i + 1);
-        match mesh.normals.is_empty() {
-            true => line(format_args!("f {a} {b} {c}")),
-            false => line(format_args!("f {a}//{a} {b}//{b} {c}//{c}")),
-        }
-    }
-    text
 }
 
 #[cfg(test)]

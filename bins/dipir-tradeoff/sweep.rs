@@ -116,23 +116,17 @@ impl Bench<'_> {
                 ("composite.target_error", &self.reference_error.to_string()),
                 ("composite.max_samples", "4194304"),
             ]);
-            self.stage(
-                "dipir-scene",
-                &self.scene.lit,
-                &folder,
-                REFERENCE_SEED,
-                &set,
-            )?;
-            let ran = self.stage(
-                "dipir-composite",
-                &self.scene.lit,
-                &folder,
-                REFERENCE_SEED,
-                &set,
-            )?;
+            let ran = self.composite(&folder, &set)?;
             write(&done, &ran.json)?;
         }
         load(&folder.join("composite/composite.exr"))
+    }
+
+    /// The scene under its known light, made in `folder` with the reference's seed.
+    fn composite(&self, folder: &Path, set: &[(String, String)]) -> anyhow::Result<Ran> {
+        let lit = &self.scene.lit;
+        self.stage("dipir-scene", lit, folder, REFERENCE_SEED, set)?;
+        self.stage("dipir-composite", lit, folder, REFERENCE_SEED, set)
     }
 
     /// Names of the effects that planning leaves on.
@@ -155,20 +149,7 @@ impl Bench<'_> {
         let beside = recover.with_file_name("truth.exr");
         if !beside.is_file() {
             let set = own(&[("composite.target_error", PICTURE_ERROR)]);
-            self.stage(
-                "dipir-scene",
-                &self.scene.lit,
-                &folder,
-                REFERENCE_SEED,
-                &set,
-            )?;
-            self.stage(
-                "dipir-composite",
-                &self.scene.lit,
-                &folder,
-                REFERENCE_SEED,
-                &set,
-            )?;
+            self.composite(&folder, &set)?;
             fs::copy(&picture, &beside)
                 .with_context(|| format!("cannot write {}", beside.display()))?;
         }

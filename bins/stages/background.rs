@@ -82,9 +82,16 @@ fn bilinear(map: &EnvironmentMap, direction: Vec3) -> Vec3 {
     top.lerp(bottom, fy)
 }
 
+/// Linear mid-grey.
+pub const MID_GREY: f64 = 0.18;
+
 /// The exposure in stops that brings the log-average luminance of `image` to mid-grey.
 pub fn automatic_exposure_ev(image: &LinearImage) -> f32 {
-    const MID_GREY: f64 = 0.18;
+    exposure_ev_to(image, MID_GREY) as f32
+}
+
+/// The exposure in stops that brings the log-average luminance of `image` to `level`; 0 for a black one.
+pub fn exposure_ev_to(image: &LinearImage, level: f64) -> f64 {
     let logs: Vec<f64> = image
         .0
         .pixels()
@@ -97,7 +104,7 @@ pub fn automatic_exposure_ev(image: &LinearImage) -> f32 {
         return 0.0;
     }
     let average = (logs.iter().sum::<f64>() / logs.len() as f64).exp();
-    (MID_GREY / average).log2() as f32
+    (level / average).log2()
 }
 
 #[cfg(test)]

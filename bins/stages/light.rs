@@ -4,12 +4,14 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use dipir_cli::session::Session;
+use dipir_imaging::raster::LinearImage;
 use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::{SgMixture, SphericalGaussian};
 use dipir_optimize::lighting::Lighting;
 use dipir_pipeline::manifest::{FILE_NAME, Manifest};
-use glam::{Quat, Vec3};
+use dipir_scene::camera::Camera;
+use glam::{Quat, Vec2, Vec3};
 use serde_json::{Value, json};
 
 use crate::composite::CompositeTable;
@@ -180,6 +182,34 @@ pub fn missing(recovered: &Path) -> anyhow::Error {
          in --set composite.environment=sky.hdr, or run dipir-optimize first",
         recovered.display()
     )
+}
+
+/// The photograph in the directions that it shows, mirrored behind the camera, its borders drawn out: a
+/// light of `width` x `height` texels without any model.
+pub fn projected(
+    photo: &LinearImage,
+    camera: &Camera,
+    [width, height]: [usize; 2],
+) -> anyhow::Result<EnvironmentMap> {
+    let empty = EnvironmentMap::constant(width, height, Vec3::ZERO);
+    let back = camera.rotation.z_axis;
+    let last = Vec2::new((photo.0.width() - 1) as f32, (photo.0.height() - 1) as f32);
+    let texel = |k: usize| {
+        let direction = empty.direction_of(k / width, k % width);
+        // Into the view: mirrored at the plane of the picture, and never parallel to it.
+        let depth = direction.dot(back);
+        let ahead = direction - back * (depth + depth.abs().max(1e-3));
+        let pixel = camera
+            .project(camera.position + ahead)
+            .unwrap_or(camera.principal_px);
+        let pixel = pixel.clamp(Vec2::ZERO, last);
+        *photo.0.get(pixel.x as usize, pixel.y as usize)
+    };
+    Ok(EnvironmentMap::new(
+        width,
+        height,
+        (0..width * height).map(texel).collect(),
+    )?)
 }
 
 #[cfg(test)]

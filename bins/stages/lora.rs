@@ -1,4 +1,7 @@
 //! The LoRA stage: personalises the model to the photograph, keeping the object's class.
+mod data;
+mod resume;
+
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -6,16 +9,13 @@ use anyhow::Context;
 use candle_core::Tensor;
 use dipir_cli::interrupt;
 use dipir_cli::session::{Session, duration};
-use dipir_diffusion::crop::{CropBox, resample};
-use dipir_diffusion::distillation::InpaintCondition;
 use dipir_diffusion::generate::{GenerateSettings, generate};
 use dipir_diffusion::lora::{LoraInfo, LoraStyle};
 use dipir_diffusion::model::Model;
-use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
 use dipir_diffusion::text_encoder::LearnedTokens;
-use dipir_diffusion::training::{Example, LoraTrainer, StepReport, TrainingConfig, TrainingData};
+use dipir_diffusion::training::{LoraTrainer, StepReport, TrainingConfig};
 use dipir_diffusion::weights::Weights;
 use dipir_imaging::file::{read_photo, write_png};
 use dipir_imaging::transfer::Transfer;
@@ -25,6 +25,8 @@ use dipir_scene::config::SceneConfig;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
+use self::data::Data;
+use self::resume::Resume;
 use crate::concepts::{self, ConceptList, read_latents};
 use crate::model::{self, ModelTable};
 
@@ -121,89 +123,6 @@ pub struct Done {
     manifest: Manifest,
     history: Vec<StepReport>,
     resumed_at: usize,
-}
-
-/// Crops of the photograph and images of the class.
-struct Data<'a> {
-    model: &'a Model,
-    photo: Tensor,
-    size: usize,
-    min_crop: f64,
-    prompt: String,
-    class_prompt: String,
-    concepts: Option<Tensor>,
-}
-
-impl Data<'_> {
-    fn place(&self, tensor: &Tensor) -> dipir_diffusion::Result<Tensor> {
-        Ok(tensor
-            .to_device(self.model.device())?
-            .to_dtype(self.model.dtype())?)
-    }
-
-    /// A rectangle to paint, of 0.3 to 0.9 of each side, for inpainting models.
-    fn mask(
-        &self,
-        image: &Tensor,
-        stream: &mut NoiseStream,
-    ) -> dipir_diffusion::Result<Option<InpaintCondition>> {
-        if !self.model.is_inpainting() {
-            return Ok(None);
-        }
-        let (_, _, height, width) = image.dims4()?;
-        let mut span = |n: usize| {
-            let length = ((0.3 + 0.6 * stream.uniform()) * n as f64) as usize;
-            let first = stream.below(n - length + 1);
-            first..first + length
-        };
-        let (rows, columns) = (span(height), span(width));
-        let values: Vec<f32> = (0..height * width)
-            .map(|i| {
-                if rows.contains(&(i / width)) && columns.contains(&(i % width)) {
-                    1.0
-                } else {
-                    0.0
-                }
-            })
-            .collect();
-        let mask = self.place(&Tensor::from_vec(
-            values,
-            (1, 1, height, width),
-            image.device(),
-        )?)?;
-        Ok(Some(InpaintCondition::new(&self.model.vae, image, &mask)?))
-    }
-}
-
-impl TrainingData for Data<'_> {
-    fn instance(&self, stream: &mut NoiseStream) -> dipir_diffusion::Result<Example> {
-        let (_, height, width) = self.photo.dims3()?;
-        let region = CropBox::random(width, height, self.min_crop, stream);
-        let image = self.place(&resample(&self.photo, region, self.size)?)?;
-        let inpaint = self.mask(&image, stream)?;
-        Ok(Example {
-            latents: self.model.vae.encode(&image, None)?.detach(),
-            prompt: self.prompt.clone(),
-            inpaint,
-        })
-    }
-
-    fn prior(&self, stream: &mut NoiseStream) -> dipir_diffusion::Result<Option<Example>> {
-        let Some(concepts) = &self.concepts else {
-            return Ok(None);
-        };
-        let index = stream.below(concepts.dim(0)?);
-        let latents = self.place(&concepts.narrow(0, index, 1)?)?;
-        let inpaint = match self.model.is_inpainting() {
-            true => self.mask(&self.model.vae.decode(&latents)?.detach(), stream)?,
-            false => None,
-        };
-        Ok(Some(Example {
-            latents,
-            prompt: self.class_prompt.clone(),
-            inpaint,
-        }))
-    }
 }
 
 /// What a run would be, from the configuration and the concept stage's manifest.
@@ -421,86 +340,6 @@ fn read_concepts(session: &Session) -> anyhow::Result<Option<(ConceptList, PathB
         )
     })?;
     Ok(Some((list, manifest.output(&folder, "latents")?)))
-}
-
-/// Where an interrupted run goes on.
-struct Resume {
-    folder: PathBuf,
-}
-
-impl Resume {
-    fn open(session: &Session, fingerprint: &str) -> anyhow::Result<Self> {
-        let folder = session
-            .out
-            .join("lora-checkpoints")
-            .join(&fingerprint[..16]);
-        model::create_folder(&folder)?;
-        Ok(Self { folder })
-    }
-
-    /// Where the sample after an update is kept until the end.
-    fn sample(&self, step: usize) -> PathBuf {
-        self.folder.join(format!("sample-{step:06}.png"))
-    }
-
-    /// Loads the last checkpoint, if there is a usable one; returns its history.
-    fn restore(
-        &self,
-        session: &Session,
-        trainer: &mut LoraTrainer,
-        steps: usize,
-    ) -> Vec<StepReport> {
-        let path = self.folder.join("checkpoint.safetensors");
-        let history = std::fs::read(self.folder.join("history.json"))
-            .ok()
-            .and_then(|text| serde_json::from_slice::<Vec<StepReport>>(&text).ok())
-            .unwrap_or_default();
-        if !path.is_file() {
-            return vec![];
-        }
-        let usable = trainer
-            .resume(&path)
-            .map_err(anyhow::Error::from)
-            .and_then(|()| {
-                anyhow::ensure!(
-                    trainer.steps() <= steps,
-                    "it has {} updates, {steps} are wanted",
-                    trainer.steps()
-                );
-                anyhow::ensure!(
-                    history.len() >= trainer.steps(),
-                    "its history is incomplete"
-                );
-                Ok(())
-            });
-        match usable {
-            Ok(()) => history[..trainer.steps()].to_vec(),
-            Err(e) => {
-                session.warn(&format!("{} is not used: {e}", path.display()));
-                if trainer.steps() > 0 {
-                    let _ = trainer.reset();
-                }
-                vec![]
-            }
-        }
-    }
-
-    /// The history first: it may be longer than the checkpoint, never shorter.
-    fn save(&self, trainer: &LoraTrainer, history: &[StepReport]) -> anyhow::Result<()> {
-        let path = self.folder.join("history.json");
-        let partial = self.folder.join("history.partial");
-        std::fs::write(&partial, serde_json::to_vec(history)?)
-            .and_then(|()| std::fs::rename(&partial, &path))
-            .with_context(|| format!("cannot write {}", path.display()))?;
-        trainer.save_checkpoint(&self.folder.join("checkpoint.safetensors"))?;
-        Ok(())
-    }
-
-    fn remove(&self) {
-        let _ = std::fs::remove_dir_all(&self.folder);
-        // Only if nothing else is in it.
-        let _ = self.folder.parent().map(std::fs::remove_dir);
-    }
 }
 
 /// A sample under the photograph's caption.

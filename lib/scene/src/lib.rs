@@ -5,6 +5,7 @@ pub mod camera;
 pub mod config;
 pub mod description;
 pub mod error;
+pub mod export;
 pub mod features;
 pub mod import;
 pub mod material;
