@@ -37,6 +37,14 @@ pub struct Weights {
     pub regularizer: f64,
 }
 
+impl Weights {
+    /// The guidance alone.
+    pub const NONE: Self = Self {
+        consistency: 0.0,
+        regularizer: 0.0,
+    };
+}
+
 /// The chain for one photograph and one recorded scene.
 pub struct Objective {
     transport: Box<dyn LinearTransport>,
@@ -108,6 +116,11 @@ impl Objective {
         let sizes = |t: &dyn LinearTransport| (t.size(), t.environment_size());
         assert_eq!(sizes(&*transport), sizes(&*self.transport), "one scene");
         self.transport = transport;
+    }
+
+    /// Changes the weights of the terms beside the guidance.
+    pub fn set_weights(&mut self, weights: Weights) {
+        self.weights = weights;
     }
 
     /// The photograph, in linear light.

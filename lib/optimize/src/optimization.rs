@@ -5,8 +5,9 @@ use std::time::Instant;
 
 use dipir_imaging::raster::DisplayImage;
 use dipir_imaging::tone::ToneCurves;
-use dipir_light::environment::EnvironmentMap;
+use dipir_light::environment::{EnvironmentMap, solid_angle};
 use dipir_light::gaussian::LobeParameters;
+use glam::Vec3;
 
 use crate::checkpoint::State;
 use crate::crop::{CropSampler, Framing, View};
@@ -14,7 +15,7 @@ use crate::error::OptimizeError;
 use crate::guidance::{Guidance, Guided, Step};
 use crate::history::{Row, stands_still};
 use crate::lighting::Lighting;
-use crate::objective::{Forward, Objective};
+use crate::objective::{Forward, Objective, Weights};
 use crate::parameters::{Bounds, Parameters};
 use crate::settings::Settings;
 use crate::tensors::Tensors;
@@ -119,6 +120,16 @@ impl Optimization<'_> {
                 seed: settings.seed,
             };
 
+            // From here on both sets are what is delivered, and only the picture pulls at it: they
+            // agree, and the shadow's sparsity would dim the object.
+            let one_light = settings.light && iteration >= settings.fused_at();
+            if one_light {
+                self.objective.set_weights(Weights::NONE);
+            }
+            if one_light && iteration == settings.fused_at() {
+                self.join(&mut state);
+            }
+
             // Transport.
             let recorded = self.record_again(&mut state)?;
 
@@ -134,6 +145,13 @@ impl Optimization<'_> {
                     self.gradient(&state.parameters, &forward, &view, guided)
                 }
             };
+            let judged = judged.map(|judged| match one_light {
+                true => Judged {
+                    gradient: judged.gradient.shared(&Parameters::TWINS),
+                    ..judged
+                },
+                false => judged,
+            });
 
             // Previews show what the step starts from.
             if settings.preview_every > 0 && iteration.is_multiple_of(settings.preview_every) {
@@ -196,8 +214,7 @@ impl Optimization<'_> {
             if every > 0 && state.iteration.is_multiple_of(every) {
                 self.keep(&state)?;
             }
-            let fused = (settings.fused_after * settings.iterations as f64).ceil() as usize;
-            stopped_early = stands_still(&state.history, settings.patience, fused);
+            stopped_early = stands_still(&state.history, settings.patience, settings.fused_at());
         }
         self.outcome(state, stopped_early, watch)
     }
@@ -213,6 +230,24 @@ impl Optimization<'_> {
             self.record(light.clone())?;
         }
         Ok(state)
+    }
+
+    /// Makes the fused light, as lobes, the light of both sets, with the momentum of the
+    /// foreground. Fusing maps leaves what lobes cannot say where the sets still differ; from here
+    /// on the optimiser sees it, and mends it.
+    fn join(&self, state: &mut State) {
+        let (width, height) = self.objective.transport().environment_size();
+        let light = Lighting::of(&state.parameters, width, height);
+        let joined = Parameters::of_lobes(&light.lobes);
+        state.parameters = Parameters {
+            foreground: joined.foreground,
+            shadow: joined.shadow,
+            log_exposure: 0.0,
+            ..state.parameters.clone()
+        };
+        for moments in [&mut state.adam.first, &mut state.adam.second] {
+            *moments = std::mem::take(moments).twinned(&Parameters::TWINS);
+        }
     }
 
     /// Records transport for the current light if the record samples it badly.
@@ -235,13 +270,15 @@ impl Optimization<'_> {
         {
             return Ok(false);
         }
+        let (width, height) = self.objective.transport().environment_size();
+        let light = sharpened(light, width, height);
         self.record(light.clone())?;
         state.record_light = Some(light);
         state.records += 1;
         Ok(true)
     }
 
-    fn record(&mut self, light: Vec<glam::Vec3>) -> Result<(), OptimizeError> {
+    fn record(&mut self, light: Vec<Vec3>) -> Result<(), OptimizeError> {
         let Some(recorder) = &mut self.recorder else {
             return Ok(());
         };
@@ -336,6 +373,28 @@ impl Optimization<'_> {
             stopped_early,
         })
     }
+}
+
+/// `light`, and as much energy once more where it is bright: what transport is recorded for. A record
+/// for the light alone has few samples where a lobe would shine if it were narrower, and with their
+/// noise the loss rises as the lobe narrows, so that it stays too wide.
+fn sharpened(mut light: Vec<Vec3>, width: usize, height: usize) -> Vec<Vec3> {
+    let area = |k: usize| solid_angle(width, height, k / width);
+    // The mean of brightness squared where the energy is.
+    let (mut energy, mut cubes) = (0.0, 0.0);
+    for (k, texel) in light.iter().enumerate() {
+        let l = f64::from(texel.element_sum());
+        energy += l * area(k);
+        cubes += l * l * l * area(k);
+    }
+    if cubes > 0.0 {
+        let per_square = energy / cubes;
+        for texel in &mut light {
+            let l = f64::from(texel.element_sum());
+            *texel *= (1.0 + l * l * per_square) as f32;
+        }
+    }
+    light
 }
 
 /// The guidance's answer, carried back to the parameters.

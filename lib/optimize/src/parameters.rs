@@ -179,6 +179,13 @@ impl Parameters {
         }
     }
 
+    /// Tensors of the foreground's lobes and of the shadow's, pair by pair.
+    pub const TWINS: [[&str; 2]; 3] = [
+        ["foreground.log_radiance", "shadow.log_radiance"],
+        ["foreground.direction", "shadow.direction"],
+        ["foreground.log_sigma", "shadow.log_sigma"],
+    ];
+
     /// Brings parameters back to where they mean something, after a step: directions to unit
     /// length, the rest within `bounds`.
     pub fn retract(&mut self, bounds: &Bounds) {

@@ -52,6 +52,32 @@ impl Tensors {
         norm(all)
     }
 
+    /// Both tensors of each pair are their sum: the gradient of parameters that are one and the same.
+    pub fn shared(mut self, pairs: &[[&str; 2]]) -> Self {
+        self.pairwise(pairs, |a, b| a + b);
+        self
+    }
+
+    /// The second tensor of each pair becomes the first.
+    pub fn twinned(mut self, pairs: &[[&str; 2]]) -> Self {
+        self.pairwise(pairs, |a, _| a);
+        self
+    }
+
+    fn pairwise(&mut self, pairs: &[[&str; 2]], of: impl Fn(f64, f64) -> f64) {
+        for [a, b] in pairs {
+            let place = |name: &str| self.0.iter().position(|t| t.name == name);
+            let (Some(a), Some(b)) = (place(a), place(b)) else {
+                continue;
+            };
+            for k in 0..self.0[a].values.len().min(self.0[b].values.len()) {
+                let value = of(self.0[a].values[k], self.0[b].values[k]);
+                self.0[a].values[k] = value;
+                self.0[b].values[k] = value;
+            }
+        }
+    }
+
     /// The same names and sizes, filled with zeros.
     pub fn zeros_like(&self) -> Self {
         let zeroed = self.0.iter().map(|t| Tensor {
