@@ -31,7 +31,12 @@ fn history(project: &Project) -> Vec<Value> {
 
 #[test]
 fn every_family_and_every_kind_of_guidance_moves_the_light() {
-    for (family, guidance) in [("sd15", "lds"), ("sd21", "sds"), ("inpaint", "csd")] {
+    for (family, guidance) in [
+        ("sd15", "lds"),
+        ("sd21", "sds"),
+        ("inpaint", "csd"),
+        ("sd15", "sdedit"),
+    ] {
         let project = project(family, &format!("guidance = \"{guidance}\""));
         let run = project.run(OPTIMIZE, &[]);
         run.expect_success();

@@ -310,7 +310,7 @@ fn what_cannot_be_optimised_is_refused_with_the_way_out() {
         &["optimize.guidance=magic"],
         2,
         "error: --set optimize.guidance=magic: optimize.guidance is \"magic\", accepted: \"lds\", \
-         \"sds\", \"csd\", \"reference\"",
+         \"sds\", \"csd\", \"sdedit\", \"reference\"",
     );
     optimize_fails(
         &project,

@@ -8,7 +8,7 @@ use candle_core::Tensor;
 use crate::error::{Result, argument};
 use crate::lora::Lora;
 use crate::pass::Pass;
-use crate::sampler::guided;
+use crate::sampler::{Sampler, Solver, edit, guided};
 use crate::schedule::NoiseSchedule;
 use crate::unet::UNet;
 use crate::vae::Vae;
@@ -27,6 +27,15 @@ pub enum Guidance {
     /// Adapted conditional minus un-adapted unconditional prediction
     /// [Liang et al. 2024, eq. 8].
     Lds,
+    /// Latents minus what they become when they are noised up to t and denoised under the prompt
+    /// (SDEdit) [Meng et al. 2022; as "dataset update" Haque et al. 2023]: the gradient of half their
+    /// squared distance. w(t) is left out.
+    Edit {
+        /// Classifier-free guidance scale.
+        scale: f64,
+        /// Steps of DPM-Solver++(2M) over the whole schedule, of which those below t are taken.
+        steps: usize,
+    },
 }
 
 /// w(t).
@@ -117,12 +126,13 @@ pub struct ScoreDistillation<'a> {
     pub guidance: Guidance,
     /// w(t).
     pub weighting: Weighting,
-    /// Adapter of the personalised model. SDS and CSD use it in both terms,
-    /// LDS in the conditional one only.
+    /// Adapter of the personalised model. LDS uses it in the conditional term only, all others in
+    /// both.
     pub lora: Option<&'a Arc<Lora>>,
     /// States of the prompt, [1 or batch, tokens, width].
     pub conditional: &'a Tensor,
-    /// States of the empty prompt.
+    /// States of the empty prompt, or, for a batch of 1, of several prompts [prompts, tokens, width],
+    /// over which the prediction is averaged: what the wanted one is to be told from.
     pub unconditional: &'a Tensor,
     /// For 9-channel networks.
     pub inpaint: Option<&'a InpaintCondition>,
@@ -131,8 +141,8 @@ pub struct ScoreDistillation<'a> {
 /// The result of a step.
 #[derive(Debug, Clone)]
 pub struct ScoreGradient {
-    /// w(t) times the difference, [batch, c, h, w]: the gradient at the
-    /// latents, dz_t/dz left out as is usual.
+    /// w(t) times the difference, [batch, c, h, w]: the gradient at the latents, dz_t/dz left out
+    /// as is usual.
     pub gradient: Tensor,
     /// Mean square of the difference without w(t).
     pub difference: f64,
@@ -150,13 +160,22 @@ impl ScoreDistillation<'_> {
             ));
         }
         let latents = latents.detach();
-        let x_t = self.schedule.add_noise(&latents, noise, t)?;
-        let (conditional, unconditional) = self.predictions(&x_t, t)?;
-        let difference = match self.guidance {
-            Guidance::Sds { scale } => (guided(&unconditional, &conditional, scale)? - noise)?,
-            Guidance::Csd | Guidance::Lds => (conditional - unconditional)?,
-        };
         let weight = self.weighting.at(self.schedule.alpha_bar(t)?);
+        let (difference, weight) = match self.guidance {
+            Guidance::Edit { scale, steps } => {
+                let edited = self.edited(&latents, t, noise, scale, steps)?;
+                ((&latents - edited)?, 1.0)
+            }
+            Guidance::Sds { scale } => {
+                let (conditional, unconditional) = self.noise(&latents, t, noise)?;
+                let guided = guided(&unconditional, &conditional, scale)?;
+                ((guided - noise)?, weight)
+            }
+            Guidance::Csd | Guidance::Lds => {
+                let (conditional, unconditional) = self.noise(&latents, t, noise)?;
+                ((conditional - unconditional)?, weight)
+            }
+        };
         let mean_square = difference
             .to_dtype(candle_core::DType::F32)?
             .sqr()?
@@ -168,8 +187,35 @@ impl ScoreDistillation<'_> {
         })
     }
 
-    /// Noise predictions (conditional, unconditional), in one batch.
-    fn predictions(&self, x_t: &Tensor, t: usize) -> Result<(Tensor, Tensor)> {
+    /// What SDEdit makes of `latents`, from timestep `t` on.
+    fn edited(
+        &self,
+        latents: &Tensor,
+        t: usize,
+        noise: &Tensor,
+        scale: f64,
+        steps: usize,
+    ) -> Result<Tensor> {
+        let mut sampler = Sampler::new(self.schedule, Solver::DpmSolver2M, steps)?;
+        let strength = (t + 1) as f64 / self.schedule.len() as f64;
+        edit(&mut sampler, latents, noise, strength, |x, t| {
+            let (conditional, unconditional) = self.outputs(x, t)?;
+            guided(&unconditional, &conditional, scale)
+        })
+    }
+
+    /// Noise predictions (conditional, unconditional).
+    fn noise(&self, latents: &Tensor, t: usize, noise: &Tensor) -> Result<(Tensor, Tensor)> {
+        let x_t = self.schedule.add_noise(latents, noise, t)?;
+        let (conditional, unconditional) = self.outputs(&x_t, t)?;
+        Ok((
+            self.schedule.noise_of(&conditional, &x_t, t)?,
+            self.schedule.noise_of(&unconditional, &x_t, t)?,
+        ))
+    }
+
+    /// The network's outputs (conditional, mean of the unconditional), in one batch.
+    fn outputs(&self, x_t: &Tensor, t: usize) -> Result<(Tensor, Tensor)> {
         let batch = x_t.dim(0)?;
         let input = match self.inpaint {
             Some(condition) => condition.join(x_t)?,
@@ -179,8 +225,15 @@ impl ScoreDistillation<'_> {
             let (_, tokens, width) = context.dims3()?;
             Ok(context.broadcast_as((batch, tokens, width))?.contiguous()?)
         };
-        let context = Tensor::cat(&[spread(self.conditional)?, spread(self.unconditional)?], 0)?;
-        let both = Tensor::cat(&[&input, &input], 0)?;
+        let mut contexts = vec![spread(self.conditional)?];
+        let several = batch == 1 && self.unconditional.dim(0)? > 1;
+        contexts.push(match several {
+            true => self.unconditional.clone(),
+            false => spread(self.unconditional)?,
+        });
+        let context = Tensor::cat(&contexts, 0)?;
+        let rows = context.dim(0)?;
+        let inputs = Tensor::cat(&vec![&input; rows / batch], 0)?;
         let lora_rows = (self.guidance == Guidance::Lds).then_some(batch);
         let pass = Pass {
             lora: self.lora.cloned(),
@@ -189,11 +242,15 @@ impl ScoreDistillation<'_> {
         };
         let output = self
             .unet
-            .forward(&both, &[t as f64], &context, &pass)?
+            .forward(&inputs, &[t as f64], &context, &pass)?
             .detach();
-        let noise = self
-            .schedule
-            .noise_of(&output, &Tensor::cat(&[x_t, x_t], 0)?, t)?;
-        Ok((noise.narrow(0, 0, batch)?, noise.narrow(0, batch, batch)?))
+        let unconditional = output.narrow(0, batch, rows - batch)?;
+        Ok((
+            output.narrow(0, 0, batch)?,
+            match several {
+                true => unconditional.mean_keepdim(0)?,
+                false => unconditional,
+            },
+        ))
     }
 }

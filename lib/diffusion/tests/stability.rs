@@ -83,7 +83,15 @@ fn score_distillation_is_finite_at_both_ends_for_every_prediction() -> Outcome {
         .into_iter()
         .filter(|s| s.config().beta_schedule == BetaSchedule::ScaledLinear)
     {
-        for guidance in [Guidance::Sds { scale: 100.0 }, Guidance::Csd, Guidance::Lds] {
+        for guidance in [
+            Guidance::Sds { scale: 100.0 },
+            Guidance::Csd,
+            Guidance::Lds,
+            Guidance::Edit {
+                scale: 7.5,
+                steps: 4,
+            },
+        ] {
             let step = ScoreDistillation {
                 unet: &model.unet,
                 schedule: &schedule,

@@ -390,6 +390,60 @@ fn score_distillation_is_the_difference_of_separate_predictions() -> Outcome {
     Ok(())
 }
 
+#[test]
+fn several_prompts_to_be_told_from_are_averaged_and_an_edit_pulls_towards_itself() -> Outcome {
+    let model = model("sd15")?;
+    let (latents, noise) = (normal(75, &[1, 4, 8, 8]), normal(76, &[1, 4, 8, 8]));
+    let c = model.encode_prompts(&["a car"], None)?;
+    let others = model.encode_prompts(&["a cat", "a tree", ""], None)?;
+    let t = 500;
+    let found = |guidance: Guidance, unconditional: &Tensor| {
+        ScoreDistillation {
+            unet: &model.unet,
+            schedule: &model.schedule,
+            guidance,
+            weighting: Weighting::NoiseVariance,
+            lora: None,
+            conditional: &c,
+            unconditional,
+            inpaint: None,
+        }
+        .gradient(&latents, t, &noise)
+    };
+    let largest = |t: &Tensor| -> dipir_diffusion::Result<f32> {
+        Ok(t.abs()?.max_all()?.to_scalar::<f32>()?)
+    };
+    let together = found(Guidance::Csd, &others)?.gradient;
+    let mut mean = together.zeros_like()?;
+    for k in 0..3 {
+        let one = found(Guidance::Csd, &others.narrow(0, k, 1)?)?.gradient;
+        mean = (mean + (one / 3.0)?)?;
+    }
+    let size = largest(&together)?;
+    assert!(largest(&(together - mean)?)? < 1e-4 * size);
+
+    // One step down to the end is the clean sample that is predicted.
+    let guidance = Guidance::Edit {
+        scale: 3.0,
+        steps: 1,
+    };
+    let edited = found(guidance, &others.narrow(0, 2, 1)?)?.gradient;
+    let sampler = Sampler::new(&model.schedule, Solver::DpmSolver2M, 1)?;
+    let start = sampler.timesteps()[0];
+    let x_t = model.schedule.add_noise(&latents, &noise, start)?;
+    let predict = |context: &Tensor| {
+        let output = model
+            .unet
+            .forward(&x_t, &[start as f64], context, &Pass::default())?;
+        model.schedule.sample_of(&output, &x_t, start)
+    };
+    let clean = guided(&predict(&others.narrow(0, 2, 1)?)?, &predict(&c)?, 3.0)?;
+    let wanted = (&latents - clean)?;
+    let error = largest(&(edited - &wanted)?)?;
+    assert!(error < 1e-4 * largest(&wanted)?, "{error}");
+    Ok(())
+}
+
 /// For data of one point the best noise prediction is known in closed form,
 /// and both solvers have to end at that point.
 #[test]
