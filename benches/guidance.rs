@@ -325,6 +325,8 @@ struct Variant {
     read_start: bool,
     /// Regularisers hold the light sets together.
     anchors: bool,
+    /// The light is told from the same light from other sides, not from no caption.
+    turned: bool,
 }
 
 const WHOLE: Variant = Variant {
@@ -336,9 +338,10 @@ const WHOLE: Variant = Variant {
     inversion: true,
     read_start: true,
     anchors: true,
+    turned: true,
 };
 
-const VARIANTS: [Variant; 9] = [
+const VARIANTS: [Variant; 10] = [
     WHOLE,
     Variant {
         name: "5a guidance, no light words",
@@ -371,13 +374,18 @@ const VARIANTS: [Variant; 9] = [
         ..WHOLE
     },
     Variant {
-        name: "5g guidance, CSD",
-        kind: GuidanceKind::Csd,
+        name: "5g guidance, pictures edited",
+        kind: GuidanceKind::SdEdit,
         ..WHOLE
     },
     Variant {
         name: "5h guidance, no regularisers",
         anchors: false,
+        ..WHOLE
+    },
+    Variant {
+        name: "5i guidance, told from no caption",
+        turned: false,
         ..WHOLE
     },
 ];
@@ -420,6 +428,7 @@ fn guided(
             guidance_scale: 7.5,
             prompt: (!variant.light_words).then(|| format!("a photo of a {class}")),
             adapt: false,
+            turned: variant.turned,
         },
         None,
         class,
@@ -473,7 +482,7 @@ fn main() -> anyhow::Result<()> {
         iterations: 50,
         rate: 0.1,
         ablations: false,
-        guidance_draws: 2,
+        guidance_draws: 1,
         samples: 192,
         reader: ReaderSettings::default(),
         json: None,

@@ -71,6 +71,9 @@ pub struct Train {
     /// Share of examples that show the place around the object
     #[arg(long, default_value_t = Recipe::default().background)]
     pub background: f64,
+    /// Weight of telling the right light from wrong ones, as a share of the loss at chance
+    #[arg(long, default_value_t = TrainerSettings::default().contrast)]
+    pub contrast: f64,
     /// Updates between checkpoints
     #[arg(long, default_value_t = 200)]
     pub checkpoint_every: usize,

@@ -85,6 +85,7 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
         samples: args.samples,
         batch: args.batch,
         seed: args.seed,
+        contrast: args.contrast,
         ..TrainerSettings::default()
     };
     let recipe = Recipe {
@@ -104,12 +105,21 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     let progress = Progress::new("training", output.quiet);
     let clock = Instant::now();
     let mut mean: Option<f64> = None;
+    let mut surprise: Option<f64> = None;
     trainer.run(&data, &mut |trainer, update| {
         // Over about fifty updates.
         let loss = mean.map_or(update.loss, |m| 0.98 * m + 0.02 * update.loss);
         mean = Some(loss);
         progress.set(update.seen as f64 / args.samples.max(1) as f64);
-        progress.say(format!("{} examples, loss {loss:.4}", update.seen));
+        let told = match update.surprise.is_nan() {
+            true => String::new(),
+            false => {
+                let now = surprise.map_or(update.surprise, |m| 0.98 * m + 0.02 * update.surprise);
+                surprise = Some(now);
+                format!(", surprise at the light {now:.3}")
+            }
+        };
+        progress.say(format!("{} examples, loss {loss:.4}{told}", update.seen));
         let stop = go_on();
         let every = (args.checkpoint_every.max(1) * args.batch).max(1);
         if stop.is_break() || update.seen.is_multiple_of(every) {
@@ -119,8 +129,9 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     })?;
     progress.done();
     trainer.save(&checkpoint)?;
-    interrupt::check()?;
+    // Also of a run that is stopped: its gates can be measured, and it goes on from its checkpoint.
     blueprint.write_weights(out, trainer.average())?;
+    interrupt::check()?;
     let seconds = clock.elapsed().as_secs_f64();
     output.result(
         || {

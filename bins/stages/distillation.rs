@@ -18,7 +18,7 @@ use dipir_optimize::guidance::{Guidance, Guided, Step};
 use dipir_optimize::settings::{GuidanceKind, OptimizeTable};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
-use dipir_prior::energy::states;
+use dipir_prior::energy::{guiding, states};
 use dipir_prior::reader::Reading;
 use dipir_prior::words::Caption;
 use glam::Vec3;
@@ -33,6 +33,9 @@ const STRENGTH: f64 = 100.0;
 /// Crops of a model that knows light, in sides of the object's box: as it was trained.
 const LIGHT_SCALE: [f32; 2] = [2.2, 3.0];
 
+/// Denoising steps from noise alone to a picture; an edited picture takes those below its timestep.
+const EDIT_STEPS: usize = 10;
+
 /// What of `[optimize]` is about the model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DistillationSettings {
@@ -42,12 +45,15 @@ pub struct DistillationSettings {
     pub timesteps: [[f64; 2]; 2],
     /// Draws of noise for an iteration.
     pub draws: usize,
-    /// Classifier-free guidance of SDS.
+    /// Classifier-free guidance of SDS and of edited pictures.
     pub guidance_scale: f64,
     /// What the picture should show; from class, word and light if not given.
     pub prompt: Option<String>,
     /// Whether a LoRA is used.
     pub adapt: bool,
+    /// Whether a light that was read is told from the same light from other sides; else from no
+    /// caption.
+    pub turned: bool,
 }
 
 impl DistillationSettings {
@@ -75,7 +81,7 @@ impl DistillationSettings {
             let message = "accepted: pairs of a lower and a higher share, from 0 to 1";
             return Err(session.config.invalid("optimize.timesteps", message).into());
         }
-        let draws = table.draws.unwrap_or(if knows_light { 2 } else { 1 });
+        let draws = table.draws.unwrap_or(1);
         if !(1..=64).contains(&draws) {
             let message = format!("{draws} is out of range; accepted: 1 to 64");
             return Err(session.config.invalid("optimize.draws", message).into());
@@ -87,6 +93,7 @@ impl DistillationSettings {
             guidance_scale: table.guidance_scale.unwrap_or(7.5),
             prompt: table.prompt.clone(),
             adapt: table.adapt.unwrap_or(true),
+            turned: true,
         })
     }
 }
@@ -164,9 +171,12 @@ impl<'a> Distillation<'a> {
             (Some(reading), None) => {
                 let known = model.tokenizer.words(class)?.len() == 1;
                 let class = if known { class } else { "object" };
-                let caption = Caption::new(class, Some(&reading.light.words));
-                let both = states(model, &[Some(caption), None])?;
-                (both.narrow(0, 0, 1)?, both.narrow(0, 1, 1)?)
+                let words = &reading.light.words;
+                let all = match settings.turned {
+                    true => guiding(model, class, words)?,
+                    false => states(model, &[Some(Caption::new(class, Some(words))), None])?,
+                };
+                (all.narrow(0, 0, 1)?, all.narrow(0, 1, all.dim(0)? - 1)?)
             }
             (_, prompt) => {
                 let own = match word {
@@ -226,6 +236,10 @@ impl<'a> Distillation<'a> {
                 scale: self.settings.guidance_scale,
             },
             GuidanceKind::Csd => Kind::Csd,
+            GuidanceKind::SdEdit => Kind::Edit {
+                scale: self.settings.guidance_scale,
+                steps: EDIT_STEPS,
+            },
             _ => Kind::Lds,
         };
         let distillation = ScoreDistillation {

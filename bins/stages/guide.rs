@@ -66,7 +66,7 @@ impl Asked {
 const REFINEMENT: usize = 50;
 /// Their learning rates beside those that find a light from a neutral start: difference of two
 /// predictions pulls what the caption does not say away from where it was read (docs/prior.md).
-const REFINEMENT_RATE: f64 = 0.1;
+const REFINEMENT_RATE: f64 = 0.05;
 
 /// What `table` leaves open, for a start that is near.
 fn refine(table: &OptimizeTable, settings: &mut Settings) {

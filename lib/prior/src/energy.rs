@@ -11,7 +11,7 @@ use crate::blueprint::FACTOR;
 use crate::error::Result;
 use crate::examples::{SIZE, dilate};
 use crate::student::{Spoken, condition_of, latents_of};
-use crate::words::Caption;
+use crate::words::{Caption, LightWords};
 
 /// Timesteps, as shares of all, at which light is recognised.
 pub const SHARES: [f64; 4] = [0.5, 0.6, 0.7, 0.8];
@@ -117,8 +117,8 @@ pub fn energies(
     Ok(sums)
 }
 
-/// Mean over `draws` of the difference of the noise predictions under the
-/// first and the second context: what LDS would change, [1, c, h, w].
+/// Mean over `draws` of the noise prediction under the first context less that under the others, on
+/// average: what LDS would change, [1, c, h, w].
 pub fn difference(
     model: &Model,
     observation: &Observation,
@@ -129,11 +129,26 @@ pub fn difference(
 ) -> Result<Tensor> {
     let mut sum = observation.latents.zeros_like()?;
     let weight = 1.0 / (shares.len() * draws) as f64;
+    let others = contexts.dims()[0] - 1;
     let add = |_: &Tensor, predicted: &Tensor| {
-        let difference = (predicted.narrow(0, 0, 1)? - predicted.narrow(0, 1, 1)?)?;
+        let other = predicted.narrow(0, 1, others)?.mean_keepdim(0)?;
+        let difference = (predicted.narrow(0, 0, 1)? - other)?;
         sum = (&sum + (difference * weight)?)?;
         Ok(())
     };
     for_each_draw(model, observation, contexts, shares, draws, stream, add)?;
     Ok(sum)
+}
+
+/// States of what guides towards `light`: the caption that says so, and those that it is told from
+/// ([`LightWords::turned`]), or the empty one where there is no sun to turn.
+pub fn guiding(model: &Model, class: &str, light: &LightWords) -> Result<Tensor> {
+    let said = |light: &LightWords| Some(Caption::new(class, Some(light)));
+    let captions: Vec<_> = match light.is_overcast() {
+        true => vec![said(light), None],
+        false => std::iter::once(said(light))
+            .chain(light.turned().iter().map(said))
+            .collect(),
+    };
+    states(model, &captions)
 }

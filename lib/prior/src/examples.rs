@@ -193,6 +193,8 @@ pub struct Example {
     pub weight: Vec<f32>,
     /// What is said.
     pub caption: Option<Caption>,
+    /// Captions with other lights, to be told from the one that is said.
+    pub rivals: Vec<Caption>,
 }
 
 /// Shares of what examples show; each is one ingredient of the recipe.
@@ -205,6 +207,8 @@ pub struct Recipe {
     /// Composites under a light other than the place's, with their own
     /// light in the caption.
     pub foreign_light: f64,
+    /// Captions with a wrong light beside each right one.
+    pub rivals: usize,
 }
 
 impl Default for Recipe {
@@ -213,6 +217,19 @@ impl Default for Recipe {
             light_words: 0.85,
             background: 0.85,
             foreign_light: 0.5,
+            rivals: 0,
+        }
+    }
+}
+
+impl Recipe {
+    /// The same with `rivals` beside each caption; every caption names its light.
+    pub fn contrasted(&self, rivals: usize) -> Self {
+        Self {
+            light_words: 1.0,
+            background: self.background.min(0.7),
+            rivals,
+            ..*self
         }
     }
 }
@@ -305,6 +322,13 @@ impl Example {
             _ => class.to_owned(),
         };
         let words = window.words(light.words(lens.suns()));
+        let rivals = match named {
+            true => recipe.rivals,
+            false => 0,
+        };
+        let rivals = (0..rivals)
+            .map(|_| Caption::new(&class, Some(&words.rival(stream))))
+            .collect();
         let caption = if named {
             Some(Caption::new(&class, Some(&words)))
         } else if stream.uniform() < 0.5 {
@@ -318,6 +342,7 @@ impl Example {
             mask,
             weight,
             caption,
+            rivals,
         }
     }
 }

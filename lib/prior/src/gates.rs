@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::{RECORD_SIZE, SceneView};
-use crate::energy::{Observation, SHARES, difference, energies, states};
+use crate::energy::{Observation, SHARES, difference, energies, guiding, states};
 use crate::error::Result;
 use crate::examples::{Example, Lens, Tone, Window, angle_between, dilate};
 use crate::lights::{Light, Sun};
@@ -150,15 +150,15 @@ fn ask(model: &Model, index: u64, draws: usize) -> Result<Answer> {
         .chain([-truth, truth + FRAC_PI_4, truth - FRAC_PI_4])
         .map(|a| trial.caption(a))
         .collect();
-    let contexts = states(model, &captions)?;
-    let e = energies(model, &observation, &contexts, &SHARES, draws, &mut stream)?;
+    let asked = states(model, &captions)?;
+    let e = energies(model, &observation, &asked, &SHARES, draws, &mut stream)?;
     let best = minimum_around(&e[..AZIMUTHS]);
-    let pair = states(model, &[trial.caption(truth), None])?;
+    let contexts = guiding(model, trial.class, &trial.words(truth))?;
     let sign = |near: usize, far: usize, stream: &mut NoiseStream| -> Result<bool> {
         let (image, observation) = trial.observe(near, &tone)?;
         let (further, _) = trial.observe(far, &tone)?;
         let step = (latents_of(further)? - latents_of(image)?)?;
-        let lds = difference(model, &observation, &pair, &SHARES, draws, stream)?;
+        let lds = difference(model, &observation, &contexts, &SHARES, draws, stream)?;
         // Going further away must go against what LDS asks for.
         Ok((step * lds)?.sum_all()?.to_scalar::<f32>()? > 0.0)
     };

@@ -35,6 +35,10 @@ pub struct Spoken {
     mixing: Option<Tensor>,
 }
 
+/// Nats for the mean squared error of the noise over a picture: of the order of half the number of
+/// latent values.
+const NATS: f64 = 1000.0;
+
 /// Registers the placeholders of [`Caption`] with a tokenizer.
 pub fn add_placeholders(tokenizer: &mut Tokenizer) {
     let first = tokenizer.vocab_size() as u32;
@@ -107,6 +111,8 @@ pub struct Batch {
     pub weights: Tensor,
     /// What is said.
     pub captions: Vec<Option<Caption>>,
+    /// Captions with a wrong light, as many for each of the first examples; the others have none.
+    pub rivals: Vec<Vec<Caption>>,
 }
 
 /// Scaled latents of pictures in [0, 1], each [3, SIZE, SIZE].
@@ -144,8 +150,9 @@ pub fn condition_of(shown: Vec<f32>, masks: &[Vec<f32>]) -> Result<Tensor> {
 }
 
 impl Batch {
-    /// Puts examples together.
-    pub fn new(examples: Vec<Example>) -> Result<Self> {
+    /// Puts examples together, those with rivals first. All that have rivals have as many.
+    pub fn new(mut examples: Vec<Example>) -> Result<Self> {
+        examples.sort_by_key(|e| e.rivals.is_empty());
         let weights: Vec<f32> = examples
             .iter()
             .flat_map(|e| e.weight.iter().copied())
@@ -166,6 +173,11 @@ impl Batch {
             )?,
             condition: condition_of(shown, &masks)?,
             weights: Tensor::cat(&[&weights, &weights, &weights], 1)?,
+            rivals: examples
+                .iter_mut()
+                .map(|e| std::mem::take(&mut e.rivals))
+                .take_while(|r| !r.is_empty())
+                .collect(),
             captions: examples.into_iter().map(|e| e.caption).collect(),
         })
     }
@@ -264,23 +276,71 @@ impl Student {
         &self.variables
     }
 
-    /// Weighted mean squared error of the velocity, in the graph.
-    pub fn loss(&self, batch: &Batch, stream: &mut NoiseStream) -> Result<Tensor> {
+    /// Weighted mean squared error of the velocity, and the share of surprise at the right caption
+    /// among its rivals; both in the graph, the second `None` where no example has rivals.
+    pub fn loss(
+        &self,
+        batch: &Batch,
+        stream: &mut NoiseStream,
+    ) -> Result<(Tensor, Option<Tensor>)> {
         let count = batch.latents.dims()[0];
         let steps = self.schedule.len();
-        let timesteps: Vec<usize> = (0..count).map(|_| draw_timestep(steps, stream)).collect();
+        let contrasted = batch.rivals.len();
+        let timesteps: Vec<usize> = (0..count)
+            .map(|i| match i < contrasted {
+                true => ((0.4 + 0.5 * stream.uniform()) * steps as f64) as usize,
+                false => draw_timestep(steps, stream),
+            })
+            .collect();
         let noise = stream.normal_tensor(batch.latents.dims(), DType::F32, &Device::Cpu)?;
         let noisy = self
             .schedule
             .add_noise_each(&batch.latents, &noise, &timesteps)?;
         let target = self.schedule.target(&batch.latents, &noise, &timesteps)?;
         let input = Tensor::cat(&[&noisy, &batch.condition], 1)?;
-        let context = Spoken::new(&self.tokenizer, &batch.captions)?.states(&self.text)?;
-        let t: Vec<f64> = timesteps.iter().map(|&t| t as f64).collect();
-        let output = self.unet.forward(&input, &t, &context, &Pass::default())?;
-        let error = ((output - target)?.sqr()? * &batch.weights)?.sum_all()?;
+        // A row for every caption: the right ones, then the rivals of each.
+        let rows: Vec<u32> = (0..count as u32)
+            .chain((0..contrasted).flat_map(|i| vec![i as u32; batch.rivals[i].len()]))
+            .collect();
+        let captions: Vec<Option<Caption>> = batch
+            .captions
+            .iter()
+            .cloned()
+            .chain(batch.rivals.iter().flatten().cloned().map(Some))
+            .collect();
+        let t: Vec<f64> = rows.iter().map(|&i| timesteps[i as usize] as f64).collect();
+        let index = Tensor::new(rows.as_slice(), &Device::Cpu)?;
+        let of_rows = |t: &Tensor| t.index_select(&index, 0);
+        let context = Spoken::new(&self.tokenizer, &captions)?.states(&self.text)?;
+        let output = self
+            .unet
+            .forward(&of_rows(&input)?, &t, &context, &Pass::default())?;
+        let error = (output - of_rows(&target)?)?.sqr()?;
+        let error = (error * of_rows(&batch.weights)?)?
+            .flatten_from(1)?
+            .sum(1)?;
         let total = batch.weights.sum_all()?.to_scalar::<f32>()? as f64;
-        Ok((error / total)?)
+        let loss = (error.narrow(0, 0, count)?.sum_all()? / total)?;
+        if contrasted == 0 {
+            return Ok((loss, None));
+        }
+        // The mean error of the noise, as it is compared where light is read.
+        let weights = batch.weights.flatten_from(1)?.sum(1)?;
+        let weights = weights.narrow(0, 0, contrasted)?.to_vec1::<f32>()?;
+        let scales: Vec<f32> = (0..contrasted)
+            .map(|i| {
+                let alpha = self.schedule.alpha_bar(timesteps[i])?;
+                Ok((NATS * alpha) as f32 / weights[i])
+            })
+            .collect::<Result<_>>()?;
+        let scales = Tensor::from_vec(scales, (contrasted, 1), &Device::Cpu)?;
+        let right = error.narrow(0, 0, contrasted)?.unsqueeze(1)?;
+        let wrong = error.narrow(0, count, rows.len() - count)?;
+        let wrong = wrong.reshape((contrasted, ()))?;
+        let nats = (Tensor::cat(&[&right, &wrong], 1)?.broadcast_mul(&scales)?).neg()?;
+        let surprise = (nats.log_sum_exp(1)? - nats.narrow(1, 0, 1)?.squeeze(1)?)?;
+        let even = (1.0 + (rows.len() - count) as f64 / contrasted as f64).ln();
+        Ok((loss, Some((surprise.mean_all()? / even)?)))
     }
 }
 

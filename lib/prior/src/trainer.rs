@@ -29,6 +29,9 @@ pub struct TrainerSettings {
     pub learning_rate: f64,
     /// Key of all random numbers.
     pub seed: u64,
+    /// Weight of telling the right light from wrong ones; 0: it is not asked.
+    #[serde(default)]
+    pub contrast: f64,
 }
 
 impl Default for TrainerSettings {
@@ -38,6 +41,7 @@ impl Default for TrainerSettings {
             batch: 64,
             learning_rate: 5e-4,
             seed: 1,
+            contrast: 0.0,
         }
     }
 }
@@ -45,6 +49,8 @@ impl Default for TrainerSettings {
 /// Parts of a batch that are worked on side by side. Fixed, so that the sums
 /// and with them the weights are the same on any machine.
 const SHARDS: usize = 2;
+/// Wrong captions beside a right one, where lights are contrasted.
+const RIVALS: usize = 3;
 /// Updates over which the learning rate rises.
 const WARMUP: f64 = 200.0;
 
@@ -55,10 +61,19 @@ pub struct Update {
     pub seen: usize,
     /// Loss of this batch.
     pub loss: f64,
+    /// Surprise at the right light among wrong ones: 1 at chance, 0 if it is known.
+    pub surprise: f64,
     /// Norm of the gradient before clipping.
     pub gradient_norm: f64,
     /// Seconds that it took.
     pub seconds: f64,
+}
+
+/// What a part of a batch gave.
+struct Shard {
+    gradients: BTreeMap<String, Tensor>,
+    loss: f64,
+    surprise: f64,
 }
 
 /// A training run.
@@ -134,7 +149,7 @@ impl Trainer {
     pub fn step(&mut self, data: &Dataset) -> Result<Update> {
         let start = Instant::now();
         let step = self.optimizer.steps();
-        let shards: Vec<Result<(BTreeMap<String, Tensor>, f64)>> = std::thread::scope(|scope| {
+        let shards: Vec<Result<Shard>> = std::thread::scope(|scope| {
             let this = &*self;
             let threads: Vec<_> = (0..SHARDS)
                 .map(|shard| {
@@ -150,10 +165,15 @@ impl Trainer {
                 .collect()
         });
         let mut sum: Option<BTreeMap<String, Tensor>> = None;
-        let mut loss = 0.0;
+        let (mut loss, mut surprise) = (0.0, 0.0);
         for shard in shards {
-            let (gradients, shard_loss) = shard?;
-            loss += shard_loss / SHARDS as f64;
+            let Shard {
+                gradients,
+                loss: own,
+                surprise: own_surprise,
+            } = shard?;
+            loss += own / SHARDS as f64;
+            surprise += own_surprise / SHARDS as f64;
             sum = Some(match sum {
                 None => gradients,
                 Some(mut sum) => {
@@ -184,28 +204,44 @@ impl Trainer {
         Ok(Update {
             seen: self.seen(),
             loss,
+            surprise,
             gradient_norm,
             seconds: start.elapsed().as_secs_f64(),
         })
     }
 
-    fn shard(
-        &self,
-        data: &Dataset,
-        step: u64,
-        shard: usize,
-    ) -> Result<(BTreeMap<String, Tensor>, f64)> {
+    fn shard(&self, data: &Dataset, step: u64, shard: usize) -> Result<Shard> {
         let key = step * SHARDS as u64 + shard as u64;
         let mut stream = NoiseStream::new(self.settings.seed ^ 0x7eac4, key);
-        let examples = (0..self.settings.batch / SHARDS)
-            .map(|_| {
+        let rows = self.settings.batch / SHARDS;
+        // Three rows in four are for telling lights apart.
+        let contrasted = match self.settings.contrast > 0.0 {
+            true => rows * 3 / 4 / (RIVALS + 1),
+            false => 0,
+        };
+        let plain = rows - contrasted * (RIVALS + 1);
+        let contrasting = self.recipe.contrasted(RIVALS);
+        let examples = (0..contrasted + plain)
+            .map(|i| {
                 let scene = data.scene(stream.below(data.len()));
-                Example::draw(scene, &self.recipe, &mut stream)
+                let recipe = match i < contrasted {
+                    true => &contrasting,
+                    false => &self.recipe,
+                };
+                Example::draw(scene, recipe, &mut stream)
             })
             .collect();
-        let loss = self.student.loss(&Batch::new(examples)?, &mut stream)?;
-        let gradients = self.optimizer.collect(&loss.backward()?)?;
-        Ok((gradients, loss.to_scalar::<f32>()? as f64))
+        let (loss, surprise) = self.student.loss(&Batch::new(examples)?, &mut stream)?;
+        let value = |t: &Tensor| -> Result<f64> { Ok(t.to_scalar::<f32>()? as f64) };
+        let whole = match &surprise {
+            Some(surprise) => (&loss + (surprise * self.settings.contrast)?)?,
+            None => loss.clone(),
+        };
+        Ok(Shard {
+            gradients: self.optimizer.collect(&whole.backward()?)?,
+            loss: value(&loss)?,
+            surprise: surprise.as_ref().map_or(Ok(f64::NAN), value)?,
+        })
     }
 
     /// Trains to the end; `report` sees every update and may stop.
@@ -252,10 +288,11 @@ impl Trainer {
             .cloned()
             .unwrap_or_default();
         let expected = serde_json::json!(self.settings).to_string();
-        // A run may be made longer or shorter on the way.
+        // A run may be made longer or shorter on the way, and learn to tell lights apart late.
         let made = serde_json::from_str::<TrainerSettings>(&found).ok();
         let made = made.map(|made| TrainerSettings {
             samples: self.settings.samples,
+            contrast: self.settings.contrast,
             ..made
         });
         if made != Some(self.settings) {
@@ -303,6 +340,7 @@ mod tests {
             batch: 4,
             learning_rate: 1e-3,
             seed: 2,
+            contrast: 0.0,
         };
         Trainer::new(&blueprint, folder, settings, Recipe::default()).unwrap()
     }

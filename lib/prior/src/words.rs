@@ -6,6 +6,7 @@
 
 use std::f32::consts::{PI, TAU};
 
+use dipir_diffusion::noise::NoiseStream;
 use serde::{Deserialize, Serialize};
 
 /// Where the sun stands on a clock face that lies on the ground, seen from
@@ -132,6 +133,70 @@ impl LightWords {
             between(&HEIGHTS, degrees),
             between(&SKIES, self.sun_share),
         ]
+    }
+}
+
+impl LightWords {
+    /// A light that this one might be taken for: another azimuth near by or anywhere, the mirror image,
+    /// another elevation, another sky.
+    pub fn rival(&self, stream: &mut NoiseStream) -> Self {
+        let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+        let kind = range(0.0, 1.0);
+        let side = if range(0.0, 1.0) < 0.5 { -1.0 } else { 1.0 };
+        let amount = range(0.0, 1.0);
+        if self.is_overcast() {
+            return Self {
+                azimuth: amount * TAU,
+                elevation: range(0.25, 1.2),
+                sun_share: range(0.45, 0.93),
+            };
+        }
+        match kind {
+            x if x < 0.45 => Self {
+                azimuth: self.azimuth + side * (20.0 + 40.0 * amount).to_radians(),
+                ..*self
+            },
+            x if x < 0.6 => Self {
+                azimuth: amount * TAU,
+                ..*self
+            },
+            x if x < 0.7 => Self {
+                azimuth: -self.azimuth,
+                ..*self
+            },
+            x if x < 0.93 => {
+                let step = side * (10.0 + 25.0 * amount).to_radians();
+                let turned = |e: f32| (0.2..1.3).contains(&e);
+                let elevation = match turned(self.elevation + step) {
+                    true => self.elevation + step,
+                    false => self.elevation - step,
+                };
+                Self { elevation, ..*self }
+            }
+            x if x < 0.96 => Self {
+                sun_share: 0.0,
+                ..*self
+            },
+            _ => {
+                let step = 0.25 + 0.15 * amount;
+                let sun_share = match self.sun_share > 0.69 {
+                    true => self.sun_share - step,
+                    false => self.sun_share + step,
+                };
+                Self { sun_share, ..*self }
+            }
+        }
+    }
+}
+
+impl LightWords {
+    /// The same light from the three other quarters: what is common to all four, brightness, height,
+    /// sky, is not of the light's direction.
+    pub fn turned(&self) -> [Self; 3] {
+        [1.0, 2.0, 3.0].map(|quarters| Self {
+            azimuth: self.azimuth + quarters * PI / 2.0,
+            ..*self
+        })
     }
 }
 
