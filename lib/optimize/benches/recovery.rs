@@ -8,7 +8,8 @@
 //! Run with `cargo test -p dipir-optimize --bench recovery -- --bench [OBJECT/LIGHT...] [key=value...]`:
 //! prints the table of `docs/recovery.md`. Names pick scenes; keys are `iterations`, `lobes`,
 //! `samples`, `columns` (of the environment), `width` (of the picture), `tone` (0 holds the tone
-//! curves), `consistency`, `regularizer`; `show` prints how the loss fell and the brightest lobes.
+//! curves), `consistency`, `regularizer`, `fused` (the share of the iterations after which both light
+//! sets are one), `radiance`, `direction`, `sigma` (learning rates); `show` prints how the loss fell and the brightest lobes.
 //! Without `--bench`, as tests run it, one small scene proves that it works.
 use std::ops::ControlFlow;
 use std::time::Instant;
@@ -120,9 +121,16 @@ fn truth(name: &str) -> (Truth, Vec3) {
     let sky = lobe(Vec3::Y, Vec3::new(0.3, 0.42, 0.6), 0.9);
     let mixture = |peak: SphericalGaussian, others: &[SphericalGaussian]| {
         let lobes = [&[peak], others].concat();
+        // Not the first lobe's own direction: where it is wide, the others move the sum's peak.
+        let light = Lighting {
+            exposure: 1.0,
+            lobes: lobes.clone(),
+            fusion_residual: 0.0,
+        };
+        let brightest = light.peak_direction().expect("light");
         (
             Truth::Lobes(SgMixture::new(lobes).expect("lobes")),
-            peak.direction,
+            brightest,
         )
     };
     match name {
@@ -390,6 +398,15 @@ fn knobs(arguments: &[String], timing: bool) -> Knobs {
         preview_every: Some(0),
         ..OptimizeTable::default()
     };
+    table.fused_after = value("fused");
+    let rates = &mut table.learning_rates;
+    for (key, rate) in [
+        ("radiance", &mut rates.radiance),
+        ("direction", &mut rates.direction),
+        ("sigma", &mut rates.sigma),
+    ] {
+        *rate = value(key).unwrap_or(*rate);
+    }
     if !timing {
         table.iterations = Some(20);
         table.samples = Some(8);

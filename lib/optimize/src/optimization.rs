@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use dipir_imaging::raster::DisplayImage;
 use dipir_imaging::tone::ToneCurves;
-use dipir_light::environment::{EnvironmentMap, solid_angle};
+use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::LobeParameters;
 use glam::Vec3;
 
@@ -270,8 +270,6 @@ impl Optimization<'_> {
         {
             return Ok(false);
         }
-        let (width, height) = self.objective.transport().environment_size();
-        let light = sharpened(light, width, height);
         self.record(light.clone())?;
         state.record_light = Some(light);
         state.records += 1;
@@ -373,28 +371,6 @@ impl Optimization<'_> {
             stopped_early,
         })
     }
-}
-
-/// `light`, and as much energy once more where it is bright: what transport is recorded for. A record
-/// for the light alone has few samples where a lobe would shine if it were narrower, and with their
-/// noise the loss rises as the lobe narrows, so that it stays too wide.
-fn sharpened(mut light: Vec<Vec3>, width: usize, height: usize) -> Vec<Vec3> {
-    let area = |k: usize| solid_angle(width, height, k / width);
-    // The mean of brightness squared where the energy is.
-    let (mut energy, mut cubes) = (0.0, 0.0);
-    for (k, texel) in light.iter().enumerate() {
-        let l = f64::from(texel.element_sum());
-        energy += l * area(k);
-        cubes += l * l * l * area(k);
-    }
-    if cubes > 0.0 {
-        let per_square = energy / cubes;
-        for texel in &mut light {
-            let l = f64::from(texel.element_sum());
-            *texel *= (1.0 + l * l * per_square) as f32;
-        }
-    }
-    light
 }
 
 /// The guidance's answer, carried back to the parameters.

@@ -359,6 +359,42 @@ mod tests {
     }
 
     #[test]
+    fn a_model_that_knows_nothing_is_as_surprised_as_chance() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let blueprint = Blueprint {
+            channels: vec![8, 16],
+            text_width: 16,
+        };
+        blueprint.write_configs(folder.path()).expect("written");
+        let student = Student::new(&blueprint, folder.path(), 1).expect("built");
+        let example = |value: f32, rivals: usize| Example {
+            image: vec![value; 3 * SIZE * SIZE],
+            shown: vec![0.5; 3 * SIZE * SIZE],
+            mask: vec![1.0; SIZE * SIZE],
+            weight: vec![0.5 + value; SIZE * SIZE],
+            caption: caption(0.3),
+            rivals: (1..=rivals)
+                .filter_map(|k| caption(0.3 + k as f32))
+                .collect(),
+        };
+        let loss = |examples: Vec<Example>| {
+            let batch = Batch::new(examples).expect("a batch");
+            let mut stream = NoiseStream::new(3, 3);
+            let (loss, surprise) = student.loss(&batch, &mut stream).expect("a loss");
+            let value = |t: Tensor| t.to_scalar::<f32>().expect("a value");
+            (value(loss), surprise.map(value))
+        };
+        // Its output is 0 whatever is said, so all captions are as likely.
+        let (mixed, surprise) = loss(vec![example(0.2, 0), example(0.7, 3), example(0.4, 3)]);
+        let surprise = surprise.expect("rivals");
+        assert!((surprise - 1.0).abs() < 1e-5, "{surprise}");
+        // Rivals leave the first loss alone; without them there is no second.
+        let (plain, none) = loss(vec![example(0.7, 0), example(0.4, 0), example(0.2, 0)]);
+        assert!(none.is_none());
+        assert!(mixed.is_finite() && plain.is_finite() && mixed > 0.0);
+    }
+
+    #[test]
     fn captions_carry_each_number_of_the_light() {
         let folder = tempfile::tempdir().expect("a folder");
         let blueprint = Blueprint::default();

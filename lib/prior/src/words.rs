@@ -257,6 +257,51 @@ mod tests {
     use super::*;
 
     #[test]
+    fn rivals_say_another_light_that_could_be() {
+        let light = LightWords {
+            azimuth: 1.0,
+            elevation: 0.5,
+            sun_share: 0.8,
+        };
+        let overcast = LightWords {
+            sun_share: 0.0,
+            ..light
+        };
+        let mut stream = NoiseStream::new(1, 2);
+        let mut heights = 0;
+        for _ in 0..500 {
+            let rival = light.rival(&mut stream);
+            let [a, b] = [light, rival].map(|l| Caption::new("ball", Some(&l)));
+            assert_ne!(a, b);
+            assert!((0.2..1.3).contains(&rival.elevation), "{rival:?}");
+            assert!((0.0..=0.95).contains(&rival.sun_share), "{rival:?}");
+            heights += usize::from(rival.elevation != light.elevation);
+            assert!(!overcast.rival(&mut stream).is_overcast());
+        }
+        assert!((50..200).contains(&heights), "{heights}");
+    }
+
+    #[test]
+    fn a_light_from_the_other_sides_is_the_same_light() {
+        let light = LightWords {
+            azimuth: 1.0,
+            elevation: 0.5,
+            sun_share: 0.8,
+        };
+        let around = light.turned();
+        let sum = around
+            .iter()
+            .chain([&light])
+            .map(|l| glam::Vec2::from_angle(l.azimuth));
+        assert!(sum.sum::<glam::Vec2>().length() < 1e-6);
+        assert!(
+            around
+                .iter()
+                .all(|l| (l.elevation, l.sun_share) == (0.5, 0.8))
+        );
+    }
+
+    #[test]
     fn captions_name_the_light() {
         let light = LightWords {
             azimuth: PI / 2.0,
