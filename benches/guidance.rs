@@ -480,7 +480,7 @@ fn main() -> anyhow::Result<()> {
         scenes: 100,
         first: 0,
         iterations: 50,
-        rate: 0.1,
+        rate: 0.05,
         ablations: false,
         guidance_draws: 1,
         samples: 192,
