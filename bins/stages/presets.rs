@@ -226,7 +226,8 @@ impl LightRun {
 
     /// The presets beside `quality`, as far as `table` leaves to them.
     pub fn outlook(&self, quality: Quality, table: &OptimizeTable) -> Outlook {
-        let error = |p: &Preset| p.light.map(|l| l.error);
+        // Measured with a reference; what a model guides to is another matter.
+        let error = |p: &Preset| p.light.filter(|_| !self.by_model).map(|l| l.error);
         Outlook::beside(quality, |p| {
             let there = OptimizePreset {
                 iterations: table.iterations.unwrap_or(p.optimize.iterations),
@@ -255,6 +256,10 @@ mod tests {
         assert!(draft.composite.target_error > standard.composite.target_error);
         assert!(standard.composite.target_error > high.composite.target_error);
         assert!(draft.optimize.samples <= standard.optimize.samples);
+        assert!(all().measured.is_some() && all().command.is_some());
+        let [draft, standard, high] = [draft, standard, high].map(|p| p.light.unwrap());
+        assert!(draft.cost_s < standard.cost_s && standard.cost_s < high.cost_s);
+        assert!(draft.error > standard.error && standard.error > high.error);
     }
 
     #[test]
@@ -272,6 +277,25 @@ mod tests {
                 library
             );
         }
+    }
+
+    #[test]
+    fn errors_measured_with_a_reference_are_not_promised_of_a_model() {
+        let here = of(Quality::Standard).optimize;
+        let outlook = |by_model: bool| {
+            let run = LightRun {
+                iterations: Some(here.iterations),
+                samples: here.samples,
+                side: here.size,
+                photo_side: 4096,
+                record_s: 2.0,
+                optimization_s: 10.0,
+                by_model,
+            };
+            run.outlook(Quality::Standard, &OptimizeTable::default())
+        };
+        assert!(outlook(false).0.iter().all(|e| e.error.is_some()));
+        assert!(outlook(true).0.iter().all(|e| e.error.is_none()));
     }
 
     #[test]
