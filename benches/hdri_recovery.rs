@@ -5,6 +5,10 @@
 //! itself, and `dipir-optimize` gets to see the composite alone. A sum of lobes cannot be a panorama,
 //! so the same is done under lobes that were fitted to it: a truth that can be found.
 //!
+//! Paths between the folds of a metal knot keep noise in a composite that more paths hardly take out, so
+//! both composites are rendered twice: the product of two differences that share no random number
+//! has the light's error for its mean, and no noise.
+//!
 //! Run with `cargo test --bench hdri_recovery -- --bench MAP... [yaw=DEG] [iterations=N] [samples=N]
 //! [columns=N]`, maps as HDR or EXR. Without `--bench`, as tests run it, one object under a small generated map proves that
 //! it works.
@@ -55,9 +59,9 @@ fn main() {
         })
     };
     println!(
-        "| map | truth | object | peak, degrees | RMSE touched | RMSE all | recorded RMSE | optimise, s |"
+        "| map | truth | object | peak, degrees | RMSE touched | with noise | RMSE all | recorded RMSE | optimise, s |"
     );
-    println!("|---|---|---|--:|--:|--:|--:|--:|");
+    println!("|---|---|---|--:|--:|--:|--:|--:|--:|");
     if !arguments.iter().any(|a| a == "--bench") {
         let knobs = Knobs {
             yaw_deg: 0.0,
@@ -189,50 +193,79 @@ fn recover(folder: &Path, truth: &str, photo: &Value, knobs: &Knobs) -> String {
         "-s",
         "composite.tone=reinhard",
     ];
+    // The truth that is kept is the one that the optimiser sees.
+    let render = |settings: &[&str], seed: u32, target: f64| {
+        let seed = format!("pipeline.seed={seed}");
+        let target = format!("composite.target_error={target}");
+        let sets = ["-s", &seed, "-s", &target];
+        run(COMPOSITE, folder, &[settings, &sets].concat());
+        let out = if settings.is_empty() { "out" } else { "truth" };
+        let path = folder.join(out).join("composite/composite.exr");
+        Layers::read_exr(path).expect("reads")
+    };
+    let fine = knobs.target_error;
     run(SCENE, folder, &lit);
-    run(COMPOSITE, folder, &lit);
+    let truths = [(2, 2.0 * fine), (0, fine)].map(|(seed, t)| render(&lit, seed, t));
     run(SCENE, folder, &[]);
     let optimized = run(OPTIMIZE, folder, &[]);
-    run(COMPOSITE, folder, &["-s", "pipeline.seed=1"]);
+    let found = [(3, 2.0 * fine), (1, fine)].map(|(seed, t)| render(&[], seed, t));
+    let [touched, all] = apart(&truths, &found);
 
     let map = EnvironmentMap::read(folder.join(format!("{truth}.exr"))).expect("reads");
     let [columns, rows] = PEAK_GRID;
     let (peak, _) = map.resampled(columns, rows).peak();
     let light = Lighting::read(&folder.join("out/light/lighting.json")).expect("reads");
-    let found = light.map(columns, rows).peak().0;
-    let half = 0.5 * f64::from(found.distance(peak));
-    let (touched, all) = apart(folder);
+    let direction = light.map(columns, rows).peak().0;
+    let half = 0.5 * f64::from(direction.distance(peak));
     format!(
-        "{:.2} | {touched:.4} | {all:.4} | {:.4} | {:.1}",
+        "{:.2} | {:.4} | {:.4} | {:.4} | {:.4} | {:.1}",
         (2.0 * half.min(1.0).asin()).to_degrees(),
+        touched.free,
+        touched.noisy,
+        all.free,
         number(&optimized["rmse"]),
         number(&optimized["elapsed_s"]),
     )
 }
 
-/// Display-referred RMSE of both composites, over what object or shadow touch, and over all.
-fn apart(folder: &Path) -> (f64, f64) {
-    let layers = |out: &str| {
-        Layers::read_exr(folder.join(out).join("composite/composite.exr")).expect("reads")
+/// A display-referred RMSE.
+struct Apart {
+    /// Without the noise of the renders.
+    free: f64,
+    /// Of the later pair, as it was rendered.
+    noisy: f64,
+}
+
+/// Distance of two pairs of composites, over what object or shadow touch, and over all.
+fn apart(truths: &[Layers; 2], found: &[Layers; 2]) -> [Apart; 2] {
+    let pictures = |pair: &[Layers; 2]| {
+        [0, 1].map(|i| {
+            let mut picture = pair[i].rgb("").expect("a picture");
+            for p in picture.pixels_mut() {
+                *p = Vec3::from(p.to_array().map(|v| Transfer::Srgb.encode_scalar(v)));
+            }
+            picture
+        })
     };
-    let (truth, found) = (layers("truth"), layers("out"));
-    let picture = |l: &Layers| l.rgb("").expect("a picture");
-    let (a, b) = (picture(&truth), picture(&found));
-    let alpha = truth.channel("object.A").expect("coverage");
-    let shadow = truth.rgb("shadow").expect("a shadow");
-    let (mut touched, mut all, mut count) = (0.0, 0.0, 0.0);
-    for k in 0..a.pixels().len() {
-        let shown = |p: Vec3| p.to_array().map(|v| Transfer::Srgb.encode_scalar(v));
-        let (x, y) = (shown(a.pixels()[k]), shown(b.pixels()[k]));
-        let square: f64 = (0..3).map(|c| f64::from(x[c] - y[c]).powi(2)).sum::<f64>() / 3.0;
-        all += square;
-        if alpha.pixels()[k] > 0.0 || shadow.pixels()[k].min_element() < 0.999 {
-            touched += square;
-            count += 1.0;
+    let (a, b) = (pictures(truths), pictures(found));
+    let alpha = truths[1].channel("object.A").expect("coverage");
+    let shadow = truths[1].rgb("shadow").expect("a shadow");
+    let difference = |i: usize, k: usize| (b[i].pixels()[k] - a[i].pixels()[k]).as_dvec3();
+    let over = |counts: &dyn Fn(usize) -> bool| {
+        let kept: Vec<usize> = (0..alpha.pixels().len()).filter(|k| counts(*k)).collect();
+        let mean = |i: usize, j: usize| {
+            let products = kept.iter().map(|&k| difference(i, k).dot(difference(j, k)));
+            products.sum::<f64>() / (3 * kept.len()).max(1) as f64
+        };
+        Apart {
+            free: mean(0, 1).max(0.0).sqrt(),
+            noisy: mean(1, 1).sqrt(),
         }
-    }
-    let root = |sum: f64, n: f64| (sum / n.max(1.0)).sqrt();
-    (root(touched, count), root(all, a.pixels().len() as f64))
+    };
+    [
+        over(&|k| alpha.pixels()[k] > 0.0 || shadow.pixels()[k].min_element() < 0.999),
+        over(&|_| true),
+    ]
 }
 
 /// A torus knot that stands on y = 0, as an OBJ file.

@@ -71,7 +71,7 @@ pub struct Train {
     /// Share of examples that show the place around the object
     #[arg(long, default_value_t = Recipe::default().background)]
     pub background: f64,
-    /// Weight of telling the right light from wrong ones, as a share of the loss at chance
+    /// Weight of the surprise at the right light among three wrong ones, 1 at chance; 0: not asked
     #[arg(long, default_value_t = TrainerSettings::default().contrast)]
     pub contrast: f64,
     /// Updates between checkpoints

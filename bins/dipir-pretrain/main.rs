@@ -80,6 +80,10 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
             return Err(Usage(format!("--{name} {share}: accepted are 0 to 1")).into());
         }
     }
+    if !(args.contrast >= 0.0 && args.contrast.is_finite()) {
+        let message = format!("--contrast {}: accepted are 0 and more", args.contrast);
+        return Err(Usage(message).into());
+    }
     let data = scenes(&args.data, args.seed, output)?;
     let settings = TrainerSettings {
         samples: args.samples,

@@ -172,7 +172,9 @@ impl<'a> Distillation<'a> {
                 let known = model.tokenizer.words(class)?.len() == 1;
                 let class = if known { class } else { "object" };
                 let words = &reading.light.words;
-                let all = match settings.turned {
+                // SDS and edited pictures extrapolate from what is subtracted: that is no other light.
+                let differs = matches!(settings.guidance, GuidanceKind::Lds | GuidanceKind::Csd);
+                let all = match settings.turned && differs {
                     true => guiding(model, class, words)?,
                     false => states(model, &[Some(Caption::new(class, Some(words))), None])?,
                 };

@@ -41,7 +41,7 @@ pub const STAGE: &str = "light";
 /// The executable that runs it.
 pub const EXECUTABLE: &str = "dipir-optimize";
 /// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 
 /// Side of the crops of a reference, when it is compared on crops.
 const CROP_SIDE: usize = 128;

@@ -279,23 +279,27 @@ mod tests {
         }
     }
 
+    fn standard_run(by_model: bool) -> LightRun {
+        let here = of(Quality::Standard).optimize;
+        LightRun {
+            iterations: Some(here.iterations),
+            samples: here.samples,
+            side: here.size,
+            photo_side: 4096,
+            record_s: 2.0,
+            optimization_s: 10.0,
+            by_model,
+        }
+    }
+
     #[test]
     fn errors_measured_with_a_reference_are_not_promised_of_a_model() {
-        let here = of(Quality::Standard).optimize;
-        let outlook = |by_model: bool| {
-            let run = LightRun {
-                iterations: Some(here.iterations),
-                samples: here.samples,
-                side: here.size,
-                photo_side: 4096,
-                record_s: 2.0,
-                optimization_s: 10.0,
-                by_model,
-            };
-            run.outlook(Quality::Standard, &OptimizeTable::default())
-        };
-        assert!(outlook(false).0.iter().all(|e| e.error.is_some()));
-        assert!(outlook(true).0.iter().all(|e| e.error.is_none()));
+        for by_model in [false, true] {
+            let table = OptimizeTable::default();
+            let outlook = standard_run(by_model).outlook(Quality::Standard, &table);
+            assert_eq!(outlook.0.len(), 2);
+            assert!(outlook.0.iter().all(|e| e.error.is_none() == by_model));
+        }
     }
 
     #[test]
@@ -344,15 +348,7 @@ mod tests {
     #[test]
     fn a_light_run_costs_what_its_steps_and_paths_cost() {
         let here = of(Quality::Standard).optimize;
-        let run = LightRun {
-            iterations: Some(here.iterations),
-            samples: here.samples,
-            side: here.size,
-            photo_side: 4096,
-            record_s: 2.0,
-            optimization_s: 10.0,
-            by_model: false,
-        };
+        let run = standard_run(false);
         assert!((run.seconds_with(&here) - 12.0).abs() < 1e-9);
         let more = OptimizePreset {
             samples: 64 * here.samples,
@@ -360,10 +356,7 @@ mod tests {
         };
         // 64 times the paths; 6.5 times the replay.
         assert!((run.seconds_with(&more) - 128.0 - 65.0).abs() < 0.5);
-        let model = LightRun {
-            by_model: true,
-            ..run
-        };
+        let model = standard_run(true);
         let half = OptimizePreset {
             iterations: here.iterations / 2,
             ..more

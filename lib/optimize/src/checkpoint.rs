@@ -33,7 +33,7 @@ pub struct State {
 }
 
 /// Version of the file.
-const SCHEMA: u32 = 1;
+const SCHEMA: u32 = 2;
 
 /// The part of a checkpoint that is JSON.
 #[derive(Serialize, Deserialize)]

@@ -468,11 +468,15 @@ fn killed_at_any_iteration_and_started_again_the_result_is_the_same_bytes() {
         "at iteration 50, for the record serves well from then on"
     );
     assert!(whole.history[50].recorded);
-    for k in 0..4 {
+    // At random, and before and after both light sets are joined.
+    let joined = case.settings.fused_at();
+    let random = |k: u64| 1 + (mix64(k) % 129) as usize;
+    let ends = [random(0), random(1), random(2), joined - 1, joined];
+    for (k, at) in ends.into_iter().enumerate() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
         // Killed: what happened after the last checkpoint is lost. Interrupted: nothing is.
-        let (killed, at) = (k % 2 == 0, 1 + (mix64(k) % 129) as usize);
+        let killed = k % 2 == 0;
         let mut first = case_clone(&case);
         let mut stop = |event: Event| match event {
             Event::Step(row) if row.iteration == at => ControlFlow::Break(()),

@@ -110,7 +110,8 @@ pub struct OptimizeTable {
     pub consistency: Option<f64>,
     /// Weight of the regulariser of the shadow's light.
     pub regularizer: Option<f64>,
-    /// Share of the iterations after which both light sets are fused, in (0, 1].
+    /// Share of the iterations after which both light sets are fused, in (0, 1]; from there on one
+    /// light is optimised.
     pub fused_after: Option<f64>,
     /// Whether a reference is compared on random crops, as a diffusion model sees the picture,
     /// instead of as a whole.
@@ -149,7 +150,7 @@ pub struct LearningRates {
     pub sigma: f64,
     /// Of tone parameters: slower than the light, which should explain what it can.
     pub tone: f64,
-    /// Of the log of the exposure: as radiance.
+    /// Of the log of the exposure, which scales all radiance at once: slower than that of one lobe.
     pub exposure: f64,
 }
 

@@ -223,7 +223,8 @@ impl Default for Recipe {
 }
 
 impl Recipe {
-    /// The same with `rivals` beside each caption; every caption names its light.
+    /// The same with `rivals` beside each caption; every caption names its light, and three in ten show
+    /// nothing around the object, as where light is read.
     pub fn contrasted(&self, rivals: usize) -> Self {
         Self {
             light_words: 1.0,

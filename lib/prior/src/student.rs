@@ -389,9 +389,30 @@ mod tests {
         let surprise = surprise.expect("rivals");
         assert!((surprise - 1.0).abs() < 1e-5, "{surprise}");
         // Rivals leave the first loss alone; without them there is no second.
-        let (plain, none) = loss(vec![example(0.7, 0), example(0.4, 0), example(0.2, 0)]);
-        assert!(none.is_none());
-        assert!(mixed.is_finite() && plain.is_finite() && mixed > 0.0);
+        let (fewer, _) = loss(vec![example(0.2, 0), example(0.7, 1), example(0.4, 1)]);
+        assert_eq!(mixed, fewer);
+        assert!(loss(vec![example(0.7, 0), example(0.4, 0)]).1.is_none());
+
+        // Once it says something: rows meet their own picture, for rivals that say the same as the
+        // right caption are as likely again; others are not.
+        for (name, variable) in student.variables() {
+            if name.starts_with("unet.conv_out.") || name.ends_with(".proj_out.weight") {
+                let mut noise = NoiseStream::new(9, variable.elem_count() as u64);
+                let values = noise.normal_tensor(variable.dims(), DType::F32, &Device::Cpu);
+                let small = (values.expect("noise") * 0.1).expect("noise");
+                variable.set(&small).expect("set");
+            }
+        }
+        let same = |value: f32| Example {
+            rivals: vec![caption(0.3).expect("one"); 3],
+            ..example(value, 0)
+        };
+        let surprise = loss(vec![same(0.7), same(0.4)]).1.expect("rivals");
+        // Errors of about 1 in f32, times 1,000 nats.
+        assert!((surprise - 1.0).abs() < 1e-3, "{surprise}");
+        let surprise = loss(vec![example(0.7, 3), example(0.4, 3)]).1;
+        let surprise = surprise.expect("rivals");
+        assert!((surprise - 1.0).abs() > 1e-2, "{surprise}");
     }
 
     #[test]

@@ -51,6 +51,11 @@ impl Default for TrainerSettings {
 const SHARDS: usize = 2;
 /// Wrong captions beside a right one, where lights are contrasted.
 const RIVALS: usize = 3;
+/// Examples that are contrasted in a part of so many rows: three rows in four.
+fn contrasted_in(rows: usize) -> usize {
+    rows * 3 / 4 / (RIVALS + 1)
+}
+
 /// Updates over which the learning rate rises.
 const WARMUP: f64 = 200.0;
 
@@ -61,7 +66,8 @@ pub struct Update {
     pub seen: usize,
     /// Loss of this batch.
     pub loss: f64,
-    /// Surprise at the right light among wrong ones: 1 at chance, 0 if it is known.
+    /// Surprise at the right light among wrong ones: 1 at chance, 0 if it is known; NaN if it is not
+    /// asked.
     pub surprise: f64,
     /// Norm of the gradient before clipping.
     pub gradient_norm: f64,
@@ -98,6 +104,13 @@ impl Trainer {
             return Err(Error::Argument(format!(
                 "batch = {}: accepted are even numbers from {SHARDS}",
                 settings.batch
+            )));
+        }
+        if settings.contrast > 0.0 && contrasted_in(settings.batch / SHARDS) == 0 {
+            return Err(Error::Argument(format!(
+                "batch = {}: to contrast lights, accepted are even numbers from {}",
+                settings.batch,
+                SHARDS * (RIVALS + 1) * 3 / 2
             )));
         }
         let student = Student::new(blueprint, folder, settings.seed)?;
@@ -214,9 +227,8 @@ impl Trainer {
         let key = step * SHARDS as u64 + shard as u64;
         let mut stream = NoiseStream::new(self.settings.seed ^ 0x7eac4, key);
         let rows = self.settings.batch / SHARDS;
-        // Three rows in four are for telling lights apart.
         let contrasted = match self.settings.contrast > 0.0 {
-            true => rows * 3 / 4 / (RIVALS + 1),
+            true => contrasted_in(rows),
             false => 0,
         };
         let plain = rows - contrasted * (RIVALS + 1);
@@ -387,6 +399,43 @@ mod tests {
         other.settings.seed = 3;
         let error = other.resume(&checkpoint).unwrap_err().to_string();
         assert!(error.contains("\"seed\":3"), "{error}");
+    }
+
+    #[test]
+    fn lights_can_be_contrasted_from_the_middle_of_a_run_on() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = scenes(&folder.path().join("scenes"));
+        let checkpoint = folder.path().join("checkpoint.safetensors");
+        let batch = |trainer: &mut Trainer, contrast: f64| {
+            trainer.settings = TrainerSettings {
+                batch: 12,
+                contrast,
+                ..trainer.settings
+            };
+        };
+        let mut plain = small(folder.path(), 48);
+        batch(&mut plain, 0.0);
+        assert!(plain.step(&data).unwrap().surprise.is_nan());
+        plain.save(&checkpoint).unwrap();
+        let mut later = small(folder.path(), 48);
+        batch(&mut later, 0.5);
+        later.resume(&checkpoint).unwrap();
+        assert_eq!(later.seen(), 12);
+        // After one step at a rising rate it knows next to nothing.
+        let surprise = later.step(&data).unwrap().surprise;
+        assert!((surprise - 1.0).abs() < 0.05, "{surprise}");
+
+        let blueprint = Blueprint {
+            channels: vec![8, 16],
+            text_width: 16,
+        };
+        let settings = TrainerSettings {
+            batch: 10,
+            ..later.settings
+        };
+        let refused = Trainer::new(&blueprint, folder.path(), settings, Recipe::default());
+        let error = refused.err().unwrap().to_string();
+        assert!(error.contains("even numbers from 12"), "{error}");
     }
 
     #[test]

@@ -134,9 +134,7 @@ impl LightWords {
             between(&SKIES, self.sun_share),
         ]
     }
-}
 
-impl LightWords {
     /// A light that this one might be taken for: another azimuth near by or anywhere, the mirror image,
     /// another elevation, another sky.
     pub fn rival(&self, stream: &mut NoiseStream) -> Self {
@@ -187,9 +185,7 @@ impl LightWords {
             }
         }
     }
-}
 
-impl LightWords {
     /// The same light from the three other quarters: what is common to all four, brightness, height,
     /// sky, is not of the light's direction.
     pub fn turned(&self) -> [Self; 3] {
