@@ -4,7 +4,9 @@
 //! Ten kinds of scene, five seeds each. The true error of a render is its display-referred RMSE from a
 //! reference with a tenth of the target's error, less the reference's own.
 //!
-//! Run with `cargo test -p dipir-render --bench calibration -- --bench [target=RMSE] [size=PIXELS]`.
+//! Run with `cargo test -p dipir-render --bench calibration -- --bench [target=RMSE] [size=PIXELS]
+//! [samples=N] [NAME]`: `samples` draws so many in every pixel instead of stopping at the target, and only
+//! scenes whose name holds NAME are rendered.
 //! Without `--bench`, as tests run it, one small scene proves that it works.
 mod gallery;
 
@@ -35,8 +37,15 @@ fn main() {
     let whole = arguments.iter().any(|a| a == "--bench");
     let size = value("size", if whole { 48.0 } else { 12.0 }) as u32;
     let target = value("target", if whole { 0.008 } else { 0.03 }) as f32;
+    let samples = value("samples", 0.0) as u32;
+    let stop = match samples {
+        0 => Stop::TargetError(target),
+        n => Stop::Samples(n),
+    };
+    let name = arguments.iter().find(|a| !a.contains(['=', '-']));
     let scenes = gallery::scenes(size)
         .into_iter()
+        .filter(|(n, _)| name.is_none_or(|name| n.contains(name.as_str())))
         .take(if whole { 10 } else { 1 });
     let light = gallery::sky();
     println!(
@@ -52,7 +61,7 @@ fn main() {
         let reference = render(Stop::TargetError(target / 10.0), 1 << 40);
         let (mut stated, mut bounds, mut squares, mut within) = (vec![], vec![], 0.0, 0);
         for seed in 0..SEEDS {
-            let found = render(Stop::TargetError(target), seed);
+            let found = render(stop, seed);
             let square = squared_difference(&found.film, &reference.film)
                 - reference.error.rmse * reference.error.rmse;
             squares += square.max(0.0) / SEEDS as f64;
@@ -70,7 +79,7 @@ fn main() {
             median(&bounds).expect("some"),
             ratios.last().expect("one"),
         );
-        if whole {
+        if whole && samples == 0 {
             budgets.push((
                 name,
                 [0.3, 1.0, 3.0].map(|s| spent(&renderer, &light, &simulation, s)),
@@ -83,7 +92,7 @@ fn main() {
     println!(
         "\nwithin the 95% bound: {all_within} of {count}; true over target: {least:.2} to {most:.2}\n"
     );
-    if whole {
+    if !budgets.is_empty() {
         println!("| scene | of 0.3 s | of 1 s | of 3 s |\n|---|--:|--:|--:|");
         for (name, shares) in budgets {
             let cells = shares.map(|s| format!("{:.0}%", 100.0 * s));

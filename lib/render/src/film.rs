@@ -170,6 +170,19 @@ impl Film {
         }
     }
 
+    /// Standard error of the shadow, pooled over a pixel and its neighbours.
+    fn shadow_noise(&self, x: usize, y: usize) -> Vec3 {
+        let (width, height) = (self.shadow.width(), self.shadow.height());
+        let (mut sum, mut count) = (Vec3::ZERO, 0.0);
+        for y in y.saturating_sub(1)..(y + 2).min(height) {
+            for x in x.saturating_sub(1)..(x + 2).min(width) {
+                sum += *self.shadow_variance.get(x, y);
+                count += 1.0;
+            }
+        }
+        Vec3::from((sum / count).to_array().map(f32::sqrt))
+    }
+
     /// Takes over what `job` has found so far.
     pub fn develop(&mut self, job: &Job) {
         for (index, &(x, y)) in job.pixels.iter().enumerate() {
@@ -278,16 +291,51 @@ impl Viewing<'_> {
         (encode(value + step) - encode(value - step)) / (2.0 * f64::from(step))
     }
 
-    /// Whether the layers change the photograph at this pixel by half an 8-bit step or more.
+    /// Whether the layers change the photograph at this pixel by half an 8-bit step or more, and by more
+    /// than noise would: counted as touched, unshadowed pixels would make the mean error look smaller
+    /// than it is.
     pub fn is_touched(&self, film: &Film, x: usize, y: usize) -> bool {
         if *film.alpha.get(x, y) > 0.0 {
             return true;
         }
         let background = self.background(x, y);
         let after = background * *film.shadow.get(x, y);
+        let noise = background * film.shadow_noise(x, y);
         (0..3).any(|c| {
             let encode = |x: f32| self.transfer.encode_scalar(x.max(0.0)).clamp(0.0, 1.0);
             (encode(after[c]) - encode(background[c])).abs() > 0.5 / 255.0
+                && (after[c] - background[c]).abs() > 2.0 * noise[c]
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn noise_on_bright_ground_touches_nothing() {
+        let viewing = Viewing {
+            background: None,
+            transfer: Transfer::Srgb,
+        };
+        let mut film = Film::new(4, 4);
+        // Two 8-bit steps darker, once with less noise than that, once with more.
+        *film.shadow.get_mut(1, 1) = Vec3::splat(0.95);
+        let with_error = |film: &mut Film, error: f32| {
+            let variances = film.shadow_variance.pixels_mut();
+            variances.fill(Vec3::splat(error * error));
+        };
+        with_error(&mut film, 0.01);
+        assert!(viewing.is_touched(&film, 1, 1));
+        with_error(&mut film, 0.04);
+        assert!(!viewing.is_touched(&film, 1, 1));
+        // Less than half a step is not seen, however sure it is.
+        *film.shadow.get_mut(1, 1) = Vec3::splat(0.995);
+        with_error(&mut film, 0.0);
+        assert!(!viewing.is_touched(&film, 1, 1));
+        // Where the object covers anything, it touches.
+        *film.alpha.get_mut(2, 2) = 0.001;
+        assert!(viewing.is_touched(&film, 2, 2));
     }
 }
