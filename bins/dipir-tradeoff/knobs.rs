@@ -1,5 +1,7 @@
 //! What can be turned: settings that buy accuracy for time, as data.
+use dipir::presets;
 use dipir_numerics::hashing::hash_u64s;
+use dipir_pipeline::config::Quality;
 
 /// Which part of the pipeline a knob belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -156,6 +158,31 @@ impl Setting {
     }
 }
 
+/// What `set` changes of the standard preset: settings that come to the same are measured once.
+pub fn turned(set: &[(String, String)]) -> Vec<(String, String)> {
+    let preset = presets::of(Quality::Standard);
+    let standard = [
+        ("pipeline.quality", "standard".to_owned()),
+        (
+            "composite.target_error",
+            preset.composite.target_error.to_string(),
+        ),
+        (
+            "optimize.iterations",
+            preset.optimize.iterations.to_string(),
+        ),
+        ("optimize.lobes", preset.optimize.lobes.to_string()),
+        (
+            "optimize.environment",
+            format!("{:?}", preset.optimize.environment),
+        ),
+        ("optimize.samples", preset.optimize.samples.to_string()),
+    ];
+    let is_standard =
+        |(key, value): &(String, String)| standard.iter().any(|(k, v)| k == key && v == value);
+    set.iter().filter(|s| !is_standard(s)).cloned().collect()
+}
+
 /// Series of the three presets.
 pub const PRESETS: &str = "preset";
 /// Series of the joint search.
@@ -222,6 +249,28 @@ pub fn settings(part: Part, effects_on: &[String], joint: usize) -> Vec<Setting>
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn values_of_the_standard_preset_come_to_the_same() {
+        let all = settings(Part::Light, &[], 0);
+        let mut same: Vec<&str> = Vec::new();
+        for setting in &all {
+            if turned(&setting.set).is_empty() {
+                same.push(&setting.series);
+            }
+        }
+        let expected = [
+            PRESETS,
+            "iterations",
+            "lobes",
+            "environment",
+            "samples of the record",
+        ];
+        assert_eq!(same, expected);
+        let render = settings(Part::Render, &[], 0);
+        let same = render.iter().filter(|s| turned(&s.set).is_empty());
+        assert_eq!(same.count(), 2);
+    }
 
     #[test]
     fn every_setting_is_measured_once_and_the_joint_search_turns_several_knobs() {

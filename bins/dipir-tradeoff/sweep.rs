@@ -12,7 +12,7 @@ use dipir_render::effects::EffectsPlan;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::knobs::{Part, Setting};
+use crate::knobs::{Part, Setting, turned};
 use crate::scenes::Scene;
 
 /// What one run of one setting showed.
@@ -208,7 +208,7 @@ impl Bench<'_> {
     }
 
     fn sample_file(&self, setting: &Setting, seed: u64) -> PathBuf {
-        let name = format!("{}-{seed}.json", key(&setting.set));
+        let name = format!("{}-{seed}.json", key(&turned(&setting.set)));
         let folder = self.out.join("points").join(folder_name(&self.scene.name));
         folder.join(setting.part.name()).join(name)
     }
