@@ -139,11 +139,10 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     let seconds = clock.elapsed().as_secs_f64();
     output.result(
         || {
+            let loss = mean.map_or(String::new(), |m| format!(", loss {m:.4}"));
+            let (folder, seen) = (out.display(), trainer.seen());
             format!(
-                "wrote {}: {} examples, loss {:.4}, in {}",
-                out.display(),
-                trainer.seen(),
-                mean.unwrap_or(f64::NAN),
+                "wrote {folder}: {seen} examples{loss}, in {}",
                 duration(seconds)
             )
         },
