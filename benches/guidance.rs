@@ -409,12 +409,11 @@ fn guided(
         true => reading.light,
         false => reading.encoder,
     };
-    let told = Reading {
-        light: said,
-        ..reading.clone()
-    };
     let class = trial.place.stage.shape.word();
     let coverage = trial.transport.coverage().clone();
+    let camera = &trial.place.stage.camera;
+    let told = bounding_box(&coverage)
+        .map(|object| said.words.seen_from(reading::heading(camera, object)));
     let paint = match variant.background {
         true => coverage,
         false => Raster::filled(SIZE as usize, SIZE as usize, 1.0),
@@ -432,7 +431,7 @@ fn guided(
         },
         None,
         class,
-        Some(&told),
+        told.as_ref(),
         &trial.photo,
         &paint,
     )?;
@@ -445,7 +444,7 @@ fn guided(
         )
     };
     let start = match variant.read_start {
-        true => start(&said, &trial.place.stage.camera, lobes),
+        true => start(&said, camera, lobes),
         false => {
             let ambient = glam::DVec3::splat(ambient_of(&trial.linear));
             Parameters::from_light(lobes, ambient, ambient * 0.3, None)

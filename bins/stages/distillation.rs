@@ -19,8 +19,7 @@ use dipir_optimize::settings::{GuidanceKind, OptimizeTable};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_prior::energy::{guiding, states};
-use dipir_prior::reader::Reading;
-use dipir_prior::words::Caption;
+use dipir_prior::words::{Caption, LightWords};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
@@ -140,13 +139,55 @@ impl Adapter {
     }
 }
 
+/// The states of what a picture should be, and of what that is told from.
+struct Said {
+    conditional: Tensor,
+    unconditional: Tensor,
+}
+
+impl Said {
+    fn new(conditional: &Tensor, unconditional: &Tensor) -> Self {
+        Self {
+            conditional: conditional.detach(),
+            unconditional: unconditional.detach(),
+        }
+    }
+
+    /// That the light is `words`.
+    fn of_light(
+        model: &Model,
+        settings: &DistillationSettings,
+        class: &str,
+        words: &LightWords,
+    ) -> anyhow::Result<Self> {
+        let known = model.tokenizer.words(class)?.len() == 1;
+        let class = if known { class } else { "object" };
+        // SDS and edited pictures extrapolate from what is subtracted: that is no other light.
+        let differs = matches!(settings.guidance, GuidanceKind::Lds | GuidanceKind::Csd);
+        let all = match settings.turned && differs {
+            true => guiding(model, class, words)?,
+            false => states(model, &[Some(Caption::new(class, Some(words))), None])?,
+        };
+        let others = all.dim(0)? - 1;
+        Ok(Self::new(&all.narrow(0, 0, 1)?, &all.narrow(0, 1, others)?))
+    }
+}
+
+/// `picture` with left and right swapped.
+fn mirror(picture: &Raster<Vec3>) -> Raster<Vec3> {
+    let (width, height) = (picture.width(), picture.height());
+    let rows = (0..height).flat_map(|y| picture.row(y).iter().rev().copied());
+    Raster::from_pixels(width, height, rows.collect())
+}
+
 /// Score distillation on crops of the composite.
 pub struct Distillation<'a> {
     model: &'a Model,
     settings: DistillationSettings,
     lora: Option<Arc<Lora>>,
-    conditional: Tensor,
-    unconditional: Tensor,
+    said: Said,
+    /// What is said of the mirror image, where what is said has sides.
+    mirrored: Option<Said>,
     background: Raster<Vec3>,
     paint: Raster<Vec3>,
     side: usize,
@@ -154,31 +195,23 @@ pub struct Distillation<'a> {
 }
 
 impl<'a> Distillation<'a> {
-    /// Guides towards what `reading` and the class say; `background` is the photograph, `paint` 1
-    /// where an inpainting model may paint.
+    /// Guides towards `light`, as seen from where the object's crop looks, and the class;
+    /// `background` is the photograph, `paint` 1 where an inpainting model may paint.
     pub fn new(
         model: &'a Model,
         settings: DistillationSettings,
         adapter: Option<&Adapter>,
         class: &str,
-        reading: Option<&Reading>,
+        light: Option<&LightWords>,
         background: &DisplayImage,
         paint: &Raster<f32>,
     ) -> anyhow::Result<Self> {
         let word = adapter.map(|a| a.word.as_str());
         let learned = adapter.and_then(|a| a.learned.as_ref());
-        let (conditional, unconditional) = match (reading, &settings.prompt) {
-            (Some(reading), None) => {
-                let known = model.tokenizer.words(class)?.len() == 1;
-                let class = if known { class } else { "object" };
-                let words = &reading.light.words;
-                // SDS and edited pictures extrapolate from what is subtracted: that is no other light.
-                let differs = matches!(settings.guidance, GuidanceKind::Lds | GuidanceKind::Csd);
-                let all = match settings.turned && differs {
-                    true => guiding(model, class, words)?,
-                    false => states(model, &[Some(Caption::new(class, Some(words))), None])?,
-                };
-                (all.narrow(0, 0, 1)?, all.narrow(0, 1, all.dim(0)? - 1)?)
+        let (said, mirrored) = match (light, &settings.prompt) {
+            (Some(words), None) => {
+                let of = |words| Said::of_light(model, &settings, class, words);
+                (of(words)?, Some(of(&words.mirrored())?))
             }
             (_, prompt) => {
                 let own = match word {
@@ -186,21 +219,20 @@ impl<'a> Distillation<'a> {
                     None => format!("a photo of a {class}"),
                 };
                 let prompt = prompt.clone().unwrap_or(own);
-                (
-                    model.encode_prompts(&[&prompt], learned)?,
-                    model.encode_prompts(&[""], None)?,
-                )
+                let conditional = model.encode_prompts(&[&prompt], learned)?;
+                let unconditional = model.encode_prompts(&[""], None)?;
+                (Said::new(&conditional, &unconditional), None)
             }
         };
         Ok(Self {
             model,
             lora: adapter.map(|a| a.lora.clone()),
-            conditional: conditional.detach(),
-            unconditional: unconditional.detach(),
+            said,
+            mirrored,
             background: background.0.clone(),
             paint: paint.map(|&a| Vec3::splat(a)),
             side: model::native_size(model),
-            knows_light: reading.is_some(),
+            knows_light: light.is_some(),
             settings,
         })
     }
@@ -212,14 +244,17 @@ impl<'a> Distillation<'a> {
         Ok(image.to_dtype(self.model.dtype())?)
     }
 
-    fn condition(&self, view: &View) -> anyhow::Result<Option<InpaintCondition>> {
+    fn condition(&self, view: &View, swap: bool) -> anyhow::Result<Option<InpaintCondition>> {
         if !self.model.is_inpainting() {
             return Ok(None);
         }
-        let shown = self.tensor(&view.apply(&self.background))?;
+        let seen = |picture: &Raster<Vec3>| match swap {
+            true => mirror(&view.apply(picture)),
+            false => view.apply(picture),
+        };
+        let shown = self.tensor(&seen(&self.background))?;
         let side = self.side;
-        let mask: Vec<f32> = view
-            .apply(&self.paint)
+        let mask: Vec<f32> = seen(&self.paint)
             .pixels()
             .iter()
             .map(|p| f32::from(p.x > 0.02))
@@ -230,9 +265,16 @@ impl<'a> Distillation<'a> {
     }
 
     fn judge(&self, picture: &Raster<Vec3>, view: &View, step: Step) -> anyhow::Result<Guided> {
-        let image = Var::from_tensor(&self.tensor(picture)?)?;
+        // Every other iteration sees the mirror image: what the model gets wrong of a picture it mostly
+        // gets wrong differently there.
+        let swapped = self.mirrored.as_ref().filter(|_| step.iteration % 2 == 1);
+        let said = swapped.unwrap_or(&self.said);
+        let image = Var::from_tensor(&match swapped {
+            Some(_) => self.tensor(&mirror(picture))?,
+            None => self.tensor(picture)?,
+        })?;
         let latents = self.model.vae.encode(&image, None)?;
-        let condition = self.condition(view)?;
+        let condition = self.condition(view, swapped.is_some())?;
         let guidance = match self.settings.guidance {
             GuidanceKind::Sds => Kind::Sds {
                 scale: self.settings.guidance_scale,
@@ -250,8 +292,8 @@ impl<'a> Distillation<'a> {
             guidance,
             weighting: Weighting::NoiseVariance,
             lora: self.lora.as_ref(),
-            conditional: &self.conditional,
-            unconditional: &self.unconditional,
+            conditional: &said.conditional,
+            unconditional: &said.unconditional,
             inpaint: condition.as_ref(),
         };
         let mut stream = NoiseStream::new(step.seed ^ 0xd15711, step.iteration as u64);
@@ -295,9 +337,13 @@ impl<'a> Distillation<'a> {
         let pixels = (0..n)
             .map(|i| Vec3::new(values[i], values[n + i], values[2 * n + i]))
             .collect();
+        let gradient = Raster::from_pixels(self.side, self.side, pixels);
         Ok(Guided {
             loss: size,
-            gradient: Raster::from_pixels(self.side, self.side, pixels),
+            gradient: match swapped {
+                Some(_) => mirror(&gradient),
+                None => gradient,
+            },
             timestep: Some(mean_t),
         })
     }

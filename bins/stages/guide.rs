@@ -8,6 +8,7 @@ use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_optimize::crop::bounding_box;
 use dipir_optimize::settings::{GuidanceKind, LearningRates, OptimizeTable, Settings, Start};
 use dipir_prior::reader::{ReaderSettings, Reading};
+use dipir_prior::words::LightWords;
 use dipir_render::render::Renderer;
 use dipir_scene::config::SceneConfig;
 
@@ -181,12 +182,12 @@ impl Guide {
         &mut self,
         settings: &DistillationSettings,
         class: &str,
-        reading: Option<&Reading>,
+        light: Option<&LightWords>,
         photo: &DisplayImage,
         paint: &Raster<f32>,
     ) -> anyhow::Result<Distillation<'_>> {
         let model = self.model.as_ref().context("no model is loaded")?;
         let (settings, adapter) = (settings.clone(), self.adapter.as_ref());
-        Distillation::new(model, settings, adapter, class, reading, photo, paint)
+        Distillation::new(model, settings, adapter, class, light, photo, paint)
     }
 }

@@ -11,7 +11,7 @@ use dipir_cli::session::{Session, duration};
 use dipir_imaging::file::{read_photo, write_png};
 use dipir_imaging::raster::DisplayImage;
 use dipir_optimize::OptimizeError;
-use dipir_optimize::crop::{Framing, USUAL_SCALE};
+use dipir_optimize::crop::{Framing, USUAL_SCALE, bounding_box};
 use dipir_optimize::guidance::{Guidance, Reference, rmse, touched};
 use dipir_optimize::history::Row;
 use dipir_optimize::lighting::Lighting;
@@ -130,7 +130,12 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         ) => {
             // A model that knows light sees the ground on which the shadow will fall.
             let paint = if reading.is_some() { &coverage } else { &mask };
-            Box::new(guide.distillation(settings, class, reading.as_ref(), &shown, paint)?)
+            let seen = reading.as_ref().zip(bounding_box(&coverage));
+            let seen = seen.map(|(r, object)| {
+                let heading = reading::heading(&frame.camera, object);
+                r.light.words.seen_from(heading)
+            });
+            Box::new(guide.distillation(settings, class, seen.as_ref(), &shown, paint)?)
         }
     };
     let mut go_on = |_: f64| interruption();

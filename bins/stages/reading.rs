@@ -68,14 +68,20 @@ pub fn planes(picture: &Raster<Vec3>) -> Vec<f32> {
 fn crop_of(photo: &Raster<Vec3>, camera: &Camera, region: PixelBox) -> Crop {
     let size = (photo.width(), photo.height());
     let resize = CropResize::new(size, region, (SIZE, SIZE), Filter::Bilinear);
+    Crop {
+        picture: planes(&resize.apply(photo)),
+        heading: heading(camera, region),
+    }
+}
+
+/// Angle on the ground from where the camera looks to the middle of `region`, towards the right,
+/// radians: azimuths of a crop are relative to it.
+pub fn heading(camera: &Camera, region: PixelBox) -> f32 {
     let corner = Vec2::new(region.x as f32, region.y as f32);
     let half = Vec2::new(region.width as f32, region.height as f32) * 0.5;
     let ray = camera.ray(corner + half).direction;
     let (forward, right) = ground_axes(camera);
-    Crop {
-        picture: planes(&resize.apply(photo)),
-        heading: ray.dot(right).atan2(ray.dot(forward)),
-    }
+    ray.dot(right).atan2(ray.dot(forward))
 }
 
 /// A square of `side` around a point, moved into the picture.

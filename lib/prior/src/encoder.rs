@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
-use crate::examples::{Lens, SIZE, Tone, Window};
+use crate::examples::{self, Lens, SIZE, Tone, Window};
 use crate::lights::Light;
 use crate::record::Layer;
 use crate::words::LightWords;
@@ -115,13 +115,12 @@ impl LightEncoder {
         }
         let mut sum = [0f32; OUTPUTS];
         for mirrored in [false, true] {
-            let values = pictures.iter().flat_map(|p| {
-                p.chunks_exact(SIZE).flat_map(move |row| {
-                    (0..SIZE).map(move |x| row[if mirrored { SIZE - 1 - x } else { x }])
-                })
-            });
+            let values = match mirrored {
+                true => examples::mirrored(&pictures.concat()),
+                false => pictures.concat(),
+            };
             let shape = (pictures.len(), 3, SIZE, SIZE);
-            let x = Tensor::from_vec(values.collect::<Vec<f32>>(), shape, &Device::Cpu)?;
+            let x = Tensor::from_vec(values, shape, &Device::Cpu)?;
             for row in self.forward(&x.affine(2.0, -1.0)?)?.to_vec2::<f32>()? {
                 for (i, (sum, v)) in sum.iter_mut().zip(row).enumerate() {
                     // The mirror swaps left and right.

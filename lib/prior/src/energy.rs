@@ -68,42 +68,37 @@ fn predictions(
 }
 
 /// Calls `each` with the noise and with what is predicted of it under every context, [contexts, c, h, w],
-/// for `draws` of noise at each of the `shares` of the timesteps.
-fn for_each_draw(
+/// for noise drawn at each of the `shares` of the timesteps.
+fn for_each_share(
     model: &Model,
     observation: &Observation,
     contexts: &Tensor,
     shares: &[f64],
-    draws: usize,
     stream: &mut NoiseStream,
     mut each: impl FnMut(&Tensor, &Tensor) -> Result<()>,
 ) -> Result<()> {
     for &share in shares {
         let t = model.schedule.timestep_at(share);
-        for _ in 0..draws {
-            let noise =
-                stream.normal_tensor(observation.latents.dims(), DType::F32, &Device::Cpu)?;
-            let noisy = model.schedule.add_noise(&observation.latents, &noise, t)?;
-            let output = predictions(model, observation, &noisy, t, contexts)?;
-            let shown = noisy.broadcast_as(output.shape())?.contiguous()?;
-            each(&noise, &model.schedule.noise_of(&output, &shown, t)?)?;
-        }
+        let noise = stream.normal_tensor(observation.latents.dims(), DType::F32, &Device::Cpu)?;
+        let noisy = model.schedule.add_noise(&observation.latents, &noise, t)?;
+        let output = predictions(model, observation, &noisy, t, contexts)?;
+        let shown = noisy.broadcast_as(output.shape())?.contiguous()?;
+        each(&noise, &model.schedule.noise_of(&output, &shown, t)?)?;
     }
     Ok(())
 }
 
-/// Mean squared error of the noise under each context, averaged over
-/// `shares` of the timesteps and `draws` of noise.
+/// Mean squared error of the noise under each context, one draw of it at each of `shares` of the
+/// timesteps.
 pub fn energies(
     model: &Model,
     observation: &Observation,
     contexts: &Tensor,
     shares: &[f64],
-    draws: usize,
     stream: &mut NoiseStream,
 ) -> Result<Vec<f64>> {
     let mut sums = vec![0f64; contexts.dims()[0]];
-    let weight = 1.0 / (shares.len() * draws) as f64;
+    let weight = 1.0 / shares.len() as f64;
     let add = |noise: &Tensor, predicted: &Tensor| {
         let error = predicted.broadcast_sub(noise)?.sqr()?;
         let error = error.broadcast_mul(&observation.weights)?;
@@ -113,22 +108,21 @@ pub fn energies(
             .for_each(|(s, e)| *s += e as f64 * weight);
         Ok(())
     };
-    for_each_draw(model, observation, contexts, shares, draws, stream, add)?;
+    for_each_share(model, observation, contexts, shares, stream, add)?;
     Ok(sums)
 }
 
-/// Mean over `draws` of the noise prediction under the first context less that under the others, on
+/// Mean over `shares` of the timesteps of the noise prediction under the first context less that under the others, on
 /// average: what LDS would change, [1, c, h, w].
 pub fn difference(
     model: &Model,
     observation: &Observation,
     contexts: &Tensor,
     shares: &[f64],
-    draws: usize,
     stream: &mut NoiseStream,
 ) -> Result<Tensor> {
     let mut sum = observation.latents.zeros_like()?;
-    let weight = 1.0 / (shares.len() * draws) as f64;
+    let weight = 1.0 / shares.len() as f64;
     let others = contexts.dims()[0] - 1;
     let add = |_: &Tensor, predicted: &Tensor| {
         let other = predicted.narrow(0, 1, others)?.mean_keepdim(0)?;
@@ -136,7 +130,7 @@ pub fn difference(
         sum = (&sum + (difference * weight)?)?;
         Ok(())
     };
-    for_each_draw(model, observation, contexts, shares, draws, stream, add)?;
+    for_each_share(model, observation, contexts, shares, stream, add)?;
     Ok(sum)
 }
 

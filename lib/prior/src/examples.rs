@@ -39,6 +39,15 @@ impl Window {
         mirrored: false,
     };
 
+    /// The middle for every even draw of noise, its mirror image for every odd one: what the model gets
+    /// wrong of one it mostly gets wrong differently of the other.
+    pub fn of_draw(draw: usize) -> Self {
+        Self {
+            mirrored: draw % 2 == 1,
+            ..Self::MIDDLE
+        }
+    }
+
     /// Anywhere.
     pub fn draw(stream: &mut NoiseStream) -> Self {
         Self {
@@ -50,13 +59,9 @@ impl Window {
 
     /// What the mirror makes of a light.
     pub fn words(&self, words: LightWords) -> LightWords {
-        LightWords {
-            azimuth: if self.mirrored {
-                -words.azimuth
-            } else {
-                words.azimuth
-            },
-            ..words
+        match self.mirrored {
+            true => words.mirrored(),
+            false => words,
         }
     }
 }
@@ -233,6 +238,12 @@ impl Recipe {
             ..*self
         }
     }
+}
+
+/// Planes of rows of [`SIZE`] values with left and right swapped.
+pub fn mirrored(planes: &[f32]) -> Vec<f32> {
+    let rows = planes.chunks_exact(SIZE);
+    rows.flat_map(|row| row.iter().rev().copied()).collect()
 }
 
 /// The largest value within `radius` pixels (a square).

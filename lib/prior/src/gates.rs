@@ -89,19 +89,19 @@ impl Trial {
         }
     }
 
-    fn lens(&self) -> Lens<'_> {
+    fn lens(&self, window: Window) -> Lens<'_> {
         let scene = SceneView {
             planes: &self.planes,
             class: self.class,
             color: "white",
             suns: self.suns.clone(),
         };
-        Lens::new(scene, Window::MIDDLE)
+        Lens::new(scene, window)
     }
 
     /// The composite under the sun at `OFFSETS[sun]`, seen as in guidance.
-    fn observe(&self, sun: usize, tone: &Tone) -> Result<(Vec<f32>, Observation)> {
-        let lens = self.lens();
+    fn observe(&self, sun: usize, tone: &Tone, window: Window) -> Result<(Vec<f32>, Observation)> {
+        let lens = self.lens(window);
         let light = Light { sun, ..self.light };
         let mut image = lens.composite(&self.light, &light);
         let mut clean = lens.layer(Layer::Background, &self.light);
@@ -124,8 +124,10 @@ impl Trial {
         }
     }
 
-    fn caption(&self, azimuth: f32) -> Option<Caption> {
-        Some(Caption::new(self.class, Some(&self.words(azimuth))))
+    /// The caption that names the sun at `azimuth`, for a picture seen through `window`.
+    fn caption(&self, azimuth: f32, window: Window) -> Option<Caption> {
+        let words = window.words(self.words(azimuth));
+        Some(Caption::new(self.class, Some(&words)))
     }
 }
 
@@ -144,26 +146,32 @@ fn ask(model: &Model, index: u64, draws: usize) -> Result<Answer> {
         shoulder: 0.5,
     };
     let truth = trial.suns[0].azimuth;
-    let (_, observation) = trial.observe(0, &tone)?;
     let around = (0..AZIMUTHS).map(|k| truth + TAU * k as f32 / AZIMUTHS as f32);
-    let captions: Vec<_> = around
+    let azimuths: Vec<f32> = around
         .chain([-truth, truth + FRAC_PI_4, truth - FRAC_PI_4])
-        .map(|a| trial.caption(a))
         .collect();
-    let asked = states(model, &captions)?;
-    let e = energies(model, &observation, &asked, &SHARES, draws, &mut stream)?;
+    let mut e = vec![0f64; azimuths.len()];
+    // How far going further away goes against what LDS asks for.
+    let mut against = [0f32; 2];
+    for draw in 0..draws {
+        let window = Window::of_draw(draw);
+        let captions: Vec<_> = azimuths.iter().map(|&a| trial.caption(a, window)).collect();
+        let asked = states(model, &captions)?;
+        let (_, observation) = trial.observe(0, &tone, window)?;
+        let found = energies(model, &observation, &asked, &SHARES, &mut stream)?;
+        e.iter_mut().zip(found).for_each(|(e, f)| *e += f);
+        let contexts = guiding(model, trial.class, &window.words(trial.words(truth)))?;
+        for (against, (near, far)) in against.iter_mut().zip([(1, 2), (3, 4)]) {
+            let (image, observation) = trial.observe(near, &tone, window)?;
+            let (further, _) = trial.observe(far, &tone, window)?;
+            let step = (latents_of(further)? - latents_of(image)?)?;
+            let lds = difference(model, &observation, &contexts, &SHARES, &mut stream)?;
+            *against += (step * lds)?.sum_all()?.to_scalar::<f32>()?;
+        }
+    }
     let best = minimum_around(&e[..AZIMUTHS]);
-    let contexts = guiding(model, trial.class, &trial.words(truth))?;
-    let sign = |near: usize, far: usize, stream: &mut NoiseStream| -> Result<bool> {
-        let (image, observation) = trial.observe(near, &tone)?;
-        let (further, _) = trial.observe(far, &tone)?;
-        let step = (latents_of(further)? - latents_of(image)?)?;
-        let lds = difference(model, &observation, &contexts, &SHARES, draws, stream)?;
-        // Going further away must go against what LDS asks for.
-        Ok((step * lds)?.sum_all()?.to_scalar::<f32>()? > 0.0)
-    };
     Ok(Answer {
-        signs: [sign(1, 2, &mut stream)?, sign(3, 4, &mut stream)?],
+        signs: against.map(|a| a > 0.0),
         mirror: e[0] < e[AZIMUTHS],
         beside: [e[0] < e[AZIMUTHS + 1], e[0] < e[AZIMUTHS + 2]],
         azimuth_error: best.to_degrees() as f64,
@@ -202,7 +210,7 @@ pub fn minimum_angle(values: &[f64]) -> f32 {
 }
 
 /// Measures the gates on `scenes` scenes with `draws` of noise at each
-/// timestep. `progress` is told how many are done and may stop.
+/// timestep, every other of them seen in the mirror. `progress` is told how many are done and may stop.
 pub fn measure(
     model: &Model,
     scenes: usize,
@@ -266,6 +274,20 @@ mod tests {
                 .collect();
             assert!(angle_between(minimum_angle(&values), shift as f32) < 0.01);
         }
+    }
+
+    #[test]
+    fn the_mirror_swaps_a_picture_and_its_caption() {
+        let trial = Trial::draw(2);
+        let [plain, swapped] = [0, 1].map(Window::of_draw);
+        let layer = |window| trial.lens(window).layer(Layer::Background, &trial.light);
+        assert_eq!(layer(swapped), crate::examples::mirrored(&layer(plain)));
+        assert_ne!(layer(swapped), layer(plain));
+        let azimuth = trial.suns[0].azimuth;
+        assert_eq!(
+            trial.caption(azimuth, swapped),
+            trial.caption(-azimuth, plain)
+        );
     }
 
     #[test]

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::encoder::{LightEncoder, LightEstimate};
 use crate::energy::{Observation, SHARES, energies, states};
 use crate::error::Result;
-use crate::examples::{SIZE, dilate};
+use crate::examples::{SIZE, dilate, mirrored};
 use crate::gates::minimum_angle;
 use crate::words::{Caption, LightWords};
 
@@ -223,35 +223,38 @@ fn crop_energies(
     settings: &ReaderSettings,
     stream: &mut NoiseStream,
 ) -> Result<Vec<f64>> {
-    let captions: Vec<_> = candidates(share)
-        .into_iter()
-        .map(|words| {
-            let words = LightWords {
-                azimuth: words.azimuth - crop.heading,
-                ..words
-            };
+    let asked = |swap: bool| -> Result<Tensor> {
+        let captions = candidates(share).into_iter().map(|words| {
+            let words = words.seen_from(crop.heading);
+            let words = if swap { words.mirrored() } else { words };
             Some(Caption::new("object", Some(&words)))
-        })
-        .collect();
-    let contexts: Tensor = states(model, &captions)?;
-    let mut sum = vec![0f64; contexts.dims()[0]];
-    for _ in 0..settings.draws {
+        });
+        states(model, &captions.collect::<Vec<_>>())
+    };
+    // Every other draw sees the mirror image.
+    let views = [
+        (crop.picture.clone(), asked(false)?),
+        (mirrored(&crop.picture), asked(true)?),
+    ];
+    let mut sum = vec![0f64; AZIMUTHS * ELEVATIONS.len()];
+    for draw in 0..settings.draws {
+        let (picture, contexts) = &views[draw % 2];
         let observation = match settings.context {
             Context::Box => {
                 let mask = middle_box(stream);
-                Observation::new(&crop.picture, &crop.picture, &mask, &mask)?
+                Observation::new(picture, picture, &mask, &mask)?
             }
             Context::Hidden => {
                 let all = vec![1.0; SIZE * SIZE];
                 let focus = middle_box(stream);
-                Observation::new(&crop.picture, &crop.picture, &all, &focus)?
+                Observation::new(picture, picture, &all, &focus)?
             }
             Context::Filled => {
-                let Plate { shown, object } = Plate::new(&crop.picture);
-                Observation::new(&crop.picture, &shown, &object, &object)?
+                let Plate { shown, object } = Plate::new(picture);
+                Observation::new(picture, &shown, &object, &object)?
             }
         };
-        let e = energies(model, &observation, &contexts, &SHARES, 1, stream)?;
+        let e = energies(model, &observation, contexts, &SHARES, stream)?;
         sum.iter_mut()
             .zip(e)
             .for_each(|(s, e)| *s += e / settings.draws as f64);

@@ -135,6 +135,22 @@ impl LightWords {
         ]
     }
 
+    /// The same light in a mirror that swaps left and right.
+    pub fn mirrored(&self) -> Self {
+        Self {
+            azimuth: -self.azimuth,
+            ..*self
+        }
+    }
+
+    /// The same light from where the camera's forward direction is turned right by `angle`.
+    pub fn seen_from(&self, angle: f32) -> Self {
+        Self {
+            azimuth: self.azimuth - angle,
+            ..*self
+        }
+    }
+
     /// A light that this one might be taken for: another azimuth near by or anywhere, the mirror image,
     /// another elevation, another sky.
     pub fn rival(&self, stream: &mut NoiseStream) -> Self {
@@ -251,6 +267,26 @@ impl Caption {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_ahead_is_left_of_who_looks_to_the_right() {
+        let ahead = LightWords {
+            azimuth: 0.0,
+            elevation: 0.5,
+            sun_share: 0.8,
+        };
+        let hour = |w: &LightWords| {
+            let all = w.mixtures()[0].clone();
+            all.into_iter()
+                .max_by(|a, b| a.1.total_cmp(&b.1))
+                .unwrap()
+                .0
+        };
+        let turned = ahead.seen_from(PI / 2.0);
+        assert_eq!(hour(&ahead), "twelve");
+        assert_eq!(hour(&turned), "nine");
+        assert_eq!(hour(&turned.mirrored()), "three");
+    }
 
     #[test]
     fn rivals_say_another_light_that_could_be() {
