@@ -374,3 +374,73 @@ impl Guidance for Distillation<'_> {
             })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use candle_core::Device;
+
+    use super::*;
+
+    #[test]
+    fn an_odd_iteration_is_that_of_the_mirror_image_turned_back() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("data/prior");
+        let mut model = Model::load(&folder, DType::F32, &Device::Cpu).unwrap();
+        dipir_prior::student::add_placeholders(&mut model.tokenizer);
+        let side = model::native_size(&model);
+        let drawn = |value: fn(f32, f32) -> Vec3| {
+            let unit = |k: usize| k as f32 / side as f32;
+            let pixels = (0..side * side).map(|i| value(unit(i % side), unit(i / side)));
+            Raster::from_pixels(side, side, pixels.collect())
+        };
+        let photo = drawn(|x, y| Vec3::new(0.3 + 0.4 * x, 0.5, 0.4 + 0.3 * y));
+        let picture = drawn(|x, y| match (x - 0.4).hypot(y - 0.5) < 0.2 {
+            true => Vec3::new(0.9 - x, 0.4, 0.3),
+            false => Vec3::new(0.3 + 0.4 * x, 0.5 * x.max(0.5), 0.4 + 0.3 * y),
+        });
+        let paint = drawn(|x, y| Vec3::splat(f32::from((x - 0.4).hypot(y - 0.5) < 0.25)));
+        let settings = DistillationSettings {
+            guidance: GuidanceKind::Lds,
+            timesteps: [[0.5, 0.8]; 2],
+            draws: 2,
+            guidance_scale: 7.5,
+            prompt: None,
+            adapt: false,
+            turned: true,
+        };
+        let light = LightWords {
+            azimuth: 1.1,
+            elevation: 0.6,
+            sun_share: 0.8,
+        };
+        let distillation = |light: &LightWords, photo: &Raster<Vec3>, paint: &Raster<Vec3>| {
+            let (photo, paint) = (DisplayImage(photo.clone()), paint.map(|p| p.x));
+            let settings = settings.clone();
+            Distillation::new(&model, settings, None, "car", Some(light), &photo, &paint).unwrap()
+        };
+        let gradient = |d: &Distillation<'_>, picture: &Raster<Vec3>, iteration: usize| {
+            let step = Step {
+                iteration,
+                iterations: 10,
+                seed: 5,
+            };
+            d.judge(picture, &View::whole(), step).unwrap().gradient
+        };
+        let as_it_is = distillation(&light, &photo, &paint);
+        let mut turned = distillation(&light.mirrored(), &mirror(&photo), &mirror(&paint));
+        turned.mirrored = None;
+        let found = gradient(&as_it_is, &picture, 1);
+        assert_eq!(found, mirror(&gradient(&turned, &mirror(&picture), 1)));
+        assert_ne!(found, mirror(&found));
+        // An even one sees the picture itself.
+        let mut only = distillation(&light, &photo, &paint);
+        only.mirrored = None;
+        let plain = gradient(&only, &picture, 2);
+        assert_eq!(gradient(&as_it_is, &picture, 2), plain);
+        assert_ne!(
+            gradient(&as_it_is, &picture, 1),
+            gradient(&only, &picture, 1)
+        );
+    }
+}
