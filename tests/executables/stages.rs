@@ -170,3 +170,42 @@ fn a_mask_of_the_photos_foreground_hides_the_object() {
     let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
     assert_eq!(layers.rgb("").unwrap(), layers.rgb("background").unwrap());
 }
+
+/// A tetrahedron of glass as a glTF file that is complete in itself.
+const GLASS: &str = r#"{
+  "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+  "extensionsUsed": ["KHR_materials_transmission"],
+  "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 0.05},
+                 "extensions": {"KHR_materials_transmission": {"transmissionFactor": 1}}}],
+  "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
+  "accessors": [
+    {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3",
+     "min": [-0.5, 0, -0.5], "max": [0.5, 0.9, 0.4]},
+    {"bufferView": 1, "componentType": 5123, "count": 12, "type": "SCALAR"}],
+  "bufferViews": [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": 24}],
+  "buffers": [{"byteLength": 72, "uri": "data:application/octet-stream;base64,AAAAvwAAAADNzMw+AAAAPwAAAADNzMw+AAAAAAAAAAAAAAC/AAAAAGZmZj8AAAAAAAABAAMAAQACAAMAAgAAAAMAAAACAAEA"}]
+}"#;
+
+#[test]
+fn glass_under_a_sun_warns_that_its_error_may_be_larger_and_under_a_sky_does_not() {
+    let project = Project::new();
+    project.write("glass.gltf", GLASS);
+    let texels = |sun: f32| {
+        let mut texels = vec![glam::Vec3::splat(0.4); 64 * 32];
+        texels[8 * 64 + 20] = glam::Vec3::splat(sun);
+        dipir_light::environment::EnvironmentMap::new(64, 32, texels).unwrap()
+    };
+    texels(2000.0).write(project.path("sun.exr")).unwrap();
+    texels(0.4).write(project.path("plain.exr")).unwrap();
+    let object = ["--set", "scene.objects.0.path=glass.gltf"];
+    project.run(SCENE, &object).expect_success();
+    let warned = |map: &str| {
+        let environment = format!("composite.environment={map}");
+        let run = project.run(COMPOSITE, &[&object[..], &["--set", &environment]].concat());
+        run.expect_success();
+        run.stderr
+            .contains("warning: glass under a small, bright light")
+    };
+    assert!(warned("sun.exr"));
+    assert!(!warned("plain.exr"));
+}
