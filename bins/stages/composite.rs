@@ -35,7 +35,7 @@ pub const STAGE: &str = "composite";
 /// The executable that runs it.
 pub const EXECUTABLE: &str = "dipir-composite";
 /// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 
 /// The `[composite]` table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
