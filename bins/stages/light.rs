@@ -251,7 +251,8 @@ mod tests {
         };
         let with_sky = |sigma: f32, share: f32| {
             let lobe = SphericalGaussian { sigma, ..up };
-            let sky = (1.0 / share - 1.0) * lobe.solid_angle() as f32 / (4.0 * 3.1416);
+            let sky =
+                (1.0 / share - 1.0) * lobe.solid_angle() as f32 / (4.0 * std::f32::consts::PI);
             let map = rasterize(&[lobe], 512, 256);
             let texels = map.texels().iter().map(|t| *t + Vec3::splat(sky));
             EnvironmentMap::new(512, 256, texels.collect()).unwrap()
