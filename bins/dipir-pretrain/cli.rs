@@ -53,6 +53,7 @@ pub struct Data {
 }
 
 #[derive(Args)]
+#[command(allow_negative_numbers = true)]
 pub struct Train {
     #[command(flatten)]
     pub data: Data,

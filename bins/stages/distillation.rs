@@ -265,8 +265,8 @@ impl<'a> Distillation<'a> {
     }
 
     fn judge(&self, picture: &Raster<Vec3>, view: &View, step: Step) -> anyhow::Result<Guided> {
-        // Every other iteration sees the mirror image: what the model gets wrong of a picture it mostly
-        // gets wrong differently there.
+        // Every other iteration sees the mirror image: what the model gets wrong of a picture it partly
+        // gets wrong differently there (docs/prior.md).
         let swapped = self.mirrored.as_ref().filter(|_| step.iteration % 2 == 1);
         let said = swapped.unwrap_or(&self.said);
         let image = Var::from_tensor(&match swapped {

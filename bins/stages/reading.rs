@@ -325,6 +325,28 @@ mod tests {
     }
 
     #[test]
+    fn what_stands_at_the_right_is_turned_to_by_its_angle_on_the_ground() {
+        let (_, camera, _) = ground(160, 120);
+        let at = |x: usize| PixelBox {
+            x,
+            y: 50,
+            width: 20,
+            height: 20,
+        };
+        assert!(heading(&camera, at(70)).abs() < 1e-6);
+        let (left, right) = (heading(&camera, at(0)), heading(&camera, at(140)));
+        assert!((left + right).abs() < 1e-6);
+        // Of the ground point that is seen there.
+        let ray = camera.ray(Vec2::new(150.0, 60.0)).direction;
+        let (forward, across) = ground_axes(&camera);
+        let tangent = ray.dot(across) / ray.dot(forward);
+        assert!(
+            right > 0.2 && (right.tan() - tangent).abs() < 1e-5,
+            "{right}"
+        );
+    }
+
+    #[test]
     fn crops_stay_inside_small_and_large_pictures() {
         let (photo, camera, proxy) = ground(40, 30);
         for side in [1, 8, 30] {

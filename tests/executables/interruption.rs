@@ -18,6 +18,11 @@ const ENDLESS: [&str; 4] = [
 /// Starts a composite and waits until it writes its folder.
 fn start_endless(project: &Project) -> Child {
     let mut child = project.command(COMPOSITE, &ENDLESS).spawn().unwrap();
+    wait_until_it_writes(project, &mut child);
+    child
+}
+
+fn wait_until_it_writes(project: &Project, child: &mut Child) {
     let deadline = Instant::now() + Duration::from_secs(60);
     while !project.path("out/.composite.partial").exists() {
         let ended = child.try_wait().unwrap();
@@ -27,7 +32,6 @@ fn start_endless(project: &Project) -> Child {
         );
         std::thread::yield_now();
     }
-    child
 }
 
 #[test]
@@ -65,6 +69,29 @@ fn control_c_ends_with_130_and_leaves_nothing_half_written() {
     run.expect_error(130, "interrupted; earlier results are as they were");
     assert!(project.artifacts("out/composite") == before);
     assert!(!project.path("out/.composite.partial").exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn control_c_at_a_terminal_is_told_once_by_the_run_and_not_by_its_stage() {
+    use std::os::unix::process::CommandExt;
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    // A terminal sends it to the run and to its stage: to a group of processes.
+    let mut command = project.command(DIPIR, &[&["run"], &ENDLESS[..]].concat());
+    let mut child = command.process_group(0).spawn().unwrap();
+    wait_until_it_writes(&project, &mut child);
+    let group = format!("-{}", child.id());
+    let sent = Command::new("kill").args(["-INT", "--", &group]).status();
+    assert!(sent.unwrap().success());
+    let run: Run = child.wait_with_output().unwrap().into();
+    assert_eq!(run.code, Some(130));
+    assert_eq!(
+        run.stderr.matches("interrupted").count(),
+        1,
+        "{}",
+        run.stderr
+    );
 }
 
 #[test]

@@ -51,15 +51,13 @@ pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
             if error.is::<Said>() {
                 return ExitCode::from(code);
             }
-            let text = match code {
-                INTERRUPTED => interrupt::MESSAGE.into(),
-                _ => {
-                    let label = bold_red("error:", color_on_stderr());
-                    format!("{label} {}", describe(&error))
-                }
-            };
-            // A reader that went away is no reason to end otherwise.
-            let _ = writeln!(stderr(), "{text}");
+            if code == INTERRUPTED {
+                interrupt::say();
+            } else {
+                let label = bold_red("error:", color_on_stderr());
+                // A reader that went away is no reason to end otherwise.
+                let _ = writeln!(stderr(), "{label} {}", describe(&error));
+            }
             code
         }
     };

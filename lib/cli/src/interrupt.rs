@@ -12,6 +12,8 @@ use std::time::Duration;
 use crate::exit::INTERRUPTED;
 
 static ASKED: AtomicBool = AtomicBool::new(false);
+/// Whether somebody waits for this process who says so himself when it is stopped.
+static SUPERVISED: AtomicBool = AtomicBool::new(false);
 
 /// The user asked to stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,6 +52,7 @@ pub fn listen_patiently() -> anyhow::Result<()> {
 /// Takes the end of standard input for Ctrl-C. Whoever started this process holds the other end,
 /// so the work stops when that process does, however it ends.
 pub fn follow_standard_input() {
+    SUPERVISED.store(true, Ordering::SeqCst);
     thread::spawn(|| {
         let mut buffer = [0; 64];
         let mut input = stdin().lock();
@@ -66,9 +69,16 @@ fn stop() {
     {
         let _ = std::fs::remove_dir_all(folder);
     }
-    // Whoever read this may be gone, which is no reason to stay.
-    let _ = writeln!(stderr(), "{MESSAGE}");
+    say();
     process::exit(INTERRUPTED.into());
+}
+
+/// Tells the user, unless another process does.
+pub(crate) fn say() {
+    if !SUPERVISED.load(Ordering::SeqCst) {
+        // Whoever read this may be gone, which is no reason to stay.
+        let _ = writeln!(stderr(), "{MESSAGE}");
+    }
 }
 
 /// Notes the folder to remove when the process ends early.

@@ -40,7 +40,7 @@ impl Window {
     };
 
     /// The middle for every even draw of noise, its mirror image for every odd one: what the model gets
-    /// wrong of one it mostly gets wrong differently of the other.
+    /// wrong of one it partly gets wrong differently of the other (docs/prior.md).
     pub fn of_draw(draw: usize) -> Self {
         Self {
             mirrored: draw % 2 == 1,

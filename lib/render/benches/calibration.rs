@@ -42,7 +42,9 @@ fn main() {
         0 => Stop::TargetError(target),
         n => Stop::Samples(n),
     };
-    let name = arguments.iter().find(|a| !a.contains(['=', '-']));
+    let name = arguments
+        .iter()
+        .find(|a| !a.contains('=') && !a.starts_with("--"));
     let scenes = gallery::scenes(size)
         .into_iter()
         .filter(|(n, _)| name.is_none_or(|name| n.contains(name.as_str())))

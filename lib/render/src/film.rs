@@ -300,12 +300,14 @@ impl Viewing<'_> {
         }
         let background = self.background(x, y);
         let after = background * *film.shadow.get(x, y);
-        let noise = background * film.shadow_noise(x, y);
-        (0..3).any(|c| {
-            let encode = |x: f32| self.transfer.encode_scalar(x.max(0.0)).clamp(0.0, 1.0);
-            (encode(after[c]) - encode(background[c])).abs() > 0.5 / 255.0
-                && (after[c] - background[c]).abs() > 2.0 * noise[c]
-        })
+        let encode = |x: f32| self.transfer.encode_scalar(x.max(0.0)).clamp(0.0, 1.0);
+        let seen = |c: usize| (encode(after[c]) - encode(background[c])).abs() > 0.5 / 255.0;
+        // Of noise alone, one in twenty is beyond two standard errors.
+        let is_sure = |c: usize| {
+            let noise = background[c] * film.shadow_noise(x, y)[c];
+            (after[c] - background[c]).abs() > 2.0 * noise
+        };
+        (0..3).any(|c| seen(c) && is_sure(c))
     }
 }
 
