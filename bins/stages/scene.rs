@@ -30,7 +30,7 @@ pub const STAGE: &str = "scene";
 /// The executable that runs it.
 pub const EXECUTABLE: &str = "dipir-scene";
 /// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 5;
+pub const VERSION: u32 = 6;
 
 /// What the stage did.
 pub struct Done {
