@@ -113,6 +113,8 @@ fn foreground<const F: u32>(
         max_depth: DEPTH,
         start: PathStart::Camera,
         roulette_depth: u32::MAX,
+        min_roughness: 0.0,
+        min_lit_roughness: 0.0,
     };
     let pixels = (0..SIZE * SIZE)
         .into_par_iter()

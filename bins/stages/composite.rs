@@ -10,16 +10,13 @@ use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentSampler;
-use dipir_light::rasterize::rasterize;
 use dipir_pipeline::config::{Config, Quality};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_render::adaptive::Stop;
-use dipir_render::features::{TRANSMISSION, has};
 use dipir_render::film::Film;
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings};
-use dipir_scene::material::Material;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -35,7 +32,7 @@ pub const STAGE: &str = "composite";
 /// The executable that runs it.
 pub const EXECUTABLE: &str = "dipir-composite";
 /// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 4;
+pub const VERSION: u32 = 5;
 
 /// The `[composite]` table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -219,12 +216,6 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     )?;
     let exr = writer.output("layers", "composite.exr")?;
     layers.to_layers(&inputs.gbuffer)?.write_exr(exr)?;
-    if focuses(&inputs, &light) {
-        session.warn(
-            "glass under a small, bright light: what it focuses on the ground is met by few paths, so the \
-             picture may be further from converged than the error says",
-        );
-    }
     writer.set_estimated_error(rendered.error.upper_95);
     let manifest = writer.finish()?;
     let seconds = clock.elapsed().as_secs_f64();
@@ -244,21 +235,6 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         seconds,
         outlook: Outlook::around_error(error, at_target),
     })
-}
-
-/// Whether light is focused by glass: the estimated error only knows what paths have met.
-fn focuses(inputs: &Inputs, light: &Source) -> bool {
-    let simulation = inputs.scene.effects.simulation();
-    let materials = &inputs.scene.loaded.scene.materials;
-    let is_glass = |m: &Material| m.transmission.as_ref().is_some_and(|t| t.factor > 0.0);
-    has(simulation.features, TRANSMISSION)
-        && materials.iter().any(is_glass)
-        && match light {
-            Source::Map(light) => light::is_concentrated(&light.map),
-            Source::Recovered(light) => {
-                light::is_concentrated(&rasterize(light.lobes.lobes(), 512, 256))
-            }
-        }
 }
 
 /// Of a time budget, what is left for sampling: it began with `clock`, and the result has to be

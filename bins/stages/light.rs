@@ -84,29 +84,6 @@ pub struct Recovered {
     pub tone: ToneCurves,
 }
 
-/// Steradians from which half of a light comes if it is called concentrated: seven degrees across.
-const SMALL_SOURCE: f64 = 0.01;
-
-/// Whether half of a light comes from so little of the sphere that paths which are not aimed at it
-/// seldom meet it.
-pub fn is_concentrated(map: &EnvironmentMap) -> bool {
-    let (width, luminance) = (map.width(), map.luminance());
-    let mut texels: Vec<(f32, f64)> = (luminance.iter().enumerate())
-        .map(|(k, &l)| (l, map.solid_angle(k / width)))
-        .collect();
-    texels.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let half = 0.5 * texels.iter().map(|(l, s)| f64::from(*l) * s).sum::<f64>();
-    let (mut light, mut extent) = (0.0, 0.0);
-    for (l, s) in texels {
-        if light >= half {
-            break;
-        }
-        light += f64::from(l) * s;
-        extent += s;
-    }
-    extent < SMALL_SOURCE
-}
-
 /// What the light stage left, exposed and turned; an error that says what to do if there is
 /// nothing. `scene` is the manifest of the scene that is lit.
 pub fn recovered(
@@ -238,34 +215,8 @@ pub fn projected(
 #[cfg(test)]
 mod tests {
     use dipir_light::cosine::CosineWeightedMap;
-    use dipir_light::rasterize::rasterize;
 
     use super::*;
-
-    #[test]
-    fn a_sun_is_concentrated_and_a_hazy_one_or_a_sky_is_not() {
-        let up = SphericalGaussian {
-            direction: Vec3::new(0.3, 0.8, 0.2).normalize(),
-            radiance: Vec3::ONE,
-            sigma: 0.02,
-        };
-        let with_sky = |sigma: f32, share: f32| {
-            let lobe = SphericalGaussian { sigma, ..up };
-            let sky =
-                (1.0 / share - 1.0) * lobe.solid_angle() as f32 / (4.0 * std::f32::consts::PI);
-            let map = rasterize(&[lobe], 512, 256);
-            let texels = map.texels().iter().map(|t| *t + Vec3::splat(sky));
-            EnvironmentMap::new(512, 256, texels.collect()).unwrap()
-        };
-        assert!(is_concentrated(&with_sky(0.02, 0.9)));
-        assert!(!is_concentrated(&with_sky(0.12, 0.9)));
-        assert!(!is_concentrated(&with_sky(0.02, 0.3)));
-        assert!(!is_concentrated(&EnvironmentMap::constant(
-            16,
-            8,
-            Vec3::ONE
-        )));
-    }
 
     #[test]
     fn the_pilot_light_shows_a_white_floor_at_a_radiance_of_about_one() {

@@ -1,12 +1,12 @@
 //! Whether the error that a render states is its error, whether a target is met, and whether a time
 //! budget is kept, as tables in Markdown.
 //!
-//! Ten kinds of scene, five seeds each. The true error of a render is its display-referred RMSE from a
+//! Twelve kinds of scene, five seeds each. The true error of a render is its display-referred RMSE from a
 //! reference with a tenth of the target's error, less the reference's own.
 //!
 //! Run with `cargo test -p dipir-render --bench calibration -- --bench [target=RMSE] [size=PIXELS]
-//! [samples=N] [NAME]`: `samples` draws so many in every pixel instead of stopping at the target, and only
-//! scenes whose name holds NAME are rendered.
+//! [samples=N] [glints=0] [NAME]`: `samples` draws so many in every pixel instead of stopping at the target, `glints=0`
+//! leaves glints to chance, and only scenes whose name holds NAME are rendered.
 //! Without `--bench`, as tests run it, one small scene proves that it works.
 mod gallery;
 
@@ -38,6 +38,7 @@ fn main() {
     let size = value("size", if whole { 48.0 } else { 12.0 }) as u32;
     let target = value("target", if whole { 0.008 } else { 0.03 }) as f32;
     let samples = value("samples", 0.0) as u32;
+    let glints = value("glints", 1.0) > 0.0;
     let stop = match samples {
         0 => Stop::TargetError(target),
         n => Stop::Samples(n),
@@ -47,8 +48,9 @@ fn main() {
         .find(|a| !a.contains('=') && !a.starts_with("--"));
     let scenes = gallery::scenes(size)
         .into_iter()
+        .chain(gallery::glinting(size))
         .filter(|(n, _)| name.is_none_or(|name| n.contains(name.as_str())))
-        .take(if whole { 10 } else { 1 });
+        .take(if whole { usize::MAX } else { 1 });
     let light = gallery::sky();
     println!(
         "| scene | stated, median | 95% bound, median | true, root mean square | true / target | within the bound |"
@@ -59,11 +61,16 @@ fn main() {
     for (name, scene) in scenes {
         let renderer = Renderer::new(&scene);
         let simulation = EffectsPlan::everything(&scene, &Settings::default()).simulation();
-        let render = |stop, seed| render(&renderer, &light, &simulation, stop, seed);
-        let reference = render(Stop::TargetError(target / 10.0), 1 << 40);
+        let reference = render(
+            &renderer,
+            &light,
+            &simulation,
+            (Stop::TargetError(target / 10.0), true),
+            1 << 40,
+        );
         let (mut stated, mut bounds, mut squares, mut within) = (vec![], vec![], 0.0, 0);
         for seed in 0..SEEDS {
-            let found = render(stop, seed);
+            let found = render(&renderer, &light, &simulation, (stop, glints), seed);
             let square = squared_difference(&found.film, &reference.film)
                 - reference.error.rmse * reference.error.rmse;
             squares += square.max(0.0) / SEEDS as f64;
@@ -107,13 +114,14 @@ fn render(
     renderer: &Renderer,
     light: &dipir_light::environment::EnvironmentSampler,
     simulation: &Simulation,
-    stop: Stop,
+    (stop, glints): (Stop, bool),
     seed: u64,
 ) -> Rendered {
     let settings = Settings {
         seed,
         stop,
         max_samples: 1 << 20,
+        glints,
         ..Settings::default()
     };
     let go_on = &mut |_: &_| ControlFlow::Continue(());
@@ -131,7 +139,7 @@ fn spent(
 ) -> f64 {
     let clock = Instant::now();
     let stop = Stop::TimeBudget(Duration::from_secs_f64(seconds));
-    render(renderer, light, simulation, stop, 0);
+    render(renderer, light, simulation, (stop, true), 0);
     clock.elapsed().as_secs_f64() / seconds
 }
 

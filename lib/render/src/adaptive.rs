@@ -7,6 +7,7 @@
 //! one sample (Lagrange's rule). Cost is counted in rays and samples, never in seconds, so that the
 //! same samples are drawn by any number of threads on any machine; a time budget only decides
 //! after which round to stop.
+use std::collections::HashSet;
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 
@@ -15,7 +16,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::counters::RayCounts;
 use crate::error::RenderError;
-use crate::film::{Film, Job, REPLICATES, SquaredError, Viewing};
+use crate::film::{Film, Job, Layer, REPLICATES, SquaredError, Viewing};
+use crate::glints::Found;
 
 /// When to stop.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -93,22 +95,29 @@ pub struct Refined {
     pub rounds: u32,
 }
 
+/// Samples per replicate of a pixel in focus in its first round: a glint may fill a hundredth of where they gather.
+const FIRST_ROUND_IN_FOCUS: u32 = 1024;
+
 /// Draws samples until `stop`. `advance(job, n)` brings a job to `n` samples per pixel and
-/// replicate; `progress` may break off after any round. A time budget counts from `start`.
+/// replicate; `focus(film, jobs)` is asked once, after the first round, which pixels of the object should begin
+/// anew with samples elsewhere; `progress` may break off after any round. A time budget counts
+/// from `start`.
 pub fn refine(
     size: (usize, usize),
-    jobs: &mut [Job],
+    mut jobs: Vec<Job>,
     stop: Stop,
     start: Instant,
     max_samples: u32,
     viewing: &Viewing,
     advance: &(impl Fn(&mut Job, u32) + Sync),
+    focus: &dyn Fn(&Film, &[Job]) -> Found,
     progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
 ) -> Result<Refined, RenderError> {
     let limit = max_samples.div_ceil(REPLICATES as u32).max(1);
     let mut film = Film::new(size.0, size.1);
     let mut goals = vec![first_goal(stop, limit); jobs.len()];
     let mut round = 0;
+    let mut looking = RayCounts::default();
     loop {
         let round_start = Instant::now();
         let cost_before: f64 = jobs.iter().map(Job::cost).sum();
@@ -120,9 +129,18 @@ pub fn refine(
                     advance(job, goal);
                 }
             });
+        let cost_of_round = jobs.iter().map(Job::cost).sum::<f64>() - cost_before;
+        let seconds_of_round = round_start.elapsed().as_secs_f64();
         round += 1;
         for job in jobs.iter() {
             film.develop(job);
+        }
+        if round == 1 {
+            let found = focus(&film, &jobs);
+            looking = found.counts;
+            let goal = FIRST_ROUND_IN_FOCUS.min(limit);
+            let begun = begin_anew(&mut jobs, found, goal, advance);
+            jobs[begun..].iter().for_each(|job| film.develop(job));
         }
         let errors: Vec<SquaredError> = jobs
             .par_iter()
@@ -132,13 +150,13 @@ pub fn refine(
         let cost: f64 = jobs.iter().map(Job::cost).sum();
         let growth = match stop {
             Stop::TimeBudget(budget) => {
-                let rate = round_start.elapsed().as_secs_f64() / (cost - cost_before).max(1.0);
+                let rate = seconds_of_round / cost_of_round.max(1.0);
                 let left = budget.as_secs_f64() - start.elapsed().as_secs_f64();
                 timed_growth(left, rate * cost)
             }
             _ => 0.0,
         };
-        let next = next_goals(stop, limit, jobs, &errors, &error, cost * growth);
+        let next = next_goals(stop, limit, &jobs, &errors, &error, cost * growth);
         let out_of_time = matches!(stop, Stop::TimeBudget(_)) && growth == 0.0;
         let done = out_of_time
             || next
@@ -149,19 +167,19 @@ pub fn refine(
             round,
             error,
             samples: jobs.iter().map(Job::samples_drawn).sum(),
-            rays: jobs.iter().map(|j| j.counts.total()).sum(),
+            rays: jobs.iter().map(|j| j.counts.total()).sum::<u64>() + looking.total(),
             elapsed: start.elapsed(),
             fraction: if done {
                 1.0
             } else {
-                fraction(stop, &error, cost, jobs, &next, start.elapsed())
+                fraction(stop, &error, cost, &jobs, &next, start.elapsed())
             },
         };
         if progress(&report).is_break() {
             return Err(RenderError::Interrupted);
         }
         if done {
-            let mut counts = RayCounts::default();
+            let mut counts = looking;
             jobs.iter().for_each(|job| counts.merge(&job.counts));
             return Ok(Refined {
                 film,
@@ -173,6 +191,27 @@ pub fn refine(
         }
         goals = next;
     }
+}
+
+/// Gives every pixel that `found` names a job of its own, behind the others, and brings it to `goal` samples.
+/// Returns the first of them.
+fn begin_anew(
+    jobs: &mut Vec<Job>,
+    found: Found,
+    goal: u32,
+    advance: &(impl Fn(&mut Job, u32) + Sync),
+) -> usize {
+    let names: HashSet<(u32, u32)> = found.pixels.iter().map(|f| f.0).collect();
+    if !names.is_empty() {
+        let objects = jobs.iter_mut().filter(|job| job.layer == Layer::Object);
+        objects.for_each(|job| job.give_up(|pixel| names.contains(&pixel)));
+        jobs.retain(|job| !job.pixels.is_empty());
+    }
+    let first = jobs.len();
+    jobs.extend(found.pixels.into_iter().map(|(p, f)| Job::focused(p, f)));
+    let new = jobs[first..].par_iter_mut().with_max_len(1);
+    new.for_each(|job| advance(job, goal));
+    first
 }
 
 fn first_goal(stop: Stop, limit: u32) -> u32 {

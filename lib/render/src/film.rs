@@ -5,6 +5,7 @@ use dipir_imaging::transfer::Transfer;
 use glam::Vec3;
 
 use crate::counters::RayCounts;
+use crate::glints::Focus;
 use crate::shadow::{Block, ShadowSums, ratio};
 
 /// Independently scrambled sample sequences per pixel. Their spread is an unbiased estimate of the
@@ -28,7 +29,7 @@ impl Layer {
     /// Numbers that are summed per pixel and replicate.
     fn channels(self) -> usize {
         match self {
-            Layer::Object => 4,
+            Layer::Object => 5,
             Layer::PlaneShadow => 3,
             Layer::MeshShadow => 7,
         }
@@ -48,9 +49,13 @@ pub struct Job {
     pub samples: u32,
     /// Rays traced so far.
     pub counts: RayCounts,
+    /// Where in its pixels samples are drawn, if not evenly.
+    pub focus: Option<Focus>,
     /// Light per sample where the denominator of the ratio is known.
     arriving: Option<Vec3>,
     sums: Vec<f32>,
+    /// Of every pixel in focus, the sum of squared samples.
+    squares: Vec<Vec3>,
 }
 
 impl Job {
@@ -66,10 +71,39 @@ impl Job {
             block,
             samples: 0,
             counts: RayCounts::default(),
+            focus: None,
             arriving,
             sums: vec![0.0; pixels.len() * REPLICATES * layer.channels()],
+            squares: Vec::new(),
             pixels,
         }
+    }
+
+    /// A job without samples for one pixel of the object, whose samples go where `focus` says.
+    pub fn focused((x, y): (u32, u32), focus: Focus) -> Self {
+        let block = Block {
+            x,
+            y,
+            width: 1,
+            height: 1,
+        };
+        Self {
+            focus: Some(focus),
+            squares: vec![Vec3::ZERO],
+            ..Self::new(Layer::Object, block, vec![(x, y)], None)
+        }
+    }
+
+    /// Gives up the pixels that `is_given` names, with their samples.
+    pub fn give_up(&mut self, is_given: impl Fn((u32, u32)) -> bool) {
+        let size = REPLICATES * self.layer.channels();
+        let kept = |index: &usize| !is_given(self.pixels[*index]);
+        let kept: Vec<usize> = (0..self.pixels.len()).filter(kept).collect();
+        let sums = kept
+            .iter()
+            .flat_map(|i| &self.sums[i * size..(i + 1) * size]);
+        self.sums = sums.copied().collect();
+        self.pixels = kept.iter().map(|&i| self.pixels[i]).collect();
     }
 
     /// The sums of one replicate of the `index`th pixel.
@@ -88,6 +122,34 @@ impl Job {
         }
     }
 
+    /// Adds squared samples of the `index`th pixel, which is in focus.
+    pub fn add_squares(&mut self, index: usize, squares: Vec3) {
+        self.squares[index] += squares;
+    }
+
+    /// Variance of the `index`th pixel's colour. Few of many samples meet a glint, and replicates may
+    /// agree because both met none: in focus the spread of the samples themselves says more, which overstates that of
+    /// stratified ones.
+    fn colour_variance(&self, index: usize) -> Vec3 {
+        let (mean, _) = self.estimate(index, None);
+        match self.squares.get(index) {
+            Some(&squares) => {
+                let n = (self.samples * REPLICATES as u32).max(2) as f32;
+                ((squares / n - mean * mean) / (n - 1.0)).max(Vec3::ZERO)
+            }
+            None => self.spread(mean, |k| self.estimate(index, Some(k)).0),
+        }
+    }
+
+    /// Variance of the mean of what replicates say: their squared deviations over K (K - 1).
+    fn spread(&self, mean: Vec3, replicate: impl Fn(usize) -> Vec3) -> Vec3 {
+        let norm = 1.0 / (REPLICATES * (REPLICATES - 1)) as f32;
+        (0..REPLICATES).fold(Vec3::ZERO, |sum, k| {
+            let deviation = replicate(k) - mean;
+            sum + deviation * deviation * norm
+        })
+    }
+
     /// The estimate of one pixel from one replicate, or from all: colour or ratio, and coverage.
     fn estimate(&self, index: usize, replicate: Option<usize>) -> (Vec3, f32) {
         let mut total = [0f32; 7];
@@ -101,7 +163,8 @@ impl Job {
         let [a, b, c, d, e, f, g] = total;
         let blocked = Vec3::new(a, b, c);
         match self.layer {
-            Layer::Object if samples > 0.0 => (blocked / samples, d / samples),
+            // Covered pixels are covered whatever the weights of their samples.
+            Layer::Object if samples > 0.0 => (blocked / samples, d / e),
             Layer::Object => (Vec3::ZERO, 0.0),
             Layer::PlaneShadow | Layer::MeshShadow => {
                 let sums = ShadowSums {
@@ -188,14 +251,9 @@ impl Film {
         for (index, &(x, y)) in job.pixels.iter().enumerate() {
             let (x, y) = (x as usize, y as usize);
             let (colour, coverage) = job.estimate(index, None);
-            let (mut colour_variance, mut coverage_variance) = (Vec3::ZERO, 0.0);
-            // Variance of the mean of K values: their squared deviations over K (K - 1).
-            let norm = 1.0 / (REPLICATES * (REPLICATES - 1)) as f32;
-            for k in 0..REPLICATES {
-                let (c, a) = job.estimate(index, Some(k));
-                colour_variance += (c - colour) * (c - colour) * norm;
-                coverage_variance += (a - coverage) * (a - coverage) * norm;
-            }
+            let colour_variance = job.colour_variance(index);
+            let coverages = |k| Vec3::splat(job.estimate(index, Some(k)).1);
+            let coverage_variance = job.spread(Vec3::splat(coverage), coverages).x;
             if job.layer == Layer::Object {
                 *self.object.get_mut(x, y) = colour;
                 *self.alpha.get_mut(x, y) = coverage;
@@ -238,7 +296,8 @@ impl SquaredError {
 }
 
 impl Viewing<'_> {
-    fn background(&self, x: usize, y: usize) -> Vec3 {
+    /// The photograph at a pixel, linear.
+    pub fn background(&self, x: usize, y: usize) -> Vec3 {
         self.background
             .map_or(Vec3::splat(0.18), |image| *image.0.get(x, y))
     }
@@ -263,11 +322,10 @@ impl Viewing<'_> {
                 ),
             };
             let mean = composite(job.estimate(index, None));
-            let norm = 1.0 / (REPLICATES * (REPLICATES - 1)) as f32;
-            let variance = (0..REPLICATES).fold(Vec3::ZERO, |sum, k| {
-                let deviation = composite(job.estimate(index, Some(k))) - mean;
-                sum + deviation * deviation * norm
-            });
+            let variance = match job.focus {
+                Some(_) => job.colour_variance(index),
+                None => job.spread(mean, |k| composite(job.estimate(index, Some(k)))),
+            };
             let squared = (0..3)
                 .map(|c| {
                     let slope = self.slope(mean[c], variance[c].sqrt());

@@ -54,6 +54,11 @@ pub struct PathContext<'a, L> {
     pub start: PathStart,
     /// Interactions after which Russian roulette may end a path.
     pub roulette_depth: u32,
+    /// Surfaces count as at least this rough; 0 leaves them as they are.
+    pub min_roughness: f32,
+    /// The same, but only for light that reaches them from where the light is sampled: a small source is then met by
+    /// many paths, and shown blurred.
+    pub min_lit_roughness: f32,
 }
 
 impl<L> Clone for PathContext<'_, L> {
@@ -160,7 +165,7 @@ impl Gather for Vec3 {
 /// Dimension pairs per vertex: light, lobe, direction, roulette.
 const DIMENSIONS_PER_VERTEX: u32 = 4;
 
-/// Surfaces are at least this rough to paths that begin on the proxy. A light of half a degree that
+/// [`PathContext::min_roughness`] of paths that begin on the proxy. A light of half a degree that
 /// a polished surface throws onto the ground is found by one path in thousands, which leaves
 /// specks; blurred by a lobe whose peak is no more than a few times a diffuse surface's, the same
 /// energy arrives without them. Known as path regularisation [Kaplanyan and Dachsbacher 2013].
@@ -193,7 +198,33 @@ impl<L: PathLight> PathContext<'_, L> {
         counts: &mut RayCounts,
         gather: &mut G,
     ) -> f32 {
-        let ray = self.world.camera().ray(corner + sampler.next_2d());
+        let point = corner + sampler.next_2d();
+        self.trace_from_image::<F, G>(point, sampler, counts, gather)
+    }
+
+    /// One path through `point` of the image plane, in pixels; draws from the sampler's current
+    /// dimension on.
+    #[inline]
+    pub fn image_sample<const F: u32>(
+        &self,
+        point: Vec2,
+        sampler: &mut Sampler,
+        counts: &mut RayCounts,
+    ) -> PathSample {
+        let mut radiance = Vec3::ZERO;
+        let coverage = self.trace_from_image::<F, _>(point, sampler, counts, &mut radiance);
+        PathSample { radiance, coverage }
+    }
+
+    #[inline]
+    fn trace_from_image<const F: u32, G: Gather>(
+        &self,
+        point: Vec2,
+        sampler: &mut Sampler,
+        counts: &mut RayCounts,
+        gather: &mut G,
+    ) -> f32 {
+        let ray = self.world.camera().ray(point);
         let alpha_key = sampler.next_u64();
         counts.add(RayKind::Camera);
         self.trace::<F, G>(&ray, alpha_key, sampler, counts, gather)
@@ -269,10 +300,8 @@ impl<L: PathLight> PathContext<'_, L> {
                 world
                     .surfaces
                     .interact::<F>(ray.direction, hit.triangle, hit.u, hit.v);
-            if self.start != PathStart::Camera {
-                surface.roughness = surface.roughness.max(MIN_CAUSTIC_ROUGHNESS);
-                surface.coat.roughness = surface.coat.roughness.max(MIN_CAUSTIC_ROUGHNESS);
-            }
+            surface.roughness = surface.roughness.max(self.min_roughness);
+            surface.coat.roughness = surface.coat.roughness.max(self.min_roughness);
             let vertex = Vertex {
                 surfaces: &world.surfaces,
                 direction: ray.direction,
@@ -294,15 +323,22 @@ impl<L: PathLight> PathContext<'_, L> {
                 break;
             }
             let bsdf = Bsdf::<F>::new(&surface, -ray.direction);
+            let blurred = (self.min_lit_roughness > 0.0).then(|| {
+                let mut surface = surface;
+                surface.roughness = surface.roughness.max(self.min_lit_roughness);
+                surface.coat.roughness = surface.coat.roughness.max(self.min_lit_roughness);
+                Bsdf::<F>::new(&surface, -ray.direction)
+            });
+            let lit = blurred.as_ref().unwrap_or(&bsdf);
             sampler.set_dimension(first_dimension + depth * DIMENSIONS_PER_VERTEX);
             let light_numbers = sampler.next_2d();
             let lobe_number = sampler.next_1d();
             let direction_numbers = sampler.next_2d();
 
             // ---- Light sampling -------------------------------------------------------------
-            if !bsdf.is_delta() {
+            if !lit.is_delta() {
                 let light = self.light.sample(light_numbers);
-                let (value, bsdf_pdf) = bsdf.eval_pdf(light.direction);
+                let (value, bsdf_pdf) = lit.eval_pdf(light.direction);
                 // Both densities may underflow to 0: then there is no such sample.
                 let returns = value != Vec3::ZERO || G::DERIVATIVES;
                 if light.pdf > 0.0 && returns && light.radiance != Vec3::ZERO {
@@ -314,7 +350,7 @@ impl<L: PathLight> PathContext<'_, L> {
                     if known || !world.hides_light::<F>(&shadow, !alpha_key) {
                         let weight = balance_heuristic(light.pdf, bsdf_pdf) / light.pdf;
                         let arriving = throughput * value;
-                        gather.lit(&bsdf, &vertex, throughput, light.direction, value);
+                        gather.lit(lit, &vertex, throughput, light.direction, value);
                         match self.photo_beyond::<F>(&shadow, counts) {
                             Some(seen) => gather.photographed(arriving, seen, weight),
                             None => {
@@ -334,10 +370,10 @@ impl<L: PathLight> PathContext<'_, L> {
             if throughput.max_element() <= 0.0 {
                 break;
             }
-            sampled_pdf = if sample.delta {
-                f32::INFINITY
-            } else {
-                sample.pdf
+            sampled_pdf = match &blurred {
+                Some(blurred) => blurred.eval_pdf(sample.wi).1,
+                None if sample.delta => f32::INFINITY,
+                None => sample.pdf,
             };
             leaves = world.escapes && is_outward(&surface, sample.wi);
             ray = world.leave(&surface, sample.wi);

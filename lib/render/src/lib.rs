@@ -11,6 +11,7 @@ pub mod film;
 pub mod footprint;
 pub mod foreground;
 pub mod gbuffer;
+pub mod glints;
 pub mod light;
 pub mod material_gradient;
 pub mod photo;

@@ -219,6 +219,8 @@ impl Renderer<'_> {
             max_depth: simulation.max_depth,
             start: PathStart::Camera,
             roulette_depth: ROULETTE_DEPTH,
+            min_roughness: 0.0,
+            min_lit_roughness: 0.0,
         };
         let bvh = &self.geometry().bvh;
         let footprint = Footprint::new(self.camera(), bvh.bounds(), bvh.clusters());

@@ -217,6 +217,8 @@ fn the_gradient_of_a_whole_render_equals_differences_in_f64_along_the_same_paths
             max_depth: 4,
             start: PathStart::Camera,
             roulette_depth: 2,
+            min_roughness: 0.0,
+            min_lit_roughness: 0.0,
         };
         let settings = GradientSettings {
             seed: 3,

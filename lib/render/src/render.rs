@@ -21,6 +21,7 @@ use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
 use crate::film::{Film, Job, Layer, REPLICATES, Viewing};
 use crate::footprint::Footprint;
 use crate::foreground::{PathContext, PathStart};
+use crate::glints::{self, Found, Patience};
 use crate::light::{PathLight, SceneLight};
 use crate::photo::Photo;
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowSums};
@@ -60,6 +61,8 @@ pub struct Settings<'a> {
     pub occluders: Option<&'a Raster<f32>>,
     /// Share of a plane's light that may be blocked without being looked for.
     pub shadow_tolerance: f32,
+    /// Whether [`glints`] are looked for, which samples hardly meet; never where their number is given.
+    pub glints: bool,
 }
 
 impl Default for Settings<'_> {
@@ -73,6 +76,7 @@ impl Default for Settings<'_> {
             occluders: None,
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
+            glints: true,
         }
     }
 }
@@ -181,6 +185,8 @@ impl<'a> Renderer<'a> {
             max_depth: simulation.max_depth,
             start: PathStart::Camera,
             roulette_depth: ROULETTE_DEPTH,
+            min_roughness: 0.0,
+            min_lit_roughness: 0.0,
         };
         let plane = match &self.geometry.proxy {
             ProxyGeometry::Plane(plane) if simulation.shadow => light.on_plane(plane.normal),
@@ -212,19 +218,20 @@ impl<'a> Renderer<'a> {
                 Layer::Object => advance_object(&path, settings.seed, job, goal),
                 _ => advance_shadow(&shadow, settings.seed, job, goal),
             };
-            self.run(jobs, settings, start, &advance, progress)
+            self.run(jobs, settings, start, &path, &advance, progress)
         } else {
             let advance =
                 |job: &mut Job, goal: u32| advance_object(&path, settings.seed, job, goal);
-            self.run(jobs, settings, start, &advance, progress)
+            self.run(jobs, settings, start, &path, &advance, progress)
         }
     }
 
-    fn run(
+    fn run<L: PathLight>(
         &self,
-        mut jobs: Vec<Job>,
+        jobs: Vec<Job>,
         settings: &Settings,
         start: Instant,
+        path: &PathContext<L>,
         advance: &(impl Fn(&mut Job, u32) + Sync),
         progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
     ) -> Result<Rendered, RenderError> {
@@ -233,14 +240,27 @@ impl<'a> Renderer<'a> {
             background: settings.background,
             transfer: settings.transfer,
         };
+        let focus = |film: &Film, jobs: &[Job]| {
+            if !settings.glints || matches!(settings.stop, Stop::Samples(_)) {
+                return Found::default();
+            }
+            let objects = jobs.iter().filter(|job| job.layer == Layer::Object);
+            let pixels: Vec<_> = objects.flat_map(|job| job.pixels.iter().copied()).collect();
+            let patience = match settings.stop {
+                Stop::TimeBudget(budget) => Patience::Until(Instant::now() + budget / 10),
+                _ => Patience::Samples(jobs.iter().map(Job::samples_drawn).sum()),
+            };
+            glints::find(path, film, &viewing, &pixels, patience, settings.seed)
+        };
         let refined = refine(
             (width, height),
-            &mut jobs,
+            jobs,
             settings.stop,
             start,
             settings.max_samples,
             &viewing,
             advance,
+            &focus,
             progress,
         )?;
         let mut film = refined.film;
@@ -376,18 +396,29 @@ fn advance_object_with<L: PathLight, const F: u32>(
         let corner = Vec2::new(x as f32, y as f32);
         for replicate in 0..REPLICATES {
             let base = sequence(seed, Stream::FOREGROUND, replicate, (x, y));
-            let (mut radiance, mut coverage) = (Vec3::ZERO, 0.0);
+            let (mut radiance, mut coverage, mut weights) = (Vec3::ZERO, 0.0, 0.0);
+            let mut squares = Vec3::ZERO;
             for sample in job.samples..goal {
                 let mut sampler = base.with_sample(sample);
-                let s = path.camera_sample::<F>(corner, &mut sampler, &mut counts);
-                radiance += s.radiance;
-                coverage += s.coverage;
+                let place = sampler.next_2d();
+                let (place, weight) = match &job.focus {
+                    Some(focus) => focus.place(place),
+                    None => (place, 1.0),
+                };
+                let s = path.image_sample::<F>(corner + place, &mut sampler, &mut counts);
+                radiance += s.radiance * weight;
+                squares += s.radiance * s.radiance * (weight * weight);
+                coverage += s.coverage * weight;
+                weights += weight;
             }
             job.add(
                 index,
                 replicate,
-                &[radiance.x, radiance.y, radiance.z, coverage],
+                &[radiance.x, radiance.y, radiance.z, coverage, weights],
             );
+            if job.focus.is_some() {
+                job.add_squares(index, squares);
+            }
         }
     }
     job.counts = counts;

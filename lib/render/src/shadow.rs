@@ -22,7 +22,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::blocker::{Blocker, Cone};
 use crate::counters::{RayCounts, RayKind};
-use crate::foreground::{Gather, PathContext, PathStart};
+use crate::foreground::{Gather, MIN_CAUSTIC_ROUGHNESS, PathContext, PathStart};
 use crate::light::PathLight;
 use crate::world::{ProxyGeometry, ProxyPoint};
 
@@ -381,6 +381,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                 emission: sent.emission,
             },
             photo: None,
+            min_roughness: MIN_CAUSTIC_ROUGHNESS,
             ..self.path
         };
         let alpha_key = hash_u64s(&[sampler.next_u64(), 1]);

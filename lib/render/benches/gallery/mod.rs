@@ -1,4 +1,4 @@
-//! Ten kinds of scene that benches render.
+//! Kinds of scene that benches render.
 use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_render::shapes::{append, icosphere, quad, torus_knot};
 use dipir_scene::camera::Camera;
@@ -55,27 +55,59 @@ fn matte(grey: f32) -> Material {
     }
 }
 
-/// Name and scene, ten kinds; square pictures of `size` pixels a side.
-pub fn scenes(size: u32) -> Vec<(&'static str, Scene)> {
-    let scene = |mesh, material, proxy| Scene {
+fn scene(size: u32, mesh: TriangleMesh, material: Material, proxy: Proxy) -> Scene {
+    Scene {
         mesh,
         materials: vec![material],
         textures: Vec::new(),
         camera: camera(size),
         proxy,
+    }
+}
+
+/// A coat of varnish.
+fn coat(factor: f32, roughness: f32) -> Option<Clearcoat> {
+    Some(Clearcoat {
+        factor,
+        factor_texture: None,
+        roughness,
+        roughness_texture: None,
+        normal_texture: None,
+    })
+}
+
+fn gold(roughness: f32) -> Material {
+    Material {
+        base_color: Vec4::new(0.9, 0.6, 0.2, 1.0),
+        metallic: 1.0,
+        roughness,
+        ..Material::default()
+    }
+}
+
+/// Name and scene, two more kinds, in which a sun is mirrored in places much smaller than a pixel.
+#[allow(dead_code, reason = "not every bench renders them")]
+pub fn glinting(size: u32) -> Vec<(&'static str, Scene)> {
+    let lacquer = Material {
+        clearcoat: coat(1.0, 0.03),
+        ..matte(0.3)
     };
+    let scene = |material| scene(size, knot(), material, ground());
+    vec![
+        ("polished metal", scene(gold(0.05))),
+        ("lacquer", scene(lacquer)),
+    ]
+}
+
+/// Name and scene, ten kinds; square pictures of `size` pixels a side.
+pub fn scenes(size: u32) -> Vec<(&'static str, Scene)> {
+    let scene = |mesh, material, proxy| scene(size, mesh, material, proxy);
     let mut coloured = ball();
     coloured.colors = coloured
         .normals
         .iter()
         .map(|n| n.abs().extend(1.0))
         .collect();
-    let metal = Material {
-        base_color: Vec4::new(0.9, 0.6, 0.2, 1.0),
-        metallic: 1.0,
-        roughness: 0.3,
-        ..Material::default()
-    };
     let emitter = Material {
         emissive: Vec3::new(0.5, 0.3, 0.1),
         ..matte(0.5)
@@ -96,13 +128,7 @@ pub fn scenes(size: u32) -> Vec<(&'static str, Scene)> {
     };
     let faint = Material {
         emissive: Vec3::splat(1e-3),
-        clearcoat: Some(Clearcoat {
-            factor: 0.01,
-            factor_texture: None,
-            roughness: 0.1,
-            roughness_texture: None,
-            normal_texture: None,
-        }),
+        clearcoat: coat(0.01, 0.1),
         ..matte(0.2)
     };
     let sheet = quad(Vec3::new(-0.5, 0.2, 0.0), Vec3::X, Vec3::Y);
@@ -116,7 +142,7 @@ pub fn scenes(size: u32) -> Vec<(&'static str, Scene)> {
     vec![
         ("matte, convex", scene(ball(), matte(0.6), ground())),
         ("matte, concave", scene(knot(), matte(0.8), ground())),
-        ("metal", scene(knot(), metal, ground())),
+        ("metal", scene(knot(), gold(0.3), ground())),
         ("coloured", scene(coloured, matte(0.9), ground())),
         ("emitter", scene(ball(), emitter, ground())),
         ("half-transparent", scene(sheet, veil, ground())),

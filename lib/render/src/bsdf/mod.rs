@@ -126,6 +126,9 @@ pub struct Bsdf<const F: u32> {
     chances: [f32; TECHNIQUES.len()],
 }
 
+/// Share of the paths through a surface that others reflected by it are at least, whatever light it reflects.
+const LEAST_REFLECTED: f32 = 0.25;
+
 impl<const F: u32> Bsdf<F> {
     /// Prepares what depends on the unit vector `wo` alone. `wo` lies on the side of
     /// `surface.geometric_normal`.
@@ -147,6 +150,11 @@ impl<const F: u32> Bsdf<F> {
         let grey = |c: Vec3| c.element_sum() * (1.0 / 3.0);
         // A black metal seen from above reflects nothing there, but something elsewhere.
         let least = if has(F, SPECULAR) { 1e-3 } else { 0.0 };
+        // The little that glass reflects may be a sun, seen by way of a second reflection: few paths would look for it.
+        let least = match grey(a.specular) > 0.0 {
+            true => f32::max(least, LEAST_REFLECTED * grey(a.transmitted)),
+            false => least,
+        };
         let mut chances = [
             grey(a.diffuse) * below,
             grey(a.specular).max(least) * below,

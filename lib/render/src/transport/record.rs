@@ -305,6 +305,8 @@ impl Transport {
             max_depth: simulation.max_depth,
             start: PathStart::Camera,
             roulette_depth: ROULETTE_DEPTH,
+            min_roughness: 0.0,
+            min_lit_roughness: 0.0,
         };
         let geometry = &world.geometry;
         let plane: Vec<UnitOnPlane> = match &geometry.proxy {
