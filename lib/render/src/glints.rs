@@ -44,6 +44,9 @@ const PATHS_PER_CELL: u32 = 4;
 /// Paths of all scans of a pixel.
 const PATHS_PER_SCAN: u64 =
     ((SIDES[0] * SIDES[0] + 2 * LOOKED_INTO as u32 * PARTS) * PATHS_PER_CELL) as u64;
+/// Of so many pixels all are looked at that are smooth enough; of more only those whose first surface may mirror a
+/// source.
+const MOST_INDIRECT: usize = 4096;
 /// So many pixels may be scanned, however few samples the picture has taken.
 const LEAST_SCANS: usize = 32;
 /// Share of the samples of a pixel in focus that are spread evenly; each scan directs as many of the others.
@@ -150,7 +153,7 @@ pub struct Found {
 /// How long is looked for glints.
 #[derive(Clone, Copy, Debug)]
 pub enum Patience {
-    /// For a quarter as many paths as the picture has taken samples, and at least some.
+    /// For a sixteenth as many paths as the picture has taken samples, and at least some.
     Samples(u64),
     /// Until then.
     Until(Instant),
@@ -160,7 +163,7 @@ impl Patience {
     /// How many pixels may be scanned.
     fn scans(self) -> usize {
         match self {
-            Self::Samples(n) => LEAST_SCANS.max((n / 4 / PATHS_PER_SCAN) as usize),
+            Self::Samples(n) => LEAST_SCANS.max((n / 16 / PATHS_PER_SCAN) as usize),
             Self::Until(_) => usize::MAX,
         }
     }
@@ -179,6 +182,8 @@ struct Suspect {
     pixel: (u32, u32),
     /// Spread of the normals in the pixel, radians.
     spread: f32,
+    /// Whether a bright source may be mirrored by the first surface that is met.
+    is_direct: bool,
     /// How far the display value is from that with rougher surfaces.
     difference: f32,
     counts: RayCounts,
@@ -194,44 +199,66 @@ pub fn find<L: PathLight>(
     patience: Patience,
     seed: u64,
 ) -> Found {
-    if !has_bright_source(path.light, seed) {
+    let sources = bright_sources(path.light, seed);
+    if sources.is_empty() {
         return Found::default();
     }
-    with_features!(path.world.mask, F => find_with::<_, F>(path, film, viewing, pixels, patience, seed))
+    with_features!(path.world.mask, F => {
+        let mut suspects = suspects::<_, F>(path, &sources, pixels, seed);
+        if suspects.len() > MOST_INDIRECT {
+            suspects.retain(|s| s.is_direct);
+        }
+        look_into::<_, F>(path, film, viewing, suspects, patience, seed)
+    })
 }
 
-fn find_with<L: PathLight, const F: u32>(
+/// The sequence of `pixel`.
+fn sequence(seed: u64, (x, y): (u32, u32)) -> Sampler {
+    Sampler::new(seed, Stream::GLINTS, (y << 16) | (x & 0xffff), 0)
+}
+
+/// Pixels in which a surface is smoother than it is curved.
+fn suspects<L: PathLight, const F: u32>(
+    path: &PathContext<L>,
+    sources: &[Vec3],
+    pixels: &[(u32, u32)],
+    seed: u64,
+) -> Vec<Suspect> {
+    let suspects = pixels.par_iter().filter_map(|&pixel| {
+        let mut counts = RayCounts::default();
+        let sampler = sequence(seed, pixel);
+        let (spread, is_direct) =
+            spread_of_normals::<_, F>(path, sources, pixel, &sampler, &mut counts)?;
+        Some(Suspect {
+            pixel,
+            spread,
+            is_direct,
+            difference: 0.0,
+            counts,
+        })
+    });
+    suspects.collect()
+}
+
+/// Scans those of `suspects` that rougher surfaces confirm.
+fn look_into<L: PathLight, const F: u32>(
     path: &PathContext<L>,
     film: &Film,
     viewing: &Viewing,
-    pixels: &[(u32, u32)],
+    mut suspects: Vec<Suspect>,
     patience: Patience,
     seed: u64,
 ) -> Found {
-    let sampler = |(x, y)| Sampler::new(seed, Stream::GLINTS, (y << 16) | (x & 0xffff), 0);
     let ask = |suspect: &mut Suspect, paths| {
         if patience.is_over(0.0) {
             suspect.difference = 0.0;
             return;
         }
         let rougher = path.at_least_as_rough_as(MOLLIFIED * suspect.spread);
-        let sampler = sampler(suspect.pixel);
+        let sampler = sequence(seed, suspect.pixel);
         let found = rougher.mean::<F>(suspect.pixel, paths, &sampler, &mut suspect.counts);
         suspect.difference = noticed(film, viewing, suspect.pixel, found);
     };
-    let mut suspects: Vec<Suspect> = pixels
-        .par_iter()
-        .filter_map(|&pixel| {
-            let mut counts = RayCounts::default();
-            let spread = spread_of_normals::<_, F>(path, pixel, &sampler(pixel), &mut counts)?;
-            Some(Suspect {
-                pixel,
-                spread,
-                difference: 0.0,
-                counts,
-            })
-        })
-        .collect();
     let mut counts = RayCounts::default();
     let (clock, asked) = (Instant::now(), suspects.len());
     for paths in PATHS_PER_PIXEL {
@@ -253,7 +280,7 @@ fn find_with<L: PathLight, const F: u32>(
         if patience.is_over(scan_s) {
             return None;
         }
-        let focus = path.scan::<F>(s.pixel, s.spread, &sampler(s.pixel), &mut s.counts);
+        let focus = path.scan::<F>(s.pixel, s.spread, &sequence(seed, s.pixel), &mut s.counts);
         Some((s.pixel, focus))
     });
     let pixels = found.collect();
@@ -261,29 +288,32 @@ fn find_with<L: PathLight, const F: u32>(
     Found { pixels, counts }
 }
 
-/// Whether a source outshines the rest of the light by [`BRIGHT`].
-fn has_bright_source(light: &impl PathLight, seed: u64) -> bool {
-    let (mut brightest, mut rest) = (0f32, 0.0);
+/// Directions of sources that outshine the rest of the light by [`BRIGHT`].
+fn bright_sources(light: &impl PathLight, seed: u64) -> Vec<Vec3> {
+    let (mut drawn, mut rest) = (Vec::new(), 0.0);
     let n = 64;
     for sample in 0..n {
         let mut sampler = Sampler::new(seed, Stream::GLINTS, u32::MAX, sample);
-        let drawn = light.sample(sampler.next_2d());
-        if drawn.pdf > 0.0 {
-            brightest = brightest.max(luminance(drawn.radiance));
+        let source = light.sample(sampler.next_2d());
+        if source.pdf > 0.0 {
+            drawn.push((source.direction, luminance(source.radiance)));
         }
         let direction = dipir_numerics::warp::square_to_sphere(sampler.next_2d());
         rest += luminance(light.eval_with_pdf(direction).0) / n as f32;
     }
-    brightest > BRIGHT * rest
+    let bright = drawn.iter().filter(|d| d.1 > BRIGHT * rest);
+    bright.map(|d| d.0).collect()
 }
 
-/// How far normals in `pixel` lie from their mean, radians; `None` where no surface is smoother than that.
+/// How far normals in `pixel` lie from their mean, radians, and whether they may mirror one of `sources`; `None` where no
+/// surface is smoother than that.
 fn spread_of_normals<L: PathLight, const F: u32>(
     path: &PathContext<L>,
+    sources: &[Vec3],
     (x, y): (u32, u32),
     sampler: &Sampler,
     counts: &mut RayCounts,
-) -> Option<f32> {
+) -> Option<(f32, bool)> {
     let world = path.world;
     let corner = Vec2::new(x as f32, y as f32);
     let (mut normals, mut smoothest) = (Vec::with_capacity(RAYS_PER_PIXEL as usize), 1f32);
@@ -308,7 +338,13 @@ fn spread_of_normals<L: PathLight, const F: u32>(
     let spread = normals
         .iter()
         .fold(0f32, |s, n| s.max(n.angle_between(mean)));
-    (smoothest < MOLLIFIED * spread).then_some(spread)
+    let view = -world.camera().ray(corner + 0.5).direction;
+    // Corners lie farther out than the normals that were met.
+    let mirrors = |source: &Vec3| {
+        let half = (view + *source).try_normalize();
+        half.is_some_and(|half| half.angle_between(mean) < 2.0 * spread)
+    };
+    (smoothest < MOLLIFIED * spread).then(|| (spread, sources.iter().any(mirrors)))
 }
 
 impl<L: PathLight> PathContext<'_, L> {
