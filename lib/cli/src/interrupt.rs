@@ -12,7 +12,7 @@ use std::time::Duration;
 use crate::exit::INTERRUPTED;
 
 static ASKED: AtomicBool = AtomicBool::new(false);
-/// Whether somebody waits for this process who says so himself when it is stopped.
+/// Whether another process waits for this one, and tells the user when it is stopped.
 static SUPERVISED: AtomicBool = AtomicBool::new(false);
 
 /// The user asked to stop.

@@ -9,8 +9,7 @@
 //!
 //! Both pictures share their random numbers, so an effect that changes nothing measures exactly
 //! zero; and the squared difference is the product of two independently seeded differences, so that
-//! noise does not count as contribution. Few samples tell of most effects that are needed, as they
-//! contribute much more than the tolerance; that one is not takes more, for what happens seldom does not show.
+//! noise does not count as contribution.
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 
@@ -410,8 +409,7 @@ fn leave_out<L: SceneLight>(
     // ---- What each effect contributes, alone ------------------------------------------------
     let mut measured: Vec<(Effect, Difference)> = Vec::new();
     for &effect in &open {
-        let without = everything.without(effect).simulation();
-        let difference = pilot.difference(&reference, &without, |d| d.is_above(plan.tolerance))?;
+        let difference = pilot.difference(&reference, &everything.without(effect).simulation())?;
         if let Some(e) = plan.effects.iter_mut().find(|e| e.name == effect) {
             e.contribution = Some(difference.rmse);
             e.contribution_se = Some(difference.std_error);
@@ -458,8 +456,7 @@ fn leave_out<L: SceneLight>(
             let depth = (least + most) / 2;
             let mut shallow = everything.clone();
             shallow.max_depth = depth;
-            let difference =
-                pilot.difference(&reference, &shallow.simulation(), |d| d.is_above(tolerance))?;
+            let difference = pilot.difference(&reference, &shallow.simulation())?;
             step()?;
             if spent + difference.upper_95() <= tolerance {
                 most = depth;
@@ -472,9 +469,7 @@ fn leave_out<L: SceneLight>(
     if let Some(depth) = config.max_depth {
         plan.max_depth = depth;
     }
-    let planned = plan.simulation();
-    let left_out = pilot.difference(&reference, &planned, |_| false)?;
-    plan.left_out = Some(left_out.rmse);
+    plan.left_out = Some(pilot.difference(&reference, &plan.simulation())?.rmse);
     Ok(())
 }
 

@@ -398,4 +398,31 @@ mod tests {
         *film.alpha.get_mut(2, 2) = 0.001;
         assert!(viewing.is_touched(&film, 2, 2));
     }
+
+    #[test]
+    fn pixels_that_are_not_given_up_keep_their_samples() {
+        let block = Block {
+            x: 2,
+            y: 3,
+            width: 3,
+            height: 1,
+        };
+        let pixels = vec![(2, 3), (3, 3), (4, 3)];
+        let channels = Layer::Object.channels();
+        let mut job = Job::new(Layer::Object, block, pixels, None);
+        for index in 0..3 {
+            for replicate in 0..REPLICATES {
+                let first = (100 * index + 10 * replicate) as f32;
+                let values: Vec<f32> = (0..channels).map(|c| first + c as f32).collect();
+                job.add(index, replicate, &values);
+            }
+        }
+        let before = job.clone();
+        job.give_up(|pixel| pixel == (3, 3));
+        assert_eq!(job.pixels, [(2, 3), (4, 3)]);
+        for replicate in 0..REPLICATES {
+            assert_eq!(job.sums(0, replicate), before.sums(0, replicate));
+            assert_eq!(job.sums(1, replicate), before.sums(2, replicate));
+        }
+    }
 }

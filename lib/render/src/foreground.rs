@@ -183,9 +183,7 @@ impl<L: PathLight> PathContext<'_, L> {
         sampler: &mut Sampler,
         counts: &mut RayCounts,
     ) -> PathSample {
-        let mut radiance = Vec3::ZERO;
-        let coverage = self.camera_trace::<F, _>(corner, sampler, counts, &mut radiance);
-        PathSample { radiance, coverage }
+        self.image_sample::<F>(corner + sampler.next_2d(), sampler, counts)
     }
 
     /// Like [`camera_sample`](Self::camera_sample), with the light going to `gather`; returns the

@@ -2,8 +2,8 @@
 //!
 //! A sample meets such an image with a chance of one in hundreds or thousands. Until one does, neither the
 //! picture nor its estimated error knows of it, and a sun in the lacquer of a small or distant car
-//! is lost. What finds it is the same pixel rendered with surfaces as rough as they are curved within it:
-//! the same light arrives, spread over the whole pixel [path mollification as in path space
+//! is lost. What finds it is the same pixel lit as if surfaces were nearly as rough as they are curved within it:
+//! the same light arrives, spread over a good part of the pixel [path mollification as in path space
 //! regularization, Kaplanyan and Dachsbacher 2013]. Where that is brighter or darker than what was sampled, the
 //! pixel's square is scanned in the same way, cell by cell and then the brightest cells part by part, and from then
 //! on sampled more where the scans are bright ([`Focus`]). The picture itself is made of samples of the true surfaces alone,
@@ -14,7 +14,8 @@ use std::time::{Duration, Instant};
 use dipir_imaging::composite::composite_pixel;
 use dipir_light::luminance::luminance;
 use dipir_numerics::sampler::{Sampler, Stream};
-use glam::{Vec2, Vec3};
+use dipir_numerics::warp::square_to_sphere;
+use glam::{UVec2, Vec2, Vec3};
 use rayon::prelude::*;
 
 use crate::counters::{RayCounts, RayKind};
@@ -51,6 +52,10 @@ const MOST_INDIRECT: usize = 4096;
 const LEAST_SCANS: usize = 32;
 /// Share of the samples of a pixel in focus that are spread evenly; each scan directs as many of the others.
 const EVEN: f32 = 0.5;
+/// The largest number below 1.
+const BELOW_1: f32 = 1.0 - f32::EPSILON / 2.0;
+/// The farthest place in a cell that is still told from the next one: eight bits number the cells of a row.
+const WITHIN_CELL: f32 = 1.0 - f32::EPSILON * 128.0;
 
 /// Where in a pixel its samples go: a density on the unit square, a mixture of an even one and of one for each scan,
 /// constant on its cells.
@@ -97,19 +102,20 @@ impl Scan {
     }
 
     fn place(&self, u: Vec2) -> Vec2 {
-        let last = self.cells.len() - 1;
-        let index = self.cumulative.partition_point(|&c| c <= u.x).min(last);
+        // Below 1, the last of the sums, so that the cell has a share.
+        let number = u.x.min(BELOW_1);
+        let index = self.cumulative.partition_point(|&c| c <= number);
         let before = self.cumulative[index] - self.share(index);
-        let within = ((u.x - before) / self.share(index)).clamp(0.0, 1.0);
+        let within = Vec2::new((number - before) / self.share(index), u.y);
         let corner = corner_of(self.cells[index], self.side);
         // Rounding must not leave the cell, whose density is that of the sample.
-        (corner + Vec2::new(within, u.y).min(Vec2::splat(0.999_999))) / self.side as f32
+        (corner + within.clamp(Vec2::ZERO, Vec2::splat(WITHIN_CELL))) / self.side as f32
     }
 
     fn density(&self, point: Vec2) -> f32 {
         let at = (point * self.side as f32)
             .as_uvec2()
-            .min(glam::UVec2::splat(self.side - 1));
+            .min(UVec2::splat(self.side - 1));
         match self.cells.binary_search(&(at.y * self.side + at.x)) {
             Ok(index) => self.share(index) * (self.side * self.side) as f32,
             Err(_) => 0.0,
@@ -298,7 +304,7 @@ fn bright_sources(light: &impl PathLight, seed: u64) -> Vec<Vec3> {
         if source.pdf > 0.0 {
             drawn.push((source.direction, luminance(source.radiance)));
         }
-        let direction = dipir_numerics::warp::square_to_sphere(sampler.next_2d());
+        let direction = square_to_sphere(sampler.next_2d());
         rest += luminance(light.eval_with_pdf(direction).0) / n as f32;
     }
     let bright = drawn.iter().filter(|d| d.1 > BRIGHT * rest);

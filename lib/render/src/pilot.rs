@@ -1,5 +1,4 @@
 //! Small renders that tell what an effect is worth.
-use std::cell::OnceCell;
 use std::ops::ControlFlow;
 
 use dipir_imaging::composite::composite_pixel;
@@ -25,9 +24,8 @@ use crate::world::ProxyGeometry;
 const OBJECT_PIXELS: f32 = 1024.0;
 /// Most pixels of a pilot render.
 const MAX_PIXELS: f32 = 16384.0;
-/// Samples per pixel of each of the two pictures: few, which mostly tell, and many where they do not.
-const FEW: u32 = 4;
-const MANY: u32 = 16;
+/// Samples per pixel of each of the two pictures.
+const SAMPLES: u32 = 16;
 
 /// A scene at low resolution, under one light.
 pub struct Pilot<'a, L: SceneLight> {
@@ -39,16 +37,8 @@ pub struct Pilot<'a, L: SceneLight> {
     occluders: Option<Raster<f32>>,
 }
 
-/// The pictures that others are compared with.
-pub struct Reference {
-    simulation: Simulation,
-    few: Pictures,
-    /// Rendered when they are first asked for.
-    many: OnceCell<Pictures>,
-}
-
 /// Two pictures with independent seeds.
-struct Pictures {
+pub struct Pictures {
     composites: [Raster<Vec3>; 2],
     touched: Vec<bool>,
     cost: f64,
@@ -71,11 +61,6 @@ impl Difference {
     /// One-sided 95% confidence bound of the RMSE.
     pub fn upper_95(&self) -> f64 {
         (self.mean_square.0.max(0.0) + 1.645 * self.mean_square.1).sqrt()
-    }
-
-    /// Whether the RMSE is larger than `value` by three standard errors.
-    pub fn is_above(&self, value: f64) -> bool {
-        self.mean_square.0 - 3.0 * self.mean_square.1 > value * value
     }
 }
 
@@ -119,20 +104,19 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
         }
     }
 
-    /// One picture of `simulation`, of few samples.
+    /// One picture of `simulation`.
     pub fn render(&self, simulation: &Simulation) -> Result<Rendered, RenderError> {
-        self.render_seeded(simulation, FEW, 0)
+        self.render_seeded(simulation, 0)
     }
 
     fn render_seeded(
         &self,
         simulation: &Simulation,
-        samples: u32,
         picture: u64,
     ) -> Result<Rendered, RenderError> {
         let settings = Settings {
             seed: hash_u64s(&[self.seed, u64::from(Stream::PILOT.0), picture]),
-            stop: Stop::Samples(samples),
+            stop: Stop::Samples(SAMPLES),
             background: self.background.as_ref(),
             transfer: self.transfer,
             occluders: self.occluders.as_ref(),
@@ -144,28 +128,12 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
             })
     }
 
-    fn render_twice(
-        &self,
-        simulation: &Simulation,
-        samples: u32,
-    ) -> Result<[Rendered; 2], RenderError> {
-        Ok([
-            self.render_seeded(simulation, samples, 0)?,
-            self.render_seeded(simulation, samples, 1)?,
-        ])
-    }
-
-    /// What `simulation` looks like, for others to be compared with.
-    pub fn reference(&self, simulation: &Simulation) -> Result<Reference, RenderError> {
-        Ok(Reference {
-            simulation: *simulation,
-            few: self.pictures(simulation, FEW)?,
-            many: OnceCell::new(),
-        })
-    }
-
-    fn pictures(&self, simulation: &Simulation, samples: u32) -> Result<Pictures, RenderError> {
-        let rendered = self.render_twice(simulation, samples)?;
+    /// The pictures that others are compared with.
+    pub fn reference(&self, simulation: &Simulation) -> Result<Pictures, RenderError> {
+        let rendered = [
+            self.render_seeded(simulation, 0)?,
+            self.render_seeded(simulation, 1)?,
+        ];
         let viewing = Viewing {
             background: self.background.as_ref(),
             transfer: self.transfer,
@@ -184,36 +152,16 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
         })
     }
 
-    /// How much the picture changes if `simulation` replaces the reference's: of few samples if what they say is
-    /// `enough`, of many otherwise.
+    /// How much the picture changes if `simulation` replaces the reference's.
     pub fn difference(
         &self,
-        reference: &Reference,
-        simulation: &Simulation,
-        enough: impl Fn(&Difference) -> bool,
-    ) -> Result<Difference, RenderError> {
-        let rendered = self.render_twice(simulation, FEW)?;
-        let few = self.compare(&reference.few, rendered, simulation);
-        if enough(&few) {
-            return Ok(few);
-        }
-        if reference.many.get().is_none() {
-            let many = self.pictures(&reference.simulation, MANY)?;
-            reference.many.get_or_init(|| many);
-        }
-        let rendered = self.render_twice(simulation, MANY)?;
-        Ok(match reference.many.get() {
-            Some(many) => self.compare(many, rendered, simulation),
-            None => few,
-        })
-    }
-
-    fn compare(
-        &self,
         reference: &Pictures,
-        rendered: [Rendered; 2],
         simulation: &Simulation,
-    ) -> Difference {
+    ) -> Result<Difference, RenderError> {
+        let rendered = [
+            self.render_seeded(simulation, 0)?,
+            self.render_seeded(simulation, 1)?,
+        ];
         let cost = cost(&rendered, simulation);
         let composites = rendered.map(|r| self.display(&r));
         let mut squares = Running::default();
@@ -238,13 +186,13 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
             }
         };
         let rmse = mean.max(0.0).sqrt();
-        Difference {
+        Ok(Difference {
             rmse,
             // d sqrt(m) = dm / (2 sqrt(m)), but no more than the root of the error itself.
             std_error: (se / (2.0 * rmse).max(se.sqrt())).max(0.0),
             mean_square: (mean, se),
             cost_share: (1.0 - cost / reference.cost.max(1.0)).clamp(0.0, 1.0),
-        }
+        })
     }
 
     /// The composite in display values.

@@ -199,9 +199,7 @@ fn assert_plan_keeps_the_picture(scene: &Scene, settings: &Settings) -> EffectsP
     let all = EffectsPlan::everything(scene, settings).simulation();
     let reference = pilot.reference(&all).expect("renders");
     let planned = p.simulation();
-    let difference = pilot
-        .difference(&reference, &planned, |_| false)
-        .expect("renders");
+    let difference = pilot.difference(&reference, &planned).expect("renders");
     // The measurement itself is uncertain by its standard error.
     let allowed = p.tolerance + 2.0 * difference.std_error;
     assert!(difference.rmse <= allowed, "{difference:?} {p:?}");

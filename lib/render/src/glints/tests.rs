@@ -2,7 +2,6 @@ use dipir_light::environment::EnvironmentSampler;
 use dipir_scene::material::Material;
 use dipir_scene::proxy::Proxy;
 use dipir_scene::scene::Scene;
-use glam::UVec2;
 use proptest::prelude::*;
 
 use super::*;
@@ -17,10 +16,10 @@ const FOV_DEG: f32 = 2.0;
 const RADIUS: f32 = 0.5;
 
 /// A mirror ball far away, of some 70 pixels.
-fn mirror_ball() -> Scene {
+fn mirror_ball(roughness: f32) -> Scene {
     let mirror = Material {
         metallic: 1.0,
-        roughness: 0.02,
+        roughness,
         ..matte(Vec3::ONE)
     };
     let view = camera(Vec3::Z * DISTANCE, Vec3::ZERO, FOV_DEG, PIXELS);
@@ -35,13 +34,14 @@ fn small_sun() -> (EnvironmentSampler, f32) {
     (EnvironmentSampler::new(map), irradiance)
 }
 
-fn sampled(glints: bool, seed: u64) -> Rendered {
+fn sampled(roughness: f32, glints: bool, seed: u64) -> Rendered {
     let settings = Settings {
         stop: Stop::TargetError(0.005),
         glints,
         ..settings(0, seed)
     };
-    render(&mirror_ball(), &small_sun().0, &everything(1), &settings)
+    let ball = mirror_ball(roughness);
+    render(&ball, &small_sun().0, &everything(1), &settings)
 }
 
 /// Radiance over all pixels times their solid angle, on whom the picture shines.
@@ -56,15 +56,25 @@ fn a_mirror_ball_throws_a_quarter_of_what_it_catches_at_every_distant_eye() {
     // A ball mirrors a distant light into all directions alike: I = E R^2 / 4. A smoothed ball of 41k
     // triangles does so within a few percent, a camera at 80 radii within two.
     let expected = small_sun().1 * RADIUS * RADIUS / 4.0 / (DISTANCE * DISTANCE);
-    for seed in 0..3 {
-        let with = sampled(true, seed);
+    for (roughness, seed) in [
+        (0.02, 0),
+        (0.02, 1),
+        (0.02, 2),
+        (0.0, 0),
+        (0.0, 1),
+        (0.0, 2),
+    ] {
+        let with = sampled(roughness, true, seed);
         let share = received(&with) / expected;
-        assert!((0.9..1.1).contains(&share), "{share} with seed {seed}");
+        assert!(
+            (0.9..1.1).contains(&share),
+            "{share}: roughness {roughness}, seed {seed}"
+        );
         assert!(with.error.upper_95 <= 0.005);
     }
     // It is small: without looking for it, it is missed, and nobody is told.
     let missed = (0..3).filter(|&seed| {
-        let without = sampled(false, seed);
+        let without = sampled(0.02, false, seed);
         received(&without) < 0.5 * expected && without.error.upper_95 <= 0.005
     });
     assert!(missed.count() > 0);
@@ -74,7 +84,7 @@ fn a_mirror_ball_throws_a_quarter_of_what_it_catches_at_every_distant_eye() {
 fn what_is_found_does_not_depend_on_threads() {
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-        pool.expect("a pool").install(|| sampled(true, 7))
+        pool.expect("a pool").install(|| sampled(0.02, true, 7))
     };
     let (one, two) = (with(1), with(2));
     assert_eq!(one.film.object, two.film.object);
@@ -92,14 +102,32 @@ fn under_an_even_sky_and_on_matte_surfaces_nothing_is_looked_for() {
             .counts
             .total()
     };
-    let ball = mirror_ball();
+    let ball = mirror_ball(0.02);
     assert_eq!(rays(&ball, &sky(1.0), true), rays(&ball, &sky(1.0), false));
-    let mut dull = mirror_ball();
+    let mut dull = mirror_ball(0.02);
     dull.materials[0] = matte(Vec3::ONE);
     let (sun, _) = small_sun();
     // But for the rays that see that it is matte.
     let seen = u64::from(PIXELS * PIXELS * RAYS_PER_PIXEL);
     assert!(rays(&dull, &sun, true) <= rays(&dull, &sun, false) + seen);
+}
+
+#[test]
+fn without_time_nothing_is_looked_into() {
+    let with = |glints| {
+        let settings = Settings {
+            stop: Stop::TimeBudget(Duration::ZERO),
+            glints,
+            ..settings(0, 1)
+        };
+        let ball = mirror_ball(0.02);
+        render(&ball, &small_sun().0, &everything(1), &settings)
+    };
+    let (looking, blind) = (with(true), with(false));
+    assert_eq!(looking.film.object, blind.film.object);
+    // But for the rays that see that it is polished.
+    let seen = u64::from(PIXELS * PIXELS * RAYS_PER_PIXEL);
+    assert!(looking.counts.total() <= blind.counts.total() + seen);
 }
 
 /// Scans whose shares are given by cell and response.
@@ -123,8 +151,9 @@ proptest! {
     ) {
         let (a, b, c) = responses;
         let focus = focus_of(vec![a, b, c]);
-        // Of a quarter of the square and of all of it; weights are at most 2.
-        let (n, mut quarter, mut whole) = (1 << 12, 0.0, 0.0);
+        // Of a quarter of the square and of all of it. Weights are at most 2, so a sum of n independent ones has
+        // a standard deviation of 1 / sqrt(n) at most, .008; these are stratified.
+        let (n, mut quarter, mut whole) = (1 << 14, 0.0, 0.0);
         for sample in 0..n {
             let u = Sampler::new(3, Stream::TEST, 0, sample).next_2d();
             let (point, weight) = focus.place(u);
@@ -138,6 +167,31 @@ proptest! {
         prop_assert!((whole - 1.0).abs() < 0.03, "{whole}");
         prop_assert!((quarter - 0.25).abs() < 0.03, "{quarter}");
     }
+}
+
+#[test]
+fn places_stay_in_cells_that_have_a_share_however_numbers_are_rounded() {
+    let (side, last) = (SIDES[2], SIDES[2] * SIDES[2] - 1);
+    // The second response is lost in the sum of the first.
+    let scan = Scan::new(side, vec![(7, 1e6), (last - 1, 1e-6), (last, 1.0)]).expect("responses");
+    for x in [
+        0.0,
+        0.5,
+        scan.cumulative[0],
+        scan.cumulative[1],
+        BELOW_1,
+        1.0,
+    ] {
+        for y in [0.0, 0.5, BELOW_1, 1.0] {
+            let point = scan.place(Vec2::new(x, y));
+            assert!(scan.density(point) > 0.0, "{x} {y}: {point}");
+        }
+    }
+    // The last of several scans takes what is rounded up to its end.
+    let focus = focus_of(vec![vec![(0, 1.0)], vec![(1, 1.0)], vec![(last, 1.0)]]);
+    let (point, weight) = focus.place(Vec2::new(BELOW_1, BELOW_1));
+    assert!(point.min_element() > 1.0 - 1.0 / side as f32, "{point}");
+    assert!(weight < 1e-4, "{weight}");
 }
 
 #[test]
