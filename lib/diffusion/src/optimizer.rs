@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Tensor, Var};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result, argument};
@@ -106,7 +107,7 @@ impl AdamW {
         &mut self,
         gradients: &BTreeMap<String, Tensor>,
         max_norm: f64,
-        learning_rate: impl Fn(&str) -> f64,
+        learning_rate: impl Fn(&str) -> f64 + Sync,
     ) -> Result<f64> {
         if let Some(name) = self.slots.keys().find(|n| !gradients.contains_key(*n)) {
             return Err(Error::Gradient {
@@ -129,7 +130,7 @@ impl AdamW {
         } = self.config;
         let correction1 = 1.0 - beta1.powf(self.steps as f64);
         let correction2 = 1.0 - beta2.powf(self.steps as f64);
-        for (name, slot) in &mut self.slots {
+        self.slots.par_iter_mut().try_for_each(|(name, slot)| {
             let rate = learning_rate(name);
             let gradient = (gradients[name].detach() * scale)?;
             slot.first = ((&slot.first * beta1)? + (&gradient * (1.0 - beta1))?)?;
@@ -137,8 +138,8 @@ impl AdamW {
             let spread = ((&slot.second / correction2)?.sqrt()? + eps)?;
             let update = ((&slot.first / correction1)? / spread)?;
             let kept = (slot.variable.as_detached_tensor() * (1.0 - rate * weight_decay))?;
-            slot.variable.set(&(kept - (update * rate)?)?)?;
-        }
+            Ok::<_, Error>(slot.variable.set(&(kept - (update * rate)?)?)?)
+        })?;
         Ok(norm)
     }
 
@@ -188,13 +189,17 @@ impl AdamW {
 /// Euclidean norm of all gradients together, summed in f64; an error names
 /// the first that is not finite.
 pub fn gradient_norm(gradients: &BTreeMap<String, Tensor>) -> Result<f64> {
+    let squares = |gradient: &Tensor| -> Result<f64> {
+        let gradient = gradient.to_dtype(DType::F64)?;
+        Ok(gradient.sqr()?.sum_all()?.to_scalar::<f64>()?)
+    };
+    let squares: Vec<(&String, Result<f64>)> = gradients
+        .par_iter()
+        .map(|(name, gradient)| (name, squares(gradient)))
+        .collect();
     let mut total = 0f64;
-    for (name, gradient) in gradients {
-        let squares = gradient
-            .to_dtype(DType::F64)?
-            .sqr()?
-            .sum_all()?
-            .to_scalar::<f64>()?;
+    for (name, squares) in squares {
+        let squares = squares?;
         if !squares.is_finite() {
             return Err(Error::Gradient {
                 name: name.clone(),

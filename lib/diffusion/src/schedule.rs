@@ -205,6 +205,18 @@ impl NoiseSchedule {
         self.per_item(x0, noise, timesteps, |signal, sigma| (signal, sigma))
     }
 
+    /// The noise by which `x0` becomes `noisy` at each item's timestep: the inverse of [`Self::add_noise_each`].
+    pub fn noise_between_each(
+        &self,
+        x0: &Tensor,
+        noisy: &Tensor,
+        timesteps: &[usize],
+    ) -> Result<Tensor> {
+        self.per_item(x0, noisy, timesteps, |signal, sigma| {
+            (-signal / sigma, 1.0 / sigma)
+        })
+    }
+
     /// What the network should predict for these samples and this noise.
     pub fn target(&self, x0: &Tensor, noise: &Tensor, timesteps: &[usize]) -> Result<Tensor> {
         match self.config.prediction_type {

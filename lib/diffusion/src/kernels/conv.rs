@@ -70,38 +70,53 @@ impl ConvShape {
 /// Unfolds the inputs of output rows `first..first + rows` of one image into
 /// [depth, rows * out_width].
 fn unfold(shape: ConvShape, image: &[f32], first: usize, rows: usize, columns: &mut [f32]) {
-    let (out_width, kernel) = (shape.out_width(), shape.kernel);
+    let kernel = shape.kernel;
     for (row, target) in columns
-        .chunks_exact_mut(rows * out_width)
+        .chunks_exact_mut(rows * shape.out_width())
         .enumerate()
         .take(shape.depth())
     {
-        let (channel, ky, kx) = (row / (kernel * kernel), row / kernel % kernel, row % kernel);
+        let (channel, tap) = (
+            row / (kernel * kernel),
+            (row / kernel % kernel, row % kernel),
+        );
         let plane = &image[channel * shape.height * shape.width..][..shape.height * shape.width];
-        for (i, target) in target.chunks_exact_mut(out_width).enumerate() {
-            let y = ((first + i) * shape.stride + ky).wrapping_sub(shape.pad_before);
-            if y >= shape.height {
-                target.fill(0.0);
-                continue;
+        unfold_tap(shape, plane, first, tap, target);
+    }
+}
+
+/// What tap (row, column) of the kernel meets in one channel, for output rows from `first`.
+fn unfold_tap(
+    shape: ConvShape,
+    plane: &[f32],
+    first: usize,
+    (ky, kx): (usize, usize),
+    target: &mut [f32],
+) {
+    let out_width = shape.out_width();
+    for (i, target) in target.chunks_exact_mut(out_width).enumerate() {
+        let y = ((first + i) * shape.stride + ky).wrapping_sub(shape.pad_before);
+        if y >= shape.height {
+            target.fill(0.0);
+            continue;
+        }
+        let source = &plane[y * shape.width..][..shape.width];
+        if shape.stride == 1 {
+            // x = column + kx - pad_before must lie in 0..width.
+            let start = shape.pad_before.saturating_sub(kx).min(out_width);
+            let end = (shape.width + shape.pad_before)
+                .saturating_sub(kx)
+                .clamp(start, out_width);
+            target[..start].fill(0.0);
+            target[end..].fill(0.0);
+            if end > start {
+                target[start..end]
+                    .copy_from_slice(&source[start + kx - shape.pad_before..][..end - start]);
             }
-            let source = &plane[y * shape.width..][..shape.width];
-            if shape.stride == 1 {
-                // x = column + kx - pad_before must lie in 0..width.
-                let start = shape.pad_before.saturating_sub(kx).min(out_width);
-                let end = (shape.width + shape.pad_before)
-                    .saturating_sub(kx)
-                    .clamp(start, out_width);
-                target[..start].fill(0.0);
-                target[end..].fill(0.0);
-                if end > start {
-                    target[start..end]
-                        .copy_from_slice(&source[start + kx - shape.pad_before..][..end - start]);
-                }
-            } else {
-                for (j, value) in target.iter_mut().enumerate() {
-                    let x = (j * shape.stride + kx).wrapping_sub(shape.pad_before);
-                    *value = if x < shape.width { source[x] } else { 0.0 };
-                }
+        } else {
+            for (j, value) in target.iter_mut().enumerate() {
+                let x = (j * shape.stride + kx).wrapping_sub(shape.pad_before);
+                *value = if x < shape.width { source[x] } else { 0.0 };
             }
         }
     }
@@ -308,46 +323,86 @@ fn fold_product(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f32> {
 }
 
 /// Gradient of [`conv2d`] with respect to w.
+///
+/// Images of few pixels are worked on together, so that the sums over pixels are long, and the result is
+/// made transposed, [depth, outputs]: the unfolded pixels are then read as they lie, and only the smaller `g` is
+/// turned.
 pub(crate) fn conv2d_vjp_weight(shape: ConvShape, g: &[f32], x: &[f32]) -> Vec<f32> {
-    let (pixels, depth) = (shape.out_pixels(), shape.depth());
+    let (pixels, depth, outputs) = (shape.out_pixels(), shape.depth(), shape.outputs);
     let image_len = shape.inputs * shape.height * shape.width;
     let (block_rows, out_width) = (shape.block_rows(), shape.out_width());
-    let mut dw = vec![0.0; shape.outputs * depth];
-    let mut columns = vec![0f32; depth * block_rows * out_width];
+    // A group is one block of one image, or several whole images.
+    let together = (BLOCK_PIXELS / pixels.max(1)).clamp(1, shape.batch.max(1));
+    let width = block_rows * out_width * together;
+    let mut columns = vec![0f32; depth * width];
+    let mut gathered = vec![0f32; outputs * width];
+    let mut turned = vec![0.0; depth * outputs];
     let mut keep = 0.0;
-    for item in 0..shape.batch {
-        let image = &x[item * image_len..][..image_len];
+    for item in (0..shape.batch).step_by(together) {
+        let images = together.min(shape.batch - item);
         for first in (0..shape.out_height()).step_by(block_rows) {
             let rows = block_rows.min(shape.out_height() - first);
-            let count = rows * out_width;
-            let unfolded = if shape.is_pointwise() {
-                View {
-                    data: &image[first * out_width..],
-                    row: pixels,
-                    column: 1,
-                }
+            let (each, count) = (rows * out_width, rows * out_width * images);
+            let columns = &mut columns[..depth * count];
+            unfold_images(shape, &x[item * image_len..], first, rows, images, columns);
+            let offset = item * outputs * pixels + first * out_width;
+            let g = if images == 1 {
+                View::rows(&g[offset..], pixels)
             } else {
-                unfold_parallel(shape, image, first, rows, &mut columns[..depth * count]);
-                View::rows(&columns[..depth * count], count)
-            };
-            let offset = item * shape.outputs * pixels + first * out_width;
-            let g = View {
-                data: &g[offset..],
-                row: pixels,
-                column: 1,
+                let gathered = &mut gathered[..outputs * count];
+                for (output, target) in gathered.chunks_exact_mut(count).enumerate() {
+                    for (image, target) in target.chunks_exact_mut(each).enumerate() {
+                        let start = offset + (image * outputs + output) * pixels;
+                        target.copy_from_slice(&g[start..start + each]);
+                    }
+                }
+                View::rows(gathered, count)
             };
             product(
-                (shape.outputs, depth, count),
-                &mut dw,
+                (depth, outputs, count),
+                &mut turned,
                 keep,
-                g,
-                unfolded.transposed(),
+                View::rows(columns, count),
+                g.transposed(),
                 Threads::All,
             );
             keep = 1.0;
         }
     }
+    let mut dw = vec![0.0; outputs * depth];
+    for (output, dw) in dw.chunks_exact_mut(depth.max(1)).enumerate() {
+        let column = turned.iter().skip(output).step_by(outputs);
+        dw.iter_mut().zip(column).for_each(|(d, &t)| *d = t);
+    }
     dw
+}
+
+/// Unfolds output rows `first..first + rows` of `images` images into [depth, images * rows * out_width], with the
+/// channels shared among threads.
+fn unfold_images(
+    shape: ConvShape,
+    x: &[f32],
+    first: usize,
+    rows: usize,
+    images: usize,
+    columns: &mut [f32],
+) {
+    let plane = shape.height * shape.width;
+    let taps = shape.kernel * shape.kernel;
+    let each = rows * shape.out_width();
+    columns
+        .par_chunks_mut(taps * images * each)
+        .with_min_len(8)
+        .enumerate()
+        .for_each(|(channel, columns)| {
+            for (tap, target) in columns.chunks_exact_mut(images * each).enumerate() {
+                let tap = (tap / shape.kernel, tap % shape.kernel);
+                for (image, target) in target.chunks_exact_mut(each).enumerate() {
+                    let start = (image * shape.inputs + channel) * plane;
+                    unfold_tap(shape, &x[start..start + plane], first, tap, target);
+                }
+            }
+        });
 }
 
 /// [`unfold`] with the channels shared among threads.

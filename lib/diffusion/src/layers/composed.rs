@@ -85,19 +85,23 @@ fn convolutions_agree() {
         (3, 2, Padding::After(1), (0, 1)),
         (1, 1, Padding::Same(0), (0, 0)),
     ] {
-        let inputs = [
-            normal(4, &[2, 5, 8, 6]),
-            normal(5, &[6, 5, kernel, kernel]),
-            normal(6, &[6]),
-        ];
-        let layer =
-            |t: &[Tensor]| Conv2d::from_tensors(t[1].clone(), t[2].clone(), stride, padding);
-        assert_agree(
-            &format!("convolution {kernel} stride {stride} {padding:?}"),
-            &inputs,
-            &|t| layer(t)?.forward(&t[0]),
-            &|t| layer(t)?.forward_composed(&t[0], ends.0, ends.1),
-        );
+        // Gradients of weights take several small images together: of 24, 48 and 12 pixels, 13 are some groups
+        // and a smaller one.
+        for batch in [2, 13] {
+            let inputs = [
+                normal(4, &[batch, 5, 8, 6]),
+                normal(5, &[6, 5, kernel, kernel]),
+                normal(6, &[6]),
+            ];
+            let layer =
+                |t: &[Tensor]| Conv2d::from_tensors(t[1].clone(), t[2].clone(), stride, padding);
+            assert_agree(
+                &format!("convolution {kernel} stride {stride} {padding:?} batch {batch}"),
+                &inputs,
+                &|t| layer(t)?.forward(&t[0]),
+                &|t| layer(t)?.forward_composed(&t[0], ends.0, ends.1),
+            );
+        }
     }
 }
 
