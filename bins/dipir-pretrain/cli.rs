@@ -75,6 +75,15 @@ pub struct Train {
     /// Weight of the surprise at the right light among three wrong ones, 1 at chance; 0: not asked
     #[arg(long, default_value_t = TrainerSettings::default().contrast)]
     pub contrast: f64,
+    /// Share of examples that are seen under another light than is said, and asked for under the one that is
+    #[arg(long, default_value_t = Recipe::default().relit)]
+    pub relit: f64,
+    /// Learning rate after the warm-up
+    #[arg(long, default_value_t = TrainerSettings::default().learning_rate)]
+    pub learning_rate: f64,
+    /// Model folder whose weights a new run starts from
+    #[arg(long, value_name = "MODEL")]
+    pub from: Option<PathBuf>,
     /// Updates between checkpoints
     #[arg(long, default_value_t = 200)]
     pub checkpoint_every: usize,
@@ -99,6 +108,9 @@ pub struct Gates {
     /// Held-out scenes
     #[arg(long, default_value_t = 100)]
     pub scenes: usize,
+    /// Number of the first; those of the card are 0 to 99, so choose others to tune on
+    #[arg(long, default_value_t = 0)]
+    pub first: u64,
     /// Draws of noise at each timestep
     #[arg(long, default_value_t = 4)]
     pub draws: usize,

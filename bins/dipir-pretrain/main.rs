@@ -35,7 +35,8 @@ use serde_json::json;
 fn main() -> ExitCode {
     exit::run(|| {
         let cli = Cli::parse();
-        interrupt::listen()?;
+        // All commands look every few seconds, and training has weights to save.
+        interrupt::listen_patiently()?;
         match &cli.command {
             Command::Train(args) => train(args, &cli.output),
             Command::Encoder(args) => train_encoder(args, &cli.output),
@@ -75,6 +76,7 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     for (name, share) in [
         ("light-words", args.light_words),
         ("background", args.background),
+        ("relit", args.relit),
     ] {
         if !(0.0..=1.0).contains(&share) {
             return Err(Usage(format!("--{name} {share}: accepted are 0 to 1")).into());
@@ -84,17 +86,25 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
         let message = format!("--contrast {}: accepted are 0 and more", args.contrast);
         return Err(Usage(message).into());
     }
+    if !(args.learning_rate > 0.0 && args.learning_rate.is_finite()) {
+        let message = format!(
+            "--learning-rate {}: accepted are numbers above 0",
+            args.learning_rate
+        );
+        return Err(Usage(message).into());
+    }
     let data = scenes(&args.data, args.seed, output)?;
     let settings = TrainerSettings {
         samples: args.samples,
         batch: args.batch,
         seed: args.seed,
         contrast: args.contrast,
-        ..TrainerSettings::default()
+        learning_rate: args.learning_rate,
     };
     let recipe = Recipe {
         light_words: args.light_words,
         background: args.background,
+        relit: args.relit,
         ..Recipe::default()
     };
     let blueprint = Blueprint::default();
@@ -104,6 +114,8 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     let checkpoint = args.data.cache.join("checkpoint.safetensors");
     if checkpoint.is_file() {
         trainer.resume(&checkpoint)?;
+    } else if let Some(from) = &args.from {
+        trainer.start_from(from)?;
     }
     let resumed_at = trainer.seen();
     let progress = Progress::new("training", output.quiet);
@@ -206,7 +218,7 @@ fn measure(args: &Gates, output: &OutputArgs) -> anyhow::Result<()> {
     }
     let model = load(&args.model)?;
     let progress = std::sync::Mutex::new(Progress::new("gates", output.quiet));
-    let found = gates::measure(&model, args.scenes, args.draws, &|done| {
+    let found = gates::measure(&model, args.first, args.scenes, args.draws, &|done| {
         if let Ok(progress) = progress.lock() {
             progress.set(done as f64 / args.scenes as f64);
         }
@@ -214,38 +226,44 @@ fn measure(args: &Gates, output: &OutputArgs) -> anyhow::Result<()> {
     })?;
     drop(progress);
     interrupt::check()?;
-    let percent = |share: f64| format!("{:.1}%", 100.0 * share);
     output.result(
         || {
-            format!(
-                "{} held-out scenes, {} draws of noise at each of {} timesteps\n\
-                 {:<52} {:>7}  {:>7}\n\
-                 {:<52} {:>7}  {:>7}\n\
-                 {:<52} {:>7}  {:>7}\n\
-                 {:<52} {:>7}  {:>7}\n\
-                 {:<52} {:>7}  {:>7}\n\
-                 {:<52} {:>7}",
-                found.scenes,
-                args.draws,
-                dipir_prior::energy::SHARES.len(),
-                "gate",
-                "found",
-                "wanted",
-                "LDS 25 degrees off points back to the true azimuth",
-                percent(found.gradient_sign),
-                "97%",
-                "true light preferred to its mirror image",
-                percent(found.over_mirror),
-                "98%",
-                "true light preferred to one 45 degrees off",
-                percent(found.over_45),
-                "90%",
-                "best azimuth from the true one, median, degrees",
-                format!("{:.1}", found.azimuth_median),
-                "10",
-                "best azimuth within 30 degrees of the true one",
-                percent(found.within_30),
-            )
+            let percent = |share: f64| format!("{:.1}%", 100.0 * share);
+            let degrees = |angle: f64| format!("{angle:.1}");
+            let mut columns = vec![("found", &found)];
+            columns.extend(found.by_shape.iter().map(|(k, v)| (k.as_str(), v)));
+            let names: String = columns.iter().map(|c| format!(" {:>8}", c.0)).collect();
+            let row = |what: &str, wanted: &str, of: &dyn Fn(&gates::Gates) -> String| {
+                let values = columns.iter().map(|c| format!(" {:>8}", of(c.1)));
+                format!("\n{what:<51}{wanted:>7}{}", values.collect::<String>())
+            };
+            [
+                format!(
+                    "{} held-out scenes, {} draws of noise at each of {} timesteps\n{:<51}{:>7}{names}",
+                    found.scenes,
+                    args.draws,
+                    dipir_prior::energy::SHARES.len(),
+                    "gate",
+                    "wanted"
+                ),
+                row("scenes", "", &|g| g.scenes.to_string()),
+                row("LDS 25 degrees off points back to the true azimuth", "97%", &|g| {
+                    percent(g.gradient_sign)
+                }),
+                row("true light preferred to its mirror image", "98%", &|g| {
+                    percent(g.over_mirror)
+                }),
+                row("true light preferred to one 45 degrees off", "90%", &|g| {
+                    percent(g.over_45)
+                }),
+                row("best azimuth from the true one, median, degrees", "10", &|g| {
+                    degrees(g.azimuth_median)
+                }),
+                row("best azimuth within 30 degrees of the true one", "", &|g| {
+                    percent(g.within_30)
+                }),
+            ]
+            .concat()
         },
         || json!(found),
     );

@@ -25,6 +25,12 @@ pub const SCALING: f64 = 2.0;
 /// Tokens of a caption, both markers included.
 pub const LENGTH: usize = 20;
 
+/// Prefixes of the names of variables, and the file of the model folder in which these lie without them.
+pub const WEIGHT_FILES: [(&str, &str); 2] = [
+    ("unet.", "unet/diffusion_pytorch_model.safetensors"),
+    ("text.", "text_encoder/model.safetensors"),
+];
+
 /// Widths of the networks.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Blueprint {
@@ -150,10 +156,7 @@ impl Blueprint {
 
     /// Writes weights named as in training, "unet." and "text." first, in f16.
     pub fn write_weights(&self, folder: &Path, weights: &BTreeMap<String, Tensor>) -> Result<()> {
-        for (prefix, file) in [
-            ("unet.", "unet/diffusion_pytorch_model.safetensors"),
-            ("text.", "text_encoder/model.safetensors"),
-        ] {
+        for (prefix, file) in WEIGHT_FILES {
             let part = weights
                 .iter()
                 .filter_map(|(name, t)| name.strip_prefix(prefix).map(|n| (n.to_owned(), t)))

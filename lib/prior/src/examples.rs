@@ -16,6 +16,10 @@ use crate::words::{Caption, LightWords};
 /// Pixels on a side of an example.
 pub const SIZE: usize = 32;
 const PIXELS: usize = SIZE * SIZE;
+/// Of examples that are seen under another light than is said, those whose place lies in neither light or in the one
+/// that is seen; and, above this, whole pictures, where light is read: all of it is seen under the other light.
+const FOREIGN_RELIT: f64 = 0.45;
+const WHOLE_RELIT: f64 = 0.65;
 
 /// A picture [3, SIZE, SIZE], linear or in [0, 1].
 pub type Picture = Vec<f32>;
@@ -190,6 +194,8 @@ impl Tone {
 pub struct Example {
     /// The picture in [0, 1].
     pub image: Picture,
+    /// What noise is put on where it is not the picture: the same under another light than is said.
+    pub seen: Option<Picture>,
     /// What is shown around the mask, in [0, 1].
     pub shown: Picture,
     /// 1 where the model may paint, [SIZE, SIZE].
@@ -214,6 +220,8 @@ pub struct Recipe {
     pub foreign_light: f64,
     /// Captions with a wrong light beside each right one.
     pub rivals: usize,
+    /// Examples that are seen under another light than is said, and asked for under the one that is.
+    pub relit: f64,
 }
 
 impl Default for Recipe {
@@ -223,6 +231,7 @@ impl Default for Recipe {
             background: 0.85,
             foreign_light: 0.5,
             rivals: 0,
+            relit: 0.0,
         }
     }
 }
@@ -235,6 +244,7 @@ impl Recipe {
             light_words: 1.0,
             background: self.background.min(0.7),
             rivals,
+            relit: 0.0,
             ..*self
         }
     }
@@ -296,25 +306,41 @@ impl Example {
         let window = Window::draw(stream);
         let (class, color) = (scene.class, scene.color);
         let lens = Lens::new(scene, window);
-        let place = Light::draw(lens.suns(), stream);
+        let mut place = Light::draw(lens.suns(), stream);
+        let relit = recipe.relit > 0.0 && stream.uniform() < recipe.relit;
         let kind = stream.uniform();
-        let foreign = kind < recipe.foreign_light;
+        let (foreign, whole) = match relit {
+            true => (kind < FOREIGN_RELIT, kind > WHOLE_RELIT),
+            false => (kind < recipe.foreign_light, kind > 0.8),
+        };
         let light = if foreign {
             Light::draw(lens.suns(), stream)
         } else {
             place
         };
-        let mut image = if kind > 0.8 {
-            lens.layer(Layer::Whole, &light)
-        } else {
-            lens.composite(&place, &light)
-        };
+        let other = relit.then(|| other_light(&light, lens.suns(), stream));
+        if let Some(other) = other
+            && foreign
+            && kind > 0.4 * FOREIGN_RELIT
+        {
+            // What is seen looks as if it belonged there, and yet is not what is said.
+            place = other;
+        }
         let tone = Tone::draw(stream);
-        tone.apply(&mut image);
+        let picture = |light: &Light| {
+            let mut image = match whole {
+                true => lens.layer(Layer::Whole, light),
+                false => lens.composite(&place, light),
+            };
+            tone.apply(&mut image);
+            image
+        };
+        let image = picture(&light);
+        let seen = other.map(|other| picture(&other));
         let coverage = lens.coverage();
         let hard: Vec<f32> = coverage.iter().map(|&c| f32::from(c > 0.02)).collect();
         let view = stream.uniform();
-        let (mask, shown) = if view >= recipe.background {
+        let (mask, shown) = if view >= recipe.background || (relit && whole) {
             (vec![1.0; PIXELS], image.clone())
         } else if view < 0.25 * recipe.background && !foreign {
             // As in inpainting: the picture itself around a box.
@@ -326,7 +352,7 @@ impl Example {
             (dilate(&hard, stream.below(2)), clean)
         };
         let weight = dilate(&hard, 5).iter().map(|m| 0.15 + m).collect();
-        let named = foreign || stream.uniform() < recipe.light_words;
+        let named = relit || foreign || stream.uniform() < recipe.light_words;
         let said = stream.uniform();
         let class = match said {
             x if x < 0.25 => "object".to_owned(),
@@ -350,6 +376,7 @@ impl Example {
         };
         Self {
             image,
+            seen,
             shown,
             mask,
             weight,
@@ -357,6 +384,23 @@ impl Example {
             rivals,
         }
     }
+}
+
+/// A light that `light` might be taken for: its sun elsewhere, half of the time next to where it is, and one time in
+/// eight the sky another one, too.
+fn other_light(light: &Light, suns: &[Sun], stream: &mut NoiseStream) -> Light {
+    let (near, step) = (stream.uniform() < 0.5, stream.below(suns.len() - 1));
+    let step = match near {
+        // Suns are numbered around the sky.
+        true => [1, suns.len() - 1][step % 2],
+        false => step + 1,
+    };
+    let sun = (light.sun + step) % suns.len();
+    if stream.uniform() < 0.875 && light.share > 0.0 {
+        return light.turned_to(sun, suns);
+    }
+    let other = Light::draw(suns, stream);
+    other.scaled(light.irradiance(suns) / other.irradiance(suns))
 }
 
 /// The difference of two angles, radians in [0, pi].
@@ -367,3 +411,57 @@ pub fn angle_between(a: f32, b: f32) -> f32 {
 
 /// Number of suns that every scene has.
 pub const LIGHTS: usize = SUNS;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::record::Record;
+    use crate::studio::{Kinds, Stage, View};
+
+    #[test]
+    fn what_is_seen_under_another_light_differs_where_the_object_and_its_shadow_are() {
+        let stage = Stage::draw(3, 1, RECORD_SIZE as u32, Kinds::Trained, View::Close);
+        let record = Record::trace(&stage, 3, 1);
+        let planes: Vec<f16> = record.planes.iter().map(|&v| f16::from_f32(v)).collect();
+        let scene = SceneView {
+            planes: &planes,
+            class: "box",
+            color: "white",
+            suns: stage.suns.clone(),
+        };
+        let recipe = Recipe {
+            relit: 1.0,
+            ..Recipe::default()
+        };
+        let (mut elsewhere, mut whole) = (0, 0);
+        for index in 0..60 {
+            let window = Window::draw(&mut NoiseStream::new(4, index));
+            let mut stream = NoiseStream::new(4, index);
+            let example = Example::draw(scene.clone(), &recipe, &mut stream);
+            let seen = example.seen.expect("another light");
+            assert!(example.caption.is_some());
+            let differs = |i: usize| {
+                (0..3).any(|c| (example.image[c * PIXELS + i] - seen[c * PIXELS + i]).abs() > 0.02)
+            };
+            assert!((0..PIXELS).any(differs), "{index}");
+            // Where neither the suns of this scene are shaded nor much of the sky.
+            let lens = Lens::new(scene.clone(), window);
+            let coverage = lens.coverage();
+            let mut free: Vec<bool> = coverage.iter().map(|c| *c == 0.0).collect();
+            for plane in 0..SHADOW {
+                let mut shade = vec![0.0; PIXELS];
+                lens.add(9 * BASIS + plane, 1.0, &mut shade);
+                free.iter_mut().zip(shade).for_each(|(f, s)| *f &= s > 0.97);
+            }
+            let changed = (0..PIXELS).filter(|&i| free[i] && differs(i)).count();
+            // Of whole pictures everything is lit anew, and nothing is shown around the object.
+            if changed > 0 {
+                whole += 1;
+                assert!(example.mask.iter().all(|m| *m == 1.0), "{index}");
+            } else {
+                elsewhere += 1;
+            }
+        }
+        assert!(whole > 4 && elsewhere > 30, "{whole} {elsewhere}");
+    }
+}

@@ -1,6 +1,7 @@
 //! What the model must be able to tell before it is trusted to guide,
 //! measured on scenes and solids that training never showed.
 
+use std::collections::BTreeMap;
 use std::f32::consts::{FRAC_PI_4, PI, TAU};
 use std::ops::ControlFlow;
 
@@ -17,6 +18,7 @@ use crate::error::Result;
 use crate::examples::{Example, Lens, Tone, Window, angle_between, dilate};
 use crate::lights::{Light, Sun};
 use crate::record::{Layer, Record};
+use crate::shapes::Shape;
 use crate::student::latents_of;
 use crate::studio::{Kinds, Stage, View};
 use crate::words::{Caption, LightWords};
@@ -44,12 +46,15 @@ pub struct Gates {
     pub azimuth_median: f64,
     /// Share of best azimuths within 30 degrees.
     pub within_30: f64,
+    /// The same for each solid that is inserted, by its name.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub by_shape: BTreeMap<String, Gates>,
 }
 
 /// A scene recorded for a true sun and others around it.
 pub struct Trial {
     planes: Vec<f16>,
-    class: &'static str,
+    shape: Shape,
     suns: Vec<Sun>,
     light: Light,
 }
@@ -83,7 +88,7 @@ impl Trial {
         let light = Light::new(0, sun.elevation, (total, share), tints, 1.0);
         Self {
             planes: record.planes.iter().map(|&v| f16::from_f32(v)).collect(),
-            class: stage.shape.word(),
+            shape: stage.shape,
             suns: stage.suns,
             light,
         }
@@ -92,7 +97,7 @@ impl Trial {
     fn lens(&self, window: Window) -> Lens<'_> {
         let scene = SceneView {
             planes: &self.planes,
-            class: self.class,
+            class: self.shape.word(),
             color: "white",
             suns: self.suns.clone(),
         };
@@ -127,11 +132,12 @@ impl Trial {
     /// The caption that names the sun at `azimuth`, for a picture seen through `window`.
     fn caption(&self, azimuth: f32, window: Window) -> Option<Caption> {
         let words = window.words(self.words(azimuth));
-        Some(Caption::new(self.class, Some(&words)))
+        Some(Caption::new(self.shape.word(), Some(&words)))
     }
 }
 
 struct Answer {
+    shape: Shape,
     signs: [bool; 2],
     mirror: bool,
     beside: [bool; 2],
@@ -160,7 +166,7 @@ fn ask(model: &Model, index: u64, draws: usize) -> Result<Answer> {
         let (_, observation) = trial.observe(0, &tone, window)?;
         let found = energies(model, &observation, &asked, &SHARES, &mut stream)?;
         e.iter_mut().zip(found).for_each(|(e, f)| *e += f);
-        let contexts = guiding(model, trial.class, &window.words(trial.words(truth)))?;
+        let contexts = guiding(model, trial.shape.word(), &window.words(trial.words(truth)))?;
         for (against, (near, far)) in against.iter_mut().zip([(1, 2), (3, 4)]) {
             let (image, observation) = trial.observe(near, &tone, window)?;
             let (further, _) = trial.observe(far, &tone, window)?;
@@ -171,6 +177,7 @@ fn ask(model: &Model, index: u64, draws: usize) -> Result<Answer> {
     }
     let best = minimum_around(&e[..AZIMUTHS]);
     Ok(Answer {
+        shape: trial.shape,
         signs: against.map(|a| a > 0.0),
         mirror: e[0] < e[AZIMUTHS],
         beside: [e[0] < e[AZIMUTHS + 1], e[0] < e[AZIMUTHS + 2]],
@@ -209,16 +216,17 @@ pub fn minimum_angle(values: &[f64]) -> f32 {
         .unwrap_or(0.0) as f32
 }
 
-/// Measures the gates on `scenes` scenes with `draws` of noise at each
+/// Measures the gates on `scenes` scenes from number `first` on with `draws` of noise at each
 /// timestep, every other of them seen in the mirror. `progress` is told how many are done and may stop.
 pub fn measure(
     model: &Model,
+    first: u64,
     scenes: usize,
     draws: usize,
     progress: &(dyn Fn(usize) -> ControlFlow<()> + Sync),
 ) -> Result<Gates> {
     let done = std::sync::atomic::AtomicUsize::new(0);
-    let answers: Vec<Answer> = (0..scenes as u64)
+    let answers: Vec<Answer> = (first..first + scenes as u64)
         .into_par_iter()
         .map(|i| {
             let answer = ask(model, i, draws)?;
@@ -229,22 +237,37 @@ pub fn measure(
         .into_iter()
         .flatten()
         .collect();
+    let mut by_shape: BTreeMap<String, Vec<&Answer>> = BTreeMap::new();
+    for answer in &answers {
+        let name = format!("{:?}", answer.shape).to_lowercase();
+        by_shape.entry(name).or_default().push(answer);
+    }
+    let by_shape = by_shape.into_iter().map(|(k, v)| (k, summary(&v)));
+    Ok(Gates {
+        by_shape: by_shape.collect(),
+        ..summary(&answers.iter().collect::<Vec<_>>())
+    })
+}
+
+/// Shares and medians of some answers.
+fn summary(answers: &[&Answer]) -> Gates {
     let share = |count: usize, of: usize| count as f64 / of.max(1) as f64;
     let n = answers.len();
     let mut errors: Vec<f64> = answers.iter().map(|a| a.azimuth_error).collect();
     errors.sort_by(f64::total_cmp);
     let both = |pair: fn(&Answer) -> [bool; 2]| {
-        let right = answers.iter().flat_map(pair).filter(|r| *r).count();
+        let right = answers.iter().flat_map(|a| pair(a)).filter(|r| *r).count();
         share(right, 2 * n)
     };
-    Ok(Gates {
+    Gates {
         scenes: n,
         gradient_sign: both(|a| a.signs),
         over_mirror: share(answers.iter().filter(|a| a.mirror).count(), n),
         over_45: both(|a| a.beside),
         azimuth_median: errors.get(n / 2).copied().unwrap_or(f64::NAN),
         within_30: share(errors.iter().filter(|e| **e <= 30.0).count(), n),
-    })
+        by_shape: BTreeMap::new(),
+    }
 }
 
 /// An example as it would be trained on, for pictures of the data.

@@ -93,6 +93,34 @@ impl Light {
         Self::new(sun, elevation, (total, share), tints, range(0.6, 1.5))
     }
 
+    /// The same light with its sun at another of `suns`: tints, sky and irradiance of the ground stay.
+    pub fn turned_to(&self, sun: usize, suns: &[Sun]) -> Self {
+        let height = |sun: usize| suns[sun].elevation.sin().max(0.1);
+        Self {
+            sun,
+            sun_color: self.sun_color * (height(self.sun) / height(sun)),
+            ..*self
+        }
+    }
+
+    /// Irradiance of the ground.
+    pub fn irradiance(&self, suns: &[Sun]) -> Vec3 {
+        // Of radiance h (1 - y) + z y: pi (h / 3 + 2 z / 3).
+        let sky = std::f32::consts::PI * (self.horizon / 3.0 + self.zenith * (2.0 / 3.0));
+        self.sun_color * suns[self.sun].elevation.sin() + sky
+    }
+
+    /// The same light, each colour by its factor as bright.
+    pub fn scaled(&self, factors: Vec3) -> Self {
+        Self {
+            sun_color: self.sun_color * factors,
+            horizon: self.horizon * factors,
+            zenith: self.zenith * factors,
+            bounce: self.bounce * factors,
+            ..*self
+        }
+    }
+
     /// What a caption says about it.
     pub fn words(&self, suns: &[Sun]) -> LightWords {
         let sun = suns[self.sun];
@@ -140,10 +168,27 @@ mod tests {
     #[test]
     fn irradiance_of_the_ground_is_what_was_asked_for() {
         let light = Light::new(0, 0.6, (2.0, 0.7), (0.3, 0.4), 1.1);
-        let sky = std::f32::consts::PI * (light.horizon / 3.0 + 2.0 * light.zenith / 3.0);
-        let ground = light.sun_color * 0.6f32.sin() + sky;
+        let suns = [Sun {
+            azimuth: 0.0,
+            elevation: 0.6,
+            sharpness: 200.0,
+        }];
+        let ground = light.irradiance(&suns);
         assert!((ground.element_sum() / 3.0 - 2.0).abs() < 1e-4);
+        let brighter = light.scaled(Vec3::new(1.0, 2.0, 3.0)).irradiance(&suns);
+        assert!((brighter - ground * Vec3::new(1.0, 2.0, 3.0)).length() < 1e-5);
         let sun = light.sun_color.element_sum() / 3.0 * 0.6f32.sin();
         assert!((sun / 2.0 - 0.7).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_sun_that_moves_leaves_the_ground_as_bright() {
+        let suns = draw_suns(8, &mut NoiseStream::new(1, 1));
+        let light = Light::new(2, suns[2].elevation, (2.0, 0.7), (0.3, 0.4), 1.1);
+        let expected = Light::new(5, suns[5].elevation, (2.0, 0.7), (0.3, 0.4), 1.1);
+        let moved = light.turned_to(5, &suns);
+        assert_eq!((moved.sun, moved.share), (5, 0.7));
+        assert!((moved.sun_color - expected.sun_color).length() < 1e-5);
+        assert!((moved.bounce - expected.bounce).length() < 1e-5);
     }
 }

@@ -1,6 +1,7 @@
 //! Procedural solids as triangle meshes. All stand on y = 0, centred on the
 //! y axis, about one metre across.
 
+use dipir_diffusion::noise::NoiseStream;
 use dipir_scene::mesh::TriangleMesh;
 use glam::Vec3;
 
@@ -21,6 +22,12 @@ pub enum Shape {
     Car,
     /// A slab on four legs.
     Table,
+    /// Flat, slanted faces around: a stump of a pyramid on 3, 5 or 6 sides.
+    Stump,
+    /// Two slanted faces that meet in a ridge, on low walls.
+    Roof,
+    /// Irregular flat faces.
+    Rock,
     /// Held out from training: a cylinder with round ends.
     Capsule,
     /// Held out from training: a pyramid on a square.
@@ -28,8 +35,8 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// Those that the model is trained on.
-    pub const TRAINED: [Self; 7] = [
+    /// Those that stand around in every scene; the model is trained on them.
+    pub const COMMON: [Self; 7] = [
         Self::Ball,
         Self::Box,
         Self::Cylinder,
@@ -38,10 +45,13 @@ impl Shape {
         Self::Car,
         Self::Table,
     ];
+    /// Those with slanted flat faces, which tell of the sun's direction by their shading alone where they cast no shadow;
+    /// the model is trained on them, too.
+    pub const FACETED: [Self; 3] = [Self::Stump, Self::Roof, Self::Rock];
     /// Those that only evaluation shows.
     pub const HELD_OUT: [Self; 2] = [Self::Capsule, Self::Pyramid];
 
-    /// The word in captions; kinds that are held out are just objects.
+    /// The word in captions; kinds for which there is none are just objects.
     pub fn word(self) -> &'static str {
         match self {
             Self::Ball => "ball",
@@ -51,7 +61,7 @@ impl Shape {
             Self::Ring => "ring",
             Self::Car => "car",
             Self::Table => "table",
-            Self::Capsule | Self::Pyramid => "object",
+            Self::Stump | Self::Roof | Self::Rock | Self::Capsule | Self::Pyramid => "object",
         }
     }
 
@@ -107,6 +117,20 @@ impl Shape {
                 }
                 mesh
             }
+            Self::Stump => {
+                let (r, h) = (mix(0.4, 0.7, p[0]), mix(0.4, 1.1, p[1]));
+                let sides = [3, 5, 6][((3.0 * p[2]) as usize).min(2)];
+                let top = r * mix(0.15, 0.65, (3.0 * p[2]).fract());
+                let profile = [(0.0, 0.0), (r, 0.0), (r, 0.0), (top, h), (top, h), (0.0, h)];
+                revolve(&profile, sides)
+            }
+            Self::Roof => roof(
+                mix(0.35, 0.65, p[0]),
+                mix(0.35, 0.9, p[1]),
+                mix(0.35, 0.6, p[2]),
+                mix(0.0, 0.35, (7.0 * p[2]).fract()),
+            ),
+            Self::Rock => rock(p),
             Self::Capsule => {
                 let (r, h) = (mix(0.22, 0.35, p[0]), mix(0.3, 0.8, p[1]));
                 let mut profile = arc(r, Vec3::new(0.0, r, 0.0), 16);
@@ -142,7 +166,12 @@ fn revolve(profile: &[(f32, f32)], sides: usize) -> TriangleMesh {
         if (r0, y0) == (r1, y1) {
             continue;
         }
-        let slope = Vec3::new(y1 - y0, r0 - r1, 0.0).normalize_or_zero();
+        // The middle of a flat side is nearer to the axis than its edges.
+        let flatness = match sides {
+            8.. => 1.0,
+            _ => (std::f32::consts::PI / sides as f32).cos(),
+        };
+        let slope = Vec3::new(y1 - y0, flatness * (r0 - r1), 0.0).normalize_or_zero();
         for side in 0..sides {
             let angle = |s: usize| std::f32::consts::TAU * s as f32 / sides as f32;
             let (a, b) = (angle(side), angle(side + 1));
@@ -174,6 +203,82 @@ fn quad(mesh: &mut TriangleMesh, p: [Vec3; 4], n: [Vec3; 4], lower: bool, upper:
         mesh.indices.push([first, first + 2, first + 3]);
         mesh.materials.push(0);
     }
+}
+
+/// A flat triangle of a solid around `center`, facing outwards; none if it has no area.
+fn facet(mesh: &mut TriangleMesh, [a, b, c]: [Vec3; 3], center: Vec3) {
+    let Some(normal) = (b - a).cross(c - a).try_normalize() else {
+        return;
+    };
+    let outwards = normal.dot((a + b + c) / 3.0 - center) > 0.0;
+    let first = mesh.positions.len() as u32;
+    let (corners, normal) = match outwards {
+        true => ([a, b, c], normal),
+        false => ([a, c, b], -normal),
+    };
+    mesh.positions.extend(corners);
+    mesh.normals.extend([normal; 3]);
+    mesh.indices.push([first, first + 1, first + 2]);
+    mesh.materials.push(0);
+}
+
+/// A house without windows: half its width and depth, walls and roof by their heights.
+fn roof(width: f32, rise: f32, depth: f32, walls: f32) -> TriangleMesh {
+    let mut mesh = TriangleMesh::default();
+    let profile = [
+        (-width, 0.0),
+        (width, 0.0),
+        (width, walls),
+        (0.0, walls + rise),
+        (-width, walls),
+    ];
+    let center = Vec3::new(0.0, 0.4 * (walls + rise), 0.0);
+    let at = |i: usize, z: f32| Vec3::new(profile[i % 5].0, profile[i % 5].1, z);
+    for i in 0..5 {
+        let [a, b] = [i, i + 1];
+        let [near, far] = [depth, -depth];
+        facet(&mut mesh, [at(a, near), at(b, near), at(b, far)], center);
+        facet(&mut mesh, [at(a, near), at(b, far), at(a, far)], center);
+    }
+    for z in [depth, -depth] {
+        for i in 1..4 {
+            facet(&mut mesh, [at(0, z), at(i, z), at(i + 1, z)], center);
+        }
+    }
+    mesh
+}
+
+/// Rings of five to eight corners that stand out by chance, up to a tip.
+fn rock(p: [f32; 3]) -> TriangleMesh {
+    let key = p.map(f32::to_bits);
+    let mut stream = NoiseStream::new(u64::from(key[0]) << 32 | u64::from(key[1]), key[2].into());
+    let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+    let sides = range(5.0, 9.0) as usize;
+    let height = range(0.4, 1.1);
+    let (size, waist, shoulder) = (range(0.38, 0.55), range(0.35, 0.7), range(0.7, 1.1));
+    let mut ring = |y: f32, radius: f32| -> Vec<Vec3> {
+        (0..sides)
+            .map(|k| {
+                let angle = (k as f32 + range(-0.25, 0.25)) / sides as f32 * std::f32::consts::TAU;
+                let (s, c) = angle.sin_cos();
+                let r = radius * range(0.8, 1.15);
+                Vec3::new(r * c, y, r * s)
+            })
+            .collect()
+    };
+    let foot = ring(0.0, size);
+    let middle = ring(waist * height, size * shoulder);
+    let tip = Vec3::new(range(-0.15, 0.15), height, range(-0.15, 0.15));
+    let center = Vec3::new(0.0, 0.4 * height, 0.0);
+    let mut mesh = TriangleMesh::default();
+    for k in 0..sides {
+        let next = (k + 1) % sides;
+        let [a, b, c, d] = [foot[k], foot[next], middle[next], middle[k]];
+        for corners in [[Vec3::ZERO, a, b], [a, b, c], [a, c, d], [d, c, tip]] {
+            facet(&mut mesh, corners, center);
+        }
+    }
+    mesh
 }
 
 /// A box with flat faces.
@@ -229,7 +334,8 @@ mod tests {
 
     #[test]
     fn solids_stand_on_the_ground_and_face_outwards() {
-        for shape in Shape::TRAINED.into_iter().chain(Shape::HELD_OUT) {
+        let trained = Shape::COMMON.into_iter().chain(Shape::FACETED);
+        for shape in trained.chain(Shape::HELD_OUT) {
             for p in [[0.0; 3], [0.5; 3], [1.0; 3]] {
                 let mesh = shape.mesh(p);
                 let (low, high) = mesh.bounds().expect("triangles");
@@ -252,7 +358,10 @@ mod tests {
                     let n = mesh.scaled_normal(t).as_vec3().normalize_or_zero();
                     for &i in triangle {
                         let shading = mesh.normals[i as usize];
-                        assert!(n.dot(shading) > 0.5, "{shape:?}: {n} against {shading}");
+                        // Flat faces are flat; round ones have the normal of their corners.
+                        let flat = Shape::FACETED.contains(&shape) || shape == Shape::Pyramid;
+                        let least = if flat { 0.999 } else { 0.5 };
+                        assert!(n.dot(shading) > least, "{shape:?}: {n} against {shading}");
                     }
                 }
             }

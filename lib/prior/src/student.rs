@@ -105,6 +105,10 @@ impl Spoken {
 pub struct Batch {
     /// Latents of the pictures, [batch, c, h, w].
     pub latents: Tensor,
+    /// Latents that noise is put on: the same, or the picture under another light.
+    pub seen: Tensor,
+    /// Whether they differ.
+    pub relit: Vec<bool>,
     /// Mask and masked latents, [batch, 1 + c, h, w].
     pub condition: Tensor,
     /// Weights of latent values.
@@ -164,13 +168,18 @@ impl Batch {
             .iter()
             .flat_map(|e| e.shown.iter().copied())
             .collect();
-        Ok(Self {
-            latents: latents_of(
+        let pictures = |of: fn(&Example) -> &Vec<f32>| {
+            latents_of(
                 examples
                     .iter()
-                    .flat_map(|e| e.image.iter().copied())
+                    .flat_map(|e| of(e).iter().copied())
                     .collect(),
-            )?,
+            )
+        };
+        Ok(Self {
+            latents: pictures(|e| &e.image)?,
+            seen: pictures(|e| e.seen.as_ref().unwrap_or(&e.image))?,
+            relit: examples.iter().map(|e| e.seen.is_some()).collect(),
             condition: condition_of(shown, &masks)?,
             weights: Tensor::cat(&[&weights, &weights, &weights], 1)?,
             rivals: examples
@@ -287,7 +296,7 @@ impl Student {
         let steps = self.schedule.len();
         let contrasted = batch.rivals.len();
         let timesteps: Vec<usize> = (0..count)
-            .map(|i| match i < contrasted {
+            .map(|i| match i < contrasted || batch.relit[i] {
                 true => ((0.4 + 0.5 * stream.uniform()) * steps as f64) as usize,
                 false => draw_timestep(steps, stream),
             })
@@ -295,7 +304,11 @@ impl Student {
         let noise = stream.normal_tensor(batch.latents.dims(), DType::F32, &Device::Cpu)?;
         let noisy = self
             .schedule
-            .add_noise_each(&batch.latents, &noise, &timesteps)?;
+            .add_noise_each(&batch.seen, &noise, &timesteps)?;
+        // From what is seen to the light that is said, the rest of the noise as it is.
+        let noise = self
+            .schedule
+            .noise_between_each(&batch.latents, &noisy, &timesteps)?;
         let target = self.schedule.target(&batch.latents, &noise, &timesteps)?;
         let input = Tensor::cat(&[&noisy, &batch.condition], 1)?;
         // A row for every caption: the right ones, then the rivals of each.
@@ -369,6 +382,7 @@ mod tests {
         let student = Student::new(&blueprint, folder.path(), 1).expect("built");
         let example = |value: f32, rivals: usize| Example {
             image: vec![value; 3 * SIZE * SIZE],
+            seen: None,
             shown: vec![0.5; 3 * SIZE * SIZE],
             mask: vec![1.0; SIZE * SIZE],
             weight: vec![0.5 + value; SIZE * SIZE],
@@ -413,6 +427,52 @@ mod tests {
         let surprise = loss(vec![example(0.7, 3), example(0.4, 3)]).1;
         let surprise = surprise.expect("rivals");
         assert!((surprise - 1.0).abs() > 1e-2, "{surprise}");
+    }
+
+    #[test]
+    fn what_is_seen_under_another_light_is_asked_for_under_the_one_that_is_said() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let blueprint = Blueprint {
+            channels: vec![8, 16],
+            text_width: 16,
+        };
+        blueprint.write_configs(folder.path()).expect("written");
+        let student = Student::new(&blueprint, folder.path(), 1).expect("built");
+        let flat = |value: f32| vec![value; 3 * SIZE * SIZE];
+        let example = Example {
+            image: flat(0.2),
+            seen: Some(flat(0.7)),
+            shown: flat(0.5),
+            mask: vec![1.0; SIZE * SIZE],
+            weight: vec![1.0; SIZE * SIZE],
+            caption: caption(0.3),
+            rivals: vec![],
+        };
+        let batch = Batch::new(vec![example]).expect("a batch");
+        let latent = |t: &Tensor| {
+            t.mean_all()
+                .expect("mean")
+                .to_scalar::<f32>()
+                .expect("value")
+        };
+        let [asked, seen] = [&batch.latents, &batch.seen].map(|t| f64::from(latent(t)));
+        for seed in 0..4 {
+            let (loss, _) = student
+                .loss(&batch, &mut NoiseStream::new(3, seed))
+                .expect("a loss");
+            // It answers 0, so the loss is the mean square of what is asked for: of signal e + (signal^2 seen - asked) / noise.
+            let t = (0.4 + 0.5 * NoiseStream::new(3, seed).uniform()) * 1000.0;
+            let (signal, noise) = student
+                .schedule
+                .signal_and_noise(t as usize)
+                .expect("in range");
+            let mean = (signal * signal * seen - asked) / noise;
+            let expected = signal * signal + mean * mean;
+            let found = f64::from(loss.to_scalar::<f32>().expect("a value"));
+            // Means over 3,072 normal numbers: .018 of e, .026 of its square.
+            let tolerance = 4.0 * (0.026 * signal * signal + 2.0 * 0.018 * signal * mean.abs());
+            assert!((found - expected).abs() < tolerance, "{found} {expected}");
+        }
     }
 
     #[test]

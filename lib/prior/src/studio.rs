@@ -179,7 +179,11 @@ impl Stage {
         let mut stream = NoiseStream::new(seed, index);
         let mut draw = Draw(&mut stream);
         let shape = match kinds {
-            Kinds::Trained => Shape::TRAINED[draw.below(Shape::TRAINED.len())],
+            // Faces tell less of the light than shadows do, so half of the scenes are about them.
+            Kinds::Trained => match draw.below(2) {
+                0 => Shape::COMMON[draw.below(Shape::COMMON.len())],
+                _ => Shape::FACETED[draw.below(Shape::FACETED.len())],
+            },
             Kinds::HeldOut => Shape::HELD_OUT[draw.below(Shape::HELD_OUT.len())],
         };
         let (main, radius) = draw.solid(shape, Vec2::ZERO);
@@ -200,7 +204,14 @@ impl Stage {
                 draw.range(0.9, reach),
             );
             let at = Vec2::from_angle(angle) * distance;
-            let kind = Shape::TRAINED[draw.below(Shape::TRAINED.len())];
+            let known = match kinds {
+                Kinds::Trained => Shape::COMMON.len() + Shape::FACETED.len(),
+                Kinds::HeldOut => Shape::COMMON.len(),
+            };
+            let kind = match draw.below(known) {
+                n if n < Shape::COMMON.len() => Shape::COMMON[n],
+                n => Shape::FACETED[n - Shape::COMMON.len()],
+            };
             let (mesh, r) = draw.solid(kind, at);
             let free = placed.iter().all(|(p, q)| p.distance(at) > r + q + 0.05);
             // Nothing between the camera and the main object.

@@ -10,9 +10,10 @@ use candle_core::{DType, Device, Tensor};
 use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::optimizer::{AdamW, AdamWConfig};
 use dipir_diffusion::weights::{Weights, write_safetensors};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::blueprint::Blueprint;
+use crate::blueprint::{Blueprint, WEIGHT_FILES};
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
 use crate::examples::{Example, Recipe};
@@ -177,43 +178,39 @@ impl Trainer {
                 })
                 .collect()
         });
-        let mut sum: Option<BTreeMap<String, Tensor>> = None;
+        let mut gradients: Vec<BTreeMap<String, Tensor>> = vec![];
         let (mut loss, mut surprise) = (0.0, 0.0);
         for shard in shards {
-            let Shard {
-                gradients,
-                loss: own,
-                surprise: own_surprise,
-            } = shard?;
-            loss += own / SHARDS as f64;
-            surprise += own_surprise / SHARDS as f64;
-            sum = Some(match sum {
-                None => gradients,
-                Some(mut sum) => {
-                    for (name, gradient) in gradients {
-                        let entry = sum
-                            .get_mut(&name)
-                            .ok_or_else(|| Error::Argument(format!("no gradient of {name}")))?;
-                        *entry = (&*entry + gradient)?;
-                    }
-                    sum
+            let shard = shard?;
+            loss += shard.loss / SHARDS as f64;
+            surprise += shard.surprise / SHARDS as f64;
+            gradients.push(shard.gradients);
+        }
+        let names: Vec<&String> = self.student.variables().keys().collect();
+        let gradients = names
+            .into_par_iter()
+            .map(|name| {
+                // Every shard has every gradient, or `collect` had failed.
+                let mut sum = gradients[0][name].clone();
+                for shard in &gradients[1..] {
+                    sum = (sum + &shard[name])?;
                 }
-            });
-        }
-        let mut gradients = sum.unwrap_or_default();
-        for gradient in gradients.values_mut() {
-            *gradient = (&*gradient * (1.0 / SHARDS as f64))?;
-        }
+                Ok((name.clone(), (sum * (1.0 / SHARDS as f64))?))
+            })
+            .collect::<Result<BTreeMap<_, _>>>()?;
         let rate = self.learning_rate();
         let gradient_norm = self.optimizer.step(&gradients, 1.0, |_| rate)?;
         let step = self.optimizer.steps() as f64;
         let keep = (1.0 - 1.0 / (0.1 * step + 2.0)).min(0.999);
-        for (name, variable) in self.student.variables() {
-            // Detached, or the average would hold the graph of every update.
-            let value = variable.as_detached_tensor();
-            let average = ((&self.average[name] * keep)? + (value * (1.0 - keep))?)?;
-            self.average.insert(name.clone(), average.detach());
-        }
+        let variables = self.student.variables();
+        self.average
+            .par_iter_mut()
+            .try_for_each(|(name, average)| {
+                // Detached, or the average would hold the graph of every update.
+                let value = variables[name].as_detached_tensor();
+                *average = ((&*average * keep)? + (value * (1.0 - keep))?)?.detach();
+                Ok::<_, Error>(())
+            })?;
         Ok(Update {
             seen: self.seen(),
             loss,
@@ -285,6 +282,37 @@ impl Trainer {
             ),
         ]);
         Ok(write_safetensors(path, &tensors, &metadata)?)
+    }
+
+    /// Starts from the weights of the model in `folder`, of the same blueprint.
+    pub fn start_from(&mut self, folder: &Path) -> Result<()> {
+        for (prefix, file) in WEIGHT_FILES {
+            let path = folder.join(file);
+            let weights = Weights::open_file(&path)?;
+            for (name, variable) in self.student.variables() {
+                let Some(inner) = name.strip_prefix(prefix) else {
+                    continue;
+                };
+                let value = weights.tensor(inner, DType::F32, &Device::Cpu)?;
+                let value = value.ok_or_else(|| Error::Content {
+                    path: path.clone(),
+                    message: format!("{inner} is missing"),
+                })?;
+                if value.dims() != variable.dims() {
+                    return Err(Error::Content {
+                        path: path.clone(),
+                        message: format!(
+                            "{inner} has the shape {:?}, this run's {:?}",
+                            value.dims(),
+                            variable.dims()
+                        ),
+                    });
+                }
+                variable.set(&value)?;
+                self.average.insert(name.clone(), value);
+            }
+        }
+        Ok(())
     }
 
     /// Goes on from what [`Trainer::save`] wrote.
