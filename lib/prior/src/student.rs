@@ -371,15 +371,19 @@ mod tests {
         Some(Caption::new("red car", Some(&light)))
     }
 
-    #[test]
-    fn a_model_that_knows_nothing_is_as_surprised_as_chance() {
+    fn small() -> Student {
         let folder = tempfile::tempdir().expect("a folder");
         let blueprint = Blueprint {
             channels: vec![8, 16],
             text_width: 16,
         };
         blueprint.write_configs(folder.path()).expect("written");
-        let student = Student::new(&blueprint, folder.path(), 1).expect("built");
+        Student::new(&blueprint, folder.path(), 1).expect("built")
+    }
+
+    #[test]
+    fn a_model_that_knows_nothing_is_as_surprised_as_chance() {
+        let student = small();
         let example = |value: f32, rivals: usize| Example {
             image: vec![value; 3 * SIZE * SIZE],
             seen: None,
@@ -431,13 +435,7 @@ mod tests {
 
     #[test]
     fn what_is_seen_under_another_light_is_asked_for_under_the_one_that_is_said() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let blueprint = Blueprint {
-            channels: vec![8, 16],
-            text_width: 16,
-        };
-        blueprint.write_configs(folder.path()).expect("written");
-        let student = Student::new(&blueprint, folder.path(), 1).expect("built");
+        let student = small();
         let flat = |value: f32| vec![value; 3 * SIZE * SIZE];
         let example = Example {
             image: flat(0.2),

@@ -467,6 +467,50 @@ mod tests {
     }
 
     #[test]
+    fn a_run_starts_from_the_weights_of_a_model_of_its_shape() {
+        let folder = tempfile::tempdir().unwrap();
+        let blueprint = Blueprint {
+            channels: vec![8, 16],
+            text_width: 16,
+        };
+        let first = small(folder.path(), 24);
+        blueprint
+            .write_weights(folder.path(), first.average())
+            .unwrap();
+        let settings = TrainerSettings {
+            seed: 9,
+            ..first.settings
+        };
+        let mut second =
+            Trainer::new(&blueprint, folder.path(), settings, Recipe::default()).unwrap();
+        second.start_from(folder.path()).unwrap();
+        let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        for (name, variable) in second.student.variables() {
+            let wanted = values(&first.average()[name]);
+            // Stored in half precision.
+            for (found, wanted) in values(variable).into_iter().zip(wanted) {
+                assert!(
+                    (found - wanted).abs() <= 1e-3 * wanted.abs() + 1e-6,
+                    "{name}"
+                );
+            }
+            assert_eq!(values(variable), values(&second.average()[name]));
+        }
+
+        let other = tempfile::tempdir().unwrap();
+        let wider = Blueprint {
+            channels: vec![8, 24],
+            ..blueprint
+        };
+        wider.write_configs(other.path()).unwrap();
+        let mut third = Trainer::new(&wider, other.path(), settings, Recipe::default()).unwrap();
+        let error = third.start_from(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("has the shape"), "{error}");
+        let error = third.start_from(other.path()).unwrap_err().to_string();
+        assert!(error.contains("diffusion_pytorch_model"), "{error}");
+    }
+
+    #[test]
     fn scenes_that_were_cut_off_are_refused_with_what_to_do() {
         let folder = tempfile::tempdir().unwrap();
         let data = scenes(folder.path());
