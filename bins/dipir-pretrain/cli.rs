@@ -10,7 +10,10 @@ const EXAMPLES: &str = "\
 Examples:
   dipir-pretrain train --out model --cache scenes      render scenes, train, write a model folder
   dipir-pretrain encoder --out model --cache scenes    train its light encoder
+  dipir-pretrain train --out model --cache scenes --from data/prior --relit 0.4 --learning-rate 4e-4
+                                                       train a model further
   dipir-pretrain gates model                           what it can tell, on scenes it never saw
+  dipir-pretrain gates model --first 1000 --scenes 48  the same on other scenes, to tune on
   dipir-pretrain sheet model sheet.png                 pictures of its light words
 
 Training goes on from CACHE/checkpoint.safetensors where it stopped. The card of
@@ -81,7 +84,7 @@ pub struct Train {
     /// Learning rate after the warm-up
     #[arg(long, default_value_t = TrainerSettings::default().learning_rate)]
     pub learning_rate: f64,
-    /// Model folder whose weights a new run starts from
+    /// Model folder whose weights a new run starts from; one that has a checkpoint goes on from that
     #[arg(long, value_name = "MODEL")]
     pub from: Option<PathBuf>,
     /// Updates between checkpoints

@@ -93,7 +93,6 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
         );
         return Err(Usage(message).into());
     }
-    let data = scenes(&args.data, args.seed, output)?;
     let settings = TrainerSettings {
         samples: args.samples,
         batch: args.batch,
@@ -117,6 +116,7 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     } else if let Some(from) = &args.from {
         trainer.start_from(from)?;
     }
+    let data = scenes(&args.data, args.seed, output)?;
     let resumed_at = trainer.seen();
     let progress = Progress::new("training", output.quiet);
     let clock = Instant::now();

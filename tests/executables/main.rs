@@ -10,6 +10,7 @@ mod large;
 mod manual;
 mod page;
 mod pipeline;
+mod pretraining;
 mod project;
 mod recovery;
 mod reproducibility;

@@ -21,6 +21,8 @@ pub const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-optimize");
 pub const TRADEOFF: &str = env!("CARGO_BIN_EXE_dipir-tradeoff");
 /// `dipir-evaluate`.
 pub const EVALUATE: &str = env!("CARGO_BIN_EXE_dipir-evaluate");
+/// `dipir-pretrain`.
+pub const PRETRAIN: &str = env!("CARGO_BIN_EXE_dipir-pretrain");
 /// `dipir-inspect`.
 pub const INSPECT: &str = env!("CARGO_BIN_EXE_dipir-inspect");
 

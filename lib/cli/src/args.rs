@@ -52,14 +52,14 @@ pub struct CommonArgs {
 #[derive(Args, Clone, Copy, Debug, Default)]
 pub struct OutputArgs {
     /// Print the result as JSON
-    #[arg(long)]
+    #[arg(long, global = true)]
     pub json: bool,
 
     /// Print errors only
-    #[arg(long, short = 'q', conflicts_with = "verbose")]
+    #[arg(long, short = 'q', global = true, conflicts_with = "verbose")]
     pub quiet: bool,
 
     /// Print more about what is done
-    #[arg(long, short = 'v')]
+    #[arg(long, short = 'v', global = true)]
     pub verbose: bool,
 }

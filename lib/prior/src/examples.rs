@@ -16,10 +16,39 @@ use crate::words::{Caption, LightWords};
 /// Pixels on a side of an example.
 pub const SIZE: usize = 32;
 const PIXELS: usize = SIZE * SIZE;
-/// Of examples that are seen under another light than is said, those whose place lies in neither light or in the one
-/// that is seen; and, above this, whole pictures, where light is read: all of it is seen under the other light.
-const FOREIGN_RELIT: f64 = 0.45;
-const WHOLE_RELIT: f64 = 0.65;
+
+/// What lights the picture around the object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Surroundings {
+    /// The light that is said, object and place in one rendering.
+    Whole,
+    /// The light that is said, the object put in afterwards.
+    Said,
+    /// The light that the object is seen under, which is not the one that is said.
+    Seen,
+    /// A light of its own.
+    Other,
+}
+
+impl Surroundings {
+    fn draw(recipe: &Recipe, relit: bool, stream: &mut NoiseStream) -> Self {
+        let kind = stream.uniform();
+        match relit {
+            true if kind < 0.18 => Self::Other,
+            // It looks as if it belonged there, and yet is not what is said.
+            true if kind < 0.45 => Self::Seen,
+            // As where light is read: all of the picture is seen under the other light.
+            true if kind > 0.65 => Self::Whole,
+            false if kind < recipe.foreign_light => Self::Other,
+            false if kind > 0.8 => Self::Whole,
+            _ => Self::Said,
+        }
+    }
+
+    fn is_foreign(self) -> bool {
+        matches!(self, Self::Seen | Self::Other)
+    }
+}
 
 /// A picture [3, SIZE, SIZE], linear or in [0, 1].
 pub type Picture = Vec<f32>;
@@ -306,31 +335,23 @@ impl Example {
         let window = Window::draw(stream);
         let (class, color) = (scene.class, scene.color);
         let lens = Lens::new(scene, window);
-        let mut place = Light::draw(lens.suns(), stream);
+        let drawn = Light::draw(lens.suns(), stream);
         let relit = recipe.relit > 0.0 && stream.uniform() < recipe.relit;
-        let kind = stream.uniform();
-        let (foreign, whole) = match relit {
-            true => (kind < FOREIGN_RELIT, kind > WHOLE_RELIT),
-            false => (kind < recipe.foreign_light, kind > 0.8),
-        };
-        let light = if foreign {
-            Light::draw(lens.suns(), stream)
-        } else {
-            place
+        let surroundings = Surroundings::draw(recipe, relit, stream);
+        let light = match surroundings.is_foreign() {
+            true => Light::draw(lens.suns(), stream),
+            false => drawn,
         };
         let other = relit.then(|| other_light(&light, lens.suns(), stream));
-        if let Some(other) = other
-            && foreign
-            && kind > 0.4 * FOREIGN_RELIT
-        {
-            // What is seen looks as if it belonged there, and yet is not what is said.
-            place = other;
-        }
+        let around = match surroundings {
+            Surroundings::Seen => other.unwrap_or(drawn),
+            Surroundings::Whole | Surroundings::Said | Surroundings::Other => drawn,
+        };
         let tone = Tone::draw(stream);
         let picture = |light: &Light| {
-            let mut image = match whole {
-                true => lens.layer(Layer::Whole, light),
-                false => lens.composite(&place, light),
+            let mut image = match surroundings {
+                Surroundings::Whole => lens.layer(Layer::Whole, light),
+                _ => lens.composite(&around, light),
             };
             tone.apply(&mut image);
             image
@@ -340,19 +361,20 @@ impl Example {
         let coverage = lens.coverage();
         let hard: Vec<f32> = coverage.iter().map(|&c| f32::from(c > 0.02)).collect();
         let view = stream.uniform();
-        let (mask, shown) = if view >= recipe.background || (relit && whole) {
-            (vec![1.0; PIXELS], image.clone())
-        } else if view < 0.25 * recipe.background && !foreign {
-            // As in inpainting: the picture itself around a box.
-            let margin = std::array::from_fn(|_| 0.7 * stream.uniform() as f32);
-            (boxed(&coverage, margin), image.clone())
-        } else {
-            let mut clean = lens.layer(Layer::Background, &place);
-            tone.apply(&mut clean);
-            (dilate(&hard, stream.below(2)), clean)
-        };
+        let (mask, shown) =
+            if view >= recipe.background || (relit && surroundings == Surroundings::Whole) {
+                (vec![1.0; PIXELS], image.clone())
+            } else if view < 0.25 * recipe.background && !surroundings.is_foreign() {
+                // As in inpainting: the picture itself around a box.
+                let margin = std::array::from_fn(|_| 0.7 * stream.uniform() as f32);
+                (boxed(&coverage, margin), image.clone())
+            } else {
+                let mut clean = lens.layer(Layer::Background, &around);
+                tone.apply(&mut clean);
+                (dilate(&hard, stream.below(2)), clean)
+            };
         let weight = dilate(&hard, 5).iter().map(|m| 0.15 + m).collect();
-        let named = relit || foreign || stream.uniform() < recipe.light_words;
+        let named = relit || surroundings.is_foreign() || stream.uniform() < recipe.light_words;
         let said = stream.uniform();
         let class = match said {
             x if x < 0.25 => "object".to_owned(),

@@ -226,7 +226,7 @@ pub fn measure(
     progress: &(dyn Fn(usize) -> ControlFlow<()> + Sync),
 ) -> Result<Gates> {
     let done = std::sync::atomic::AtomicUsize::new(0);
-    let answers: Vec<Answer> = (first..first + scenes as u64)
+    let answers: Vec<Answer> = (first..first.saturating_add(scenes as u64))
         .into_par_iter()
         .map(|i| {
             let answer = ask(model, i, draws)?;

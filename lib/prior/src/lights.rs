@@ -105,9 +105,13 @@ impl Light {
 
     /// Irradiance of the ground.
     pub fn irradiance(&self, suns: &[Sun]) -> Vec3 {
+        self.sun_color * suns[self.sun].elevation.sin() + self.sky_irradiance()
+    }
+
+    /// Irradiance of the ground by the sky alone.
+    pub fn sky_irradiance(&self) -> Vec3 {
         // Of radiance h (1 - y) + z y: pi (h / 3 + 2 z / 3).
-        let sky = std::f32::consts::PI * (self.horizon / 3.0 + self.zenith * (2.0 / 3.0));
-        self.sun_color * suns[self.sun].elevation.sin() + sky
+        std::f32::consts::PI * (self.horizon / 3.0 + self.zenith * (2.0 / 3.0))
     }
 
     /// The same light, each colour by its factor as bright.

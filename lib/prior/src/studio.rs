@@ -195,6 +195,10 @@ impl Stage {
             View::Close => ([0, 1, 1, 2, 2, 2, 3, 3][draw.below(8)], 2.1, 12),
             View::Wide => ([3, 4, 4, 5, 5, 6, 6, 7][draw.below(8)], 3.4, 40),
         };
+        let around = match kinds {
+            Kinds::Trained => [&Shape::COMMON[..], &Shape::FACETED].concat(),
+            Kinds::HeldOut => Shape::COMMON.to_vec(),
+        };
         for _ in 0..attempts {
             if paints.len() == wanted {
                 break;
@@ -204,14 +208,7 @@ impl Stage {
                 draw.range(0.9, reach),
             );
             let at = Vec2::from_angle(angle) * distance;
-            let known = match kinds {
-                Kinds::Trained => Shape::COMMON.len() + Shape::FACETED.len(),
-                Kinds::HeldOut => Shape::COMMON.len(),
-            };
-            let kind = match draw.below(known) {
-                n if n < Shape::COMMON.len() => Shape::COMMON[n],
-                n => Shape::FACETED[n - Shape::COMMON.len()],
-            };
+            let kind = around[draw.below(around.len())];
             let (mesh, r) = draw.solid(kind, at);
             let free = placed.iter().all(|(p, q)| p.distance(at) > r + q + 0.05);
             // Nothing between the camera and the main object.
