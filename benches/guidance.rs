@@ -269,10 +269,23 @@ fn run(
             "share": trial.place.light.share,
         },
     }));
-    let seen = start(&reading.encoder, camera, lobes);
+    let mut unasked = reading.crops.clone();
+    unasked.iter_mut().for_each(|c| c.energies.clear());
+    let seen = combine(unasked, &reading.encoder, &knobs.reader);
+    let seen = start(&seen.light, camera, lobes);
     found.insert(ENCODER, answer(&trial, &objective, &seen, &truth));
     let read = start(&reading.light, camera, lobes);
     found.insert("4 inversion", answer(&trial, &objective, &read, &truth));
+    // The same with a hard sun, and with a softer one.
+    for (name, sure) in [
+        ("4c inversion, sure", 0.0),
+        ("4d inversion, twice as unsure", 4.0),
+    ] {
+        let mut light = reading.light;
+        light.confidence = light.confidence.clamp(1e-3, 1.0).powf(sure);
+        let light = start(&light, camera, lobes);
+        found.insert(name, answer(&trial, &objective, &light, &truth));
+    }
     let mut known = reading.light;
     known.words.azimuth = trial.place.sun().azimuth;
     let turned = start(&known, camera, lobes);
@@ -290,8 +303,7 @@ fn run(
         encoder: 0.0,
         ..knobs.reader
     };
-    let energies: Vec<f64> = reading.energies.iter().flatten().copied().collect();
-    let alone = combine(&energies, &reading.encoder, &unaided);
+    let alone = combine(reading.crops.clone(), &reading.encoder, &unaided);
     let alone = start(&alone.light, camera, lobes);
     found.insert(
         "4b inversion, no encoder",

@@ -20,10 +20,15 @@ use crate::interruption;
 const CROP: f32 = 2.6;
 /// Crops that the model is asked to explain.
 const CROPS: usize = 12;
-/// The first of them, around the place of the insertion.
-const NEAR: usize = 3;
+/// The first of them, around the place of the insertion, where nothing stands yet.
+const EMPTY: usize = 3;
 /// Width of the sun's lobe at the start, radians: that of the model's training, in the middle.
 const SUN_SIGMA: f32 = 0.07;
+/// How much of what is not known of the sun's direction its lobe covers, of which a hard shadow would be
+/// in the wrong place.
+const HEDGE: f32 = 0.5;
+/// Its largest width, radians.
+const WIDEST: f32 = 0.8;
 /// Share of the ground's light that it throws back at the object.
 const GROUND_ALBEDO: f32 = 0.3;
 
@@ -224,7 +229,7 @@ pub fn read_light(
         progress(share);
         interruption()
     };
-    match read(model, &encoder, &crops, NEAR, settings, seed, &report)? {
+    match read(model, &encoder, &crops, EMPTY, settings, seed, &report)? {
         Some(reading) => Ok(Some(reading)),
         None => Err(Interrupted.into()),
     }
@@ -245,11 +250,12 @@ pub fn start(estimate: &LightEstimate, camera: &Camera, lobes: usize) -> Paramet
         let lobe = SphericalGaussian {
             direction: direction(camera, words.azimuth, words.elevation),
             radiance: Vec3::ONE,
-            sigma: SUN_SIGMA,
+            sigma: SUN_SIGMA.hypot(HEDGE * estimate.spread()).min(WIDEST),
         };
-        let facing = on_ground / words.elevation.sin().max(0.1);
+        // What the ground has of it if it is as bright as 1, no sun at the horizon assumed.
+        let of_one = lobe.irradiance(Vec3::Y).x.max(0.1 * lobe.solid_angle());
         SphericalGaussian {
-            radiance: facing / lobe.solid_angle() as f32,
+            radiance: on_ground / of_one as f32,
             ..lobe
         }
     });
@@ -299,12 +305,28 @@ mod tests {
             warmth: 0.0,
             sky_warmth: 0.0,
         };
-        let start = start(&estimate, &camera, 32);
-        let lobes = start.foreground_lobes();
-        assert_eq!(lobes.len(), 32);
-        let ground: DVec3 = lobes.iter().map(|l| l.irradiance(Vec3::Y)).sum();
-        // Candidates near the horizon and the ambient lobe's slope leave some percent.
-        assert!((ground.y / 2.0 - 1.0).abs() < 0.15, "{ground}");
+        let width = |confidence: f32| {
+            let estimate = LightEstimate {
+                confidence,
+                ..estimate
+            };
+            let lobes = start(&estimate, &camera, 32).foreground_lobes();
+            assert_eq!(lobes.len(), 32);
+            let ground: DVec3 = lobes.iter().map(|l| l.irradiance(Vec3::Y)).sum();
+            // Candidates near the horizon and the ambient lobe's slope leave some percent.
+            assert!(
+                (ground.y / 2.0 - 1.0).abs() < 0.15,
+                "{confidence}: {ground}"
+            );
+            let sun = lobes
+                .iter()
+                .max_by(|a, b| a.radiance.x.total_cmp(&b.radiance.x));
+            sun.expect("lobes").sigma
+        };
+        // Who does not know where the sun is throws no hard shadow.
+        let widths = [1.0, 0.95, 0.7, 0.0].map(width);
+        assert!((widths[0] - SUN_SIGMA).abs() < 1e-3, "{widths:?}");
+        assert!(widths.is_sorted_by(|a, b| a < b), "{widths:?}");
     }
 
     /// Grey ground seen from above, and the camera that sees it.

@@ -24,14 +24,15 @@ use crate::words::LightWords;
 pub const FILE: &str = "light_encoder.safetensors";
 /// Numbers that it tells.
 const OUTPUTS: usize = 7;
-const CHANNELS: [usize; 4] = [3, 32, 64, 96];
+const CHANNELS: [usize; 4] = [3, 48, 96, 160];
+const HIDDEN: usize = 160;
 
 /// What a photograph says about its light.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LightEstimate {
     /// Azimuth, elevation and share of the sun.
     pub words: LightWords,
-    /// How sure it is of the azimuth, 0 to about 1.
+    /// How sure it is of the azimuth, 0 to about 1: the length of the mean of its directions.
     pub confidence: f32,
     /// Irradiance of open ground on the photograph's linear scale.
     pub irradiance: f32,
@@ -74,8 +75,8 @@ impl LightEncoder {
         }
         let side = SIZE >> (CHANNELS.len() - 1);
         let flat = CHANNELS[CHANNELS.len() - 1] * side * side;
-        let hidden = Linear::new(&parameters.sub("hidden"), flat, 128)?;
-        let out = Linear::new(&parameters.sub("out"), 128, OUTPUTS)?;
+        let hidden = Linear::new(&parameters.sub("hidden"), flat, HIDDEN)?;
+        let out = Linear::new(&parameters.sub("out"), HIDDEN, OUTPUTS)?;
         Ok(Self {
             convolutions,
             norms,
@@ -106,39 +107,55 @@ impl LightEncoder {
         Ok(self.out.forward(&h.silu()?)?)
     }
 
-    /// Reads the light off pictures [3, SIZE, SIZE] in [0, 1] of one place,
-    /// each and its mirror image, and averages. Azimuths are relative to the
-    /// camera.
-    pub fn estimate(&self, pictures: &[Vec<f32>]) -> Result<LightEstimate> {
-        if pictures.is_empty() {
-            return Err(Error::Argument("the light encoder needs a picture".into()));
-        }
-        let mut sum = [0f32; OUTPUTS];
-        for mirrored in [false, true] {
-            let values = match mirrored {
-                true => examples::mirrored(&pictures.concat()),
-                false => pictures.concat(),
-            };
-            let shape = (pictures.len(), 3, SIZE, SIZE);
-            let x = Tensor::from_vec(values, shape, &Device::Cpu)?;
-            for row in self.forward(&x.affine(2.0, -1.0)?)?.to_vec2::<f32>()? {
-                for (i, (sum, v)) in sum.iter_mut().zip(row).enumerate() {
-                    // The mirror swaps left and right.
-                    *sum += if mirrored && i == 1 { -v } else { v };
-                }
-            }
-        }
-        let mean = sum.map(|v| v / (2 * pictures.len()) as f32);
+    /// Reads the light off a picture [3, SIZE, SIZE] in [0, 1] and off its mirror image, and averages. The
+    /// azimuth is relative to the camera.
+    pub fn estimate(&self, picture: &[f32]) -> Result<LightEstimate> {
+        let pair = [picture.to_vec(), examples::mirrored(picture)].concat();
+        let x = Tensor::from_vec(pair, (2, 3, SIZE, SIZE), &Device::Cpu)?;
+        let rows = self.forward(&x.affine(2.0, -1.0)?)?.to_vec2::<f32>()?;
+        // The mirror swaps left and right.
+        let mean = |i: usize| 0.5 * (rows[0][i] + if i == 1 { -rows[1][i] } else { rows[1][i] });
         Ok(LightEstimate {
             words: LightWords {
-                azimuth: mean[1].atan2(mean[0]),
-                elevation: (mean[2] + 0.75).clamp(0.15, 1.4),
-                sun_share: (mean[3] + 0.6).clamp(0.0, 0.97),
+                azimuth: mean(1).atan2(mean(0)),
+                elevation: (mean(2) + 0.75).clamp(0.15, 1.4),
+                sun_share: (mean(3) + 0.6).clamp(0.0, 0.97),
             },
-            confidence: mean[0].hypot(mean[1]),
-            irradiance: mean[4].exp(),
-            warmth: mean[5],
-            sky_warmth: mean[6],
+            confidence: mean(0).hypot(mean(1)),
+            irradiance: mean(4).exp(),
+            warmth: mean(5),
+            sky_warmth: mean(6),
+        })
+    }
+}
+
+impl LightEstimate {
+    /// Standard deviation of the azimuth, radians: that of a wrapped normal distribution whose mean vector is as long
+    /// as the confidence [Mardia and Jupp 2000, 3.5.7].
+    pub fn spread(&self) -> f32 {
+        (-2.0 * self.confidence.clamp(1e-3, 1.0).ln()).sqrt()
+    }
+
+    /// The mean of what several pictures of one place say: of azimuths as vectors as long as they are sure, of
+    /// irradiances geometric.
+    pub fn mean(of: &[Self]) -> Result<Self> {
+        if of.is_empty() {
+            return Err(Error::Argument("the light encoder needs a picture".into()));
+        }
+        let mean =
+            |value: &dyn Fn(&Self) -> f32| of.iter().map(value).sum::<f32>() / of.len() as f32;
+        let c = mean(&|e| e.confidence * e.words.azimuth.cos());
+        let s = mean(&|e| e.confidence * e.words.azimuth.sin());
+        Ok(Self {
+            words: LightWords {
+                azimuth: s.atan2(c),
+                elevation: mean(&|e| e.words.elevation),
+                sun_share: mean(&|e| e.words.sun_share),
+            },
+            confidence: c.hypot(s),
+            irradiance: mean(&|e| e.irradiance.ln()).exp(),
+            warmth: mean(&|e| e.warmth),
+            sky_warmth: mean(&|e| e.sky_warmth),
         })
     }
 }
@@ -147,7 +164,7 @@ impl LightEncoder {
 fn target(light: &Light, words: &LightWords, exposure: f32) -> [f32; OUTPUTS] {
     let seen = if words.is_overcast() { 0.0 } else { 1.0 };
     let (s, c) = words.azimuth.sin_cos();
-    let sky = (light.horizon + 2.0 * light.zenith) * (std::f32::consts::PI / 3.0);
+    let sky = light.sky_irradiance();
     let ground = light.sun_color * words.elevation.sin() + sky;
     let ratio = |v: glam::Vec3| (v.x.max(1e-4) / v.z.max(1e-4)).ln();
     [
@@ -235,4 +252,53 @@ pub fn train(
         .collect::<Result<BTreeMap<_, _>>>()?;
     write_safetensors(&folder.join(FILE), &tensors, &BTreeMap::new())?;
     Ok(true)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn estimate(azimuth: f32, confidence: f32, irradiance: f32) -> LightEstimate {
+        LightEstimate {
+            words: LightWords {
+                azimuth,
+                elevation: 0.6,
+                sun_share: 0.7,
+            },
+            confidence,
+            irradiance,
+            warmth: 0.1,
+            sky_warmth: -0.2,
+        }
+    }
+
+    #[test]
+    fn a_mean_listens_to_those_that_are_sure_and_is_unsure_where_they_disagree() {
+        let agreed = LightEstimate::mean(&[estimate(1.0, 0.9, 2.0); 3]).unwrap();
+        assert!(
+            (agreed.words.azimuth - 1.0).abs() < 1e-6 && (agreed.confidence - 0.9).abs() < 1e-6
+        );
+        let sure =
+            LightEstimate::mean(&[estimate(0.0, 0.9, 1.0), estimate(2.0, 0.1, 4.0)]).unwrap();
+        assert!(sure.words.azimuth < 0.12, "{sure:?}");
+        assert!((sure.irradiance - 2.0).abs() < 1e-5, "{sure:?}");
+        let opposed =
+            LightEstimate::mean(&[estimate(0.0, 0.9, 1.0), estimate(3.0, 0.9, 1.0)]).unwrap();
+        assert!(
+            opposed.confidence < 0.1 && opposed.spread() > 2.0,
+            "{opposed:?}"
+        );
+        assert!(LightEstimate::mean(&[]).is_err());
+    }
+
+    #[test]
+    fn the_spread_is_that_of_a_wrapped_normal() {
+        // The mean of exp(i x) over a normal x of deviation d is exp(-d d / 2).
+        for d in [0.05f32, 0.3, 1.0, 2.0] {
+            let of = estimate(0.0, (-0.5 * d * d).exp(), 1.0);
+            assert!((of.spread() / d - 1.0).abs() < 1e-3, "{d}: {}", of.spread());
+        }
+        assert_eq!(estimate(0.0, 1.2, 1.0).spread(), 0.0);
+        assert!(estimate(0.0, 0.0, 1.0).spread().is_finite());
+    }
 }

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::encoder::{LightEncoder, LightEstimate};
-use crate::energy::{Observation, SHARES, energies, states};
+use crate::energy::{Observation, energies, states};
 use crate::error::Result;
 use crate::examples::{SIZE, dilate, mirrored};
 use crate::gates::minimum_angle;
@@ -22,6 +22,9 @@ use crate::words::{Caption, LightWords};
 pub const AZIMUTHS: usize = 16;
 /// Elevations of the search, degrees.
 pub const ELEVATIONS: [f32; 3] = [20.0, 40.0, 60.0];
+
+/// The timestep, as a share of all, at which crops are looked at: higher ones add nothing to it.
+const TOLD_AT: f64 = 0.5;
 
 /// A square of the photograph.
 #[derive(Debug, Clone)]
@@ -50,12 +53,12 @@ pub enum Context {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReaderSettings {
-    /// Draws of noise for each crop and timestep; 0 asks the encoder alone.
+    /// Draws of noise for each crop, every other of them in the mirror; 0 asks the encoder alone.
     pub draws: usize,
-    /// Weight of the model's energies, in nats for the summed error of all
-    /// crops.
+    /// Weight of the model's energies, in nats for the error of a crop.
     pub trust: f64,
-    /// Weight of the encoder's azimuth.
+    /// Weight of the encoder's azimuth: nats between it and the opposite one are twice this where the encoder
+    /// is sure.
     pub encoder: f64,
     /// What is shown of a crop.
     pub context: Context,
@@ -65,8 +68,8 @@ impl Default for ReaderSettings {
     fn default() -> Self {
         Self {
             draws: 2,
-            trust: 400.0,
-            encoder: 2.0,
+            trust: 20.0,
+            encoder: 16.0,
             context: Context::Hidden,
         }
     }
@@ -81,6 +84,17 @@ pub struct Reading {
     pub encoder: LightEstimate,
     /// Summed energies by elevation and azimuth, each less the smallest; none if only the encoder was asked.
     pub energies: Vec<Vec<f64>>,
+    /// What every crop says by itself.
+    pub crops: Vec<CropReading>,
+}
+
+/// What was read off one crop.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CropReading {
+    /// What the encoder says, azimuth relative to the camera.
+    pub encoder: LightEstimate,
+    /// Energies of the candidates, one elevation after the other; none if only the encoder was asked.
+    pub energies: Vec<f64>,
 }
 
 /// The share of a crop's side that its blanked box takes, as in training
@@ -254,7 +268,7 @@ fn crop_energies(
                 Observation::new(picture, &shown, &object, &object)?
             }
         };
-        let e = energies(model, &observation, contexts, &SHARES, stream)?;
+        let e = energies(model, &observation, contexts, &[TOLD_AT], stream)?;
         sum.iter_mut()
             .zip(e)
             .for_each(|(s, e)| *s += e / settings.draws as f64);
@@ -262,105 +276,202 @@ fn crop_energies(
     Ok(sum)
 }
 
-/// Reads the light off `crops` of one photograph, the first of them around
-/// the place of the insertion; the encoder sees those `near` first ones.
+/// Reads the light off `crops` of one photograph. The encoder sees what stands there: all crops but the first
+/// `empty` ones, in whose middle nothing does, unless there are no others.
 /// `progress` is told the share that is done and may stop: then the result is
 /// `None`.
 pub fn read(
     model: &Model,
     encoder: &LightEncoder,
     crops: &[Crop],
-    near: usize,
+    empty: usize,
     settings: &ReaderSettings,
     seed: u64,
     progress: &(dyn Fn(f64) -> ControlFlow<()> + Sync),
 ) -> Result<Option<Reading>> {
-    let pictures: Vec<Vec<f32>> = crops.iter().take(near).map(|c| c.picture.clone()).collect();
-    let mut seen = encoder.estimate(&pictures)?;
-    seen.words.azimuth += crops.first().map_or(0.0, |c| c.heading);
-    if settings.draws == 0 {
-        return Ok(Some(Reading {
-            light: seen,
-            encoder: seen,
+    let readings = crops.iter().map(|crop| {
+        let mut encoder = encoder.estimate(&crop.picture)?;
+        encoder.words.azimuth += crop.heading;
+        Ok(CropReading {
+            encoder,
             energies: vec![],
-        }));
+        })
+    });
+    let mut readings = readings.collect::<Result<Vec<_>>>()?;
+    let seen: Vec<LightEstimate> = readings.iter().map(|r| r.encoder).collect();
+    let seen = LightEstimate::mean(match seen.get(empty..) {
+        Some(objects) if !objects.is_empty() => objects,
+        _ => &seen,
+    })?;
+    if settings.draws == 0 {
+        return Ok(Some(combine(readings, &seen, settings)));
     }
     let share = seen.words.sun_share.max(0.45);
     let done = std::sync::atomic::AtomicUsize::new(0);
-    let each = crops
+    let go_on = crops
         .par_iter()
+        .zip(&mut readings)
         .enumerate()
-        .map(|(i, crop)| {
+        .map(|(i, (crop, reading))| {
             let mut stream = NoiseStream::new(seed ^ 0x4ead, i as u64);
-            let e = crop_energies(model, crop, share, settings, &mut stream)?;
+            reading.energies = crop_energies(model, crop, share, settings, &mut stream)?;
             let n = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
             Ok(progress(n as f64 / crops.len() as f64)
                 .is_continue()
-                .then_some(e))
+                .then_some(()))
         })
-        .collect::<Result<Option<Vec<_>>>>()?;
-    let Some(each) = each else {
-        return Ok(None);
-    };
-    let mut sum = vec![0f64; AZIMUTHS * ELEVATIONS.len()];
-    for e in each {
-        sum.iter_mut().zip(e).for_each(|(s, e)| *s += e);
-    }
-    Ok(Some(combine(&sum, &seen, settings)))
+        .collect::<Result<Option<()>>>()?;
+    Ok(go_on.map(|()| combine(readings, &seen, settings)))
 }
 
-/// Energies and the encoder's answer to one answer.
-pub fn combine(sum: &[f64], seen: &LightEstimate, settings: &ReaderSettings) -> Reading {
+/// The length of the mean of directions around the circle that have so many nats against them.
+fn mean_length(nats: &[f64]) -> f32 {
+    let least = nats.iter().copied().fold(f64::INFINITY, f64::min);
+    let (mut c, mut s, mut total) = (0.0, 0.0, 0.0);
+    for (k, n) in nats.iter().enumerate() {
+        let (p, angle) = (
+            (least - n).exp(),
+            f64::from(TAU) * k as f64 / nats.len() as f64,
+        );
+        c += p * angle.cos();
+        s += p * angle.sin();
+        total += p;
+    }
+    (c.hypot(s) / total) as f32
+}
+
+/// What all crops say by their energies, and the encoder's answer, to one answer.
+pub fn combine(
+    crops: Vec<CropReading>,
+    seen: &LightEstimate,
+    settings: &ReaderSettings,
+) -> Reading {
+    let mut sum = vec![0f64; AZIMUTHS * ELEVATIONS.len()];
+    for crop in &crops {
+        sum.iter_mut()
+            .zip(&crop.energies)
+            .for_each(|(s, e)| *s += e);
+    }
     let least = sum.iter().copied().fold(f64::INFINITY, f64::min);
     let energies: Vec<Vec<f64>> = sum
         .chunks_exact(AZIMUTHS)
         .map(|row| row.iter().map(|e| e - least).collect())
         .collect();
-    // Nats of every candidate: the model's and the encoder's.
+    // Nats against every candidate: the model's and the encoder's.
     let angle = |k: usize| TAU * k as f32 / AZIMUTHS as f32;
     let pull = settings.encoder * seen.confidence as f64;
+    let against = |(k, e): (usize, &f64)| {
+        settings.trust * e - pull * f64::from((angle(k) - seen.words.azimuth).cos())
+    };
     let nats: Vec<Vec<f64>> = energies
         .iter()
-        .map(|row| {
-            row.iter()
-                .enumerate()
-                .map(|(k, e)| {
-                    settings.trust * e - pull * f64::from((angle(k) - seen.words.azimuth).cos())
-                })
-                .collect()
-        })
+        .map(|row| row.iter().enumerate().map(against).collect())
         .collect();
-    let best = nats.iter().flatten().copied().fold(f64::INFINITY, f64::min);
     let by_azimuth: Vec<f64> = (0..AZIMUTHS)
         .map(|k| {
-            -nats
-                .iter()
-                .map(|row| (best - row[k]).exp())
-                .sum::<f64>()
-                .ln()
+            let column = nats.iter().map(|row| row[k]);
+            let least = column.clone().fold(f64::INFINITY, f64::min);
+            least - column.map(|n| (least - n).exp()).sum::<f64>().ln()
         })
         .collect();
     let azimuth = minimum_angle(&by_azimuth);
-    // The mean elevation under the posterior, half-way to the encoder's.
-    let (mut mean, mut total) = (0.0, 0.0);
-    for (row, elevation) in nats.iter().zip(ELEVATIONS) {
-        for n in row {
-            let p = (best - n).exp();
-            mean += p * f64::from(elevation.to_radians());
-            total += p;
-        }
-    }
-    let elevation = 0.5 * ((mean / total) as f32 + seen.words.elevation);
+    let confidence = mean_length(&by_azimuth);
+    let was_asked = crops.iter().any(|c| !c.energies.is_empty());
     Reading {
         light: LightEstimate {
+            // Three heights tell less of the elevation than the encoder does.
             words: LightWords {
                 azimuth,
-                elevation,
                 ..seen.words
             },
+            confidence,
             ..*seen
         },
         encoder: *seen,
-        energies,
+        energies: if was_asked { energies } else { vec![] },
+        crops,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SEEN: LightEstimate = LightEstimate {
+        words: LightWords {
+            azimuth: 1.0,
+            elevation: 0.7,
+            sun_share: 0.8,
+        },
+        confidence: 1.0,
+        irradiance: 2.0,
+        warmth: 0.0,
+        sky_warmth: 0.0,
+    };
+
+    /// A crop whose energies, `depth` deep, are least at `azimuth` and at the elevation number `row`.
+    fn crop(azimuth: f32, row: usize, depth: f64) -> CropReading {
+        let energies = (0..AZIMUTHS * ELEVATIONS.len())
+            .map(|k| {
+                let off = TAU * (k % AZIMUTHS) as f32 / AZIMUTHS as f32 - azimuth;
+                let beside = f64::from(u8::from(k / AZIMUTHS != row));
+                depth * (1.0 - f64::from(off.cos()) + beside)
+            })
+            .collect();
+        CropReading {
+            encoder: SEEN,
+            energies,
+        }
+    }
+
+    fn read(crops: Vec<CropReading>, encoder: f64) -> LightEstimate {
+        let settings = ReaderSettings {
+            trust: 1.0,
+            encoder,
+            ..ReaderSettings::default()
+        };
+        combine(crops, &SEEN, &settings).light
+    }
+
+    #[test]
+    fn crops_that_agree_are_believed() {
+        let light = read(vec![crop(2.3, 2, 9.0); 4], 0.0);
+        assert!((light.words.azimuth - 2.3).abs() < 0.02, "{light:?}");
+        assert_eq!(light.words.elevation, SEEN.words.elevation);
+        assert!(light.confidence > 0.95, "{light:?}");
+    }
+
+    #[test]
+    fn crops_that_disagree_leave_doubt() {
+        let light = read(vec![crop(1.0, 1, 2.0), crop(4.0, 1, 2.0)], 0.0);
+        assert!(light.confidence < 0.5, "{light:?}");
+        let with_encoder = read(vec![crop(1.0, 1, 2.0), crop(4.0, 1, 2.0)], 8.0);
+        assert!(
+            (with_encoder.words.azimuth - 1.0).abs() < 0.3,
+            "{with_encoder:?}"
+        );
+        assert!(with_encoder.confidence > 0.8, "{with_encoder:?}");
+    }
+
+    #[test]
+    fn energies_of_any_size_are_combined_to_numbers() {
+        for depth in [0.0, 1e-12, 1e3, 1e12] {
+            let light = read(vec![crop(1.0, 0, depth), crop(4.0, 2, depth)], 0.0);
+            let words = light.words;
+            assert!(
+                words.azimuth.is_finite() && words.elevation.is_finite(),
+                "{depth}"
+            );
+            assert!(
+                (0.0..=1.0).contains(&light.confidence),
+                "{depth}: {light:?}"
+            );
+        }
+        // Without crops the encoder is left.
+        let words = read(vec![], 2.0).words;
+        assert!(
+            (words.azimuth - SEEN.words.azimuth).abs() < 0.02,
+            "{words:?}"
+        );
     }
 }
