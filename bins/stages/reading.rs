@@ -20,8 +20,8 @@ use crate::interruption;
 const CROP: f32 = 2.6;
 /// Crops that the model is asked to explain.
 const CROPS: usize = 12;
-/// The first of them, around the place of the insertion, where nothing stands yet.
-const EMPTY: usize = 3;
+/// The first of them, around the place of the insertion.
+const NEAR: usize = 3;
 /// Width of the sun's lobe at the start, radians: that of the model's training, in the middle.
 const SUN_SIGMA: f32 = 0.07;
 /// How much of what is not known of the sun's direction its lobe covers, of which a hard shadow would be
@@ -229,7 +229,7 @@ pub fn read_light(
         progress(share);
         interruption()
     };
-    match read(model, &encoder, &crops, EMPTY, settings, seed, &report)? {
+    match read(model, &encoder, &crops, NEAR, settings, seed, &report)? {
         Some(reading) => Ok(Some(reading)),
         None => Err(Interrupted.into()),
     }

@@ -68,7 +68,7 @@ impl Default for ReaderSettings {
     fn default() -> Self {
         Self {
             draws: 2,
-            trust: 20.0,
+            trust: 10.0,
             encoder: 16.0,
             context: Context::Hidden,
         }
@@ -276,15 +276,14 @@ fn crop_energies(
     Ok(sum)
 }
 
-/// Reads the light off `crops` of one photograph. The encoder sees what stands there: all crops but the first
-/// `empty` ones, in whose middle nothing does, unless there are no others.
+/// Reads the light off `crops` of one photograph, the first `same` of which are views of one place and count as one.
 /// `progress` is told the share that is done and may stop: then the result is
 /// `None`.
 pub fn read(
     model: &Model,
     encoder: &LightEncoder,
     crops: &[Crop],
-    empty: usize,
+    same: usize,
     settings: &ReaderSettings,
     seed: u64,
     progress: &(dyn Fn(f64) -> ControlFlow<()> + Sync),
@@ -298,11 +297,8 @@ pub fn read(
         })
     });
     let mut readings = readings.collect::<Result<Vec<_>>>()?;
-    let seen: Vec<LightEstimate> = readings.iter().map(|r| r.encoder).collect();
-    let seen = LightEstimate::mean(match seen.get(empty..) {
-        Some(objects) if !objects.is_empty() => objects,
-        _ => &seen,
-    })?;
+    let shares = (0..readings.len()).map(|i| if i < same { 1.0 / same as f32 } else { 1.0 });
+    let seen = LightEstimate::mean(readings.iter().map(|r| r.encoder).zip(shares))?;
     if settings.draws == 0 {
         return Ok(Some(combine(readings, &seen, settings)));
     }
