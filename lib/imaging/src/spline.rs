@@ -323,14 +323,18 @@ impl Curve {
         }
         let k = find(y, &self.knots.y);
         let bin = &self.bins[k];
-        // The root of a xi^2 + b xi + c that lies in [0, 1], in the form that does not cancel
-        // [Durkan et al. 2019, appendix A]. The discriminant is not negative but for rounding.
+        // The root of a xi^2 + b xi + c that lies in [0, 1] [Durkan et al. 2019, appendix A], in that of its two
+        // forms which does not cancel. The discriminant is not negative but for rounding; a is positive if b is not.
         let rise = (y - bin.y) / bin.h;
         let a = bin.s - bin.d0 + rise * bin.bend;
         let b = bin.d0 - rise * bin.bend;
         let c = -bin.s * rise;
         let root = (b * b - 4.0 * a * c).max(0.0).sqrt();
-        let xi = if c == 0.0 { 0.0 } else { -2.0 * c / (b + root) };
+        let xi = match (c == 0.0, b < 0.0) {
+            (true, _) => 0.0,
+            (false, true) => (root - b) / (2.0 * a),
+            (false, false) => -2.0 * c / (b + root),
+        };
         bin.x + (self.knots.x[k + 1] - bin.x) * xi.clamp(0.0, 1.0)
     }
 }
@@ -651,6 +655,24 @@ mod tests {
                     );
                 }
             }
+        }
+    }
+
+    #[test]
+    fn heights_in_a_bin_that_ends_steeply_are_inverted() {
+        // Slopes of the last bin: 1 and 12, .03 on average; -2 c / (b + root) cancels.
+        let mut logits = [0.0; PARAMETERS];
+        let found = [
+            5.502, 3.242, 1.365, -13.963, 16.776, 18.064, -0.416, 4.1, -7.124, 14.472,
+        ];
+        logits[..10].copy_from_slice(&found);
+        logits[15] = 11.639;
+        let knots = SplineParameters::from_array(logits).knots();
+        for k in 0..=1000 {
+            let y = f64::from(k) / 1000.0;
+            let x = knots.inverse(y);
+            let tolerance = 8.0 * f64::EPSILON * (1.0 + knots.slope(x) * (1.0 + x.abs()));
+            assert!((knots.eval(x) - y).abs() < tolerance.max(1e-13), "{y}: {x}");
         }
     }
 
