@@ -14,6 +14,7 @@ Examples:
   dipir-evaluate run --environment-from estimates/             another estimator: estimates/SCENE.exr
   dipir-evaluate report                                        tables and a page of what is there
   dipir-evaluate report --scene generated                      of some scenes
+  dipir-evaluate report --lpips alex.safetensors               with LPIPS
   dipir-evaluate study page --method ours                      a page that asks people
   dipir-evaluate study count answers/*.json                    what they said
 
@@ -136,6 +137,11 @@ pub struct ReportArgs {
     /// The method that others are compared with, scene by scene [default: ours, if there]
     #[arg(long, value_name = "NAME")]
     pub baseline: Option<String>,
+
+    /// Weights of LPIPS with AlexNet, to compute that, too: the tensors of
+    /// lpips.LPIPS(net="alex").state_dict() as safetensors
+    #[arg(long, value_name = "FILE")]
+    pub lpips: Option<PathBuf>,
 
     /// Only scenes whose names begin like this; may be repeated
     #[arg(long, value_name = "NAME")]

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 use dipir_cli::exit::Usage;
+use dipir_evaluation::lpips::Lpips;
 use dipir_evaluation::summary::Summary;
 use serde_json::{Value, json};
 
@@ -12,7 +13,7 @@ use crate::bench::{Bench, SceneInfo, read_json, write, write_json};
 use crate::cli::ReportArgs;
 use crate::methods;
 use crate::page::{Page, image, text};
-use crate::run::{Score, TRUTH};
+use crate::run::{Score, Shown, TRUTH};
 
 /// Seed of every bootstrap.
 const SEED: u64 = 1;
@@ -26,7 +27,7 @@ struct Metric {
     of: fn(&Score) -> Option<f64>,
 }
 
-const METRICS: [Metric; 8] = [
+static METRICS: [Metric; 9] = [
     Metric {
         name: "RMSE",
         about: "display-referred, all pixels; less is better",
@@ -56,6 +57,12 @@ const METRICS: [Metric; 8] = [
         about: "the same, over the object alone",
         digits: 4,
         of: |s| s.picture.map(|p| p.si_rmse_object),
+    },
+    Metric {
+        name: "LPIPS",
+        about: "learned perceptual distance with AlexNet, all pixels; less is better",
+        digits: 4,
+        of: |s| s.lpips,
     },
     Metric {
         name: "peak, degrees",
@@ -91,17 +98,24 @@ struct Column {
 pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
     let bench = Bench::new(&args.folder.out);
     let scenes = bench.chosen(&args.scene)?;
-    let columns = read(&bench, &scenes)?;
+    let mut columns = read(&bench, &scenes)?;
+    if let Some(file) = &args.lpips {
+        add_lpips(&bench, &Lpips::load(file)?, &mut columns)?;
+    }
+    let metrics = told(&columns);
     let baseline = baseline(args, &columns)?;
     let files = ["json", "csv", "md", "html"].map(|e| bench.root().join(format!("report.{e}")));
-    let summaries = summaries(&columns, baseline);
-    write_json(&files[0], &to_json(&columns, &summaries, baseline))?;
-    write(&files[1], csv(&columns))?;
-    let table = markdown(&columns, &summaries, baseline);
+    let summaries = summaries(&columns, &metrics, baseline);
+    write_json(
+        &files[0],
+        &to_json(&columns, &metrics, &summaries, baseline),
+    )?;
+    write(&files[1], csv(&columns, &metrics))?;
+    let table = markdown(&columns, &metrics, &summaries, baseline);
     write(&files[2], &table)?;
     write(
         &files[3],
-        html(&bench, &scenes, &columns, &summaries, baseline)?,
+        html(&bench, &scenes, (&columns, &metrics), &summaries, baseline)?,
     )?;
     args.folder.output.result(
         || {
@@ -150,6 +164,30 @@ fn read(bench: &Bench, scenes: &[SceneInfo]) -> anyhow::Result<Vec<Column>> {
     Ok(columns)
 }
 
+/// Adds LPIPS to the scores of pictures.
+fn add_lpips(bench: &Bench, network: &Lpips, columns: &mut [Column]) -> anyhow::Result<()> {
+    let shown = |method: &str, scene: &str| {
+        Shown::read(&bench.run(method, scene).join("composite/composite.exr"))
+    };
+    for column in columns {
+        for (scene, score) in &mut column.scores {
+            let found = shown(&column.name, scene)?.picture;
+            let distance = network.distance(&found, &shown(TRUTH, scene)?.picture)?;
+            score.lpips = Some(distance);
+        }
+    }
+    Ok(())
+}
+
+/// The metrics that some score has.
+fn told(columns: &[Column]) -> Vec<&'static Metric> {
+    let has = |m: &&Metric| {
+        let mut scores = columns.iter().flat_map(|c| c.scores.values());
+        scores.any(|s| (m.of)(s).is_some())
+    };
+    METRICS.iter().filter(has).collect()
+}
+
 /// The column that others are compared with.
 fn baseline(args: &ReportArgs, columns: &[Column]) -> anyhow::Result<Option<usize>> {
     let find = |name: &str| columns.iter().position(|c| c.name == name);
@@ -172,7 +210,7 @@ struct Row {
     beside: Option<Summary>,
 }
 
-fn summaries(columns: &[Column], baseline: Option<usize>) -> Vec<Row> {
+fn summaries(columns: &[Column], metrics: &[&Metric], baseline: Option<usize>) -> Vec<Row> {
     let compared = METRICS[COMPARED].of;
     let row = |(k, column): (usize, &Column)| {
         let all = |of: fn(&Score) -> Option<f64>| -> Vec<f64> {
@@ -187,7 +225,7 @@ fn summaries(columns: &[Column], baseline: Option<usize>) -> Vec<Row> {
             Summary::of(&all, SEED)
         });
         Row {
-            metrics: METRICS
+            metrics: metrics
                 .iter()
                 .map(|m| Summary::of(&all(m.of), SEED))
                 .collect(),
@@ -197,12 +235,17 @@ fn summaries(columns: &[Column], baseline: Option<usize>) -> Vec<Row> {
     columns.iter().enumerate().map(row).collect()
 }
 
-fn to_json(columns: &[Column], rows: &[Row], baseline: Option<usize>) -> Value {
+fn to_json(
+    columns: &[Column],
+    metrics: &[&Metric],
+    rows: &[Row],
+    baseline: Option<usize>,
+) -> Value {
     let methods = columns.iter().zip(rows).map(|(column, row)| {
-        let metrics: BTreeMap<&str, &Option<Summary>> =
-            METRICS.iter().map(|m| m.name).zip(&row.metrics).collect();
+        let medians: BTreeMap<&str, &Option<Summary>> =
+            metrics.iter().map(|m| m.name).zip(&row.metrics).collect();
         json!({
-            "name": column.name, "title": column.title, "medians": metrics,
+            "name": column.name, "title": column.title, "medians": medians,
             "beside_baseline": row.beside, "scores": column.scores.values().collect::<Vec<_>>(),
         })
     });
@@ -213,12 +256,13 @@ fn to_json(columns: &[Column], rows: &[Row], baseline: Option<usize>) -> Value {
     })
 }
 
-fn csv(columns: &[Column]) -> String {
-    let heads: Vec<&str> = METRICS.iter().map(|m| m.name).collect();
+fn csv(columns: &[Column], metrics: &[&Metric]) -> String {
+    let heads: Vec<&str> = metrics.iter().map(|m| m.name).collect();
     let mut out = format!("method,scene,\"{}\"\n", heads.join("\",\""));
     for column in columns {
         for (scene, score) in &column.scores {
-            let cells = METRICS.map(|m| (m.of)(score).map_or(String::new(), |v| v.to_string()));
+            let cell = |m: &&Metric| (m.of)(score).map_or(String::new(), |v| v.to_string());
+            let cells: Vec<String> = metrics.iter().map(cell).collect();
             let _ = writeln!(out, "{},{scene},{}", column.name, cells.join(","));
         }
     }
@@ -229,9 +273,14 @@ fn cell(summary: &Option<Summary>, digits: usize) -> String {
     summary.as_ref().map_or("-".into(), |s| s.text(digits))
 }
 
-fn markdown(columns: &[Column], rows: &[Row], baseline: Option<usize>) -> String {
+fn markdown(
+    columns: &[Column],
+    metrics: &[&Metric],
+    rows: &[Row],
+    baseline: Option<usize>,
+) -> String {
     let mut out = String::from("| method | scenes |");
-    for metric in &METRICS {
+    for metric in metrics {
         let _ = write!(out, " {} |", metric.name);
     }
     if let Some(b) = baseline {
@@ -242,11 +291,11 @@ fn markdown(columns: &[Column], rows: &[Row], baseline: Option<usize>) -> String
         );
     }
     out += "\n|---|--:|";
-    out += &"---|".repeat(METRICS.len() + usize::from(baseline.is_some()));
+    out += &"---|".repeat(metrics.len() + usize::from(baseline.is_some()));
     out.push('\n');
     for (column, row) in columns.iter().zip(rows) {
         let _ = write!(out, "| {} | {} |", column.title, column.scores.len());
-        for (metric, summary) in METRICS.iter().zip(&row.metrics) {
+        for (metric, summary) in metrics.iter().zip(&row.metrics) {
             let _ = write!(out, " {} |", cell(summary, metric.digits));
         }
         if baseline.is_some() {
@@ -260,7 +309,7 @@ fn markdown(columns: &[Column], rows: &[Row], baseline: Option<usize>) -> String
 fn html(
     bench: &Bench,
     scenes: &[SceneInfo],
-    columns: &[Column],
+    (columns, metrics): (&[Column], &[&Metric]),
     rows: &[Row],
     baseline: Option<usize>,
 ) -> anyhow::Result<String> {
@@ -270,7 +319,7 @@ fn html(
         scenes.len()
     ));
     page.push("<div class=\"wide\"><table><thead><tr><th>method</th><th>scenes</th>");
-    for metric in &METRICS {
+    for metric in metrics {
         page.push(&format!(
             "<th title=\"{}\">{}</th>",
             text(metric.about),
@@ -291,7 +340,7 @@ fn html(
             text(&column.title),
             column.scores.len()
         ));
-        for (metric, summary) in METRICS.iter().zip(&row.metrics) {
+        for (metric, summary) in metrics.iter().zip(&row.metrics) {
             page.push(&format!("<td>{}</td>", text(&cell(summary, metric.digits))));
         }
         if baseline.is_some() {
@@ -303,7 +352,7 @@ fn html(
         page.push("</tr>");
     }
     page.push("</tbody></table></div><ul class=\"soft\">");
-    for metric in &METRICS {
+    for metric in metrics {
         page.push(&format!(
             "<li>{}: {}</li>",
             text(metric.name),

@@ -46,6 +46,9 @@ pub struct Score {
     pub scene: String,
     /// Errors of the picture; absent for the truth.
     pub picture: Option<PictureScores>,
+    /// LPIPS of the picture, if a report was asked for it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
     /// Errors of the light.
     pub light: Option<LightScores>,
     /// Seconds of the stages before the composite, and of the composite.
@@ -215,6 +218,7 @@ impl Runner<'_> {
                 title: "Truth".into(),
                 scene: scene.name.clone(),
                 picture: None,
+                lpips: None,
                 light: None,
                 seconds: run.seconds,
                 peak_rss_bytes: run.peak_rss_bytes,
@@ -311,6 +315,7 @@ impl Runner<'_> {
                 &truth.picture,
                 &truth.touched,
             )),
+            lpips: None,
             light: Some(compare_lights(&light, &truth.map)),
             seconds: run.seconds,
             peak_rss_bytes: run.peak_rss_bytes,
@@ -497,14 +502,16 @@ impl<'a> Stages<'a> {
 }
 
 /// A picture as it is displayed.
-struct Shown {
-    picture: DisplayImage,
+pub struct Shown {
+    /// The composite.
+    pub picture: DisplayImage,
     photo: DisplayImage,
     coverage: Raster<f32>,
 }
 
 impl Shown {
-    fn read(exr: &Path) -> anyhow::Result<Self> {
+    /// Reads the layers of a composite.
+    pub fn read(exr: &Path) -> anyhow::Result<Self> {
         let layers = Layers::read_exr(exr)?;
         let shown = |name: &str| anyhow::Ok(Transfer::Srgb.encode(&LinearImage(layers.rgb(name)?)));
         Ok(Self {

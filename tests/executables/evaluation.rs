@@ -1,6 +1,9 @@
 //! `dipir-evaluate`: scenes, runs, report, study.
+use std::collections::HashMap;
 use std::fs;
+use std::path::Path;
 
+use candle_core::{DType, Device, Tensor};
 use dipir_light::environment::EnvironmentMap;
 use glam::Vec3;
 use serde_json::{Value, json};
@@ -21,10 +24,36 @@ fn evaluation() -> Project {
     map.write(project.path("maps/square.exr")).unwrap();
     project.write("models/toy.obj", OBJECT);
     let make = [
-        "make", "--hdri", "maps", "--models", "models", "--count", "1", "--size", "24x16",
+        "make", "--hdri", "maps", "--models", "models", "--count", "1", "--size", "36x32",
     ];
     project.run(EVALUATE, &make).expect_success();
     project
+}
+
+/// Weights of LPIPS, all of them 0.
+fn blind_network(path: &Path) {
+    let layers = [
+        ("1.0", 64, 3, 11),
+        ("2.3", 192, 64, 5),
+        ("3.6", 384, 192, 3),
+        ("4.8", 256, 384, 3),
+        ("5.10", 256, 256, 3),
+    ];
+    let zeros = |shape: &[usize]| Tensor::zeros(shape, DType::F32, &Device::Cpu).unwrap();
+    let tensors: HashMap<String, Tensor> = (0..)
+        .zip(layers)
+        .flat_map(|(k, (name, out, inputs, side))| {
+            [
+                (
+                    format!("net.slice{name}.weight"),
+                    zeros(&[out, inputs, side, side]),
+                ),
+                (format!("net.slice{name}.bias"), zeros(&[out])),
+                (format!("lin{k}.model.1.weight"), zeros(&[1, out, 1, 1])),
+            ]
+        })
+        .collect();
+    candle_core::safetensors::save(&tensors, path).unwrap();
 }
 
 #[test]
@@ -58,6 +87,20 @@ fn methods_run_once_and_are_reported_and_asked_about() {
     // The photograph, the truth, and both methods.
     assert_eq!(page.matches("data:image/png;base64,").count(), 4);
     assert!(page.contains("Photograph projected") && !page.contains("http"));
+
+    // Weights that are not there, and weights under which nothing is perceived.
+    let table = || String::from_utf8(project.read("evaluation/report.csv")).unwrap();
+    assert!(!table().contains("LPIPS"));
+    let lpips = ["report", "--lpips", "alex.safetensors"];
+    let told = "error: cannot use alex.safetensors: No such file or directory; it must hold the tensors of \
+                lpips.LPIPS(net=\"alex\").state_dict()";
+    project.run(EVALUATE, &lpips).expect_error(1, told);
+    blind_network(&project.path("alex.safetensors"));
+    project.run(EVALUATE, &lpips).expect_success();
+    let report: Value = serde_json::from_slice(&project.read("evaluation/report.json")).unwrap();
+    let score = &report["methods"][0]["scores"][0];
+    assert_eq!(score["lpips"].as_f64(), Some(0.0), "{score}");
+    assert!(table().contains("\"LPIPS\""));
 
     project
         .run(EVALUATE, &["study", "page", "--method", "projected"])

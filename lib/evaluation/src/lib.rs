@@ -4,6 +4,7 @@ pub mod chart;
 pub mod drawing;
 pub mod front;
 mod glyphs;
+pub mod lpips;
 pub mod scores;
 pub mod study;
 pub mod summary;
