@@ -6,9 +6,9 @@
 //! of the pipeline without a model, the light encoder, the inversion, and guidance on top of it.
 //!
 //! Run with `cargo test --bench guidance -- --bench [MODEL] [key=value...]`: `scenes` and `first`
-//! choose the scenes, `iterations = 0` leaves guidance out, `ablations = 1` adds guidance with one
+//! choose the scenes, `street = 1` puts them in front of houses and trees, `iterations = 0` leaves guidance out, `ablations = 1` adds guidance with one
 //! ingredient less each, `rate` scales the learning rates, `noise` is the draws of
-//! noise of an iteration, `trust`, `encoder` and `draws` are the reader's, `json` is a file for every scene's numbers. Prints the table of docs/prior.md with
+//! noise of an iteration, `trust`, `encoder`, `t` and `draws` are the reader's, `json` is a file for every scene's numbers. Prints the table of docs/prior.md with
 //! bootstrap intervals. Without `--bench`, as tests run it, it does nothing: what it measures takes
 //! minutes.
 use std::collections::BTreeMap;
@@ -37,7 +37,7 @@ use dipir_prior::lights::sun_angles;
 use dipir_prior::place::Place;
 use dipir_prior::reader::{ReaderSettings, Reading, combine};
 use dipir_prior::student::add_placeholders;
-use dipir_prior::studio::Paint;
+use dipir_prior::studio::{Paint, Setting};
 use dipir_render::features::SPECULAR;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
@@ -77,8 +77,8 @@ fn ground() -> Proxy {
 }
 
 impl Trial {
-    fn draw(index: u64, samples: u32) -> anyhow::Result<Self> {
-        let place = Place::draw(SEED, index, SIZE);
+    fn draw(index: u64, samples: u32, setting: Setting) -> anyhow::Result<Self> {
+        let place = Place::draw(SEED, index, SIZE, setting);
         let (stage, tone) = (&place.stage, place.tone);
         let mut shown: Vec<f32> = place.radiance.iter().flat_map(|p| p.to_array()).collect();
         tone.apply(&mut shown);
@@ -200,6 +200,7 @@ struct Knobs {
     model: PathBuf,
     scenes: u64,
     first: u64,
+    setting: Setting,
     iterations: usize,
     rate: f64,
     ablations: bool,
@@ -215,7 +216,7 @@ fn run(
     index: u64,
     readings: &mut Vec<serde_json::Value>,
 ) -> anyhow::Result<BTreeMap<&'static str, Answer>> {
-    let trial = Trial::draw(index, knobs.samples)?;
+    let trial = Trial::draw(index, knobs.samples, knobs.setting)?;
     let lobes = 32;
     let table = OptimizeTable {
         iterations: Some(knobs.iterations.max(1)),
@@ -490,6 +491,7 @@ fn main() -> anyhow::Result<()> {
         model: "data/prior".into(),
         scenes: 100,
         first: 0,
+        setting: Setting::Open,
         iterations: 50,
         rate: 0.05,
         ablations: false,
@@ -503,10 +505,17 @@ fn main() -> anyhow::Result<()> {
         match arg.split_once('=') {
             Some(("scenes", v)) => knobs.scenes = v.parse()?,
             Some(("first", v)) => knobs.first = v.parse()?,
+            Some(("street", v)) => {
+                knobs.setting = match v.parse::<u8>()? {
+                    0 => Setting::Open,
+                    _ => Setting::Street,
+                }
+            }
             Some(("iterations", v)) => knobs.iterations = v.parse()?,
             Some(("rate", v)) => knobs.rate = v.parse()?,
             Some(("trust", v)) => knobs.reader.trust = v.parse()?,
             Some(("encoder", v)) => knobs.reader.encoder = v.parse()?,
+            Some(("t", v)) => knobs.reader.told_at = v.parse()?,
             Some(("json", v)) => knobs.json = Some(v.into()),
             Some(("ablations", v)) => knobs.ablations = v.parse::<u8>()? != 0,
             Some(("noise", v)) => knobs.guidance_draws = v.parse()?,

@@ -8,7 +8,7 @@ use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::rasterize::rasterize;
 use dipir_prior::lights::{Light, Sun, sun_direction};
 use dipir_prior::record::{BASIS, Layer, Record, first_plane, shadow_weights, weights};
-use dipir_prior::studio::{Kinds, Stage, View};
+use dipir_prior::studio::{Kinds, Setting, Stage, View};
 use dipir_render::features::SPECULAR;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
@@ -42,7 +42,13 @@ fn map(light: &Light, sun: Sun) -> EnvironmentMap {
 #[test]
 fn objects_and_shadows_are_as_the_renderer_shows_them() {
     for index in 0..3 {
-        let mut stage = Stage::draw(11, index, SIZE, Kinds::Trained, View::Close);
+        let mut stage = Stage::draw(
+            11,
+            index,
+            SIZE,
+            (Kinds::Trained, Setting::Open),
+            View::Close,
+        );
         stage.main_paint.metallic = false;
         stage.main_paint.roughness = 0.8;
         let sun = Sun {

@@ -76,6 +76,9 @@ pub struct MakeArgs {
     /// sun, square
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub generated: u64,
+    /// Generated places are in front of houses and trees instead of on open ground
+    #[arg(long)]
+    pub street: bool,
 
     /// Seed of what is drawn
     #[arg(long, value_name = "N", default_value_t = 0)]

@@ -6,6 +6,7 @@ use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_prior::place::Place;
+use dipir_prior::studio::Setting;
 use dipir_scene::export::to_obj;
 
 use crate::bench::{Bench, SceneInfo, Tone, write, write_json};
@@ -16,11 +17,21 @@ const MAP: [usize; 2] = [512, 256];
 const SEED: u64 = 0xeba1_5ce2;
 
 /// Makes the scene number `index` under `seed`, `side` pixels high and wide, unless it is there; its name.
-pub fn make(bench: &Bench, seed: u64, index: u64, side: usize) -> anyhow::Result<String> {
-    let place = Place::draw(SEED ^ seed, index, side as u32);
+pub fn make(
+    bench: &Bench,
+    seed: u64,
+    index: u64,
+    side: usize,
+    setting: Setting,
+) -> anyhow::Result<String> {
+    let place = Place::draw(SEED ^ seed, index, side as u32, setting);
     let stage = &place.stage;
     let class = stage.shape.word();
-    let name = format!("generated-{index:03}-{class}");
+    let kind = match setting {
+        Setting::Open => "generated",
+        Setting::Street => "street",
+    };
+    let name = format!("{kind}-{index:03}-{class}");
     let folder = bench.scene(&name);
     if folder.join("scene.json").is_file() {
         return Ok(name);

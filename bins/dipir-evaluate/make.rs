@@ -12,6 +12,7 @@ use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
 use dipir_numerics::sampler::{Sampler, Stream};
+use dipir_prior::studio::Setting;
 use dipir_render::shapes::torus_knot;
 use dipir_scene::export::to_obj;
 use glam::Vec3;
@@ -55,9 +56,19 @@ pub fn run(args: &MakeArgs) -> anyhow::Result<()> {
     if let Some(folder) = &args.hdri {
         made = of_panoramas(args, &bench, folder, &progress)?;
     }
+    let setting = match args.street {
+        true => Setting::Street,
+        false => Setting::Open,
+    };
     for n in 0..args.generated {
         progress.set(n as f64 / args.generated as f64);
-        made.push(generated::make(&bench, args.seed, n, args.size[1])?);
+        made.push(generated::make(
+            &bench,
+            args.seed,
+            n,
+            args.size[1],
+            setting,
+        )?);
     }
     progress.done();
     args.folder.output.result(

@@ -3,6 +3,8 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use dipir_cli::args::OutputArgs;
+use dipir_prior::encoder::EncoderSettings;
+use dipir_prior::energy::SHARES;
 use dipir_prior::examples::Recipe;
 use dipir_prior::trainer::TrainerSettings;
 
@@ -93,15 +95,22 @@ pub struct Train {
 }
 
 #[derive(Args)]
+#[command(allow_negative_numbers = true)]
 pub struct Encoder {
     #[command(flatten)]
     pub data: Data,
     /// Pictures to train on
-    #[arg(long, default_value_t = 300_000)]
+    #[arg(long, default_value_t = EncoderSettings::default().samples)]
     pub samples: usize,
     /// Key of all random numbers
-    #[arg(long, default_value_t = 3)]
+    #[arg(long, default_value_t = EncoderSettings::default().seed)]
     pub seed: u64,
+    /// Learning rate after the warm-up
+    #[arg(long, default_value_t = EncoderSettings::default().learning_rate)]
+    pub learning_rate: f64,
+    /// Model folder whose encoder it starts from
+    #[arg(long, value_name = "MODEL")]
+    pub from: Option<PathBuf>,
 }
 
 #[derive(Args)]
@@ -117,6 +126,9 @@ pub struct Gates {
     /// Draws of noise at each timestep
     #[arg(long, default_value_t = 4)]
     pub draws: usize,
+    /// Timesteps at which lights are compared, shares of all
+    #[arg(long, value_delimiter = ',', default_values_t = SHARES)]
+    pub timesteps: Vec<f64>,
 }
 
 #[derive(Args)]

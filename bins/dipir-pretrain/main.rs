@@ -19,11 +19,12 @@ use dipir_diffusion::generate::{GenerateSettings, generate};
 use dipir_diffusion::model::Model;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
+use dipir_diffusion::weights::Weights;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, Raster};
-use dipir_prior::blueprint::Blueprint;
+use dipir_prior::blueprint::{Blueprint, WEIGHT_FILES};
 use dipir_prior::dataset::{Dataset, DatasetSettings};
-use dipir_prior::encoder;
+use dipir_prior::encoder::{self, EncoderSettings};
 use dipir_prior::examples::Recipe;
 use dipir_prior::gates;
 use dipir_prior::student::add_placeholders;
@@ -72,6 +73,16 @@ fn scenes(data: &Data, seed: u64, output: &OutputArgs) -> anyhow::Result<Dataset
     dataset.ok_or_else(|| Interrupted.into())
 }
 
+fn check_rate(rate: f64) -> anyhow::Result<()> {
+    match rate > 0.0 && rate.is_finite() {
+        true => Ok(()),
+        false => {
+            let message = format!("--learning-rate {rate}: accepted are numbers above 0");
+            Err(Usage(message).into())
+        }
+    }
+}
+
 fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     for (name, share) in [
         ("light-words", args.light_words),
@@ -86,13 +97,7 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
         let message = format!("--contrast {}: accepted are 0 and more", args.contrast);
         return Err(Usage(message).into());
     }
-    if !(args.learning_rate > 0.0 && args.learning_rate.is_finite()) {
-        let message = format!(
-            "--learning-rate {}: accepted are numbers above 0",
-            args.learning_rate
-        );
-        return Err(Usage(message).into());
-    }
+    check_rate(args.learning_rate)?;
     let settings = TrainerSettings {
         samples: args.samples,
         batch: args.batch,
@@ -108,13 +113,20 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     };
     let blueprint = Blueprint::default();
     let out = &args.data.out;
+    let checkpoint = args.data.cache.join("checkpoint.safetensors");
+    let from = args.from.as_ref().filter(|_| !checkpoint.is_file());
+    // Before anything is written.
+    if let Some(from) = from {
+        for (_, file) in WEIGHT_FILES {
+            Weights::open_file(&from.join(file))?;
+        }
+    }
     blueprint.write_configs(out)?;
     let mut trainer = Trainer::new(&blueprint, out, settings, recipe)?;
-    let checkpoint = args.data.cache.join("checkpoint.safetensors");
-    if checkpoint.is_file() {
-        trainer.resume(&checkpoint)?;
-    } else if let Some(from) = &args.from {
-        trainer.start_from(from)?;
+    match from {
+        Some(from) => trainer.start_from(from)?,
+        None if checkpoint.is_file() => trainer.resume(&checkpoint)?,
+        None => {}
     }
     let data = scenes(&args.data, args.seed, output)?;
     let resumed_at = trainer.seen();
@@ -169,25 +181,29 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
 }
 
 fn train_encoder(args: &Encoder, output: &OutputArgs) -> anyhow::Result<()> {
+    check_rate(args.learning_rate)?;
+    let from = args.from.as_deref();
+    if let Some(from) = from {
+        Weights::open_file(&from.join(encoder::FILE))?;
+    }
     let seed = TrainerSettings::default().seed;
     let data = scenes(&args.data, seed, output)?;
+    let settings = EncoderSettings {
+        samples: args.samples,
+        seed: args.seed,
+        learning_rate: args.learning_rate,
+    };
     std::fs::create_dir_all(&args.data.out)
         .with_context(|| format!("cannot create {}", args.data.out.display()))?;
     let progress = Progress::new("encoder", output.quiet);
     let mut mean: Option<f64> = None;
-    let finished = encoder::train(
-        &data,
-        args.samples,
-        args.seed,
-        &args.data.out,
-        &mut |seen, loss| {
-            let loss = mean.map_or(loss, |m| 0.98 * m + 0.02 * loss);
-            mean = Some(loss);
-            progress.set(seen as f64 / args.samples as f64);
-            progress.say(format!("loss {loss:.4}"));
-            go_on()
-        },
-    )?;
+    let finished = encoder::train(&data, &settings, from, &args.data.out, &mut |seen, loss| {
+        let loss = mean.map_or(loss, |m| 0.98 * m + 0.02 * loss);
+        mean = Some(loss);
+        progress.set(seen as f64 / args.samples as f64);
+        progress.say(format!("loss {loss:.4}"));
+        go_on()
+    })?;
     progress.done();
     if !finished {
         return Err(Interrupted.into());
@@ -216,14 +232,24 @@ fn measure(args: &Gates, output: &OutputArgs) -> anyhow::Result<()> {
     if args.scenes == 0 || args.draws == 0 {
         return Err(Usage("--scenes and --draws must be at least 1".into()).into());
     }
+    if let Some(t) = args.timesteps.iter().find(|t| !(0.0..1.0).contains(*t)) {
+        return Err(Usage(format!("--timesteps {t}: accepted are 0 to below 1")).into());
+    }
     let model = load(&args.model)?;
     let progress = std::sync::Mutex::new(Progress::new("gates", output.quiet));
-    let found = gates::measure(&model, args.first, args.scenes, args.draws, &|done| {
-        if let Ok(progress) = progress.lock() {
-            progress.set(done as f64 / args.scenes as f64);
-        }
-        go_on()
-    })?;
+    let found = gates::measure(
+        &model,
+        args.first,
+        args.scenes,
+        args.draws,
+        &args.timesteps,
+        &|done| {
+            if let Ok(progress) = progress.lock() {
+                progress.set(done as f64 / args.scenes as f64);
+            }
+            go_on()
+        },
+    )?;
     drop(progress);
     interrupt::check()?;
     output.result(
@@ -242,7 +268,7 @@ fn measure(args: &Gates, output: &OutputArgs) -> anyhow::Result<()> {
                     "{} held-out scenes, {} draws of noise at each of {} timesteps\n{:<51}{:>7}{names}",
                     found.scenes,
                     args.draws,
-                    dipir_prior::energy::SHARES.len(),
+                    args.timesteps.len(),
                     "gate",
                     "wanted"
                 ),

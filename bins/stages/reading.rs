@@ -24,10 +24,10 @@ const CROPS: usize = 12;
 const NEAR: usize = 3;
 /// Width of the sun's lobe at the start, radians: that of the model's training, in the middle.
 const SUN_SIGMA: f32 = 0.07;
-/// How much of what is not known of the sun's direction its lobe covers, of which a hard shadow would be
-/// in the wrong place.
+/// Width of the sun's lobe for each radian by which its azimuth is unsure: a hard shadow would lie in the wrong
+/// place.
 const HEDGE: f32 = 0.5;
-/// Its largest width, radians.
+/// Largest width of the sun's lobe, radians.
 const WIDEST: f32 = 0.8;
 /// Share of the ground's light that it throws back at the object.
 const GROUND_ALBEDO: f32 = 0.3;
@@ -252,7 +252,7 @@ pub fn start(estimate: &LightEstimate, camera: &Camera, lobes: usize) -> Paramet
             radiance: Vec3::ONE,
             sigma: SUN_SIGMA.hypot(HEDGE * estimate.spread()).min(WIDEST),
         };
-        // What the ground has of it if it is as bright as 1, no sun at the horizon assumed.
+        // Irradiance of the ground if the lobe's radiance is 1; at the horizon it would be next to nothing.
         let of_one = lobe.irradiance(Vec3::Y).x.max(0.1 * lobe.solid_angle());
         SphericalGaussian {
             radiance: on_ground / of_one as f32,

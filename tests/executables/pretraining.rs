@@ -1,7 +1,9 @@
 //! `dipir-pretrain`: a run from a model and what it refuses.
+use std::time::{Duration, Instant};
+
 use serde_json::Value;
 
-use crate::project::{PRETRAIN, Project};
+use crate::project::{PRETRAIN, Project, Run};
 
 /// The embedded model's folder.
 const PRIOR: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/data/prior");
@@ -41,13 +43,15 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
         (first["examples"].as_u64(), first["resumed_at"].as_u64()),
         (Some(24), Some(0))
     );
-    // From nothing it is 1 and more; of a model that knows pictures .2, and two updates of 1e-6 change nothing.
-    assert!(first["loss"].as_f64().unwrap() < 0.5, "{first}");
     let weights = "model/unet/diffusion_pytorch_model.safetensors";
     let trained = project.read(weights);
     let again = run(&from);
     assert_eq!(again["resumed_at"].as_u64(), Some(24));
     assert_eq!(project.read(weights), trained);
+    // A model that knows pictures errs less than one that knows nothing.
+    std::fs::remove_file(project.path("cache/checkpoint.safetensors")).unwrap();
+    let [known, unknown] = [&first, &run(&[])].map(|r| r["loss"].as_f64().unwrap());
+    assert!(known < 0.5 * unknown, "{known} {unknown}");
 
     let gates = [
         "gates", "model", "--first", "1000", "--scenes", "2", "--draws", "1", "--json",
@@ -56,6 +60,46 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
     found.expect_success();
     let found: Value = serde_json::from_str(&found.stdout).unwrap();
     assert_eq!(found["scenes"].as_u64(), Some(2), "{found}");
+    let late = [&gates[..], &["--timesteps", "0.5,1"]].concat();
+    let told = "error: --timesteps 1: accepted are 0 to below 1";
+    project.run(PRETRAIN, &late).expect_error(2, told);
+}
+
+#[cfg(unix)]
+#[test]
+fn control_c_saves_what_was_trained() {
+    let project = Project::new();
+    let endless = ["--samples", "1200000", "--checkpoint-every", "1"];
+    let endless: Vec<&str> = TINY
+        .into_iter()
+        .filter(|a| !["--samples", "24"].contains(a))
+        .chain(endless)
+        .collect();
+    let mut child = project.command(PRETRAIN, &endless).spawn().unwrap();
+    let checkpoint = project.path("cache/checkpoint.safetensors");
+    let deadline = Instant::now() + Duration::from_secs(120);
+    while !checkpoint.is_file() {
+        let ended = child.try_wait().unwrap();
+        assert!(ended.is_none() && Instant::now() < deadline, "{ended:?}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let pid = child.id().to_string();
+    let sent = std::process::Command::new("kill")
+        .args(["-INT", &pid])
+        .status();
+    assert!(sent.unwrap().success());
+    let run: Run = child.wait_with_output().unwrap().into();
+    run.expect_error(130, "interrupted; earlier results are as they were");
+    // The weights so far are a model, and a run goes on from where this one was.
+    assert!(
+        project
+            .path("model/unet/diffusion_pytorch_model.safetensors")
+            .is_file()
+    );
+    let again = project.run(PRETRAIN, &[&TINY[..], &["--json"]].concat());
+    again.expect_success();
+    let again: Value = serde_json::from_str(&again.stdout).unwrap();
+    assert!(again["resumed_at"].as_u64().unwrap() > 0, "{again}");
 }
 
 #[test]
@@ -72,6 +116,40 @@ fn what_is_wrong_is_told_before_scenes_are_rendered() {
     ] {
         let run = project.run(PRETRAIN, &[&TINY[..], &wrong].concat());
         run.expect_error(code, &format!("error: {told}"));
-        assert!(!project.path("cache/scenes").exists(), "{wrong:?}");
+        for written in ["cache/scenes", "model"] {
+            assert!(!project.path(written).exists(), "{wrong:?}");
+        }
     }
+}
+
+#[test]
+fn an_encoder_goes_on_from_that_of_a_model() {
+    let project = Project::new();
+    let tiny = [
+        "encoder",
+        "--out",
+        "model",
+        "--cache",
+        "cache",
+        "--scenes",
+        "2",
+        "--samples",
+        "128",
+    ];
+    let nowhere = project.run(PRETRAIN, &[&tiny[..], &["--from", "nowhere"]].concat());
+    let told = "error: cannot read nowhere/light_encoder.safetensors: No such file or directory";
+    nowhere.expect_error(1, told);
+    assert!(!project.path("cache").exists() && !project.path("model").exists());
+    let late = [&tiny[..], &["--learning-rate", "-1"]].concat();
+    let told = "error: --learning-rate -1: accepted are numbers above 0";
+    project.run(PRETRAIN, &late).expect_error(2, told);
+    // One that knows light errs less than one that knows nothing.
+    let loss = |more: &[&str]| {
+        let run = project.run(PRETRAIN, &[&tiny[..], &["--json"], more].concat());
+        run.expect_success();
+        let told: Value = serde_json::from_str(&run.stdout).unwrap();
+        told["loss"].as_f64().unwrap()
+    };
+    let (known, unknown) = (loss(&["--from", PRIOR]), loss(&[]));
+    assert!(known < 0.5 * unknown, "{known} {unknown}");
 }

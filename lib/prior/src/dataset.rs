@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use crate::error::{Error, Result, io};
 use crate::lights::Sun;
 use crate::record::{PLANES, Record};
-use crate::studio::{Kinds, SUNS, Stage, View};
+use crate::studio::{Kinds, SUNS, Setting, Stage, View};
 
 /// Scenes in a file.
 pub const BLOCK: usize = 64;
@@ -28,7 +28,7 @@ const FACTS: usize = 2 + 3 * SUNS;
 pub struct DatasetSettings {
     /// Key of all random numbers.
     pub seed: u64,
-    /// How many scenes; rounded up to whole files.
+    /// How many scenes, every second of them a street; rounded up to whole files.
     pub scenes: usize,
     /// Which main objects.
     pub kinds: Kinds,
@@ -180,7 +180,8 @@ fn write_block(path: &Path, settings: &DatasetSettings, block: usize) -> Result<
                 settings.seed,
                 index,
                 RECORD_SIZE as u32,
-                settings.kinds,
+                // Every second scene: photographs of real places show more than open ground.
+                (settings.kinds, [Setting::Open, Setting::Street][i % 2]),
                 View::Close,
             );
             let record = Record::trace(&stage, settings.seed, index);

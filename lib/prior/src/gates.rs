@@ -20,7 +20,7 @@ use crate::lights::{Light, Sun};
 use crate::record::{Layer, Record};
 use crate::shapes::Shape;
 use crate::student::latents_of;
-use crate::studio::{Kinds, Stage, View};
+use crate::studio::{Kinds, Setting, Stage, View};
 use crate::words::{Caption, LightWords};
 
 /// Key of the scenes on which gates are measured; training uses others.
@@ -66,7 +66,7 @@ impl Trial {
             HELD_OUT_SEED,
             index,
             RECORD_SIZE as u32,
-            Kinds::HeldOut,
+            (Kinds::HeldOut, Setting::Open),
             View::Close,
         );
         let mut stream = NoiseStream::new(HELD_OUT_SEED ^ 1, index);
@@ -144,7 +144,7 @@ struct Answer {
     azimuth_error: f64,
 }
 
-fn ask(model: &Model, index: u64, draws: usize) -> Result<Answer> {
+fn ask(model: &Model, index: u64, draws: usize, told_at: &[f64]) -> Result<Answer> {
     let trial = Trial::draw(index);
     let mut stream = NoiseStream::new(HELD_OUT_SEED ^ 2, index);
     let tone = Tone {
@@ -164,7 +164,7 @@ fn ask(model: &Model, index: u64, draws: usize) -> Result<Answer> {
         let captions: Vec<_> = azimuths.iter().map(|&a| trial.caption(a, window)).collect();
         let asked = states(model, &captions)?;
         let (_, observation) = trial.observe(0, &tone, window)?;
-        let found = energies(model, &observation, &asked, &SHARES, &mut stream)?;
+        let found = energies(model, &observation, &asked, told_at, &mut stream)?;
         e.iter_mut().zip(found).for_each(|(e, f)| *e += f);
         let contexts = guiding(model, trial.shape.word(), &window.words(trial.words(truth)))?;
         for (against, (near, far)) in against.iter_mut().zip([(1, 2), (3, 4)]) {
@@ -217,19 +217,21 @@ pub fn minimum_angle(values: &[f64]) -> f32 {
 }
 
 /// Measures the gates on `scenes` scenes from number `first` on with `draws` of noise at each
-/// timestep, every other of them seen in the mirror. `progress` is told how many are done and may stop.
+/// timestep, every other of them seen in the mirror: the timesteps of [`SHARES`] for LDS, those of `told_at`, shares of all,
+/// for what explains the picture. `progress` is told how many are done and may stop.
 pub fn measure(
     model: &Model,
     first: u64,
     scenes: usize,
     draws: usize,
+    told_at: &[f64],
     progress: &(dyn Fn(usize) -> ControlFlow<()> + Sync),
 ) -> Result<Gates> {
     let done = std::sync::atomic::AtomicUsize::new(0);
     let answers: Vec<Answer> = (first..first.saturating_add(scenes as u64))
         .into_par_iter()
         .map(|i| {
-            let answer = ask(model, i, draws)?;
+            let answer = ask(model, i, draws, told_at)?;
             let n = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
             Ok((progress(n).is_continue()).then_some(answer))
         })
@@ -316,7 +318,13 @@ mod tests {
     #[test]
     fn shadows_fall_away_from_the_sun() {
         // The sun from the right: the shadow darkens the ground on the left.
-        let mut stage = Stage::draw(3, 1, RECORD_SIZE as u32, Kinds::Trained, View::Close);
+        let mut stage = Stage::draw(
+            3,
+            1,
+            RECORD_SIZE as u32,
+            (Kinds::Trained, Setting::Open),
+            View::Close,
+        );
         for sun in &mut stage.suns {
             *sun = Sun {
                 azimuth: PI / 2.0,

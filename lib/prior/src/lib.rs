@@ -1,6 +1,7 @@
 //! The small model that knows light: scenes to train it on, how captions
 //! name light, its training, and what it finds out about a photograph.
 
+mod backdrop;
 pub mod blueprint;
 pub mod dataset;
 pub mod encoder;

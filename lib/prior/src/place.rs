@@ -12,7 +12,7 @@ use glam::Vec3;
 use crate::examples::Tone;
 use crate::lights::{Light, Sun, sun_direction};
 use crate::record::{Layer, Record, first_plane, weights};
-use crate::studio::{Kinds, Stage, View};
+use crate::studio::{Kinds, Setting, Stage, View};
 
 /// A place, its light, and what a camera sees of it.
 #[derive(Debug, Clone)]
@@ -29,8 +29,9 @@ pub struct Place {
 
 impl Place {
     /// The place number `index` under `seed`, seen on `size` x `size` pixels.
-    pub fn draw(seed: u64, index: u64, size: u32) -> Self {
-        let mut stage = Stage::draw(seed, index, size, Kinds::HeldOut, View::Wide);
+    pub fn draw(seed: u64, index: u64, size: u32, setting: Setting) -> Self {
+        let kinds = (Kinds::HeldOut, setting);
+        let mut stage = Stage::draw(seed, index, size, kinds, View::Wide);
         let mut stream = NoiseStream::new(seed ^ 1, index);
         let mut range = |low: f32, high: f32| low + (high - low) * stream.uniform() as f32;
         let sun = Sun {
@@ -100,7 +101,7 @@ mod tests {
 
     #[test]
     fn the_map_lights_open_ground_as_the_light_says() {
-        let place = Place::draw(5, 0, 8);
+        let place = Place::draw(5, 0, 8, Setting::Open);
         let map = place.map(256, 128).unwrap();
         let mut irradiance = Vec3::ZERO;
         for row in 0..128 {

@@ -282,7 +282,7 @@ fn rock(p: [f32; 3]) -> TriangleMesh {
 }
 
 /// A box with flat faces.
-fn cuboid(center: Vec3, half: Vec3) -> TriangleMesh {
+pub(crate) fn cuboid(center: Vec3, half: Vec3) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     for axis in 0..3 {
         for sign in [-1.0f32, 1.0] {

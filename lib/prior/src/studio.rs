@@ -6,6 +6,7 @@ use dipir_scene::camera::{Camera, FieldOfView};
 use dipir_scene::mesh::TriangleMesh;
 use glam::{DMat4, DQuat, DVec3, Vec2, Vec3};
 
+use crate::backdrop::Backdrop;
 use crate::lights::{Sun, draw_suns};
 use crate::shapes::Shape;
 use crate::words::COLORS;
@@ -42,6 +43,7 @@ enum Pattern {
     Checkers,
     Stripes,
     Noise,
+    Tiles,
 }
 
 /// Which solids may be drawn.
@@ -60,6 +62,15 @@ pub enum View {
     Close,
     /// A photograph of the place: eight metres wide, with more objects.
     Wide,
+}
+
+/// Where the objects stand.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Setting {
+    /// On open ground, seen from above.
+    Open,
+    /// In front of houses, trees and what else a street has, seen at eye level.
+    Street,
 }
 
 /// A scene without its light.
@@ -83,15 +94,26 @@ pub struct Stage {
     pub suns: Vec<Sun>,
 }
 
-struct Draw<'a>(&'a mut NoiseStream);
+/// Draws of numbers.
+pub(crate) struct Draw<'a>(&'a mut NoiseStream);
+
+impl<'a> Draw<'a> {
+    pub(crate) fn new(stream: &'a mut NoiseStream) -> Self {
+        Self(stream)
+    }
+}
 
 impl Draw<'_> {
-    fn range(&mut self, low: f32, high: f32) -> f32 {
+    pub(crate) fn range(&mut self, low: f32, high: f32) -> f32 {
         low + (high - low) * self.0.uniform() as f32
     }
 
-    fn below(&mut self, n: usize) -> usize {
+    pub(crate) fn below(&mut self, n: usize) -> usize {
         self.0.below(n)
+    }
+
+    pub(crate) fn chance(&mut self, share: f64) -> bool {
+        self.0.uniform() < share
     }
 
     fn paint(&mut self) -> Paint {
@@ -116,7 +138,7 @@ impl Draw<'_> {
         }
     }
 
-    fn ground(&mut self) -> Ground {
+    fn ground(&mut self, setting: Setting) -> Ground {
         let hue = Vec3::new(
             self.range(0.6, 1.0),
             self.range(0.6, 1.0),
@@ -130,6 +152,7 @@ impl Draw<'_> {
                 self.range(-0.04, 0.04),
             );
         let pattern = match self.range(0.0, 1.0) {
+            x if x < 0.4 && setting == Setting::Street => Pattern::Tiles,
             x if x < 0.25 => Pattern::Plain,
             x if x < 0.37 => Pattern::Checkers,
             x if x < 0.49 => Pattern::Stripes,
@@ -175,9 +198,15 @@ impl Draw<'_> {
 
 impl Stage {
     /// The scene number `index` under `seed`, for pictures of `size` pixels.
-    pub fn draw(seed: u64, index: u64, size: u32, kinds: Kinds, view: View) -> Self {
+    pub fn draw(
+        seed: u64,
+        index: u64,
+        size: u32,
+        (kinds, setting): (Kinds, Setting),
+        view: View,
+    ) -> Self {
         let mut stream = NoiseStream::new(seed, index);
-        let mut draw = Draw(&mut stream);
+        let mut draw = Draw::new(&mut stream);
         let shape = match kinds {
             // Faces tell less of the light than shadows do, so half of the scenes are about them.
             Kinds::Trained => match draw.below(2) {
@@ -219,8 +248,12 @@ impl Stage {
                 placed.push((at, r));
             }
         }
-        let ground = draw.ground();
-        let pitch = draw.range(10.0, 45.0).to_radians();
+        let ground = draw.ground(setting);
+        let (low, high) = match setting {
+            Setting::Open => (10.0, 45.0),
+            Setting::Street => (3.0, 25.0),
+        };
+        let pitch = draw.range(low, high).to_radians();
         let (distance, width) = match view {
             View::Close => (draw.range(4.0, 9.0), draw.range(2.8, 4.2)),
             View::Wide => (draw.range(8.0, 14.0), draw.range(7.0, 9.0)),
@@ -239,6 +272,15 @@ impl Stage {
             [size, size],
         );
         let suns = draw_suns(SUNS, draw.0);
+        if setting == Setting::Street {
+            let near = match view {
+                View::Close => 1.6,
+                View::Wide => 3.4,
+            };
+            let behind = Backdrop::draw(&mut Draw::new(&mut stream), near, width);
+            others.append(behind.mesh, paints.len() as u32);
+            paints.extend(behind.paints);
+        }
         Self {
             main,
             main_paint,
@@ -261,6 +303,16 @@ impl Ground {
             Pattern::Plain => 0.0,
             Pattern::Checkers => (odd(p.x) - odd(p.y)).abs(),
             Pattern::Stripes => odd(p.x),
+            Pattern::Tiles => {
+                // Every second row is shifted by half a tile; joints are dark.
+                let row = (2.0 * p.y).floor();
+                let along = p.x + 0.5 * odd(row);
+                let (across, within) = (2.0 * p.y - row, along - along.floor());
+                if across < 0.1 || within < 0.05 {
+                    return self.colors[0].min(self.colors[1]) * 0.4;
+                }
+                value_noise(Vec2::new(along.floor(), row), self.seed)
+            }
             Pattern::Noise => {
                 0.6 * value_noise(p, self.seed) + 0.4 * value_noise(p * 2.3, self.seed ^ 0x5bd1)
             }
