@@ -51,6 +51,11 @@ pub fn run(args: &MakeArgs) -> anyhow::Result<()> {
                     number of generated places with --generated";
         return Err(Usage(text.into()).into());
     }
+    if args.street && args.generated == 0 {
+        let text =
+            "--street puts generated places in front of houses: say how many with --generated";
+        return Err(Usage(text.into()).into());
+    }
     let progress = Progress::new("make", args.folder.output.quiet);
     let mut made = Vec::new();
     if let Some(folder) = &args.hdri {

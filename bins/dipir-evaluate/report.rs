@@ -7,6 +7,7 @@ use anyhow::bail;
 use dipir_cli::exit::Usage;
 use dipir_evaluation::lpips::Lpips;
 use dipir_evaluation::summary::Summary;
+use dipir_imaging::raster::DisplayImage;
 use serde_json::{Value, json};
 
 use crate::bench::{Bench, SceneInfo, read_json, write, write_json};
@@ -166,14 +167,18 @@ fn read(bench: &Bench, scenes: &[SceneInfo]) -> anyhow::Result<Vec<Column>> {
 
 /// Adds LPIPS to the scores of pictures.
 fn add_lpips(bench: &Bench, network: &Lpips, columns: &mut [Column]) -> anyhow::Result<()> {
-    let shown = |method: &str, scene: &str| {
-        Shown::read(&bench.run(method, scene).join("composite/composite.exr"))
+    let picture = |method: &str, scene: &str| -> anyhow::Result<DisplayImage> {
+        let file = bench.run(method, scene).join("composite/composite.exr");
+        Ok(Shown::read(&file)?.picture)
     };
+    let mut truths = BTreeMap::new();
     for column in columns {
         for (scene, score) in &mut column.scores {
-            let found = shown(&column.name, scene)?.picture;
-            let distance = network.distance(&found, &shown(TRUTH, scene)?.picture)?;
-            score.lpips = Some(distance);
+            if !truths.contains_key(scene) {
+                truths.insert(scene.clone(), picture(TRUTH, scene)?);
+            }
+            let found = picture(&column.name, scene)?;
+            score.lpips = Some(network.distance(&found, &truths[scene])?);
         }
     }
     Ok(())

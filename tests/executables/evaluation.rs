@@ -3,7 +3,7 @@ use std::collections::HashMap;
 use std::fs;
 use std::path::Path;
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::{Device, Tensor};
 use dipir_light::environment::EnvironmentMap;
 use glam::Vec3;
 use serde_json::{Value, json};
@@ -30,8 +30,8 @@ fn evaluation() -> Project {
     project
 }
 
-/// Weights of LPIPS, all of them 0.
-fn blind_network(path: &Path) {
+/// Weights of LPIPS that tell colours and edges apart, though not as people do.
+fn some_network(path: &Path) {
     let layers = [
         ("1.0", 64, 3, 11),
         ("2.3", 192, 64, 5),
@@ -39,21 +39,35 @@ fn blind_network(path: &Path) {
         ("4.8", 256, 384, 3),
         ("5.10", 256, 256, 3),
     ];
-    let zeros = |shape: &[usize]| Tensor::zeros(shape, DType::F32, &Device::Cpu).unwrap();
+    let waves = |shape: &[usize]| {
+        let count: usize = shape.iter().product();
+        let values = (0..count).map(|i| 0.1 * (0.7 * i as f32).sin()).collect();
+        Tensor::from_vec::<_, f32>(values, shape, &Device::Cpu).unwrap()
+    };
     let tensors: HashMap<String, Tensor> = (0..)
         .zip(layers)
         .flat_map(|(k, (name, out, inputs, side))| {
+            let linear = waves(&[1, out, 1, 1]).sqr().unwrap();
             [
                 (
                     format!("net.slice{name}.weight"),
-                    zeros(&[out, inputs, side, side]),
+                    waves(&[out, inputs, side, side]),
                 ),
-                (format!("net.slice{name}.bias"), zeros(&[out])),
-                (format!("lin{k}.model.1.weight"), zeros(&[1, out, 1, 1])),
+                (format!("net.slice{name}.bias"), waves(&[out])),
+                (format!("lin{k}.model.1.weight"), linear),
             ]
         })
         .collect();
     candle_core::safetensors::save(&tensors, path).unwrap();
+}
+
+#[test]
+fn a_street_without_places_is_refused() {
+    let project = evaluation();
+    let make = ["make", "--hdri", "maps", "--street"];
+    let told =
+        "error: --street puts generated places in front of houses: say how many with --generated";
+    project.run(EVALUATE, &make).expect_error(2, told);
 }
 
 #[test]
@@ -88,18 +102,22 @@ fn methods_run_once_and_are_reported_and_asked_about() {
     assert_eq!(page.matches("data:image/png;base64,").count(), 4);
     assert!(page.contains("Photograph projected") && !page.contains("http"));
 
-    // Weights that are not there, and weights under which nothing is perceived.
+    // Weights that are not there, and weights that are.
     let table = || String::from_utf8(project.read("evaluation/report.csv")).unwrap();
     assert!(!table().contains("LPIPS"));
     let lpips = ["report", "--lpips", "alex.safetensors"];
     let told = "error: cannot use alex.safetensors: No such file or directory; it must hold the tensors of \
                 lpips.LPIPS(net=\"alex\").state_dict()";
     project.run(EVALUATE, &lpips).expect_error(1, told);
-    blind_network(&project.path("alex.safetensors"));
+    some_network(&project.path("alex.safetensors"));
     project.run(EVALUATE, &lpips).expect_success();
     let report: Value = serde_json::from_slice(&project.read("evaluation/report.json")).unwrap();
-    let score = &report["methods"][0]["scores"][0];
-    assert_eq!(score["lpips"].as_f64(), Some(0.0), "{score}");
+    let [neutral, projected] =
+        [0, 1].map(|k| report["methods"][k]["scores"][0]["lpips"].as_f64().unwrap());
+    assert!(
+        neutral > 0.0 && projected > 0.0 && neutral != projected,
+        "{report}"
+    );
     assert!(table().contains("\"LPIPS\""));
 
     project

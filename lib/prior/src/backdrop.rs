@@ -24,7 +24,7 @@ impl Backdrop {
             backdrop.houses(draw, depth);
         }
         for _ in 0..draw.below(3) {
-            let at = backdrop.somewhere(draw, near, width);
+            let at = draw.somewhere(near, width);
             backdrop.tree(draw, at);
         }
         // One out of sight, whose shadow may be in it.
@@ -35,19 +35,14 @@ impl Backdrop {
             backdrop.tree(draw, at);
         }
         if draw.chance(0.4) {
-            let at = backdrop.somewhere(draw, near, width);
+            let at = draw.somewhere(near, width);
             backdrop.hedge(draw, at);
         }
         if draw.chance(0.3) {
-            let at = backdrop.somewhere(draw, near, width);
+            let at = draw.somewhere(near, width);
             backdrop.lamp(draw, at);
         }
         backdrop
-    }
-
-    fn somewhere(&self, draw: &mut Draw<'_>, near: f32, width: f32) -> Vec3 {
-        let depth = near + draw.range(0.3, 6.0);
-        Vec3::new(draw.range(-0.7, 0.7) * width, 0.0, -depth)
     }
 
     /// The number of a paint.
@@ -173,6 +168,12 @@ impl Backdrop {
 }
 
 impl Draw<'_> {
+    /// A place on the ground behind `near` metres.
+    fn somewhere(&mut self, near: f32, width: f32) -> Vec3 {
+        let depth = near + self.range(0.3, 6.0);
+        Vec3::new(self.range(-0.7, 0.7) * width, 0.0, -depth)
+    }
+
     /// Plaster, stone or brick.
     fn dull(&mut self) -> Paint {
         let tint = Vec3::new(
