@@ -103,21 +103,14 @@ pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
     if let Some(file) = &args.lpips {
         add_lpips(&bench, &Lpips::load(file)?, &mut columns)?;
     }
-    let metrics = told(&columns);
     let baseline = baseline(args, &columns)?;
+    let report = Report::new(columns, baseline);
     let files = ["json", "csv", "md", "html"].map(|e| bench.root().join(format!("report.{e}")));
-    let summaries = summaries(&columns, &metrics, baseline);
-    write_json(
-        &files[0],
-        &to_json(&columns, &metrics, &summaries, baseline),
-    )?;
-    write(&files[1], csv(&columns, &metrics))?;
-    let table = markdown(&columns, &metrics, &summaries, baseline);
+    write_json(&files[0], &report.json())?;
+    write(&files[1], report.csv())?;
+    let table = report.markdown();
     write(&files[2], &table)?;
-    write(
-        &files[3],
-        html(&bench, &scenes, (&columns, &metrics), &summaries, baseline)?,
-    )?;
+    write(&files[3], report.html(&bench, &scenes)?)?;
     args.folder.output.result(
         || {
             let names: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
@@ -215,179 +208,187 @@ struct Row {
     beside: Option<Summary>,
 }
 
-fn summaries(columns: &[Column], metrics: &[&Metric], baseline: Option<usize>) -> Vec<Row> {
-    let compared = METRICS[COMPARED].of;
-    let row = |(k, column): (usize, &Column)| {
-        let all = |of: fn(&Score) -> Option<f64>| -> Vec<f64> {
-            column.scores.values().filter_map(of).collect()
-        };
-        let beside = baseline.filter(|b| *b != k).and_then(|b| {
-            let difference = |(scene, score): (&String, &Score)| {
-                let other = columns[b].scores.get(scene).and_then(compared)?;
-                Some(compared(score)? - other)
-            };
-            let all: Vec<f64> = column.scores.iter().filter_map(difference).collect();
-            Summary::of(&all, SEED)
-        });
-        Row {
-            metrics: metrics
-                .iter()
-                .map(|m| Summary::of(&all(m.of), SEED))
-                .collect(),
-            beside,
-        }
-    };
-    columns.iter().enumerate().map(row).collect()
-}
-
-fn to_json(
-    columns: &[Column],
-    metrics: &[&Metric],
-    rows: &[Row],
+/// All that is told.
+struct Report {
+    columns: Vec<Column>,
+    metrics: Vec<&'static Metric>,
+    /// The column that others are compared with.
     baseline: Option<usize>,
-) -> Value {
-    let methods = columns.iter().zip(rows).map(|(column, row)| {
-        let medians: BTreeMap<&str, &Option<Summary>> =
-            metrics.iter().map(|m| m.name).zip(&row.metrics).collect();
-        json!({
-            "name": column.name, "title": column.title, "medians": medians,
-            "beside_baseline": row.beside, "scores": column.scores.values().collect::<Vec<_>>(),
-        })
-    });
-    json!({
-        "baseline": baseline.map(|b| &columns[b].name),
-        "compared_by": METRICS[COMPARED].name,
-        "methods": methods.collect::<Vec<_>>(),
-    })
+    /// One for each column.
+    rows: Vec<Row>,
 }
 
-fn csv(columns: &[Column], metrics: &[&Metric]) -> String {
-    let heads: Vec<&str> = metrics.iter().map(|m| m.name).collect();
-    let mut out = format!("method,scene,\"{}\"\n", heads.join("\",\""));
-    for column in columns {
-        for (scene, score) in &column.scores {
-            let cell = |m: &&Metric| (m.of)(score).map_or(String::new(), |v| v.to_string());
-            let cells: Vec<String> = metrics.iter().map(cell).collect();
-            let _ = writeln!(out, "{},{scene},{}", column.name, cells.join(","));
+impl Report {
+    fn new(columns: Vec<Column>, baseline: Option<usize>) -> Self {
+        let metrics = told(&columns);
+        let compared = METRICS[COMPARED].of;
+        let row = |(k, column): (usize, &Column)| {
+            let all = |of: fn(&Score) -> Option<f64>| -> Vec<f64> {
+                column.scores.values().filter_map(of).collect()
+            };
+            let beside = baseline.filter(|b| *b != k).and_then(|b| {
+                let difference = |(scene, score): (&String, &Score)| {
+                    let other = columns[b].scores.get(scene).and_then(compared)?;
+                    Some(compared(score)? - other)
+                };
+                let all: Vec<f64> = column.scores.iter().filter_map(difference).collect();
+                Summary::of(&all, SEED)
+            });
+            Row {
+                metrics: metrics
+                    .iter()
+                    .map(|m| Summary::of(&all(m.of), SEED))
+                    .collect(),
+                beside,
+            }
+        };
+        let rows = columns.iter().enumerate().map(row).collect();
+        Self {
+            columns,
+            metrics,
+            baseline,
+            rows,
         }
     }
-    out
+
+    /// Head of the differences from the baseline.
+    fn beside(&self) -> Option<String> {
+        let title = &self.columns[self.baseline?].title;
+        Some(format!("{} less that of {title}", METRICS[COMPARED].name))
+    }
+
+    fn json(&self) -> Value {
+        let methods = self.columns.iter().zip(&self.rows).map(|(column, row)| {
+            let medians: BTreeMap<&str, &Option<Summary>> = self
+                .metrics
+                .iter()
+                .map(|m| m.name)
+                .zip(&row.metrics)
+                .collect();
+            json!({
+                "name": column.name, "title": column.title, "medians": medians,
+                "beside_baseline": row.beside, "scores": column.scores.values().collect::<Vec<_>>(),
+            })
+        });
+        json!({
+            "baseline": self.baseline.map(|b| &self.columns[b].name),
+            "compared_by": METRICS[COMPARED].name,
+            "methods": methods.collect::<Vec<_>>(),
+        })
+    }
+
+    fn csv(&self) -> String {
+        let heads: Vec<&str> = self.metrics.iter().map(|m| m.name).collect();
+        let mut out = format!("method,scene,\"{}\"\n", heads.join("\",\""));
+        for column in &self.columns {
+            for (scene, score) in &column.scores {
+                let cell = |m: &&Metric| (m.of)(score).map_or(String::new(), |v| v.to_string());
+                let cells: Vec<String> = self.metrics.iter().map(cell).collect();
+                let _ = writeln!(out, "{},{scene},{}", column.name, cells.join(","));
+            }
+        }
+        out
+    }
+
+    fn markdown(&self) -> String {
+        let mut out = String::from("| method | scenes |");
+        for metric in &self.metrics {
+            let _ = write!(out, " {} |", metric.name);
+        }
+        let beside = self.beside();
+        if let Some(head) = &beside {
+            let _ = write!(out, " {head} |");
+        }
+        out += "\n|---|--:|";
+        out += &"---|".repeat(self.metrics.len() + usize::from(beside.is_some()));
+        out.push('\n');
+        for (column, row) in self.columns.iter().zip(&self.rows) {
+            let _ = write!(out, "| {} | {} |", column.title, column.scores.len());
+            for (metric, summary) in self.metrics.iter().zip(&row.metrics) {
+                let _ = write!(out, " {} |", cell(summary, metric.digits));
+            }
+            if beside.is_some() {
+                let _ = write!(out, " {} |", cell(&row.beside, METRICS[COMPARED].digits));
+            }
+            out.push('\n');
+        }
+        out
+    }
+
+    /// The page, with the pictures of `scenes`.
+    fn html(&self, bench: &Bench, scenes: &[SceneInfo]) -> anyhow::Result<String> {
+        let mut page = Page::new("Evaluation");
+        page.push(&format!(
+            "<p class=\"soft\">Medians over scenes with 95% bootstrap intervals; {} scenes.</p>",
+            scenes.len()
+        ));
+        page.push("<div class=\"wide\"><table><thead><tr><th>method</th><th>scenes</th>");
+        for metric in &self.metrics {
+            page.push(&format!(
+                "<th title=\"{}\">{}</th>",
+                text(metric.about),
+                text(metric.name)
+            ));
+        }
+        let beside = self.beside();
+        if let Some(head) = &beside {
+            page.push(&format!("<th>{}</th>", text(head)));
+        }
+        page.push("</tr></thead><tbody>");
+        for (column, row) in self.columns.iter().zip(&self.rows) {
+            page.push(&format!(
+                "<tr><td>{}</td><td>{}</td>",
+                text(&column.title),
+                column.scores.len()
+            ));
+            for (metric, summary) in self.metrics.iter().zip(&row.metrics) {
+                page.push(&format!("<td>{}</td>", text(&cell(summary, metric.digits))));
+            }
+            if beside.is_some() {
+                page.push(&format!(
+                    "<td>{}</td>",
+                    text(&cell(&row.beside, METRICS[COMPARED].digits))
+                ));
+            }
+            page.push("</tr>");
+        }
+        page.push("</tbody></table></div><ul class=\"soft\">");
+        for metric in &self.metrics {
+            page.push(&format!(
+                "<li>{}: {}</li>",
+                text(metric.name),
+                text(metric.about)
+            ));
+        }
+        page.push("</ul>");
+        for scene in scenes {
+            page.push(&format!(
+                "<h2>{}</h2><p class=\"soft\">{}</p><div class=\"grid\">",
+                text(&scene.name),
+                text(&scene.made_from)
+            ));
+            page.push(&figure(
+                &bench.scene(&scene.name).join("photo.png"),
+                "photograph",
+                "",
+            )?);
+            page.push(&figure(&picture(bench, TRUTH, &scene.name), "truth", "")?);
+            for column in &self.columns {
+                if let Some(score) = column.scores.get(&scene.name) {
+                    let said = (METRICS[COMPARED].of)(score);
+                    let said = said.map_or(String::new(), |v| format!("{v:.4}"));
+                    let path = picture(bench, &column.name, &scene.name);
+                    page.push(&figure(&path, &column.title, &said)?);
+                }
+            }
+            page.push("</div>");
+        }
+        Ok(page.finish())
+    }
 }
 
 fn cell(summary: &Option<Summary>, digits: usize) -> String {
     summary.as_ref().map_or("-".into(), |s| s.text(digits))
-}
-
-fn markdown(
-    columns: &[Column],
-    metrics: &[&Metric],
-    rows: &[Row],
-    baseline: Option<usize>,
-) -> String {
-    let mut out = String::from("| method | scenes |");
-    for metric in metrics {
-        let _ = write!(out, " {} |", metric.name);
-    }
-    if let Some(b) = baseline {
-        let _ = write!(
-            out,
-            " {} less that of {} |",
-            METRICS[COMPARED].name, columns[b].title
-        );
-    }
-    out += "\n|---|--:|";
-    out += &"---|".repeat(metrics.len() + usize::from(baseline.is_some()));
-    out.push('\n');
-    for (column, row) in columns.iter().zip(rows) {
-        let _ = write!(out, "| {} | {} |", column.title, column.scores.len());
-        for (metric, summary) in metrics.iter().zip(&row.metrics) {
-            let _ = write!(out, " {} |", cell(summary, metric.digits));
-        }
-        if baseline.is_some() {
-            let _ = write!(out, " {} |", cell(&row.beside, METRICS[COMPARED].digits));
-        }
-        out.push('\n');
-    }
-    out
-}
-
-fn html(
-    bench: &Bench,
-    scenes: &[SceneInfo],
-    (columns, metrics): (&[Column], &[&Metric]),
-    rows: &[Row],
-    baseline: Option<usize>,
-) -> anyhow::Result<String> {
-    let mut page = Page::new("Evaluation");
-    page.push(&format!(
-        "<p class=\"soft\">Medians over scenes with 95% bootstrap intervals; {} scenes.</p>",
-        scenes.len()
-    ));
-    page.push("<div class=\"wide\"><table><thead><tr><th>method</th><th>scenes</th>");
-    for metric in metrics {
-        page.push(&format!(
-            "<th title=\"{}\">{}</th>",
-            text(metric.about),
-            text(metric.name)
-        ));
-    }
-    if let Some(b) = baseline {
-        let head = format!(
-            "{} less that of {}",
-            METRICS[COMPARED].name, columns[b].title
-        );
-        page.push(&format!("<th>{}</th>", text(&head)));
-    }
-    page.push("</tr></thead><tbody>");
-    for (column, row) in columns.iter().zip(rows) {
-        page.push(&format!(
-            "<tr><td>{}</td><td>{}</td>",
-            text(&column.title),
-            column.scores.len()
-        ));
-        for (metric, summary) in metrics.iter().zip(&row.metrics) {
-            page.push(&format!("<td>{}</td>", text(&cell(summary, metric.digits))));
-        }
-        if baseline.is_some() {
-            page.push(&format!(
-                "<td>{}</td>",
-                text(&cell(&row.beside, METRICS[COMPARED].digits))
-            ));
-        }
-        page.push("</tr>");
-    }
-    page.push("</tbody></table></div><ul class=\"soft\">");
-    for metric in metrics {
-        page.push(&format!(
-            "<li>{}: {}</li>",
-            text(metric.name),
-            text(metric.about)
-        ));
-    }
-    page.push("</ul>");
-    for scene in scenes {
-        page.push(&format!(
-            "<h2>{}</h2><p class=\"soft\">{}</p><div class=\"grid\">",
-            text(&scene.name),
-            text(&scene.made_from)
-        ));
-        page.push(&figure(
-            &bench.scene(&scene.name).join("photo.png"),
-            "photograph",
-            "",
-        )?);
-        page.push(&figure(&picture(bench, TRUTH, &scene.name), "truth", "")?);
-        for column in columns {
-            if let Some(score) = column.scores.get(&scene.name) {
-                let said = (METRICS[COMPARED].of)(score);
-                let said = said.map_or(String::new(), |v| format!("{v:.4}"));
-                let path = picture(bench, &column.name, &scene.name);
-                page.push(&figure(&path, &column.title, &said)?);
-            }
-        }
-        page.push("</div>");
-    }
-    Ok(page.finish())
 }
 
 /// Where a method's picture of a scene is.

@@ -24,7 +24,7 @@ use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_prior::blueprint::{Blueprint, WEIGHT_FILES};
 use dipir_prior::dataset::{Dataset, DatasetSettings};
-use dipir_prior::encoder::{self, EncoderSettings};
+use dipir_prior::encoder::{self, EncoderSettings, LightEncoder};
 use dipir_prior::examples::Recipe;
 use dipir_prior::gates;
 use dipir_prior::student::add_placeholders;
@@ -237,8 +237,10 @@ fn measure(args: &Gates, output: &OutputArgs) -> anyhow::Result<()> {
     }
     let model = load(&args.model)?;
     let progress = std::sync::Mutex::new(Progress::new("gates", output.quiet));
+    let encoder = LightEncoder::load(&args.model)?;
     let found = gates::measure(
         &model,
+        encoder.as_ref(),
         args.first,
         args.scenes,
         args.draws,
@@ -256,45 +258,58 @@ fn measure(args: &Gates, output: &OutputArgs) -> anyhow::Result<()> {
         || {
             let percent = |share: f64| format!("{:.1}%", 100.0 * share);
             let degrees = |angle: f64| format!("{angle:.1}");
-            let mut columns = vec![("found", &found)];
-            columns.extend(found.by_shape.iter().map(|(k, v)| (k.as_str(), v)));
-            let names: String = columns.iter().map(|c| format!(" {:>8}", c.0)).collect();
-            let row = |what: &str, wanted: &str, of: &dyn Fn(&gates::Gates) -> String| {
-                let values = columns.iter().map(|c| format!(" {:>8}", of(c.1)));
-                format!("\n{what:<51}{wanted:>7}{}", values.collect::<String>())
+            let column = |name: &str, scenes: usize, sign: Option<f64>, of: &gates::Recognition| {
+                [
+                    name.to_owned(),
+                    scenes.to_string(),
+                    sign.map_or_else(String::new, percent),
+                    percent(of.over_opposite),
+                    percent(of.over_mirror),
+                    percent(of.over_45),
+                    degrees(of.azimuth_median),
+                    percent(of.within_30),
+                ]
             };
-            [
-                format!(
-                    "{} held-out scenes, {} draws of noise at each of {} timesteps\n{:<51}{:>7}{names}",
-                    found.scenes,
-                    args.draws,
-                    args.timesteps.len(),
-                    "gate",
-                    "wanted"
-                ),
-                row("scenes", "", &|g| g.scenes.to_string()),
-                row("LDS 25 degrees off points back to the true azimuth", "97%", &|g| {
-                    percent(g.gradient_sign)
-                }),
-                row("true light preferred to its mirror image", "98%", &|g| {
-                    percent(g.over_mirror)
-                }),
-                row("true light preferred to one 45 degrees off", "90%", &|g| {
-                    percent(g.over_45)
-                }),
-                row("best azimuth from the true one, median, degrees", "10", &|g| {
-                    degrees(g.azimuth_median)
-                }),
-                row("best azimuth within 30 degrees of the true one", "", &|g| {
-                    percent(g.within_30)
-                }),
-            ]
-            .concat()
+            let of_gates = |name: &str, g: &gates::Gates| {
+                column(name, g.scenes, Some(g.gradient_sign), &g.recognition)
+            };
+            let mut columns = vec![of_gates("found", &found)];
+            columns.extend(found.by_shape.iter().map(|(k, v)| of_gates(k, v)));
+            columns.extend(
+                found
+                    .encoder
+                    .map(|e| column("encoder", found.scenes, None, &e)),
+            );
+            let rows = GATES.iter().enumerate().map(|(i, (what, wanted))| {
+                let values = columns.iter().map(|c| format!(" {:>8}", c[i]));
+                format!("\n{what:<51}{wanted:>7}{}", values.collect::<String>())
+            });
+            [format!(
+                "{} held-out scenes, {} draws of noise at each of {} timesteps",
+                found.scenes,
+                args.draws,
+                args.timesteps.len(),
+            )]
+            .into_iter()
+            .chain(rows)
+            .collect::<String>()
         },
         || json!(found),
     );
     Ok(())
 }
+
+/// Rows of the table of gates, and what is wanted of each.
+const GATES: [(&str, &str); 8] = [
+    ("gate", "wanted"),
+    ("scenes", ""),
+    ("LDS 25 degrees off points back to the true azimuth", "97%"),
+    ("true light preferred to the opposite one", "98%"),
+    ("true light preferred to its image, left and right", "98%"),
+    ("true light preferred to one 45 degrees off", "90%"),
+    ("best azimuth from the true one, median, degrees", "10"),
+    ("best azimuth within 30 degrees of the true one", ""),
+];
 
 /// Rows of the contact sheet: what is asked for, in words of the vocabulary.
 const ASKED: [&str; 6] = [

@@ -13,6 +13,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::{RECORD_SIZE, SceneView};
+use crate::encoder::LightEncoder;
 use crate::energy::{Observation, SHARES, difference, energies, guiding, states};
 use crate::error::Result;
 use crate::examples::{Example, Lens, Tone, Window, angle_between, dilate};
@@ -31,14 +32,13 @@ const AZIMUTHS: usize = 16;
 /// the mirror image is the last.
 const OFFSETS: [f32; 7] = [0.0, 25.0, 35.0, -25.0, -35.0, 45.0, -45.0];
 
-/// Shares of right answers and errors, over scenes.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Gates {
-    /// Scenes that were looked at.
-    pub scenes: usize,
-    /// LDS 25 degrees off the truth points back to it.
-    pub gradient_sign: f64,
-    /// The true light explains the picture better than its mirror image.
+/// How well the true azimuth is told from others: shares of right answers and an error, over scenes.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Recognition {
+    /// The true light explains the picture better than the opposite one.
+    pub over_opposite: f64,
+    /// ... than its image in the mirror that swaps left and right, which is next to it where the sun is
+    /// straight ahead or behind.
     pub over_mirror: f64,
     /// ... than a light 45 degrees off.
     pub over_45: f64,
@@ -46,6 +46,21 @@ pub struct Gates {
     pub azimuth_median: f64,
     /// Share of best azimuths within 30 degrees.
     pub within_30: f64,
+}
+
+/// What a model can tell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Gates {
+    /// Scenes that were looked at.
+    pub scenes: usize,
+    /// LDS 25 degrees off the truth points back to it.
+    pub gradient_sign: f64,
+    /// What the model's errors tell.
+    #[serde(flatten)]
+    pub recognition: Recognition,
+    /// What the light encoder reads off the same pictures, without noise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub encoder: Option<Recognition>,
     /// The same for each solid that is inserted, by its name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub by_shape: BTreeMap<String, Gates>,
@@ -136,15 +151,42 @@ impl Trial {
     }
 }
 
-struct Answer {
-    shape: Shape,
-    signs: [bool; 2],
+/// Which other azimuths are told from the true one in a scene, and how far off the best is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Told {
+    opposite: bool,
     mirror: bool,
     beside: [bool; 2],
     azimuth_error: f64,
 }
 
-fn ask(model: &Model, index: u64, draws: usize, told_at: &[f64]) -> Result<Answer> {
+impl Told {
+    /// By an answer: of two azimuths the nearer one is preferred.
+    fn by(answer: f32, truth: f32) -> Self {
+        let error = angle_between(answer, truth);
+        let nearer = |than: f32| error < angle_between(answer, than);
+        Self {
+            opposite: nearer(truth + PI),
+            mirror: nearer(-truth),
+            beside: [FRAC_PI_4, -FRAC_PI_4].map(|d| nearer(truth + d)),
+            azimuth_error: f64::from(error.to_degrees()),
+        }
+    }
+}
+
+struct Answer {
+    shape: Shape,
+    signs: [bool; 2],
+    model: Told,
+    encoder: Option<Told>,
+}
+
+fn ask(
+    (model, encoder): (&Model, Option<&LightEncoder>),
+    index: u64,
+    draws: usize,
+    told_at: &[f64],
+) -> Result<Answer> {
     let trial = Trial::draw(index);
     let mut stream = NoiseStream::new(HELD_OUT_SEED ^ 2, index);
     let tone = Tone {
@@ -176,12 +218,23 @@ fn ask(model: &Model, index: u64, draws: usize, told_at: &[f64]) -> Result<Answe
         }
     }
     let best = minimum_around(&e[..AZIMUTHS]);
+    let encoder = match encoder {
+        Some(encoder) => {
+            let (image, _) = trial.observe(0, &tone, Window::MIDDLE)?;
+            Some(Told::by(encoder.estimate(&image)?.words.azimuth, truth))
+        }
+        None => None,
+    };
     Ok(Answer {
         shape: trial.shape,
         signs: against.map(|a| a > 0.0),
-        mirror: e[0] < e[AZIMUTHS],
-        beside: [e[0] < e[AZIMUTHS + 1], e[0] < e[AZIMUTHS + 2]],
-        azimuth_error: best.to_degrees() as f64,
+        model: Told {
+            opposite: e[0] < e[AZIMUTHS / 2],
+            mirror: e[0] < e[AZIMUTHS],
+            beside: [e[0] < e[AZIMUTHS + 1], e[0] < e[AZIMUTHS + 2]],
+            azimuth_error: best.to_degrees() as f64,
+        },
+        encoder,
     })
 }
 
@@ -221,6 +274,7 @@ pub fn minimum_angle(values: &[f64]) -> f32 {
 /// for what explains the picture. `progress` is told how many are done and may stop.
 pub fn measure(
     model: &Model,
+    encoder: Option<&LightEncoder>,
     first: u64,
     scenes: usize,
     draws: usize,
@@ -231,7 +285,7 @@ pub fn measure(
     let answers: Vec<Answer> = (first..first.saturating_add(scenes as u64))
         .into_par_iter()
         .map(|i| {
-            let answer = ask(model, i, draws, told_at)?;
+            let answer = ask((model, encoder), i, draws, told_at)?;
             let n = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
             Ok((progress(n).is_continue()).then_some(answer))
         })
@@ -253,23 +307,33 @@ pub fn measure(
 
 /// Shares and medians of some answers.
 fn summary(answers: &[&Answer]) -> Gates {
-    let share = |count: usize, of: usize| count as f64 / of.max(1) as f64;
-    let n = answers.len();
-    let mut errors: Vec<f64> = answers.iter().map(|a| a.azimuth_error).collect();
-    errors.sort_by(f64::total_cmp);
-    let both = |pair: fn(&Answer) -> [bool; 2]| {
-        let right = answers.iter().flat_map(|a| pair(a)).filter(|r| *r).count();
-        share(right, 2 * n)
-    };
+    let signs = answers.iter().flat_map(|a| a.signs);
+    let encoder: Option<Vec<Told>> = answers.iter().map(|a| a.encoder).collect();
     Gates {
-        scenes: n,
-        gradient_sign: both(|a| a.signs),
-        over_mirror: share(answers.iter().filter(|a| a.mirror).count(), n),
-        over_45: both(|a| a.beside),
-        azimuth_median: errors.get(n / 2).copied().unwrap_or(f64::NAN),
-        within_30: share(errors.iter().filter(|e| **e <= 30.0).count(), n),
+        scenes: answers.len(),
+        gradient_sign: share(signs),
+        recognition: recognition(&answers.iter().map(|a| a.model).collect::<Vec<_>>()),
+        encoder: encoder.map(|told| recognition(&told)),
         by_shape: BTreeMap::new(),
     }
+}
+
+fn recognition(told: &[Told]) -> Recognition {
+    let mut errors: Vec<f64> = told.iter().map(|t| t.azimuth_error).collect();
+    errors.sort_by(f64::total_cmp);
+    Recognition {
+        over_opposite: share(told.iter().map(|t| t.opposite)),
+        over_mirror: share(told.iter().map(|t| t.mirror)),
+        over_45: share(told.iter().flat_map(|t| t.beside)),
+        azimuth_median: errors.get(told.len() / 2).copied().unwrap_or(f64::NAN),
+        within_30: share(errors.iter().map(|e| *e <= 30.0)),
+    }
+}
+
+/// The share that is right; 0 of nothing.
+fn share(right: impl Iterator<Item = bool>) -> f64 {
+    let (right, all) = right.fold((0usize, 0usize), |(r, n), x| (r + usize::from(x), n + 1));
+    right as f64 / all.max(1) as f64
 }
 
 /// An example as it would be trained on, for pictures of the data.
@@ -299,6 +363,21 @@ mod tests {
                 .collect();
             assert!(angle_between(minimum_angle(&values), shift as f32) < 0.01);
         }
+    }
+
+    #[test]
+    fn of_two_azimuths_the_nearer_to_an_answer_is_preferred() {
+        let told = |answer: f32, truth: f32| Told::by(answer.to_radians(), truth.to_radians());
+        // 20 degrees off: less than half of 45 to one side, and of the 60 to the mirror image.
+        let found = told(50.0, 30.0);
+        assert!(found.opposite && found.mirror && found.beside == [true, true]);
+        assert!((found.azimuth_error - 20.0).abs() < 1e-4, "{found:?}");
+        // 25 degrees beyond: the light 45 degrees further is nearer, the one before is not.
+        assert_eq!(told(55.0, 30.0).beside, [false, true]);
+        // Across the sun straight ahead: the mirror image is nearer, at 350 degrees.
+        let across = told(-4.0, 10.0);
+        assert!(!across.mirror && across.opposite && (across.azimuth_error - 14.0).abs() < 1e-4);
+        assert!(!told(200.0, 30.0).opposite);
     }
 
     #[test]
