@@ -8,7 +8,7 @@ use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::rasterize::rasterize;
 use dipir_prior::lights::{Light, Sun, sun_direction};
 use dipir_prior::record::{BASIS, Layer, Record, first_plane, shadow_weights, weights};
-use dipir_prior::studio::{Kinds, Paint, Setting, Stage, View};
+use dipir_prior::studio::{Brief, Kinds, Paint, Setting, Stage, View};
 use dipir_render::features::SPECULAR;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
@@ -103,8 +103,12 @@ fn apart(squares: &[[f32; 2]]) -> (f32, f32) {
 
 /// A scene under one sun, nothing in it of metal.
 fn stage(index: u64, setting: Setting) -> (Stage, Sun, Light) {
-    let kinds = (Kinds::Trained, setting);
-    let mut stage = Stage::draw(11, index, SIZE, kinds, View::Close);
+    let brief = Brief {
+        kinds: Kinds::Trained,
+        setting,
+        view: View::Close,
+    };
+    let mut stage = Stage::draw(11, index, SIZE, brief);
     for paint in stage.paints.iter_mut().chain([&mut stage.main_paint]) {
         (paint.metallic, paint.roughness) = (false, 0.8);
     }

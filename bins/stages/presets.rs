@@ -5,6 +5,7 @@ use std::sync::OnceLock;
 use dipir_cli::session::duration;
 use dipir_optimize::settings::OptimizeTable;
 use dipir_pipeline::config::Quality;
+use dipir_scene::config::EffectsMode;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
@@ -26,12 +27,22 @@ pub struct Presets {
 pub struct Preset {
     /// Which.
     pub quality: Quality,
+    /// Of `[scene]`.
+    pub scene: ScenePreset,
     /// Of `[composite]`.
     pub composite: CompositePreset,
     /// Of `[optimize]`.
     pub optimize: OptimizePreset,
     /// What recovering light was measured to cost.
     pub light: Option<Measured>,
+}
+
+/// Of `[scene]`.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScenePreset {
+    /// Of `[scene.effects]`: whether planning is worth its time.
+    pub effects: EffectsMode,
 }
 
 /// Of `[composite]`.
@@ -256,6 +267,7 @@ mod tests {
         assert!(draft.composite.target_error > standard.composite.target_error);
         assert!(standard.composite.target_error > high.composite.target_error);
         assert!(draft.optimize.samples <= standard.optimize.samples);
+        assert_eq!(draft.scene.effects, EffectsMode::All);
         assert!(all().measured.is_some() && all().command.is_some());
         let [draft, standard, high] = [draft, standard, high].map(|p| p.light.unwrap());
         assert!(draft.cost_s < standard.cost_s && standard.cost_s < high.cost_s);

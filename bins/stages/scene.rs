@@ -22,7 +22,7 @@ use serde_json::{Value, json};
 use crate::composite::CompositeTable;
 use crate::interruption;
 use crate::light;
-use crate::presets::Outlook;
+use crate::presets::{self, Outlook};
 use crate::transport::{self, Frame};
 
 /// Name of the stage and of its folder.
@@ -71,6 +71,7 @@ impl Record {
 /// Runs the stage.
 pub fn run(session: &Session) -> anyhow::Result<Done> {
     let config: SceneConfig = session.config.table("scene")?;
+    let wanted = settings(session)?.effects;
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
     let mut loaded = Scene::load(&config, &session.config.base_dir())
@@ -104,7 +105,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let effects = effects::plan(
         &renderer,
         &EnvironmentSampler::new(light.map.clone()),
-        &config.effects,
+        &wanted,
         &settings,
         &mut |fraction| {
             progress.set(fraction);
@@ -207,13 +208,14 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     )
 }
 
-/// The keys of `[scene]` that decide what the stage writes: what the object is called concerns the
-/// stages that ask a model.
+/// The keys of `[scene]` that decide what the stage writes, with what the quality says where they are silent: what
+/// the object is called concerns the stages that ask a model.
 pub fn settings(session: &Session) -> anyhow::Result<SceneConfig> {
-    Ok(SceneConfig {
-        class: None,
-        ..session.config.table("scene")?
-    })
+    let mut config: SceneConfig = session.config.table("scene")?;
+    let quality = presets::of(session.pipeline.quality).scene;
+    config.effects.mode = config.effects.mode.or(Some(quality.effects));
+    config.class = None;
+    Ok(config)
 }
 
 /// The files that the configuration itself names, every one once.

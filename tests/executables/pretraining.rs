@@ -60,6 +60,17 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
     found.expect_success();
     let found: Value = serde_json::from_str(&found.stdout).unwrap();
     assert_eq!(found["scenes"].as_u64(), Some(2), "{found}");
+    assert!(found["over_opposite"].is_f64() && found["encoder"].is_null());
+    // A folder with a light encoder is told what that reads, too.
+    let encoder = std::path::Path::new(PRIOR).join("light_encoder.safetensors");
+    std::fs::copy(encoder, project.path("model/light_encoder.safetensors")).unwrap();
+    let table = project.run(PRETRAIN, &gates[..gates.len() - 1]);
+    table.expect_success();
+    let heads = table.stdout.lines().nth(1).unwrap_or_default();
+    let heads: Vec<&str> = heads.split_whitespace().collect();
+    assert_eq!(heads[..3], ["gate", "wanted", "found"]);
+    assert_eq!(heads.last(), Some(&"encoder"));
+    assert_eq!(table.stdout.lines().count(), 9, "{}", table.stdout);
     let late = [&gates[..], &["--timesteps", "0.5,1"]].concat();
     let told = "error: --timesteps 1: accepted are 0 to below 1";
     project.run(PRETRAIN, &late).expect_error(2, told);

@@ -94,6 +94,20 @@ fn an_effect_that_is_switched_off_costs_no_ray() {
 }
 
 #[test]
+fn a_draft_is_not_planned_unless_it_is_asked_for() {
+    let project = Project::new();
+    let draft = ["--set", "pipeline.quality=draft"];
+    let left_out = |more: &[&str]| {
+        project
+            .run(SCENE, &[&draft[..], more].concat())
+            .expect_success();
+        json(&project, "out/scene/effects.json")["left_out"].as_f64()
+    };
+    assert_eq!(left_out(&[]), None);
+    assert!(left_out(&["--set", "scene.effects.mode=planned"]).is_some());
+}
+
+#[test]
 fn a_scene_set_up_with_other_settings_is_warned_of() {
     let project = Project::new();
     project.run(SCENE, &[]).expect_success();

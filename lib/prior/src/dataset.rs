@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use crate::error::{Error, Result, io};
 use crate::lights::Sun;
 use crate::record::{PLANES, Record};
-use crate::studio::{Kinds, SUNS, Setting, Stage, View};
+use crate::studio::{Brief, Kinds, SUNS, Setting, Stage, View};
 
 /// Scenes in a file.
 pub const BLOCK: usize = 64;
@@ -180,9 +180,12 @@ fn write_block(path: &Path, settings: &DatasetSettings, block: usize) -> Result<
                 settings.seed,
                 index,
                 RECORD_SIZE as u32,
-                // Every second scene: photographs of real places show more than open ground.
-                (settings.kinds, [Setting::Open, Setting::Street][i % 2]),
-                View::Close,
+                Brief {
+                    kinds: settings.kinds,
+                    // Photographs of real places show more than open ground.
+                    setting: [Setting::Open, Setting::Street][i % 2],
+                    view: View::Close,
+                },
             );
             let record = Record::trace(&stage, settings.seed, index);
             let planes = record.planes.iter().map(|&v| f16::from_f32(v)).collect();

@@ -438,7 +438,7 @@ pub const LIGHTS: usize = SUNS;
 mod tests {
     use super::*;
     use crate::record::Record;
-    use crate::studio::{Kinds, Setting, Stage, View};
+    use crate::studio::{Brief, Kinds, Setting, Stage, View};
 
     #[test]
     fn what_is_seen_under_another_light_differs_where_the_object_and_its_shadow_are() {
@@ -446,8 +446,11 @@ mod tests {
             3,
             1,
             RECORD_SIZE as u32,
-            (Kinds::Trained, Setting::Open),
-            View::Close,
+            Brief {
+                kinds: Kinds::Trained,
+                setting: Setting::Open,
+                view: View::Close,
+            },
         );
         let record = Record::trace(&stage, 3, 1);
         let planes: Vec<f16> = record.planes.iter().map(|&v| f16::from_f32(v)).collect();

@@ -21,7 +21,7 @@ use crate::lights::{Light, Sun};
 use crate::record::{Layer, Record};
 use crate::shapes::Shape;
 use crate::student::latents_of;
-use crate::studio::{Kinds, Setting, Stage, View};
+use crate::studio::{Brief, Kinds, Setting, Stage, View};
 use crate::words::{Caption, LightWords};
 
 /// Key of the scenes on which gates are measured; training uses others.
@@ -81,8 +81,11 @@ impl Trial {
             HELD_OUT_SEED,
             index,
             RECORD_SIZE as u32,
-            (Kinds::HeldOut, Setting::Open),
-            View::Close,
+            Brief {
+                kinds: Kinds::HeldOut,
+                setting: Setting::Open,
+                view: View::Close,
+            },
         );
         let mut stream = NoiseStream::new(HELD_OUT_SEED ^ 1, index);
         let sun = Sun {
@@ -401,8 +404,11 @@ mod tests {
             3,
             1,
             RECORD_SIZE as u32,
-            (Kinds::Trained, Setting::Open),
-            View::Close,
+            Brief {
+                kinds: Kinds::Trained,
+                setting: Setting::Open,
+                view: View::Close,
+            },
         );
         for sun in &mut stage.suns {
             *sun = Sun {

@@ -12,7 +12,7 @@ use glam::Vec3;
 use crate::examples::Tone;
 use crate::lights::{Light, Sun, sun_direction};
 use crate::record::{Layer, Record, first_plane, weights};
-use crate::studio::{Kinds, Setting, Stage, View};
+use crate::studio::{Brief, Kinds, Setting, Stage, View};
 
 /// A place, its light, and what a camera sees of it.
 #[derive(Debug, Clone)]
@@ -30,8 +30,12 @@ pub struct Place {
 impl Place {
     /// The place number `index` under `seed`, seen on `size` x `size` pixels.
     pub fn draw(seed: u64, index: u64, size: u32, setting: Setting) -> Self {
-        let kinds = (Kinds::HeldOut, setting);
-        let mut stage = Stage::draw(seed, index, size, kinds, View::Wide);
+        let brief = Brief {
+            kinds: Kinds::HeldOut,
+            setting,
+            view: View::Wide,
+        };
+        let mut stage = Stage::draw(seed, index, size, brief);
         let mut stream = NoiseStream::new(seed ^ 1, index);
         let mut range = |low: f32, high: f32| low + (high - low) * stream.uniform() as f32;
         let sun = Sun {

@@ -73,6 +73,17 @@ pub enum Setting {
     Street,
 }
 
+/// What kind of scene is drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Brief {
+    /// Which solids.
+    pub kinds: Kinds,
+    /// Where they stand.
+    pub setting: Setting,
+    /// How much is seen.
+    pub view: View,
+}
+
 /// A scene without its light.
 #[derive(Debug, Clone)]
 pub struct Stage {
@@ -198,13 +209,12 @@ impl Draw<'_> {
 
 impl Stage {
     /// The scene number `index` under `seed`, for pictures of `size` pixels.
-    pub fn draw(
-        seed: u64,
-        index: u64,
-        size: u32,
-        (kinds, setting): (Kinds, Setting),
-        view: View,
-    ) -> Self {
+    pub fn draw(seed: u64, index: u64, size: u32, brief: Brief) -> Self {
+        let Brief {
+            kinds,
+            setting,
+            view,
+        } = brief;
         let mut stream = NoiseStream::new(seed, index);
         let mut draw = Draw::new(&mut stream);
         let shape = match kinds {

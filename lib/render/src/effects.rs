@@ -184,7 +184,9 @@ impl EffectsPlan {
                 PlannedEffect {
                     name,
                     enabled: absent.is_none(),
-                    reason: absent.unwrap_or("everything was asked for").to_owned(),
+                    reason: absent
+                        .unwrap_or("everything is simulated, nothing was planned")
+                        .to_owned(),
                     contribution: None,
                     contribution_se: None,
                     time_share: None,
@@ -354,7 +356,7 @@ pub fn plan<L: SceneLight>(
     }
     explain_dependents(&mut plan);
     let pilot = Pilot::new(renderer, light, settings);
-    if config.mode == EffectsMode::Planned {
+    if config.mode() == EffectsMode::Planned {
         leave_out(&mut plan, &pilot, config, progress)?;
     }
     if let Some(depth) = config.max_depth {

@@ -144,9 +144,9 @@ macro_rules! effects_config {
         #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
         #[serde(deny_unknown_fields)]
         pub struct EffectsConfig {
-            /// Whether planning decides what is simulated.
-            #[serde(default)]
-            pub mode: EffectsMode,
+            /// Whether planning decides what is simulated; by default it does.
+            #[serde(skip_serializing_if = "Option::is_none")]
+            pub mode: Option<EffectsMode>,
             /// Display-referred RMSE that may be left out, 0.002 by default.
             #[serde(skip_serializing_if = "Option::is_none")]
             pub tolerance: Option<f64>,
@@ -195,6 +195,11 @@ impl EffectsConfig {
     /// Most interactions of a path that are ever simulated; an albedo of 0.8 leaves 17% of the
     /// light after eight.
     pub const MOST_DEPTH: u32 = 8;
+
+    /// Whether planning decides what is simulated.
+    pub fn mode(&self) -> EffectsMode {
+        self.mode.unwrap_or_default()
+    }
 
     /// Display-referred RMSE that may be left out.
     pub fn tolerance(&self) -> f64 {
