@@ -426,7 +426,7 @@ fn guided(
     let coverage = trial.transport.coverage().clone();
     let camera = &trial.place.stage.camera;
     let told = bounding_box(&coverage)
-        .map(|object| said.words.seen_from(reading::heading(camera, object)));
+        .map(|object| said.words.seen_from(reading::gaze(camera, object).heading));
     let paint = match variant.background {
         true => coverage,
         false => Raster::filled(SIZE as usize, SIZE as usize, 1.0),

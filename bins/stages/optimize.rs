@@ -132,8 +132,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
             let paint = if reading.is_some() { &coverage } else { &mask };
             let seen = reading.as_ref().zip(bounding_box(&coverage));
             let seen = seen.map(|(r, object)| {
-                let heading = reading::heading(&frame.camera, object);
-                r.light.words.seen_from(heading)
+                let gaze = reading::gaze(&frame.camera, object);
+                r.light.words.seen_from(gaze.heading)
             });
             Box::new(guide.distillation(settings, class, seen.as_ref(), &shown, paint)?)
         }

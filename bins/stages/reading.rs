@@ -9,6 +9,7 @@ use dipir_optimize::parameters::Parameters;
 use dipir_prior::encoder::{LightEncoder, LightEstimate};
 use dipir_prior::examples::SIZE;
 use dipir_prior::reader::{Crop, ReaderSettings, Reading, read};
+use dipir_prior::words::Gaze;
 use dipir_scene::camera::Camera;
 use dipir_scene::proxy::Proxy;
 use glam::{DVec3, Vec2, Vec3};
@@ -75,18 +76,17 @@ fn crop_of(photo: &Raster<Vec3>, camera: &Camera, region: PixelBox) -> Crop {
     let resize = CropResize::new(size, region, (SIZE, SIZE), Filter::Bilinear);
     Crop {
         picture: planes(&resize.apply(photo)),
-        heading: heading(camera, region),
+        gaze: gaze(camera, region),
     }
 }
 
-/// Angle on the ground from where the camera looks to the middle of `region`, towards the right,
-/// radians: azimuths of a crop are relative to it.
-pub fn heading(camera: &Camera, region: PixelBox) -> f32 {
+/// Where the middle of `region` lies: azimuths of a crop are relative to its heading.
+pub fn gaze(camera: &Camera, region: PixelBox) -> Gaze {
     let corner = Vec2::new(region.x as f32, region.y as f32);
     let half = Vec2::new(region.width as f32, region.height as f32) * 0.5;
     let ray = camera.ray(corner + half).direction;
     let (forward, right) = ground_axes(camera);
-    ray.dot(right).atan2(ray.dot(forward))
+    Gaze::along(ray, forward, right)
 }
 
 /// A square of `side` around a point, moved into the picture.
@@ -355,8 +355,8 @@ mod tests {
             width: 20,
             height: 20,
         };
-        assert!(heading(&camera, at(70)).abs() < 1e-6);
-        let (left, right) = (heading(&camera, at(0)), heading(&camera, at(140)));
+        assert!(gaze(&camera, at(70)).heading.abs() < 1e-6);
+        let (left, right) = (gaze(&camera, at(0)).heading, gaze(&camera, at(140)).heading);
         assert!((left + right).abs() < 1e-6);
         // Of the ground point that is seen there.
         let ray = camera.ray(Vec2::new(150.0, 60.0)).direction;
@@ -421,6 +421,6 @@ mod tests {
         let middle = sum / count as f32;
         assert!(middle.distance(Vec2::splat(15.5)) < 5.0, "{middle}");
         // Towards the right of the view.
-        assert!(found[3].heading > 0.02, "{}", found[3].heading);
+        assert!(found[3].gaze.heading > 0.02, "{:?}", found[3].gaze);
     }
 }

@@ -14,14 +14,14 @@ use rayon::prelude::*;
 use crate::error::{Error, Result, io};
 use crate::lights::Sun;
 use crate::record::{PLANES, Record};
-use crate::studio::{Brief, Kinds, SUNS, Setting, Stage, View};
+use crate::studio::{Brief, Kinds, Outlook, SUNS, Setting, Stage, View};
 
 /// Scenes in a file.
 pub const BLOCK: usize = 64;
 /// Pixels on a side of a recorded picture; examples are crops of it.
 pub const RECORD_SIZE: usize = 40;
-/// Numbers about a scene beside its planes.
-const FACTS: usize = 2 + 3 * SUNS;
+/// Numbers about a scene beside its planes: words for class and colour, pitch and reach of the camera, its suns.
+const FACTS: usize = 4 + 3 * SUNS;
 
 /// Which scenes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,6 +56,8 @@ pub struct SceneView<'a> {
     pub class: &'static str,
     /// The word for its colour.
     pub color: &'static str,
+    /// How the camera looks at it.
+    pub outlook: Outlook,
     /// Its suns.
     pub suns: Vec<Sun>,
 }
@@ -154,7 +156,11 @@ impl Block {
             planes: bytemuck::cast_slice(bytes),
             class: word(&CLASSES, facts[0]),
             color: word(&crate::words::COLORS, facts[1]),
-            suns: facts[2..]
+            outlook: Outlook {
+                pitch: facts[2],
+                reach: facts[3],
+            },
+            suns: facts[4..]
                 .chunks_exact(3)
                 .map(|f| Sun {
                     azimuth: f[0],
@@ -192,9 +198,12 @@ fn write_block(path: &Path, settings: &DatasetSettings, block: usize) -> Result<
             let position = |words: &[&str], word: &str| {
                 words.iter().position(|w| *w == word).unwrap_or(0) as f32
             };
+            let outlook = stage.outlook();
             let mut facts = vec![
                 position(&CLASSES, stage.shape.word()),
                 position(&crate::words::COLORS, stage.main_paint.word),
+                outlook.pitch,
+                outlook.reach,
             ];
             for sun in &stage.suns {
                 facts.extend([sun.azimuth, sun.elevation, sun.sharpness]);

@@ -25,7 +25,7 @@ pub const FILE: &str = "light_encoder.safetensors";
 /// Numbers that it tells.
 const OUTPUTS: usize = 7;
 const CHANNELS: [usize; 4] = [3, 48, 96, 160];
-const HIDDEN: usize = 160;
+const HIDDEN: usize = 384;
 
 /// What a photograph says about its light.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -42,48 +42,85 @@ pub struct LightEstimate {
     pub sky_warmth: f32,
 }
 
-/// The network.
+/// Numbers by which the network is told the camera's pitch.
+const PITCH: usize = 2;
+
+/// The camera's pitch, radians, as the network is told it: training has 0 to 45 degrees.
+fn pitch_features(pitch: f32) -> [f32; PITCH] {
+    let x = (pitch.clamp(0.0, 0.9) - 0.4) / 0.3;
+    [x, x * x - 1.0]
+}
+
+/// The network: a shadow's direction in the picture says that of the sun only to who knows how steeply the camera
+/// looks down, so what every level finds is scaled and shifted by the pitch.
 #[derive(Debug)]
 pub struct LightEncoder {
-    convolutions: Vec<Conv2d>,
-    norms: Vec<GroupNorm>,
+    levels: Vec<Level>,
     hidden: Linear,
     out: Linear,
     variables: BTreeMap<String, Var>,
 }
 
+#[derive(Debug)]
+struct Level {
+    convolution: Conv2d,
+    norm: GroupNorm,
+    /// To scales and shifts of all channels.
+    pitch: Linear,
+}
+
+impl Level {
+    fn forward(&self, x: &Tensor, pitch: &Tensor) -> Result<Tensor> {
+        let x = self.norm.forward(&self.convolution.forward(x)?)?;
+        let (rows, channels) = (x.dim(0)?, x.dim(1)?);
+        let change = self
+            .pitch
+            .forward(pitch)?
+            .reshape((rows, 2, channels, 1, 1))?;
+        let part = |k: usize| change.narrow(1, k, 1)?.squeeze(1);
+        let scale = (part(0)? + 1.0)?;
+        Ok(x.broadcast_mul(&scale)?.broadcast_add(&part(1)?)?)
+    }
+}
+
 impl LightEncoder {
     fn new(parameters: Parameters) -> Result<Self> {
-        let mut convolutions = vec![];
-        let mut norms = vec![];
+        let mut levels = vec![];
         for (i, pair) in CHANNELS.windows(2).enumerate() {
             let p = parameters.sub(format!("levels.{i}"));
-            convolutions.push(Conv2d::new(
-                &p.sub("conv"),
-                (pair[0], pair[1]),
-                3,
-                2,
-                Padding::Same(1),
-            )?);
-            norms.push(GroupNorm::new(
-                &p.sub("norm"),
-                8,
-                pair[1],
-                1e-5,
-                NormActivation::Silu,
-            )?);
+            let channels = pair[1];
+            levels.push(Level {
+                convolution: Conv2d::new(
+                    &p.sub("conv"),
+                    (pair[0], channels),
+                    3,
+                    2,
+                    Padding::Same(1),
+                )?,
+                norm: GroupNorm::new(&p.sub("norm"), 8, channels, 1e-5, NormActivation::Silu)?,
+                pitch: Linear::new(&p.sub("pitch"), PITCH, 2 * channels)?,
+            });
         }
         let side = SIZE >> (CHANNELS.len() - 1);
         let flat = CHANNELS[CHANNELS.len() - 1] * side * side;
         let hidden = Linear::new(&parameters.sub("hidden"), flat, HIDDEN)?;
         let out = Linear::new(&parameters.sub("out"), HIDDEN, OUTPUTS)?;
         Ok(Self {
-            convolutions,
-            norms,
+            levels,
             hidden,
             out,
             variables: parameters.finish(|_| false)?,
         })
+    }
+
+    /// Makes the pitch say nothing, as training begins.
+    fn forget_pitch(&self) -> Result<()> {
+        for (name, variable) in &self.variables {
+            if name.contains(".pitch.") {
+                variable.set(&variable.zeros_like()?)?;
+            }
+        }
+        Ok(())
     }
 
     /// Reads [`FILE`] of a model folder; `None` if it has none.
@@ -97,22 +134,25 @@ impl LightEncoder {
         Self::new(parameters).map(Some)
     }
 
-    /// Outputs [batch, OUTPUTS] for pictures [batch, 3, SIZE, SIZE] in [-1, 1].
-    fn forward(&self, pictures: &Tensor) -> Result<Tensor> {
+    /// Outputs [batch, OUTPUTS] for pictures [batch, 3, SIZE, SIZE] in [-1, 1] and features of the pitch
+    /// [batch, PITCH].
+    fn forward(&self, pictures: &Tensor, pitch: &Tensor) -> Result<Tensor> {
         let mut x = pictures.clone();
-        for (conv, norm) in self.convolutions.iter().zip(&self.norms) {
-            x = norm.forward(&conv.forward(&x)?)?;
+        for level in &self.levels {
+            x = level.forward(&x, pitch)?;
         }
         let h = self.hidden.forward(&x.flatten_from(1)?)?;
         Ok(self.out.forward(&h.silu()?)?)
     }
 
     /// Reads the light off a picture [3, SIZE, SIZE] in [0, 1] and off its mirror image, and averages. The
-    /// azimuth is relative to the camera.
-    pub fn estimate(&self, picture: &[f32]) -> Result<LightEstimate> {
+    /// azimuth is relative to where the picture's middle lies, `pitch` radians below the horizon.
+    pub fn estimate(&self, picture: &[f32], pitch: f32) -> Result<LightEstimate> {
         let pair = [picture.to_vec(), examples::mirrored(picture)].concat();
         let x = Tensor::from_vec(pair, (2, 3, SIZE, SIZE), &Device::Cpu)?;
-        let rows = self.forward(&x.affine(2.0, -1.0)?)?.to_vec2::<f32>()?;
+        let pitch = Tensor::new(&[pitch_features(pitch); 2], &Device::Cpu)?;
+        let rows = self.forward(&x.affine(2.0, -1.0)?, &pitch)?;
+        let rows = rows.to_vec2::<f32>()?;
         // The mirror swaps left and right.
         let mean = |i: usize| 0.5 * (rows[0][i] + if i == 1 { -rows[1][i] } else { rows[1][i] });
         Ok(LightEstimate {
@@ -183,14 +223,18 @@ fn target(light: &Light, words: &LightWords, exposure: f32) -> [f32; OUTPUTS] {
     ]
 }
 
-/// A batch of places without the inserted object, and their lights.
-fn batch(
-    data: &Dataset,
-    count: usize,
-    stream: &mut NoiseStream,
-) -> Result<(Tensor, Tensor, Tensor)> {
+/// Pictures, what the network is told of the camera, what it should say, and how much each of that counts.
+struct Batch {
+    pictures: Tensor,
+    pitch: Tensor,
+    targets: Tensor,
+    weights: Tensor,
+}
+
+/// Places with and without the inserted object.
+fn batch(data: &Dataset, count: usize, stream: &mut NoiseStream) -> Result<Batch> {
     let (mut pictures, mut targets): (Vec<f32>, Vec<f32>) = (vec![], vec![]);
-    let mut weights: Vec<f32> = vec![];
+    let (mut pitch, mut weights): (Vec<f32>, Vec<f32>) = (vec![], vec![]);
     for _ in 0..count {
         let window = Window::draw(stream);
         let lens = Lens::new(data.scene(stream.below(data.len())), window);
@@ -204,17 +248,19 @@ fn batch(
         let tone = Tone::draw(stream);
         let mut picture = lens.layer(layer, &light);
         tone.apply(&mut picture);
-        let words = window.words(light.words(lens.suns()));
+        let words = lens.words(light.words(lens.suns()));
+        pitch.extend(pitch_features(lens.gaze().pitch));
         pictures.extend(picture.iter().map(|v| 2.0 * v - 1.0));
         targets.extend(target(&light, &words, tone.exposure));
         let seen = if words.is_overcast() { 0.0 } else { 1.0 };
         weights.extend([1.0, 1.0, 2.0 * seen, 2.0, 1.0, 0.3 * seen, 0.3]);
     }
-    Ok((
-        Tensor::from_vec(pictures, (count, 3, SIZE, SIZE), &Device::Cpu)?,
-        Tensor::from_vec(targets, (count, OUTPUTS), &Device::Cpu)?,
-        Tensor::from_vec(weights, (count, OUTPUTS), &Device::Cpu)?,
-    ))
+    Ok(Batch {
+        pictures: Tensor::from_vec(pictures, (count, 3, SIZE, SIZE), &Device::Cpu)?,
+        pitch: Tensor::from_vec(pitch, (count, PITCH), &Device::Cpu)?,
+        targets: Tensor::from_vec(targets, (count, OUTPUTS), &Device::Cpu)?,
+        weights: Tensor::from_vec(weights, (count, OUTPUTS), &Device::Cpu)?,
+    })
 }
 
 /// Settings of the training of an encoder.
@@ -262,6 +308,9 @@ pub fn train(
         }
     };
     let encoder = LightEncoder::new(parameters)?;
+    if from.is_none() {
+        encoder.forget_pitch()?;
+    }
     let config = AdamWConfig {
         weight_decay: 0.02,
         ..AdamWConfig::default()
@@ -270,8 +319,9 @@ pub fn train(
     let steps = samples.div_ceil(BATCH);
     for step in 0..steps {
         let mut stream = NoiseStream::new(seed ^ 0xec0de, step as u64);
-        let (pictures, targets, weights) = batch(data, BATCH, &mut stream)?;
-        let error = ((encoder.forward(&pictures)? - targets)?.sqr()? * weights)?;
+        let batch = batch(data, BATCH, &mut stream)?;
+        let found = encoder.forward(&batch.pictures, &batch.pitch)?;
+        let error = ((found - batch.targets)?.sqr()? * batch.weights)?;
         let loss = error.mean_all()?;
         let gradients = optimizer.collect(&loss.backward()?)?;
         let done = step as f64 / steps as f64;
@@ -335,6 +385,18 @@ mod tests {
             "{opposed:?}"
         );
         assert!(mean(&[]).is_err());
+    }
+
+    #[test]
+    fn a_network_that_was_never_shown_the_pitch_does_not_heed_it() {
+        let encoder = LightEncoder::new(Parameters::random(3, &Device::Cpu)).unwrap();
+        let picture: Vec<f32> = (0..3 * SIZE * SIZE).map(|i| (i % 7) as f32 / 7.0).collect();
+        let told = |pitch: f32| encoder.estimate(&picture, pitch).unwrap();
+        assert_ne!(told(0.1), told(0.6));
+        encoder.forget_pitch().unwrap();
+        assert_eq!(told(0.1), told(0.6));
+        // Beyond what training shows is taken for its end.
+        assert_eq!(pitch_features(1.4), pitch_features(0.9));
     }
 
     #[test]

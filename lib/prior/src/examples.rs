@@ -11,7 +11,7 @@ use crate::dataset::{RECORD_SIZE, SceneView};
 use crate::lights::{Light, Sun};
 use crate::record::{BASIS, Layer, PLANES, SHADOW, first_plane, shadow_weights, weights};
 use crate::studio::SUNS;
-use crate::words::{Caption, LightWords};
+use crate::words::{Caption, Gaze, LightWords};
 
 /// Pixels on a side of an example.
 pub const SIZE: usize = 32;
@@ -89,14 +89,6 @@ impl Window {
             mirrored: stream.below(2) == 1,
         }
     }
-
-    /// What the mirror makes of a light.
-    pub fn words(&self, words: LightWords) -> LightWords {
-        match self.mirrored {
-            true => words.mirrored(),
-            false => words,
-        }
-    }
 }
 
 /// A scene seen through a window.
@@ -110,6 +102,25 @@ impl<'a> Lens<'a> {
     /// `scene` through `window`.
     pub fn new(scene: SceneView<'a>, window: Window) -> Self {
         Self { scene, window }
+    }
+
+    /// Where the middle of the window lies for the camera.
+    pub fn gaze(&self) -> Gaze {
+        let middle = |start: usize| {
+            let half = 0.5 * RECORD_SIZE as f32;
+            (start as f32 + 0.5 * SIZE as f32) / half - 1.0
+        };
+        let outlook = self.scene.outlook;
+        outlook.at(middle(self.window.x), middle(self.window.y))
+    }
+
+    /// A light, relative to the camera, as it is from where the window lies, and in the mirror if it is one.
+    pub fn words(&self, words: LightWords) -> LightWords {
+        let words = words.seen_from(self.gaze().heading);
+        match self.window.mirrored {
+            true => words.mirrored(),
+            false => words,
+        }
     }
 
     /// The scene's suns.
@@ -381,7 +392,7 @@ impl Example {
             x if x < 0.6 => format!("{color} {class}"),
             _ => class.to_owned(),
         };
-        let words = window.words(light.words(lens.suns()));
+        let words = lens.words(light.words(lens.suns()));
         let rivals = match named {
             true => recipe.rivals,
             false => 0,
@@ -458,6 +469,7 @@ mod tests {
             planes: &planes,
             class: "box",
             color: "white",
+            outlook: stage.outlook(),
             suns: stage.suns.clone(),
         };
         let recipe = Recipe {

@@ -21,7 +21,7 @@ use crate::lights::{Light, Sun};
 use crate::record::{Layer, Record};
 use crate::shapes::Shape;
 use crate::student::latents_of;
-use crate::studio::{Brief, Kinds, Setting, Stage, View};
+use crate::studio::{Brief, Kinds, Outlook, Setting, Stage, View};
 use crate::words::{Caption, LightWords};
 
 /// Key of the scenes on which gates are measured; training uses others.
@@ -70,6 +70,7 @@ pub struct Gates {
 pub struct Trial {
     planes: Vec<f16>,
     shape: Shape,
+    outlook: Outlook,
     suns: Vec<Sun>,
     light: Light,
 }
@@ -107,6 +108,7 @@ impl Trial {
         Self {
             planes: record.planes.iter().map(|&v| f16::from_f32(v)).collect(),
             shape: stage.shape,
+            outlook: stage.outlook(),
             suns: stage.suns,
             light,
         }
@@ -117,6 +119,7 @@ impl Trial {
             planes: &self.planes,
             class: self.shape.word(),
             color: "white",
+            outlook: self.outlook,
             suns: self.suns.clone(),
         };
         Lens::new(scene, window)
@@ -149,7 +152,7 @@ impl Trial {
 
     /// The caption that names the sun at `azimuth`, for a picture seen through `window`.
     fn caption(&self, azimuth: f32, window: Window) -> Option<Caption> {
-        let words = window.words(self.words(azimuth));
+        let words = self.lens(window).words(self.words(azimuth));
         Some(Caption::new(self.shape.word(), Some(&words)))
     }
 }
@@ -211,7 +214,11 @@ fn ask(
         let (_, observation) = trial.observe(0, &tone, window)?;
         let found = energies(model, &observation, &asked, told_at, &mut stream)?;
         e.iter_mut().zip(found).for_each(|(e, f)| *e += f);
-        let contexts = guiding(model, trial.shape.word(), &window.words(trial.words(truth)))?;
+        let contexts = guiding(
+            model,
+            trial.shape.word(),
+            &trial.lens(window).words(trial.words(truth)),
+        )?;
         for (against, (near, far)) in against.iter_mut().zip([(1, 2), (3, 4)]) {
             let (image, observation) = trial.observe(near, &tone, window)?;
             let (further, _) = trial.observe(far, &tone, window)?;
@@ -224,7 +231,13 @@ fn ask(
     let encoder = match encoder {
         Some(encoder) => {
             let (image, _) = trial.observe(0, &tone, Window::MIDDLE)?;
-            Some(Told::by(encoder.estimate(&image)?.words.azimuth, truth))
+            Some(Told::by(
+                encoder
+                    .estimate(&image, trial.lens(Window::MIDDLE).gaze().pitch)?
+                    .words
+                    .azimuth,
+                truth,
+            ))
         }
         None => None,
     };

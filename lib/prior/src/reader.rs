@@ -16,7 +16,7 @@ use crate::energy::{Observation, energies, states};
 use crate::error::{Error, Result};
 use crate::examples::{SIZE, dilate, mirrored};
 use crate::gates::minimum_angle;
-use crate::words::{Caption, LightWords};
+use crate::words::{Caption, Gaze, LightWords};
 
 /// Azimuths of the search.
 pub const AZIMUTHS: usize = 16;
@@ -28,9 +28,8 @@ pub const ELEVATIONS: [f32; 3] = [20.0, 40.0, 60.0];
 pub struct Crop {
     /// [3, SIZE, SIZE] in [0, 1].
     pub picture: Vec<f32>,
-    /// Angle on the ground from the camera's forward direction to the
-    /// crop's middle, towards the right, radians.
-    pub heading: f32,
+    /// Where its middle lies.
+    pub gaze: Gaze,
 }
 
 /// What the model sees of a crop when it is asked to explain its middle.
@@ -239,7 +238,7 @@ fn crop_energies(
 ) -> Result<Vec<f64>> {
     let asked = |swap: bool| -> Result<Tensor> {
         let captions = candidates(share).into_iter().map(|words| {
-            let words = words.seen_from(crop.heading);
+            let words = words.seen_from(crop.gaze.heading);
             let words = if swap { words.mirrored() } else { words };
             Some(Caption::new("object", Some(&words)))
         });
@@ -289,8 +288,8 @@ pub fn read(
     progress: &(dyn Fn(f64) -> ControlFlow<()> + Sync),
 ) -> Result<Option<Reading>> {
     let readings = crops.iter().map(|crop| {
-        let mut encoder = encoder.estimate(&crop.picture)?;
-        encoder.words.azimuth += crop.heading;
+        let mut encoder = encoder.estimate(&crop.picture, crop.gaze.pitch)?;
+        encoder.words.azimuth += crop.gaze.heading;
         Ok(CropReading {
             encoder,
             energies: vec![],

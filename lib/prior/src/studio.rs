@@ -9,7 +9,7 @@ use glam::{DMat4, DQuat, DVec3, Vec2, Vec3};
 use crate::backdrop::Backdrop;
 use crate::lights::{Sun, draw_suns};
 use crate::shapes::Shape;
-use crate::words::COLORS;
+use crate::words::{COLORS, Gaze};
 
 /// Suns for which every scene is recorded.
 pub const SUNS: usize = 8;
@@ -304,6 +304,34 @@ impl Stage {
     }
 }
 
+/// How a camera looks at a scene: upright, and straight at the middle of its square picture.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Outlook {
+    /// Angle below the horizon, radians.
+    pub pitch: f32,
+    /// Tangent of half the picture's angle.
+    pub reach: f32,
+}
+
+impl Outlook {
+    /// Where a point of the picture lies, from -1 to 1 to the right and down.
+    pub fn at(&self, x: f32, y: f32) -> Gaze {
+        let (s, c) = self.pitch.sin_cos();
+        let (x, y) = (x * self.reach, y * self.reach);
+        Gaze::along(Vec3::new(x, -s - y * c, -c + y * s), Vec3::NEG_Z, Vec3::X)
+    }
+}
+
+impl Stage {
+    /// How its camera looks at it.
+    pub fn outlook(&self) -> Outlook {
+        Outlook {
+            pitch: self.camera.rotation.z_axis.y.asin(),
+            reach: 0.5 * self.camera.resolution[1] as f32 / self.camera.focal_px.y,
+        }
+    }
+}
+
 impl Ground {
     /// Linear albedo at (x, z), metres.
     pub fn albedo(&self, at: Vec2) -> Vec3 {
@@ -347,4 +375,48 @@ fn value_noise(p: Vec2, seed: u32) -> f32 {
         at(0, 1) + (at(1, 1) - at(0, 1)) * f.x,
     );
     low + (high - low) * f.y
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_of_the_picture_lie_where_the_rays_of_the_camera_go() {
+        for (index, setting) in [(0, Setting::Open), (1, Setting::Street)] {
+            let brief = Brief {
+                kinds: Kinds::HeldOut,
+                setting,
+                view: View::Wide,
+            };
+            let stage = Stage::draw(7, index, 40, brief);
+            for (x, y) in [(0.0, 0.0), (-1.0, 0.5), (0.7, -1.0), (1.0, 1.0)] {
+                let ray = stage
+                    .camera
+                    .ray(Vec2::new(20.0 + 20.0 * x, 20.0 + 20.0 * y));
+                let wanted = Gaze::along(ray.direction, Vec3::NEG_Z, Vec3::X);
+                let found = stage.outlook().at(x, y);
+                let off = (found.heading - wanted.heading).hypot(found.pitch - wanted.pitch);
+                assert!(off < 1e-5, "{found:?} {wanted:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_lies_to_the_right_and_low_in_the_picture_has_a_heading_and_more_pitch() {
+        let outlook = Outlook {
+            pitch: 0.3,
+            reach: 0.5,
+        };
+        assert!((outlook.at(0.0, 0.0).pitch - 0.3).abs() < 1e-6);
+        // Half the picture's angle further down.
+        assert!((outlook.at(0.0, 1.0).pitch - 0.3 - 0.5f32.atan()).abs() < 1e-6);
+        assert_eq!(outlook.at(0.0, -1.0).heading, 0.0);
+        // Level with the camera's right, half as far as what lies ahead.
+        let level = Outlook {
+            pitch: 0.0,
+            ..outlook
+        };
+        assert!((level.at(1.0, 0.0).heading - 0.5f32.atan()).abs() < 1e-6);
+    }
 }

@@ -113,6 +113,26 @@ pub struct LightWords {
     pub sun_share: f32,
 }
 
+/// Where the middle of a picture lies for the camera that took it, on level ground.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Gaze {
+    /// Angle on the ground from the camera's forward direction, towards the right, radians.
+    pub heading: f32,
+    /// Angle below the horizon, radians.
+    pub pitch: f32,
+}
+
+impl Gaze {
+    /// Along `direction`, where `forward` and `right` are level and of unit length.
+    pub fn along(direction: glam::Vec3, forward: glam::Vec3, right: glam::Vec3) -> Self {
+        let (x, z) = (direction.dot(right), direction.dot(forward));
+        Self {
+            heading: x.atan2(z),
+            pitch: (-direction.y).atan2(x.hypot(z)),
+        }
+    }
+}
+
 /// Words and weights that stand at one place of a caption; weights sum to 1.
 pub type Mixture = Vec<(&'static str, f32)>;
 
