@@ -358,6 +358,9 @@ mod tests {
         assert!(gaze(&camera, at(70)).heading.abs() < 1e-6);
         let (left, right) = (gaze(&camera, at(0)).heading, gaze(&camera, at(140)).heading);
         assert!((left + right).abs() < 1e-6);
+        // The middle of the picture is 3 metres away and 2 below.
+        let down = (2f32 / 3.0).atan();
+        assert!((gaze(&camera, at(70)).pitch - down).abs() < 1e-6);
         // Of the ground point that is seen there.
         let ray = camera.ray(Vec2::new(150.0, 60.0)).direction;
         let (forward, across) = ground_axes(&camera);

@@ -45,7 +45,7 @@ pub struct LightEstimate {
 /// Numbers by which the network is told the camera's pitch.
 const PITCH: usize = 2;
 
-/// The camera's pitch, radians, as the network is told it: training has 0 to 45 degrees.
+/// The camera's pitch, radians, as the network is told it: training has about 0 to 50 degrees.
 fn pitch_features(pitch: f32) -> [f32; PITCH] {
     let x = (pitch.clamp(0.0, 0.9) - 0.4) / 0.3;
     [x, x * x - 1.0]

@@ -449,7 +449,52 @@ pub const LIGHTS: usize = SUNS;
 mod tests {
     use super::*;
     use crate::record::Record;
-    use crate::studio::{Brief, Kinds, Setting, Stage, View};
+    use crate::studio::{Brief, Kinds, Outlook, Setting, Stage, View};
+
+    #[test]
+    fn a_light_is_told_from_where_the_window_looks_and_then_mirrored() {
+        let lens = |x: usize, mirrored: bool| {
+            let scene = SceneView {
+                planes: &[],
+                class: "box",
+                color: "white",
+                outlook: Outlook {
+                    pitch: 0.0,
+                    reach: 0.5,
+                },
+                suns: vec![],
+            };
+            let window = Window {
+                x,
+                mirrored,
+                ..Window::MIDDLE
+            };
+            Lens::new(scene, window)
+        };
+        let light = LightWords {
+            azimuth: 0.7,
+            elevation: 0.5,
+            sun_share: 0.8,
+        };
+        let told = |x: usize, mirrored: bool| lens(x, mirrored).words(light).azimuth;
+        // The last window's middle lies 4 pixels to the right of 20, of which 20 pixels are a half of what lies ahead.
+        let heading = (0.5f32 * 4.0 / 20.0).atan();
+        let last = RECORD_SIZE - SIZE;
+        for (found, wanted) in [
+            (told(Window::MIDDLE.x, false), 0.7),
+            (told(last, false), 0.7 - heading),
+            (told(last, true), heading - 0.7),
+            (told(0, false), 0.7 + heading),
+        ] {
+            assert!((found - wanted).abs() < 1e-6, "{found} {wanted}");
+        }
+        let lower = Window {
+            y: last,
+            ..Window::MIDDLE
+        };
+        let scene = lens(0, false).scene;
+        assert!((Lens::new(scene, lower).gaze().pitch - heading).abs() < 1e-6);
+    }
 
     #[test]
     fn what_is_seen_under_another_light_differs_where_the_object_and_its_shadow_are() {

@@ -214,11 +214,8 @@ fn ask(
         let (_, observation) = trial.observe(0, &tone, window)?;
         let found = energies(model, &observation, &asked, told_at, &mut stream)?;
         e.iter_mut().zip(found).for_each(|(e, f)| *e += f);
-        let contexts = guiding(
-            model,
-            trial.shape.word(),
-            &trial.lens(window).words(trial.words(truth)),
-        )?;
+        let words = trial.lens(window).words(trial.words(truth));
+        let contexts = guiding(model, trial.shape.word(), &words)?;
         for (against, (near, far)) in against.iter_mut().zip([(1, 2), (3, 4)]) {
             let (image, observation) = trial.observe(near, &tone, window)?;
             let (further, _) = trial.observe(far, &tone, window)?;
@@ -231,13 +228,9 @@ fn ask(
     let encoder = match encoder {
         Some(encoder) => {
             let (image, _) = trial.observe(0, &tone, Window::MIDDLE)?;
-            Some(Told::by(
-                encoder
-                    .estimate(&image, trial.lens(Window::MIDDLE).gaze().pitch)?
-                    .words
-                    .azimuth,
-                truth,
-            ))
+            let pitch = trial.lens(Window::MIDDLE).gaze().pitch;
+            let read = encoder.estimate(&image, pitch)?;
+            Some(Told::by(read.words.azimuth, truth))
         }
         None => None,
     };

@@ -114,7 +114,7 @@ pub struct LightWords {
 }
 
 /// Where the middle of a picture lies for the camera that took it, on level ground.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gaze {
     /// Angle on the ground from the camera's forward direction, towards the right, radians.
     pub heading: f32,
