@@ -147,12 +147,14 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
                 format!(", surprise at the light {now:.3}")
             }
         };
-        progress.say(format!("{} examples, loss {loss:.4}{told}", update.seen));
+        let state = format!("{} examples, loss {loss:.4}{told}", update.seen);
         let stop = go_on();
         let every = (args.checkpoint_every.max(1) * args.batch).max(1);
         if stop.is_break() || update.seen.is_multiple_of(every) {
             trainer.save(&checkpoint)?;
+            progress.note(&state);
         }
+        progress.say(state);
         Ok(stop)
     })?;
     progress.done();

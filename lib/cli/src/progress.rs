@@ -1,4 +1,4 @@
-//! A progress bar on standard error; nothing where that is not a terminal.
+//! A progress bar on standard error; where that is not a terminal, only what is worth keeping.
 use std::io::{IsTerminal, stderr};
 use std::time::Duration;
 
@@ -11,6 +11,7 @@ const STEPS: u64 = 1000;
 #[derive(Debug)]
 pub struct Progress {
     bar: ProgressBar,
+    quiet: bool,
 }
 
 impl Progress {
@@ -33,7 +34,7 @@ impl Progress {
         if visible {
             bar.enable_steady_tick(Duration::from_millis(200));
         }
-        Self { bar }
+        Self { bar, quiet }
     }
 
     /// Shows `fraction` done, in `[0, 1]`.
@@ -46,6 +47,15 @@ impl Progress {
     /// Shows `message` behind the bar, as in the error so far.
     pub fn say(&self, message: impl Into<String>) {
         self.bar.set_message(message.into());
+    }
+
+    /// Writes `line` to stay: above the bar, or as it is into the log of hours of work without a terminal.
+    pub fn note(&self, line: &str) {
+        match self.bar.is_hidden() {
+            false => self.bar.println(line),
+            true if self.quiet => {}
+            true => eprintln!("{line}"),
+        }
     }
 
     /// Takes the bar away.
