@@ -244,8 +244,17 @@ pub struct Example {
     pub weight: Vec<f32>,
     /// What is said.
     pub caption: Option<Caption>,
-    /// Captions with other lights, to be told from the one that is said.
-    pub rivals: Vec<Caption>,
+    /// Other lights, to be told from the one that is said.
+    pub rivals: Vec<Rival>,
+}
+
+/// Another light than the one under which a picture is seen.
+#[derive(Debug, Clone)]
+pub struct Rival {
+    /// What says it.
+    pub caption: Caption,
+    /// The picture under it, in [0, 1], to be asked for; without, it is only to be told from the one that is seen.
+    pub image: Option<Picture>,
 }
 
 /// Shares of what examples show; each is one ingredient of the recipe.
@@ -258,7 +267,7 @@ pub struct Recipe {
     /// Composites under a light other than the place's, with their own
     /// light in the caption.
     pub foreign_light: f64,
-    /// Captions with a wrong light beside each right one.
+    /// Other lights beside each one that is said; pictures under all but the first are asked for, too.
     pub rivals: usize,
     /// Examples that are seen under another light than is said, and asked for under the one that is.
     pub relit: f64,
@@ -372,10 +381,15 @@ impl Example {
         let coverage = lens.coverage();
         let hard: Vec<f32> = coverage.iter().map(|&c| f32::from(c > 0.02)).collect();
         let view = stream.uniform();
+        // What is seen is asked for under other lights, too.
+        let several = relit || recipe.rivals > 0;
         let (mask, shown) =
-            if view >= recipe.background || (relit && surroundings == Surroundings::Whole) {
+            if view >= recipe.background || (several && surroundings == Surroundings::Whole) {
                 (vec![1.0; PIXELS], image.clone())
-            } else if view < 0.25 * recipe.background && !surroundings.is_foreign() {
+            } else if view < 0.25 * recipe.background
+                && !surroundings.is_foreign()
+                && recipe.rivals == 0
+            {
                 // As in inpainting: the picture itself around a box.
                 let margin = std::array::from_fn(|_| 0.7 * stream.uniform() as f32);
                 (boxed(&coverage, margin), image.clone())
@@ -398,7 +412,18 @@ impl Example {
             false => 0,
         };
         let rivals = (0..rivals)
-            .map(|_| Caption::new(&class, Some(&words.rival(stream))))
+            .map(|i| {
+                // Suns anywhere for the first, which is not in the record, so that there is no picture.
+                let other = (i > 0).then(|| other_light(&light, lens.suns(), stream));
+                let words = match &other {
+                    Some(other) => lens.words(other.words(lens.suns())),
+                    None => words.rival(stream),
+                };
+                Rival {
+                    caption: Caption::new(&class, Some(&words)),
+                    image: other.map(|other| picture(&other)),
+                }
+            })
             .collect();
         let caption = if named {
             Some(Caption::new(&class, Some(&words)))
@@ -496,6 +521,62 @@ mod tests {
         assert!((Lens::new(scene, lower).gaze().pitch - heading).abs() < 1e-6);
     }
 
+    fn planes_of(stage: &Stage) -> Vec<f16> {
+        let record = Record::trace(stage, 3, 1);
+        record.planes.iter().map(|&v| f16::from_f32(v)).collect()
+    }
+
+    #[test]
+    fn rivals_are_pictured_under_the_light_that_they_say_and_never_given_away() {
+        let stage = Stage::draw(
+            3,
+            1,
+            RECORD_SIZE as u32,
+            Brief {
+                kinds: Kinds::Trained,
+                setting: Setting::Open,
+                view: View::Close,
+            },
+        );
+        let planes = planes_of(&stage);
+        let scene = SceneView {
+            planes: &planes,
+            class: "box",
+            color: "white",
+            outlook: stage.outlook(),
+            suns: stage.suns.clone(),
+        };
+        let recipe = Recipe::default().contrasted(3);
+        let (mut covered, mut open) = (0, 0);
+        for index in 0..40 {
+            let mut stream = NoiseStream::new(4, index);
+            let example = Example::draw(scene.clone(), &recipe, &mut stream);
+            assert!(example.caption.is_some() && example.seen.is_none());
+            let [unseen, seen @ ..] = &example.rivals[..] else {
+                panic!("no rivals")
+            };
+            assert!(unseen.image.is_none() && seen.len() == 2);
+            for rival in seen {
+                let image = rival.image.as_ref().expect("a picture");
+                assert_ne!(image, &example.image, "{index}");
+                assert_ne!(Some(&rival.caption), example.caption.as_ref());
+            }
+            // What is shown does not give the object's light away: nothing, or the place without the object, hidden only
+            // where that stands.
+            if example.mask.iter().all(|m| *m == 1.0) {
+                covered += 1;
+            } else {
+                open += 1;
+                let window = Window::draw(&mut NoiseStream::new(4, index));
+                let coverage = Lens::new(scene.clone(), window).coverage();
+                let hard: Vec<f32> = coverage.iter().map(|&c| f32::from(c > 0.02)).collect();
+                let mut near = example.mask.iter().zip(dilate(&hard, 1));
+                assert!(near.all(|(m, near)| *m <= near), "{index}");
+            }
+        }
+        assert!(covered > 5 && open > 10, "{covered} {open}");
+    }
+
     #[test]
     fn what_is_seen_under_another_light_differs_where_the_object_and_its_shadow_are() {
         let stage = Stage::draw(
@@ -508,8 +589,7 @@ mod tests {
                 view: View::Close,
             },
         );
-        let record = Record::trace(&stage, 3, 1);
-        let planes: Vec<f16> = record.planes.iter().map(|&v| f16::from_f32(v)).collect();
+        let planes = planes_of(&stage);
         let scene = SceneView {
             planes: &planes,
             class: "box",

@@ -15,7 +15,7 @@ use dipir_diffusion::vae::pixel_unshuffle;
 
 use crate::blueprint::{Blueprint, FACTOR, SCALING};
 use crate::error::{Error, Result};
-use crate::examples::{Example, SIZE};
+use crate::examples::{Example, Rival, SIZE};
 use crate::words::{CLOCK, Caption, HEIGHTS, PLACEHOLDERS, SKIES};
 
 /// Networks and variables.
@@ -35,9 +35,9 @@ pub struct Spoken {
     mixing: Option<Tensor>,
 }
 
-/// Nats for the mean squared error of the noise over a picture: of the order of half the number of
-/// latent values.
-const NATS: f64 = 1000.0;
+/// Nats for the mean squared error of the noise over a picture: as many as made the surprise of one draw of noise
+/// least, before lights were contrasted (300; half the number of latent values, 1,500, is too sure of itself by far).
+const NATS: f64 = 400.0;
 
 /// Registers the placeholders of [`Caption`] with a tokenizer.
 pub fn add_placeholders(tokenizer: &mut Tokenizer) {
@@ -115,8 +115,8 @@ pub struct Batch {
     pub weights: Tensor,
     /// What is said.
     pub captions: Vec<Option<Caption>>,
-    /// Captions with a wrong light, as many for each of the first examples; the others have none.
-    pub rivals: Vec<Vec<Caption>>,
+    /// Other lights, as many for each of the first examples; the others have none.
+    pub rivals: Vec<Vec<Rival>>,
 }
 
 /// Scaled latents of pictures in [0, 1], each [3, SIZE, SIZE].
@@ -190,6 +190,12 @@ impl Batch {
             captions: examples.into_iter().map(|e| e.caption).collect(),
         })
     }
+}
+
+/// Weighted squared errors of rows, [rows].
+fn errors(output: &Tensor, target: &Tensor, weights: &Tensor) -> Result<Tensor> {
+    let error = ((output - target)?.sqr()? * weights)?;
+    Ok(error.flatten_from(1)?.sum(1)?)
 }
 
 /// Timesteps of training: one in four anywhere, the others where light is
@@ -285,8 +291,8 @@ impl Student {
         &self.variables
     }
 
-    /// Weighted mean squared error of the velocity, and the share of surprise at the right caption
-    /// among its rivals; both in the graph, the second `None` where no example has rivals.
+    /// Weighted mean squared error of the velocity, that under rivals of which there are pictures included, and the
+    /// share of surprise at the right caption among its rivals; both in the graph, the second `None` where no example has rivals.
     pub fn loss(
         &self,
         batch: &Batch,
@@ -312,6 +318,7 @@ impl Student {
         let target = self.schedule.target(&batch.latents, &noise, &timesteps)?;
         let input = Tensor::cat(&[&noisy, &batch.condition], 1)?;
         // A row for every caption: the right ones, then the rivals of each.
+        let rivals: Vec<&Rival> = batch.rivals.iter().flatten().collect();
         let rows: Vec<u32> = (0..count as u32)
             .chain((0..contrasted).flat_map(|i| vec![i as u32; batch.rivals[i].len()]))
             .collect();
@@ -319,7 +326,7 @@ impl Student {
             .captions
             .iter()
             .cloned()
-            .chain(batch.rivals.iter().flatten().cloned().map(Some))
+            .chain(rivals.iter().map(|r| Some(r.caption.clone())))
             .collect();
         let t: Vec<f64> = rows.iter().map(|&i| timesteps[i as usize] as f64).collect();
         let index = Tensor::new(rows.as_slice(), &Device::Cpu)?;
@@ -328,12 +335,33 @@ impl Student {
         let output = self
             .unet
             .forward(&of_rows(&input)?, &t, &context, &Pass::default())?;
-        let error = (output - of_rows(&target)?)?.sqr()?;
-        let error = (error * of_rows(&batch.weights)?)?
-            .flatten_from(1)?
-            .sum(1)?;
-        let total = batch.weights.sum_all()?.to_scalar::<f32>()? as f64;
-        let loss = (error.narrow(0, 0, count)?.sum_all()? / total)?;
+        let weights = of_rows(&batch.weights)?;
+        let error = errors(&output, &of_rows(&target)?, &weights)?;
+        let mut sum = error.narrow(0, 0, count)?.sum_all()?;
+        let mut total = batch.weights.sum_all()?;
+        // Rows of the rivals whose pictures are asked for, too.
+        let asked: Vec<usize> = (0..rivals.len())
+            .filter(|&i| rivals[i].image.is_some())
+            .map(|i| count + i)
+            .collect();
+        if !asked.is_empty() {
+            let index: Vec<u32> = asked.iter().map(|&row| row as u32).collect();
+            let index = Tensor::new(index, &Device::Cpu)?;
+            let of_asked = |t: &Tensor| t.index_select(&index, 0);
+            let at: Vec<usize> = asked
+                .iter()
+                .map(|&row| timesteps[rows[row] as usize])
+                .collect();
+            let pictures = rivals.iter().filter_map(|r| r.image.as_ref()).flatten();
+            let latents = latents_of(pictures.copied().collect())?;
+            let noisy = of_asked(&of_rows(&noisy)?)?;
+            let noise = self.schedule.noise_between_each(&latents, &noisy, &at)?;
+            let target = self.schedule.target(&latents, &noise, &at)?;
+            let weights = of_asked(&weights)?;
+            sum = (sum + errors(&of_asked(&output)?, &target, &weights)?.sum_all()?)?;
+            total = (total + weights.sum_all()?)?;
+        }
+        let loss = sum.div(&total)?;
         if contrasted == 0 {
             return Ok((loss, None));
         }
@@ -371,6 +399,13 @@ mod tests {
         Some(Caption::new("red car", Some(&light)))
     }
 
+    fn rival(azimuth: f32, image: Option<Vec<f32>>) -> Rival {
+        Rival {
+            caption: caption(azimuth).expect("a caption"),
+            image,
+        }
+    }
+
     fn small() -> Student {
         let folder = tempfile::tempdir().expect("a folder");
         let blueprint = Blueprint {
@@ -391,9 +426,7 @@ mod tests {
             mask: vec![1.0; SIZE * SIZE],
             weight: vec![0.5 + value; SIZE * SIZE],
             caption: caption(0.3),
-            rivals: (1..=rivals)
-                .filter_map(|k| caption(0.3 + k as f32))
-                .collect(),
+            rivals: (1..=rivals).map(|k| rival(0.3 + k as f32, None)).collect(),
         };
         let loss = |examples: Vec<Example>| {
             let batch = Batch::new(examples).expect("a batch");
@@ -411,6 +444,18 @@ mod tests {
         assert_eq!(mixed, fewer);
         assert!(loss(vec![example(0.7, 0), example(0.4, 0)]).1.is_none());
 
+        // One that is to be painted as what is seen is asks for the same, one that is not for more.
+        let painted = |value: f32| Example {
+            rivals: vec![rival(1.3, Some(vec![value; 3 * SIZE * SIZE]))],
+            ..example(0.7, 0)
+        };
+        let alone = loss(vec![example(0.7, 1)]).0;
+        let (same, other) = (loss(vec![painted(0.7)]), loss(vec![painted(0.2)]));
+        assert!((same.0 / alone - 1.0).abs() < 1e-5, "{same:?} {alone}");
+        assert!(other.0 > 1.02 * alone, "{other:?} {alone}");
+        // What is told apart is the noise of what is seen.
+        assert!((other.1.expect("a rival") - 1.0).abs() < 1e-5, "{other:?}");
+
         // Once it says something: rows meet their own picture, for rivals that say the same as the
         // right caption are as likely again; others are not.
         for (name, variable) in student.variables() {
@@ -422,7 +467,7 @@ mod tests {
             }
         }
         let same = |value: f32| Example {
-            rivals: vec![caption(0.3).expect("one"); 3],
+            rivals: vec![rival(0.3, None); 3],
             ..example(value, 0)
         };
         let surprise = loss(vec![same(0.7), same(0.4)]).1.expect("rivals");
