@@ -521,6 +521,25 @@ mod tests {
         assert!((Lens::new(scene, lower).gaze().pitch - heading).abs() < 1e-6);
     }
 
+    fn one_stage() -> Stage {
+        let brief = Brief {
+            kinds: Kinds::Trained,
+            setting: Setting::Open,
+            view: View::Close,
+        };
+        Stage::draw(3, 1, RECORD_SIZE as u32, brief)
+    }
+
+    fn view_of<'a>(stage: &Stage, planes: &'a [f16]) -> SceneView<'a> {
+        SceneView {
+            planes,
+            class: "box",
+            color: "white",
+            outlook: stage.outlook(),
+            suns: stage.suns.clone(),
+        }
+    }
+
     fn planes_of(stage: &Stage) -> Vec<f16> {
         let record = Record::trace(stage, 3, 1);
         record.planes.iter().map(|&v| f16::from_f32(v)).collect()
@@ -528,24 +547,9 @@ mod tests {
 
     #[test]
     fn rivals_are_pictured_under_the_light_that_they_say_and_never_given_away() {
-        let stage = Stage::draw(
-            3,
-            1,
-            RECORD_SIZE as u32,
-            Brief {
-                kinds: Kinds::Trained,
-                setting: Setting::Open,
-                view: View::Close,
-            },
-        );
+        let stage = one_stage();
         let planes = planes_of(&stage);
-        let scene = SceneView {
-            planes: &planes,
-            class: "box",
-            color: "white",
-            outlook: stage.outlook(),
-            suns: stage.suns.clone(),
-        };
+        let scene = view_of(&stage, &planes);
         let recipe = Recipe::default().contrasted(3);
         let (mut covered, mut open) = (0, 0);
         for index in 0..40 {
@@ -579,24 +583,9 @@ mod tests {
 
     #[test]
     fn what_is_seen_under_another_light_differs_where_the_object_and_its_shadow_are() {
-        let stage = Stage::draw(
-            3,
-            1,
-            RECORD_SIZE as u32,
-            Brief {
-                kinds: Kinds::Trained,
-                setting: Setting::Open,
-                view: View::Close,
-            },
-        );
+        let stage = one_stage();
         let planes = planes_of(&stage);
-        let scene = SceneView {
-            planes: &planes,
-            class: "box",
-            color: "white",
-            outlook: stage.outlook(),
-            suns: stage.suns.clone(),
-        };
+        let scene = view_of(&stage, &planes);
         let recipe = Recipe {
             relit: 1.0,
             ..Recipe::default()
