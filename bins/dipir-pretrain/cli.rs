@@ -78,7 +78,7 @@ pub struct Train {
     #[arg(long, default_value_t = Recipe::default().background)]
     pub background: f64,
     /// Weight of telling the right light from three wrong ones, whose surprise is 1 at chance; 0: not asked. Three rows
-    /// of four are then noisy pictures that are asked for under four lights each
+    /// of four are then groups of one noisy picture that four captions are asked about
     #[arg(long, default_value_t = TrainerSettings::default().contrast)]
     pub contrast: f64,
     /// Share of examples that are seen under another light than is said, and asked for under the one that is

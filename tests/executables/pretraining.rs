@@ -30,11 +30,14 @@ const TINY: [&str; 11] = [
 fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
     let project = Project::new();
     let run = |more: &[&str]| {
+        let quiet = ["--json", "--quiet", "--checkpoint-every", "1"];
         let run = project.run(
             PRETRAIN,
-            &[&TINY[..], &["--relit", "1", "--json"], more].concat(),
+            &[&TINY[..], &["--relit", "1"], &quiet, more].concat(),
         );
         run.expect_success();
+        // Not even of checkpoints.
+        assert_eq!(run.stderr, "");
         serde_json::from_str::<Value>(&run.stdout).unwrap()
     };
     let from = ["--from", PRIOR, "--learning-rate", "1e-6"];

@@ -546,7 +546,7 @@ mod tests {
     }
 
     #[test]
-    fn rivals_are_pictured_under_the_light_that_they_say_and_never_given_away() {
+    fn rivals_have_pictures_of_their_own_and_no_light_is_given_away() {
         let stage = one_stage();
         let planes = planes_of(&stage);
         let scene = view_of(&stage, &planes);
