@@ -6,7 +6,7 @@
 //! of the pipeline without a model, the light encoder, the inversion, and guidance on top of it.
 //!
 //! Run with `cargo test --bench guidance -- --bench [MODEL] [key=value...]`: `scenes` and `first`
-//! choose the scenes, `street = 1` puts them in front of houses and trees, `iterations = 0` leaves guidance out, `ablations = 1` adds guidance with one
+//! choose the scenes, `places` is open, street or yard, `iterations = 0` leaves guidance out, `ablations = 1` adds guidance with one
 //! ingredient less each, `rate` scales the learning rates, `noise` is the draws of
 //! noise of an iteration, `trust`, `encoder`, `t` and `draws` are the reader's, `json` is a file for every scene's numbers. Prints the table of docs/prior.md with
 //! bootstrap intervals. Without `--bench`, as tests run it, it does nothing: what it measures takes
@@ -505,10 +505,12 @@ fn main() -> anyhow::Result<()> {
         match arg.split_once('=') {
             Some(("scenes", v)) => knobs.scenes = v.parse()?,
             Some(("first", v)) => knobs.first = v.parse()?,
-            Some(("street", v)) => {
-                knobs.setting = match v.parse::<u8>()? {
-                    0 => Setting::Open,
-                    _ => Setting::Street,
+            Some(("places", v)) => {
+                knobs.setting = match v {
+                    "open" => Setting::Open,
+                    "street" => Setting::Street,
+                    "yard" => Setting::Yard,
+                    other => anyhow::bail!("places={other}: accepted are open, street and yard"),
                 }
             }
             Some(("iterations", v)) => knobs.iterations = v.parse()?,

@@ -1,7 +1,7 @@
 //! The command line of `dipir-evaluate`.
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use dipir_cli::args::OutputArgs;
 
 const EXAMPLES: &str = "\
@@ -76,9 +76,9 @@ pub struct MakeArgs {
     /// sun, square
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub generated: u64,
-    /// Generated places are in front of houses and trees instead of on open ground
-    #[arg(long)]
-    pub street: bool,
+    /// Where generated places are
+    #[arg(long, value_enum, default_value_t = Places::Open)]
+    pub places: Places,
 
     /// Seed of what is drawn
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -87,6 +87,17 @@ pub struct MakeArgs {
     /// Width and height of the photographs
     #[arg(long, value_name = "WxH", default_value = "192x128", value_parser = parse_size)]
     pub size: [usize; 2],
+}
+
+/// Kinds of generated places.
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Places {
+    /// On open ground
+    Open,
+    /// In front of houses and trees
+    Street,
+    /// Among things of all sizes, between walls
+    Yard,
 }
 
 #[derive(Args)]

@@ -30,6 +30,7 @@ pub fn make(
     let kind = match setting {
         Setting::Open => "generated",
         Setting::Street => "street",
+        Setting::Yard => "yard",
     };
     let name = format!("{kind}-{index:03}-{class}");
     let folder = bench.scene(&name);

@@ -19,7 +19,7 @@ use glam::Vec3;
 use serde_json::json;
 
 use crate::bench::{Bench, SceneInfo, Tone, write, write_json};
-use crate::cli::MakeArgs;
+use crate::cli::{MakeArgs, Places};
 use crate::generated;
 
 /// Vertical field of view of every photograph, degrees.
@@ -51,9 +51,8 @@ pub fn run(args: &MakeArgs) -> anyhow::Result<()> {
                     number of generated places with --generated";
         return Err(Usage(text.into()).into());
     }
-    if args.street && args.generated == 0 {
-        let text =
-            "--street puts generated places in front of houses: say how many with --generated";
+    if args.places != Places::Open && args.generated == 0 {
+        let text = "--places is about generated places: say how many with --generated";
         return Err(Usage(text.into()).into());
     }
     let progress = Progress::new("make", args.folder.output.quiet);
@@ -61,9 +60,10 @@ pub fn run(args: &MakeArgs) -> anyhow::Result<()> {
     if let Some(folder) = &args.hdri {
         made = of_panoramas(args, &bench, folder, &progress)?;
     }
-    let setting = match args.street {
-        true => Setting::Street,
-        false => Setting::Open,
+    let setting = match args.places {
+        Places::Open => Setting::Open,
+        Places::Street => Setting::Street,
+        Places::Yard => Setting::Yard,
     };
     for n in 0..args.generated {
         progress.set(n as f64 / args.generated as f64);

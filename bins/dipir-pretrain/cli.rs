@@ -112,6 +112,9 @@ pub struct Encoder {
     /// Model folder whose encoder it starts from
     #[arg(long, value_name = "MODEL")]
     pub from: Option<PathBuf>,
+    /// Also write some of the pictures that it is trained on, side by side
+    #[arg(long, value_name = "PNG")]
+    pub sheet: Option<PathBuf>,
 }
 
 #[derive(Args)]

@@ -23,9 +23,9 @@ use dipir_diffusion::weights::Weights;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_prior::blueprint::{Blueprint, WEIGHT_FILES};
-use dipir_prior::dataset::{Dataset, DatasetSettings};
+use dipir_prior::dataset::{Dataset, DatasetSettings, Places};
 use dipir_prior::encoder::{self, EncoderSettings, LightEncoder};
-use dipir_prior::examples::Recipe;
+use dipir_prior::examples::{Recipe, SIZE};
 use dipir_prior::gates;
 use dipir_prior::student::add_placeholders;
 use dipir_prior::studio::Kinds;
@@ -55,13 +55,14 @@ fn go_on() -> ControlFlow<()> {
 }
 
 /// Renders what is missing of the training scenes.
-fn scenes(data: &Data, seed: u64, output: &OutputArgs) -> anyhow::Result<Dataset> {
+fn scenes(data: &Data, places: Places, seed: u64, output: &OutputArgs) -> anyhow::Result<Dataset> {
     if data.scenes == 0 {
         return Err(Usage("--scenes 0: at least one scene is needed".into()).into());
     }
     let settings = DatasetSettings {
         seed,
         scenes: data.scenes,
+        places,
         kinds: Kinds::Trained,
     };
     let progress = Progress::new("scenes", output.quiet);
@@ -128,7 +129,7 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
         None if checkpoint.is_file() => trainer.resume(&checkpoint)?,
         None => {}
     }
-    let data = scenes(&args.data, args.seed, output)?;
+    let data = scenes(&args.data, Places::Objects, args.seed, output)?;
     let resumed_at = trainer.seen();
     let progress = Progress::new("training", output.quiet);
     let clock = Instant::now();
@@ -189,7 +190,7 @@ fn train_encoder(args: &Encoder, output: &OutputArgs) -> anyhow::Result<()> {
         Weights::open_file(&from.join(encoder::FILE))?;
     }
     let seed = TrainerSettings::default().seed;
-    let data = scenes(&args.data, seed, output)?;
+    let data = scenes(&args.data, Places::Anywhere, seed, output)?;
     let settings = EncoderSettings {
         samples: args.samples,
         seed: args.seed,
@@ -197,13 +198,22 @@ fn train_encoder(args: &Encoder, output: &OutputArgs) -> anyhow::Result<()> {
     };
     std::fs::create_dir_all(&args.data.out)
         .with_context(|| format!("cannot create {}", args.data.out.display()))?;
+    if let Some(png) = &args.sheet {
+        const COLUMNS: usize = 12;
+        let pictures = encoder::pictures(&data, 8 * COLUMNS, args.seed)?;
+        write_sheet(png, &pictures, SIZE, COLUMNS)?;
+    }
     let progress = Progress::new("encoder", output.quiet);
     let mut mean: Option<f64> = None;
     let finished = encoder::train(&data, &settings, from, &args.data.out, &mut |seen, loss| {
         let loss = mean.map_or(loss, |m| 0.98 * m + 0.02 * loss);
         mean = Some(loss);
         progress.set(seen as f64 / args.samples as f64);
-        progress.say(format!("loss {loss:.4}"));
+        let state = format!("{seen} pictures, loss {loss:.4}");
+        if seen.is_multiple_of(encoder::SAVED_EVERY) {
+            progress.note(&state);
+        }
+        progress.say(state);
         go_on()
     })?;
     progress.done();
@@ -329,7 +339,7 @@ fn sheet(args: &Sheet) -> anyhow::Result<()> {
     let side = model.unet.config().sample_size * model.vae.downscale();
     let repeats = 2;
     let (columns, rows) = (classes.len() * repeats, ASKED.len());
-    let mut picture = Raster::filled(columns * side, rows * side, Vec3::ZERO);
+    let mut pictures = vec![];
     let progress = Progress::new("sheet", false);
     for (row, light) in ASKED.iter().enumerate() {
         for column in 0..columns {
@@ -347,26 +357,38 @@ fn sheet(args: &Sheet) -> anyhow::Result<()> {
                 !interrupt::asked()
             })?;
             let pixels = made.image.flatten_all()?.to_vec1::<f32>()?;
-            let n = side * side;
-            for i in 0..n {
-                let at = |c: usize| (0.5 * pixels[c * n + i] + 0.5).clamp(0.0, 1.0);
-                *picture.get_mut(column * side + i % side, row * side + i / side) =
-                    Vec3::new(at(0), at(1), at(2));
-            }
+            pictures.push(pixels.iter().map(|v| 0.5 * v + 0.5).collect());
             progress.set((row * columns + column + 1) as f64 / (rows * columns) as f64);
         }
     }
     progress.done();
-    let enlarged = Raster::from_pixels(
-        picture.width() * 3,
-        picture.height() * 3,
-        (0..picture.width() * picture.height() * 9)
-            .map(|i| {
-                let (x, y) = (i % (picture.width() * 3), i / (picture.width() * 3));
-                *picture.get(x / 3, y / 3)
-            })
-            .collect(),
-    );
-    write_png(&args.png, &DisplayImage(enlarged))?;
+    write_sheet(&args.png, &pictures, side, columns)
+}
+
+/// Writes pictures [3, side, side] in [0, 1] side by side.
+fn write_sheet(
+    png: &Path,
+    pictures: &[Vec<f32>],
+    side: usize,
+    columns: usize,
+) -> anyhow::Result<()> {
+    let rows = pictures.len().div_ceil(columns);
+    let mut sheet = Raster::filled(columns * side, rows * side, Vec3::ZERO);
+    for (k, picture) in pictures.iter().enumerate() {
+        let (left, top) = (k % columns * side, k / columns * side);
+        for i in 0..side * side {
+            let at = |c: usize| picture[c * side * side + i].clamp(0.0, 1.0);
+            *sheet.get_mut(left + i % side, top + i / side) = Vec3::new(at(0), at(1), at(2));
+        }
+    }
+    write_enlarged(png, &sheet)
+}
+
+/// Writes a picture three times as large.
+fn write_enlarged(png: &Path, picture: &Raster<Vec3>) -> anyhow::Result<()> {
+    let (width, height) = (3 * picture.width(), 3 * picture.height());
+    let pixels = (0..width * height).map(|i| *picture.get(i % width / 3, i / width / 3));
+    let enlarged = Raster::from_pixels(width, height, pixels.collect());
+    write_png(png, &DisplayImage(enlarged))?;
     Ok(())
 }

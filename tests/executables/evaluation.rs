@@ -64,9 +64,8 @@ fn some_network(path: &Path) {
 #[test]
 fn a_street_without_places_is_refused() {
     let project = evaluation();
-    let make = ["make", "--hdri", "maps", "--street"];
-    let told =
-        "error: --street puts generated places in front of houses: say how many with --generated";
+    let make = ["make", "--hdri", "maps", "--places", "street"];
+    let told = "error: --places is about generated places: say how many with --generated";
     project.run(EVALUATE, &make).expect_error(2, told);
 }
 

@@ -46,13 +46,13 @@ impl Backdrop {
     }
 
     /// The number of a paint.
-    fn paint(&mut self, paint: Paint) -> u32 {
+    pub(crate) fn paint(&mut self, paint: Paint) -> u32 {
         self.paints.push(paint);
         self.paints.len() as u32 - 1
     }
 
     /// Three houses side by side with windows and ledges, `depth` metres behind the origin.
-    fn houses(&mut self, draw: &mut Draw<'_>, depth: f32) {
+    pub(crate) fn houses(&mut self, draw: &mut Draw<'_>, depth: f32) {
         let scale = draw.range(0.5, 1.6);
         let yaw = draw.range(-0.6, 0.6);
         let dark = self.paint(Paint {
@@ -175,7 +175,7 @@ impl Draw<'_> {
     }
 
     /// Plaster, stone or brick.
-    fn dull(&mut self) -> Paint {
+    pub(crate) fn dull(&mut self) -> Paint {
         let tint = Vec3::new(
             self.range(0.8, 1.1),
             self.range(0.65, 1.0),
@@ -189,7 +189,7 @@ impl Draw<'_> {
         }
     }
 
-    fn leaves(&mut self) -> Paint {
+    pub(crate) fn leaves(&mut self) -> Paint {
         let color = Vec3::new(
             self.range(0.03, 0.2),
             self.range(0.08, 0.25),
@@ -202,7 +202,7 @@ impl Draw<'_> {
     }
 
     /// Leaves about `size` metres across around `center`.
-    fn clump(&mut self, center: Vec3, size: f32) -> TriangleMesh {
+    pub(crate) fn clump(&mut self, center: Vec3, size: f32) -> TriangleMesh {
         let p = [0; 3].map(|_| self.range(0.0, 1.0));
         let mut mesh = Shape::Rock.mesh(p);
         let turn = DQuat::from_rotation_z(f64::from(self.range(0.0, std::f32::consts::TAU)));

@@ -23,13 +23,43 @@ pub const RECORD_SIZE: usize = 40;
 /// Numbers about a scene beside its planes: words for class and colour, pitch and reach of the camera, its suns.
 const FACTS: usize = 4 + 3 * SUNS;
 
+/// What the scenes of a dataset show.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Places {
+    /// An object in the middle, every second time in a street: what the diffusion model is trained on.
+    Objects,
+    /// Anything, as crops of photographs show it; every second time a yard: what the light encoder is trained on.
+    Anywhere,
+}
+
+impl Places {
+    fn setting(self, index: usize) -> Setting {
+        match self {
+            Self::Objects => [Setting::Open, Setting::Street][index % 2],
+            Self::Anywhere => {
+                [Setting::Open, Setting::Yard, Setting::Street, Setting::Yard][index % 4]
+            }
+        }
+    }
+
+    /// What names of files begin with.
+    fn prefix(self) -> &'static str {
+        match self {
+            Self::Objects => "scenes",
+            Self::Anywhere => "places",
+        }
+    }
+}
+
 /// Which scenes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DatasetSettings {
     /// Key of all random numbers.
     pub seed: u64,
-    /// How many scenes, every second of them a street; rounded up to whole files.
+    /// How many scenes; rounded up to whole files.
     pub scenes: usize,
+    /// What they show.
+    pub places: Places,
     /// Which main objects.
     pub kinds: Kinds,
 }
@@ -62,8 +92,8 @@ pub struct SceneView<'a> {
     pub suns: Vec<Sun>,
 }
 
-fn block_path(folder: &Path, block: usize) -> PathBuf {
-    folder.join(format!("scenes-{block:05}.safetensors"))
+fn block_path(folder: &Path, places: Places, block: usize) -> PathBuf {
+    folder.join(format!("{}-{block:05}.safetensors", places.prefix()))
 }
 
 impl Dataset {
@@ -77,7 +107,7 @@ impl Dataset {
         std::fs::create_dir_all(folder).map_err(io("create", folder))?;
         let blocks = settings.scenes.div_ceil(BLOCK);
         for block in 0..blocks {
-            let path = block_path(folder, block);
+            let path = block_path(folder, settings.places, block);
             if !path.is_file() {
                 write_block(&path, settings, block)?;
             }
@@ -85,13 +115,13 @@ impl Dataset {
                 return Ok(None);
             }
         }
-        Self::open(folder, blocks).map(Some)
+        Self::open(folder, settings.places, blocks).map(Some)
     }
 
     /// The first `blocks` files of `folder`.
-    pub fn open(folder: &Path, blocks: usize) -> Result<Self> {
+    pub fn open(folder: &Path, places: Places, blocks: usize) -> Result<Self> {
         let blocks = (0..blocks)
-            .map(|b| Block::open(&block_path(folder, b)))
+            .map(|b| Block::open(&block_path(folder, places, b)))
             .collect::<Result<_>>()?;
         Ok(Self { blocks })
     }
@@ -189,7 +219,7 @@ fn write_block(path: &Path, settings: &DatasetSettings, block: usize) -> Result<
                 Brief {
                     kinds: settings.kinds,
                     // Photographs of real places show more than open ground.
-                    setting: [Setting::Open, Setting::Street][i % 2],
+                    setting: settings.places.setting(i),
                     view: View::Close,
                 },
             );

@@ -15,9 +15,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
-use crate::examples::{self, Lens, SIZE, Tone, Window};
+use crate::examples::{self, Lens, SIZE, Window};
 use crate::lights::Light;
+use crate::photo::Look;
 use crate::record::Layer;
+use crate::shards::{SHARDS, Shards, mean_gradients};
 use crate::words::LightWords;
 
 /// File of the encoder in a model folder.
@@ -67,6 +69,8 @@ struct Level {
     norm: GroupNorm,
     /// To scales and shifts of all channels.
     pitch: Linear,
+    /// What is added to that; the first level has none, where it would cost most and see least.
+    residual: Option<(GroupNorm, Conv2d)>,
 }
 
 impl Level {
@@ -79,7 +83,14 @@ impl Level {
             .reshape((rows, 2, channels, 1, 1))?;
         let part = |k: usize| change.narrow(1, k, 1)?.squeeze(1);
         let scale = (part(0)? + 1.0)?;
-        Ok(x.broadcast_mul(&scale)?.broadcast_add(&part(1)?)?)
+        let x = x.broadcast_mul(&scale)?.broadcast_add(&part(1)?)?;
+        match &self.residual {
+            Some((norm, convolution)) => {
+                let more = convolution.forward(&norm.forward(&x)?)?;
+                Ok((x + more)?)
+            }
+            None => Ok(x),
+        }
     }
 }
 
@@ -89,6 +100,18 @@ impl LightEncoder {
         for (i, pair) in CHANNELS.windows(2).enumerate() {
             let p = parameters.sub(format!("levels.{i}"));
             let channels = pair[1];
+            let residual = match i {
+                0 => None,
+                _ => {
+                    let p = p.sub("residual");
+                    let norm =
+                        GroupNorm::new(&p.sub("norm"), 8, channels, 1e-5, NormActivation::Silu)?;
+                    let same = Padding::Same(1);
+                    let convolution =
+                        Conv2d::new(&p.sub("conv"), (channels, channels), 3, 1, same)?;
+                    Some((norm, convolution))
+                }
+            };
             levels.push(Level {
                 convolution: Conv2d::new(
                     &p.sub("conv"),
@@ -99,6 +122,7 @@ impl LightEncoder {
                 )?,
                 norm: GroupNorm::new(&p.sub("norm"), 8, channels, 1e-5, NormActivation::Silu)?,
                 pitch: Linear::new(&p.sub("pitch"), PITCH, 2 * channels)?,
+                residual,
             });
         }
         let side = SIZE >> (CHANNELS.len() - 1);
@@ -143,6 +167,17 @@ impl LightEncoder {
         }
         let h = self.hidden.forward(&x.flatten_from(1)?)?;
         Ok(self.out.forward(&h.silu()?)?)
+    }
+
+    /// Writes [`FILE`] into `folder` in f16.
+    fn write(&self, folder: &Path) -> Result<()> {
+        let tensors = self
+            .variables
+            .iter()
+            .map(|(n, v)| Ok((n.clone(), v.to_dtype(DType::F16)?)))
+            .collect::<Result<BTreeMap<_, _>>>()?;
+        write_safetensors(&folder.join(FILE), &tensors, &BTreeMap::new())?;
+        Ok(())
     }
 
     /// Reads the light off a picture [3, SIZE, SIZE] in [0, 1] and off its mirror image, and averages. The
@@ -238,20 +273,20 @@ fn batch(data: &Dataset, count: usize, stream: &mut NoiseStream) -> Result<Batch
     for _ in 0..count {
         let window = Window::draw(stream);
         let lens = Lens::new(data.scene(stream.below(data.len())), window);
-        let light = Light::draw(lens.suns(), stream);
+        let light = Light::draw_any(lens.suns(), stream);
         // The whole picture has one more object in it.
         let layer = if stream.below(2) == 0 {
             Layer::Background
         } else {
             Layer::Whole
         };
-        let tone = Tone::draw(stream);
+        let look = Look::draw(stream);
         let mut picture = lens.layer(layer, &light);
-        tone.apply(&mut picture);
+        look.apply(&mut picture, stream);
         let words = lens.words(light.words(lens.suns()));
         pitch.extend(pitch_features(lens.gaze().pitch));
         pictures.extend(picture.iter().map(|v| 2.0 * v - 1.0));
-        targets.extend(target(&light, &words, tone.exposure));
+        targets.extend(target(&light, &words, look.exposure));
         let seen = if words.is_overcast() { 0.0 } else { 1.0 };
         weights.extend([1.0, 1.0, 2.0 * seen, 2.0, 1.0, 0.3 * seen, 0.3]);
     }
@@ -261,6 +296,13 @@ fn batch(data: &Dataset, count: usize, stream: &mut NoiseStream) -> Result<Batch
         targets: Tensor::from_vec(targets, (count, OUTPUTS), &Device::Cpu)?,
         weights: Tensor::from_vec(weights, (count, OUTPUTS), &Device::Cpu)?,
     })
+}
+
+/// Pictures [3, SIZE, SIZE] in [0, 1] as training shows them, to be looked at.
+pub fn pictures(data: &Dataset, count: usize, seed: u64) -> Result<Vec<Vec<f32>>> {
+    let batch = batch(data, count, &mut NoiseStream::new(seed ^ 0xec0de, 0))?;
+    let values = batch.pictures.affine(0.5, 0.5)?.flatten_from(1)?;
+    Ok(values.to_vec2()?)
 }
 
 /// Settings of the training of an encoder.
@@ -284,9 +326,14 @@ impl Default for EncoderSettings {
     }
 }
 
+/// Pictures of one update.
+const BATCH: usize = 64;
+/// Pictures after which the file is written.
+pub const SAVED_EVERY: usize = 1000 * BATCH;
+
 /// Trains an encoder on `samples` pictures and writes [`FILE`] into `folder`
-/// in f16. `report` is told samples and loss and may stop; whether it
-/// was finished is returned.
+/// in f16, now and then and at the end. `report` is told samples and loss and may stop; whether it
+/// was finished is returned. What was written by then is good to go on `from`.
 pub fn train(
     data: &Dataset,
     settings: &EncoderSettings,
@@ -294,7 +341,6 @@ pub fn train(
     folder: &Path,
     report: &mut dyn FnMut(usize, f64) -> ControlFlow<()>,
 ) -> Result<bool> {
-    const BATCH: usize = 64;
     let &EncoderSettings {
         samples,
         seed,
@@ -316,29 +362,36 @@ pub fn train(
         ..AdamWConfig::default()
     };
     let mut optimizer = AdamW::new(&encoder.variables, config)?;
+    let threads = Shards::new()?;
     let steps = samples.div_ceil(BATCH);
     for step in 0..steps {
-        let mut stream = NoiseStream::new(seed ^ 0xec0de, step as u64);
-        let batch = batch(data, BATCH, &mut stream)?;
-        let found = encoder.forward(&batch.pictures, &batch.pitch)?;
-        let error = ((found - batch.targets)?.sqr()? * batch.weights)?;
-        let loss = error.mean_all()?;
-        let gradients = optimizer.collect(&loss.backward()?)?;
+        let work = |shard: usize| -> Result<(f64, BTreeMap<String, Tensor>)> {
+            let key = (step * SHARDS + shard) as u64;
+            let mut stream = NoiseStream::new(seed ^ 0xec0de, key);
+            let batch = batch(data, BATCH / SHARDS, &mut stream)?;
+            let found = encoder.forward(&batch.pictures, &batch.pitch)?;
+            let error = ((found - batch.targets)?.sqr()? * batch.weights)?;
+            let loss = error.mean_all()?;
+            let gradients = optimizer.collect(&loss.backward()?)?;
+            Ok((loss.to_scalar::<f32>()?.into(), gradients))
+        };
+        let (losses, gradients): (Vec<_>, Vec<_>) = threads.run(work)?.into_iter().unzip();
+        let loss = losses.iter().sum::<f64>() / SHARDS as f64;
+        let gradients = mean_gradients(&gradients)?;
         let done = step as f64 / steps as f64;
         let rate = learning_rate * ((step + 1) as f64 / 100.0).min(1.0);
         let rate = rate * 0.5 * (1.0 + (std::f64::consts::PI * done).cos());
         optimizer.step(&gradients, 1.0, |_| rate)?;
-        let loss = loss.to_scalar::<f32>()? as f64;
-        if report((step + 1) * BATCH, loss).is_break() {
+        let seen = (step + 1) * BATCH;
+        let stop = report(seen, loss).is_break();
+        if stop || seen.is_multiple_of(SAVED_EVERY) {
+            encoder.write(folder)?;
+        }
+        if stop {
             return Ok(false);
         }
     }
-    let tensors = encoder
-        .variables
-        .iter()
-        .map(|(n, v)| Ok((n.clone(), v.to_dtype(DType::F16)?)))
-        .collect::<Result<BTreeMap<_, _>>>()?;
-    write_safetensors(&folder.join(FILE), &tensors, &BTreeMap::new())?;
+    encoder.write(folder)?;
     Ok(true)
 }
 

@@ -10,14 +10,17 @@ pub mod error;
 pub mod examples;
 pub mod gates;
 pub mod lights;
+mod photo;
 pub mod place;
 pub mod reader;
 pub mod record;
 pub mod shapes;
+mod shards;
 pub mod student;
 pub mod studio;
 pub mod tokenizer_files;
 pub mod trainer;
 pub mod words;
+mod yard;
 
 pub use error::{Error, Result};

@@ -93,6 +93,24 @@ impl Light {
         Self::new(sun, elevation, (total, share), tints, range(0.6, 1.5))
     }
 
+    /// A light as photographs have it: beside those of [`draw`](Self::draw), one in six without a sun to be seen, one in
+    /// six hazy, low suns redder, and the camera's white balance off by up to a fifth.
+    pub fn draw_any(suns: &[Sun], stream: &mut NoiseStream) -> Self {
+        let drawn = Self::draw(suns, stream);
+        let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+        let balance = Vec3::new(range(-0.2, 0.2), 0.0, range(-0.2, 0.2)).exp();
+        let elevation = suns[drawn.sun].elevation;
+        let low = ((30f32.to_radians() - elevation) / 25f32.to_radians()).clamp(0.0, 1.0);
+        let tints = (range(0.0, 0.5) + 0.5 * low, range(0.0, 0.6));
+        let share = match range(0.0, 1.0) {
+            x if x < 0.16 => range(0.0, 0.1),
+            x if x < 0.32 => range(0.15, 0.45),
+            _ => range(0.45, 0.93),
+        };
+        let total = std::f32::consts::PI * range(0.35, 1.2);
+        Self::new(drawn.sun, elevation, (total, share), tints, range(0.5, 1.5)).scaled(balance)
+    }
+
     /// The same light with its sun at another of `suns`: tints, sky and irradiance of the ground stay.
     pub fn turned_to(&self, sun: usize, suns: &[Sun]) -> Self {
         let height = |sun: usize| suns[sun].elevation.sin().max(0.1);
@@ -136,8 +154,11 @@ impl Light {
     }
 }
 
-/// `count` suns spread around the sky.
-pub fn draw_suns(count: usize, stream: &mut NoiseStream) -> Vec<Sun> {
+/// Lowest and highest of most scenes' suns, degrees.
+pub const SUN_HEIGHTS: [f32; 2] = [13.0, 73.0];
+
+/// `count` suns spread around the sky, from the lowest to the highest of `heights`, degrees.
+pub fn draw_suns(count: usize, heights: [f32; 2], stream: &mut NoiseStream) -> Vec<Sun> {
     let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
     let start = range(0.0, 1.0);
     let turn = range(0.0, 1.0);
@@ -148,7 +169,7 @@ pub fn draw_suns(count: usize, stream: &mut NoiseStream) -> Vec<Sun> {
             let height = (turn + k as f32 * 0.618_034).fract();
             Sun {
                 azimuth: at * std::f32::consts::TAU,
-                elevation: (13.0 + 60.0 * height).to_radians(),
+                elevation: (heights[0] + (heights[1] - heights[0]) * height).to_radians(),
                 sharpness: range(100f64.ln(), 500f64.ln()).exp(),
             }
         })
@@ -187,7 +208,7 @@ mod tests {
 
     #[test]
     fn a_sun_that_moves_leaves_the_ground_as_bright() {
-        let suns = draw_suns(8, &mut NoiseStream::new(1, 1));
+        let suns = draw_suns(8, SUN_HEIGHTS, &mut NoiseStream::new(1, 1));
         let light = Light::new(2, suns[2].elevation, (2.0, 0.7), (0.3, 0.4), 1.1);
         let expected = Light::new(5, suns[5].elevation, (2.0, 0.7), (0.3, 0.4), 1.1);
         let moved = light.turned_to(5, &suns);

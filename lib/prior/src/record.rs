@@ -333,8 +333,14 @@ impl Record {
                 // The sky itself.
                 let mut seen = [Vec3::ZERO; BASIS];
                 let y = ray.direction.y.max(0.0);
-                seen[SUNS] = Vec3::splat(1.0 - y);
-                seen[SUNS + 1] = Vec3::splat(y);
+                let look = &tracer.stage.sky;
+                let cover = look.cover(ray.direction);
+                seen[SUNS] = Vec3::splat(cover * (1.0 - y));
+                seen[SUNS + 1] = Vec3::splat(cover * y);
+                for (seen, sun) in seen.iter_mut().zip(&tracer.stage.suns) {
+                    let at = sun_direction(sun.azimuth, sun.elevation);
+                    *seen = Vec3::splat(look.around_sun(ray.direction, at));
+                }
                 add(Layer::Background, &seen);
                 if main.is_none() {
                     add(Layer::Whole, &seen);

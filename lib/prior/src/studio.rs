@@ -7,9 +7,10 @@ use dipir_scene::mesh::TriangleMesh;
 use glam::{DMat4, DQuat, DVec3, Vec2, Vec3};
 
 use crate::backdrop::Backdrop;
-use crate::lights::{Sun, draw_suns};
+use crate::lights::{SUN_HEIGHTS, Sun, draw_suns};
 use crate::shapes::Shape;
 use crate::words::{COLORS, Gaze};
+use crate::yard::Clearing;
 
 /// Suns for which every scene is recorded.
 pub const SUNS: usize = 8;
@@ -35,6 +36,51 @@ pub struct Ground {
     scale: f32,
     turn: Vec2,
     seed: u32,
+    wear: Wear,
+}
+
+/// What use and weather leave on a ground, in shares of its albedo.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Wear {
+    /// Fine mottling.
+    grain: f32,
+    /// Dark patches with clear edges, which are no shadows.
+    stains: f32,
+    /// How much darker or brighter the ground is on one side of a line.
+    kerb: f32,
+    /// Where that line runs, metres from the origin.
+    offset: f32,
+}
+
+/// What else the sky shows to who looks at it; what it lights the place with is the light's.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct SkyLook {
+    /// Radiance next to the sun for an irradiance of 1, per steradian.
+    glow: f32,
+    /// How fast that falls, per radian.
+    fall: f32,
+    /// How much clouds add and take away, in shares of the radiance.
+    clouds: f32,
+    seed: u32,
+}
+
+impl SkyLook {
+    /// The radiance that the sun adds in `direction`, for an irradiance of 1 on what faces it.
+    pub fn around_sun(&self, direction: Vec3, sun: Vec3) -> f32 {
+        let angle = direction.dot(sun).clamp(-1.0, 1.0).acos();
+        self.glow * (-self.fall * angle).exp()
+    }
+
+    /// The factor on the sky's radiance in `direction`.
+    pub fn cover(&self, direction: Vec3) -> f32 {
+        if self.clouds == 0.0 {
+            return 1.0;
+        }
+        // Clouds are a layer: towards the horizon they lie closer together.
+        let at = Vec2::new(direction.x, direction.z) * (3.0 / (direction.y + 0.15));
+        let noise = 0.6 * value_noise(at, self.seed) + 0.4 * value_noise(at * 2.7, self.seed ^ 1);
+        1.0 + self.clouds * (2.0 * noise - 1.0)
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -71,6 +117,8 @@ pub enum Setting {
     Open,
     /// In front of houses, trees and what else a street has, seen at eye level.
     Street,
+    /// Among things of all sizes, walls on any side and the shadows of what is out of sight, seen from near or far.
+    Yard,
 }
 
 /// What kind of scene is drawn.
@@ -103,6 +151,8 @@ pub struct Stage {
     pub camera: Camera,
     /// Suns for which it is recorded.
     pub suns: Vec<Sun>,
+    /// What the sky shows.
+    pub sky: SkyLook,
 }
 
 /// Draws of numbers.
@@ -127,7 +177,7 @@ impl Draw<'_> {
         self.0.uniform() < share
     }
 
-    fn paint(&mut self) -> Paint {
+    pub(crate) fn paint(&mut self) -> Paint {
         let index = self.below(COLORS.len());
         let vivid = self.range(0.45, 0.85);
         let dull = self.range(0.03, 0.16);
@@ -163,7 +213,7 @@ impl Draw<'_> {
                 self.range(-0.04, 0.04),
             );
         let pattern = match self.range(0.0, 1.0) {
-            x if x < 0.4 && setting == Setting::Street => Pattern::Tiles,
+            x if x < 0.4 && setting != Setting::Open => Pattern::Tiles,
             x if x < 0.25 => Pattern::Plain,
             x if x < 0.37 => Pattern::Checkers,
             x if x < 0.49 => Pattern::Stripes,
@@ -180,6 +230,32 @@ impl Draw<'_> {
             pattern,
             scale,
             turn: Vec2::new(c, s),
+            seed: self.below(1 << 20) as u32,
+            wear: match setting {
+                Setting::Open | Setting::Street => Wear::default(),
+                Setting::Yard => self.wear(),
+            },
+        }
+    }
+
+    fn wear(&mut self) -> Wear {
+        let mut one_in_two = |high: f32| match self.chance(0.5) {
+            true => self.range(0.0, high),
+            false => 0.0,
+        };
+        Wear {
+            grain: one_in_two(0.7),
+            stains: one_in_two(0.6),
+            kerb: one_in_two(1.0),
+            offset: self.range(-3.0, 3.0),
+        }
+    }
+
+    fn sky_look(&mut self) -> SkyLook {
+        SkyLook {
+            glow: self.range(0.0, 0.4),
+            fall: self.range(1.5, 4.0),
+            clouds: self.range(0.0, 0.6),
             seed: self.below(1 << 20) as u32,
         }
     }
@@ -259,19 +335,29 @@ impl Stage {
             }
         }
         let ground = draw.ground(setting);
-        let (low, high) = match setting {
-            Setting::Open => (10.0, 45.0),
-            Setting::Street => (3.0, 25.0),
+        let (low, high) = match (setting, view) {
+            (Setting::Open, _) => (10.0, 45.0),
+            (Setting::Street, _) | (Setting::Yard, View::Wide) => (3.0, 25.0),
+            (Setting::Yard, View::Close) => (1.0, 45.0),
         };
         let pitch = draw.range(low, high).to_radians();
-        let (distance, width) = match view {
-            View::Close => (draw.range(4.0, 9.0), draw.range(2.8, 4.2)),
-            View::Wide => (draw.range(8.0, 14.0), draw.range(7.0, 9.0)),
+        let (distance, width) = match (setting, view) {
+            (_, View::Wide) => (draw.range(8.0, 14.0), draw.range(7.0, 9.0)),
+            (Setting::Yard, View::Close) => {
+                let distance = draw.range(2.5f32.ln(), 18f32.ln()).exp();
+                (distance, (distance * draw.range(0.15, 0.7)).clamp(1.2, 9.0))
+            }
+            (_, View::Close) => (draw.range(4.0, 9.0), draw.range(2.8, 4.2)),
+        };
+        // What is looked at need not be the object.
+        let aside = match (setting, view) {
+            (Setting::Yard, View::Close) => 0.25 * width,
+            _ => 0.3,
         };
         let target = Vec3::new(
-            draw.range(-0.3, 0.3),
+            draw.range(-aside, aside),
             draw.range(0.15, 0.5),
-            draw.range(-0.3, 0.3),
+            draw.range(-aside, aside),
         );
         let back = Vec3::new(0.0, pitch.sin(), pitch.cos());
         let camera = Camera::look_at(
@@ -281,16 +367,35 @@ impl Stage {
             FieldOfView::Vertical(2.0 * (0.5 * width / distance).atan()),
             [size, size],
         );
-        let suns = draw_suns(SUNS, draw.0);
-        if setting == Setting::Street {
-            let near = match view {
-                View::Close => 1.6,
-                View::Wide => 3.4,
-            };
-            let behind = Backdrop::draw(&mut Draw::new(&mut stream), near, width);
-            others.append(behind.mesh, paints.len() as u32);
-            paints.extend(behind.paints);
-        }
+        let suns = match setting {
+            Setting::Open | Setting::Street => draw_suns(SUNS, SUN_HEIGHTS, draw.0),
+            Setting::Yard => draw_suns(SUNS, [5.0, 75.0], draw.0),
+        };
+        let mut draw = Draw::new(&mut stream);
+        let near = match view {
+            View::Close => 1.6,
+            View::Wide => 3.4,
+        };
+        let (behind, sky) = match setting {
+            Setting::Open => (Backdrop::default(), SkyLook::default()),
+            Setting::Street => {
+                let street = Backdrop::draw(&mut draw, near, width);
+                (street, SkyLook::default())
+            }
+            Setting::Yard => {
+                let clearing = Clearing {
+                    radius: placed
+                        .iter()
+                        .fold(radius, |r, (at, q)| r.max(at.length() + q)),
+                    camera: Vec2::new(camera.position.x, camera.position.z),
+                    width,
+                };
+                let yard = Backdrop::yard(&mut draw, &around, &clearing);
+                (yard, draw.sky_look())
+            }
+        };
+        others.append(behind.mesh, paints.len() as u32);
+        paints.extend(behind.paints);
         Self {
             main,
             main_paint,
@@ -300,6 +405,7 @@ impl Stage {
             ground,
             camera,
             suns,
+            sky,
         }
     }
 }
@@ -335,6 +441,28 @@ impl Stage {
 impl Ground {
     /// Linear albedo at (x, z), metres.
     pub fn albedo(&self, at: Vec2) -> Vec3 {
+        (self.pattern_at(at) * self.wear_at(at)).min(Vec3::splat(0.9))
+    }
+
+    fn wear_at(&self, at: Vec2) -> f32 {
+        let wear = &self.wear;
+        if *wear == Wear::default() {
+            return 1.0;
+        }
+        let fine = value_noise(at * 9.0, self.seed ^ 7) + value_noise(at * 23.0, self.seed ^ 8);
+        let mut factor = 1.0 + wear.grain * 0.5 * (fine - 1.0);
+        let blot = 0.7 * value_noise(at * 0.9, self.seed ^ 9)
+            + 0.3 * value_noise(at * 4.0, self.seed ^ 10);
+        if blot > 0.62 {
+            factor *= 1.0 - wear.stains;
+        }
+        if self.turn.perp_dot(at) > wear.offset {
+            factor *= 1.0 - 0.6 * wear.kerb;
+        }
+        factor
+    }
+
+    fn pattern_at(&self, at: Vec2) -> Vec3 {
         let p = Vec2::new(self.turn.dot(at), self.turn.perp_dot(at)) * self.scale;
         let odd = |x: f32| (x.floor() as i64).rem_euclid(2) as f32;
         let mix = match self.pattern {
@@ -418,5 +546,71 @@ mod tests {
             ..outlook
         };
         assert!((level.at(1.0, 0.0).heading - 0.5f32.atan()).abs() < 1e-6);
+    }
+
+    fn yard(index: u64) -> Stage {
+        let brief = Brief {
+            kinds: Kinds::Trained,
+            setting: Setting::Yard,
+            view: View::Close,
+        };
+        Stage::draw(7, index, 16, brief)
+    }
+
+    #[test]
+    fn a_yards_sky_is_brightest_around_the_sun_and_clouds_leave_it_as_bright_on_the_whole() {
+        let mut clouded = 0;
+        for index in 0..20 {
+            let look = yard(index).sky;
+            let sun = Vec3::new(0.6, 0.8, 0.0);
+            let at = |degrees: f32| {
+                let (s, c) = degrees.to_radians().sin_cos();
+                look.around_sun(sun * c + Vec3::Z * s, sun)
+            };
+            assert!(at(0.0) > at(20.0) && at(20.0) > at(90.0) && at(90.0) >= 0.0);
+            let cover = (0..4000).map(|i| {
+                let (s, c) = (i as f32 * 2.4).sin_cos();
+                let y = (i as f32 + 0.5) / 4000.0;
+                let r = (1.0 - y * y).sqrt();
+                look.cover(Vec3::new(r * c, y, r * s))
+            });
+            let mean = cover.sum::<f32>() / 4000.0;
+            assert!((mean - 1.0).abs() < 0.15, "{index}: {mean}");
+            clouded += usize::from(look.clouds > 0.2);
+        }
+        assert!(clouded > 8);
+        let clear = Stage::draw(7, 0, 16, OPEN).sky;
+        assert_eq!(
+            (clear.around_sun(Vec3::Y, Vec3::Y), clear.cover(Vec3::Y)),
+            (0.0, 1.0)
+        );
+    }
+
+    const OPEN: Brief = Brief {
+        kinds: Kinds::Trained,
+        setting: Setting::Open,
+        view: View::Close,
+    };
+
+    #[test]
+    fn worn_ground_stays_a_ground_and_new_ground_is_its_pattern() {
+        let mut mottled = 0;
+        for index in 0..20 {
+            let (worn, new) = (yard(index).ground, Stage::draw(7, index, 16, OPEN).ground);
+            let mut factors = vec![];
+            for i in 0..400 {
+                let at = Vec2::new((i % 20) as f32, (i / 20) as f32) * 0.37 - 3.0;
+                assert_eq!(new.albedo(at), new.pattern_at(at));
+                let albedo = worn.albedo(at);
+                assert!(
+                    albedo.min_element() > 0.0 && albedo.max_element() <= 0.9,
+                    "{albedo}"
+                );
+                factors.push(worn.wear_at(at));
+            }
+            mottled += usize::from(factors.iter().any(|f| *f != 1.0));
+        }
+        // Each kind of wear is there half of the time.
+        assert!((10..20).contains(&mottled), "{mottled}");
     }
 }

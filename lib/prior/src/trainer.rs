@@ -17,6 +17,7 @@ use crate::blueprint::{Blueprint, WEIGHT_FILES};
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
 use crate::examples::{Example, Recipe};
+use crate::shards::{SHARDS, Shards, mean_gradients};
 use crate::student::{Batch, Student};
 
 /// Settings of a training run.
@@ -47,9 +48,6 @@ impl Default for TrainerSettings {
     }
 }
 
-/// Parts of a batch that are worked on side by side. Fixed, so that the sums
-/// and with them the weights are the same on any machine.
-const SHARDS: usize = 2;
 /// Wrong captions beside a right one, where lights are contrasted.
 const RIVALS: usize = 3;
 /// Examples that are contrasted in a part of so many rows: three rows in four.
@@ -90,7 +88,7 @@ pub struct Trainer {
     student: Student,
     optimizer: AdamW,
     average: BTreeMap<String, Tensor>,
-    pools: Vec<rayon::ThreadPool>,
+    shards: Shards,
 }
 
 impl Trainer {
@@ -127,17 +125,13 @@ impl Trainer {
             .iter()
             .map(|(n, v)| Ok((n.clone(), v.as_detached_tensor().copy()?)))
             .collect::<Result<_>>()?;
-        let pools = (0..SHARDS)
-            .map(|_| rayon::ThreadPoolBuilder::new().num_threads(1).build())
-            .collect::<Result<_, _>>()
-            .map_err(|e| Error::Argument(format!("cannot start threads: {e}")))?;
         Ok(Self {
             settings,
             recipe,
             student,
             optimizer,
             average,
-            pools,
+            shards: Shards::new()?,
         })
     }
 
@@ -163,41 +157,16 @@ impl Trainer {
     pub fn step(&mut self, data: &Dataset) -> Result<Update> {
         let start = Instant::now();
         let step = self.optimizer.steps();
-        let shards: Vec<Result<Shard>> = std::thread::scope(|scope| {
-            let this = &*self;
-            let threads: Vec<_> = (0..SHARDS)
-                .map(|shard| {
-                    scope.spawn(move || this.pools[shard].install(|| this.shard(data, step, shard)))
-                })
-                .collect();
-            threads
-                .into_iter()
-                .map(|t| match t.join() {
-                    Ok(result) => result,
-                    Err(panic) => std::panic::resume_unwind(panic),
-                })
-                .collect()
-        });
-        let mut gradients: Vec<BTreeMap<String, Tensor>> = vec![];
+        let shards = self.shards.run(|shard| self.shard(data, step, shard))?;
+        let mut gradients = vec![];
         let (mut loss, mut surprise) = (0.0, 0.0);
         for shard in shards {
-            let shard = shard?;
             loss += shard.loss / SHARDS as f64;
             surprise += shard.surprise / SHARDS as f64;
             gradients.push(shard.gradients);
         }
-        let names: Vec<&String> = self.student.variables().keys().collect();
-        let gradients = names
-            .into_par_iter()
-            .map(|name| {
-                // Every shard has every gradient, or `collect` had failed.
-                let mut sum = gradients[0][name].clone();
-                for shard in &gradients[1..] {
-                    sum = (sum + &shard[name])?;
-                }
-                Ok((name.clone(), (sum * (1.0 / SHARDS as f64))?))
-            })
-            .collect::<Result<BTreeMap<_, _>>>()?;
+        // Every shard has every gradient, or `collect` had failed.
+        let gradients = mean_gradients(&gradients)?;
         let rate = self.learning_rate();
         let gradient_norm = self.optimizer.step(&gradients, 1.0, |_| rate)?;
         let step = self.optimizer.steps() as f64;
@@ -355,13 +324,14 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::DatasetSettings;
+    use crate::dataset::{DatasetSettings, Places};
     use crate::studio::Kinds;
 
     fn scenes(folder: &Path) -> Dataset {
         let settings = DatasetSettings {
             seed: 5,
             scenes: 1,
+            places: Places::Objects,
             kinds: Kinds::Trained,
         };
         Dataset::make(folder, &settings, &mut |_| ControlFlow::Continue(()))
@@ -518,7 +488,9 @@ mod tests {
         let path = folder.path().join("scenes-00000.safetensors");
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-        let error = Dataset::open(folder.path(), 1).unwrap_err().to_string();
+        let error = Dataset::open(folder.path(), Places::Objects, 1)
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("scenes-00000.safetensors"), "{error}");
     }
 }
