@@ -398,6 +398,8 @@ pub fn train(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::dataset::{DatasetSettings, Places};
+    use crate::studio::Kinds;
 
     fn estimate(azimuth: f32, confidence: f32, irradiance: f32) -> LightEstimate {
         LightEstimate {
@@ -461,5 +463,49 @@ mod tests {
         }
         assert_eq!(estimate(0.0, 1.2, 1.0).spread(), 0.0);
         assert!(estimate(0.0, 0.0, 1.0).spread().is_finite());
+    }
+
+    #[test]
+    fn a_run_that_is_stopped_leaves_an_encoder_to_go_on_from() {
+        let folder = tempfile::tempdir().unwrap();
+        let settings = DatasetSettings {
+            seed: 5,
+            scenes: 1,
+            places: Places::Anywhere,
+            kinds: Kinds::Trained,
+        };
+        let on = &mut |_| ControlFlow::Continue(());
+        let data = Dataset::make(folder.path(), &settings, on)
+            .unwrap()
+            .unwrap();
+        assert!(folder.path().join("places-00000.safetensors").is_file());
+        let shown = pictures(&data, 3, 1).unwrap();
+        let in_range = |p: &Vec<f32>| p.iter().all(|v| (-1e-6..=1.000_001).contains(v));
+        assert!(shown.len() == 3 && shown.iter().all(in_range));
+        let settings = EncoderSettings {
+            samples: 4 * BATCH,
+            ..EncoderSettings::default()
+        };
+        let (mut seen, stop_at) = (vec![], 2 * BATCH);
+        let done = train(&data, &settings, None, folder.path(), &mut |count, loss| {
+            seen.push((count, loss));
+            match count >= stop_at {
+                true => ControlFlow::Break(()),
+                false => ControlFlow::Continue(()),
+            }
+        });
+        assert!(!done.unwrap() && seen.len() == 2);
+        let from = Some(folder.path());
+        let mut counts = vec![];
+        let done = train(&data, &settings, from, folder.path(), &mut |count, loss| {
+            assert!(loss.is_finite());
+            counts.push(count);
+            ControlFlow::Continue(())
+        });
+        assert!(done.unwrap());
+        assert_eq!(counts, [1, 2, 3, 4].map(|k| k * BATCH));
+        let encoder = LightEncoder::load(folder.path()).unwrap().unwrap();
+        let found = encoder.estimate(&shown[0], 0.3).unwrap();
+        assert!(found.confidence.is_finite() && found.irradiance > 0.0);
     }
 }

@@ -216,4 +216,32 @@ mod tests {
         assert!((moved.sun_color - expected.sun_color).length() < 1e-5);
         assert!((moved.bounce - expected.bounce).length() < 1e-5);
     }
+
+    #[test]
+    fn photographs_have_hazy_skies_and_red_low_suns() {
+        let suns = draw_suns(8, [5.0, 75.0], &mut NoiseStream::new(2, 1));
+        let (mut overcast, mut hazy) = (0, 0);
+        let mut warmth = [(0.0, 0); 2];
+        for index in 0..1200 {
+            let light = Light::draw_any(&suns, &mut NoiseStream::new(3, index));
+            let ground = light.irradiance(&suns);
+            assert!(
+                ground.is_finite() && ground.min_element() > 0.0,
+                "{light:?}"
+            );
+            overcast += usize::from(light.words(&suns).is_overcast());
+            hazy += usize::from((0.15..0.45).contains(&light.share));
+            if light.share > 0.45 {
+                let is_high = suns[light.sun].elevation > 0.6;
+                let (sum, count) = &mut warmth[usize::from(is_high)];
+                *sum += (light.sun_color.x / light.sun_color.z).ln();
+                *count += 1;
+            }
+        }
+        // 192 of each expected, with a standard deviation of 13.
+        assert!((140..245).contains(&overcast), "{overcast}");
+        assert!((140..245).contains(&hazy), "{hazy}");
+        let [low, high] = warmth.map(|(sum, count)| sum / count as f32);
+        assert!(low > high + 0.1, "{low} {high}");
+    }
 }
