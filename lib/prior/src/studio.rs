@@ -46,7 +46,7 @@ struct Wear {
     grain: f32,
     /// Dark patches with clear edges, which are no shadows.
     stains: f32,
-    /// How much darker or brighter the ground is on one side of a line.
+    /// How much darker the ground is on one side of a line, 1 for six tenths.
     kerb: f32,
     /// Where that line runs, metres from the origin.
     offset: f32,
