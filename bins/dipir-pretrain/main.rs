@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::Instant;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use candle_core::{DType, Device};
 use clap::Parser;
 use cli::{Cli, Command, Data, Encoder, Gates, Sheet, Train};
@@ -185,6 +185,7 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
 
 fn train_encoder(args: &Encoder, output: &OutputArgs) -> anyhow::Result<()> {
     check_rate(args.learning_rate)?;
+    args.sheet.as_deref().map_or(Ok(()), check_place)?;
     let from = args.from.as_deref();
     if let Some(from) = from {
         Weights::open_file(&from.join(encoder::FILE))?;
@@ -334,6 +335,7 @@ const ASKED: [&str; 6] = [
 ];
 
 fn sheet(args: &Sheet) -> anyhow::Result<()> {
+    check_place(&args.png)?;
     let model = load(&args.model)?;
     let classes = ["red car", "white ball", "yellow box", "blue cone"];
     let side = model.unet.config().sample_size * model.vae.downscale();
@@ -363,6 +365,22 @@ fn sheet(args: &Sheet) -> anyhow::Result<()> {
     }
     progress.done();
     write_sheet(&args.png, &pictures, side, columns)
+}
+
+/// That a picture can be put at `png`, before the minutes that it takes to make it.
+fn check_place(png: &Path) -> anyhow::Result<()> {
+    let folder = png.parent().filter(|f| !f.as_os_str().is_empty());
+    if let Some(folder) = folder.filter(|f| !f.is_dir()) {
+        bail!(
+            "cannot write {}: there is no folder {}; create it first",
+            png.display(),
+            folder.display()
+        );
+    }
+    if png.is_dir() {
+        bail!("cannot write {}: it is a folder", png.display());
+    }
+    Ok(())
 }
 
 /// Writes pictures [3, side, side] in [0, 1] side by side.

@@ -163,6 +163,10 @@ fn an_encoder_goes_on_from_that_of_a_model() {
     let late = [&tiny[..], &["--learning-rate", "-1"]].concat();
     let told = "error: --learning-rate -1: accepted are numbers above 0";
     project.run(PRETRAIN, &late).expect_error(2, told);
+    let lost = [&tiny[..], &["--sheet", "nowhere/sheet.png"]].concat();
+    let told = "error: cannot write nowhere/sheet.png: there is no folder nowhere; create it first";
+    project.run(PRETRAIN, &lost).expect_error(1, told);
+    assert!(!project.path("cache").exists() && !project.path("model").exists());
     // One that knows light errs less than one that knows nothing.
     let loss = |more: &[&str]| {
         let run = project.run(PRETRAIN, &[&tiny[..], &["--json"], more].concat());
@@ -170,6 +174,16 @@ fn an_encoder_goes_on_from_that_of_a_model() {
         let told: Value = serde_json::from_str(&run.stdout).unwrap();
         told["loss"].as_f64().unwrap()
     };
-    let (known, unknown) = (loss(&["--from", PRIOR]), loss(&[]));
+    let sheet = ["--from", PRIOR, "--sheet", "sheet.png"];
+    let (known, unknown) = (loss(&sheet), loss(&[]));
     assert!(known < 0.5 * unknown, "{known} {unknown}");
+    // What it is shown: eight rows of twelve pictures, three times as large.
+    let sheet = image::open(project.path("sheet.png")).unwrap().to_rgb8();
+    assert_eq!(sheet.dimensions(), (12 * 32 * 3, 8 * 32 * 3));
+    let tiles: std::collections::BTreeSet<Vec<u8>> = (0..96)
+        .map(|k| (k % 12 * 96, k / 12 * 96))
+        .map(|(x, y)| image::imageops::crop_imm(&sheet, x, y, 96, 96).to_image())
+        .map(|tile| tile.into_raw())
+        .collect();
+    assert!(tiles.len() > 90, "{} of 96 differ", tiles.len());
 }
