@@ -3,6 +3,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use dipir_cli::args::OutputArgs;
+use dipir_prior::blueprint::Blueprint;
 use dipir_prior::encoder::EncoderSettings;
 use dipir_prior::energy::SHARES;
 use dipir_prior::examples::Recipe;
@@ -71,6 +72,10 @@ pub struct Train {
     /// Key of all random numbers
     #[arg(long, default_value_t = TrainerSettings::default().seed)]
     pub seed: u64,
+    /// Residual blocks of the UNet at each resolution on the way down; on the way up it has one more. A model that a run
+    /// starts from may have fewer
+    #[arg(long, default_value_t = Blueprint::default().layers)]
+    pub layers: usize,
     /// Share of captions that name the light
     #[arg(long, default_value_t = Recipe::default().light_words)]
     pub light_words: f64,
@@ -81,6 +86,10 @@ pub struct Train {
     /// of four are then groups of one noisy picture that four captions are asked about
     #[arg(long, default_value_t = TrainerSettings::default().contrast)]
     pub contrast: f64,
+    /// Weight of naming the sun's direction that is seen, whatever is said, by a layer on the middle of the UNet that only
+    /// training has; 0: not asked
+    #[arg(long, default_value_t = TrainerSettings::default().naming)]
+    pub name_light: f64,
     /// Share of examples that are seen under another light than is said, and asked for under the one that is
     #[arg(long, default_value_t = Recipe::default().relit)]
     pub relit: f64,

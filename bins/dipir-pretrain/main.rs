@@ -94,16 +94,22 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
             return Err(Usage(format!("--{name} {share}: accepted are 0 to 1")).into());
         }
     }
-    if !(args.contrast >= 0.0 && args.contrast.is_finite()) {
-        let message = format!("--contrast {}: accepted are 0 and more", args.contrast);
-        return Err(Usage(message).into());
+    for (name, weight) in [("contrast", args.contrast), ("name-light", args.name_light)] {
+        if !(weight >= 0.0 && weight.is_finite()) {
+            let message = format!("--{name} {weight}: accepted are 0 and more");
+            return Err(Usage(message).into());
+        }
     }
     check_rate(args.learning_rate)?;
+    if !(1..=8).contains(&args.layers) {
+        return Err(Usage(format!("--layers {}: accepted are 1 to 8", args.layers)).into());
+    }
     let settings = TrainerSettings {
         samples: args.samples,
         batch: args.batch,
         seed: args.seed,
         contrast: args.contrast,
+        naming: args.name_light,
         learning_rate: args.learning_rate,
     };
     let recipe = Recipe {
@@ -112,7 +118,10 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
         relit: args.relit,
         ..Recipe::default()
     };
-    let blueprint = Blueprint::default();
+    let blueprint = Blueprint {
+        layers: args.layers,
+        ..Blueprint::default()
+    };
     let out = &args.data.out;
     let checkpoint = args.data.cache.join("checkpoint.safetensors");
     let from = args.from.as_ref().filter(|_| !checkpoint.is_file());
@@ -134,21 +143,25 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     let progress = Progress::new("training", output.quiet);
     let clock = Instant::now();
     let mut mean: Option<f64> = None;
-    let mut surprise: Option<f64> = None;
+    let (mut surprise, mut naming) = (None, None);
+    // Over about fifty updates.
+    let smooth = |mean: &mut Option<f64>, now: f64| {
+        let smoothed = mean.map_or(now, |m| 0.98 * m + 0.02 * now);
+        *mean = Some(smoothed);
+        smoothed
+    };
     trainer.run(&data, &mut |trainer, update| {
-        // Over about fifty updates.
-        let loss = mean.map_or(update.loss, |m| 0.98 * m + 0.02 * update.loss);
-        mean = Some(loss);
+        let loss = smooth(&mut mean, update.loss);
         progress.set(update.seen as f64 / args.samples.max(1) as f64);
-        let told = match update.surprise.is_nan() {
-            true => String::new(),
-            false => {
-                let now = surprise.map_or(update.surprise, |m| 0.98 * m + 0.02 * update.surprise);
-                surprise = Some(now);
-                format!(", surprise at the light {now:.3}")
+        let mut state = format!("{} examples, loss {loss:.4}", update.seen);
+        for (what, mean, now) in [
+            ("surprise at the light", &mut surprise, update.surprise),
+            ("light named to", &mut naming, update.naming),
+        ] {
+            if !now.is_nan() {
+                state += &format!(", {what} {:.3}", smooth(mean, now));
             }
-        };
-        let state = format!("{} examples, loss {loss:.4}{told}", update.seen);
+        }
         let stop = go_on();
         let every = (args.checkpoint_every.max(1) * args.batch).max(1);
         if stop.is_break() || update.seen.is_multiple_of(every) {

@@ -33,7 +33,13 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
         let quiet = ["--json", "--quiet", "--checkpoint-every", "1"];
         let run = project.run(
             PRETRAIN,
-            &[&TINY[..], &["--relit", "1"], &quiet, more].concat(),
+            &[
+                &TINY[..],
+                &["--relit", "1", "--name-light", "0.1"],
+                &quiet,
+                more,
+            ]
+            .concat(),
         );
         run.expect_success();
         // Not even of checkpoints.
@@ -51,10 +57,18 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
     let again = run(&from);
     assert_eq!(again["resumed_at"].as_u64(), Some(24));
     assert_eq!(project.read(weights), trained);
-    // A model that knows pictures errs less than one that knows nothing.
-    std::fs::remove_file(project.path("cache/checkpoint.safetensors")).unwrap();
-    let [known, unknown] = [&first, &run(&[])].map(|r| r["loss"].as_f64().unwrap());
+    // A model that knows pictures errs less than one that knows nothing, and a deeper one that goes on from it as little.
+    let afresh = |more: &[&str]| {
+        std::fs::remove_file(project.path("cache/checkpoint.safetensors")).unwrap();
+        run(more)
+    };
+    let deeper = afresh(&[&from[..], &["--layers", "2"]].concat());
+    let config: Value = serde_json::from_slice(&project.read("model/unet/config.json")).unwrap();
+    assert_eq!(config["layers_per_block"].as_u64(), Some(2));
+    let unknown = afresh(&[]);
+    let [known, deeper, unknown] = [&first, &deeper, &unknown].map(|r| r["loss"].as_f64().unwrap());
     assert!(known < 0.5 * unknown, "{known} {unknown}");
+    assert!((deeper / known - 1.0).abs() < 1e-2, "{deeper} {known}");
 
     let gates = [
         "gates", "model", "--first", "1000", "--scenes", "2", "--draws", "1", "--json",
@@ -128,6 +142,12 @@ fn what_is_wrong_is_told_before_scenes_are_rendered() {
     for (wrong, code, told) in [
         (["--from", "nowhere"], 1, NO_WEIGHTS),
         (["--relit", "1.5"], 2, "--relit 1.5: accepted are 0 to 1"),
+        (["--layers", "0"], 2, "--layers 0: accepted are 1 to 8"),
+        (
+            ["--name-light", "-1"],
+            2,
+            "--name-light -1: accepted are 0 and more",
+        ),
         (
             ["--learning-rate", "0"],
             2,

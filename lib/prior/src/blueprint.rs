@@ -36,6 +36,8 @@ pub const WEIGHT_FILES: [(&str, &str); 2] = [
 pub struct Blueprint {
     /// Channels of the UNet by level, finest first.
     pub channels: Vec<usize>,
+    /// Residual blocks of a level on the way down; on the way up it has one more.
+    pub layers: usize,
     /// Width of the text encoder.
     pub text_width: usize,
 }
@@ -44,6 +46,7 @@ impl Default for Blueprint {
     fn default() -> Self {
         Self {
             channels: vec![32, 64, 128],
+            layers: 1,
             text_width: 64,
         }
     }
@@ -64,7 +67,7 @@ impl Blueprint {
             down_block_types: (0..levels).map(|l| kind(l > 0, "Down")).collect(),
             up_block_types: (0..levels).rev().map(|l| kind(l > 0, "Up")).collect(),
             block_out_channels: self.channels.clone(),
-            layers_per_block: 1,
+            layers_per_block: self.layers,
             transformer_layers_per_block: PerLevel::All(1),
             attention_head_dim: PerLevel::Each(
                 self.channels
@@ -80,6 +83,32 @@ impl Blueprint {
             addition_embed_type_num_heads: 4,
             ..UNetConfig::default()
         }
+    }
+
+    /// The variable of a UNet with `before` residual blocks a level that `name`, without "unet.", goes on from;
+    /// `None` for those of a block that it had not. Blocks come in before the last one of the way up, whose skip
+    /// connection is that of the level above, and after the last one of the way down.
+    pub fn name_before(&self, name: &str, before: usize) -> Option<String> {
+        let mut parts: Vec<&str> = name.split('.').collect();
+        let [
+            way @ ("down_blocks" | "up_blocks"),
+            _,
+            "resnets" | "attentions",
+            block,
+            ..,
+        ] = parts[..]
+        else {
+            return Some(name.to_owned());
+        };
+        let block: usize = block.parse().ok()?;
+        let block = match way {
+            "up_blocks" if block == self.layers => before,
+            _ if block < before => block,
+            _ => return None,
+        };
+        let block = block.to_string();
+        parts[3] = &block;
+        Some(parts.join("."))
     }
 
     /// The text encoder's configuration for a vocabulary of `vocab_size`.

@@ -244,6 +244,8 @@ pub struct Example {
     pub weight: Vec<f32>,
     /// What is said.
     pub caption: Option<Caption>,
+    /// The light that the object is seen under.
+    pub light: LightWords,
     /// Other lights, to be told from the one that is said.
     pub rivals: Vec<Rival>,
 }
@@ -286,12 +288,14 @@ impl Default for Recipe {
 }
 
 impl Recipe {
-    /// The same with `rivals` beside each caption; every caption names its light, and three in ten show
-    /// nothing around the object, as where light is read.
+    /// The same with `rivals` beside each caption; every caption names its light, three in ten show
+    /// nothing around the object, as where light is read, and what is shown is always under the light that is
+    /// to be told, so that it may be told from there, too.
     pub fn contrasted(&self, rivals: usize) -> Self {
         Self {
             light_words: 1.0,
             background: self.background.min(0.7),
+            foreign_light: 0.0,
             rivals,
             relit: 0.0,
             ..*self
@@ -377,7 +381,7 @@ impl Example {
             image
         };
         let image = picture(&light);
-        let seen = other.map(|other| picture(&other));
+        let seen = other.as_ref().map(&picture);
         let coverage = lens.coverage();
         let hard: Vec<f32> = coverage.iter().map(|&c| f32::from(c > 0.02)).collect();
         let view = stream.uniform();
@@ -407,6 +411,8 @@ impl Example {
             _ => class.to_owned(),
         };
         let words = lens.words(light.words(lens.suns()));
+        let seen_light = other.as_ref().unwrap_or(&light);
+        let seen_light = lens.words(seen_light.words(lens.suns()));
         let rivals = match named {
             true => recipe.rivals,
             false => 0,
@@ -439,6 +445,7 @@ impl Example {
             mask,
             weight,
             caption,
+            light: seen_light,
             rivals,
         }
     }
@@ -475,6 +482,7 @@ mod tests {
     use super::*;
     use crate::record::Record;
     use crate::studio::{Brief, Kinds, Outlook, Setting, Stage, View};
+    use crate::words::Mixture;
 
     #[test]
     fn a_light_is_told_from_where_the_window_looks_and_then_mirrored() {
@@ -545,6 +553,14 @@ mod tests {
         record.planes.iter().map(|&v| f16::from_f32(v)).collect()
     }
 
+    fn mixtures(example: &Example) -> Vec<Mixture> {
+        example.caption.clone().expect("a caption").mixtures
+    }
+
+    fn mixtures_of(light: &LightWords) -> Vec<Mixture> {
+        Caption::new("object", Some(light)).mixtures
+    }
+
     #[test]
     fn rivals_have_pictures_of_their_own_and_no_light_is_given_away() {
         let stage = one_stage();
@@ -556,6 +572,7 @@ mod tests {
             let mut stream = NoiseStream::new(4, index);
             let example = Example::draw(scene.clone(), &recipe, &mut stream);
             assert!(example.caption.is_some() && example.seen.is_none());
+            assert_eq!(mixtures(&example), mixtures_of(&example.light));
             let [unseen, seen @ ..] = &example.rivals[..] else {
                 panic!("no rivals")
             };
@@ -595,8 +612,9 @@ mod tests {
             let window = Window::draw(&mut NoiseStream::new(4, index));
             let mut stream = NoiseStream::new(4, index);
             let example = Example::draw(scene.clone(), &recipe, &mut stream);
+            // What is said is not what is seen.
+            assert_ne!(mixtures(&example), mixtures_of(&example.light));
             let seen = example.seen.expect("another light");
-            assert!(example.caption.is_some());
             let differs = |i: usize| {
                 (0..3).any(|c| (example.image[c * PIXELS + i] - seen[c * PIXELS + i]).abs() > 0.02)
             };

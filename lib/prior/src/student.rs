@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Device, Tensor, Var};
+use dipir_diffusion::layers::Linear;
 use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::parameters::Parameters;
 use dipir_diffusion::pass::Pass;
@@ -16,7 +17,7 @@ use dipir_diffusion::vae::pixel_unshuffle;
 use crate::blueprint::{Blueprint, FACTOR, SCALING};
 use crate::error::{Error, Result};
 use crate::examples::{Example, Rival, SIZE};
-use crate::words::{CLOCK, Caption, HEIGHTS, PLACEHOLDERS, SKIES};
+use crate::words::{CLOCK, Caption, HEIGHTS, LightWords, PLACEHOLDERS, SKIES};
 
 /// Networks and variables.
 #[derive(Debug)]
@@ -25,7 +26,60 @@ pub struct Student {
     text: TextEncoder,
     tokenizer: Tokenizer,
     schedule: NoiseSchedule,
+    naming: Option<NamingHead>,
     variables: BTreeMap<String, Var>,
+}
+
+/// Losses of a batch, scalars in the graph.
+pub struct Losses {
+    /// Weighted mean squared error of the velocity, that under rivals of which there are pictures included.
+    pub velocity: Tensor,
+    /// Share of the surprise at the right caption among its rivals; `None` where no example has rivals.
+    pub surprise: Option<Tensor>,
+    /// Mean squared error of the direction of the sun that is seen, as the middle of the UNet tells it;
+    /// `None` where it is not asked.
+    pub naming: Option<Tensor>,
+}
+
+/// Names the light that is seen from what the UNet's middle block makes of a picture, whatever is said. Only
+/// training has it.
+#[derive(Debug)]
+struct NamingHead {
+    hidden: Linear,
+    out: Linear,
+    variables: BTreeMap<String, Var>,
+}
+
+impl NamingHead {
+    const HIDDEN: usize = 96;
+    /// Cosine and sine of the azimuth, and the elevation in radians from .75 on.
+    const OUTPUTS: usize = 3;
+
+    fn new(inputs: usize, seed: u64) -> Result<Self> {
+        let parameters = Parameters::random(seed, &Device::Cpu);
+        let p = &parameters;
+        Ok(Self {
+            hidden: Linear::new(&p.sub("hidden"), inputs, Self::HIDDEN)?,
+            out: Linear::new(&p.sub("out"), Self::HIDDEN, Self::OUTPUTS)?,
+            variables: parameters.finish(|_| false)?,
+        })
+    }
+
+    /// Over rows that have a sun; 0 where none has.
+    fn loss(&self, middle: &Tensor, lights: &[LightWords]) -> Result<Tensor> {
+        let h = self.hidden.forward(&middle.flatten_from(1)?)?.silu()?;
+        let told = self.out.forward(&h)?;
+        let wanted: Vec<f32> = lights
+            .iter()
+            .flat_map(|l| [l.azimuth.cos(), l.azimuth.sin(), l.elevation - 0.75])
+            .collect();
+        let wanted = Tensor::from_vec(wanted, told.shape(), &Device::Cpu)?;
+        let sunny: Vec<f32> = lights.iter().map(|l| f32::from(!l.is_overcast())).collect();
+        let count = sunny.iter().sum::<f32>().max(1.0);
+        let error = (told - wanted)?.sqr()?.sum(1)?;
+        let error = (error * Tensor::new(sunny.as_slice(), &Device::Cpu)?)?.sum_all()?;
+        Ok((error / f64::from(count))?)
+    }
 }
 
 /// Captions as the text encoder takes them.
@@ -115,6 +169,8 @@ pub struct Batch {
     pub weights: Tensor,
     /// What is said.
     pub captions: Vec<Option<Caption>>,
+    /// The lights that the objects are seen under.
+    pub lights: Vec<LightWords>,
     /// Other lights, as many for each of the first examples; the others have none.
     pub rivals: Vec<Vec<Rival>>,
 }
@@ -187,6 +243,7 @@ impl Batch {
                 .map(|e| std::mem::take(&mut e.rivals))
                 .take_while(|r| !r.is_empty())
                 .collect(),
+            lights: examples.iter().map(|e| e.light).collect(),
             captions: examples.into_iter().map(|e| e.caption).collect(),
         })
     }
@@ -235,10 +292,24 @@ impl Student {
             text,
             tokenizer,
             schedule: NoiseSchedule::new(blueprint.schedule())?,
+            naming: None,
             variables,
         };
         student.prepare()?;
         Ok(student)
+    }
+
+    /// The same with a head that names the light that is seen; its variables are named "naming." and belong to no model.
+    pub fn with_naming(mut self, seed: u64) -> Result<Self> {
+        let config = self.unet.config();
+        let side = config.sample_size >> (config.levels() - 1);
+        let channels = config.block_out_channels[config.levels() - 1];
+        let head = NamingHead::new(channels * side * side, seed ^ 0x4ead)?;
+        let variables = head.variables.iter();
+        self.variables
+            .extend(variables.map(|(n, v)| (format!("naming.{n}"), v.clone())));
+        self.naming = Some(head);
+        Ok(self)
     }
 
     /// Residual branches start at nothing, words of one scale in its order.
@@ -291,13 +362,8 @@ impl Student {
         &self.variables
     }
 
-    /// Weighted mean squared error of the velocity, that under rivals of which there are pictures included, and the
-    /// share of surprise at the right caption among its rivals; both in the graph, the second `None` where no example has rivals.
-    pub fn loss(
-        &self,
-        batch: &Batch,
-        stream: &mut NoiseStream,
-    ) -> Result<(Tensor, Option<Tensor>)> {
+    /// The losses of a batch under noise from `stream`.
+    pub fn loss(&self, batch: &Batch, stream: &mut NoiseStream) -> Result<Losses> {
         let count = batch.latents.dims()[0];
         let steps = self.schedule.len();
         let contrasted = batch.rivals.len();
@@ -332,9 +398,14 @@ impl Student {
         let index = Tensor::new(rows.as_slice(), &Device::Cpu)?;
         let of_rows = |t: &Tensor| t.index_select(&index, 0);
         let context = Spoken::new(&self.tokenizer, &captions)?.states(&self.text)?;
-        let output = self
-            .unet
-            .forward(&of_rows(&input)?, &t, &context, &Pass::default())?;
+        let (output, middle) =
+            self.unet
+                .forward_and_middle(&of_rows(&input)?, &t, &context, &Pass::default())?;
+        let naming = self.naming.as_ref().map(|head| {
+            let lights: Vec<_> = rows.iter().map(|&i| batch.lights[i as usize]).collect();
+            head.loss(&middle, &lights)
+        });
+        let naming = naming.transpose()?;
         let weights = of_rows(&batch.weights)?;
         let error = errors(&output, &of_rows(&target)?, &weights)?;
         let mut sum = error.narrow(0, 0, count)?.sum_all()?;
@@ -361,9 +432,13 @@ impl Student {
             sum = (sum + errors(&of_asked(&output)?, &target, &weights)?.sum_all()?)?;
             total = (total + weights.sum_all()?)?;
         }
-        let loss = sum.div(&total)?;
+        let velocity = sum.div(&total)?;
         if contrasted == 0 {
-            return Ok((loss, None));
+            return Ok(Losses {
+                velocity,
+                surprise: None,
+                naming,
+            });
         }
         // The mean error of the noise, as it is compared where light is read.
         let weights = batch.weights.flatten_from(1)?.sum(1)?;
@@ -381,22 +456,28 @@ impl Student {
         let nats = (Tensor::cat(&[&right, &wrong], 1)?.broadcast_mul(&scales)?).neg()?;
         let surprise = (nats.log_sum_exp(1)? - nats.narrow(1, 0, 1)?.squeeze(1)?)?;
         let even = (1.0 + (rows.len() - count) as f64 / contrasted as f64).ln();
-        Ok((loss, Some((surprise.mean_all()? / even)?)))
+        Ok(Losses {
+            velocity,
+            surprise: Some((surprise.mean_all()? / even)?),
+            naming,
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::words::LightWords;
 
-    fn caption(azimuth: f32) -> Option<Caption> {
-        let light = LightWords {
+    fn light(azimuth: f32) -> LightWords {
+        LightWords {
             azimuth,
             elevation: 0.5,
             sun_share: 0.8,
-        };
-        Some(Caption::new("red car", Some(&light)))
+        }
+    }
+
+    fn caption(azimuth: f32) -> Option<Caption> {
+        Some(Caption::new("red car", Some(&light(azimuth))))
     }
 
     fn rival(azimuth: f32, image: Option<Vec<f32>>) -> Rival {
@@ -410,6 +491,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let blueprint = Blueprint {
             channels: vec![8, 16],
+            layers: 1,
             text_width: 16,
         };
         blueprint.write_configs(folder.path()).expect("written");
@@ -426,14 +508,15 @@ mod tests {
             mask: vec![1.0; SIZE * SIZE],
             weight: vec![0.5 + value; SIZE * SIZE],
             caption: caption(0.3),
+            light: light(0.3),
             rivals: (1..=rivals).map(|k| rival(0.3 + k as f32, None)).collect(),
         };
         let loss = |examples: Vec<Example>| {
             let batch = Batch::new(examples).expect("a batch");
             let mut stream = NoiseStream::new(3, 3);
-            let (loss, surprise) = student.loss(&batch, &mut stream).expect("a loss");
+            let losses = student.loss(&batch, &mut stream).expect("a loss");
             let value = |t: Tensor| t.to_scalar::<f32>().expect("a value");
-            (value(loss), surprise.map(value))
+            (value(losses.velocity), losses.surprise.map(value))
         };
         // Its output is 0 whatever is said, so all captions are as likely.
         let (mixed, surprise) = loss(vec![example(0.2, 0), example(0.7, 3), example(0.4, 3)]);
@@ -479,6 +562,54 @@ mod tests {
     }
 
     #[test]
+    fn the_light_that_is_seen_is_named_whatever_is_said() {
+        let student = small();
+        let unet_alone = student.variables().len();
+        let student = student.with_naming(4).expect("built");
+        assert_eq!(student.variables().len(), unet_alone + 4);
+        // A head that answers 0 errs by the length of what is asked for, in rows that have a sun.
+        for (name, variable) in student.variables() {
+            if name.starts_with("naming.out.") {
+                let nothing = variable.zeros_like().expect("zeros");
+                variable.set(&nothing).expect("set");
+            }
+        }
+        let seen = |light: LightWords| Example {
+            image: vec![0.4; 3 * SIZE * SIZE],
+            seen: None,
+            shown: vec![0.5; 3 * SIZE * SIZE],
+            mask: vec![1.0; SIZE * SIZE],
+            weight: vec![1.0; SIZE * SIZE],
+            caption: caption(2.0),
+            light,
+            rivals: vec![],
+        };
+        let overcast = LightWords {
+            sun_share: 0.0,
+            ..light(0.0)
+        };
+        let high = LightWords {
+            elevation: 1.25,
+            ..light(0.0)
+        };
+        let naming = |examples: Vec<Example>| {
+            let batch = Batch::new(examples).expect("a batch");
+            let losses = student.loss(&batch, &mut NoiseStream::new(3, 3));
+            let naming = losses.expect("a loss").naming.expect("a head");
+            naming.to_scalar::<f32>().expect("a value")
+        };
+        for (lights, expected) in [
+            (vec![light(1.0)], 1.0 + 0.25f32.powi(2)),
+            (vec![light(1.0), overcast], 1.0 + 0.25f32.powi(2)),
+            (vec![high, light(3.0)], 1.0 + 0.5 * (0.25 + 0.0625)),
+            (vec![overcast], 0.0),
+        ] {
+            let found = naming(lights.into_iter().map(seen).collect());
+            assert!((found - expected).abs() < 1e-5, "{found} {expected}");
+        }
+    }
+
+    #[test]
     fn what_is_seen_under_another_light_is_asked_for_under_the_one_that_is_said() {
         let student = small();
         let flat = |value: f32| vec![value; 3 * SIZE * SIZE];
@@ -489,6 +620,7 @@ mod tests {
             mask: vec![1.0; SIZE * SIZE],
             weight: vec![1.0; SIZE * SIZE],
             caption: caption(0.3),
+            light: light(0.3),
             rivals: vec![],
         };
         let batch = Batch::new(vec![example]).expect("a batch");
@@ -500,7 +632,7 @@ mod tests {
         };
         let [asked, seen] = [&batch.latents, &batch.seen].map(|t| f64::from(latent(t)));
         for seed in 0..4 {
-            let (loss, _) = student
+            let losses = student
                 .loss(&batch, &mut NoiseStream::new(3, seed))
                 .expect("a loss");
             // It answers 0, so the loss is the mean square of what is asked for: of signal e + (signal^2 seen - asked) / noise.
@@ -511,7 +643,7 @@ mod tests {
                 .expect("in range");
             let mean = (signal * signal * seen - asked) / noise;
             let expected = signal * signal + mean * mean;
-            let found = f64::from(loss.to_scalar::<f32>().expect("a value"));
+            let found = f64::from(losses.velocity.to_scalar::<f32>().expect("a value"));
             // Means over 3,072 normal numbers: .018 of e, .026 of its square.
             let tolerance = 4.0 * (0.026 * signal * signal + 2.0 * 0.018 * signal * mean.abs());
             assert!((found - expected).abs() < tolerance, "{found} {expected}");

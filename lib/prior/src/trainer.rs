@@ -7,8 +7,10 @@ use std::path::Path;
 use std::time::Instant;
 
 use candle_core::{DType, Device, Tensor};
+use dipir_diffusion::config::ConfigFile;
 use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::optimizer::{AdamW, AdamWConfig};
+use dipir_diffusion::unet::UNetConfig;
 use dipir_diffusion::weights::{Weights, write_safetensors};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -34,6 +36,9 @@ pub struct TrainerSettings {
     /// Weight of telling the right light from wrong ones; 0: it is not asked.
     #[serde(default)]
     pub contrast: f64,
+    /// Weight of naming the light that is seen, from the middle of the UNet; 0: it is not asked.
+    #[serde(default)]
+    pub naming: f64,
 }
 
 impl Default for TrainerSettings {
@@ -44,6 +49,7 @@ impl Default for TrainerSettings {
             learning_rate: 5e-4,
             seed: 1,
             contrast: 0.0,
+            naming: 0.0,
         }
     }
 }
@@ -53,6 +59,16 @@ const RIVALS: usize = 3;
 /// Examples that are contrasted in a part of so many rows: three rows in four.
 fn contrasted_in(rows: usize) -> usize {
     rows * 3 / 4 / (RIVALS + 1)
+}
+
+/// Weights [outputs, inputs, 1, 1] of a convolution that passes its first inputs on.
+fn first_channels(shape: &[usize]) -> Result<Tensor> {
+    let (outputs, inputs) = (shape[0], shape[1]);
+    let mut values = vec![0f32; outputs * inputs];
+    for channel in 0..outputs.min(inputs) {
+        values[channel * inputs + channel] = 1.0;
+    }
+    Ok(Tensor::from_vec(values, shape, &Device::Cpu)?)
 }
 
 /// Updates over which the learning rate rises.
@@ -68,6 +84,8 @@ pub struct Update {
     /// Surprise at the right light among wrong ones: 1 at chance, 0 if it is known; NaN if it is not
     /// asked.
     pub surprise: f64,
+    /// Mean squared error of the named direction; NaN if it is not asked.
+    pub naming: f64,
     /// Norm of the gradient before clipping.
     pub gradient_norm: f64,
     /// Seconds that it took.
@@ -79,10 +97,12 @@ struct Shard {
     gradients: BTreeMap<String, Tensor>,
     loss: f64,
     surprise: f64,
+    naming: f64,
 }
 
 /// A training run.
 pub struct Trainer {
+    blueprint: Blueprint,
     settings: TrainerSettings,
     recipe: Recipe,
     student: Student,
@@ -112,7 +132,10 @@ impl Trainer {
                 SHARDS * (RIVALS + 1) * 3 / 2
             )));
         }
-        let student = Student::new(blueprint, folder, settings.seed)?;
+        let mut student = Student::new(blueprint, folder, settings.seed)?;
+        if settings.naming > 0.0 {
+            student = student.with_naming(settings.seed)?;
+        }
         let config = AdamWConfig {
             beta1: 0.9,
             beta2: 0.99,
@@ -126,6 +149,7 @@ impl Trainer {
             .map(|(n, v)| Ok((n.clone(), v.as_detached_tensor().copy()?)))
             .collect::<Result<_>>()?;
         Ok(Self {
+            blueprint: blueprint.clone(),
             settings,
             recipe,
             student,
@@ -159,10 +183,11 @@ impl Trainer {
         let step = self.optimizer.steps();
         let shards = self.shards.run(|shard| self.shard(data, step, shard))?;
         let mut gradients = vec![];
-        let (mut loss, mut surprise) = (0.0, 0.0);
+        let (mut loss, mut surprise, mut naming) = (0.0, 0.0, 0.0);
         for shard in shards {
             loss += shard.loss / SHARDS as f64;
             surprise += shard.surprise / SHARDS as f64;
+            naming += shard.naming / SHARDS as f64;
             gradients.push(shard.gradients);
         }
         // Every shard has every gradient, or `collect` had failed.
@@ -184,6 +209,7 @@ impl Trainer {
             seen: self.seen(),
             loss,
             surprise,
+            naming,
             gradient_norm,
             seconds: start.elapsed().as_secs_f64(),
         })
@@ -209,16 +235,24 @@ impl Trainer {
                 Example::draw(scene, recipe, &mut stream)
             })
             .collect();
-        let (loss, surprise) = self.student.loss(&Batch::new(examples)?, &mut stream)?;
+        let losses = self.student.loss(&Batch::new(examples)?, &mut stream)?;
         let value = |t: &Tensor| -> Result<f64> { Ok(t.to_scalar::<f32>()? as f64) };
-        let whole = match &surprise {
-            Some(surprise) => (&loss + (surprise * self.settings.contrast)?)?,
-            None => loss.clone(),
-        };
+        let mut whole = losses.velocity.clone();
+        let settings = &self.settings;
+        for (part, weight) in [
+            (&losses.surprise, settings.contrast),
+            (&losses.naming, settings.naming),
+        ] {
+            if let Some(part) = part {
+                whole = (whole + (part * weight)?)?;
+            }
+        }
+        let asked = |part: &Option<Tensor>| part.as_ref().map_or(Ok(f64::NAN), value);
         Ok(Shard {
             gradients: self.optimizer.collect(&whole.backward()?)?,
-            loss: value(&loss)?,
-            surprise: surprise.as_ref().map_or(Ok(f64::NAN), value)?,
+            loss: value(&losses.velocity)?,
+            surprise: asked(&losses.surprise)?,
+            naming: asked(&losses.naming)?,
         })
     }
 
@@ -253,8 +287,20 @@ impl Trainer {
         Ok(write_safetensors(path, &tensors, &metadata)?)
     }
 
-    /// Starts from the weights of the model in `folder`, of the same blueprint.
+    /// Starts from the weights of the model in `folder`, of the same blueprint or one with fewer layers: then the others
+    /// pass on what they are given, so that this model says what that one says.
     pub fn start_from(&mut self, folder: &Path) -> Result<()> {
+        let config = ConfigFile::read(&folder.join("unet/config.json"))?;
+        let before = UNetConfig::from_file(&config)?.layers_per_block;
+        let now = self.blueprint.layers;
+        if before > now {
+            return Err(Error::Content {
+                path: config.path().to_owned(),
+                message: format!(
+                    "layers_per_block is {before}, this run's {now}; accepted are models of as many or fewer"
+                ),
+            });
+        }
         for (prefix, file) in WEIGHT_FILES {
             let path = folder.join(file);
             let weights = Weights::open_file(&path)?;
@@ -262,7 +308,19 @@ impl Trainer {
                 let Some(inner) = name.strip_prefix(prefix) else {
                     continue;
                 };
-                let value = weights.tensor(inner, DType::F32, &Device::Cpu)?;
+                let inner = match prefix {
+                    "unet." => self.blueprint.name_before(inner, before),
+                    _ => Some(inner.to_owned()),
+                };
+                let Some(inner) = inner else {
+                    if name.ends_with(".conv_shortcut.weight") {
+                        variable.set(&first_channels(variable.dims())?)?;
+                    }
+                    let value = variable.as_detached_tensor().copy()?;
+                    self.average.insert(name.clone(), value);
+                    continue;
+                };
+                let value = weights.tensor(&inner, DType::F32, &Device::Cpu)?;
                 let value = value.ok_or_else(|| Error::Content {
                     path: path.clone(),
                     message: format!("{inner} is missing"),
@@ -342,6 +400,7 @@ mod tests {
     fn small(folder: &Path, samples: usize) -> Trainer {
         let blueprint = Blueprint {
             channels: vec![8, 16],
+            layers: 1,
             text_width: 16,
         };
         blueprint.write_configs(folder).unwrap();
@@ -351,6 +410,7 @@ mod tests {
             learning_rate: 1e-3,
             seed: 2,
             contrast: 0.0,
+            naming: 0.0,
         };
         Trainer::new(&blueprint, folder, settings, Recipe::default()).unwrap()
     }
@@ -425,6 +485,7 @@ mod tests {
 
         let blueprint = Blueprint {
             channels: vec![8, 16],
+            layers: 1,
             text_width: 16,
         };
         let settings = TrainerSettings {
@@ -437,10 +498,67 @@ mod tests {
     }
 
     #[test]
+    fn what_names_the_light_is_trained_and_left_out_of_the_model() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = scenes(&folder.path().join("scenes"));
+        let checkpoint = folder.path().join("checkpoint.safetensors");
+        let plain = small(folder.path(), 1200);
+        let settings = TrainerSettings {
+            batch: 12,
+            contrast: 0.5,
+            naming: 1.0,
+            ..plain.settings
+        };
+        let new = |settings: TrainerSettings| {
+            Trainer::new(&plain.blueprint, folder.path(), settings, Recipe::default()).unwrap()
+        };
+        let mut naming = new(settings);
+        let errors: Vec<f64> = (0..40)
+            .map(|_| naming.step(&data).unwrap().naming)
+            .collect();
+        let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
+        // Suns are all around, so that nothing is an answer to begin with; then it is worth something.
+        let (early, late) = (mean(&errors[..10]), mean(&errors[30..]));
+        assert!(late < early, "{early} {late}");
+
+        naming.save(&checkpoint).unwrap();
+        new(settings).resume(&checkpoint).unwrap();
+        let other = TrainerSettings {
+            naming: 0.0,
+            ..settings
+        };
+        let error = new(other).resume(&checkpoint).unwrap_err().to_string();
+        assert!(error.contains("\"naming\":1.0"), "{error}");
+
+        naming
+            .blueprint
+            .write_weights(folder.path(), naming.average())
+            .unwrap();
+        let unet = Weights::open_file(&folder.path().join(WEIGHT_FILES[0].1)).unwrap();
+        let inner = |name: &str| name.strip_prefix("unet.").map(str::to_owned);
+        let wanted: Vec<String> = plain
+            .student
+            .variables()
+            .keys()
+            .filter_map(|n| inner(n))
+            .collect();
+        assert!(unet.names().eq(wanted.iter().map(String::as_str)));
+        assert!(
+            plain
+                .student
+                .variables()
+                .keys()
+                .all(|n| !n.starts_with("naming."))
+        );
+        new(other).start_from(folder.path()).unwrap();
+    }
+
+    #[test]
     fn a_run_starts_from_the_weights_of_a_model_of_its_shape() {
         let folder = tempfile::tempdir().unwrap();
         let blueprint = Blueprint {
             channels: vec![8, 16],
+            layers: 1,
             text_width: 16,
         };
         let first = small(folder.path(), 24);
@@ -478,6 +596,74 @@ mod tests {
         assert!(error.contains("has the shape"), "{error}");
         let error = third.start_from(other.path()).unwrap_err().to_string();
         assert!(error.contains("diffusion_pytorch_model"), "{error}");
+    }
+
+    #[test]
+    fn a_deeper_model_begins_as_the_one_that_it_is_grown_from() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = scenes(&folder.path().join("scenes"));
+        let first = small(folder.path(), 24);
+        // What begins at nothing says something.
+        for (name, variable) in first.student.variables() {
+            let ends = [".conv2.weight", ".proj_out.weight", "unet.conv_out.weight"];
+            if ends.iter().any(|e| name.ends_with(e)) {
+                let mut noise = NoiseStream::new(9, variable.elem_count() as u64);
+                let values = noise.normal_tensor(variable.dims(), DType::F32, &Device::Cpu);
+                variable.set(&(values.unwrap() * 0.05).unwrap()).unwrap();
+            }
+        }
+        let weights = first.student.variables().iter();
+        let weights: BTreeMap<_, _> = weights
+            .map(|(n, v)| (n.clone(), v.as_detached_tensor()))
+            .collect();
+        first
+            .blueprint
+            .write_weights(folder.path(), &weights)
+            .unwrap();
+        let deeper = Blueprint {
+            layers: 3,
+            ..first.blueprint.clone()
+        };
+        let grown = tempfile::tempdir().unwrap();
+        deeper.write_configs(grown.path()).unwrap();
+        let begin = || Trainer::new(&deeper, grown.path(), first.settings, Recipe::default());
+        let loss = |trainer: &Trainer| {
+            let mut stream = NoiseStream::new(1, 2);
+            let example = Example::draw(data.scene(0), &trainer.recipe, &mut stream);
+            let batch = Batch::new(vec![example]).unwrap();
+            let losses = trainer.student.loss(&batch, &mut stream).unwrap();
+            losses.velocity.to_scalar::<f32>().unwrap()
+        };
+        let mut second = begin().unwrap();
+        let fresh = loss(&second);
+        second.start_from(folder.path()).unwrap();
+        let (found, wanted) = (loss(&second), loss(&first));
+        // Stored in half precision.
+        assert!((found - wanted).abs() < 1e-3 * wanted, "{found} {wanted}");
+        assert!((fresh - wanted).abs() > 1e-2 * wanted, "{fresh} {wanted}");
+        // Every block learns.
+        let before: BTreeMap<_, _> = second
+            .student
+            .variables()
+            .iter()
+            .map(|(n, v)| (n.clone(), v.as_detached_tensor().copy().unwrap()))
+            .collect();
+        second.step(&data).unwrap();
+        for (name, variable) in second.student.variables() {
+            if name.ends_with("conv2.weight") {
+                let moved = (variable.as_tensor() - &before[name]).unwrap();
+                let moved = moved.abs().unwrap().max_all().unwrap();
+                assert!(moved.to_scalar::<f32>().unwrap() > 0.0, "{name}");
+            }
+        }
+
+        let mut shallow = small(folder.path(), 24);
+        second
+            .blueprint
+            .write_weights(grown.path(), second.average())
+            .unwrap();
+        let error = shallow.start_from(grown.path()).unwrap_err().to_string();
+        assert!(error.contains("layers_per_block is 3"), "{error}");
     }
 
     #[test]

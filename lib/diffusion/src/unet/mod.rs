@@ -187,6 +187,18 @@ impl UNet {
         context: &Tensor,
         pass: &Pass,
     ) -> Result<Tensor> {
+        let (output, _) = self.forward_and_middle(sample, timesteps, context, pass)?;
+        Ok(output)
+    }
+
+    /// As [`UNet::forward`], with what the middle block makes of it: [batch, channels, h, w] of the coarsest level.
+    pub fn forward_and_middle(
+        &self,
+        sample: &Tensor,
+        timesteps: &[f64],
+        context: &Tensor,
+        pass: &Pass,
+    ) -> Result<(Tensor, Tensor)> {
         let timesteps = self.check(sample, timesteps, context)?;
         // Recomputed segments take the timestep vector as a constant, which
         // it is not where text is part of it.
@@ -223,6 +235,7 @@ impl UNet {
         for stage in &self.middle {
             x = run(stage, &x, &time, context, pass)?;
         }
+        let middle = x.clone();
         for level in &self.up {
             for stage in &level.stages {
                 let Some(skip) = skips.pop() else {
@@ -235,7 +248,8 @@ impl UNet {
                 x = upsample.forward(&upsample_nearest(&x, height, width)?)?;
             }
         }
-        self.conv_out.forward(&self.norm_out.forward(&x)?)
+        let output = self.conv_out.forward(&self.norm_out.forward(&x)?)?;
+        Ok((output, middle))
     }
 
     fn check(&self, sample: &Tensor, timesteps: &[f64], context: &Tensor) -> Result<Vec<f64>> {
