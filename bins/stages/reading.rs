@@ -143,7 +143,7 @@ const OWN_SIZES: [f32; 4] = [0.2, 0.4, 0.7, 1.1];
 /// Smallest side of a crop, pixels: less holds too little of an object.
 const SMALLEST: f32 = 24.0;
 /// Crops whose middle stands out less are not taken for objects.
-const LEAST_INTEREST: f32 = 0.7;
+const LEAST_INTEREST: f32 = 0.4;
 
 /// Squares of the photograph: the first three around the place of the insertion, the others where
 /// something seems to stand on the ground.
