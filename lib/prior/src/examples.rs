@@ -298,7 +298,6 @@ impl Recipe {
             foreign_light: 0.0,
             rivals,
             relit: 0.0,
-            ..*self
         }
     }
 }
