@@ -144,12 +144,6 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     let clock = Instant::now();
     let mut mean: Option<f64> = None;
     let (mut surprise, mut naming) = (None, None);
-    // Over about fifty updates.
-    let smooth = |mean: &mut Option<f64>, now: f64| {
-        let smoothed = mean.map_or(now, |m| 0.98 * m + 0.02 * now);
-        *mean = Some(smoothed);
-        smoothed
-    };
     trainer.run(&data, &mut |trainer, update| {
         let loss = smooth(&mut mean, update.loss);
         progress.set(update.seen as f64 / args.samples.max(1) as f64);
@@ -196,6 +190,13 @@ fn train(args: &Train, output: &OutputArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Takes `now` into a mean over about fifty updates.
+fn smooth(mean: &mut Option<f64>, now: f64) -> f64 {
+    let smoothed = mean.map_or(now, |m| 0.98 * m + 0.02 * now);
+    *mean = Some(smoothed);
+    smoothed
+}
+
 fn train_encoder(args: &Encoder, output: &OutputArgs) -> anyhow::Result<()> {
     check_rate(args.learning_rate)?;
     args.sheet.as_deref().map_or(Ok(()), check_place)?;
@@ -220,8 +221,7 @@ fn train_encoder(args: &Encoder, output: &OutputArgs) -> anyhow::Result<()> {
     let progress = Progress::new("encoder", output.quiet);
     let mut mean: Option<f64> = None;
     let finished = encoder::train(&data, &settings, from, &args.data.out, &mut |seen, loss| {
-        let loss = mean.map_or(loss, |m| 0.98 * m + 0.02 * loss);
-        mean = Some(loss);
+        let loss = smooth(&mut mean, loss);
         progress.set(seen as f64 / args.samples as f64);
         let state = format!("{seen} pictures, loss {loss:.4}");
         if seen.is_multiple_of(encoder::SAVED_EVERY) {

@@ -10,6 +10,7 @@ pub mod error;
 pub mod examples;
 pub mod gates;
 pub mod lights;
+mod naming;
 mod photo;
 pub mod place;
 pub mod reader;

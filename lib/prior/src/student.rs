@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Device, Tensor, Var};
-use dipir_diffusion::layers::Linear;
 use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::parameters::Parameters;
 use dipir_diffusion::pass::Pass;
@@ -17,6 +16,7 @@ use dipir_diffusion::vae::pixel_unshuffle;
 use crate::blueprint::{Blueprint, FACTOR, SCALING};
 use crate::error::{Error, Result};
 use crate::examples::{Example, Rival, SIZE};
+use crate::naming::NamingHead;
 use crate::words::{CLOCK, Caption, HEIGHTS, LightWords, PLACEHOLDERS, SKIES};
 
 /// Networks and variables.
@@ -39,47 +39,6 @@ pub struct Losses {
     /// Mean squared error of the direction of the sun that is seen, as the middle of the UNet tells it;
     /// `None` where it is not asked.
     pub naming: Option<Tensor>,
-}
-
-/// Names the light that is seen from what the UNet's middle block makes of a picture, whatever is said. Only
-/// training has it.
-#[derive(Debug)]
-struct NamingHead {
-    hidden: Linear,
-    out: Linear,
-    variables: BTreeMap<String, Var>,
-}
-
-impl NamingHead {
-    const HIDDEN: usize = 96;
-    /// Cosine and sine of the azimuth, and the elevation in radians from .75 on.
-    const OUTPUTS: usize = 3;
-
-    fn new(inputs: usize, seed: u64) -> Result<Self> {
-        let parameters = Parameters::random(seed, &Device::Cpu);
-        let p = &parameters;
-        Ok(Self {
-            hidden: Linear::new(&p.sub("hidden"), inputs, Self::HIDDEN)?,
-            out: Linear::new(&p.sub("out"), Self::HIDDEN, Self::OUTPUTS)?,
-            variables: parameters.finish(|_| false)?,
-        })
-    }
-
-    /// Over rows that have a sun; 0 where none has.
-    fn loss(&self, middle: &Tensor, lights: &[LightWords]) -> Result<Tensor> {
-        let h = self.hidden.forward(&middle.flatten_from(1)?)?.silu()?;
-        let told = self.out.forward(&h)?;
-        let wanted: Vec<f32> = lights
-            .iter()
-            .flat_map(|l| [l.azimuth.cos(), l.azimuth.sin(), l.elevation - 0.75])
-            .collect();
-        let wanted = Tensor::from_vec(wanted, told.shape(), &Device::Cpu)?;
-        let sunny: Vec<f32> = lights.iter().map(|l| f32::from(!l.is_overcast())).collect();
-        let count = sunny.iter().sum::<f32>().max(1.0);
-        let error = (told - wanted)?.sqr()?.sum(1)?;
-        let error = (error * Tensor::new(sunny.as_slice(), &Device::Cpu)?)?.sum_all()?;
-        Ok((error / f64::from(count))?)
-    }
 }
 
 /// Captions as the text encoder takes them.
@@ -305,7 +264,7 @@ impl Student {
         let side = config.sample_size >> (config.levels() - 1);
         let channels = config.block_out_channels[config.levels() - 1];
         let head = NamingHead::new(channels * side * side, seed ^ 0x4ead)?;
-        let variables = head.variables.iter();
+        let variables = head.variables().iter();
         self.variables
             .extend(variables.map(|(n, v)| (format!("naming.{n}"), v.clone())));
         self.naming = Some(head);

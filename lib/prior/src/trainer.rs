@@ -279,6 +279,7 @@ impl Trainer {
         }
         let metadata = BTreeMap::from([
             ("steps".to_owned(), self.optimizer.steps().to_string()),
+            ("layers".to_owned(), self.blueprint.layers.to_string()),
             (
                 "settings".to_owned(),
                 serde_json::json!(self.settings).to_string(),
@@ -365,6 +366,15 @@ impl Trainer {
         if made != Some(self.settings) {
             return Err(fail(format!(
                 "the checkpoint was made with {found}, this run has {expected}; delete it or use its settings"
+            )));
+        }
+        // Blocks of the same name are others in a UNet of another depth. Checkpoints from before had one a level.
+        let layers = weights.metadata().get("layers");
+        let layers = layers.map_or("1", String::as_str);
+        if layers != self.blueprint.layers.to_string() {
+            return Err(fail(format!(
+                "the checkpoint has {layers} residual blocks a level, this run {}; use as many (--layers {layers}), or delete it",
+                self.blueprint.layers
             )));
         }
         let steps = weights.metadata().get("steps").and_then(|s| s.parse().ok());
@@ -664,6 +674,11 @@ mod tests {
             .unwrap();
         let error = shallow.start_from(grown.path()).unwrap_err().to_string();
         assert!(error.contains("layers_per_block is 3"), "{error}");
+        let checkpoint = grown.path().join("checkpoint.safetensors");
+        second.save(&checkpoint).unwrap();
+        begin().unwrap().resume(&checkpoint).unwrap();
+        let error = shallow.resume(&checkpoint).unwrap_err().to_string();
+        assert!(error.contains("--layers 3"), "{error}");
     }
 
     #[test]
