@@ -316,6 +316,8 @@ impl Trainer {
                 let Some(inner) = inner else {
                     if name.ends_with(".conv_shortcut.weight") {
                         variable.set(&first_channels(variable.dims())?)?;
+                    } else if name.ends_with(".conv_shortcut.bias") {
+                        variable.set(&variable.zeros_like()?)?;
                     }
                     let value = variable.as_detached_tensor().copy()?;
                     self.average.insert(name.clone(), value);
