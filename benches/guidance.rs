@@ -16,9 +16,6 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use candle_core::{DType, Device};
-use dipir::distillation::{Distillation, DistillationSettings};
-use dipir::light;
-use dipir::reading::{self, read_light, start};
 use dipir_diffusion::model::Model;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
@@ -31,7 +28,7 @@ use dipir_optimize::lighting::Lighting;
 use dipir_optimize::objective::Objective;
 use dipir_optimize::optimization::Optimization;
 use dipir_optimize::parameters::{Parameters, ambient_of};
-use dipir_optimize::settings::{GuidanceKind, OptimizeTable, Preset, Settings};
+use dipir_optimize::settings::{GuidanceKind, LightTable, Preset, Settings};
 use dipir_prior::examples::{Tone, angle_between};
 use dipir_prior::lights::sun_angles;
 use dipir_prior::place::Place;
@@ -44,6 +41,9 @@ use dipir_render::transport::{RecordSettings, Transport};
 use dipir_scene::material::Material;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
+use dipir_stages::known_light;
+use dipir_stages::light::distillation::{Distillation, DistillationSettings};
+use dipir_stages::light::reading::{self, read_light, start};
 use glam::Vec3;
 
 /// Key of these scenes; training and gates have others.
@@ -218,9 +218,9 @@ fn run(
 ) -> anyhow::Result<BTreeMap<&'static str, Answer>> {
     let trial = Trial::draw(index, knobs.samples, knobs.setting)?;
     let lobes = 32;
-    let table = OptimizeTable {
+    let table = LightTable {
         iterations: Some(knobs.iterations.max(1)),
-        ..OptimizeTable::default()
+        ..LightTable::default()
     };
     let mut settings = table.settings(Preset::Standard, 1)?;
     settings.preview_every = 0;
@@ -244,7 +244,7 @@ fn run(
         answer(&trial, &objective, &plain, &truth),
     );
     let projected = trial.under(
-        &light::projected(&trial.linear, &trial.place.stage.camera, MAP)?,
+        &known_light::projected(&trial.linear, &trial.place.stage.camera, MAP)?,
         &objective,
         None,
     );

@@ -2,7 +2,7 @@
 //! `docs/recovery.md`.
 //!
 //! Of every panorama a photograph is cut out, three objects are put into it under the panorama
-//! itself, and `dipir-optimize` gets to see the composite alone. A sum of lobes cannot be a panorama,
+//! itself, and `dipir-light` gets to see the composite alone. A sum of lobes cannot be a panorama,
 //! so the same is done under lobes that were fitted to it: a truth that can be found.
 //!
 //! Paths between the folds of a metal knot keep noise in a composite that more paths hardly take out, so
@@ -46,7 +46,7 @@ struct Knobs {
     iterations: u32,
     size: &'static str,
     target_error: f64,
-    /// Further lines of `[optimize]`.
+    /// Further lines of `[light]`.
     more: String,
 }
 
@@ -125,7 +125,7 @@ fn run(executable: &str, folder: &Path, arguments: &[&str]) -> Value {
 }
 
 const SCENE: &str = env!("CARGO_BIN_EXE_dipir-scene");
-const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-optimize");
+const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-light");
 const COMPOSITE: &str = env!("CARGO_BIN_EXE_dipir-composite");
 
 /// A row of the table for every truth and object.
@@ -177,7 +177,7 @@ fn recover(folder: &Path, truth: &str, photo: &Value, knobs: &Knobs) -> String {
         "[scene]\nbackground = \"photo.png\"\nclass = \"knot\"\n[[scene.objects]]\npath = \"knot.obj\"\n\
          [scene.camera]\nposition = {stand:?}\nlook_at = {look_at:?}\nfov_deg = 40.0\n\
          [scene.proxy]\nplane = {{ point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }}\n\
-         [optimize]\nguidance = \"reference\"\nreference = \"truth/composite/composite.exr\"\n\
+         [light]\nguidance = \"reference\"\nreference = \"truth/composite/composite.exr\"\n\
          iterations = {}\npreview_every = 0\n{}[composite]\ntarget_error = {}\n",
         knobs.iterations, knobs.more, knobs.target_error
     );

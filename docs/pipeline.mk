@@ -3,7 +3,7 @@
 #   make -f docs/pipeline.mk                             the root pipeline.toml
 #   make -f docs/pipeline.mk PIPELINE=photo/pipeline.toml OUT=photo/out INPUTS="photo/a.jpg photo/chair.glb"
 #   make -f docs/pipeline.mk GIVEN=1                     [composite] environment gives the light
-#   make -f docs/pipeline.mk REFERENCE=1                 [optimize] guidance = "reference": no model
+#   make -f docs/pipeline.mk REFERENCE=1                 [light] guidance = "reference": no model
 #
 # Make goes by times of files, and by the whole of pipeline.toml: it runs more often than
 # `dipir run`, which goes by what is in the files and by the keys that a stage reads.
@@ -30,7 +30,7 @@ $(call done,lora): $(call done,concepts) $(INPUTS)
 	$(call run,dipir-lora)
 
 $(call done,light): $(call done,scene) $(if $(REFERENCE),,$(call done,lora))
-	$(call run,dipir-optimize)
+	$(call run,dipir-light)
 
 $(call done,composite): $(call done,scene) $(if $(GIVEN),,$(call done,light))
 	$(call run,dipir-composite)

@@ -1,17 +1,15 @@
 //! `dipir-concepts`: images of the object's class from the un-adapted model.
-mod cli;
-
 use std::process::ExitCode;
 
 use clap::Parser;
-use cli::Cli;
 use dipir_cli::exit;
 use dipir_cli::session::Session;
+use dipir_stages::command_line::concepts::Cli;
 
 fn main() -> ExitCode {
     exit::run(|| {
         let session = Session::start(&Cli::parse().common)?;
-        let done = dipir::concepts::run(&session)?;
+        let done = dipir_stages::concepts::run(&session)?;
         session.result(|| done.to_string(), || done.to_json());
         Ok(())
     })

@@ -126,7 +126,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "DIR")]
     pub model: Option<PathBuf>,
 
-    /// Set a key for every method, as in --set optimize.iterations=100; may be repeated
+    /// Set a key for every method, as in --set light.iterations=100; may be repeated
     #[arg(long = "set", short = 's', value_name = "KEY=VALUE")]
     pub set: Vec<String>,
 

@@ -1,10 +1,10 @@
 //! Maps of methods that need no optimisation, on the photograph's scale.
-use dipir::light;
 use dipir_imaging::raster::LinearImage;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::fit::fit;
 use dipir_light::rasterize::rasterize;
 use dipir_scene::camera::Camera;
+use dipir_stages::known_light;
 
 use crate::bench::Tone;
 
@@ -33,7 +33,7 @@ pub fn projected(
     camera: &Camera,
 ) -> anyhow::Result<EnvironmentMap> {
     let exposed = LinearImage(photo.0.map(|p| tone.undone(*p)));
-    light::projected(&exposed, camera, PROJECTED)
+    known_light::projected(&exposed, camera, PROJECTED)
 }
 
 /// The truth as lobes: the best that the representation can do.

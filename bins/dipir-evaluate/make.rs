@@ -4,7 +4,6 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dipir::background::{MID_GREY, View, exposure_ev_to};
 use dipir_cli::exit::Usage;
 use dipir_cli::progress::Progress;
 use dipir_imaging::file::write_png;
@@ -15,6 +14,7 @@ use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_prior::studio::Setting;
 use dipir_render::shapes::torus_knot;
 use dipir_scene::export::to_obj;
+use dipir_stages::scene::background::{MID_GREY, View, exposure_ev_to};
 use glam::Vec3;
 use serde_json::json;
 

@@ -36,7 +36,7 @@ pub enum Stage {
     Concepts,
     /// `dipir-lora`
     Lora,
-    /// `dipir-optimize`
+    /// `dipir-light`
     Light,
 }
 
@@ -47,7 +47,7 @@ impl Stage {
             Stage::Scene => "dipir-scene",
             Stage::Concepts => "dipir-concepts",
             Stage::Lora => "dipir-lora",
-            Stage::Light => "dipir-optimize",
+            Stage::Light => "dipir-light",
         }
     }
 

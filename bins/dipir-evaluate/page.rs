@@ -2,8 +2,8 @@
 use std::path::Path;
 
 use anyhow::Context;
-use dipir::report::html::Html;
-use dipir::report::picture::base64;
+use dipir_stages::report::html::Html;
+use dipir_stages::report::picture::base64;
 
 const STYLE: &str = include_str!("style.css");
 

@@ -5,7 +5,6 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use anyhow::{Context, anyhow};
-use dipir::children::Executables;
 use dipir_cli::exit::Usage;
 use dipir_cli::interrupt;
 use dipir_cli::progress::Progress;
@@ -18,6 +17,7 @@ use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
 use dipir_scene::description::SceneDescription;
+use dipir_stages::children::Executables;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -89,7 +89,7 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
         executables: Executables::beside_this()?,
         args,
         methods,
-        model: dipir::model::digest(args.model.as_deref())?,
+        model: dipir_stages::model::digest(args.model.as_deref())?,
         threads: (threads / args.jobs).max(1),
     };
     let total = scenes.len() * runner.methods.len();
@@ -250,7 +250,7 @@ impl Runner<'_> {
         if is_done(&score_file, &key) {
             return Ok(());
         }
-        // Methods that differ in [optimize] and [composite] alone share what runs before.
+        // Methods that differ in [light] and [composite] alone share what runs before.
         let shared: Vec<&String> = method
             .set
             .iter()
@@ -364,11 +364,11 @@ impl Runner<'_> {
             more,
             self.args.set,
             self.args.target_error,
-            dipir::scene::VERSION,
-            dipir::concepts::VERSION,
-            dipir::lora::VERSION,
-            dipir::optimize::VERSION,
-            dipir::composite::VERSION,
+            dipir_stages::scene::VERSION,
+            dipir_stages::concepts::VERSION,
+            dipir_stages::lora::VERSION,
+            dipir_stages::light::VERSION,
+            dipir_stages::composite::VERSION,
         ]);
         hasher.update(decides.to_string().as_bytes());
         Ok(hasher.finalize().to_hex().to_string())

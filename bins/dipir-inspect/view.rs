@@ -1,13 +1,13 @@
 //! `--png`: a picture of one layer that any viewer shows.
 use std::path::Path;
 
-use dipir::preview;
 use dipir_cli::exit::Usage;
 use dipir_imaging::file::write_png;
 use dipir_imaging::layers::Layers;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
+use dipir_stages::preview;
 use glam::Vec3;
 
 use crate::cli::ViewArgs;

@@ -13,7 +13,7 @@ use dipir_hub::{Error, Hub, Outcome, Revision, SOURCE_FILE, Source, Variant};
 use dipir_pipeline::lock::{FolderLock, WhenLocked};
 use serde_json::json;
 
-use crate::cli::{FetchArgs, Precision};
+use dipir_stages::command_line::model::{FetchArgs, Precision};
 
 /// Where models are if nothing else is said.
 const ENDPOINT: &str = "https://huggingface.co";

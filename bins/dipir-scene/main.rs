@@ -1,12 +1,8 @@
 //! `dipir-scene`: sets the scene up for all later stages.
-mod cli;
-
 use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Parser;
-use cli::{BackgroundArgs, Cli, Command};
-use dipir::background::{View, automatic_exposure_ev};
 use dipir_cli::args::CommonArgs;
 use dipir_cli::exit::{self, Usage};
 use dipir_cli::session::Session;
@@ -14,6 +10,8 @@ use dipir_imaging::file::write_png;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
+use dipir_stages::command_line::scene::{BackgroundArgs, Cli, Command};
+use dipir_stages::scene::background::{View, automatic_exposure_ev};
 use serde_json::json;
 
 fn main() -> ExitCode {
@@ -28,7 +26,7 @@ fn main() -> ExitCode {
 
 fn set_up(args: &CommonArgs) -> anyhow::Result<()> {
     let session = Session::start(args)?;
-    let done = dipir::scene::run(&session)?;
+    let done = dipir_stages::scene::run(&session)?;
     session.result(|| done.to_string(), || done.to_json());
     Ok(())
 }

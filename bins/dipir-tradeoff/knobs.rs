@@ -1,7 +1,7 @@
 //! What can be turned: settings that buy accuracy for time, as data.
-use dipir::presets;
 use dipir_numerics::hashing::hash_u64s;
 use dipir_pipeline::config::Quality;
+use dipir_stages::presets;
 
 /// Which part of the pipeline a knob belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -86,7 +86,7 @@ pub const KNOBS: &[Knob] = &[
     Knob {
         name: "iterations",
         part: Part::Light,
-        key: "optimize.iterations",
+        key: "light.iterations",
         values: &["50", "150", "300", "600"],
         with: &[],
         joint: true,
@@ -94,7 +94,7 @@ pub const KNOBS: &[Knob] = &[
     Knob {
         name: "lobes",
         part: Part::Light,
-        key: "optimize.lobes",
+        key: "light.lobes",
         values: &["4", "8", "16", "32", "48"],
         with: &[],
         joint: true,
@@ -102,7 +102,7 @@ pub const KNOBS: &[Knob] = &[
     Knob {
         name: "environment",
         part: Part::Light,
-        key: "optimize.environment",
+        key: "light.environment",
         values: &["[32, 16]", "[64, 32]", "[128, 64]", "[256, 128]"],
         with: &[],
         joint: true,
@@ -110,7 +110,7 @@ pub const KNOBS: &[Knob] = &[
     Knob {
         name: "samples of the record",
         part: Part::Light,
-        key: "optimize.samples",
+        key: "light.samples",
         values: &["8", "32", "128", "512"],
         with: &[],
         joint: true,
@@ -118,7 +118,7 @@ pub const KNOBS: &[Knob] = &[
     Knob {
         name: "size of the picture",
         part: Part::Light,
-        key: "optimize.size",
+        key: "light.size",
         values: &["48", "96", "144"],
         with: &[],
         joint: true,
@@ -126,7 +126,7 @@ pub const KNOBS: &[Knob] = &[
     Knob {
         name: "weights in f32",
         part: Part::Light,
-        key: "optimize.precision",
+        key: "light.precision",
         values: &["single"],
         with: &[],
         joint: false,
@@ -167,16 +167,13 @@ pub fn turned(set: &[(String, String)]) -> Vec<(String, String)> {
             "composite.target_error",
             preset.composite.target_error.to_string(),
         ),
+        ("light.iterations", preset.optimize.iterations.to_string()),
+        ("light.lobes", preset.optimize.lobes.to_string()),
         (
-            "optimize.iterations",
-            preset.optimize.iterations.to_string(),
-        ),
-        ("optimize.lobes", preset.optimize.lobes.to_string()),
-        (
-            "optimize.environment",
+            "light.environment",
             format!("{:?}", preset.optimize.environment),
         ),
-        ("optimize.samples", preset.optimize.samples.to_string()),
+        ("light.samples", preset.optimize.samples.to_string()),
     ];
     let is_standard =
         |(key, value): &(String, String)| standard.iter().any(|(k, v)| k == key && v == value);

@@ -9,10 +9,10 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use cli::{Cli, Track};
-use dipir::children::Executables;
 use dipir_cli::exit::{self, Usage};
 use dipir_cli::interrupt;
 use dipir_cli::progress::Progress;
+use dipir_stages::children::Executables;
 use knobs::{Part, Setting};
 use scenes::Scene;
 use serde_json::json;

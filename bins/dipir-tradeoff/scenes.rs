@@ -4,7 +4,6 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dipir::background::{View, automatic_exposure_ev};
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
@@ -12,6 +11,7 @@ use dipir_light::environment::EnvironmentMap;
 use dipir_render::shapes::{append, icosphere, torus_knot};
 use dipir_scene::export::to_obj;
 use dipir_scene::mesh::TriangleMesh;
+use dipir_stages::scene::background::{View, automatic_exposure_ev};
 use glam::{Vec2, Vec3};
 
 /// A project that is measured.
@@ -91,7 +91,7 @@ pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<S
         stand.to_array(),
         ahead.to_array()
     );
-    let recover = "[optimize]\nguidance = \"reference\"\nreference = \"truth.exr\"\n\
+    let recover = "[light]\nguidance = \"reference\"\nreference = \"truth.exr\"\n\
                    preview_every = 0\ncheckpoint_every = 0\n";
     fs::write(folder.join("recover.toml"), format!("{camera}{recover}")).with_context(failed)?;
     let lit = format!(

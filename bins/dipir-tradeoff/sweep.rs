@@ -4,11 +4,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dipir::children::{Executables, Ran};
 use dipir_imaging::layers::Layers;
 use dipir_imaging::raster::{DisplayImage, LinearImage};
 use dipir_imaging::transfer::Transfer;
 use dipir_render::effects::EffectsPlan;
+use dipir_stages::children::{Executables, Ran};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -263,18 +263,18 @@ impl Bench<'_> {
         seed: u64,
         reference: &Reference,
     ) -> anyhow::Result<Sample> {
-        // A record of no use to anybody, so that dipir-optimize makes its own and its cost is that of
+        // A record of no use to anybody, so that dipir-light makes its own and its cost is that of
         // recording and optimising, without planning.
         let folder = self.work().join(format!("recover-{seed}"));
         if !folder.join("scene/stage.json").is_file() {
             let tiny = own(&[
-                ("optimize.samples", "1"),
-                ("optimize.size", "8"),
-                ("optimize.environment", "[8, 4]"),
+                ("light.samples", "1"),
+                ("light.size", "8"),
+                ("light.environment", "[8, 4]"),
             ]);
             self.stage("dipir-scene", recover, &folder, seed, &tiny)?;
         }
-        let ran = self.stage("dipir-optimize", recover, &folder, seed, &setting.set)?;
+        let ran = self.stage("dipir-light", recover, &folder, seed, &setting.set)?;
         let picture = own(&[("composite.target_error", PICTURE_ERROR)]);
         self.stage("dipir-composite", recover, &folder, seed, &picture)?;
         let found = load(&folder.join("composite/composite.exr"))?;

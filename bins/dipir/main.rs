@@ -15,7 +15,7 @@ const EXAMPLES: &str = "\
 Examples:
   dipir run                                 what ./pipeline.toml says, as far as it is not done yet
   dipir run photo/pipeline.toml             another project
-  dipir run --set optimize.iterations=50    a key set for this run; only what it concerns runs
+  dipir run --set light.iterations=50    a key set for this run; only what it concerns runs
   dipir run --until lora                    that stage and what it needs
   dipir run --from light --force            that stage and all that read it, once more
   dipir status                              what would run, and why

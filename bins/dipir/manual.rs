@@ -8,14 +8,9 @@ use clap::{Args, Command, CommandFactory, ValueEnum};
 use clap_complete::Shell;
 use clap_mangen::Man;
 use dipir_cli::session::print_line;
+use dipir_stages::command_line::{composite, concepts, light, lora, model, scene};
 
 // Of these command lines only what they say of themselves is used here.
-#[allow(dead_code)]
-#[path = "../dipir-composite/cli.rs"]
-mod composite;
-#[allow(dead_code)]
-#[path = "../dipir-concepts/cli.rs"]
-mod concepts;
 #[allow(dead_code)]
 #[path = "../dipir-evaluate/cli.rs"]
 mod evaluate;
@@ -23,20 +18,8 @@ mod evaluate;
 #[path = "../dipir-inspect/cli.rs"]
 mod inspect;
 #[allow(dead_code)]
-#[path = "../dipir-lora/cli.rs"]
-mod lora;
-#[allow(dead_code)]
-#[path = "../dipir-model/cli.rs"]
-mod model;
-#[allow(dead_code)]
-#[path = "../dipir-optimize/cli.rs"]
-mod optimize;
-#[allow(dead_code)]
 #[path = "../dipir-pretrain/cli.rs"]
 mod pretrain;
-#[allow(dead_code)]
-#[path = "../dipir-scene/cli.rs"]
-mod scene;
 #[allow(dead_code)]
 #[path = "../dipir-tradeoff/cli.rs"]
 mod tradeoff;
@@ -72,7 +55,7 @@ enum Executable {
     DipirScene,
     DipirConcepts,
     DipirLora,
-    DipirOptimize,
+    DipirLight,
     DipirComposite,
     DipirInspect,
     DipirModel,
@@ -88,7 +71,7 @@ impl Executable {
             Self::DipirScene => scene::Cli::command(),
             Self::DipirConcepts => concepts::Cli::command(),
             Self::DipirLora => lora::Cli::command(),
-            Self::DipirOptimize => optimize::Cli::command(),
+            Self::DipirLight => light::Cli::command(),
             Self::DipirComposite => composite::Cli::command(),
             Self::DipirInspect => inspect::Cli::command(),
             Self::DipirModel => model::Cli::command(),

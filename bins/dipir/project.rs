@@ -2,12 +2,12 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use dipir::pipeline;
-use dipir::report::quoted;
-use dipir::{composite, concepts, lora, optimize, scene};
 use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::session::Session;
 use dipir_pipeline::graph::Graph;
+use dipir_stages::graph;
+use dipir_stages::report::quoted;
+use dipir_stages::{composite, concepts, light, lora, scene};
 
 #[derive(Args, Clone, Debug)]
 pub struct ProjectArgs {
@@ -67,7 +67,7 @@ impl ProjectArgs {
     /// Reads the configuration and draws the graph.
     pub fn open(&self) -> anyhow::Result<(Session, Graph)> {
         let session = Session::open(&self.common())?;
-        let graph = pipeline::graph(&session)?;
+        let graph = graph::graph(&session)?;
         Ok((session, graph))
     }
 }
@@ -94,7 +94,7 @@ impl Stage {
             Self::Scene => scene::STAGE,
             Self::Concepts => concepts::STAGE,
             Self::Lora => lora::STAGE,
-            Self::Light => optimize::STAGE,
+            Self::Light => light::STAGE,
             Self::Composite => composite::STAGE,
         }
     }

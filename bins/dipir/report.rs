@@ -2,12 +2,12 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use dipir::pipeline;
-use dipir::report::Report;
-use dipir::truth::{self, Truth};
 use dipir_cli::exit::{Usage, describe};
 use dipir_cli::session::Session;
 use dipir_pipeline::graph::{Graph, Node};
+use dipir_stages::graph;
+use dipir_stages::report::Report;
+use dipir_stages::truth::{self, Truth};
 use serde_json::json;
 
 use crate::project::ProjectArgs;
@@ -24,7 +24,7 @@ pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
         let message = "no stage has run yet, so there is nothing to show; run dipir run first";
         return Err(Usage(message.into()).into());
     }
-    let needed = graph.up_to(pipeline::LAST);
+    let needed = graph.up_to(graph::LAST);
     let (path, truth) = write(&args.project, &session, &graph, &needed)?;
     session.result(
         || in_words(&path, truth.as_ref()),
@@ -40,7 +40,7 @@ pub fn write(
     graph: &Graph,
     needed: &[&Node],
 ) -> anyhow::Result<(PathBuf, Option<Truth>)> {
-    let status = pipeline::assess(session, graph, needed)?;
+    let status = graph::assess(session, graph, needed)?;
     let truth = truth::compare(session).unwrap_or_else(|e| {
         session.warn(&format!(
             "not compared with the true light: {}",

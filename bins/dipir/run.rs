@@ -6,8 +6,6 @@ use std::thread::{self, JoinHandle};
 
 use anyhow::Context;
 use clap::Args;
-use dipir::pipeline;
-use dipir::truth::Truth;
 use dipir_cli::exit::{self, Said, Usage};
 use dipir_cli::interrupt::{self, Interrupted};
 use dipir_cli::session::Session;
@@ -17,6 +15,8 @@ use dipir_pipeline::graph::{Graph, Node};
 use dipir_pipeline::lock::{FolderLock, WhenLocked};
 use dipir_pipeline::runner::{self, Stopped, Work};
 use dipir_pipeline::status::State;
+use dipir_stages::graph;
+use dipir_stages::truth::Truth;
 use serde_json::{Value, json};
 
 use crate::project::{ProjectArgs, Stage};
@@ -71,7 +71,7 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
         let _lock = lock_when(&session, when_locked)?;
         runner::run(&nodes, args.jobs, &mut work).map_err(stopped)?;
     }
-    let report = match dipir::report::is_current(&session) {
+    let report = match dipir_stages::report::is_current(&session) {
         true => None,
         false => page(args, &session, &graph, &nodes),
     };
@@ -96,7 +96,7 @@ type Page = (PathBuf, Option<Truth>);
 
 /// The stages that are asked for, in order.
 fn selected<'a>(args: &RunArgs, graph: &'a Graph) -> anyhow::Result<Vec<&'a Node>> {
-    let until = args.until.map_or(pipeline::LAST, Stage::name);
+    let until = args.until.map_or(graph::LAST, Stage::name);
     let mut nodes = graph.up_to(until);
     if let Some(from) = args.from {
         let from = from.name();
@@ -115,7 +115,7 @@ fn selected<'a>(args: &RunArgs, graph: &'a Graph) -> anyhow::Result<Vec<&'a Node
 }
 
 fn all_fresh(session: &Session, graph: &Graph, nodes: &[&Node]) -> anyhow::Result<bool> {
-    let states = pipeline::assess(session, graph, nodes)?;
+    let states = graph::assess(session, graph, nodes)?;
     let fresh = |s: &State| matches!(s, State::Fresh | State::Unneeded { .. });
     // Stages that were not asked for count as up to date, whatever they are.
     let asked = states
@@ -205,7 +205,7 @@ impl Work for Pipeline<'_> {
     type Error = anyhow::Error;
 
     fn command(&mut self, node: &Node) -> anyhow::Result<Option<Command>> {
-        let state = pipeline::state_of(self.session, node.stage)?;
+        let state = graph::state_of(self.session, node.stage)?;
         match &state {
             State::Fresh if !self.args.force => {
                 self.say(node, "up to date");

@@ -1,8 +1,8 @@
 //! `dipir status` and `dipir graph`.
 use clap::Args;
-use dipir::pipeline;
 use dipir_cli::style::{bold, color_on_stdout, faint};
 use dipir_pipeline::status::{StageStatus, State};
+use dipir_stages::graph;
 use serde_json::json;
 
 use crate::project::{ProjectArgs, Stage};
@@ -30,8 +30,8 @@ pub struct GraphArgs {
 /// Says of each stage whether it is up to date, and why not.
 pub fn run(args: &StatusArgs) -> anyhow::Result<()> {
     let (session, graph) = args.project.open()?;
-    let needed = graph.up_to(args.until.map_or(pipeline::LAST, Stage::name));
-    let all = pipeline::assess(&session, &graph, &needed)?;
+    let needed = graph.up_to(args.until.map_or(graph::LAST, Stage::name));
+    let all = graph::assess(&session, &graph, &needed)?;
     session.result(|| in_words(&all), || json!({"stages": all}));
     Ok(())
 }

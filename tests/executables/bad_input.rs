@@ -209,7 +209,7 @@ fn a_composite_without_any_light_says_where_to_get_one() {
     project.run(COMPOSITE, &[]).expect_error(
         1,
         "error: there is no light: [composite] environment is not set and out/light/lighting.json \
-         is missing; name a map, as in --set composite.environment=sky.hdr, or run dipir-optimize \
+         is missing; name a map, as in --set composite.environment=sky.hdr, or run dipir-light \
          first",
     );
 }

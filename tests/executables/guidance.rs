@@ -17,7 +17,7 @@ fn project(family: &str, more: &str) -> Project {
     let (scene, _) = text.split_once("[composite]").unwrap();
     let table = format!(
         "[model]\npath = {model:?}\n\
-         [optimize]\niterations = 3\nlobes = 6\nenvironment = [16, 8]\nsamples = 16\nadapt = false\n{more}\n\
+         [light]\niterations = 3\nlobes = 6\nenvironment = [16, 8]\nsamples = 16\nadapt = false\n{more}\n\
          [composite]\ntarget_error = 0.05\n"
     );
     project.write("pipeline.toml", format!("{scene}{table}"));
@@ -74,15 +74,15 @@ fn the_same_bytes_for_any_number_of_threads_and_other_bytes_for_another_seed() {
 fn what_cannot_guide_is_refused_with_what_to_do() {
     let project = project("sd15", "");
     for (set, code, says) in [
-        ("optimize.start=read", 2, "optimize.start"),
-        ("optimize.timesteps=[[0.9, 0.5]]", 2, "optimize.timesteps"),
+        ("light.start=read", 2, "light.start"),
+        ("light.timesteps=[[0.9, 0.5]]", 2, "light.timesteps"),
         (
-            "optimize.timesteps=[[0.1, 0.5], [0.1, 0.4], [0.1, 0.3]]",
+            "light.timesteps=[[0.1, 0.5], [0.1, 0.4], [0.1, 0.3]]",
             2,
             "one pair, or two",
         ),
-        ("optimize.draws=0", 2, "1 to 64"),
-        ("optimize.adapt=true", 1, "dipir-lora"),
+        ("light.draws=0", 2, "1 to 64"),
+        ("light.adapt=true", 1, "dipir-lora"),
         ("model.path=nowhere", 1, "nowhere"),
     ] {
         let run = project.run(OPTIMIZE, &["-s", set]);
@@ -97,7 +97,7 @@ fn without_a_path_the_embedded_model_reads_the_light() {
     let project = Project::new();
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
     let (scene, _) = text.split_once("[composite]").unwrap();
-    let table = "[optimize]\nstart = \"encoder\"\niterations = 1\nlobes = 6\n\
+    let table = "[light]\nstart = \"encoder\"\niterations = 1\nlobes = 6\n\
                  environment = [16, 8]\nsamples = 16\nadapt = false\n";
     project.write("pipeline.toml", format!("{scene}{table}"));
     project.run(SCENE, &[]).expect_success();

@@ -9,7 +9,7 @@ const EXECUTABLES: [&str; 8] = [
     "dipir-scene",
     "dipir-concepts",
     "dipir-lora",
-    "dipir-optimize",
+    "dipir-light",
     "dipir-composite",
     "dipir-inspect",
     "dipir-model",
@@ -54,12 +54,12 @@ fn every_executable_and_subcommand_has_a_manual_page() {
         let text = page(name);
         assert!(text.contains(&format!(".TH {name} 1")), "{name}: {text}");
     }
-    let text = page("dipir-optimize");
+    let text = page("dipir-light");
     assert!(
         text.contains("\\-\\-set") && text.contains("Exit codes: 0 done"),
         "{text}"
     );
     // The page of one executable goes to standard output.
-    let one = project.run(DIPIR, &["man", "--of", "dipir-optimize"]);
+    let one = project.run(DIPIR, &["man", "--of", "dipir-light"]);
     assert_eq!(one.stdout, text);
 }

@@ -52,7 +52,7 @@ fn the_page_shows_every_stage_and_needs_no_other_file() {
         ">memory</th",
         " MiB",
         "every material is opaque",
-        "dipir-optimize --set report.truth=sky.exr",
+        "dipir-light --set report.truth=sky.exr",
     ] {
         assert!(page.contains(part), "{part}");
     }
@@ -115,7 +115,7 @@ fn the_recovered_light_is_compared_with_the_true_one_once() {
     let project = whole::project();
     // What was recovered is declared the truth: light and picture agree to noise and a texel.
     let settings = [
-        "optimize.learning_rates.tone=0",
+        "light.learning_rates.tone=0",
         "composite.target_error=0.005",
         "report.truth=known.exr",
         "report.truth_tone=reinhard",

@@ -115,7 +115,7 @@ fn until_and_from_select_stages_and_force_runs_them_once_more() {
     );
     project.run(DIPIR, &["run", "--from", "lora"]).expect_error(
         2,
-        "error: --from lora: the stage is not needed: [optimize] guidance = \"reference\" asks no \
+        "error: --from lora: the stage is not needed: [light] guidance = \"reference\" asks no \
          diffusion model",
     );
 }
@@ -174,11 +174,11 @@ fn the_graph_is_shown_for_people_and_for_graphviz() {
         run.stdout
     };
     assert_eq!(
-        graph(&["--set", "optimize.guidance=lds"]),
+        graph(&["--set", "light.guidance=lds"]),
         "scene      dipir-scene      reads no other stage\n\
          concepts   dipir-concepts   reads no other stage\n\
          lora       dipir-lora       reads concepts\n\
-         light      dipir-optimize   reads scene, lora\n\
+         light      dipir-light   reads scene, lora\n\
          composite  dipir-composite  reads scene, light\n"
     );
     let dot = graph(&["--dot"]);

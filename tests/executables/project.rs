@@ -15,8 +15,8 @@ pub const DIPIR: &str = env!("CARGO_BIN_EXE_dipir");
 pub const SCENE: &str = env!("CARGO_BIN_EXE_dipir-scene");
 /// `dipir-composite`.
 pub const COMPOSITE: &str = env!("CARGO_BIN_EXE_dipir-composite");
-/// `dipir-optimize`.
-pub const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-optimize");
+/// `dipir-light`.
+pub const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-light");
 /// `dipir-tradeoff`.
 pub const TRADEOFF: &str = env!("CARGO_BIN_EXE_dipir-tradeoff");
 /// `dipir-evaluate`.

@@ -18,7 +18,7 @@ use serde_json::Value;
 use crate::project::*;
 
 const OPTIMIZE_TABLE: &str = r#"
-[optimize]
+[light]
 guidance = "reference"
 reference = "reference.exr"
 iterations = 150
@@ -69,12 +69,7 @@ fn json(project: &Project, name: &str) -> Value {
 #[test]
 fn light_is_recovered_from_a_picture_and_lights_the_composite() {
     let project = project();
-    let thorough = [
-        "-s",
-        "optimize.iterations=500",
-        "-s",
-        "optimize.samples=256",
-    ];
+    let thorough = ["-s", "light.iterations=500", "-s", "light.samples=256"];
     project.run(SCENE, &thorough).expect_success();
     assert!(project.path("out/scene/transport.safetensors").exists());
     let run = project.run(OPTIMIZE, &[&thorough[..], &["--json"]].concat());
@@ -235,9 +230,9 @@ fn killed_at_a_random_iteration_and_run_again_the_light_is_the_same_bytes() {
     let project = project();
     let long = [
         "--set",
-        "optimize.iterations=400",
+        "light.iterations=400",
         "--set",
-        "optimize.checkpoint_every=7",
+        "light.checkpoint_every=7",
     ];
     project.run(SCENE, &[]).expect_success();
     project.run(OPTIMIZE, &long).expect_success();
@@ -269,9 +264,9 @@ fn a_damaged_checkpoint_is_told_and_the_run_starts_from_the_beginning() {
     let project = project();
     let long = [
         "--set",
-        "optimize.iterations=400",
+        "light.iterations=400",
         "--set",
-        "optimize.checkpoint_every=7",
+        "light.checkpoint_every=7",
     ];
     project.run(SCENE, &[]).expect_success();
     let mut child = start_and_wait(&project, &long, 1);
@@ -307,16 +302,16 @@ fn what_cannot_be_optimised_is_refused_with_the_way_out() {
     let project = project();
     optimize_fails(
         &project,
-        &["optimize.guidance=magic"],
+        &["light.guidance=magic"],
         2,
-        "error: --set optimize.guidance=magic: optimize.guidance is \"magic\", accepted: \"lds\", \
+        "error: --set light.guidance=magic: light.guidance is \"magic\", accepted: \"lds\", \
          \"sds\", \"csd\", \"sdedit\", \"reference\"",
     );
     optimize_fails(
         &project,
-        &["optimize.lobes=0"],
+        &["light.lobes=0"],
         2,
-        "error: --set optimize.lobes=0: optimize.lobes: 0 is out of range; accepted: 1 to 1024",
+        "error: --set light.lobes=0: light.lobes: 0 is out of range; accepted: 1 to 1024",
     );
     optimize_fails(
         &project,
@@ -330,9 +325,9 @@ fn what_cannot_be_optimised_is_refused_with_the_way_out() {
     dipir_imaging::file::write_png(project.path("small.png"), &small).unwrap();
     optimize_fails(
         &project,
-        &["optimize.reference=small.png"],
+        &["light.reference=small.png"],
         2,
-        "error: --set optimize.reference=small.png: optimize.reference: \"small.png\" has 3 x 2 \
+        "error: --set light.reference=small.png: light.reference: \"small.png\" has 3 x 2 \
          pixels; accepted: a picture of the photograph's size, 36 x 24",
     );
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
@@ -344,13 +339,13 @@ fn what_cannot_be_optimised_is_refused_with_the_way_out() {
         &project,
         &[],
         2,
-        "error: pipeline.toml:18: optimize.reference: is missing: name the picture that the \
+        "error: pipeline.toml:18: light.reference: is missing: name the picture that the \
          composite should equal, as in reference = \"image.exr\"",
     );
     project.run(COMPOSITE, &[]).expect_error(
         1,
         "error: there is no light: [composite] environment is not set and out/light/lighting.json \
-         is missing; name a map, as in --set composite.environment=sky.hdr, or run dipir-optimize \
+         is missing; name a map, as in --set composite.environment=sky.hdr, or run dipir-light \
          first",
     );
 }
@@ -367,7 +362,7 @@ fn light_that_was_recovered_for_another_scene_is_warned_of() {
     run.expect_success();
     assert_eq!(
         run.stderr.trim_end(),
-        "warning: the light was recovered for another set-up of the scene; run dipir-optimize again \
+        "warning: the light was recovered for another set-up of the scene; run dipir-light again \
          to recover it for this one"
     );
 }
@@ -386,7 +381,7 @@ fn a_material_is_recovered_under_a_known_light_and_used_by_the_composite() {
         project.read("truth/composite/composite.exr"),
     );
     paint("0.5 0.5 0.5");
-    let table = "\n[optimize]\nguidance = \"reference\"\nreference = \"reference.exr\"\n\
+    let table = "\n[light]\nguidance = \"reference\"\nreference = \"reference.exr\"\n\
                  materials = [\"paint\"]\niterations = 150\n";
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
     project.write("pipeline.toml", text + table);
@@ -404,10 +399,10 @@ fn a_material_is_recovered_under_a_known_light_and_used_by_the_composite() {
     assert!(apart < 0.012, "{apart} with {found}");
 
     project
-        .run(OPTIMIZE, &["-s", r#"optimize.materials=["pant"]"#])
+        .run(OPTIMIZE, &["-s", r#"light.materials=["pant"]"#])
         .expect_error(
             2,
-            "error: --set optimize.materials=[\"pant\"]: optimize.materials: the scene has no material \"pant\"; it has: \"paint\"",
+            "error: --set light.materials=[\"pant\"]: light.materials: the scene has no material \"pant\"; it has: \"paint\"",
         );
 }
 
@@ -423,7 +418,7 @@ fn painted() -> Project {
         project.read("truth/composite/composite.exr"),
     );
     project.write("object.mtl", "newmtl paint\nKd 0.5 0.5 0.5\n");
-    let table = "\n[optimize]\nguidance = \"reference\"\nreference = \"reference.exr\"\n\
+    let table = "\n[light]\nguidance = \"reference\"\nreference = \"reference.exr\"\n\
                  materials = [\"paint\"]\niterations = 60\ncheckpoint_every = 5\n";
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
     project.write("pipeline.toml", text + table);
@@ -467,13 +462,13 @@ fn tone_curves_alone_are_recovered_under_a_light_that_is_kept() {
     write_png(project.path("lifted.png"), &DisplayImage(lifted)).unwrap();
     let arguments = [
         "-s",
-        "optimize.light=false",
+        "light.recover_light=false",
         "-s",
-        "optimize.start=kept.json",
+        "light.start=kept.json",
         "-s",
-        "optimize.reference=lifted.png",
+        "light.reference=lifted.png",
         "-s",
-        "optimize.learning_rates.tone=0.02",
+        "light.learning_rates.tone=0.02",
         "--json",
     ];
     let run = project.run(OPTIMIZE, &arguments);
@@ -496,8 +491,8 @@ fn tone_curves_alone_are_recovered_under_a_light_that_is_kept() {
     // Lifted: the object's curve rises above the diagonal.
     assert!(tone.foreground.eval(0.3) > 0.32, "{tone:?}");
 
-    let run = project.run(OPTIMIZE, &["-s", "optimize.start=none.json"]);
+    let run = project.run(OPTIMIZE, &["-s", "light.start=none.json"]);
     assert_eq!(run.code, Some(1));
-    let message = "cannot use optimize.start = \"none.json\"";
+    let message = "cannot use light.start = \"none.json\"";
     assert!(run.stderr.contains(message), "{}", run.stderr);
 }

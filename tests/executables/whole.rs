@@ -36,7 +36,7 @@ checkpoint_every = 2
 sample_every = 3
 recompute = false
 
-[optimize]
+[light]
 guidance = "reference"
 reference = "reference.exr"
 iterations = 40

@@ -27,7 +27,7 @@ use dipir_optimize::objective::Objective;
 use dipir_optimize::optimization::{Event, Optimization, Outcome};
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::recorder::SceneRecorder;
-use dipir_optimize::settings::{OptimizeTable, Preset, Settings};
+use dipir_optimize::settings::{LightTable, Preset, Settings};
 use dipir_render::adaptive::Stop;
 use dipir_render::features::{SPECULAR, TEXTURES};
 use dipir_render::light::SceneLight;
@@ -47,7 +47,7 @@ const CONVERGED: f32 = 0.002;
 
 /// How a scene is recovered.
 struct Knobs {
-    table: OptimizeTable,
+    table: LightTable,
     width: u32,
     target: f32,
     /// Print how the loss fell and the brightest lobes.
@@ -387,16 +387,16 @@ fn knobs(arguments: &[String], timing: bool) -> Knobs {
         })
     };
     let columns = value("columns").map(|c| [c as usize, c as usize / 2]);
-    let mut table = OptimizeTable {
+    let mut table = LightTable {
         iterations: value("iterations").map(|v| v as usize),
         lobes: value("lobes").map(|v| v as usize),
         samples: value("samples").map(|v| v as u32),
         environment: columns,
-        tone: value("tone").map(|v| v != 0.0),
+        recover_tone: value("tone").map(|v| v != 0.0),
         consistency: value("consistency"),
         regularizer: value("regularizer"),
         preview_every: Some(0),
-        ..OptimizeTable::default()
+        ..LightTable::default()
     };
     table.fused_after = value("fused");
     let rates = &mut table.learning_rates;

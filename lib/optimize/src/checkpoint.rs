@@ -124,10 +124,10 @@ mod tests {
     use safetensors::tensor::TensorView;
 
     use super::*;
-    use crate::settings::{OptimizeTable, Preset};
+    use crate::settings::{LightTable, Preset};
 
     fn settings() -> Settings {
-        OptimizeTable::default().settings(Preset::Draft, 3).unwrap()
+        LightTable::default().settings(Preset::Draft, 3).unwrap()
     }
 
     fn state() -> State {

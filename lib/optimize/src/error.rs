@@ -28,7 +28,7 @@ pub enum OptimizeError {
     /// Several steps in a row were not finite.
     #[error(
         "`{tensor}` is not finite in iteration {iteration}, and {in_a_row} steps in a row could not be \
-         taken; nothing was changed by them: lower optimize.learning_rates, or look at the inputs of \
+         taken; nothing was changed by them: lower light.learning_rates, or look at the inputs of \
          `{tensor}`"
     )]
     NotFinite {

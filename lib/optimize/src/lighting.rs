@@ -126,7 +126,7 @@ impl Lighting {
         let bad = |detail: String| OptimizeError::BadFile {
             path: path.into(),
             detail,
-            remedy: "correct it, or run dipir-optimize again",
+            remedy: "correct it, or run dipir-light again",
         };
         let mut light: Self = serde_json::from_slice(&text)
             .map_err(|e| bad(format!("is no recovered light: {e}")))?;

@@ -1,6 +1,6 @@
 use super::*;
 use crate::guidance::{Reference, rmse, touched};
-use crate::settings::{OptimizeTable, Preset};
+use crate::settings::{LightTable, Preset};
 use crate::testing::{DenseTransport, WEIGHTS, objective};
 use crate::transport::LinearTransport;
 use dipir_imaging::raster::Raster;
@@ -13,7 +13,7 @@ const PICTURE: (usize, usize) = (20, 16);
 const MAP: (usize, usize) = (24, 12);
 
 fn settings(iterations: usize) -> Settings {
-    let table = OptimizeTable {
+    let table = LightTable {
         iterations: Some(iterations),
         lobes: Some(14),
         environment: Some([MAP.0, MAP.1]),
@@ -243,7 +243,7 @@ fn a_nan_from_one_step_on_ends_the_run_with_the_name_of_what_went_bad() {
     assert_eq!(
         error.unwrap_err().to_string(),
         "`gradient of the guidance` is not finite in iteration 11, and 5 steps in a row could not be \
-         taken; nothing was changed by them: lower optimize.learning_rates, or look at the inputs of \
+         taken; nothing was changed by them: lower light.learning_rates, or look at the inputs of \
          `gradient of the guidance`"
     );
     let error = run_spoiled(&case, &|k, g| {

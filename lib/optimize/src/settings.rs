@@ -1,4 +1,4 @@
-//! The `[optimize]` table and what follows from it.
+//! The `[light]` table and what follows from it.
 use std::f64::consts::PI;
 use std::path::PathBuf;
 
@@ -66,10 +66,10 @@ impl From<Start> for String {
     }
 }
 
-/// The `[optimize]` table.
+/// The `[light]` table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct OptimizeTable {
+pub struct LightTable {
     /// Steps of the optimiser; the quality's by default.
     pub iterations: Option<usize>,
     /// What judges the picture.
@@ -77,7 +77,7 @@ pub struct OptimizeTable {
     /// With `guidance = "reference"`: the picture that the composite should equal, EXR or HDR
     /// (linear), PNG or JPEG (as the photograph is encoded), of the photograph's size.
     pub reference: Option<PathBuf>,
-    /// Where the optimisation starts, and what `light = false` keeps: `"auto"`, `"read"`,
+    /// Where the optimisation starts, and what `recover_light = false` keeps: `"auto"`, `"read"`,
     /// `"neutral"`, or a `lighting.json`.
     pub start: Start,
     /// With a diffusion model: least and largest noise that it is asked at, as shares of its
@@ -119,10 +119,10 @@ pub struct OptimizeTable {
     /// Names of materials to recover from the reference instead of the light, under the known light
     /// of `[composite] environment`: base colour, metalness, roughness and strength of emission.
     pub materials: Vec<String>,
-    /// Whether the light is optimised.
-    pub light: Option<bool>,
-    /// Whether the tone curves are optimised.
-    pub tone: Option<bool>,
+    /// Whether the light is recovered; it is by default.
+    pub recover_light: Option<bool>,
+    /// Whether the tone curves are recovered; they are by default.
+    pub recover_tone: Option<bool>,
     /// Iterations between previews; 0 for none.
     pub preview_every: Option<usize>,
     /// Iterations between checkpoints; 0 for none.
@@ -248,7 +248,7 @@ const LAST_RATE: f64 = 0.02;
 /// Entries of a record in half precision number their texel in 16 bits.
 const MOST_TEXELS_IN_HALF: usize = 1 << 16;
 
-impl OptimizeTable {
+impl LightTable {
     /// The settings: what the table says, else what `preset` says. `seed` is the pipeline's.
     pub fn settings(&self, preset: Preset, seed: u64) -> Result<Settings, BadSetting> {
         let (iterations, lobes, environment, samples, size) = match preset {
@@ -280,8 +280,8 @@ impl OptimizeTable {
             // delivered. Two sets find a light more easily, one finds its width (docs/recovery.md).
             fused_after: self.fused_after.unwrap_or(0.5),
             crops: self.crops,
-            light: self.light.unwrap_or(true),
-            tone: self.tone.unwrap_or(true),
+            light: self.recover_light.unwrap_or(true),
+            tone: self.recover_tone.unwrap_or(true),
             preview_every: self.preview_every.unwrap_or(50),
             checkpoint_every: self.checkpoint_every.unwrap_or(25),
             patience: self.patience,
@@ -411,7 +411,7 @@ mod tests {
 
     #[test]
     fn presets_pass_their_own_check_and_the_table_goes_first() {
-        let mut table = OptimizeTable::default();
+        let mut table = LightTable::default();
         for preset in [Preset::Draft, Preset::Standard, Preset::High] {
             assert!(table.settings(preset, 0).is_ok());
         }
@@ -427,8 +427,8 @@ mod tests {
 
     #[test]
     fn impossible_settings_are_refused_by_key() {
-        let refused = |change: &dyn Fn(&mut OptimizeTable)| {
-            let mut table = OptimizeTable::default();
+        let refused = |change: &dyn Fn(&mut LightTable)| {
+            let mut table = LightTable::default();
             change(&mut table);
             table.settings(Preset::Standard, 0).unwrap_err()
         };
@@ -463,23 +463,21 @@ mod tests {
         assert_eq!(refused(&|t| t.consistency = Some(-1.0)).key, "consistency");
         assert_eq!(refused(&|t| t.fused_after = Some(0.0)).key, "fused_after");
         assert_eq!(
-            refused(&|t| (t.light, t.tone) = (Some(false), Some(false))).key,
+            refused(&|t| (t.recover_light, t.recover_tone) = (Some(false), Some(false))).key,
             "light"
         );
     }
 
     #[test]
     fn fusion_and_rates_run_from_start_to_end() {
-        let s = OptimizeTable::default()
-            .settings(Preset::Standard, 0)
-            .unwrap();
+        let s = LightTable::default().settings(Preset::Standard, 0).unwrap();
         assert_eq!((s.fusion(0), s.fusion(300), s.fusion(599)), (0.0, 1.0, 1.0));
         assert_eq!((s.fused_at(), s.fusion(299) < 1.0), (300, true));
         assert!((s.fusion(150) - 0.5).abs() < 2e-3);
         assert_eq!(s.rate(0), 1.0);
         assert!((s.rate(599) - LAST_RATE).abs() < 1e-12);
         assert!((1..600).all(|i| s.rate(i) < s.rate(i - 1)));
-        let one = OptimizeTable {
+        let one = LightTable {
             iterations: Some(1),
             ..Default::default()
         };

@@ -24,7 +24,7 @@ pub const TABLES: [&str; 8] = [
     "scene",
     "concepts",
     "lora",
-    "optimize",
+    "light",
     "composite",
     "report",
 ];

@@ -7,7 +7,7 @@ use tempfile::TempDir;
 
 macro_rules! files {
     ($($name:literal)*) => {
-        [$(($name, include_bytes!(concat!("../../data/prior/", $name)).as_slice())),*]
+        [$(($name, include_bytes!(concat!("../../../../data/prior/", $name)).as_slice())),*]
     };
 }
 
@@ -72,7 +72,7 @@ mod tests {
 
     #[test]
     fn every_file_of_the_repository_s_model_is_embedded() {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("data/prior");
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data/prior");
         let mut found = Vec::new();
         let mut folders = vec![root.clone()];
         while let Some(folder) = folders.pop() {

@@ -1,4 +1,6 @@
 //! The diffusion model of the `[model]` table.
+mod embedded;
+
 use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 
@@ -14,8 +16,6 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tempfile::TempDir;
-
-use crate::embedded;
 
 /// The `[model]` table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

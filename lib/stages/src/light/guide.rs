@@ -6,17 +6,19 @@ use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_optimize::crop::bounding_box;
-use dipir_optimize::settings::{GuidanceKind, LearningRates, OptimizeTable, Settings, Start};
+use dipir_optimize::settings::{GuidanceKind, LearningRates, LightTable, Settings, Start};
 use dipir_prior::reader::{ReaderSettings, Reading};
 use dipir_prior::words::LightWords;
 use dipir_render::render::Renderer;
 use dipir_scene::config::SceneConfig;
 
-use crate::distillation::{Adapter, Distillation, DistillationSettings};
+use crate::light::distillation::{Adapter, Distillation, DistillationSettings};
+use crate::light::reading;
+use crate::light::reading::Place;
+use crate::light::reference_of;
+use crate::model;
 use crate::model::{Loaded, ModelTable};
-use crate::optimize::reference_of;
-use crate::reading::Place;
-use crate::{model, reading, transport};
+use crate::scene::transport;
 
 /// What judges the picture, as far as files go.
 pub(crate) enum Judge {
@@ -36,14 +38,14 @@ pub(crate) enum Judge {
 
 /// What the configuration asks for.
 pub(crate) struct Asked {
-    pub(crate) table: OptimizeTable,
+    pub(crate) table: LightTable,
     pub(crate) settings: Settings,
     pub(crate) judge: Judge,
 }
 
 impl Asked {
     pub(crate) fn of(session: &Session) -> anyhow::Result<Self> {
-        let table: OptimizeTable = session.config.table("optimize")?;
+        let table: LightTable = session.config.table("light")?;
         let mut settings = transport::settings(session, &table)?;
         let judge = match table.guidance {
             GuidanceKind::Reference => {
@@ -70,7 +72,7 @@ const REFINEMENT: usize = 50;
 const REFINEMENT_RATE: f64 = 0.05;
 
 /// What `table` leaves open, for a start that is near.
-fn refine(table: &OptimizeTable, settings: &mut Settings) {
+fn refine(table: &LightTable, settings: &mut Settings) {
     settings.iterations = table.iterations.unwrap_or(REFINEMENT);
     if table.learning_rates == LearningRates::default() {
         settings.learning_rates = settings.learning_rates.scaled(REFINEMENT_RATE);
@@ -78,7 +80,7 @@ fn refine(table: &OptimizeTable, settings: &mut Settings) {
 }
 
 /// The model that guides and how it is asked.
-fn diffusion(session: &Session, table: &OptimizeTable) -> anyhow::Result<Judge> {
+fn diffusion(session: &Session, table: &LightTable) -> anyhow::Result<Judge> {
     let model_table: ModelTable = session.config.table("model")?;
     let scene: SceneConfig = session.config.table("scene")?;
     let knows_light = model_table.knows_light(session);
@@ -93,7 +95,7 @@ fn diffusion(session: &Session, table: &OptimizeTable) -> anyhow::Result<Judge> 
                 model_table.name(),
                 dipir_prior::encoder::FILE
             );
-            return Err(session.config.invalid("optimize.start", message).into());
+            return Err(session.config.invalid("light.start", message).into());
         }
         Start::Read => Some(ReaderSettings::default()),
         Start::Encoder => Some(ReaderSettings {

@@ -1,25 +1,17 @@
 //! The stages behind the executables: each a function from a session to a folder of artifacts.
-pub mod background;
 pub mod children;
+pub mod command_line;
 pub mod composite;
 pub mod concepts;
-pub mod distillation;
-mod embedded;
-mod guide;
+pub mod graph;
+pub mod known_light;
 pub mod light;
 pub mod lora;
-pub mod materials;
 pub mod model;
-pub mod optimize;
-pub mod pipeline;
 pub mod presets;
 pub mod preview;
-pub mod reading;
 pub mod report;
-mod resume;
 pub mod scene;
-pub mod scene_folder;
-pub mod transport;
 pub mod truth;
 
 use std::ops::ControlFlow;

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 
 use dipir_cli::exit::{self, describe};
 use dipir_cli::session::Session;
-use dipir_optimize::settings::{GuidanceKind, OptimizeTable};
+use dipir_optimize::settings::{GuidanceKind, LightTable};
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::graph::{Graph, Node};
 use dipir_pipeline::stage::StagePlan;
@@ -12,16 +12,17 @@ use dipir_pipeline::status::{self, StageStatus, State};
 use dipir_scene::config::SceneConfig;
 
 use crate::composite::CompositeTable;
+use crate::light::materials;
 use crate::model::ModelTable;
 use crate::truth::ReportTable;
-use crate::{composite, concepts, lora, materials, optimize, scene};
+use crate::{composite, concepts, light, lora, scene};
 
 /// The stage that everything leads to.
 pub const LAST: &str = composite::STAGE;
 
 /// The graph of the session's configuration.
 pub fn graph(session: &Session) -> anyhow::Result<Graph> {
-    let optimize: OptimizeTable = session.config.table("optimize")?;
+    let optimize: LightTable = session.config.table("light")?;
     let composite: CompositeTable = session.config.table("composite")?;
     // Read here so that a slip in them is told before anything runs.
     let _: (SceneConfig, ModelTable, ReportTable) = (
@@ -35,10 +36,10 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
     let is_adapted = optimize.adapt.unwrap_or(true);
 
     let no_model = match (light_is_given, is_guided_by_model) {
-        _ if materials => Some("[optimize] materials asks no diffusion model"),
+        _ if materials => Some("[light] materials asks no diffusion model"),
         (true, _) => Some("[composite] environment gives the light"),
-        (false, false) => Some("[optimize] guidance = \"reference\" asks no diffusion model"),
-        (false, true) if !is_adapted => Some("[optimize] adapt = false uses the model as it is"),
+        (false, false) => Some("[light] guidance = \"reference\" asks no diffusion model"),
+        (false, true) if !is_adapted => Some("[light] adapt = false uses the model as it is"),
         (false, true) => None,
     };
     let no_concepts = match lora::preserves_concepts(session)? {
@@ -65,8 +66,8 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
             no_model,
         ),
         node(
-            optimize::STAGE,
-            optimize::EXECUTABLE,
+            light::STAGE,
+            light::EXECUTABLE,
             chosen(&[
                 (scene::STAGE, true),
                 (lora::STAGE, is_guided_by_model && is_adapted),
@@ -76,7 +77,7 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
         node(
             composite::STAGE,
             composite::EXECUTABLE,
-            chosen(&[(scene::STAGE, true), (optimize::STAGE, !light_is_given)]),
+            chosen(&[(scene::STAGE, true), (light::STAGE, !light_is_given)]),
             None,
         ),
     ]))
@@ -89,8 +90,8 @@ pub fn plan(session: &Session, stage: &str) -> anyhow::Result<StagePlan> {
         scene::STAGE => scene::plan(session),
         concepts::STAGE => concepts::plan(session),
         lora::STAGE => lora::plan(session),
-        optimize::STAGE if materials::are_asked_for(session)? => materials::plan(session),
-        optimize::STAGE => optimize::plan(session),
+        light::STAGE if materials::are_asked_for(session)? => materials::plan(session),
+        light::STAGE => light::plan(session),
         composite::STAGE => composite::plan(session, &session.config.table("composite")?),
         other => anyhow::bail!("there is no stage \"{other}\""),
     }

@@ -1,4 +1,8 @@
 //! The scene stage: reads everything once, decides what to simulate, and writes down both.
+pub mod background;
+pub mod folder;
+pub mod transport;
+
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -7,7 +11,7 @@ use dipir_cli::exit::Usage;
 use dipir_cli::interrupt;
 use dipir_cli::session::{Session, duration, size};
 use dipir_light::environment::EnvironmentSampler;
-use dipir_optimize::settings::{OptimizeTable, Settings as OptimizeSettings};
+use dipir_optimize::settings::{LightTable, Settings as OptimizeSettings};
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
@@ -21,9 +25,9 @@ use serde_json::{Value, json};
 
 use crate::composite::CompositeTable;
 use crate::interruption;
-use crate::light;
+use crate::known_light;
 use crate::presets::{self, Outlook};
-use crate::transport::{self, Frame};
+use crate::scene::transport::Frame;
 
 /// Name of the stage and of its folder.
 pub const STAGE: &str = "scene";
@@ -79,11 +83,11 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     for warning in &loaded.warnings {
         session.warn(warning);
     }
-    let optimize: OptimizeTable = session.config.table("optimize")?;
+    let optimize: LightTable = session.config.table("light")?;
     let optimize = transport::settings(session, &optimize)?;
-    let known = light::known(session, &composite)?;
+    let known = known_light::known(session, &composite)?;
     let recorded = known.is_none().then_some(&optimize);
-    let light = known.unwrap_or_else(light::pilot);
+    let light = known.unwrap_or_else(known_light::pilot);
     let read = loaded.inputs.iter();
     let plan_of_this = plan_with(
         session,
@@ -252,9 +256,9 @@ fn plan_with<'a>(
 ) -> anyhow::Result<StagePlan> {
     let config = settings(session)?;
     let composite: CompositeTable = session.config.table("composite")?;
-    let optimize: OptimizeTable = session.config.table("optimize")?;
+    let optimize: LightTable = session.config.table("light")?;
     let optimize = transport::settings(session, &optimize)?;
-    let known = light::known_params(&composite);
+    let known = known_light::known_params(&composite);
     // Where the light is given, nothing is recovered: the record would be made for nobody.
     let transport = known.is_none().then(|| {
         json!({
@@ -265,7 +269,7 @@ fn plan_with<'a>(
     });
     let light = known
         .as_ref()
-        .map_or_else(light::pilot_params, |k| k.0.clone());
+        .map_or_else(known_light::pilot_params, |k| k.0.clone());
     let params = json!({
         "scene": serde_json::to_value(&config)?, "light": light, "transport": transport,
     });

@@ -15,7 +15,7 @@ use glam::{Quat, Vec2, Vec3};
 use serde_json::{Value, json};
 
 use crate::composite::CompositeTable;
-use crate::optimize;
+use crate::light;
 
 /// A light that is a map.
 pub struct Light {
@@ -91,7 +91,7 @@ pub fn recovered(
     table: &CompositeTable,
     scene: &Manifest,
 ) -> anyhow::Result<Recovered> {
-    let folder = session.stage_folder(optimize::STAGE);
+    let folder = session.stage_folder(light::STAGE);
     let manifest = manifest(session)?;
     warn_of_another_scene(session, &manifest, scene);
     let lighting_file = manifest.output(&folder, "lighting")?;
@@ -118,11 +118,11 @@ pub fn recovered(
 
 /// The manifest of the light stage; an error that says what to do if it has not run.
 pub fn manifest(session: &Session) -> anyhow::Result<Manifest> {
-    let folder = session.stage_folder(optimize::STAGE);
+    let folder = session.stage_folder(light::STAGE);
     if !folder.join(FILE_NAME).exists() {
         return Err(missing(&folder.join("lighting.json")));
     }
-    Ok(Manifest::read(&folder, optimize::EXECUTABLE)?)
+    Ok(Manifest::read(&folder, light::EXECUTABLE)?)
 }
 
 /// The light may have been recovered before the scene was set up anew.
@@ -133,7 +133,7 @@ pub fn warn_of_another_scene(session: &Session, light: &Manifest, scene: &Manife
     };
     if of(&light.inputs) != of(&scene.outputs) {
         session.warn(
-            "the light was recovered for another set-up of the scene; run dipir-optimize again to \
+            "the light was recovered for another set-up of the scene; run dipir-light again to \
              recover it for this one",
         );
     }
@@ -179,7 +179,7 @@ pub fn pilot_params() -> Value {
 pub fn missing(recovered: &Path) -> anyhow::Error {
     anyhow::anyhow!(
         "there is no light: [composite] environment is not set and {} is missing; name a map, as \
-         in --set composite.environment=sky.hdr, or run dipir-optimize first",
+         in --set composite.environment=sky.hdr, or run dipir-light first",
         recovered.display()
     )
 }

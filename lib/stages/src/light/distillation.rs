@@ -15,7 +15,7 @@ use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_optimize::OptimizeError;
 use dipir_optimize::crop::{Framing, USUAL_SCALE, View};
 use dipir_optimize::guidance::{Guidance, Guided, Step};
-use dipir_optimize::settings::{GuidanceKind, OptimizeTable};
+use dipir_optimize::settings::{GuidanceKind, LightTable};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_prior::energy::{guiding, states};
@@ -35,7 +35,7 @@ const LIGHT_SCALE: [f32; 2] = [2.2, 3.0];
 /// Denoising steps from noise alone to a picture; an edited picture takes those below its timestep.
 const EDIT_STEPS: usize = 10;
 
-/// What of `[optimize]` is about the model.
+/// What of `[light]` is about the model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DistillationSettings {
     /// Which difference of predictions.
@@ -57,11 +57,7 @@ pub struct DistillationSettings {
 
 impl DistillationSettings {
     /// What `table` says, else what is good for a model that knows light or does not.
-    pub fn new(
-        session: &Session,
-        table: &OptimizeTable,
-        knows_light: bool,
-    ) -> anyhow::Result<Self> {
+    pub fn new(session: &Session, table: &LightTable, knows_light: bool) -> anyhow::Result<Self> {
         let timesteps = match table.timesteps.as_deref() {
             None if knows_light => [[0.5, 0.9]; 2],
             // [DiPIR, section 4.3].
@@ -70,7 +66,7 @@ impl DistillationSettings {
             Some([first, last]) => [*first, *last],
             Some(_) => {
                 let message = "accepted: one pair, or two of which the second is reached at the end, as in [[0.02, 0.6], [0.02, 0.3]]";
-                return Err(session.config.invalid("optimize.timesteps", message).into());
+                return Err(session.config.invalid("light.timesteps", message).into());
             }
         };
         if timesteps
@@ -78,12 +74,12 @@ impl DistillationSettings {
             .any(|[low, high]| !(0.0 <= *low && low <= high && *high <= 1.0))
         {
             let message = "accepted: pairs of a lower and a higher share, from 0 to 1";
-            return Err(session.config.invalid("optimize.timesteps", message).into());
+            return Err(session.config.invalid("light.timesteps", message).into());
         }
         let draws = table.draws.unwrap_or(1);
         if !(1..=64).contains(&draws) {
             let message = format!("{draws} is out of range; accepted: 1 to 64");
-            return Err(session.config.invalid("optimize.draws", message).into());
+            return Err(session.config.invalid("light.draws", message).into());
         }
         Ok(Self {
             guidance: table.guidance,
@@ -385,7 +381,7 @@ mod tests {
 
     #[test]
     fn an_odd_iteration_is_that_of_the_mirror_image_turned_back() {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("data/prior");
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data/prior");
         let mut model = Model::load(&folder, DType::F32, &Device::Cpu).unwrap();
         dipir_prior::student::add_placeholders(&mut model.tokenizer);
         let side = model::native_size(&model);

@@ -11,7 +11,7 @@ use dipir_optimize::OptimizeError;
 use dipir_optimize::materials::{
     MaterialOptimization, MaterialOutcome, MaterialSettings, RecoveredMaterial,
 };
-use dipir_optimize::settings::OptimizeTable;
+use dipir_optimize::settings::LightTable;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_render::adaptive::{Progress, Stop};
@@ -20,11 +20,11 @@ use dipir_scene::material::Material;
 use serde_json::{Value, json};
 
 use crate::composite::{CompositeTable, Tone};
-use crate::light;
-use crate::resume::{self, Resume};
-use crate::scene_folder::{self, SceneFolder};
-use crate::transport::{self, Frame};
-use crate::{interruption, optimize};
+use crate::known_light;
+use crate::light::resume::{self, Resume};
+use crate::scene::folder::{self, SceneFolder};
+use crate::scene::transport::{self, Frame};
+use crate::{interruption, light};
 
 /// Role of the file among the light stage's outputs.
 const ROLE: &str = "materials";
@@ -41,24 +41,24 @@ pub struct Done {
     resumed_at: usize,
 }
 
-/// Whether `[optimize] materials` names any.
+/// Whether `[light] materials` names any.
 pub fn are_asked_for(session: &Session) -> anyhow::Result<bool> {
-    let table: OptimizeTable = session.config.table("optimize")?;
+    let table: LightTable = session.config.table("light")?;
     Ok(!table.materials.is_empty())
 }
 
-/// Recovers the materials of `[optimize] materials` from the reference.
+/// Recovers the materials of `[light] materials` from the reference.
 pub fn run(session: &Session) -> anyhow::Result<Done> {
-    let table: OptimizeTable = session.config.table("optimize")?;
+    let table: LightTable = session.config.table("light")?;
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
     let settings = transport::settings(session, &table)?;
-    let (_, reference_file) = optimize::reference_of(session, &table)?;
-    let light = light::known(session, &composite)?.ok_or_else(|| needs_light(session))?;
+    let (_, reference_file) = light::reference_of(session, &table)?;
+    let light = known_light::known(session, &composite)?.ok_or_else(|| needs_light(session))?;
     let scene = SceneFolder::read(session)?;
     let materials = indices(session, &scene.loaded.scene.materials, &table.materials)?;
     let frame = Frame::new(&scene.loaded, settings.size);
-    let reference = optimize::read_reference(session, &scene, &frame, &reference_file)?;
+    let reference = light::read_reference(session, &scene, &frame, &reference_file)?;
     let material_settings = MaterialSettings {
         checkpoint_every: settings.checkpoint_every,
         ..settings_of(&table, settings.seed)
@@ -66,7 +66,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let plan = plan(session)?;
     let decisive = settings_of(&table, settings.seed);
     let fingerprint = resume::run_fingerprint(&plan, &json!(decisive))?;
-    let folder = session.stage_folder(optimize::STAGE);
+    let folder = session.stage_folder(light::STAGE);
     let mut writer = session.begin(plan)?;
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
     let sampler = EnvironmentSampler::new(light.map.clone());
@@ -112,13 +112,13 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
 
 /// What a run would be, from the configuration and the scene stage's manifest.
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
-    let table: OptimizeTable = session.config.table("optimize")?;
+    let table: LightTable = session.config.table("light")?;
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
     let settings = transport::settings(session, &table)?;
-    let (reference_path, reference_file) = optimize::reference_of(session, &table)?;
+    let (reference_path, reference_file) = light::reference_of(session, &table)?;
     let (light, environment) =
-        light::known_params(&composite).ok_or_else(|| needs_light(session))?;
+        known_light::known_params(&composite).ok_or_else(|| needs_light(session))?;
     let params = json!({
         "materials": table.materials,
         "iterations": settings_of(&table, settings.seed).iterations,
@@ -127,16 +127,16 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
         "light": light,
         "tone": composite.tone,
     });
-    let (stage, version) = (optimize::STAGE, optimize::VERSION);
+    let (stage, version) = (light::STAGE, light::VERSION);
     let mut plan = StagePlan::new(stage, version, params, session.pipeline.seed);
-    let scene = scene_folder::manifest(session)?;
-    scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
+    let scene = folder::manifest(session)?;
+    folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
     plan.input("reference", &reference_path, &reference_file)?;
     plan.input("environment", environment, &session.resolve(environment))?;
     Ok(plan)
 }
 
-fn settings_of(table: &OptimizeTable, seed: u64) -> MaterialSettings {
+fn settings_of(table: &LightTable, seed: u64) -> MaterialSettings {
     let default = MaterialSettings::default();
     MaterialSettings {
         iterations: table.iterations.unwrap_or(default.iterations),
@@ -148,7 +148,7 @@ fn settings_of(table: &OptimizeTable, seed: u64) -> MaterialSettings {
 fn needs_light(session: &Session) -> anyhow::Error {
     let message = "needs a known light, for a picture alone does not tell a dark material from a \
                    dim light; name a map, as in --set composite.environment=sky.hdr";
-    session.config.invalid("optimize.materials", message).into()
+    session.config.invalid("light.materials", message).into()
 }
 
 /// The photograph as the object shades it, at the frame's size.
@@ -196,7 +196,7 @@ fn indices(
                 "the scene has no material {name:?}; it has: {}",
                 known.join(", ")
             );
-            return Err(session.config.invalid("optimize.materials", message).into());
+            return Err(session.config.invalid("light.materials", message).into());
         }
     }
     found.sort_unstable();
@@ -209,8 +209,8 @@ fn recovery(session: &Session) -> anyhow::Result<Option<Manifest>> {
     if !are_asked_for(session)? {
         return Ok(None);
     }
-    let folder = session.stage_folder(optimize::STAGE);
-    Ok(Some(Manifest::read(&folder, optimize::EXECUTABLE)?))
+    let folder = session.stage_folder(light::STAGE);
+    Ok(Some(Manifest::read(&folder, light::EXECUTABLE)?))
 }
 
 /// Notes the recovered materials as an input, if the configuration asks for them.
@@ -227,11 +227,11 @@ pub fn use_recovered(session: &Session, scene: &mut SceneFolder) -> anyhow::Resu
     let Some(manifest) = recovery(session)? else {
         return Ok(());
     };
-    light::warn_of_another_scene(session, &manifest, &scene.manifest);
-    let file = manifest.output(&session.stage_folder(optimize::STAGE), ROLE)?;
+    known_light::warn_of_another_scene(session, &manifest, &scene.manifest);
+    let file = manifest.output(&session.stage_folder(light::STAGE), ROLE)?;
     let text = std::fs::read_to_string(&file)?;
     let found: Vec<RecoveredMaterial> = serde_json::from_str(&text).map_err(|e| {
-        let tool = optimize::EXECUTABLE;
+        let tool = light::EXECUTABLE;
         anyhow::anyhow!(
             "{}: {e}; it was written by another version: run {tool} again",
             file.display()

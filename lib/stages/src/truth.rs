@@ -26,9 +26,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::composite::{CompositeTable, Tone};
-use crate::scene_folder::SceneFolder;
-use crate::transport::{self, Frame};
-use crate::{composite, interruption, optimize, scene};
+use crate::scene::folder::SceneFolder;
+use crate::scene::transport::{self, Frame};
+use crate::{composite, interruption, light, scene};
 
 /// Display-referred RMSE, as a 95% bound, to which the picture under the true light is rendered: in
 /// quadrature, a small part of any difference worth telling.
@@ -80,12 +80,12 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
     };
     let lit: CompositeTable = session.config.table("composite")?;
     let is_there = |stage: &str| session.stage_folder(stage).join(FILE_NAME).is_file();
-    let needed = [scene::STAGE, optimize::STAGE, composite::STAGE];
+    let needed = [scene::STAGE, light::STAGE, composite::STAGE];
     if lit.environment.is_some() || !needed.into_iter().all(is_there) {
         return Ok(None);
     }
-    let folder = session.stage_folder(optimize::STAGE);
-    let manifest = Manifest::read(&folder, optimize::EXECUTABLE)?;
+    let folder = session.stage_folder(light::STAGE);
+    let manifest = Manifest::read(&folder, light::EXECUTABLE)?;
     let recovered = Lighting::read(&manifest.output(&folder, "lighting")?)?;
     let truth = EnvironmentMap::read(session.resolve(path))
         .with_context(|| format!("cannot use report.truth = \"{}\"", path.display()))?

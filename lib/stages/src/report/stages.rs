@@ -7,7 +7,7 @@ use dipir_render::effects::EffectsPlan;
 use super::html::{self, Html};
 use super::plot::number;
 use super::{Report, Section, json};
-use crate::{composite, optimize, scene};
+use crate::{composite, light, scene};
 
 /// Every stage with its state, error, time and memory.
 pub fn table(report: &Report) -> Section {
@@ -61,7 +61,7 @@ pub fn table(report: &Report) -> Section {
 fn error_in_words(stage: &str, error: f64) -> String {
     let unit = match stage {
         scene::STAGE => "left out",
-        optimize::STAGE => "from the guidance's reference",
+        light::STAGE => "from the guidance's reference",
         composite::STAGE => "95% bound",
         _ => "",
     };

@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use dipir_cli::session::duration;
-use dipir_optimize::settings::OptimizeTable;
+use dipir_optimize::settings::LightTable;
 use dipir_pipeline::config::Quality;
 use dipir_scene::config::EffectsMode;
 use serde::Deserialize;
@@ -31,8 +31,8 @@ pub struct Preset {
     pub scene: ScenePreset,
     /// Of `[composite]`.
     pub composite: CompositePreset,
-    /// Of `[optimize]`.
-    pub optimize: OptimizePreset,
+    /// Of `[light]`.
+    pub optimize: LightPreset,
     /// What recovering light was measured to cost.
     pub light: Option<Measured>,
 }
@@ -53,11 +53,11 @@ pub struct CompositePreset {
     pub target_error: f32,
 }
 
-/// Of `[optimize]`; see its table for what each is.
+/// Of `[light]`; see its table for what each is.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)]
-pub struct OptimizePreset {
+pub struct LightPreset {
     pub iterations: usize,
     pub lobes: usize,
     pub environment: [usize; 2],
@@ -75,10 +75,10 @@ pub struct Measured {
     pub error: f64,
 }
 
-impl OptimizePreset {
+impl LightPreset {
     /// Fills what `table` leaves open.
-    pub fn fill(&self, table: &OptimizeTable) -> OptimizeTable {
-        OptimizeTable {
+    pub fn fill(&self, table: &LightTable) -> LightTable {
+        LightTable {
             iterations: table.iterations.or(Some(self.iterations)),
             lobes: table.lobes.or(Some(self.lobes)),
             environment: table.environment.or(Some(self.environment)),
@@ -221,7 +221,7 @@ const REPLAY_POWER: f64 = 0.45;
 
 impl LightRun {
     /// About how long it would have taken with `preset`.
-    pub fn seconds_with(&self, preset: &OptimizePreset) -> f64 {
+    pub fn seconds_with(&self, preset: &LightPreset) -> f64 {
         let side = preset.size.min(self.photo_side);
         let pixels = (side as f64 / self.side.max(1) as f64).powi(2);
         let samples = f64::from(preset.samples) / f64::from(self.samples.max(1));
@@ -236,11 +236,11 @@ impl LightRun {
     }
 
     /// The presets beside `quality`, as far as `table` leaves to them.
-    pub fn outlook(&self, quality: Quality, table: &OptimizeTable) -> Outlook {
+    pub fn outlook(&self, quality: Quality, table: &LightTable) -> Outlook {
         // Measured with a reference; what a model guides to is another matter.
         let error = |p: &Preset| p.light.filter(|_| !self.by_model).map(|l| l.error);
         Outlook::beside(quality, |p| {
-            let there = OptimizePreset {
+            let there = LightPreset {
                 iterations: table.iterations.unwrap_or(p.optimize.iterations),
                 samples: table.samples.unwrap_or(p.optimize.samples),
                 size: table.size.unwrap_or(p.optimize.size),
@@ -276,7 +276,7 @@ mod tests {
 
     #[test]
     fn the_library_s_own_presets_are_these() {
-        let table = OptimizeTable::default();
+        let table = LightTable::default();
         for (quality, preset) in [
             (Quality::Draft, LibraryPreset::Draft),
             (Quality::Standard, LibraryPreset::Standard),
@@ -307,7 +307,7 @@ mod tests {
     #[test]
     fn errors_measured_with_a_reference_are_not_promised_of_a_model() {
         for by_model in [false, true] {
-            let table = OptimizeTable::default();
+            let table = LightTable::default();
             let outlook = standard_run(by_model).outlook(Quality::Standard, &table);
             assert_eq!(outlook.0.len(), 2);
             assert!(outlook.0.iter().all(|e| e.error.is_none() == by_model));
@@ -316,9 +316,9 @@ mod tests {
 
     #[test]
     fn what_the_table_says_goes_first() {
-        let table = OptimizeTable {
+        let table = LightTable {
             samples: Some(7),
-            ..OptimizeTable::default()
+            ..LightTable::default()
         };
         let filled = of(Quality::Draft).optimize.fill(&table);
         assert_eq!(filled.samples, Some(7));
@@ -362,14 +362,14 @@ mod tests {
         let here = of(Quality::Standard).optimize;
         let run = standard_run(false);
         assert!((run.seconds_with(&here) - 12.0).abs() < 1e-9);
-        let more = OptimizePreset {
+        let more = LightPreset {
             samples: 64 * here.samples,
             ..here
         };
         // 64 times the paths; 6.5 times the replay.
         assert!((run.seconds_with(&more) - 128.0 - 65.0).abs() < 0.5);
         let model = standard_run(true);
-        let half = OptimizePreset {
+        let half = LightPreset {
             iterations: here.iterations / 2,
             ..more
         };
@@ -379,14 +379,14 @@ mod tests {
             ..model
         };
         assert!((refined.seconds_with(&half) - 128.0 - 10.0).abs() < 1e-9);
-        let open = run.outlook(Quality::Standard, &OptimizeTable::default()).0;
+        let open = run.outlook(Quality::Standard, &LightTable::default()).0;
         assert_eq!(open.len(), 2);
         assert!(open[0].seconds < open[1].seconds);
-        let table = OptimizeTable {
+        let table = LightTable {
             iterations: Some(here.iterations),
             samples: Some(here.samples),
             size: Some(here.size),
-            ..OptimizeTable::default()
+            ..LightTable::default()
         };
         // Nothing is left to a preset.
         for estimate in run.outlook(Quality::Standard, &table).0 {

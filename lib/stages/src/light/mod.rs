@@ -1,5 +1,11 @@
 //! The light stage: recovers the light and the tone curves under which the object looks as the
 //! guidance wants it to.
+pub mod distillation;
+mod guide;
+pub mod materials;
+pub mod reading;
+mod resume;
+
 use std::fmt;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -19,7 +25,7 @@ use dipir_optimize::objective::Objective;
 use dipir_optimize::optimization::{Event, Optimization, Outcome};
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::recorder::SceneRecorder;
-use dipir_optimize::settings::{GuidanceKind, OptimizeTable, Settings, Start};
+use dipir_optimize::settings::{GuidanceKind, LightTable, Settings, Start};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
 use dipir_prior::reader::{ReaderSettings, Reading};
@@ -28,18 +34,18 @@ use dipir_render::transport::{RecordSettings, Transport};
 use glam::Vec3;
 use serde_json::{Value, json};
 
-use crate::distillation::Adapter;
-use crate::guide::{Asked, Guide, Judge};
+use crate::light::distillation::Adapter;
+use crate::light::guide::{Asked, Guide, Judge};
+use crate::light::resume::{Resume, fingerprint};
 use crate::presets::{LightRun, Outlook};
-use crate::resume::{Resume, fingerprint};
-use crate::scene_folder::{self, SceneFolder};
-use crate::transport::{self, Frame};
-use crate::{interruption, model, reading};
+use crate::scene::folder::{self, SceneFolder};
+use crate::scene::transport::{self, Frame};
+use crate::{interruption, model};
 
 /// Name of the stage and of its folder.
 pub const STAGE: &str = "light";
 /// The executable that runs it.
-pub const EXECUTABLE: &str = "dipir-optimize";
+pub const EXECUTABLE: &str = "dipir-light";
 /// Raised whenever the same inputs give other outputs.
 pub const VERSION: u32 = 3;
 
@@ -219,8 +225,8 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
         params(&settings, &judge),
         session.pipeline.seed,
     );
-    let scene = scene_folder::manifest(session)?;
-    scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
+    let scene = folder::manifest(session)?;
+    folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
     match &judge {
         Judge::Reference { path, file } => plan.input("reference", path, file)?,
         Judge::Diffusion {
@@ -239,37 +245,34 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     Ok(plan)
 }
 
-/// The light of `[optimize] start`: its file as the configuration names it, where it is, and what it
+/// The light of `[light] start`: its file as the configuration names it, where it is, and what it
 /// holds.
 fn first_light(
     session: &Session,
-    table: &OptimizeTable,
+    table: &LightTable,
 ) -> anyhow::Result<Option<(PathBuf, PathBuf, Lighting)>> {
     let Start::File(path) = &table.start else {
         return Ok(None);
     };
     let file = session.resolve(path);
     let light = Lighting::read(&file)
-        .with_context(|| format!("cannot use optimize.start = \"{}\"", path.display()))?;
+        .with_context(|| format!("cannot use light.start = \"{}\"", path.display()))?;
     if light.lobes.is_empty() {
         let message = format!(
             "\"{}\" holds no lobes; accepted: a lighting.json that holds some",
             path.display()
         );
-        return Err(session.config.invalid("optimize.start", message).into());
+        return Err(session.config.invalid("light.start", message).into());
     }
     Ok(Some((path.clone(), file, light)))
 }
 
 /// The reference, as the configuration names it and where it is.
-pub fn reference_of(
-    session: &Session,
-    table: &OptimizeTable,
-) -> anyhow::Result<(PathBuf, PathBuf)> {
+pub fn reference_of(session: &Session, table: &LightTable) -> anyhow::Result<(PathBuf, PathBuf)> {
     let path = table.reference.clone().ok_or_else(|| {
         let message = "is missing: name the picture that the composite should equal, as in \
                        reference = \"image.exr\"";
-        session.config.invalid("optimize.reference", message)
+        session.config.invalid("light.reference", message)
     })?;
     let file = session.resolve(&path);
     Ok((path, file))
@@ -295,7 +298,7 @@ pub fn read_reference(
             expected[0],
             expected[1]
         );
-        return Err(session.config.invalid("optimize.reference", message).into());
+        return Err(session.config.invalid("light.reference", message).into());
     }
     Ok(transfer.encode(&frame.scale(&image)))
 }

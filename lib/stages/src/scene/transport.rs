@@ -1,6 +1,6 @@
 //! The picture that is optimised, and the record of how light reaches it.
 //!
-//! Light is optimised on a picture whose longest side is `[optimize] size`: the photograph and
+//! Light is optimised on a picture whose longest side is `[light] size`: the photograph and
 //! its mask scaled down by the mean over each pixel's area, the camera with them. Light and tone
 //! curves have no resolution; what is recovered serves the photograph at its full one.
 use std::ops::ControlFlow;
@@ -8,7 +8,7 @@ use std::ops::ControlFlow;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::resize::{Filter, resize};
-use dipir_optimize::settings::{OptimizeTable, Preset, Settings};
+use dipir_optimize::settings::{LightTable, Preset, Settings};
 use dipir_render::error::RenderError;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
@@ -22,8 +22,8 @@ pub const FILE: &str = "transport.safetensors";
 /// Its role among the scene stage's outputs.
 pub const ROLE: &str = "transport";
 
-/// The `[optimize]` table with the quality's values for what it leaves open.
-pub fn settings(session: &Session, table: &OptimizeTable) -> anyhow::Result<Settings> {
+/// The `[light]` table with the quality's values for what it leaves open.
+pub fn settings(session: &Session, table: &LightTable) -> anyhow::Result<Settings> {
     let filled = presets::of(session.pipeline.quality).optimize.fill(table);
     let settings = filled.settings(Preset::Standard, session.pipeline.seed);
     settings.map_err(|e| {

@@ -1,22 +1,20 @@
-//! `dipir-optimize`: recovers the light of the photograph and its tone curves.
-mod cli;
-
+//! `dipir-light`: recovers the light of the photograph and its tone curves.
 use std::process::ExitCode;
 
 use clap::Parser;
-use cli::Cli;
 use dipir_cli::exit;
 use dipir_cli::session::Session;
+use dipir_stages::command_line::light::Cli;
 
 fn main() -> ExitCode {
     exit::run(|| {
         let session = Session::start(&Cli::parse().common)?;
-        if dipir::materials::are_asked_for(&session)? {
-            let done = dipir::materials::run(&session)?;
+        if dipir_stages::light::materials::are_asked_for(&session)? {
+            let done = dipir_stages::light::materials::run(&session)?;
             session.result(|| done.to_string(), || done.to_json());
             return Ok(());
         }
-        let done = dipir::optimize::run(&session)?;
+        let done = dipir_stages::light::run(&session)?;
         session.result(|| done.to_string(), || done.to_json());
         Ok(())
     })

@@ -22,10 +22,10 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::interruption;
-use crate::light::{self, Light, Recovered};
-use crate::materials;
+use crate::known_light::{self, Light, Recovered};
+use crate::light::materials;
 use crate::presets::{self, Outlook};
-use crate::scene_folder::{self, SceneFolder};
+use crate::scene::folder::{self, SceneFolder};
 
 /// Name of the stage and of its folder.
 pub const STAGE: &str = "composite";
@@ -189,9 +189,9 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     table.check(&session.config)?;
     let mut inputs = read(session)?;
     materials::use_recovered(session, &mut inputs.scene)?;
-    let light = match light::known(session, &table)? {
+    let light = match known_light::known(session, &table)? {
         Some(light) => Source::Map(light),
-        None => Source::Recovered(Box::new(light::recovered(
+        None => Source::Recovered(Box::new(known_light::recovered(
             session,
             &table,
             &inputs.scene.manifest,
@@ -258,10 +258,10 @@ fn read(session: &Session) -> anyhow::Result<Inputs> {
 /// What a run would be, from the configuration and the manifests of the stages that it reads.
 pub fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> {
     table.check(&session.config)?;
-    let scene = scene_folder::manifest(session)?;
-    let known = light::known_params(table);
+    let scene = folder::manifest(session)?;
+    let known = known_light::known_params(table);
     let params = json!({
-        "light": known.as_ref().map_or_else(|| light::recovered_params(table), |k| k.0.clone()),
+        "light": known.as_ref().map_or_else(|| known_light::recovered_params(table), |k| k.0.clone()),
         "tone": table.tone,
         "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
         "stop": match table.stop(session.pipeline.quality) {
@@ -271,10 +271,10 @@ pub fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePl
         },
     });
     let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
-    scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
+    folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
     match known {
         Some((_, path)) => plan.input("environment", path, &session.resolve(path))?,
-        None => plan.outputs_of(&light::manifest(session)?, &["lighting", "tone"])?,
+        None => plan.outputs_of(&known_light::manifest(session)?, &["lighting", "tone"])?,
     }
     materials::add_input(session, &mut plan)?;
     Ok(plan)

@@ -15,7 +15,7 @@ use super::picture::{figure, image};
 use super::plot::{Mark, Plot, Series, number, running_mean};
 use super::{Report, Section, json, outputs};
 use crate::preview::environment;
-use crate::{composite, light, optimize};
+use crate::{composite, known_light, light};
 
 /// Columns of the map as it is shown.
 const MAP_WIDTH: usize = 512;
@@ -26,7 +26,7 @@ const PREVIEW: usize = 256;
 
 /// The light that was recovered, else the one that was given.
 pub fn section(report: &Report) -> Section {
-    let Some(run) = report.stage(optimize::STAGE)? else {
+    let Some(run) = report.stage(light::STAGE)? else {
         return given(report);
     };
     if !run.1.outputs.iter().any(|o| o.role == "lighting") {
@@ -65,7 +65,7 @@ pub fn section(report: &Report) -> Section {
 fn given(report: &Report) -> Section {
     let table = report.session.config.table("composite")?;
     let table: composite::CompositeTable = table;
-    let Some(known) = light::known(report.session, &table)? else {
+    let Some(known) = known_light::known(report.session, &table)? else {
         return Ok(None);
     };
     let shown = known.map.resampled(MAP_WIDTH, MAP_WIDTH / 2);
