@@ -357,7 +357,7 @@ impl Settings {
         }
         if !self.light && !self.tone {
             let message = "light and tone are both off, so nothing is optimised; switch one on";
-            return wrong("light", message.into());
+            return wrong("recover_light", message.into());
         }
         Ok(())
     }
@@ -464,7 +464,7 @@ mod tests {
         assert_eq!(refused(&|t| t.fused_after = Some(0.0)).key, "fused_after");
         assert_eq!(
             refused(&|t| (t.recover_light, t.recover_tone) = (Some(false), Some(false))).key,
-            "light"
+            "recover_light"
         );
     }
 
