@@ -53,7 +53,8 @@ impl LightEstimate {
             all.push(self.sun(*k, self.sun_probability * share, &base));
         }
         let total: f64 = all.iter().map(|c| c.probability).sum();
-        all.iter_mut().for_each(|c| c.probability /= total.max(1e-12));
+        all.iter_mut()
+            .for_each(|c| c.probability /= total.max(1e-12));
         all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
         all
     }
@@ -61,11 +62,17 @@ impl LightEstimate {
     /// The most probable bins, each far from those before.
     fn centres(&self, count: usize) -> Vec<usize> {
         let mut order: Vec<usize> = (0..BINS).collect();
-        order.sort_by(|a, b| self.posterior.around(*b).total_cmp(&self.posterior.around(*a)));
+        order.sort_by(|a, b| {
+            self.posterior
+                .around(*b)
+                .total_cmp(&self.posterior.around(*a))
+        });
         let mut chosen: Vec<usize> = Vec::new();
         let near = APART_DEG.to_radians().cos();
         for k in order {
-            let far = chosen.iter().all(|c| bin_direction(*c).dot(bin_direction(k)) < near);
+            let far = chosen
+                .iter()
+                .all(|c| bin_direction(*c).dot(bin_direction(k)) < near);
             if far && chosen.len() < count {
                 chosen.push(k);
             }

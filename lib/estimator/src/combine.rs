@@ -33,7 +33,8 @@ pub fn combine(estimates: &[LightEstimate]) -> Result<LightEstimate, EstimatorEr
         add_turned(&mut base, &e.base, turn, 1.0 / count);
     }
     let best = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    combined.posterior = PeakPosterior::normalised(scores.iter().map(|s| (s - best).exp()).collect());
+    combined.posterior =
+        PeakPosterior::normalised(scores.iter().map(|s| (s - best).exp()).collect());
     // Photographs of one place make the same mistake about its kind: odds are averaged, not multiplied.
     combined.sun_probability = 1.0 / (1.0 + (-odds / count).exp());
     combined.base = base.iter().map(|t| t.map(|v| v as f32)).collect();
@@ -69,6 +70,12 @@ fn product(intervals: impl Iterator<Item = (Interval, f64)>) -> Interval {
         mean += (i.middle + offset) / (width * width);
         least = least.min(width);
     }
-    let (mean, width) = (mean / precision, precision.sqrt().recip().max(least / std::f64::consts::SQRT_2));
+    let (mean, width) = (
+        mean / precision,
+        precision
+            .sqrt()
+            .recip()
+            .max(least / std::f64::consts::SQRT_2),
+    );
     Interval::new(mean - 0.5 * width, mean, mean + 0.5 * width)
 }

@@ -14,7 +14,9 @@ pub enum EstimatorError {
         source: std::io::Error,
     },
     /// The bytes are no weights of this estimator.
-    #[error("the light estimator's weights are refused: {0}; train them again with `dipir-pretrain light`")]
+    #[error(
+        "the light estimator's weights are refused: {0}; train them again with `dipir-pretrain light`"
+    )]
     Weights(String),
     /// Nothing to combine.
     #[error("no estimates were given to combine; at least one is needed")]

@@ -103,9 +103,18 @@ impl LightEstimate {
                 })
                 .collect();
             let scale = peak * (weight / total);
-            texels.iter_mut().zip(shape).for_each(|(t, s)| *t += scale * s);
+            texels
+                .iter_mut()
+                .zip(shape)
+                .for_each(|(t, s)| *t += scale * s);
         }
-        let finite = |t: Vec3| if t.is_finite() { t.max(Vec3::ZERO) } else { Vec3::ZERO };
+        let finite = |t: Vec3| {
+            if t.is_finite() {
+                t.max(Vec3::ZERO)
+            } else {
+                Vec3::ZERO
+            }
+        };
         let texels = texels.into_iter().map(finite).collect();
         let map = EnvironmentMap::new(width, height, texels).unwrap_or(grid);
         to_world(&map, self.heading_rad)

@@ -56,7 +56,10 @@ impl Estimator {
         if members.is_empty() {
             return Err(EstimatorError::Weights("there is no network".into()));
         }
-        Ok(Self { members, calibration })
+        Ok(Self {
+            members,
+            calibration,
+        })
     }
 
     /// The estimator that is part of the program.
@@ -77,12 +80,29 @@ impl Estimator {
     /// The estimator of a safetensors file's bytes.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, EstimatorError> {
         let (members, metadata) = from_bytes(bytes)?;
-        let text = metadata
-            .get(CALIBRATION)
-            .ok_or_else(|| EstimatorError::Weights(format!("the metadata has no `{CALIBRATION}`")))?;
+        let text = metadata.get(CALIBRATION).ok_or_else(|| {
+            EstimatorError::Weights(format!("the metadata has no `{CALIBRATION}`"))
+        })?;
         let calibration = serde_json::from_str(text)
             .map_err(|e| EstimatorError::Weights(format!("`{CALIBRATION}`: {e}")))?;
         Self::new(members, calibration)
+    }
+
+    /// The same networks with another calibration.
+    pub fn calibrated(&self, calibration: Calibration) -> Self {
+        Self {
+            members: self.members.clone(),
+            calibration,
+        }
+    }
+
+    /// The networks of all, with the calibration of the first.
+    pub fn joined(all: &[Self]) -> Result<Self, EstimatorError> {
+        let members = all.iter().flat_map(|e| e.members.iter().cloned()).collect();
+        Self::new(
+            members,
+            all.first().map(|e| e.calibration).unwrap_or_default(),
+        )
     }
 
     /// The bytes of a safetensors file.
@@ -104,14 +124,24 @@ impl Estimator {
     }
 
     /// The light of a photograph's features and those of its mirror image, averaged.
-    pub fn of_features(&self, features: &[Vec<f32>; 2], reference: f32, heading_rad: f64) -> LightEstimate {
+    pub fn of_features(
+        &self,
+        features: &[Vec<f32>; 2],
+        reference: f32,
+        heading_rad: f64,
+    ) -> LightEstimate {
         let mut sum = Sum::default();
         for member in &self.members {
             let plain = self.read(&member.forward(&features[0]), false);
             let mirrored = self.read(&member.forward(&features[1]), true);
             sum.add(&plain.plus(&mirrored));
         }
-        sum.estimate(2 * self.members.len(), reference, heading_rad, &self.calibration)
+        sum.estimate(
+            2 * self.members.len(),
+            reference,
+            heading_rad,
+            &self.calibration,
+        )
     }
 
     fn read(&self, o: &[f32], mirrored: bool) -> Sum {
@@ -167,7 +197,13 @@ impl Sum {
         self.sun += other.sun;
     }
 
-    fn estimate(self, count: usize, reference: f32, heading_rad: f64, c: &Calibration) -> LightEstimate {
+    fn estimate(
+        self,
+        count: usize,
+        reference: f32,
+        heading_rad: f64,
+        c: &Calibration,
+    ) -> LightEstimate {
         let n = count as f64;
         let scale = c.exposure * f64::from(reference) / n;
         let q = self.quantiles.map(|q| q / n);
@@ -175,7 +211,11 @@ impl Sum {
         LightEstimate {
             heading_rad,
             reference: f64::from(reference),
-            base: self.base.iter().map(|t| t.map(|v| (v * scale) as f32)).collect(),
+            base: self
+                .base
+                .iter()
+                .map(|t| t.map(|v| (v * scale) as f32))
+                .collect(),
             peak: self.peak.map(|v| (v * scale) as f32),
             posterior: PeakPosterior::normalised(self.weights),
             sun_probability: self.sun / n,
@@ -194,5 +234,9 @@ impl Sum {
 
 fn widened([low, middle, high]: [f64; 3], margin: f64) -> Interval {
     let i = Interval::new(low, middle, high);
-    Interval::new((i.low - margin).min(i.middle), i.middle, (i.high + margin).max(i.middle))
+    Interval::new(
+        (i.low - margin).min(i.middle),
+        i.middle,
+        (i.high + margin).max(i.middle),
+    )
 }

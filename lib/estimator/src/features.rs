@@ -49,17 +49,30 @@ impl Glance {
         let clean = photo.0.map(|p| clean(*p));
         let small = resize(&clean, SIDE, SIDE, Filter::Area);
         let size = [photo.0.width() as u32, photo.0.height() as u32];
-        let camera = Camera { resolution: camera.resolution.map(|n| n.max(1)), ..*camera };
+        let camera = Camera {
+            resolution: camera.resolution.map(|n| n.max(1)),
+            ..*camera
+        };
         debug_assert!(size[0] > 0 && size[1] > 0);
         Self::of_small(small, &camera.scaled([SIDE as u32; 2]))
     }
 
     /// A picture that has the size already, with its camera at that size.
     pub fn of_small(small: Raster<Vec3>, camera: &Camera) -> Self {
-        assert_eq!((small.width(), small.height()), (SIDE, SIDE), "the size that is looked at");
+        assert_eq!(
+            (small.width(), small.height()),
+            (SIDE, SIDE),
+            "the size that is looked at"
+        );
         let elevation = |k: usize| {
             let pixel = Vec2::new((k % SIDE) as f32 + 0.5, (k / SIDE) as f32 + 0.5);
-            camera.ray(pixel).direction.y.clamp(-1.0, 1.0).asin().to_degrees()
+            camera
+                .ray(pixel)
+                .direction
+                .y
+                .clamp(-1.0, 1.0)
+                .asin()
+                .to_degrees()
         };
         let half = 0.5 * SIDE as f32;
         let forward = -camera.rotation.z_axis;
@@ -95,12 +108,20 @@ impl Glance {
         let log: Vec<f32> = light.iter().map(|l| (l + FLOOR).ln()).collect();
         let reference = self.reference().ln();
         let [pitch, half_x, half_y] = self.pitch_half;
-        let mut all = vec![reference, pitch, 3.0 * pitch.sin(), half_x, half_y, half_x * pitch];
+        let mut all = vec![
+            reference,
+            pitch,
+            3.0 * pitch.sin(),
+            half_x,
+            half_y,
+            half_x * pitch,
+        ];
         all.extend(self.cells(&log, reference));
         all.extend(edges(&log));
         let mut sorted = log.clone();
         sorted.sort_by(f32::total_cmp);
-        let quantile = |q: &f32| sorted[(q * (sorted.len() - 1) as f32).round() as usize] - reference;
+        let quantile =
+            |q: &f32| sorted[(q * (sorted.len() - 1) as f32).round() as usize] - reference;
         all.extend(QUANTILES.iter().map(quantile));
         let share = |test: &dyn Fn(f32) -> bool| {
             let count = self.pixels.iter().filter(|p| test(p.max_element())).count();
@@ -120,7 +141,8 @@ impl Glance {
         for cell in 0..CELLS * CELLS {
             let inside: Vec<usize> = pixels_of(cell, CELLS).collect();
             let count = inside.len() as f32;
-            let mean = inside.iter().map(|&k| self.pixels[k]).sum::<Vec3>() / count + Vec3::splat(FLOOR);
+            let mean =
+                inside.iter().map(|&k| self.pixels[k]).sum::<Vec3>() / count + Vec3::splat(FLOOR);
             let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
             let (mut sum, mut squares) = (0.0, 0.0);
             for &k in &inside {
@@ -143,7 +165,13 @@ impl Glance {
 
     /// Of the pixels between two elevations: their share, mean and deviation of log-luminance, two tints, mean
     /// luminance, and how log-luminance grows to the right. Zeros where there are hardly any.
-    fn band(&self, [low, high]: [f32; 2], light: &[f32], log: &[f32], reference: f32) -> [f32; PER_BAND] {
+    fn band(
+        &self,
+        [low, high]: [f32; 2],
+        light: &[f32],
+        log: &[f32],
+        reference: f32,
+    ) -> [f32; PER_BAND] {
         let mut sums = [0f64; 8];
         for (k, p) in self.pixels.iter().enumerate() {
             if !(self.elevation_deg[k] >= low && self.elevation_deg[k] < high) {
@@ -162,7 +190,9 @@ impl Glance {
                 value * across,
                 across,
             ];
-            sums.iter_mut().zip(terms).for_each(|(s, t)| *s += f64::from(t));
+            sums.iter_mut()
+                .zip(terms)
+                .for_each(|(s, t)| *s += f64::from(t));
         }
         let share = (sums[0] / (SIDE * SIDE) as f64) as f32;
         if share < 0.01 {
@@ -206,7 +236,11 @@ fn edges(log: &[f32]) -> Vec<f32> {
         for cell in 0..COARSE * COARSE {
             let (mut sum, mut count) = (0.0f32, 0);
             for k in pixels_of(cell, COARSE) {
-                let inside = if step == 1 { k % SIDE + 1 < SIDE } else { k + SIDE < SIDE * SIDE };
+                let inside = if step == 1 {
+                    k % SIDE + 1 < SIDE
+                } else {
+                    k + SIDE < SIDE * SIDE
+                };
                 if inside {
                     sum += (log[k + step] - log[k]).abs();
                     count += 1;

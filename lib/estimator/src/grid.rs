@@ -89,8 +89,12 @@ pub fn smooth_map(base: &[[f32; 3]], width: usize, height: usize) -> Vec<Vec3> {
     };
     let mut texels = Vec::with_capacity(width * height);
     for i in 0..height {
-        let y = ((i as f32 + 0.5) / height as f32 * BASE[1] as f32 - 0.5).clamp(0.0, (BASE[1] - 1) as f32);
-        let (top, fy) = ((y as usize).min(BASE[1] - 2), y - (y as usize).min(BASE[1] - 2) as f32);
+        let y = ((i as f32 + 0.5) / height as f32 * BASE[1] as f32 - 0.5)
+            .clamp(0.0, (BASE[1] - 1) as f32);
+        let (top, fy) = (
+            (y as usize).min(BASE[1] - 2),
+            y - (y as usize).min(BASE[1] - 2) as f32,
+        );
         for j in 0..width {
             let x = (j as f32 + 0.5) / width as f32 * BASE[0] as f32 - 0.5;
             let (left, fx) = (x.floor() as i64, x - x.floor());
@@ -106,7 +110,11 @@ pub fn smooth_map(base: &[[f32; 3]], width: usize, height: usize) -> Vec<Vec3> {
         found += *t * solid_angle(width, height, k / width) as f32;
     }
     let scale = Vec3::from_array(std::array::from_fn(|c| {
-        if found[c] > 0.0 { wanted[c] / found[c] } else { 1.0 }
+        if found[c] > 0.0 {
+            wanted[c] / found[c]
+        } else {
+            1.0
+        }
     }));
     texels.iter().map(|t| *t * scale).collect()
 }

@@ -54,8 +54,13 @@ pub struct Network {
 impl Network {
     /// Features as the first layer takes them.
     pub fn standardised(&self, features: &[f32]) -> Vec<f32> {
-        let one = |(x, (m, d)): (&f32, (&f32, &f32))| ((x - m) / d).clamp(-FEATURE_LIMIT, FEATURE_LIMIT);
-        features.iter().zip(self.mean.iter().zip(&self.deviation)).map(one).collect()
+        let one =
+            |(x, (m, d)): (&f32, (&f32, &f32))| ((x - m) / d).clamp(-FEATURE_LIMIT, FEATURE_LIMIT);
+        features
+            .iter()
+            .zip(self.mean.iter().zip(&self.deviation))
+            .map(one)
+            .collect()
     }
 
     /// The [`OUTPUTS`] numbers for [`FEATURES`] features.
@@ -92,7 +97,10 @@ fn layer([weight, bias]: &[Vec<f32>; 2], x: &[f32]) -> Vec<f32> {
 }
 
 /// The bytes of a safetensors file with networks as `member.N.*` and `metadata`.
-pub fn to_bytes(members: &[Network], metadata: HashMap<String, String>) -> Result<Vec<u8>, EstimatorError> {
+pub fn to_bytes(
+    members: &[Network],
+    metadata: HashMap<String, String>,
+) -> Result<Vec<u8>, EstimatorError> {
     let refused = |e: safetensors::SafeTensorError| EstimatorError::Weights(e.to_string());
     let mut stored: Vec<(String, Vec<usize>, Vec<u8>)> = Vec::new();
     for (n, member) in members.iter().enumerate() {
@@ -104,7 +112,8 @@ pub fn to_bytes(members: &[Network], metadata: HashMap<String, String>) -> Resul
     let views = stored
         .iter()
         .map(|(name, shape, bytes)| {
-            let view = TensorView::new(safetensors::Dtype::F32, shape.clone(), bytes).map_err(refused)?;
+            let view =
+                TensorView::new(safetensors::Dtype::F32, shape.clone(), bytes).map_err(refused)?;
             Ok((name.clone(), view))
         })
         .collect::<Result<Vec<_>, EstimatorError>>()?;
@@ -117,11 +126,16 @@ pub fn from_bytes(bytes: &[u8]) -> Result<(Vec<Network>, HashMap<String, String>
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(refused)?;
     let file = SafeTensors::deserialize(bytes).map_err(refused)?;
     let mut members = Vec::new();
-    while file.tensor(&format!("member.{}.mean", members.len())).is_ok() {
+    while file
+        .tensor(&format!("member.{}.mean", members.len()))
+        .is_ok()
+    {
         members.push(member(&file, members.len())?);
     }
     if members.is_empty() {
-        return Err(EstimatorError::Weights("there is no `member.0.mean`".into()));
+        return Err(EstimatorError::Weights(
+            "there is no `member.0.mean`".into(),
+        ));
     }
     Ok((members, header.metadata().clone().unwrap_or_default()))
 }
@@ -130,9 +144,15 @@ fn member(file: &SafeTensors<'_>, n: usize) -> Result<Network, EstimatorError> {
     let read = |name: &str, shape: &[usize]| -> Result<Vec<f32>, EstimatorError> {
         let name = format!("member.{n}.{name}");
         let refused = |why: String| EstimatorError::Weights(format!("`{name}` {why}"));
-        let tensor = file.tensor(&name).map_err(|_| refused("is missing".into()))?;
+        let tensor = file
+            .tensor(&name)
+            .map_err(|_| refused("is missing".into()))?;
         if tensor.dtype() != safetensors::Dtype::F32 || tensor.shape() != shape {
-            return Err(refused(format!("is {:?} of {:?}, not F32 of {shape:?}", tensor.dtype(), tensor.shape())));
+            return Err(refused(format!(
+                "is {:?} of {:?}, not F32 of {shape:?}",
+                tensor.dtype(),
+                tensor.shape()
+            )));
         }
         let values: Vec<f32> = tensor
             .data()
@@ -152,8 +172,17 @@ fn member(file: &SafeTensors<'_>, n: usize) -> Result<Network, EstimatorError> {
         hidden,
         mean: read("mean", &[FEATURES])?,
         deviation: read("deviation", &[FEATURES])?,
-        first: [read("first.weight", &[FEATURES, hidden])?, read("first.bias", &[hidden])?],
-        second: [read("second.weight", &[hidden, hidden])?, read("second.bias", &[hidden])?],
-        output: [read("output.weight", &[hidden, OUTPUTS])?, read("output.bias", &[OUTPUTS])?],
+        first: [
+            read("first.weight", &[FEATURES, hidden])?,
+            read("first.bias", &[hidden])?,
+        ],
+        second: [
+            read("second.weight", &[hidden, hidden])?,
+            read("second.bias", &[hidden])?,
+        ],
+        output: [
+            read("output.weight", &[hidden, OUTPUTS])?,
+            read("output.bias", &[OUTPUTS])?,
+        ],
     })
 }

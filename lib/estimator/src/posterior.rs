@@ -36,12 +36,20 @@ impl PeakPosterior {
 
     /// Probability of each azimuth.
     pub fn azimuths(&self) -> [f64; AZIMUTHS] {
-        std::array::from_fn(|a| (0..ELEVATIONS).map(|e| f64::from(self.weights[e * AZIMUTHS + a])).sum())
+        std::array::from_fn(|a| {
+            (0..ELEVATIONS)
+                .map(|e| f64::from(self.weights[e * AZIMUTHS + a]))
+                .sum()
+        })
     }
 
     /// Probability of each elevation.
     pub fn elevations(&self) -> [f64; ELEVATIONS] {
-        std::array::from_fn(|e| (0..AZIMUTHS).map(|a| f64::from(self.weights[e * AZIMUTHS + a])).sum())
+        std::array::from_fn(|e| {
+            (0..AZIMUTHS)
+                .map(|a| f64::from(self.weights[e * AZIMUTHS + a]))
+                .sum()
+        })
     }
 
     /// The shortest arc that holds `level` of the azimuths, degrees. `middle` is the arc's median in `(-180, 180]`;
@@ -61,7 +69,11 @@ impl PeakPosterior {
             let (mut low, mut high) = (start, start + 360.0);
             for _ in 0..40 {
                 let middle = 0.5 * (low + high);
-                if cumulative(middle) - cumulative(start) < share { low = middle } else { high = middle }
+                if cumulative(middle) - cumulative(start) < share {
+                    low = middle
+                } else {
+                    high = middle
+                }
             }
             high
         };
@@ -81,7 +93,8 @@ impl PeakPosterior {
         let quantile = |q: f64| {
             let mut left = q * total;
             for (e, p) in elevations.iter().enumerate() {
-                let [low, high] = [ELEVATION_EDGES_DEG[e], ELEVATION_EDGES_DEG[e + 1]].map(f64::from);
+                let [low, high] =
+                    [ELEVATION_EDGES_DEG[e], ELEVATION_EDGES_DEG[e + 1]].map(f64::from);
                 if left <= *p || e + 1 == ELEVATIONS {
                     let share = if *p > 0.0 { (left / p).min(1.0) } else { 0.5 };
                     return low + share * (high - low);
@@ -90,20 +103,33 @@ impl PeakPosterior {
             }
             90.0
         };
-        Interval::new(quantile(0.5 - 0.5 * level), quantile(0.5), quantile(0.5 + 0.5 * level))
+        Interval::new(
+            quantile(0.5 - 0.5 * level),
+            quantile(0.5),
+            quantile(0.5 + 0.5 * level),
+        )
     }
 
     /// Probability of the bin that holds a direction relative to the view, shared among the bins around it.
     pub fn density(&self, towards: Vec3) -> f64 {
         let soft = soft_bins(towards);
-        soft.iter().zip(&self.weights).map(|(s, w)| f64::from(s * w)).sum()
+        soft.iter()
+            .zip(&self.weights)
+            .map(|(s, w)| f64::from(s * w))
+            .sum()
     }
 
     /// The most probable direction: the mean over the bins within 40 degrees of the best one.
     pub fn mode(&self) -> Vec3 {
-        let best = (0..BINS).max_by(|a, b| self.around(*a).total_cmp(&self.around(*b))).unwrap_or(0);
-        let near = |k: &usize| bin_direction(*k).dot(bin_direction(best)) > 40f32.to_radians().cos();
-        let sum: Vec3 = (0..BINS).filter(near).map(|k| bin_direction(k) * self.weights[k]).sum();
+        let best = (0..BINS)
+            .max_by(|a, b| self.around(*a).total_cmp(&self.around(*b)))
+            .unwrap_or(0);
+        let near =
+            |k: &usize| bin_direction(*k).dot(bin_direction(best)) > 40f32.to_radians().cos();
+        let sum: Vec3 = (0..BINS)
+            .filter(near)
+            .map(|k| bin_direction(k) * self.weights[k])
+            .sum();
         sum.normalize_or(bin_direction(best))
     }
 

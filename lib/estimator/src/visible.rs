@@ -33,20 +33,34 @@ pub struct Visible {
 impl Visible {
     /// Places a decoded photograph into a map of `width` x `height` texels, fading over the outer `border_deg` degrees
     /// of the picture. Every texel is the mean over its cell.
-    pub fn new(photo: &LinearImage, camera: &Camera, width: usize, height: usize, border_deg: f32) -> Self {
+    pub fn new(
+        photo: &LinearImage,
+        camera: &Camera,
+        width: usize,
+        height: usize,
+        border_deg: f32,
+    ) -> Self {
         let view = View::new(photo, camera, height, border_deg);
         let (mut texels, mut alpha, mut clipped) = (Vec::new(), Vec::new(), Vec::new());
         for i in 0..height {
             for j in 0..width {
                 let (mut light, mut weight, mut white) = (Vec3::ZERO, 0.0, 0.0);
                 for s in 0..SAMPLES * SAMPLES {
-                    let u = (j as f32 + (s % SAMPLES) as f32 / SAMPLES as f32 + 0.5 / SAMPLES as f32) / width as f32;
-                    let v = (i as f32 + (s / SAMPLES) as f32 / SAMPLES as f32 + 0.5 / SAMPLES as f32) / height as f32;
+                    let u =
+                        (j as f32 + (s % SAMPLES) as f32 / SAMPLES as f32 + 0.5 / SAMPLES as f32)
+                            / width as f32;
+                    let v =
+                        (i as f32 + (s / SAMPLES) as f32 / SAMPLES as f32 + 0.5 / SAMPLES as f32)
+                            / height as f32;
                     let towards = dipir_light::environment::direction_at(u, v);
                     if let Some((value, seen)) = view.look(towards) {
                         light += value * seen;
                         weight += seen;
-                        white += if value.max_element() >= CLIPPED { seen } else { 0.0 };
+                        white += if value.max_element() >= CLIPPED {
+                            seen
+                        } else {
+                            0.0
+                        };
                     }
                 }
                 let seen = weight > 0.0;
@@ -158,7 +172,11 @@ fn border_ratios(visible: &Visible, unseen: &EnvironmentMap) -> Vec<f32> {
     for (k, [weight, here, there]) in sums.iter().enumerate() {
         if *weight > 0.0 && *here > 0.0 && *there > 0.0 {
             let stops = (here / there).log2().clamp(-MOST_STOPS, MOST_STOPS);
-            seen.push((grid.direction_of(k / COARSE[0], k % COARSE[0]), *weight, stops));
+            seen.push((
+                grid.direction_of(k / COARSE[0], k % COARSE[0]),
+                *weight,
+                stops,
+            ));
         }
     }
     (0..sums.len())
