@@ -20,13 +20,13 @@ pub enum Framing {
 
 /// The part of the picture that one iteration sees.
 #[derive(Clone, Debug)]
-pub struct View {
+pub struct CropView {
     /// The box in the picture; `None` for all of it.
     pub crop: Option<PixelBox>,
     resize: Option<CropResize>,
 }
 
-impl View {
+impl CropView {
     /// All of the picture.
     pub fn whole() -> Self {
         Self {
@@ -39,7 +39,7 @@ impl View {
     pub fn of(size: (usize, usize), crop: PixelBox, side: usize) -> Self {
         Self {
             crop: Some(crop),
-            resize: Some(CropResize::new(size, crop, (side, side), Filter::Bilinear)),
+            resize: Some(CropResize::new(size, crop, (side, side), Filter::Tent)),
         }
     }
 

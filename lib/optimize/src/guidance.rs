@@ -7,7 +7,7 @@ use dipir_imaging::resize::PixelBox;
 use dipir_numerics::sum::Neumaier;
 use glam::Vec3;
 
-use crate::crop::{Framing, View};
+use crate::crop::{CropView, Framing};
 use crate::error::OptimizeError;
 use crate::objective::Objective;
 use crate::parameters::Parameters;
@@ -44,7 +44,7 @@ pub trait Guidance {
     fn gradient(
         &mut self,
         picture: &Raster<Vec3>,
-        view: &View,
+        view: &CropView,
         step: Step,
     ) -> Result<Guided, OptimizeError>;
 }
@@ -116,7 +116,7 @@ impl Guidance for Reference {
     fn gradient(
         &mut self,
         picture: &Raster<Vec3>,
-        view: &View,
+        view: &CropView,
         _: Step,
     ) -> Result<Guided, OptimizeError> {
         let reference = view.apply(&self.picture.0);

@@ -10,7 +10,7 @@ use dipir_light::gaussian::LobeParameters;
 use glam::Vec3;
 
 use crate::checkpoint::State;
-use crate::crop::{CropSampler, Framing, View};
+use crate::crop::{CropSampler, CropView, Framing};
 use crate::error::OptimizeError;
 use crate::guidance::{Guidance, Guided, Step};
 use crate::history::{Row, stands_still};
@@ -287,12 +287,12 @@ impl Optimization<'_> {
         Ok(())
     }
 
-    fn view(&self, crops: &CropSampler, step: Step) -> View {
+    fn view(&self, crops: &CropSampler, step: Step) -> CropView {
         match self.guidance.framing() {
-            Framing::Whole => View::whole(),
+            Framing::Whole => CropView::whole(),
             Framing::Crops { side, scale } => {
                 let crop = crops.crop(step.seed, step.iteration, scale);
-                View::of(self.objective.transport().size(), crop, side)
+                CropView::of(self.objective.transport().size(), crop, side)
             }
         }
     }
@@ -302,7 +302,7 @@ impl Optimization<'_> {
         &self,
         parameters: &Parameters,
         forward: &Forward,
-        view: &View,
+        view: &CropView,
         guided: Guided,
     ) -> Result<Judged, String> {
         if !guided.loss.is_finite() {
