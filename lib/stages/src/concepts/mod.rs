@@ -254,7 +254,7 @@ fn make(
     interrupt::check()?;
     let generated = outcome?;
     let partial = png.with_extension("partial.png");
-    write_png(&partial, &model::to_display(&generated.image)?)?;
+    write_png(&partial, &dipir_tensors::model_output(&generated.image)?)?;
     std::fs::rename(&partial, png).with_context(|| format!("cannot write {}", png.display()))?;
     let latents = generated
         .latents

@@ -4,16 +4,14 @@ use std::sync::Arc;
 use anyhow::Context;
 use candle_core::{DType, Tensor, Var};
 use dipir_cli::session::Session;
-use dipir_diffusion::distillation::{
-    Guidance as Kind, InpaintCondition, ScoreDistillation, Weighting,
-};
+use dipir_diffusion::distillation::{InpaintCondition, ScoreDistillation, ScoreRule, Weighting};
 use dipir_diffusion::lora::Lora;
 use dipir_diffusion::model::Model;
 use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::text_encoder::LearnedTokens;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_optimize::OptimizeError;
-use dipir_optimize::crop::{Framing, USUAL_SCALE, View};
+use dipir_optimize::crop::{CropView, Framing, USUAL_SCALE};
 use dipir_optimize::guidance::{Guidance, Guided, Step};
 use dipir_optimize::settings::{GuidanceKind, LightTable};
 use dipir_pipeline::manifest::Manifest;
@@ -235,12 +233,12 @@ impl<'a> Distillation<'a> {
 
     /// Planes [1, 3, side, side] in [-1, 1].
     fn tensor(&self, picture: &Raster<Vec3>) -> anyhow::Result<Tensor> {
-        let image = model::from_display(&DisplayImage(picture.clone()))?;
+        let image = dipir_tensors::model_input(&DisplayImage(picture.clone()))?;
         let image = image.unsqueeze(0)?.to_device(self.model.device())?;
         Ok(image.to_dtype(self.model.dtype())?)
     }
 
-    fn condition(&self, view: &View, swap: bool) -> anyhow::Result<Option<InpaintCondition>> {
+    fn condition(&self, view: &CropView, swap: bool) -> anyhow::Result<Option<InpaintCondition>> {
         if !self.model.is_inpainting() {
             return Ok(None);
         }
@@ -249,18 +247,13 @@ impl<'a> Distillation<'a> {
             false => view.apply(picture),
         };
         let shown = self.tensor(&seen(&self.background))?;
-        let side = self.side;
-        let mask: Vec<f32> = seen(&self.paint)
-            .pixels()
-            .iter()
-            .map(|p| f32::from(p.x > 0.02))
-            .collect();
-        let mask = Tensor::from_vec(mask, (1, 1, side, side), self.model.device())?;
+        let mask = dipir_tensors::mask(&seen(&self.paint).map(|p| p.x), 0.02)?;
+        let mask = mask.to_device(self.model.device())?;
         let mask = mask.to_dtype(self.model.dtype())?;
         Ok(Some(InpaintCondition::new(&self.model.vae, &shown, &mask)?))
     }
 
-    fn judge(&self, picture: &Raster<Vec3>, view: &View, step: Step) -> anyhow::Result<Guided> {
+    fn judge(&self, picture: &Raster<Vec3>, view: &CropView, step: Step) -> anyhow::Result<Guided> {
         // Every other iteration sees the mirror image: what the model gets wrong of a picture it partly
         // gets wrong differently there (docs/prior.md).
         let swapped = self.mirrored.as_ref().filter(|_| step.iteration % 2 == 1);
@@ -271,21 +264,21 @@ impl<'a> Distillation<'a> {
         })?;
         let latents = self.model.vae.encode(&image, None)?;
         let condition = self.condition(view, swapped.is_some())?;
-        let guidance = match self.settings.guidance {
-            GuidanceKind::Sds => Kind::Sds {
+        let rule = match self.settings.guidance {
+            GuidanceKind::Sds => ScoreRule::Sds {
                 scale: self.settings.guidance_scale,
             },
-            GuidanceKind::Csd => Kind::Csd,
-            GuidanceKind::SdEdit => Kind::Edit {
+            GuidanceKind::Csd => ScoreRule::Csd,
+            GuidanceKind::SdEdit => ScoreRule::Edit {
                 scale: self.settings.guidance_scale,
                 steps: EDIT_STEPS,
             },
-            _ => Kind::Lds,
+            _ => ScoreRule::Lds,
         };
         let distillation = ScoreDistillation {
             unet: &self.model.unet,
             schedule: &self.model.schedule,
-            guidance,
+            rule,
             weighting: Weighting::NoiseVariance,
             lora: self.lora.as_ref(),
             conditional: &said.conditional,
@@ -325,15 +318,7 @@ impl<'a> Distillation<'a> {
             .get(&image)
             .context("the autoencoder cuts the graph")?;
         let at_image = (at_image.to_dtype(DType::F32)? * (2.0 * scale))?;
-        let values = at_image
-            .to_device(&candle_core::Device::Cpu)?
-            .flatten_all()?
-            .to_vec1::<f32>()?;
-        let n = self.side * self.side;
-        let pixels = (0..n)
-            .map(|i| Vec3::new(values[i], values[n + i], values[2 * n + i]))
-            .collect();
-        let gradient = Raster::from_pixels(self.side, self.side, pixels);
+        let gradient = dipir_tensors::picture(&at_image)?;
         Ok(Guided {
             loss: size,
             gradient: match swapped {
@@ -360,7 +345,7 @@ impl Guidance for Distillation<'_> {
     fn gradient(
         &mut self,
         picture: &Raster<Vec3>,
-        view: &View,
+        view: &CropView,
         step: Step,
     ) -> Result<Guided, OptimizeError> {
         self.judge(picture, view, step)
@@ -421,7 +406,7 @@ mod tests {
                 iterations: 10,
                 seed: 5,
             };
-            d.judge(picture, &View::whole(), step).unwrap().gradient
+            d.judge(picture, &CropView::whole(), step).unwrap().gradient
         };
         let as_it_is = distillation(&light, &photo, &paint);
         let mut turned = distillation(&light.mirrored(), &mirror(&photo), &mirror(&paint));

@@ -213,7 +213,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         .transpose()?;
     let photo = read_photo(&photo_file, transfer)?;
     let data = Data {
-        photo: model::from_display(&photo.transfer.encode(&photo.image))?,
+        photo: dipir_tensors::model_input(&photo.transfer.encode(&photo.image))?,
         size: model::native_size(&model),
         min_crop: table.min_crop,
         prompt: table.instance_prompt(),
@@ -363,7 +363,7 @@ fn show(model: &Model, trainer: &LoraTrainer, data: &Data, path: &Path) -> anyho
     interrupt::check()?;
     // Beside its place and renamed: a sample that is there is whole.
     let partial = path.with_extension("partial.png");
-    write_png(&partial, &model::to_display(&generated?.image)?)?;
+    write_png(&partial, &dipir_tensors::model_output(&generated?.image)?)?;
     std::fs::rename(&partial, path).with_context(|| format!("cannot write {}", path.display()))
 }
 
