@@ -1,13 +1,64 @@
 //! Lines, discs and text, written as SVG and drawn as pixels: both show the same.
 use std::fmt::Write;
 
-use dipir_imaging::raster::{DisplayImage, Raster};
-use glam::{Vec2, Vec3};
+use glam::Vec2;
 
-use crate::glyphs::{CAPITAL, lay_out};
+use crate::pixels::{Canvas, Pixels};
 
-/// An sRGB colour, 8 bits each.
-pub type Color = [u8; 3];
+/// The style sheet that drawings inside of a page need.
+pub const STYLE: &str = include_str!("style.css");
+
+/// What a colour is for: the page's style says which one it is, on light and on dark paper.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Color {
+    /// Text and axes.
+    Ink,
+    /// Lines of the grid.
+    Grid,
+    /// What stands back.
+    Soft,
+    /// One of twelve that differ, repeated: eight that people with a colour vision deficiency tell
+    /// apart [Okabe and Ito 2008], then darker ones.
+    Series(usize),
+}
+
+/// Colours of series on light paper, as in `style.css`.
+const SERIES: [[u8; 3]; 12] = [
+    [0, 114, 178],
+    [213, 94, 0],
+    [0, 158, 115],
+    [204, 121, 167],
+    [230, 159, 0],
+    [86, 180, 233],
+    [0, 0, 0],
+    [148, 103, 50],
+    [120, 94, 200],
+    [100, 140, 40],
+    [180, 40, 60],
+    [90, 110, 120],
+];
+
+impl Color {
+    /// sRGB on light paper, 8 bits each.
+    pub(crate) fn on_light(self) -> [u8; 3] {
+        match self {
+            Self::Ink => [40, 40, 40],
+            Self::Grid => [220, 223, 227],
+            Self::Soft => [120, 120, 120],
+            Self::Series(k) => SERIES[k % SERIES.len()],
+        }
+    }
+
+    /// As CSS has it.
+    fn css(self) -> String {
+        match self {
+            Self::Ink => "var(--ink)".into(),
+            Self::Grid => "var(--grid)".into(),
+            Self::Soft => "var(--soft)".into(),
+            Self::Series(k) => format!("var(--s{})", k % SERIES.len()),
+        }
+    }
+}
 
 /// Where a text lies beside its place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -22,10 +73,11 @@ pub enum Anchor {
 
 /// A part of a drawing; lengths in pixels, y downwards.
 #[derive(Clone, Debug, PartialEq)]
-enum Shape {
+pub(crate) enum Shape {
     Line {
         points: Vec<Vec2>,
         width: f32,
+        opacity: f32,
         color: Color,
     },
     Disc {
@@ -49,18 +101,13 @@ enum Shape {
     },
 }
 
-/// A picture of lines and text on white.
+/// A picture of lines and text.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Drawing {
     width: usize,
     height: usize,
     shapes: Vec<Shape>,
 }
-
-/// Width of a letter's strokes as a share of a capital's height.
-const STROKE: f32 = 0.11;
-/// A capital's height as a share of a font's size, in the usual sans-serif fonts.
-const CAPITAL_OF_SIZE: f32 = 0.72;
 
 impl Drawing {
     /// Nothing, on `width` x `height` pixels.
@@ -77,6 +124,17 @@ impl Drawing {
         self.shapes.push(Shape::Line {
             points: points.into_iter().collect(),
             width,
+            opacity: 1.0,
+            color,
+        });
+    }
+
+    /// Adds a thin, pale line through `points`.
+    pub fn faint_line(&mut self, points: impl IntoIterator<Item = Vec2>, color: Color) {
+        self.shapes.push(Shape::Line {
+            points: points.into_iter().collect(),
+            width: 1.0,
+            opacity: 0.3,
             color,
         });
     }
@@ -119,6 +177,9 @@ impl Drawing {
         color: Color,
         upwards: bool,
     ) {
+        if text.is_empty() {
+            return;
+        }
         self.shapes.push(Shape::Text {
             at,
             size,
@@ -133,38 +194,49 @@ impl Drawing {
     pub fn to_svg(&self) -> String {
         let (w, h) = (self.width, self.height);
         let mut svg = format!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {w} {h}\" width=\"{w}\" \
-             height=\"{h}\" font-family=\"Helvetica, Arial, sans-serif\">\n\
-             <rect width=\"{w}\" height=\"{h}\" fill=\"white\"/>\n"
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" class=\"chart\" viewBox=\"0 0 {w} {h}\" \
+             width=\"{w}\" height=\"{h}\">\n<style>{STYLE}</style>\n\
+             <rect width=\"{w}\" height=\"{h}\" fill=\"var(--paper)\"/>\n"
         );
-        for shape in &self.shapes {
-            svg += &svg_of(shape);
-        }
+        self.shapes.iter().for_each(|shape| svg += &svg_of(shape));
         svg + "</svg>\n"
     }
 
-    /// As pixels, `scale` of them for each of the drawing's.
-    pub fn to_image(&self, scale: usize) -> DisplayImage {
-        let (width, height) = (self.width * scale, self.height * scale);
-        let mut canvas = Canvas {
-            image: Raster::filled(width, height, Vec3::ONE),
-            scale: scale as f32,
-        };
-        for shape in &self.shapes {
-            canvas.draw(shape);
-        }
-        DisplayImage(canvas.image)
+    /// An element of a page that has [`STYLE`], as wide as there is room, on the page's own paper.
+    /// `label` says what it shows to those who cannot see it.
+    pub fn to_inline_svg(&self, label: &str) -> String {
+        let (w, h) = (self.width, self.height);
+        let label = escaped(label);
+        let mut svg = format!(
+            "<svg class=\"chart\" viewBox=\"0 0 {w} {h}\" role=\"img\" aria-label=\"{label}\">\n"
+        );
+        self.shapes.iter().for_each(|shape| svg += &svg_of(shape));
+        svg + "</svg>\n"
+    }
+
+    /// As pixels on white, `scale` of them for each of the drawing's.
+    pub fn to_pixels(&self, scale: usize) -> Pixels {
+        let mut canvas = Canvas::new(self.width * scale, self.height * scale, scale as f32);
+        self.shapes.iter().for_each(|shape| canvas.draw(shape));
+        canvas.pixels
     }
 }
 
-fn hex([r, g, b]: Color) -> String {
-    format!("#{r:02x}{g:02x}{b:02x}")
-}
-
+/// Text inside of an element or an attribute.
 fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;")
-        .replace('<', "&lt;")
-        .replace('>', "&gt;")
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out += "&amp;",
+            '<' => out += "&lt;",
+            '>' => out += "&gt;",
+            '"' => out += "&quot;",
+            // Not allowed in XML, whatever the escape.
+            c if c.is_control() => out.push('\u{fffd}'),
+            c => out.push(c),
+        }
+    }
+    out
 }
 
 fn svg_of(shape: &Shape) -> String {
@@ -172,17 +244,22 @@ fn svg_of(shape: &Shape) -> String {
         Shape::Line {
             points,
             width,
+            opacity,
             color,
         } => {
             let mut places = String::new();
             for p in points {
                 let _ = write!(places, "{:.1},{:.1} ", p.x, p.y);
             }
+            let faint = match *opacity < 1.0 {
+                true => format!(" opacity=\"{opacity}\""),
+                false => String::new(),
+            };
             format!(
                 "<polyline points=\"{}\" fill=\"none\" stroke=\"{}\" stroke-width=\"{width}\" \
-                 stroke-linejoin=\"round\"/>\n",
+                 stroke-linejoin=\"round\"{faint}/>\n",
                 places.trim_end(),
-                hex(*color)
+                color.css()
             )
         }
         Shape::Disc {
@@ -193,7 +270,7 @@ fn svg_of(shape: &Shape) -> String {
             "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"{radius}\" fill=\"{}\"/>\n",
             center.x,
             center.y,
-            hex(*color)
+            color.css()
         ),
         Shape::Ring {
             center,
@@ -205,7 +282,7 @@ fn svg_of(shape: &Shape) -> String {
              stroke-width=\"{width}\"/>\n",
             center.x,
             center.y,
-            hex(*color)
+            color.css()
         ),
         Shape::Text {
             at,
@@ -229,158 +306,75 @@ fn svg_of(shape: &Shape) -> String {
                  fill=\"{}\"{turn}>{}</text>\n",
                 at.x,
                 at.y,
-                hex(*color),
+                color.css(),
                 escaped(text)
             )
         }
     }
 }
 
-struct Canvas {
-    image: Raster<Vec3>,
-    scale: f32,
-}
-
-impl Canvas {
-    fn draw(&mut self, shape: &Shape) {
-        match shape {
-            Shape::Line {
-                points,
-                width,
-                color,
-            } => self.polyline(points, *width, *color),
-            Shape::Disc {
-                center,
-                radius,
-                color,
-            } => self.polyline(&[*center], 2.0 * radius, *color),
-            Shape::Ring {
-                center,
-                radius,
-                width,
-                color,
-            } => {
-                let c = *center * self.scale;
-                let (r, half) = (radius * self.scale, 0.5 * width * self.scale);
-                self.fill(c - r - half, c + r + half, *color, |p| {
-                    (p.distance(c) - r).abs() - half
-                });
-            }
-            Shape::Text {
-                at,
-                size,
-                anchor,
-                upwards,
-                text,
-                color,
-            } => {
-                let (strokes, width) = lay_out(text);
-                let unit = size * CAPITAL_OF_SIZE / CAPITAL;
-                let start = match anchor {
-                    Anchor::Start => 0.0,
-                    Anchor::Middle => -0.5 * width,
-                    Anchor::End => -width,
-                };
-                for stroke in strokes {
-                    let place = |(x, y): (f32, f32)| {
-                        let offset = Vec2::new(start + x, -y) * unit;
-                        *at + match upwards {
-                            true => Vec2::new(offset.y, -offset.x),
-                            false => offset,
-                        }
-                    };
-                    let points: Vec<Vec2> = stroke.into_iter().map(place).collect();
-                    self.polyline(&points, STROKE * CAPITAL * unit, *color);
-                }
-            }
-        }
-    }
-
-    /// A line with round joints and ends; one point is a disc.
-    fn polyline(&mut self, points: &[Vec2], width: f32, color: Color) {
-        let half = 0.5 * width * self.scale;
-        let scaled: Vec<Vec2> = points.iter().map(|p| *p * self.scale).collect();
-        let Some(first) = scaled.first() else { return };
-        let low = scaled.iter().fold(*first, |a, p| a.min(*p)) - half;
-        let high = scaled.iter().fold(*first, |a, p| a.max(*p)) + half;
-        self.fill(low, high, color, |p| {
-            let pieces = scaled
-                .windows(2)
-                .map(|s| distance_to_segment(p, s[0], s[1]));
-            pieces.fold(p.distance(*first), f32::min) - half
-        });
-    }
-
-    /// Blends `color` in where the signed distance is negative, antialiased over a pixel.
-    fn fill(&mut self, low: Vec2, high: Vec2, color: Color, distance: impl Fn(Vec2) -> f32) {
-        let color = Vec3::from_array(color.map(|c| f32::from(c) / 255.0));
-        let (width, height) = (self.image.width(), self.image.height());
-        let first = |v: f32| (v - 1.0).max(0.0) as usize;
-        let last = |v: f32, n: usize| ((v + 2.0).max(0.0) as usize).min(n);
-        for y in first(low.y)..last(high.y, height) {
-            for x in first(low.x)..last(high.x, width) {
-                let center = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
-                let coverage = (0.5 - distance(center)).clamp(0.0, 1.0);
-                if coverage > 0.0 {
-                    let pixel = self.image.get_mut(x, y);
-                    *pixel = pixel.lerp(color, coverage);
-                }
-            }
-        }
-    }
-}
-
-fn distance_to_segment(p: Vec2, a: Vec2, b: Vec2) -> f32 {
-    let along = b - a;
-    let length = along.length_squared();
-    let t = match length > 0.0 {
-        true => ((p - a).dot(along) / length).clamp(0.0, 1.0),
-        false => 0.0,
-    };
-    p.distance(a + t * along)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const BLACK: Color = [0, 0, 0];
+    const INK: Color = Color::Ink;
 
     #[test]
     fn a_line_covers_its_pixels_and_no_others() {
         let mut drawing = Drawing::new(10, 10);
-        drawing.line([Vec2::new(2.0, 5.0), Vec2::new(8.0, 5.0)], 2.0, BLACK);
-        let image = drawing.to_image(1);
-        assert_eq!(*image.0.get(5, 4), Vec3::ZERO);
-        assert_eq!(*image.0.get(5, 5), Vec3::ZERO);
-        assert_eq!(*image.0.get(5, 7), Vec3::ONE);
-        assert_eq!(*image.0.get(0, 5), Vec3::ONE);
-        assert_eq!(drawing.to_image(2).0.width(), 20);
+        drawing.line([Vec2::new(2.0, 5.0), Vec2::new(8.0, 5.0)], 2.0, INK);
+        let image = drawing.to_pixels(1);
+        let ink = INK.on_light();
+        assert_eq!([image.get(5, 4), image.get(5, 5)], [ink; 2]);
+        assert_eq!([image.get(5, 7), image.get(0, 5)], [[255; 3]; 2]);
+        assert_eq!(drawing.to_pixels(2).width, 20);
     }
 
     #[test]
     fn text_and_svg_show_what_was_drawn() {
         let mut drawing = Drawing::new(60, 30);
-        drawing.text(Vec2::new(30.0, 20.0), 12.0, Anchor::Middle, "a<b", BLACK);
-        drawing.disc(Vec2::new(5.0, 5.0), 3.0, [255, 0, 0]);
-        drawing.ring(Vec2::new(50.0, 8.0), 4.0, 1.0, [0, 0, 255]);
+        drawing.text(Vec2::new(30.0, 20.0), 12.0, Anchor::Middle, "a<b", INK);
+        drawing.disc(Vec2::new(5.0, 5.0), 3.0, Color::Series(1));
+        drawing.ring(Vec2::new(50.0, 8.0), 4.0, 1.0, Color::Series(2));
         let svg = drawing.to_svg();
         assert!(
-            svg.contains(">a&lt;b</text>") && svg.contains("#ff0000"),
+            svg.contains(">a&lt;b</text>") && svg.contains("fill=\"var(--s1)\""),
             "{svg}"
         );
-        let image = drawing.to_image(1);
-        assert_eq!(*image.0.get(5, 5), Vec3::new(1.0, 0.0, 0.0));
-        let dark = (20..40).flat_map(|x| (8..22).map(move |y| (x, y)));
-        assert!(dark.filter(|&(x, y)| image.0.get(x, y).x < 0.5).count() > 5);
+        let image = drawing.to_pixels(1);
+        assert_eq!(image.get(5, 5), [213, 94, 0]);
+        let text = (20..40).flat_map(|x| (8..22).map(move |y| (x, y)));
+        assert!(text.filter(|&(x, y)| image.get(x, y)[0] < 128).count() > 5);
     }
 
     #[test]
     fn text_that_runs_upwards_stays_left_of_its_place() {
         let mut drawing = Drawing::new(40, 60);
-        drawing.text_upwards(Vec2::new(20.0, 50.0), 12.0, Anchor::Start, "HH", BLACK);
-        let image = drawing.to_image(1);
-        let dark = |x: usize| (0..60).any(|y| image.0.get(x, y).x < 0.5);
+        drawing.text_upwards(Vec2::new(20.0, 50.0), 12.0, Anchor::Start, "HH", INK);
+        let image = drawing.to_pixels(1);
+        let dark = |x: usize| (0..60).any(|y| image.get(x, y)[0] < 128);
         assert!((12..20).any(dark) && !(23..40).any(dark));
+    }
+
+    #[test]
+    fn every_colour_has_a_place_in_the_style_for_light_and_for_dark_paper() {
+        let names = (0..SERIES.len()).map(|k| format!("--s{k}: "));
+        for name in names.chain(["--paper: ", "--ink: ", "--grid: ", "--soft: "].map(String::from))
+        {
+            assert_eq!(STYLE.matches(&name).count(), 2, "{name}");
+        }
+        for (k, [r, g, b]) in SERIES.into_iter().enumerate() {
+            let rule = format!("--s{k}: #{r:02x}{g:02x}{b:02x}");
+            assert!(STYLE.contains(&rule), "{rule}");
+        }
+    }
+
+    #[test]
+    fn an_inline_drawing_says_what_it_shows_and_is_text_whatever_it_is_called() {
+        let svg = Drawing::new(10, 10).to_inline_svg("a \"loss\" <b>");
+        assert!(
+            svg.contains("aria-label=\"a &quot;loss&quot; &lt;b&gt;\""),
+            "{svg}"
+        );
     }
 }

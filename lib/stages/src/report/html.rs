@@ -2,6 +2,9 @@
 //! module put together is markup.
 use std::fmt::Write;
 
+use base64::prelude::{BASE64_STANDARD, Engine};
+use dipir_plotting::chart::Chart;
+
 /// Finished markup.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Html(String);
@@ -47,6 +50,26 @@ impl Html {
     pub fn code(tag: &'static str, code: &'static str) -> Self {
         assert!(!code.contains("</"), "{tag}");
         Self(format!("<{tag}>{code}</{tag}>"))
+    }
+
+    /// A chart under its title, with its numbers as a CSV file; nothing if there are no two points
+    /// to draw.
+    pub fn chart(title: &str, chart: &Chart) -> Option<Self> {
+        if chart.visible_points() < 2 {
+            return None;
+        }
+        let numbers = BASE64_STANDARD.encode(chart.to_csv());
+        let address = format!("data:text/csv;base64,{numbers}");
+        let name = title.split([':', ',']).next().unwrap_or(title);
+        let file = format!("{}.csv", name.to_lowercase().replace(' ', "-"));
+        let link = [("href", address.as_str()), ("download", file.as_str())];
+        let caption = [
+            Self::text(format!("{title} ")),
+            Self::element("a", &link, [Self::text("CSV")]),
+        ];
+        let drawing = Self(chart.draw().to_inline_svg(title));
+        let figure = [Self::element("figcaption", &[], caption), drawing];
+        Some(Self::element("figure", &[("class", "plot")], figure))
     }
 
     /// One after the other.
