@@ -72,7 +72,7 @@ impl From<Start> for String {
 pub struct LightTable {
     /// Steps of the optimiser; the quality's by default.
     pub iterations: Option<usize>,
-    /// What judges the picture.
+    /// Where the gradient of the picture comes from.
     pub guidance: GuidanceKind,
     /// With `guidance = "reference"`: the picture that the composite should equal, EXR or HDR
     /// (linear), PNG or JPEG (as the photograph is encoded), of the photograph's size.
@@ -196,7 +196,7 @@ pub struct Preset {
     pub size: usize,
 }
 
-/// A value of the table that no run can work with.
+/// A value of the table that is refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{message}")]
 pub struct BadSetting {
@@ -289,7 +289,7 @@ impl LightTable {
 }
 
 impl Settings {
-    /// Refuses what no run can work with.
+    /// Refuses values that no run can work with.
     pub fn check(&self) -> Result<(), BadSetting> {
         let wrong = |key, message: String| Err(BadSetting { key, message });
         let counts = [
