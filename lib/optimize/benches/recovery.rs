@@ -58,7 +58,7 @@ struct Knobs {
 fn standard_preset() -> Preset {
     let presets = include_str!("../../stages/src/presets.json");
     let mut presets: serde_json::Value = serde_json::from_str(presets).expect("JSON");
-    serde_json::from_value(presets["presets"][1]["optimize"].take()).expect("a preset")
+    serde_json::from_value(presets["presets"][1]["light"].take()).expect("a preset")
 }
 
 fn simulation() -> Simulation {

@@ -171,11 +171,6 @@ pub fn digest(folder: Option<&Path>) -> anyhow::Result<String> {
     Ok(hasher.finalize().to_hex().to_string())
 }
 
-/// The side of the images that the model was trained on, in pixels.
-pub fn native_size(model: &Model) -> usize {
-    model.unet.config().sample_size * model.vae.downscale()
-}
-
 /// Creates a folder and its parents.
 pub fn create_folder(path: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))

@@ -11,9 +11,9 @@ use glam::Vec3;
 use super::html::{Html, table};
 use super::picture::{figure, image};
 use super::{Report, Section};
+use crate::names::{COMPOSITE, SCENE};
 use crate::preview::{normals, stretched};
 use crate::truth::Truth;
-use crate::{composite, scene};
 
 /// Longest side of the large pictures: a full screen's width of page.
 const LARGE: usize = 1152;
@@ -22,7 +22,7 @@ const LAYER: usize = 480;
 
 /// How the photograph is encoded, and so the picture.
 fn transfer(report: &Report) -> anyhow::Result<Transfer> {
-    let scene = report.stage(scene::STAGE)?;
+    let scene = report.stage(SCENE.name)?;
     let (folder, manifest) = scene.context("the scene's folder is missing")?;
     let scene = SceneDescription::read(&manifest.output(&folder, "scene")?)?;
     Ok(scene.background.transfer)
@@ -30,7 +30,7 @@ fn transfer(report: &Report) -> anyhow::Result<Transfer> {
 
 /// The photograph and the picture, one over the other.
 pub fn before_and_after(report: &Report) -> Section {
-    let Some((folder, manifest)) = report.stage(composite::STAGE)? else {
+    let Some((folder, manifest)) = report.stage(COMPOSITE.name)? else {
         return Ok(None);
     };
     let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
@@ -69,7 +69,7 @@ pub fn before_and_after(report: &Report) -> Section {
 
 /// The layers that a compositor gets.
 pub fn layers(report: &Report) -> Section {
-    let Some((folder, manifest)) = report.stage(composite::STAGE)? else {
+    let Some((folder, manifest)) = report.stage(COMPOSITE.name)? else {
         return Ok(None);
     };
     let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
