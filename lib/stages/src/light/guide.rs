@@ -7,8 +7,8 @@ use dipir_cli::session::Session;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_optimize::crop::bounding_box;
 use dipir_optimize::settings::{GuidanceKind, LearningRates, LightTable, Settings, Start};
-use dipir_prior::reader::{ReaderSettings, Reading};
-use dipir_prior::words::LightWords;
+use dipir_prior::caption::LightDescription;
+use dipir_prior::inversion::{InversionSettings, Reading};
 use dipir_render::render::Renderer;
 use dipir_scene::config::SceneConfig;
 
@@ -32,7 +32,7 @@ pub(crate) enum Judge {
         settings: DistillationSettings,
         class: String,
         /// How light is read off the photograph, if it is.
-        reads: Option<ReaderSettings>,
+        reads: Option<InversionSettings>,
     },
 }
 
@@ -85,7 +85,7 @@ fn diffusion(session: &Session, table: &LightTable) -> anyhow::Result<Judge> {
     let scene: SceneConfig = session.config.table("scene")?;
     let knows_light = model_table.knows_light(session);
     let reads = match &table.start {
-        Start::Auto => knows_light.then(ReaderSettings::default),
+        Start::Auto => knows_light.then(InversionSettings::default),
         Start::Neutral | Start::File(_) => None,
         Start::Read | Start::Encoder if !knows_light => {
             let message = format!(
@@ -97,10 +97,10 @@ fn diffusion(session: &Session, table: &LightTable) -> anyhow::Result<Judge> {
             );
             return Err(session.config.invalid("light.start", message).into());
         }
-        Start::Read => Some(ReaderSettings::default()),
-        Start::Encoder => Some(ReaderSettings {
+        Start::Read => Some(InversionSettings::default()),
+        Start::Encoder => Some(InversionSettings {
             draws: 0,
-            ..ReaderSettings::default()
+            ..InversionSettings::default()
         }),
     };
     Ok(Judge::Diffusion {
@@ -137,7 +137,7 @@ impl Guide {
             .then(|| Adapter::load(session, &mut model))
             .transpose()?;
         if reads.is_some() {
-            dipir_prior::student::add_placeholders(&mut model.tokenizer);
+            dipir_prior::text_conditioning::add_placeholders(&mut model.tokenizer);
         }
         Ok(Self {
             model: Some(model),
@@ -184,7 +184,7 @@ impl Guide {
         &mut self,
         settings: &DistillationSettings,
         class: &str,
-        light: Option<&LightWords>,
+        light: Option<&LightDescription>,
         photo: &DisplayImage,
         paint: &Raster<f32>,
     ) -> anyhow::Result<Distillation<'_>> {

@@ -28,7 +28,7 @@ use dipir_optimize::recorder::SceneRecorder;
 use dipir_optimize::settings::{GuidanceKind, LightTable, Settings, Start};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
-use dipir_prior::reader::{ReaderSettings, Reading};
+use dipir_prior::inversion::{InversionSettings, Reading};
 use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
 use glam::Vec3;
@@ -138,8 +138,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
             let paint = if reading.is_some() { &coverage } else { &mask };
             let seen = reading.as_ref().zip(bounding_box(&coverage));
             let seen = seen.map(|(r, object)| {
-                let gaze = reading::gaze(&frame.camera, object);
-                r.light.words.seen_from(gaze.heading)
+                let seen_from = reading::view_direction(&frame.camera, object);
+                r.light.description.seen_from(seen_from.heading)
             });
             Box::new(guide.distillation(settings, class, seen.as_ref(), &shown, paint)?)
         }
@@ -304,7 +304,7 @@ pub fn read_reference(
 }
 
 /// How light is read, as far as it decides.
-fn read_param(reads: &Option<ReaderSettings>) -> Value {
+fn read_param(reads: &Option<InversionSettings>) -> Value {
     match reads {
         Some(settings) if settings.draws == 0 => json!("encoder"),
         other => json!(other.is_some()),
