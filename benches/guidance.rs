@@ -8,7 +8,7 @@
 //! Run with `cargo test --bench guidance -- --bench [MODEL] [key=value...]`: `scenes` and `first`
 //! choose the scenes, `places` is open, street or yard, `iterations = 0` leaves guidance out, `ablations = 1` adds guidance with one
 //! ingredient less each, `rate` scales the learning rates, `noise` is the draws of
-//! noise of an iteration, `trust`, `encoder`, `t` and `draws` are the reader's, `json` is a file for every scene's numbers. Prints the table of docs/prior.md with
+//! noise of an iteration, `energy`, `encoder`, `t` and `draws` are the inversion's, `json` is a file for every scene's numbers. Prints the table of docs/prior.md with
 //! bootstrap intervals. Without `--bench`, as tests run it, it does nothing: what it measures takes
 //! minutes.
 use std::collections::BTreeMap;
@@ -32,12 +32,12 @@ use dipir_optimize::optimization::Optimization;
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::settings::{GuidanceKind, LightTable, Settings};
 use dipir_pipeline::config::Quality;
-use dipir_prior::examples::{Tone, angle_between};
-use dipir_prior::lights::sun_angles;
-use dipir_prior::place::Place;
-use dipir_prior::reader::{ReaderSettings, Reading, combine};
-use dipir_prior::student::add_placeholders;
-use dipir_prior::studio::{Paint, Setting};
+use dipir_pretraining::CameraResponse;
+use dipir_pretraining::generated_photograph::GeneratedPhotograph;
+use dipir_pretraining::lighting::sun_angles;
+use dipir_pretraining::scene::{Paint, Setting};
+use dipir_prior::inversion::{InversionSettings, Reading, angle_between, combine};
+use dipir_prior::text_conditioning::add_placeholders;
 use dipir_render::features::SPECULAR;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
@@ -48,7 +48,7 @@ use dipir_stages::known_light;
 use dipir_stages::presets;
 use glam::Vec3;
 
-/// Key of these scenes; training and gates have others.
+/// Key of these scenes. Training and quality checks have others.
 const SEED: u64 = 0x5ce7e5;
 /// Pixels on a side of the photographs.
 const SIZE: u32 = 96;
@@ -56,7 +56,7 @@ const SIZE: u32 = 96;
 const MAP: [usize; 2] = [128, 64];
 
 struct Trial {
-    place: Place,
+    place: GeneratedPhotograph,
     photo: DisplayImage,
     linear: LinearImage,
     transport: Transport,
@@ -80,8 +80,8 @@ fn ground() -> Proxy {
 
 impl Trial {
     fn draw(index: u64, samples: u32, setting: Setting) -> anyhow::Result<Self> {
-        let place = Place::draw(SEED, index, SIZE, setting);
-        let (stage, tone) = (&place.stage, place.tone);
+        let place = GeneratedPhotograph::draw(SEED, index, SIZE, setting);
+        let (stage, tone) = (&place.scene, place.response);
         let mut shown: Vec<f32> = place.radiance.iter().flat_map(|p| p.to_array()).collect();
         tone.apply(&mut shown);
         // As a file would hold it.
@@ -127,7 +127,7 @@ impl Trial {
     /// The composite under the true light with the photograph's own tone.
     fn truth(&self, objective: &Objective) -> anyhow::Result<DisplayImage> {
         let map = self.place.map(MAP[0], MAP[1])?;
-        Ok(self.under(&map, objective, Some(&self.place.tone)))
+        Ok(self.under(&map, objective, Some(&self.place.response)))
     }
 
     /// The composite under `map`, the object through `tone`.
@@ -135,7 +135,7 @@ impl Trial {
         &self,
         map: &EnvironmentMap,
         objective: &Objective,
-        tone: Option<&Tone>,
+        tone: Option<&CameraResponse>,
     ) -> DisplayImage {
         let transport = objective.transport();
         let object = transport.foreground(map.texels());
@@ -208,7 +208,7 @@ struct Knobs {
     ablations: bool,
     guidance_draws: usize,
     samples: u32,
-    reader: ReaderSettings,
+    reader: InversionSettings,
     json: Option<PathBuf>,
 }
 
@@ -246,7 +246,7 @@ fn run(
         answer(&trial, &objective, &plain, &truth),
     );
     let projected = trial.under(
-        &known_light::projected(&trial.linear, &trial.place.stage.camera, MAP)?,
+        &known_light::projected(&trial.linear, &trial.place.scene.camera, MAP)?,
         &objective,
         None,
     );
@@ -255,7 +255,7 @@ fn run(
     let Some(object) = bounding_box(&coverage) else {
         return Ok(found);
     };
-    let camera = &trial.place.stage.camera;
+    let camera = &trial.place.scene.camera;
     let proxy = ground();
     let place = reading::Place {
         camera,
@@ -292,20 +292,20 @@ fn run(
         found.insert(name, answer(&trial, &objective, &light, &truth));
     }
     let mut known = reading.light;
-    known.words.azimuth = trial.place.sun().azimuth;
+    known.description.azimuth = trial.place.sun().azimuth;
     let turned = start(&known, camera, lobes);
     found.insert(
         "6 true azimuth",
         answer(&trial, &objective, &turned, &truth),
     );
-    known.words.elevation = trial.place.sun().elevation;
+    known.description.elevation = trial.place.sun().elevation;
     let turned = start(&known, camera, lobes);
     found.insert(
         "7 true direction",
         answer(&trial, &objective, &turned, &truth),
     );
-    let unaided = ReaderSettings {
-        encoder: 0.0,
+    let unaided = InversionSettings {
+        encoder_weight: 0.0,
         ..knobs.reader
     };
     let alone = combine(reading.crops.clone(), &reading.encoder, &unaided);
@@ -426,11 +426,13 @@ fn guided(
         true => reading.light,
         false => reading.encoder,
     };
-    let class = trial.place.stage.shape.word();
+    let class = trial.place.scene.shape.word();
     let coverage = trial.transport.coverage().clone();
-    let camera = &trial.place.stage.camera;
-    let told = bounding_box(&coverage)
-        .map(|object| said.words.seen_from(reading::gaze(camera, object).heading));
+    let camera = &trial.place.scene.camera;
+    let told = bounding_box(&coverage).map(|object| {
+        said.description
+            .seen_from(reading::view_direction(camera, object).heading)
+    });
     let paint = match variant.background {
         true => coverage,
         false => Raster::filled(SIZE as usize, SIZE as usize, 1.0),
@@ -501,7 +503,7 @@ fn main() -> anyhow::Result<()> {
         ablations: false,
         guidance_draws: 1,
         samples: 192,
-        reader: ReaderSettings::default(),
+        reader: InversionSettings::default(),
         json: None,
     };
     let mut bench = false;
@@ -513,21 +515,18 @@ fn main() -> anyhow::Result<()> {
                 knobs.setting = match v {
                     "open" => Setting::Open,
                     "street" => Setting::Street,
-                    "yard" => Setting::Yard,
+                    "yard" => Setting::Courtyard,
                     other => anyhow::bail!("places={other}: accepted are open, street and yard"),
                 }
             }
             Some(("iterations", v)) => knobs.iterations = v.parse()?,
             Some(("rate", v)) => knobs.rate = v.parse()?,
-            Some(("trust", v)) => knobs.reader.trust = v.parse()?,
-            Some(("encoder", v)) => knobs.reader.encoder = v.parse()?,
-            Some(("t", v)) => knobs.reader.told_at = v.parse()?,
+            Some(("energy", v)) => knobs.reader.energy_weight = v.parse()?,
+            Some(("encoder", v)) => knobs.reader.encoder_weight = v.parse()?,
+            Some(("t", v)) => knobs.reader.timestep = v.parse()?,
             Some(("json", v)) => knobs.json = Some(v.into()),
             Some(("ablations", v)) => knobs.ablations = v.parse::<u8>()? != 0,
             Some(("noise", v)) => knobs.guidance_draws = v.parse()?,
-            Some(("context", v)) => {
-                knobs.reader.context = serde_json::from_value(serde_json::json!(v))?;
-            }
             Some(("samples", v)) => knobs.samples = v.parse()?,
             Some(("draws", v)) => knobs.reader.draws = v.parse()?,
             Some((key, _)) => anyhow::bail!("unknown key {key}"),

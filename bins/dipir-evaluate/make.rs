@@ -11,7 +11,7 @@ use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
 use dipir_numerics::sampler::{Sampler, Stream};
-use dipir_prior::studio::Setting;
+use dipir_pretraining::scene::Setting;
 use dipir_render::shapes::torus_knot;
 use dipir_scene::export::to_obj;
 use dipir_stages::scene::background::{MID_GREY, View, exposure_ev_to};
@@ -63,7 +63,7 @@ pub fn run(args: &MakeArgs) -> anyhow::Result<()> {
     let setting = match args.places {
         Places::Open => Setting::Open,
         Places::Street => Setting::Street,
-        Places::Yard => Setting::Yard,
+        Places::Yard => Setting::Courtyard,
     };
     for n in 0..args.generated {
         progress.set(n as f64 / args.generated as f64);

@@ -18,9 +18,6 @@ mod evaluate;
 #[path = "../dipir-inspect/cli.rs"]
 mod inspect;
 #[allow(dead_code)]
-#[path = "../dipir-pretrain/cli.rs"]
-mod pretrain;
-#[allow(dead_code)]
 #[path = "../dipir-tradeoff/cli.rs"]
 mod tradeoff;
 
@@ -77,7 +74,7 @@ impl Executable {
             Self::DipirModel => model::Cli::command(),
             Self::DipirEvaluate => evaluate::Cli::command(),
             Self::DipirTradeoff => tradeoff::Cli::command(),
-            Self::DipirPretrain => pretrain::Cli::command(),
+            Self::DipirPretrain => dipir_pretraining::command_line::Cli::command(),
         }
     }
 }

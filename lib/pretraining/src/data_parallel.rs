@@ -1,5 +1,6 @@
-//! Parts of a batch that are worked on side by side, each by one thread of its own: small convolutions gain nothing
-//! from more.
+//! Data-parallel gradients: every batch is split into parts of equal size, and each part has one thread. The small
+//! convolutions of these networks gain nothing from more.
+
 use std::collections::BTreeMap;
 
 use candle_core::Tensor;
@@ -7,25 +8,25 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 
-/// Parts of a batch. Fixed, so that sums and with them weights are the same on any machine.
-pub(crate) const SHARDS: usize = 2;
+/// Parts of a batch. The number is fixed, so that sums and trained weights are the same on any machine.
+pub(crate) const PARTS: usize = 2;
 
-/// A thread for each part.
-pub(crate) struct Shards {
+/// One thread for every part.
+pub(crate) struct Workers {
     pools: Vec<rayon::ThreadPool>,
 }
 
-impl Shards {
+impl Workers {
     /// Starts the threads.
     pub fn new() -> Result<Self> {
-        let pools = (0..SHARDS)
+        let pools = (0..PARTS)
             .map(|_| rayon::ThreadPoolBuilder::new().num_threads(1).build())
             .collect::<Result<_, _>>()
             .map_err(|e| Error::Argument(format!("cannot start threads: {e}")))?;
         Ok(Self { pools })
     }
 
-    /// What `work` makes of the number of each part.
+    /// Results of `work` for the number of every part.
     pub fn run<T: Send>(&self, work: impl Fn(usize) -> Result<T> + Sync) -> Result<Vec<T>> {
         std::thread::scope(|scope| {
             let work = &work;
@@ -33,7 +34,7 @@ impl Shards {
                 .pools
                 .iter()
                 .enumerate()
-                .map(|(shard, pool)| scope.spawn(move || pool.install(|| work(shard))))
+                .map(|(part, pool)| scope.spawn(move || pool.install(|| work(part))))
                 .collect();
             threads
                 .into_iter()
@@ -46,11 +47,11 @@ impl Shards {
     }
 }
 
-/// The means of gradients that have the same names.
+/// The mean gradient of every variable; all parts have the same variables.
 pub(crate) fn mean_gradients(
-    shards: &[BTreeMap<String, Tensor>],
+    parts: &[BTreeMap<String, Tensor>],
 ) -> Result<BTreeMap<String, Tensor>> {
-    let Some((first, others)) = shards.split_first() else {
+    let Some((first, others)) = parts.split_first() else {
         return Ok(BTreeMap::new());
     };
     let names: Vec<&String> = first.keys().collect();
@@ -58,10 +59,10 @@ pub(crate) fn mean_gradients(
         .into_par_iter()
         .map(|name| {
             let mut sum = first[name].clone();
-            for shard in others {
-                sum = (sum + &shard[name])?;
+            for part in others {
+                sum = (sum + &part[name])?;
             }
-            Ok((name.clone(), (sum * (1.0 / shards.len() as f64))?))
+            Ok((name.clone(), (sum * (1.0 / parts.len() as f64))?))
         })
         .collect()
 }

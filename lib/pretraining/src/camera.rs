@@ -1,35 +1,70 @@
-//! What a camera and a file do to a picture beside exposing it.
+//! From linear light to the display values of a photograph.
+
 use dipir_diffusion::noise::NoiseStream;
+use dipir_prior::picture::SIZE;
 
-use crate::examples::{SIZE, Tone};
+use crate::random::between;
 
-/// How linear light becomes the pixels of a photograph's crop.
+/// Exposure and tone curve of a camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Look {
+pub struct CameraResponse {
+    /// Factor on linear light.
+    pub exposure: f32,
+    /// Blend of two curves: 0 clips at white, 1 is 1 - exp(-x).
+    pub shoulder: f32,
+}
+
+impl CameraResponse {
+    /// That of a random camera.
+    pub fn draw(stream: &mut NoiseStream) -> Self {
+        Self {
+            exposure: (0.35 * (2.0 * stream.uniform() - 1.0)).exp() as f32,
+            shoulder: stream.uniform() as f32,
+        }
+    }
+
+    /// Turns a linear picture into display values in [0, 1] (sRGB).
+    pub fn apply(&self, linear: &mut [f32]) {
+        for v in linear {
+            let x = (*v * self.exposure).max(0.0);
+            let soft = 1.0 - (-x).exp();
+            let x = x.min(1.0) + (soft - x.min(1.0)) * self.shoulder;
+            *v = if x <= 0.003_130_8 {
+                12.92 * x
+            } else {
+                1.055 * x.powf(1.0 / 2.4) - 0.055
+            };
+        }
+    }
+}
+
+/// All that happens between linear light and the pixels of a photograph's crop.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct CameraEffects {
     /// Factor on linear light.
     pub exposure: f32,
     tone: Curve,
     /// Exponent on display values.
     gamma: f32,
-    /// Share of each neighbour's value that runs into a pixel's, along rows and along columns.
+    /// Weight of each neighbour in the blur, along rows and along columns.
     blur: f32,
-    /// Standard deviation of what is added to display values.
+    /// Standard deviation of noise on display values.
     noise: f32,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Curve {
-    /// As in the small model's other training.
-    Shoulder(Tone),
+    /// As the diffusion model is trained.
+    Shoulder(CameraResponse),
     /// x / (1 + x).
     Reinhard,
 }
 
-impl Look {
-    /// Of any camera.
+impl CameraEffects {
+    /// Those of a random camera.
     pub fn draw(stream: &mut NoiseStream) -> Self {
-        let tone = Tone::draw(stream);
-        let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+        let tone = CameraResponse::draw(stream);
+        let mut range = |low, high| between(stream, low, high);
         let kind = range(0.0, 1.0);
         let gamma = range(-0.15, 0.15).exp();
         let (wide, blur, noise) = (range(-0.5, 0.5), range(-0.2, 0.2), range(-0.02, 0.02));
@@ -38,7 +73,7 @@ impl Look {
             exposure,
             tone: match kind < 0.25 {
                 true => Curve::Reinhard,
-                false => Curve::Shoulder(Tone { exposure, ..tone }),
+                false => Curve::Shoulder(CameraResponse { exposure, ..tone }),
             },
             gamma,
             blur: blur.max(0.0),
@@ -55,7 +90,7 @@ impl Look {
                     let x = (*v * self.exposure).max(0.0);
                     *v = x / (1.0 + x);
                 }
-                let plain = Tone {
+                let plain = CameraResponse {
                     exposure: 1.0,
                     shoulder: 0.0,
                 };
@@ -72,7 +107,7 @@ impl Look {
         }
         if self.noise > 0.0 {
             for v in picture.iter_mut() {
-                // Three uniform numbers are near enough to a normal one of variance 1/4.
+                // The sum of three uniform numbers has the variance 1/4 and is close to normal.
                 let sum: f64 = (0..3).map(|_| stream.uniform()).sum();
                 *v = (*v + 2.0 * self.noise * (sum as f32 - 1.5)).clamp(0.0, 1.0);
             }
@@ -80,7 +115,7 @@ impl Look {
     }
 }
 
-/// Gives each pixel of [SIZE, SIZE] this share of each neighbour, edges repeated.
+/// Gives each neighbour the weight `share` in every pixel of [SIZE, SIZE]; edges are repeated.
 fn blur(plane: &mut [f32], share: f32) {
     let mut line = [0f32; SIZE];
     for (step, other) in [(1, SIZE), (SIZE, 1)] {
@@ -104,7 +139,7 @@ mod tests {
     fn a_blur_spreads_a_point_and_loses_nothing() {
         let mut plane = vec![0.0; SIZE * SIZE];
         plane[5 * SIZE + 7] = 1.0;
-        // At the edge what would run out stays in.
+        // Edges lose nothing.
         plane[0] = 1.0;
         blur(&mut plane, 0.2);
         assert!((plane.iter().sum::<f32>() - 2.0).abs() < 1e-5);
@@ -122,15 +157,18 @@ mod tests {
     fn pictures_stay_in_range_and_brighter_light_stays_brighter() {
         for index in 0..100 {
             let mut stream = NoiseStream::new(4, index);
-            let look = Look::draw(&mut stream);
+            let effects = CameraEffects::draw(&mut stream);
             let apply = |value: f32, stream: &mut NoiseStream| {
                 let mut picture = vec![value; 3 * SIZE * SIZE];
-                look.apply(&mut picture, stream);
-                assert!(picture.iter().all(|v| (0.0..=1.0).contains(v)), "{look:?}");
+                effects.apply(&mut picture, stream);
+                assert!(
+                    picture.iter().all(|v| (0.0..=1.0).contains(v)),
+                    "{effects:?}"
+                );
                 picture.iter().sum::<f32>() / picture.len() as f32
             };
             let values = [0.02, 0.2, 0.6].map(|v| apply(v, &mut stream));
-            assert!(values.is_sorted_by(|a, b| a < b), "{values:?} {look:?}");
+            assert!(values.is_sorted_by(|a, b| a < b), "{values:?} {effects:?}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Sizes of the small model, and its folder in the diffusers layout.
+//! Sizes of the small model's networks, and its folder in the layout of diffusers.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -9,40 +9,35 @@ use dipir_diffusion::schedule::{BetaSchedule, Prediction, ScheduleConfig};
 use dipir_diffusion::text_encoder::TextEncoderConfig;
 use dipir_diffusion::unet::UNetConfig;
 use dipir_diffusion::weights::write_safetensors;
+use dipir_prior::caption::vocabulary;
+use dipir_prior::picture::{LATENT_CHANNELS, LATENT_FACTOR, LATENT_SCALE, SIZE};
 use serde_json::{Value, json};
 
 use crate::error::{Result, io};
-use crate::examples::SIZE;
 use crate::tokenizer_files;
-use crate::words::vocabulary;
 
-/// Pixels to a latent pixel along one side.
-pub const FACTOR: usize = 2;
-/// Channels of the latents.
-pub const LATENTS: usize = 3 * FACTOR * FACTOR;
-/// From pixels in [-1, 1] to latents near unit variance.
-pub const SCALING: f64 = 2.0;
-/// Tokens of a caption, both markers included.
+/// Tokens of a caption, with start and end.
 pub const LENGTH: usize = 20;
 
-/// Prefixes of the names of variables, and the file of the model folder in which these lie without them.
+/// Prefixes of variables' names in training, and the file of the model folder that holds those variables without the
+/// prefix.
 pub const WEIGHT_FILES: [(&str, &str); 2] = [
     ("unet.", "unet/diffusion_pytorch_model.safetensors"),
     ("text.", "text_encoder/model.safetensors"),
 ];
 
-/// Widths of the networks.
+/// Sizes of the networks.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Blueprint {
+pub struct Architecture {
     /// Channels of the UNet by level, finest first.
     pub channels: Vec<usize>,
-    /// Residual blocks of a level on the way down; on the way up it has one more.
+    /// Residual blocks of each level in the downward half; the upward half has one more.
     pub layers: usize,
     /// Width of the text encoder.
     pub text_width: usize,
 }
 
-impl Default for Blueprint {
+impl Default for Architecture {
     fn default() -> Self {
         Self {
             channels: vec![32, 64, 128],
@@ -52,8 +47,8 @@ impl Default for Blueprint {
     }
 }
 
-impl Blueprint {
-    /// The UNet's configuration: attention at all levels but the finest.
+impl Architecture {
+    /// The UNet's configuration. All levels but the finest have attention.
     pub fn unet(&self) -> UNetConfig {
         let levels = self.channels.len();
         let kind = |with: bool, name: &str| {
@@ -61,9 +56,9 @@ impl Blueprint {
             format!("{cross}{name}Block2D")
         };
         UNetConfig {
-            sample_size: SIZE / FACTOR,
-            in_channels: 2 * LATENTS + 1,
-            out_channels: LATENTS,
+            sample_size: SIZE / LATENT_FACTOR,
+            in_channels: 2 * LATENT_CHANNELS + 1,
+            out_channels: LATENT_CHANNELS,
             down_block_types: (0..levels).map(|l| kind(l > 0, "Down")).collect(),
             up_block_types: (0..levels).rev().map(|l| kind(l > 0, "Up")).collect(),
             block_out_channels: self.channels.clone(),
@@ -85,9 +80,9 @@ impl Blueprint {
         }
     }
 
-    /// The variable of a UNet with `before` residual blocks a level that `name`, without "unet.", goes on from;
-    /// `None` for those of a block that it had not. Blocks come in before the last one of the way up, whose skip
-    /// connection is that of the level above, and after the last one of the way down.
+    /// Name of the variable that initialises `name`, without "unet.", in a UNet with `before` residual blocks a level;
+    /// `None` if its block is new. New blocks follow the last one of the downward half and precede the last one of the
+    /// upward half, whose skip connection comes from the level above.
     pub fn name_before(&self, name: &str, before: usize) -> Option<String> {
         let mut parts: Vec<&str> = name.split('.').collect();
         let [
@@ -133,7 +128,7 @@ impl Blueprint {
         }
     }
 
-    /// Writes everything but the weights; returns the vocabulary's size.
+    /// Writes all files of the folder but the weights, and returns the vocabulary's size.
     pub fn write_configs(&self, folder: &Path) -> Result<usize> {
         let vocab = tokenizer_files::write(&folder.join("tokenizer"), &vocabulary(), LENGTH)?;
         let with = |config: Value, extra: &[(&str, Value)]| {
@@ -164,7 +159,7 @@ impl Blueprint {
                 ("clip_sample", json!(false)),
             ],
         );
-        let vae = json!({"_class_name": "PixelUnshuffle", "factor": FACTOR, "in_channels": 3, "scaling_factor": SCALING});
+        let vae = json!({"_class_name": "PixelUnshuffle", "factor": LATENT_FACTOR, "in_channels": 3, "scaling_factor": LATENT_SCALE});
         let index = json!({"_class_name": "StableDiffusionInpaintPipeline"});
         for (name, value) in [
             ("model_index.json", index),
@@ -183,7 +178,7 @@ impl Blueprint {
         Ok(vocab)
     }
 
-    /// Writes weights named as in training, "unet." and "text." first, in f16.
+    /// Writes weights, named as in training, in f16.
     pub fn write_weights(&self, folder: &Path, weights: &BTreeMap<String, Tensor>) -> Result<()> {
         for (prefix, file) in WEIGHT_FILES {
             let part = weights

@@ -1,27 +1,24 @@
-//! Light in words: how a caption names where the sun stands, how high, and
-//! how clear the sky is; and the vocabulary for it.
+//! Captions that describe light: the sun's azimuth and elevation and how clear the sky is, and their vocabulary.
 //!
-//! Values between two words are mixtures of their embeddings, so that the
-//! language is continuous although its words are few.
+//! A value between two words is a weighted mean of the words' embeddings, so a caption changes continuously with the light.
 
 use std::f32::consts::{PI, TAU};
 
-use dipir_diffusion::noise::NoiseStream;
 use serde::{Deserialize, Serialize};
 
-/// Where the sun stands on a clock face that lies on the ground, seen from
-/// above with the camera at six looking to twelve.
+/// Words for the sun's azimuth: hours of a clock face on the ground, seen from above, with the camera at six looking
+/// towards twelve.
 pub const CLOCK: [&str; 12] = [
     "twelve", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
     "eleven",
 ];
-/// Words for the sun's height and the elevations that they name, degrees.
+/// Words for the sun's elevation, and what each means, degrees.
 pub const HEIGHTS: [(&str, f32); 3] = [("low", 15.0), ("middle", 40.0), ("high", 65.0)];
-/// Words for the share of the light on the ground that comes from the sun.
+/// Words for the sun's share of the irradiance of the ground, and what each means.
 pub const SKIES: [(&str, f32); 3] = [("hazy", 0.4), ("fair", 0.7), ("clear", 0.95)];
-/// The word for a sky without sun.
+/// The word for a sky without a sun.
 pub const OVERCAST: &str = "overcast";
-/// Colours of objects.
+/// Words for colours of objects.
 pub const COLORS: [&str; 8] = [
     "white", "grey", "black", "red", "orange", "yellow", "green", "blue",
 ];
@@ -90,7 +87,7 @@ const OTHERS: [&str; 60] = [
     "right",
 ];
 
-/// Every word that is one token, in the order of their tokens.
+/// All words that are one token, in the order of the tokens.
 pub fn vocabulary() -> Vec<&'static str> {
     let mut words: Vec<&str> = OTHERS.to_vec();
     words.extend(COLORS);
@@ -101,29 +98,28 @@ pub fn vocabulary() -> Vec<&'static str> {
     words
 }
 
-/// What a caption says about light.
+/// The light as a caption describes it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct LightWords {
-    /// Angle from the camera's forward direction to the sun on the ground,
-    /// towards the right, radians.
+pub struct LightDescription {
+    /// Angle on the ground from the camera's forward direction to the sun, positive to the right, radians.
     pub azimuth: f32,
-    /// Angle of the sun above the ground, radians.
+    /// Angle of the sun above the horizon, radians.
     pub elevation: f32,
-    /// Share of the light on the ground that comes from the sun, 0 to 1.
+    /// The sun's share of the irradiance of the ground, 0 to 1.
     pub sun_share: f32,
 }
 
-/// Where the middle of a picture lies for the camera that took it, on level ground.
+/// Direction of the middle of a picture from the camera that took it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Gaze {
-    /// Angle on the ground from the camera's forward direction, towards the right, radians.
+pub struct ViewDirection {
+    /// Angle on the ground from the camera's forward direction, positive to the right, radians.
     pub heading: f32,
     /// Angle below the horizon, radians.
     pub pitch: f32,
 }
 
-impl Gaze {
-    /// Along `direction`, where `forward` and `right` are level and of unit length.
+impl ViewDirection {
+    /// The angles of `direction`; `forward` and `right` are horizontal unit vectors.
     pub fn along(direction: glam::Vec3, forward: glam::Vec3, right: glam::Vec3) -> Self {
         let (x, z) = (direction.dot(right), direction.dot(forward));
         Self {
@@ -133,17 +129,17 @@ impl Gaze {
     }
 }
 
-/// Words and weights that stand at one place of a caption; weights sum to 1.
-pub type Mixture = Vec<(&'static str, f32)>;
+/// Words with weights that sum to 1, for one placeholder of a caption.
+pub type WordMixture = Vec<(&'static str, f32)>;
 
-impl LightWords {
-    /// Whether the sky is named overcast and nothing is said of the sun.
+impl LightDescription {
+    /// Whether the caption says overcast, and nothing of the sun.
     pub fn is_overcast(&self) -> bool {
         self.sun_share < 0.15
     }
 
-    /// The mixtures for clock, height and sky.
-    pub fn mixtures(&self) -> [Mixture; 3] {
+    /// Mixtures of words for azimuth, elevation and the sun's share.
+    pub fn mixtures(&self) -> [WordMixture; 3] {
         let hours = (self.azimuth.rem_euclid(TAU) / TAU) * 12.0;
         let (hour, part) = (hours.floor(), hours.fract());
         let clock = |h: f32| CLOCK[h as usize % 12];
@@ -155,7 +151,7 @@ impl LightWords {
         ]
     }
 
-    /// The same light in a mirror that swaps left and right.
+    /// The same light with left and right swapped.
     pub fn mirrored(&self) -> Self {
         Self {
             azimuth: -self.azimuth,
@@ -163,7 +159,7 @@ impl LightWords {
         }
     }
 
-    /// The same light from where the camera's forward direction is turned right by `angle`.
+    /// The same light for a camera that is turned right by `angle`, radians.
     pub fn seen_from(&self, angle: f32) -> Self {
         Self {
             azimuth: self.azimuth - angle,
@@ -171,60 +167,9 @@ impl LightWords {
         }
     }
 
-    /// A light that this one might be taken for: another azimuth near by or anywhere, the mirror image,
-    /// another elevation, another sky.
-    pub fn rival(&self, stream: &mut NoiseStream) -> Self {
-        let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
-        let kind = range(0.0, 1.0);
-        let side = if range(0.0, 1.0) < 0.5 { -1.0 } else { 1.0 };
-        let amount = range(0.0, 1.0);
-        if self.is_overcast() {
-            return Self {
-                azimuth: amount * TAU,
-                elevation: range(0.25, 1.2),
-                sun_share: range(0.45, 0.93),
-            };
-        }
-        match kind {
-            x if x < 0.45 => Self {
-                azimuth: self.azimuth + side * (20.0 + 40.0 * amount).to_radians(),
-                ..*self
-            },
-            x if x < 0.6 => Self {
-                azimuth: amount * TAU,
-                ..*self
-            },
-            x if x < 0.7 => Self {
-                azimuth: -self.azimuth,
-                ..*self
-            },
-            x if x < 0.93 => {
-                let step = side * (10.0 + 25.0 * amount).to_radians();
-                let turned = |e: f32| (0.2..1.3).contains(&e);
-                let elevation = match turned(self.elevation + step) {
-                    true => self.elevation + step,
-                    false => self.elevation - step,
-                };
-                Self { elevation, ..*self }
-            }
-            x if x < 0.96 => Self {
-                sun_share: 0.0,
-                ..*self
-            },
-            _ => {
-                let step = 0.25 + 0.15 * amount;
-                let sun_share = match self.sun_share > 0.69 {
-                    true => self.sun_share - step,
-                    false => self.sun_share + step,
-                };
-                Self { sun_share, ..*self }
-            }
-        }
-    }
-
-    /// The same light from the three other quarters: what is common to all four, brightness, height,
-    /// sky, is not of the light's direction.
-    pub fn turned(&self) -> [Self; 3] {
+    /// The same light turned by one, two and three quarters of a circle. All else that predictions for them share,
+    /// such as brightness, is not about the direction.
+    pub fn quarter_turns(&self) -> [Self; 3] {
         [1.0, 2.0, 3.0].map(|quarters| Self {
             azimuth: self.azimuth + quarters * PI / 2.0,
             ..*self
@@ -232,30 +177,30 @@ impl LightWords {
     }
 }
 
-/// The two neighbours of `value` on a scale of words; beyond the ends, the
-/// last step goes on, which keeps different values different.
-fn between(scale: &[(&'static str, f32); 3], value: f32) -> Mixture {
+/// The two words next to `value`, weighted linearly. Weights extrapolate by up to .3 beyond the ends of the scale, so
+/// that values there still differ.
+fn between(scale: &[(&'static str, f32); 3], value: f32) -> WordMixture {
     let i = usize::from(value > scale[1].1);
     let (low, high) = (scale[i], scale[i + 1]);
     let t = ((value - low.1) / (high.1 - low.1)).clamp(-0.3, 1.3);
     vec![(low.0, 1.0 - t), (high.0, t)]
 }
 
-/// A caption: plain words, and places whose embedding is a mixture.
+/// A caption: text with placeholders, and the mixture of words for each.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Caption {
-    /// The text with a placeholder word at each mixture.
+    /// The text, with a placeholder for each mixture.
     pub text: String,
-    /// Mixtures in the order of their placeholders.
-    pub mixtures: Vec<Mixture>,
+    /// Mixtures in the order of the placeholders.
+    pub mixtures: Vec<WordMixture>,
 }
 
-/// Stands where a mixture goes; token `vocab_size + i` for the i-th.
+/// Words that stand for mixtures; the i-th is the token `vocab_size + i`.
 pub const PLACEHOLDERS: [&str; 3] = ["mixeda", "mixedb", "mixedc"];
 
 impl Caption {
-    /// "a photo of a {class}", and what `light` says if it is given.
-    pub fn new(class: &str, light: Option<&LightWords>) -> Self {
+    /// "a photo of a {class}", followed by `light` if it is given.
+    pub fn new(class: &str, light: Option<&LightDescription>) -> Self {
         let mut text = format!("a photo of a {class}");
         let mut mixtures = vec![];
         match light {
@@ -269,33 +214,30 @@ impl Caption {
         }
         Self { text, mixtures }
     }
-
-    /// The nearest caption in words alone.
-    pub fn spoken(&self) -> String {
-        let mut text = self.text.clone();
-        for (placeholder, mixture) in PLACEHOLDERS.iter().zip(&self.mixtures) {
-            let word = mixture
-                .iter()
-                .max_by(|a, b| a.1.total_cmp(&b.1))
-                .map_or("", |m| m.0);
-            text = text.replace(placeholder, word);
-        }
-        text
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    /// The caption with the likeliest word for every placeholder.
+    fn plain_text(caption: &Caption) -> String {
+        let mut text = caption.text.clone();
+        for (placeholder, mixture) in PLACEHOLDERS.iter().zip(&caption.mixtures) {
+            let likeliest = mixture.iter().max_by(|a, b| a.1.total_cmp(&b.1));
+            text = text.replace(placeholder, likeliest.unwrap().0);
+        }
+        text
+    }
+
     #[test]
-    fn what_is_ahead_is_left_of_who_looks_to_the_right() {
-        let ahead = LightWords {
+    fn a_camera_that_turns_right_sees_what_was_ahead_on_its_left() {
+        let ahead = LightDescription {
             azimuth: 0.0,
             elevation: 0.5,
             sun_share: 0.8,
         };
-        let hour = |w: &LightWords| {
+        let hour = |w: &LightDescription| {
             let all = w.mixtures()[0].clone();
             all.into_iter()
                 .max_by(|a, b| a.1.total_cmp(&b.1))
@@ -309,38 +251,13 @@ mod tests {
     }
 
     #[test]
-    fn rivals_say_another_light_that_could_be() {
-        let light = LightWords {
+    fn quarter_turns_change_the_azimuth_alone() {
+        let light = LightDescription {
             azimuth: 1.0,
             elevation: 0.5,
             sun_share: 0.8,
         };
-        let overcast = LightWords {
-            sun_share: 0.0,
-            ..light
-        };
-        let mut stream = NoiseStream::new(1, 2);
-        let mut heights = 0;
-        for _ in 0..500 {
-            let rival = light.rival(&mut stream);
-            let [a, b] = [light, rival].map(|l| Caption::new("ball", Some(&l)));
-            assert_ne!(a, b);
-            assert!((0.2..1.3).contains(&rival.elevation), "{rival:?}");
-            assert!((0.0..=0.95).contains(&rival.sun_share), "{rival:?}");
-            heights += usize::from(rival.elevation != light.elevation);
-            assert!(!overcast.rival(&mut stream).is_overcast());
-        }
-        assert!((50..200).contains(&heights), "{heights}");
-    }
-
-    #[test]
-    fn a_light_from_the_other_sides_is_the_same_light() {
-        let light = LightWords {
-            azimuth: 1.0,
-            elevation: 0.5,
-            sun_share: 0.8,
-        };
-        let around = light.turned();
+        let around = light.quarter_turns();
         let sum = around
             .iter()
             .chain([&light])
@@ -354,23 +271,23 @@ mod tests {
     }
 
     #[test]
-    fn captions_name_the_light() {
-        let light = LightWords {
+    fn captions_describe_the_light() {
+        let light = LightDescription {
             azimuth: PI / 2.0,
             elevation: 0.3,
             sun_share: 0.9,
         };
         let caption = Caption::new("car", Some(&light));
         assert_eq!(
-            caption.spoken(),
+            plain_text(&caption),
             "a photo of a car, sun at three, low, clear"
         );
-        let overcast = LightWords {
+        let overcast = LightDescription {
             sun_share: 0.0,
             ..light
         };
         assert_eq!(
-            Caption::new("car", Some(&overcast)).spoken(),
+            plain_text(&Caption::new("car", Some(&overcast))),
             "a photo of a car, overcast"
         );
     }
@@ -378,7 +295,7 @@ mod tests {
     #[test]
     fn mixtures_are_continuous_around_the_clock() {
         let at = |degrees: f32| {
-            let light = LightWords {
+            let light = LightDescription {
                 azimuth: degrees.to_radians(),
                 elevation: 0.6,
                 sun_share: 0.7,

@@ -1,13 +1,12 @@
-//! Lights of training scenes: a sun over a sky that is graded from horizon
-//! to zenith, and what the ground throws back.
+//! Light of generated scenes: a sun, a sky with a gradient from horizon to zenith, and light that the ground reflects.
 
 use dipir_diffusion::noise::NoiseStream;
+use dipir_prior::caption::LightDescription;
 use glam::Vec3;
 
-use crate::words::LightWords;
+use crate::random::between;
 
-/// Direction to a sun at `azimuth` (from -z towards +x) and `elevation`,
-/// radians; the camera looks along -z.
+/// Direction to a sun at `azimuth`, from -z towards +x, and `elevation`, radians. The camera looks along -z.
 pub fn sun_direction(azimuth: f32, elevation: f32) -> Vec3 {
     let (s, c) = azimuth.sin_cos();
     let (up, out) = elevation.sin_cos();
@@ -20,23 +19,23 @@ pub fn sun_angles(direction: Vec3) -> (f32, f32) {
     (d.x.atan2(-d.z), d.y.clamp(-1.0, 1.0).asin())
 }
 
-/// A sun's place and size.
+/// Direction and size of a sun.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sun {
-    /// From the camera's forward direction towards its right, radians.
+    /// Angle on the ground from the camera's forward direction, positive to the right, radians.
     pub azimuth: f32,
-    /// Above the ground, radians.
+    /// Angle above the horizon, radians.
     pub elevation: f32,
-    /// Its radiance falls as exp(sharpness (cos - 1)).
+    /// Its radiance is proportional to exp(sharpness (cos - 1)).
     pub sharpness: f32,
 }
 
-/// The light on a scene, linear in every colour.
+/// The light of a scene, linear RGB.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Light {
-    /// Which of the scene's suns.
+pub struct SunSkyLight {
+    /// Index of its sun among those of the scene.
     pub sun: usize,
-    /// Irradiance of the sun on a surface that faces it.
+    /// Irradiance by the sun of a surface that faces it.
     pub sun_color: Vec3,
     /// Radiance at the horizon.
     pub horizon: Vec3,
@@ -44,17 +43,16 @@ pub struct Light {
     pub zenith: Vec3,
     /// Radiance from below.
     pub bounce: Vec3,
-    /// Share of the sun in the irradiance of the ground.
+    /// The sun's share of the irradiance of the ground.
     pub share: f32,
 }
 
-/// Albedo of the ground in the light that comes from below.
+/// Albedo of the ground that reflects light from below.
 const BOUNCE_ALBEDO: f32 = 0.35;
 
-impl Light {
-    /// A light whose irradiance on the ground is `total`, of which `share`
-    /// comes from a sun at `elevation`; `warm` and `blue` in [0, 1] tint sun
-    /// and sky, `graded` is the horizon's radiance over the mean.
+impl SunSkyLight {
+    /// The light that irradiates the ground by `total`, `share` of it from a sun at `elevation`. `warm` and `blue`, from 0
+    /// to 1, tint sun and sky; `graded` is the horizon's radiance over the mean.
     pub fn new(
         sun: usize,
         elevation: f32,
@@ -81,9 +79,9 @@ impl Light {
         }
     }
 
-    /// A light with one of `suns`, one in ten without sun.
+    /// A random light with one of `suns`. One in ten has no sun.
     pub fn draw(suns: &[Sun], stream: &mut NoiseStream) -> Self {
-        let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+        let mut range = |low, high| between(stream, low, high);
         let sun = (range(0.0, suns.len() as f64) as usize).min(suns.len().saturating_sub(1));
         let overcast = range(0.0, 1.0) < 0.1;
         let share = if overcast { 0.0 } else { range(0.45, 0.93) };
@@ -93,11 +91,11 @@ impl Light {
         Self::new(sun, elevation, (total, share), tints, range(0.6, 1.5))
     }
 
-    /// A light as photographs have it: beside those of [`draw`](Self::draw), one in six without a sun to be seen, one in
-    /// six hazy, low suns redder, and the camera's white balance off by up to a fifth.
-    pub fn draw_any(suns: &[Sun], stream: &mut NoiseStream) -> Self {
+    /// A random light as photographs have it. Beyond [`draw`](Self::draw), one in six has no visible sun, one in six is
+    /// hazy, low suns are redder, and the white balance is off by up to a fifth.
+    pub fn draw_varied(suns: &[Sun], stream: &mut NoiseStream) -> Self {
         let drawn = Self::draw(suns, stream);
-        let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+        let mut range = |low, high| between(stream, low, high);
         let balance = Vec3::new(range(-0.2, 0.2), 0.0, range(-0.2, 0.2)).exp();
         let elevation = suns[drawn.sun].elevation;
         let low = ((30f32.to_radians() - elevation) / 25f32.to_radians()).clamp(0.0, 1.0);
@@ -111,7 +109,7 @@ impl Light {
         Self::new(drawn.sun, elevation, (total, share), tints, range(0.5, 1.5)).scaled(balance)
     }
 
-    /// The same light with its sun at another of `suns`: tints, sky and irradiance of the ground stay.
+    /// The same light with another of `suns`. Tints, sky and irradiance of the ground stay.
     pub fn turned_to(&self, sun: usize, suns: &[Sun]) -> Self {
         let height = |sun: usize| suns[sun].elevation.sin().max(0.1);
         Self {
@@ -132,7 +130,7 @@ impl Light {
         std::f32::consts::PI * (self.horizon / 3.0 + self.zenith * (2.0 / 3.0))
     }
 
-    /// The same light, each colour by its factor as bright.
+    /// The same light with every colour scaled by its factor.
     pub fn scaled(&self, factors: Vec3) -> Self {
         Self {
             sun_color: self.sun_color * factors,
@@ -143,10 +141,10 @@ impl Light {
         }
     }
 
-    /// What a caption says about it.
-    pub fn words(&self, suns: &[Sun]) -> LightWords {
+    /// Its description for a caption.
+    pub fn describe(&self, suns: &[Sun]) -> LightDescription {
         let sun = suns[self.sun];
-        LightWords {
+        LightDescription {
             azimuth: sun.azimuth,
             elevation: sun.elevation,
             sun_share: self.share,
@@ -154,18 +152,18 @@ impl Light {
     }
 }
 
-/// Lowest and highest of most scenes' suns, degrees.
+/// Lowest and highest sun of all scenes but courtyards, degrees.
 pub const SUN_HEIGHTS: [f32; 2] = [13.0, 73.0];
 
-/// `count` suns spread around the sky, from the lowest to the highest of `heights`, degrees.
+/// `count` suns, spread evenly over azimuths and over elevations in `heights`, degrees.
 pub fn draw_suns(count: usize, heights: [f32; 2], stream: &mut NoiseStream) -> Vec<Sun> {
-    let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+    let mut range = |low, high| between(stream, low, high);
     let start = range(0.0, 1.0);
     let turn = range(0.0, 1.0);
     (0..count)
         .map(|k| {
             let at = (k as f32 + start + range(-0.4, 0.4)) / count as f32;
-            // A golden-ratio sequence spreads the heights.
+            // The golden-ratio sequence spreads elevations evenly.
             let height = (turn + k as f32 * 0.618_034).fract();
             Sun {
                 azimuth: at * std::f32::consts::TAU,
@@ -186,13 +184,13 @@ mod tests {
             let (a, e) = sun_angles(sun_direction(azimuth, elevation));
             assert!((a - azimuth).abs() < 1e-5 && (e - elevation).abs() < 1e-5);
         }
-        // Three o'clock is to the camera's right.
+        // Three o'clock is on the camera's right.
         assert!(sun_direction(std::f32::consts::FRAC_PI_2, 0.0).x > 0.99);
     }
 
     #[test]
-    fn irradiance_of_the_ground_is_what_was_asked_for() {
-        let light = Light::new(0, 0.6, (2.0, 0.7), (0.3, 0.4), 1.1);
+    fn the_irradiance_of_the_ground_is_as_requested() {
+        let light = SunSkyLight::new(0, 0.6, (2.0, 0.7), (0.3, 0.4), 1.1);
         let suns = [Sun {
             azimuth: 0.0,
             elevation: 0.6,
@@ -207,10 +205,10 @@ mod tests {
     }
 
     #[test]
-    fn a_sun_that_moves_leaves_the_ground_as_bright() {
+    fn a_sun_that_moves_keeps_the_irradiance_of_the_ground() {
         let suns = draw_suns(8, SUN_HEIGHTS, &mut NoiseStream::new(1, 1));
-        let light = Light::new(2, suns[2].elevation, (2.0, 0.7), (0.3, 0.4), 1.1);
-        let expected = Light::new(5, suns[5].elevation, (2.0, 0.7), (0.3, 0.4), 1.1);
+        let light = SunSkyLight::new(2, suns[2].elevation, (2.0, 0.7), (0.3, 0.4), 1.1);
+        let expected = SunSkyLight::new(5, suns[5].elevation, (2.0, 0.7), (0.3, 0.4), 1.1);
         let moved = light.turned_to(5, &suns);
         assert_eq!((moved.sun, moved.share), (5, 0.7));
         assert!((moved.sun_color - expected.sun_color).length() < 1e-5);
@@ -218,18 +216,18 @@ mod tests {
     }
 
     #[test]
-    fn photographs_have_hazy_skies_and_red_low_suns() {
+    fn varied_lights_have_hazy_skies_and_red_low_suns() {
         let suns = draw_suns(8, [5.0, 75.0], &mut NoiseStream::new(2, 1));
         let (mut overcast, mut hazy) = (0, 0);
         let mut warmth = [(0.0, 0); 2];
         for index in 0..1200 {
-            let light = Light::draw_any(&suns, &mut NoiseStream::new(3, index));
+            let light = SunSkyLight::draw_varied(&suns, &mut NoiseStream::new(3, index));
             let ground = light.irradiance(&suns);
             assert!(
                 ground.is_finite() && ground.min_element() > 0.0,
                 "{light:?}"
             );
-            overcast += usize::from(light.words(&suns).is_overcast());
+            overcast += usize::from(light.describe(&suns).is_overcast());
             hazy += usize::from((0.15..0.45).contains(&light.share));
             if light.share > 0.45 {
                 let is_high = suns[light.sun].elevation > 0.6;

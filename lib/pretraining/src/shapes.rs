@@ -1,11 +1,12 @@
-//! Procedural solids as triangle meshes. All stand on y = 0, centred on the
-//! y axis, about one metre across.
+//! Procedural solids as triangle meshes, about one metre wide, centred on the y axis and resting on y = 0.
 
 use dipir_diffusion::noise::NoiseStream;
 use dipir_scene::mesh::TriangleMesh;
 use glam::Vec3;
 
-/// A kind of object, and the word for it.
+use crate::random::between;
+
+/// A kind of solid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
     /// A sphere.
@@ -16,26 +17,26 @@ pub enum Shape {
     Cylinder,
     /// An upright cone.
     Cone,
-    /// A torus that lies on the ground.
+    /// A torus on the ground.
     Ring,
     /// Body, cabin and four wheels.
     Car,
     /// A slab on four legs.
     Table,
-    /// Flat, slanted faces around: a stump of a pyramid on 3, 5 or 6 sides.
+    /// A truncated pyramid with 3, 5 or 6 sides.
     Stump,
-    /// Two slanted faces that meet in a ridge, on low walls.
+    /// A gabled roof on low walls.
     Roof,
-    /// Irregular flat faces.
+    /// An irregular solid with flat faces.
     Rock,
-    /// Held out from training: a cylinder with round ends.
+    /// A cylinder with round ends; training never shows it.
     Capsule,
-    /// Held out from training: a pyramid on a square.
+    /// A pyramid on a square; training never shows it.
     Pyramid,
 }
 
 impl Shape {
-    /// Those that stand around in every scene; the model is trained on them.
+    /// Shapes that all kinds of scenes have.
     pub const COMMON: [Self; 7] = [
         Self::Ball,
         Self::Box,
@@ -45,13 +46,13 @@ impl Shape {
         Self::Car,
         Self::Table,
     ];
-    /// Those with slanted flat faces, which tell of the sun's direction by their shading alone where they cast no shadow;
-    /// the model is trained on them, too.
+    /// Shapes of training with slanted flat faces. Under a high sun they cast little shadow, and only their shading shows
+    /// the light's direction.
     pub const FACETED: [Self; 3] = [Self::Stump, Self::Roof, Self::Rock];
-    /// Those that only evaluation shows.
+    /// Shapes of evaluation, which training never shows.
     pub const HELD_OUT: [Self; 2] = [Self::Capsule, Self::Pyramid];
 
-    /// The word in captions; kinds for which there is none are just objects.
+    /// Its word in captions; "object" if the vocabulary has none.
     pub fn word(self) -> &'static str {
         match self {
             Self::Ball => "ball",
@@ -157,8 +158,8 @@ fn arc(r: f32, center: Vec3, steps: usize) -> Vec<(f32, f32)> {
         .collect()
 }
 
-/// A profile of (radius, height) turned around the y axis. A doubled point
-/// makes an edge; elsewhere, from 8 sides on, normals are smooth.
+/// A solid of revolution of a profile of (radius, height) around the y axis. A repeated point makes a sharp edge. Other
+/// edges are smooth from 8 sides on.
 fn revolve(profile: &[(f32, f32)], sides: usize) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     for pair in profile.windows(2) {
@@ -166,7 +167,7 @@ fn revolve(profile: &[(f32, f32)], sides: usize) -> TriangleMesh {
         if (r0, y0) == (r1, y1) {
             continue;
         }
-        // The middle of a flat side is nearer to the axis than its edges.
+        // The middle of a flat side is closer to the axis than its edges.
         let flatness = match sides {
             8.. => 1.0,
             _ => (std::f32::consts::PI / sides as f32).cos(),
@@ -190,7 +191,7 @@ fn revolve(profile: &[(f32, f32)], sides: usize) -> TriangleMesh {
     mesh
 }
 
-/// Two triangles, or the one that is left where an end of the quad is a point.
+/// Two triangles, or one where an end of the quad is a point.
 fn quad(mesh: &mut TriangleMesh, p: [Vec3; 4], n: [Vec3; 4], lower: bool, upper: bool) {
     let first = mesh.positions.len() as u32;
     mesh.positions.extend(p);
@@ -205,7 +206,7 @@ fn quad(mesh: &mut TriangleMesh, p: [Vec3; 4], n: [Vec3; 4], lower: bool, upper:
     }
 }
 
-/// A flat triangle of a solid around `center`, facing outwards; none if it has no area.
+/// A flat triangle that faces away from `center`; none if it has no area.
 fn facet(mesh: &mut TriangleMesh, [a, b, c]: [Vec3; 3], center: Vec3) {
     let Some(normal) = (b - a).cross(c - a).try_normalize() else {
         return;
@@ -222,7 +223,7 @@ fn facet(mesh: &mut TriangleMesh, [a, b, c]: [Vec3; 3], center: Vec3) {
     mesh.materials.push(0);
 }
 
-/// A house without windows: half its width and depth, walls and roof by their heights.
+/// A gabled house of half width, roof height, half depth and wall height.
 fn roof(width: f32, rise: f32, depth: f32, walls: f32) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     let profile = [
@@ -248,11 +249,11 @@ fn roof(width: f32, rise: f32, depth: f32, walls: f32) -> TriangleMesh {
     mesh
 }
 
-/// Rings of five to eight corners that stand out by chance, up to a tip.
+/// Two rings of five to eight random corners, and a tip.
 fn rock(p: [f32; 3]) -> TriangleMesh {
     let key = p.map(f32::to_bits);
     let mut stream = NoiseStream::new(u64::from(key[0]) << 32 | u64::from(key[1]), key[2].into());
-    let mut range = |low: f64, high: f64| (low + (high - low) * stream.uniform()) as f32;
+    let mut range = |low, high| between(&mut stream, low, high);
     let sides = range(5.0, 9.0) as usize;
     let height = range(0.4, 1.1);
     let (size, waist, shoulder) = (range(0.38, 0.55), range(0.35, 0.7), range(0.7, 1.1));
@@ -281,7 +282,7 @@ fn rock(p: [f32; 3]) -> TriangleMesh {
     mesh
 }
 
-/// A box with flat faces.
+/// A box around `center` with half sides `half`.
 pub(crate) fn cuboid(center: Vec3, half: Vec3) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     for axis in 0..3 {
@@ -333,7 +334,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn solids_stand_on_the_ground_and_face_outwards() {
+    fn solids_rest_on_the_ground_and_face_outwards() {
         let trained = Shape::COMMON.into_iter().chain(Shape::FACETED);
         for shape in trained.chain(Shape::HELD_OUT) {
             for p in [[0.0; 3], [0.5; 3], [1.0; 3]] {
@@ -358,7 +359,7 @@ mod tests {
                     let n = mesh.scaled_normal(t).as_vec3().normalize_or_zero();
                     for &i in triangle {
                         let shading = mesh.normals[i as usize];
-                        // Flat faces are flat; round ones have the normal of their corners.
+                        // Flat faces have one normal, round ones those of their corners.
                         let flat = Shape::FACETED.contains(&shape) || shape == Shape::Pyramid;
                         let least = if flat { 0.999 } else { 0.5 };
                         assert!(n.dot(shading) > least, "{shape:?}: {n} against {shading}");

@@ -1,33 +1,33 @@
-//! What stands behind the objects of a scene: rows of houses, trees, hedges and lamp posts, as crops of
-//! photographs of real places show it.
+//! Streets behind the objects of a scene: rows of houses, trees, hedges and lamp posts.
 use dipir_scene::mesh::TriangleMesh;
 use glam::{DMat4, DQuat, DVec3, Vec3};
 
+use crate::random::Draw;
+use crate::scene::Paint;
 use crate::shapes::{Shape, cuboid};
-use crate::studio::{Draw, Paint};
 
-/// A mesh whose triangles index paints.
+/// Everything of a scene that is no placed object: a mesh and its materials.
 #[derive(Debug, Default)]
 pub struct Backdrop {
-    /// In the coordinates of the scene.
+    /// In scene coordinates; materials of triangles index `paints`.
     pub mesh: TriangleMesh,
     /// Materials.
     pub paints: Vec<Paint>,
 }
 
 impl Backdrop {
-    /// Draws what stands behind the origin, from `near` metres on towards -z, in a view `width` metres wide there.
-    pub fn draw(draw: &mut Draw<'_>, near: f32, width: f32) -> Self {
+    /// A street that begins `near` metres behind the origin, towards -z. The view is `width` metres wide there.
+    pub fn street(draw: &mut Draw<'_>, near: f32, width: f32) -> Self {
         let mut backdrop = Self::default();
         if draw.chance(0.75) {
             let depth = near + draw.range(0.5, 9.0);
             backdrop.houses(draw, depth);
         }
         for _ in 0..draw.below(3) {
-            let at = draw.somewhere(near, width);
+            let at = draw.point_behind(near, width);
             backdrop.tree(draw, at);
         }
-        // One out of sight, whose shadow may be in it.
+        // A tree outside of the picture, whose shadow may be visible.
         if draw.chance(0.3) {
             let side = width * draw.range(0.6, 1.2);
             let side = if draw.chance(0.5) { side } else { -side };
@@ -35,17 +35,17 @@ impl Backdrop {
             backdrop.tree(draw, at);
         }
         if draw.chance(0.4) {
-            let at = draw.somewhere(near, width);
+            let at = draw.point_behind(near, width);
             backdrop.hedge(draw, at);
         }
         if draw.chance(0.3) {
-            let at = draw.somewhere(near, width);
+            let at = draw.point_behind(near, width);
             backdrop.lamp(draw, at);
         }
         backdrop
     }
 
-    /// The number of a paint.
+    /// Adds a paint and returns its index.
     pub(crate) fn paint(&mut self, paint: Paint) -> u32 {
         self.paints.push(paint);
         self.paints.len() as u32 - 1
@@ -58,9 +58,9 @@ impl Backdrop {
         let dark = self.paint(Paint {
             color: Vec3::splat(draw.range(0.01, 0.06)),
             roughness: draw.range(0.2, 0.6),
-            ..draw.dull()
+            ..draw.masonry()
         });
-        let trim = draw.dull();
+        let trim = draw.masonry();
         let trim = self.paint(trim);
         let mut row = TriangleMesh::default();
         let mut x = -draw.range(6.0, 12.0);
@@ -68,7 +68,7 @@ impl Backdrop {
             let (width, floors) = (draw.range(4.0, 9.0), 1 + draw.below(4));
             let (storey, bay) = (draw.range(2.2, 3.2), draw.range(1.4, 3.0));
             let height = storey * floors as f32;
-            let wall = draw.dull();
+            let wall = draw.masonry();
             let wall = self.paint(wall);
             let middle = Vec3::new(x + 0.5 * width, 0.5 * height, -2.0);
             let half = Vec3::new(0.5 * width, 0.5 * height, 2.0);
@@ -105,7 +105,7 @@ impl Backdrop {
         let (height, thick) = (draw.range(1.0, 3.5), draw.range(0.04, 0.16));
         let bark = Paint {
             color: Vec3::new(0.16, 0.11, 0.07) * draw.range(0.4, 1.6),
-            ..draw.dull()
+            ..draw.masonry()
         };
         let bark = self.paint(bark);
         let trunk = cuboid(
@@ -133,7 +133,7 @@ impl Backdrop {
             draw.range(0.12, 0.5),
             draw.range(0.2, 0.4),
         );
-        let stone = draw.dull();
+        let stone = draw.masonry();
         let stone = self.paint(stone);
         self.mesh.append(cuboid(at + Vec3::Y * half.y, half), stone);
         if draw.chance(0.6) {
@@ -150,12 +150,12 @@ impl Backdrop {
 
     fn lamp(&mut self, draw: &mut Draw<'_>, at: Vec3) {
         let (height, thick) = (draw.range(1.5, 4.0), draw.range(0.02, 0.06));
-        let post = draw.dull();
+        let post = draw.masonry();
         let post = self.paint(post);
         let middle = at + Vec3::Y * (0.5 * height);
         self.mesh
             .append(cuboid(middle, Vec3::new(thick, 0.5 * height, thick)), post);
-        let globe = draw.dull();
+        let globe = draw.masonry();
         let globe = self.paint(globe);
         let mut ball = Shape::Ball.mesh([0.5; 3]);
         ball.transform(&DMat4::from_scale_rotation_translation(
@@ -168,14 +168,14 @@ impl Backdrop {
 }
 
 impl Draw<'_> {
-    /// A place on the ground behind `near` metres.
-    fn somewhere(&mut self, near: f32, width: f32) -> Vec3 {
+    /// A random point on the ground, more than `near` metres behind the origin.
+    fn point_behind(&mut self, near: f32, width: f32) -> Vec3 {
         let depth = near + self.range(0.3, 6.0);
         Vec3::new(self.range(-0.7, 0.7) * width, 0.0, -depth)
     }
 
-    /// Plaster, stone or brick.
-    pub(crate) fn dull(&mut self) -> Paint {
+    /// Colour of plaster, stone or brick.
+    pub(crate) fn masonry(&mut self) -> Paint {
         let tint = Vec3::new(
             self.range(0.8, 1.1),
             self.range(0.65, 1.0),
@@ -189,6 +189,7 @@ impl Draw<'_> {
         }
     }
 
+    /// Colour of leaves.
     pub(crate) fn leaves(&mut self) -> Paint {
         let color = Vec3::new(
             self.range(0.03, 0.2),
@@ -197,11 +198,11 @@ impl Draw<'_> {
         );
         Paint {
             color,
-            ..self.dull()
+            ..self.masonry()
         }
     }
 
-    /// Leaves about `size` metres across around `center`.
+    /// A clump of leaves, about `size` metres wide, around `center`.
     pub(crate) fn clump(&mut self, center: Vec3, size: f32) -> TriangleMesh {
         let p = [0; 3].map(|_| self.range(0.0, 1.0));
         let mut mesh = Shape::Rock.mesh(p);
@@ -221,11 +222,11 @@ mod tests {
     use dipir_diffusion::noise::NoiseStream;
 
     #[test]
-    fn nothing_stands_where_the_objects_are_and_everything_has_a_paint() {
+    fn streets_leave_the_objects_free_and_every_triangle_has_a_paint() {
         let (mut drawn, mut houses) = (0, 0);
         for index in 0..200 {
             let mut stream = NoiseStream::new(7, index);
-            let backdrop = Backdrop::draw(&mut Draw::new(&mut stream), 1.6, 3.5);
+            let backdrop = Backdrop::street(&mut Draw::new(&mut stream), 1.6, 3.5);
             let mesh = &backdrop.mesh;
             assert!(
                 mesh.materials
@@ -234,7 +235,7 @@ mod tests {
             );
             assert_eq!(mesh.materials.len(), mesh.indices.len());
             for p in &mesh.positions {
-                // Leaves may hang over them.
+                // Leaves may be above the objects.
                 let away = p.x.hypot(p.z);
                 assert!(p.is_finite() && (away > 1.2 || p.y > 0.4), "{index}: {p}");
             }

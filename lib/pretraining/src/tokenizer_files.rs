@@ -1,5 +1,5 @@
-//! A tokenizer of CLIP's kind for a small vocabulary: every listed word is
-//! one token, anything else falls into bytes.
+//! A tokenizer like that of CLIP for a small vocabulary: every listed word is one token, other words are split into
+//! bytes.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -29,7 +29,7 @@ fn byte_characters() -> Vec<char> {
         .collect()
 }
 
-/// Merges under which each of `words` becomes one token.
+/// Merges that make each of `words` one token.
 fn merges_for(words: &[&str], characters: &[char]) -> Vec<(String, String)> {
     let mut merges: Vec<(String, String)> = vec![];
     let mut ranks: HashMap<(String, String), usize> = HashMap::new();
@@ -58,7 +58,7 @@ fn merges_for(words: &[&str], characters: &[char]) -> Vec<(String, String)> {
     merges
 }
 
-/// Writes the folder `tokenizer/` for `words` and sequences of `length`.
+/// Writes the folder `tokenizer/` for `words` and sequences of `length` tokens, and returns the vocabulary's size.
 pub fn write(folder: &Path, words: &[&str], length: usize) -> Result<usize> {
     let characters = byte_characters();
     let merges = merges_for(words, &characters);
@@ -99,7 +99,7 @@ mod tests {
     use dipir_diffusion::tokenizer::Tokenizer;
 
     use super::*;
-    use crate::words::vocabulary;
+    use dipir_prior::caption::vocabulary;
 
     #[test]
     fn every_word_of_the_vocabulary_is_one_token() {

@@ -1,70 +1,74 @@
-//! Records of many scenes on disk: files of [`BLOCK`] scenes, written once
-//! and memory-mapped. A run that was stopped goes on at the first missing
-//! file.
+//! Recorded scenes on disk, in memory-mapped files of [`BLOCK`] scenes. Every file is written once. An interrupted run
+//! continues at the first missing file.
 
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use candle_core::{DType, Device, Tensor};
+use dipir_prior::caption::COLORS;
 use half::f16;
 use memmap2::Mmap;
 use rayon::prelude::*;
 
+use crate::direct_light::{DirectLightImages, PLANES};
 use crate::error::{Error, Result, io};
-use crate::lights::Sun;
-use crate::record::{PLANES, Record};
-use crate::studio::{Brief, Kinds, Outlook, SUNS, Setting, Stage, View};
+use crate::lighting::Sun;
+use crate::scene::{Framing, GeneratedScene, ObjectSet, SUNS, SceneKind, Setting};
+use crate::square_camera::SquareCamera;
 
 /// Scenes in a file.
 pub const BLOCK: usize = 64;
-/// Pixels on a side of a recorded picture; examples are crops of it.
+/// Pixels on a side of a recorded picture. Examples are crops of it.
 pub const RECORD_SIZE: usize = 40;
-/// Numbers about a scene beside its planes: words for class and colour, pitch and reach of the camera, its suns.
+/// Numbers of a scene beside its planes: class and colour, pitch and field of view of the camera, suns.
 const FACTS: usize = 4 + 3 * SUNS;
 
-/// What the scenes of a dataset show.
+/// Which settings the scenes of a dataset have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Places {
-    /// An object in the middle, every second time in a street: what the diffusion model is trained on.
-    Objects,
-    /// Anything, as crops of photographs show it; every second time a yard: what the light encoder is trained on.
-    Anywhere,
+pub enum SceneMix {
+    /// Half open ground, half streets. The diffusion model is trained on them.
+    OpenAndStreets,
+    /// Half courtyards, a quarter each open ground and streets. The light encoder is trained on them.
+    WithCourtyards,
 }
 
-impl Places {
+impl SceneMix {
     fn setting(self, index: usize) -> Setting {
         match self {
-            Self::Objects => [Setting::Open, Setting::Street][index % 2],
-            Self::Anywhere => {
-                [Setting::Open, Setting::Yard, Setting::Street, Setting::Yard][index % 4]
-            }
+            Self::OpenAndStreets => [Setting::Open, Setting::Street][index % 2],
+            Self::WithCourtyards => [
+                Setting::Open,
+                Setting::Courtyard,
+                Setting::Street,
+                Setting::Courtyard,
+            ][index % 4],
         }
     }
 
-    /// What names of files begin with.
+    /// Prefix of the names of files.
     fn prefix(self) -> &'static str {
         match self {
-            Self::Objects => "scenes",
-            Self::Anywhere => "places",
+            Self::OpenAndStreets => "scenes",
+            Self::WithCourtyards => "places",
         }
     }
 }
 
-/// Which scenes.
+/// Which scenes a dataset has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DatasetSettings {
     /// Key of all random numbers.
     pub seed: u64,
-    /// How many scenes; rounded up to whole files.
+    /// Number of scenes, rounded up to whole files.
     pub scenes: usize,
-    /// What they show.
-    pub places: Places,
-    /// Which main objects.
-    pub kinds: Kinds,
+    /// Their settings.
+    pub mix: SceneMix,
+    /// Their main objects.
+    pub objects: ObjectSet,
 }
 
-/// The scenes of a folder.
+/// The recorded scenes of a folder.
 #[derive(Debug)]
 pub struct Dataset {
     blocks: Vec<Block>,
@@ -79,26 +83,26 @@ struct Block {
 
 /// One recorded scene.
 #[derive(Debug, Clone)]
-pub struct SceneView<'a> {
+pub struct RecordedScene<'a> {
     /// [PLANES, RECORD_SIZE, RECORD_SIZE]
     pub planes: &'a [f16],
-    /// The word for the main object.
+    /// Word for the main object.
     pub class: &'static str,
-    /// The word for its colour.
+    /// Word for its colour.
     pub color: &'static str,
-    /// How the camera looks at it.
-    pub outlook: Outlook,
-    /// Its suns.
+    /// The camera.
+    pub camera: SquareCamera,
+    /// Suns under which it is recorded.
     pub suns: Vec<Sun>,
 }
 
-fn block_path(folder: &Path, places: Places, block: usize) -> PathBuf {
-    folder.join(format!("{}-{block:05}.safetensors", places.prefix()))
+fn block_path(folder: &Path, mix: SceneMix, block: usize) -> PathBuf {
+    folder.join(format!("{}-{block:05}.safetensors", mix.prefix()))
 }
 
 impl Dataset {
-    /// Traces what is missing of `folder`, then opens it. `progress` is told
-    /// the number of finished scenes and may stop the work.
+    /// Traces the scenes that are missing in `folder`, then opens it. `progress` is called with the number of finished
+    /// scenes and may stop the work; then the result is `None`.
     pub fn make(
         folder: &Path,
         settings: &DatasetSettings,
@@ -107,7 +111,7 @@ impl Dataset {
         std::fs::create_dir_all(folder).map_err(io("create", folder))?;
         let blocks = settings.scenes.div_ceil(BLOCK);
         for block in 0..blocks {
-            let path = block_path(folder, settings.places, block);
+            let path = block_path(folder, settings.mix, block);
             if !path.is_file() {
                 write_block(&path, settings, block)?;
             }
@@ -115,13 +119,13 @@ impl Dataset {
                 return Ok(None);
             }
         }
-        Self::open(folder, settings.places, blocks).map(Some)
+        Self::open(folder, settings.mix, blocks).map(Some)
     }
 
     /// The first `blocks` files of `folder`.
-    pub fn open(folder: &Path, places: Places, blocks: usize) -> Result<Self> {
+    pub fn open(folder: &Path, mix: SceneMix, blocks: usize) -> Result<Self> {
         let blocks = (0..blocks)
-            .map(|b| Block::open(&block_path(folder, places, b)))
+            .map(|b| Block::open(&block_path(folder, mix, b)))
             .collect::<Result<_>>()?;
         Ok(Self { blocks })
     }
@@ -137,7 +141,7 @@ impl Dataset {
     }
 
     /// Scene number `index`.
-    pub fn scene(&self, index: usize) -> SceneView<'_> {
+    pub fn scene(&self, index: usize) -> RecordedScene<'_> {
         self.blocks[index / BLOCK].scene(index % BLOCK)
     }
 }
@@ -148,8 +152,7 @@ const PLANE_BYTES: usize = PLANES * RECORD_SIZE * RECORD_SIZE * 2;
 impl Block {
     fn open(path: &Path) -> Result<Self> {
         let file = std::fs::File::open(path).map_err(io("read", path))?;
-        // SAFETY: the files are written whole and renamed into place, and
-        // nothing in this program changes them afterwards.
+        // SAFETY: files are written completely, then renamed into place, and this program never changes them afterwards.
         let map = unsafe { Mmap::map(&file) }.map_err(io("map", path))?;
         let fail = |message: &str| Error::Content {
             path: path.to_owned(),
@@ -163,7 +166,7 @@ impl Block {
         if weights.shape("planes") != Some(&shape) || facts.dims() != [BLOCK, FACTS] {
             return Err(fail("tensors have other shapes than this version writes"));
         }
-        // "planes" sorts last and fills the end of the file.
+        // Tensors are sorted by name, so "planes" fills the end of the file.
         let planes = map
             .len()
             .checked_sub(BLOCK * PLANE_BYTES)
@@ -176,19 +179,19 @@ impl Block {
         })
     }
 
-    fn scene(&self, index: usize) -> SceneView<'_> {
+    fn scene(&self, index: usize) -> RecordedScene<'_> {
         let bytes = &self.map[self.planes + index * PLANE_BYTES..][..PLANE_BYTES];
         let facts = &self.facts[index * FACTS..][..FACTS];
         let word = |words: &'static [&'static str], at: f32| {
             words.get(at as usize).copied().unwrap_or("object")
         };
-        SceneView {
+        RecordedScene {
             planes: bytemuck::cast_slice(bytes),
             class: word(&CLASSES, facts[0]),
-            color: word(&crate::words::COLORS, facts[1]),
-            outlook: Outlook {
+            color: word(&COLORS, facts[1]),
+            camera: SquareCamera {
                 pitch: facts[2],
-                reach: facts[3],
+                tan_half_fov: facts[3],
             },
             suns: facts[4..]
                 .chunks_exact(3)
@@ -202,7 +205,7 @@ impl Block {
     }
 }
 
-/// Words for kinds of objects, by the number that files hold.
+/// Words for classes, by the number in files.
 const CLASSES: [&str; 8] = [
     "object", "ball", "box", "cylinder", "cone", "ring", "car", "table",
 ];
@@ -212,30 +215,29 @@ fn write_block(path: &Path, settings: &DatasetSettings, block: usize) -> Result<
         .into_par_iter()
         .map(|i| {
             let index = (block * BLOCK + i) as u64;
-            let stage = Stage::draw(
+            let scene = GeneratedScene::draw(
                 settings.seed,
                 index,
                 RECORD_SIZE as u32,
-                Brief {
-                    kinds: settings.kinds,
-                    // Photographs of real places show more than open ground.
-                    setting: settings.places.setting(i),
-                    view: View::Close,
+                SceneKind {
+                    objects: settings.objects,
+                    setting: settings.mix.setting(i),
+                    framing: Framing::Close,
                 },
             );
-            let record = Record::trace(&stage, settings.seed, index);
-            let planes = record.planes.iter().map(|&v| f16::from_f32(v)).collect();
+            let images = DirectLightImages::trace(&scene, settings.seed, index);
+            let planes = images.planes.iter().map(|&v| f16::from_f32(v)).collect();
             let position = |words: &[&str], word: &str| {
                 words.iter().position(|w| *w == word).unwrap_or(0) as f32
             };
-            let outlook = stage.outlook();
+            let camera = scene.square_camera();
             let mut facts = vec![
-                position(&CLASSES, stage.shape.word()),
-                position(&crate::words::COLORS, stage.main_paint.word),
-                outlook.pitch,
-                outlook.reach,
+                position(&CLASSES, scene.shape.word()),
+                position(&COLORS, scene.main_paint.word),
+                camera.pitch,
+                camera.tan_half_fov,
             ];
-            for sun in &stage.suns {
+            for sun in &scene.suns {
                 facts.extend([sun.azimuth, sun.elevation, sun.sharpness]);
             }
             (planes, facts)

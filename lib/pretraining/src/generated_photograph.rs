@@ -1,5 +1,5 @@
-//! Photographs of generated places whose light is known: several solids on open ground under a sun and a
-//! sky, and one more, of a kind that training never showed, that is to be put among them.
+//! Photographs of generated scenes whose light is known. The main object, of a shape that training never shows, is to be
+//! inserted.
 use std::f32::consts::{PI, TAU};
 
 use dipir_diffusion::noise::NoiseStream;
@@ -9,33 +9,33 @@ use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::rasterize::rasterize;
 use glam::Vec3;
 
-use crate::examples::Tone;
-use crate::lights::{Light, Sun, sun_direction};
-use crate::record::{Layer, Record, first_plane, weights};
-use crate::studio::{Brief, Kinds, Setting, Stage, View};
+use crate::camera::CameraResponse;
+use crate::direct_light::{DirectLightImages, Layer, first_plane, weights};
+use crate::lighting::{Sun, SunSkyLight, sun_direction};
+use crate::scene::{Framing, GeneratedScene, ObjectSet, SceneKind, Setting};
 
-/// A place, its light, and what a camera sees of it.
+/// A generated scene, its light, and the photograph without the main object.
 #[derive(Debug, Clone)]
-pub struct Place {
-    /// What stands there, and what is to be inserted.
-    pub stage: Stage,
-    /// The true light, of the sun `stage.suns[0]`.
-    pub light: Light,
-    /// The camera's exposure and curve.
-    pub tone: Tone,
-    /// Linear radiance without the inserted solid, row by row, before exposure.
+pub struct GeneratedPhotograph {
+    /// The scene; its main object is to be inserted.
+    pub scene: GeneratedScene,
+    /// The true light. Its sun is `scene.suns[0]`.
+    pub light: SunSkyLight,
+    /// Exposure and tone curve of the camera.
+    pub response: CameraResponse,
+    /// Linear radiance without the main object, row by row, before exposure.
     pub radiance: Vec<Vec3>,
 }
 
-impl Place {
-    /// The place number `index` under `seed`, seen on `size` x `size` pixels.
+impl GeneratedPhotograph {
+    /// The photograph number `index` under `seed`, of `size` x `size` pixels.
     pub fn draw(seed: u64, index: u64, size: u32, setting: Setting) -> Self {
-        let brief = Brief {
-            kinds: Kinds::HeldOut,
+        let kind = SceneKind {
+            objects: ObjectSet::HeldOut,
             setting,
-            view: View::Wide,
+            framing: Framing::Wide,
         };
-        let mut stage = Stage::draw(seed, index, size, brief);
+        let mut scene = GeneratedScene::draw(seed, index, size, kind);
         let mut stream = NoiseStream::new(seed ^ 1, index);
         let mut range = |low: f32, high: f32| low + (high - low) * stream.uniform() as f32;
         let sun = Sun {
@@ -43,39 +43,39 @@ impl Place {
             elevation: range(18.0, 66.0).to_radians(),
             sharpness: range(110.0, 400.0),
         };
-        stage.suns = vec![sun; stage.suns.len()];
+        scene.suns = vec![sun; scene.suns.len()];
         let share = range(0.55, 0.93);
         let total = PI * range(0.5, 1.05);
         let tints = (range(0.0, 0.5), range(0.0, 0.5));
-        let light = Light::new(0, sun.elevation, (total, share), tints, range(0.6, 1.5));
-        let tone = Tone {
+        let light = SunSkyLight::new(0, sun.elevation, (total, share), tints, range(0.6, 1.5));
+        let response = CameraResponse {
             exposure: range(0.75, 1.35),
             shoulder: range(0.0, 1.0),
         };
-        let record = Record::trace(&stage, seed, index);
-        let count = record.size * record.size;
+        let images = DirectLightImages::trace(&scene, seed, index);
+        let count = images.size * images.size;
         let mut radiance = vec![Vec3::ZERO; count];
         for (b, weight) in weights(&light).iter().enumerate() {
             let plane = |c: usize| (first_plane(Layer::Background) + 3 * b + c) * count;
             for (p, pixel) in radiance.iter_mut().enumerate() {
                 *pixel +=
-                    *weight * Vec3::from_array([0, 1, 2].map(|c| record.planes[plane(c) + p]));
+                    *weight * Vec3::from_array([0, 1, 2].map(|c| images.planes[plane(c) + p]));
             }
         }
         Self {
-            stage,
+            scene,
             light,
-            tone,
+            response,
             radiance,
         }
     }
 
     /// The sun.
     pub fn sun(&self) -> Sun {
-        self.stage.suns[0]
+        self.scene.suns[0]
     }
 
-    /// The true light as a map: sun, graded sky, and what the ground throws back. An error if a side is 0.
+    /// The true light as an environment map. An error if a side is 0.
     pub fn map(&self, width: usize, height: usize) -> Result<EnvironmentMap, LightError> {
         let sun = self.sun();
         let lobe = SphericalGaussian {
@@ -104,9 +104,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_map_lights_open_ground_as_the_light_says() {
-        let place = Place::draw(5, 0, 8, Setting::Open);
-        let map = place.map(256, 128).unwrap();
+    fn the_map_has_the_lights_irradiance_of_the_ground() {
+        let photograph = GeneratedPhotograph::draw(5, 0, 8, Setting::Open);
+        let map = photograph.map(256, 128).unwrap();
         let mut irradiance = Vec3::ZERO;
         for row in 0..128 {
             let theta = (row as f32 + 0.5) / 128.0 * PI;
@@ -116,13 +116,13 @@ mod tests {
                 irradiance += map.texels()[row * 256 + column] * y.max(0.0) * solid_angle;
             }
         }
-        let light = &place.light;
-        let sun = light.sun_color * place.sun().elevation.sin();
-        // Over the upper half of the sphere, of (1 - y) y and of y y: pi/3 and 2 pi/3.
+        let light = &photograph.light;
+        let sun = light.sun_color * photograph.sun().elevation.sin();
+        // Integrals over the upper hemisphere: pi/3 of (1 - y) y, 2 pi/3 of y y.
         let sky = light.horizon * (PI / 3.0) + light.zenith * (2.0 * PI / 3.0);
         let error = (irradiance - sun - sky).length() / irradiance.length();
-        // The sun's lobe is rasterised: a part of it lies under texel centres, none under the horizon.
+        // The sun's lobe is rasterised, which moves parts of it by up to half a texel.
         assert!(error < 0.01, "{irradiance} instead of {}", sun + sky);
-        assert!(place.radiance.iter().any(|p| p.max_element() > 0.01));
+        assert!(photograph.radiance.iter().any(|p| p.max_element() > 0.01));
     }
 }

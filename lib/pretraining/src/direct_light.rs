@@ -1,45 +1,48 @@
-//! What light does in a scene, one picture for each sun and each part of the
-//! sky: a scene is traced once and lit as often as one likes.
+//! Images of a generated scene under each light of a small basis, for training: [`DirectLightImages`].
+//!
+//! This is a second tracer beside the recorder of `dipir-render`. It computes direct light only, by Lambert's cosine and a
+//! GGX highlight that is added to it.
 
 use dipir_diffusion::noise::NoiseStream;
 use dipir_scene::bvh::Bvh;
 use dipir_scene::camera::Ray;
 use glam::{Vec2, Vec3};
 
-use crate::lights::{Light, Sun, sun_direction};
-use crate::studio::{Paint, SUNS, Stage};
+use crate::lighting::{Sun, SunSkyLight, sun_direction};
+use crate::scene::{GeneratedScene, Paint, SUNS};
 
-/// Pictures of a layer: one for each sun, then horizon, zenith and bounce.
+/// Pictures of a layer: one for each sun, then horizon, zenith and light from below.
 pub const BASIS: usize = SUNS + 3;
-/// Planes of the shadow: visible shares of each sun, horizon and zenith.
-pub const SHADOW: usize = SUNS + 2;
-/// Planes of a record: three layers of RGB pictures, shadow, coverage.
-pub const PLANES: usize = 3 * 3 * BASIS + SHADOW + 1;
+/// Planes of the shadow: visible share of each sun, of the horizon and of the zenith.
+pub const SHADOW_PLANES: usize = SUNS + 2;
+/// First plane of the shadow, after three layers of RGB pictures.
+pub const FIRST_SHADOW_PLANE: usize = 3 * 3 * BASIS;
+/// All planes: three layers of RGB pictures, shadow, coverage.
+pub const PLANES: usize = FIRST_SHADOW_PLANE + SHADOW_PLANES + 1;
 
-/// Rays towards each sun from each quarter of a pixel.
+/// Rays to each sun from each quarter of a pixel.
 const SUN_RAYS: usize = 2;
-/// Rays towards the sky from each quarter of a pixel.
+/// Rays to the sky from each quarter of a pixel.
 const SKY_RAYS: usize = 10;
-/// The ground is seen to this distance, metres.
+/// Distance at which the ground ends, metres.
 const HORIZON: f32 = 60.0;
-/// Rays start this far above the surface, metres.
+/// Distance from the surface at which rays start, metres.
 const OFFSET: f32 = 8e-3;
 
-/// The layers of a record, in the order of its planes.
+/// The layers, in the order of their planes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Layer {
-    /// The place without the main object.
+    /// The scene without the main object.
     Background,
-    /// The main object alone over black, as it is composited: lit by the
-    /// whole sky, shadowed by itself.
+    /// The main object alone over black, as it is composited: only the object itself shadows it.
     Object,
-    /// Everything as it really is.
+    /// The whole scene.
     Whole,
 }
 
-/// Response planes [PLANES, size, size] of one scene in row-major order.
+/// Planes [PLANES, size, size] of one scene, row by row.
 #[derive(Debug, Clone)]
-pub struct Record {
+pub struct DirectLightImages {
     /// The planes.
     pub planes: Vec<f32>,
     /// Pixels on a side.
@@ -51,8 +54,8 @@ pub fn first_plane(layer: Layer) -> usize {
     layer as usize * 3 * BASIS
 }
 
-/// Weights of the pictures of a layer under `light`, by colour.
-pub fn weights(light: &Light) -> [Vec3; BASIS] {
+/// Weights of a layer's pictures under `light`, RGB.
+pub fn weights(light: &SunSkyLight) -> [Vec3; BASIS] {
     let mut w = [Vec3::ZERO; BASIS];
     w[light.sun] = light.sun_color;
     w[SUNS] = light.horizon;
@@ -61,11 +64,10 @@ pub fn weights(light: &Light) -> [Vec3; BASIS] {
     w
 }
 
-/// Weights of the shadow's planes under `light`: shares of the irradiance of
-/// open ground, by colour.
-pub fn shadow_weights(light: &Light, suns: &[Sun]) -> [Vec3; SHADOW] {
+/// Weights of the shadow's planes under `light`: shares of the irradiance of open ground, RGB.
+pub fn shadow_weights(light: &SunSkyLight, suns: &[Sun]) -> [Vec3; SHADOW_PLANES] {
     let third = std::f32::consts::PI / 3.0;
-    let mut w = [Vec3::ZERO; SHADOW];
+    let mut w = [Vec3::ZERO; SHADOW_PLANES];
     w[light.sun] = light.sun_color * suns[light.sun].elevation.sin();
     w[SUNS] = light.horizon * third;
     w[SUNS + 1] = light.zenith * (2.0 * third);
@@ -73,7 +75,7 @@ pub fn shadow_weights(light: &Light, suns: &[Sun]) -> [Vec3; SHADOW] {
     w.map(|v| v / total.max(Vec3::splat(1e-9)))
 }
 
-/// A point that light arrives at.
+/// A point to be lit.
 struct Point {
     position: Vec3,
     normal: Vec3,
@@ -135,7 +137,7 @@ impl Point {
 }
 
 struct Tracer<'a> {
-    stage: &'a Stage,
+    scene: &'a GeneratedScene,
     main: Bvh,
     others: Bvh,
 }
@@ -145,23 +147,23 @@ impl Tracer<'_> {
         tree.occluded(ray, f32::INFINITY, |_, _, _| true)
     }
 
-    /// The nearest of the main object's points on `ray`.
+    /// The main object's first point on `ray`, and its distance.
     fn main_point(&self, ray: &Ray) -> Option<(f32, Point)> {
         let hit = self.main.closest(ray, f32::INFINITY, |_, _, _| true)?;
-        let normal = shading_normal(&self.stage.main, &hit);
+        let normal = shading_normal(&self.scene.main, &hit);
         let position = ray.origin + ray.direction * hit.t;
-        let point = Point::new(position, normal, -ray.direction, &self.stage.main_paint);
+        let point = Point::new(position, normal, -ray.direction, &self.scene.main_paint);
         Some((hit.t, point))
     }
 
-    /// What lies behind the main object on `ray`, and whether it is ground.
+    /// The first point on `ray` without the main object, its distance, and whether it is ground.
     fn background_point(&self, ray: &Ray) -> Option<(f32, Point, bool)> {
         let hit = self.others.closest(ray, f32::INFINITY, |_, _, _| true);
         let ground = (ray.direction.y < -1e-5).then(|| -ray.origin.y / ray.direction.y);
         let ground = ground.filter(|t| *t < HORIZON && hit.is_none_or(|h| *t < h.t));
         if let Some(t) = ground {
             let position = ray.origin + ray.direction * t;
-            let albedo = self.stage.ground.albedo(Vec2::new(position.x, position.z));
+            let albedo = self.scene.ground.albedo(Vec2::new(position.x, position.z));
             let point = Point {
                 position,
                 normal: Vec3::Y,
@@ -174,9 +176,9 @@ impl Tracer<'_> {
         }
         let hit = hit?;
         let position = ray.origin + ray.direction * hit.t;
-        let material = self.stage.others.materials[hit.triangle as usize];
-        let normal = shading_normal(&self.stage.others, &hit);
-        let paint = &self.stage.paints[material as usize];
+        let material = self.scene.others.materials[hit.triangle as usize];
+        let normal = shading_normal(&self.scene.others, &hit);
+        let paint = &self.scene.paints[material as usize];
         Some((
             hit.t,
             Point::new(position, normal, -ray.direction, paint),
@@ -190,7 +192,7 @@ fn shading_normal(mesh: &dipir_scene::mesh::TriangleMesh, hit: &dipir_scene::bvh
     (a * (1.0 - hit.u - hit.v) + b * hit.u + c * hit.v).normalize_or(Vec3::Y)
 }
 
-/// Directions that one quarter of a pixel looks for light in.
+/// Directions of the shadow rays of one quarter of a pixel.
 struct Directions {
     suns: [[Vec3; SUN_RAYS]; SUNS],
     sky: [Vec3; SKY_RAYS],
@@ -225,11 +227,11 @@ impl Directions {
     }
 }
 
-/// Responses of a point: to each sun, horizon, zenith, bounce.
+/// Radiance of a point under each light of the basis.
 type Response = [Vec3; BASIS];
 
-/// Responses of `point` with both kinds of occlusion: by `own` alone, and by
-/// everything.
+/// Responses of `point` if only `own` occludes light, and if both meshes do. `visible` is called for every shadow ray
+/// with its plane, its direction, and whether `own` and `other` block it.
 fn responses(
     point: &Point,
     directions: &Directions,
@@ -273,40 +275,39 @@ fn responses(
     (alone, whole)
 }
 
-impl Record {
-    /// Traces `stage`; random numbers are those of (`seed`, `index`).
-    pub fn trace(stage: &Stage, seed: u64, index: u64) -> Self {
-        let size = stage.camera.resolution[0] as usize;
+impl DirectLightImages {
+    /// Traces `scene` with the random numbers of (`seed`, `index`).
+    pub fn trace(scene: &GeneratedScene, seed: u64, index: u64) -> Self {
+        let size = scene.camera.resolution[0] as usize;
         let tracer = Tracer {
-            stage,
-            main: Bvh::build(&stage.main),
-            others: Bvh::build(&stage.others),
+            scene,
+            main: Bvh::build(&scene.main),
+            others: Bvh::build(&scene.others),
         };
-        let mut record = Self {
+        let mut images = Self {
             planes: vec![0.0; PLANES * size * size],
             size,
         };
         for pixel in 0..size * size {
             let mut stream = NoiseStream::new(seed ^ 0x7ace, index << 20 | pixel as u64);
-            record.pixel(&tracer, pixel, &mut stream);
+            images.pixel(&tracer, pixel, &mut stream);
         }
-        record
+        images
     }
 
     fn pixel(&mut self, tracer: &Tracer, pixel: usize, stream: &mut NoiseStream) {
-        let count = self.size * self.size;
         let mut layers = [[Vec3::ZERO; BASIS]; 3];
-        // Of shadows: sums over the ground's quarters that the object leaves.
-        let (mut shadow, mut open) = ([0f32; SHADOW], 0f32);
+        // Shadow, summed over the quarters that show the ground.
+        let (mut shadow, mut open) = ([0f32; SHADOW_PLANES], 0f32);
         let mut coverage = 0.0;
         for quarter in 0..4 {
-            let directions = Directions::draw(&tracer.stage.suns, quarter, stream);
+            let directions = Directions::draw(&tracer.scene.suns, quarter, stream);
             let offset = Vec2::new(
                 ((quarter % 2) as f32 + stream.uniform() as f32) * 0.5,
                 ((quarter / 2) as f32 + stream.uniform() as f32) * 0.5,
             );
             let corner = Vec2::new((pixel % self.size) as f32, (pixel / self.size) as f32);
-            let ray = tracer.stage.camera.ray(corner + offset);
+            let ray = tracer.scene.camera.ray(corner + offset);
             let background = tracer.background_point(&ray);
             let main = tracer
                 .main_point(&ray)
@@ -330,16 +331,16 @@ impl Record {
                 coverage += share;
             }
             let Some((_, point, is_ground)) = background else {
-                // The sky itself.
+                // The sky is visible.
                 let mut seen = [Vec3::ZERO; BASIS];
                 let y = ray.direction.y.max(0.0);
-                let look = &tracer.stage.sky;
-                let cover = look.cover(ray.direction);
+                let sky = &tracer.scene.sky;
+                let cover = sky.cover(ray.direction);
                 seen[SUNS] = Vec3::splat(cover * (1.0 - y));
                 seen[SUNS + 1] = Vec3::splat(cover * y);
-                for (seen, sun) in seen.iter_mut().zip(&tracer.stage.suns) {
+                for (seen, sun) in seen.iter_mut().zip(&tracer.scene.suns) {
                     let at = sun_direction(sun.azimuth, sun.elevation);
-                    *seen = Vec3::splat(look.around_sun(ray.direction, at));
+                    *seen = Vec3::splat(sky.around_sun(ray.direction, at));
                 }
                 add(Layer::Background, &seen);
                 if main.is_none() {
@@ -365,6 +366,12 @@ impl Record {
                 accumulate_shadow(&seen, &mut shadow);
             }
         }
+        self.store_layers(pixel, &layers);
+        self.store_shadow(pixel, &shadow, open, coverage);
+    }
+
+    fn store_layers(&mut self, pixel: usize, layers: &[[Vec3; BASIS]; 3]) {
+        let count = self.size * self.size;
         for (layer, responses) in layers.iter().enumerate() {
             for (b, response) in responses.iter().enumerate() {
                 for c in 0..3 {
@@ -372,8 +379,18 @@ impl Record {
                 }
             }
         }
-        let first = 9 * BASIS;
-        // Quarters without ground keep all their light.
+    }
+
+    /// Stores shadow and coverage of a pixel in which `open` quarters show the ground.
+    fn store_shadow(
+        &mut self,
+        pixel: usize,
+        shadow: &[f32; SHADOW_PLANES],
+        open: f32,
+        coverage: f32,
+    ) {
+        let count = self.size * self.size;
+        // Quarters without ground have no shadow.
         let ground_share = if coverage < 1.0 {
             open * 0.25 / (1.0 - coverage)
         } else {
@@ -381,15 +398,16 @@ impl Record {
         };
         for (b, sum) in shadow.iter().enumerate() {
             let visible = if open > 0.0 { sum / open } else { 1.0 };
-            self.planes[(first + b) * count + pixel] = 1.0 + ground_share * (visible - 1.0);
+            let plane = FIRST_SHADOW_PLANE + b;
+            self.planes[plane * count + pixel] = 1.0 + ground_share * (visible - 1.0);
         }
         self.planes[(PLANES - 1) * count + pixel] = coverage;
     }
 }
 
-/// Adds the visible shares of one quarter's light, weighted by the cosine.
-fn accumulate_shadow(seen: &[(usize, Vec3, bool)], shadow: &mut [f32; SHADOW]) {
-    let mut sums = [[0f32; 2]; SHADOW];
+/// Adds the visible shares of one quarter, weighted by the cosine.
+fn accumulate_shadow(seen: &[(usize, Vec3, bool)], shadow: &mut [f32; SHADOW_PLANES]) {
+    let mut sums = [[0f32; 2]; SHADOW_PLANES];
     for &(plane, d, blocked) in seen {
         let mut add = |plane: usize, weight: f32| {
             sums[plane][1] += weight;
