@@ -3,7 +3,7 @@
 //! recorded transport a scene instead of path tracing composites, which takes seconds, not minutes.
 //!
 //! Run with `cargo test --bench guidance -- --bench [MODEL] [key=value...]`: `scenes` and `first` choose
-//! the scenes, `places` is open, street or yard, `iterations` are those of guidance (0 leaves it out),
+//! the scenes, `places` is open, street or yard, `iterations` are those of guidance (0 leaves its row out),
 //! `draws` are the noises that the inversion looks at, `json` is a file for every scene's reading. Without
 //! `--bench`, as tests run it, it does nothing.
 use std::collections::BTreeMap;
@@ -13,21 +13,20 @@ use std::path::PathBuf;
 use candle_core::{DType, Device};
 use dipir_diffusion::model::Model;
 use dipir_evaluation::summary::Summary;
+use dipir_guidance::distillation::DistillationSettings;
+use dipir_guidance::reading::start;
+use dipir_guidance::recover::{ModelGuidance, Problem, Recovery, Target, recover_light};
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
-use dipir_imaging::resize::PixelBox;
 use dipir_imaging::transfer::Transfer;
-use dipir_light::gaussian::LobeParameters;
-use dipir_optimize::crop::bounding_box;
 use dipir_optimize::guidance::{rmse, touched};
 use dipir_optimize::lighting::Lighting;
 use dipir_optimize::objective::Objective;
-use dipir_optimize::optimization::Optimization;
 use dipir_optimize::parameters::{Parameters, ambient_of};
-use dipir_optimize::settings::{GuidanceKind, LightTable, Preset, Settings};
+use dipir_optimize::settings::{LightTable, Preset, Settings};
 use dipir_prior::examples::angle_between;
 use dipir_prior::lights::sun_angles;
 use dipir_prior::place::Place;
-use dipir_prior::reader::{ReaderSettings, Reading, combine};
+use dipir_prior::reader::{ReaderSettings, combine};
 use dipir_prior::student::add_placeholders;
 use dipir_prior::studio::Setting;
 use dipir_render::features::SPECULAR;
@@ -36,8 +35,6 @@ use dipir_render::transport::{RecordSettings, Transport};
 use dipir_scene::material::Material;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
-use dipir_stages::light::distillation::{Distillation, DistillationSettings};
-use dipir_stages::light::reading::{self, read_light, start};
 use glam::{DVec3, Vec3};
 
 /// Key of these scenes; training and gates have others.
@@ -99,9 +96,8 @@ impl Arguments {
 
 struct Trial {
     place: Place,
-    photo: DisplayImage,
     linear: LinearImage,
-    transport: Transport,
+    scene: Scene,
     settings: Settings,
 }
 
@@ -123,7 +119,7 @@ impl Trial {
             (v * 255.0).round() / 255.0
         });
         let photo = DisplayImage(Raster::from_pixels(SIZE, SIZE, pixels.collect()));
-        let linear = Transfer::Srgb.decode(photo.clone());
+        let linear = Transfer::Srgb.decode(photo);
         let paint = &place.stage.main_paint;
         let scene = Scene {
             mesh: place.stage.main.clone(),
@@ -137,6 +133,23 @@ impl Trial {
             camera: place.stage.camera,
             proxy: GROUND,
         };
+        let table = LightTable {
+            iterations: Some(arguments.iterations.max(1)),
+            ..LightTable::default()
+        };
+        let mut settings = table.settings(Preset::Standard, index)?;
+        settings.preview_every = 0;
+        settings.checkpoint_every = 0;
+        settings.learning_rates = settings.learning_rates.scaled(RATE);
+        Ok(Self {
+            place,
+            linear,
+            scene,
+            settings,
+        })
+    }
+
+    fn record(&self) -> RecordSettings<'_> {
         let simulation = Simulation {
             features: SPECULAR,
             max_depth: 3,
@@ -144,35 +157,18 @@ impl Trial {
             proxy_occlusion: true,
             light_on_proxy: None,
         };
-        let record = RecordSettings {
+        RecordSettings {
             environment: MAP,
             samples: SAMPLES,
             shadow_samples: SAMPLES,
-            background: Some(&linear),
+            background: Some(&self.linear),
             ..RecordSettings::new(simulation)
-        };
-        let renderer = Renderer::new(&scene);
-        let transport = Transport::record(&renderer, &record, &mut |_| ControlFlow::Continue(()))?;
-        let table = LightTable {
-            iterations: Some(arguments.iterations.max(1)),
-            ..LightTable::default()
-        };
-        let mut settings = table.settings(Preset::Standard, 1)?;
-        settings.preview_every = 0;
-        settings.checkpoint_every = 0;
-        settings.learning_rates = settings.learning_rates.scaled(RATE);
-        Ok(Self {
-            place,
-            photo,
-            linear,
-            transport,
-            settings,
-        })
+        }
     }
 
-    fn objective(&self) -> anyhow::Result<Objective> {
+    fn objective(&self, transport: &Transport) -> anyhow::Result<Objective> {
         Ok(Objective::new(
-            Box::new(self.transport.clone()),
+            Box::new(transport.clone()),
             self.linear.clone(),
             Transfer::Srgb,
             self.settings.weights(),
@@ -180,11 +176,11 @@ impl Trial {
     }
 
     /// The composite under the true light, the object through the photograph's own tone curve.
-    fn truth(&self) -> anyhow::Result<DisplayImage> {
+    fn truth(&self, transport: &Transport) -> anyhow::Result<DisplayImage> {
         let map = self.place.map(MAP[0], MAP[1])?;
-        let object = self.transport.foreground(map.texels());
-        let shadow = self.transport.shadow(map.texels());
-        let coverage = self.transport.coverage();
+        let object = transport.foreground(map.texels());
+        let shadow = transport.shadow(map.texels());
+        let coverage = transport.coverage();
         let pixels = (0..SIZE * SIZE).map(|p| {
             let a = coverage.pixels()[p];
             let mut values = (object.pixels()[p] / a.max(1e-6)).to_array();
@@ -201,64 +197,52 @@ impl Trial {
         )))
     }
 
-    fn errors(&self, light: &Parameters, truth: &DisplayImage) -> anyhow::Result<Errors> {
-        let objective = self.objective()?;
+    fn errors(&self, objective: &Objective, light: &Parameters, truth: &DisplayImage) -> Errors {
         let picture = objective.forward(light, 1.0).picture;
         let peak = Lighting::of(light, MAP[0], MAP[1]).peak_direction();
         let (azimuth, elevation) = peak.map_or((f32::NAN, f32::NAN), sun_angles);
         let sun = self.place.sun();
-        Ok(Errors {
+        Errors {
             azimuth: angle_between(azimuth, sun.azimuth).to_degrees().into(),
             elevation: (elevation - sun.elevation).abs().to_degrees().into(),
-            rmse: rmse(&picture, truth, &touched(&objective), None),
-        })
+            rmse: rmse(&picture, truth, &touched(objective), None),
+        }
     }
 
-    /// The light after guidance by LDS, from the light that was read.
-    fn guided(
+    /// The light read off the photograph, and guided by LDS from there.
+    fn recover(
         &self,
         model: &Model,
-        reading: &Reading,
-        object: PixelBox,
-    ) -> anyhow::Result<Parameters> {
-        let camera = &self.place.stage.camera;
-        let heading = reading::gaze(camera, object).heading;
-        let words = reading.light.words.seen_from(heading);
-        let settings = DistillationSettings {
-            guidance: GuidanceKind::Lds,
-            timesteps: [[0.5, 0.9]; 2],
-            draws: 1,
-            guidance_scale: 7.5,
-            prompt: None,
-            adapt: false,
-            turned: true,
+        reader: &ReaderSettings,
+        renderer: &Renderer,
+        transport: Transport,
+    ) -> anyhow::Result<Recovery> {
+        let table = LightTable {
+            adapt: Some(false),
+            ..LightTable::default()
         };
-        let mut guidance = Distillation::new(
+        let distillation = DistillationSettings::new(&table, true);
+        let distillation = distillation.map_err(|e| anyhow::anyhow!(e.message))?;
+        let target = Target::Model(ModelGuidance {
             model,
-            settings,
-            None,
-            self.place.stage.shape.word(),
-            Some(&words),
-            &self.photo,
-            &self.transport.coverage().clone(),
-        )?;
-        let optimization = Optimization {
-            objective: self.objective()?,
-            guidance: &mut guidance,
-            recorder: None,
-            settings: self.settings.clone(),
-            start: start(&reading.light, camera, self.settings.lobes),
+            adapter: None,
+            settings: &distillation,
+            class: self.place.stage.shape.word(),
+            reading: Some(reader),
+        });
+        let problem = Problem {
+            renderer,
+            transport,
+            record: self.record(),
+            background: &self.linear,
+            transfer: Transfer::Srgb,
+            settings: &self.settings,
+            start: None,
             checkpoint: None,
         };
-        let outcome = optimization.run(&mut |_| ControlFlow::Continue(()))?;
-        let lobes = outcome.lighting.lobes.iter();
-        let lobes: Vec<_> = lobes.map(LobeParameters::of).collect();
-        Ok(Parameters {
-            foreground: lobes.clone(),
-            shadow: lobes,
-            tone: outcome.parameters.tone,
-            log_exposure: 0.0,
-        })
+        Ok(recover_light(problem, &target, &|_| {
+            ControlFlow::Continue(())
+        })?)
     }
 }
 
@@ -273,7 +257,10 @@ fn measure(
 ) -> anyhow::Result<(BTreeMap<&'static str, Errors>, serde_json::Value)> {
     let trial = Trial::draw(arguments, index)?;
     let lobes = trial.settings.lobes;
-    let camera = &trial.place.stage.camera;
+    let camera = &trial.scene.camera;
+    let renderer = Renderer::new(&trial.scene);
+    let record = trial.record();
+    let transport = Transport::record(&renderer, &record, &mut |_| ControlFlow::Continue(()))?;
     let ambient = DVec3::splat(ambient_of(&trial.linear));
     let mut lights = vec![
         ("1 neutral", Parameters::neutral(lobes, ambient.x)),
@@ -282,16 +269,9 @@ fn measure(
             Parameters::from_light(lobes, ambient, ambient * 0.3, None),
         ),
     ];
-    let object = bounding_box(trial.transport.coverage());
-    let object = object.ok_or_else(|| anyhow::anyhow!("scene {index} shows no object"))?;
-    let place = reading::Place {
-        camera,
-        proxy: &GROUND,
-        object,
-    };
     let reader = &arguments.reader;
-    let reading = read_light(model, &trial.photo, &place, reader, index, &|_| {})?;
-    let Some(reading) = reading else {
+    let recovery = trial.recover(model, reader, &renderer, transport.clone())?;
+    let Some(reading) = recovery.reading else {
         anyhow::bail!("the model has no light encoder");
     };
     let mut encoder_alone = reading.crops.clone();
@@ -316,18 +296,23 @@ fn measure(
         lights.push((name, start(light, camera, lobes)));
     }
     if arguments.iterations > 0 {
-        lights.push(("8 guidance", trial.guided(model, &reading, object)?));
+        let outcome = recovery.outcome;
+        let guided = Parameters {
+            tone: outcome.parameters.tone,
+            ..Parameters::of_lobes(&outcome.lighting.lobes)
+        };
+        lights.push(("8 guidance", guided));
     }
-    let truth = trial.truth()?;
-    let errors = lights
-        .iter()
-        .map(|(name, light)| Ok((*name, trial.errors(light, &truth)?)));
+    let objective = trial.objective(&transport)?;
+    let truth = trial.truth(&transport)?;
+    let errors = lights.iter();
+    let errors = errors.map(|(name, light)| (*name, trial.errors(&objective, light, &truth)));
     let sun = trial.place.sun();
     let json = serde_json::json!({
         "scene": index, "reading": reading,
         "truth": {"azimuth": sun.azimuth, "elevation": sun.elevation, "share": trial.place.light.share},
     });
-    Ok((errors.collect::<anyhow::Result<_>>()?, json))
+    Ok((errors.collect(), json))
 }
 
 fn main() -> anyhow::Result<()> {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use dipir_cli::exit::Usage;
 use dipir_evaluation::results::read_json;
-use dipir_stages::composite::Tone;
+use dipir_stages::composite::table::Tone;
 use serde::{Deserialize, Serialize};
 
 /// The folder.

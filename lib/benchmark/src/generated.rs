@@ -9,7 +9,7 @@ use dipir_imaging::transfer::Transfer;
 use dipir_prior::place::Place;
 use dipir_prior::studio::Setting;
 use dipir_scene::export::to_obj;
-use dipir_stages::composite::Tone;
+use dipir_stages::composite::table::Tone;
 
 use crate::folder::{EvaluationFolder, SceneInfo};
 

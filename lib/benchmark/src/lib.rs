@@ -19,5 +19,4 @@ pub mod run;
 mod runner;
 pub mod score;
 pub mod spheres;
-pub mod stages;
 pub mod study;

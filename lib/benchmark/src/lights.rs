@@ -4,7 +4,7 @@ use dipir_light::environment::EnvironmentMap;
 use dipir_light::fit::fit;
 use dipir_light::rasterize::rasterize;
 use dipir_scene::camera::Camera;
-use dipir_stages::composite::Tone;
+use dipir_stages::composite::table::Tone;
 use dipir_stages::known_light;
 use glam::{DVec3, Vec3};
 

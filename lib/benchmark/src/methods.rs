@@ -3,9 +3,12 @@ use std::path::Path;
 
 use anyhow::Context;
 use dipir_cli::exit::Usage;
+use dipir_stages::names::{self, StageName};
 use serde::{Deserialize, Serialize};
 
-use crate::stages;
+/// The stages that a method may run before the composite, in their order.
+pub const BEFORE_COMPOSITE: [&StageName; 4] =
+    [&names::SCENE, &names::CONCEPTS, &names::LORA, &names::LIGHT];
 
 /// The built-in table.
 pub const TABLE: &str = include_str!("methods.toml");
@@ -50,7 +53,7 @@ pub struct Method {
 }
 
 fn scene_alone() -> Vec<String> {
-    vec![dipir_stages::scene::STAGE.into()]
+    vec![names::SCENE.name.into()]
 }
 
 #[derive(Deserialize)]
@@ -87,18 +90,19 @@ fn parse(text: &str) -> anyhow::Result<Vec<Method>> {
                 method.name
             );
         }
-        if let Some(other) = method.stages.iter().find(|s| stages::find(s).is_none()) {
-            let names: Vec<&str> = stages::ALL.iter().map(|s| s.name).collect();
-            anyhow::bail!(
-                "method \"{}\": there is no stage \"{other}\"; accepted: {}",
-                method.name,
-                names.join(", ")
-            );
-        }
-        let recovers = method
+        let accepted = BEFORE_COMPOSITE.map(|s| s.name);
+        if let Some(other) = method
             .stages
             .iter()
-            .any(|s| s == dipir_stages::light::STAGE);
+            .find(|s| !accepted.contains(&s.as_str()))
+        {
+            anyhow::bail!(
+                "method \"{}\": no stage before the composite is called \"{other}\"; accepted: {}",
+                method.name,
+                accepted.join(", ")
+            );
+        }
+        let recovers = method.stages.iter().any(|s| s == names::LIGHT.name);
         if recovers != (method.light == Source::Recovered) {
             anyhow::bail!(
                 "method \"{}\": light = \"recovered\" and the stage \"light\" go together",
@@ -165,7 +169,7 @@ mod tests {
             message(
                 "[[method]]\nname = \"a\"\ntitle = \"\"\nlight = \"recovered\"\nstages = [\"optimize\"]\n"
             ),
-            "method \"a\": there is no stage \"optimize\"; accepted: scene, concepts, lora, light, composite"
+            "method \"a\": no stage before the composite is called \"optimize\"; accepted: scene, concepts, lora, light"
         );
     }
 }

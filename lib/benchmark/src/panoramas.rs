@@ -13,7 +13,7 @@ use dipir_light::environment::EnvironmentMap;
 use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_render::shapes::torus_knot;
 use dipir_scene::export::to_obj;
-use dipir_stages::composite::Tone;
+use dipir_stages::composite::table::Tone;
 use dipir_stages::scene::background::{MID_GREY, View, exposure_ev_to};
 use glam::Vec3;
 

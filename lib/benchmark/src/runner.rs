@@ -14,15 +14,15 @@ use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::{Artifact, FILE_NAME};
 use dipir_pipeline::stage::StagePlan;
 use dipir_scene::description::SceneDescription;
-use dipir_stages::composite::Tone;
+use dipir_stages::composite::table::Tone;
+use dipir_stages::names::{self, StageName};
 use serde_json::{Value, json};
 
 use crate::command_line::RunArgs;
 use crate::folder::{EvaluationFolder, SceneInfo, TRUTH};
 use crate::lights;
-use crate::methods::{Method, Source};
+use crate::methods::{BEFORE_COMPOSITE, Method, Source};
 use crate::score::{Score, Truth};
-use crate::stages;
 
 /// Raised whenever the same run would get another score.
 const VERSION: u32 = 2;
@@ -83,8 +83,8 @@ impl Runner<'_> {
                 "composite.target_error",
                 &(0.5 * self.args.target_error).to_string(),
             );
-            run.stage(dipir_stages::scene::STAGE)?;
-            run.stage(dipir_stages::composite::STAGE)?;
+            run.stage(&names::SCENE)?;
+            run.stage(&names::COMPOSITE)?;
             run.keep(&folder)?;
             let score = Score {
                 key,
@@ -137,14 +137,15 @@ impl Runner<'_> {
             run.set("composite.environment", &toml_string(&file)?);
             run.set("composite.tone", tone_key(scene.tone));
         }
-        for stage in &method.stages {
+        for stage in BEFORE_COMPOSITE {
+            let runs = method.stages.iter().any(|s| s == stage.name);
             // The light is the method's own; what comes before may be there already.
-            let is_there = work.join(stage).join(FILE_NAME).is_file();
-            if stage == dipir_stages::light::STAGE || !is_there {
+            let is_there = work.join(stage.name).join(FILE_NAME).is_file();
+            if runs && (*stage == names::LIGHT || !is_there) {
                 run.stage(stage)?;
             }
         }
-        run.stage(dipir_stages::composite::STAGE)?;
+        run.stage(&names::COMPOSITE)?;
         run.keep(&folder)?;
         let light = match given {
             Some(map) => map,
@@ -231,7 +232,7 @@ impl Runner<'_> {
         imported: Option<&Path>,
     ) -> anyhow::Result<String> {
         let folder = self.evaluation.scene(&scene.name);
-        let versions: Vec<(&str, u32)> = stages::ALL.iter().map(|s| (s.name, s.version)).collect();
+        let versions = names::ALL.map(|s| (s.name, s.version));
         let params = json!({
             "scene": scene,
             "run": params,
@@ -334,8 +335,7 @@ impl<'a> StageRuns<'a> {
         self.set.push(format!("{key}={value}"));
     }
 
-    fn stage(&mut self, name: &str) -> anyhow::Result<()> {
-        let stage = stages::find(name).with_context(|| format!("there is no stage \"{name}\""))?;
+    fn stage(&mut self, stage: &StageName) -> anyhow::Result<()> {
         let mut arguments: Vec<String> = vec![
             "-p".into(),
             self.pipeline.to_string_lossy().into(),
