@@ -10,6 +10,7 @@ use dipir_cli::exit::Usage;
 use dipir_cli::session::Session;
 use dipir_diffusion::model::Model;
 use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::stage::StagePlan;
 use dipir_prior::encoder;
 use glam::Vec3;
@@ -166,11 +167,8 @@ pub fn digest(folder: Option<&Path>) -> anyhow::Result<String> {
         Some(folder) => files(Path::new(""), folder, &mut plan)?,
         None => embedded::inputs(&mut plan),
     }
-    let mut hasher = blake3::Hasher::new();
-    for input in &plan.inputs {
-        hasher.update(input.blake3.as_bytes());
-    }
-    Ok(hasher.finalize().to_hex().to_string())
+    let fingerprint = Fingerprint::of("model").inputs(&plan.inputs).finish();
+    Ok(fingerprint.as_str().to_owned())
 }
 
 /// An image tensor [1, 3, h, w] in [-1, 1] as display values.
@@ -206,9 +204,4 @@ pub fn from_display(image: &DisplayImage) -> anyhow::Result<Tensor> {
 /// The side of the images that the model was trained on, in pixels.
 pub fn native_size(model: &Model) -> usize {
     model.unet.config().sample_size * model.vae.downscale()
-}
-
-/// Creates a folder and its parents.
-pub fn create_folder(path: &Path) -> anyhow::Result<()> {
-    std::fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))
 }
