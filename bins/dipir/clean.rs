@@ -51,9 +51,8 @@ struct Found {
 pub fn run(args: &CleanArgs) -> anyhow::Result<()> {
     let (session, graph) = args.project.open()?;
     let out = &session.out;
-    let asked = |stage: &str| {
-        args.stages.is_empty() || args.stages.iter().any(|s| s.name() == stage)
-    };
+    let asked =
+        |stage: &str| args.stages.is_empty() || args.stages.iter().any(|s| s.name() == stage);
     let stages = graph.nodes().iter().map(|n| n.stage);
     let stages: Vec<&'static str> = stages.filter(|stage| asked(stage)).collect();
     let mut locks = Vec::new();
@@ -89,13 +88,17 @@ fn find(args: &CleanArgs, out: &Path, stages: &[&'static str]) -> anyhow::Result
                 other => other.into(),
             });
         }
-        if !stage::untidy(&folder).is_empty() {
+        if !stage::untidy(&folder, stage).is_empty() {
             found.untidy.push((folder.clone(), stage));
         }
         if let Some(owned) = Owned::of_stage(&folder, stage) {
             found.folders.push((folder, owned));
         }
-        found.add_folders_in(&out.join(format!("{stage}-checkpoints")), Kind::Checkpoints, stage)?;
+        found.add_folders_in(
+            &out.join(format!("{stage}-checkpoints")),
+            Kind::Checkpoints,
+            stage,
+        )?;
         let hashes = hashes_file(out, stage);
         if Hashes::are_in(&hashes) {
             found.files.push(hashes);
@@ -142,7 +145,11 @@ impl Found {
             }
             kept.extend(contents.others.iter().map(|name| folder.join(name)));
         }
-        removed.extend(self.untidy.iter().flat_map(|(f, _)| stage::untidy(f)));
+        removed.extend(
+            self.untidy
+                .iter()
+                .flat_map(|(f, stage)| stage::untidy(f, stage)),
+        );
         removed.extend(self.files.iter().cloned());
         Ok((removed, kept))
     }

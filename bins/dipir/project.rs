@@ -18,12 +18,7 @@ pub struct ProjectArgs {
     pub files: Vec<PathBuf>,
 
     /// The same, as the executables of the stages name it
-    #[arg(
-        long,
-        short = 'p',
-        value_name = "FILE",
-        conflicts_with = "files"
-    )]
+    #[arg(long, short = 'p', value_name = "FILE", conflicts_with = "files")]
     pub pipeline: Option<PathBuf>,
 
     /// Set a key of the file, as in --set scene.class=car; may be repeated, the last one wins

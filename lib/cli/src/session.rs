@@ -171,9 +171,7 @@ pub fn print_line(text: &str) {
 pub fn check_threads(threads: usize) -> Result<(), String> {
     match threads <= MAX_THREADS {
         true => Ok(()),
-        false => Err(format!(
-            "accepted: 0, for one a core, to {MAX_THREADS}"
-        )),
+        false => Err(format!("accepted: 0, for one a core, to {MAX_THREADS}")),
     }
 }
 

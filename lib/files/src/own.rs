@@ -165,7 +165,10 @@ mod tests {
     #[test]
     fn what_a_killed_run_left_is_cleared_and_anothers_file_of_that_name_is_kept() {
         let folder = tempfile::tempdir().unwrap();
-        let (path, partial) = (folder.path().join("page"), folder.path().join(".page.partial"));
+        let (path, partial) = (
+            folder.path().join("page"),
+            folder.path().join(".page.partial"),
+        );
         for left in [&b""[..], &MARK[..4], MARK] {
             fs::write(&partial, left).unwrap();
             replace(&path, &content("x"), MARK).unwrap();

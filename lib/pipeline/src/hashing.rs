@@ -173,7 +173,12 @@ pub fn hash_file(path: &Path) -> Result<(u64, String), StageError> {
 
 fn hash(file: &mut File) -> std::io::Result<(u64, String)> {
     let length = file.metadata()?.len();
-    let mut buffer = vec![0; PIECE.min(usize::try_from(length).unwrap_or(PIECE)).max(4096)];
+    let mut buffer = vec![
+        0;
+        PIECE
+            .min(usize::try_from(length).unwrap_or(PIECE))
+            .max(4096)
+    ];
     let mut hasher = blake3::Hasher::new();
     let mut bytes = 0;
     loop {
@@ -223,7 +228,17 @@ mod tests {
     #[test]
     fn hashes_are_those_of_the_whole_content_whatever_the_length() {
         let folder = tempfile::tempdir().unwrap();
-        for length in [0, 1, 4095, 4096, 4097, PIECE - 1, PIECE, PIECE + 1, 2 * PIECE + 7] {
+        for length in [
+            0,
+            1,
+            4095,
+            4096,
+            4097,
+            PIECE - 1,
+            PIECE,
+            PIECE + 1,
+            2 * PIECE + 7,
+        ] {
             let content: Vec<u8> = (0..length).map(|k| (k % 251) as u8).collect();
             let path = folder.path().join(length.to_string());
             fs::write(&path, &content).unwrap();

@@ -203,20 +203,26 @@ impl Owned {
         let (last, first): (Vec<_>, Vec<_>) = ours
             .into_iter()
             .partition(|name| is_named(name, FILE_NAME) || is_named(name, manifest::FILE_NAME));
-        first.iter().try_for_each(|name| remove_file(&folder.join(name)))?;
+        first
+            .iter()
+            .try_for_each(|name| remove_file(&folder.join(name)))?;
         for name in folders.iter().rev() {
             // One that holds something else stays.
             let _ = fs::remove_dir(folder.join(name));
         }
         let (mark, manifest): (Vec<_>, Vec<_>) =
             last.into_iter().partition(|name| is_named(name, FILE_NAME));
-        manifest.iter().try_for_each(|name| remove_file(&folder.join(name)))?;
+        manifest
+            .iter()
+            .try_for_each(|name| remove_file(&folder.join(name)))?;
         if others.is_empty() {
-            mark.iter().try_for_each(|name| remove_file(&folder.join(name)))?;
+            mark.iter()
+                .try_for_each(|name| remove_file(&folder.join(name)))?;
             return fs::remove_dir(folder).map_err(|e| StageError::io("remove", folder, e));
         }
         if Mark::read(folder).is_none() {
-            mark.iter().try_for_each(|name| remove_file(&folder.join(name)))?;
+            mark.iter()
+                .try_for_each(|name| remove_file(&folder.join(name)))?;
         }
         Mark::new(self.kind, &self.stage, Vec::new()).write(folder)
     }
@@ -306,7 +312,12 @@ mod tests {
         assert!(fits("previews/#.png", "previews/000015.png"));
         assert!(fits("#.partial.png", "3.partial.png"));
         assert!(fits("history.json", "history.json"));
-        for name in ["previews/.png", "previews/mine.png", "previews/1.png.bak", "a1.png"] {
+        for name in [
+            "previews/.png",
+            "previews/mine.png",
+            "previews/1.png.bak",
+            "a1.png",
+        ] {
             assert!(!fits("previews/#.png", name), "{name}");
         }
     }

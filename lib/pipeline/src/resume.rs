@@ -57,8 +57,13 @@ impl Resume {
     /// Those of its files that lie in its folder `below`, by name, sorted.
     pub fn files_in(&self, below: &str) -> Result<Vec<String>, StageError> {
         let contents = self.owned.contents(&self.folder)?;
-        let inside = contents.ours.iter().filter_map(|name| name.strip_prefix(below).ok());
-        Ok(inside.map(|name| name.to_string_lossy().into_owned()).collect())
+        let inside = contents
+            .ours
+            .iter()
+            .filter_map(|name| name.strip_prefix(below).ok());
+        Ok(inside
+            .map(|name| name.to_string_lossy().into_owned())
+            .collect())
     }
 
     /// Removes the file `name` if it is there.
@@ -82,7 +87,11 @@ impl Resume {
 }
 
 /// The folders of `kind` that `stage` made in `root`, with what in them is its own.
-pub fn folders_in(root: &Path, kind: Kind, stage: &str) -> Result<Vec<(PathBuf, Owned)>, StageError> {
+pub fn folders_in(
+    root: &Path,
+    kind: Kind,
+    stage: &str,
+) -> Result<Vec<(PathBuf, Owned)>, StageError> {
     if !is_folder(root) {
         return Ok(Vec::new());
     }
@@ -120,9 +129,16 @@ mod tests {
         open(2).remove();
         assert!(open(1).file("checkpoint").exists());
         assert_eq!(resume.files_in("previews").unwrap(), ["1.png", "2.png"]);
-        assert_eq!(folders_in(&root, Kind::Checkpoints, "light").unwrap().len(), 1);
+        assert_eq!(
+            folders_in(&root, Kind::Checkpoints, "light").unwrap().len(),
+            1
+        );
         assert!(folders_in(&root, Kind::Cache, "light").unwrap().is_empty());
-        assert!(folders_in(&root, Kind::Checkpoints, "lora").unwrap().is_empty());
+        assert!(
+            folders_in(&root, Kind::Checkpoints, "lora")
+                .unwrap()
+                .is_empty()
+        );
         resume.remove();
         assert!(!resume.file("checkpoint").exists());
         assert!(resume.file("previews/mine.png").exists());

@@ -274,9 +274,18 @@ pub fn tidy(target: &Path, stage: &str) -> Result<(), StageError> {
 }
 
 /// What [`tidy`] would clear up.
-pub fn untidy(target: &Path) -> Vec<PathBuf> {
-    let beside = ["partial", "previous"].map(|suffix| sibling(target, suffix));
-    beside.into_iter().filter(|path| is_folder(path)).collect()
+pub fn untidy(target: &Path, stage: &str) -> Vec<PathBuf> {
+    let [partial, previous] = ["partial", "previous"].map(|suffix| sibling(target, suffix));
+    let is_owned = |path: &Path| Owned::of_stage(path, stage).is_some();
+    let is_begun = |path: &Path| is_unfinished(path) || is_empty(path).unwrap_or(false);
+    let mut found = Vec::new();
+    if is_begun(&partial) || is_owned(&partial) {
+        found.push(partial);
+    }
+    if is_owned(&previous) {
+        found.push(previous);
+    }
+    found
 }
 
 fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), StageError> {
@@ -303,9 +312,7 @@ fn recover(target: &Path, stage: &str) -> Result<(), StageError> {
     match Owned::of_stage(&previous, stage) {
         None => Ok(()),
         Some(owned) if is_folder(target) => owned.absorb(&previous, target),
-        Some(_) => {
-            fs::rename(&previous, target).map_err(|e| StageError::io("restore", target, e))
-        }
+        Some(_) => fs::rename(&previous, target).map_err(|e| StageError::io("restore", target, e)),
     }
 }
 

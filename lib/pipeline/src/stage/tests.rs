@@ -196,7 +196,9 @@ fn leftovers_of_a_killed_run_are_cleared() {
     fs::create_dir(&partial).unwrap();
     for left in [None, Some(""), Some("stale.png")] {
         if let Some(name) = left {
-            Mark::new(Kind::Unfinished, "scene", vec![]).make(&partial).unwrap();
+            Mark::new(Kind::Unfinished, "scene", vec![])
+                .make(&partial)
+                .unwrap();
             fs::write(partial.join(name).with_extension("png"), "x").unwrap();
         }
         run(&target, "new");

@@ -220,7 +220,13 @@ fn cache_folder(
         "precision": plan.params["precision"],
     });
     let fingerprint = Fingerprint::of_plan(plan).params(params).finish();
-    Ok(Resume::open(&root, Kind::Cache, STAGE, &fingerprint, &CACHED)?)
+    Ok(Resume::open(
+        &root,
+        Kind::Cache,
+        STAGE,
+        &fingerprint,
+        &CACHED,
+    )?)
 }
 
 /// Whether both files of an image are there with the hashes that were noted when they were made.
