@@ -10,7 +10,8 @@ use dipir_pipeline::hashing::Hashes;
 use dipir_pipeline::lock::{FolderLock, WhenLocked};
 use dipir_pipeline::mark::{Kind, Owned};
 use dipir_pipeline::{resume, stage};
-use dipir_stages::{concepts, report};
+use dipir_stages::names::CONCEPTS;
+use dipir_stages::report;
 use serde_json::json;
 
 use crate::project::{ProjectArgs, Stage};
@@ -111,7 +112,7 @@ fn find(args: &CleanArgs, out: &Path, stages: &[&'static str]) -> anyhow::Result
         found.files.push(page);
     }
     if args.cache {
-        found.add_folders_in(&out.join("concepts-cache"), Kind::Cache, concepts::STAGE)?;
+        found.add_folders_in(&out.join("concepts-cache"), Kind::Cache, CONCEPTS.name)?;
     }
     Ok(found)
 }

@@ -12,6 +12,8 @@ use dipir_pipeline::resume;
 use dipir_pipeline::stage::StagePlan;
 use serde_json::{Value, json};
 
+use crate::names::LIGHT;
+
 /// Name of the checkpoint's file.
 const CHECKPOINT: &str = "checkpoint.safetensors";
 /// Folder of the previews.
@@ -38,8 +40,7 @@ impl Resume {
     pub(crate) fn open(session: &Session, fingerprint: &Fingerprint) -> anyhow::Result<Self> {
         let root = session.out.join("light-checkpoints");
         let files = [CHECKPOINT, "checkpoint.partial", "previews/#.png"];
-        let kept =
-            resume::Resume::open(&root, Kind::Checkpoints, super::STAGE, fingerprint, &files)?;
+        let kept = resume::Resume::open(&root, Kind::Checkpoints, LIGHT.name, fingerprint, &files)?;
         let folder = kept.folder().to_owned();
         Ok(Self { kept, folder })
     }

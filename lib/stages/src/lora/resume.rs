@@ -8,6 +8,8 @@ use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::mark::Kind;
 use dipir_pipeline::resume;
 
+use crate::names::LORA;
+
 /// The files of a run: the checkpoint, the losses so far, and samples, each with the name under
 /// which it is written.
 const FILES: [&str; 6] = [
@@ -28,7 +30,7 @@ impl Resume {
     pub(super) fn open(session: &Session, fingerprint: &Fingerprint) -> anyhow::Result<Self> {
         let root = session.out.join("lora-checkpoints");
         let kind = Kind::Checkpoints;
-        let kept = resume::Resume::open(&root, kind, super::STAGE, fingerprint, &FILES)?;
+        let kept = resume::Resume::open(&root, kind, LORA.name, fingerprint, &FILES)?;
         Ok(Self { kept })
     }
 
