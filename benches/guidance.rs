@@ -17,6 +17,8 @@ use std::path::PathBuf;
 
 use candle_core::{DType, Device};
 use dipir_diffusion::model::Model;
+use dipir_guidance::distillation::{Distillation, DistillationSettings};
+use dipir_guidance::reading::{self, read_light, start};
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
@@ -42,8 +44,6 @@ use dipir_scene::material::Material;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
 use dipir_stages::known_light;
-use dipir_stages::light::distillation::{Distillation, DistillationSettings};
-use dipir_stages::light::reading::{self, read_light, start};
 use glam::Vec3;
 
 /// Key of these scenes; training and gates have others.
@@ -260,7 +260,9 @@ fn run(
         proxy: &proxy,
         object,
     };
-    let reading = read_light(model, &trial.photo, &place, &knobs.reader, index, &|_| {})?;
+    let reading = read_light(model, &trial.photo, &place, &knobs.reader, index, &|_| {
+        ControlFlow::Continue(())
+    })?;
     let Some(reading) = reading else {
         anyhow::bail!("the model has no light encoder");
     };

@@ -32,9 +32,9 @@ pub struct Preset {
     /// Of `[composite]`.
     pub composite: CompositePreset,
     /// Of `[light]`.
-    pub optimize: LightPreset,
+    pub light: LightPreset,
     /// What recovering light was measured to cost.
-    pub light: Option<Measured>,
+    pub recovery: Option<Measured>,
 }
 
 /// Of `[scene]`.
@@ -238,13 +238,13 @@ impl LightRun {
     /// The presets beside `quality`, as far as `table` leaves to them.
     pub fn outlook(&self, quality: Quality, table: &LightTable) -> Outlook {
         // Measured with a reference; what a model guides to is another matter.
-        let error = |p: &Preset| p.light.filter(|_| !self.by_model).map(|l| l.error);
+        let error = |p: &Preset| p.recovery.filter(|_| !self.by_model).map(|l| l.error);
         Outlook::beside(quality, |p| {
             let there = LightPreset {
-                iterations: table.iterations.unwrap_or(p.optimize.iterations),
-                samples: table.samples.unwrap_or(p.optimize.samples),
-                size: table.size.unwrap_or(p.optimize.size),
-                ..p.optimize
+                iterations: table.iterations.unwrap_or(p.light.iterations),
+                samples: table.samples.unwrap_or(p.light.samples),
+                size: table.size.unwrap_or(p.light.size),
+                ..p.light
             };
             Some((self.seconds_with(&there), error(p)))
         })
@@ -266,10 +266,10 @@ mod tests {
         );
         assert!(draft.composite.target_error > standard.composite.target_error);
         assert!(standard.composite.target_error > high.composite.target_error);
-        assert!(draft.optimize.samples <= standard.optimize.samples);
+        assert!(draft.light.samples <= standard.light.samples);
         assert_eq!(draft.scene.effects, EffectsMode::All);
         assert!(all().measured.is_some() && all().command.is_some());
-        let [draft, standard, high] = [draft, standard, high].map(|p| p.light.unwrap());
+        let [draft, standard, high] = [draft, standard, high].map(|p| p.recovery.unwrap());
         assert!(draft.cost_s < standard.cost_s && standard.cost_s < high.cost_s);
         assert!(draft.error > standard.error && standard.error > high.error);
     }
@@ -283,7 +283,7 @@ mod tests {
             (Quality::High, LibraryPreset::High),
         ] {
             let library: Settings = table.settings(preset, 0).unwrap();
-            let filled = of(quality).optimize.fill(&table);
+            let filled = of(quality).light.fill(&table);
             assert_eq!(
                 filled.settings(LibraryPreset::Standard, 0).unwrap(),
                 library
@@ -292,7 +292,7 @@ mod tests {
     }
 
     fn standard_run(by_model: bool) -> LightRun {
-        let here = of(Quality::Standard).optimize;
+        let here = of(Quality::Standard).light;
         LightRun {
             iterations: Some(here.iterations),
             samples: here.samples,
@@ -320,12 +320,9 @@ mod tests {
             samples: Some(7),
             ..LightTable::default()
         };
-        let filled = of(Quality::Draft).optimize.fill(&table);
+        let filled = of(Quality::Draft).light.fill(&table);
         assert_eq!(filled.samples, Some(7));
-        assert_eq!(
-            filled.iterations,
-            Some(of(Quality::Draft).optimize.iterations)
-        );
+        assert_eq!(filled.iterations, Some(of(Quality::Draft).light.iterations));
     }
 
     #[test]
@@ -359,7 +356,7 @@ mod tests {
 
     #[test]
     fn a_light_run_costs_what_its_steps_and_paths_cost() {
-        let here = of(Quality::Standard).optimize;
+        let here = of(Quality::Standard).light;
         let run = standard_run(false);
         assert!((run.seconds_with(&here) - 12.0).abs() < 1e-9);
         let more = LightPreset {

@@ -7,8 +7,8 @@ use super::html::Html;
 use super::picture::figure;
 use super::plot::{Mark, Plot, Series, running_mean};
 use super::{Report, Section, json, outputs};
-use crate::concepts::ConceptList;
-use crate::{concepts, lora};
+use crate::concepts::folder::ConceptList;
+use crate::names::{CONCEPTS, LORA};
 
 /// Longest side of a concept image.
 const CONCEPT: usize = 128;
@@ -20,7 +20,7 @@ const MOST_CONCEPTS: usize = 64;
 /// Concept images, the course of the loss, samples.
 pub fn section(report: &Report) -> Section {
     let mut parts = Vec::new();
-    if let Some(run) = report.stage(concepts::STAGE)? {
+    if let Some(run) = report.stage(CONCEPTS.name)? {
         let list: ConceptList = json(&run, "concepts")?;
         let mut figures = Vec::new();
         for entry in list.concepts.iter().take(MOST_CONCEPTS) {
@@ -36,7 +36,7 @@ pub fn section(report: &Report) -> Section {
         parts.push(Html::element("p", &[("class", "soft")], [Html::text(note)]));
         parts.push(Html::element("div", &[("class", "grid-of small")], figures));
     }
-    if let Some(run) = report.stage(lora::STAGE)? {
+    if let Some(run) = report.stage(LORA.name)? {
         let training: Value = json(&run, "training")?;
         let plots = losses(&training).into_iter().filter_map(|p| p.render());
         parts.push(Html::element("div", &[("class", "plots")], plots));

@@ -14,8 +14,10 @@ use super::html::{Html, table};
 use super::picture::{figure, image};
 use super::plot::{Mark, Plot, Series, number, running_mean};
 use super::{Report, Section, json, outputs};
+use crate::composite::table::CompositeTable;
+use crate::known_light;
+use crate::names::LIGHT;
 use crate::preview::environment;
-use crate::{composite, known_light, light};
 
 /// Columns of the map as it is shown.
 const MAP_WIDTH: usize = 512;
@@ -26,7 +28,7 @@ const PREVIEW: usize = 256;
 
 /// The light that was recovered, else the one that was given.
 pub fn section(report: &Report) -> Section {
-    let Some(run) = report.stage(light::STAGE)? else {
+    let Some(run) = report.stage(LIGHT.name)? else {
         return given(report);
     };
     if !run.1.outputs.iter().any(|o| o.role == "lighting") {
@@ -64,7 +66,7 @@ pub fn section(report: &Report) -> Section {
 /// The map of `[composite] environment`.
 fn given(report: &Report) -> Section {
     let table = report.session.config.table("composite")?;
-    let table: composite::CompositeTable = table;
+    let table: CompositeTable = table;
     let Some(known) = known_light::known(report.session, &table)? else {
         return Ok(None);
     };

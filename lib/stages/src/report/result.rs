@@ -9,7 +9,7 @@ use super::html::{Html, table};
 use super::picture::{figure, image};
 use super::plot::number;
 use super::{Report, Section};
-use crate::composite;
+use crate::names::COMPOSITE;
 use crate::preview::{normals, stretched};
 use crate::truth::Truth;
 
@@ -20,7 +20,7 @@ const LAYER: usize = 480;
 
 /// The photograph and the picture, one over the other.
 pub fn before_and_after(report: &Report) -> Section {
-    let Some((folder, manifest)) = report.stage(composite::STAGE)? else {
+    let Some((folder, manifest)) = report.stage(COMPOSITE.name)? else {
         return Ok(None);
     };
     let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
@@ -59,7 +59,7 @@ pub fn before_and_after(report: &Report) -> Section {
 
 /// The layers that a compositor gets.
 pub fn layers(report: &Report) -> Section {
-    let Some((folder, manifest)) = report.stage(composite::STAGE)? else {
+    let Some((folder, manifest)) = report.stage(COMPOSITE.name)? else {
         return Ok(None);
     };
     let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;

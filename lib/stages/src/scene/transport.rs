@@ -24,7 +24,7 @@ pub const ROLE: &str = "transport";
 
 /// The `[light]` table with the quality's values for what it leaves open.
 pub fn settings(session: &Session, table: &LightTable) -> anyhow::Result<Settings> {
-    let filled = presets::of(session.pipeline.quality).optimize.fill(table);
+    let filled = presets::of(session.pipeline.quality).light.fill(table);
     let settings = filled.settings(Preset::Standard, session.pipeline.seed);
     settings.map_err(|e| {
         let key = format!("optimize.{}", e.key);
