@@ -112,7 +112,7 @@ impl SceneDescription {
     /// Reads a description.
     pub fn read(path: &Path) -> Result<Self, Error> {
         const AGAIN: &str = "run dipir-scene again";
-        let bytes = std::fs::read(path).map_err(|source| Error::Read {
+        let bytes = dipir_files::read(path).map_err(|source| Error::Read {
             role: "the scene description".into(),
             path: path.into(),
             source,
