@@ -13,8 +13,11 @@ use crate::description::{FileRecord, ObjectRecord, PhotoRecord, ProxyRecord, Sce
 use crate::error::Error;
 use crate::features::SceneFeatures;
 use crate::import::{self, Imported};
+use crate::light::PunctualLight;
+use crate::limits::Limits;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
+use crate::printable::printable;
 use crate::proxy::Proxy;
 use crate::texture::Texture;
 
@@ -55,6 +58,8 @@ pub struct LoadedScene {
     pub occluders: Option<Raster<f32>>,
     /// From which the same scene can be rebuilt.
     pub description: SceneDescription,
+    /// Lights that the objects' files bring along, as placed. They are not rendered.
+    pub lights: Vec<PunctualLight>,
     /// All files that were read.
     pub inputs: Vec<Input>,
     /// One sentence each.
@@ -65,7 +70,7 @@ impl Scene {
     /// Reads all files that `config` names, relative to `base_dir`, and places the objects.
     pub fn load(config: &SceneConfig, base_dir: &Path) -> Result<LoadedScene, Error> {
         let settings = config.validate()?;
-        let mut files = Files::new(base_dir);
+        let mut files = Files::new(base_dir, settings.limits);
         let (photo, background) = files.photo(&settings.background, settings.transfer)?;
         let resolution = [background.width, background.height];
         let occluders = match &settings.occluders {
@@ -103,7 +108,13 @@ impl Scene {
             files.warnings.extend(warning);
             objects.push(placed);
         }
-        let (mesh, materials, textures) = assembly.into_parts();
+        let Assembly {
+            mesh,
+            materials,
+            textures,
+            lights,
+            ..
+        } = assembly;
         let (occluders, occluders_record) = occluders.unzip();
         Ok(LoadedScene {
             scene: Scene {
@@ -124,7 +135,9 @@ impl Scene {
                 camera,
                 proxy: proxy_record,
                 effects: settings.effects,
+                limits: settings.limits,
             },
+            lights,
             inputs: files.inputs,
             warnings: files.warnings,
         })
@@ -139,7 +152,7 @@ impl Scene {
 impl SceneDescription {
     /// Rebuilds the scene from the files it was made of; an error if one of them changed.
     pub fn load(&self, base_dir: &Path) -> Result<LoadedScene, Error> {
-        let mut files = Files::new(base_dir);
+        let mut files = Files::new(base_dir, self.limits);
         files.check("the background", &self.background.file)?;
         let (photo, background) =
             files.photo(&self.background.file.path, self.background.transfer)?;
@@ -167,7 +180,13 @@ impl SceneDescription {
                 Ok((object.transform(), ()))
             })?;
         }
-        let (mesh, materials, textures) = assembly.into_parts();
+        let Assembly {
+            mesh,
+            materials,
+            textures,
+            lights,
+            ..
+        } = assembly;
         Ok(LoadedScene {
             scene: Scene {
                 mesh,
@@ -179,6 +198,7 @@ impl SceneDescription {
             photo,
             occluders,
             description: self.clone(),
+            lights,
             inputs: files.inputs,
             warnings: files.warnings,
         })
@@ -193,15 +213,17 @@ impl SceneDescription {
 /// Reads files relative to a folder and keeps the list.
 struct Files<'a> {
     base_dir: &'a Path,
+    limits: Limits,
     inputs: Vec<Input>,
     warnings: Vec<String>,
     hashes: HashMap<PathBuf, String>,
 }
 
 impl<'a> Files<'a> {
-    fn new(base_dir: &'a Path) -> Self {
+    fn new(base_dir: &'a Path, limits: Limits) -> Self {
         Self {
             base_dir,
+            limits,
             inputs: Vec::new(),
             warnings: Vec::new(),
             hashes: HashMap::new(),
@@ -234,7 +256,7 @@ impl<'a> Files<'a> {
             return Ok(known.clone());
         }
         let mut hasher = blake3::Hasher::new();
-        std::fs::File::open(&location)
+        dipir_files::open(&location)
             .and_then(|file| hasher.update_reader(file).map(|_| ()))
             .map_err(|source| Error::Read {
                 role: role.into(),
@@ -297,8 +319,8 @@ impl<'a> Files<'a> {
 
     /// Imports an object and notes all files that it consists of.
     fn import(&mut self, role: &str, path: &Path) -> Result<(Imported, ObjectRecord), Error> {
-        let imported = import::load_object(&self.base_dir.join(path))?;
-        let shown = path.display();
+        let imported = import::load_object_within(&self.base_dir.join(path), &self.limits)?;
+        let shown = printable(path.display());
         self.warnings.extend(
             imported
                 .warnings
@@ -336,6 +358,7 @@ struct Assembly {
     mesh: TriangleMesh,
     materials: Vec<Material>,
     textures: Vec<Texture>,
+    lights: Vec<PunctualLight>,
     /// How many objects of each file are still to come.
     pending: HashMap<PathBuf, usize>,
     kept: HashMap<PathBuf, (Imported, ObjectRecord, u32)>,
@@ -351,6 +374,7 @@ impl Assembly {
             mesh: TriangleMesh::default(),
             materials: Vec::new(),
             textures: Vec::new(),
+            lights: Vec::new(),
             pending,
             kept: HashMap::new(),
         }
@@ -380,6 +404,8 @@ impl Assembly {
         let (map, extra) = place(&imported)?;
         let pending = self.pending.entry(path.into()).or_insert(1);
         *pending -= 1;
+        self.lights
+            .extend(imported.lights.iter().map(|light| light.placed(&map)));
         let origin = imported.origin;
         let mut mesh = if *pending > 0 {
             let mesh = imported.mesh.clone();
@@ -399,12 +425,10 @@ impl Assembly {
         }
         record.transform = ObjectRecord::rows(&map);
         let total = self.mesh.positions.len() as u64 + mesh.positions.len() as u64;
-        import::Limits::default().check(total, self.mesh.indices.len() as u64)?;
+        files
+            .limits
+            .check_mesh(total, (self.mesh.indices.len() + mesh.indices.len()) as u64)?;
         self.mesh.append(mesh, first_material);
         Ok((record, extra))
-    }
-
-    fn into_parts(self) -> (TriangleMesh, Vec<Material>, Vec<Texture>) {
-        (self.mesh, self.materials, self.textures)
     }
 }
