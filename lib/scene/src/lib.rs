@@ -20,5 +20,6 @@ pub mod scene;
 pub mod texture;
 pub mod transforms;
 pub mod triangle;
+pub mod visibility;
 
 pub use error::Error;

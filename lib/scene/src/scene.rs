@@ -1,5 +1,5 @@
 //! Everything that a renderer needs of a scene, but the light.
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use dipir_imaging::file::{self, Photo};
@@ -20,6 +20,7 @@ use crate::mesh::TriangleMesh;
 use crate::printable::printable;
 use crate::proxy::Proxy;
 use crate::texture::Texture;
+use crate::visibility;
 
 /// Objects to insert, the camera that took the photo, and the proxy that catches the shadow.
 #[derive(Clone, Debug)]
@@ -93,7 +94,7 @@ impl Scene {
                 (Proxy::Mesh(mesh), ProxyRecord::Mesh(record))
             }
         };
-        let mut assembly = Assembly::new(settings.objects.iter().map(|o| o.path.clone()));
+        let mut assembly = Assembly::new(camera, settings.objects.iter().map(|o| o.path.clone()));
         let mut objects = Vec::new();
         for (i, object) in settings.objects.iter().enumerate() {
             let key = format!("scene.objects[{i}]");
@@ -108,6 +109,7 @@ impl Scene {
             files.warnings.extend(warning);
             objects.push(placed);
         }
+        files.warnings.extend(repeated(&objects));
         let Assembly {
             mesh,
             materials,
@@ -173,7 +175,10 @@ impl SceneDescription {
                 Proxy::Mesh(files.proxy_mesh(&record.file.path)?.0)
             }
         };
-        let mut assembly = Assembly::new(self.objects.iter().map(|o| o.file.path.clone()));
+        let mut assembly = Assembly::new(
+            self.camera,
+            self.objects.iter().map(|o| o.file.path.clone()),
+        );
         for object in &self.objects {
             files.check_object("the object", object)?;
             assembly.add(&mut files, &object.file.path, |_| {
@@ -210,6 +215,23 @@ impl SceneDescription {
     }
 }
 
+/// Says how many objects stand where one of the same file stands already.
+fn repeated(objects: &[ObjectRecord]) -> Option<String> {
+    let mut seen = HashSet::new();
+    for object in objects {
+        seen.insert((
+            &object.file.path,
+            object.transform.map(|row| row.map(f64::to_bits)),
+        ));
+    }
+    match objects.len() - seen.len() {
+        0 => None,
+        n => Some(format!(
+            "scene.objects: {n} of them stand where the same file stands already, and are drawn once"
+        )),
+    }
+}
+
 /// Reads files relative to a folder and keeps the list.
 struct Files<'a> {
     base_dir: &'a Path,
@@ -227,6 +249,14 @@ impl<'a> Files<'a> {
             inputs: Vec::new(),
             warnings: Vec::new(),
             hashes: HashMap::new(),
+        }
+    }
+
+    /// Adds a warning, once, with the names in it made printable.
+    fn warn(&mut self, warning: String) {
+        let warning = printable(warning);
+        if !self.warnings.contains(&warning) {
+            self.warnings.push(warning);
         }
     }
 
@@ -355,6 +385,7 @@ impl<'a> Files<'a> {
 /// Objects put together into one mesh; a file that several objects use is read once and its
 /// materials are shared.
 struct Assembly {
+    camera: Camera,
     mesh: TriangleMesh,
     materials: Vec<Material>,
     textures: Vec<Texture>,
@@ -365,12 +396,13 @@ struct Assembly {
 }
 
 impl Assembly {
-    fn new(paths: impl Iterator<Item = PathBuf>) -> Self {
+    fn new(camera: Camera, paths: impl Iterator<Item = PathBuf>) -> Self {
         let mut pending = HashMap::new();
         for path in paths {
             *pending.entry(path).or_insert(0) += 1;
         }
         Self {
+            camera,
             mesh: TriangleMesh::default(),
             materials: Vec::new(),
             textures: Vec::new(),
@@ -422,6 +454,10 @@ impl Assembly {
                 element: bad as u64,
                 value: format!("{:?}", mesh.positions[bad].to_array()),
             });
+        }
+        let materials = &self.materials[first_material as usize..];
+        for why in visibility::hidden(&mesh, materials, &self.camera) {
+            files.warn(format!("\"{}\": {why}", path.display()));
         }
         record.transform = ObjectRecord::rows(&map);
         let total = self.mesh.positions.len() as u64 + mesh.positions.len() as u64;
