@@ -13,6 +13,7 @@ pub mod limits;
 pub mod material;
 pub mod mesh;
 pub mod placement;
+pub mod plausibility;
 pub mod printable;
 pub mod proxy;
 pub mod ray_offset;
