@@ -248,7 +248,7 @@ fn whole(bytes: &[u8]) -> Result<&[u8], Error> {
         ));
     };
     if version == 1 {
-        return Err(old_version("1"));
+        return Err(old_version("1.0"));
     }
     if version != 2 {
         return Err(Error::malformed(

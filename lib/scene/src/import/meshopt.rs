@@ -84,7 +84,7 @@ fn attributes(bytes: &[u8], count: usize, stride: usize) -> Result<Vec<u8>, Stri
     }
     let mut previous = tail[tail.len() - stride..].to_vec();
     let mut out = vec![0; count * stride];
-    let block_elements = (8192 / stride & !15).min(256);
+    let block_elements = ((8192 / stride) & !15).min(256);
     for block in out.chunks_mut(block_elements * stride) {
         let elements = block.len() / stride;
         let groups = elements.div_ceil(16);
@@ -304,7 +304,7 @@ fn octahedral(x: f32, y: f32, one: f32) -> [f32; 3] {
     let (x, y) = (x / one, y / one);
     let z = 1.0 - x.abs() - y.abs();
     let below = z.min(0.0);
-    let (x, y) = (x + below.copysign(x) * -1.0, y + below.copysign(y) * -1.0);
+    let (x, y) = (x - below.copysign(x), y - below.copysign(y));
     let length = (x * x + y * y + z * z).sqrt();
     [x / length, y / length, z / length]
 }
@@ -342,7 +342,7 @@ fn quaternion(data: &mut [u8]) {
         let [x, y, z] = [0, 1, 2].map(|k| f32::from(word(k)) * scale);
         let w = (1.0 - x * x - y * y - z * z).max(0.0).sqrt();
         for (offset, c) in [(1, x), (2, y), (3, z), (0, w)] {
-            let at = 2 * ((last & 3) as usize + offset & 3);
+            let at = 2 * (((last & 3) as usize + offset) & 3);
             let word = (c * 32767.0).round() as i16;
             v[at..at + 2].copy_from_slice(&word.to_le_bytes());
         }

@@ -40,7 +40,7 @@ fn a_broken_glb_says_where_it_breaks() {
     old[4] = 1;
     assert_eq!(
         message_of(&old),
-        "the file is glTF 1, which is not read; convert it to glTF 2.0: gltf-pipeline -i OLD.gltf -o NEW.glb"
+        "the file is glTF 1.0, which is not read; convert it to glTF 2.0: gltf-pipeline -i OLD.gltf -o NEW.glb"
     );
     let mut short = whole.clone();
     short[8..12].copy_from_slice(&11u32.to_le_bytes());

@@ -145,7 +145,7 @@ fn broken_plys_say_where() {
         (
             "end_header\n",
             "",
-            "line 15: \"0 0 0 255 0 188\" is not understood; export the file again",
+            "line 14: \"0 0 0 255 0 188\" is not understood; export the file again",
         ),
     ] {
         let text = SQUARE.replacen(from, to, 1);
