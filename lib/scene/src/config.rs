@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::{CameraSettings, FieldOfView, WorldUp};
 use crate::error::Error;
+use crate::limits::Limits;
 use crate::placement::{Anchor, Placement, Rest, Size};
 use crate::proxy::Plane;
 
@@ -36,13 +37,16 @@ pub struct SceneConfig {
     /// What to simulate.
     #[serde(default)]
     pub effects: EffectsConfig,
+    /// How much files may ask for.
+    #[serde(default, skip_serializing_if = "Limits::is_default")]
+    pub limits: Limits,
 }
 
 /// One `[[scene.objects]]` table as written.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectConfig {
-    /// `.glb`, `.gltf` or `.obj`, required.
+    /// `.glb`, `.gltf`, `.obj`, `.ply` or `.stl`, required.
     pub path: Option<PathBuf>,
     /// Where the object rests, metres; the origin by default.
     pub position: Option<[f32; 3]>,
@@ -226,6 +230,8 @@ pub struct SceneSettings {
     pub proxy: ProxySettings,
     /// What to simulate.
     pub effects: EffectsConfig,
+    /// How much files may ask for.
+    pub limits: Limits,
 }
 
 /// A checked `[[scene.objects]]` table.
@@ -325,6 +331,7 @@ impl SceneConfig {
                 Some(proxy) => proxy.validate()?,
             },
             effects: self.effects,
+            limits: self.limits,
         })
     }
 }

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::camera::Camera;
 use crate::config::EffectsConfig;
 use crate::error::Error;
+use crate::limits::Limits;
 use crate::proxy::Plane;
 
 /// A file with the hash of its contents.
@@ -92,6 +93,9 @@ pub struct SceneDescription {
     pub proxy: ProxyRecord,
     /// What the user says about effects.
     pub effects: EffectsConfig,
+    /// How much files may ask for.
+    #[serde(default, skip_serializing_if = "Limits::is_default")]
+    pub limits: Limits,
 }
 
 impl SceneDescription {
