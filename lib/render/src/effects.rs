@@ -319,6 +319,7 @@ fn has_textures(m: &Material) -> bool {
         || m.clearcoat
             .is_some_and(|c| c.factor_texture.is_some() || c.roughness_texture.is_some())
         || m.transmission.is_some_and(|t| t.texture.is_some())
+        || m.extensions.textures().next().is_some()
 }
 
 /// What the user wants of `effect`.
