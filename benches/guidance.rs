@@ -17,6 +17,8 @@ use std::path::PathBuf;
 
 use candle_core::{DType, Device};
 use dipir_diffusion::model::Model;
+use dipir_guidance::distillation::{Distillation, DistillationSettings};
+use dipir_guidance::reading::{self, read_light, start};
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
@@ -28,7 +30,8 @@ use dipir_optimize::lighting::Lighting;
 use dipir_optimize::objective::Objective;
 use dipir_optimize::optimization::Optimization;
 use dipir_optimize::parameters::{Parameters, ambient_of};
-use dipir_optimize::settings::{GuidanceKind, LightTable, Preset, Settings};
+use dipir_optimize::settings::{GuidanceKind, LightTable, Settings};
+use dipir_pipeline::config::Quality;
 use dipir_prior::examples::{Tone, angle_between};
 use dipir_prior::lights::sun_angles;
 use dipir_prior::place::Place;
@@ -42,8 +45,7 @@ use dipir_scene::material::Material;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
 use dipir_stages::known_light;
-use dipir_stages::light::distillation::{Distillation, DistillationSettings};
-use dipir_stages::light::reading::{self, read_light, start};
+use dipir_stages::presets;
 use glam::Vec3;
 
 /// Key of these scenes; training and gates have others.
@@ -222,7 +224,7 @@ fn run(
         iterations: Some(knobs.iterations.max(1)),
         ..LightTable::default()
     };
-    let mut settings = table.settings(Preset::Standard, 1)?;
+    let mut settings = table.settings(&presets::of(Quality::Standard).light, 1)?;
     settings.preview_every = 0;
     settings.checkpoint_every = 0;
     settings.learning_rates = settings.learning_rates.scaled(knobs.rate);
@@ -260,7 +262,9 @@ fn run(
         proxy: &proxy,
         object,
     };
-    let reading = read_light(model, &trial.photo, &place, &knobs.reader, index, &|_| {})?;
+    let reading = read_light(model, &trial.photo, &place, &knobs.reader, index, &|_| {
+        ControlFlow::Continue(())
+    })?;
     let Some(reading) = reading else {
         anyhow::bail!("the model has no light encoder");
     };

@@ -364,11 +364,7 @@ impl Runner<'_> {
             more,
             self.args.set,
             self.args.target_error,
-            dipir_stages::scene::VERSION,
-            dipir_stages::concepts::VERSION,
-            dipir_stages::lora::VERSION,
-            dipir_stages::light::VERSION,
-            dipir_stages::composite::VERSION,
+            dipir_stages::names::ALL.map(|s| s.version),
         ]);
         hasher.update(decides.to_string().as_bytes());
         Ok(hasher.finalize().to_hex().to_string())

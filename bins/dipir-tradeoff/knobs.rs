@@ -167,13 +167,13 @@ pub fn turned(set: &[(String, String)]) -> Vec<(String, String)> {
             "composite.target_error",
             preset.composite.target_error.to_string(),
         ),
-        ("light.iterations", preset.optimize.iterations.to_string()),
-        ("light.lobes", preset.optimize.lobes.to_string()),
+        ("light.iterations", preset.light.iterations.to_string()),
+        ("light.lobes", preset.light.lobes.to_string()),
         (
             "light.environment",
-            format!("{:?}", preset.optimize.environment),
+            format!("{:?}", preset.light.environment),
         ),
-        ("light.samples", preset.optimize.samples.to_string()),
+        ("light.samples", preset.light.samples.to_string()),
     ];
     let is_standard =
         |(key, value): &(String, String)| standard.iter().any(|(k, v)| k == key && v == value);

@@ -6,8 +6,8 @@ use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::session::Session;
 use dipir_pipeline::graph::Graph;
 use dipir_stages::graph;
+use dipir_stages::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE};
 use dipir_stages::report::quoted;
-use dipir_stages::{composite, concepts, light, lora, scene};
 
 #[derive(Args, Clone, Debug)]
 pub struct ProjectArgs {
@@ -91,11 +91,11 @@ impl Stage {
     /// Name of the stage and of its folder.
     pub fn name(self) -> &'static str {
         match self {
-            Self::Scene => scene::STAGE,
-            Self::Concepts => concepts::STAGE,
-            Self::Lora => lora::STAGE,
-            Self::Light => light::STAGE,
-            Self::Composite => composite::STAGE,
+            Self::Scene => SCENE.name,
+            Self::Concepts => CONCEPTS.name,
+            Self::Lora => LORA.name,
+            Self::Light => LIGHT.name,
+            Self::Composite => COMPOSITE.name,
         }
     }
 }

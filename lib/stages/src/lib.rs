@@ -8,6 +8,7 @@ pub mod known_light;
 pub mod light;
 pub mod lora;
 pub mod model;
+pub mod names;
 pub mod presets;
 pub mod preview;
 pub mod report;

@@ -1,48 +1,43 @@
 //! Guidance by a diffusion model: what it would change about the composite, as a gradient.
 use std::sync::Arc;
 
-use anyhow::Context;
 use candle_core::{DType, Tensor, Var};
-use dipir_cli::session::Session;
-use dipir_diffusion::distillation::{
-    Guidance as Kind, InpaintCondition, ScoreDistillation, Weighting,
-};
+use dipir_diffusion::distillation::{InpaintCondition, ScoreDistillation, ScoreRule, Weighting};
 use dipir_diffusion::lora::Lora;
 use dipir_diffusion::model::Model;
 use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::text_encoder::LearnedTokens;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_optimize::OptimizeError;
-use dipir_optimize::crop::{Framing, USUAL_SCALE, View};
+use dipir_optimize::crop::{CropView, Framing, USUAL_SCALE};
 use dipir_optimize::guidance::{Guidance, Guided, Step};
-use dipir_optimize::settings::{GuidanceKind, LightTable};
-use dipir_pipeline::manifest::Manifest;
-use dipir_pipeline::stage::StagePlan;
+use dipir_optimize::settings::{BadSetting, GuidanceKind, LightTable};
 use dipir_prior::energy::{guiding, states};
 use dipir_prior::words::{Caption, LightWords};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use crate::lora::{self, LoraTable};
-use crate::model;
+use crate::error::{Error, Result};
 
 /// The mean square of a picture's gradient is of order 1 / pixels times this: beside the
 /// regularisers it weighs as much as a reference does.
 const STRENGTH: f64 = 100.0;
-/// Crops of a model that knows light, in sides of the object's box: as it was trained.
+/// Sides of the crops that a model with light captions sees, in sides of the object's box: those of
+/// its training.
 const LIGHT_SCALE: [f32; 2] = [2.2, 3.0];
 
-/// Denoising steps from noise alone to a picture; an edited picture takes those below its timestep.
+/// Denoising steps from pure noise to a picture. An edited picture takes those below its timestep.
 const EDIT_STEPS: usize = 10;
 
-/// What of `[light]` is about the model.
+/// How a diffusion model guides: its part of the `[light]` table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DistillationSettings {
-    /// Which difference of predictions.
+    /// Which difference of noise predictions is the gradient.
     pub guidance: GuidanceKind,
-    /// Least and largest noise at the start and at the end.
+    /// Least and largest noise level, as shares of all timesteps: in the first and in the last
+    /// iteration.
     pub timesteps: [[f64; 2]; 2],
-    /// Draws of noise for an iteration.
+    /// Noise samples in each iteration.
     pub draws: usize,
     /// Classifier-free guidance of SDS and of edited pictures.
     pub guidance_scale: f64,
@@ -50,14 +45,19 @@ pub struct DistillationSettings {
     pub prompt: Option<String>,
     /// Whether a LoRA is used.
     pub adapt: bool,
-    /// Whether a light that was read is told from the same light from other sides; else from no
-    /// caption.
+    /// Whether the estimated light is contrasted with the same light turned to other sides; else
+    /// with the empty caption.
     pub turned: bool,
 }
 
 impl DistillationSettings {
-    /// What `table` says, else what is good for a model that knows light or does not.
-    pub fn new(session: &Session, table: &LightTable, knows_light: bool) -> anyhow::Result<Self> {
+    /// What `table` says. Where it is silent: the defaults for models with or without light
+    /// captions.
+    ///
+    /// # Errors
+    /// A value out of range, with its key.
+    pub fn new(table: &LightTable, knows_light: bool) -> std::result::Result<Self, BadSetting> {
+        let wrong = |key, message: String| Err(BadSetting { key, message });
         let timesteps = match table.timesteps.as_deref() {
             None if knows_light => [[0.5, 0.9]; 2],
             // [DiPIR, section 4.3].
@@ -65,8 +65,9 @@ impl DistillationSettings {
             Some([one]) => [*one; 2],
             Some([first, last]) => [*first, *last],
             Some(_) => {
-                let message = "accepted: one pair, or two of which the second is reached at the end, as in [[0.02, 0.6], [0.02, 0.3]]";
-                return Err(session.config.invalid("light.timesteps", message).into());
+                let message = "accepted: one pair, or two of which the second is reached at the \
+                               end, as in [[0.02, 0.6], [0.02, 0.3]]";
+                return wrong("timesteps", message.into());
             }
         };
         if timesteps
@@ -74,12 +75,14 @@ impl DistillationSettings {
             .any(|[low, high]| !(0.0 <= *low && low <= high && *high <= 1.0))
         {
             let message = "accepted: pairs of a lower and a higher share, from 0 to 1";
-            return Err(session.config.invalid("light.timesteps", message).into());
+            return wrong("timesteps", message.into());
         }
         let draws = table.draws.unwrap_or(1);
         if !(1..=64).contains(&draws) {
-            let message = format!("{draws} is out of range; accepted: 1 to 64");
-            return Err(session.config.invalid("light.draws", message).into());
+            return wrong(
+                "draws",
+                format!("{draws} is out of range; accepted: 1 to 64"),
+            );
         }
         Ok(Self {
             guidance: table.guidance,
@@ -93,55 +96,23 @@ impl DistillationSettings {
     }
 }
 
-/// The LoRA stage's result.
+/// A LoRA that was trained on the photograph.
 pub struct Adapter {
-    lora: Arc<Lora>,
-    learned: Option<LearnedTokens>,
-    word: String,
+    /// Its matrices.
+    pub lora: Arc<Lora>,
+    /// The embedding of its word, if one was learned.
+    pub learned: Option<LearnedTokens>,
+    /// The word that stands for the photograph's style in prompts.
+    pub word: String,
 }
 
-impl Adapter {
-    /// Enters what the LoRA stage wrote into the plan.
-    pub fn add_inputs(session: &Session, plan: &mut StagePlan) -> anyhow::Result<()> {
-        let folder = session.stage_folder(lora::STAGE);
-        let manifest = Manifest::read(&folder, lora::EXECUTABLE)?;
-        let mut roles = vec!["lora"];
-        if manifest.outputs.iter().any(|o| o.role == "word") {
-            roles.push("word");
-        }
-        Ok(plan.outputs_of(&manifest, &roles)?)
-    }
-
-    /// Reads what the LoRA stage wrote; gives its word, if it learned one, a token of its own.
-    pub fn load(session: &Session, model: &mut Model) -> anyhow::Result<Self> {
-        let table: LoraTable = session.config.table("lora")?;
-        let folder = session.stage_folder(lora::STAGE);
-        let manifest = Manifest::read(&folder, lora::EXECUTABLE)?;
-        let targets = model.unet.adapter_targets();
-        let path = manifest.output(&folder, "lora")?;
-        let lora = Lora::load(&path, &targets, model.dtype(), model.device())?;
-        let learned = match manifest.outputs.iter().any(|o| o.role == "word") {
-            true => {
-                let path = manifest.output(&folder, "word")?;
-                Some(lora::learned_word(model, &table.word, &path)?)
-            }
-            false => None,
-        };
-        Ok(Self {
-            lora: Arc::new(lora),
-            learned,
-            word: table.word,
-        })
-    }
-}
-
-/// The states of what a picture should be, and of what that is told from.
-struct Said {
+/// Text states of the wanted picture and of what it is contrasted with.
+struct Contrast {
     conditional: Tensor,
     unconditional: Tensor,
 }
 
-impl Said {
+impl Contrast {
     fn new(conditional: &Tensor, unconditional: &Tensor) -> Self {
         Self {
             conditional: conditional.detach(),
@@ -149,16 +120,17 @@ impl Said {
         }
     }
 
-    /// That the light is `words`.
+    /// Contrasts a picture of `class` under the light `words` with others.
     fn of_light(
         model: &Model,
         settings: &DistillationSettings,
         class: &str,
         words: &LightWords,
-    ) -> anyhow::Result<Self> {
+    ) -> Result<Self> {
         let known = model.tokenizer.words(class)?.len() == 1;
         let class = if known { class } else { "object" };
-        // SDS and edited pictures extrapolate from what is subtracted: that is no other light.
+        // SDS and SDEdit extrapolate away from the unconditional prediction, which must be that of no
+        // caption.
         let differs = matches!(settings.guidance, GuidanceKind::Lds | GuidanceKind::Csd);
         let all = match settings.turned && differs {
             true => guiding(model, class, words)?,
@@ -181,9 +153,9 @@ pub struct Distillation<'a> {
     model: &'a Model,
     settings: DistillationSettings,
     lora: Option<Arc<Lora>>,
-    said: Said,
-    /// What is said of the mirror image, where what is said has sides.
-    mirrored: Option<Said>,
+    contrast: Contrast,
+    /// The same for the mirror image, if the light has a side.
+    mirrored: Option<Contrast>,
     background: Raster<Vec3>,
     paint: Raster<Vec3>,
     side: usize,
@@ -201,12 +173,12 @@ impl<'a> Distillation<'a> {
         light: Option<&LightWords>,
         background: &DisplayImage,
         paint: &Raster<f32>,
-    ) -> anyhow::Result<Self> {
+    ) -> Result<Self> {
         let word = adapter.map(|a| a.word.as_str());
         let learned = adapter.and_then(|a| a.learned.as_ref());
-        let (said, mirrored) = match (light, &settings.prompt) {
+        let (contrast, mirrored) = match (light, &settings.prompt) {
             (Some(words), None) => {
-                let of = |words| Said::of_light(model, &settings, class, words);
+                let of = |words| Contrast::of_light(model, &settings, class, words);
                 (of(words)?, Some(of(&words.mirrored())?))
             }
             (_, prompt) => {
@@ -217,30 +189,30 @@ impl<'a> Distillation<'a> {
                 let prompt = prompt.clone().unwrap_or(own);
                 let conditional = model.encode_prompts(&[&prompt], learned)?;
                 let unconditional = model.encode_prompts(&[""], None)?;
-                (Said::new(&conditional, &unconditional), None)
+                (Contrast::new(&conditional, &unconditional), None)
             }
         };
         Ok(Self {
             model,
             lora: adapter.map(|a| a.lora.clone()),
-            said,
+            contrast,
             mirrored,
             background: background.0.clone(),
             paint: paint.map(|&a| Vec3::splat(a)),
-            side: model::native_size(model),
+            side: model.native_size(),
             knows_light: light.is_some(),
             settings,
         })
     }
 
     /// Planes [1, 3, side, side] in [-1, 1].
-    fn tensor(&self, picture: &Raster<Vec3>) -> anyhow::Result<Tensor> {
-        let image = model::from_display(&DisplayImage(picture.clone()))?;
+    fn tensor(&self, picture: &Raster<Vec3>) -> Result<Tensor> {
+        let image = dipir_tensors::model_input(&DisplayImage(picture.clone()))?;
         let image = image.unsqueeze(0)?.to_device(self.model.device())?;
         Ok(image.to_dtype(self.model.dtype())?)
     }
 
-    fn condition(&self, view: &View, swap: bool) -> anyhow::Result<Option<InpaintCondition>> {
+    fn condition(&self, view: &CropView, swap: bool) -> Result<Option<InpaintCondition>> {
         if !self.model.is_inpainting() {
             return Ok(None);
         }
@@ -249,47 +221,42 @@ impl<'a> Distillation<'a> {
             false => view.apply(picture),
         };
         let shown = self.tensor(&seen(&self.background))?;
-        let side = self.side;
-        let mask: Vec<f32> = seen(&self.paint)
-            .pixels()
-            .iter()
-            .map(|p| f32::from(p.x > 0.02))
-            .collect();
-        let mask = Tensor::from_vec(mask, (1, 1, side, side), self.model.device())?;
+        let mask = dipir_tensors::mask(&seen(&self.paint).map(|p| p.x), 0.02)?;
+        let mask = mask.to_device(self.model.device())?;
         let mask = mask.to_dtype(self.model.dtype())?;
         Ok(Some(InpaintCondition::new(&self.model.vae, &shown, &mask)?))
     }
 
-    fn judge(&self, picture: &Raster<Vec3>, view: &View, step: Step) -> anyhow::Result<Guided> {
-        // Every other iteration sees the mirror image: what the model gets wrong of a picture it partly
-        // gets wrong differently there (docs/prior.md).
+    fn evaluate(&self, picture: &Raster<Vec3>, view: &CropView, step: Step) -> Result<Guided> {
+        // Every other iteration uses the mirror image: part of the model's error changes sign there
+        // (docs/prior.md).
         let swapped = self.mirrored.as_ref().filter(|_| step.iteration % 2 == 1);
-        let said = swapped.unwrap_or(&self.said);
+        let contrast = swapped.unwrap_or(&self.contrast);
         let image = Var::from_tensor(&match swapped {
             Some(_) => self.tensor(&mirror(picture))?,
             None => self.tensor(picture)?,
         })?;
         let latents = self.model.vae.encode(&image, None)?;
         let condition = self.condition(view, swapped.is_some())?;
-        let guidance = match self.settings.guidance {
-            GuidanceKind::Sds => Kind::Sds {
+        let rule = match self.settings.guidance {
+            GuidanceKind::Sds => ScoreRule::Sds {
                 scale: self.settings.guidance_scale,
             },
-            GuidanceKind::Csd => Kind::Csd,
-            GuidanceKind::SdEdit => Kind::Edit {
+            GuidanceKind::Csd => ScoreRule::Csd,
+            GuidanceKind::SdEdit => ScoreRule::Edit {
                 scale: self.settings.guidance_scale,
                 steps: EDIT_STEPS,
             },
-            _ => Kind::Lds,
+            _ => ScoreRule::Lds,
         };
         let distillation = ScoreDistillation {
             unet: &self.model.unet,
             schedule: &self.model.schedule,
-            guidance,
+            rule,
             weighting: Weighting::NoiseVariance,
             lora: self.lora.as_ref(),
-            conditional: &said.conditional,
-            unconditional: &said.unconditional,
+            conditional: &contrast.conditional,
+            unconditional: &contrast.unconditional,
             inpaint: condition.as_ref(),
         };
         let mut stream = NoiseStream::new(step.seed ^ 0xd15711, step.iteration as u64);
@@ -316,24 +283,16 @@ impl<'a> Distillation<'a> {
                 Some(sum) => (sum + found.gradient)?,
             });
         }
-        let sum = sum.context("no draw of noise")?.detach();
+        let sum = sum.ok_or(Error::Cut("no noise was drawn"))?.detach();
         let scale = STRENGTH / (draws * latents.elem_count()) as f64;
         // The gradient is injected at the latents and carried back to the picture.
         let injected = (&latents * &sum)?.sum_all()?;
         let gradients = injected.backward()?;
         let at_image = gradients
             .get(&image)
-            .context("the autoencoder cuts the graph")?;
+            .ok_or(Error::Cut("the autoencoder has no gradient at its input"))?;
         let at_image = (at_image.to_dtype(DType::F32)? * (2.0 * scale))?;
-        let values = at_image
-            .to_device(&candle_core::Device::Cpu)?
-            .flatten_all()?
-            .to_vec1::<f32>()?;
-        let n = self.side * self.side;
-        let pixels = (0..n)
-            .map(|i| Vec3::new(values[i], values[n + i], values[2 * n + i]))
-            .collect();
-        let gradient = Raster::from_pixels(self.side, self.side, pixels);
+        let gradient = dipir_tensors::picture(&at_image)?;
         Ok(Guided {
             loss: size,
             gradient: match swapped {
@@ -360,10 +319,10 @@ impl Guidance for Distillation<'_> {
     fn gradient(
         &mut self,
         picture: &Raster<Vec3>,
-        view: &View,
+        view: &CropView,
         step: Step,
-    ) -> Result<Guided, OptimizeError> {
-        self.judge(picture, view, step)
+    ) -> std::result::Result<Guided, OptimizeError> {
+        self.evaluate(picture, view, step)
             .map_err(|e| OptimizeError::Guidance {
                 iteration: step.iteration,
                 source: e.into(),
@@ -384,7 +343,7 @@ mod tests {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data/prior");
         let mut model = Model::load(&folder, DType::F32, &Device::Cpu).unwrap();
         dipir_prior::student::add_placeholders(&mut model.tokenizer);
-        let side = model::native_size(&model);
+        let side = model.native_size();
         let drawn = |value: fn(f32, f32) -> Vec3| {
             let unit = |k: usize| k as f32 / side as f32;
             let pixels = (0..side * side).map(|i| value(unit(i % side), unit(i / side)));
@@ -421,7 +380,9 @@ mod tests {
                 iterations: 10,
                 seed: 5,
             };
-            d.judge(picture, &View::whole(), step).unwrap().gradient
+            d.evaluate(picture, &CropView::whole(), step)
+                .unwrap()
+                .gradient
         };
         let as_it_is = distillation(&light, &photo, &paint);
         let mut turned = distillation(&light.mirrored(), &mirror(&photo), &mirror(&paint));

@@ -1,6 +1,7 @@
-//! What a model that knows light reads off the photograph, and the start that follows from it.
-use anyhow::Context;
-use dipir_cli::interrupt::Interrupted;
+//! The light that a model with light captions sees in crops of the photograph, and the start of the
+//! optimisation that follows from it.
+use std::ops::ControlFlow;
+
 use dipir_diffusion::model::Model;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_imaging::resize::{CropResize, Filter, PixelBox};
@@ -14,7 +15,7 @@ use dipir_scene::camera::Camera;
 use dipir_scene::proxy::Proxy;
 use glam::{DVec3, Vec2, Vec3};
 
-use crate::interruption;
+use crate::error::{Error, Result};
 
 /// Side of a crop in longer sides of the object's box: as the model was trained, where the object
 /// takes about two fifths.
@@ -65,15 +66,14 @@ fn direction(camera: &Camera, azimuth: f32, elevation: f32) -> Vec3 {
     (forward * c + right * s) * elevation.cos() + Vec3::Y * elevation.sin()
 }
 
-/// The planes [3, SIZE, SIZE] of a square picture.
+/// The planes [3, SIZE, SIZE] of a square picture, clamped to [0, 1].
 pub fn planes(picture: &Raster<Vec3>) -> Vec<f32> {
-    let channel = |c: usize| picture.pixels().iter().map(move |p| p[c].clamp(0.0, 1.0));
-    (0..3).flat_map(channel).collect()
+    dipir_tensors::planes(&picture.map(|p| p.clamp(Vec3::ZERO, Vec3::ONE)))
 }
 
 fn crop_of(photo: &Raster<Vec3>, camera: &Camera, region: PixelBox) -> Crop {
     let size = (photo.width(), photo.height());
-    let resize = CropResize::new(size, region, (SIZE, SIZE), Filter::Bilinear);
+    let resize = CropResize::new(size, region, (SIZE, SIZE), Filter::Tent);
     Crop {
         picture: planes(&resize.apply(photo)),
         gaze: gaze(camera, region),
@@ -210,28 +210,26 @@ fn crops(photo: &Raster<Vec3>, place: &Place<'_>) -> Vec<Crop> {
     chosen
 }
 
-/// Reads the light off `photo`, display values, around the place of the insertion; `None` if the model
-/// cannot. `progress` is told the share that is done.
+/// Estimates the light from `photo`, display values, around the place of the insertion; `None` if the
+/// model has no light encoder. `progress` is told the share that is done and may break off.
+///
+/// # Errors
+/// Those of the model; [`Error::Interrupted`] if `progress` broke off.
 pub fn read_light(
     model: &Model,
     photo: &DisplayImage,
     place: &Place<'_>,
     settings: &ReaderSettings,
     seed: u64,
-    progress: &(dyn Fn(f64) + Sync),
-) -> anyhow::Result<Option<Reading>> {
-    let encoder = LightEncoder::load(&model.folder).context("cannot use the light encoder")?;
-    let Some(encoder) = encoder else {
+    progress: &(dyn Fn(f64) -> ControlFlow<()> + Sync),
+) -> Result<Option<Reading>> {
+    let Some(encoder) = LightEncoder::load(&model.folder)? else {
         return Ok(None);
     };
     let crops = crops(&photo.0, place);
-    let report = |share: f64| {
-        progress(share);
-        interruption()
-    };
-    match read(model, &encoder, &crops, NEAR, settings, seed, &report)? {
+    match read(model, &encoder, &crops, NEAR, settings, seed, progress)? {
         Some(reading) => Ok(Some(reading)),
-        None => Err(Interrupted.into()),
+        None => Err(Error::Interrupted),
     }
 }
 
