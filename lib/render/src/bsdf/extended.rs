@@ -4,8 +4,8 @@
 //!
 //! Where reflectance has a colour or a film, what lies below receives what its largest channel
 //! leaves over: light is lost, never gained. An anisotropic lobe is an isotropic one, stretched along
-//! the tangent [Heitz 2014, section 5.3]; what single scattering loses is taken from the isotropic
-//! lobe with the same product of widths.
+//! the tangent [Heitz 2014, section 5.3]. Of what its single scattering loses it gets back what the isotropic
+//! lobe that is as wide as it is across the tangent loses, which is less.
 use glam::Vec3;
 
 use super::fresnel::f0_from_ior;
@@ -18,8 +18,6 @@ use crate::surface::SurfacePoint;
 pub(super) struct Interface {
     /// Perceptual roughness across the tangent.
     pub roughness: f32,
-    /// Perceptual roughness of the isotropic lobe with the same energy.
-    pub mean_roughness: f32,
     /// How much wider the lobe is along the tangent than across it.
     pub stretch: f32,
     /// Reflectance at normal incidence, dielectric and metal mixed, without the film.
@@ -37,7 +35,6 @@ impl Interface {
     /// Without extensions.
     pub const PLAIN: Self = Self {
         roughness: 1.0,
-        mean_roughness: 1.0,
         stretch: 1.0,
         f0: Vec3::ZERO,
         f90: Vec3::ONE,
@@ -67,7 +64,6 @@ impl Interface {
             dielectric: (dielectric, extension.specular.max(dielectric)),
             film,
             roughness: surface.roughness,
-            mean_roughness: surface.roughness,
             ..Self::PLAIN
         };
         if extension.anisotropy > 0.0 {
@@ -75,7 +71,6 @@ impl Interface {
             let across = interface.roughness * interface.roughness;
             let along = across + (1.0 - across) * extension.anisotropy * extension.anisotropy;
             interface.stretch = along / across;
-            interface.mean_roughness = (along * across).powf(0.25);
         }
         interface
     }

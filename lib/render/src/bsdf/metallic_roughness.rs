@@ -194,7 +194,7 @@ impl Base {
         passing: f32,
     ) -> Self {
         let interface = Interface::new(surface);
-        let energy = LobeEnergy::new(interface.mean_roughness);
+        let energy = LobeEnergy::new(interface.roughness);
         let ggx = Ggx::new(interface.roughness);
         let (f0_dielectric, f90) = interface.dielectric;
         let (loss, share) = (energy.loss(wo.z), energy.share(wo.z));
