@@ -40,7 +40,7 @@ const FIRST_ROUND: u32 = 8;
 /// uncertain.
 const MAX_GROWTH: f64 = 4.0;
 
-/// The first round under a time budget, small, because nobody knows yet what a sample takes.
+/// The first round under a time budget, small, because the time of a sample is not known yet.
 const FIRST_TIMED_ROUND: u32 = 4;
 
 /// Under a time budget the total cost grows at most by this factor a round, so that how long the

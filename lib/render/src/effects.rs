@@ -27,7 +27,7 @@ use crate::pilot::{Difference, Pilot};
 use crate::render::{Renderer, Settings, Simulation};
 use crate::shadow::LightOnProxy;
 
-/// Something that light does, by the name that files use.
+/// A phenomenon that can be simulated, by its name in files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Effect {

@@ -61,7 +61,7 @@ pub struct Settings<'a> {
     /// 1 where the photograph's own foreground hides the object, 0 where it does not; of the
     /// camera's size.
     pub occluders: Option<&'a Raster<f32>>,
-    /// Share of a plane's light that may be blocked without being looked for.
+    /// Share of a plane's light that may be blocked without being sampled.
     pub shadow_tolerance: f32,
     /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
     pub highlights: bool,

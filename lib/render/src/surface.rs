@@ -71,7 +71,7 @@ pub struct SurfacePoint {
     pub transmission: f32,
     /// Dielectric coat over the base.
     pub coat: CoatPoint,
-    /// What further extensions say.
+    /// Extensions beside coat and transmission.
     pub extension: ExtensionPoint,
     /// Emitted radiance towards the side that is seen, linear.
     pub emission: Vec3,
@@ -122,7 +122,7 @@ impl SurfacePoint {
     }
 }
 
-/// A material without what the planned effects leave out.
+/// A material reduced to the planned effects.
 #[derive(Clone, Debug)]
 struct Prepared {
     material: Material,
@@ -237,8 +237,8 @@ impl<'a> Surfaces<'a> {
         })
     }
 
-    /// Whether light that comes from behind does not find `triangle`. Transmissive surfaces
-    /// are found from both sides.
+    /// Whether rays from behind pass through `triangle`. Transmissive surfaces are met from both
+    /// sides.
     #[inline]
     pub fn single_sided(&self, triangle: u32) -> bool {
         let m = self.material(triangle);
