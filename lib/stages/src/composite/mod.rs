@@ -309,8 +309,11 @@ impl<'a> Composite<'a> {
     }
 }
 
+/// Rounded to half precision, at most its largest finite value: an infinite shadow ratio times a black
+/// photograph would be NaN.
 fn half_vec(v: Vec3) -> Vec3 {
-    let half = |x: f32| half::f16::from_f32(x).to_f32();
+    let most = half::f16::MAX.to_f32();
+    let half = |x: f32| half::f16::from_f32(x.clamp(-most, most)).to_f32();
     Vec3::new(half(v.x), half(v.y), half(v.z))
 }
 
