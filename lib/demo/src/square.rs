@@ -51,19 +51,10 @@ impl Square {
         self.materials.push(Material {
             name: name.into(),
             base_color: color.extend(1.0),
-            base_color_texture: None,
             metallic: 0.0,
             roughness,
-            metallic_roughness_texture: None,
-            normal_texture: None,
-            emissive: Vec3::ZERO,
-            emissive_texture: None,
-            alpha_mode: dipir_scene::material::AlphaMode::Opaque,
             double_sided: true,
-            ior: 1.5,
-            clearcoat: None,
-            transmission: None,
-            unlit: false,
+            ..Material::default()
         });
         self.materials.len() as u32 - 1
     }

@@ -34,10 +34,10 @@ fn small_sun() -> (EnvironmentSampler, f32) {
     (EnvironmentSampler::new(map), irradiance)
 }
 
-fn sampled(roughness: f32, glints: bool, seed: u64) -> Rendered {
+fn sampled(roughness: f32, highlights: bool, seed: u64) -> Rendered {
     let settings = Settings {
         stop: Stop::TargetError(0.005),
-        glints,
+        highlights,
         ..settings(0, seed)
     };
     let ball = mirror_ball(roughness);
@@ -93,9 +93,9 @@ fn what_is_found_does_not_depend_on_threads() {
 
 #[test]
 fn under_an_even_sky_and_on_matte_surfaces_nothing_is_looked_for() {
-    let rays = |scene: &Scene, light: &EnvironmentSampler, glints| {
+    let rays = |scene: &Scene, light: &EnvironmentSampler, highlights| {
         let settings = Settings {
-            glints,
+            highlights,
             ..settings(16, 0)
         };
         render(scene, light, &everything(2), &settings)
@@ -114,10 +114,10 @@ fn under_an_even_sky_and_on_matte_surfaces_nothing_is_looked_for() {
 
 #[test]
 fn without_time_nothing_is_looked_into() {
-    let with = |glints| {
+    let with = |highlights| {
         let settings = Settings {
             stop: Stop::TimeBudget(Duration::ZERO),
-            glints,
+            highlights,
             ..settings(0, 1)
         };
         let ball = mirror_ball(0.02);
@@ -131,9 +131,9 @@ fn without_time_nothing_is_looked_into() {
 }
 
 /// Scans whose shares are given by cell and response.
-fn focus_of(responses: Vec<Vec<(u32, f32)>>) -> Focus {
+fn density_of(responses: Vec<Vec<(u32, f32)>>) -> PixelDensity {
     let scans = SIDES.into_iter().zip(responses);
-    Focus {
+    PixelDensity {
         scans: scans.filter_map(|(side, r)| Scan::new(side, r)).collect(),
     }
 }
@@ -150,13 +150,13 @@ proptest! {
         responses in (responses(16), responses(64), responses(256)),
     ) {
         let (a, b, c) = responses;
-        let focus = focus_of(vec![a, b, c]);
+        let density = density_of(vec![a, b, c]);
         // Of a quarter of the square and of all of it. Weights are at most 2, so a sum of n independent ones has
         // a standard deviation of 1 / sqrt(n) at most, .008; these are stratified.
         let (n, mut quarter, mut whole) = (1 << 14, 0.0, 0.0);
         for sample in 0..n {
             let u = Sampler::new(3, Stream::TEST, 0, sample).next_2d();
-            let (point, weight) = focus.place(u);
+            let (point, weight) = density.place(u);
             prop_assert!((0.0..=1.0).contains(&point.x) && (0.0..=1.0).contains(&point.y));
             prop_assert!(weight > 0.0 && weight <= 1.0 / EVEN + 1e-4);
             whole += f64::from(weight) / f64::from(n);
@@ -188,8 +188,8 @@ fn places_stay_in_cells_that_have_a_share_however_numbers_are_rounded() {
         }
     }
     // The last of several scans takes what is rounded up to its end.
-    let focus = focus_of(vec![vec![(0, 1.0)], vec![(1, 1.0)], vec![(last, 1.0)]]);
-    let (point, weight) = focus.place(Vec2::new(BELOW_1, BELOW_1));
+    let density = density_of(vec![vec![(0, 1.0)], vec![(1, 1.0)], vec![(last, 1.0)]]);
+    let (point, weight) = density.place(Vec2::new(BELOW_1, BELOW_1));
     assert!(point.min_element() > 1.0 - 1.0 / side as f32, "{point}");
     assert!(weight < 1e-4, "{weight}");
 }

@@ -1,13 +1,13 @@
-//! Glints: images of a small, bright light in polished surfaces, smaller than a pixel.
+//! Highlights smaller than a pixel: reflections of a small, bright light in polished surfaces.
 //!
-//! A sample meets such an image with a chance of one in hundreds or thousands. Until one does, neither the
-//! picture nor its estimated error knows of it, and a sun in the lacquer of a small or distant car
-//! is lost. What finds it is the same pixel lit as if surfaces were nearly as rough as they are curved within it:
-//! the same light arrives, spread over a good part of the pixel [path mollification as in path space
-//! regularization, Kaplanyan and Dachsbacher 2013]. Where that is brighter or darker than what was sampled, the
-//! pixel's square is scanned in the same way, cell by cell and then the brightest cells part by part, and from then
-//! on sampled more where the scans are bright ([`Focus`]). The picture itself is made of samples of the true surfaces alone,
-//! divided by their density, and stays unbiased.
+//! One in hundreds or thousands of samples meets such a reflection. Until one does, it is missing from the
+//! picture and from its estimated error: the sun in the lacquer of a distant car is lost. To find
+//! highlights, the pixel is traced with surfaces nearly as rough as they are curved within it: the
+//! same light arrives, spread over a large part of the pixel [path space regularization, Kaplanyan
+//! and Dachsbacher 2013]. Where the result differs from what was sampled, the pixel's square is
+//! scanned with such surfaces, first cell by cell, then the brightest cells at finer scales. From
+//! then on samples are drawn in proportion to what the scans found ([`PixelDensity`]). All samples
+//! of the picture use the true surfaces and are divided by their density, so it stays unbiased.
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
@@ -24,43 +24,43 @@ use crate::film::{Film, Viewing};
 use crate::foreground::PathContext;
 use crate::light::PathLight;
 
-/// Camera rays that look how curved a surface is within a pixel.
+/// Camera rays that measure how curved a surface is within a pixel.
 const RAYS_PER_PIXEL: u32 = 8;
-/// Paths through a pixel that may hold a glint, and through one that seems to.
+/// Paths through a pixel that may hold a highlight, and through one whose first paths found one.
 const PATHS_PER_PIXEL: [u32; 2] = [32, 128];
-/// How much rougher surfaces get, as a share of the spread of normals: the lobe fills the tenth part of
-/// the pixel, so that every picture of a glint is met, and remains much brighter than without.
+/// Roughness that surfaces get, as a share of the spread of normals: the lobe then fills a tenth of the pixel,
+/// so that paths meet every highlight, and it is still much brighter than its surroundings.
 const MOLLIFIED: f32 = 1.0 / 3.0;
 /// Display values by which a pixel must differ.
 const NOTICEABLE: f32 = 0.04;
-/// A source this many times brighter than the rest of the light is about as bright as the rest when a dielectric
-/// mirrors it.
+/// A source this many times brighter than the mean of the light is, reflected by a dielectric, about as bright as
+/// that mean.
 const BRIGHT: f32 = 25.0;
 /// Columns and rows of cells in a pixel, scan by scan.
 const SIDES: [u32; 3] = [16, 64, 256];
-/// Cells of a scan whose parts the next looks at.
-const LOOKED_INTO: usize = 16;
+/// Brightest cells of a scan that the next scan refines.
+const REFINED: usize = 16;
 /// Paths through every cell of a scan.
 const PATHS_PER_CELL: u32 = 4;
 /// Paths of all scans of a pixel.
 const PATHS_PER_SCAN: u64 =
-    ((SIDES[0] * SIDES[0] + 2 * LOOKED_INTO as u32 * PARTS) * PATHS_PER_CELL) as u64;
-/// Of so many pixels all are looked at that are smooth enough; of more only those whose first surface may mirror a
-/// source.
+    ((SIDES[0] * SIDES[0] + 2 * REFINED as u32 * PARTS) * PATHS_PER_CELL) as u64;
+/// Most candidate pixels that are all tested; if there are more, only those whose first surface may mirror a source
+/// are.
 const MOST_INDIRECT: usize = 4096;
-/// So many pixels may be scanned, however few samples the picture has taken.
+/// Pixels that may be scanned, however few samples the picture has taken.
 const LEAST_SCANS: usize = 32;
-/// Share of the samples of a pixel in focus that are spread evenly; each scan directs as many of the others.
+/// Share of a pixel's samples that are uniform; the scans share the others equally.
 const EVEN: f32 = 0.5;
 /// The largest number below 1.
 const BELOW_1: f32 = 1.0 - f32::EPSILON / 2.0;
 /// The farthest place in a cell that is still told from the next one: eight bits number the cells of a row.
 const WITHIN_CELL: f32 = 1.0 - f32::EPSILON * 128.0;
 
-/// Where in a pixel its samples go: a density on the unit square, a mixture of an even one and of one for each scan,
-/// constant on its cells.
+/// Density of the samples within a pixel, on the unit square: a mixture of a uniform one and one for each scan, which
+/// is constant on its cells.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Focus {
+pub struct PixelDensity {
     scans: Vec<Scan>,
 }
 
@@ -127,7 +127,7 @@ fn corner_of(cell: u32, side: u32) -> Vec2 {
     Vec2::new((cell % side) as f32, (cell / side) as f32)
 }
 
-impl Focus {
+impl PixelDensity {
     /// A point of the unit square from two uniform numbers, and one over its density.
     pub fn place(&self, u: Vec2) -> (Vec2, f32) {
         let each = (1.0 - EVEN) / self.scans.len() as f32;
@@ -147,25 +147,25 @@ impl Focus {
     }
 }
 
-/// What looking for glints led to.
+/// Result of the search for highlights.
 #[derive(Clone, Debug, Default)]
 pub struct Found {
-    /// Pixels whose samples should be drawn anew, and where in them.
-    pub pixels: Vec<((u32, u32), Focus)>,
-    /// Rays that it took, but for those that found a pixel too rough or too flat.
+    /// Pixels whose samples are to be drawn again, with their densities.
+    pub pixels: Vec<((u32, u32), PixelDensity)>,
+    /// Rays that the search traced, without those of pixels that are too rough or too flat.
     pub counts: RayCounts,
 }
 
-/// How long is looked for glints.
+/// Effort that the search may take.
 #[derive(Clone, Copy, Debug)]
-pub enum Patience {
-    /// For a sixteenth as many paths as the picture has taken samples, and at least some.
+pub enum Limit {
+    /// A sixteenth as many paths as the picture has taken samples, and at least some.
     Samples(u64),
-    /// Until then.
+    /// All that fits before this time.
     Until(Instant),
 }
 
-impl Patience {
+impl Limit {
     /// How many pixels may be scanned.
     fn scans(self) -> usize {
         match self {
@@ -174,7 +174,7 @@ impl Patience {
         }
     }
 
-    /// Whether there is no time for so many seconds of work.
+    /// Whether `seconds` of work no longer fit.
     fn is_over(self, seconds: f64) -> bool {
         match self {
             Self::Samples(_) => false,
@@ -183,8 +183,8 @@ impl Patience {
     }
 }
 
-/// A pixel that may hold a glint.
-struct Suspect {
+/// A pixel that may hold a highlight.
+struct Candidate {
     pixel: (u32, u32),
     /// Spread of the normals in the pixel, radians.
     spread: f32,
@@ -195,14 +195,14 @@ struct Suspect {
     counts: RayCounts,
 }
 
-/// Of `pixels`, those whose samples should be drawn anew, with where: glints that were not met, or by chance.
-/// `film` holds what was sampled so far. Traces nothing where the light has no bright source.
+/// Those of `pixels` with highlights that the samples in `film` missed or met by chance, with the density of their
+/// new samples. Traces nothing where the light has no bright source.
 pub fn find<L: PathLight>(
     path: &PathContext<L>,
     film: &Film,
     viewing: &Viewing,
     pixels: &[(u32, u32)],
-    patience: Patience,
+    limit: Limit,
     seed: u64,
 ) -> Found {
     let sources = bright_sources(path.light, seed);
@@ -210,11 +210,11 @@ pub fn find<L: PathLight>(
         return Found::default();
     }
     with_features!(path.world.mask, F => {
-        let mut suspects = suspects::<_, F>(path, &sources, pixels, seed);
-        if suspects.len() > MOST_INDIRECT {
-            suspects.retain(|s| s.is_direct);
+        let mut candidates = candidates::<_, F>(path, &sources, pixels, seed);
+        if candidates.len() > MOST_INDIRECT {
+            candidates.retain(|s| s.is_direct);
         }
-        look_into::<_, F>(path, film, viewing, suspects, patience, seed)
+        scan_candidates::<_, F>(path, film, viewing, candidates, limit, seed)
     })
 }
 
@@ -224,18 +224,18 @@ fn sequence(seed: u64, (x, y): (u32, u32)) -> Sampler {
 }
 
 /// Pixels in which a surface is smoother than it is curved.
-fn suspects<L: PathLight, const F: u32>(
+fn candidates<L: PathLight, const F: u32>(
     path: &PathContext<L>,
     sources: &[Vec3],
     pixels: &[(u32, u32)],
     seed: u64,
-) -> Vec<Suspect> {
-    let suspects = pixels.par_iter().filter_map(|&pixel| {
+) -> Vec<Candidate> {
+    let candidates = pixels.par_iter().filter_map(|&pixel| {
         let mut counts = RayCounts::default();
         let sampler = sequence(seed, pixel);
         let (spread, is_direct) =
             spread_of_normals::<_, F>(path, sources, pixel, &sampler, &mut counts)?;
-        Some(Suspect {
+        Some(Candidate {
             pixel,
             spread,
             is_direct,
@@ -243,54 +243,54 @@ fn suspects<L: PathLight, const F: u32>(
             counts,
         })
     });
-    suspects.collect()
+    candidates.collect()
 }
 
-/// Scans those of `suspects` that rougher surfaces confirm.
-fn look_into<L: PathLight, const F: u32>(
+/// Scans those of `candidates` that differ when traced with rougher surfaces.
+fn scan_candidates<L: PathLight, const F: u32>(
     path: &PathContext<L>,
     film: &Film,
     viewing: &Viewing,
-    mut suspects: Vec<Suspect>,
-    patience: Patience,
+    mut candidates: Vec<Candidate>,
+    limit: Limit,
     seed: u64,
 ) -> Found {
-    let ask = |suspect: &mut Suspect, paths| {
-        if patience.is_over(0.0) {
-            suspect.difference = 0.0;
+    let test = |candidate: &mut Candidate, paths| {
+        if limit.is_over(0.0) {
+            candidate.difference = 0.0;
             return;
         }
-        let rougher = path.at_least_as_rough_as(MOLLIFIED * suspect.spread);
-        let sampler = sequence(seed, suspect.pixel);
-        let found = rougher.mean::<F>(suspect.pixel, paths, &sampler, &mut suspect.counts);
-        suspect.difference = noticed(film, viewing, suspect.pixel, found);
+        let rougher = path.at_least_as_rough_as(MOLLIFIED * candidate.spread);
+        let sampler = sequence(seed, candidate.pixel);
+        let found = rougher.mean::<F>(candidate.pixel, paths, &sampler, &mut candidate.counts);
+        candidate.difference = noticed(film, viewing, candidate.pixel, found);
     };
     let mut counts = RayCounts::default();
-    let (clock, asked) = (Instant::now(), suspects.len());
+    let (clock, tested) = (Instant::now(), candidates.len());
     for paths in PATHS_PER_PIXEL {
-        suspects.par_iter_mut().for_each(|s| ask(s, paths));
-        let clear = |s: &Suspect| s.difference <= NOTICEABLE;
-        suspects
+        candidates.par_iter_mut().for_each(|s| test(s, paths));
+        let clear = |s: &Candidate| s.difference <= NOTICEABLE;
+        candidates
             .iter()
             .filter(|s| clear(s))
             .for_each(|s| counts.merge(&s.counts));
-        suspects.retain(|s| !clear(s));
+        candidates.retain(|s| !clear(s));
     }
-    // The second question only makes this longer, and a scan seem to take longer.
-    let paths = (asked as u64 * u64::from(PATHS_PER_PIXEL[0])).max(1) as f64;
+    // The second test adds to the time, which overstates that of a scan.
+    let paths = (tested as u64 * u64::from(PATHS_PER_PIXEL[0])).max(1) as f64;
     let threads = rayon::current_num_threads() as f64;
     let scan_s = clock.elapsed().as_secs_f64() * threads / paths * PATHS_PER_SCAN as f64;
-    suspects.sort_by(|a, b| b.difference.total_cmp(&a.difference));
-    let scanned = suspects.len().min(patience.scans());
-    let found = suspects[..scanned].par_iter_mut().filter_map(|s| {
-        if patience.is_over(scan_s) {
+    candidates.sort_by(|a, b| b.difference.total_cmp(&a.difference));
+    let scanned = candidates.len().min(limit.scans());
+    let found = candidates[..scanned].par_iter_mut().filter_map(|s| {
+        if limit.is_over(scan_s) {
             return None;
         }
-        let focus = path.scan::<F>(s.pixel, s.spread, &sequence(seed, s.pixel), &mut s.counts);
-        Some((s.pixel, focus))
+        let density = path.scan::<F>(s.pixel, s.spread, &sequence(seed, s.pixel), &mut s.counts);
+        Some((s.pixel, density))
     });
     let pixels = found.collect();
-    suspects.iter().for_each(|s| counts.merge(&s.counts));
+    candidates.iter().for_each(|s| counts.merge(&s.counts));
     Found { pixels, counts }
 }
 
@@ -311,8 +311,8 @@ fn bright_sources(light: &impl PathLight, seed: u64) -> Vec<Vec3> {
     bright.map(|d| d.0).collect()
 }
 
-/// How far normals in `pixel` lie from their mean, radians, and whether they may mirror one of `sources`; `None` where no
-/// surface is smoother than that.
+/// Largest angle of the normals in `pixel` to their mean, radians, and whether they may mirror one of `sources`; `None`
+/// where no surface is smoother than that.
 fn spread_of_normals<L: PathLight, const F: u32>(
     path: &PathContext<L>,
     sources: &[Vec3],
@@ -345,7 +345,7 @@ fn spread_of_normals<L: PathLight, const F: u32>(
         .iter()
         .fold(0f32, |s, n| s.max(n.angle_between(mean)));
     let view = -world.camera().ray(corner + 0.5).direction;
-    // Corners lie farther out than the normals that were met.
+    // The pixel's corners lie farther out than the sampled normals.
     let mirrors = |source: &Vec3| {
         let half = (view + *source).try_normalize();
         half.is_some_and(|half| half.angle_between(mean) < 2.0 * spread)
@@ -381,20 +381,20 @@ impl<L: PathLight> PathContext<'_, L> {
         (radiance, coverage)
     }
 
-    /// Where in `pixel`, whose normals differ by `spread`, it is brighter than in most of it: in cells that are
-    /// small, in the parts of the brightest of them, and in theirs.
+    /// Density of samples in `pixel`, whose normals differ by `spread`: scans of all cells, of the parts of the
+    /// brightest of them, and of the brightest parts in turn.
     fn scan<const F: u32>(
         &self,
         (x, y): (u32, u32),
         spread: f32,
         sampler: &Sampler,
         counts: &mut RayCounts,
-    ) -> Focus {
+    ) -> PixelDensity {
         let corner = Vec2::new(x as f32, y as f32);
         let mut cells: Vec<u32> = (0..SIDES[0] * SIDES[0]).collect();
         let mut usual = None;
-        let mut focus = Focus { scans: Vec::new() };
-        // Behind the samples that looked for suspects.
+        let mut density = PixelDensity { scans: Vec::new() };
+        // After the samples that tested candidates.
         let mut index = PATHS_PER_PIXEL[1];
         for (number, side) in SIDES.into_iter().enumerate() {
             let rougher = self.at_least_as_rough_as(2.0 * spread / side as f32);
@@ -414,14 +414,14 @@ impl<L: PathLight> PathContext<'_, L> {
             let usual = *usual.get_or_insert_with(|| median(&seen));
             seen.iter_mut().for_each(|s| s.1 = (s.1 - usual).max(0.0));
             let mut seen = spread_out(&seen, side);
-            focus.scans.extend(Scan::new(side, seen.clone()));
+            density.scans.extend(Scan::new(side, seen.clone()));
             if let Some(&finer) = SIDES.get(number + 1) {
                 seen.sort_by(|a, b| b.1.total_cmp(&a.1));
-                seen.truncate(LOOKED_INTO);
+                seen.truncate(REFINED);
                 cells = seen.iter().flat_map(|s| parts(s.0, side, finer)).collect();
             }
         }
-        focus
+        density
     }
 }
 
@@ -441,7 +441,7 @@ fn median(seen: &[(u32, f32)]) -> f32 {
     values[values.len() / 2]
 }
 
-/// Every cell with what it and its neighbours return: paths are few, and a glint has an extent.
+/// Every cell with the sum over it and its neighbours: paths are few, and a highlight has an extent.
 fn spread_out(seen: &[(u32, f32)], side: u32) -> Vec<(u32, f32)> {
     let values: HashMap<u32, f32> = seen.iter().copied().collect();
     let around = |i: u32| i.saturating_sub(1)..(i + 2).min(side);
