@@ -22,19 +22,21 @@ use dipir_optimize::guidance::{rmse, touched};
 use dipir_optimize::lighting::Lighting;
 use dipir_optimize::objective::Objective;
 use dipir_optimize::parameters::{Parameters, ambient_of};
-use dipir_optimize::settings::{LightTable, Preset, Settings};
-use dipir_prior::examples::angle_between;
-use dipir_prior::lights::sun_angles;
-use dipir_prior::place::Place;
-use dipir_prior::reader::{ReaderSettings, combine};
-use dipir_prior::student::add_placeholders;
-use dipir_prior::studio::Setting;
+use dipir_optimize::settings::{LightTable, Settings};
+use dipir_pipeline::config::Quality;
+use dipir_pretraining::generated_photograph::GeneratedPhotograph;
+use dipir_pretraining::lighting::sun_angles;
+use dipir_pretraining::scene::Setting;
+use dipir_prior::inversion::angle_between;
+use dipir_prior::inversion::{InversionSettings, combine};
+use dipir_prior::text_conditioning::add_placeholders;
 use dipir_render::features::SPECULAR;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
 use dipir_scene::material::Material;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
+use dipir_stages::presets;
 use glam::{DVec3, Vec3};
 
 /// Key of these scenes; training and gates have others.
@@ -58,7 +60,7 @@ struct Arguments {
     first: u64,
     setting: Setting,
     iterations: usize,
-    reader: ReaderSettings,
+    reader: InversionSettings,
     json: Option<PathBuf>,
 }
 
@@ -71,7 +73,7 @@ impl Arguments {
             first: 0,
             setting: Setting::Open,
             iterations: 50,
-            reader: ReaderSettings::default(),
+            reader: InversionSettings::default(),
             json: None,
         };
         let mut is_bench = false;
@@ -81,7 +83,7 @@ impl Arguments {
                 Some(("first", v)) => parsed.first = v.parse()?,
                 Some(("places", "open")) => parsed.setting = Setting::Open,
                 Some(("places", "street")) => parsed.setting = Setting::Street,
-                Some(("places", "yard")) => parsed.setting = Setting::Yard,
+                Some(("places", "yard")) => parsed.setting = Setting::Courtyard,
                 Some(("iterations", v)) => parsed.iterations = v.parse()?,
                 Some(("draws", v)) => parsed.reader.draws = v.parse()?,
                 Some(("json", v)) => parsed.json = Some(v.into()),
@@ -95,7 +97,7 @@ impl Arguments {
 }
 
 struct Trial {
-    place: Place,
+    place: GeneratedPhotograph,
     linear: LinearImage,
     scene: Scene,
     settings: Settings,
@@ -110,9 +112,9 @@ struct Errors {
 
 impl Trial {
     fn draw(arguments: &Arguments, index: u64) -> anyhow::Result<Self> {
-        let place = Place::draw(SEED, index, SIZE as u32, arguments.setting);
+        let place = GeneratedPhotograph::draw(SEED, index, SIZE as u32, arguments.setting);
         let mut values: Vec<f32> = place.radiance.iter().flat_map(|p| p.to_array()).collect();
-        place.tone.apply(&mut values);
+        place.response.apply(&mut values);
         // As a file would hold it.
         let pixels = values.chunks_exact(3).map(|p| {
             let v = Vec3::from_slice(p).clamp(Vec3::ZERO, Vec3::ONE);
@@ -120,9 +122,9 @@ impl Trial {
         });
         let photo = DisplayImage(Raster::from_pixels(SIZE, SIZE, pixels.collect()));
         let linear = Transfer::Srgb.decode(photo);
-        let paint = &place.stage.main_paint;
+        let paint = &place.scene.main_paint;
         let scene = Scene {
-            mesh: place.stage.main.clone(),
+            mesh: place.scene.main.clone(),
             materials: vec![Material {
                 base_color: paint.color.extend(1.0),
                 roughness: paint.roughness,
@@ -130,14 +132,14 @@ impl Trial {
                 ..Material::default()
             }],
             textures: vec![],
-            camera: place.stage.camera,
+            camera: place.scene.camera,
             proxy: GROUND,
         };
         let table = LightTable {
             iterations: Some(arguments.iterations.max(1)),
             ..LightTable::default()
         };
-        let mut settings = table.settings(Preset::Standard, index)?;
+        let mut settings = table.settings(&presets::of(Quality::Standard).light, index)?;
         settings.preview_every = 0;
         settings.checkpoint_every = 0;
         settings.learning_rates = settings.learning_rates.scaled(RATE);
@@ -184,7 +186,7 @@ impl Trial {
         let pixels = (0..SIZE * SIZE).map(|p| {
             let a = coverage.pixels()[p];
             let mut values = (object.pixels()[p] / a.max(1e-6)).to_array();
-            self.place.tone.apply(&mut values);
+            self.place.response.apply(&mut values);
             let object = Vec3::from_array(values.map(|v| Transfer::Srgb.decode_scalar(v)));
             let ground = self.linear.0.pixels()[p] * shadow.pixels()[p];
             let linear = ground * (1.0 - a) + object * a;
@@ -213,7 +215,7 @@ impl Trial {
     fn recover(
         &self,
         model: &Model,
-        reader: &ReaderSettings,
+        reader: &InversionSettings,
         renderer: &Renderer,
         transport: Transport,
     ) -> anyhow::Result<Recovery> {
@@ -227,7 +229,7 @@ impl Trial {
             model,
             adapter: None,
             settings: &distillation,
-            class: self.place.stage.shape.word(),
+            class: self.place.scene.shape.word(),
             reading: Some(reader),
         });
         let problem = Problem {
@@ -277,15 +279,15 @@ fn measure(
     let mut encoder_alone = reading.crops.clone();
     encoder_alone.iter_mut().for_each(|c| c.energies.clear());
     let encoder = combine(encoder_alone, &reading.encoder, reader).light;
-    let no_encoder = ReaderSettings {
-        encoder: 0.0,
+    let no_encoder = InversionSettings {
+        encoder_weight: 0.0,
         ..*reader
     };
     let inversion = combine(reading.crops.clone(), &reading.encoder, &no_encoder).light;
     let mut true_azimuth = reading.light;
-    true_azimuth.words.azimuth = trial.place.sun().azimuth;
+    true_azimuth.description.azimuth = trial.place.sun().azimuth;
     let mut true_direction = true_azimuth;
-    true_direction.words.elevation = trial.place.sun().elevation;
+    true_direction.description.elevation = trial.place.sun().elevation;
     for (name, light) in [
         (ENCODER, &encoder),
         ("4 inversion", &inversion),

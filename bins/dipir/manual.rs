@@ -13,11 +13,6 @@ use dipir_inspection::command_line as inspect;
 use dipir_stages::command_line::{composite, concepts, light, lora, model, scene};
 use dipir_tradeoff::command_line as tradeoff;
 
-// Of this command line only what it says of itself is used here.
-#[allow(dead_code)]
-#[path = "../dipir-pretrain/cli.rs"]
-mod pretrain;
-
 /// Name of this executable.
 pub const DIPIR: &str = "dipir";
 
@@ -71,7 +66,7 @@ impl Executable {
             Self::DipirModel => model::Cli::command(),
             Self::DipirEvaluate => evaluate::Cli::command(),
             Self::DipirTradeoff => tradeoff::Cli::command(),
-            Self::DipirPretrain => pretrain::Cli::command(),
+            Self::DipirPretrain => dipir_pretraining::command_line::Cli::command(),
         }
     }
 }

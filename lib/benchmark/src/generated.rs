@@ -6,8 +6,8 @@ use dipir_evaluation::results::{write, write_json};
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
-use dipir_prior::place::Place;
-use dipir_prior::studio::Setting;
+use dipir_pretraining::generated_photograph::GeneratedPhotograph;
+use dipir_pretraining::scene::Setting;
 use dipir_scene::export::to_obj;
 use dipir_stages::composite::table::Tone;
 
@@ -15,7 +15,7 @@ use crate::folder::{EvaluationFolder, SceneInfo};
 
 /// Columns and rows of the true light.
 const MAP: [usize; 2] = [512, 256];
-/// Keeps these places apart from those that are trained on, tuned with and tested for the gates.
+/// Key of these places. Training, tuning and quality checks have others.
 const SEED: u64 = 0xeba1_5ce2;
 
 /// Makes the scene number `index` under `seed`, `side` pixels high and wide, unless it is there; its name.
@@ -26,20 +26,20 @@ pub fn make(
     side: usize,
     setting: Setting,
 ) -> anyhow::Result<String> {
-    let place = Place::draw(SEED ^ seed, index, side as u32, setting);
-    let stage = &place.stage;
+    let place = GeneratedPhotograph::draw(SEED ^ seed, index, side as u32, setting);
+    let stage = &place.scene;
     let class = stage.shape.word();
     let kind = match setting {
         Setting::Open => "generated",
         Setting::Street => "street",
-        Setting::Yard => "yard",
+        Setting::Courtyard => "yard",
     };
     let name = format!("{kind}-{index:03}-{class}");
     let folder = evaluation.scene(&name);
     if folder.join("scene.json").is_file() {
         return Ok(name);
     }
-    let exposure = place.tone.exposure;
+    let exposure = place.response.exposure;
     let exposed = place.radiance.iter().map(|p| *p * exposure).collect();
     let photo = LinearImage(Raster::from_pixels(side, side, exposed));
     let paint = stage.main_paint;

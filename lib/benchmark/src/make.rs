@@ -1,6 +1,6 @@
 //! Scenes whose true light is known.
 use dipir_cli::exit::Usage;
-use dipir_prior::studio::Setting;
+use dipir_pretraining::scene::Setting;
 
 use crate::command_line::{MakeArgs, Places};
 use crate::folder::EvaluationFolder;
@@ -29,7 +29,7 @@ pub fn make(args: &MakeArgs, progress: &dyn Fn(f64)) -> anyhow::Result<Vec<Strin
     let setting = match args.places {
         Places::Open => Setting::Open,
         Places::Street => Setting::Street,
-        Places::Yard => Setting::Yard,
+        Places::Yard => Setting::Courtyard,
     };
     for n in 0..args.generated {
         progress(n as f64 / args.generated as f64);

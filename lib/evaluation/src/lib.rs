@@ -1,9 +1,6 @@
 //! Scores of pictures and lights, medians with intervals, Pareto fronts, charts, and the counts of a user
 //! study. Nothing here renders or starts programs, and nothing of the pipeline imports it.
-pub mod chart;
-pub mod drawing;
 pub mod front;
-mod glyphs;
 pub mod lpips;
 pub mod results;
 pub mod scores;
