@@ -254,7 +254,7 @@ impl Runner<'_> {
         if let Some(map) = imported {
             add("map", map)?;
         }
-        Ok(Fingerprint::of_plan(&plan).as_str().to_owned())
+        Ok(Fingerprint::of_plan(&plan).finish().as_str().to_owned())
     }
 }
 
