@@ -26,6 +26,8 @@ impl Stream {
     pub const RECORD: Stream = Stream(4);
     /// Initial values and random crops of the optimisation.
     pub const OPTIMIZE: Stream = Stream(5);
+    /// Generated content: the pictures that models are trained on.
+    pub const CONTENT: Stream = Stream(7);
     /// Bootstrap resampling.
     pub const BOOTSTRAP: Stream = Stream(8);
     /// Tests.
