@@ -73,6 +73,23 @@ fn control_c_ends_with_130_and_leaves_nothing_half_written() {
 
 #[cfg(unix)]
 #[test]
+fn an_abort_as_for_want_of_memory_says_what_it_comes_from() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let child = start_endless(&project);
+    let pid = child.id().to_string();
+    let sent = Command::new("kill").args(["-ABRT", &pid]).status();
+    assert!(sent.unwrap().success());
+    let run: Run = child.wait_with_output().unwrap().into();
+    assert_eq!(run.code, None, "ended by the signal");
+    assert!(run.stderr.contains("memory ran out"), "{}", run.stderr);
+    // The next run takes away what is left.
+    project.run(COMPOSITE, &[]).expect_success();
+    assert_eq!(project.names("out"), ["composite", "scene"]);
+}
+
+#[cfg(unix)]
+#[test]
 fn control_c_at_a_terminal_is_told_once_by_the_run_and_not_by_its_stage() {
     use std::os::unix::process::CommandExt;
     let project = Project::new();

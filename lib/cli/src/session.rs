@@ -179,7 +179,7 @@ fn start_threads(threads: usize) -> anyhow::Result<()> {
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build_global()
-        .context("cannot start the worker threads; ask for fewer with --threads")
+        .context("cannot start the worker threads; ask for fewer with --threads, or give the process more memory (ulimit -v)")
 }
 
 /// `1.2 s`, `3 min 20 s`.
