@@ -295,6 +295,20 @@ impl DirectLightImages {
         images
     }
 
+    /// Pixels of `layer` under `light`, linear, row by row.
+    pub fn layer(&self, layer: Layer, light: &SunSkyLight) -> Vec<Vec3> {
+        let count = self.size * self.size;
+        let mut pixels = vec![Vec3::ZERO; count];
+        for (b, weight) in weights(light).iter().enumerate() {
+            let plane = |c: usize| &self.planes[(first_plane(layer) + 3 * b + c) * count..];
+            let [red, green, blue] = [0, 1, 2].map(plane);
+            for (p, pixel) in pixels.iter_mut().enumerate() {
+                *pixel += *weight * Vec3::new(red[p], green[p], blue[p]);
+            }
+        }
+        pixels
+    }
+
     fn pixel(&mut self, tracer: &Tracer, pixel: usize, stream: &mut NoiseStream) {
         let mut layers = [[Vec3::ZERO; BASIS]; 3];
         // Shadow, summed over the quarters that show the ground.
