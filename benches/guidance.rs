@@ -30,7 +30,8 @@ use dipir_optimize::lighting::Lighting;
 use dipir_optimize::objective::Objective;
 use dipir_optimize::optimization::Optimization;
 use dipir_optimize::parameters::{Parameters, ambient_of};
-use dipir_optimize::settings::{GuidanceKind, LightTable, Preset, Settings};
+use dipir_optimize::settings::{GuidanceKind, LightTable, Settings};
+use dipir_pipeline::config::Quality;
 use dipir_pretraining::CameraResponse;
 use dipir_pretraining::generated_photograph::GeneratedPhotograph;
 use dipir_pretraining::lighting::sun_angles;
@@ -44,6 +45,7 @@ use dipir_scene::material::Material;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
 use dipir_stages::known_light;
+use dipir_stages::presets;
 use glam::Vec3;
 
 /// Key of these scenes. Training and quality checks have others.
@@ -222,7 +224,7 @@ fn run(
         iterations: Some(knobs.iterations.max(1)),
         ..LightTable::default()
     };
-    let mut settings = table.settings(Preset::Standard, 1)?;
+    let mut settings = table.settings(&presets::of(Quality::Standard).light, 1)?;
     settings.preview_every = 0;
     settings.checkpoint_every = 0;
     settings.learning_rates = settings.learning_rates.scaled(knobs.rate);

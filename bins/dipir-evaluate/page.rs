@@ -2,8 +2,8 @@
 use std::path::Path;
 
 use anyhow::Context;
+use base64::prelude::{BASE64_STANDARD, Engine};
 use dipir_stages::report::html::Html;
-use dipir_stages::report::picture::base64;
 
 const STYLE: &str = include_str!("style.css");
 
@@ -59,7 +59,10 @@ pub fn image(path: &Path, alt: &str) -> anyhow::Result<String> {
 /// The PNG file as an address.
 pub fn address(path: &Path) -> anyhow::Result<String> {
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    Ok(format!("data:image/png;base64,{}", base64(&bytes)))
+    Ok(format!(
+        "data:image/png;base64,{}",
+        BASE64_STANDARD.encode(bytes)
+    ))
 }
 
 #[cfg(test)]

@@ -5,10 +5,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dipir_evaluation::chart::{Chart, Dot, Panel, Series};
 use dipir_evaluation::front::{elbow, excess_error, pareto, three_presets};
 use dipir_imaging::file::write_png;
+use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_numerics::stats::{Running, median, t_half_width};
+use dipir_plotting::chart::{Chart, Mark, Panel, Point as Dot, Scale, Series};
 use serde_json::{Value, json};
 
 use crate::knobs::PRESETS;
@@ -150,10 +151,12 @@ fn chart(part: &str, scenes: &[SceneRows]) -> Chart {
                 },
             };
             match series.iter_mut().find(|s| s.name == row.point.series) {
-                Some(s) => s.dots.push(dot),
+                Some(s) => s.points.push(dot),
                 None => series.push(Series {
                     name: row.point.series.clone(),
-                    dots: vec![dot],
+                    mark: Mark::Dots,
+                    points: vec![dot],
+                    ..Series::default()
                 }),
             }
         }
@@ -166,9 +169,15 @@ fn chart(part: &str, scenes: &[SceneRows]) -> Chart {
             elbow: rows.iter().find(|r| r.is_elbow).map(Row::place),
         }
     };
+    let log = |label: String| Scale {
+        label,
+        log: true,
+        range: None,
+    };
     Chart {
-        x_label: format!("processor seconds of the {part} track"),
-        y_label: "error: display-referred RMSE".into(),
+        x: log(format!("processor seconds of the {part} track")),
+        y: log("error: display-referred RMSE".into()),
+        size: [330.0, 300.0],
         panels: scenes.iter().map(panel).collect(),
     }
 }
@@ -291,7 +300,9 @@ pub fn write_all(points: &[Point], about: &Value, out: &Path) -> anyhow::Result<
         let drawing = chart(part, scenes).draw();
         let svg = save(format!("tradeoff-{part}.svg"), drawing.to_svg())?;
         let png = svg.with_extension("png");
-        write_png(&png, &drawing.to_image(1))?;
+        let pixels = drawing.to_pixels(1);
+        let raster = Raster::from_pixels(pixels.width, pixels.height, pixels.colors);
+        write_png(&png, &DisplayImage(raster))?;
         files.extend([svg, png]);
     }
     Ok(files)

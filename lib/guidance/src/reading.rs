@@ -66,15 +66,14 @@ fn direction(camera: &Camera, azimuth: f32, elevation: f32) -> Vec3 {
     (forward * c + right * s) * elevation.cos() + Vec3::Y * elevation.sin()
 }
 
-/// The planes [3, SIZE, SIZE] of a square picture.
+/// The planes [3, SIZE, SIZE] of a square picture, clamped to [0, 1].
 pub fn planes(picture: &Raster<Vec3>) -> Vec<f32> {
-    let channel = |c: usize| picture.pixels().iter().map(move |p| p[c].clamp(0.0, 1.0));
-    (0..3).flat_map(channel).collect()
+    dipir_tensors::planes(&picture.map(|p| p.clamp(Vec3::ZERO, Vec3::ONE)))
 }
 
 fn crop_of(photo: &Raster<Vec3>, camera: &Camera, region: PixelBox) -> Crop {
     let size = (photo.width(), photo.height());
-    let resize = CropResize::new(size, region, (SIZE, SIZE), Filter::Bilinear);
+    let resize = CropResize::new(size, region, (SIZE, SIZE), Filter::Tent);
     Crop {
         picture: planes(&resize.apply(photo)),
         view_direction: view_direction(camera, region),
