@@ -1,7 +1,9 @@
 //! Images of a generated scene under each light of a small basis, for training: [`DirectLightImages`].
 //!
 //! This is a second tracer beside the recorder of `dipir-render`. It computes direct light only, by Lambert's cosine and a
-//! GGX highlight that is added to it.
+//! GGX highlight that is added to it. Training needs more and less than the recorder makes: pictures of the ground and of
+//! the whole scene, but only for a basis of [`BASIS`] lights. `cargo run -p dipir-pretraining --example tracer-cost` compares
+//! time and variance of the two; `tests/training_pictures.rs` compares their pictures.
 
 use dipir_diffusion::noise::NoiseStream;
 use dipir_scene::bvh::Bvh;
