@@ -2,19 +2,15 @@
 use std::ops::ControlFlow;
 
 use dipir_imaging::raster::{LinearImage, Raster};
-use dipir_light::environment::EnvironmentMap;
-use dipir_light::gaussian::SphericalGaussian;
-use dipir_light::rasterize::rasterize;
 use dipir_pretraining::direct_light::{
-    DirectLightImages, FIRST_SHADOW_PLANE, Layer, first_plane, shadow_weights, weights,
+    DirectLightImages, FIRST_SHADOW_PLANE, Layer, shadow_weights,
 };
-use dipir_pretraining::lighting::{Sun, SunSkyLight, sun_direction};
+use dipir_pretraining::lighting::{Sun, SunSkyLight};
 use dipir_pretraining::scene::{Framing, GeneratedScene, ObjectSet, Paint, SceneKind, Setting};
 use dipir_render::features::SPECULAR;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
 use dipir_scene::camera::Camera;
-use dipir_scene::material::Material;
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
@@ -22,39 +18,11 @@ use glam::Vec3;
 
 const SIZE: u32 = 40;
 
-/// A light of the training as an environment map.
-fn map(light: &SunSkyLight, sun: Sun) -> EnvironmentMap {
-    let lobe = SphericalGaussian {
-        direction: sun_direction(sun.azimuth, sun.elevation),
-        radiance: Vec3::ONE,
-        sigma: sun.sharpness.powf(-0.5),
-    };
-    let lobe = SphericalGaussian {
-        radiance: light.sun_color / lobe.solid_angle() as f32,
-        ..lobe
-    };
-    let map = rasterize(&[lobe], 128, 64);
-    let texels = map.texels().iter().enumerate().map(|(k, texel)| {
-        let y = map.direction_of(k / 128, k % 128).y;
-        let sky = light.horizon * (1.0 - y) + light.zenith * y;
-        *texel + if y > 0.0 { sky } else { light.bounce }
-    });
-    EnvironmentMap::new(128, 64, texels.collect()).unwrap()
-}
-
 /// The renderer's record of a mesh on the ground.
 fn transport(mesh: &TriangleMesh, paints: &[Paint], camera: Camera) -> Transport {
     let scene = Scene {
         mesh: mesh.clone(),
-        materials: paints
-            .iter()
-            .map(|paint| Material {
-                base_color: paint.color.extend(1.0),
-                roughness: paint.roughness,
-                metallic: 0.0,
-                ..Material::default()
-            })
-            .collect(),
+        materials: paints.iter().map(Paint::material).collect(),
         textures: vec![],
         camera,
         proxy: Proxy::Plane(Plane {
@@ -80,17 +48,6 @@ fn transport(mesh: &TriangleMesh, paints: &[Paint], camera: Camera) -> Transport
     Transport::record(&renderer, &settings, &mut |_| ControlFlow::Continue(())).unwrap()
 }
 
-/// A pixel of a layer under `light`.
-fn traced(images: &DirectLightImages, layer: Layer, light: &SunSkyLight, pixel: usize) -> Vec3 {
-    let n = (SIZE * SIZE) as usize;
-    let plane = |b: usize, c: usize| (first_plane(layer) + 3 * b + c) * n + pixel;
-    let basis = weights(light);
-    let lit = basis.iter().enumerate().map(|(b, weight)| {
-        *weight * Vec3::from_array([0, 1, 2].map(|c| images.planes[plane(b, c)]))
-    });
-    lit.sum()
-}
-
 /// The square of 8 x 8 pixels that a pixel is in; sums over squares have less noise.
 fn square(pixel: usize) -> usize {
     (pixel / SIZE as usize / 8) * 5 + pixel % SIZE as usize / 8
@@ -103,7 +60,7 @@ fn apart(squares: &[[f32; 2]]) -> (f32, f32) {
 }
 
 /// A scene without metal under one sun.
-fn scene(index: u64, setting: Setting) -> (GeneratedScene, Sun, SunSkyLight) {
+fn scene(index: u64, setting: Setting) -> (GeneratedScene, SunSkyLight) {
     let kind = SceneKind {
         objects: ObjectSet::Training,
         setting,
@@ -120,16 +77,17 @@ fn scene(index: u64, setting: Setting) -> (GeneratedScene, Sun, SunSkyLight) {
     };
     scene.suns = vec![sun; scene.suns.len()];
     let light = SunSkyLight::new(0, sun.elevation, (3.0, 0.7), (0.3, 0.1), 1.0);
-    (scene, sun, light)
+    (scene, light)
 }
 
 #[test]
 fn objects_and_shadows_agree_with_the_renderer() {
     for index in 0..3 {
-        let (scene, sun, light) = scene(index, Setting::Open);
+        let (scene, light) = scene(index, Setting::Open);
         let images = DirectLightImages::trace(&scene, 11, index);
         let transport = transport(&scene.main, &[scene.main_paint], scene.camera);
-        let map = map(&light, sun);
+        let map = light.environment(&scene.suns, 128, 64).unwrap();
+        let traced = images.layer(Layer::Object, &light);
         let (object, shadow) = (
             transport.foreground(map.texels()),
             transport.shadow(map.texels()),
@@ -145,10 +103,7 @@ fn objects_and_shadows_agree_with_the_renderer() {
                 .map(|(b, w)| *w * images.planes[(FIRST_SHADOW_PLANE + b) * n + p])
                 .sum();
             let pairs = [
-                [
-                    traced(&images, Layer::Object, &light, p),
-                    object.pixels()[p],
-                ],
+                [traced[p], object.pixels()[p]],
                 [
                     (Vec3::ONE - seen) * open,
                     (Vec3::ONE - shadow.pixels()[p]) * open,
@@ -173,15 +128,16 @@ fn objects_and_shadows_agree_with_the_renderer() {
 #[test]
 fn houses_and_trees_agree_with_the_renderer() {
     for index in 0..3 {
-        let (scene, sun, light) = scene(index, Setting::Street);
+        let (scene, light) = scene(index, Setting::Street);
         let images = DirectLightImages::trace(&scene, 11, index);
         let transport = transport(&scene.others, &scene.paints, scene.camera);
-        let lit = transport.foreground(map(&light, sun).texels());
+        let map = light.environment(&scene.suns, 128, 64).unwrap();
+        let lit = transport.foreground(map.texels());
+        let traced = images.layer(Layer::Background, &light);
         let mut squares = [[0f32; 2]; 25];
         let mut covered = 0;
         for p in (0..(SIZE * SIZE) as usize).filter(|p| transport.coverage().pixels()[*p] > 0.999) {
-            let place = traced(&images, Layer::Background, &light, p);
-            squares[square(p)][0] += place.element_sum();
+            squares[square(p)][0] += traced[p].element_sum();
             squares[square(p)][1] += lit.pixels()[p].element_sum();
             covered += 1;
         }

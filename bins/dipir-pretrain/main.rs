@@ -98,7 +98,7 @@ fn train(args: &TrainArgs, output: &OutputArgs) -> anyhow::Result<()> {
 fn train_encoder(args: &EncoderArgs, output: &OutputArgs) -> anyhow::Result<()> {
     let run = args.run()?;
     run.check()?;
-    // Scenes are those of the diffusion model's default seed, whatever the seed of this run.
+    // The seed of the run does not change its scenes.
     let seed = TrainerSettings::default().seed;
     let data = scenes(&args.data, SceneMix::WithCourtyards, seed, output)?;
     let progress = Progress::new("encoder", output.quiet);

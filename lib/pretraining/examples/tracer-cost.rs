@@ -8,16 +8,13 @@ use std::time::Instant;
 
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_light::environment::EnvironmentMap;
-use dipir_light::gaussian::SphericalGaussian;
-use dipir_light::rasterize::rasterize;
 use dipir_numerics::stats::median;
-use dipir_pretraining::direct_light::{DirectLightImages, Layer, first_plane, weights};
-use dipir_pretraining::lighting::{SunSkyLight, sun_direction};
+use dipir_pretraining::direct_light::{DirectLightImages, Layer};
+use dipir_pretraining::lighting::SunSkyLight;
 use dipir_pretraining::scene::{Framing, GeneratedScene, ObjectSet, Paint, SceneKind, Setting};
 use dipir_render::features::SPECULAR;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
-use dipir_scene::material::Material;
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
@@ -26,40 +23,26 @@ use glam::Vec3;
 const SIZE: usize = 40;
 const MAP: [usize; 2] = [128, 64];
 
-/// `lights` of one scene as one environment map: suns, and the sky of the first.
-fn map(scene: &GeneratedScene, lights: &[SunSkyLight]) -> EnvironmentMap {
-    let lobe = |light: &SunSkyLight| {
-        let sun = scene.suns[light.sun];
-        let lobe = SphericalGaussian {
-            direction: sun_direction(sun.azimuth, sun.elevation),
-            radiance: Vec3::ONE,
-            sigma: sun.sharpness.powf(-0.5),
-        };
-        SphericalGaussian {
-            radiance: light.sun_color / lobe.solid_angle() as f32,
-            ..lobe
-        }
-    };
-    let suns = rasterize(&lights.iter().map(lobe).collect::<Vec<_>>(), MAP[0], MAP[1]);
-    let texels = suns.texels().iter().enumerate().map(|(k, texel)| {
-        let y = suns.direction_of(k / MAP[0], k % MAP[0]).y;
-        let sky = lights[0].horizon * (1.0 - y) + lights[0].zenith * y;
-        *texel + if y > 0.0 { sky } else { lights[0].bounce }
+/// A map of all `lights` of one scene, which guides the recorder's samples.
+fn guide(scene: &GeneratedScene, lights: &[SunSkyLight]) -> EnvironmentMap {
+    let maps = lights.iter().map(|light| map(scene, light));
+    let sum = maps.reduce(|sum, map| {
+        let texels = sum.texels().iter().zip(map.texels()).map(|(a, b)| *a + *b);
+        EnvironmentMap::new(MAP[0], MAP[1], texels.collect()).expect("a map")
     });
-    EnvironmentMap::new(MAP[0], MAP[1], texels.collect()).expect("a map")
+    sum.expect("a light")
+}
+
+fn map(scene: &GeneratedScene, light: &SunSkyLight) -> EnvironmentMap {
+    let map = light.environment(&scene.suns, MAP[0], MAP[1]);
+    map.expect("a map")
 }
 
 /// The renderer's scene of a mesh on the ground.
 fn rendered(mesh: &TriangleMesh, paints: &[Paint], scene: &GeneratedScene) -> Scene {
-    let material = |paint: &Paint| Material {
-        base_color: paint.color.extend(1.0),
-        roughness: paint.roughness,
-        metallic: f32::from(paint.metallic),
-        ..Material::default()
-    };
     Scene {
         mesh: mesh.clone(),
-        materials: paints.iter().map(material).collect(),
+        materials: paints.iter().map(Paint::material).collect(),
         textures: vec![],
         camera: scene.camera,
         proxy: Proxy::Plane(Plane {
@@ -99,19 +82,6 @@ fn record(
     (transport.expect("a record"), clock.elapsed().as_secs_f64())
 }
 
-/// A layer of the tracer under `light`.
-fn traced(images: &DirectLightImages, layer: Layer, light: &SunSkyLight) -> Vec<Vec3> {
-    let n = SIZE * SIZE;
-    let basis = weights(light);
-    let pixel = |p: usize| {
-        let value = |b: usize, c: usize| images.planes[(first_plane(layer) + 3 * b + c) * n + p];
-        let lit = basis.iter().enumerate();
-        lit.map(|(b, w)| *w * Vec3::new(value(b, 0), value(b, 1), value(b, 2)))
-            .sum()
-    };
-    (0..n).map(pixel).collect()
-}
-
 /// Half the mean squared difference of two independent pictures over `pixels`: the variance of one.
 fn variance(pictures: [&[Vec3]; 2], pixels: &[usize]) -> f64 {
     let squares = pixels
@@ -131,7 +101,7 @@ fn compare(index: u64, samples: u32) -> [f64; 4] {
     let light =
         |k: usize| SunSkyLight::new(k, scene.suns[k].elevation, (3.0, 0.7), (0.3, 0.1), 1.0);
     let lights: Vec<SunSkyLight> = (0..scene.suns.len()).map(light).collect();
-    let guide = map(&scene, &lights);
+    let guide = guide(&scene, &lights);
     let clock = Instant::now();
     let images = [0, 1].map(|seed| DirectLightImages::trace(&scene, seed, index));
     let traced_s = 0.5 * clock.elapsed().as_secs_f64();
@@ -155,10 +125,10 @@ fn compare(index: u64, samples: u32) -> [f64; 4] {
             .collect();
         let (mut of_recorder, mut of_tracer) = (0.0, 0.0);
         for light in &lights {
-            let map = map(&scene, &[*light]);
+            let map = map(&scene, light);
             let pictures = records.each_ref().map(|r| r.foreground(map.texels()));
             of_recorder += variance([pictures[0].pixels(), pictures[1].pixels()], &pixels);
-            let pictures = images.each_ref().map(|i| traced(i, layer, light));
+            let pictures = images.each_ref().map(|i| i.layer(layer, light));
             of_tracer += variance([&pictures[0], &pictures[1]], &pixels);
         }
         of_recorder / of_tracer

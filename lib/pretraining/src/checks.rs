@@ -307,19 +307,19 @@ fn summary(answers: &[&SceneResult]) -> QualityReport {
         scenes: answers.len(),
         gradient_sign: share(signs),
         recognition: recognition(&answers.iter().map(|a| a.model).collect::<Vec<_>>()),
-        encoder: encoder.map(|told| recognition(&told)),
+        encoder: encoder.map(|of| recognition(&of)),
         by_shape: BTreeMap::new(),
     }
 }
 
-fn recognition(told: &[Preferences]) -> Recognition {
-    let mut errors: Vec<f64> = told.iter().map(|t| t.azimuth_error).collect();
+fn recognition(of: &[Preferences]) -> Recognition {
+    let mut errors: Vec<f64> = of.iter().map(|t| t.azimuth_error).collect();
     errors.sort_by(f64::total_cmp);
     Recognition {
-        over_opposite: share(told.iter().map(|t| t.opposite)),
-        over_mirror: share(told.iter().map(|t| t.mirror)),
-        over_45: share(told.iter().flat_map(|t| t.beside)),
-        azimuth_median: errors.get(told.len() / 2).copied().unwrap_or(f64::NAN),
+        over_opposite: share(of.iter().map(|t| t.opposite)),
+        over_mirror: share(of.iter().map(|t| t.mirror)),
+        over_45: share(of.iter().flat_map(|t| t.beside)),
+        azimuth_median: errors.get(of.len() / 2).copied().unwrap_or(f64::NAN),
         within_30: share(errors.iter().map(|e| *e <= 30.0)),
     }
 }
@@ -387,18 +387,18 @@ mod tests {
 
     #[test]
     fn of_two_azimuths_the_nearer_to_an_answer_is_preferred() {
-        let told =
+        let preferences =
             |answer: f32, truth: f32| Preferences::by(answer.to_radians(), truth.to_radians());
         // 20 degrees off is less than half of 45, and of the 60 to the mirror image.
-        let found = told(50.0, 30.0);
+        let found = preferences(50.0, 30.0);
         assert!(found.opposite && found.mirror && found.beside == [true, true]);
         assert!((found.azimuth_error - 20.0).abs() < 1e-4, "{found:?}");
         // 25 degrees off: the light 45 degrees off on that side is nearer, the one on the other side is not.
-        assert_eq!(told(55.0, 30.0).beside, [false, true]);
+        assert_eq!(preferences(55.0, 30.0).beside, [false, true]);
         // The mirror image, at 350 degrees, is nearer.
-        let across = told(-4.0, 10.0);
+        let across = preferences(-4.0, 10.0);
         assert!(!across.mirror && across.opposite && (across.azimuth_error - 14.0).abs() < 1e-4);
-        assert!(!told(200.0, 30.0).opposite);
+        assert!(!preferences(200.0, 30.0).opposite);
     }
 
     #[test]

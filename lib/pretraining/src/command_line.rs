@@ -114,7 +114,7 @@ pub struct TrainArgs {
 }
 
 impl TrainArgs {
-    /// The run that is asked for.
+    /// The run of these arguments. An error names a value that is out of range.
     pub fn run(&self) -> Result<ModelRunSettings, Usage> {
         for (name, share) in [
             ("light-captions", self.light_captions),
@@ -185,7 +185,7 @@ pub struct EncoderArgs {
 }
 
 impl EncoderArgs {
-    /// The run that is asked for.
+    /// The run of these arguments. An error names a value that is out of range.
     pub fn run(&self) -> Result<EncoderRun, Usage> {
         check_rate(self.learning_rate)?;
         self.data.check()?;

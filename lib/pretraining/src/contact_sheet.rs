@@ -9,6 +9,7 @@ use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_tensors::model_output;
 use glam::Vec3;
 
 use crate::error::{Error, Result};
@@ -46,18 +47,15 @@ pub fn check_path(png: &Path) -> Result<()> {
     }
 }
 
-/// Writes pictures [3, side, side] in [0, 1] side by side.
-pub fn write(png: &Path, pictures: &[Vec<f32>], side: usize, columns: usize) -> Result<()> {
-    let (width, height) = (columns * side, pictures.len().div_ceil(columns) * side);
+/// Writes pictures of one size, with display values, side by side.
+pub fn write(png: &Path, pictures: &[Raster<Vec3>], columns: usize) -> Result<()> {
+    let (width, height) = pictures.first().map_or((1, 1), |p| (p.width(), p.height()));
     let pixel = |x: usize, y: usize| {
-        let plane = |c: usize| {
-            let picture = pictures.get(y / side * columns + x / side);
-            let value = picture.map(|p| p[(c * side + y % side) * side + x % side]);
-            value.unwrap_or(0.0).clamp(0.0, 1.0)
-        };
-        Vec3::new(plane(0), plane(1), plane(2))
+        let picture = pictures.get(y / height * columns + x / width);
+        picture.map_or(Vec3::ZERO, |p| *p.get(x % width, y % height))
     };
-    let (width, height) = (ENLARGEMENT * width, ENLARGEMENT * height);
+    let rows = pictures.len().div_ceil(columns);
+    let (width, height) = (ENLARGEMENT * columns * width, ENLARGEMENT * rows * height);
     let pixels =
         (0..width * height).map(|i| pixel(i % width / ENLARGEMENT, i / width / ENLARGEMENT));
     let sheet = Raster::from_pixels(width, height, pixels.collect());
@@ -99,10 +97,9 @@ pub fn sample_lights(
         if !goes_on {
             return Ok(false);
         }
-        let pixels = made?.image.flatten_all()?.to_vec1::<f32>()?;
-        pictures.push(pixels.iter().map(|v| 0.5 * v + 0.5).collect());
+        pictures.push(model_output(&made?.image)?.0);
     }
-    write(png, &pictures, side, columns)?;
+    write(png, &pictures, columns)?;
     Ok(true)
 }
 
@@ -116,13 +113,13 @@ mod tests {
     fn pictures_lie_side_by_side_and_enlarged() {
         let folder = tempfile::tempdir().unwrap();
         let png = folder.path().join("sheet.png");
-        let pictures: Vec<Vec<f32>> = (0..3).map(|k| vec![k as f32 * 0.5; 12]).collect();
-        write(&png, &pictures, 2, 2).unwrap();
+        let grey = |k: usize| Raster::filled(2, 2, Vec3::splat(k as f32 * 0.5));
+        write(&png, &[0, 1, 2].map(grey), 2).unwrap();
         let sheet = read_photo(&png, Transfer::Linear).unwrap().image.0;
         assert_eq!((sheet.width(), sheet.height()), (12, 12));
         let red = |x: usize, y: usize| sheet.get(x, y).x;
-        // Half of 255 is rounded.
-        assert!((red(6, 0) - 0.5).abs() <= 0.5 / 255.0, "{}", red(6, 0));
+        // PNGs have steps of 1 / 255.
+        assert!((red(6, 0) - 0.5).abs() < 1.0 / 255.0, "{}", red(6, 0));
         assert_eq!((red(5, 5), red(5, 6)), (0.0, 1.0));
         // The last row has one picture.
         assert_eq!(red(6, 6), 0.0);

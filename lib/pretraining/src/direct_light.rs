@@ -1,7 +1,9 @@
 //! Images of a generated scene under each light of a small basis, for training: [`DirectLightImages`].
 //!
 //! This is a second tracer beside the recorder of `dipir-render`. It computes direct light only, by Lambert's cosine and a
-//! GGX highlight that is added to it.
+//! GGX highlight that is added to it. Training needs more and less than the recorder makes: pictures of the ground and of
+//! the whole scene, but only for a basis of [`BASIS`] lights. `cargo run -p dipir-pretraining --example tracer-cost` compares
+//! time and variance of the two; `tests/training_pictures.rs` compares their pictures.
 
 use dipir_diffusion::noise::NoiseStream;
 use dipir_scene::bvh::Bvh;
@@ -293,6 +295,20 @@ impl DirectLightImages {
             images.pixel(&tracer, pixel, &mut stream);
         }
         images
+    }
+
+    /// Pixels of `layer` under `light`, linear, row by row.
+    pub fn layer(&self, layer: Layer, light: &SunSkyLight) -> Vec<Vec3> {
+        let count = self.size * self.size;
+        let mut pixels = vec![Vec3::ZERO; count];
+        for (b, weight) in weights(light).iter().enumerate() {
+            let plane = |c: usize| &self.planes[(first_plane(layer) + 3 * b + c) * count..];
+            let [red, green, blue] = [0, 1, 2].map(plane);
+            for (p, pixel) in pixels.iter_mut().enumerate() {
+                *pixel += *weight * Vec3::new(red[p], green[p], blue[p]);
+            }
+        }
+        pixels
     }
 
     fn pixel(&mut self, tracer: &Tracer, pixel: usize, stream: &mut NoiseStream) {

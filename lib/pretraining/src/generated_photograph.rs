@@ -5,13 +5,11 @@ use std::f32::consts::{PI, TAU};
 use dipir_diffusion::noise::NoiseStream;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::error::LightError;
-use dipir_light::gaussian::SphericalGaussian;
-use dipir_light::rasterize::rasterize;
 use glam::Vec3;
 
 use crate::camera::CameraResponse;
-use crate::direct_light::{DirectLightImages, Layer, first_plane, weights};
-use crate::lighting::{Sun, SunSkyLight, sun_direction};
+use crate::direct_light::{DirectLightImages, Layer};
+use crate::lighting::{Sun, SunSkyLight};
 use crate::scene::{Framing, GeneratedScene, ObjectSet, SceneKind, Setting};
 
 /// A generated scene, its light, and the photograph without the main object.
@@ -53,15 +51,7 @@ impl GeneratedPhotograph {
             shoulder: range(0.0, 1.0),
         };
         let images = DirectLightImages::trace(&scene, seed, index);
-        let count = images.size * images.size;
-        let mut radiance = vec![Vec3::ZERO; count];
-        for (b, weight) in weights(&light).iter().enumerate() {
-            let plane = |c: usize| (first_plane(Layer::Background) + 3 * b + c) * count;
-            for (p, pixel) in radiance.iter_mut().enumerate() {
-                *pixel +=
-                    *weight * Vec3::from_array([0, 1, 2].map(|c| images.planes[plane(c) + p]));
-            }
-        }
+        let radiance = images.layer(Layer::Background, &light);
         Self {
             scene,
             light,
@@ -77,25 +67,7 @@ impl GeneratedPhotograph {
 
     /// The true light as an environment map. An error if a side is 0.
     pub fn map(&self, width: usize, height: usize) -> Result<EnvironmentMap, LightError> {
-        let sun = self.sun();
-        let lobe = SphericalGaussian {
-            direction: sun_direction(sun.azimuth, sun.elevation),
-            radiance: Vec3::ONE,
-            sigma: sun.sharpness.powf(-0.5),
-        };
-        let lobe = SphericalGaussian {
-            radiance: self.light.sun_color / lobe.solid_angle() as f32,
-            ..lobe
-        };
-        let sunlit = rasterize(&[lobe], width, height);
-        let texels = sunlit.texels().iter().enumerate().map(|(k, sun)| {
-            let y = sunlit.direction_of(k / width, k % width).y;
-            *sun + match y > 0.0 {
-                true => self.light.horizon * (1.0 - y) + self.light.zenith * y,
-                false => self.light.bounce,
-            }
-        });
-        EnvironmentMap::new(width, height, texels.collect())
+        self.light.environment(&self.scene.suns, width, height)
     }
 }
 

@@ -1,6 +1,10 @@
 //! Light of generated scenes: a sun, a sky with a gradient from horizon to zenith, and light that the ground reflects.
 
 use dipir_diffusion::noise::NoiseStream;
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::error::LightError;
+use dipir_light::gaussian::SphericalGaussian;
+use dipir_light::rasterize::rasterize;
 use dipir_prior::caption::LightDescription;
 use glam::Vec3;
 
@@ -139,6 +143,34 @@ impl SunSkyLight {
             bounce: self.bounce * factors,
             ..*self
         }
+    }
+
+    /// Its environment map. An error if a side is 0.
+    pub fn environment(
+        &self,
+        suns: &[Sun],
+        width: usize,
+        height: usize,
+    ) -> Result<EnvironmentMap, LightError> {
+        let sun = suns[self.sun];
+        let lobe = SphericalGaussian {
+            direction: sun_direction(sun.azimuth, sun.elevation),
+            radiance: Vec3::ONE,
+            sigma: sun.sharpness.powf(-0.5),
+        };
+        let lobe = SphericalGaussian {
+            radiance: self.sun_color / lobe.solid_angle() as f32,
+            ..lobe
+        };
+        let sunlit = rasterize(&[lobe], width, height);
+        let texels = sunlit.texels().iter().enumerate().map(|(k, sun)| {
+            let y = sunlit.direction_of(k / width, k % width).y;
+            *sun + match y > 0.0 {
+                true => self.horizon * (1.0 - y) + self.zenith * y,
+                false => self.bounce,
+            }
+        });
+        EnvironmentMap::new(width, height, texels.collect())
     }
 
     /// Its description for a caption.

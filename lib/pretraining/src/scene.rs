@@ -3,6 +3,7 @@
 use dipir_diffusion::noise::NoiseStream;
 use dipir_prior::caption::COLORS;
 use dipir_scene::camera::{Camera, FieldOfView};
+use dipir_scene::material::Material;
 use dipir_scene::mesh::TriangleMesh;
 use glam::{DMat4, DQuat, DVec3, Vec2, Vec3};
 
@@ -28,6 +29,18 @@ pub struct Paint {
     pub metallic: bool,
     /// The word for the colour.
     pub word: &'static str,
+}
+
+impl Paint {
+    /// The renderer's material.
+    pub fn material(&self) -> Material {
+        Material {
+            base_color: self.color.extend(1.0),
+            roughness: self.roughness,
+            metallic: f32::from(u8::from(self.metallic)),
+            ..Material::default()
+        }
+    }
 }
 
 /// Which kinds of main objects a scene may have.

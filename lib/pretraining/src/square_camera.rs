@@ -67,7 +67,7 @@ mod tests {
             tan_half_fov: 0.5,
         };
         assert!((camera.direction(0.0, 0.0).pitch - 0.3).abs() < 1e-6);
-        // Half the picture's angle further down.
+        // The lower edge is half the field of view below the middle.
         assert!((camera.direction(0.0, 1.0).pitch - 0.3 - 0.5f32.atan()).abs() < 1e-6);
         assert_eq!(camera.direction(0.0, -1.0).heading, 0.0);
         // Level with the camera's right, half as far as what lies ahead.

@@ -10,6 +10,7 @@ use dipir_diffusion::weights::Weights;
 use dipir_prior::encoder;
 use dipir_prior::picture::SIZE;
 use dipir_prior::text_conditioning::add_placeholders;
+use dipir_tensors::from_planes;
 
 use crate::architecture::{Architecture, WEIGHT_FILES};
 use crate::contact_sheet;
@@ -233,7 +234,8 @@ impl EncoderRun {
         if let Some(png) = &self.sheet {
             let count = SHEET_ROWS * SHEET_COLUMNS;
             let pictures = encoder_training::pictures(data, count, self.settings.seed)?;
-            contact_sheet::write(png, &pictures, SIZE, SHEET_COLUMNS)?;
+            let pictures = pictures.iter().map(|p| from_planes(p, SIZE, SIZE));
+            contact_sheet::write(png, &pictures.collect::<Vec<_>>(), SHEET_COLUMNS)?;
         }
         let mut mean = MovingMean::default();
         let from = self.from.as_deref();

@@ -76,11 +76,6 @@ impl EncodedCaptions {
         };
         Ok(text.forward(&self.tokens, learned.as_ref())?)
     }
-
-    /// Tokens of every caption; those from the vocabulary's size on are placeholders.
-    pub fn tokens(&self) -> &[Vec<u32>] {
-        &self.tokens
-    }
 }
 
 /// States of captions under `model`, [captions, tokens, width].
@@ -99,4 +94,52 @@ pub fn guidance_states(model: &Model, class: &str, light: &LightDescription) -> 
             .collect(),
     };
     caption_states(model, &captions)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    #[test]
+    fn every_placeholder_of_every_caption_is_a_token_of_its_own() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data/prior/tokenizer");
+        let mut tokenizer = Tokenizer::load(&folder).unwrap();
+        add_placeholders(&mut tokenizer);
+        let light = |azimuth: f32| LightDescription {
+            azimuth,
+            elevation: 0.5,
+            sun_share: 0.8,
+        };
+        let caption = |azimuth: f32| Some(Caption::new("red car", Some(&light(azimuth))));
+        let encoded =
+            EncodedCaptions::new(&tokenizer, &[caption(0.1), None, caption(2.0)]).unwrap();
+        let vocab = tokenizer.vocab_size() as u32;
+        let tokens = encoded.tokens.iter().flatten();
+        let placeholders: Vec<u32> = tokens.copied().filter(|t| *t >= vocab).collect();
+        assert_eq!(placeholders, [0, 1, 2, 3, 4, 5].map(|i| vocab + i));
+        // The weights of each sum to 1.
+        let sums = encoded.word_weights.unwrap().sum(1).unwrap();
+        let sums = sums.to_vec1::<f32>().unwrap();
+        assert_eq!(sums.len(), 6);
+        assert!(sums.iter().all(|s| (s - 1.0).abs() < 1e-6), "{sums:?}");
+    }
+
+    #[test]
+    fn a_word_without_a_token_is_refused_with_a_remedy() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data/prior/tokenizer");
+        let mut tokenizer = Tokenizer::load(&folder).unwrap();
+        add_placeholders(&mut tokenizer);
+        let caption = Caption {
+            text: "mixeda".into(),
+            mixtures: vec![vec![("zebra", 1.0)]],
+        };
+        let refused = EncodedCaptions::new(&tokenizer, &[Some(caption)]);
+        let error = refused.err().unwrap().to_string();
+        assert!(
+            error.contains("\"zebra\"") && error.contains("data/prior"),
+            "{error}"
+        );
+    }
 }
