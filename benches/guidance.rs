@@ -18,6 +18,7 @@ use dipir_guidance::reading::start;
 use dipir_guidance::recover::{ModelGuidance, Problem, Recovery, Target, recover_light};
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
+use dipir_light::environment::EnvironmentMap;
 use dipir_optimize::guidance::{rmse, touched};
 use dipir_optimize::lighting::Lighting;
 use dipir_optimize::objective::Objective;
@@ -36,6 +37,7 @@ use dipir_render::transport::{RecordSettings, Transport};
 use dipir_scene::material::Material;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
+use dipir_stages::known_light;
 use dipir_stages::presets;
 use glam::{DVec3, Vec3};
 
@@ -177,26 +179,24 @@ impl Trial {
         )?)
     }
 
-    /// The composite under the true light, the object through the photograph's own tone curve.
-    fn truth(&self, transport: &Transport) -> anyhow::Result<DisplayImage> {
-        let map = self.place.map(MAP[0], MAP[1])?;
+    /// The composite under `map`, the object through the photograph's own tone curve if `is_toned`.
+    fn under(&self, map: &EnvironmentMap, transport: &Transport, is_toned: bool) -> DisplayImage {
         let object = transport.foreground(map.texels());
         let shadow = transport.shadow(map.texels());
         let coverage = transport.coverage();
         let pixels = (0..SIZE * SIZE).map(|p| {
             let a = coverage.pixels()[p];
-            let mut values = (object.pixels()[p] / a.max(1e-6)).to_array();
-            self.place.response.apply(&mut values);
-            let object = Vec3::from_array(values.map(|v| Transfer::Srgb.decode_scalar(v)));
+            let mut object = object.pixels()[p] / a.max(1e-6);
+            if is_toned {
+                let mut values = object.to_array();
+                self.place.response.apply(&mut values);
+                object = Vec3::from_array(values.map(|v| Transfer::Srgb.decode_scalar(v)));
+            }
             let ground = self.linear.0.pixels()[p] * shadow.pixels()[p];
             let linear = ground * (1.0 - a) + object * a;
             Vec3::from_array(linear.to_array().map(|v| Transfer::Srgb.encode_scalar(v)))
         });
-        Ok(DisplayImage(Raster::from_pixels(
-            SIZE,
-            SIZE,
-            pixels.collect(),
-        )))
+        DisplayImage(Raster::from_pixels(SIZE, SIZE, pixels.collect()))
     }
 
     fn errors(&self, objective: &Objective, light: &Parameters, truth: &DisplayImage) -> Errors {
@@ -284,6 +284,8 @@ fn measure(
         ..*reader
     };
     let inversion = combine(reading.crops.clone(), &reading.encoder, &no_encoder).light;
+    let mut hard_sun = reading.light;
+    hard_sun.confidence = 1.0;
     let mut true_azimuth = reading.light;
     true_azimuth.description.azimuth = trial.place.sun().azimuth;
     let mut true_direction = true_azimuth;
@@ -292,6 +294,7 @@ fn measure(
         (ENCODER, &encoder),
         ("4 inversion", &inversion),
         ("5 inversion with the encoder", &reading.light),
+        ("5b the same with a hard sun", &hard_sun),
         ("6 true azimuth, the rest as read", &true_azimuth),
         ("7 true direction, the rest as read", &true_direction),
     ] {
@@ -306,15 +309,24 @@ fn measure(
         lights.push(("8 guidance", guided));
     }
     let objective = trial.objective(&transport)?;
-    let truth = trial.truth(&transport)?;
+    let truth = trial.under(&trial.place.map(MAP[0], MAP[1])?, &transport, true);
     let errors = lights.iter();
     let errors = errors.map(|(name, light)| (*name, trial.errors(&objective, light, &truth)));
+    let mut errors: BTreeMap<_, _> = errors.collect();
+    let projected = known_light::projected(&trial.linear, camera, MAP)?;
+    let picture = trial.under(&projected, &transport, false);
+    let projected = Errors {
+        azimuth: f64::NAN,
+        elevation: f64::NAN,
+        rmse: rmse(&picture, &truth, &touched(&objective), None),
+    };
+    errors.insert("2b photograph projected", projected);
     let sun = trial.place.sun();
     let json = serde_json::json!({
         "scene": index, "reading": reading,
         "truth": {"azimuth": sun.azimuth, "elevation": sun.elevation, "share": trial.place.light.share},
     });
-    Ok((errors.collect(), json))
+    Ok((errors, json))
 }
 
 fn main() -> anyhow::Result<()> {
