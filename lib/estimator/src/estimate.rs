@@ -6,6 +6,7 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use crate::grid::{BIN_SIGMA, BINS, bin_direction, smooth_map, to_world};
+use crate::known::KnownSource;
 use crate::posterior::{PeakPosterior, words};
 
 /// Columns and rows of maps of the light.
@@ -63,6 +64,9 @@ pub struct LightEstimate {
     pub elevation_deg: Interval,
     /// Its most probable direction in words.
     pub words: String,
+    /// The strongest source, where its direction is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub source: Option<KnownSource>,
 }
 
 impl LightEstimate {
@@ -120,8 +124,15 @@ impl LightEstimate {
         to_world(&map, self.heading_rad)
     }
 
-    /// At most `count` lobes whose sum fits the mean light, with its energy in every channel.
+    /// At most `count` lobes whose sum fits the mean light, with its energy in every channel. A source whose
+    /// direction is known comes first.
     pub fn lobes(&self, count: usize) -> Vec<SphericalGaussian> {
-        fit(&self.map(), count).lobes
+        match self.source_lobe() {
+            Some(source) => {
+                let rest = fit(&self.base_map(), count.saturating_sub(1)).lobes;
+                std::iter::once(source).chain(rest).collect()
+            }
+            None => fit(&self.map(), count).lobes,
+        }
     }
 }

@@ -227,6 +227,7 @@ impl Sum {
             azimuth_deg: Interval::new(0.0, 0.0, 0.0),
             elevation_deg: Interval::new(0.0, 0.0, 0.0),
             words: String::new(),
+            source: None,
         }
         .described()
     }

@@ -10,6 +10,7 @@ mod estimate;
 mod estimator;
 pub mod features;
 pub mod grid;
+mod known;
 pub mod network;
 pub mod posterior;
 #[cfg(test)]
@@ -21,5 +22,9 @@ pub use combine::combine;
 pub use error::EstimatorError;
 pub use estimate::{Interval, LightEstimate};
 pub use estimator::{Calibration, Estimator};
+pub use known::{KnownAngle, KnownSource, KnownSun};
 pub use posterior::PeakPosterior;
 pub use visible::{Visible, merged};
+
+/// Raised whenever the same photograph and camera get another estimate.
+pub const VERSION: u32 = 1;

@@ -16,16 +16,40 @@ use crate::parameters::Parameters;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Lighting {
-    /// Radiance times this is on the photograph's linear scale, where 1 is display white.
+    /// Radiance times this is on the photograph's linear scale, where 1 is display white; 1 where a
+    /// file does not say.
+    #[serde(default = "one")]
     pub exposure: f32,
     /// The lobes, whose sum is the light.
     pub lobes: Vec<SphericalGaussian>,
     /// How far the lobes are from the fused map that they stand for: the integral of the
     /// difference in luminance over that of the map.
+    #[serde(default)]
     pub fusion_residual: f64,
+    /// Lobes at the start of the list that the map of the surroundings lacks, where there is one.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub sources: usize,
+}
+
+fn one() -> f32 {
+    1.0
+}
+
+fn is_zero(count: &usize) -> bool {
+    *count == 0
 }
 
 impl Lighting {
+    /// Lobes on the photograph's scale.
+    pub fn of_lobes(lobes: Vec<SphericalGaussian>) -> Self {
+        Self {
+            exposure: 1.0,
+            lobes,
+            fusion_residual: 0.0,
+            sources: 0,
+        }
+    }
+
     /// The fused light of `parameters`, on maps of `width` x `height` texels.
     ///
     /// Fusion multiplies the foreground's map by a gain, texel by texel; a product of a lobe and a
@@ -74,6 +98,7 @@ impl Lighting {
             exposure: 1.0,
             lobes,
             fusion_residual: if total > 0.0 { apart / total } else { 0.0 },
+            sources: 0,
         }
     }
 

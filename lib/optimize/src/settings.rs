@@ -3,6 +3,7 @@ use std::f64::consts::PI;
 use std::path::PathBuf;
 
 use dipir_render::transport::Precision;
+use dipir_sun::table::{ShadowTable, SunTable};
 use serde::{Deserialize, Serialize};
 
 use crate::objective::Weights;
@@ -12,8 +13,12 @@ use crate::tensors::Group;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GuidanceKind {
-    /// Score distillation with a personalised diffusion model [DiPIR, eq. 8].
+    /// `"auto"`: `"lds"` with a model of `[model] path`, `"none"` with the embedded one.
     #[default]
+    Auto,
+    /// Nothing guides: the light is what the optimisation would start from.
+    None,
+    /// Score distillation with a personalised diffusion model [DiPIR, eq. 8].
     Lds,
     /// Score distillation sampling [DiPIR, eq. 7].
     Sds,
@@ -25,13 +30,27 @@ pub enum GuidanceKind {
     Reference,
 }
 
+impl GuidanceKind {
+    /// The kind that is meant, where a configuration names a model or does not.
+    pub fn resolved(self, names_model: bool) -> Self {
+        match (self, names_model) {
+            (Self::Auto, true) => Self::Lds,
+            (Self::Auto, false) => Self::None,
+            (other, _) => other,
+        }
+    }
+}
+
 /// Where the optimisation starts: one of the words below, or a file.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "String", into = "String")]
 pub enum Start {
-    /// `"auto"`: `"read"` where the model can read light, else `"neutral"`.
+    /// `"auto"`: `"neutral"` with a reference, `"read"` where a model guides that knows light, else
+    /// `"estimated"`.
     #[default]
     Auto,
+    /// `"estimated"`: what the light estimator says of the whole photograph.
+    Estimated,
     /// `"read"`: what a model that knows light reads off the photograph.
     Read,
     /// `"encoder"`: what that model's light encoder sees, without asking the model itself.
@@ -46,6 +65,7 @@ impl From<String> for Start {
     fn from(text: String) -> Self {
         match text.as_str() {
             "auto" => Self::Auto,
+            "estimated" => Self::Estimated,
             "read" => Self::Read,
             "encoder" => Self::Encoder,
             "neutral" => Self::Neutral,
@@ -58,6 +78,7 @@ impl From<Start> for String {
     fn from(start: Start) -> Self {
         match start {
             Start::Auto => "auto".into(),
+            Start::Estimated => "estimated".into(),
             Start::Read => "read".into(),
             Start::Encoder => "encoder".into(),
             Start::Neutral => "neutral".into(),
@@ -77,9 +98,19 @@ pub struct LightTable {
     /// With `guidance = "reference"`: the picture that the composite should equal, EXR or HDR
     /// (linear), PNG or JPEG (as the photograph is encoded), of the photograph's size.
     pub reference: Option<PathBuf>,
-    /// Where the optimisation starts, and what `recover_light = false` keeps: `"auto"`, `"read"`,
-    /// `"neutral"`, or a `lighting.json`.
+    /// Where the optimisation starts, and what `recover_light = false` keeps: `"auto"`,
+    /// `"estimated"`, `"read"`, `"encoder"`, `"neutral"`, or a `lighting.json`.
     pub start: Start,
+    /// With an estimated start: the number of one of its candidates, from 1, instead of their mean.
+    pub candidate: Option<usize>,
+    /// With an estimated start: what is known of the sun. Without it, what the photograph's own
+    /// data say (time, place and heading).
+    pub sun: Option<SunTable>,
+    /// With an estimated start: a shadow drawn on the photograph, from an object's foot to the tip.
+    pub shadow: Option<ShadowTable>,
+    /// Whether what the photograph shows belongs to the light; with an estimated start it does by
+    /// default.
+    pub visible: Option<bool>,
     /// With a diffusion model: least and largest noise that it is asked at, as shares of its
     /// timesteps. A second pair is reached linearly in the last iteration. The model's own by
     /// default.
@@ -292,8 +323,12 @@ impl Settings {
     /// Refuses values that no run can work with.
     pub fn check(&self) -> Result<(), BadSetting> {
         let wrong = |key, message: String| Err(BadSetting { key, message });
+        if self.iterations > 1_000_000 {
+            let found = self.iterations;
+            let message = format!("{found} is out of range; accepted: 0 to 1000000");
+            return wrong("iterations", message);
+        }
         let counts = [
-            ("iterations", self.iterations, 1_000_000),
             ("lobes", self.lobes, 1024),
             ("size", self.size, 1 << 14),
             ("samples", self.samples as usize, 1 << 20),

@@ -4,15 +4,14 @@ use std::cell::RefCell;
 
 use dipir_cli::exit::{self, describe};
 use dipir_cli::session::Session;
-use dipir_optimize::settings::{GuidanceKind, LightTable};
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::graph::{Graph, Node};
 use dipir_pipeline::stage::StagePlan;
 use dipir_pipeline::status::{self, StageStatus, State};
 use dipir_scene::config::SceneConfig;
 
-use crate::composite::table::CompositeTable;
 use crate::light::materials;
+use crate::light::method::Method;
 use crate::model::ModelTable;
 use crate::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE, StageName};
 use crate::truth::ReportTable;
@@ -23,26 +22,15 @@ pub const LAST: &str = COMPOSITE.name;
 
 /// The graph of the session's configuration.
 pub fn graph(session: &Session) -> anyhow::Result<Graph> {
-    let table: LightTable = session.config.table("light")?;
-    let composite: CompositeTable = session.config.table("composite")?;
     // Read here so that a slip in them is told before anything runs.
     let _: (SceneConfig, ModelTable, ReportTable) = (
         session.config.table("scene")?,
         session.config.table("model")?,
         session.config.table("report")?,
     );
-    let materials = materials::are_asked_for(session)?;
-    let light_is_given = composite.environment.is_some() && !materials;
-    let is_guided_by_model = table.guidance != GuidanceKind::Reference && !materials;
-    let is_adapted = table.adapt.unwrap_or(true);
-
-    let no_model = match (light_is_given, is_guided_by_model) {
-        _ if materials => Some("[light] materials asks no diffusion model"),
-        (true, _) => Some("[composite] environment gives the light"),
-        (false, false) => Some("[light] guidance = \"reference\" asks no diffusion model"),
-        (false, true) if !is_adapted => Some("[light] adapt = false uses the model as it is"),
-        (false, true) => None,
-    };
+    let method = Method::of(session)?;
+    let light_is_given = method == Method::Given;
+    let no_model = method.without_model();
     let no_concepts = match lora::preserves_concepts(session)? {
         true => no_model,
         false => no_model.or(Some("concepts.count or lora.prior_weight is 0")),
@@ -67,10 +55,7 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
         ),
         node(
             &LIGHT,
-            chosen(&[
-                (SCENE.name, true),
-                (LORA.name, is_guided_by_model && is_adapted),
-            ]),
+            chosen(&[(SCENE.name, true), (LORA.name, no_model.is_none())]),
             light_is_given.then_some("[composite] environment gives the light"),
         ),
         node(

@@ -94,9 +94,7 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
         .rotated_y(f64::from(table.truth_rotation_deg).to_radians());
 
     let scene = SceneFolder::read(session)?;
-    let record = Transport::load(scene.manifest.output(&scene.folder, transport::ROLE)?)?;
-    let longest = record.size()[0].max(record.size()[1]);
-    let frame = Frame::new(&scene.loaded, longest);
+    let (record, frame) = recorded(session, &scene)?;
     let transfer = scene.loaded.photo.transfer;
     let no_weights = Weights {
         consistency: 0.0,
@@ -119,6 +117,31 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
         rmse_neutral: apart(&neutral),
         peak: Some(peak),
     }))
+}
+
+/// The scene stage's record, else one of its own, and the size at which it is compared.
+fn recorded(session: &Session, scene: &SceneFolder) -> anyhow::Result<(Transport, Frame)> {
+    if scene
+        .manifest
+        .outputs
+        .iter()
+        .any(|o| o.role == transport::ROLE)
+    {
+        let record = Transport::load(scene.manifest.output(&scene.folder, transport::ROLE)?)?;
+        let longest = record.size()[0].max(record.size()[1]);
+        return Ok((record, Frame::new(&scene.loaded, longest)));
+    }
+    let settings = transport::settings(session, &session.config.table("light")?)?;
+    let frame = Frame::new(&scene.loaded, settings.size);
+    let simulation = scene.effects.simulation();
+    let hash = transport::scene_hash(&scene.loaded, &simulation)?;
+    let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
+    let record = transport::record(
+        session,
+        &renderer,
+        &frame.record_settings(&settings, simulation, hash),
+    )?;
+    Ok((record, frame))
 }
 
 /// The composite stage's picture, linear.

@@ -3,6 +3,7 @@ pub mod table;
 
 use std::fmt;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use dipir_cli::session::{Session, duration};
@@ -12,6 +13,7 @@ use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentSampler;
+use dipir_light::map_with_lobes::MapWithLobes;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_render::adaptive::Stop;
@@ -177,7 +179,7 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
     scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
     match known {
         Some((_, path)) => plan.input("environment", path, &session.resolve(path))?,
-        None => plan.outputs_of(&light_folder::manifest(session)?, &["lighting", "tone"])?,
+        None => light_folder::add_inputs(session, &mut plan)?,
     }
     materials::add_input(session, &mut plan)?;
     Ok(plan)
@@ -195,7 +197,14 @@ fn render(
             let map = EnvironmentSampler::new(light.map.clone());
             render_under(session, table, stop, inputs, &map)
         }
-        Source::Recovered(light) => render_under(session, table, stop, inputs, &light.lobes),
+        Source::Recovered(light) => match &light.surroundings {
+            Some(map) => {
+                let map = EnvironmentSampler::new(Arc::new(map.clone()));
+                let light = MapWithLobes::new(map, light.lobes.clone());
+                render_under(session, table, stop, inputs, &light)
+            }
+            None => render_under(session, table, stop, inputs, &light.lobes),
+        },
     }
 }
 

@@ -3,9 +3,11 @@ use std::path::Path;
 
 use dipir_cli::session::Session;
 use dipir_imaging::tone::ToneCurves;
+use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::{SgMixture, SphericalGaussian};
 use dipir_optimize::lighting::Lighting;
 use dipir_pipeline::manifest::{Artifact, FILE_NAME, Manifest};
+use dipir_pipeline::stage::StagePlan;
 use glam::Quat;
 use serde_json::{Value, json};
 
@@ -21,10 +23,29 @@ pub fn recovered_params(table: &CompositeTable) -> Value {
     })
 }
 
+/// Role of the map of the surroundings among the stage's outputs.
+const SURROUNDINGS: &str = "surroundings";
+
+fn has_surroundings(manifest: &Manifest) -> bool {
+    manifest.outputs.iter().any(|o| o.role == SURROUNDINGS)
+}
+
+/// Enters what lights the composite into its plan.
+pub fn add_inputs(session: &Session, plan: &mut StagePlan) -> anyhow::Result<()> {
+    let manifest = manifest(session)?;
+    let roles: &[&str] = match has_surroundings(&manifest) {
+        true => &["lighting", "tone", SURROUNDINGS],
+        false => &["lighting", "tone"],
+    };
+    Ok(plan.outputs_of(&manifest, roles)?)
+}
+
 /// A light that the light stage recovered.
 pub struct Recovered {
-    /// The lobes, on the photograph's scale.
+    /// The lobes, on the photograph's scale; with `surroundings` the sources that these lack.
     pub lobes: SgMixture,
+    /// The rest of the light, where it is a map.
+    pub surroundings: Option<EnvironmentMap>,
     /// The tone curves that were recovered with it.
     pub tone: ToneCurves,
 }
@@ -43,7 +64,17 @@ pub fn recovered(
     let tone_file = manifest.output(&folder, "tone")?;
     let exposure = table.exposure_ev.exp2();
     let turn = Quat::from_rotation_y(table.rotation_deg.to_radians());
-    let lobes = Lighting::read(&lighting_file)?.exposed_lobes();
+    let lighting = Lighting::read(&lighting_file)?;
+    let mut lobes = lighting.exposed_lobes();
+    let surroundings = match has_surroundings(&manifest) {
+        true => {
+            lobes.truncate(lighting.sources);
+            let map = EnvironmentMap::read(manifest.output(&folder, SURROUNDINGS)?)?;
+            let angle = f64::from(table.rotation_deg).to_radians();
+            Some(map.scaled(exposure).rotated_y(angle))
+        }
+        false => None,
+    };
     let lobes = lobes.into_iter().map(|lobe| SphericalGaussian {
         direction: turn * lobe.direction,
         radiance: lobe.radiance * exposure,
@@ -57,6 +88,7 @@ pub fn recovered(
             );
             session.config.invalid("composite.exposure_ev", message)
         })?,
+        surroundings,
         tone: ToneCurves::read_json(&tone_file)?,
     })
 }

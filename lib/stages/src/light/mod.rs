@@ -1,9 +1,12 @@
 //! The light stage: recovers the light and the tone curves under which the object looks as the
 //! guidance wants it to.
+mod estimate;
 pub mod folder;
 pub mod materials;
+pub(crate) mod method;
 mod request;
 mod resume;
+mod surroundings;
 
 use std::fmt;
 use std::ops::ControlFlow;
@@ -15,23 +18,31 @@ use anyhow::Context;
 use dipir_cli::interrupt::Interrupted;
 use dipir_cli::progress::Progress;
 use dipir_cli::session::{Session, duration};
+use dipir_estimator::LightEstimate;
 use dipir_guidance::distillation::Adapter;
 use dipir_guidance::recover::{Event, ModelGuidance, Problem, Recovery, Target, recover_light};
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::DisplayImage;
+use dipir_imaging::tone::ToneCurves;
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::gaussian::SphericalGaussian;
 use dipir_optimize::history::Row;
 use dipir_optimize::lighting::Lighting;
-use dipir_optimize::optimization::{self, Outcome};
+use dipir_optimize::optimization;
+use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::settings::{Settings, Start};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
+use dipir_prior::inversion::Reading;
 use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
 use glam::Vec3;
 use serde_json::{Value, json};
 
-use crate::light::request::{Guide, Request, first_light, read_reference};
+use crate::light::estimate::Estimated;
+use crate::light::request::{First, Guide, Request, first_light, read_reference};
 use crate::light::resume::{Resume, fingerprint};
+use crate::light::surroundings::{map_of, narrow_first, surroundings};
 use crate::model::{self, Loaded};
 use crate::names::LIGHT;
 use crate::presets::{LightRun, Outlook};
@@ -43,7 +54,7 @@ use crate::{interruption, lora};
 pub struct Done {
     folder: PathBuf,
     manifest: Manifest,
-    recovery: Recovery,
+    found: Found,
     size: [u32; 2],
     resumed_at: usize,
     /// What other presets would have taken; empty for a run that went on from a checkpoint.
@@ -68,7 +79,7 @@ impl Inputs {
         let frame = Frame::new(&scene.loaded, request.settings.size);
         let reference = match &request.guide {
             Guide::Reference { file, .. } => Some(read_reference(session, &scene, &frame, file)?),
-            Guide::Model { .. } => None,
+            Guide::Model { .. } | Guide::None => None,
         };
         Ok(Self {
             scene,
@@ -115,24 +126,136 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let plan = plan(session)?;
     let fingerprint = fingerprint(&plan, &request.settings)?;
     let mut writer = session.begin(plan)?;
-    let resume = Resume::open(session, &fingerprint)?;
-    let (recovery, resumed_at) = recover(session, &request, &inputs, &resume, &mut writer)?;
-    write_results(&request.settings, &recovery, &resume, &mut writer)?;
+    let clock = Instant::now();
+    let estimated = match request.start {
+        First::Estimated => {
+            let (loaded, lobes) = (&inputs.scene.loaded, request.settings.lobes);
+            Some(estimate::estimate(session, &request.table, loaded, lobes)?)
+        }
+        _ => None,
+    };
+    writer.set_timing("estimate", clock.elapsed().as_secs_f64());
+    let (found, resumed_at, resume) = match &request.guide {
+        Guide::None => (start_alone(&request, &inputs, estimated.as_ref()), 0, None),
+        _ => {
+            let resume = Resume::open(session, &fingerprint)?;
+            let start = estimated.as_ref().map(|e| e.lobes.as_slice());
+            let (recovery, at) = recover(session, &request, &inputs, start, &resume, &mut writer)?;
+            (Found::of(recovery), at, Some(resume))
+        }
+    };
+    let found = found.with_surroundings(&request, &inputs, estimated);
+    write_results(&request.settings, &found, resume.as_ref(), &mut writer)?;
     let manifest = writer.finish()?;
-    resume.remove();
-    let outlook = match resumed_at {
-        0 => light_run(&inputs.scene, &request, &manifest)
-            .outlook(session.pipeline.quality, &request.table),
+    if let Some(resume) = resume {
+        resume.remove();
+    }
+    let outlook = match (resumed_at, &request.guide) {
+        (0, Guide::Reference { .. } | Guide::Model { .. }) => {
+            light_run(&inputs.scene, &request, &manifest)
+                .outlook(session.pipeline.quality, &request.table)
+        }
         _ => Outlook::default(),
     };
     Ok(Done {
         folder: LIGHT.folder(session),
         manifest,
-        recovery,
+        found,
         size: inputs.frame.camera.resolution,
         resumed_at,
         outlook,
     })
+}
+
+/// The light that was found, and how.
+struct Found {
+    lighting: Lighting,
+    tone: ToneCurves,
+    history: Vec<Row>,
+    stopped_early: bool,
+    /// What the guiding model read off the photograph.
+    reading: Option<Reading>,
+    /// Display-referred RMSE against the reference.
+    rmse: Option<f64>,
+    /// What the estimator said of the photograph.
+    estimated: Option<Estimated>,
+    /// The light but the first lobes, where it is traced as a map.
+    surroundings: Option<EnvironmentMap>,
+}
+
+impl Found {
+    fn of(recovery: Recovery) -> Self {
+        let outcome = recovery.outcome;
+        Self {
+            lighting: outcome.lighting,
+            tone: outcome.tone,
+            history: outcome.history,
+            stopped_early: outcome.stopped_early,
+            reading: recovery.reading,
+            rmse: recovery.rmse,
+            estimated: None,
+            surroundings: None,
+        }
+    }
+
+    /// Steps that were skipped because something was not finite.
+    fn skipped(&self) -> usize {
+        self.history.iter().filter(|r| r.skipped.is_some()).count()
+    }
+
+    /// With the map of the surroundings, where one is traced.
+    fn with_surroundings(
+        mut self,
+        request: &Request,
+        inputs: &Inputs,
+        estimated: Option<Estimated>,
+    ) -> Self {
+        let loaded = &inputs.scene.loaded;
+        let visible = request.shows_visible();
+        let as_estimated = estimated
+            .as_ref()
+            .filter(|_| matches!(request.guide, Guide::None));
+        let smooth = match as_estimated {
+            Some(e) => {
+                self.lighting.sources = e.sources;
+                Some(e.smooth.clone())
+            }
+            None => visible.then(|| {
+                let (lobes, sources) = narrow_first(&self.lighting.exposed_lobes());
+                let smooth = map_of(&lobes[sources..]);
+                self.lighting.lobes = lobes;
+                self.lighting.exposure = 1.0;
+                self.lighting.sources = sources;
+                smooth
+            }),
+        };
+        self.surroundings = smooth.map(|light| surroundings(loaded, &light, visible));
+        self.estimated = estimated;
+        self
+    }
+}
+
+/// The light of the start, where nothing guides.
+fn start_alone(request: &Request, inputs: &Inputs, estimated: Option<&Estimated>) -> Found {
+    let lighting = match (&inputs.first, estimated) {
+        (Some(light), _) => light.clone(),
+        (None, Some(estimated)) => Lighting::of_lobes(estimated.lobes.clone()),
+        (None, None) => {
+            let ambient = ambient_of(&inputs.frame.background);
+            let neutral = Parameters::neutral(request.settings.lobes, ambient);
+            Lighting::of_lobes(neutral.foreground_lobes())
+        }
+    };
+    Found {
+        lighting,
+        tone: ToneCurves::identity(),
+        history: vec![],
+        stopped_early: false,
+        reading: None,
+        rmse: None,
+        estimated: None,
+        surroundings: None,
+    }
 }
 
 /// Recovers light and tone curves; says at which iteration it went on.
@@ -140,6 +263,7 @@ fn recover(
     session: &Session,
     request: &Request,
     inputs: &Inputs,
+    start: Option<&[SphericalGaussian]>,
     resume: &Resume,
     writer: &mut StageWriter,
 ) -> anyhow::Result<(Recovery, usize)> {
@@ -183,7 +307,7 @@ fn recover(
         background: &frame.background,
         transfer: loaded.photo.transfer,
         settings,
-        start: first.as_deref(),
+        start: first.as_deref().or(start),
         checkpoint: Some(&checkpoint),
     };
     let (recovery, resumed_at) = follow(session, settings, resume, |watch| {
@@ -201,7 +325,7 @@ fn light_run(scene: &SceneFolder, request: &Request, manifest: &Manifest) -> Lig
     let resolution = scene.loaded.scene.camera.resolution;
     let photo_side = resolution[0].max(resolution[1]) as usize;
     let (by_model, refines) = match &request.guide {
-        Guide::Reference { .. } => (false, false),
+        Guide::Reference { .. } | Guide::None => (false, false),
         Guide::Model { reading, .. } => (true, reading.is_some()),
     };
     LightRun {
@@ -224,6 +348,7 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let scene = scene_folder::manifest(session)?;
     scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
     match &request.guide {
+        Guide::None => {}
         Guide::Reference { path, file } => plan.input("reference", path, file)?,
         Guide::Model {
             table, settings, ..
@@ -351,33 +476,61 @@ impl Watch<'_> {
 
 fn write_results(
     settings: &Settings,
-    recovery: &Recovery,
-    resume: &Resume,
+    found: &Found,
+    resume: Option<&Resume>,
     writer: &mut StageWriter,
 ) -> anyhow::Result<()> {
-    let outcome = &recovery.outcome;
-    writer.write_json("lighting", "lighting.json", &outcome.lighting)?;
-    let [columns, rows] = settings.environment;
-    let path = writer.output("environment", "environment.exr")?;
-    outcome.lighting.map(columns, rows).write(path)?;
-    writer.write_json("tone", "tone.json", &outcome.tone)?;
-    writer.write_json("history", "history.json", &rows_without_times(outcome)?)?;
-    for name in resume.previews()? {
-        let path = writer.output("preview", Path::new("previews").join(&name))?;
-        let kept = resume.folder.join("previews").join(&name);
-        std::fs::copy(&kept, path).with_context(|| format!("cannot copy {}", kept.display()))?;
+    writer.write_json("lighting", "lighting.json", &found.lighting)?;
+    let environment = match &found.surroundings {
+        Some(map) => {
+            map.write(writer.output("surroundings", "surroundings.exr")?)?;
+            let sources = &found.lighting.exposed_lobes()[..found.lighting.sources];
+            sum(map, &map_of(sources))?
+        }
+        None => found
+            .lighting
+            .map(settings.environment[0], settings.environment[1]),
+    };
+    environment.write(writer.output("environment", "environment.exr")?)?;
+    writer.write_json("tone", "tone.json", &found.tone)?;
+    if let Some(estimated) = &found.estimated {
+        writer.write_json("estimate", "estimate.json", &estimated.estimate)?;
+        writer.write_json("candidates", "candidates.json", &estimated.candidates)?;
     }
-    if let Some(reading) = &recovery.reading {
+    if let Some(reading) = &found.reading {
         writer.write_json("reading", "reading.json", reading)?;
     }
-    if let Some(rmse) = recovery.rmse {
+    if let Some(rmse) = found.rmse {
         writer.set_estimated_error(rmse);
+    }
+    let Some(resume) = resume else {
+        return Ok(());
+    };
+    writer.write_json(
+        "history",
+        "history.json",
+        &rows_without_times(&found.history)?,
+    )?;
+    for name in resume.previews()? {
+        let path = writer.output("preview", Path::new("previews").join(&name))?;
+        let kept = resume.preview_named(&name);
+        std::fs::copy(&kept, path).with_context(|| format!("cannot copy {}", kept.display()))?;
     }
     Ok(())
 }
 
+/// Texel by texel; both maps have the same size.
+fn sum(a: &EnvironmentMap, b: &EnvironmentMap) -> anyhow::Result<EnvironmentMap> {
+    let texels = a.texels().iter().zip(b.texels()).map(|(a, b)| *a + *b);
+    Ok(EnvironmentMap::new(
+        a.width(),
+        a.height(),
+        texels.collect(),
+    )?)
+}
+
 /// The history without the seconds, which differ from run to run: they are in `stage.json`.
-fn rows_without_times(outcome: &Outcome) -> anyhow::Result<Vec<Value>> {
+fn rows_without_times(history: &[Row]) -> anyhow::Result<Vec<Value>> {
     let row = |row: &Row| {
         let mut value = serde_json::to_value(row)?;
         if let Some(row) = value.as_object_mut() {
@@ -385,7 +538,22 @@ fn rows_without_times(outcome: &Outcome) -> anyhow::Result<Vec<Value>> {
         }
         Ok(value)
     };
-    outcome.history.iter().map(row).collect()
+    history.iter().map(row).collect()
+}
+
+/// An estimate in a sentence.
+fn in_words(estimate: &LightEstimate) -> String {
+    let (azimuth, elevation) = (estimate.azimuth_deg, estimate.elevation_deg);
+    format!(
+        "estimated: most light {}; in four photographs of five its azimuth is {:.0} to {:.0} degrees to the \
+         right of the view and its elevation {:.0} to {:.0}; a sun with a probability of {:.0}%",
+        estimate.words,
+        azimuth.low,
+        azimuth.high,
+        elevation.low,
+        elevation.high,
+        100.0 * estimate.sun_probability
+    )
 }
 
 /// Degrees above the horizon, and counter-clockwise from +z seen from above.
@@ -397,12 +565,7 @@ fn angles_deg(direction: Vec3) -> [f32; 2] {
 
 impl Done {
     fn records(&self) -> usize {
-        self.recovery
-            .outcome
-            .history
-            .iter()
-            .filter(|r| r.recorded)
-            .count()
+        self.found.history.iter().filter(|r| r.recorded).count()
     }
 
     fn guidance(&self, row: Option<&Row>) -> Option<f64> {
@@ -411,22 +574,23 @@ impl Done {
 
     /// For programs.
     pub fn to_json(&self) -> Value {
-        let history = &self.recovery.outcome.history;
+        let history = &self.found.history;
         json!({
             "folder": self.folder,
             "size": self.size,
             "iterations": history.len(),
             "resumed_at": self.resumed_at,
-            "skipped": self.recovery.outcome.skipped(),
-            "stopped_early": self.recovery.outcome.stopped_early,
+            "skipped": self.found.skipped(),
+            "stopped_early": self.found.stopped_early,
             "recorded_anew": self.records(),
             "guidance_at_start": self.guidance(history.first()),
             "guidance_at_end": self.guidance(history.last()),
-            "rmse": self.recovery.rmse,
-            "reading": self.recovery.reading,
+            "rmse": self.found.rmse,
+            "reading": self.found.reading,
+            "estimate": self.found.estimated.as_ref().map(|e| &e.estimate),
             "other_presets": self.outlook.to_json(),
-            "peak_direction": self.recovery.outcome.lighting.peak_direction(),
-            "fusion_residual": self.recovery.outcome.lighting.fusion_residual,
+            "peak_direction": self.found.lighting.peak_direction(),
+            "fusion_residual": self.found.lighting.fusion_residual,
             "elapsed_s": self.manifest.elapsed_s,
             "timings_s": self.manifest.timings_s,
             "peak_rss_bytes": self.manifest.peak_rss_bytes,
@@ -445,14 +609,14 @@ impl fmt::Display for Done {
         write!(
             f,
             "  {} iterations on {} x {} pixels",
-            self.recovery.outcome.history.len(),
+            self.found.history.len(),
             self.size[0],
             self.size[1]
         )?;
-        if let Some(rmse) = self.recovery.rmse {
+        if let Some(rmse) = self.found.rmse {
             write!(f, ", {rmse:.5} of display-referred RMSE from the reference")?;
         }
-        if let Some(peak) = self.recovery.outcome.lighting.peak_direction() {
+        if let Some(peak) = self.found.lighting.peak_direction() {
             let [elevation, azimuth] = angles_deg(peak);
             write!(
                 f,
@@ -460,7 +624,10 @@ impl fmt::Display for Done {
                  degrees from +z towards +x"
             )?;
         }
-        let skipped = self.recovery.outcome.skipped();
+        if let Some(estimated) = &self.found.estimated {
+            write!(f, "\n  {}", in_words(&estimated.estimate))?;
+        }
+        let skipped = self.found.skipped();
         if skipped > 0 {
             write!(
                 f,

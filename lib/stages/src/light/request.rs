@@ -12,12 +12,15 @@ use dipir_prior::inversion::InversionSettings;
 use dipir_scene::config::SceneConfig;
 use serde_json::{Value, json};
 
+use crate::light::method::Method;
 use crate::model::ModelTable;
 use crate::scene::folder::SceneFolder;
 use crate::scene::transport::{self, Frame};
 
 /// What guides, as far as files go.
 pub(crate) enum Guide {
+    /// Nothing: the start is the light.
+    None,
     /// A picture that the composite should equal.
     Reference {
         /// As the configuration names it.
@@ -40,19 +43,57 @@ pub(crate) struct Request {
     pub(crate) table: LightTable,
     pub(crate) settings: Settings,
     pub(crate) guide: Guide,
+    pub(crate) start: First,
+}
+
+/// Where the light starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum First {
+    /// Nearly uniform light.
+    Neutral,
+    /// What the light estimator says of the photograph.
+    Estimated,
+    /// What the guiding model reads off the photograph.
+    Read,
+    /// The light of a file.
+    File,
+}
+
+impl First {
+    fn of(session: &Session, table: &LightTable, guide: &Guide) -> anyhow::Result<Self> {
+        let first = match (&table.start, guide) {
+            (Start::File(_), _) => Self::File,
+            (Start::Neutral, _) | (Start::Auto, Guide::Reference { .. }) => Self::Neutral,
+            (
+                _,
+                Guide::Model {
+                    reading: Some(_), ..
+                },
+            ) => Self::Read,
+            (Start::Read | Start::Encoder, _) => {
+                let message = "reads with the guiding model, and none guides; accepted: auto, \
+                               estimated, neutral, a lighting.json, or guidance = \"lds\" beside it";
+                return Err(session.config.invalid("light.start", message).into());
+            }
+            (Start::Auto | Start::Estimated, _) => Self::Estimated,
+        };
+        Ok(first)
+    }
 }
 
 impl Request {
     pub(crate) fn of(session: &Session) -> anyhow::Result<Self> {
         let table: LightTable = session.config.table("light")?;
         let mut settings = transport::settings(session, &table)?;
-        let guide = match table.guidance {
-            GuidanceKind::Reference => {
+        let guide = match Method::of(session)? {
+            Method::Reference => {
                 let (path, file) = reference_of(session, &table)?;
                 Guide::Reference { path, file }
             }
-            _ => model_guide(session, &table)?,
+            Method::Model { adapted } => model_guide(session, &table, adapted)?,
+            Method::Start | Method::Materials | Method::Given => Guide::None,
         };
+        let start = First::of(session, &table, &guide)?;
         if let Guide::Model {
             reading: Some(_), ..
         } = &guide
@@ -63,6 +104,7 @@ impl Request {
             table,
             settings,
             guide,
+            start,
         })
     }
 
@@ -72,7 +114,15 @@ impl Request {
             checkpoint_every: 0,
             ..self.settings.clone()
         };
-        match &self.guide {
+        let table = &self.table;
+        let start = (self.start == First::Estimated).then(|| {
+            json!({
+                "estimator": dipir_estimator::VERSION, "candidate": table.candidate,
+                "sun": table.sun, "shadow": table.shadow,
+            })
+        });
+        let mut params = match &self.guide {
+            Guide::None => json!({"lobes": settings.lobes, "start": table.start}),
             Guide::Reference { .. } => {
                 json!({"light": settings, "guidance": GuidanceKind::Reference})
             }
@@ -85,7 +135,18 @@ impl Request {
                 "light": settings, "guidance": distillation, "class": class,
                 "precision": table.precision, "reading": reading_param(reading),
             }),
+        };
+        if let Some(params) = params.as_object_mut() {
+            params.extend(start.map(|s| ("estimate".to_owned(), s)));
+            params.insert("visible".into(), json!(self.shows_visible()));
         }
+        params
+    }
+
+    /// Whether what the photograph shows belongs to the light.
+    pub(super) fn shows_visible(&self) -> bool {
+        let default = self.start == First::Estimated && matches!(self.guide, Guide::None);
+        self.table.visible.unwrap_or(default)
     }
 }
 
@@ -112,13 +173,13 @@ fn refine(table: &LightTable, settings: &mut Settings) {
 }
 
 /// The model that guides and how it is used.
-fn model_guide(session: &Session, table: &LightTable) -> anyhow::Result<Guide> {
+fn model_guide(session: &Session, table: &LightTable, adapted: bool) -> anyhow::Result<Guide> {
     let model: ModelTable = session.config.table("model")?;
     let scene: SceneConfig = session.config.table("scene")?;
     let knows_light = model.knows_light(session);
     let reading = match &table.start {
         Start::Auto => knows_light.then(InversionSettings::default),
-        Start::Neutral | Start::File(_) => None,
+        Start::Neutral | Start::Estimated | Start::File(_) => None,
         Start::Read | Start::Encoder if !knows_light => {
             let message = format!(
                 "\"{}\" needs a model that knows light, and {} has no {}; accepted: auto, neutral, or \
@@ -135,7 +196,12 @@ fn model_guide(session: &Session, table: &LightTable) -> anyhow::Result<Guide> {
             ..InversionSettings::default()
         }),
     };
-    let settings = DistillationSettings::new(table, reading.is_some()).map_err(|e| {
+    let table = LightTable {
+        guidance: table.guidance.resolved(model.path.is_some()),
+        adapt: Some(adapted),
+        ..table.clone()
+    };
+    let settings = DistillationSettings::new(&table, reading.is_some()).map_err(|e| {
         session
             .config
             .invalid(&format!("light.{}", e.key), e.message)

@@ -85,6 +85,11 @@ impl Resume {
         }
     }
 
+    /// Where a picture of a name from [`previews`](Self::previews) is.
+    pub(crate) fn preview_named(&self, name: &str) -> PathBuf {
+        self.kept.file(format!("{PREVIEWS}/{name}"))
+    }
+
     /// Names of the pictures that were kept, in the order of their iterations.
     pub(crate) fn previews(&self) -> anyhow::Result<Vec<String>> {
         Ok(self.kept.files_in(PREVIEWS)?)

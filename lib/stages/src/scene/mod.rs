@@ -27,6 +27,7 @@ use serde_json::{Value, json};
 use crate::composite::table::CompositeTable;
 use crate::interruption;
 use crate::known_light;
+use crate::light::method::Method;
 use crate::names::SCENE;
 use crate::presets::{self, Outlook};
 use crate::scene::transport::Frame;
@@ -81,7 +82,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let table: LightTable = session.config.table("light")?;
     let recovery = transport::settings(session, &table)?;
     let known = known_light::known(session, &composite)?;
-    let recorded = known.is_none().then_some(&recovery);
+    let recorded = Method::of(session)?.replays().then_some(&recovery);
     let light = known.unwrap_or_else(known_light::pilot);
     let read = loaded.inputs.iter();
     let plan_of_this = plan_with(
@@ -254,8 +255,8 @@ fn plan_with<'a>(
     let table: LightTable = session.config.table("light")?;
     let recovery = transport::settings(session, &table)?;
     let known = known_light::known_params(&composite);
-    // Where the light is given, nothing is recovered: the record would be made for nobody.
-    let transport = known.is_none().then(|| {
+    // Where nothing is optimised, the record would be made for nobody.
+    let transport = Method::of(session)?.replays().then(|| {
         json!({
             "size": recovery.size, "environment": recovery.environment,
             "samples": recovery.samples, "precision": recovery.precision,
@@ -362,7 +363,7 @@ impl fmt::Display for Done {
             ),
             None => write!(
                 f,
-                "\n  light transport: not recorded, for [composite] environment gives the light"
+                "\n  light transport: not recorded, for no light is optimised"
             ),
         }
     }

@@ -27,7 +27,7 @@ pub fn settings(session: &Session, table: &LightTable) -> anyhow::Result<Setting
     let preset = presets::of(session.pipeline.quality).light;
     let settings = table.settings(&preset, session.pipeline.seed);
     settings.map_err(|e| {
-        let key = format!("optimize.{}", e.key);
+        let key = format!("light.{}", e.key);
         session.config.invalid(&key, e.message).into()
     })
 }

@@ -1,0 +1,152 @@
+//! The light that is estimated from the photograph alone, with what is known of the sun.
+use anyhow::Context;
+use dipir_cli::session::Session;
+use dipir_estimator::{Estimator, KnownAngle, KnownSun, LightEstimate};
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::gaussian::SphericalGaussian;
+use dipir_optimize::settings::LightTable;
+use dipir_scene::proxy::Proxy;
+use dipir_scene::scene::LoadedScene;
+use dipir_sun::shadow::{Angle, Ground, sun_of_shadow};
+use dipir_sun::table::{SunTable, Taken};
+use glam::Vec2;
+use serde::Serialize;
+
+/// Candidates that are told.
+const CANDIDATES: usize = 8;
+
+/// What `candidates.json` says of one light.
+#[derive(Serialize)]
+pub(super) struct CandidateEntry {
+    /// The number to choose it by, from 1.
+    candidate: usize,
+    /// How probable it is.
+    probability: f64,
+    /// Where its light comes from, relative to the view.
+    words: String,
+}
+
+/// An estimated light.
+pub(super) struct Estimated {
+    /// The distribution.
+    pub(super) estimate: LightEstimate,
+    /// Lights that it allows, the most probable first.
+    pub(super) candidates: Vec<CandidateEntry>,
+    /// The chosen light as lobes, its sources first.
+    pub(super) lobes: Vec<SphericalGaussian>,
+    /// How many of the lobes are sources that [`smooth`](Self::smooth) lacks.
+    pub(super) sources: usize,
+    /// The light without these sources.
+    pub(super) smooth: EnvironmentMap,
+}
+
+/// The light of the whole photograph: a function of photograph, camera and what is known of the
+/// sun, not of objects, presets or seeds.
+pub(super) fn estimate(
+    session: &Session,
+    table: &LightTable,
+    loaded: &LoadedScene,
+    lobes: usize,
+) -> anyhow::Result<Estimated> {
+    let camera = &loaded.scene.camera;
+    let estimator = Estimator::embedded().context("cannot read the embedded light estimator")?;
+    let estimate = estimator.estimate(&loaded.photo.image, camera);
+    let estimate = match known_sun(session, table, loaded, &estimate)? {
+        Some(sun) => estimate.knowing(&sun),
+        None => estimate,
+    };
+    let candidates = estimate.candidates(CANDIDATES);
+    let told = |(k, c): (usize, &dipir_estimator::Candidate)| CandidateEntry {
+        candidate: k + 1,
+        probability: c.probability,
+        words: c.words.clone(),
+    };
+    let entries = candidates.iter().enumerate().map(told).collect();
+    let (lobes, sources, smooth) = match table.candidate {
+        None => {
+            let sources = usize::from(estimate.source_lobe().is_some());
+            let smooth = match sources {
+                0 => estimate.map(),
+                _ => estimate.base_map(),
+            };
+            (estimate.lobes(lobes), sources, smooth)
+        }
+        Some(number) => {
+            let chosen = number.checked_sub(1).and_then(|k| candidates.get(k));
+            let chosen = chosen.ok_or_else(|| {
+                let message = format!("{number} is no candidate; accepted: 1 to {CANDIDATES}");
+                session.config.invalid("light.candidate", message)
+            })?;
+            match chosen.direction {
+                Some(_) => (chosen.lobes.clone(), 1, estimate.base_map()),
+                None => (chosen.lobes.clone(), 0, chosen.map.clone()),
+            }
+        }
+    };
+    Ok(Estimated {
+        estimate,
+        candidates: entries,
+        lobes,
+        sources,
+        smooth,
+    })
+}
+
+/// What the configuration and the photograph's own data say of the sun, relative to the view.
+fn known_sun(
+    session: &Session,
+    table: &LightTable,
+    loaded: &LoadedScene,
+    estimate: &LightEstimate,
+) -> anyhow::Result<Option<KnownSun>> {
+    let camera = &loaded.scene.camera;
+    let forward = -camera.rotation.z_axis.as_dvec3();
+    let facts = &loaded.photo.facts;
+    let taken = Taken {
+        time: facts.time.clone(),
+        latitude_deg: facts.latitude_deg,
+        longitude_deg: facts.longitude_deg,
+        heading_deg: facts.heading.map(|h| h.deg),
+    };
+    let sun = table.sun.clone().unwrap_or_else(SunTable::default);
+    let wrong = |key: &str, e: String| session.config.invalid(key, e);
+    let mut known = sun
+        .resolve("light.sun", &taken, forward)
+        .map_err(|e| wrong("light.sun", e.to_string()))?;
+    if let Some(shadow) = &table.shadow {
+        let shadow = shadow
+            .resolve("light.shadow")
+            .map_err(|e| wrong("light.shadow", e.to_string()))?;
+        let Proxy::Plane(plane) = &loaded.scene.proxy else {
+            let message = "needs [scene.proxy] plane: the shadow falls onto it";
+            return Err(wrong("light.shadow", message.into()).into());
+        };
+        let ground = Ground {
+            point: plane.point.as_dvec3(),
+            normal: plane.normal.as_dvec3(),
+        };
+        let ray = |pixel: glam::DVec2| {
+            let ray = camera.ray(Vec2::new(pixel.x as f32, pixel.y as f32));
+            (ray.origin.as_dvec3(), ray.direction.as_dvec3())
+        };
+        let found = sun_of_shadow(&shadow, &ground, ray)
+            .map_err(|e| wrong("light.shadow", e.to_string()))?;
+        known.azimuth = Some(found.azimuth);
+        known.elevation = found.elevation.or(known.elevation);
+    }
+    let heading_deg = estimate.heading_rad.to_degrees();
+    let angle = |a: Angle, from: f64| KnownAngle {
+        deg: a.deg - from,
+        sigma_deg: a.sigma_deg,
+    };
+    let says_something = known.azimuth.is_some()
+        || known.elevation.is_some()
+        || known.share.is_some()
+        || known.radius_deg.is_some();
+    Ok(says_something.then(|| KnownSun {
+        azimuth: known.azimuth.map(|a| angle(a, heading_deg)),
+        elevation: known.elevation.map(|a| angle(a, 0.0)),
+        radius_deg: known.radius_deg,
+        share: known.share,
+    }))
+}

@@ -1,0 +1,71 @@
+//! Which way the configuration takes to a light, told before any file is looked at.
+use dipir_cli::session::Session;
+use dipir_optimize::settings::{GuidanceKind, LightTable, Start};
+
+use crate::composite::table::CompositeTable;
+use crate::model::ModelTable;
+
+/// A way to a light.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Method {
+    /// `[light] materials`: materials are recovered under a known light.
+    Materials,
+    /// `[composite] environment` gives the light.
+    Given,
+    /// The light is where an optimisation would start: nothing guides.
+    Start,
+    /// A reference guides.
+    Reference,
+    /// A diffusion model guides.
+    Model {
+        /// Whether with a LoRA.
+        adapted: bool,
+    },
+}
+
+impl Method {
+    pub(crate) fn of(session: &Session) -> anyhow::Result<Self> {
+        let table: LightTable = session.config.table("light")?;
+        let composite: CompositeTable = session.config.table("composite")?;
+        let model: ModelTable = session.config.table("model")?;
+        if !table.materials.is_empty() {
+            return Ok(Self::Materials);
+        }
+        if composite.environment.is_some() {
+            return Ok(Self::Given);
+        }
+        let stands = table.iterations == Some(0);
+        Ok(match table.guidance.resolved(model.path.is_some()) {
+            GuidanceKind::Reference => Self::Reference,
+            GuidanceKind::None | GuidanceKind::Auto => Self::Start,
+            _ if stands && !asks_model(&table) => Self::Start,
+            _ => Self::Model {
+                adapted: table.adapt.unwrap_or(true) && !stands,
+            },
+        })
+    }
+
+    /// Why no diffusion model is asked; `None` if one is.
+    pub(crate) fn without_model(self) -> Option<&'static str> {
+        match self {
+            Self::Materials => Some("[light] materials asks no diffusion model"),
+            Self::Given => Some("[composite] environment gives the light"),
+            Self::Start => Some("no diffusion model guides ([light] guidance)"),
+            Self::Reference => Some("[light] guidance = \"reference\" asks no diffusion model"),
+            Self::Model { adapted: false } => {
+                Some("[light] adapt = false or iterations = 0 uses the model as it is")
+            }
+            Self::Model { adapted: true } => None,
+        }
+    }
+
+    /// Whether light transport is recorded for it.
+    pub(crate) fn replays(self) -> bool {
+        matches!(self, Self::Reference | Self::Model { .. })
+    }
+}
+
+/// Whether the start needs the model.
+fn asks_model(table: &LightTable) -> bool {
+    matches!(table.start, Start::Read | Start::Encoder)
+}

@@ -1,0 +1,43 @@
+//! The light around the place as a map: what the photograph shows of it where it shows it.
+use dipir_estimator::{Visible, merged};
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::gaussian::SphericalGaussian;
+use dipir_light::rasterize::rasterize;
+use dipir_scene::scene::LoadedScene;
+
+/// Columns and rows of the map: texels of .7 degrees, about what a photograph resolves of its own
+/// view when it is reflected by a small object.
+pub(super) const MAP: [usize; 2] = [512, 256];
+/// Width of the soft border of the photograph in the map, degrees.
+const BORDER_DEG: f32 = 6.0;
+/// A lobe narrower than this, radians, is traced as a lobe: two texels of the map.
+const NARROW: f32 = 2.0 * std::f32::consts::TAU / MAP[0] as f32;
+
+/// `lobes` with the narrow ones first, and how many these are.
+pub(super) fn narrow_first(lobes: &[SphericalGaussian]) -> (Vec<SphericalGaussian>, usize) {
+    let (narrow, wide): (Vec<_>, Vec<_>) = lobes.iter().partition(|l| l.sigma < NARROW);
+    let sources = narrow.len();
+    (narrow.into_iter().chain(wide).copied().collect(), sources)
+}
+
+/// The map of `lobes`.
+pub(super) fn map_of(lobes: &[SphericalGaussian]) -> EnvironmentMap {
+    rasterize(lobes, MAP[0], MAP[1])
+}
+
+/// `light` with what the photograph shows, if that is wanted.
+pub(super) fn surroundings(
+    loaded: &LoadedScene,
+    light: &EnvironmentMap,
+    visible: bool,
+) -> EnvironmentMap {
+    let [width, height] = MAP;
+    match visible {
+        true => {
+            let camera = &loaded.scene.camera;
+            let seen = Visible::new(&loaded.photo.image, camera, width, height, BORDER_DEG);
+            merged(&seen, light)
+        }
+        false => light.resampled(width, height),
+    }
+}
