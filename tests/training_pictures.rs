@@ -1,14 +1,15 @@
-//! The pictures that the small model learns from are traced by a short program of their own, fast
-//! and without what the model need not know. They must show what the renderer would show.
+//! Training pictures have a tracer of their own, for direct light only. They must agree with the renderer.
 use std::ops::ControlFlow;
 
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::rasterize::rasterize;
-use dipir_prior::lights::{Light, Sun, sun_direction};
-use dipir_prior::record::{BASIS, Layer, Record, first_plane, shadow_weights, weights};
-use dipir_prior::studio::{Brief, Kinds, Paint, Setting, Stage, View};
+use dipir_pretraining::direct_light::{
+    DirectLightImages, FIRST_SHADOW_PLANE, Layer, first_plane, shadow_weights, weights,
+};
+use dipir_pretraining::lighting::{Sun, SunSkyLight, sun_direction};
+use dipir_pretraining::scene::{Framing, GeneratedScene, ObjectSet, Paint, SceneKind, Setting};
 use dipir_render::features::SPECULAR;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
@@ -21,8 +22,8 @@ use glam::Vec3;
 
 const SIZE: u32 = 40;
 
-/// The light of the training as a map.
-fn map(light: &Light, sun: Sun) -> EnvironmentMap {
+/// A light of the training as an environment map.
+fn map(light: &SunSkyLight, sun: Sun) -> EnvironmentMap {
     let lobe = SphericalGaussian {
         direction: sun_direction(sun.azimuth, sun.elevation),
         radiance: Vec3::ONE,
@@ -41,7 +42,7 @@ fn map(light: &Light, sun: Sun) -> EnvironmentMap {
     EnvironmentMap::new(128, 64, texels.collect()).unwrap()
 }
 
-/// Of things on the ground, as the renderer sees them.
+/// The renderer's record of a mesh on the ground.
 fn transport(mesh: &TriangleMesh, paints: &[Paint], camera: Camera) -> Transport {
     let scene = Scene {
         mesh: mesh.clone(),
@@ -79,37 +80,37 @@ fn transport(mesh: &TriangleMesh, paints: &[Paint], camera: Camera) -> Transport
     Transport::record(&renderer, &settings, &mut |_| ControlFlow::Continue(())).unwrap()
 }
 
-/// A pixel of a layer of a record.
-fn recorded(record: &Record, layer: Layer, light: &Light, pixel: usize) -> Vec3 {
+/// A pixel of a layer under `light`.
+fn traced(images: &DirectLightImages, layer: Layer, light: &SunSkyLight, pixel: usize) -> Vec3 {
     let n = (SIZE * SIZE) as usize;
     let plane = |b: usize, c: usize| (first_plane(layer) + 3 * b + c) * n + pixel;
     let basis = weights(light);
     let lit = basis.iter().enumerate().map(|(b, weight)| {
-        *weight * Vec3::from_array([0, 1, 2].map(|c| record.planes[plane(b, c)]))
+        *weight * Vec3::from_array([0, 1, 2].map(|c| images.planes[plane(b, c)]))
     });
     lit.sum()
 }
 
-/// Squares of 8 x 8 pixels average the noise of 40 rays a pixel away.
+/// The square of 8 x 8 pixels that a pixel is in; sums over squares have less noise.
 fn square(pixel: usize) -> usize {
     (pixel / SIZE as usize / 8) * 5 + pixel % SIZE as usize / 8
 }
 
-/// What sums over squares differ by, and their total.
+/// Summed differences of the sums over squares, and their total.
 fn apart(squares: &[[f32; 2]]) -> (f32, f32) {
     let apart = squares.iter().map(|s| (s[0] - s[1]).abs()).sum();
     (apart, squares.iter().map(|s| s[1]).sum())
 }
 
-/// A scene under one sun, nothing in it of metal.
-fn stage(index: u64, setting: Setting) -> (Stage, Sun, Light) {
-    let brief = Brief {
-        kinds: Kinds::Trained,
+/// A scene without metal under one sun.
+fn scene(index: u64, setting: Setting) -> (GeneratedScene, Sun, SunSkyLight) {
+    let kind = SceneKind {
+        objects: ObjectSet::Training,
         setting,
-        view: View::Close,
+        framing: Framing::Close,
     };
-    let mut stage = Stage::draw(11, index, SIZE, brief);
-    for paint in stage.paints.iter_mut().chain([&mut stage.main_paint]) {
+    let mut scene = GeneratedScene::draw(11, index, SIZE, kind);
+    for paint in scene.paints.iter_mut().chain([&mut scene.main_paint]) {
         (paint.metallic, paint.roughness) = (false, 0.8);
     }
     let sun = Sun {
@@ -117,17 +118,17 @@ fn stage(index: u64, setting: Setting) -> (Stage, Sun, Light) {
         elevation: 0.7,
         sharpness: 150.0,
     };
-    stage.suns = vec![sun; stage.suns.len()];
-    let light = Light::new(0, sun.elevation, (3.0, 0.7), (0.3, 0.1), 1.0);
-    (stage, sun, light)
+    scene.suns = vec![sun; scene.suns.len()];
+    let light = SunSkyLight::new(0, sun.elevation, (3.0, 0.7), (0.3, 0.1), 1.0);
+    (scene, sun, light)
 }
 
 #[test]
-fn objects_and_shadows_are_as_the_renderer_shows_them() {
+fn objects_and_shadows_agree_with_the_renderer() {
     for index in 0..3 {
-        let (stage, sun, light) = stage(index, Setting::Open);
-        let record = Record::trace(&stage, 11, index);
-        let transport = transport(&stage.main, &[stage.main_paint], stage.camera);
+        let (scene, sun, light) = scene(index, Setting::Open);
+        let images = DirectLightImages::trace(&scene, 11, index);
+        let transport = transport(&scene.main, &[scene.main_paint], scene.camera);
         let map = map(&light, sun);
         let (object, shadow) = (
             transport.foreground(map.texels()),
@@ -135,17 +136,17 @@ fn objects_and_shadows_are_as_the_renderer_shows_them() {
         );
         let n = (SIZE * SIZE) as usize;
         let mut squares = [[[0f32; 2]; 25]; 2];
-        let shares = shadow_weights(&light, &stage.suns);
+        let shares = shadow_weights(&light, &scene.suns);
         for p in 0..n {
             let open = 1.0 - transport.coverage().pixels()[p];
             let seen: Vec3 = shares
                 .iter()
                 .enumerate()
-                .map(|(b, w)| *w * record.planes[(9 * BASIS + b) * n + p])
+                .map(|(b, w)| *w * images.planes[(FIRST_SHADOW_PLANE + b) * n + p])
                 .sum();
             let pairs = [
                 [
-                    recorded(&record, Layer::Object, &light, p),
+                    traced(&images, Layer::Object, &light, p),
                     object.pixels()[p],
                 ],
                 [
@@ -161,8 +162,8 @@ fn objects_and_shadows_are_as_the_renderer_shows_them() {
         }
         for (layer, sums) in ["object", "shadow"].iter().zip(squares) {
             let (apart, total) = apart(&sums);
-            // The record's highlight is added to the diffuse light instead of taken from it, 4 to 8%;
-            // a thousandth of every pixel is noise, where little shadow is seen.
+            // The tracer adds highlights to the diffuse light, which the renderer takes from it: 4 to 8%. A thousandth of
+            // every pixel is noise where there is little shadow.
             let allowed = 0.12 * total + 0.001 * 3.0 * n as f32;
             assert!(apart < allowed, "{layer} of {index}: {apart} of {total}");
         }
@@ -170,23 +171,23 @@ fn objects_and_shadows_are_as_the_renderer_shows_them() {
 }
 
 #[test]
-fn houses_and_trees_are_as_the_renderer_shows_them() {
+fn houses_and_trees_agree_with_the_renderer() {
     for index in 0..3 {
-        let (stage, sun, light) = stage(index, Setting::Street);
-        let record = Record::trace(&stage, 11, index);
-        let transport = transport(&stage.others, &stage.paints, stage.camera);
+        let (scene, sun, light) = scene(index, Setting::Street);
+        let images = DirectLightImages::trace(&scene, 11, index);
+        let transport = transport(&scene.others, &scene.paints, scene.camera);
         let lit = transport.foreground(map(&light, sun).texels());
         let mut squares = [[0f32; 2]; 25];
         let mut covered = 0;
         for p in (0..(SIZE * SIZE) as usize).filter(|p| transport.coverage().pixels()[*p] > 0.999) {
-            let place = recorded(&record, Layer::Background, &light, p);
+            let place = traced(&images, Layer::Background, &light, p);
             squares[square(p)][0] += place.element_sum();
             squares[square(p)][1] += lit.pixels()[p].element_sum();
             covered += 1;
         }
         let (apart, total) = apart(&squares);
         assert!(covered > 50, "{covered} pixels of {index} show something");
-        // Highlights, as above.
+        // Highlights differ as above.
         assert!(apart < 0.12 * total, "{index}: {apart} of {total}");
     }
 }

@@ -138,6 +138,31 @@ fn a_folder_that_no_stage_wrote_is_not_replaced() {
 }
 
 #[test]
+fn what_lies_beside_the_artifacts_is_there_after_the_next_run() {
+    let project = Project::new();
+    project.run_both(&[]);
+    project.write("out/composite/painted over.psd", "years of work");
+    project.write("out/composite/composite.png.bak", "mine");
+    project.run_both(&[]);
+    assert_eq!(
+        project.read("out/composite/painted over.psd"),
+        b"years of work"
+    );
+    assert_eq!(
+        project.names("out/composite"),
+        [
+            ".dipir",
+            "composite.exr",
+            "composite.png",
+            "composite.png.bak",
+            "painted over.psd",
+            "stage.json"
+        ]
+    );
+    assert_eq!(project.names("out"), ["composite", "scene"]);
+}
+
+#[test]
 fn an_output_folder_that_is_a_file_is_one_message() {
     let project = Project::new();
     File::create(project.path("out")).unwrap();

@@ -33,13 +33,7 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
         let quiet = ["--json", "--quiet", "--checkpoint-every", "1"];
         let run = project.run(
             PRETRAIN,
-            &[
-                &TINY[..],
-                &["--relit", "1", "--name-light", "0.1"],
-                &quiet,
-                more,
-            ]
-            .concat(),
+            &[&TINY[..], &["--relit", "1"], &quiet, more].concat(),
         );
         run.expect_success();
         // Not even of checkpoints.
@@ -71,10 +65,10 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
     // .005 apart when it was measured; a model that knows nothing is more than twice as far off.
     assert!((deeper / known - 1.0).abs() < 1e-2, "{deeper} {known}");
 
-    let gates = [
-        "gates", "model", "--first", "1000", "--scenes", "2", "--draws", "1", "--json",
+    let check = [
+        "check", "model", "--first", "1000", "--scenes", "2", "--draws", "1", "--json",
     ];
-    let found = project.run(PRETRAIN, &gates);
+    let found = project.run(PRETRAIN, &check);
     found.expect_success();
     let found: Value = serde_json::from_str(&found.stdout).unwrap();
     assert_eq!(found["scenes"].as_u64(), Some(2), "{found}");
@@ -82,14 +76,14 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
     // A folder with a light encoder is told what that reads, too.
     let encoder = std::path::Path::new(PRIOR).join("light_encoder.safetensors");
     std::fs::copy(encoder, project.path("model/light_encoder.safetensors")).unwrap();
-    let table = project.run(PRETRAIN, &gates[..gates.len() - 1]);
+    let table = project.run(PRETRAIN, &check[..check.len() - 1]);
     table.expect_success();
     let heads = table.stdout.lines().nth(1).unwrap_or_default();
     let heads: Vec<&str> = heads.split_whitespace().collect();
-    assert_eq!(heads[..3], ["gate", "wanted", "found"]);
+    assert_eq!(heads[..3], ["check", "wanted", "found"]);
     assert_eq!(heads.last(), Some(&"encoder"));
     assert_eq!(table.stdout.lines().count(), 9, "{}", table.stdout);
-    let late = [&gates[..], &["--timesteps", "0.5,1"]].concat();
+    let late = [&check[..], &["--timesteps", "0.5,1"]].concat();
     let told = "error: --timesteps 1: accepted are 0 to below 1";
     project.run(PRETRAIN, &late).expect_error(2, told);
 }
@@ -145,9 +139,9 @@ fn what_is_wrong_is_told_before_scenes_are_rendered() {
         (["--relit", "1.5"], 2, "--relit 1.5: accepted are 0 to 1"),
         (["--layers", "0"], 2, "--layers 0: accepted are 1 to 8"),
         (
-            ["--name-light", "-1"],
+            ["--contrast", "-1"],
             2,
-            "--name-light -1: accepted are 0 and more",
+            "--contrast -1: accepted are 0 and more",
         ),
         (
             ["--learning-rate", "0"],

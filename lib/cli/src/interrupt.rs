@@ -9,6 +9,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use dipir_pipeline::stage::discard;
+
 use crate::exit::INTERRUPTED;
 
 static ASKED: AtomicBool = AtomicBool::new(false);
@@ -43,9 +45,13 @@ pub fn listen() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Starts to listen without ever ending the process: for work that waits for others to stop.
+/// Starts to listen without ever ending the process: for work that waits for others to stop. Does
+/// nothing when called again.
 pub fn listen_patiently() -> anyhow::Result<()> {
-    ctrlc::set_handler(|| ASKED.store(true, Ordering::SeqCst))?;
+    static LISTENS: AtomicBool = AtomicBool::new(false);
+    if !LISTENS.swap(true, Ordering::SeqCst) {
+        ctrlc::set_handler(|| ASKED.store(true, Ordering::SeqCst))?;
+    }
     Ok(())
 }
 
@@ -67,7 +73,7 @@ fn stop() {
     if let Ok(mut folder) = UNFINISHED.lock()
         && let Some(folder) = folder.take()
     {
-        let _ = std::fs::remove_dir_all(folder);
+        discard(&folder);
     }
     say();
     process::exit(INTERRUPTED.into());

@@ -101,7 +101,8 @@ const FIRST_ROUND_IN_FOCUS: u32 = 1024;
 /// Draws samples until `stop`. `advance(job, n)` brings a job to `n` samples per pixel and
 /// replicate; `focus(film, jobs)` is asked once, after the first round, which pixels of the object should begin
 /// anew with samples elsewhere; `progress` may break off after any round. A time budget counts
-/// from `start`.
+/// from `start`; where it ends within the first round, the pixels that have no samples yet are taken from `coarse`,
+/// the same picture at a lower resolution. Without one, the first round is always finished.
 pub fn refine(
     size: (usize, usize),
     mut jobs: Vec<Job>,
@@ -111,12 +112,17 @@ pub fn refine(
     viewing: &Viewing,
     advance: &(impl Fn(&mut Job, u32) + Sync),
     focus: &dyn Fn(&Film, &[Job]) -> Found,
+    coarse: Option<&Film>,
     progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
 ) -> Result<Refined, RenderError> {
     let limit = max_samples.div_ceil(REPLICATES as u32).max(1);
     let mut film = Film::new(size.0, size.1);
     let mut goals = vec![first_goal(stop, limit); jobs.len()];
     let mut round = 0;
+    let is_late = || match stop {
+        Stop::TimeBudget(budget) => coarse.is_some() && start.elapsed() >= budget,
+        _ => false,
+    };
     let mut looking = RayCounts::default();
     loop {
         let round_start = Instant::now();
@@ -125,22 +131,25 @@ pub fn refine(
             .zip(&goals)
             .with_max_len(1)
             .for_each(|(job, &goal)| {
-                if goal > job.samples {
+                if goal > job.samples && (job.samples > 0 || !is_late()) {
                     advance(job, goal);
                 }
             });
         let cost_of_round = jobs.iter().map(Job::cost).sum::<f64>() - cost_before;
         let seconds_of_round = round_start.elapsed().as_secs_f64();
         round += 1;
-        for job in jobs.iter() {
-            film.develop(job);
+        film.develop(&jobs);
+        if round == 1
+            && let Some(coarse) = coarse
+        {
+            film.fill_in(&jobs, coarse);
         }
-        if round == 1 {
+        if round == 1 && !is_late() {
             let found = focus(&film, &jobs);
             looking = found.counts;
             let goal = FIRST_ROUND_IN_FOCUS.min(limit);
             let begun = begin_anew(&mut jobs, found, goal, advance);
-            jobs[begun..].iter().for_each(|job| film.develop(job));
+            film.develop(&jobs[begun..]);
         }
         let errors: Vec<SquaredError> = jobs
             .par_iter()

@@ -11,6 +11,7 @@ use dipir_scene::camera::Camera;
 use glam::Vec3;
 
 use crate::adaptive::Stop;
+use crate::coarse::{at_resolution, shrink};
 use crate::error::RenderError;
 use crate::features::{CLEARCOAT, NORMAL_MAPPING, SPECULAR, TEXTURES, TRANSMISSION, has};
 use crate::film::Viewing;
@@ -232,7 +233,7 @@ fn cost(rendered: &[Rendered; 2], simulation: &Simulation) -> f64 {
 
 /// The renderer's camera at a resolution at which the object fills about [`OBJECT_PIXELS`].
 fn pilot_camera(renderer: &Renderer) -> Camera {
-    let mut camera = *renderer.camera();
+    let camera = *renderer.camera();
     let [width, height] = camera.resolution;
     let bvh = &renderer.geometry().bvh;
     let footprint = Footprint::new(&camera, bvh.bounds(), bvh.clusters());
@@ -250,32 +251,5 @@ fn pilot_camera(renderer: &Renderer) -> Camera {
     let resolution = camera
         .resolution
         .map(|n| ((n as f32 * scale).round() as u32).max(1));
-    let factor = glam::Vec2::new(
-        resolution[0] as f32 / width as f32,
-        resolution[1] as f32 / height as f32,
-    );
-    camera.focal_px *= factor;
-    camera.principal_px *= factor;
-    camera.resolution = resolution;
-    camera
-}
-
-/// Averages pixels: each lands in the target pixel that holds its centre.
-fn shrink<T>(image: &Raster<T>, [width, height]: [usize; 2]) -> Raster<T>
-where
-    T: Copy + Default + std::ops::AddAssign + std::ops::Div<f32, Output = T>,
-{
-    let mut sums = vec![(T::default(), 0f32); width * height];
-    for y in 0..image.height() {
-        let row = (2 * y + 1) * height / (2 * image.height());
-        for x in 0..image.width() {
-            let column = (2 * x + 1) * width / (2 * image.width());
-            let sum = &mut sums[row * width + column];
-            sum.0 += *image.get(x, y);
-            sum.1 += 1.0;
-        }
-    }
-    // Never larger than the image, so every target pixel has received one.
-    let pixels = sums.into_iter().map(|(sum, n)| sum / n).collect();
-    Raster::from_pixels(width, height, pixels)
+    at_resolution(camera, resolution)
 }

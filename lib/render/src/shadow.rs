@@ -211,11 +211,12 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
 
     /// Whether any pixel of `block` could be shadowed noticeably, or receive light of the object.
     pub fn may_shade(&self, block: Block, cones: &mut [P::Cone<'p>]) -> bool {
-        if let Some((center, reach)) = self.corners_on_plane(block) {
-            let cone = self.blocker.cone(center, reach);
-            return self.restrict(cones, &cone);
+        match self.corners_on_plane(block) {
+            // Light of the object may arrive from any distance.
+            Some(_) if self.light_on_proxy.is_some() => true,
+            Some((center, reach)) => self.restrict(cones, &self.blocker.cone(center, reach)),
+            None => !self.is_above_horizon(block),
         }
-        !self.is_above_horizon(block)
     }
 
     /// Gathers the light that is blocked in `samples` samples of the pixel `(x, y)`.

@@ -11,6 +11,7 @@ pub mod import;
 pub mod material;
 pub mod mesh;
 pub mod placement;
+pub mod plausibility;
 pub mod proxy;
 pub mod ray_offset;
 pub mod scene;

@@ -15,7 +15,10 @@ fn mean(film: &crate::film::Film) -> (f64, f64) {
     for (i, &a) in film.alpha.pixels().iter().enumerate() {
         if a == 1.0 {
             sum += f64::from(film.object.pixels()[i].x);
-            variance += f64::from(film.object_variance.pixels()[i].x);
+            variance += f64::from(
+                film.object_variance(i % film.alpha.width(), i / film.alpha.width())
+                    .x,
+            );
             coverage += 1.0;
         }
     }
@@ -112,7 +115,7 @@ fn a_diffuse_sphere_in_direct_sun_matches_the_closed_form() {
             let expected = 0.8 / std::f64::consts::PI * irradiance * cosine;
             let (x, y) = (x as usize, y as usize);
             let found = f64::from(r.film.object.get(x, y).x);
-            let se = f64::from(r.film.object_variance.get(x, y).x).sqrt();
+            let se = f64::from(r.film.object_variance(x, y).x).sqrt();
             // Facets of 2 degrees bend the normal's interpolation by up to 1e-4, the sun is
             // 1 degree wide, and 64 positions leave 1e-3 at the terminator.
             let tolerance = 2e-3 * irradiance;

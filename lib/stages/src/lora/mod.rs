@@ -17,9 +17,9 @@ use dipir_diffusion::model::Model;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
 use dipir_diffusion::training::{LoraTrainer, StepReport};
-use dipir_guidance::picture;
 use dipir_imaging::file::{read_photo, write_png};
 use dipir_imaging::transfer::Transfer;
+use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
 use dipir_scene::config::SceneConfig;
@@ -111,16 +111,10 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         .find(|i| i.path.to_string_lossy().contains("unet/diffusion"))
         .map(|i| i.blake3.clone());
     let folder = LORA.folder(session);
-    let decides = json!([
-        plan.version,
-        plan.seed,
-        plan.device,
-        plan.inputs,
-        table.without_steps(),
-        transfer,
-        model_table.precision
-    ]);
-    let fingerprint = blake3::hash(decides.to_string().as_bytes());
+    let decides = json!({
+        "lora": table.without_steps(), "transfer": transfer, "precision": model_table.precision,
+    });
+    let fingerprint = Fingerprint::of_plan(&plan).params(decides).finish();
     let mut writer = session.begin(plan)?;
 
     let mut model = model::load(session, &model_table)?;
@@ -130,7 +124,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         .transpose()?;
     let photo = read_photo(&photo_file, transfer)?;
     let data = Data {
-        photo: picture::from_display(&photo.transfer.encode(&photo.image))?,
+        photo: dipir_tensors::model_input(&photo.transfer.encode(&photo.image))?,
         size: model.native_size(),
         min_crop: table.min_crop,
         prompt: table.instance_prompt(),
@@ -149,7 +143,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         table.training(session.pipeline.seed),
         start.as_ref(),
     )?;
-    let resume = Resume::open(session, fingerprint.to_hex().as_str())?;
+    let resume = Resume::open(session, &fingerprint)?;
     let mut history = resume.restore(session, &mut trainer, table.steps);
     let resumed_at = trainer.steps();
     if resumed_at > 0 {
@@ -238,7 +232,7 @@ fn show(model: &Model, trainer: &LoraTrainer, data: &Data, path: &Path) -> anyho
     interrupt::check()?;
     // Beside its place and renamed: a sample that is there is whole.
     let partial = path.with_extension("partial.png");
-    write_png(&partial, &picture::to_display(&generated?.image)?)?;
+    write_png(&partial, &dipir_tensors::model_output(&generated?.image)?)?;
     std::fs::rename(&partial, path).with_context(|| format!("cannot write {}", path.display()))
 }
 

@@ -20,6 +20,7 @@ use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
 use dipir_scene::config::SceneConfig;
+use dipir_scene::plausibility::implausible;
 use dipir_scene::scene::{LoadedScene, Scene};
 use serde_json::{Value, json};
 
@@ -74,7 +75,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     composite.check(&session.config)?;
     let mut loaded = Scene::load(&config, &session.config.base_dir())
         .map_err(|e| with_place(e, &session.config))?;
-    for warning in &loaded.warnings {
+    for warning in loaded.warnings.iter().chain(&implausible(&loaded.scene)) {
         session.warn(warning);
     }
     let table: LightTable = session.config.table("light")?;

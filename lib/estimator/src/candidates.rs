@@ -1,0 +1,117 @@
+//! Lights that the photograph allows, far apart from each other.
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::fit::fit;
+use dipir_light::gaussian::SphericalGaussian;
+use glam::{Quat, Vec3};
+
+use crate::estimate::LightEstimate;
+use crate::grid::{BINS, bin_direction};
+use crate::posterior::words;
+
+/// Candidates stand at least this far apart, degrees.
+const APART_DEG: f32 = 40.0;
+/// Width of a candidate's source, radians: a sun's shadows, softened by a few degrees.
+const SOURCE_SIGMA: f32 = 0.03;
+/// A source that is there is at most this many times as strong as it is expected to be.
+const MOST_ENERGY: f64 = 4.0;
+/// Lobes of the smooth part.
+const BASE_LOBES: usize = 12;
+
+/// One light that the photograph allows.
+#[derive(Clone, Debug)]
+pub struct Candidate {
+    /// How probable it is; the candidates' sum to 1.
+    pub probability: f64,
+    /// Where its light comes from, relative to the view, in words.
+    pub words: String,
+    /// Unit vector towards its source in the world; `None` for soft light.
+    pub direction: Option<Vec3>,
+    /// The light as a map in the world.
+    pub map: EnvironmentMap,
+    /// The same as lobes; the source comes first.
+    pub lobes: Vec<SphericalGaussian>,
+}
+
+impl LightEstimate {
+    /// At most `count` lights, the most probable first: soft light without a sun, and suns that stand at least 40
+    /// degrees apart.
+    pub fn candidates(&self, count: usize) -> Vec<Candidate> {
+        if count == 0 {
+            return Vec::new();
+        }
+        let base = fit(&self.base_map(), BASE_LOBES).lobes;
+        let mut all = vec![Candidate {
+            probability: 1.0 - self.sun_probability,
+            words: "soft light without a sun".into(),
+            direction: None,
+            map: self.map(),
+            lobes: self.lobes(2 * BASE_LOBES),
+        }];
+        let centres = self.centres(count - 1);
+        let shares = self.shares(&centres);
+        for (k, share) in centres.iter().zip(&shares) {
+            all.push(self.sun(*k, self.sun_probability * share, &base));
+        }
+        let total: f64 = all.iter().map(|c| c.probability).sum();
+        all.iter_mut()
+            .for_each(|c| c.probability /= total.max(1e-12));
+        all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
+        all
+    }
+
+    /// The most probable bins, each far from those before.
+    fn centres(&self, count: usize) -> Vec<usize> {
+        let mut order: Vec<usize> = (0..BINS).collect();
+        order.sort_by(|a, b| {
+            self.posterior
+                .around(*b)
+                .total_cmp(&self.posterior.around(*a))
+        });
+        let mut chosen: Vec<usize> = Vec::new();
+        let near = APART_DEG.to_radians().cos();
+        for k in order {
+            let far = chosen
+                .iter()
+                .all(|c| bin_direction(*c).dot(bin_direction(k)) < near);
+            if far && chosen.len() < count {
+                chosen.push(k);
+            }
+        }
+        chosen
+    }
+
+    /// Each bin's probability goes to the nearest of `centres`.
+    fn shares(&self, centres: &[usize]) -> Vec<f64> {
+        let mut shares = vec![0.0; centres.len()];
+        for (k, w) in self.posterior.weights.iter().enumerate() {
+            let closeness = |c: &usize| bin_direction(centres[*c]).dot(bin_direction(k));
+            let nearest = (0..centres.len()).max_by(|a, b| closeness(a).total_cmp(&closeness(b)));
+            if let Some(n) = nearest {
+                shares[n] += f64::from(*w);
+            }
+        }
+        shares
+    }
+
+    fn sun(&self, bin: usize, probability: f64, base: &[SphericalGaussian]) -> Candidate {
+        let energy = (1.0 / self.sun_probability.max(1e-3)).min(MOST_ENERGY) as f32;
+        let mut weights = [0.0; BINS];
+        weights[bin] = 1.0;
+        let direction = Quat::from_rotation_y(-self.heading_rad as f32) * bin_direction(bin);
+        let mut source = SphericalGaussian {
+            direction,
+            radiance: Vec3::ONE,
+            sigma: SOURCE_SIGMA,
+        };
+        source.radiance = Vec3::from(self.peak) * energy / source.solid_angle() as f32;
+        let mut lobes = vec![source];
+        lobes.extend_from_slice(base);
+        Candidate {
+            probability,
+            words: words(bin_direction(bin)),
+            direction: Some(direction),
+            map: self.map_with(&weights, energy),
+            lobes,
+        }
+    }
+}

@@ -1,0 +1,242 @@
+//! From a photograph and its camera to its light.
+use std::collections::HashMap;
+use std::path::Path;
+
+use dipir_imaging::raster::LinearImage;
+use dipir_scene::camera::Camera;
+use serde::{Deserialize, Serialize};
+
+use crate::error::EstimatorError;
+use crate::estimate::{Interval, LightEstimate};
+use crate::features::Glance;
+use crate::grid::{BASE_TEXELS, BINS, heading, mirrored_bin, mirrored_texel};
+use crate::network::{
+    ENERGY, HISTOGRAM, LOG_ENERGY, LOG_RADIANCE, MAP, Network, QUANTILES, SUN, from_bytes, to_bytes,
+};
+use crate::posterior::PeakPosterior;
+
+/// The key of the calibration in the file's metadata.
+const CALIBRATION: &str = "calibration";
+
+/// What is measured on places that were left out, and applied to every estimate.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Calibration {
+    /// Radiance is multiplied by this.
+    pub exposure: f64,
+    /// The posterior's logarithm is divided by this, and so is the sun's score.
+    pub temperature: f64,
+    /// Added to both ends of the exposure's interval, stops.
+    pub exposure_margin: f64,
+    /// Added to both ends of the share's interval.
+    pub share_margin: f64,
+}
+
+impl Default for Calibration {
+    fn default() -> Self {
+        Self {
+            exposure: 1.0,
+            temperature: 1.0,
+            exposure_margin: 0.0,
+            share_margin: 0.0,
+        }
+    }
+}
+
+/// Networks whose answers are averaged, and their calibration.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Estimator {
+    members: Vec<Network>,
+    calibration: Calibration,
+}
+
+impl Estimator {
+    /// Networks, of which there has to be one.
+    pub fn new(members: Vec<Network>, calibration: Calibration) -> Result<Self, EstimatorError> {
+        if members.is_empty() {
+            return Err(EstimatorError::Weights("there is no network".into()));
+        }
+        Ok(Self {
+            members,
+            calibration,
+        })
+    }
+
+    /// The estimator that is part of the program.
+    pub fn embedded() -> Result<Self, EstimatorError> {
+        Self::from_bytes(include_bytes!("../weights/places.safetensors"))
+    }
+
+    /// The estimator of a file that [`to_bytes`](Self::to_bytes) made.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, EstimatorError> {
+        let path = path.as_ref();
+        let bytes = std::fs::read(path).map_err(|source| EstimatorError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+        Self::from_bytes(&bytes)
+    }
+
+    /// The estimator of a safetensors file's bytes.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, EstimatorError> {
+        let (members, metadata) = from_bytes(bytes)?;
+        let text = metadata.get(CALIBRATION).ok_or_else(|| {
+            EstimatorError::Weights(format!("the metadata has no `{CALIBRATION}`"))
+        })?;
+        let calibration = serde_json::from_str(text)
+            .map_err(|e| EstimatorError::Weights(format!("`{CALIBRATION}`: {e}")))?;
+        Self::new(members, calibration)
+    }
+
+    /// The same networks with another calibration.
+    pub fn calibrated(&self, calibration: Calibration) -> Self {
+        Self {
+            members: self.members.clone(),
+            calibration,
+        }
+    }
+
+    /// The networks of all, with the calibration of the first.
+    pub fn joined(all: &[Self]) -> Result<Self, EstimatorError> {
+        let members = all.iter().flat_map(|e| e.members.iter().cloned()).collect();
+        Self::new(
+            members,
+            all.first().map(|e| e.calibration).unwrap_or_default(),
+        )
+    }
+
+    /// The bytes of a safetensors file.
+    pub fn to_bytes(&self) -> Result<Vec<u8>, EstimatorError> {
+        let text = serde_json::to_string(&self.calibration)
+            .map_err(|e| EstimatorError::Weights(e.to_string()))?;
+        to_bytes(&self.members, HashMap::from([(CALIBRATION.into(), text)]))
+    }
+
+    /// The light of a whole photograph, which is decoded by its transfer function: values in `[0, 1]`.
+    pub fn estimate(&self, photo: &LinearImage, camera: &Camera) -> LightEstimate {
+        self.of_glance(&Glance::new(photo, camera), heading(camera))
+    }
+
+    /// The light of a photograph at the size that is looked at, taken towards an azimuth in the world.
+    pub fn of_glance(&self, glance: &Glance, heading_rad: f64) -> LightEstimate {
+        let features = [glance.features(), glance.mirrored().features()];
+        self.of_features(&features, glance.reference(), heading_rad)
+    }
+
+    /// The light of a photograph's features and those of its mirror image, averaged.
+    pub fn of_features(
+        &self,
+        features: &[Vec<f32>; 2],
+        reference: f32,
+        heading_rad: f64,
+    ) -> LightEstimate {
+        let mut sum = Sum::default();
+        for member in &self.members {
+            let plain = self.read(&member.forward(&features[0]), false);
+            let mirrored = self.read(&member.forward(&features[1]), true);
+            sum.add(&plain.plus(&mirrored));
+        }
+        sum.estimate(
+            2 * self.members.len(),
+            reference,
+            heading_rad,
+            &self.calibration,
+        )
+    }
+
+    fn read(&self, o: &[f32], mirrored: bool) -> Sum {
+        let texel = |k| if mirrored { mirrored_texel(k) } else { k };
+        let bin = |k| if mirrored { mirrored_bin(k) } else { k };
+        let radiance = |v: f32| f64::from(v.clamp(LOG_RADIANCE[0], LOG_RADIANCE[1])).exp();
+        let energy = |v: f32| f64::from(v.clamp(LOG_ENERGY[0], LOG_ENERGY[1])).exp();
+        let temperature = self.calibration.temperature;
+        let scores: Vec<f64> = (0..BINS)
+            .map(|k| f64::from(o[HISTOGRAM + bin(k)]) / temperature)
+            .collect();
+        let best = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let weights: Vec<f64> = scores.iter().map(|s| (s - best).exp()).collect();
+        let total: f64 = weights.iter().sum();
+        Sum {
+            base: (0..BASE_TEXELS)
+                .map(|k| std::array::from_fn(|c| radiance(o[MAP + 3 * texel(k) + c])))
+                .collect(),
+            peak: std::array::from_fn(|c| energy(o[ENERGY + c])),
+            weights: weights.iter().map(|w| w / total).collect(),
+            sun: 1.0 / (1.0 + (-f64::from(o[SUN]) / temperature).exp()),
+            quantiles: std::array::from_fn(|k| f64::from(o[QUANTILES + k])),
+        }
+    }
+}
+
+/// Answers added up, relative to the photograph's mean.
+#[derive(Default)]
+struct Sum {
+    base: Vec<[f64; 3]>,
+    peak: [f64; 3],
+    weights: Vec<f64>,
+    sun: f64,
+    quantiles: [f64; 6],
+}
+
+impl Sum {
+    fn plus(mut self, other: &Self) -> Self {
+        self.add(other);
+        self
+    }
+
+    fn add(&mut self, other: &Self) {
+        self.base.resize(BASE_TEXELS, [0.0; 3]);
+        self.weights.resize(BINS, 0.0);
+        for (a, b) in self.base.iter_mut().zip(&other.base) {
+            a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+        }
+        let pairs = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+        pairs(&mut self.peak, &other.peak);
+        pairs(&mut self.weights, &other.weights);
+        pairs(&mut self.quantiles, &other.quantiles);
+        self.sun += other.sun;
+    }
+
+    fn estimate(
+        self,
+        count: usize,
+        reference: f32,
+        heading_rad: f64,
+        c: &Calibration,
+    ) -> LightEstimate {
+        let n = count as f64;
+        let scale = c.exposure * f64::from(reference) / n;
+        let q = self.quantiles.map(|q| q / n);
+        let unit = |v: f64| v.clamp(0.0, 1.0);
+        LightEstimate {
+            heading_rad,
+            reference: f64::from(reference),
+            base: self
+                .base
+                .iter()
+                .map(|t| t.map(|v| (v * scale) as f32))
+                .collect(),
+            peak: self.peak.map(|v| (v * scale) as f32),
+            posterior: PeakPosterior::normalised(self.weights),
+            sun_probability: self.sun / n,
+            exposure_stops: widened([q[1], q[0], q[2]], c.exposure_margin),
+            share: {
+                let i = widened([q[4], q[3], q[5]], c.share_margin);
+                Interval::new(unit(i.low), unit(i.middle), unit(i.high))
+            },
+            azimuth_deg: Interval::new(0.0, 0.0, 0.0),
+            elevation_deg: Interval::new(0.0, 0.0, 0.0),
+            words: String::new(),
+        }
+        .described()
+    }
+}
+
+fn widened([low, middle, high]: [f64; 3], margin: f64) -> Interval {
+    let i = Interval::new(low, middle, high);
+    Interval::new(
+        (i.low - margin).min(i.middle),
+        i.middle,
+        (i.high + margin).max(i.middle),
+    )
+}

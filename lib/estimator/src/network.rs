@@ -1,0 +1,188 @@
+//! The network: two hidden layers from features to light, small enough to be applied by plain loops, which give the
+//! same bytes on any number of threads.
+use std::collections::HashMap;
+
+use safetensors::tensor::{SafeTensors, TensorView};
+
+use crate::error::EstimatorError;
+use crate::features::FEATURES;
+use crate::grid::{BASE_TEXELS, BINS};
+
+/// Where the logarithms of the smooth part begin among the outputs, texel after texel, red, green, blue.
+pub const MAP: usize = 0;
+/// Where the logarithm of the strongest source's energy begins: red, green, blue.
+pub const ENERGY: usize = MAP + 3 * BASE_TEXELS;
+/// Where the scores of the bins begin.
+pub const HISTOGRAM: usize = ENERGY + 3;
+/// The score of a sun-like source.
+pub const SUN: usize = HISTOGRAM + BINS;
+/// Median, 10% and 90% quantiles of the mean radiance, stops over the photograph's mean; then of the strongest
+/// source's share.
+pub const QUANTILES: usize = SUN + 1;
+/// Outputs in all.
+pub const OUTPUTS: usize = QUANTILES + 6;
+/// Standardised features are cut off here, deviations: a camera or a picture that was never seen stays finite.
+pub const FEATURE_LIMIT: f32 = 5.0;
+/// Logarithms of radiance over the photograph's mean are kept between these.
+pub const LOG_RADIANCE: [f32; 2] = [-8.0, 6.0];
+/// Logarithms of energy over the photograph's mean are kept between these.
+pub const LOG_ENERGY: [f32; 2] = [-8.0, 8.0];
+
+/// `x / (1 + exp(-x))`.
+#[inline]
+pub fn silu(x: f32) -> f32 {
+    x / (1.0 + (-x).exp())
+}
+
+/// Weights. Matrices are row-major with a row for each input.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Network {
+    /// Units of each hidden layer.
+    pub hidden: usize,
+    /// Mean of each feature over the training photographs.
+    pub mean: Vec<f32>,
+    /// Deviation of each feature over the training photographs.
+    pub deviation: Vec<f32>,
+    /// First layer, `FEATURES x hidden`, then its bias.
+    pub first: [Vec<f32>; 2],
+    /// Second layer, `hidden x hidden`, then its bias.
+    pub second: [Vec<f32>; 2],
+    /// Output layer, `hidden x OUTPUTS`, then its bias.
+    pub output: [Vec<f32>; 2],
+}
+
+impl Network {
+    /// Features as the first layer takes them.
+    pub fn standardised(&self, features: &[f32]) -> Vec<f32> {
+        let one =
+            |(x, (m, d)): (&f32, (&f32, &f32))| ((x - m) / d).clamp(-FEATURE_LIMIT, FEATURE_LIMIT);
+        features
+            .iter()
+            .zip(self.mean.iter().zip(&self.deviation))
+            .map(one)
+            .collect()
+    }
+
+    /// The [`OUTPUTS`] numbers for [`FEATURES`] features.
+    pub fn forward(&self, features: &[f32]) -> Vec<f32> {
+        assert_eq!(features.len(), FEATURES, "features");
+        let x = self.standardised(features);
+        let h: Vec<f32> = layer(&self.first, &x).into_iter().map(silu).collect();
+        let step = layer(&self.second, &h);
+        let h: Vec<f32> = h.iter().zip(step).map(|(h, s)| h + silu(s)).collect();
+        layer(&self.output, &h)
+    }
+
+    fn tensors(&self) -> [(&'static str, Vec<usize>, &Vec<f32>); 8] {
+        let n = self.hidden;
+        [
+            ("mean", vec![FEATURES], &self.mean),
+            ("deviation", vec![FEATURES], &self.deviation),
+            ("first.weight", vec![FEATURES, n], &self.first[0]),
+            ("first.bias", vec![n], &self.first[1]),
+            ("second.weight", vec![n, n], &self.second[0]),
+            ("second.bias", vec![n], &self.second[1]),
+            ("output.weight", vec![n, OUTPUTS], &self.output[0]),
+            ("output.bias", vec![OUTPUTS], &self.output[1]),
+        ]
+    }
+}
+
+fn layer([weight, bias]: &[Vec<f32>; 2], x: &[f32]) -> Vec<f32> {
+    let mut y = bias.clone();
+    for (row, &value) in weight.chunks(bias.len()).zip(x) {
+        y.iter_mut().zip(row).for_each(|(y, w)| *y += value * w);
+    }
+    y
+}
+
+/// The bytes of a safetensors file with networks as `member.N.*` and `metadata`.
+pub fn to_bytes(
+    members: &[Network],
+    metadata: HashMap<String, String>,
+) -> Result<Vec<u8>, EstimatorError> {
+    let refused = |e: safetensors::SafeTensorError| EstimatorError::Weights(e.to_string());
+    let mut stored: Vec<(String, Vec<usize>, Vec<u8>)> = Vec::new();
+    for (n, member) in members.iter().enumerate() {
+        for (name, shape, values) in member.tensors() {
+            let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            stored.push((format!("member.{n}.{name}"), shape, bytes));
+        }
+    }
+    let views = stored
+        .iter()
+        .map(|(name, shape, bytes)| {
+            let view =
+                TensorView::new(safetensors::Dtype::F32, shape.clone(), bytes).map_err(refused)?;
+            Ok((name.clone(), view))
+        })
+        .collect::<Result<Vec<_>, EstimatorError>>()?;
+    safetensors::serialize(views, Some(metadata)).map_err(refused)
+}
+
+/// The networks and the metadata of such bytes.
+pub fn from_bytes(bytes: &[u8]) -> Result<(Vec<Network>, HashMap<String, String>), EstimatorError> {
+    let refused = |e: safetensors::SafeTensorError| EstimatorError::Weights(e.to_string());
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(refused)?;
+    let file = SafeTensors::deserialize(bytes).map_err(refused)?;
+    let mut members = Vec::new();
+    while file
+        .tensor(&format!("member.{}.mean", members.len()))
+        .is_ok()
+    {
+        members.push(member(&file, members.len())?);
+    }
+    if members.is_empty() {
+        return Err(EstimatorError::Weights(
+            "there is no `member.0.mean`".into(),
+        ));
+    }
+    Ok((members, header.metadata().clone().unwrap_or_default()))
+}
+
+fn member(file: &SafeTensors<'_>, n: usize) -> Result<Network, EstimatorError> {
+    let read = |name: &str, shape: &[usize]| -> Result<Vec<f32>, EstimatorError> {
+        let name = format!("member.{n}.{name}");
+        let refused = |why: String| EstimatorError::Weights(format!("`{name}` {why}"));
+        let tensor = file
+            .tensor(&name)
+            .map_err(|_| refused("is missing".into()))?;
+        if tensor.dtype() != safetensors::Dtype::F32 || tensor.shape() != shape {
+            return Err(refused(format!(
+                "is {:?} of {:?}, not F32 of {shape:?}",
+                tensor.dtype(),
+                tensor.shape()
+            )));
+        }
+        let values: Vec<f32> = tensor
+            .data()
+            .chunks_exact(4)
+            .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+            .collect();
+        match values.iter().all(|v| v.is_finite()) {
+            true => Ok(values),
+            false => Err(refused("holds values that are not finite".into())),
+        }
+    };
+    let bias = file
+        .tensor(&format!("member.{n}.first.bias"))
+        .map_err(|_| EstimatorError::Weights(format!("`member.{n}.first.bias` is missing")))?;
+    let hidden = bias.shape().first().copied().unwrap_or(0);
+    Ok(Network {
+        hidden,
+        mean: read("mean", &[FEATURES])?,
+        deviation: read("deviation", &[FEATURES])?,
+        first: [
+            read("first.weight", &[FEATURES, hidden])?,
+            read("first.bias", &[hidden])?,
+        ],
+        second: [
+            read("second.weight", &[hidden, hidden])?,
+            read("second.bias", &[hidden])?,
+        ],
+        output: [
+            read("output.weight", &[hidden, OUTPUTS])?,
+            read("output.bias", &[OUTPUTS])?,
+        ],
+    })
+}

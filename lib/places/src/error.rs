@@ -1,0 +1,40 @@
+//! What can go wrong in training.
+use std::path::PathBuf;
+
+/// Why training stopped.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PlacesError {
+    /// A folder or file could not be read or written.
+    #[error("cannot {what} `{}`", path.display())]
+    File {
+        /// "read" or "write".
+        what: &'static str,
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The folder holds too few panoramas.
+    #[error("`{}` holds {found} panoramas (*.hdr, *.exr); {folds} folds need at least {folds} places", path.display())]
+    TooFew {
+        /// The folder.
+        path: PathBuf,
+        /// Panoramas found.
+        found: usize,
+        /// Folds asked for.
+        folds: usize,
+    },
+    /// A panorama is no map of light.
+    #[error(transparent)]
+    Light(#[from] dipir_light::error::LightError),
+    /// Weights could not be made or read.
+    #[error(transparent)]
+    Estimator(#[from] dipir_estimator::EstimatorError),
+    /// A setting that cannot be worked with.
+    #[error("{0}")]
+    Setting(String),
+    /// Training was stopped by the caller; what is finished is kept.
+    #[error("training was stopped; the same command goes on from the folds that are finished")]
+    Stopped,
+}

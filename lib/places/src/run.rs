@@ -1,0 +1,279 @@
+//! From a folder of panoramas to weights and figures.
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use dipir_estimator::{Calibration, Estimator};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::error::PlacesError;
+use crate::examples::{Example, drawn, standard};
+use crate::figures::{Case, Figures, calibration, figures};
+use crate::place::{Place, folds, read_places};
+use crate::probes::Probes;
+use crate::trainer::{Training, train};
+
+/// What `dipir-pretrain light` is asked for.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Settings {
+    /// Folder of panoramas (*.hdr, *.exr); `panoramas.tsv` in it may name kinds.
+    pub panoramas: PathBuf,
+    /// The file of weights; figures are written beside it as `.json`, finished folds as `.foldN`.
+    pub out: PathBuf,
+    /// Folds of places; each is left out by one network.
+    pub folds: usize,
+    /// Photographs drawn of each place.
+    pub views: usize,
+    /// Photographs of each place that figures are made of.
+    pub judged: usize,
+    /// Networks learn from at most this many places each; all without it.
+    pub places: Option<usize>,
+    /// Seed of photographs and networks.
+    pub seed: u64,
+    /// How networks are trained.
+    pub training: Training,
+}
+
+impl Settings {
+    /// The settings of the weights that are part of the program.
+    pub fn new(panoramas: PathBuf, out: PathBuf) -> Self {
+        Self {
+            panoramas,
+            out,
+            folds: 5,
+            views: 240,
+            judged: 8,
+            places: None,
+            seed: 1,
+            training: Training::default(),
+        }
+    }
+}
+
+/// How far training is.
+#[derive(Clone, Debug)]
+pub enum Progress {
+    /// Panoramas were read.
+    Places(usize),
+    /// Photographs were drawn.
+    Photographs(usize),
+    /// A network is being trained: its fold, the share that is done, the mean loss of late.
+    Training(usize, f64, f64),
+    /// A finished fold was found and is kept.
+    Kept(usize),
+}
+
+/// What training gives.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// What was asked for.
+    pub settings: Settings,
+    /// Names of the places with their folds.
+    pub places: Vec<(String, usize)>,
+    /// The calibration on places left out.
+    pub calibration: Calibration,
+    /// Photographs as the evaluation takes them, places left out.
+    pub standard: Vec<Figures>,
+    /// Photographs of any camera, places left out.
+    pub any: Vec<Figures>,
+    /// Photographs as the evaluation takes them, of places that the networks were trained on.
+    pub seen: Vec<Figures>,
+}
+
+/// Trains a network for each fold, calibrates them on the places left out, writes weights and figures. The same
+/// settings give the same bytes for any number of threads. `progress` returns `false` to stop.
+pub fn run(
+    settings: &Settings,
+    progress: &(dyn Fn(Progress) -> bool + Sync),
+) -> Result<Outcome, PlacesError> {
+    checked(settings)?;
+    let places = read_places(&settings.panoramas)?;
+    if places.len() < settings.folds {
+        let (path, found, folds) = (settings.panoramas.clone(), places.len(), settings.folds);
+        return Err(PlacesError::TooFew { path, found, folds });
+    }
+    progress(Progress::Places(places.len()));
+    let fold = folds(&places, settings.folds);
+    let probes = Probes::default();
+    let photographs = drawn(&places, settings.views, &probes, settings.seed);
+    let judged = standard(&places, settings.judged, &probes);
+    progress(Progress::Photographs(photographs.len() + judged.len()));
+    let stopped = AtomicBool::new(false);
+    let failure: Mutex<Option<PlacesError>> = Mutex::new(None);
+    let members: Vec<Option<Estimator>> = (0..settings.folds)
+        .into_par_iter()
+        .map(|f| {
+            let kept = |p: Progress| !stopped.load(Ordering::Relaxed) && progress(p);
+            let member = one_fold(settings, f, &fold, &photographs, &probes, &kept);
+            if member.is_err() {
+                stopped.store(true, Ordering::Relaxed);
+            }
+            member
+                .map_err(|e| {
+                    failure
+                        .lock()
+                        .map(|mut slot| slot.get_or_insert(e).to_string())
+                })
+                .ok()
+        })
+        .collect();
+    if let Some(error) = failure.into_inner().ok().flatten() {
+        return Err(error);
+    }
+    let members: Vec<Estimator> = members.into_iter().flatten().collect();
+    finish(
+        settings,
+        &places,
+        &fold,
+        &members,
+        [&judged, &photographs],
+        &probes,
+    )
+}
+
+fn checked(s: &Settings) -> Result<(), PlacesError> {
+    let t = &s.training;
+    let sound = s.folds >= 2 && s.views > 0 && s.judged > 0 && t.hidden > 0 && t.batch > 0;
+    let shares = [t.dropout, t.feature_dropout]
+        .iter()
+        .all(|d| (0.0..1.0).contains(d));
+    match sound && shares {
+        true => Ok(()),
+        false => Err(PlacesError::Setting(
+            "training needs at least 2 folds, 1 view, 1 judged view, 1 hidden unit, a batch of 1, and dropouts in [0, 1)".into(),
+        )),
+    }
+}
+
+/// The network that has not seen fold `f`: read from a finished run of the same settings, or trained.
+fn one_fold(
+    settings: &Settings,
+    f: usize,
+    fold: &[usize],
+    photographs: &[Example],
+    probes: &Probes,
+    progress: &dyn Fn(Progress) -> bool,
+) -> Result<Estimator, PlacesError> {
+    let file = settings.out.with_extension(format!("fold{f}"));
+    let note = settings.out.with_extension(format!("fold{f}.json"));
+    let wanted = serde_json::to_string(settings).unwrap_or_default();
+    if std::fs::read_to_string(&note).is_ok_and(|text| text == wanted) {
+        if let Ok(member) = Estimator::load(&file) {
+            progress(Progress::Kept(f));
+            return Ok(member);
+        }
+    }
+    let seen = learned(settings, f, fold);
+    let examples: Vec<&Example> = photographs
+        .iter()
+        .filter(|e| seen.contains(&e.place))
+        .collect();
+    let mut told = |done: f64, loss: f64| progress(Progress::Training(f, done, loss));
+    let network = train(
+        &examples,
+        &settings.training,
+        probes,
+        settings.seed ^ (f as u64 + 1) << 32,
+        &mut told,
+    )
+    .ok_or(PlacesError::Stopped)?;
+    let member = Estimator::new(vec![network], Calibration::default())?;
+    write(&file, &member.to_bytes()?)?;
+    write(&note, wanted.as_bytes())?;
+    Ok(member)
+}
+
+/// The places that the network of fold `f` learns from.
+fn learned(settings: &Settings, f: usize, fold: &[usize]) -> Vec<usize> {
+    let mut seen: Vec<usize> = (0..fold.len()).filter(|p| fold[*p] != f).collect();
+    crate::network::Dice::new(settings.seed ^ 0xc0de).shuffle(&mut seen);
+    seen.truncate(settings.places.unwrap_or(usize::MAX));
+    seen
+}
+
+fn cases(
+    examples: &[&Example],
+    places: &[Place],
+    fold: &[usize],
+    of: impl Fn(usize) -> Estimator + Sync,
+) -> Vec<Case> {
+    examples
+        .par_iter()
+        .map(|e| Case {
+            estimate: of(fold[e.place]).of_features(&e.features, e.reference, 0.0),
+            example: (*e).clone(),
+            kind: places[e.place].kind.clone(),
+            fold: fold[e.place],
+        })
+        .collect()
+}
+
+fn finish(
+    settings: &Settings,
+    places: &[Place],
+    fold: &[usize],
+    members: &[Estimator],
+    [judged, photographs]: [&[Example]; 2],
+    probes: &Probes,
+) -> Result<Outcome, PlacesError> {
+    let judged: Vec<&Example> = judged.iter().collect();
+    let every = (settings.views / settings.judged).max(1);
+    let any: Vec<&Example> = photographs.iter().step_by(every).collect();
+    let both: Vec<&Example> = judged.iter().chain(&any).copied().collect();
+    let found = calibration(&cases(&both, places, fold, |f| members[f].clone()), probes);
+    let calibrated: Vec<Estimator> = members.iter().map(|m| m.calibrated(found)).collect();
+    let left_out = |examples: &[&Example]| {
+        figures(
+            &cases(examples, places, fold, |f| calibrated[f].clone()),
+            probes,
+        )
+    };
+    let seen = cases(&judged, places, fold, |f| {
+        calibrated[(f + 1) % calibrated.len()].clone()
+    });
+    let outcome = Outcome {
+        settings: settings.clone(),
+        places: places
+            .iter()
+            .zip(fold)
+            .map(|(p, f)| (p.name.clone(), *f))
+            .collect(),
+        calibration: found,
+        standard: left_out(&judged),
+        any: left_out(&any),
+        seen: figures(&seen, probes),
+    };
+    let ensemble = Estimator::joined(&calibrated)?;
+    write(&settings.out, &ensemble.to_bytes()?)?;
+    let text =
+        serde_json::to_string_pretty(&outcome).map_err(|e| PlacesError::Setting(e.to_string()))?;
+    write(&settings.out.with_extension("json"), text.as_bytes())?;
+    for f in 0..settings.folds {
+        for extension in [format!("fold{f}"), format!("fold{f}.json")] {
+            // Only what this run made; a fold that is gone already is no loss.
+            std::fs::remove_file(settings.out.with_extension(extension)).ok();
+        }
+    }
+    Ok(outcome)
+}
+
+/// Written beside its place and renamed, so that it is there whole or not at all.
+fn write(path: &Path, bytes: &[u8]) -> Result<(), PlacesError> {
+    let failed = |source| PlacesError::File {
+        what: "write",
+        path: path.to_owned(),
+        source,
+    };
+    if let Some(folder) = path.parent().filter(|f| !f.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).map_err(failed)?;
+    }
+    let partial = path.with_file_name(format!(
+        "{}.partial",
+        path.file_name()
+            .map(|n| n.to_string_lossy().into_owned())
+            .unwrap_or_default()
+    ));
+    std::fs::write(&partial, bytes).map_err(failed)?;
+    std::fs::rename(&partial, path).map_err(failed)
+}
