@@ -186,18 +186,15 @@ impl Encoding {
 
     fn coders(&self) -> [Coder; 3] {
         [0, 1, 2].map(|k| {
-            let mut middles = self.curves[k].table(2 * STEPS);
-            let mut last = f32::NEG_INFINITY;
-            let middles = middles
-                .drain(..)
-                .skip(1)
-                .step_by(2)
-                .map(|v| {
-                    last = last.max(v);
-                    last
-                })
-                .collect();
-            Coder { middles }
+            let halves = self.curves[k].table(2 * STEPS);
+            let between = halves.windows(3).step_by(2).map(|w| {
+                // A curve in 16-bit steps may be flat near black: the middle stays off both ends.
+                let margin = 0.125 * (w[2] - w[0]);
+                w[1].clamp(w[0] + margin, w[2] - margin)
+            });
+            Coder {
+                middles: between.collect(),
+            }
         })
     }
 }
