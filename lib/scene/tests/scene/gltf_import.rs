@@ -1,5 +1,5 @@
 //! What a glTF file says is what arrives.
-use dipir_scene::import::{Folder, Limits, load_gltf_bytes, load_object};
+use dipir_scene::import::{Folder, Limits, NoFiles, load_gltf_bytes, load_object};
 use dipir_scene::material::AlphaMode;
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::texture::{Filter, Wrap, decode_textures};
@@ -286,7 +286,7 @@ fn chunks_of_unknown_kinds_are_passed_over() {
     whole.extend([4, 0, 0, 0, b'A', b'C', b'M', b'E', 1, 2, 3, 4]);
     let length = (whole.len() as u32).to_le_bytes();
     whole[8..12].copy_from_slice(&length);
-    let load = |bytes: &[u8]| load_gltf_bytes(bytes, &Folder::new(""), &Limits::default());
+    let load = |bytes: &[u8]| load_gltf_bytes(bytes, &NoFiles, &Limits::default());
     assert_eq!(load(&whole).unwrap().mesh.indices, [[0, 1, 2]]);
 
     // Directly behind the JSON, where only a binary chunk would be read.
@@ -569,7 +569,7 @@ fn data_uris_and_percent_encoded_files_are_found() {
     let text = glb.json.to_string();
     let imported = load_gltf_bytes(
         text.as_bytes(),
-        &Folder::new(folder.path()),
+        &Folder::new(folder.path(), &Limits::default()),
         &Limits::default(),
     )
     .unwrap();
