@@ -230,9 +230,9 @@ mod tests {
         for (width, height) in [(24, 12), (64, 32), (10, 7), (1, 1)] {
             let raster = light.rasterised(width, height);
             assert_eq!((raster.width(), raster.height()), (width, height));
-            // Texels are rounded to f32, and quadrature over a texel is good to 1e-5.
+            // The quadrature over texels that are wider than a lobe is good to 1e-4.
             let ratio = raster.integral() / light.integral();
-            assert!((ratio - 1.0).abs().max_element() < 2e-5, "{ratio}");
+            assert!((ratio - 1.0).abs().max_element() < 1e-4, "{ratio}");
         }
         // On its own grid, the map is as it was.
         let own = MapWithLobes::new(map(), black_lobes()).rasterised(24, 12);

@@ -215,7 +215,7 @@ impl Base {
             diffuse: Vec3::ZERO,
             transmitted: Transmitted::default(),
             albedo: BaseAlbedo {
-                specular: (f0 + (grazing - f0) * share) * (1.0 - loss),
+                specular: interface.fresnel(share, wo.z) * (1.0 - loss),
                 further: further * loss,
                 ..BaseAlbedo::default()
             },

@@ -270,7 +270,7 @@ impl<const F: u32> Bsdf<F> {
         };
         if side > 0.0 {
             let coat_at = self.coat_at(wi);
-            if local.z > 0.0 && diffuse + specular > 0.0 {
+            if local.z > 0.0 && diffuse + specular + sheen > 0.0 {
                 let sum = half(&self.frame, self.base.wo.z + local.z);
                 let mut r = self.base.reflected::<F>(local, sum);
                 if has(F, EXTENSIONS)
