@@ -33,7 +33,6 @@ pub(crate) fn run_fingerprint(plan: &StagePlan, settings: &Value) -> anyhow::Res
 /// Where an interrupted run goes on: a folder beside the stage's own.
 pub(crate) struct Resume {
     kept: resume::Resume,
-    pub(crate) folder: PathBuf,
 }
 
 impl Resume {
@@ -41,8 +40,7 @@ impl Resume {
         let root = session.out.join("light-checkpoints");
         let files = [CHECKPOINT, "checkpoint.partial", "previews/#.png"];
         let kept = resume::Resume::open(&root, Kind::Checkpoints, LIGHT.name, fingerprint, &files)?;
-        let folder = kept.folder().to_owned();
-        Ok(Self { kept, folder })
+        Ok(Self { kept })
     }
 
     pub(crate) fn checkpoint(&self) -> PathBuf {
