@@ -233,6 +233,7 @@ fn paths_are_relative_to_the_file() {
 #[test]
 fn unrelated_names_are_not_suggested() {
     assert_eq!(nearest("zzz", TABLES), None);
+    assert_eq!(nearest("rnu", ["run", "report"]), Some("run".into()));
     assert_eq!(nearest("compsite", TABLES), Some("composite".into()));
 }
 
