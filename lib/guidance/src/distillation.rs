@@ -2,25 +2,22 @@
 use std::sync::Arc;
 
 use candle_core::{DType, Tensor, Var};
-use dipir_diffusion::distillation::{
-    Guidance as Kind, InpaintCondition, ScoreDistillation, Weighting,
-};
+use dipir_diffusion::distillation::{InpaintCondition, ScoreDistillation, ScoreRule, Weighting};
 use dipir_diffusion::lora::Lora;
 use dipir_diffusion::model::Model;
 use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::text_encoder::LearnedTokens;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_optimize::OptimizeError;
-use dipir_optimize::crop::{Framing, USUAL_SCALE, View};
+use dipir_optimize::crop::{CropView, Framing, USUAL_SCALE};
 use dipir_optimize::guidance::{Guidance, Guided, Step};
 use dipir_optimize::settings::{BadSetting, GuidanceKind, LightTable};
-use dipir_prior::energy::{guiding, states};
-use dipir_prior::words::{Caption, LightWords};
+use dipir_prior::caption::{Caption, LightDescription};
+use dipir_prior::text_conditioning::{caption_states, guidance_states};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
-use crate::picture::from_display;
 
 /// The mean square of a picture's gradient is of order 1 / pixels times this: beside the
 /// regularisers it weighs as much as a reference does.
@@ -128,7 +125,7 @@ impl Contrast {
         model: &Model,
         settings: &DistillationSettings,
         class: &str,
-        words: &LightWords,
+        words: &LightDescription,
     ) -> Result<Self> {
         let known = model.tokenizer.words(class)?.len() == 1;
         let class = if known { class } else { "object" };
@@ -136,8 +133,8 @@ impl Contrast {
         // caption.
         let differs = matches!(settings.guidance, GuidanceKind::Lds | GuidanceKind::Csd);
         let all = match settings.turned && differs {
-            true => guiding(model, class, words)?,
-            false => states(model, &[Some(Caption::new(class, Some(words))), None])?,
+            true => guidance_states(model, class, words)?,
+            false => caption_states(model, &[Some(Caption::new(class, Some(words))), None])?,
         };
         let others = all.dim(0)? - 1;
         Ok(Self::new(&all.narrow(0, 0, 1)?, &all.narrow(0, 1, others)?))
@@ -173,7 +170,7 @@ impl<'a> Distillation<'a> {
         settings: DistillationSettings,
         adapter: Option<&Adapter>,
         class: &str,
-        light: Option<&LightWords>,
+        light: Option<&LightDescription>,
         background: &DisplayImage,
         paint: &Raster<f32>,
     ) -> Result<Self> {
@@ -210,12 +207,12 @@ impl<'a> Distillation<'a> {
 
     /// Planes [1, 3, side, side] in [-1, 1].
     fn tensor(&self, picture: &Raster<Vec3>) -> Result<Tensor> {
-        let image = from_display(&DisplayImage(picture.clone()))?;
+        let image = dipir_tensors::model_input(&DisplayImage(picture.clone()))?;
         let image = image.unsqueeze(0)?.to_device(self.model.device())?;
         Ok(image.to_dtype(self.model.dtype())?)
     }
 
-    fn condition(&self, view: &View, swap: bool) -> Result<Option<InpaintCondition>> {
+    fn condition(&self, view: &CropView, swap: bool) -> Result<Option<InpaintCondition>> {
         if !self.model.is_inpainting() {
             return Ok(None);
         }
@@ -224,18 +221,13 @@ impl<'a> Distillation<'a> {
             false => view.apply(picture),
         };
         let shown = self.tensor(&seen(&self.background))?;
-        let side = self.side;
-        let mask: Vec<f32> = seen(&self.paint)
-            .pixels()
-            .iter()
-            .map(|p| f32::from(p.x > 0.02))
-            .collect();
-        let mask = Tensor::from_vec(mask, (1, 1, side, side), self.model.device())?;
+        let mask = dipir_tensors::mask(&seen(&self.paint).map(|p| p.x), 0.02)?;
+        let mask = mask.to_device(self.model.device())?;
         let mask = mask.to_dtype(self.model.dtype())?;
         Ok(Some(InpaintCondition::new(&self.model.vae, &shown, &mask)?))
     }
 
-    fn evaluate(&self, picture: &Raster<Vec3>, view: &View, step: Step) -> Result<Guided> {
+    fn evaluate(&self, picture: &Raster<Vec3>, view: &CropView, step: Step) -> Result<Guided> {
         // Every other iteration uses the mirror image: part of the model's error changes sign there
         // (docs/prior.md).
         let swapped = self.mirrored.as_ref().filter(|_| step.iteration % 2 == 1);
@@ -246,21 +238,21 @@ impl<'a> Distillation<'a> {
         })?;
         let latents = self.model.vae.encode(&image, None)?;
         let condition = self.condition(view, swapped.is_some())?;
-        let guidance = match self.settings.guidance {
-            GuidanceKind::Sds => Kind::Sds {
+        let rule = match self.settings.guidance {
+            GuidanceKind::Sds => ScoreRule::Sds {
                 scale: self.settings.guidance_scale,
             },
-            GuidanceKind::Csd => Kind::Csd,
-            GuidanceKind::SdEdit => Kind::Edit {
+            GuidanceKind::Csd => ScoreRule::Csd,
+            GuidanceKind::SdEdit => ScoreRule::Edit {
                 scale: self.settings.guidance_scale,
                 steps: EDIT_STEPS,
             },
-            _ => Kind::Lds,
+            _ => ScoreRule::Lds,
         };
         let distillation = ScoreDistillation {
             unet: &self.model.unet,
             schedule: &self.model.schedule,
-            guidance,
+            rule,
             weighting: Weighting::NoiseVariance,
             lora: self.lora.as_ref(),
             conditional: &contrast.conditional,
@@ -300,15 +292,7 @@ impl<'a> Distillation<'a> {
             .get(&image)
             .ok_or(Error::Cut("the autoencoder has no gradient at its input"))?;
         let at_image = (at_image.to_dtype(DType::F32)? * (2.0 * scale))?;
-        let values = at_image
-            .to_device(&candle_core::Device::Cpu)?
-            .flatten_all()?
-            .to_vec1::<f32>()?;
-        let n = self.side * self.side;
-        let pixels = (0..n)
-            .map(|i| Vec3::new(values[i], values[n + i], values[2 * n + i]))
-            .collect();
-        let gradient = Raster::from_pixels(self.side, self.side, pixels);
+        let gradient = dipir_tensors::picture(&at_image)?;
         Ok(Guided {
             loss: size,
             gradient: match swapped {
@@ -335,7 +319,7 @@ impl Guidance for Distillation<'_> {
     fn gradient(
         &mut self,
         picture: &Raster<Vec3>,
-        view: &View,
+        view: &CropView,
         step: Step,
     ) -> std::result::Result<Guided, OptimizeError> {
         self.evaluate(picture, view, step)
@@ -358,7 +342,7 @@ mod tests {
     fn an_odd_iteration_is_that_of_the_mirror_image_turned_back() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data/prior");
         let mut model = Model::load(&folder, DType::F32, &Device::Cpu).unwrap();
-        dipir_prior::student::add_placeholders(&mut model.tokenizer);
+        dipir_prior::text_conditioning::add_placeholders(&mut model.tokenizer);
         let side = model.native_size();
         let drawn = |value: fn(f32, f32) -> Vec3| {
             let unit = |k: usize| k as f32 / side as f32;
@@ -380,12 +364,14 @@ mod tests {
             adapt: false,
             turned: true,
         };
-        let light = LightWords {
+        let light = LightDescription {
             azimuth: 1.1,
             elevation: 0.6,
             sun_share: 0.8,
         };
-        let distillation = |light: &LightWords, photo: &Raster<Vec3>, paint: &Raster<Vec3>| {
+        let distillation = |light: &LightDescription,
+                            photo: &Raster<Vec3>,
+                            paint: &Raster<Vec3>| {
             let (photo, paint) = (DisplayImage(photo.clone()), paint.map(|p| p.x));
             let settings = settings.clone();
             Distillation::new(&model, settings, None, "car", Some(light), &photo, &paint).unwrap()
@@ -396,7 +382,9 @@ mod tests {
                 iterations: 10,
                 seed: 5,
             };
-            d.evaluate(picture, &View::whole(), step).unwrap().gradient
+            d.evaluate(picture, &CropView::whole(), step)
+                .unwrap()
+                .gradient
         };
         let as_it_is = distillation(&light, &photo, &paint);
         let mut turned = distillation(&light.mirrored(), &mirror(&photo), &mirror(&paint));

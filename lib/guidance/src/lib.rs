@@ -3,10 +3,8 @@
 //! - [`reading`]: the light that a model with light captions sees in the photograph.
 //! - [`distillation`]: what a diffusion model would change about the composite, as a gradient.
 //! - [`recover`]: from a recorded scene to the light and tone curves that the guidance asks for.
-//! - [`picture`]: pictures as tensors and back.
 pub mod distillation;
 pub mod error;
-pub mod picture;
 pub mod reading;
 pub mod recover;
 

@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use dipir_cli::session::duration;
-use dipir_optimize::settings::LightTable;
+use dipir_optimize::settings::{LightTable, Preset as LightPreset};
 use dipir_pipeline::config::Quality;
 use dipir_scene::config::EffectsMode;
 use serde::Deserialize;
@@ -53,18 +53,6 @@ pub struct CompositePreset {
     pub target_error: f32,
 }
 
-/// Of `[light]`; see its table for what each is.
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
-pub struct LightPreset {
-    pub iterations: usize,
-    pub lobes: usize,
-    pub environment: [usize; 2],
-    pub samples: u32,
-    pub size: usize,
-}
-
 /// Means over the measured scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -73,20 +61,6 @@ pub struct Measured {
     pub cost_s: f64,
     /// Display-referred RMSE of the composite under the recovered light.
     pub error: f64,
-}
-
-impl LightPreset {
-    /// Fills what `table` leaves open.
-    pub fn fill(&self, table: &LightTable) -> LightTable {
-        LightTable {
-            iterations: table.iterations.or(Some(self.iterations)),
-            lobes: table.lobes.or(Some(self.lobes)),
-            environment: table.environment.or(Some(self.environment)),
-            samples: table.samples.or(Some(self.samples)),
-            size: table.size.or(Some(self.size)),
-            ..table.clone()
-        }
-    }
 }
 
 /// All presets.
@@ -253,8 +227,6 @@ impl LightRun {
 
 #[cfg(test)]
 mod tests {
-    use dipir_optimize::settings::{Preset as LibraryPreset, Settings};
-
     use super::*;
 
     #[test]
@@ -268,27 +240,13 @@ mod tests {
         assert!(standard.composite.target_error > high.composite.target_error);
         assert!(draft.light.samples <= standard.light.samples);
         assert_eq!(draft.scene.effects, EffectsMode::All);
+        for preset in &all().presets {
+            assert!(LightTable::default().settings(&preset.light, 0).is_ok());
+        }
         assert!(all().measured.is_some() && all().command.is_some());
         let [draft, standard, high] = [draft, standard, high].map(|p| p.recovery.unwrap());
         assert!(draft.cost_s < standard.cost_s && standard.cost_s < high.cost_s);
         assert!(draft.error > standard.error && standard.error > high.error);
-    }
-
-    #[test]
-    fn the_library_s_own_presets_are_these() {
-        let table = LightTable::default();
-        for (quality, preset) in [
-            (Quality::Draft, LibraryPreset::Draft),
-            (Quality::Standard, LibraryPreset::Standard),
-            (Quality::High, LibraryPreset::High),
-        ] {
-            let library: Settings = table.settings(preset, 0).unwrap();
-            let filled = of(quality).light.fill(&table);
-            assert_eq!(
-                filled.settings(LibraryPreset::Standard, 0).unwrap(),
-                library
-            );
-        }
     }
 
     fn standard_run(by_model: bool) -> LightRun {
@@ -312,17 +270,6 @@ mod tests {
             assert_eq!(outlook.0.len(), 2);
             assert!(outlook.0.iter().all(|e| e.error.is_none() == by_model));
         }
-    }
-
-    #[test]
-    fn what_the_table_says_goes_first() {
-        let table = LightTable {
-            samples: Some(7),
-            ..LightTable::default()
-        };
-        let filled = of(Quality::Draft).light.fill(&table);
-        assert_eq!(filled.samples, Some(7));
-        assert_eq!(filled.iterations, Some(of(Quality::Draft).light.iterations));
     }
 
     #[test]

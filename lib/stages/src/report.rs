@@ -1,11 +1,11 @@
 //! `report.html`: one page that shows a run, complete in itself.
 //!
 //! Whatever stages there are is shown; what cannot be read is said where it would stand.
+mod curves;
 pub mod html;
 mod learning;
 mod lighting;
 pub mod picture;
-mod plot;
 mod result;
 mod stages;
 
@@ -28,7 +28,7 @@ pub const MARK: &[u8] =
 /// Name of the file in the folder of artifacts.
 pub const FILE: &str = "report.html";
 /// Raised whenever the same artifacts give another page.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 /// What the page says beside what the artifacts hold.
 pub struct Report<'a> {
@@ -114,6 +114,7 @@ impl Report<'_> {
             ),
             Html::of("title", format!("{title} – dipir")),
             Html::code("style", include_str!("report/style.css")),
+            Html::code("style", dipir_plotting::STYLE),
         ];
         let intro = [
             Html::of("h1", &title),

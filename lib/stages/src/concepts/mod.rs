@@ -16,7 +16,6 @@ use dipir_diffusion::model::Model;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
 use dipir_diffusion::weights::write_safetensors;
-use dipir_guidance::picture;
 use dipir_imaging::file::write_png;
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::fingerprint::Fingerprint;
@@ -216,7 +215,7 @@ fn make(
     interrupt::check()?;
     let generated = outcome?;
     let partial = png.with_extension("partial.png");
-    write_png(&partial, &picture::to_display(&generated.image)?)?;
+    write_png(&partial, &dipir_tensors::model_output(&generated.image)?)?;
     std::fs::rename(&partial, png).with_context(|| format!("cannot write {}", png.display()))?;
     let latents = generated
         .latents

@@ -17,7 +17,6 @@ use dipir_diffusion::model::Model;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
 use dipir_diffusion::training::{LoraTrainer, StepReport};
-use dipir_guidance::picture;
 use dipir_imaging::file::{read_photo, write_png};
 use dipir_imaging::transfer::Transfer;
 use dipir_pipeline::fingerprint::Fingerprint;
@@ -125,7 +124,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         .transpose()?;
     let photo = read_photo(&photo_file, transfer)?;
     let data = Data {
-        photo: picture::from_display(&photo.transfer.encode(&photo.image))?,
+        photo: dipir_tensors::model_input(&photo.transfer.encode(&photo.image))?,
         size: model.native_size(),
         min_crop: table.min_crop,
         prompt: table.instance_prompt(),
@@ -233,7 +232,7 @@ fn show(model: &Model, trainer: &LoraTrainer, data: &Data, path: &Path) -> anyho
     interrupt::check()?;
     // Beside its place and renamed: a sample that is there is whole.
     let partial = path.with_extension("partial.png");
-    write_png(&partial, &picture::to_display(&generated?.image)?)?;
+    write_png(&partial, &dipir_tensors::model_output(&generated?.image)?)?;
     std::fs::rename(&partial, path).with_context(|| format!("cannot write {}", path.display()))
 }
 

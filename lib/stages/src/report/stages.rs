@@ -2,10 +2,10 @@
 use dipir_cli::session::{duration, size};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::status::State;
+use dipir_plotting::number;
 use dipir_render::effects::EffectsPlan;
 
 use super::html::{self, Html};
-use super::plot::number;
 use super::{Report, Section, json};
 use crate::names::{COMPOSITE, LIGHT, SCENE};
 
