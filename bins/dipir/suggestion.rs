@@ -5,7 +5,7 @@ use std::path::Path;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, Parser};
 use dipir_cli::exit::Usage;
-use dipir_pipeline::config::renamed;
+use dipir_pipeline::config::{nearest, renamed};
 
 use crate::Cli;
 
@@ -28,7 +28,10 @@ fn meant(error: &clap::Error) -> Option<String> {
         _ => None,
     };
     match error.kind() {
-        ErrorKind::InvalidSubcommand => file(said(ContextKind::InvalidSubcommand)?),
+        ErrorKind::InvalidSubcommand => {
+            let name = said(ContextKind::InvalidSubcommand)?;
+            file(name).or_else(|| command(name))
+        }
         ErrorKind::InvalidValue => {
             let value = said(ContextKind::InvalidValue)?;
             let option = said(ContextKind::InvalidArg)?;
@@ -37,6 +40,16 @@ fn meant(error: &clap::Error) -> Option<String> {
         }
         _ => None,
     }
+}
+
+/// For a slip of the pen.
+fn command(name: &str) -> Option<String> {
+    let all = Cli::command();
+    let names = all.get_subcommands().map(clap::Command::get_name);
+    let meant = nearest(name, names)?;
+    Some(format!(
+        "{name} is no command of dipir; did you mean dipir {meant}?"
+    ))
 }
 
 /// For a file where a command should stand.

@@ -185,5 +185,8 @@ fn an_output_folder_that_is_a_file_is_one_message() {
     File::create(project.path("out")).unwrap();
     let run = project.run(SCENE, &[]);
     assert_eq!(run.code, Some(1));
-    assert_eq!(run.stderr, "error: cannot create out: file exists\n");
+    assert_eq!(
+        run.stderr,
+        "error: cannot create out: file exists; move it away or choose another folder with --out\n"
+    );
 }

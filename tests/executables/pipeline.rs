@@ -178,7 +178,7 @@ fn the_graph_is_shown_for_people_and_for_graphviz() {
         "scene      dipir-scene      reads no other stage\n\
          concepts   dipir-concepts   reads no other stage\n\
          lora       dipir-lora       reads concepts\n\
-         light      dipir-light   reads scene, lora\n\
+         light      dipir-light      reads scene, lora\n\
          composite  dipir-composite  reads scene, light\n"
     );
     let dot = graph(&["--dot"]);

@@ -11,7 +11,7 @@ const ABORTED: &[u8] = b"error: the process cannot go on; where the line above s
 /// limit on its size becomes an error of the write, and an abort says what it comes from.
 pub(crate) fn prepare() {
     // SAFETY: called first thing in main. To ignore a signal runs no code of ours, and the handler
-    // only calls `write`, which handlers may.
+    // only calls `write`, `signal` and `raise`, which handlers may.
     #[cfg(unix)]
     unsafe {
         libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
@@ -20,12 +20,14 @@ pub(crate) fn prepare() {
     }
 }
 
-/// Returns to `abort`, which then ends the process by the signal.
+/// Says it and ends the process by the signal, whoever sent it.
 #[cfg(unix)]
 extern "C" fn say_aborted(_: libc::c_int) {
-    // SAFETY: the bytes outlive the call.
+    // SAFETY: the bytes outlive the call, and handlers may call all three.
     unsafe {
         libc::write(libc::STDERR_FILENO, ABORTED.as_ptr().cast(), ABORTED.len());
+        libc::signal(libc::SIGABRT, libc::SIG_DFL);
+        libc::raise(libc::SIGABRT);
     }
 }
 

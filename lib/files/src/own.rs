@@ -79,8 +79,8 @@ pub fn sync_folder(folder: &Path) -> io::Result<()> {
 }
 
 /// The first `length` bytes of a regular file, fewer if it is shorter; `None` if nothing is there.
-/// Of what is not a regular file nothing is read: a beginning that is no one's.
-fn beginning(path: &Path, length: usize) -> io::Result<Option<Vec<u8>>> {
+/// What is not a regular file is an error.
+pub fn beginning(path: &Path, length: usize) -> io::Result<Option<Vec<u8>>> {
     match fs::symlink_metadata(path) {
         Ok(found) if !found.is_file() => return Err(not_ours(path)),
         Ok(_) => {}

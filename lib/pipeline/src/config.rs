@@ -244,9 +244,14 @@ pub fn nearest<S: AsRef<str>>(
     // Jaro-Winkler of 0.75 accepts transpositions and one or two lost letters in a word of
     // usual length, and rejects unrelated words of the same length.
     const NEAR: f64 = 0.75;
+    // In a word of three or four letters two that changed places leave it little alike.
+    let likeness = |c: &str| match strsim::osa_distance(name, c) {
+        1 if name.len() > 2 => strsim::jaro_winkler(name, c).max(NEAR),
+        _ => strsim::jaro_winkler(name, c),
+    };
     candidates
         .into_iter()
-        .map(|c| (strsim::jaro_winkler(name, c.as_ref()), c))
+        .map(|c| (likeness(c.as_ref()), c))
         .filter(|(score, _)| *score >= NEAR)
         .max_by(|a, b| a.0.total_cmp(&b.0))
         .map(|(_, c)| c.as_ref().to_string())

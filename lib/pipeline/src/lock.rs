@@ -86,10 +86,12 @@ impl Drop for FolderLock {
 fn sign(file: &mut File, path: &Path) -> Result<(), StageError> {
     let failed = |e| StageError::io("write", path, e);
     let mut begins = Vec::new();
-    let length = HEAD.len() as u64;
-    let read = (&*file).take(length).read_to_end(&mut begins);
+    let read = (&*file).take(64).read_to_end(&mut begins);
     read.map_err(failed)?;
-    if !HEAD.as_bytes().starts_with(&begins) {
+    let length = begins.len().min(HEAD.len());
+    // Locks of earlier versions hold a number alone.
+    let is_number = begins.len() < 16 && begins.trim_ascii().iter().all(u8::is_ascii_digit);
+    if !HEAD.as_bytes().starts_with(&begins[..length]) && !is_number {
         let message = "it is there already and is no lock of dipir";
         return Err(failed(io::Error::new(
             io::ErrorKind::AlreadyExists,
@@ -174,7 +176,7 @@ mod tests {
     fn a_lock_file_left_by_a_dead_process_holds_nobody_up() {
         let parent = tempfile::tempdir().unwrap();
         let folder = parent.path().join("scene");
-        for left in ["", "dipir", "dipir lock 999999999\n"] {
+        for left in ["", "dipir", "dipir lock 999999999\n", "4711\n"] {
             fs::write(lock_path(&folder), left).unwrap();
             let lock = FolderLock::take(&folder, WhenLocked::Refuse).unwrap();
             let text = fs::read_to_string(lock_path(&folder)).unwrap();

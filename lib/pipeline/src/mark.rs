@@ -287,9 +287,14 @@ pub(crate) fn is_empty(folder: &Path) -> Result<bool, StageError> {
     for entry in fs::read_dir(folder).map_err(failed)? {
         let entry = entry.map_err(failed)?;
         let name = entry.file_name();
-        let is_begun = name == FILE_NAME || name == format!(".{FILE_NAME}.partial").as_str();
-        let is_void = entry.metadata().is_ok_and(|m| m.is_file() && m.len() == 0);
-        if !(is_begun && is_void) {
+        let begins = |length: usize| {
+            let read = dipir_files::beginning(&entry.path(), length);
+            read.ok().flatten().unwrap_or_else(|| b"?".into())
+        };
+        let is_void = name == FILE_NAME && begins(1).is_empty();
+        let is_begun = name == format!(".{FILE_NAME}.partial").as_str()
+            && HEAD.starts_with(&begins(HEAD.len()));
+        if !(is_begun || is_void) {
             return Ok(false);
         }
     }
@@ -345,6 +350,30 @@ mod tests {
         fs::remove_dir_all(folder.join("a")).unwrap();
         mark.owned().remove(&folder).unwrap();
         assert!(!folder.exists());
+    }
+
+    #[test]
+    fn a_folder_whose_mark_was_begun_when_its_maker_was_killed_is_free() {
+        let out = tempfile::tempdir().unwrap();
+        let folder = out.path().join("folder");
+        let mark = Mark::new(Kind::Unfinished, "scene", Vec::new());
+        let whole = serde_json::to_vec(&mark).unwrap();
+        for (name, content) in [
+            (".dipir", &b""[..]),
+            ("..dipir.partial", b""),
+            ("..dipir.partial", &whole[..9]),
+            ("..dipir.partial", &whole),
+        ] {
+            fs::create_dir(&folder).unwrap();
+            fs::write(folder.join(name), content).unwrap();
+            assert!(is_empty(&folder).unwrap(), "{name} {}", content.len());
+            mark.make(&folder).unwrap();
+            assert_eq!(Mark::read(&folder), Some(mark.clone()));
+            fs::remove_dir_all(&folder).unwrap();
+        }
+        fs::create_dir(&folder).unwrap();
+        fs::write(folder.join("..dipir.partial"), "mine").unwrap();
+        assert!(!is_empty(&folder).unwrap());
     }
 
     #[test]

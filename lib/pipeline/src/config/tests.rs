@@ -113,7 +113,7 @@ fn an_unknown_table_is_an_error() {
     assert_eq!(
         parse("[scnee]\n", &[]).unwrap_err().to_string(),
         "pipeline.toml:1: unknown key \"scnee\" (did you mean \"scene\"?); the top level accepts: \
-         pipeline, model, scene, concepts, lora, optimize, composite, report"
+         pipeline, model, scene, concepts, lora, light, composite, report"
     );
 }
 
@@ -233,7 +233,8 @@ fn paths_are_relative_to_the_file() {
 #[test]
 fn unrelated_names_are_not_suggested() {
     assert_eq!(nearest("zzz", TABLES), None);
-    assert_eq!(nearest("optimise", TABLES), Some("optimize".into()));
+    assert_eq!(nearest("rnu", ["run", "report"]), Some("run".into()));
+    assert_eq!(nearest("compsite", TABLES), Some("composite".into()));
 }
 
 #[test]

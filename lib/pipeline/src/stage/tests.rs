@@ -194,12 +194,12 @@ fn leftovers_of_a_killed_run_are_cleared() {
     let target = out.path().join("scene");
     let partial = out.path().join(".scene.partial");
     fs::create_dir(&partial).unwrap();
-    for left in [None, Some(""), Some("stale.png")] {
+    for left in [None, Some("stale.png")] {
         if let Some(name) = left {
             Mark::new(Kind::Unfinished, "scene", vec![])
                 .make(&partial)
                 .unwrap();
-            fs::write(partial.join(name).with_extension("png"), "x").unwrap();
+            fs::write(partial.join(name), "x").unwrap();
         }
         run(&target, "new");
         assert_eq!(names(&target), [".dipir", "images", "stage.json"]);
@@ -238,8 +238,10 @@ fn swapping_in_two_steps_ends_as_an_exchange_does() {
     fs::write(a.join("new"), "").unwrap();
     fs::write(b.join("old"), "").unwrap();
     swap_in_two_steps(&a, &b).unwrap();
-    assert_eq!(names(out.path()), ["b"]);
+    // What was there before is tidied up as after an exchange, once others' files are safe.
+    assert_eq!(names(out.path()), [".b.previous", "b"]);
     assert_eq!(names(&b), ["new"]);
+    assert_eq!(names(&out.path().join(".b.previous")), ["old"]);
 }
 
 #[test]
