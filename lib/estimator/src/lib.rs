@@ -12,6 +12,8 @@ pub mod features;
 pub mod grid;
 pub mod network;
 pub mod posterior;
+#[cfg(test)]
+mod tests;
 mod visible;
 
 pub use candidates::Candidate;

@@ -1,7 +1,8 @@
-//! What measurements say: how far pictures and lights are from the truth, what accuracy costs, and
-//! what people prefer. Nothing here renders or starts programs; it is told numbers and pictures.
+//! Scores of pictures and lights, medians with intervals, Pareto fronts, charts, and the counts of a user
+//! study. Nothing here renders or starts programs, and nothing of the pipeline imports it.
 pub mod front;
 pub mod lpips;
+pub mod results;
 pub mod scores;
 pub mod study;
 pub mod summary;

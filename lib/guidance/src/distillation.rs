@@ -12,8 +12,8 @@ use dipir_optimize::OptimizeError;
 use dipir_optimize::crop::{CropView, Framing, USUAL_SCALE};
 use dipir_optimize::guidance::{Guidance, Guided, Step};
 use dipir_optimize::settings::{BadSetting, GuidanceKind, LightTable};
-use dipir_prior::energy::{guiding, states};
-use dipir_prior::words::{Caption, LightWords};
+use dipir_prior::caption::{Caption, LightDescription};
+use dipir_prior::text_conditioning::{caption_states, guidance_states};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
@@ -125,7 +125,7 @@ impl Contrast {
         model: &Model,
         settings: &DistillationSettings,
         class: &str,
-        words: &LightWords,
+        words: &LightDescription,
     ) -> Result<Self> {
         let known = model.tokenizer.words(class)?.len() == 1;
         let class = if known { class } else { "object" };
@@ -133,8 +133,8 @@ impl Contrast {
         // caption.
         let differs = matches!(settings.guidance, GuidanceKind::Lds | GuidanceKind::Csd);
         let all = match settings.turned && differs {
-            true => guiding(model, class, words)?,
-            false => states(model, &[Some(Caption::new(class, Some(words))), None])?,
+            true => guidance_states(model, class, words)?,
+            false => caption_states(model, &[Some(Caption::new(class, Some(words))), None])?,
         };
         let others = all.dim(0)? - 1;
         Ok(Self::new(&all.narrow(0, 0, 1)?, &all.narrow(0, 1, others)?))
@@ -170,7 +170,7 @@ impl<'a> Distillation<'a> {
         settings: DistillationSettings,
         adapter: Option<&Adapter>,
         class: &str,
-        light: Option<&LightWords>,
+        light: Option<&LightDescription>,
         background: &DisplayImage,
         paint: &Raster<f32>,
     ) -> Result<Self> {
@@ -342,7 +342,7 @@ mod tests {
     fn an_odd_iteration_is_that_of_the_mirror_image_turned_back() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data/prior");
         let mut model = Model::load(&folder, DType::F32, &Device::Cpu).unwrap();
-        dipir_prior::student::add_placeholders(&mut model.tokenizer);
+        dipir_prior::text_conditioning::add_placeholders(&mut model.tokenizer);
         let side = model.native_size();
         let drawn = |value: fn(f32, f32) -> Vec3| {
             let unit = |k: usize| k as f32 / side as f32;
@@ -364,12 +364,14 @@ mod tests {
             adapt: false,
             turned: true,
         };
-        let light = LightWords {
+        let light = LightDescription {
             azimuth: 1.1,
             elevation: 0.6,
             sun_share: 0.8,
         };
-        let distillation = |light: &LightWords, photo: &Raster<Vec3>, paint: &Raster<Vec3>| {
+        let distillation = |light: &LightDescription,
+                            photo: &Raster<Vec3>,
+                            paint: &Raster<Vec3>| {
             let (photo, paint) = (DisplayImage(photo.clone()), paint.map(|p| p.x));
             let settings = settings.clone();
             Distillation::new(&model, settings, None, "car", Some(light), &photo, &paint).unwrap()

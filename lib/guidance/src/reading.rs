@@ -7,10 +7,10 @@ use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_imaging::resize::{CropResize, Filter, PixelBox};
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_optimize::parameters::Parameters;
+use dipir_prior::caption::ViewDirection;
 use dipir_prior::encoder::{LightEncoder, LightEstimate};
-use dipir_prior::examples::SIZE;
-use dipir_prior::reader::{Crop, ReaderSettings, Reading, read};
-use dipir_prior::words::Gaze;
+use dipir_prior::inversion::{Crop, InversionSettings, Reading, invert};
+use dipir_prior::picture::SIZE;
 use dipir_scene::camera::Camera;
 use dipir_scene::proxy::Proxy;
 use glam::{DVec3, Vec2, Vec3};
@@ -76,17 +76,17 @@ fn crop_of(photo: &Raster<Vec3>, camera: &Camera, region: PixelBox) -> Crop {
     let resize = CropResize::new(size, region, (SIZE, SIZE), Filter::Tent);
     Crop {
         picture: planes(&resize.apply(photo)),
-        gaze: gaze(camera, region),
+        view_direction: view_direction(camera, region),
     }
 }
 
 /// Where the middle of `region` lies: azimuths of a crop are relative to its heading.
-pub fn gaze(camera: &Camera, region: PixelBox) -> Gaze {
+pub fn view_direction(camera: &Camera, region: PixelBox) -> ViewDirection {
     let corner = Vec2::new(region.x as f32, region.y as f32);
     let half = Vec2::new(region.width as f32, region.height as f32) * 0.5;
     let ray = camera.ray(corner + half).direction;
     let (forward, right) = ground_axes(camera);
-    Gaze::along(ray, forward, right)
+    ViewDirection::along(ray, forward, right)
 }
 
 /// A square of `side` around a point, moved into the picture.
@@ -219,7 +219,7 @@ pub fn read_light(
     model: &Model,
     photo: &DisplayImage,
     place: &Place<'_>,
-    settings: &ReaderSettings,
+    settings: &InversionSettings,
     seed: u64,
     progress: &(dyn Fn(f64) -> ControlFlow<()> + Sync),
 ) -> Result<Option<Reading>> {
@@ -227,7 +227,7 @@ pub fn read_light(
         return Ok(None);
     };
     let crops = crops(&photo.0, place);
-    match read(model, &encoder, &crops, NEAR, settings, seed, progress)? {
+    match invert(model, &encoder, &crops, NEAR, settings, seed, progress)? {
         Some(reading) => Ok(Some(reading)),
         None => Err(Error::Interrupted),
     }
@@ -235,7 +235,7 @@ pub fn read_light(
 
 /// The start of the optimisation under an estimate of the light.
 pub fn start(estimate: &LightEstimate, camera: &Camera, lobes: usize) -> Parameters {
-    let words = &estimate.words;
+    let words = &estimate.description;
     let tint = |warmth: f32| {
         let v = Vec3::new((0.5 * warmth).exp(), 1.0, (-0.5 * warmth).exp());
         v * (3.0 / v.element_sum())
@@ -293,7 +293,7 @@ mod tests {
             [64, 48],
         );
         let estimate = LightEstimate {
-            words: dipir_prior::words::LightWords {
+            description: dipir_prior::caption::LightDescription {
                 azimuth: 0.4,
                 elevation: 0.8,
                 sun_share: 0.7,
@@ -353,12 +353,15 @@ mod tests {
             width: 20,
             height: 20,
         };
-        assert!(gaze(&camera, at(70)).heading.abs() < 1e-6);
-        let (left, right) = (gaze(&camera, at(0)).heading, gaze(&camera, at(140)).heading);
+        assert!(view_direction(&camera, at(70)).heading.abs() < 1e-6);
+        let (left, right) = (
+            view_direction(&camera, at(0)).heading,
+            view_direction(&camera, at(140)).heading,
+        );
         assert!((left + right).abs() < 1e-6);
         // The middle of the picture is 3 metres away and 2 below.
         let down = (2f32 / 3.0).atan();
-        assert!((gaze(&camera, at(70)).pitch - down).abs() < 1e-6);
+        assert!((view_direction(&camera, at(70)).pitch - down).abs() < 1e-6);
         // Of the ground point that is seen there.
         let ray = camera.ray(Vec2::new(150.0, 60.0)).direction;
         let (forward, across) = ground_axes(&camera);
@@ -422,6 +425,10 @@ mod tests {
         let middle = sum / count as f32;
         assert!(middle.distance(Vec2::splat(15.5)) < 5.0, "{middle}");
         // Towards the right of the view.
-        assert!(found[3].gaze.heading > 0.02, "{:?}", found[3].gaze);
+        assert!(
+            found[3].view_direction.heading > 0.02,
+            "{:?}",
+            found[3].view_direction
+        );
     }
 }

@@ -14,13 +14,13 @@ use dipir_optimize::optimization::{self, Optimization, Outcome};
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::recorder::SceneRecorder;
 use dipir_optimize::settings::Settings;
-use dipir_prior::reader::{ReaderSettings, Reading};
+use dipir_prior::inversion::{InversionSettings, Reading};
 use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
 
 use crate::distillation::{Adapter, Distillation, DistillationSettings};
 use crate::error::{Error, Result};
-use crate::reading::{self, Place, gaze, read_light};
+use crate::reading::{self, Place, read_light, view_direction};
 
 /// Side of the crops of a reference, pixels, when it is compared on crops.
 const CROP_SIDE: usize = 128;
@@ -65,7 +65,7 @@ pub struct ModelGuidance<'a> {
     /// What the object is called.
     pub class: &'a str,
     /// How light is read off the photograph, if the model can and should.
-    pub reading: Option<&'a ReaderSettings>,
+    pub reading: Option<&'a InversionSettings>,
 }
 
 /// What is told while light is recovered.
@@ -152,8 +152,11 @@ pub fn recover_light(
             // ground on which the shadow will fall.
             let paint = if reading.is_some() { &coverage } else { &mask };
             let seen = reading.as_ref().zip(bounding_box(&coverage));
-            let seen =
-                seen.map(|(r, object)| r.light.words.seen_from(gaze(camera, object).heading));
+            let seen = seen.map(|(r, object)| {
+                r.light
+                    .description
+                    .seen_from(view_direction(camera, object).heading)
+            });
             Box::new(Distillation::new(
                 model.model,
                 model.settings.clone(),

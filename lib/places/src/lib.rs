@@ -10,6 +10,8 @@ mod network;
 pub mod place;
 mod probes;
 pub mod run;
+#[cfg(test)]
+mod tests;
 pub mod trainer;
 pub mod view;
 

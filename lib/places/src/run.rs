@@ -158,11 +158,11 @@ fn one_fold(
     let file = settings.out.with_extension(format!("fold{f}"));
     let note = settings.out.with_extension(format!("fold{f}.json"));
     let wanted = serde_json::to_string(settings).unwrap_or_default();
-    if std::fs::read_to_string(&note).is_ok_and(|text| text == wanted) {
-        if let Ok(member) = Estimator::load(&file) {
-            progress(Progress::Kept(f));
-            return Ok(member);
-        }
+    if std::fs::read_to_string(&note).is_ok_and(|text| text == wanted)
+        && let Ok(member) = Estimator::load(&file)
+    {
+        progress(Progress::Kept(f));
+        return Ok(member);
     }
     let seen = learned(settings, f, fold);
     let examples: Vec<&Example> = photographs
@@ -192,11 +192,11 @@ fn learned(settings: &Settings, f: usize, fold: &[usize]) -> Vec<usize> {
     seen
 }
 
-fn cases(
+fn cases<'m>(
     examples: &[&Example],
     places: &[Place],
     fold: &[usize],
-    of: impl Fn(usize) -> Estimator + Sync,
+    of: impl Fn(usize) -> &'m Estimator + Sync,
 ) -> Vec<Case> {
     examples
         .par_iter()
@@ -221,16 +221,12 @@ fn finish(
     let every = (settings.views / settings.judged).max(1);
     let any: Vec<&Example> = photographs.iter().step_by(every).collect();
     let both: Vec<&Example> = judged.iter().chain(&any).copied().collect();
-    let found = calibration(&cases(&both, places, fold, |f| members[f].clone()), probes);
+    let found = calibration(&cases(&both, places, fold, |f| &members[f]), probes);
     let calibrated: Vec<Estimator> = members.iter().map(|m| m.calibrated(found)).collect();
-    let left_out = |examples: &[&Example]| {
-        figures(
-            &cases(examples, places, fold, |f| calibrated[f].clone()),
-            probes,
-        )
-    };
+    let left_out =
+        |examples: &[&Example]| figures(&cases(examples, places, fold, |f| &calibrated[f]), probes);
     let seen = cases(&judged, places, fold, |f| {
-        calibrated[(f + 1) % calibrated.len()].clone()
+        &calibrated[(f + 1) % calibrated.len()]
     });
     let outcome = Outcome {
         settings: settings.clone(),

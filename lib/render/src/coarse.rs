@@ -148,7 +148,8 @@ where
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::film::{Film, Job, Layer, PixelSet};
+    use crate::film::Film;
+    use crate::job::{Job, Layer, PixelSet};
     use crate::shadow::Block;
     use crate::shapes::icosphere;
     use crate::testing::{camera, everything, ground, matte, scene, settings, sky};

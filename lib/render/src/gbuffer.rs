@@ -1,4 +1,4 @@
-//! What lies behind every pixel: depth, normal, albedo, and who covers it.
+//! Depth, normal, albedo and coverage of every pixel.
 use dipir_imaging::error::ImagingError;
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::Raster;

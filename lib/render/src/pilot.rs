@@ -1,4 +1,4 @@
-//! Small renders that tell what an effect is worth.
+//! Small renders that measure what an effect contributes.
 use std::ops::ControlFlow;
 
 use dipir_imaging::composite::composite_pixel;
@@ -180,8 +180,9 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
             0 => (0.0, 0.0),
             1 => (squares.mean(), 0.0),
             n => {
-                // What happens seldom happens in either picture, but hardly in the same pixel of both: all products
-                // are 0, and so is their spread. What they would be if it were scattered at random is not.
+                // A rare event occurs in both pictures, but seldom in the same pixel of both: then all
+                // products are 0, and so is their spread. Their size if the events were scattered at
+                // random is a lower bound of the standard error.
                 let scattered = (each[0] * each[1] / (n as f64).powi(3)).sqrt();
                 (squares.mean(), squares.std_error().max(scattered))
             }
@@ -237,7 +238,7 @@ fn pilot_camera(renderer: &Renderer) -> Camera {
     let [width, height] = camera.resolution;
     let bvh = &renderer.geometry().bvh;
     let footprint = Footprint::new(&camera, bvh.bounds(), bvh.clusters());
-    // One pixel in 4 x 4 stands for the others.
+    // Counted in blocks of 4 x 4 pixels.
     let held = (0..height.div_ceil(4))
         .flat_map(|y| (0..width.div_ceil(4)).map(move |x| (4 * x, 4 * y)))
         .filter(|&(x, y)| footprint.overlaps(x, y, 4, 4))

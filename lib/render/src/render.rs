@@ -19,10 +19,11 @@ use crate::blocker::Blocker;
 use crate::counters::RayCounts;
 use crate::error::RenderError;
 use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
-use crate::film::{Film, Job, Layer, PixelSet, REPLICATES, Viewing};
+use crate::film::{Film, Viewing};
 use crate::footprint::Footprint;
 use crate::foreground::{PathContext, PathStart};
-use crate::glints::{self, Found, Patience};
+use crate::highlights::{self, Found, Limit};
+use crate::job::{Job, Layer, PixelSet, REPLICATES};
 use crate::light::{PathLight, SceneLight};
 use crate::photo::Photo;
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowSums};
@@ -60,10 +61,10 @@ pub struct Settings<'a> {
     /// 1 where the photograph's own foreground hides the object, 0 where it does not; of the
     /// camera's size.
     pub occluders: Option<&'a Raster<f32>>,
-    /// Share of a plane's light that may be blocked without being looked for.
+    /// Share of a plane's light that may be blocked without being sampled.
     pub shadow_tolerance: f32,
-    /// Whether [`glints`] are looked for, which samples hardly meet; never where their number is given.
-    pub glints: bool,
+    /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
+    pub highlights: bool,
 }
 
 impl Default for Settings<'_> {
@@ -77,7 +78,7 @@ impl Default for Settings<'_> {
             occluders: None,
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
-            glints: true,
+            highlights: true,
         }
     }
 }
@@ -272,17 +273,17 @@ impl<'a> Renderer<'a> {
             background: settings.background,
             transfer: settings.transfer,
         };
-        let focus = |film: &Film, jobs: &[Job]| {
-            if !settings.glints || matches!(settings.stop, Stop::Samples(_)) {
+        let find_highlights = |film: &Film, jobs: &[Job]| {
+            if !settings.highlights || matches!(settings.stop, Stop::Samples(_)) {
                 return Found::default();
             }
             let objects = jobs.iter().filter(|job| job.layer == Layer::Object);
             let pixels: Vec<_> = objects.flat_map(|job| job.pixels.iter()).collect();
-            let patience = match settings.stop {
-                Stop::TimeBudget(budget) => Patience::Until(Instant::now() + budget / 10),
-                _ => Patience::Samples(jobs.iter().map(Job::samples_drawn).sum()),
+            let limit = match settings.stop {
+                Stop::TimeBudget(budget) => Limit::Until(Instant::now() + budget / 10),
+                _ => Limit::Samples(jobs.iter().map(Job::samples_drawn).sum()),
             };
-            glints::find(path, film, &viewing, &pixels, patience, settings.seed)
+            highlights::find(path, film, &viewing, &pixels, limit, settings.seed)
         };
         let refined = refine(
             (width, height),
@@ -292,7 +293,7 @@ impl<'a> Renderer<'a> {
             settings.max_samples,
             &viewing,
             advance,
-            &focus,
+            &find_highlights,
             coarse,
             progress,
         )?;
@@ -439,8 +440,8 @@ fn advance_object_with<L: PathLight, const F: u32>(
             for sample in job.samples..goal {
                 let mut sampler = base.with_sample(sample);
                 let place = sampler.next_2d();
-                let (place, weight) = match &job.focus {
-                    Some(focus) => focus.place(place),
+                let (place, weight) = match &job.density {
+                    Some(density) => density.place(place),
                     None => (place, 1.0),
                 };
                 let s = path.image_sample::<F>(corner + place, &mut sampler, &mut counts);
@@ -454,7 +455,7 @@ fn advance_object_with<L: PathLight, const F: u32>(
                 replicate,
                 &[radiance.x, radiance.y, radiance.z, coverage, weights],
             );
-            if job.focus.is_some() {
+            if job.density.is_some() {
                 job.add_squares(index, squares);
             }
         }

@@ -50,7 +50,7 @@ pub struct ShadowContext<'a, L, P> {
     pub proxy_occlusion: bool,
     /// Light of the object on the proxy, if it counts.
     pub light_on_proxy: Option<LightOnProxy>,
-    /// Share of the plane's light below which blocking is not looked for.
+    /// Share of the plane's light that may be blocked without being sampled.
     pub tolerance: f32,
 }
 
@@ -353,7 +353,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
     }
 
     /// Gathers the light that the object sends to `point`: one path through a uniform direction of
-    /// the cone, or, far from the object, sometimes one that stands for many.
+    /// the cone; far from the object only with some chance, and a larger weight.
     fn light_sent<const F: u32, G: ShadowGather>(
         &self,
         point: &ProxyPoint,
@@ -442,10 +442,10 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
     }
 }
 
-/// Chance that a sample asks for the light that the object sends through a cone. What arrives there is
-/// at most the share of the plane's light that the cone's solid angle is of pi, for an object as
-/// bright as the plane, so fewer paths do where that is little: the noise that they leave is at most
-/// that of one part in [`PATHS_OF_SENT_LIGHT`] of the plane's light, once in many samples.
+/// Chance that a sample traces a path of light that the object sends through a cone. For an object as bright
+/// as the plane, the irradiance from the cone is at most its solid angle over pi times the plane's.
+/// Where that is little, fewer paths are traced, with larger weights: one path adds at most one part in
+/// [`PATHS_OF_SENT_LIGHT`] of the plane's light.
 fn chance_of_sent_light(cos_half_angle: f32) -> f32 {
     (2.0 * PATHS_OF_SENT_LIGHT * (1.0 - cos_half_angle)).min(1.0)
 }

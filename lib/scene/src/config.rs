@@ -81,7 +81,7 @@ pub struct CameraConfig {
     pub up: Option<[f32; 3]>,
     /// Vertical field of view, degrees.
     pub fov_deg: Option<f32>,
-    /// Focal length, millimetres; needs `sensor_mm`.
+    /// Focal length, millimetres; needs `sensor_mm` unless the photograph's Exif data tell it.
     pub focal_mm: Option<f32>,
     /// Width of the sensor, millimetres (36 for full frame).
     pub sensor_mm: Option<f32>,
@@ -509,10 +509,8 @@ impl CameraConfig {
                 focal_mm: millimetres("focal_mm", focal)?,
                 sensor_mm: millimetres("sensor_mm", sensor)?,
             }),
-            (None, Some(_), None) => Err(missing(
-                "scene.camera.sensor_mm",
-                "scene.camera.focal_mm needs the sensor's width, for instance sensor_mm = 36.0",
-            )),
+            // The photograph may know its sensor.
+            (None, Some(focal), None) => Ok(FieldOfView::Focal(millimetres("focal_mm", focal)?)),
             (None, None, Some(_)) => Err(missing(
                 "scene.camera.focal_mm",
                 "scene.camera.sensor_mm needs the focal length, for instance focal_mm = 35.0",

@@ -84,7 +84,10 @@ impl Scene {
         if let CameraSettings::Transforms { path, .. } = &settings.camera {
             files.input("camera", path);
         }
-        let (camera, warnings) = settings.camera.resolve(resolution, base_dir)?;
+        let (camera, warnings) = settings
+            .camera
+            .with_facts(&photo.facts)?
+            .resolve(resolution, base_dir)?;
         files.warnings.extend(warnings);
         let (proxy, proxy_record) = match &settings.proxy {
             ProxySettings::None => (Proxy::None, ProxyRecord::None),
@@ -321,6 +324,7 @@ impl<'a> Files<'a> {
 
     fn photo(&mut self, path: &Path, transfer: Transfer) -> Result<(Photo, PhotoRecord), Error> {
         let photo = file::read_photo(self.base_dir.join(path), transfer)?;
+        self.warnings.extend(photo.warnings.iter().cloned());
         let record = PhotoRecord {
             file: self.record("background", path)?,
             width: photo.image.0.width() as u32,

@@ -1,5 +1,4 @@
 //! The stages behind the executables: each a function from a session to a folder of artifacts.
-pub mod children;
 pub mod command_line;
 pub mod composite;
 pub mod concepts;

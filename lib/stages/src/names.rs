@@ -22,7 +22,7 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 6,
+    version: 7,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
@@ -34,19 +34,19 @@ pub const CONCEPTS: StageName = StageName {
 pub const LORA: StageName = StageName {
     name: "lora",
     executable: "dipir-lora",
-    version: 1,
+    version: 2,
 };
 /// Recovers light and tone curves.
 pub const LIGHT: StageName = StageName {
     name: "light",
     executable: "dipir-light",
-    version: 3,
+    version: 4,
 };
 /// Renders the picture and its layers.
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 5,
+    version: 6,
 };
 
 /// All stages, each after those that it reads.

@@ -22,6 +22,9 @@ use crate::truth::Truth;
 use html::Html;
 pub use stages::quoted;
 
+/// How every page begins: what tells a page of ours from another's.
+pub const MARK: &[u8] =
+    b"<!doctype html>\n<html lang=\"en\"><head><meta name=\"generator\" content=\"dipir ";
 /// Name of the file in the folder of artifacts.
 pub const FILE: &str = "report.html";
 /// Raised whenever the same artifacts give another page.
@@ -46,14 +49,16 @@ impl Report<'_> {
     /// Writes the page and returns where it is.
     pub fn write(&self) -> anyhow::Result<PathBuf> {
         let path = self.session.out.join(FILE);
-        let partial = self.session.out.join(format!(".{FILE}.partial"));
-        std::fs::write(&partial, self.page()?)
-            .and_then(|()| std::fs::rename(&partial, &path))
-            .map_err(|e| {
-                let _ = std::fs::remove_file(&partial);
-                let reason = dipir_pipeline::manifest::plain_reason(&e);
-                anyhow::anyhow!("cannot write {}: {reason}", path.display())
-            })?;
+        dipir_files::replace(&path, self.page()?.as_bytes(), MARK).map_err(|e| {
+            let way_out = match e.kind() {
+                std::io::ErrorKind::AlreadyExists => {
+                    "; move it away or choose another folder with --out"
+                }
+                _ => "",
+            };
+            let reason = dipir_pipeline::manifest::plain_reason(&e);
+            anyhow::anyhow!("cannot write {}: {reason}{way_out}", path.display())
+        })?;
         Ok(path)
     }
 
@@ -85,6 +90,14 @@ impl Report<'_> {
             Some(Html::all(head.into_iter().chain([content])))
         });
         let head = [
+            Html::element(
+                "meta",
+                &[
+                    ("name", "generator"),
+                    ("content", concat!("dipir ", env!("CARGO_PKG_VERSION"))),
+                ],
+                [],
+            ),
             Html::element("meta", &[("charset", "utf-8")], []),
             Html::element(
                 "meta",
@@ -145,7 +158,7 @@ const KEY: &str = "dipir-made-of";
 
 /// Whether the page that is there shows the artifacts that are there.
 pub fn is_current(session: &Session) -> bool {
-    let page = std::fs::read_to_string(session.out.join(FILE));
+    let page = dipir_files::read_to_string(session.out.join(FILE));
     match (page, key(session)) {
         (Ok(page), Ok(key)) => page.contains(&format!("name=\"{KEY}\" content=\"{key}\"")),
         _ => false,

@@ -15,6 +15,8 @@ use super::container::{self, Resolver};
 use super::document::{self, Document, raw_extension};
 use crate::error::Error;
 use crate::material::{AlphaMode, Clearcoat, Material, TextureRef, Transmission};
+
+mod extensions;
 use crate::texture::{Encoding, Filter, ImageSource, Texture, Wrap};
 
 const EXPORT: &str = "export the file again";
@@ -82,7 +84,7 @@ impl<'a> MaterialReader<'a> {
             .iter()
             .flat_map(|e| e.others.keys())
             .map(String::as_str)
-            .filter(|name| *name != CLEARCOAT)
+            .filter(|name| *name != CLEARCOAT && !extensions::READ.contains(name))
             .collect();
         unread.sort_unstable();
         if !unread.is_empty() {
@@ -126,6 +128,7 @@ impl<'a> MaterialReader<'a> {
         if let Some(coat) = raw_extension(&extensions.others, CLEARCOAT, &at)? {
             material.clearcoat = self.clearcoat(&coat, &at)?;
         }
+        material.extensions = self.extensions(&extensions.others, &at)?;
         if let Some(transmission) = &extensions.transmission {
             let factor = transmission.transmission_factor.0;
             let factor = self.factor(factor, 1.0, 0.0, &at, "transmissionFactor");

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use dipir_cli::session::{Session, duration};
 use dipir_imaging::composite::composite;
-use dipir_imaging::file::write_png;
+use dipir_imaging::file::write_picture;
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
@@ -111,10 +111,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let Course { rendered, .. } = course;
     let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light))?;
     let png = writer.output("picture", "composite.png")?;
-    write_png(
-        png,
-        &inputs.scene.loaded.photo.transfer.encode(&layers.beauty),
-    )?;
+    write_picture(png, &layers.beauty, &inputs.scene.loaded.photo)?;
     let exr = writer.output("layers", "composite.exr")?;
     layers.to_layers(&inputs.gbuffer)?.write_exr(exr)?;
     writer.set_estimated_error(rendered.error.upper_95);
@@ -268,17 +265,20 @@ struct Composite<'a> {
     alpha: Raster<f32>,
     shadow: LinearImage,
     beauty: LinearImage,
+    /// How the object's and the shadow's colours are stored.
+    precision: [Precision; 2],
 }
 
 impl<'a> Composite<'a> {
     fn new(inputs: &'a Inputs, film: Film, curve: &Curve) -> anyhow::Result<Self> {
         let background = &inputs.scene.loaded.photo.image;
         let (object, shadow) = curve.apply(film.object, &film.alpha, film.shadow);
-        // Stored in half precision: rounded before they are put together, so that whoever does it
-        // again from the file gets the same picture.
-        let object = LinearImage(object.map(|v| half_vec(*v)));
-        let alpha = film.alpha.map(|a| half::f16::from_f32(*a).to_f32());
-        let shadow = LinearImage(shadow.map(|v| half_vec(*v)));
+        // Rounded to what the file stores before they are put together, so that whoever does it
+        // again from the file gets the same picture. Light beyond half precision is stored in full.
+        let precision = [Precision::of_colour(&object), Precision::of_colour(&shadow)];
+        let object = LinearImage(object.map(|v| precision[0].round_colour(*v)));
+        let alpha = film.alpha.map(|a| Precision::Half.round(*a));
+        let shadow = LinearImage(shadow.map(|v| precision[1].round_colour(*v)));
         let beauty = composite(background, &object, &alpha, &shadow)?;
         Ok(Self {
             background,
@@ -286,18 +286,20 @@ impl<'a> Composite<'a> {
             alpha,
             shadow,
             beauty,
+            precision,
         })
     }
 
     fn to_layers(&self, gbuffer: &Layers) -> anyhow::Result<Layers> {
         let (width, height) = (self.alpha.width(), self.alpha.height());
         let mut layers = Layers::new(width, height);
-        layers.insert_rgb("", Precision::Half, &self.beauty.0)?;
+        let of = |image: &LinearImage| Precision::of_colour(&image.0);
+        layers.insert_rgb("", of(&self.beauty), &self.beauty.0)?;
         layers.insert("A", Precision::Half, Raster::filled(width, height, 1.0))?;
-        layers.insert_rgb("object", Precision::Half, &self.object.0)?;
+        layers.insert_rgb("object", self.precision[0], &self.object.0)?;
         layers.insert("object.A", Precision::Half, self.alpha.clone())?;
-        layers.insert_rgb("shadow", Precision::Half, &self.shadow.0)?;
-        layers.insert_rgb("background", Precision::Half, &self.background.0)?;
+        layers.insert_rgb("shadow", self.precision[1], &self.shadow.0)?;
+        layers.insert_rgb("background", of(self.background), &self.background.0)?;
         layers.insert(
             "depth.Z",
             Precision::Full,
@@ -307,11 +309,6 @@ impl<'a> Composite<'a> {
         layers.insert_rgb("albedo", Precision::Half, &gbuffer.rgb("albedo")?)?;
         Ok(layers)
     }
-}
-
-fn half_vec(v: Vec3) -> Vec3 {
-    let half = |x: f32| half::f16::from_f32(x).to_f32();
-    Vec3::new(half(v.x), half(v.y), half(v.z))
 }
 
 /// What is done to the light of the object and to the shadow before they are laid over the

@@ -18,7 +18,10 @@ use dipir_diffusion::sampler::Solver;
 use dipir_diffusion::weights::write_safetensors;
 use dipir_imaging::file::write_png;
 use dipir_pipeline::error::StageError;
+use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::{Manifest, hash_file};
+use dipir_pipeline::mark::Kind;
+use dipir_pipeline::resume::Resume;
 use dipir_pipeline::stage::StagePlan;
 use dipir_scene::config::SceneConfig;
 use serde_json::{Value, json};
@@ -27,6 +30,15 @@ use crate::model::{self, ModelTable};
 use crate::names::CONCEPTS;
 use folder::{ConceptEntry, ConceptList, read_latents};
 use table::ConceptsTable;
+
+/// The files of an image in the cache, and the names under which they are written.
+const CACHED: [&str; 5] = [
+    "#.png",
+    "#.safetensors",
+    "#.blake3",
+    "#.partial",
+    "#.partial.png",
+];
 
 /// What the stage did.
 pub struct Done {
@@ -91,10 +103,10 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         let concept = concept(&list.class, index, session.pipeline.seed);
         let stem = format!("{index:04}");
         let (png, tensor) = (
-            cache.join(format!("{stem}.png")),
-            cache.join(format!("{stem}.safetensors")),
+            cache.file(format!("{stem}.png")),
+            cache.file(format!("{stem}.safetensors")),
         );
-        let seal = cache.join(format!("{stem}.blake3"));
+        let seal = cache.file(format!("{stem}.blake3"));
         if !is_whole(&seal, &png, &tensor) {
             let settings = GenerateSettings {
                 solver: Solver::DpmSolver2M,
@@ -142,20 +154,24 @@ fn cache_folder(
     table: &ConceptsTable,
     plan: &StagePlan,
     class: &str,
-) -> anyhow::Result<PathBuf> {
+) -> anyhow::Result<Resume> {
     let root = match &table.cache {
         Some(path) => session.resolve(path),
         None => session.out.join("concepts-cache"),
     };
-    let setting = json!({
-        "version": CONCEPTS.version, "class": class, "steps": table.steps, "guidance": table.guidance, "size": table.size,
-        "seed": plan.seed, "device": plan.device, "precision": plan.params["precision"],
-        "model": plan.inputs.iter().map(|i| &i.blake3).collect::<Vec<_>>(),
+    // How many images there are does not show in any of them.
+    let params = json!({
+        "class": class, "steps": table.steps, "guidance": table.guidance, "size": table.size,
+        "precision": plan.params["precision"],
     });
-    let key = blake3::hash(setting.to_string().as_bytes()).to_hex();
-    let folder = root.join(&key.as_str()[..16]);
-    model::create_folder(&folder)?;
-    Ok(folder)
+    let fingerprint = Fingerprint::of_plan(plan).params(params).finish();
+    Ok(Resume::open(
+        &root,
+        Kind::Cache,
+        CONCEPTS.name,
+        &fingerprint,
+        &CACHED,
+    )?)
 }
 
 /// Whether both files of an image are there with the hashes that were noted when they were made.

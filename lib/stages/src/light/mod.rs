@@ -102,7 +102,7 @@ impl Model {
             .then(|| lora::folder::read(session, &mut loaded))
             .transpose()?;
         if reading.is_some() {
-            dipir_prior::student::add_placeholders(&mut loaded.tokenizer);
+            dipir_prior::text_conditioning::add_placeholders(&mut loaded.tokenizer);
         }
         Ok(Some(Self { loaded, adapter }))
     }

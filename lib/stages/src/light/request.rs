@@ -8,7 +8,7 @@ use dipir_imaging::file::read_photo;
 use dipir_imaging::raster::DisplayImage;
 use dipir_optimize::lighting::Lighting;
 use dipir_optimize::settings::{GuidanceKind, LearningRates, LightTable, Settings, Start};
-use dipir_prior::reader::ReaderSettings;
+use dipir_prior::inversion::InversionSettings;
 use dipir_scene::config::SceneConfig;
 use serde_json::{Value, json};
 
@@ -31,7 +31,7 @@ pub(crate) enum Guide {
         settings: DistillationSettings,
         class: String,
         /// How light is read off the photograph, if it is.
-        reading: Option<ReaderSettings>,
+        reading: Option<InversionSettings>,
     },
 }
 
@@ -90,7 +90,7 @@ impl Request {
 }
 
 /// How light is read, as far as it decides.
-fn reading_param(reading: &Option<ReaderSettings>) -> Value {
+fn reading_param(reading: &Option<InversionSettings>) -> Value {
     match reading {
         Some(settings) if settings.draws == 0 => json!("encoder"),
         other => json!(other.is_some()),
@@ -117,7 +117,7 @@ fn model_guide(session: &Session, table: &LightTable) -> anyhow::Result<Guide> {
     let scene: SceneConfig = session.config.table("scene")?;
     let knows_light = model.knows_light(session);
     let reading = match &table.start {
-        Start::Auto => knows_light.then(ReaderSettings::default),
+        Start::Auto => knows_light.then(InversionSettings::default),
         Start::Neutral | Start::File(_) => None,
         Start::Read | Start::Encoder if !knows_light => {
             let message = format!(
@@ -129,10 +129,10 @@ fn model_guide(session: &Session, table: &LightTable) -> anyhow::Result<Guide> {
             );
             return Err(session.config.invalid("light.start", message).into());
         }
-        Start::Read => Some(ReaderSettings::default()),
-        Start::Encoder => Some(ReaderSettings {
+        Start::Read => Some(InversionSettings::default()),
+        Start::Encoder => Some(InversionSettings {
             draws: 0,
-            ..ReaderSettings::default()
+            ..InversionSettings::default()
         }),
     };
     let settings = DistillationSettings::new(table, reading.is_some()).map_err(|e| {

@@ -19,6 +19,7 @@ use dipir_diffusion::sampler::Solver;
 use dipir_diffusion::training::{LoraTrainer, StepReport};
 use dipir_imaging::file::{read_photo, write_png};
 use dipir_imaging::transfer::Transfer;
+use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
 use dipir_scene::config::SceneConfig;
@@ -110,16 +111,10 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         .find(|i| i.path.to_string_lossy().contains("unet/diffusion"))
         .map(|i| i.blake3.clone());
     let folder = LORA.folder(session);
-    let decides = json!([
-        plan.version,
-        plan.seed,
-        plan.device,
-        plan.inputs,
-        table.without_steps(),
-        transfer,
-        model_table.precision
-    ]);
-    let fingerprint = blake3::hash(decides.to_string().as_bytes());
+    let decides = json!({
+        "lora": table.without_steps(), "transfer": transfer, "precision": model_table.precision,
+    });
+    let fingerprint = Fingerprint::of_plan(&plan).params(decides).finish();
     let mut writer = session.begin(plan)?;
 
     let mut model = model::load(session, &model_table)?;
@@ -148,7 +143,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         table.training(session.pipeline.seed),
         start.as_ref(),
     )?;
-    let resume = Resume::open(session, fingerprint.to_hex().as_str())?;
+    let resume = Resume::open(session, &fingerprint)?;
     let mut history = resume.restore(session, &mut trainer, table.steps);
     let resumed_at = trainer.steps();
     if resumed_at > 0 {

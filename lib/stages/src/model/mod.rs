@@ -9,6 +9,7 @@ use candle_core::{DType, Device};
 use dipir_cli::exit::Usage;
 use dipir_cli::session::Session;
 use dipir_diffusion::model::Model;
+use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::stage::StagePlan;
 use dipir_prior::encoder;
 use serde::{Deserialize, Serialize};
@@ -164,14 +165,6 @@ pub fn digest(folder: Option<&Path>) -> anyhow::Result<String> {
         Some(folder) => files(Path::new(""), folder, &mut plan)?,
         None => embedded::inputs(&mut plan),
     }
-    let mut hasher = blake3::Hasher::new();
-    for input in &plan.inputs {
-        hasher.update(input.blake3.as_bytes());
-    }
-    Ok(hasher.finalize().to_hex().to_string())
-}
-
-/// Creates a folder and its parents.
-pub fn create_folder(path: &Path) -> anyhow::Result<()> {
-    std::fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))
+    let fingerprint = Fingerprint::of("model").inputs(&plan.inputs).finish();
+    Ok(fingerprint.as_str().to_owned())
 }

@@ -1,0 +1,375 @@
+//! Properties of estimates that hold for any weights.
+use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::gaussian::SgMixture;
+use dipir_light::luminance::luminance;
+use dipir_scene::camera::{Camera, FieldOfView};
+use glam::{DVec3, Vec3};
+
+use crate::features::{FEATURES, Glance};
+use crate::grid::{BINS, bin_direction, heading};
+use crate::network::{HISTOGRAM, Network, OUTPUTS};
+use crate::posterior::{PeakPosterior, direction_deg, words};
+use crate::{Calibration, Estimator, LightEstimate, Visible, combine, merged};
+
+fn estimator() -> Estimator {
+    let wave = |n: usize, scale: f32| {
+        (0..n)
+            .map(|k| scale * (0.37 * (k * k % 1013) as f32).sin())
+            .collect::<Vec<_>>()
+    };
+    let hidden = 8;
+    let mut bias = wave(OUTPUTS, 0.5);
+    bias[HISTOGRAM + 40] += 3.0;
+    let network = Network {
+        hidden,
+        mean: vec![0.0; FEATURES],
+        deviation: vec![1.0; FEATURES],
+        first: [wave(FEATURES * hidden, 0.1), vec![0.1; hidden]],
+        second: [wave(hidden * hidden, 0.3), vec![0.0; hidden]],
+        output: [wave(hidden * OUTPUTS, 0.3), bias],
+    };
+    Estimator::new(vec![network], Calibration::default()).unwrap()
+}
+
+/// A picture that is not its own mirror image.
+fn photo(width: usize, height: usize) -> LinearImage {
+    let pixel = |k: usize| {
+        let (x, y) = (
+            (k % width) as f32 / width as f32,
+            (k / width) as f32 / height as f32,
+        );
+        Vec3::new(0.2 + 0.6 * x, 0.3 + 0.3 * y, 0.5 * (1.0 - y) + 0.2 * x * y)
+    };
+    LinearImage(Raster::from_pixels(
+        width,
+        height,
+        (0..width * height).map(pixel).collect(),
+    ))
+}
+
+fn mirrored(photo: &LinearImage) -> LinearImage {
+    let pixels = (0..photo.0.height()).flat_map(|y| photo.0.row(y).iter().rev().copied());
+    LinearImage(Raster::from_pixels(
+        photo.0.width(),
+        photo.0.height(),
+        pixels.collect(),
+    ))
+}
+
+/// A level camera at eye height that looks to an azimuth, degrees.
+fn camera(azimuth_deg: f32, width: u32, height: u32) -> Camera {
+    let (sin, cos) = azimuth_deg.to_radians().sin_cos();
+    let eye = Vec3::new(0.0, 1.6, 0.0);
+    let ahead = eye + Vec3::new(sin, -0.2, -cos);
+    Camera::look_at(
+        eye,
+        ahead,
+        Vec3::Y,
+        FieldOfView::Vertical(0.8),
+        [width, height],
+    )
+}
+
+fn finite(e: &LightEstimate) -> bool {
+    let map = e.map();
+    let texels = map
+        .texels()
+        .iter()
+        .all(|t| t.is_finite() && t.min_element() >= 0.0);
+    let intervals = [e.exposure_stops, e.share, e.azimuth_deg, e.elevation_deg];
+    texels
+        && intervals
+            .iter()
+            .all(|i| i.low <= i.middle && i.middle <= i.high && i.high.is_finite())
+}
+
+#[test]
+fn a_turned_camera_turns_the_light_with_it() {
+    let (estimator, photo) = (estimator(), photo(60, 40));
+    let here = estimator.estimate(&photo, &camera(0.0, 60, 40));
+    // A quarter turn is 16 whole texels, so that maps agree to the rounding of the camera's rays.
+    let there = estimator.estimate(&photo, &camera(90.0, 60, 40));
+    assert!((there.heading_rad - std::f64::consts::FRAC_PI_2).abs() < 1e-6);
+    let turned = here.map().rotated_y(-std::f64::consts::FRAC_PI_2);
+    for (a, b) in turned.texels().iter().zip(there.map().texels()) {
+        assert!(a.distance(*b) < 1e-3 * (1.0 + a.length()), "{a} {b}");
+    }
+}
+
+#[test]
+fn a_mirrored_photograph_has_mirrored_light() {
+    let (estimator, photo, camera) = (estimator(), photo(64, 64), camera(0.0, 64, 64));
+    let (plain, other) = (
+        estimator.estimate(&photo, &camera).map(),
+        estimator.estimate(&mirrored(&photo), &camera).map(),
+    );
+    let width = plain.width();
+    for (k, a) in plain.texels().iter().enumerate() {
+        let b = other.texel(k / width, width - 1 - k % width);
+        assert!(
+            a.distance(b) < 1e-3 * (1.0 + a.length()),
+            "texel {k}: {a} {b}"
+        );
+    }
+}
+
+#[test]
+fn the_same_photograph_has_the_same_estimate_to_the_bit() {
+    let (estimator, photo, camera) = (estimator(), photo(90, 50), camera(30.0, 90, 50));
+    assert_eq!(
+        estimator.estimate(&photo, &camera),
+        estimator.estimate(&photo, &camera)
+    );
+}
+
+#[test]
+fn extreme_photographs_and_cameras_stay_finite() {
+    let estimator = estimator();
+    let flat = |v: f32, w: usize, h: usize| LinearImage(Raster::filled(w, h, Vec3::splat(v)));
+    for photo in [
+        flat(0.0, 30, 20),
+        flat(1.0, 30, 20),
+        flat(0.4, 1, 1),
+        flat(f32::NAN, 3, 2),
+        flat(f32::INFINITY, 2, 2),
+    ] {
+        let size = [photo.0.width() as u32, photo.0.height() as u32];
+        assert!(finite(
+            &estimator.estimate(&photo, &camera(10.0, size[0], size[1]))
+        ));
+        for to in [Vec3::NEG_Y, Vec3::Y] {
+            let vertical = Camera::look_at(
+                Vec3::ZERO,
+                to,
+                Vec3::NEG_Z,
+                FieldOfView::Vertical(1.0),
+                size,
+            );
+            assert!(finite(&estimator.estimate(&photo, &vertical)));
+        }
+    }
+}
+
+#[test]
+fn looking_down_with_the_head_to_the_north_is_heading_north() {
+    let down = Camera::look_at(
+        Vec3::ZERO,
+        Vec3::NEG_Y,
+        Vec3::NEG_Z,
+        FieldOfView::Vertical(1.0),
+        [8, 8],
+    );
+    assert!(heading(&down).abs() < 1e-6, "{}", heading(&down));
+    let up = Camera::look_at(
+        Vec3::ZERO,
+        Vec3::Y,
+        Vec3::Z,
+        FieldOfView::Vertical(1.0),
+        [8, 8],
+    );
+    assert!(heading(&up).abs() < 1e-6, "{}", heading(&up));
+}
+
+#[test]
+fn lobes_light_surfaces_as_the_map_does() {
+    let estimate = estimator().estimate(&photo(60, 40), &camera(20.0, 60, 40));
+    let (map, lobes) = (estimate.map(), SgMixture::new(estimate.lobes(24)).unwrap());
+    let total = map.integral();
+    // The fit keeps each channel's energy; irradiance blurs what it does not resolve.
+    assert!((lobes.integral() - total).abs().max_element() < 1e-3 * total.max_element());
+    for normal in [Vec3::X, Vec3::Y, Vec3::Z, Vec3::NEG_X, Vec3::NEG_Z] {
+        let truth: DVec3 = (0..map.width() * map.height())
+            .map(|k| {
+                let (i, j) = (k / map.width(), k % map.width());
+                let cos = f64::from(map.direction_of(i, j).dot(normal).max(0.0));
+                map.texel(i, j).as_dvec3() * map.solid_angle(i) * cos
+            })
+            .sum();
+        let off = (lobes.irradiance(normal) - truth).abs().max_element();
+        assert!(
+            off < 0.05 * truth.max_element(),
+            "{normal}: {off} of {truth}"
+        );
+    }
+}
+
+#[test]
+fn a_map_holds_the_energy_of_its_parts() {
+    let estimate = estimator().estimate(&photo(60, 40), &camera(0.0, 60, 40));
+    let peak = (estimate.map().integral() - estimate.base_map().integral()).as_vec3();
+    assert!(
+        peak.distance(Vec3::from(estimate.peak)) < 1e-3 * peak.length(),
+        "{peak}"
+    );
+}
+
+#[test]
+fn intervals_hold_what_they_say() {
+    let sharp = PeakPosterior::normalised((0..BINS).map(|k| f64::from(k == 3 * 24 + 23)).collect());
+    let azimuth = sharp.azimuth_interval(0.8);
+    // Bin 23 spans 345 to 360 degrees: the shortest arc with .8 of it is 12 degrees long.
+    assert!(
+        azimuth.low >= -15.1 && azimuth.high <= 0.1 && azimuth.high - azimuth.low < 13.1,
+        "{azimuth:?}"
+    );
+    let elevation = sharp.elevation_interval(0.8);
+    assert!(
+        elevation.low > 32.0 && elevation.high < 52.0,
+        "{elevation:?}"
+    );
+    let open = PeakPosterior::uniform().azimuth_interval(0.8);
+    assert!((open.high - open.low - 288.0).abs() < 0.1, "{open:?}");
+}
+
+#[test]
+fn an_arc_across_the_back_keeps_its_middle_behind() {
+    let mut weights = vec![0.0; BINS];
+    (weights[24 + 11], weights[24 + 12]) = (1.0, 1.0);
+    let i = PeakPosterior::normalised(weights).azimuth_interval(0.8);
+    assert!(
+        i.middle.abs() > 174.0 && i.low <= i.middle && i.middle <= i.high,
+        "{i:?}"
+    );
+}
+
+#[test]
+fn directions_have_words() {
+    assert_eq!(
+        words(direction_deg(-140.0, 35.0)),
+        "from behind on the left, 35 degrees high"
+    );
+    assert_eq!(
+        words(direction_deg(5.0, -4.0)),
+        "from ahead, 4 degrees below the horizon"
+    );
+    assert_eq!(
+        words(direction_deg(90.0, 10.0)),
+        "from the right, 10 degrees high"
+    );
+    assert_eq!(
+        words(direction_deg(0.0, 80.0)),
+        "from above, 80 degrees high"
+    );
+}
+
+#[test]
+fn candidates_are_far_apart_and_their_probabilities_sum_to_one() {
+    let estimate = estimator().estimate(&photo(60, 40), &camera(0.0, 60, 40));
+    let all = estimate.candidates(8);
+    assert_eq!(all.len(), 8);
+    assert!((all.iter().map(|c| c.probability).sum::<f64>() - 1.0).abs() < 1e-9);
+    let towards: Vec<Vec3> = all.iter().filter_map(|c| c.direction).collect();
+    for (k, a) in towards.iter().enumerate() {
+        for b in &towards[..k] {
+            assert!(a.dot(*b) < 40f32.to_radians().cos() + 1e-3);
+        }
+    }
+    assert!(estimate.candidates(0).is_empty());
+}
+
+#[test]
+fn two_views_of_one_sun_are_surer_than_each() {
+    let mut one = estimator().estimate(&photo(60, 40), &camera(0.0, 60, 40));
+    one.posterior = PeakPosterior::normalised(
+        (0..BINS)
+            .map(|k| f64::from(bin_direction(k).dot(direction_deg(60.0, 30.0)) * 6.0).exp())
+            .collect(),
+    );
+    let mut two = one.clone();
+    // The second camera is turned by 90 degrees to the right: the same sun stands 30 degrees to its left.
+    two.heading_rad = std::f64::consts::FRAC_PI_2;
+    two.posterior = one.posterior.turned(90.0);
+    let both = combine(&[one.clone(), two]).unwrap();
+    let towards = direction_deg(60.0, 30.0);
+    assert!(both.posterior.density(towards) > 1.3 * one.posterior.density(towards));
+    assert!(both.posterior.mode().dot(towards) > 0.98);
+    assert!(combine(&[]).is_err());
+}
+
+#[test]
+fn what_is_seen_is_where_the_camera_looks() {
+    let camera = camera(90.0, 60, 40);
+    let seen = Visible::new(
+        &LinearImage(Raster::filled(60, 40, Vec3::splat(0.5))),
+        &camera,
+        64,
+        32,
+        3.0,
+    );
+    for (k, alpha) in seen.alpha.iter().enumerate() {
+        let direction = seen.map.direction_of(k / 64, k % 64);
+        let inside = camera
+            .project(camera.position + direction)
+            .is_some_and(|p| p.x > 0.0 && p.y > 0.0 && p.x < 60.0 && p.y < 40.0);
+        // Half a texel of 5.6 degrees may cross the border.
+        assert!(
+            *alpha == 0.0 || inside || *alpha < 0.5,
+            "texel {k}: {alpha}"
+        );
+        if *alpha > 0.0 {
+            assert!(seen.map.texels()[k].distance(Vec3::splat(0.5)) < 1e-5);
+        }
+    }
+    assert!(seen.alpha.iter().any(|a| *a > 0.99));
+}
+
+#[test]
+fn a_merged_map_shows_the_photograph_and_keeps_clipped_sources() {
+    let camera = camera(0.0, 60, 40);
+    let bright = EnvironmentMap::constant(64, 32, Vec3::splat(3.0));
+    let grey = LinearImage(Raster::filled(60, 40, Vec3::splat(0.5)));
+    let seen = Visible::new(&grey, &camera, 64, 32, 3.0);
+    let map = merged(&seen, &bright);
+    let best = (0..seen.alpha.len())
+        .max_by(|a, b| seen.alpha[*a].total_cmp(&seen.alpha[*b]))
+        .unwrap();
+    assert!(map.texels()[best].distance(Vec3::splat(0.5)) < 1e-2);
+    // Behind the camera the estimate's own exposure holds.
+    let behind = luminance(map.eval(Vec3::Z));
+    assert!((behind - 3.0).abs() < 0.05, "{behind}");
+    let white = LinearImage(Raster::filled(60, 40, Vec3::ONE));
+    let clipped = merged(&Visible::new(&white, &camera, 64, 32, 3.0), &bright);
+    assert!(luminance(clipped.texels()[best]) > 2.99);
+}
+
+#[test]
+fn features_are_of_the_whole_photograph_at_any_size() {
+    let camera = |n: u32| camera(0.0, n, n);
+    let (small, large) = (
+        Glance::new(&photo(64, 64), &camera(64)),
+        Glance::new(&photo(256, 256), &camera(256)),
+    );
+    let (a, b) = (small.features(), large.features());
+    // The ramps are sampled at pixel corners: they differ by 3/8 of a pixel of the smaller one, under .006.
+    let most = a
+        .iter()
+        .zip(&b)
+        .map(|(a, b)| (a - b).abs())
+        .fold(0.0, f32::max);
+    assert!(a.len() == FEATURES && most < 0.1, "{most}");
+}
+
+#[test]
+fn weights_come_back_from_their_file_and_others_are_refused() {
+    let estimator = estimator();
+    let bytes = estimator.to_bytes().unwrap();
+    assert_eq!(Estimator::from_bytes(&bytes).unwrap(), estimator);
+    let refused = Estimator::from_bytes(&bytes[..bytes.len() / 2])
+        .unwrap_err()
+        .to_string();
+    assert!(refused.contains("dipir-pretrain light"), "{refused}");
+    let missing = Estimator::load("nowhere.safetensors")
+        .unwrap_err()
+        .to_string();
+    assert!(missing.contains("nowhere.safetensors"), "{missing}");
+}
+
+#[test]
+fn the_embedded_estimator_is_bounded_on_any_photograph() {
+    let estimator = Estimator::embedded().unwrap();
+    let estimate = estimator.estimate(&photo(60, 40), &camera(0.0, 60, 40));
+    assert!(finite(&estimate));
+    // A light that is a thousand times the photograph is no answer to a picture of middle greys.
+    assert!(estimate.exposure_stops.middle.abs() < 10.0, "{estimate:?}");
+}

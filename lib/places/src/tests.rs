@@ -1,0 +1,171 @@
+//! Properties of the photographs, and a whole training in small.
+use std::path::Path;
+
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::luminance::luminance;
+use glam::{Vec2, Vec3};
+
+use crate::examples::Example;
+use crate::place::{Place, SMOOTH, folds};
+use crate::probes::{PROBES, Probes};
+use crate::trainer::Training;
+use crate::view::View;
+use crate::{PlacesError, Settings, run};
+
+/// A sky over a ground, with a sun at azimuth 90 degrees, 40 high, and a wall of its own grey.
+fn panorama(grey: f32) -> EnvironmentMap {
+    let sun = dipir_estimator::grid::direction(std::f32::consts::FRAC_PI_2, 0.698);
+    let black = EnvironmentMap::constant(128, 64, Vec3::ZERO);
+    let texel = |k: usize| {
+        let d = black.direction_of(k / 128, k % 128);
+        let sky = if d.y > 0.0 {
+            Vec3::new(0.6, 0.8, 1.0)
+        } else {
+            Vec3::splat(grey)
+        };
+        let lit = sky * (1.0 + 0.3 * d.x);
+        if d.dot(sun) > 0.9985 {
+            lit + Vec3::splat(400.0)
+        } else {
+            lit
+        }
+    };
+    EnvironmentMap::new(128, 64, (0..128 * 64).map(texel).collect()).unwrap()
+}
+
+fn place(name: &str, grey: f32) -> Place {
+    Place::new(name, "outdoor", panorama(grey))
+}
+
+#[test]
+fn a_place_comes_apart_into_smooth_light_and_its_sun() {
+    let p = place("yard", 0.3);
+    let sun = dipir_estimator::grid::direction(std::f32::consts::FRAC_PI_2, 0.698);
+    assert!(p.sun && p.peak.dot(sun) > 0.999, "{} {}", p.share, p.peak);
+    let whole = luminance(p.panorama.integral().as_vec3());
+    let parts = luminance(p.smooth.integral().as_vec3() + p.energy);
+    assert!((whole - parts).abs() < 1e-3 * whole, "{whole} {parts}");
+}
+
+#[test]
+fn the_sun_is_found_relative_to_the_view() {
+    let (p, probes) = (place("yard", 0.3), Probes::default());
+    // Heading by a quarter turn to the right looks at the sun.
+    let e = Example::new(&p, 0, &View::standard(SMOOTH[0] / 4), &probes, 0);
+    assert!(
+        e.truth.peak.x.abs() < 0.03 && e.truth.peak.z < -0.7,
+        "{}",
+        e.truth.peak
+    );
+    let e = Example::new(&p, 0, &View::standard(0), &probes, 0);
+    assert!(e.truth.peak.x > 0.7, "{}", e.truth.peak);
+}
+
+#[test]
+fn probes_hold_the_irradiance_of_the_panorama() {
+    let (p, probes) = (place("yard", 0.3), Probes::default());
+    let e = Example::new(&p, 0, &View::standard(0), &probes, 0);
+    let scale = View::standard(0).take(&p, 0).1 / e.reference;
+    for (k, normal) in probes.normals.iter().enumerate() {
+        let truth: Vec3 = (0..128 * 64)
+            .map(|t| {
+                let (i, j) = (t / 128, t % 128);
+                let cos = p.panorama.direction_of(i, j).dot(*normal).max(0.0);
+                p.panorama.texel(i, j) * cos * p.panorama.solid_angle(i) as f32
+            })
+            .sum::<Vec3>()
+            * scale
+            / std::f32::consts::PI;
+        // The smooth part is kept on texels of 5.6 degrees.
+        let off = (e.truth.all[k] - truth).abs().max_element();
+        assert!(
+            off < 0.02 * truth.max_element() + 0.02,
+            "{normal}: {} {truth}",
+            e.truth.all[k]
+        );
+    }
+    assert_eq!(
+        e.truth.mirrored(&probes).mirrored(&probes).all.len(),
+        PROBES
+    );
+}
+
+#[test]
+fn views_are_drawn_within_their_ranges_and_the_same_again() {
+    for n in 0..200 {
+        let view = View::drawn(3, 5, n);
+        assert_eq!(view, View::drawn(3, 5, n));
+        let pitch = view.pitch.to_degrees();
+        assert!((-40.0..=20.0).contains(&pitch) && view.heading < SMOOTH[0]);
+        assert!(view.half.cmpgt(Vec2::splat(0.05)).all() && view.half.max_element() <= 1.0001);
+        assert!((view.curve.iter().sum::<f32>() - 1.0).abs() < 1e-5);
+    }
+}
+
+#[test]
+fn places_seen_again_are_in_one_fold() {
+    let names = [
+        "quarry_02",
+        "quarry_04",
+        "kloppenheim_01_puresky",
+        "kloppenheim_05",
+        "yard",
+        "hall",
+    ];
+    let places: Vec<Place> = names.iter().map(|n| place(n, 0.2)).collect();
+    let fold = folds(&places, 3);
+    assert!(fold[0] == fold[1] && fold[2] == fold[3]);
+    assert_eq!(fold.iter().max(), Some(&2));
+}
+
+fn settings(folder: &Path, out: &str) -> Settings {
+    let training = Training {
+        hidden: 8,
+        epochs: 1,
+        batch: 8,
+        ..Training::default()
+    };
+    Settings {
+        folds: 2,
+        views: 6,
+        judged: 2,
+        training,
+        ..Settings::new(folder.to_owned(), folder.join(out))
+    }
+}
+
+#[test]
+fn training_gives_the_same_bytes_for_any_number_of_threads_and_leaves_nothing_else() {
+    let folder = tempfile::tempdir().unwrap();
+    for (n, grey) in [0.1, 0.2, 0.4, 0.6].into_iter().enumerate() {
+        let name = ["yard", "hall", "field", "street"][n];
+        panorama(grey)
+            .write(folder.path().join(format!("{name}.exr")))
+            .unwrap();
+    }
+    let whole = settings(folder.path(), "whole.safetensors");
+    let outcome = run(&whole, &|_| true).unwrap();
+    assert_eq!(outcome.places.len(), 4);
+    let first = std::fs::read(&whole.out).unwrap();
+    let one_thread = rayon::ThreadPoolBuilder::new()
+        .num_threads(1)
+        .build()
+        .unwrap();
+    one_thread.install(|| run(&whole, &|_| true)).unwrap();
+    assert_eq!(
+        std::fs::read(&whole.out).unwrap(),
+        first,
+        "any number of threads"
+    );
+    let left: Vec<String> = std::fs::read_dir(folder.path())
+        .unwrap()
+        .filter_map(|e| Some(e.ok()?.file_name().to_string_lossy().into_owned()))
+        .filter(|n| n.contains("fold"))
+        .collect();
+    assert!(left.is_empty(), "{left:?}");
+    let few = Settings { folds: 9, ..whole };
+    assert!(matches!(
+        run(&few, &|_| true),
+        Err(PlacesError::TooFew { found: 4, .. })
+    ));
+}
