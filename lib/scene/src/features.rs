@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use crate::material::{AlphaMode, Material};
 use crate::scene::Scene;
 
-/// What could matter to a render: absent here means it cannot.
+/// What a render may have to simulate. What is false here, no surface has.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SceneFeatures {
     /// Textures other than normal maps.

@@ -3,13 +3,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
 
-/// The `[scene.limits]` table. Every limit is checked before memory is taken; what exceeds one is
-/// refused by an error that names its key.
+/// The `[scene.limits]` table. Every limit is checked before memory is taken. A file that exceeds one
+/// is refused, and the error names the key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Limits {
-    /// Triangles of all objects together, copies counted: a scene needs some 150 bytes for each.
-    /// There may be three times as many vertices.
+    /// Triangles of all objects together, copies counted. Vertices may be three times as many.
     pub triangles: u64,
     /// Copies of meshes (`EXT_mesh_gpu_instancing`) in a file.
     pub instances: u64,
@@ -24,7 +23,7 @@ pub struct Limits {
 }
 
 impl Default for Limits {
-    /// Together some 6 GB.
+    /// Beyond what usual models need.
     fn default() -> Self {
         Self {
             triangles: 20_000_000,

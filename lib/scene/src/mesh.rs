@@ -38,7 +38,7 @@ impl TriangleMesh {
             .map(|&i| self.positions[i as usize])
     }
 
-    /// Whether all positions are finite; if not, the first vertex that is not.
+    /// The first vertex whose position is not finite, if there is one.
     pub fn first_non_finite(&self) -> Option<usize> {
         self.positions.iter().position(|p| !p.is_finite())
     }
@@ -70,14 +70,13 @@ impl TriangleMesh {
     }
 
     /// Adds the triangles of `other`, whose material `i` is this mesh's `i + first_material`.
-    /// Attributes that only one of both has get neutral values in the other; if only one has
-    /// normals, the other's vertices are split and get those of their triangles.
+    /// Where only one mesh has an attribute, the other gets neutral values. Where only one has
+    /// normals, the other's triangles get vertices of their own with geometric normals.
     pub fn append(&mut self, mut other: Self, first_material: u32) {
         for m in &mut other.materials {
             *m += first_material;
         }
         if self.indices.is_empty() {
-            // Keeps what `self` had reserved only where there is something to copy.
             *self = other;
             return;
         }
@@ -103,7 +102,7 @@ impl TriangleMesh {
             .extend(other.indices.iter().map(|t| t.map(|i| i + base)));
     }
 
-    /// Makes room for that many vertices and triangles in the attributes that are in use.
+    /// Reserves memory for so many vertices and triangles in every attribute that is in use.
     pub fn reserve(&mut self, vertices: usize, triangles: usize) {
         fn grow<T>(values: &mut Vec<T>, total: usize) {
             if !values.is_empty() {
@@ -151,8 +150,8 @@ impl TriangleMesh {
         (b - a).cross(c - a)
     }
 
-    /// Replaces normals that are zero or not finite by the area-weighted mean of their triangles'
-    /// and brings the others to unit length. Returns how many were replaced.
+    /// Brings normals to unit length. One that is zero or not finite becomes the area-weighted mean
+    /// of its triangles' normals. Returns how many these were.
     pub fn repair_normals(&mut self) -> usize {
         let mut broken = 0;
         for n in &mut self.normals {
@@ -181,9 +180,9 @@ impl TriangleMesh {
     }
 }
 
-/// The map of normals that belongs to a linear map of points, up to a positive factor. Cofactors
-/// instead of the inverse transpose: the same direction, but defined for maps that flatten; the sign
-/// keeps normals on the outside of mirrored objects.
+/// How normals change under a linear map of points, up to a positive factor. The matrix of
+/// cofactors has the direction of the inverse transpose, but exists for maps that flatten, too. Its
+/// sign keeps normals on the outside of mirrored objects.
 pub fn normal_matrix(linear: &DMat3) -> DMat3 {
     let [x, y, z] = [linear.x_axis, linear.y_axis, linear.z_axis];
     let sign = if linear.determinant() < 0.0 {

@@ -1,8 +1,8 @@
 //! Where an object stands: its lowest point rests on the proxy.
 //!
-//! Up is the normal of a proxy plane and +y otherwise. The object is turned by roll (z), pitch (x)
-//! and yaw (y), in this order, stood upright, scaled, and moved until its anchor lies over the
-//! contact point and its lowest point at it. All of it in double precision.
+//! Up is the normal of a proxy plane, else +y. The object is turned by roll (about z), pitch (x) and
+//! yaw (y), in this order; scaled; tilted so that its y points up; and moved so that its anchor lies
+//! above the contact point and its lowest point at the same height. This is computed in double precision.
 use glam::{DMat3, DMat4, DQuat, DVec3, Vec3, swizzles::Vec3Swizzles};
 use serde::{Deserialize, Serialize};
 
@@ -61,9 +61,9 @@ pub struct Placement {
 }
 
 impl Placement {
-    /// The map from the coordinates of `mesh`, whose zero lies at `origin` in its file, to the
-    /// world. `key` names the object's table in messages; a warning is returned if the object
-    /// hovers over a plane or reaches below it.
+    /// The map from the coordinates of `mesh` to the world. The mesh's (0, 0, 0) lies at `origin` in
+    /// the file; `key` names the object's table in messages. Returns a warning if the object hovers
+    /// over a plane or reaches below it.
     pub fn resolve(
         &self,
         mesh: &TriangleMesh,

@@ -1,4 +1,4 @@
-//! Everything that a renderer needs of a scene, but the light.
+//! Everything of a scene that a renderer needs, except the light.
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
@@ -42,7 +42,7 @@ pub struct Scene {
 pub struct Input {
     /// What it is: `background`, `object`, …
     pub role: String,
-    /// As written, relative to the folder of the pipeline file where it can be.
+    /// As written: relative to the folder of the pipeline file, or absolute.
     pub path: PathBuf,
     /// Where it was found.
     pub location: PathBuf,
@@ -218,7 +218,7 @@ impl SceneDescription {
     }
 }
 
-/// Says how many objects stand where one of the same file stands already.
+/// A warning if objects of the same file stand at the same place.
 fn repeated(objects: &[ObjectRecord]) -> Option<String> {
     let mut seen = HashSet::new();
     for object in objects {
@@ -386,8 +386,8 @@ impl<'a> Files<'a> {
     }
 }
 
-/// Objects put together into one mesh; a file that several objects use is read once and its
-/// materials are shared.
+/// Puts objects together into one mesh. A file that several objects use is read once, and they share
+/// its materials.
 struct Assembly {
     camera: Camera,
     mesh: TriangleMesh,

@@ -113,8 +113,7 @@ impl ImageSource {
         }
     }
 
-    /// The number of pixels that the header tells of; `None` if it cannot be read, of which decoding
-    /// will say more.
+    /// The number of pixels by the header; `None` if it cannot be read. Decoding will say why.
     fn pixels(&self) -> Result<Option<u64>, Error> {
         let size = match self {
             Self::File(path) => {
@@ -288,8 +287,8 @@ impl DecodedTexture {
     }
 }
 
-/// Brings a coordinate into the first period (or near the edge), so that the product with the
-/// image's size keeps its digits and fits an integer whatever the coordinate.
+/// Brings a coordinate into the first period, or near the edge: its product with the image's size
+/// then fits an integer and keeps its digits.
 fn reduce(u: f32, wrap: Wrap) -> f32 {
     match wrap {
         Wrap::Repeat => u - u.floor(),

@@ -3,8 +3,8 @@ use crate::camera::Camera;
 use crate::material::{AlphaMode, Material};
 use crate::mesh::TriangleMesh;
 
-/// What hides the whole of `mesh`, which is placed and whose material `i` is `materials[i]`, or
-/// some of its materials; one sentence each. Whether it lies in the picture is not looked at.
+/// Says why nothing of the placed `mesh` can be seen, or which of its `materials` cannot; one sentence
+/// each. Whether the mesh lies in the picture is not checked.
 pub fn hidden(mesh: &TriangleMesh, materials: &[Material], camera: &Camera) -> Vec<String> {
     let nothing = |why: String| vec![format!("nothing of it can be seen: {why}")];
     if let Some(why) = without_extent(mesh, camera) {

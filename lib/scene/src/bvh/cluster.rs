@@ -20,10 +20,10 @@ const RADIUS: usize = 14;
 /// ones are good enough.
 const NEAR_ROUNDS: usize = 3;
 
-/// A round that would merge fewer pairs than one for this many boxes is stalled.
+/// A round is stalled if it would merge less than one pair for so many boxes.
 const STALLED: usize = 16;
 
-/// With so few boxes left a stalled round costs nothing.
+/// With so few boxes left, a stalled round costs next to nothing.
 const FEW: usize = 64;
 
 /// The triangles along a Morton curve; of those that `compare` calls equal only the first.
@@ -54,8 +54,7 @@ pub fn order(triangles: &[[Vec3; 3]], compare: impl Fn(u32, u32) -> Ordering + S
     order
 }
 
-/// The hierarchy over the boxes of `order`'s triangles, whose leaves hold a triangle each, and how
-/// many rounds it took.
+/// Builds the hierarchy over the triangles in `order`, one a leaf; also returns the number of rounds.
 pub fn cluster(triangles: &[[Vec3; 3]], order: &[u32]) -> (Bvh2, usize) {
     let mut current: Vec<Bvh2Node> = order
         .iter()

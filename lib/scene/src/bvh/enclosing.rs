@@ -66,7 +66,7 @@ pub fn enclosing_sphere(points: impl Iterator<Item = Vec3> + Clone) -> Option<Sp
     Some(Sphere { center, radius })
 }
 
-/// Moves `center` to about that of the smallest ball around `points`; returns the radius there.
+/// Moves `center` close to the centre of the smallest ball around `points`; returns the radius.
 fn approach_center(center: &mut DVec3, points: &[DVec3]) -> f64 {
     const STEPS: usize = 256;
     for step in 0..STEPS {

@@ -91,7 +91,13 @@ fn reference(text: &str) -> Vec<[Corner; 3]> {
         };
         for t in 0..mesh.indices.len() / 3 {
             let at = [3 * t, 3 * t + 1, 3 * t + 2];
-            let keys = at.map(|k| (mesh.indices[k], mesh.normal_indices.get(k)));
+            // Indices without normals mean nothing.
+            let normal = |k: usize| {
+                mesh.normal_indices
+                    .get(k)
+                    .filter(|_| !mesh.normals.is_empty())
+            };
+            let keys = at.map(|k| (mesh.indices[k], normal(k)));
             if keys[0] != keys[1] && keys[1] != keys[2] && keys[2] != keys[0] {
                 all.push(keys.map(|(p, n)| {
                     (
