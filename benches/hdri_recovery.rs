@@ -1,38 +1,37 @@
-//! The light of panoramas, recovered from a picture through the executables, for
-//! `docs/recovery.md`.
+//! The light of panoramas, recovered from a picture through the executables, for `docs/recovery.md`.
 //!
-//! Of every panorama a photograph is cut out, three objects are put into it under the panorama
-//! itself, and `dipir-light` gets to see the composite alone. A sum of lobes cannot be a panorama,
-//! so the same is done under lobes that were fitted to it: a truth that can be found.
+//! Of every panorama a photograph is cut out, three objects are put into it under the panorama itself, and
+//! `dipir-light` sees the composite alone. The same is done under lobes that were fitted to the
+//! panorama, because a sum of lobes can be found and a panorama cannot.
 //!
-//! Paths between the folds of a metal knot keep noise in a composite that more paths hardly take out, so
-//! truth and result are each rendered twice to be compared: the product of two differences that share
-//! no random number has the light's error for its mean, and no noise. The truth that the optimiser saw
-//! is a third render, for its light fits that one's noise a little.
+//! Truth and result are each rendered twice, with other seeds. The product of the two differences has
+//! the light's error for its mean, and no noise. The truth that the optimiser sees is a third render.
 //!
 //! Run with `cargo test --bench hdri_recovery -- --bench MAP... [yaw=DEG] [iterations=N] [samples=N]
-//! [columns=N]`, maps as HDR or EXR. Without `--bench`, as tests run it, one object under a small generated map proves that
-//! it works.
+//! [columns=N]`, maps as HDR or EXR. Without `--bench`, as tests run it, one object under a small generated
+//! map proves that it works.
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
+use dipir_evaluation::scores::compare_lights;
+use dipir_imaging::file::write_png;
 use dipir_imaging::layers::Layers;
+use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::fit::fit;
 use dipir_light::rasterize::rasterize;
-use dipir_optimize::lighting::Lighting;
 use dipir_render::shapes::torus_knot;
 use dipir_scene::export::to_obj;
+use dipir_stages::scene::background::{View, automatic_exposure_ev};
 use glam::Vec3;
 use serde_json::Value;
 
 /// Lobes that are fitted to a panorama: as many as the optimiser has.
 const LOBES: usize = 32;
-/// Columns and rows on which the direction of most light is looked for: 2.8 degrees, so that a
-/// texel of a lamp does not outshine a sun behind clouds.
-const PEAK_GRID: [usize; 2] = [128, 64];
+/// Vertical field of view of the photographs, degrees.
+const FOV_DEG: f32 = 40.0;
 
 /// Name, and the material as an MTL file has it.
 const OBJECTS: [(&str, &str); 3] = [
@@ -42,9 +41,9 @@ const OBJECTS: [(&str, &str); 3] = [
 ];
 
 struct Knobs {
-    yaw_deg: f64,
+    yaw_deg: f32,
     iterations: u32,
-    size: &'static str,
+    size: [usize; 2],
     target_error: f64,
     /// Further lines of `[light]`.
     more: String,
@@ -67,7 +66,7 @@ fn main() {
         let knobs = Knobs {
             yaw_deg: 0.0,
             iterations: 20,
-            size: "36x24",
+            size: [36, 24],
             target_error: 0.02,
             more: "environment = [32, 16]\nlobes = 8\nsamples = 8\n".into(),
         };
@@ -81,9 +80,9 @@ fn main() {
         more += &format!("environment = [{columns}, {}]\n", columns / 2.0);
     }
     let knobs = Knobs {
-        yaw_deg: value("yaw").unwrap_or(0.0),
+        yaw_deg: value("yaw").unwrap_or(0.0) as f32,
         iterations: value("iterations").unwrap_or(600.0) as u32,
-        size: "192x128",
+        size: [192, 128],
         target_error: 0.002,
         more,
     };
@@ -125,7 +124,7 @@ fn run(executable: &str, folder: &Path, arguments: &[&str]) -> Value {
 }
 
 const SCENE: &str = env!("CARGO_BIN_EXE_dipir-scene");
-const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-light");
+const LIGHT: &str = env!("CARGO_BIN_EXE_dipir-light");
 const COMPOSITE: &str = env!("CARGO_BIN_EXE_dipir-composite");
 
 /// A row of the table for every truth and object.
@@ -137,45 +136,40 @@ fn recover_all(name: &str, map: &EnvironmentMap, objects: &[(&str, &str)], knobs
     let lobes = fit(map, LOBES).lobes;
     let fitted = rasterize(&lobes, map.width().max(512), map.height().max(256));
     fitted.write(folder.join("lobes.exr")).expect("writes");
-    let yaw = knobs.yaw_deg.to_string();
-    let cut = [
-        "background",
-        "--from",
-        "map.exr",
-        "--fov",
-        "40",
-        "--pitch",
-        "-14",
-        "--yaw",
-        &yaw,
-        "--size",
-        knobs.size,
-        "photo.png",
-    ];
-    let photo = run(SCENE, folder, &cut);
-    fs::write(folder.join("knot.obj"), knot()).expect("writes");
+    let view = View {
+        fov_rad: FOV_DEG.to_radians(),
+        yaw_rad: knobs.yaw_deg.to_radians(),
+        pitch_rad: -14f32.to_radians(),
+        roll_rad: 0.0,
+        width: knobs.size[0],
+        height: knobs.size[1],
+    };
+    let photo = view.take(map);
+    let exposure_ev = automatic_exposure_ev(&photo);
+    let exposed = LinearImage(photo.0.map(|p| *p * exposure_ev.exp2()));
+    write_png(folder.join("photo.png"), &Transfer::Srgb.encode(&exposed)).expect("writes");
+    let knot = torus_knot(Vec3::Y * 0.75, 0.45, 0.17, 256, 24);
+    fs::write(folder.join("knot.obj"), to_obj(&knot, "knot")).expect("writes");
     for truth in ["map", "lobes"] {
         for (object, material) in objects {
             let mtl = format!("newmtl m0\n{material}\n");
             fs::write(folder.join("knot.mtl"), mtl).expect("writes");
-            let row = recover(folder, truth, &photo, knobs);
+            let row = recover(folder, truth, &view, exposure_ev, knobs);
             println!("| {name} | {truth} | {object} | {row} |");
         }
     }
 }
 
 /// One recovery; the numbers of its row.
-fn recover(folder: &Path, truth: &str, photo: &Value, knobs: &Knobs) -> String {
-    let number = |v: &Value| v.as_f64().expect("a number");
-    let forward = [0, 1, 2].map(|k| number(&photo["forward"][k]));
-    let exposure = number(&photo["exposure_ev"]);
+fn recover(folder: &Path, truth: &str, view: &View, exposure_ev: f32, knobs: &Knobs) -> String {
+    let forward = -view.rotation().z_axis;
     // Four metres in front of the object, wherever the camera looks.
-    let across = forward[0].hypot(forward[2]);
-    let stand = [-4.2 * forward[0] / across, 1.75, -4.2 * forward[2] / across];
-    let look_at = [0, 1, 2].map(|k| stand[k] + forward[k]);
+    let across = forward.x.hypot(forward.z);
+    let position = [-4.2 * forward.x / across, 1.75, -4.2 * forward.z / across];
+    let look_at = (Vec3::from_array(position) + forward).to_array();
     let pipeline = format!(
         "[scene]\nbackground = \"photo.png\"\nclass = \"knot\"\n[[scene.objects]]\npath = \"knot.obj\"\n\
-         [scene.camera]\nposition = {stand:?}\nlook_at = {look_at:?}\nfov_deg = 40.0\n\
+         [scene.camera]\nposition = {position:?}\nlook_at = {look_at:?}\nfov_deg = {FOV_DEG:?}\n\
          [scene.proxy]\nplane = {{ point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }}\n\
          [light]\nguidance = \"reference\"\nreference = \"truth/composite/composite.exr\"\n\
          iterations = {}\npreview_every = 0\n{}[composite]\ntarget_error = {}\n",
@@ -183,7 +177,7 @@ fn recover(folder: &Path, truth: &str, photo: &Value, knobs: &Knobs) -> String {
     );
     fs::write(folder.join("pipeline.toml"), pipeline).expect("writes");
     let environment = format!("composite.environment=\"{truth}.exr\"");
-    let exposed = format!("composite.exposure_ev={exposure}");
+    let exposed = format!("composite.exposure_ev={exposure_ev}");
     let lit = [
         "-o",
         "truth",
@@ -209,19 +203,17 @@ fn recover(folder: &Path, truth: &str, photo: &Value, knobs: &Knobs) -> String {
     // The one that the optimiser sees.
     render(&lit, 0, fine);
     run(SCENE, folder, &[]);
-    let optimized = run(OPTIMIZE, folder, &[]);
+    let optimized = run(LIGHT, folder, &[]);
     let found = [3, 1].map(|seed| render(&[], seed, 2.0 * fine));
     let [touched, all] = apart(&truths, &found);
 
+    let number = |v: &Value| v.as_f64().expect("a number");
     let map = EnvironmentMap::read(folder.join(format!("{truth}.exr"))).expect("reads");
-    let [columns, rows] = PEAK_GRID;
-    let (peak, _) = map.resampled(columns, rows).peak();
-    let light = Lighting::read(&folder.join("out/light/lighting.json")).expect("reads");
-    let direction = light.map(columns, rows).peak().0;
-    let half = 0.5 * f64::from(direction.distance(peak));
+    let light = EnvironmentMap::read(folder.join("out/light/environment.exr")).expect("reads");
+    let peak_deg = compare_lights(&light, &map).peak_deg;
     format!(
         "{:.2} | {:.4} | {:.4} | {:.4} | {:.4} | {:.1}",
-        (2.0 * half.min(1.0).asin()).to_degrees(),
+        peak_deg.unwrap_or(f64::NAN),
         touched.free,
         touched.noisy,
         all.free,
@@ -268,9 +260,4 @@ fn apart(truths: &[Layers; 2], found: &[Layers; 2]) -> [Apart; 2] {
         over(&|k| alpha.pixels()[k] > 0.0 || shadow.pixels()[k].min_element() < 0.999),
         over(&|_| true),
     ]
-}
-
-/// A torus knot that stands on y = 0, as an OBJ file.
-fn knot() -> String {
-    to_obj(&torus_knot(Vec3::Y * 0.75, 0.45, 0.17, 256, 24), "knot")
 }

@@ -1,36 +1,123 @@
 //! `dipir-evaluate`: how good the light of a method is, where the truth is known.
-mod bench;
-mod cli;
-mod generated;
-mod lights;
-mod make;
-mod methods;
-mod page;
-mod report;
-mod run;
-mod study;
-
 use std::process::ExitCode;
 
 use clap::Parser;
-use cli::{Cli, Command, MethodsArgs, StudyCommand};
-use dipir_cli::exit;
+use dipir_benchmark::command_line::{
+    Cli, Command, MakeArgs, MethodsArgs, ReportArgs, RunArgs, SpheresArgs, StudyCommand,
+    StudyCountArgs, StudyPageArgs,
+};
+use dipir_benchmark::folder::EvaluationFolder;
+use dipir_benchmark::methods::{self, Method};
+use dipir_benchmark::run::Step;
+use dipir_benchmark::{make, report, run, spheres, study};
+use dipir_cli::exit::{self, describe};
+use dipir_cli::progress::Progress;
 use serde_json::json;
 
 fn main() -> ExitCode {
     exit::run(|| match Cli::parse().command {
-        Command::Make(args) => make::run(&args),
-        Command::Run(args) => run::run(&args),
-        Command::Report(args) => report::run(&args),
-        Command::Study(StudyCommand::Page(args)) => study::page(&args),
-        Command::Study(StudyCommand::Count(args)) => study::count(&args),
-        Command::Methods(args) => list(&args),
+        Command::Make(args) => make_scenes(&args),
+        Command::Run(args) => run_methods(&args),
+        Command::Report(args) => write_report(&args),
+        Command::Study(StudyCommand::Page(args)) => write_study(&args),
+        Command::Study(StudyCommand::Count(args)) => count_answers(&args),
+        Command::Methods(args) => list_methods(&args),
+        Command::Spheres(args) => compare_spheres(&args),
     })
 }
 
-fn list(args: &MethodsArgs) -> anyhow::Result<()> {
+fn make_scenes(args: &MakeArgs) -> anyhow::Result<()> {
+    let progress = Progress::new("make", args.folder.output.quiet);
+    let made = make::make(args, &|share| progress.set(share))?;
+    progress.done();
+    let evaluation = EvaluationFolder::new(&args.folder.out);
+    let scenes = evaluation.root().join("scenes");
+    args.folder.output.result(
+        || format!("{} scenes in {}", made.len(), scenes.display()),
+        || json!({"scenes": made, "folder": evaluation.root()}),
+    );
+    Ok(())
+}
+
+fn run_methods(args: &RunArgs) -> anyhow::Result<()> {
+    let output = &args.folder.output;
+    let progress = Progress::new("evaluate", output.quiet);
+    let outcome = run::run(args, &|step: Step| {
+        let Step {
+            done,
+            total,
+            scene,
+            method,
+        } = step;
+        progress.set(done as f64 / total as f64);
+        if output.verbose {
+            progress.note(&format!("{done} of {total}: {scene}, {method}"));
+        }
+    })?;
+    progress.done();
+    for (which, error) in &outcome.failures {
+        output.warn(&format!("{which}: {}", describe(error)));
+    }
+    if let Some((which, error)) = outcome.failures.into_iter().next() {
+        return Err(error.context(format!(
+            "not every run succeeded; the first that failed is {which}"
+        )));
+    }
+    output.result(
+        || {
+            format!(
+                "{} methods on {} scenes in {}; show them with dipir-evaluate report",
+                outcome.methods,
+                outcome.scenes,
+                outcome.folder.display()
+            )
+        },
+        || json!({"scenes": outcome.scenes, "methods": outcome.methods, "folder": args.folder.out}),
+    );
+    Ok(())
+}
+
+fn write_report(args: &ReportArgs) -> anyhow::Result<()> {
+    let written = report::report(args)?;
+    args.folder.output.result(
+        || {
+            let names = written.files.iter().map(|f| f.display().to_string());
+            let names: Vec<String> = names.collect();
+            format!("{}\nwrote {}", written.tables.trim_end(), names.join(", "))
+        },
+        || json!({"files": written.files}),
+    );
+    Ok(())
+}
+
+fn write_study(args: &StudyPageArgs) -> anyhow::Result<()> {
+    let page = study::page(args)?;
+    args.folder.output.result(
+        || {
+            format!(
+                "wrote {}: {} pairs; open it in a browser, and count the files that it saves with \
+                 dipir-evaluate study count",
+                page.file.display(),
+                page.pairs
+            )
+        },
+        || json!({"page": page.file, "pairs": page.pairs}),
+    );
+    Ok(())
+}
+
+fn count_answers(args: &StudyCountArgs) -> anyhow::Result<()> {
+    let counted = study::count(args)?;
+    args.output.result(
+        || study::table(&counted.verdicts),
+        || json!({"participants": counted.participants, "verdicts": counted.verdicts}),
+    );
+    Ok(())
+}
+
+fn list_methods(args: &MethodsArgs) -> anyhow::Result<()> {
     let methods = methods::read(None)?;
-    let line = |m: &methods::Method| {
+    let line = |m: &Method| {
         let needs = if m.model { ", asks a model" } else { "" };
         format!("{:12} {}{needs}", m.name, m.title)
     };
@@ -41,5 +128,12 @@ fn list(args: &MethodsArgs) -> anyhow::Result<()> {
         },
         || json!({"methods": methods}),
     );
+    Ok(())
+}
+
+fn compare_spheres(args: &SpheresArgs) -> anyhow::Result<()> {
+    let scores = spheres::compare_files(&args.truth, &args.estimate, args.png.as_deref())?;
+    args.output
+        .result(|| spheres::table(&scores), || json!({"spheres": scores}));
     Ok(())
 }

@@ -4,13 +4,18 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
-use dipir_cli::exit::Usage;
+use dipir_cli::exit::{Usage, printable};
+use dipir_pipeline::error::StageError;
+use dipir_pipeline::hashing::Hashes;
 use dipir_pipeline::lock::{FolderLock, WhenLocked};
-use dipir_pipeline::manifest::FILE_NAME;
+use dipir_pipeline::mark::{Kind, Owned};
+use dipir_pipeline::{resume, stage};
+use dipir_stages::names::CONCEPTS;
+use dipir_stages::report;
 use serde_json::json;
 
 use crate::project::{ProjectArgs, Stage};
-use crate::run::lock;
+use crate::run::{hashes_file, lock};
 
 #[derive(Args)]
 pub struct CleanArgs {
@@ -30,69 +35,157 @@ pub struct CleanArgs {
     dry_run: bool,
 }
 
+/// What is removed, and what is left in its place.
+#[derive(Default)]
+struct Found {
+    /// Folders of which we know what in them is ours.
+    folders: Vec<(PathBuf, Owned)>,
+    /// What stages that were killed left, by the stage's folder.
+    untidy: Vec<(PathBuf, &'static str)>,
+    /// Files of ours outside of such folders.
+    files: Vec<PathBuf>,
+    /// Folders that go when nothing is in them any more.
+    roots: Vec<PathBuf>,
+}
+
 /// Removes what stages wrote, and nothing else.
 pub fn run(args: &CleanArgs) -> anyhow::Result<()> {
     let (session, graph) = args.project.open()?;
     let out = &session.out;
-    let all = args.stages.is_empty();
-    let mut found = Vec::new();
+    let asked =
+        |stage: &str| args.stages.is_empty() || args.stages.iter().any(|s| s.name() == stage);
+    let stages = graph.nodes().iter().map(|n| n.stage);
+    let stages: Vec<&'static str> = stages.filter(|stage| asked(stage)).collect();
     let mut locks = Vec::new();
-    if out.is_dir() {
+    if out.is_dir() && !args.dry_run {
         locks.push(lock(&session)?);
-    }
-    for node in graph.nodes() {
-        let stage = node.stage;
-        if !all && !args.stages.iter().any(|s| s.name() == stage) {
-            continue;
-        }
-        if out.is_dir() {
+        for stage in &stages {
             locks.push(FolderLock::take(&out.join(stage), WhenLocked::Refuse)?);
         }
-        let folder = out.join(stage);
-        let is_ours = folder.join(FILE_NAME).is_file();
-        if folder.exists() && !is_ours && fs::read_dir(&folder)?.next().is_some() {
-            return Err(Usage(format!(
-                "{} holds no {FILE_NAME}, so no stage wrote it and it is left alone; nothing was \
-                 removed",
-                folder.display()
-            ))
-            .into());
-        }
-        let beside = ["partial", "previous"].map(|s| out.join(format!(".{stage}.{s}")));
-        found.push(folder);
-        found.extend(beside);
-        found.push(out.join(format!("{stage}-checkpoints")));
     }
-    if all {
-        found.push(out.join("report.html"));
-    }
-    if args.cache {
-        found.push(out.join("concepts-cache"));
-    }
-    found.retain(|p| p.exists());
+    let found = find(args, out, &stages)?;
+    let (removed, kept) = found.listed()?;
     if !args.dry_run {
-        found.iter().try_for_each(|p| remove(p))?;
+        found.remove()?;
     }
+    drop(locks);
     session.result(
-        || in_words(&found, args.dry_run),
-        || json!({"removed": found}),
+        || in_words(&removed, &kept, args.dry_run),
+        || json!({"removed": removed, "kept": kept, "dry_run": args.dry_run}),
     );
     Ok(())
 }
 
-fn remove(path: &Path) -> anyhow::Result<()> {
-    match path.is_dir() {
-        true => fs::remove_dir_all(path),
-        false => fs::remove_file(path),
+/// Looks for what is ours; an error if a stage's folder is another's.
+fn find(args: &CleanArgs, out: &Path, stages: &[&'static str]) -> anyhow::Result<Found> {
+    let mut found = Found::default();
+    for stage in stages.iter().copied() {
+        let folder = out.join(stage);
+        if let Err(e) = stage::refuse_foreign(&folder, stage) {
+            return Err(match e {
+                StageError::Foreign { folder, why } => {
+                    Usage(format!("{} {why}; nothing was removed", folder.display())).into()
+                }
+                other => other.into(),
+            });
+        }
+        if !stage::untidy(&folder, stage).is_empty() {
+            found.untidy.push((folder.clone(), stage));
+        }
+        if let Some(owned) = Owned::of_stage(&folder, stage) {
+            found.folders.push((folder, owned));
+        }
+        found.add_folders_in(
+            &out.join(format!("{stage}-checkpoints")),
+            Kind::Checkpoints,
+            stage,
+        )?;
+        let hashes = hashes_file(out, stage);
+        if Hashes::are_in(&hashes) {
+            found.files.push(hashes);
+        }
     }
-    .with_context(|| format!("cannot remove {}", path.display()))
+    let page = out.join(report::FILE);
+    // What is not a regular file is none of ours.
+    let is_ours = dipir_files::begins_with(&page, report::MARK).unwrap_or(false);
+    if args.stages.is_empty() && is_ours {
+        found.files.push(page);
+    }
+    if args.cache {
+        found.add_folders_in(&out.join("concepts-cache"), Kind::Cache, CONCEPTS.name)?;
+    }
+    Ok(found)
 }
 
-fn in_words(found: &[PathBuf], dry_run: bool) -> String {
-    if found.is_empty() {
-        return "nothing to remove".into();
+impl Found {
+    fn add_folders_in(&mut self, root: &Path, kind: Kind, stage: &str) -> Result<(), StageError> {
+        let folders = resume::folders_in(root, kind, stage)?;
+        if !folders.is_empty() {
+            self.roots.push(root.into());
+        }
+        self.folders.extend(folders);
+        Ok(())
     }
-    let verb = if dry_run { "would remove" } else { "removed" };
-    let names: Vec<String> = found.iter().map(|p| p.display().to_string()).collect();
-    format!("{verb} {}", names.join(", "))
+
+    /// What is removed, and what lies in the same folders and is kept.
+    fn listed(&self) -> Result<(Vec<PathBuf>, Vec<PathBuf>), StageError> {
+        let (mut removed, mut kept) = (Vec::new(), Vec::new());
+        for (folder, owned) in &self.folders {
+            let contents = owned.contents(folder)?;
+            let is_mark = |name: &PathBuf| name == Path::new(dipir_pipeline::mark::FILE_NAME);
+            match contents.others.is_empty() {
+                true => removed.push(folder.clone()),
+                // The mark stays, so that the folder is known.
+                false => removed.extend(
+                    contents
+                        .ours
+                        .iter()
+                        .filter(|name| !is_mark(name))
+                        .map(|name| folder.join(name)),
+                ),
+            }
+            kept.extend(contents.others.iter().map(|name| folder.join(name)));
+        }
+        removed.extend(
+            self.untidy
+                .iter()
+                .flat_map(|(f, stage)| stage::untidy(f, stage)),
+        );
+        removed.extend(self.files.iter().cloned());
+        Ok((removed, kept))
+    }
+
+    fn remove(self) -> anyhow::Result<()> {
+        // First, for what others put beside an earlier result moves to the stage's folder.
+        for (folder, stage) in &self.untidy {
+            stage::tidy(folder, stage)?;
+        }
+        for (folder, owned) in &self.folders {
+            owned.remove(folder)?;
+        }
+        for file in &self.files {
+            fs::remove_file(file).with_context(|| format!("cannot remove {}", file.display()))?;
+        }
+        for root in &self.roots {
+            // Only if nothing else is in it.
+            let _ = fs::remove_dir(root);
+        }
+        Ok(())
+    }
+}
+
+fn in_words(removed: &[PathBuf], kept: &[PathBuf], dry_run: bool) -> String {
+    let listed = |paths: &[PathBuf]| {
+        let names: Vec<String> = paths.iter().map(|p| p.display().to_string()).collect();
+        names.join(", ")
+    };
+    let mut text = match (removed.is_empty(), dry_run) {
+        (true, _) => "nothing to remove".into(),
+        (false, true) => format!("would remove {}", listed(removed)),
+        (false, false) => format!("removed {}", listed(removed)),
+    };
+    if !kept.is_empty() {
+        text += &format!("\nleft alone, as no stage wrote it: {}", listed(kept));
+    }
+    printable(&text)
 }

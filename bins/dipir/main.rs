@@ -5,6 +5,7 @@ mod project;
 mod report;
 mod run;
 mod status;
+mod suggestion;
 
 use std::process::ExitCode;
 
@@ -14,8 +15,8 @@ use dipir_cli::exit;
 const EXAMPLES: &str = "\
 Examples:
   dipir run                                 what ./pipeline.toml says, as far as it is not done yet
-  dipir run photo/pipeline.toml             another project
-  dipir run --set light.iterations=50    a key set for this run; only what it concerns runs
+  dipir run photo/pipeline.toml             another project; several are run one after the other
+  dipir run --set light.iterations=50       a key set for this run; only what it concerns runs
   dipir run --until lora                    that stage and what it needs
   dipir run --from light --force            that stage and all that read it, once more
   dipir status                              what would run, and why
@@ -53,7 +54,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    exit::run(|| match Cli::parse().command {
+    exit::run(|| match suggestion::parse()?.command {
         Command::Run(args) => run::run(&args),
         Command::Status(args) => status::run(&args),
         Command::Graph(args) => status::graph(&args),

@@ -7,22 +7,11 @@ use anyhow::Context;
 use clap::{Args, Command, CommandFactory, ValueEnum};
 use clap_complete::Shell;
 use clap_mangen::Man;
+use dipir_benchmark::command_line as evaluate;
 use dipir_cli::session::print_line;
+use dipir_inspection::command_line as inspect;
 use dipir_stages::command_line::{composite, concepts, light, lora, model, scene};
-
-// Of these command lines only what they say of themselves is used here.
-#[allow(dead_code)]
-#[path = "../dipir-evaluate/cli.rs"]
-mod evaluate;
-#[allow(dead_code)]
-#[path = "../dipir-inspect/cli.rs"]
-mod inspect;
-#[allow(dead_code)]
-#[path = "../dipir-pretrain/cli.rs"]
-mod pretrain;
-#[allow(dead_code)]
-#[path = "../dipir-tradeoff/cli.rs"]
-mod tradeoff;
+use dipir_tradeoff::command_line as tradeoff;
 
 /// Name of this executable.
 pub const DIPIR: &str = "dipir";
@@ -77,7 +66,7 @@ impl Executable {
             Self::DipirModel => model::Cli::command(),
             Self::DipirEvaluate => evaluate::Cli::command(),
             Self::DipirTradeoff => tradeoff::Cli::command(),
-            Self::DipirPretrain => pretrain::Cli::command(),
+            Self::DipirPretrain => dipir_pretraining::command_line::Cli::command(),
         }
     }
 }

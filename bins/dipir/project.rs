@@ -1,19 +1,25 @@
 //! What all subcommands start from: a configuration, its graph, and names of stages.
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use dipir_cli::args::{CommonArgs, OutputArgs};
+use dipir_cli::exit::Usage;
 use dipir_cli::session::Session;
 use dipir_pipeline::graph::Graph;
 use dipir_stages::graph;
+use dipir_stages::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE};
 use dipir_stages::report::quoted;
-use dipir_stages::{composite, concepts, light, lora, scene};
 
 #[derive(Args, Clone, Debug)]
 pub struct ProjectArgs {
     /// The file that configures all stages; relative paths in it start from its folder
-    #[arg(value_name = "FILE", default_value = "pipeline.toml")]
-    pub file: PathBuf,
+    /// [default: pipeline.toml]
+    #[arg(value_name = "FILE")]
+    pub files: Vec<PathBuf>,
+
+    /// The same, as the executables of the stages name it
+    #[arg(long, short = 'p', value_name = "FILE", conflicts_with = "files")]
+    pub pipeline: Option<PathBuf>,
 
     /// Set a key of the file, as in --set scene.class=car; may be repeated, the last one wins
     #[arg(long = "set", short = 's', value_name = "KEY=VALUE")]
@@ -32,16 +38,36 @@ pub struct ProjectArgs {
 }
 
 impl ProjectArgs {
+    /// The file.
+    pub fn file(&self) -> &Path {
+        let named = self.pipeline.as_ref().or(self.files.first());
+        named.map_or(Path::new("pipeline.toml"), |path| path)
+    }
+
+    /// The same project for each file, or for the one that is meant if none is named.
+    pub fn each(&self) -> Vec<Self> {
+        let one = |file: PathBuf| Self {
+            files: vec![file],
+            pipeline: None,
+            ..self.clone()
+        };
+        match self.files.len() {
+            0 | 1 => vec![one(self.file().to_owned())],
+            _ => self.files.iter().cloned().map(one).collect(),
+        }
+    }
+
     /// The same for the executables of the stages.
     pub fn common(&self) -> CommonArgs {
         CommonArgs {
-            pipeline: self.file.clone(),
+            pipeline: self.file().to_owned(),
             set: self.set.clone(),
             out: self.out.clone(),
             threads: None,
             seed: self.seed,
             wait: false,
             supervised: false,
+            hashes: None,
             output: self.output,
         }
     }
@@ -49,8 +75,8 @@ impl ProjectArgs {
     /// The options that repeat this on the command line of a stage's executable, for a shell.
     pub fn options(&self) -> Vec<String> {
         let mut words = Vec::new();
-        if self.file != std::path::Path::new("pipeline.toml") {
-            words.extend(["--pipeline".to_string(), self.file.display().to_string()]);
+        if self.file() != Path::new("pipeline.toml") {
+            words.extend(["--pipeline".to_string(), self.file().display().to_string()]);
         }
         for set in &self.set {
             words.extend(["--set".to_string(), set.clone()]);
@@ -66,6 +92,13 @@ impl ProjectArgs {
 
     /// Reads the configuration and draws the graph.
     pub fn open(&self) -> anyhow::Result<(Session, Graph)> {
+        if let [_, second, ..] = &self.files[..] {
+            let message = format!(
+                "{}: this takes one file; dipir run takes several",
+                second.display()
+            );
+            return Err(Usage(message).into());
+        }
         let session = Session::open(&self.common())?;
         let graph = graph::graph(&session)?;
         Ok((session, graph))
@@ -91,11 +124,11 @@ impl Stage {
     /// Name of the stage and of its folder.
     pub fn name(self) -> &'static str {
         match self {
-            Self::Scene => scene::STAGE,
-            Self::Concepts => concepts::STAGE,
-            Self::Lora => lora::STAGE,
-            Self::Light => light::STAGE,
-            Self::Composite => composite::STAGE,
+            Self::Scene => SCENE.name,
+            Self::Concepts => CONCEPTS.name,
+            Self::Lora => LORA.name,
+            Self::Light => LIGHT.name,
+            Self::Composite => COMPOSITE.name,
         }
     }
 }

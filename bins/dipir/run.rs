@@ -1,17 +1,19 @@
 //! `dipir run`: the stages' executables in order, those left out that have nothing to do.
 use std::io::{self, Read};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::thread::{self, JoinHandle};
 
 use anyhow::Context;
 use clap::Args;
-use dipir_cli::exit::{self, Said, Usage};
+use dipir_cli::ending;
+use dipir_cli::exit::{self, Said, Usage, printable};
 use dipir_cli::interrupt::{self, Interrupted};
-use dipir_cli::session::Session;
+use dipir_cli::session::{Session, check_threads};
 use dipir_cli::style::{bold, color_on_stderr};
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::graph::{Graph, Node};
+use dipir_pipeline::hashing::Hashes;
 use dipir_pipeline::lock::{FolderLock, WhenLocked};
 use dipir_pipeline::runner::{self, Stopped, Work};
 use dipir_pipeline::status::State;
@@ -53,14 +55,62 @@ pub struct RunArgs {
     wait: bool,
 }
 
-/// Runs what is not up to date.
+/// Runs what is not up to date, in one project after the other. One that fails does not keep the
+/// others from running.
 pub fn run(args: &RunArgs) -> anyhow::Result<()> {
     if args.jobs == 0 {
         return Err(Usage("--jobs 0: accepted: 1 or more".into()).into());
     }
-    let (session, graph) = args.project.open()?;
+    if let Some(Err(message)) = args.threads.map(check_threads) {
+        let threads = args.threads.unwrap_or_default();
+        return Err(Usage(format!("--threads {threads}: {message}")).into());
+    }
+    let projects = args.project.each();
+    let output = args.project.output;
+    if let [project] = &projects[..] {
+        let done = run_one(args, project)?;
+        output.result(|| done.0, || done.1);
+        return Ok(());
+    }
+    if args.project.out.is_some() {
+        let message = "--out with several files: each has a folder of its own, [pipeline] out";
+        return Err(Usage(message.into()).into());
+    }
+    let (mut results, mut failed) = (Vec::new(), None);
+    for project in &projects {
+        let name = project.file().display().to_string();
+        match run_one(args, project) {
+            Ok(done) => {
+                if !output.json {
+                    output.result(|| format!("{name}: {}", done.0), || Value::Null);
+                }
+                results.push(json!({"file": name, "done": done.1}));
+            }
+            Err(e) if e.is::<Interrupted>() => return Err(e),
+            Err(e) => {
+                let code = exit::code_of(&e);
+                if !e.is::<Said>() {
+                    exit::print(&e.context(name.clone()));
+                }
+                failed.get_or_insert(code);
+                results.push(json!({"file": name, "exit_code": code}));
+            }
+        }
+    }
+    if output.json {
+        output.result(String::new, || json!({"runs": results}));
+    }
+    match failed {
+        Some(code) => Err(Said(code).into()),
+        None => Ok(()),
+    }
+}
+
+/// Runs one project; what was done, for people and for programs.
+fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String, Value)> {
+    let (session, graph) = project.open()?;
     let nodes = selected(args, &graph)?;
-    let mut work = Pipeline::new(args, &session)?;
+    let mut work = Pipeline::new(args, project, &session)?;
     let all_fresh = all_fresh(&session, &graph, &nodes)?;
     if args.force || !all_fresh {
         interrupt::listen_patiently()?;
@@ -73,16 +123,15 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
     }
     let report = match dipir_stages::report::is_current(&session) {
         true => None,
-        false => page(args, &session, &graph, &nodes),
+        false => page(project, &session, &graph, &nodes),
     };
-    work.conclude(&nodes, report);
-    Ok(())
+    Ok(work.conclude(&nodes, report))
 }
 
 /// The page that shows the run. What the stages wrote stands without it, so that it cannot be
 /// written is no failure of the run.
-fn page(args: &RunArgs, session: &Session, graph: &Graph, nodes: &[&Node]) -> Option<Page> {
-    match report::write(&args.project, session, graph, nodes) {
+fn page(project: &ProjectArgs, session: &Session, graph: &Graph, nodes: &[&Node]) -> Option<Page> {
+    match report::write(project, session, graph, nodes) {
         Ok(page) => Some(page),
         Err(e) => {
             session.warn(&format!("there is no report: {}", exit::describe(&e)));
@@ -133,9 +182,15 @@ fn lock_when(session: &Session, when_locked: WhenLocked) -> Result<FolderLock, S
     FolderLock::take_inside(&session.out, "run", when_locked)
 }
 
+/// The file in which hashes are handed to a stage and back; removed when it is done.
+pub fn hashes_file(out: &Path, stage: &str) -> PathBuf {
+    out.join(format!(".{stage}.hashes"))
+}
+
 /// What the runner asks.
 struct Pipeline<'a> {
     args: &'a RunArgs,
+    project: &'a ProjectArgs,
     session: &'a Session,
     /// Folder of the stages' executables.
     programs: PathBuf,
@@ -144,53 +199,71 @@ struct Pipeline<'a> {
     /// What they are about to print, by stage.
     printed: Vec<(&'static str, JoinHandle<io::Result<String>>)>,
     ran: Vec<&'static str>,
+    started: Vec<&'static str>,
 }
 
 impl<'a> Pipeline<'a> {
-    fn new(args: &'a RunArgs, session: &'a Session) -> anyhow::Result<Self> {
+    fn new(
+        args: &'a RunArgs,
+        project: &'a ProjectArgs,
+        session: &'a Session,
+    ) -> anyhow::Result<Self> {
         let own =
             std::env::current_exe().context("cannot tell where the stages' executables are")?;
         Ok(Self {
             args,
+            project,
             session,
             programs: own.parent().map(PathBuf::from).unwrap_or_default(),
             results: Vec::new(),
             printed: Vec::new(),
             ran: Vec::new(),
+            started: Vec::new(),
         })
     }
 
     fn say(&self, node: &Node, text: &str) {
         if !self.args.project.output.quiet {
-            eprintln!("{}: {text}", bold(node.stage, color_on_stderr()));
+            let name = bold(node.stage, color_on_stderr());
+            eprintln!("{name}: {}", printable(text));
         }
     }
 
-    /// Says how it went.
-    fn conclude(self, nodes: &[&Node], page: Option<Page>) {
+    /// How it went.
+    fn conclude(self, nodes: &[&Node], page: Option<Page>) -> (String, Value) {
         let names: Vec<&str> = nodes.iter().map(|n| n.stage).collect();
-        let ran = self.ran;
-        self.session.result(
-            || {
-                let done = match ran.is_empty() {
-                    true => format!("nothing to do: {} up to date", listed(&names)),
-                    false => format!("ran {}", ran.join(", ")),
-                };
-                match &page {
-                    None => done,
-                    Some((path, truth)) => {
-                        format!("{done}\n{}", report::in_words(path, truth.as_ref()))
-                    }
-                }
-            },
-            || {
-                let (path, truth) = page.clone().unzip();
-                json!({
-                    "stages": names, "ran": ran, "results": self.results, "report": path,
-                    "truth": truth.flatten(),
-                })
-            },
-        );
+        let done = match self.ran.is_empty() {
+            true => format!("nothing to do: {} up to date", listed(&names)),
+            false => format!("ran {}", self.ran.join(", ")),
+        };
+        let done = match &page {
+            None => done,
+            Some((path, truth)) => format!("{done}\n{}", report::in_words(path, truth.as_ref())),
+        };
+        let (path, truth) = page.unzip();
+        let json = json!({
+            "stages": names, "ran": self.ran, "results": self.results, "report": path,
+            "truth": truth.flatten(), "hashed": Hashes::of_this_process().reads(),
+        });
+        (printable(&done), json)
+    }
+
+    /// Takes back the hashes of the stage.
+    fn take_hashes(&self, stage: &str) {
+        let path = hashes_file(&self.session.out, stage);
+        let hashes = Hashes::read(&path);
+        // Another's file of that name stays; it holds no hashes, either.
+        if Hashes::remove(&path).unwrap_or(false) {
+            hashes.adopt();
+        }
+    }
+}
+
+impl Drop for Pipeline<'_> {
+    fn drop(&mut self) {
+        for stage in &self.started {
+            let _ = Hashes::remove(&hashes_file(&self.session.out, stage));
+        }
     }
 }
 
@@ -224,8 +297,8 @@ impl Work for Pipeline<'_> {
         }
         let name = format!("{}{}", node.executable, std::env::consts::EXE_SUFFIX);
         let mut command = Command::new(self.programs.join(name));
-        let project = &self.args.project;
-        command.arg("--pipeline").arg(&project.file);
+        let project = self.project;
+        command.arg("--pipeline").arg(project.file());
         for set in &project.set {
             command.arg("--set").arg(set);
         }
@@ -240,6 +313,12 @@ impl Work for Pipeline<'_> {
         }
         // A child of a run that was killed may take a moment to notice.
         command.args(["--wait", "--supervised"]);
+        let hashes = hashes_file(&self.session.out, node.stage);
+        // Without the file the stage hashes for itself.
+        if Hashes::to_hand_over().write(&hashes).is_ok() {
+            command.arg("--hashes").arg(hashes);
+            self.started.push(node.stage);
+        }
         for (on, flag) in [
             (project.output.quiet, "--quiet"),
             (project.output.verbose, "--verbose"),
@@ -268,6 +347,7 @@ impl Work for Pipeline<'_> {
 
     fn done(&mut self, node: &Node) -> anyhow::Result<()> {
         self.ran.push(node.stage);
+        self.take_hashes(node.stage);
         if let Some(k) = self.printed.iter().position(|p| p.0 == node.stage) {
             let text = match self.printed.swap_remove(k).1.join() {
                 Ok(text) => text,
@@ -307,8 +387,9 @@ fn stopped(stopped: Stopped<anyhow::Error>) -> anyhow::Error {
             // The stage has printed what was wrong.
             Some(code) => Said(u8::try_from(code).unwrap_or(exit::FAILED)).into(),
             None => anyhow::anyhow!(
-                "the stage \"{stage}\" was ended by the system ({status}), for want of memory \
-                 perhaps; run again to go on where it was"
+                "the stage \"{stage}\" ended without a word ({status}): {}; run again to go on \
+                 where it was",
+                ending::cause(status)
             ),
         },
     }

@@ -1,5 +1,6 @@
 //! `dipir status` and `dipir graph`.
 use clap::Args;
+use dipir_cli::exit::printable;
 use dipir_cli::style::{bold, color_on_stdout, faint};
 use dipir_pipeline::status::{StageStatus, State};
 use dipir_stages::graph;
@@ -44,7 +45,7 @@ fn in_words(all: &[StageStatus]) -> String {
         .iter()
         .map(|s| {
             let name = bold(&format!("{:width$}", s.stage), color);
-            let state = s.state.to_string();
+            let state = printable(&s.state.to_string());
             match s.state {
                 State::Fresh | State::Unneeded { .. } => {
                     format!("{name}  {}", faint(&state, color))

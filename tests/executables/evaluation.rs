@@ -70,6 +70,61 @@ fn a_street_without_places_is_refused() {
 }
 
 #[test]
+fn two_lights_are_compared_by_three_spheres() {
+    let project = evaluation();
+    let grey = EnvironmentMap::constant(64, 32, Vec3::splat(0.5));
+    grey.write(project.path("grey.exr")).unwrap();
+    let compared = |estimate: &str| -> Value {
+        let arguments = ["spheres", "--json", "maps/square.exr", estimate];
+        let run = project.run(EVALUATE, &arguments);
+        run.expect_success();
+        let value: Value = serde_json::from_str(&run.stdout).unwrap();
+        value["spheres"].clone()
+    };
+    let number = |spheres: &Value, k: usize, key: &str| spheres[k]["linear"][key].as_f64().unwrap();
+    let (same, grey) = (compared("maps/square.exr"), compared("grey.exr"));
+    for k in 0..3 {
+        assert_eq!(number(&same, k, "rmse"), 0.0);
+        assert!(number(&grey, k, "si_rmse") > 0.01, "{grey}");
+    }
+    let picture = [
+        "spheres",
+        "maps/square.exr",
+        "grey.exr",
+        "--png",
+        "spheres.png",
+    ];
+    project.run(EVALUATE, &picture).expect_success();
+    assert!(project.path("spheres.png").is_file());
+}
+
+#[test]
+fn scenes_are_reported_by_kind_of_place() {
+    let project = evaluation();
+    project.write("kinds.tsv", "square\toutdoors\n");
+    fs::remove_dir_all(project.path("evaluation")).unwrap();
+    let make = [
+        "make",
+        "--hdri",
+        "maps",
+        "--models",
+        "models",
+        "--count",
+        "1",
+        "--size",
+        "36x32",
+        "--kinds",
+        "kinds.tsv",
+    ];
+    project.run(EVALUATE, &make).expect_success();
+    let run = ["run", "--target-error", "0.05", "--method", "neutral"];
+    project.run(EVALUATE, &run).expect_success();
+    project.run(EVALUATE, &["report"]).expect_success();
+    let table = String::from_utf8(project.read("evaluation/report.md")).unwrap();
+    assert!(table.contains("| outdoors | 1 |"), "{table}");
+}
+
+#[test]
 fn methods_run_once_and_are_reported_and_asked_about() {
     let project = evaluation();
     let run = [

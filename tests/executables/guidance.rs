@@ -103,7 +103,7 @@ fn without_a_path_the_embedded_model_reads_the_light() {
     project.run(SCENE, &[]).expect_success();
     project.run(OPTIMIZE, &[]).expect_success();
     let reading: Value = serde_json::from_slice(&project.read("out/light/reading.json")).unwrap();
-    let azimuth = |of: &str| reading[of]["words"]["azimuth"].as_f64().unwrap();
+    let azimuth = |of: &str| reading[of]["description"]["azimuth"].as_f64().unwrap();
     // A minimum on half degrees.
     let apart = (azimuth("light") - azimuth("encoder")).rem_euclid(std::f64::consts::TAU);
     assert!(apart.min(std::f64::consts::TAU - apart) < 0.01, "{reading}");

@@ -73,6 +73,23 @@ fn control_c_ends_with_130_and_leaves_nothing_half_written() {
 
 #[cfg(unix)]
 #[test]
+fn an_abort_as_for_want_of_memory_says_what_it_comes_from() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let child = start_endless(&project);
+    let pid = child.id().to_string();
+    let sent = Command::new("kill").args(["-ABRT", &pid]).status();
+    assert!(sent.unwrap().success());
+    let run: Run = child.wait_with_output().unwrap().into();
+    assert_eq!(run.code, None, "ended by the signal");
+    assert!(run.stderr.contains("memory ran out"), "{}", run.stderr);
+    // The next run takes away what is left.
+    project.run(COMPOSITE, &[]).expect_success();
+    assert_eq!(project.names("out"), ["composite", "scene"]);
+}
+
+#[cfg(unix)]
+#[test]
 fn control_c_at_a_terminal_is_told_once_by_the_run_and_not_by_its_stage() {
     use std::os::unix::process::CommandExt;
     let project = Project::new();
@@ -135,6 +152,31 @@ fn a_folder_that_no_stage_wrote_is_not_replaced() {
          left alone; move it away or choose another folder with --out",
     );
     assert_eq!(project.read("out/scene/thesis.tex"), b"years of work");
+}
+
+#[test]
+fn what_lies_beside_the_artifacts_is_there_after_the_next_run() {
+    let project = Project::new();
+    project.run_both(&[]);
+    project.write("out/composite/painted over.psd", "years of work");
+    project.write("out/composite/composite.png.bak", "mine");
+    project.run_both(&[]);
+    assert_eq!(
+        project.read("out/composite/painted over.psd"),
+        b"years of work"
+    );
+    assert_eq!(
+        project.names("out/composite"),
+        [
+            ".dipir",
+            "composite.exr",
+            "composite.png",
+            "composite.png.bak",
+            "painted over.psd",
+            "stage.json"
+        ]
+    );
+    assert_eq!(project.names("out"), ["composite", "scene"]);
 }
 
 #[test]

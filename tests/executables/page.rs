@@ -1,4 +1,5 @@
 //! `dipir report`: the page that shows a run.
+use base64::prelude::{BASE64_STANDARD, Engine};
 use serde_json::Value;
 
 use crate::project::*;
@@ -23,6 +24,8 @@ fn assert_well_formed(page: &str) {
         match name.strip_prefix('/') {
             Some(name) => assert_eq!(open.pop(), Some(name), "<{tag}>"),
             None if ["!doctype", "meta", "img", "input"].contains(&name) => {}
+            // Elements of SVG that hold nothing.
+            None if tag.ends_with('/') => {}
             None => open.push(name),
         }
     }
@@ -57,9 +60,13 @@ fn the_page_shows_every_stage_and_needs_no_other_file() {
         assert!(page.contains(part), "{part}");
     }
     // Nothing is fetched: all pictures are in the page.
-    for part in ["src=\"http", "href=", "url(", "@import"] {
+    for part in ["src=\"http", "url(", "@import"] {
         assert!(!page.contains(part), "{part}");
     }
+    // Curves can be saved as numbers, which are in the page, too.
+    let links = page.matches("href=").count();
+    let files = page.matches("href=\"data:text/csv;base64,").count();
+    assert!(links == files && files > 4, "{links} {files}");
     let pictures = page.matches("<img ").count();
     assert_eq!(
         pictures,
@@ -91,6 +98,29 @@ fn the_page_shows_whatever_there_is() {
     assert_well_formed(&damaged);
     assert!(damaged.contains("Not shown: out/composite/composite.exr: damaged"));
     assert!(damaged.contains("Effects"));
+}
+
+#[test]
+fn the_photograph_on_the_page_is_the_photograph_for_every_transfer() {
+    for transfer in ["srgb", "gamma22", "linear"] {
+        let project = Project::new();
+        let set = format!("scene.transfer={transfer}");
+        project
+            .run(DIPIR, &["run", "-q", "--set", &set])
+            .expect_success();
+        let page = page(&project);
+        let (_, before) = page.split_once("<div class=\"before\"").unwrap();
+        let (_, before) = before.split_once("base64,").unwrap();
+        let (before, _) = before.split_once('"').unwrap();
+        let shown = image::load_from_memory(&BASE64_STANDARD.decode(before).unwrap()).unwrap();
+        let photo = image::load_from_memory(&project.read("background.png")).unwrap();
+        let (shown, photo) = (shown.to_rgb8(), photo.to_rgb8());
+        assert_eq!(shown.dimensions(), photo.dimensions());
+        for (a, b) in shown.iter().zip(photo.iter()) {
+            // The layers are 16-bit floats: half a 2048th of a value, less than a step of 8 bits.
+            assert!(a.abs_diff(*b) <= 1, "{transfer}: {a} is not {b}");
+        }
+    }
 }
 
 #[test]

@@ -152,11 +152,11 @@ fn a_stage_that_fails_says_so_once_and_leaves_the_rest() {
 #[test]
 fn a_wrong_key_is_told_before_anything_runs() {
     let project = Project::new();
-    let run = project.run(DIPIR, &["run", "--set", "optimize.iteration=3"]);
+    let run = project.run(DIPIR, &["run", "--set", "light.iteration=3"]);
     assert_eq!(run.code, Some(2));
     assert!(
         run.stderr.starts_with(
-            "error: --set optimize.iteration=3: unknown key \"optimize.iteration\" (did you mean \
+            "error: --set light.iteration=3: unknown key \"light.iteration\" (did you mean \
              \"iterations\"?)"
         ),
         "{}",
@@ -198,12 +198,7 @@ fn clean_removes_what_stages_wrote_and_nothing_else() {
     assert_eq!(run.stdout, "would remove out/composite\n");
     assert!(project.path("out/composite").exists());
     project.run(DIPIR, &["clean"]).expect_success();
-    let left: Vec<String> = std::fs::read_dir(project.path("out"))
-        .unwrap()
-        .map(|e| e.unwrap().file_name().into_string().unwrap())
-        .filter(|name| !name.ends_with(".lock"))
-        .collect();
-    assert_eq!(left, ["notes.txt"]);
+    assert_eq!(project.names("out"), ["notes.txt"]);
     std::fs::create_dir(project.path("out/scene")).unwrap();
     project.write("out/scene/thesis.tex", "years of work");
     project.run(DIPIR, &["clean"]).expect_error(
@@ -211,6 +206,273 @@ fn clean_removes_what_stages_wrote_and_nothing_else() {
         "error: out/scene holds no stage.json, so no stage wrote it and it is left alone; nothing \
          was removed",
     );
+}
+
+#[test]
+fn clean_says_what_it_removes_and_leaves_what_others_put_there() {
+    let project = whole::project();
+    project.write("pipeline.toml", {
+        let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+        text.replace("cache = \"cache\"\n", "")
+    });
+    project
+        .run(DIPIR, &["run", "-q", "--until", "concepts"])
+        .expect_success();
+    project.run(DIPIR, &["run", "-q"]).expect_success();
+    project.write("out/scene/notes.txt", "mine");
+    let cache = format!(
+        "out/concepts-cache/{}",
+        project.names("out/concepts-cache")[0]
+    );
+    project.write(&format!("{cache}/holiday.png"), "mine");
+    let run = project.run(DIPIR, &["clean", "--cache", "--dry-run"]);
+    run.expect_success();
+    let would = run.stdout.clone();
+    assert!(
+        would.starts_with("would remove out/scene/effects.json, "),
+        "{would}"
+    );
+    assert!(
+        would.ends_with(&format!(
+            "out/report.html\nleft alone, as no stage wrote it: out/scene/notes.txt, \
+             {cache}/holiday.png\n"
+        )),
+        "{would}"
+    );
+    let run = project.run(DIPIR, &["clean", "--cache"]);
+    run.expect_success();
+    assert_eq!(run.stdout, would.replace("would remove", "removed"));
+    assert_eq!(project.names("out"), ["concepts-cache", "scene"]);
+    assert_eq!(project.names("out/scene"), [".dipir", "notes.txt"]);
+    assert_eq!(project.names(&cache), [".dipir", "holiday.png"]);
+    // The next run takes its folder again, with the notes in it.
+    project.run(DIPIR, &["run", "-q"]).expect_success();
+    assert_eq!(project.read("out/scene/notes.txt"), b"mine");
+    assert!(project.path("out/scene/scene.json").exists());
+}
+
+/// Everything in the project's folder that no stage wrote.
+const MINE: [&str; 6] = [
+    "report.html",
+    "lora-checkpoints/mine",
+    "light-checkpoints/0123456789abcdef/checkpoint.safetensors",
+    "concepts-cache/mine.png",
+    ".scene.partial/mine",
+    ".composite.hashes",
+];
+
+#[test]
+fn the_folder_of_the_project_as_out_costs_nobody_anything() {
+    let project = Project::new();
+    for name in MINE {
+        let path = project.path(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        project.write(name, "years of work");
+    }
+    let here = ["--set", "pipeline.out=."];
+    let untouched = |project: &Project| {
+        for name in MINE {
+            assert_eq!(project.read(name), b"years of work", "{name}");
+        }
+    };
+    let before = project.names("");
+    std::fs::create_dir(project.path("inner")).unwrap();
+    project.write("inner/pipeline.toml", project.read("pipeline.toml"));
+    let before = [&before[..], &["inner".to_string()]].concat();
+    let named =
+        |names: Vec<String>| -> std::collections::BTreeSet<String> { names.into_iter().collect() };
+    for (file, out) in [("pipeline.toml", "."), ("inner/pipeline.toml", "..")] {
+        let set = format!("pipeline.out={out}");
+        let run = project.run(DIPIR, &["clean", file, "--cache", "--set", &set]);
+        run.expect_success();
+        assert_eq!(run.stdout, "nothing to remove\n", "{out}");
+        // No lock is left where nothing ran.
+        assert_eq!(named(project.names("")), named(before.clone()));
+        untouched(&project);
+    }
+    // What lies where a stage would write keeps it from running.
+    let run = project.run(DIPIR, &[&["run"], &here[..]].concat());
+    assert_eq!(run.code, Some(1), "{}", run.stderr);
+    assert!(
+        run.stderr.contains(".scene.partial is there already"),
+        "{}",
+        run.stderr
+    );
+    untouched(&project);
+    std::fs::rename(project.path(".scene.partial"), project.path("away")).unwrap();
+    let run = project.run(DIPIR, &[&["run"], &here[..]].concat());
+    run.expect_success();
+    let warning = "warning: there is no report: cannot write ./report.html: \"report.html\" is there \
+                   already and dipir did not make it; move it away or choose another folder with \
+                   --out";
+    assert!(run.stderr.contains(warning), "{}", run.stderr);
+    project
+        .run(DIPIR, &[&["clean"], &here[..]].concat())
+        .expect_success();
+    std::fs::rename(project.path("away"), project.path(".scene.partial")).unwrap();
+    untouched(&project);
+    assert_eq!(named(project.names("")), named(before));
+}
+
+#[test]
+fn a_folder_with_a_foreign_stage_json_is_neither_run_over_nor_cleaned() {
+    let project = Project::new();
+    std::fs::create_dir_all(project.path("out/scene")).unwrap();
+    project.write("out/scene/stage.json", "{\"stage\": \"theatre\"}");
+    project.write("out/scene/painting.psd", "years of work");
+    let why = "its stage.json is not one that the stage \"scene\" wrote, so it is left alone";
+    project.run(SCENE, &[]).expect_error(
+        1,
+        &format!(
+            "error: out/scene is there already and {why}; move it away or choose another folder \
+             with --out"
+        ),
+    );
+    project
+        .run(DIPIR, &["clean"])
+        .expect_error(2, &format!("error: out/scene {why}; nothing was removed"));
+    assert_eq!(project.names("out/scene"), ["painting.psd", "stage.json"]);
+    assert_eq!(project.names("out"), ["scene"]);
+}
+
+#[cfg(unix)]
+#[test]
+fn links_at_the_names_of_our_files_are_not_followed() {
+    let project = Project::new();
+    project.write("thesis.tex", "years of work");
+    for name in [
+        ".run.lock",
+        ".scene.lock",
+        "report.html",
+        ".report.html.partial",
+    ] {
+        std::fs::create_dir_all(project.path("out")).unwrap();
+        let link = project.path("out").join(name);
+        std::os::unix::fs::symlink("../thesis.tex", &link).unwrap();
+        let run = project.run(DIPIR, &["run"]);
+        assert!(run.stderr.contains(name), "{name}: {}", run.stderr);
+        assert_eq!(project.read("thesis.tex"), b"years of work", "{name}");
+        assert!(
+            std::fs::symlink_metadata(&link).unwrap().is_symlink(),
+            "{name}"
+        );
+        std::fs::remove_dir_all(project.path("out")).unwrap();
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn every_input_is_read_once_to_be_hashed() {
+    let project = whole::project();
+    // A file that was written a moment ago could change without a trace.
+    std::thread::sleep(std::time::Duration::from_millis(100));
+    let hashed = |args: &[&str]| -> Vec<(String, u64)> {
+        let run = project.run(DIPIR, &[&["run", "--json"], args].concat());
+        run.expect_success();
+        let value: Value = serde_json::from_str(&run.stdout).unwrap();
+        let reads = value["hashed"].as_object().unwrap().clone();
+        let reads = reads
+            .into_iter()
+            .filter(|(path, _)| !path.starts_with("out/"));
+        reads.map(|(path, n)| (path, n.as_u64().unwrap())).collect()
+    };
+    let all = |args: &[&str], least: usize| {
+        let reads = hashed(args);
+        assert!(reads.len() >= least, "{reads:?}");
+        assert!(reads.iter().all(|(_, times)| *times == 1), "{reads:?}");
+        assert!(
+            reads.iter().any(|(path, _)| path == "background.png"),
+            "{reads:?}"
+        );
+    };
+    all(&[], 3);
+    // Twelve files of a model, read by two stages; the photograph by one of them.
+    all(&["--until", "lora"], 10);
+    // Up to date: once more each, for nothing is trusted from one run to the next.
+    all(&[], 3);
+    project.write("object.obj", OBJECT.replace("1.1", "1.2"));
+    std::thread::sleep(std::time::Duration::from_millis(100));
+    all(&[], 3);
+    assert!(
+        !project
+            .names("out")
+            .iter()
+            .any(|name| name.ends_with(".hashes"))
+    );
+}
+
+#[test]
+fn a_changed_model_is_told_in_one_phrase() {
+    let project = whole::project();
+    project
+        .run(DIPIR, &["run", "-q", "--until", "concepts"])
+        .expect_success();
+    let value: Value = serde_json::from_slice(&project.read("out/concepts/stage.json")).unwrap();
+    let files = value["inputs"].as_array().unwrap().len();
+    assert!(files > 5, "{files}");
+    let other = ["status", "--until", "concepts", "--set", "model.path=none"];
+    let status = project.run(DIPIR, &other);
+    status.expect_success();
+    let line = status
+        .stdout
+        .lines()
+        .find(|l| l.starts_with("concepts"))
+        .unwrap();
+    assert!(
+        line.contains(&format!("{files} files of the model are no longer read")),
+        "{line}"
+    );
+}
+
+#[test]
+fn a_project_is_named_in_three_ways_and_several_run_one_after_the_other() {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    for name in ["a", "b"] {
+        let table = format!("[pipeline]\nout = \"out-{name}\"\n");
+        project.write(&format!("{name}.toml"), table + &text);
+    }
+    project
+        .run(DIPIR, &["run", "-q", "-p", "a.toml"])
+        .expect_success();
+    project
+        .run(DIPIR, &["status", "--pipeline", "a.toml"])
+        .expect_success();
+    let run = project.run(DIPIR, &["run", "a.toml", "b.toml"]);
+    run.expect_success();
+    assert!(
+        run.stdout
+            .starts_with("a.toml: nothing to do: scene, composite are up to date\n")
+            && run.stdout.contains("b.toml: ran scene, composite\n"),
+        "{}",
+        run.stdout
+    );
+    assert!(project.path("out-b/composite/composite.png").exists());
+    // One that fails is told, and the others run.
+    project.write("b.toml", "[scene]\nx = 1\n");
+    let run = project.run(DIPIR, &["run", "--json", "b.toml", "a.toml"]);
+    assert_eq!(run.code, Some(2));
+    assert!(
+        run.stderr
+            .starts_with("error: b.toml\n  caused by: b.toml:2: "),
+        "{}",
+        run.stderr
+    );
+    let value: Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!(value["runs"][0], json!({"file": "b.toml", "exit_code": 2}));
+    assert_eq!(value["runs"][1]["done"]["ran"], json!([]));
+    project
+        .run(DIPIR, &["status", "a.toml", "b.toml"])
+        .expect_error(
+            2,
+            "error: b.toml: this takes one file; dipir run takes several",
+        );
+    project
+        .run(DIPIR, &["run", "-o", "x", "a.toml", "b.toml"])
+        .expect_error(
+            2,
+            "error: --out with several files: each has a folder of its own, [pipeline] out",
+        );
 }
 
 #[test]

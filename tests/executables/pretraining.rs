@@ -1,4 +1,4 @@
-//! `dipir-pretrain`: a run from a model and what it refuses.
+//! `dipir-pretrain`: runs from a model, and errors.
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
@@ -27,22 +27,16 @@ const TINY: [&str; 11] = [
 ];
 
 #[test]
-fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
+fn a_run_starts_from_a_model_and_continues_from_its_checkpoint() {
     let project = Project::new();
     let run = |more: &[&str]| {
         let quiet = ["--json", "--quiet", "--checkpoint-every", "1"];
         let run = project.run(
             PRETRAIN,
-            &[
-                &TINY[..],
-                &["--relit", "1", "--name-light", "0.1"],
-                &quiet,
-                more,
-            ]
-            .concat(),
+            &[&TINY[..], &["--relit", "1"], &quiet, more].concat(),
         );
         run.expect_success();
-        // Not even of checkpoints.
+        // --quiet also silences checkpoints.
         assert_eq!(run.stderr, "");
         serde_json::from_str::<Value>(&run.stdout).unwrap()
     };
@@ -57,7 +51,7 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
     let again = run(&from);
     assert_eq!(again["resumed_at"].as_u64(), Some(24));
     assert_eq!(project.read(weights), trained);
-    // A model that knows pictures errs less than one that knows nothing, and a deeper one that goes on from it as little.
+    // A run from a model has a smaller loss than one from random weights, and a deeper one starts with the same loss.
     let afresh = |more: &[&str]| {
         std::fs::remove_file(project.path("cache/checkpoint.safetensors")).unwrap();
         run(more)
@@ -68,30 +62,30 @@ fn a_run_goes_on_from_a_model_and_then_from_its_checkpoint() {
     let unknown = afresh(&[]);
     let [known, deeper, unknown] = [&first, &deeper, &unknown].map(|r| r["loss"].as_f64().unwrap());
     assert!(known < 0.5 * unknown, "{known} {unknown}");
-    // .005 apart when it was measured; a model that knows nothing is more than twice as far off.
+    // Measured: .005 apart. Random weights are more than twice as far off.
     assert!((deeper / known - 1.0).abs() < 1e-2, "{deeper} {known}");
 
-    let gates = [
-        "gates", "model", "--first", "1000", "--scenes", "2", "--draws", "1", "--json",
+    let check = [
+        "check", "model", "--first", "1000", "--scenes", "2", "--draws", "1", "--json",
     ];
-    let found = project.run(PRETRAIN, &gates);
+    let found = project.run(PRETRAIN, &check);
     found.expect_success();
     let found: Value = serde_json::from_str(&found.stdout).unwrap();
     assert_eq!(found["scenes"].as_u64(), Some(2), "{found}");
     assert!(found["over_opposite"].is_f64() && found["encoder"].is_null());
-    // A folder with a light encoder is told what that reads, too.
+    // A folder with a light encoder has a column for it.
     let encoder = std::path::Path::new(PRIOR).join("light_encoder.safetensors");
     std::fs::copy(encoder, project.path("model/light_encoder.safetensors")).unwrap();
-    let table = project.run(PRETRAIN, &gates[..gates.len() - 1]);
+    let table = project.run(PRETRAIN, &check[..check.len() - 1]);
     table.expect_success();
     let heads = table.stdout.lines().nth(1).unwrap_or_default();
     let heads: Vec<&str> = heads.split_whitespace().collect();
-    assert_eq!(heads[..3], ["gate", "wanted", "found"]);
+    assert_eq!(heads[..3], ["check", "wanted", "found"]);
     assert_eq!(heads.last(), Some(&"encoder"));
     assert_eq!(table.stdout.lines().count(), 9, "{}", table.stdout);
-    let late = [&gates[..], &["--timesteps", "0.5,1"]].concat();
-    let told = "error: --timesteps 1: accepted are 0 to below 1";
-    project.run(PRETRAIN, &late).expect_error(2, told);
+    let late = [&check[..], &["--timesteps", "0.5,1"]].concat();
+    let message = "error: --timesteps 1: accepted are 0 to below 1";
+    project.run(PRETRAIN, &late).expect_error(2, message);
 }
 
 #[cfg(unix)]
@@ -118,14 +112,14 @@ fn control_c_saves_what_was_trained() {
         .status();
     assert!(sent.unwrap().success());
     let mut run: Run = child.wait_with_output().unwrap().into();
-    // Without a terminal a line is written at every checkpoint, the last one at the interruption.
-    let (notes, told) = run.stderr.trim_end().rsplit_once('\n').unwrap();
+    // Without a terminal there is a line for every checkpoint; the interruption writes the last one.
+    let (notes, error) = run.stderr.trim_end().rsplit_once('\n').unwrap();
     for note in notes.lines() {
         assert!(note.contains(" examples, loss "), "{note}");
     }
-    run.stderr = told.to_owned();
+    run.stderr = error.to_owned();
     run.expect_error(130, "interrupted; earlier results are as they were");
-    // The weights so far are a model, and a run goes on from where this one was.
+    // The weights so far are a model, and another run continues from the checkpoint.
     assert!(
         project
             .path("model/unet/diffusion_pytorch_model.safetensors")
@@ -138,16 +132,16 @@ fn control_c_saves_what_was_trained() {
 }
 
 #[test]
-fn what_is_wrong_is_told_before_scenes_are_rendered() {
+fn wrong_arguments_are_refused_before_scenes_are_rendered() {
     let project = Project::new();
-    for (wrong, code, told) in [
+    for (wrong, code, message) in [
         (["--from", "nowhere"], 1, NO_WEIGHTS),
         (["--relit", "1.5"], 2, "--relit 1.5: accepted are 0 to 1"),
         (["--layers", "0"], 2, "--layers 0: accepted are 1 to 8"),
         (
-            ["--name-light", "-1"],
+            ["--contrast", "-1"],
             2,
-            "--name-light -1: accepted are 0 and more",
+            "--contrast -1: accepted are 0 and more",
         ),
         (
             ["--learning-rate", "0"],
@@ -156,7 +150,7 @@ fn what_is_wrong_is_told_before_scenes_are_rendered() {
         ),
     ] {
         let run = project.run(PRETRAIN, &[&TINY[..], &wrong].concat());
-        run.expect_error(code, &format!("error: {told}"));
+        run.expect_error(code, &format!("error: {message}"));
         for written in ["cache/scenes", "model"] {
             assert!(!project.path(written).exists(), "{wrong:?}");
         }
@@ -164,7 +158,7 @@ fn what_is_wrong_is_told_before_scenes_are_rendered() {
 }
 
 #[test]
-fn an_encoder_goes_on_from_that_of_a_model() {
+fn an_encoder_starts_from_that_of_a_model() {
     let project = Project::new();
     let tiny = [
         "encoder",
@@ -178,27 +172,28 @@ fn an_encoder_goes_on_from_that_of_a_model() {
         "128",
     ];
     let nowhere = project.run(PRETRAIN, &[&tiny[..], &["--from", "nowhere"]].concat());
-    let told = "error: cannot read nowhere/light_encoder.safetensors: No such file or directory";
-    nowhere.expect_error(1, told);
+    let message = "error: cannot read nowhere/light_encoder.safetensors: No such file or directory";
+    nowhere.expect_error(1, message);
     assert!(!project.path("cache").exists() && !project.path("model").exists());
     let late = [&tiny[..], &["--learning-rate", "-1"]].concat();
-    let told = "error: --learning-rate -1: accepted are numbers above 0";
-    project.run(PRETRAIN, &late).expect_error(2, told);
+    let message = "error: --learning-rate -1: accepted are numbers above 0";
+    project.run(PRETRAIN, &late).expect_error(2, message);
     let lost = [&tiny[..], &["--sheet", "nowhere/sheet.png"]].concat();
-    let told = "error: cannot write nowhere/sheet.png: there is no folder nowhere; create it first";
-    project.run(PRETRAIN, &lost).expect_error(1, told);
+    let message =
+        "error: cannot write nowhere/sheet.png: there is no folder nowhere; create it first";
+    project.run(PRETRAIN, &lost).expect_error(1, message);
     assert!(!project.path("cache").exists() && !project.path("model").exists());
-    // One that knows light errs less than one that knows nothing.
+    // A trained encoder has a smaller loss than a new one.
     let loss = |more: &[&str]| {
         let run = project.run(PRETRAIN, &[&tiny[..], &["--json"], more].concat());
         run.expect_success();
-        let told: Value = serde_json::from_str(&run.stdout).unwrap();
-        told["loss"].as_f64().unwrap()
+        let result: Value = serde_json::from_str(&run.stdout).unwrap();
+        result["loss"].as_f64().unwrap()
     };
     let sheet = ["--from", PRIOR, "--sheet", "sheet.png"];
     let (known, unknown) = (loss(&sheet), loss(&[]));
     assert!(known < 0.5 * unknown, "{known} {unknown}");
-    // What it is shown: eight rows of twelve pictures, three times as large.
+    // Pictures of its training: eight rows of twelve, enlarged three times.
     let sheet = image::open(project.path("sheet.png")).unwrap().to_rgb8();
     assert_eq!(sheet.dimensions(), (12 * 32 * 3, 8 * 32 * 3));
     let tiles: std::collections::BTreeSet<Vec<u8>> = (0..96)

@@ -17,6 +17,8 @@ pub const SCENE: &str = env!("CARGO_BIN_EXE_dipir-scene");
 pub const COMPOSITE: &str = env!("CARGO_BIN_EXE_dipir-composite");
 /// `dipir-light`.
 pub const OPTIMIZE: &str = env!("CARGO_BIN_EXE_dipir-light");
+/// `dipir-optimize`, the earlier name of `dipir-light`.
+pub const EARLIER: &str = env!("CARGO_BIN_EXE_dipir-optimize");
 /// `dipir-tradeoff`.
 pub const TRADEOFF: &str = env!("CARGO_BIN_EXE_dipir-tradeoff");
 /// `dipir-evaluate`.
@@ -123,18 +125,27 @@ impl Project {
         self.command(executable, args).output().unwrap().into()
     }
 
+    /// Names in a folder of the project, sorted.
+    pub fn names(&self, folder: &str) -> Vec<String> {
+        let entries = fs::read_dir(self.path(folder)).unwrap();
+        let names = entries.map(|e| e.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<String> = names.collect();
+        names.sort();
+        names
+    }
+
     /// Runs `dipir-scene` and `dipir-composite`, which must succeed.
     pub fn run_both(&self, args: &[&str]) {
         self.run(SCENE, args).expect_success();
         self.run(COMPOSITE, args).expect_success();
     }
 
-    /// Every file of a stage but `stage.json`, which holds times, with its bytes; names are
-    /// relative to the stage's folder.
+    /// Every file of a stage but its mark and `stage.json`, which holds times, with its bytes;
+    /// names are relative to the stage's folder.
     pub fn artifacts(&self, stage: &str) -> Vec<(String, Vec<u8>)> {
         let mut files = Vec::new();
         collect(&self.path(stage), "", &mut files);
-        files.retain(|(name, _)| name != "stage.json");
+        files.retain(|(name, _)| name != "stage.json" && name != ".dipir");
         files.sort();
         files
     }

@@ -122,3 +122,135 @@ fn a_photograph_is_cut_out_of_a_panorama() {
         Some(118.0)
     );
 }
+
+#[test]
+fn earlier_names_are_answered_with_the_present_ones() {
+    let project = Project::new();
+    let error = |executable: &str, args: &[&str], message: &str| {
+        let run = project.run(executable, args);
+        run.expect_error(2, message);
+    };
+    error(
+        EARLIER,
+        &[],
+        "error: dipir-optimize is called dipir-light now",
+    );
+    error(
+        DIPIR,
+        &["run", "--from", "optimize"],
+        "error: --from optimize: that stage is called light now",
+    );
+    error(
+        DIPIR,
+        &["status", "--set", "optimize.light=false"],
+        "error: --set optimize.light=false: optimize.light is called light.recover_light now",
+    );
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write("pipeline.toml", text + "[optimize]\niterations = 3\n");
+    let run = project.run(DIPIR, &["run"]);
+    assert_eq!(run.code, Some(2));
+    assert!(
+        run.stderr.ends_with(": [optimize] is called [light] now\n"),
+        "{}",
+        run.stderr
+    );
+}
+
+#[test]
+fn what_is_no_command_is_answered_with_what_was_meant() {
+    let project = Project::new();
+    let told = |args: &[&str]| {
+        let run = project.run(DIPIR, args);
+        assert_eq!(run.code, Some(2), "{args:?}");
+        run.stderr
+    };
+    assert!(told(&["rnu"]).contains("'run'"), "{}", told(&["rnu"]));
+    assert_eq!(
+        told(&["pipeline.toml"]),
+        "error: pipeline.toml is no command of dipir; to run it: dipir run pipeline.toml\n"
+    );
+    let photo = told(&["photo.jpg"]);
+    assert!(
+        photo.starts_with("error: photo.jpg is no command of dipir; ") && photo.contains("dipir "),
+        "{photo}"
+    );
+}
+
+#[test]
+fn more_threads_than_any_machine_has_are_refused() {
+    let project = Project::new();
+    let accepted = "accepted: 0, for one a core, to 1024";
+    let set = ["--set", "pipeline.threads=1000000"];
+    let message = format!("error: --set pipeline.threads=1000000: pipeline.threads: {accepted}");
+    project.run(SCENE, &set).expect_error(2, &message);
+    let run = project.run(DIPIR, &[&["run"], &set[..]].concat());
+    run.expect_error(2, &message);
+    let message = format!("error: --threads 1025: {accepted}");
+    for executable in [SCENE, COMPOSITE] {
+        let run = project.run(executable, &["--threads", "1025"]);
+        run.expect_error(2, &message);
+    }
+    let run = project.run(DIPIR, &["run", "-j", "1025"]);
+    run.expect_error(2, &message);
+    assert!(!project.path("out").exists());
+}
+
+#[test]
+fn terminal_escapes_in_names_and_values_are_shown() {
+    let project = Project::new();
+    let evil = "a\u{1b}[2J\u{9b}31m.obj";
+    for (key, code) in [
+        ("scene.objects.0.path", 1),
+        ("scene.transfer", 2),
+        ("x\u{1b}.y", 2),
+    ] {
+        let set = format!("{key}={evil}");
+        let run = project.run(SCENE, &["--set", &set]);
+        assert_eq!(run.code, Some(code), "{}", run.stderr);
+        let obeyed = |c: char| c.is_control() && c != '\n';
+        assert!(!run.stderr.contains(obeyed), "{:?}", run.stderr);
+        assert!(run.stderr.contains("a\\u{1b}[2J"), "{}", run.stderr);
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn a_pipe_as_configuration_or_input_is_refused_at_once() {
+    use std::process::Command;
+    let project = Project::new();
+    let made = Command::new("mkfifo").arg(project.path("pipe")).status();
+    assert!(made.unwrap().success());
+    project.run(DIPIR, &["status", "pipe"]).expect_error(
+        2,
+        "error: cannot read pipe: not a regular file; name another file with --pipeline",
+    );
+    project
+        .run(DIPIR, &["status", "--set", "composite.environment=pipe"])
+        .expect_success();
+    let run = project.run(DIPIR, &["status", "--set", "composite.environment=pipe"]);
+    assert!(
+        run.stdout.contains("pipe: not a regular file"),
+        "{}",
+        run.stdout
+    );
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_limit_on_the_size_of_files_is_named_and_nothing_is_lost() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let before = project.artifacts("out/scene");
+    // 1 block: 512 or 1024 bytes, by the shell.
+    let script = format!("ulimit -f 1; {SCENE}");
+    let run: Run = project
+        .command("sh", &["-c", &script])
+        .output()
+        .unwrap()
+        .into();
+    assert_eq!(run.code, Some(1), "{run:?}");
+    let told = run.stderr.to_lowercase();
+    assert!(told.contains("file too large"), "{told}");
+    assert!(project.artifacts("out/scene") == before);
+    assert_eq!(project.names("out"), ["scene"]);
+}

@@ -43,6 +43,11 @@ pub struct CommonArgs {
     #[arg(long, hide = true)]
     pub supervised: bool,
 
+    /// Hashes that the process that started this one knows already; this one adds its own to the
+    /// file
+    #[arg(long, value_name = "FILE", hide = true)]
+    pub hashes: Option<PathBuf>,
+
     #[command(flatten)]
     #[allow(missing_docs)]
     pub output: OutputArgs,

@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use dipir_pipeline::error::ConfigError;
 
+use crate::ending;
 use crate::interrupt::{self, Interrupted};
 use crate::style::{bold_red, color_on_stderr};
 
@@ -44,6 +45,7 @@ impl std::error::Error for Said {}
 /// Runs `main`, prints what went wrong with all its causes, and picks the exit code.
 pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
     one_tensor_thread();
+    ending::prepare();
     let code = match main() {
         Ok(()) => DONE,
         Err(error) => {
@@ -54,14 +56,19 @@ pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
             if code == INTERRUPTED {
                 interrupt::say();
             } else {
-                let label = bold_red("error:", color_on_stderr());
-                // A reader that went away is no reason to end otherwise.
-                let _ = writeln!(stderr(), "{label} {}", describe(&error));
+                print(&error);
             }
             code
         }
     };
     ExitCode::from(code)
+}
+
+/// Prints what went wrong with all its causes.
+pub fn print(error: &anyhow::Error) {
+    let label = bold_red("error:", color_on_stderr());
+    // A reader that went away is no reason to end otherwise.
+    let _ = writeln!(stderr(), "{label} {}", printable(&describe(error)));
 }
 
 /// Tells the tensor library to do its element-wise work on the thread that asks for it. Its pool
@@ -110,6 +117,24 @@ pub fn describe(error: &anyhow::Error) -> String {
     text
 }
 
+/// The text with what a terminal would obey, or what would turn the line around, written as an
+/// escape: names of files and values come from anywhere. Line ends stay.
+pub fn printable(text: &str) -> String {
+    let is_obeyed = |c: char| {
+        let turns = matches!(c, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}'
+            | '\u{2066}'..='\u{2069}');
+        turns || (c.is_control() && c != '\n')
+    };
+    let mut shown = String::with_capacity(text.len());
+    for c in text.chars() {
+        match is_obeyed(c) {
+            true => shown.extend(c.escape_default()),
+            false => shown.push(c),
+        }
+    }
+    shown
+}
+
 fn without_number(message: &str) -> String {
     match message.split_once(" (os error ") {
         Some((before, after)) => {
@@ -154,6 +179,15 @@ mod tests {
         assert!(
             text.ends_with("; check the path") && !text.contains("os error"),
             "{text}"
+        );
+    }
+
+    #[test]
+    fn terminal_escapes_are_shown_and_not_obeyed() {
+        let name = "a\u{1b}[2J\u{7}\u{9b}31m\r\u{202e}gnp.b\nä";
+        assert_eq!(
+            printable(name),
+            "a\\u{1b}[2J\\u{7}\\u{9b}31m\\r\\u{202e}gnp.b\nä"
         );
     }
 

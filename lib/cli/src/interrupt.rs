@@ -9,6 +9,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use anyhow::Context;
+use dipir_pipeline::stage::discard;
+
 use crate::exit::INTERRUPTED;
 
 static ASKED: AtomicBool = AtomicBool::new(false);
@@ -30,6 +33,9 @@ impl std::error::Error for Interrupted {}
 /// What the user is told.
 pub const MESSAGE: &str = "interrupted; earlier results are as they were";
 
+const NO_THREAD: &str = "cannot listen for Ctrl-C, for which a thread is needed: memory or the \
+                         number of processes is limited (ulimit -v, ulimit -u)";
+
 /// How long the work may take to stop by itself.
 const GRACE: Duration = Duration::from_millis(500);
 
@@ -39,13 +45,16 @@ static UNFINISHED: Mutex<Option<PathBuf>> = Mutex::new(None);
 /// Starts to listen. Stages write beside their target and swap at the end, so that ending the
 /// process at any moment leaves earlier results whole.
 pub fn listen() -> anyhow::Result<()> {
-    ctrlc::set_handler(stop)?;
-    Ok(())
+    ctrlc::set_handler(stop).context(NO_THREAD)
 }
 
-/// Starts to listen without ever ending the process: for work that waits for others to stop.
+/// Starts to listen without ever ending the process: for work that waits for others to stop. Does
+/// nothing when called again.
 pub fn listen_patiently() -> anyhow::Result<()> {
-    ctrlc::set_handler(|| ASKED.store(true, Ordering::SeqCst))?;
+    static LISTENS: AtomicBool = AtomicBool::new(false);
+    if !LISTENS.swap(true, Ordering::SeqCst) {
+        ctrlc::set_handler(|| ASKED.store(true, Ordering::SeqCst)).context(NO_THREAD)?;
+    }
     Ok(())
 }
 
@@ -67,7 +76,7 @@ fn stop() {
     if let Ok(mut folder) = UNFINISHED.lock()
         && let Some(folder) = folder.take()
     {
-        let _ = std::fs::remove_dir_all(folder);
+        discard(&folder);
     }
     say();
     process::exit(INTERRUPTED.into());

@@ -3,14 +3,15 @@ use std::io::{Write, stdout};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use dipir_pipeline::config::{Config, PipelineTable};
+use dipir_pipeline::config::{Config, MAX_THREADS, PipelineTable};
 use dipir_pipeline::error::StageError;
+use dipir_pipeline::hashing::Hashes;
 use dipir_pipeline::lock::WhenLocked;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
 use serde_json::Value;
 
 use crate::args::{CommonArgs, OutputArgs};
-use crate::exit::Usage;
+use crate::exit::{Usage, printable};
 use crate::interrupt;
 use crate::progress::Progress;
 use crate::style::{bold_yellow, color_on_stderr};
@@ -26,6 +27,21 @@ pub struct Session {
     pub out: PathBuf,
     when_locked: WhenLocked,
     output: OutputArgs,
+    _hashes: HandBack,
+}
+
+/// Adds the hashes that this process took to the file that it got its first ones from, for the
+/// process that started this one.
+#[derive(Debug)]
+struct HandBack(Option<PathBuf>);
+
+impl Drop for HandBack {
+    fn drop(&mut self) {
+        if let Some(path) = self.0.as_ref().filter(|path| Hashes::are_in(path)) {
+            // Without it the files are hashed once more.
+            let _ = Hashes::of_this_process().write(path);
+        }
+    }
 }
 
 impl Session {
@@ -46,6 +62,12 @@ impl Session {
         let mut pipeline = config.pipeline()?;
         pipeline.seed = args.seed.unwrap_or(pipeline.seed);
         pipeline.threads = args.threads.unwrap_or(pipeline.threads);
+        if let Err(message) = check_threads(pipeline.threads) {
+            return Err(match args.threads {
+                Some(_) => Usage(format!("--threads {}: {message}", pipeline.threads)).into(),
+                None => config.invalid("pipeline.threads", message).into(),
+            });
+        }
         let out = match &args.out {
             Some(out) => out.clone(),
             None => config.resolve(&pipeline.out),
@@ -55,10 +77,14 @@ impl Session {
                 Usage("the folder of artifacts is empty: name one with --out".into()).into(),
             );
         }
+        if let Some(path) = &args.hashes {
+            Hashes::read(path).adopt();
+        }
         Ok(Self {
             config,
             pipeline,
             out,
+            _hashes: HandBack(args.hashes.clone()),
             when_locked: match args.wait {
                 true => WhenLocked::Wait,
                 false => WhenLocked::Refuse,
@@ -106,7 +132,7 @@ impl Session {
     /// Prints a remark that only `--verbose` shows.
     pub fn remark(&self, message: impl FnOnce() -> String) {
         if self.output.verbose {
-            eprintln!("{}", message());
+            eprintln!("{}", printable(&message()));
         }
     }
 
@@ -120,7 +146,8 @@ impl OutputArgs {
     /// Prints a warning.
     pub fn warn(&self, message: &str) {
         if !self.quiet {
-            eprintln!("{} {message}", bold_yellow("warning:", color_on_stderr()));
+            let label = bold_yellow("warning:", color_on_stderr());
+            eprintln!("{label} {}", printable(message));
         }
     }
 
@@ -140,11 +167,19 @@ pub fn print_line(text: &str) {
     let _ = writeln!(out, "{text}").and_then(|()| out.flush());
 }
 
+/// Refuses more worker threads than any machine has use for.
+pub fn check_threads(threads: usize) -> Result<(), String> {
+    match threads <= MAX_THREADS {
+        true => Ok(()),
+        false => Err(format!("accepted: 0, for one a core, to {MAX_THREADS}")),
+    }
+}
+
 fn start_threads(threads: usize) -> anyhow::Result<()> {
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build_global()
-        .context("cannot start the worker threads; ask for fewer with --threads")
+        .context("cannot start the worker threads; ask for fewer with --threads, or give the process more memory (ulimit -v)")
 }
 
 /// `1.2 s`, `3 min 20 s`.

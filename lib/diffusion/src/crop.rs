@@ -1,6 +1,7 @@
 //! Random crops of a picture, resampled to a model's size.
 
 use candle_core::{Device, Tensor};
+use dipir_numerics::resample::{Filter, Taps};
 use rayon::prelude::*;
 
 use crate::error::{Result, argument};
@@ -46,20 +47,20 @@ pub fn resample(image: &Tensor, region: CropBox, size: usize) -> Result<Tensor> 
         .flatten_all()?
         .to_vec1::<f32>()?;
     let (rows, columns) = (
-        taps(region.y, region.side, size, height),
-        taps(region.x, region.side, size, width),
+        Taps::new(region.y, region.side, size, height, Filter::Tent),
+        Taps::new(region.x, region.side, size, width, Filter::Tent),
     );
     let mut out = vec![0f32; channels * size * size];
     out.par_chunks_mut(size)
         .enumerate()
         .for_each(|(line, out)| {
             let plane = &values[line / size * height * width..][..height * width];
-            let (first_row, row_weights) = &rows[line % size];
-            for (out, (first, weights)) in out.iter_mut().zip(&columns) {
+            for (x, out) in out.iter_mut().enumerate() {
                 let mut sum = 0f64;
-                for (i, row_weight) in row_weights.iter().enumerate() {
-                    let row = &plane[(first_row + i) * width + first..][..weights.len()];
-                    let line: f64 = row.iter().zip(weights).map(|(&v, &w)| v as f64 * w).sum();
+                for &(i, row_weight) in rows.of(line % size) {
+                    let row = &plane[i * width..][..width];
+                    let taps = columns.of(x).iter();
+                    let line: f64 = taps.map(|&(j, w)| f64::from(row[j]) * w).sum();
                     sum += line * row_weight;
                 }
                 *out = sum as f32;
@@ -70,32 +71,6 @@ pub fn resample(image: &Tensor, region: CropBox, size: usize) -> Result<Tensor> 
         (1, channels, size, size),
         image.device(),
     )?)
-}
-
-/// First source index and weights, summing to 1, of each target.
-fn taps(start: f64, extent: f64, size: usize, source: usize) -> Vec<(usize, Vec<f64>)> {
-    let step = extent / size as f64;
-    let radius = step.max(1.0);
-    (0..size)
-        .map(|i| {
-            // Centres are at half-integers in both grids.
-            let centre = start + (i as f64 + 0.5) * step - 0.5;
-            let last = source - 1;
-            let first = ((centre - radius).ceil().max(0.0) as usize).min(last);
-            let end = ((centre + radius).floor().max(0.0) as usize).clamp(first, last);
-            let mut weights: Vec<f64> = (first..=end)
-                .map(|j| (1.0 - (j as f64 - centre).abs() / radius).max(0.0))
-                .collect();
-            let total: f64 = weights.iter().sum();
-            if total > 0.0 {
-                weights.iter_mut().for_each(|w| *w /= total);
-            } else {
-                // Beyond the border: the nearest pixel.
-                weights = vec![1.0];
-            }
-            (first, weights)
-        })
-        .collect()
 }
 
 #[cfg(test)]

@@ -15,7 +15,7 @@ use crate::vae::Vae;
 
 /// Which difference of predictions.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Guidance {
+pub enum ScoreRule {
     /// Guided prediction minus the noise that was added [Poole et al. 2023];
     /// `scale` as in [`guided`].
     Sds {
@@ -115,7 +115,7 @@ impl InpaintCondition {
     }
 }
 
-/// Everything of a score-distillation step but latents, t and noise.
+/// A score-distillation step: everything but latents, t and noise.
 #[derive(Debug)]
 pub struct ScoreDistillation<'a> {
     /// The network.
@@ -123,7 +123,7 @@ pub struct ScoreDistillation<'a> {
     /// Its schedule.
     pub schedule: &'a NoiseSchedule,
     /// Which difference.
-    pub guidance: Guidance,
+    pub rule: ScoreRule,
     /// w(t).
     pub weighting: Weighting,
     /// Adapter of the personalised model. LDS uses it in the conditional term only, all others in
@@ -161,17 +161,17 @@ impl ScoreDistillation<'_> {
         }
         let latents = latents.detach();
         let weight = self.weighting.at(self.schedule.alpha_bar(t)?);
-        let (difference, weight) = match self.guidance {
-            Guidance::Edit { scale, steps } => {
+        let (difference, weight) = match self.rule {
+            ScoreRule::Edit { scale, steps } => {
                 let edited = self.edited(&latents, t, noise, scale, steps)?;
                 ((&latents - edited)?, 1.0)
             }
-            Guidance::Sds { scale } => {
+            ScoreRule::Sds { scale } => {
                 let (conditional, unconditional) = self.noise(&latents, t, noise)?;
                 let guided = guided(&unconditional, &conditional, scale)?;
                 ((guided - noise)?, weight)
             }
-            Guidance::Csd | Guidance::Lds => {
+            ScoreRule::Csd | ScoreRule::Lds => {
                 let (conditional, unconditional) = self.noise(&latents, t, noise)?;
                 ((conditional - unconditional)?, weight)
             }
@@ -234,7 +234,7 @@ impl ScoreDistillation<'_> {
         let context = Tensor::cat(&contexts, 0)?;
         let rows = context.dim(0)?;
         let inputs = Tensor::cat(&vec![&input; rows / batch], 0)?;
-        let lora_rows = (self.guidance == Guidance::Lds).then_some(batch);
+        let lora_rows = (self.rule == ScoreRule::Lds).then_some(batch);
         let pass = Pass {
             lora: self.lora.cloned(),
             lora_rows,

@@ -34,6 +34,11 @@ pub struct Model {
 }
 
 impl Model {
+    /// The side of the images that the model was trained on, in pixels.
+    pub fn native_size(&self) -> usize {
+        self.unet.config().sample_size * self.vae.downscale()
+    }
+
     /// Loads `model_index.json` and the folders `tokenizer`, `text_encoder`,
     /// `unet`, `vae` and `scheduler`. Half-precision weights are converted to
     /// `dtype`, which has to be f32 on the CPU. Checks that the parts fit

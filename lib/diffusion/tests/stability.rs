@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use candle_core::{DType, Device, Tensor, Var};
-use dipir_diffusion::distillation::{Guidance, ScoreDistillation, Weighting};
+use dipir_diffusion::distillation::{ScoreDistillation, ScoreRule, Weighting};
 use dipir_diffusion::lora::Lora;
 use dipir_diffusion::model::{Model, load_unet};
 use dipir_diffusion::noise::NoiseStream;
@@ -83,11 +83,11 @@ fn score_distillation_is_finite_at_both_ends_for_every_prediction() -> Outcome {
         .into_iter()
         .filter(|s| s.config().beta_schedule == BetaSchedule::ScaledLinear)
     {
-        for guidance in [
-            Guidance::Sds { scale: 100.0 },
-            Guidance::Csd,
-            Guidance::Lds,
-            Guidance::Edit {
+        for rule in [
+            ScoreRule::Sds { scale: 100.0 },
+            ScoreRule::Csd,
+            ScoreRule::Lds,
+            ScoreRule::Edit {
                 scale: 7.5,
                 steps: 4,
             },
@@ -95,7 +95,7 @@ fn score_distillation_is_finite_at_both_ends_for_every_prediction() -> Outcome {
             let step = ScoreDistillation {
                 unet: &model.unet,
                 schedule: &schedule,
-                guidance,
+                rule,
                 weighting: Weighting::NoiseVariance,
                 lora: Some(&lora),
                 conditional: &c,
@@ -108,7 +108,7 @@ fn score_distillation_is_finite_at_both_ends_for_every_prediction() -> Outcome {
                     let size = largest(&found.gradient)?;
                     assert!(
                         size.is_finite() && found.difference.is_finite(),
-                        "{guidance:?}, {:?}, t = {t}: {size}",
+                        "{rule:?}, {:?}, t = {t}: {size}",
                         schedule.config()
                     );
                 }

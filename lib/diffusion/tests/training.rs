@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use candle_core::{DType, Device, Tensor};
 use dipir_diffusion::Error;
-use dipir_diffusion::distillation::{Guidance, InpaintCondition, ScoreDistillation, Weighting};
+use dipir_diffusion::distillation::{InpaintCondition, ScoreDistillation, ScoreRule, Weighting};
 use dipir_diffusion::lora::Lora;
 use dipir_diffusion::model::Model;
 use dipir_diffusion::noise::NoiseStream;
@@ -359,18 +359,18 @@ fn score_distillation_is_the_difference_of_separate_predictions() -> Outcome {
         model.schedule.noise_of(&output, &x_t, t)
     };
     let weight = 1.0 - model.schedule.alpha_bar(t)?;
-    for (guidance, wanted) in [
+    for (rule, wanted) in [
         (
-            Guidance::Sds { scale: 7.5 },
+            ScoreRule::Sds { scale: 7.5 },
             (guided(&predict(&u, true)?, &predict(&c, true)?, 7.5)? - &noise)?,
         ),
-        (Guidance::Csd, (predict(&c, true)? - predict(&u, true)?)?),
-        (Guidance::Lds, (predict(&c, true)? - predict(&u, false)?)?),
+        (ScoreRule::Csd, (predict(&c, true)? - predict(&u, true)?)?),
+        (ScoreRule::Lds, (predict(&c, true)? - predict(&u, false)?)?),
     ] {
         let found = ScoreDistillation {
             unet: &model.unet,
             schedule: &model.schedule,
-            guidance,
+            rule,
             weighting: Weighting::NoiseVariance,
             lora: Some(&lora),
             conditional: &c,
@@ -383,7 +383,7 @@ fn score_distillation_is_the_difference_of_separate_predictions() -> Outcome {
             .max_all()?
             .to_scalar::<f32>()?;
         let size = wanted.abs()?.max_all()?.to_scalar::<f32>()?;
-        assert!(error < 1e-4 * size, "{guidance:?}: {error} of {size}");
+        assert!(error < 1e-4 * size, "{rule:?}: {error} of {size}");
         let mean = wanted.sqr()?.mean_all()?.to_scalar::<f32>()? as f64;
         assert!((found.difference - mean).abs() < 1e-3 * mean);
     }
@@ -397,11 +397,11 @@ fn several_prompts_to_be_told_from_are_averaged_and_an_edit_pulls_towards_itself
     let c = model.encode_prompts(&["a car"], None)?;
     let others = model.encode_prompts(&["a cat", "a tree", ""], None)?;
     let t = 500;
-    let found = |guidance: Guidance, unconditional: &Tensor| {
+    let found = |rule: ScoreRule, unconditional: &Tensor| {
         ScoreDistillation {
             unet: &model.unet,
             schedule: &model.schedule,
-            guidance,
+            rule,
             weighting: Weighting::NoiseVariance,
             lora: None,
             conditional: &c,
@@ -413,21 +413,21 @@ fn several_prompts_to_be_told_from_are_averaged_and_an_edit_pulls_towards_itself
     let largest = |t: &Tensor| -> dipir_diffusion::Result<f32> {
         Ok(t.abs()?.max_all()?.to_scalar::<f32>()?)
     };
-    let together = found(Guidance::Csd, &others)?.gradient;
+    let together = found(ScoreRule::Csd, &others)?.gradient;
     let mut mean = together.zeros_like()?;
     for k in 0..3 {
-        let one = found(Guidance::Csd, &others.narrow(0, k, 1)?)?.gradient;
+        let one = found(ScoreRule::Csd, &others.narrow(0, k, 1)?)?.gradient;
         mean = (mean + (one / 3.0)?)?;
     }
     let size = largest(&together)?;
     assert!(largest(&(together - mean)?)? < 1e-4 * size);
 
     // One step down to the end is the clean sample that is predicted.
-    let guidance = Guidance::Edit {
+    let rule = ScoreRule::Edit {
         scale: 3.0,
         steps: 1,
     };
-    let edited = found(guidance, &others.narrow(0, 2, 1)?)?.gradient;
+    let edited = found(rule, &others.narrow(0, 2, 1)?)?.gradient;
     let sampler = Sampler::new(&model.schedule, Solver::DpmSolver2M, 1)?;
     let start = sampler.timesteps()[0];
     let x_t = model.schedule.add_noise(&latents, &noise, start)?;

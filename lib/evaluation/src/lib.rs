@@ -1,10 +1,8 @@
-//! What measurements say: how far pictures and lights are from the truth, what accuracy costs, and
-//! what people prefer. Nothing here renders or starts programs; it is told numbers and pictures.
-pub mod chart;
-pub mod drawing;
+//! Scores of pictures and lights, medians with intervals, Pareto fronts, charts, and the counts of a user
+//! study. Nothing here renders or starts programs, and nothing of the pipeline imports it.
 pub mod front;
-mod glyphs;
 pub mod lpips;
+pub mod results;
 pub mod scores;
 pub mod study;
 pub mod summary;

@@ -1,6 +1,11 @@
 //! How far a composite and a light are from the true ones.
+use std::path::Path;
+
+use dipir_imaging::error::ImagingError;
+use dipir_imaging::layers::Layers;
 use dipir_imaging::metrics::{rmse, si_rmse, ssim};
-use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
+use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::luminance::luminance;
 use glam::{DVec3, Vec3};
@@ -48,6 +53,39 @@ impl Touched {
     }
 }
 
+/// A composite as it is displayed.
+pub struct DisplayedComposite {
+    /// The picture.
+    pub picture: DisplayImage,
+    /// The photograph without the object.
+    pub photo: DisplayImage,
+    /// Share of each pixel that the object covers.
+    pub coverage: Raster<f32>,
+}
+
+impl DisplayedComposite {
+    /// Reads the layers of a `composite.exr`.
+    ///
+    /// # Errors
+    /// If the file cannot be read or lacks a layer.
+    pub fn read(exr: &Path) -> Result<Self, ImagingError> {
+        let layers = Layers::read_exr(exr)?;
+        let displayed = |name: &str| -> Result<DisplayImage, ImagingError> {
+            Ok(Transfer::Srgb.encode(&LinearImage(layers.rgb(name)?)))
+        };
+        Ok(Self {
+            picture: displayed("")?,
+            photo: displayed("background")?,
+            coverage: layers.channel("object.A")?.clone(),
+        })
+    }
+
+    /// The pixels that object or shadow touch, this composite being the truth.
+    pub fn touched(&self) -> Touched {
+        Touched::new(&self.coverage, &self.picture, &self.photo)
+    }
+}
+
 /// The pixels of `image` where `mask` holds, as one row; one black pixel if there are none.
 fn selected(image: &DisplayImage, mask: &[bool]) -> Raster<Vec3> {
     let pixels = image.0.pixels().iter().zip(mask);
@@ -58,20 +96,24 @@ fn selected(image: &DisplayImage, mask: &[bool]) -> Raster<Vec3> {
     Raster::from_pixels(kept.len(), 1, kept)
 }
 
+/// RMSE of `found` against `truth` over the pixels where `mask` holds. Panics if the sizes differ.
+pub fn rmse_over(found: &DisplayImage, truth: &DisplayImage, mask: &[bool]) -> f64 {
+    rmse(&selected(found, mask), &selected(truth, mask))
+}
+
 /// Scores of `found` against `truth`. Panics if the sizes differ.
 pub fn compare_pictures(
     found: &DisplayImage,
     truth: &DisplayImage,
     touched: &Touched,
 ) -> PictureScores {
-    let of = |mask: &[bool]| (selected(found, mask), selected(truth, mask));
-    let (any, object) = (of(&touched.any), of(&touched.object));
+    let [found_object, true_object] = [found, truth].map(|p| selected(p, &touched.object));
     PictureScores {
         rmse: rmse(&found.0, &truth.0),
         ssim: ssim(&found.0, &truth.0),
         si_rmse: si_rmse(&found.0, &truth.0),
-        rmse_touched: rmse(&any.0, &any.1),
-        si_rmse_object: si_rmse(&object.0, &object.1),
+        rmse_touched: rmse_over(found, truth, &touched.any),
+        si_rmse_object: si_rmse(&found_object, &true_object),
     }
 }
 

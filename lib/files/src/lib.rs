@@ -1,10 +1,15 @@
-//! Opening the files that users name.
+//! Opening the files that users name, and replacing only those that this program made.
 //!
 //! A pipe can make a reader wait for ever and a device can be read without end, so anything but a
-//! regular file is refused before it is opened.
-use std::fs::{self, File};
+//! regular file is refused before it is opened. What is written over an earlier file is written
+//! beside it first; the earlier one is replaced only if it begins with the mark of this program.
+mod own;
+
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
+
+pub use own::{begins_with, open_own, replace, sync_folder};
 
 /// Opens a regular file for reading. Symbolic links are followed.
 ///
@@ -13,15 +18,26 @@ use std::path::Path;
 /// pipes, sockets and devices.
 pub fn open(path: impl AsRef<Path>) -> io::Result<File> {
     let path = path.as_ref();
-    let kind = fs::metadata(path)?.file_type();
-    if kind.is_file() {
-        return File::open(path);
-    }
-    let found = match kind.is_dir() {
-        true => "a folder, not a regular file",
-        false => "not a regular file",
+    check_regular(&fs::metadata(path)?)?;
+    let mut options = OpenOptions::new();
+    options.read(true);
+    // Something else may have come to the name since: it is not waited for, and refused.
+    own::do_not_wait(&mut options);
+    let file = options.open(path)?;
+    check_regular(&file.metadata()?)?;
+    Ok(file)
+}
+
+/// Refuses what is not a regular file.
+fn check_regular(found: &fs::Metadata) -> io::Result<()> {
+    let kind = found.file_type();
+    let message = match (kind.is_file(), kind.is_dir(), kind.is_symlink()) {
+        (true, _, _) => return Ok(()),
+        (_, true, _) => "a folder, not a regular file",
+        (_, _, true) => "a symbolic link, not a regular file",
+        _ => "not a regular file",
     };
-    Err(io::Error::new(io::ErrorKind::InvalidInput, found))
+    Err(io::Error::new(io::ErrorKind::InvalidInput, message))
 }
 
 /// The bytes of a regular file. Errors as [`open`].

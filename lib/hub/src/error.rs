@@ -92,6 +92,12 @@ pub enum Error {
         /// Of the hub.
         wanted: String,
     },
+    /// The folder that is received into holds something else.
+    #[error("{path} is there and dipir-model did not begin it; move it away or name another folder with --to", path = path.display())]
+    Foreign {
+        /// The folder.
+        path: PathBuf,
+    },
     /// Reading or writing failed.
     #[error("cannot {action} {path}: {source}", path = path.display())]
     Io {

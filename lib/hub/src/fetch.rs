@@ -142,15 +142,22 @@ fn length(path: &Path) -> Result<u64> {
     Ok(fs::metadata(path).map_err(io("read", path))?.len())
 }
 
-/// Makes `partial` a folder of this source: what is of another goes.
+/// Makes `partial` a folder of this source: the files of another source that its note lists go, and
+/// a folder without a note is another's and is refused.
 fn prepare(partial: &Path, source: &Source) -> Result<()> {
     let note = partial.join(SOURCE_FILE);
     let earlier = fs::read(&note)
         .ok()
         .and_then(|text| serde_json::from_slice::<Source>(&text).ok());
-    let same = earlier.is_some_and(|e| e.repo == source.repo && e.commit == source.commit);
-    if !same && partial.exists() {
-        fs::remove_dir_all(partial).map_err(io("write", partial))?;
+    match &earlier {
+        Some(e) if e.repo == source.repo && e.commit == source.commit => {}
+        Some(e) => remove_listed(partial, e)?,
+        None if is_free(partial)? => {}
+        None => {
+            return Err(Error::Foreign {
+                path: partial.into(),
+            });
+        }
     }
     fs::create_dir_all(partial).map_err(io("write", partial))?;
     let mut text = serde_json::to_vec_pretty(source).map_err(|e| Error::Io {
@@ -159,7 +166,50 @@ fn prepare(partial: &Path, source: &Source) -> Result<()> {
         source: e.into(),
     })?;
     text.push(b'\n');
-    fs::write(&note, text).map_err(io("write", &note))
+    // Beside it first: whoever is killed here leaves a note that can be read.
+    let beside = part_of(&note);
+    fs::write(&beside, text)
+        .and_then(|()| fs::rename(&beside, &note))
+        .map_err(io("write", &note))
+}
+
+/// Whether nothing is at `folder`, or an empty folder, or one in which the note was begun.
+fn is_free(folder: &Path) -> Result<bool> {
+    let found = match fs::symlink_metadata(folder) {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(true),
+        found => found.map_err(io("read", folder))?,
+    };
+    if !found.is_dir() {
+        return Ok(false);
+    }
+    let begun = part_of(Path::new(SOURCE_FILE));
+    for entry in fs::read_dir(folder).map_err(io("read", folder))? {
+        if Path::new(&entry.map_err(io("read", folder))?.file_name()) != begun {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// Removes what an earlier fetch of another source left, whole or in part, and nothing else.
+fn remove_listed(partial: &Path, earlier: &Source) -> Result<()> {
+    use std::path::Component;
+    let is_inside = |name: &&String| {
+        let mut parts = Path::new(name).components();
+        parts.all(|c| matches!(c, Component::Normal(_)))
+    };
+    for name in earlier.files.iter().filter(is_inside) {
+        let path = partial.join(name);
+        for path in [part_of(&path), path] {
+            match fs::remove_file(&path) {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(io("remove", &path)(e));
+                }
+                _ => {}
+            }
+        }
+    }
+    Ok(())
 }
 
 struct Run {
@@ -286,6 +336,31 @@ fn digest(mut context: Context, path: &Path) -> Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_what_an_earlier_fetch_lists_is_removed() {
+        let folder = tempfile::tempdir().expect("folder");
+        let partial = folder.path().join(".model.partial");
+        let source = |commit: &str| Source {
+            repo: "a/b".into(),
+            commit: commit.into(),
+            files: vec!["unet/x".into(), "../thesis".into()],
+        };
+        prepare(&partial, &source("1")).expect("new");
+        fs::create_dir(partial.join("unet")).expect("folder");
+        for name in ["unet/x", "unet/x.part", "notes", "../thesis"] {
+            fs::write(partial.join(name), "x").expect("write");
+        }
+        prepare(&partial, &source("1")).expect("the same");
+        assert!(partial.join("unet/x").exists());
+        prepare(&partial, &source("2")).expect("another");
+        assert!(!partial.join("unet/x").exists() && !partial.join("unet/x.part").exists());
+        assert!(partial.join("notes").exists() && partial.join("../thesis").exists());
+        fs::remove_file(partial.join(SOURCE_FILE)).expect("remove");
+        let error = prepare(&partial, &source("2")).expect_err("no note");
+        assert!(error.to_string().contains("did not begin"), "{error}");
+        assert!(partial.join("notes").exists());
+    }
 
     #[test]
     fn hashes_are_those_of_git_and_sha256() {

@@ -30,7 +30,7 @@ pub enum ImagingError {
         expected: &'static str,
     },
     /// The first bytes belong to no accepted format.
-    #[error("`{}` is {found}; expected {expected}: convert the file", path.display())]
+    #[error("`{}` is {found}; expected {expected}: {remedy}", path.display())]
     WrongFormat {
         /// The file.
         path: PathBuf,
@@ -38,6 +38,8 @@ pub enum ImagingError {
         found: &'static str,
         /// Accepted formats.
         expected: &'static str,
+        /// What to do, with the command of a converter where there is a usual one.
+        remedy: String,
     },
     /// The format is right but the contents cannot be decoded, most often because the end is missing.
     #[error("`{}` is damaged or cut short: {detail}; expected a complete {format} file: export or copy it again", path.display())]
@@ -122,6 +124,32 @@ pub enum ImagingError {
         expected: (usize, usize),
         /// The image that sets the size.
         reference: &'static str,
+    },
+    /// A photograph with more pixels than allowed.
+    #[error("`{}` is {width} x {height} pixels ({megapixels:.1} megapixels); the limit is {limit}: scale it down, or raise {key}", path.display())]
+    TooManyPixels {
+        /// The file.
+        path: PathBuf,
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+        /// Both multiplied, in millions.
+        megapixels: f64,
+        /// The most, in millions.
+        limit: f64,
+        /// The key of the configuration that sets the limit.
+        key: &'static str,
+    },
+    /// A file with more bytes than an image of the largest size has.
+    #[error("`{}` has {bytes} bytes; expected at most {limit}, the largest image uncompressed: save it compressed", path.display())]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// Its length.
+        bytes: u64,
+        /// The most.
+        limit: u64,
     },
     /// An image with no pixels, or too many of them.
     #[error(

@@ -1,7 +1,7 @@
 //! OpenEXR files in and out, between the `exr` library and [`Layers`].
 use crate::{
-    error::{ImagingError, MAX_PIXELS},
-    file::check_size,
+    decode::SizeLimit,
+    error::ImagingError,
     format::Format,
     layers::{Layers, Precision},
     raster::Raster,
@@ -28,9 +28,11 @@ use exr::{
 use half::{f16, slice::HalfFloatSliceExt};
 use rayon::prelude::*;
 use std::{
+    cell::Cell,
     fs::File,
     io::{BufRead, BufReader, BufWriter, Read, Seek, Write},
-    path::Path,
+    path::{Path, PathBuf},
+    rc::Rc,
 };
 
 /// The name of the format in messages.
@@ -85,8 +87,7 @@ pub(crate) fn write(layers: &Layers, path: &Path) -> Result<(), ImagingError> {
 
 /// Half floats, unless a finite value would overflow to infinity.
 fn half_samples(values: &[f32]) -> FlatSamples {
-    let limit = f16::MAX.to_f32();
-    if values.iter().any(|v| v.is_finite() && v.abs() > limit) {
+    if Precision::half_if_it_fits(values.iter().copied()) == Precision::Full {
         return FlatSamples::F32(values.to_vec());
     }
     let mut halves = vec![f16::ZERO; values.len()];
@@ -97,7 +98,8 @@ fn half_samples(values: &[f32]) -> FlatSamples {
 /// Opens `path` and reads as [`read`], after a look at its first bytes.
 pub(crate) fn open(path: &Path, names: Option<&[&str]>) -> Result<Layers, ImagingError> {
     let failed = |e| ImagingError::io("read", path, e);
-    let file = File::open(path).map_err(failed)?;
+    let file = dipir_files::open(path).map_err(failed)?;
+    let length = file.metadata().map_err(failed)?.len();
     let mut reader = BufReader::with_capacity(1 << 20, file);
     let start = reader.fill_buf().map_err(failed)?;
     if start.is_empty() {
@@ -107,32 +109,51 @@ pub(crate) fn open(path: &Path, names: Option<&[&str]>) -> Result<Layers, Imagin
         });
     }
     match Format::of(&start[..start.len().min(Format::SNIFF_LENGTH)]) {
-        Format::Exr => read(reader, path, names),
+        Format::Exr => read(reader, length, path, names, SizeLimit::Any),
         other => Err(other.refuse(path, EXPECTED)),
     }
 }
 
 /// Reads the channels `names`, or all, onto the display window. A name that the file lacks is
-/// left out; asking the layers for it is an error.
+/// left out; asking the layers for it is an error. `length` is the file's, in bytes: more samples
+/// than it can hold are refused before they are allocated. `limit` is that of each part.
 pub(crate) fn read(
     source: impl Read + Seek + Send,
+    length: u64,
     path: &Path,
     names: Option<&[&str]>,
+    limit: SizeLimit,
 ) -> Result<Layers, ImagingError> {
+    let refused = Rc::new(Cell::new(None));
     let reader = ReadAnyChannels {
         read_samples: WantedSamples {
             names: names.map(|names| names.iter().map(|name| name.to_string()).collect()),
+            samples_left: Cell::new(length.saturating_mul(MOST_SAMPLES_A_BYTE)),
+            limit,
+            path: path.to_owned(),
+            refused: refused.clone(),
         },
     };
     let image = reader
         .all_layers()
         .all_attributes()
         .from_buffered(source)
-        .map_err(|error| read_error(path, error))?;
+        .map_err(|error| match refused.take() {
+            Some(Refused::Size(width, height)) => match limit.check(path, width, height) {
+                Err(refused) => refused,
+                Ok(()) => read_error(path, error),
+            },
+            Some(Refused::Length) => ImagingError::Damaged {
+                path: path.to_owned(),
+                format: FORMAT,
+                detail: "it declares more pixels than a file of its length can hold".into(),
+            },
+            None => read_error(path, error),
+        })?;
 
     let window = image.attributes.display_window;
     let (width, height) = (window.size.0, window.size.1);
-    check_size(path, width, height)?;
+    limit.check(path, width, height)?;
     let mut layers = Layers::from_file(width, height, path);
     for part in image.layer_data {
         if part.attributes.environment_map == Some(EnvironmentMap::LatitudeLongitude) {
@@ -219,7 +240,25 @@ fn write_error(path: &Path, error: exr::error::Error) -> ImagingError {
 /// Reads every channel straight to f32, and keeps only those that are wanted.
 struct WantedSamples {
     names: Option<Vec<String>>,
+    /// How many more the file can hold.
+    samples_left: Cell<u64>,
+    limit: SizeLimit,
+    path: PathBuf,
+    /// Why the file is not read.
+    refused: Rc<Cell<Option<Refused>>>,
 }
+
+#[derive(Clone, Copy)]
+enum Refused {
+    /// Width and height of a part.
+    Size(usize, usize),
+    /// The file is too short for what it declares.
+    Length,
+}
+
+/// Samples that a byte of a file can stand for. Deflate makes at most 1032 bytes of one, and two
+/// bytes are the shortest sample; lossy codings of flat blocks reach a few times as much.
+const MOST_SAMPLES_A_BYTE: u64 = 2048;
 
 struct WantedSamplesReader {
     kept: Option<(SampleType, Vec<f32>)>,
@@ -246,12 +285,20 @@ impl ReadSamples for WantedSamples {
                 format!("subsampled channels (`{}`)", channel.name).into(),
             ));
         }
-        let area = size.0.checked_mul(size.1).filter(|&n| n <= MAX_PIXELS);
-        let Some(area) = area else {
-            return Err(exr::error::Error::NotSupported(
-                format!("{} x {} pixels", size.0, size.1).into(),
-            ));
+        let refuse = |why| {
+            self.refused.set(Some(why));
+            Err(exr::error::Error::Aborted)
         };
+        if self.limit.check(&self.path, size.0, size.1).is_err() {
+            return refuse(Refused::Size(size.0, size.1));
+        }
+        let area = size.0 * size.1;
+        if wanted {
+            match self.samples_left.get().checked_sub(area as u64) {
+                Some(left) => self.samples_left.set(left),
+                None => return refuse(Refused::Length),
+            }
+        }
         Ok(WantedSamplesReader {
             kept: wanted.then(|| (channel.sample_type, vec![0.0; area])),
             size,

@@ -1,75 +1,178 @@
 //! Photographs, masks, textures and linear images in files.
+pub use crate::png_file::{write_picture, write_png, write_png_16, write_png_mask};
 use crate::{
+    decode::{Decoded, SizeLimit},
+    encoding::Encoding,
     error::{ImagingError, MAX_PIXELS},
     exr_file,
+    facts::Facts,
     format::Format,
-    jpeg_header,
+    hdr_file,
     layers::Layers,
-    raster::{DisplayImage, LinearImage, Raster},
+    raster::{LinearImage, Raster},
     transfer::Transfer,
 };
 use glam::Vec3;
-use image::{
-    DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder,
-    codecs::{
-        hdr::HdrDecoder,
-        jpeg::JpegDecoder,
-        png::{CompressionType, FilterType, PngDecoder, PngEncoder},
-    },
-};
-use std::{
-    fs::File,
-    io::{BufWriter, Cursor, Write},
-    path::Path,
-};
+use image::metadata::Orientation;
+use std::{io::Cursor, io::Read, path::Path};
 
 const DISPLAY_FORMATS: &str = "a PNG or JPEG image";
 const LINEAR_FORMATS: &str = "an OpenEXR or Radiance HDR image (linear light)";
 const PHOTO_FORMATS: &str = "a PNG, JPEG, OpenEXR or Radiance HDR image";
 
-/// A photograph in linear light.
+/// A photograph in linear light, upright: an Exif orientation has been applied.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Photo {
-    /// Linear Rec.709, upright (an Exif orientation has been applied). Not premultiplied.
+    /// Linear Rec.709, not premultiplied. Colours of a wide gamut have values below 0.
     pub image: LinearImage,
     /// Opacity in `[0, 1]`, if the file has it.
     pub alpha: Option<Raster<f32>>,
-    /// The curve with which results are encoded to look like the photograph.
+    /// The curve with which results are encoded to look like the photograph, where its own
+    /// [`encoding`](Self::encoding) is not used.
     pub transfer: Transfer,
+    /// How the file's values were encoded.
+    pub encoding: Encoding,
+    /// The file's values, of 8 bits, if it is display-referred.
+    pub values: Option<Raster<[u8; 3]>>,
+    /// What the file says of how it was taken.
+    pub facts: Facts,
+    /// The file's Exif data from the TIFF header on, with no orientation left to be applied.
+    pub exif: Option<Vec<u8>>,
+    /// What of the file could not be used, one sentence each.
+    pub warnings: Vec<String>,
 }
 
-/// Reads a photograph: PNG (8 or 16 bit; grey, RGB, with or without alpha, palette) or JPEG, decoded
-/// with `transfer`; OpenEXR and Radiance HDR are linear already. Embedded colour profiles and PNG
-/// gamma chunks are ignored: `transfer` says how the pixels were encoded.
+/// The most that a photograph may ask for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PhotoLimits {
+    /// Most pixels, in millions. A pixel takes 18 bytes while it is read.
+    pub megapixels: f64,
+}
+
+impl PhotoLimits {
+    /// The key that changes the limit.
+    pub const KEY: &str = "scene.limits.photo_megapixels";
+}
+
+impl Default for PhotoLimits {
+    /// 200 megapixels, the most that cameras take.
+    fn default() -> Self {
+        Self { megapixels: 200.0 }
+    }
+}
+
+impl PhotoLimits {
+    /// Errors on an image with no pixels or too many.
+    pub(crate) fn check(
+        self,
+        path: &Path,
+        width: usize,
+        height: usize,
+    ) -> Result<(), ImagingError> {
+        let megapixels = width as f64 * height as f64 * 1e-6;
+        if megapixels > self.megapixels {
+            return Err(ImagingError::TooManyPixels {
+                path: path.to_owned(),
+                width,
+                height,
+                megapixels,
+                limit: self.megapixels,
+                key: Self::KEY,
+            });
+        }
+        if width == 0 || height == 0 {
+            return check_size(path, width, height);
+        }
+        Ok(())
+    }
+}
+
+/// Reads a photograph of up to 200 megapixels, as [`read_photo_within`].
 ///
-/// Errors on a missing, empty, truncated or unsupported file, and on NaN or infinite light.
+/// # Errors
+/// As [`read_photo_within`].
 pub fn read_photo(path: impl AsRef<Path>, transfer: Transfer) -> Result<Photo, ImagingError> {
+    read_photo_within(path, transfer, PhotoLimits::default())
+}
+
+/// Reads a photograph: PNG (8 or 16 bit; grey, RGB, with or without alpha, palette), JPEG, OpenEXR
+/// or Radiance HDR.
+///
+/// PNG and JPEG are decoded with their ICC profile if they have one and `transfer` is
+/// [`Transfer::Srgb`]; another curve overrules the file. PNG gamma chunks are ignored. OpenEXR and
+/// Radiance HDR are linear Rec.709 already.
+///
+/// # Errors
+/// On a missing, empty, truncated or unsupported file, on more pixels than `limits` allow, and on
+/// NaN or infinite light.
+pub fn read_photo_within(
+    path: impl AsRef<Path>,
+    transfer: Transfer,
+    limits: PhotoLimits,
+) -> Result<Photo, ImagingError> {
     let path = path.as_ref();
     let bytes = read_bytes(path, PHOTO_FORMATS)?;
+    let limit = SizeLimit::Photo(limits);
+    let linear = |image: LinearImage, alpha| Photo {
+        facts: Facts::of_size([image.0.width() as u32, image.0.height() as u32]),
+        image,
+        alpha,
+        transfer,
+        encoding: Encoding::named(transfer),
+        values: None,
+        exif: None,
+        warnings: Vec::new(),
+    };
     match Format::of(&bytes) {
         Format::Png | Format::Jpeg => {
-            let decoded = decode_display(&bytes, path, PHOTO_FORMATS, Orient::Upright)?;
-            let (image, alpha) = linearise(decoded, transfer);
-            Ok(Photo {
-                image,
-                alpha,
-                transfer,
-            })
+            let decoded = Decoded::of(&bytes, path, PHOTO_FORMATS, limit)?;
+            drop(bytes);
+            Ok(display_photo(decoded, path, transfer))
         }
         Format::Exr => {
-            let layers = read_colour(&bytes, path)?;
-            Ok(Photo {
-                image: linear_of_layers(&layers, path)?,
-                alpha: layers.channel("A").ok().cloned(),
-                transfer,
-            })
+            let layers = read_colour(&bytes, path, limit)?;
+            let alpha = layers.channel("A").ok().cloned();
+            Ok(linear(linear_of_layers(&layers, path)?, alpha))
         }
-        Format::Hdr => Ok(Photo {
-            image: decode_hdr(&bytes, path)?,
-            alpha: None,
-            transfer,
-        }),
+        Format::Hdr => Ok(linear(hdr_file::decode(&bytes, path, limit)?, None)),
         other => Err(other.refuse(path, PHOTO_FORMATS)),
+    }
+}
+
+fn display_photo(mut decoded: Decoded, path: &Path, transfer: Transfer) -> Photo {
+    let mut warnings = Vec::new();
+    let profile = decoded.icc.as_deref().map(|icc| {
+        Encoding::of_profile(icc, decoded.colours()).map_err(|why| {
+            warnings.push(format!(
+                "`{}`: its colour profile {why}; it is read as sRGB: convert it to sRGB if its colours look wrong",
+                path.display()
+            ));
+        })
+    });
+    let profile = profile.and_then(Result::ok);
+    let encoding = match (transfer, profile) {
+        (Transfer::Srgb, Some(profile)) => profile,
+        (_, profile) => Encoding::overruled(transfer, profile),
+    };
+    let image = decoded.light(&encoding);
+    let size = [image.0.width() as u32, image.0.height() as u32];
+    let mut exif = decoded.exif.take();
+    let facts = match &exif {
+        Some(exif) => Facts::of_exif(exif, size),
+        None => Facts::of_size(size),
+    };
+    if let Some(exif) = &mut exif {
+        let _turn = Orientation::remove_from_exif_chunk(exif);
+    }
+    Photo {
+        image,
+        alpha: decoded.opacity(),
+        transfer,
+        encoding,
+        values: Some(decoded.values_8()),
+        facts,
+        exif,
+        warnings,
     }
 }
 
@@ -78,22 +181,24 @@ pub fn read_photo(path: impl AsRef<Path>, transfer: Transfer) -> Result<Photo, I
 pub fn read_linear(path: impl AsRef<Path>) -> Result<LinearImage, ImagingError> {
     let path = path.as_ref();
     let bytes = read_bytes(path, LINEAR_FORMATS)?;
+    let limit = SizeLimit::Any;
     match Format::of(&bytes) {
-        Format::Exr => linear_of_layers(&read_colour(&bytes, path)?, path),
-        Format::Hdr => decode_hdr(&bytes, path),
+        Format::Exr => linear_of_layers(&read_colour(&bytes, path, limit)?, path),
+        Format::Hdr => hdr_file::decode(&bytes, path, limit),
         other => Err(other.refuse(path, LINEAR_FORMATS)),
     }
 }
 
-/// Reads a mask in `[0, 1]` (white is 1) from PNG or JPEG. Stored values are coverage: no transfer
-/// is applied. Colour is weighted as Rec.709 luma, and opacity multiplies.
+/// Reads a mask in `[0, 1]` (white is 1) from PNG or JPEG, upright as people see it. Stored values
+/// are coverage: no transfer and no profile is applied. Colour is weighted as Rec.709 luma, and
+/// opacity multiplies.
 pub fn read_mask(path: impl AsRef<Path>) -> Result<Raster<f32>, ImagingError> {
     let path = path.as_ref();
     let bytes = read_bytes(path, DISPLAY_FORMATS)?;
-    let decoded = decode_display(&bytes, path, DISPLAY_FORMATS, Orient::Upright)?;
-    let (image, alpha) = linearise(decoded, Transfer::Linear);
+    let decoded = Decoded::of(&bytes, path, DISPLAY_FORMATS, SizeLimit::Any)?;
+    let image = decoded.light(&Encoding::named(Transfer::Linear));
     let mut mask = image.0.map(|c| c.dot(crate::metrics::LUMA).min(1.0));
-    if let Some(alpha) = alpha {
+    if let Some(alpha) = decoded.opacity() {
         for (m, a) in mask.pixels_mut().iter_mut().zip(alpha.pixels()) {
             *m *= a;
         }
@@ -101,9 +206,9 @@ pub fn read_mask(path: impl AsRef<Path>) -> Result<Raster<f32>, ImagingError> {
     Ok(mask)
 }
 
-/// Decodes a PNG or JPEG texture to 8-bit RGBA as stored: no transfer, no orientation (glTF 2.0,
-/// 3.8.3). Grey is spread over the colours, missing alpha is 255, 16 bits are rounded to 8.
-/// `name` stands in the error for the path.
+/// Decodes a PNG or JPEG texture to 8-bit RGBA as stored: no transfer, no profile, no orientation
+/// (glTF 2.0, 3.8.3). Grey is spread over the colours, missing alpha is 255, 16 bits are rounded to
+/// 8. `name` stands in the error for the path.
 pub fn decode_texture(bytes: &[u8], name: &str) -> Result<Raster<[u8; 4]>, ImagingError> {
     let path = Path::new(name);
     if bytes.is_empty() {
@@ -112,169 +217,38 @@ pub fn decode_texture(bytes: &[u8], name: &str) -> Result<Raster<[u8; 4]>, Imagi
             expected: DISPLAY_FORMATS,
         });
     }
-    let decoded = decode_display(bytes, path, DISPLAY_FORMATS, Orient::AsStored)?;
-    let rgba = decoded.into_rgba8();
-    let (width, height) = (rgba.width() as usize, rgba.height() as usize);
-    let pixels = rgba.into_raw().as_chunks::<4>().0.to_vec();
-    Ok(Raster::from_pixels(width, height, pixels))
-}
-
-/// Writes an 8-bit RGB PNG, rounding to nearest. Values outside `[0, 1]` are clipped; NaN and
-/// infinity are errors.
-pub fn write_png(path: impl AsRef<Path>, image: &DisplayImage) -> Result<(), ImagingError> {
-    let path = path.as_ref();
-    check_finite(path, &image.0)?;
-    let bytes: Vec<u8> = image
-        .0
-        .pixels()
-        .iter()
-        .flat_map(|p| p.to_array().map(quantise_8))
-        .collect();
-    encode_png(path, &image.0, &bytes, ExtendedColorType::Rgb8)
-}
-
-/// Writes a 16-bit RGB PNG; otherwise as [`write_png`].
-pub fn write_png_16(path: impl AsRef<Path>, image: &DisplayImage) -> Result<(), ImagingError> {
-    let path = path.as_ref();
-    check_finite(path, &image.0)?;
-    // The encoder takes samples in the machine's byte order.
-    let bytes: Vec<u8> = image
-        .0
-        .pixels()
-        .iter()
-        .flat_map(|p| p.to_array())
-        .flat_map(|v| ((v.clamp(0.0, 1.0) * 65535.0 + 0.5) as u16).to_ne_bytes())
-        .collect();
-    encode_png(path, &image.0, &bytes, ExtendedColorType::Rgb16)
-}
-
-/// Writes a mask in `[0, 1]` as an 8-bit grey PNG; NaN and infinity are errors.
-pub fn write_png_mask(path: impl AsRef<Path>, mask: &Raster<f32>) -> Result<(), ImagingError> {
-    let path = path.as_ref();
-    check_finite(path, &mask.map(|&v| Vec3::splat(v)))?;
-    let bytes: Vec<u8> = mask.pixels().iter().map(|&v| quantise_8(v)).collect();
-    encode_png(path, mask, &bytes, ExtendedColorType::L8)
-}
-
-fn quantise_8(value: f32) -> u8 {
-    (value.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
+    Ok(Decoded::of(bytes, path, DISPLAY_FORMATS, SizeLimit::Any)?.rgba_8())
 }
 
 fn read_bytes(path: &Path, expected: &'static str) -> Result<Vec<u8>, ImagingError> {
-    let bytes = std::fs::read(path).map_err(|e| ImagingError::io("read", path, e))?;
-    if bytes.is_empty() {
+    let failed = |e| ImagingError::io("read", path, e);
+    let mut file = dipir_files::open(path).map_err(failed)?;
+    let length = file.metadata().map_err(failed)?.len();
+    if length == 0 {
         return Err(ImagingError::Empty {
             path: path.to_owned(),
             expected,
         });
     }
+    if length > MAX_FILE_BYTES {
+        return Err(ImagingError::TooLarge {
+            path: path.to_owned(),
+            bytes: length,
+            limit: MAX_FILE_BYTES,
+        });
+    }
+    let mut bytes = Vec::with_capacity(length as usize);
+    file.read_to_end(&mut bytes).map_err(failed)?;
     Ok(bytes)
 }
 
-/// Whether an Exif orientation is applied.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Orient {
-    Upright,
-    AsStored,
-}
+/// The largest image file that is read: 16,384 x 16,384 pixels of four 32-bit floats.
+const MAX_FILE_BYTES: u64 = 1 << 32;
 
-fn decode_display(
-    bytes: &[u8],
-    path: &Path,
-    expected: &'static str,
-    orient: Orient,
-) -> Result<DynamicImage, ImagingError> {
-    let format = Format::of(bytes);
-    let failed = |error| image_error(path, format, error);
-    match format {
-        Format::Png => {
-            let decoder = PngDecoder::new(Cursor::new(bytes)).map_err(failed)?;
-            decode_with(decoder, path, orient).map_err(failed)?
-        }
-        Format::Jpeg => {
-            jpeg_header::check(bytes, path)?;
-            let decoder = JpegDecoder::new(Cursor::new(bytes)).map_err(failed)?;
-            decode_with(decoder, path, orient).map_err(failed)?
-        }
-        other => Err(other.refuse(path, expected)),
-    }
-}
-
-/// The outer result is the decoder's, the inner one ours.
-fn decode_with(
-    mut decoder: impl ImageDecoder,
-    path: &Path,
-    orient: Orient,
-) -> image::ImageResult<Result<DynamicImage, ImagingError>> {
-    let (width, height) = decoder.dimensions();
-    let (width, height) = (width as usize, height as usize);
-    if let Err(error) = check_size(path, width, height) {
-        return Ok(Err(error));
-    }
-    let orientation = decoder.orientation();
-    let mut decoded = DynamicImage::from_decoder(decoder)?;
-    if let (Orient::Upright, Ok(orientation)) = (orient, orientation) {
-        decoded.apply_orientation(orientation);
-    }
-    Ok(Ok(decoded))
-}
-
-fn image_error(path: &Path, format: Format, error: image::ImageError) -> ImagingError {
-    match error {
-        image::ImageError::Unsupported(_) => ImagingError::Unsupported {
-            path: path.to_owned(),
-            what: format!("is a kind of {} file", format.name()),
-            remedy: "save it as an 8-bit RGB PNG",
-        },
-        other => ImagingError::Damaged {
-            path: path.to_owned(),
-            format: format.name(),
-            detail: other.to_string(),
-        },
-    }
-}
-
-/// Decoded samples to linear light and opacity, by table: a file has at most 65,536 sample values.
-fn linearise(decoded: DynamicImage, transfer: Transfer) -> (LinearImage, Option<Raster<f32>>) {
-    let (width, height) = (decoded.width() as usize, decoded.height() as usize);
-    let color = decoded.color();
-    let channels = color.channel_count() as usize;
-    let samples: Vec<u16>;
-    let max: u16;
-    if color.bytes_per_pixel() as usize == channels {
-        samples = decoded.into_bytes().into_iter().map(u16::from).collect();
-        max = 255;
-    } else {
-        samples = match channels {
-            1 => decoded.into_luma16().into_raw(),
-            2 => decoded.into_luma_alpha16().into_raw(),
-            3 => decoded.into_rgb16().into_raw(),
-            _ => decoded.into_rgba16().into_raw(),
-        };
-        max = 65535;
-    }
-    let unit = |v: u16| f32::from(v) / f32::from(max);
-    let table: Vec<f32> = (0..=max).map(|v| transfer.decode_scalar(unit(v))).collect();
-    let lookup = |v: u16| table[usize::from(v)];
-    let pixels = samples
-        .chunks_exact(channels)
-        .map(|s| match s {
-            [r, g, b] | [r, g, b, _] => Vec3::new(lookup(*r), lookup(*g), lookup(*b)),
-            _ => Vec3::splat(lookup(s[0])),
-        })
-        .collect();
-    let alpha = color.has_alpha().then(|| {
-        let opacity = samples
-            .chunks_exact(channels)
-            .map(|s| unit(s[channels - 1]));
-        Raster::from_pixels(width, height, opacity.collect())
-    });
-    let image = LinearImage(Raster::from_pixels(width, height, pixels));
-    (image, alpha)
-}
-
-fn read_colour(bytes: &[u8], path: &Path) -> Result<Layers, ImagingError> {
-    exr_file::read(Cursor::new(bytes), path, Some(&["R", "G", "B", "A", "Y"]))
+fn read_colour(bytes: &[u8], path: &Path, limit: SizeLimit) -> Result<Layers, ImagingError> {
+    let length = bytes.len() as u64;
+    let names = ["R", "G", "B", "A", "Y"];
+    exr_file::read(Cursor::new(bytes), length, path, Some(&names), limit)
 }
 
 fn linear_of_layers(layers: &Layers, path: &Path) -> Result<LinearImage, ImagingError> {
@@ -298,30 +272,8 @@ pub(crate) fn check_size(path: &Path, width: usize, height: usize) -> Result<(),
     })
 }
 
-fn decode_hdr(bytes: &[u8], path: &Path) -> Result<LinearImage, ImagingError> {
-    let failed = |error| image_error(path, Format::Hdr, error);
-    // Some programs sign with `#?RGBE`, which the strict decoder does not know.
-    let decoder = if bytes.starts_with(b"#?RADIANCE") {
-        HdrDecoder::new(Cursor::new(bytes))
-    } else {
-        HdrDecoder::new_nonstrict(Cursor::new(bytes))
-    };
-    let decoder = decoder.map_err(failed)?;
-    let (width, height) = decoder.dimensions();
-    let (width, height) = (width as usize, height as usize);
-    check_size(path, width, height)?;
-    // Decoded in place: a 4k map is 100 MB, which a conversion would move twice.
-    let mut samples = vec![[0.0f32; 3]; width * height];
-    let bytes = bytemuck::cast_slice_mut(&mut samples);
-    decoder.read_image(bytes).map_err(failed)?;
-    let pixels = samples.into_iter().map(Vec3::from_array).collect();
-    let image = Raster::from_pixels(width, height, pixels);
-    check_finite(path, &image)?;
-    Ok(LinearImage(image))
-}
-
 /// Errors with the first pixel, row by row, that is NaN or infinite.
-fn check_finite(path: &Path, image: &Raster<Vec3>) -> Result<(), ImagingError> {
+pub(crate) fn check_finite(path: &Path, image: &Raster<Vec3>) -> Result<(), ImagingError> {
     let Some(at) = image.pixels().iter().position(|p| !p.is_finite()) else {
         return Ok(());
     };
@@ -334,31 +286,4 @@ fn check_finite(path: &Path, image: &Raster<Vec3>) -> Result<(), ImagingError> {
         y: at / image.width(),
         value: values[channel],
     })
-}
-
-fn encode_png<T>(
-    path: &Path,
-    raster: &Raster<T>,
-    bytes: &[u8],
-    color: ExtendedColorType,
-) -> Result<(), ImagingError> {
-    let (width, height) = (raster.width(), raster.height());
-    if width == 0 || height == 0 || width.saturating_mul(height) > MAX_PIXELS {
-        return Err(ImagingError::BadSize {
-            what: format!("the image for `{}`", path.display()),
-            width,
-            height,
-        });
-    }
-    let file = File::create(path).map_err(|e| ImagingError::io("create", path, e))?;
-    let mut writer = BufWriter::new(file);
-    PngEncoder::new_with_quality(&mut writer, CompressionType::Fast, FilterType::Adaptive)
-        .write_image(bytes, width as u32, height as u32, color)
-        .map_err(|error| match error {
-            image::ImageError::IoError(source) => ImagingError::io("write", path, source),
-            other => ImagingError::io("write", path, std::io::Error::other(other.to_string())),
-        })?;
-    writer
-        .flush()
-        .map_err(|e| ImagingError::io("write", path, e))
 }

@@ -15,7 +15,7 @@ pub(crate) enum Format {
 
 impl Format {
     /// Bytes that suffice to tell.
-    pub const SNIFF_LENGTH: usize = 12;
+    pub const SNIFF_LENGTH: usize = 16;
 
     pub fn of(bytes: &[u8]) -> Self {
         let starts = |magic: &[u8]| bytes.starts_with(magic);
@@ -31,12 +31,24 @@ impl Format {
             Self::Other("a GIF image")
         } else if starts(b"BM") {
             Self::Other("a BMP image")
+        } else if bytes.get(8..11) == Some(b"CR\x02")
+            || starts(b"FUJIFILMCCD-RAW")
+            || starts(b"IIU\0")
+            || starts(b"IIRO")
+            || starts(b"MMOR")
+            || bytes.get(4..11) == Some(b"ftypcrx")
+        {
+            Self::Other(RAW)
         } else if starts(b"II*\0") || starts(b"MM\0*") {
-            Self::Other("a TIFF image")
+            Self::Other(TIFF)
         } else if starts(b"RIFF") && bytes.get(8..12) == Some(b"WEBP") {
             Self::Other("a WebP image")
+        } else if matches!(bytes.get(4..12), Some(b"ftypavif" | b"ftypavis")) {
+            Self::Other(AVIF)
         } else if bytes.get(4..8) == Some(b"ftyp") {
-            Self::Other("a HEIF or AVIF image")
+            Self::Other(HEIF)
+        } else if starts(b"\xff\x0a") || starts(b"\0\0\0\x0cJXL ") {
+            Self::Other(JPEG_XL)
         } else if starts(b"\xabKTX") {
             Self::Other("a KTX texture")
         } else if starts(b"DDS ") {
@@ -70,10 +82,42 @@ impl Format {
 
     /// The error for a file of this format where `expected` is wanted.
     pub fn refuse(self, path: &Path, expected: &'static str) -> ImagingError {
+        let extension = path.extension().unwrap_or_default().to_string_lossy();
+        let raw = RAW_TIFFS.contains(&extension.to_ascii_lowercase().as_str());
+        let found = match self {
+            Self::Other(TIFF) if raw => RAW,
+            other => other.described(),
+        };
         ImagingError::WrongFormat {
             path: path.to_owned(),
-            found: self.described(),
+            found,
             expected,
+            remedy: remedy(found, path),
         }
     }
+}
+
+const TIFF: &str = "a TIFF image";
+const RAW: &str = "a camera's raw file";
+const HEIF: &str = "a HEIF image";
+const AVIF: &str = "an AVIF image";
+const JPEG_XL: &str = "a JPEG XL image";
+/// Extensions of raw files that begin as TIFF files do.
+const RAW_TIFFS: [&str; 7] = ["nef", "arw", "dng", "pef", "srw", "3fr", "nrw"];
+
+/// How to convert, with the command of a usual converter.
+fn remedy(found: &str, path: &Path) -> String {
+    let tool = match found {
+        HEIF => "heif-convert -q 95",
+        AVIF => "avifdec",
+        JPEG_XL => "djxl",
+        RAW => "darktable-cli",
+        _ => return "convert the file".into(),
+    };
+    let to = path.with_extension("png");
+    format!(
+        "convert it, for instance with `{tool} \"{}\" \"{}\"`",
+        path.display(),
+        to.display()
+    )
 }

@@ -5,6 +5,7 @@ use crate::{
     raster::Raster,
 };
 use glam::Vec3;
+use half::f16;
 use std::{
     collections::BTreeMap,
     path::{Path, PathBuf},
@@ -18,6 +19,39 @@ pub enum Precision {
     Half,
     /// 32-bit float.
     Full,
+}
+
+impl Precision {
+    /// Half, unless one of the values is finite and beyond what half can hold: then it would turn
+    /// into infinity.
+    pub fn half_if_it_fits(values: impl IntoIterator<Item = f32>) -> Self {
+        let limit = f16::MAX.to_f32();
+        let mut values = values.into_iter();
+        match values.any(|v| v.is_finite() && v.abs() > limit) {
+            true => Self::Full,
+            false => Self::Half,
+        }
+    }
+
+    /// [`half_if_it_fits`](Self::half_if_it_fits) for all three colours of a layer together.
+    pub fn of_colour(colour: &Raster<Vec3>) -> Self {
+        Self::half_if_it_fits(colour.pixels().iter().flat_map(|p| p.to_array()))
+    }
+
+    /// The value as a file stores it.
+    #[inline]
+    pub fn round(self, value: f32) -> f32 {
+        match self {
+            Self::Half => f16::from_f32(value).to_f32(),
+            Self::Full => value,
+        }
+    }
+
+    /// [`round`](Self::round) of a colour.
+    #[inline]
+    pub fn round_colour(self, colour: Vec3) -> Vec3 {
+        Vec3::from_array(colour.to_array().map(|v| self.round(v)))
+    }
 }
 
 /// Samples of one channel, and how a file stores them.

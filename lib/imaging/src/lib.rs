@@ -1,14 +1,20 @@
 //! Linear and display images, their files, and what is computed on them.
 pub mod composite;
+mod decode;
+pub mod encoding;
 pub mod error;
 mod exr_file;
+pub mod facts;
 pub mod file;
 mod format;
+mod hdr_file;
 mod jpeg_header;
 pub mod layers;
 pub mod metrics;
+mod png_file;
 pub mod raster;
 pub mod resize;
+mod sensors;
 pub mod spline;
 pub mod tone;
 pub mod transfer;

@@ -17,11 +17,6 @@ pub fn rmse(a: &Raster<Vec3>, b: &Raster<Vec3>) -> f64 {
     mean(a, b, |a, b| (a - b).length_squared() / 3.0).sqrt()
 }
 
-/// Mean absolute error over all pixels and the three channels.
-pub fn mae(a: &Raster<Vec3>, b: &Raster<Vec3>) -> f64 {
-    mean(a, b, |a, b| (a - b).abs().element_sum() / 3.0)
-}
-
 /// Scale-invariant RMSE: `min over s of rmse(s * image, reference)`, one scale for all pixels and
 /// channels [Grosse et al. 2009, for one window of the whole image]. The best scale is
 /// `<image, reference> / <image, image>`, and 0 for a black image. Not symmetric.
@@ -211,7 +206,6 @@ mod tests {
         for (width, height) in [(1, 1), (3, 17), (40, 12)] {
             let image = waves(width, height, 1.0, 1.0);
             assert_eq!(rmse(&image, &image), 0.0);
-            assert_eq!(mae(&image, &image), 0.0);
             assert!(si_rmse(&image, &image) < 1e-15);
             assert!((ssim(&image, &image) - 1.0).abs() < 1e-12);
         }
@@ -236,7 +230,6 @@ mod tests {
         let a = Raster::from_pixels(2, 1, vec![Vec3::ZERO, Vec3::new(0.0, 0.0, 3.0)]);
         let b = Raster::filled(2, 1, Vec3::ZERO);
         assert!((rmse(&a, &b) - (9.0f64 / 6.0).sqrt()).abs() < 1e-15);
-        assert!((mae(&a, &b) - 0.5).abs() < 1e-15);
     }
 
     #[test]

@@ -1,19 +1,10 @@
 //! Changing the number of pixels: a linear map along columns, then along rows, and its transpose.
 use crate::raster::Raster;
+use dipir_numerics::resample::Taps;
 use rayon::prelude::*;
 use std::ops::{AddAssign, Mul, Range};
 
-/// How an output pixel weighs the input pixels around it. Weights are positive and sum to 1, so
-/// constants stay and nothing rings.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Filter {
-    /// The exact mean over the output pixel's footprint: keeps the sum of light when minifying,
-    /// repeats pixels when magnifying by whole numbers.
-    Area,
-    /// A triangle of two input pixels when magnifying (bilinear interpolation with pixel centres
-    /// at half-integers), widened to two output pixels when minifying, so that nothing aliases.
-    Bilinear,
-}
+pub use dipir_numerics::resample::Filter;
 
 /// A rectangle of whole pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -38,10 +29,10 @@ impl<T: Copy + Default + Send + Sync + AddAssign + Mul<f32, Output = T>> Sample 
 pub struct CropResize {
     source: (usize, usize),
     output: (usize, usize),
-    columns: Taps,
-    rows: Taps,
-    columns_transposed: Taps,
-    rows_transposed: Taps,
+    columns: Taps<f32>,
+    rows: Taps<f32>,
+    columns_transposed: Taps<f32>,
+    rows_transposed: Taps<f32>,
 }
 
 impl CropResize {
@@ -61,8 +52,12 @@ impl CropResize {
             crop.x + crop.width <= source.0 && crop.y + crop.height <= source.1,
             "{crop:?} leaves an image of {source:?}"
         );
-        let columns = Taps::new(crop.x..crop.x + crop.width, output.0, filter);
-        let rows = Taps::new(crop.y..crop.y + crop.height, output.1, filter);
+        let taps = |start: usize, length: usize, output: usize| {
+            let taps = Taps::new(0.0, length as f64, output, length, filter);
+            taps.single().shifted(start)
+        };
+        let columns = taps(crop.x, crop.width, output.0);
+        let rows = taps(crop.y, crop.height, output.1);
         Self {
             source,
             output,
@@ -121,91 +116,8 @@ pub fn resize<T: Sample>(
     .apply(image)
 }
 
-/// A sparse matrix from one line of samples to another, by output sample.
-#[derive(Clone, Debug)]
-struct Taps {
-    /// Output `o` weighs `entries[starts[o]..starts[o + 1]]`.
-    starts: Vec<usize>,
-    /// Input index and weight.
-    entries: Vec<(usize, f32)>,
-}
-
-impl Taps {
-    fn new(input: Range<usize>, output: usize, filter: Filter) -> Self {
-        let length = input.len();
-        let scale = length as f64 / output as f64;
-        let mut starts = vec![0];
-        let mut entries = Vec::new();
-        let mut weights = Vec::new();
-        for o in 0..output {
-            let (low, high) = match filter {
-                Filter::Area => (o as f64 * scale, (o + 1) as f64 * scale),
-                Filter::Bilinear => {
-                    let (centre, reach) = ((o as f64 + 0.5) * scale, scale.max(1.0));
-                    (centre - reach, centre + reach)
-                }
-            };
-            let first = low.floor().max(0.0) as usize;
-            let last = (high.ceil() as usize).min(length);
-            weights.clear();
-            for i in first..last {
-                let weight = match filter {
-                    Filter::Area => (high.min((i + 1) as f64) - low.max(i as f64)).max(0.0),
-                    Filter::Bilinear => {
-                        let (centre, reach) = (0.5 * (low + high), 0.5 * (high - low));
-                        (1.0 - (i as f64 + 0.5 - centre).abs() / reach).max(0.0)
-                    }
-                };
-                weights.push(weight);
-            }
-            // Cut at the border, the weights are normalised: the border pixel is not repeated.
-            let total: f64 = weights.iter().sum();
-            for (k, weight) in weights.iter().enumerate() {
-                let weight = (weight / total) as f32;
-                if weight > 0.0 {
-                    entries.push((input.start + first + k, weight));
-                }
-            }
-            starts.push(entries.len());
-        }
-        Self { starts, entries }
-    }
-
-    fn transposed(&self, inputs: usize) -> Self {
-        let mut by_input = vec![Vec::new(); inputs];
-        for o in 0..self.len() {
-            for &(i, weight) in self.of(o) {
-                by_input[i].push((o, weight));
-            }
-        }
-        let mut starts = vec![0];
-        let mut entries = Vec::with_capacity(self.entries.len());
-        for taps in by_input {
-            entries.extend(taps);
-            starts.push(entries.len());
-        }
-        Self { starts, entries }
-    }
-
-    /// Outputs.
-    fn len(&self) -> usize {
-        self.starts.len() - 1
-    }
-
-    fn of(&self, output: usize) -> &[(usize, f32)] {
-        &self.entries[self.starts[output]..self.starts[output + 1]]
-    }
-
-    /// The range of inputs with any weight.
-    fn touched(&self) -> Range<usize> {
-        let first = self.entries.iter().map(|e| e.0).min().unwrap_or(0);
-        let last = self.entries.iter().map(|e| e.0 + 1).max().unwrap_or(0);
-        first..last
-    }
-}
-
-fn filter_rows<T: Sample>(image: &Raster<T>, taps: &Taps, rows: Range<usize>) -> Raster<T> {
-    let (width, height) = (taps.len(), image.height());
+fn filter_rows<T: Sample>(image: &Raster<T>, taps: &Taps<f32>, rows: Range<usize>) -> Raster<T> {
+    let (width, height) = (taps.outputs(), image.height());
     let mut output = Raster::filled(width, height, T::default());
     let lines = output.pixels_mut().par_chunks_mut(width).enumerate();
     lines
@@ -221,8 +133,8 @@ fn filter_rows<T: Sample>(image: &Raster<T>, taps: &Taps, rows: Range<usize>) ->
     output
 }
 
-fn filter_columns<T: Sample>(image: &Raster<T>, taps: &Taps) -> Raster<T> {
-    let (width, height) = (image.width(), taps.len());
+fn filter_columns<T: Sample>(image: &Raster<T>, taps: &Taps<f32>) -> Raster<T> {
+    let (width, height) = (image.width(), taps.outputs());
     let mut output = Raster::filled(width, height, T::default());
     let lines = output.pixels_mut().par_chunks_mut(width).enumerate();
     lines.for_each(|(y, line)| {
@@ -248,7 +160,7 @@ mod tests {
     #[test]
     fn the_same_size_changes_nothing() {
         let image = noise(7, 5);
-        for filter in [Filter::Area, Filter::Bilinear] {
+        for filter in [Filter::Area, Filter::Tent] {
             assert_eq!(resize(&image, 7, 5, filter), image);
         }
     }
@@ -257,7 +169,7 @@ mod tests {
     fn a_constant_stays_constant_at_odd_sizes_and_down_to_one_pixel() {
         let image = Raster::filled(13, 9, Vec3::new(0.25, 2.0, 1e6));
         for (width, height) in [(1, 1), (5, 3), (13, 1), (17, 31), (200, 7)] {
-            for filter in [Filter::Area, Filter::Bilinear] {
+            for filter in [Filter::Area, Filter::Tent] {
                 for p in resize(&image, width, height, filter).pixels() {
                     // Up to 26 rounded weights a direction sum to 1 within 26 ulp.
                     let error = (*p / *image.get(0, 0) - Vec3::ONE).abs().max_element();
@@ -272,7 +184,7 @@ mod tests {
 
     #[test]
     fn one_pixel_grows_to_a_constant() {
-        for filter in [Filter::Area, Filter::Bilinear] {
+        for filter in [Filter::Area, Filter::Tent] {
             let grown = resize(&Raster::filled(1, 1, 0.7f32), 4, 3, filter);
             assert!(grown.pixels().iter().all(|&v| v == 0.7));
         }
@@ -296,7 +208,7 @@ mod tests {
     #[test]
     fn bilinear_interpolates_between_pixel_centres_and_holds_at_the_border() {
         let ramp = Raster::from_pixels(4, 1, vec![0.0f32, 1.0, 2.0, 3.0]);
-        let double = resize(&ramp, 8, 1, Filter::Bilinear);
+        let double = resize(&ramp, 8, 1, Filter::Tent);
         // Output centre o + 1/2 lies at (o + 1/2) / 2 - 1/2 input pixels.
         let want = [0.0, 0.25, 0.75, 1.25, 1.75, 2.25, 2.75, 3.0];
         for (got, want) in double.pixels().iter().zip(want) {
@@ -315,7 +227,7 @@ mod tests {
         let mut image = noise(9, 6);
         let cut = (0..12).map(|i| *image.get(2 + i % 4, 1 + i / 4)).collect();
         let cut = Raster::from_pixels(4, 3, cut);
-        for filter in [Filter::Area, Filter::Bilinear] {
+        for filter in [Filter::Area, Filter::Tent] {
             let want = resize(&cut, 10, 2, filter);
             let crop = CropResize::new((9, 6), inside, (10, 2), filter);
             assert_eq!(crop.apply(&image), want);
@@ -327,7 +239,7 @@ mod tests {
                 }
             }
         }
-        let crop = CropResize::new((9, 6), inside, (10, 2), Filter::Bilinear);
+        let crop = CropResize::new((9, 6), inside, (10, 2), Filter::Tent);
         assert!(crop.apply(&image).pixels().iter().all(|v| v.is_finite()));
     }
 
@@ -367,7 +279,7 @@ mod tests {
             ),
         ];
         for (source, inside, output) in cases {
-            for filter in [Filter::Area, Filter::Bilinear] {
+            for filter in [Filter::Area, Filter::Tent] {
                 let crop = CropResize::new(source, inside, output, filter);
                 let (x, y) = (noise(source.0, source.1), noise(output.0, output.1));
                 let dot = |a: &Raster<f32>, b: &Raster<f32>| -> f64 {

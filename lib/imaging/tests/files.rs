@@ -2,7 +2,8 @@
 use dipir_imaging::{
     ImagingError,
     file::{
-        decode_texture, read_linear, read_mask, read_photo, write_png, write_png_16, write_png_mask,
+        PhotoLimits, decode_texture, read_linear, read_mask, read_photo, read_photo_within,
+        write_png, write_png_16, write_png_mask,
     },
     layers::{Layers, Precision},
     raster::{DisplayImage, LinearImage, Raster},
@@ -332,7 +333,6 @@ fn files_of_other_formats_are_named_as_what_they_are() {
         (&b"GIF89a......"[..], "a GIF image"),
         (b"RIFF\0\0\0\0WEBPVP8 ", "a WebP image"),
         (b"II*\0\0\0\0\0", "a TIFF image"),
-        (b"\0\0\0\x18ftypheic", "a HEIF or AVIF image"),
         (b"hello", "not an image of a known format"),
         (b"x", "not an image of a known format"),
     ] {
@@ -343,6 +343,146 @@ fn files_of_other_formats_are_named_as_what_they_are() {
         );
         assert_eq!(words(read_photo(&path, Transfer::Srgb).unwrap_err()), want);
     }
+}
+
+#[test]
+fn files_that_a_converter_reads_are_refused_with_its_command() {
+    let folder = folder();
+    for (name, bytes, found, tool) in [
+        (
+            "x.heic",
+            &b"\0\0\0\x18ftypheic"[..],
+            "a HEIF image",
+            "heif-convert -q 95",
+        ),
+        ("x.avif", b"\0\0\0\x18ftypavif", "an AVIF image", "avifdec"),
+        ("x.jxl", b"\xff\x0a\0\0\0\0\0\0", "a JPEG XL image", "djxl"),
+        (
+            "x.CR2",
+            b"II*\0\x10\0\0\0CR\x02\0",
+            "a camera's raw file",
+            "darktable-cli",
+        ),
+        (
+            "x.NEF",
+            b"MM\0*\0\0\0\x08\0\0",
+            "a camera's raw file",
+            "darktable-cli",
+        ),
+        (
+            "x.dng",
+            b"II*\0\x08\0\0\0\0\0",
+            "a camera's raw file",
+            "darktable-cli",
+        ),
+    ] {
+        let path = put(&folder, name, bytes);
+        let (from, to) = (path.display(), path.with_extension("png"));
+        let want = format!(
+            "`{from}` is {found}; expected a PNG, JPEG, OpenEXR or Radiance HDR image: convert it, \
+             for instance with `{tool} \"{from}\" \"{}\"`",
+            to.display()
+        );
+        assert_eq!(words(read_photo(&path, Transfer::Srgb).unwrap_err()), want);
+    }
+}
+
+#[test]
+fn a_small_file_of_many_pixels_is_refused_before_it_is_decoded() {
+    let folder = folder();
+    // 16,000 x 16,000 grey pixels of one bit, all black: 31 kB.
+    let path = folder.path().join("x.png");
+    let file = std::fs::File::create(&path).unwrap();
+    let mut encoder = png::Encoder::new(file, 16_000, 16_000);
+    encoder.set_color(png::ColorType::Grayscale);
+    encoder.set_depth(png::BitDepth::One);
+    let mut writer = encoder.write_header().unwrap();
+    writer.write_image_data(&vec![0; 2000 * 16_000]).unwrap();
+    writer.finish().unwrap();
+    let length = std::fs::metadata(&path).unwrap().len();
+    assert!(length < 200_000, "{length}");
+    assert_eq!(
+        words(read_photo(&path, Transfer::Srgb).unwrap_err()),
+        format!(
+            "`{}` is 16000 x 16000 pixels (256.0 megapixels); the limit is 200: scale it down, or \
+             raise scene.limits.photo_megapixels",
+            path.display()
+        )
+    );
+    let small = put(&folder, "y.png", &png(&[9; 6], 3, 2, ExtendedColorType::L8));
+    let limits = |megapixels| PhotoLimits { megapixels };
+    assert!(read_photo_within(&small, Transfer::Srgb, limits(5e-6)).is_err());
+    assert!(read_photo_within(&small, Transfer::Srgb, limits(6e-6)).is_ok());
+}
+
+#[test]
+fn an_exr_that_declares_more_than_its_length_can_hold_is_refused() {
+    let folder = folder();
+    let path = folder.path().join("x.exr");
+    let mut layers = Layers::new(64, 64);
+    let colour = Raster::filled(64, 64, Vec3::ONE);
+    layers.insert_rgb("", Precision::Half, &colour).unwrap();
+    layers.write_exr(&path).unwrap();
+    let mut file = std::fs::read(&path).unwrap();
+    // Both windows are four numbers, the last two the right and bottom edge.
+    for name in [&b"dataWindow\0box2i\0"[..], b"displayWindow\0box2i\0"] {
+        let at = file.windows(name.len()).position(|w| w == name).unwrap() + name.len() + 12;
+        file[at..at + 4].copy_from_slice(&15_999i32.to_le_bytes());
+        file[at + 4..at + 8].copy_from_slice(&15_999i32.to_le_bytes());
+    }
+    let path = put(&folder, "wide.exr", &file);
+    assert!(matches!(
+        read_linear(&path).unwrap_err(),
+        ImagingError::Damaged { .. }
+    ));
+    assert!(matches!(
+        read_photo(&path, Transfer::Srgb).unwrap_err(),
+        ImagingError::TooManyPixels { .. } | ImagingError::Damaged { .. }
+    ));
+}
+
+#[cfg(unix)]
+#[test]
+fn devices_and_folders_are_not_read() {
+    let folder = folder();
+    for (path, found) in [
+        (Path::new("/dev/zero"), "not a regular file"),
+        (folder.path(), "a folder, not a regular file"),
+    ] {
+        for error in [
+            read_photo(path, Transfer::Srgb).unwrap_err(),
+            read_linear(path).unwrap_err(),
+            read_mask(path).unwrap_err(),
+            Layers::read_exr(path).unwrap_err(),
+        ] {
+            let ImagingError::Io { source, .. } = error else {
+                panic!("{error}");
+            };
+            assert_eq!(source.to_string(), found);
+        }
+    }
+}
+
+#[test]
+fn the_exposure_and_colour_correction_of_radiance_hdr_are_taken_out() {
+    let folder = folder();
+    let lines = "#?RADIANCE\nEXPOSURE=4\nEXPOSURE=0.5\nCOLORCORR=1 2 0.5\nEXPOSURE=1";
+    let file = flat_hdr(lines, 2, 1, [128, 128, 128, 129]);
+    let image = read_linear(put(&folder, "x.hdr", &file)).unwrap();
+    assert_eq!(image.0.pixels()[0], Vec3::new(0.5, 0.25, 1.0));
+    let file = flat_hdr("#?RADIANCE\nEXPOSURE=0", 2, 1, [128, 128, 128, 129]);
+    assert!(read_linear(put(&folder, "x.hdr", &file)).is_err());
+}
+
+#[test]
+fn a_radiance_hdr_of_another_layout_is_told_what_works() {
+    let folder = folder();
+    let file = flat_hdr("#?RADIANCE", 2, 1, [128; 4]);
+    let other = String::from_utf8_lossy(&file).replace("-Y 1 +X 2", "+Y 1 +X 2");
+    let path = put(&folder, "x.hdr", other.as_bytes());
+    let error = words(read_linear(&path).unwrap_err());
+    let remedy = "save it as OpenEXR, or as Radiance HDR in RGBE from the top left";
+    assert!(error.ends_with(remedy), "{error}");
 }
 
 #[test]

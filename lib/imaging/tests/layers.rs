@@ -1,8 +1,9 @@
 //! OpenEXR layers: what is written is what is read, and files of other programs are understood.
 use dipir_imaging::{
     ImagingError,
+    composite::composite,
     layers::{Layers, Precision},
-    raster::Raster,
+    raster::{LinearImage, Raster},
 };
 use exr::prelude::{
     AnyChannel, AnyChannels, Encoding, FlatSamples, Image, ImageAttributes, IntegerBounds, Layer,
@@ -127,6 +128,58 @@ fn light_too_bright_for_half_is_stored_in_full() {
     assert_eq!(*back.channel("R").unwrap(), sun);
     let precision: Vec<_> = back.channels().map(|(_, c)| c.precision).collect();
     assert_eq!(precision, [Precision::Half, Precision::Full]);
+}
+
+proptest! {
+    /// The composite formula on what a file holds gives the beauty that it holds.
+    #[test]
+    fn layers_of_any_brightness_recombine_without_infinity(
+        radiance in proptest::collection::vec(-6.0f32..6.0, 8),
+        alpha in proptest::collection::vec(0.0f32..=1.0, 8),
+        shadow in proptest::collection::vec(0.0f32..=1.0, 8),
+    ) {
+        let row = |values: &[f32]| {
+            Raster::from_pixels(8, 1, values.iter().map(|&v| Vec3::new(v, 0.5 * v, 0.25)).collect())
+        };
+        let light: Vec<f32> = radiance.iter().map(|&e| 10f32.powf(e)).collect();
+        let object = row(&light);
+        let of_object = Precision::of_colour(&object);
+        let object = object.map(|&v| of_object.round_colour(v));
+        let shadow = row(&shadow).map(|&v| Precision::Half.round_colour(v));
+        let alpha = Raster::from_pixels(8, 1, alpha).map(|&v| Precision::Half.round(v));
+        let background = Raster::filled(8, 1, Vec3::new(0.25, 0.5, 1.0));
+        let beauty = composite(
+            &LinearImage(background.clone()),
+            &LinearImage(object.clone()),
+            &alpha,
+            &LinearImage(shadow.clone()),
+        ).unwrap().0;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.exr");
+        let mut layers = Layers::new(8, 1);
+        layers.insert_rgb("", Precision::of_colour(&beauty), &beauty).unwrap();
+        layers.insert_rgb("object", of_object, &object).unwrap();
+        layers.insert("object.A", Precision::Half, alpha).unwrap();
+        layers.insert_rgb("shadow", Precision::Half, &shadow).unwrap();
+        layers.insert_rgb("background", Precision::Half, &background).unwrap();
+        layers.write_exr(&path).unwrap();
+        let file = Layers::read_exr(&path).unwrap();
+        let part = |name: &str| LinearImage(file.rgb(name).unwrap());
+        let again = composite(
+            &part("background"),
+            &part("object"),
+            file.channel("object.A").unwrap(),
+            &part("shadow"),
+        ).unwrap().0;
+        for (got, want) in part("").0.pixels().iter().zip(again.pixels()) {
+            for (got, want) in got.to_array().into_iter().zip(want.to_array()) {
+                prop_assert!(got.is_finite());
+                // Half rounds to 2^-11 of the value, or to 2^-25 near zero.
+                let step = want.abs() * 2f32.powi(-11) + 2f32.powi(-25);
+                prop_assert!((got - want).abs() <= step, "{} {}", got, want);
+            }
+        }
+    }
 }
 
 #[test]

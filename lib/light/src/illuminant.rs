@@ -1,4 +1,4 @@
-//! What the renderer asks of any distant light.
+//! The interface of distant lights.
 use glam::{Vec2, Vec3};
 
 /// A direction drawn in proportion to the light, with its radiance and density.

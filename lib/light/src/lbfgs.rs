@@ -18,8 +18,8 @@ struct Pair {
     rho: f64,
 }
 
-/// Walks from `x` down `f`, which returns its value and gradient, for at most `iterations`
-/// steps; ends early where no step along the search direction descends. Returns the best point.
+/// Minimises `f`, which returns its value and gradient, from `x`, for at most `iterations` steps; ends
+/// early where no step along the search direction descends. Returns the best point.
 pub(crate) fn minimise(
     mut x: Vec<f64>,
     iterations: usize,

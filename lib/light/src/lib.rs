@@ -10,6 +10,7 @@ pub mod gaussian;
 pub mod illuminant;
 mod lbfgs;
 pub mod luminance;
+pub mod map_with_lobes;
 mod mixture;
 pub mod plane;
 mod quadrature;

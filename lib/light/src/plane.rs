@@ -1,4 +1,4 @@
-//! What the shadow ratio asks of a light: the irradiance of an unoccluded plane in closed form,
+//! Light on a plane, as the shadow ratio needs it: the irradiance of an unoccluded plane in closed form,
 //! and directions drawn from inside a cone.
 use glam::{DVec3, Vec2, Vec3};
 

@@ -26,8 +26,8 @@ fn texels_with_area(
 }
 
 /// The Cauchy regulariser: `sum over texels and channels of ln(1 + 2 L^2)` times solid angle.
-/// Close to `2 L^2` for dim light and to `2 ln L` for bright light: it presses on ambient light
-/// and lets peaks be. Panics unless there are `width * height` texels.
+/// Close to `2 L^2` for dim light and to `2 ln L` for bright light: it lowers ambient light
+/// more than peaks. Panics unless there are `width * height` texels.
 pub fn cauchy(texels: &[Vec3], width: usize, height: usize) -> f64 {
     let term = |l: f64| (2.0 * l * l).ln_1p();
     let terms = texels_with_area(texels, width, height).map(|(t, area)| {

@@ -9,29 +9,6 @@ pub fn safe_sqrt(x: f32) -> f32 {
     x.max(0.0).sqrt()
 }
 
-/// Arc cosine in radians, of an argument clamped to `[-1, 1]`.
-/// The derivative is unbounded at both ends.
-#[inline]
-pub fn safe_acos(x: f32) -> f32 {
-    x.clamp(-1.0, 1.0).acos()
-}
-
-/// `n / d`, or `at_zero` where `d` is 0 or the quotient is not finite.
-/// The derivative of the replaced value is 0.
-#[inline]
-pub fn safe_div(n: f32, d: f32, at_zero: f32) -> f32 {
-    let q = n / d;
-    if q.is_finite() { q } else { at_zero }
-}
-
-/// Natural logarithm of `max(x, floor)`; `floor` must be positive.
-/// The derivative below the floor is 0.
-#[inline]
-pub fn safe_ln(x: f32, floor: f32) -> f32 {
-    debug_assert!(floor > 0.0);
-    x.max(floor).ln()
-}
-
 /// `v / |v|`, or `fallback` where `v` is zero or not finite. Scales first, so that vectors
 /// from 1e-38 to 1e38 long keep their direction.
 #[inline]
@@ -43,13 +20,6 @@ pub fn normalize_or(v: Vec3, fallback: Vec3) -> Vec3 {
     } else {
         fallback
     }
-}
-
-/// `(exp(x) - 1) / x`, 1 at 0. Relative error a few ulp for every `x`; its derivative at 0
-/// is 1/2.
-#[inline]
-pub fn expm1_over_x(x: f64) -> f64 {
-    if x == 0.0 { 1.0 } else { x.exp_m1() / x }
 }
 
 /// `1 - v . mu` of two unit vectors, as `|v - mu|^2 / 2`: exact to a few ulp where the dot
@@ -64,15 +34,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn guarded_values_at_their_limits() {
+    fn the_root_of_less_than_nothing_is_nothing() {
         assert_eq!(safe_sqrt(-1e-9), 0.0);
-        assert_eq!(safe_acos(1.0 + 1e-6), 0.0);
-        assert_eq!(safe_div(0.0, 0.0, 1.0), 1.0);
-        assert_eq!(safe_div(1.0, 0.0, 2.0), 2.0);
-        assert_eq!(safe_div(1.0, 4.0, 2.0), 0.25);
-        assert_eq!(safe_ln(0.0, 1e-6), 1e-6f32.ln());
-        assert_eq!(expm1_over_x(0.0), 1.0);
-        assert_eq!(expm1_over_x(f64::NEG_INFINITY), 0.0);
     }
 
     #[test]
@@ -89,15 +52,6 @@ mod tests {
             normalize_or(Vec3::new(f32::NAN, 0.0, 1.0), Vec3::Y),
             Vec3::Y
         );
-    }
-
-    #[test]
-    fn expm1_over_x_follows_its_series_near_zero() {
-        for x in [1e-12f64, -1e-9, 1e-6, -1e-4, 1e-3] {
-            let series = 1.0 + x / 2.0 + x * x / 6.0 + x * x * x / 24.0 + x.powi(4) / 120.0;
-            // The series' next term is x^5/720 < 2e-18.
-            assert!((expm1_over_x(x) - series).abs() < 4.0 * f64::EPSILON, "{x}");
-        }
     }
 
     #[test]

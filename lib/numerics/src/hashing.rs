@@ -1,5 +1,8 @@
 //! Integer hashes that key the counter-based random numbers.
 
+/// 2^64 over the golden ratio, odd: multiples of it are far apart [Steele et al. 2014].
+pub const GOLDEN: u64 = 0x9e37_79b9_7f4a_7c15;
+
 /// A 64-bit finaliser with full avalanche: every input bit flips every output bit with
 /// probability near one half. A bijection [Steele et al. 2014, SplitMix64, "variant 13"].
 #[inline]
@@ -14,9 +17,9 @@ pub fn mix64(mut x: u64) -> u64 {
 /// Folds any number of words into one hash; order matters.
 #[inline]
 pub fn hash_u64s(words: &[u64]) -> u64 {
-    let mut h = 0x9e37_79b9_7f4a_7c15;
+    let mut h = GOLDEN;
     for &w in words {
-        h = mix64(h ^ w).wrapping_add(0x9e37_79b9_7f4a_7c15);
+        h = mix64(h ^ w).wrapping_add(GOLDEN);
     }
     h
 }

@@ -3,6 +3,7 @@
 pub mod gradcheck;
 pub mod guarded;
 pub mod hashing;
+pub mod resample;
 pub mod sampler;
 pub mod stats;
 pub mod sum;

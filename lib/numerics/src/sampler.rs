@@ -9,7 +9,7 @@
 //! while pairs are independent of each other and of other pixels.
 use glam::Vec2;
 
-use crate::hashing::{hash_u64s, mix64};
+use crate::hashing::{GOLDEN, hash_u64s, mix64};
 
 /// Names an independent family of random numbers, so that two stages never share one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,9 +26,7 @@ impl Stream {
     pub const RECORD: Stream = Stream(4);
     /// Initial values and random crops of the optimisation.
     pub const OPTIMIZE: Stream = Stream(5);
-    /// Noise of the diffusion model.
-    pub const DIFFUSION: Stream = Stream(6);
-    /// Procedural content: demo and training scenes.
+    /// Generated content: the pictures that models are trained on.
     pub const CONTENT: Stream = Stream(7);
     /// Bootstrap resampling.
     pub const BOOTSTRAP: Stream = Stream(8);
@@ -117,7 +115,7 @@ impl Sampler {
     fn next_hash(&mut self) -> u64 {
         let d = self.dimension as u64;
         self.dimension += 1;
-        mix64(self.key ^ (d + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15))
+        mix64(self.key ^ (d + 1).wrapping_mul(GOLDEN))
     }
 }
 

@@ -54,6 +54,13 @@ struct Knobs {
     show: bool,
 }
 
+/// What the light stage does by default.
+fn standard_preset() -> Preset {
+    let presets = include_str!("../../stages/src/presets.json");
+    let mut presets: serde_json::Value = serde_json::from_str(presets).expect("JSON");
+    serde_json::from_value(presets["presets"][1]["light"].take()).expect("a preset")
+}
+
 fn simulation() -> Simulation {
     Simulation {
         features: SPECULAR | TEXTURES,
@@ -263,7 +270,7 @@ fn recover(object: &str, light: &str, knobs: &Knobs) -> Row {
     };
     let settings = knobs
         .table
-        .settings(Preset::Standard, SEEDS[1])
+        .settings(&standard_preset(), SEEDS[1])
         .expect("settings");
     let clock = Instant::now();
     let (outcome, mask, recorded_s) = optimize(&renderer, &background, &reference, &settings);

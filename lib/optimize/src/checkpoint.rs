@@ -124,10 +124,11 @@ mod tests {
     use safetensors::tensor::TensorView;
 
     use super::*;
-    use crate::settings::{LightTable, Preset};
+    use crate::settings::LightTable;
+    use crate::testing::PRESET;
 
     fn settings() -> Settings {
-        LightTable::default().settings(Preset::Draft, 3).unwrap()
+        LightTable::default().settings(&PRESET, 3).unwrap()
     }
 
     fn state() -> State {

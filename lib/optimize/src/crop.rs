@@ -1,10 +1,10 @@
-//! What part of the picture the guidance sees.
+//! The part of the picture that the guidance sees.
 use dipir_imaging::raster::Raster;
 use dipir_imaging::resize::{CropResize, Filter, PixelBox};
 use dipir_numerics::sampler::{Sampler, Stream};
 use glam::Vec3;
 
-/// What the guidance asks to see.
+/// Which part of the picture a guidance needs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Framing {
     /// Every pixel, as it is.
@@ -13,20 +13,21 @@ pub enum Framing {
     Crops {
         /// Side in pixels after resizing.
         side: usize,
-        /// Smallest and largest side of the square, in longer sides of the object's box.
+        /// Smallest and largest side of the square, as multiples of the longer side of the object's
+        /// box.
         scale: [f32; 2],
     },
 }
 
 /// The part of the picture that one iteration sees.
 #[derive(Clone, Debug)]
-pub struct View {
+pub struct CropView {
     /// The box in the picture; `None` for all of it.
     pub crop: Option<PixelBox>,
     resize: Option<CropResize>,
 }
 
-impl View {
+impl CropView {
     /// All of the picture.
     pub fn whole() -> Self {
         Self {
@@ -39,7 +40,7 @@ impl View {
     pub fn of(size: (usize, usize), crop: PixelBox, side: usize) -> Self {
         Self {
             crop: Some(crop),
-            resize: Some(CropResize::new(size, crop, (side, side), Filter::Bilinear)),
+            resize: Some(CropResize::new(size, crop, (side, side), Filter::Tent)),
         }
     }
 
@@ -86,9 +87,10 @@ impl CropSampler {
         }
     }
 
-    /// The square of one iteration, a function of `seed` and `iteration` alone: its side drawn
-    /// log-uniformly from `scale`, in sides of the object's box, at most the picture's
-    /// shorter side, its middle inside the object's box as far as the picture's edges let it.
+    /// The square of one iteration, a function of `seed` and `iteration` alone. Its side is drawn
+    /// log-uniformly from `scale` times the longer side of the object's box, and is at most the
+    /// picture's shorter side. Its middle lies in the object's box, unless the square would leave
+    /// the picture.
     pub fn crop(&self, seed: u64, iteration: usize, scale: [f32; 2]) -> PixelBox {
         let mut sampler = Sampler::new(seed, Stream::OPTIMIZE, 0, iteration as u32);
         let [smallest, largest] = scale;

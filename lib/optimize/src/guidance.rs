@@ -1,18 +1,19 @@
-//! What judges the picture.
+//! The loss on the picture.
 //!
-//! A guidance sees the displayed composite, or a crop of it, and says in which direction it should
-//! change. A reference picture does so by a loss; a diffusion model does so by a gradient alone.
+//! A guidance gets the displayed composite, or a crop of it, and returns the gradient by which it
+//! should change: of a loss where there is a reference picture, by itself where a diffusion model
+//! guides.
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_imaging::resize::PixelBox;
 use dipir_numerics::sum::Neumaier;
 use glam::Vec3;
 
-use crate::crop::{Framing, View};
+use crate::crop::{CropView, Framing};
 use crate::error::OptimizeError;
 use crate::objective::Objective;
 use crate::parameters::Parameters;
 
-/// Where in the optimisation a question is asked.
+/// Where in the optimisation a gradient is asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Step {
     /// From 0.
@@ -23,7 +24,7 @@ pub struct Step {
     pub seed: u64,
 }
 
-/// A guidance's answer.
+/// Loss and gradient of a picture.
 #[derive(Clone, Debug)]
 pub struct Guided {
     /// The loss, or for a guidance that has only a gradient a number that tells its size.
@@ -34,17 +35,17 @@ pub struct Guided {
     pub timestep: Option<f64>,
 }
 
-/// Judges pictures. A function of its arguments alone, so that a resumed run hears the same
-/// answers: what is random is keyed by [`Step`].
+/// Gives loss and gradient of pictures. A function of its arguments alone, its random numbers keyed
+/// by [`Step`], so that a resumed run gets the same gradients.
 pub trait Guidance {
-    /// What it asks to see.
+    /// Which part of the picture it needs.
     fn framing(&self) -> Framing;
 
-    /// How `picture`, display values of what `view` shows, should change.
+    /// Loss and gradient of `picture`, the display values that `view` shows.
     fn gradient(
         &mut self,
         picture: &Raster<Vec3>,
-        view: &View,
+        view: &CropView,
         step: Step,
     ) -> Result<Guided, OptimizeError>;
 }
@@ -116,7 +117,7 @@ impl Guidance for Reference {
     fn gradient(
         &mut self,
         picture: &Raster<Vec3>,
-        view: &View,
+        view: &CropView,
         _: Step,
     ) -> Result<Guided, OptimizeError> {
         let reference = view.apply(&self.picture.0);

@@ -9,7 +9,7 @@ pub struct Row {
     pub iteration: usize,
     /// Sum of the terms; `null` in a step that was skipped because something was not finite.
     pub loss: Option<f64>,
-    /// What the guidance says of the picture.
+    /// Loss of the guidance.
     pub guidance: Option<f64>,
     /// Consistency of both maps, weighted.
     pub consistency: Option<f64>,

@@ -10,7 +10,7 @@
 //!                 regularisers                                                         guidance
 //! ```
 //!
-//! [`objective`] holds that chain and its exact adjoint, [`guidance`] what judges the picture,
+//! [`objective`] holds that chain and its exact adjoint, [`guidance`] the loss on the picture,
 //! [`adam`] the steps, [`optimization`] the loop over all of it.
 pub mod adam;
 pub mod checkpoint;

@@ -127,7 +127,7 @@ pub struct MaterialOptimization<'a, L> {
     pub materials: Vec<usize>,
     /// How.
     pub settings: MaterialSettings,
-    /// Where the state is kept between steps, and goes on if the file is there.
+    /// File that keeps the state between steps; the run goes on from it if it exists.
     pub checkpoint: Option<&'a Path>,
 }
 

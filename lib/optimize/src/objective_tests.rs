@@ -1,5 +1,5 @@
 use super::*;
-use crate::crop::View;
+use crate::crop::CropView;
 use crate::guidance::{PHOTOMETRIC_SCALE, charbonnier};
 use crate::tensors::Group;
 use crate::testing::{DenseTransport, WEIGHTS, objective, recorded};
@@ -158,8 +158,8 @@ fn judged(
 ) -> (f64, Forward, Raster<Vec3>) {
     let forward = objective.forward(p, s);
     let view = match crop {
-        Some(b) => View::of(PICTURE, b, b.width),
-        None => View::whole(),
+        Some(b) => CropView::of(PICTURE, b, b.width),
+        None => CropView::whole(),
     };
     let shown = view.apply(&forward.picture.0);
     let mut loss = forward.consistency + forward.regularizer;

@@ -10,7 +10,7 @@ use dipir_light::gaussian::LobeParameters;
 use glam::Vec3;
 
 use crate::checkpoint::State;
-use crate::crop::{CropSampler, Framing, View};
+use crate::crop::{CropSampler, CropView, Framing};
 use crate::error::OptimizeError;
 use crate::guidance::{Guidance, Guided, Step};
 use crate::history::{Row, stands_still};
@@ -31,14 +31,14 @@ const RECORD_EVERY: usize = 50;
 /// would soon rest on few samples, and their noise, to which the optimiser then fits, keeps it
 /// from narrowing further.
 const LEAST_EFFICIENCY: f64 = 1.0;
-/// Times that the light is recorded anew at most, so that recording stays a small part of the run.
+/// The largest number of new records, so that recording stays a small part of the run.
 const MOST_RECORDS: usize = 8;
 
 /// An optimisation.
 pub struct Optimization<'a> {
     /// From parameters to picture and back.
     pub objective: Objective,
-    /// What judges the picture.
+    /// The loss on the picture.
     pub guidance: &'a mut dyn Guidance,
     /// Records transport anew; without it the first record serves to the end.
     pub recorder: Option<&'a mut dyn Recorder>,
@@ -46,11 +46,11 @@ pub struct Optimization<'a> {
     pub settings: Settings,
     /// Where it starts.
     pub start: Parameters,
-    /// Where it is kept between iterations, and goes on if the file is there.
+    /// File that keeps the state between iterations; the run goes on from it if it exists.
     pub checkpoint: Option<&'a Path>,
 }
 
-/// What is told while it runs.
+/// What happens during a run.
 #[derive(Debug)]
 pub enum Event<'a> {
     /// An iteration is done.
@@ -133,11 +133,11 @@ impl Optimization<'_> {
             // Transport.
             let recorded = self.record_again(&mut state)?;
 
-            // Forwards, judgement, and backwards.
+            // Forwards, the loss, and backwards.
             let parameters = state.parameters.to_tensors();
             let forward = self.objective.forward(&state.parameters, fusion);
             let view = self.view(&crops, step);
-            let judged = match bad_before_guidance(&parameters, &forward) {
+            let evaluation = match bad_before_guidance(&parameters, &forward) {
                 Some(bad) => Err(bad.to_string()),
                 None => {
                     let shown = view.apply(&forward.picture.0);
@@ -145,12 +145,12 @@ impl Optimization<'_> {
                     self.gradient(&state.parameters, &forward, &view, guided)
                 }
             };
-            let judged = judged.map(|judged| match one_light {
-                true => Judged {
-                    gradient: judged.gradient.shared(&Parameters::TWINS),
-                    ..judged
+            let evaluation = evaluation.map(|evaluation| match one_light {
+                true => Evaluation {
+                    gradient: evaluation.gradient.shared(&Parameters::TWINS),
+                    ..evaluation
                 },
-                false => judged,
+                false => evaluation,
             });
 
             // Previews show what the step starts from.
@@ -176,18 +176,18 @@ impl Optimization<'_> {
                 recorded,
                 seconds: 0.0,
             };
-            match judged {
-                Ok(judged) => {
+            match evaluation {
+                Ok(evaluation) => {
                     let mut moved = parameters;
                     let rates = |group| rate * settings.base_rate(group);
-                    state.adam.step(&mut moved, &judged.gradient, rates)?;
+                    state.adam.step(&mut moved, &evaluation.gradient, rates)?;
                     state.parameters = Parameters::from_tensors(&moved);
                     state.parameters.retract(&bounds);
                     state.bad_in_a_row = 0;
-                    row.loss = Some(judged.loss + forward.consistency + forward.regularizer);
-                    row.guidance = Some(judged.loss);
-                    row.gradient_norm = Some(judged.gradient.norm());
-                    row.t = judged.timestep;
+                    row.loss = Some(evaluation.loss + forward.consistency + forward.regularizer);
+                    row.guidance = Some(evaluation.loss);
+                    row.gradient_norm = Some(evaluation.gradient.norm());
+                    row.t = evaluation.timestep;
                 }
                 Err(tensor) => {
                     state.bad_in_a_row += 1;
@@ -232,9 +232,9 @@ impl Optimization<'_> {
         Ok(state)
     }
 
-    /// Makes the fused light, as lobes, the light of both sets, with the momentum of the
-    /// foreground. Fusing maps leaves what lobes cannot say where the sets still differ; from here
-    /// on the optimiser sees it, and mends it.
+    /// Makes the fused light, as lobes, the light of both sets, with the momentum of the foreground.
+    /// Where the sets still differ, lobes cannot express the fused map exactly; from here on the
+    /// optimiser sees that difference and reduces it.
     fn join(&self, state: &mut State) {
         let (width, height) = self.objective.transport().environment_size();
         let light = Lighting::of(&state.parameters, width, height);
@@ -287,12 +287,12 @@ impl Optimization<'_> {
         Ok(())
     }
 
-    fn view(&self, crops: &CropSampler, step: Step) -> View {
+    fn view(&self, crops: &CropSampler, step: Step) -> CropView {
         match self.guidance.framing() {
-            Framing::Whole => View::whole(),
+            Framing::Whole => CropView::whole(),
             Framing::Crops { side, scale } => {
                 let crop = crops.crop(step.seed, step.iteration, scale);
-                View::of(self.objective.transport().size(), crop, side)
+                CropView::of(self.objective.transport().size(), crop, side)
             }
         }
     }
@@ -302,9 +302,9 @@ impl Optimization<'_> {
         &self,
         parameters: &Parameters,
         forward: &Forward,
-        view: &View,
+        view: &CropView,
         guided: Guided,
-    ) -> Result<Judged, String> {
+    ) -> Result<Evaluation, String> {
         if !guided.loss.is_finite() {
             return Err("loss of the guidance".into());
         }
@@ -318,7 +318,7 @@ impl Optimization<'_> {
             .to_tensors();
         match gradient.first_not_finite() {
             Some(tensor) => Err(format!("gradient of {tensor}")),
-            None => Ok(Judged {
+            None => Ok(Evaluation {
                 loss: guided.loss,
                 timestep: guided.timestep,
                 gradient,
@@ -373,8 +373,8 @@ impl Optimization<'_> {
     }
 }
 
-/// The guidance's answer, carried back to the parameters.
-struct Judged {
+/// Loss of the picture, and its gradient with respect to the parameters.
+struct Evaluation {
     loss: f64,
     timestep: Option<f64>,
     gradient: Tensors,

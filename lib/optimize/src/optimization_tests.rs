@@ -1,7 +1,7 @@
 use super::*;
 use crate::guidance::{Reference, rmse, touched};
-use crate::settings::{LightTable, Preset};
-use crate::testing::{DenseTransport, WEIGHTS, objective};
+use crate::settings::LightTable;
+use crate::testing::{DenseTransport, PRESET, WEIGHTS, objective};
 use crate::transport::LinearTransport;
 use dipir_imaging::raster::Raster;
 use dipir_light::gaussian::SphericalGaussian;
@@ -21,7 +21,7 @@ fn settings(iterations: usize) -> Settings {
         checkpoint_every: Some(0),
         ..Default::default()
     };
-    table.settings(Preset::Standard, 5).unwrap()
+    table.settings(&PRESET, 5).unwrap()
 }
 
 fn lobe(direction: Vec3, radiance: Vec3, sigma: f32) -> SphericalGaussian {
@@ -216,7 +216,7 @@ impl Guidance for Spoiled<'_> {
     fn gradient(
         &mut self,
         picture: &Raster<Vec3>,
-        view: &View,
+        view: &CropView,
         step: Step,
     ) -> Result<Guided, OptimizeError> {
         let mut guided = self.inner.gradient(picture, view, step)?;

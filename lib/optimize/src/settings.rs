@@ -72,7 +72,7 @@ impl From<Start> for String {
 pub struct LightTable {
     /// Steps of the optimiser; the quality's by default.
     pub iterations: Option<usize>,
-    /// What judges the picture.
+    /// Where the gradient of the picture comes from.
     pub guidance: GuidanceKind,
     /// With `guidance = "reference"`: the picture that the composite should equal, EXR or HDR
     /// (linear), PNG or JPEG (as the photograph is encoded), of the photograph's size.
@@ -179,19 +179,24 @@ impl LearningRates {
     }
 }
 
-/// How much work is done where the table does not say.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Preset {
-    /// Quick looks.
-    Draft,
-    /// Results.
-    #[default]
-    Standard,
-    /// Final frames.
-    High,
+/// How much work is done where the table does not say: one row of the presets of a quality.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Preset {
+    /// Steps of the optimiser.
+    pub iterations: usize,
+    /// Lobes of each light set.
+    pub lobes: usize,
+    /// Columns and rows of the environment. A shadow's edge is as wide as the texel that holds the
+    /// sun: 1.4 degrees with 256 columns, and with 2.8 that can be seen.
+    pub environment: [usize; 2],
+    /// Paths per pixel of the record.
+    pub samples: u32,
+    /// Longest side of the picture that is optimised, pixels.
+    pub size: usize,
 }
 
-/// A value of the table that no run can work with.
+/// A value of the table that is refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{message}")]
 pub struct BadSetting {
@@ -250,24 +255,15 @@ const MOST_TEXELS_IN_HALF: usize = 1 << 16;
 
 impl LightTable {
     /// The settings: what the table says, else what `preset` says. `seed` is the pipeline's.
-    pub fn settings(&self, preset: Preset, seed: u64) -> Result<Settings, BadSetting> {
-        let (iterations, lobes, environment, samples, size) = match preset {
-            // A texel of 5.6 degrees, and candidates 37 degrees apart.
-            Preset::Draft => (200, 16, [64, 32], 64, 192),
-            // The paper's iterations; 26 degrees apart. Texels of 1.4 degrees: a shadow's edge is as
-            // wide as the texel that holds the sun, and with 2.8 degrees that can be seen.
-            Preset::Standard => (600, 32, [256, 128], 128, 384),
-            // More lobes than 32 bought nothing that was measured (docs/accuracy.md).
-            Preset::High => (600, 32, [256, 128], 512, 512),
-        };
-        let environment = self.environment.unwrap_or(environment);
+    pub fn settings(&self, preset: &Preset, seed: u64) -> Result<Settings, BadSetting> {
+        let environment = self.environment.unwrap_or(preset.environment);
         let fits_half = environment[0].saturating_mul(environment[1]) <= MOST_TEXELS_IN_HALF;
         let settings = Settings {
-            iterations: self.iterations.unwrap_or(iterations),
-            lobes: self.lobes.unwrap_or(lobes),
-            size: self.size.unwrap_or(size),
+            iterations: self.iterations.unwrap_or(preset.iterations),
+            lobes: self.lobes.unwrap_or(preset.lobes),
+            size: self.size.unwrap_or(preset.size),
             environment,
-            samples: self.samples.unwrap_or(samples),
+            samples: self.samples.unwrap_or(preset.samples),
             precision: self.precision.unwrap_or(match fits_half {
                 true => Precision::Half,
                 false => Precision::Single,
@@ -293,7 +289,7 @@ impl LightTable {
 }
 
 impl Settings {
-    /// Refuses what no run can work with.
+    /// Refuses values that no run can work with.
     pub fn check(&self) -> Result<(), BadSetting> {
         let wrong = |key, message: String| Err(BadSetting { key, message });
         let counts = [
@@ -408,20 +404,19 @@ impl Settings {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::PRESET;
 
     #[test]
-    fn presets_pass_their_own_check_and_the_table_goes_first() {
+    fn the_table_goes_before_the_preset_and_the_pipelines_seed() {
         let mut table = LightTable::default();
-        for preset in [Preset::Draft, Preset::Standard, Preset::High] {
-            assert!(table.settings(preset, 0).is_ok());
-        }
-        assert_eq!(table.settings(Preset::Standard, 7).unwrap().seed, 7);
+        let settings = table.settings(&PRESET, 7).unwrap();
+        assert_eq!((settings.lobes, settings.seed), (PRESET.lobes, 7));
         table.lobes = Some(3);
         table.seed = Some(1);
-        let settings = table.settings(Preset::High, 7).unwrap();
+        let settings = table.settings(&PRESET, 7).unwrap();
         assert_eq!(
             (settings.lobes, settings.seed, settings.iterations),
-            (3, 1, 600)
+            (3, 1, PRESET.iterations)
         );
     }
 
@@ -430,7 +425,7 @@ mod tests {
         let refused = |change: &dyn Fn(&mut LightTable)| {
             let mut table = LightTable::default();
             change(&mut table);
-            table.settings(Preset::Standard, 0).unwrap_err()
+            table.settings(&PRESET, 0).unwrap_err()
         };
         let error = refused(&|t| t.iterations = Some(0));
         assert_eq!(error.key, "iterations");
@@ -470,7 +465,11 @@ mod tests {
 
     #[test]
     fn fusion_and_rates_run_from_start_to_end() {
-        let s = LightTable::default().settings(Preset::Standard, 0).unwrap();
+        let whole = LightTable {
+            iterations: Some(600),
+            ..Default::default()
+        };
+        let s = whole.settings(&PRESET, 0).unwrap();
         assert_eq!((s.fusion(0), s.fusion(300), s.fusion(599)), (0.0, 1.0, 1.0));
         assert_eq!((s.fused_at(), s.fusion(299) < 1.0), (300, true));
         assert!((s.fusion(150) - 0.5).abs() < 2e-3);
@@ -481,7 +480,7 @@ mod tests {
             iterations: Some(1),
             ..Default::default()
         };
-        let one = one.settings(Preset::Draft, 0).unwrap();
+        let one = one.settings(&PRESET, 0).unwrap();
         assert_eq!((one.fusion(0), one.rate(0)), (0.0, 1.0));
     }
 }

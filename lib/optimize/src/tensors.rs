@@ -23,7 +23,7 @@ pub enum Group {
 pub struct Tensor {
     /// As in `foreground.direction`.
     pub name: &'static str,
-    /// Whose learning rate it takes.
+    /// The group that sets its learning rate.
     pub group: Group,
     /// The numbers.
     pub values: Vec<f64>,

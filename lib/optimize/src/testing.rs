@@ -18,7 +18,17 @@ use dipir_scene::scene::Scene;
 use glam::Vec3;
 
 use crate::objective::{Objective, Weights};
+use crate::settings::Preset;
 use crate::transport::LinearTransport;
+
+/// Little work.
+pub const PRESET: Preset = Preset {
+    iterations: 200,
+    lobes: 16,
+    environment: [64, 32],
+    samples: 64,
+    size: 192,
+};
 
 /// Transport as matrices: for every pixel the texels that it sees.
 #[derive(Clone, Debug)]

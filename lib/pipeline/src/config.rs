@@ -5,10 +5,10 @@
 //! types; a type that refuses unknown fields makes a misspelt key an error that names the
 //! accepted keys and the nearest one.
 mod deserialize;
+mod renamed;
 mod tree;
 
 use std::fmt;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
@@ -28,6 +28,8 @@ pub const TABLES: [&str; 8] = [
     "composite",
     "report",
 ];
+
+pub use renamed::renamed;
 
 /// Where a value was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -71,6 +73,9 @@ pub enum Quality {
     High,
 }
 
+/// More worker threads than this are refused: they would only fill the memory with stacks.
+pub const MAX_THREADS: usize = 1024;
+
 /// The `[pipeline]` table, which every executable reads.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -79,7 +84,8 @@ pub struct PipelineTable {
     pub out: PathBuf,
     /// Every random number follows from it.
     pub seed: u64,
-    /// Worker threads; 0 means one for every core. Never changes a result.
+    /// Worker threads, at most [`MAX_THREADS`]; 0 means one for every core. Never changes a
+    /// result.
     pub threads: usize,
     /// `cpu`, `cuda:N` or `auto`.
     pub device: String,
@@ -110,7 +116,7 @@ impl Config {
     /// Reads `path` and applies `overrides`, each `table.key=value`: a TOML value, or else a bare
     /// string. Later overrides win.
     pub fn read(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text = fs::read_to_string(path).map_err(|e| ConfigError::Read {
+        let text = dipir_files::read_to_string(path).map_err(|e| ConfigError::Read {
             path: path.into(),
             cause: plain(&e),
         })?;
@@ -127,6 +133,7 @@ impl Config {
             path: path.into(),
             root,
         };
+        renamed::check(&config)?;
         config.check_tables()?;
         Ok(config)
     }

@@ -46,6 +46,16 @@ pub enum ConfigError {
         /// The accepted key that looks most like it.
         nearest: Option<String>,
     },
+    /// A key or table by the name that it had before.
+    #[error("{at}: {old} is called {new} now")]
+    Renamed {
+        /// Where.
+        at: Place,
+        /// The dotted name that stands there.
+        old: String,
+        /// The dotted name that it has.
+        new: String,
+    },
     /// A value of the wrong type or out of its type's range.
     #[error("{at}: {key} is {found}, accepted: {accepted}")]
     WrongType {
@@ -144,10 +154,12 @@ pub enum StageError {
         holder: String,
     },
     /// The target holds something that no stage wrote.
-    #[error("{} is there already and holds no stage.json, so no stage wrote it and it is left alone; move it away or choose another folder with --out", folder.display())]
+    #[error("{} is there already and {why}; move it away or choose another folder with --out", folder.display())]
     Foreign {
         /// The folder.
         folder: PathBuf,
+        /// What tells that it is not ours.
+        why: Foreign,
     },
     /// An earlier stage has not run.
     #[error("{} is missing: run {executable} first", path.display())]
@@ -191,6 +203,26 @@ impl StageError {
             source,
         }
     }
+}
+
+/// What tells that a folder is not ours.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Foreign {
+    /// Files, and no `stage.json` among them.
+    #[error("holds no stage.json, so no stage wrote it and it is left alone")]
+    NoManifest,
+    /// A `stage.json` that is damaged, or that another stage or program wrote.
+    #[error("its stage.json is not one that the stage \"{stage}\" wrote, so it is left alone")]
+    OtherManifest {
+        /// The stage whose folder it would be.
+        stage: String,
+    },
+    /// No mark of this program.
+    #[error("holds no .dipir of this program, so it is left alone")]
+    NoMark,
+    /// A symbolic link.
+    #[error("is a symbolic link, which no stage makes, so it is left alone")]
+    Link,
 }
 
 /// How an artifact differs from what its manifest says.
@@ -251,6 +283,10 @@ fn remedy(error: &io::Error) -> &'static str {
         io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
             "; choose a folder that you may write with --out (earlier results are untouched)"
         }
+        io::ErrorKind::FileTooLarge => {
+            "; raise the limit on the size of files (ulimit -f; earlier results are untouched)"
+        }
+        io::ErrorKind::AlreadyExists => "; move it away or choose another folder with --out",
         _ => "",
     }
 }

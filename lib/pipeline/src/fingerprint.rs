@@ -23,43 +23,89 @@ use crate::stage::StagePlan;
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
 pub struct Fingerprint(String);
 
-impl Fingerprint {
-    /// The fingerprint of a planned run.
-    pub fn of_plan(plan: &StagePlan) -> Self {
-        Self::new(
-            &plan.stage,
-            plan.version,
-            &plan.params,
-            plan.seed,
-            &plan.inputs,
-        )
+/// What a [`Fingerprint`] is taken of: parts of a planned run. What is not named is left out.
+#[derive(Clone, Debug)]
+pub struct Parts<'a> {
+    of: &'a str,
+    version: u32,
+    seed: u64,
+    params: Value,
+    inputs: &'a [Artifact],
+}
+
+impl<'a> Parts<'a> {
+    /// Version of the code.
+    pub fn version(mut self, version: u32) -> Self {
+        self.version = version;
+        self
     }
 
-    /// The fingerprint of a run that was made.
-    pub fn of_manifest(m: &Manifest) -> Self {
-        Self::new(&m.stage, m.version, &m.params, m.seed, &m.inputs)
+    /// Seed of every random number.
+    pub fn seed(mut self, seed: u64) -> Self {
+        self.seed = seed;
+        self
     }
 
-    fn new(stage: &str, version: u32, params: &Value, seed: u64, inputs: &[Artifact]) -> Self {
+    /// Settings, instead of any named before.
+    pub fn params(mut self, params: Value) -> Self {
+        self.params = params;
+        self
+    }
+
+    /// Files that are read.
+    pub fn inputs(mut self, inputs: &'a [Artifact]) -> Self {
+        self.inputs = inputs;
+        self
+    }
+
+    /// The fingerprint of these parts.
+    pub fn finish(self) -> Fingerprint {
         let mut hasher = blake3::Hasher::new();
         let mut put = |text: &str| {
             hasher.update(&(text.len() as u64).to_le_bytes());
             hasher.update(text.as_bytes());
         };
         put("fingerprint 1");
-        put(stage);
-        put(&version.to_string());
-        put(&seed.to_string());
-        for (key, value) in flat(params, inputs) {
+        put(self.of);
+        put(&self.version.to_string());
+        put(&self.seed.to_string());
+        for (key, value) in flat(&self.params, self.inputs) {
             put(&key);
             put(&value);
         }
         put("inputs");
-        for (role, hash) in by_role(inputs) {
+        for (role, hash) in by_role(self.inputs) {
             put(role);
             put(hash);
         }
-        Self(hasher.finalize().to_hex().to_string())
+        Fingerprint(hasher.finalize().to_hex().to_string())
+    }
+}
+
+impl Fingerprint {
+    /// Begins the fingerprint of `what`, a stage or a part of its work.
+    pub fn of(what: &str) -> Parts<'_> {
+        Parts {
+            of: what,
+            version: 0,
+            seed: 0,
+            params: Value::Null,
+            inputs: &[],
+        }
+    }
+
+    /// Begins with all parts of a planned run.
+    pub fn of_plan(plan: &StagePlan) -> Parts<'_> {
+        Self::of(&plan.stage)
+            .version(plan.version)
+            .seed(plan.seed)
+            .params(plan.params.clone())
+            .inputs(&plan.inputs)
+    }
+
+    /// Its first 16 digits, for names of folders.
+    pub fn short(&self) -> &str {
+        &self.0[..16]
     }
 
     /// 64 hexadecimal digits.
@@ -150,6 +196,49 @@ impl fmt::Display for StaleReason {
             Self::InputRemoved { role } => write!(f, "it no longer reads the {role}"),
             Self::OutputDamaged { path, damage } => write!(f, "{}: {damage}", path.display()),
         }
+    }
+}
+
+/// The reasons in words. What has happened to several files of one role is said once.
+pub fn in_words(reasons: &[StaleReason]) -> String {
+    let mut words: Vec<String> = Vec::new();
+    let mut told: Vec<(&str, &str)> = Vec::new();
+    for reason in reasons {
+        let Some((verb, role)) = reason.about_inputs() else {
+            words.push(reason.to_string());
+            continue;
+        };
+        let alike = |r: &&StaleReason| r.about_inputs() == Some((verb, role));
+        match reasons.iter().filter(alike).count() {
+            1 => words.push(reason.to_string()),
+            _ if told.contains(&(verb, role)) => {}
+            n => {
+                told.push((verb, role));
+                let first = match reason {
+                    StaleReason::InputChanged { path, .. } => {
+                        format!(", {} the first", path.display())
+                    }
+                    _ => String::new(),
+                };
+                words.push(format!("{n} files of the {role} {verb}{first}"));
+            }
+        }
+    }
+    words.join("; ")
+}
+
+impl StaleReason {
+    /// What has happened to an input, and its role without its number.
+    fn about_inputs(&self) -> Option<(&'static str, &str)> {
+        let (verb, role) = match self {
+            Self::InputChanged { role, .. } => ("have other content", role),
+            Self::InputAdded { role } => ("are read now", role),
+            Self::InputRemoved { role } => ("are no longer read", role),
+            _ => return None,
+        };
+        let is_number = |n: &str| n.bytes().all(|b| b.is_ascii_digit());
+        let base = role.rsplit_once(' ').filter(|(_, n)| is_number(n));
+        Some((verb, base.map_or(role.as_str(), |(base, _)| base)))
     }
 }
 
@@ -316,7 +405,12 @@ mod tests {
     fn reasons(plan: &StagePlan, target: &Path) -> Vec<String> {
         let reasons = stale_reasons(plan, target).unwrap();
         let manifest = Manifest::read(target, "").unwrap();
-        let same = Fingerprint::of_manifest(&manifest) == Fingerprint::of_plan(plan);
+        let was = Fingerprint::of(&manifest.stage)
+            .version(manifest.version)
+            .seed(manifest.seed)
+            .params(manifest.params.clone())
+            .inputs(&manifest.inputs);
+        let same = was.finish() == Fingerprint::of_plan(plan).finish();
         let only_outputs = reasons
             .iter()
             .all(|r| matches!(r, StaleReason::OutputDamaged { .. }));
@@ -380,6 +474,26 @@ mod tests {
     }
 
     #[test]
+    fn a_changed_model_is_told_in_one_phrase() {
+        let changed = |role: &str, path: &str| StaleReason::InputChanged {
+            role: role.into(),
+            path: path.into(),
+        };
+        let reasons = [
+            StaleReason::Seed { was: 0, now: 1 },
+            changed("model", "sd/unet/config.json"),
+            changed("model 2", "sd/vae/config.json"),
+            changed("photo", "a.png"),
+            changed("model 12", "sd/x"),
+        ];
+        assert_eq!(
+            in_words(&reasons),
+            "the seed changed from 0 to 1; 3 files of the model have other content, \
+             sd/unet/config.json the first; the photo a.png has other content"
+        );
+    }
+
+    #[test]
     fn moving_the_folder_or_touching_a_file_changes_nothing() {
         let dir = tempfile::tempdir().unwrap();
         let here = dir.path().join("here");
@@ -396,8 +510,30 @@ mod tests {
         let a = StagePlan::new("s", 1, json!({"a": 1, "b": {"c": 2, "d": 3}}), 0);
         let b = StagePlan::new("s", 1, json!({"b": {"d": 3, "c": 2}, "a": 1}), 0);
         let c = StagePlan::new("s", 1, json!({"b": {"d": 2, "c": 3}, "a": 1}), 0);
-        assert_eq!(Fingerprint::of_plan(&a), Fingerprint::of_plan(&b));
-        assert_ne!(Fingerprint::of_plan(&a), Fingerprint::of_plan(&c));
+        let [a, b, c] = [a, b, c].map(|plan| Fingerprint::of_plan(&plan).finish());
+        assert_eq!(a, b);
+        assert_ne!(a, c);
+    }
+
+    #[test]
+    fn the_device_does_not_show_and_every_other_part_does() {
+        let mut plan = StagePlan::new("s", 1, json!({"a": 1}), 0);
+        plan.input_of_bytes("photo", Path::new("a"), b"pixels");
+        let of = |plan: &StagePlan| Fingerprint::of_plan(plan).finish();
+        let first = of(&plan);
+        plan.device = "cuda:0".into();
+        assert_eq!(of(&plan), first);
+        let parts = || Fingerprint::of_plan(&plan);
+        let other = StagePlan::new("t", 1, json!({"a": 1}), 0);
+        for changed in [
+            parts().version(2),
+            parts().seed(1),
+            parts().params(json!({"a": 2})),
+            parts().inputs(&[]),
+            Fingerprint::of_plan(&other).inputs(&plan.inputs),
+        ] {
+            assert_ne!(changed.finish(), first);
+        }
     }
 
     #[test]

@@ -1,13 +1,17 @@
 //! One writer a stage folder.
 //!
 //! The lock is the operating system's own on an open file, so it ends with its process however
-//! that ends: a lock left behind by a killed run holds nobody up. The file itself stays, because
-//! removing it would let two processes hold locks on two files of the same name.
-use std::fs::{self, File, OpenOptions, TryLockError};
-use std::io::{Read, Seek, Write};
+//! that ends: a lock left behind by a killed run holds nobody up. Whoever holds the lock removes
+//! the file when done; whoever comes to hold the lock of a file that is not at its name any more
+//! begins anew, so that two processes never hold locks on two files of the same name.
+use std::fs::{self, File, TryLockError};
+use std::io::{self, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
 use crate::error::StageError;
+
+/// How lock files begin; the number of the process follows.
+const HEAD: &str = "dipir lock ";
 
 /// What to do when somebody else writes the folder.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -22,6 +26,7 @@ pub enum WhenLocked {
 /// Held while a stage writes; released when dropped or when the process ends.
 #[derive(Debug)]
 pub struct FolderLock {
+    path: PathBuf,
     _file: File,
 }
 
@@ -43,38 +48,79 @@ impl FolderLock {
     }
 
     fn take_file(path: &Path, folder: &Path, when_locked: WhenLocked) -> Result<Self, StageError> {
-        let mut file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .open(path)
-            .map_err(|e| StageError::io("write", path, e))?;
-        match file.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) if when_locked == WhenLocked::Wait => {
-                file.lock().map_err(|e| StageError::io("lock", path, e))?;
+        loop {
+            let mut file =
+                dipir_files::open_own(path).map_err(|e| StageError::io("write", path, e))?;
+            match file.try_lock() {
+                Ok(()) => {}
+                Err(TryLockError::WouldBlock) if when_locked == WhenLocked::Wait => {
+                    file.lock().map_err(|e| StageError::io("lock", path, e))?;
+                }
+                Err(TryLockError::WouldBlock) => {
+                    return Err(StageError::Locked {
+                        folder: folder.into(),
+                        holder: holder(&mut file),
+                    });
+                }
+                Err(TryLockError::Error(e)) => return Err(StageError::io("lock", path, e)),
             }
-            Err(TryLockError::WouldBlock) => {
-                return Err(StageError::Locked {
-                    folder: folder.into(),
-                    holder: holder(&mut file),
-                });
+            if is_at(&file, path) {
+                sign(&mut file, path)?;
+                let path = path.into();
+                return Ok(Self { path, _file: file });
             }
-            Err(TryLockError::Error(e)) => return Err(StageError::io("lock", path, e)),
         }
-        file.set_len(0)
-            .and_then(|()| file.rewind())
-            .and_then(|()| writeln!(file, "{}", std::process::id()))
-            .map_err(|e| StageError::io("write", path, e))?;
-        Ok(Self { _file: file })
     }
+}
+
+impl Drop for FolderLock {
+    fn drop(&mut self) {
+        // Without a way to tell whether a file is still at its name, the file has to stay there.
+        if cfg!(unix) {
+            let _ = fs::remove_file(&self.path);
+        }
+    }
+}
+
+/// Writes who holds the lock into its file, unless another program made that.
+fn sign(file: &mut File, path: &Path) -> Result<(), StageError> {
+    let failed = |e| StageError::io("write", path, e);
+    let mut begins = Vec::new();
+    let length = HEAD.len() as u64;
+    let read = (&*file).take(length).read_to_end(&mut begins);
+    read.map_err(failed)?;
+    if !HEAD.as_bytes().starts_with(&begins) {
+        let message = "it is there already and is no lock of dipir";
+        return Err(failed(io::Error::new(
+            io::ErrorKind::AlreadyExists,
+            message,
+        )));
+    }
+    file.set_len(0)
+        .and_then(|()| file.rewind())
+        .and_then(|()| writeln!(file, "{HEAD}{}", std::process::id()))
+        .map_err(failed)
+}
+
+/// Whether the open file is the one at `path`.
+#[cfg(unix)]
+fn is_at(file: &File, path: &Path) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    let same = |a: fs::Metadata, b: fs::Metadata| (a.dev(), a.ino()) == (b.dev(), b.ino());
+    let (open, named) = (file.metadata(), fs::symlink_metadata(path));
+    open.ok().zip(named.ok()).is_some_and(|(a, b)| same(a, b))
+}
+
+#[cfg(not(unix))]
+fn is_at(_: &File, _: &Path) -> bool {
+    true
 }
 
 fn holder(file: &mut File) -> String {
     let mut text = String::new();
-    match file.read_to_string(&mut text) {
-        Ok(_) if !text.trim().is_empty() => format!("process {}", text.trim()),
+    let read = file.take(64).read_to_string(&mut text);
+    match text.trim().strip_prefix(HEAD) {
+        Some(process) if read.is_ok() => format!("process {process}"),
         _ => "another process".into(),
     }
 }
@@ -99,6 +145,9 @@ pub(crate) fn create_folder(folder: &Path) -> Result<(), StageError> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::AtomicUsize;
+    use std::sync::atomic::Ordering::SeqCst;
+
     use super::*;
 
     #[test]
@@ -125,10 +174,53 @@ mod tests {
     fn a_lock_file_left_by_a_dead_process_holds_nobody_up() {
         let parent = tempfile::tempdir().unwrap();
         let folder = parent.path().join("scene");
-        fs::write(lock_path(&folder), "999999999\n").unwrap();
-        FolderLock::take(&folder, WhenLocked::Refuse).unwrap();
-        let text = fs::read_to_string(lock_path(&folder)).unwrap();
-        assert_eq!(text, format!("{}\n", std::process::id()));
+        for left in ["", "dipir", "dipir lock 999999999\n"] {
+            fs::write(lock_path(&folder), left).unwrap();
+            let lock = FolderLock::take(&folder, WhenLocked::Refuse).unwrap();
+            let text = fs::read_to_string(lock_path(&folder)).unwrap();
+            assert_eq!(text, format!("dipir lock {}\n", std::process::id()));
+            drop(lock);
+            assert!(!lock_path(&folder).exists(), "nothing is left behind");
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn anothers_file_at_the_name_of_a_lock_is_left_as_it_is() {
+        let parent = tempfile::tempdir().unwrap();
+        let folder = parent.path().join("scene");
+        let thesis = parent.path().join("thesis");
+        fs::write(&thesis, "years of work").unwrap();
+        std::os::unix::fs::symlink(&thesis, lock_path(&folder)).unwrap();
+        FolderLock::take(&folder, WhenLocked::Refuse).unwrap_err();
+        assert_eq!(fs::read(&thesis).unwrap(), b"years of work");
+        fs::remove_file(lock_path(&folder)).unwrap();
+        fs::rename(&thesis, lock_path(&folder)).unwrap();
+        let error = FolderLock::take(&folder, WhenLocked::Refuse).unwrap_err();
+        let end = ".scene.lock: it is there already and is no lock of dipir; move it away or \
+                   choose another folder with --out";
+        assert!(error.to_string().ends_with(end), "{error}");
+        assert_eq!(fs::read(lock_path(&folder)).unwrap(), b"years of work");
+    }
+
+    #[test]
+    fn many_writers_never_hold_the_lock_together() {
+        let parent = tempfile::tempdir().unwrap();
+        let folder = parent.path().join("scene");
+        let (inside, most) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        std::thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| {
+                    for _ in 0..50 {
+                        let _lock = FolderLock::take(&folder, WhenLocked::Wait).unwrap();
+                        most.fetch_max(inside.fetch_add(1, SeqCst) + 1, SeqCst);
+                        std::thread::yield_now();
+                        inside.fetch_sub(1, SeqCst);
+                    }
+                });
+            }
+        });
+        assert_eq!(most.into_inner(), 1);
     }
 
     #[test]

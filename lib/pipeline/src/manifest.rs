@@ -3,13 +3,13 @@
 //! The file ends with a checksum of all that stands before it, so that a damaged manifest is told
 //! from a whole one as surely as the files that it lists.
 use std::collections::BTreeMap;
-use std::fs::{self, File};
-use std::io::Read;
+use std::fs;
 use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Damage, StageError, plain};
+pub use crate::hashing::hash_file;
 
 /// Version of the manifest's own layout.
 pub const SCHEMA: u32 = 2;
@@ -101,7 +101,7 @@ impl Manifest {
     /// Reads the manifest in a stage's `folder`; `executable` is named if it is not there.
     pub fn read(folder: &Path, executable: &str) -> Result<Self, StageError> {
         let path = folder.join(FILE_NAME);
-        let bytes = match fs::read(&path) {
+        let bytes = match dipir_files::read(&path) {
             Ok(bytes) => bytes,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
                 return Err(StageError::NotRun {
@@ -209,24 +209,6 @@ pub(crate) fn check_inside(path: &Path) -> Result<(), StageError> {
         Ok(())
     } else {
         Err(StageError::Escapes { path: path.into() })
-    }
-}
-
-/// Length and BLAKE3 hash of a file, read in pieces.
-pub fn hash_file(path: &Path) -> Result<(u64, String), StageError> {
-    let failed = |e| StageError::io("read", path, e);
-    let mut file = File::open(path).map_err(failed)?;
-    let mut hasher = blake3::Hasher::new();
-    let mut buffer = vec![0; 1 << 18];
-    let mut bytes = 0;
-    loop {
-        match file.read(&mut buffer).map_err(failed)? {
-            0 => return Ok((bytes, hasher.finalize().to_hex().to_string())),
-            n => {
-                hasher.update(&buffer[..n]);
-                bytes += n as u64;
-            }
-        }
     }
 }
 

@@ -2,16 +2,19 @@
 //!
 //! A stage writes into `.NAME.partial` beside its target under a lock. When it is done, its files
 //! are flushed to disk, `stage.json` is written last, and the two folders change places in one
-//! step. Killed at any instant, the target holds either the earlier result or the new one.
-use std::collections::BTreeMap;
+//! step. Killed at any instant, the target holds either the earlier result or the new one. What
+//! others put beside the earlier result moves into the new folder.
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-use crate::error::StageError;
+use crate::error::{Foreign, StageError};
 use crate::lock::{FolderLock, WhenLocked, create_folder, sibling};
 use crate::manifest::{Artifact, FILE_NAME, Manifest, SCHEMA, check_inside, peak_rss_bytes};
+use crate::mark::{Kind, Mark, Owned, foreign, is_empty, is_folder};
 
 /// What identifies a run of a stage, before it has run.
 #[derive(Clone, Debug, PartialEq)]
@@ -112,11 +115,10 @@ impl StageWriter {
             create_folder(parent)?;
         }
         let lock = FolderLock::take(target, when_locked)?;
-        recover(target)?;
-        refuse_foreign(target)?;
+        tidy(target, &plan.stage)?;
+        refuse_foreign(target, &plan.stage)?;
         let partial = sibling(target, "partial");
-        remove_folder(&partial)?;
-        create_folder(&partial)?;
+        Mark::new(Kind::Unfinished, &plan.stage, Vec::new()).make(&partial)?;
         Ok(Self {
             target: target.into(),
             partial,
@@ -130,7 +132,8 @@ impl StageWriter {
         })
     }
 
-    /// The folder that is written to; whoever ends the process on purpose should remove it.
+    /// The folder that is written to; whoever ends the process on purpose should call [`discard`]
+    /// with it.
     pub fn partial(&self) -> &Path {
         &self.partial
     }
@@ -201,24 +204,88 @@ impl StageWriter {
         let text = text.map_err(|e| StageError::io("write", &path, e.into()))?;
         fs::write(&path, text).map_err(|e| StageError::io("write", &path, e))?;
         flush(&path)?;
-        flush(&self.partial)?;
-        swap(&self.partial, &self.target)?;
-        self.finished = true;
-        // The result stands; an earlier one that cannot be removed now goes at the next run.
-        let _ = remove_folder(&self.partial);
+        let listed = self.outputs.iter().map(|(_, name)| name);
+        let listed = listed.map(|name| name.to_string_lossy().into_owned());
+        Mark::new(Kind::Stage, &manifest.stage, listed.collect()).write(&self.partial)?;
+        self.flush_folders()?;
+        {
+            let _no_discard = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
+            swap(&self.partial, &self.target)?;
+            self.finished = true;
+            // The result stands; what cannot be tidied up now is at the next run.
+            let _ = tidy(&self.target, &manifest.stage);
+        }
         if let Some(parent) = self.target.parent().filter(|p| !p.as_os_str().is_empty()) {
-            flush(parent)?;
+            sync_folder(parent)?;
         }
         Ok(manifest)
+    }
+
+    /// Flushes the names of the outputs.
+    fn flush_folders(&self) -> Result<(), StageError> {
+        let outputs = self.outputs.iter().map(|(_, name)| self.partial.join(name));
+        let folders = outputs.filter_map(|path| path.parent().map(PathBuf::from));
+        let folders: BTreeSet<PathBuf> = folders.chain([self.partial.clone()]).collect();
+        folders.iter().try_for_each(|folder| sync_folder(folder))
     }
 }
 
 impl Drop for StageWriter {
     fn drop(&mut self) {
         if !self.finished {
-            let _ = remove_folder(&self.partial);
+            discard(&self.partial);
         }
     }
+}
+
+/// Held while a folder is swapped in or discarded: after the swap, what was the unfinished folder
+/// is the earlier result, with whatever others put there.
+static UNFINISHED: Mutex<()> = Mutex::new(());
+
+/// Removes the folder that a [`StageWriter`] of this process has not finished.
+pub fn discard(partial: &Path) {
+    let _no_swap = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
+    if is_unfinished(partial) {
+        let _ = fs::remove_dir_all(partial);
+    }
+}
+
+fn is_unfinished(folder: &Path) -> bool {
+    Mark::read(folder).is_some_and(|m| m.kind == Kind::Unfinished)
+}
+
+/// Clears up beside the folder `target` of `stage` what a run that was killed left there. Its lock
+/// must be held.
+pub fn tidy(target: &Path, stage: &str) -> Result<(), StageError> {
+    recover(target, stage)?;
+    let partial = sibling(target, "partial");
+    if fs::symlink_metadata(&partial).is_err() {
+        return Ok(());
+    }
+    if is_unfinished(&partial) || is_empty(&partial)? {
+        return fs::remove_dir_all(&partial).map_err(|e| StageError::io("remove", &partial, e));
+    }
+    // An earlier result that has been replaced, or a result that a kill kept from its place.
+    match Owned::of_stage(&partial, stage) {
+        Some(owned) if is_folder(target) => owned.absorb(&partial, target),
+        Some(owned) => owned.remove(&partial),
+        None => Err(foreign(&partial, Foreign::NoMark)),
+    }
+}
+
+/// What [`tidy`] would clear up.
+pub fn untidy(target: &Path, stage: &str) -> Vec<PathBuf> {
+    let [partial, previous] = ["partial", "previous"].map(|suffix| sibling(target, suffix));
+    let is_owned = |path: &Path| Owned::of_stage(path, stage).is_some();
+    let is_begun = |path: &Path| is_unfinished(path) || is_empty(path).unwrap_or(false);
+    let mut found = Vec::new();
+    if is_begun(&partial) || is_owned(&partial) {
+        found.push(partial);
+    }
+    if is_owned(&previous) {
+        found.push(previous);
+    }
+    found
 }
 
 fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), StageError> {
@@ -230,52 +297,50 @@ fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), StageErr
 }
 
 fn flush(path: &Path) -> Result<(), StageError> {
-    let file = File::open(path).map_err(|e| StageError::io("read", path, e))?;
-    match file.sync_all() {
-        // Some file systems cannot flush a folder; its files have been flushed all the same.
-        Err(e) if path.is_dir() && e.kind() == io::ErrorKind::InvalidInput => Ok(()),
-        other => other.map_err(|e| StageError::io("write", path, e)),
-    }
+    let file = dipir_files::open(path).map_err(|e| StageError::io("read", path, e))?;
+    let flushed = file.sync_all();
+    flushed.map_err(|e| StageError::io("write", path, e))
+}
+
+fn sync_folder(folder: &Path) -> Result<(), StageError> {
+    dipir_files::sync_folder(folder).map_err(|e| StageError::io("write", folder, e))
 }
 
 /// A crash between the two renames of [`swap`]'s slow way leaves the earlier result here.
-fn recover(target: &Path) -> Result<(), StageError> {
+fn recover(target: &Path, stage: &str) -> Result<(), StageError> {
     let previous = sibling(target, "previous");
-    if !previous.exists() {
+    match Owned::of_stage(&previous, stage) {
+        None => Ok(()),
+        Some(owned) if is_folder(target) => owned.absorb(&previous, target),
+        Some(_) => fs::rename(&previous, target).map_err(|e| StageError::io("restore", target, e)),
+    }
+}
+
+/// Refuses a target that is there and that `stage` did not make.
+pub fn refuse_foreign(target: &Path, stage: &str) -> Result<(), StageError> {
+    let found = match fs::symlink_metadata(target) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
+        Err(e) => return Err(StageError::io("read", target, e)),
+        Ok(found) => found.file_type(),
+    };
+    if found.is_dir() && (is_empty(target)? || Owned::of_stage(target, stage).is_some()) {
         return Ok(());
     }
-    if target.exists() {
-        return remove_folder(&previous);
-    }
-    fs::rename(&previous, target).map_err(|e| StageError::io("restore", target, e))
-}
-
-fn refuse_foreign(target: &Path) -> Result<(), StageError> {
-    let foreign = match fs::read_dir(target) {
-        Ok(mut entries) => entries.next().is_some() && !target.join(FILE_NAME).exists(),
-        Err(e) if e.kind() == io::ErrorKind::NotFound => false,
-        Err(e) if e.kind() == io::ErrorKind::NotADirectory => true,
-        Err(e) => return Err(StageError::io("read", target, e)),
+    let has_manifest = fs::symlink_metadata(target.join(FILE_NAME)).is_ok();
+    let why = match () {
+        () if found.is_symlink() => Foreign::Link,
+        () if has_manifest => Foreign::OtherManifest {
+            stage: stage.into(),
+        },
+        () => Foreign::NoManifest,
     };
-    if foreign {
-        return Err(StageError::Foreign {
-            folder: target.into(),
-        });
-    }
-    Ok(())
-}
-
-fn remove_folder(folder: &Path) -> Result<(), StageError> {
-    match fs::remove_dir_all(folder) {
-        Err(e) if e.kind() != io::ErrorKind::NotFound => Err(StageError::io("remove", folder, e)),
-        _ => Ok(()),
-    }
+    Err(foreign(target, why))
 }
 
 /// Puts `partial` in `target`'s place; what was there before, if anything, ends up in `partial`.
 fn swap(partial: &Path, target: &Path) -> Result<(), StageError> {
     let failed = |e| StageError::io("write", target, e);
-    if !target.exists() {
+    if fs::symlink_metadata(target).is_err() {
         return fs::rename(partial, target).map_err(failed);
     }
     #[cfg(any(target_os = "linux", target_vendor = "apple"))]
@@ -296,8 +361,7 @@ fn swap_in_two_steps(partial: &Path, target: &Path) -> Result<(), StageError> {
     let failed = |e| StageError::io("write", target, e);
     let previous = sibling(target, "previous");
     fs::rename(target, &previous).map_err(failed)?;
-    fs::rename(partial, target).map_err(failed)?;
-    remove_folder(&previous)
+    fs::rename(partial, target).map_err(failed)
 }
 
 #[cfg(test)]

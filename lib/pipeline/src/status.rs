@@ -3,7 +3,7 @@
 //! Nothing is remembered between two calls: every answer comes from the bytes that are there, the
 //! outputs' included, compared with what each `stage.json` says. What the stages read of each
 //! other is compared by the hashes in the manifests, whose own files are checked in turn, so that
-//! every byte is hashed once.
+//! every byte is hashed once ([`hash_file`](crate::hashing::hash_file)).
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::thread;
@@ -11,7 +11,7 @@ use std::thread;
 use serde::Serialize;
 
 use crate::error::StageError;
-use crate::fingerprint::{StaleReason, stale_reasons};
+use crate::fingerprint::{StaleReason, in_words, stale_reasons};
 use crate::graph::{Graph, Node};
 use crate::stage::StagePlan;
 
@@ -60,13 +60,9 @@ pub struct StageStatus {
 
 impl fmt::Display for State {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let listed = |reasons: &[StaleReason]| {
-            let words: Vec<String> = reasons.iter().map(StaleReason::to_string).collect();
-            words.join("; ")
-        };
         match self {
             Self::Fresh => write!(f, "up to date"),
-            Self::Stale { reasons } => write!(f, "stale: {}", listed(reasons)),
+            Self::Stale { reasons } => write!(f, "stale: {}", in_words(reasons)),
             Self::Waits { on, reasons } if reasons.is_empty() => {
                 write!(f, "waits for {}, and runs if that changes", on.join(", "))
             }
@@ -74,7 +70,7 @@ impl fmt::Display for State {
                 write!(
                     f,
                     "stale: {}; runs after {}",
-                    listed(reasons),
+                    in_words(reasons),
                     on.join(", ")
                 )
             }

@@ -1,28 +1,8 @@
 //! What can go wrong.
 
-use std::path::{Path, PathBuf};
-
-/// Failure of training or of use of the small model.
+/// Failure to estimate light with the small model.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A file could not be read or written.
-    #[error("cannot {action} {path}: {source}", path = path.display())]
-    Io {
-        /// "read", "write", ...
-        action: &'static str,
-        /// Which file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// A file does not hold what it should.
-    #[error("{path}: {message}", path = path.display())]
-    Content {
-        /// Which file.
-        path: PathBuf,
-        /// What is wrong and what to do.
-        message: String,
-    },
     /// A value is out of its range.
     #[error("{0}")]
     Argument(String),
@@ -36,13 +16,3 @@ pub enum Error {
 
 /// Shorthand.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
-
-/// Turns an I/O error into [`Error::Io`].
-pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Error {
-    let path = path.to_owned();
-    move |source| Error::Io {
-        action,
-        path,
-        source,
-    }
-}

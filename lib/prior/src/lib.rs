@@ -1,27 +1,12 @@
-//! The small model that knows light: scenes to train it on, how captions
-//! name light, its training, and what it finds out about a photograph.
+//! What the pipeline needs to estimate the light of a photograph with the small model: captions that describe light, the
+//! light encoder, and inversion. `dipir-pretraining` trains the model.
 
-mod backdrop;
-pub mod blueprint;
-pub mod dataset;
+pub mod caption;
 pub mod encoder;
 pub mod energy;
 pub mod error;
-pub mod examples;
-pub mod gates;
-pub mod lights;
-mod naming;
-mod photo;
-pub mod place;
-pub mod reader;
-pub mod record;
-pub mod shapes;
-mod shards;
-pub mod student;
-pub mod studio;
-pub mod tokenizer_files;
-pub mod trainer;
-pub mod words;
-mod yard;
+pub mod inversion;
+pub mod picture;
+pub mod text_conditioning;
 
 pub use error::{Error, Result};

@@ -5,8 +5,8 @@
 //! reference with a tenth of the target's error, less the reference's own.
 //!
 //! Run with `cargo test -p dipir-render --bench calibration -- --bench [target=RMSE] [size=PIXELS]
-//! [samples=N] [glints=0] [NAME]`: `samples` draws so many in every pixel instead of stopping at the target, `glints=0`
-//! leaves glints to chance, and only scenes whose name holds NAME are rendered.
+//! [samples=N] [highlights=0] [NAME]`: `samples` draws so many in every pixel instead of stopping at the target, `highlights=0`
+//! leaves highlights to chance, and only scenes whose name holds NAME are rendered.
 //! Without `--bench`, as tests run it, one small scene proves that it works.
 mod gallery;
 
@@ -38,7 +38,7 @@ fn main() {
     let size = value("size", if whole { 48.0 } else { 12.0 }) as u32;
     let target = value("target", if whole { 0.008 } else { 0.03 }) as f32;
     let samples = value("samples", 0.0) as u32;
-    let glints = value("glints", 1.0) > 0.0;
+    let highlights = value("highlights", 1.0) > 0.0;
     let stop = match samples {
         0 => Stop::TargetError(target),
         n => Stop::Samples(n),
@@ -48,7 +48,7 @@ fn main() {
         .find(|a| !a.contains('=') && !a.starts_with("--"));
     let scenes = gallery::scenes(size)
         .into_iter()
-        .chain(gallery::glinting(size))
+        .chain(gallery::with_highlights(size))
         .filter(|(n, _)| name.is_none_or(|name| n.contains(name.as_str())))
         .take(if whole { usize::MAX } else { 1 });
     let light = gallery::sky();
@@ -70,7 +70,7 @@ fn main() {
         );
         let (mut stated, mut bounds, mut squares, mut within) = (vec![], vec![], 0.0, 0);
         for seed in 0..SEEDS {
-            let found = render(&renderer, &light, &simulation, (stop, glints), seed);
+            let found = render(&renderer, &light, &simulation, (stop, highlights), seed);
             let square = squared_difference(&found.film, &reference.film)
                 - reference.error.rmse * reference.error.rmse;
             squares += square.max(0.0) / SEEDS as f64;
@@ -114,14 +114,14 @@ fn render(
     renderer: &Renderer,
     light: &dipir_light::environment::EnvironmentSampler,
     simulation: &Simulation,
-    (stop, glints): (Stop, bool),
+    (stop, highlights): (Stop, bool),
     seed: u64,
 ) -> Rendered {
     let settings = Settings {
         seed,
         stop,
         max_samples: 1 << 20,
-        glints,
+        highlights,
         ..Settings::default()
     };
     let go_on = &mut |_: &_| ControlFlow::Continue(());

@@ -16,8 +16,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::counters::RayCounts;
 use crate::error::RenderError;
-use crate::film::{Film, Job, Layer, REPLICATES, SquaredError, Viewing};
-use crate::glints::Found;
+use crate::film::{Film, SquaredError, Viewing};
+use crate::highlights::Found;
+use crate::job::{Job, Layer, REPLICATES};
 
 /// When to stop.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -39,7 +40,7 @@ const FIRST_ROUND: u32 = 8;
 /// uncertain.
 const MAX_GROWTH: f64 = 4.0;
 
-/// The first round under a time budget, small, because nobody knows yet what a sample takes.
+/// The first round under a time budget, small, because the time of a sample is not known yet.
 const FIRST_TIMED_ROUND: u32 = 4;
 
 /// Under a time budget the total cost grows at most by this factor a round, so that how long the
@@ -95,13 +96,15 @@ pub struct Refined {
     pub rounds: u32,
 }
 
-/// Samples per replicate of a pixel in focus in its first round: a glint may fill a hundredth of where they gather.
-const FIRST_ROUND_IN_FOCUS: u32 = 1024;
+/// Samples per replicate of a pixel with a highlight in its first round: the highlight may fill a hundredth of the area
+/// that they concentrate on.
+const FIRST_ROUND_WITH_HIGHLIGHT: u32 = 1024;
 
 /// Draws samples until `stop`. `advance(job, n)` brings a job to `n` samples per pixel and
-/// replicate; `focus(film, jobs)` is asked once, after the first round, which pixels of the object should begin
-/// anew with samples elsewhere; `progress` may break off after any round. A time budget counts
-/// from `start`.
+/// replicate; `find_highlights(film, jobs)` says once, after the first round, which pixels of the object start
+/// again with another density of samples; `progress` may break off after any round. A time budget counts
+/// from `start`; where it ends within the first round, the pixels that have no samples yet are taken from `coarse`,
+/// the same picture at a lower resolution. Without one, the first round is always finished.
 pub fn refine(
     size: (usize, usize),
     mut jobs: Vec<Job>,
@@ -110,14 +113,19 @@ pub fn refine(
     max_samples: u32,
     viewing: &Viewing,
     advance: &(impl Fn(&mut Job, u32) + Sync),
-    focus: &dyn Fn(&Film, &[Job]) -> Found,
+    find_highlights: &dyn Fn(&Film, &[Job]) -> Found,
+    coarse: Option<&Film>,
     progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
 ) -> Result<Refined, RenderError> {
     let limit = max_samples.div_ceil(REPLICATES as u32).max(1);
     let mut film = Film::new(size.0, size.1);
     let mut goals = vec![first_goal(stop, limit); jobs.len()];
     let mut round = 0;
-    let mut looking = RayCounts::default();
+    let is_late = || match stop {
+        Stop::TimeBudget(budget) => coarse.is_some() && start.elapsed() >= budget,
+        _ => false,
+    };
+    let mut search = RayCounts::default();
     loop {
         let round_start = Instant::now();
         let cost_before: f64 = jobs.iter().map(Job::cost).sum();
@@ -125,22 +133,25 @@ pub fn refine(
             .zip(&goals)
             .with_max_len(1)
             .for_each(|(job, &goal)| {
-                if goal > job.samples {
+                if goal > job.samples && (job.samples > 0 || !is_late()) {
                     advance(job, goal);
                 }
             });
         let cost_of_round = jobs.iter().map(Job::cost).sum::<f64>() - cost_before;
         let seconds_of_round = round_start.elapsed().as_secs_f64();
         round += 1;
-        for job in jobs.iter() {
-            film.develop(job);
+        film.develop(&jobs);
+        if round == 1
+            && let Some(coarse) = coarse
+        {
+            film.fill_in(&jobs, coarse);
         }
-        if round == 1 {
-            let found = focus(&film, &jobs);
-            looking = found.counts;
-            let goal = FIRST_ROUND_IN_FOCUS.min(limit);
-            let begun = begin_anew(&mut jobs, found, goal, advance);
-            jobs[begun..].iter().for_each(|job| film.develop(job));
+        if round == 1 && !is_late() {
+            let found = find_highlights(&film, &jobs);
+            search = found.counts;
+            let goal = FIRST_ROUND_WITH_HIGHLIGHT.min(limit);
+            let begun = start_again(&mut jobs, found, goal, advance);
+            film.develop(&jobs[begun..]);
         }
         let errors: Vec<SquaredError> = jobs
             .par_iter()
@@ -167,7 +178,7 @@ pub fn refine(
             round,
             error,
             samples: jobs.iter().map(Job::samples_drawn).sum(),
-            rays: jobs.iter().map(|j| j.counts.total()).sum::<u64>() + looking.total(),
+            rays: jobs.iter().map(|j| j.counts.total()).sum::<u64>() + search.total(),
             elapsed: start.elapsed(),
             fraction: if done {
                 1.0
@@ -179,7 +190,7 @@ pub fn refine(
             return Err(RenderError::Interrupted);
         }
         if done {
-            let mut counts = looking;
+            let mut counts = search;
             jobs.iter().for_each(|job| counts.merge(&job.counts));
             return Ok(Refined {
                 film,
@@ -195,7 +206,7 @@ pub fn refine(
 
 /// Gives every pixel that `found` names a job of its own, behind the others, and brings it to `goal` samples.
 /// Returns the first of them.
-fn begin_anew(
+fn start_again(
     jobs: &mut Vec<Job>,
     found: Found,
     goal: u32,

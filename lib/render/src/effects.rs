@@ -27,7 +27,7 @@ use crate::pilot::{Difference, Pilot};
 use crate::render::{Renderer, Settings, Simulation};
 use crate::shadow::LightOnProxy;
 
-/// Something that light does, by the name that files use.
+/// A phenomenon that can be simulated, by its name in files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Effect {
@@ -319,6 +319,7 @@ fn has_textures(m: &Material) -> bool {
         || m.clearcoat
             .is_some_and(|c| c.factor_texture.is_some() || c.roughness_texture.is_some())
         || m.transmission.is_some_and(|t| t.texture.is_some())
+        || m.extensions.textures().next().is_some()
 }
 
 /// What the user wants of `effect`.

@@ -12,15 +12,17 @@ pub const PROXY_RADIANCE: u32 = 1 << 8;
 /// Everything that a plan can ask for.
 pub const EVERYTHING: u32 = ALL | PROXY_RADIANCE;
 
-/// The masks that are compiled, cheapest first; the last can do everything, the one before it
-/// everything but [`SPECULAR`].
-pub const BUNDLES: [u32; 6] = [
+/// The masks that are compiled, cheapest first; the last is for scenes whose materials have
+/// [`EXTENSIONS`], the one before it can do everything else, and the one before that everything
+/// but [`SPECULAR`].
+pub const BUNDLES: [u32; 7] = [
     0,
     SPECULAR,
     TEXTURES | EMISSION,
     SPECULAR | TEXTURES | NORMAL_MAPPING | EMISSION,
     EVERYTHING & !SPECULAR,
     EVERYTHING,
+    EVERYTHING | EXTENSIONS,
 ];
 
 /// The cheapest of [`BUNDLES`] that can do all of `wanted`, without [`SPECULAR`] if that is not
@@ -29,8 +31,11 @@ pub const BUNDLES: [u32; 6] = [
 pub fn bundle(wanted: u32) -> u32 {
     BUNDLES
         .into_iter()
-        .find(|b| b & wanted == wanted & EVERYTHING && (b & SPECULAR) == (wanted & SPECULAR))
-        .unwrap_or(EVERYTHING)
+        .find(|b| {
+            b & wanted == wanted & (EVERYTHING | EXTENSIONS)
+                && (b & SPECULAR) == (wanted & SPECULAR)
+        })
+        .unwrap_or(EVERYTHING | EXTENSIONS)
 }
 
 /// Evaluates `$body` with `$mask` bound to the compiled mask that [`bundle`] picks for
@@ -39,7 +44,7 @@ macro_rules! with_features {
     ($wanted:expr, $mask:ident => $body:expr) => {{
         use $crate::features::{BUNDLES, bundle};
         let wanted = bundle($wanted);
-        with_features!(@arms wanted, $mask, $body, 0 1 2 3 4)
+        with_features!(@arms wanted, $mask, $body, 0 1 2 3 4 5)
     }};
     (@arms $wanted:ident, $mask:ident, $body:expr, $($i:literal)*) => {
         match $wanted {
@@ -48,7 +53,7 @@ macro_rules! with_features {
                 $body
             })*
             _ => {
-                const $mask: u32 = BUNDLES[5];
+                const $mask: u32 = BUNDLES[6];
                 $body
             }
         }
@@ -63,7 +68,11 @@ mod tests {
     #[test]
     fn a_bundle_has_all_that_is_wanted_and_no_unwanted_specular_lobe() {
         for wanted in 0..=EVERYTHING {
-            let wanted = wanted & EVERYTHING;
+            // A reflection is what extensions extend.
+            let wanted = match has(wanted, SPECULAR) {
+                true => wanted,
+                false => wanted & !EXTENSIONS,
+            };
             let b = bundle(wanted);
             assert_eq!(b & wanted, wanted);
             assert_eq!(b & SPECULAR, wanted & SPECULAR);

@@ -7,7 +7,7 @@
 //! vertex, the light's own sampling and the BSDF's, combined by the balance heuristic [Veach and
 //! Guibas 1995]; mirror-like lobes belong to the BSDF alone.
 //!
-//! Light that the object throws onto the proxy is blurred where the object is polished
+//! Light that the object reflects onto the proxy is blurred where the object is polished
 //! ([`MIN_CAUSTIC_ROUGHNESS`]).
 //!
 //! What it cannot do: caustics from light through rough glass onto the object converge slowly, as
@@ -19,13 +19,13 @@ use dipir_scene::bvh::Hit;
 use dipir_scene::camera::Ray;
 use glam::{Vec2, Vec3};
 
-use crate::bsdf::features::{EMISSION, has};
+use crate::bsdf::features::{EMISSION, EXTENSIONS, has};
 use crate::bsdf::{Bsdf, BsdfSample};
 use crate::counters::{RayCounts, RayKind};
 use crate::features::PROXY_RADIANCE;
 use crate::light::PathLight;
 use crate::photo::Photo;
-use crate::surface::{SurfacePoint, Surfaces};
+use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
 use crate::world::World;
 
 /// Where paths begin.
@@ -33,7 +33,7 @@ use crate::world::World;
 pub enum PathStart {
     /// At the camera: everything is seen.
     Camera,
-    /// On the proxy: surfaces without lighting shed no light there.
+    /// On the proxy: unlit surfaces send no light there.
     Proxy {
         /// Whether light counts that the object emits and sends straight to the proxy.
         emission: bool,
@@ -96,7 +96,7 @@ pub trait Gather {
         self.local(throughput * seen * weight);
     }
 
-    /// What the surface at `vertex` sheds by itself arrives with `throughput`.
+    /// What the surface at `vertex` emits arrives with `throughput`.
     #[inline(always)]
     fn emitted<const F: u32>(&mut self, vertex: &Vertex, throughput: Vec3) {
         let surface = vertex.surface;
@@ -166,7 +166,7 @@ impl Gather for Vec3 {
 const DIMENSIONS_PER_VERTEX: u32 = 4;
 
 /// [`PathContext::min_roughness`] of paths that begin on the proxy. A light of half a degree that
-/// a polished surface throws onto the ground is found by one path in thousands, which leaves
+/// a polished surface reflects onto the ground is found by one path in thousands, which leaves
 /// specks; blurred by a lobe whose peak is no more than a few times a diffuse surface's, the same
 /// energy arrives without them. Known as path regularisation [Kaplanyan and Dachsbacher 2013].
 pub const MIN_CAUSTIC_ROUGHNESS: f32 = 0.6;
@@ -257,6 +257,8 @@ impl<L: PathLight> PathContext<'_, L> {
         let mut sampled_pdf = f32::INFINITY; //      density of the segment's direction, infinite
         //                                           if the light could not have drawn it
         let mut leaves = false; //                   the segment is known to miss the object
+        let mut filling = Vec3::ZERO; //             attenuation per metre of the segment
+        let mut thickness = 0.0; //                  metres of it if the segment meets no inner side
         let first_dimension = sampler.dimension();
         let emits = has(F, EMISSION) && has(world.mask, EMISSION);
 
@@ -280,6 +282,10 @@ impl<L: PathLight> PathContext<'_, L> {
             };
 
             // ---- Escape: the light, as found by BSDF sampling -------------------------------
+            if has(F, EXTENSIONS) && filling != Vec3::ZERO {
+                let inside = hit.map_or(thickness, |hit| hit.t);
+                throughput *= ExtensionPoint::left_after(filling, inside);
+            }
             let Some(hit) = hit else {
                 if depth == 0 {
                     return 0.0;
@@ -336,7 +342,15 @@ impl<L: PathLight> PathContext<'_, L> {
             // ---- Light sampling -------------------------------------------------------------
             if !lit.is_delta() {
                 let light = self.light.sample(light_numbers);
-                let (value, bsdf_pdf) = lit.eval_pdf(light.direction);
+                let (mut value, bsdf_pdf) = lit.eval_pdf(light.direction);
+                if has(F, EXTENSIONS) && surface.enters(light.direction) {
+                    let ExtensionPoint {
+                        attenuation,
+                        thickness,
+                        ..
+                    } = surface.extension;
+                    value *= ExtensionPoint::left_after(attenuation, thickness);
+                }
                 // Both densities may underflow to 0: then there is no such sample.
                 let returns = value != Vec3::ZERO || G::DERIVATIVES;
                 if light.pdf > 0.0 && returns && light.radiance != Vec3::ZERO {
@@ -373,6 +387,12 @@ impl<L: PathLight> PathContext<'_, L> {
                 None if sample.delta => f32::INFINITY,
                 None => sample.pdf,
             };
+            if has(F, EXTENSIONS) && sample.transmitted {
+                let inside = surface.enters(sample.wi);
+                let ExtensionPoint { attenuation, .. } = surface.extension;
+                filling = attenuation * f32::from(inside);
+                thickness = surface.extension.thickness;
+            }
             leaves = world.escapes && is_outward(&surface, sample.wi);
             ray = world.leave(&surface, sample.wi);
 

@@ -1,4 +1,4 @@
-//! What lies behind every pixel: depth, normal, albedo, and who covers it.
+//! Depth, normal, albedo and coverage of every pixel.
 use dipir_imaging::error::ImagingError;
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::Raster;
@@ -12,7 +12,7 @@ use crate::footprint::Footprint;
 use crate::render::Renderer;
 use crate::world::World;
 
-/// Geometry and albedo as the camera sees them.
+/// Geometry and albedo as the camera sees them: 36 bytes a pixel.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GBuffer {
     /// Distance along the optical axis to the nearest surface, object before proxy, metres;
@@ -47,27 +47,33 @@ impl GBuffer {
         let [width, height] = world.camera().resolution;
         let bvh = &world.geometry.bvh;
         let footprint = Footprint::new(world.camera(), bvh.bounds(), bvh.clusters());
-        let pixels: Vec<Pixel> = (0..width * height)
-            .into_par_iter()
-            .map(|i| {
-                let (x, y) = (i % width, i / width);
-                let object = footprint.holds(x, y);
-                with_features!(world.mask, F => pixel::<F>(&world, (x, y), object, seed))
-            })
-            .collect();
-        let (width, height) = (width as usize, height as usize);
-        fn raster<T>(width: usize, pixels: &[Pixel], get: impl Fn(&Pixel) -> T) -> Raster<T> {
-            let values: Vec<T> = pixels.iter().map(get).collect();
-            Raster::from_pixels(width, pixels.len() / width.max(1), values)
-        }
-        debug_assert_eq!(pixels.len(), width * height);
-        Ok(Self {
-            depth: raster(width, &pixels, |p| p.depth),
-            normal: raster(width, &pixels, |p| p.normal),
-            albedo: raster(width, &pixels, |p| p.albedo),
-            object_alpha: raster(width, &pixels, |p| p.object),
-            proxy_alpha: raster(width, &pixels, |p| p.proxy),
-        })
+        let size = (width as usize, height as usize);
+        let mut all = Self {
+            depth: Raster::filled(size.0, size.1, f32::INFINITY),
+            normal: Raster::filled(size.0, size.1, Vec3::ZERO),
+            albedo: Raster::filled(size.0, size.1, Vec3::ZERO),
+            object_alpha: Raster::filled(size.0, size.1, 0.0),
+            proxy_alpha: Raster::filled(size.0, size.1, 0.0),
+        };
+        let rows = all.depth.pixels_mut().par_chunks_mut(size.0);
+        let rows = rows.zip(all.normal.pixels_mut().par_chunks_mut(size.0));
+        let rows = rows.zip(all.albedo.pixels_mut().par_chunks_mut(size.0));
+        let rows = rows.zip(all.object_alpha.pixels_mut().par_chunks_mut(size.0));
+        let rows = rows.zip(all.proxy_alpha.pixels_mut().par_chunks_mut(size.0));
+        rows.enumerate()
+            .for_each(|(y, ((((depth, normal), albedo), object), proxy))| {
+                for x in 0..size.0 {
+                    let at = (x as u32, y as u32);
+                    let held = footprint.holds(at.0, at.1);
+                    let seen = with_features!(world.mask, F => pixel::<F>(&world, at, held, seed));
+                    depth[x] = seen.depth;
+                    normal[x] = seen.normal;
+                    albedo[x] = seen.albedo;
+                    object[x] = seen.object;
+                    proxy[x] = seen.proxy;
+                }
+            });
+        Ok(all)
     }
 
     /// As the channels `depth.Z normal.X/Y/Z albedo.R/G/B object.A proxy.A`; depth in full

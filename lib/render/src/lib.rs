@@ -2,6 +2,7 @@
 pub mod adaptive;
 pub mod blocker;
 pub mod bsdf;
+mod coarse;
 pub mod convexity;
 pub mod counters;
 pub mod effects;
@@ -11,7 +12,8 @@ pub mod film;
 pub mod footprint;
 pub mod foreground;
 pub mod gbuffer;
-pub mod glints;
+pub mod highlights;
+pub mod job;
 pub mod light;
 pub mod material_gradient;
 pub mod photo;

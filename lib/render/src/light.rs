@@ -5,6 +5,8 @@
 //! BSDF sampling, which paths do anyway, finds it better ("MIS compensation", Karlík et al. 2019).
 //! A plane receives both parts, but each is sampled by itself: how many samples fall into the sun
 //! is then no longer left to chance, which is most of a shadow's noise at low sample counts.
+mod map_with_lobes;
+
 use std::sync::Arc;
 
 use dipir_light::cosine::CosineWeightedMap;
@@ -171,6 +173,16 @@ impl CompensatedMap {
             } else {
                 0.0
             },
+        }
+    }
+}
+
+impl CompensatedMap {
+    /// Luminance of the bright part, integrated over the sphere.
+    pub(crate) fn bright_luminance(&self) -> f64 {
+        match self.inverse_total > 0.0 {
+            true => 1.0 / f64::from(self.inverse_total),
+            false => 0.0,
         }
     }
 }

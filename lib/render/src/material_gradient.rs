@@ -27,6 +27,7 @@ use crate::foreground::{Gather, PathContext, PathStart, Vertex};
 use crate::light::{PathLight, SceneLight};
 use crate::photo::Photo;
 use crate::render::{ROULETTE_DEPTH, Renderer, Simulation, pixels_of, sequence};
+use crate::world::World;
 
 /// The derivatives of a scalar with respect to one material's factors.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -206,7 +207,12 @@ impl Renderer<'_> {
                 camera_height,
             });
         }
-        let world = self.world(simulation.features)?;
+        let world = World::without_extensions(
+            self.scene(),
+            *self.camera(),
+            self.geometry().clone(),
+            simulation.features,
+        )?;
         let photo = settings
             .background
             .filter(|_| has(simulation.features, PROXY_RADIANCE))

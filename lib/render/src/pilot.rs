@@ -1,4 +1,4 @@
-//! Small renders that tell what an effect is worth.
+//! Small renders that measure what an effect contributes.
 use std::ops::ControlFlow;
 
 use dipir_imaging::composite::composite_pixel;
@@ -11,6 +11,7 @@ use dipir_scene::camera::Camera;
 use glam::Vec3;
 
 use crate::adaptive::Stop;
+use crate::coarse::{at_resolution, shrink};
 use crate::error::RenderError;
 use crate::features::{CLEARCOAT, NORMAL_MAPPING, SPECULAR, TEXTURES, TRANSMISSION, has};
 use crate::film::Viewing;
@@ -179,8 +180,9 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
             0 => (0.0, 0.0),
             1 => (squares.mean(), 0.0),
             n => {
-                // What happens seldom happens in either picture, but hardly in the same pixel of both: all products
-                // are 0, and so is their spread. What they would be if it were scattered at random is not.
+                // A rare event occurs in both pictures, but seldom in the same pixel of both: then all
+                // products are 0, and so is their spread. Their size if the events were scattered at
+                // random is a lower bound of the standard error.
                 let scattered = (each[0] * each[1] / (n as f64).powi(3)).sqrt();
                 (squares.mean(), squares.std_error().max(scattered))
             }
@@ -232,11 +234,11 @@ fn cost(rendered: &[Rendered; 2], simulation: &Simulation) -> f64 {
 
 /// The renderer's camera at a resolution at which the object fills about [`OBJECT_PIXELS`].
 fn pilot_camera(renderer: &Renderer) -> Camera {
-    let mut camera = *renderer.camera();
+    let camera = *renderer.camera();
     let [width, height] = camera.resolution;
     let bvh = &renderer.geometry().bvh;
     let footprint = Footprint::new(&camera, bvh.bounds(), bvh.clusters());
-    // One pixel in 4 x 4 stands for the others.
+    // Counted in blocks of 4 x 4 pixels.
     let held = (0..height.div_ceil(4))
         .flat_map(|y| (0..width.div_ceil(4)).map(move |x| (4 * x, 4 * y)))
         .filter(|&(x, y)| footprint.overlaps(x, y, 4, 4))
@@ -250,32 +252,5 @@ fn pilot_camera(renderer: &Renderer) -> Camera {
     let resolution = camera
         .resolution
         .map(|n| ((n as f32 * scale).round() as u32).max(1));
-    let factor = glam::Vec2::new(
-        resolution[0] as f32 / width as f32,
-        resolution[1] as f32 / height as f32,
-    );
-    camera.focal_px *= factor;
-    camera.principal_px *= factor;
-    camera.resolution = resolution;
-    camera
-}
-
-/// Averages pixels: each lands in the target pixel that holds its centre.
-fn shrink<T>(image: &Raster<T>, [width, height]: [usize; 2]) -> Raster<T>
-where
-    T: Copy + Default + std::ops::AddAssign + std::ops::Div<f32, Output = T>,
-{
-    let mut sums = vec![(T::default(), 0f32); width * height];
-    for y in 0..image.height() {
-        let row = (2 * y + 1) * height / (2 * image.height());
-        for x in 0..image.width() {
-            let column = (2 * x + 1) * width / (2 * image.width());
-            let sum = &mut sums[row * width + column];
-            sum.0 += *image.get(x, y);
-            sum.1 += 1.0;
-        }
-    }
-    // Never larger than the image, so every target pixel has received one.
-    let pixels = sums.into_iter().map(|(sum, n)| sum / n).collect();
-    Raster::from_pixels(width, height, pixels)
+    at_resolution(camera, resolution)
 }

@@ -12,16 +12,18 @@ use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_scene::camera::Camera;
 use dipir_scene::scene::Scene;
 use glam::{DVec3, Vec2, Vec3};
+use rayon::prelude::*;
 
 use crate::adaptive::{EstimatedError, Progress, Stop, refine};
 use crate::blocker::Blocker;
 use crate::counters::RayCounts;
 use crate::error::RenderError;
 use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
-use crate::film::{Film, Job, Layer, REPLICATES, Viewing};
+use crate::film::{Film, Viewing};
 use crate::footprint::Footprint;
 use crate::foreground::{PathContext, PathStart};
-use crate::glints::{self, Found, Patience};
+use crate::highlights::{self, Found, Limit};
+use crate::job::{Job, Layer, PixelSet, REPLICATES};
 use crate::light::{PathLight, SceneLight};
 use crate::photo::Photo;
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowSums};
@@ -59,10 +61,10 @@ pub struct Settings<'a> {
     /// 1 where the photograph's own foreground hides the object, 0 where it does not; of the
     /// camera's size.
     pub occluders: Option<&'a Raster<f32>>,
-    /// Share of a plane's light that may be blocked without being looked for.
+    /// Share of a plane's light that may be blocked without being sampled.
     pub shadow_tolerance: f32,
-    /// Whether [`glints`] are looked for, which samples hardly meet; never where their number is given.
-    pub glints: bool,
+    /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
+    pub highlights: bool,
 }
 
 impl Default for Settings<'_> {
@@ -76,7 +78,7 @@ impl Default for Settings<'_> {
             occluders: None,
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
-            glints: true,
+            highlights: true,
         }
     }
 }
@@ -86,7 +88,10 @@ impl Default for Settings<'_> {
 pub struct Rendered {
     /// Colour, coverage, shadow ratio and their variances.
     pub film: Film,
-    /// Estimated error of the composite.
+    /// The picture was rendered at one over this of the frame's resolution and enlarged: above 1
+    /// where a time budget is too short for the frame.
+    pub divisor: u32,
+    /// Estimated error of the composite: what samples leave, not what a lower resolution does.
     pub error: EstimatedError,
     /// Rays traced.
     pub counts: RayCounts,
@@ -162,7 +167,10 @@ impl<'a> Renderer<'a> {
     }
 
     /// Renders the layers. `progress` is told after every round and may break off. The result
-    /// does not depend on the number of threads.
+    /// does not depend on the number of threads, unless a time budget decides how much is sampled.
+    ///
+    /// Memory: 28 bytes for every pixel of the frame, and for those that the object or its shadow
+    /// may touch 40 (a plane's shadow), 56 (the object) and 72 (a mesh's shadow) more.
     pub fn render<L: SceneLight>(
         &self,
         light: &L,
@@ -172,14 +180,38 @@ impl<'a> Renderer<'a> {
     ) -> Result<Rendered, RenderError> {
         let start = Instant::now();
         self.check_images(settings.background, settings.occluders)?;
-        let world = self.world(simulation.features)?;
+        let mut world = self.world(simulation.features)?;
+        let mut rendered = match settings.stop {
+            Stop::TimeBudget(budget) => self.render_within(
+                light, &mut world, simulation, settings, budget, start, progress,
+            ),
+            _ => self.render_world(light, &world, simulation, settings, start, None, progress),
+        }?;
+        if let Some(mask) = settings.occluders {
+            rendered.film.hide_behind(mask);
+        }
+        Ok(rendered)
+    }
+
+    /// Renders the layers of `world`, occluders left aside; `coarse` is the same picture at a lower
+    /// resolution.
+    pub(crate) fn render_world<L: SceneLight>(
+        &self,
+        light: &L,
+        world: &World,
+        simulation: &Simulation,
+        settings: &Settings,
+        start: Instant,
+        coarse: Option<&Film>,
+        progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
+    ) -> Result<Rendered, RenderError> {
         let photo = settings
             .background
             .filter(|_| has(simulation.features, PROXY_RADIANCE))
             .map(|image| Photo { image });
         let on_object = light.on_object();
         let path = PathContext {
-            world: &world,
+            world,
             light: &on_object,
             photo: photo.as_ref(),
             max_depth: simulation.max_depth,
@@ -218,11 +250,11 @@ impl<'a> Renderer<'a> {
                 Layer::Object => advance_object(&path, settings.seed, job, goal),
                 _ => advance_shadow(&shadow, settings.seed, job, goal),
             };
-            self.run(jobs, settings, start, &path, &advance, progress)
+            self.run(jobs, settings, start, &path, &advance, coarse, progress)
         } else {
             let advance =
                 |job: &mut Job, goal: u32| advance_object(&path, settings.seed, job, goal);
-            self.run(jobs, settings, start, &path, &advance, progress)
+            self.run(jobs, settings, start, &path, &advance, coarse, progress)
         }
     }
 
@@ -233,6 +265,7 @@ impl<'a> Renderer<'a> {
         start: Instant,
         path: &PathContext<L>,
         advance: &(impl Fn(&mut Job, u32) + Sync),
+        coarse: Option<&Film>,
         progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
     ) -> Result<Rendered, RenderError> {
         let [width, height] = self.camera.resolution.map(|n| n as usize);
@@ -240,17 +273,17 @@ impl<'a> Renderer<'a> {
             background: settings.background,
             transfer: settings.transfer,
         };
-        let focus = |film: &Film, jobs: &[Job]| {
-            if !settings.glints || matches!(settings.stop, Stop::Samples(_)) {
+        let find_highlights = |film: &Film, jobs: &[Job]| {
+            if !settings.highlights || matches!(settings.stop, Stop::Samples(_)) {
                 return Found::default();
             }
             let objects = jobs.iter().filter(|job| job.layer == Layer::Object);
-            let pixels: Vec<_> = objects.flat_map(|job| job.pixels.iter().copied()).collect();
-            let patience = match settings.stop {
-                Stop::TimeBudget(budget) => Patience::Until(Instant::now() + budget / 10),
-                _ => Patience::Samples(jobs.iter().map(Job::samples_drawn).sum()),
+            let pixels: Vec<_> = objects.flat_map(|job| job.pixels.iter()).collect();
+            let limit = match settings.stop {
+                Stop::TimeBudget(budget) => Limit::Until(Instant::now() + budget / 10),
+                _ => Limit::Samples(jobs.iter().map(Job::samples_drawn).sum()),
             };
-            glints::find(path, film, &viewing, &pixels, patience, settings.seed)
+            highlights::find(path, film, &viewing, &pixels, limit, settings.seed)
         };
         let refined = refine(
             (width, height),
@@ -260,15 +293,13 @@ impl<'a> Renderer<'a> {
             settings.max_samples,
             &viewing,
             advance,
-            &focus,
+            &find_highlights,
+            coarse,
             progress,
         )?;
-        let mut film = refined.film;
-        if let Some(mask) = settings.occluders {
-            film.hide_behind(mask);
-        }
         Ok(Rendered {
-            film,
+            film: refined.film,
+            divisor: 1,
             error: refined.error,
             counts: refined.counts,
             samples: refined.samples,
@@ -325,9 +356,9 @@ impl<'a> Renderer<'a> {
         self.blocks()
             .filter(|b| footprint.overlaps(b.x, b.y, b.width, b.height))
             .filter_map(|block| {
-                let pixels: Vec<_> = pixels_of(block)
-                    .filter(|&(x, y)| footprint.holds(x, y) && is_visible(settings, x, y))
-                    .collect();
+                let pixels = PixelSet::new(block, |(x, y)| {
+                    footprint.holds(x, y) && is_visible(settings, x, y)
+                });
                 (!pixels.is_empty()).then(|| Job::new(Layer::Object, block, pixels, None))
             })
             .collect()
@@ -345,17 +376,26 @@ impl<'a> Renderer<'a> {
             ProxyGeometry::Plane(_) => Layer::PlaneShadow,
             ProxyGeometry::Mesh { .. } => Layer::MeshShadow,
         };
-        let mut cones: Vec<P::Cone<'_>> = shadow.plane.iter().map(PlaneLight::cone).collect();
-        self.blocks()
-            .filter(|&block| layer == Layer::MeshShadow || shadow.may_shade(block, &mut cones))
-            .filter_map(|block| {
-                let pixels: Vec<_> = pixels_of(block).collect();
-                let visible = pixels.iter().any(|&(x, y)| is_visible(settings, x, y));
-                visible.then(|| Job::new(layer, block, pixels, arriving))
-            })
+        let blocks: Vec<Block> = self.blocks().collect();
+        let shaded = |blocks: &[Block]| {
+            let mut cones: Vec<P::Cone<'_>> = shadow.plane.iter().map(PlaneLight::cone).collect();
+            let shaded = blocks.iter().filter(|&&block| {
+                layer == Layer::MeshShadow || shadow.may_shade(block, &mut cones)
+            });
+            shaded.copied().collect::<Vec<_>>()
+        };
+        let shaded: Vec<Vec<Block>> = blocks.par_chunks(BLOCKS_AT_ONCE).map(shaded).collect();
+        shaded
+            .into_iter()
+            .flatten()
+            .filter(|&block| pixels_of(block).any(|(x, y)| is_visible(settings, x, y)))
+            .map(|block| Job::new(layer, block, PixelSet::new(block, |_| true), arriving))
             .collect()
     }
 }
+
+/// Blocks that are looked at with the same samplers of cones.
+const BLOCKS_AT_ONCE: usize = 1024;
 
 fn is_visible(settings: &Settings, x: u32, y: u32) -> bool {
     settings
@@ -391,8 +431,7 @@ fn advance_object_with<L: PathLight, const F: u32>(
     goal: u32,
 ) {
     let mut counts = job.counts;
-    for index in 0..job.pixels.len() {
-        let (x, y) = job.pixels[index];
+    for (index, (x, y)) in job.pixels.iter().enumerate() {
         let corner = Vec2::new(x as f32, y as f32);
         for replicate in 0..REPLICATES {
             let base = sequence(seed, Stream::FOREGROUND, replicate, (x, y));
@@ -401,8 +440,8 @@ fn advance_object_with<L: PathLight, const F: u32>(
             for sample in job.samples..goal {
                 let mut sampler = base.with_sample(sample);
                 let place = sampler.next_2d();
-                let (place, weight) = match &job.focus {
-                    Some(focus) => focus.place(place),
+                let (place, weight) = match &job.density {
+                    Some(density) => density.place(place),
                     None => (place, 1.0),
                 };
                 let s = path.image_sample::<F>(corner + place, &mut sampler, &mut counts);
@@ -416,7 +455,7 @@ fn advance_object_with<L: PathLight, const F: u32>(
                 replicate,
                 &[radiance.x, radiance.y, radiance.z, coverage, weights],
             );
-            if job.focus.is_some() {
+            if job.density.is_some() {
                 job.add_squares(index, squares);
             }
         }
@@ -468,8 +507,7 @@ fn advance_shadow_with<L: PathLight, P: PlaneLight, const F: u32>(
                 },
             );
         } else {
-            for index in 0..job.pixels.len() {
-                let (x, y) = job.pixels[index];
+            for (index, (x, y)) in job.pixels.iter().enumerate() {
                 let s: ShadowSums =
                     shadow.mesh_pixel::<F, _>((x, y), range, &sampler(x, y), &mut counts);
                 let (b, a) = (s.blocked, s.arriving);

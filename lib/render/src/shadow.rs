@@ -50,7 +50,7 @@ pub struct ShadowContext<'a, L, P> {
     pub proxy_occlusion: bool,
     /// Light of the object on the proxy, if it counts.
     pub light_on_proxy: Option<LightOnProxy>,
-    /// Share of the plane's light below which blocking is not looked for.
+    /// Share of the plane's light that may be blocked without being sampled.
     pub tolerance: f32,
 }
 
@@ -211,11 +211,12 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
 
     /// Whether any pixel of `block` could be shadowed noticeably, or receive light of the object.
     pub fn may_shade(&self, block: Block, cones: &mut [P::Cone<'p>]) -> bool {
-        if let Some((center, reach)) = self.corners_on_plane(block) {
-            let cone = self.blocker.cone(center, reach);
-            return self.restrict(cones, &cone);
+        match self.corners_on_plane(block) {
+            // Light of the object may arrive from any distance.
+            Some(_) if self.light_on_proxy.is_some() => true,
+            Some((center, reach)) => self.restrict(cones, &self.blocker.cone(center, reach)),
+            None => !self.is_above_horizon(block),
         }
-        !self.is_above_horizon(block)
     }
 
     /// Gathers the light that is blocked in `samples` samples of the pixel `(x, y)`.
@@ -352,7 +353,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
     }
 
     /// Gathers the light that the object sends to `point`: one path through a uniform direction of
-    /// the cone, or, far from the object, sometimes one that stands for many.
+    /// the cone; far from the object only with some chance, and a larger weight.
     fn light_sent<const F: u32, G: ShadowGather>(
         &self,
         point: &ProxyPoint,
@@ -441,10 +442,10 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
     }
 }
 
-/// Chance that a sample asks for the light that the object sends through a cone. What arrives there is
-/// at most the share of the plane's light that the cone's solid angle is of pi, for an object as
-/// bright as the plane, so fewer paths do where that is little: the noise that they leave is at most
-/// that of one part in [`PATHS_OF_SENT_LIGHT`] of the plane's light, once in many samples.
+/// Chance that a sample traces a path of light that the object sends through a cone. For an object as bright
+/// as the plane, the irradiance from the cone is at most its solid angle over pi times the plane's.
+/// Where that is little, fewer paths are traced, with larger weights: one path adds at most one part in
+/// [`PATHS_OF_SENT_LIGHT`] of the plane's light.
 fn chance_of_sent_light(cos_half_angle: f32) -> f32 {
     (2.0 * PATHS_OF_SENT_LIGHT * (1.0 - cos_half_angle)).min(1.0)
 }

@@ -3,9 +3,13 @@
 //! The rules of glTF 2.0 apply: vertex colours and textures multiply the factors, back faces
 //! of double-sided surfaces turn all their normals round, a normal map's +Y points up in the
 //! image (against v).
+mod extensions;
+
 use dipir_numerics::guarded::normalize_or;
 use dipir_scene::error::Error;
-use dipir_scene::material::{AlphaMode, Clearcoat, Material, TextureRef, Transmission};
+use dipir_scene::material::{
+    AlphaMode, Clearcoat, Material, MaterialExtensions, TextureRef, Transmission,
+};
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::ray_offset::{geometric_normal, interpolate};
 use dipir_scene::scene::Scene;
@@ -13,8 +17,11 @@ use dipir_scene::texture::{DecodedTexture, decode_textures};
 use glam::{Vec2, Vec3, Vec4};
 
 use crate::bsdf::features::{
-    ALPHA, CLEARCOAT, EMISSION, NORMAL_MAPPING, PLAIN_GGX, SPECULAR, TEXTURES, TRANSMISSION, has,
+    ALPHA, CLEARCOAT, EMISSION, EXTENSIONS, NORMAL_MAPPING, PLAIN_GGX, SPECULAR, TEXTURES,
+    TRANSMISSION, has,
 };
+
+pub use extensions::{ExtensionPoint, FilmPoint};
 
 /// The coat at a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -64,6 +71,8 @@ pub struct SurfacePoint {
     pub transmission: f32,
     /// Dielectric coat over the base.
     pub coat: CoatPoint,
+    /// Extensions beside coat and transmission.
+    pub extension: ExtensionPoint,
     /// Emitted radiance towards the side that is seen, linear.
     pub emission: Vec3,
     /// Shows `base_color` as radiance, whatever the light.
@@ -84,6 +93,12 @@ pub struct FactorSlopes {
 }
 
 impl SurfacePoint {
+    /// Whether `direction`, seen from the outside, leads into the object.
+    #[inline]
+    pub fn enters(&self, direction: Vec3) -> bool {
+        self.front_face && direction.dot(self.geometric_normal) < 0.0
+    }
+
     /// A flat, white, rough, opaque dielectric at the origin that faces `normal`.
     pub fn facing(normal: Vec3) -> Self {
         Self {
@@ -100,13 +115,14 @@ impl SurfacePoint {
                 normal,
                 ..CoatPoint::NONE
             },
+            extension: ExtensionPoint::NONE,
             emission: Vec3::ZERO,
             unlit: false,
         }
     }
 }
 
-/// A material without what the planned effects leave out.
+/// A material reduced to the planned effects.
 #[derive(Clone, Debug)]
 struct Prepared {
     material: Material,
@@ -137,7 +153,14 @@ impl Prepared {
         if !has(mask, TRANSMISSION) {
             m.transmission = None;
         }
+        if !has(mask, EXTENSIONS) {
+            m.extensions = MaterialExtensions::default();
+        }
+        if m.transmission.is_none() {
+            m.extensions.volume = None;
+        }
         if !has(mask, TEXTURES) {
+            m.extensions.textures_mut().for_each(|t| *t = None);
             m.base_color_texture = None;
             m.metallic_roughness_texture = None;
             m.emissive_texture = None;
@@ -177,6 +200,7 @@ impl Prepared {
         ]
         .into_iter()
         .flatten()
+        .chain(m.extensions.textures().copied())
         .map(|t| t.texture)
     }
 }
@@ -213,8 +237,8 @@ impl<'a> Surfaces<'a> {
         })
     }
 
-    /// Whether light that comes from behind does not find `triangle`. Transmissive surfaces
-    /// are found from both sides.
+    /// Whether rays from behind pass through `triangle`. Transmissive surfaces are met from both
+    /// sides.
     #[inline]
     pub fn single_sided(&self, triangle: u32) -> bool {
         let m = self.material(triangle);
@@ -336,6 +360,10 @@ impl<'a> Surfaces<'a> {
                     ..self.coat_at::<F>(c, &point)
                 },
                 _ => CoatPoint::NONE,
+            },
+            extension: match has(F, EXTENSIONS) && !m.extensions.is_empty() {
+                true => self.extensions_at::<F>(&m.extensions, &point, vertices, smooth),
+                false => ExtensionPoint::NONE,
             },
             emission,
             unlit: m.unlit,

@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_scene::camera::Camera;
-use dipir_scene::material::{AlphaMode, Material};
+use dipir_scene::material::{AlphaMode, Material, MaterialExtensions};
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
@@ -31,6 +31,7 @@ pub fn matte(colour: Vec3) -> Material {
         ior: 1.5,
         clearcoat: None,
         transmission: None,
+        extensions: MaterialExtensions::default(),
         unlit: false,
     }
 }

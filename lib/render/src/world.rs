@@ -10,7 +10,7 @@ use dipir_scene::ray_offset::spawn_origin;
 use dipir_scene::scene::Scene;
 use glam::Vec3;
 
-use crate::bsdf::features::{ALPHA, TRANSMISSION, has};
+use crate::bsdf::features::{ALPHA, EXTENSIONS, SPECULAR, TRANSMISSION, has};
 use crate::convexity::is_convex;
 use crate::error::RenderError;
 use crate::surface::{SurfacePoint, Surfaces};
@@ -106,8 +106,24 @@ pub struct World<'a> {
 }
 
 impl<'a> World<'a> {
-    /// Prepares `scene` for the effects in `mask`; decodes only the textures that they need.
+    /// Prepares `scene` for the effects in `mask`, and for the extensions of its materials where it
+    /// has any and `mask` has [`SPECULAR`]; decodes only the textures that they need.
     pub fn new(
+        scene: &'a Scene,
+        camera: Camera,
+        geometry: Arc<Geometry>,
+        mask: u32,
+    ) -> Result<Self, RenderError> {
+        let extended = scene.materials.iter().any(|m| !m.extensions.is_empty());
+        let mask = match has(mask, SPECULAR) && extended {
+            true => mask | EXTENSIONS,
+            false => mask,
+        };
+        Self::without_extensions(scene, camera, geometry, mask)
+    }
+
+    /// Prepares `scene` for the effects in `mask` alone.
+    pub(crate) fn without_extensions(
         scene: &'a Scene,
         camera: Camera,
         geometry: Arc<Geometry>,

@@ -1,6 +1,7 @@
 //! A pinhole camera that looks down its own -z.
 use std::path::{Path, PathBuf};
 
+use dipir_imaging::facts::Facts;
 use glam::{DMat3, Mat3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
@@ -75,6 +76,9 @@ pub enum FieldOfView {
         /// Width of the sensor.
         sensor_mm: f32,
     },
+    /// A lens before the sensor that the photograph's own data tell of, millimetres; without such
+    /// data before one of 36 mm.
+    Focal(f32),
 }
 
 /// Which axis of a camera file's world points up.
@@ -104,6 +108,7 @@ impl Camera {
                 focal_mm,
                 sensor_mm,
             } => focal_mm / sensor_mm * w,
+            FieldOfView::Focal(focal_mm) => focal_mm / 36.0 * w,
         };
         Self {
             position,
@@ -116,6 +121,27 @@ impl Camera {
 }
 
 impl CameraSettings {
+    /// The same settings with what the photograph's own data say put in: the width of the sensor
+    /// behind a focal length. An error if it is wanted and the photograph does not say it.
+    pub fn with_facts(&self, facts: &Facts) -> Result<Self, Error> {
+        let mut settings = self.clone();
+        if let Self::LookAt { field_of_view, .. } = &mut settings
+            && let FieldOfView::Focal(focal_mm) = *field_of_view
+        {
+            let Some(sensor_mm) = facts.sensor_width_mm() else {
+                return Err(Error::Missing {
+                    key: "scene.camera.sensor_mm".into(),
+                    remedy: "the photograph does not say which sensor took it: write the sensor's width, for instance sensor_mm = 36.0".into(),
+                });
+            };
+            *field_of_view = FieldOfView::Lens {
+                focal_mm,
+                sensor_mm: sensor_mm as f32,
+            };
+        }
+        Ok(settings)
+    }
+
     /// The camera of a photo of `resolution`; files are found relative to `base_dir`. Warnings say
     /// what of a camera file was ignored.
     pub fn resolve(
@@ -135,7 +161,7 @@ impl CameraSettings {
             }
             Self::Transforms { path, frame, up } => {
                 let path = base_dir.join(path);
-                let bytes = std::fs::read(&path).map_err(|source| Error::Read {
+                let bytes = dipir_files::read(&path).map_err(|source| Error::Read {
                     role: "the camera file".into(),
                     path: path.clone(),
                     source,
@@ -174,6 +200,26 @@ pub enum CameraSettings {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_focal_length_alone_is_enough_where_the_photograph_knows_its_sensor() {
+        let settings = CameraSettings::LookAt {
+            position: Vec3::Z,
+            look_at: Vec3::ZERO,
+            up: Vec3::Y,
+            field_of_view: FieldOfView::Focal(50.0),
+        };
+        let mut facts = Facts::of_size([600, 400]);
+        let error = settings.with_facts(&facts).unwrap_err().to_string();
+        assert!(
+            error.starts_with("scene.camera.sensor_mm is missing"),
+            "{error}"
+        );
+        facts.sensor_mm = Some([24.0, 16.0]);
+        let known = settings.with_facts(&facts).unwrap();
+        let (camera, _) = known.resolve([600, 400], Path::new("")).unwrap();
+        assert_eq!(camera.focal_px, Vec2::splat(1250.0));
+    }
 
     #[test]
     fn a_scaled_camera_sees_the_same_directions_at_scaled_pixels() {

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::{CameraSettings, FieldOfView, WorldUp};
 use crate::error::Error;
+use crate::limits::Limits;
 use crate::placement::{Anchor, Placement, Rest, Size};
 use crate::proxy::Plane;
 
@@ -36,13 +37,16 @@ pub struct SceneConfig {
     /// What to simulate.
     #[serde(default)]
     pub effects: EffectsConfig,
+    /// How much files may ask for.
+    #[serde(default, skip_serializing_if = "Limits::is_default")]
+    pub limits: Limits,
 }
 
 /// One `[[scene.objects]]` table as written.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectConfig {
-    /// `.glb`, `.gltf` or `.obj`, required.
+    /// `.glb`, `.gltf`, `.obj`, `.ply` or `.stl`, required.
     pub path: Option<PathBuf>,
     /// Where the object rests, metres; the origin by default.
     pub position: Option<[f32; 3]>,
@@ -77,7 +81,7 @@ pub struct CameraConfig {
     pub up: Option<[f32; 3]>,
     /// Vertical field of view, degrees.
     pub fov_deg: Option<f32>,
-    /// Focal length, millimetres; needs `sensor_mm`.
+    /// Focal length, millimetres; needs `sensor_mm` unless the photograph's Exif data tell it.
     pub focal_mm: Option<f32>,
     /// Width of the sensor, millimetres (36 for full frame).
     pub sensor_mm: Option<f32>,
@@ -226,6 +230,8 @@ pub struct SceneSettings {
     pub proxy: ProxySettings,
     /// What to simulate.
     pub effects: EffectsConfig,
+    /// How much files may ask for.
+    pub limits: Limits,
 }
 
 /// A checked `[[scene.objects]]` table.
@@ -325,6 +331,7 @@ impl SceneConfig {
                 Some(proxy) => proxy.validate()?,
             },
             effects: self.effects,
+            limits: self.limits,
         })
     }
 }
@@ -502,10 +509,8 @@ impl CameraConfig {
                 focal_mm: millimetres("focal_mm", focal)?,
                 sensor_mm: millimetres("sensor_mm", sensor)?,
             }),
-            (None, Some(_), None) => Err(missing(
-                "scene.camera.sensor_mm",
-                "scene.camera.focal_mm needs the sensor's width, for instance sensor_mm = 36.0",
-            )),
+            // The photograph may know its sensor.
+            (None, Some(focal), None) => Ok(FieldOfView::Focal(millimetres("focal_mm", focal)?)),
             (None, None, Some(_)) => Err(missing(
                 "scene.camera.focal_mm",
                 "scene.camera.sensor_mm needs the focal length, for instance focal_mm = 35.0",

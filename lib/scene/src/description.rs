@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::camera::Camera;
 use crate::config::EffectsConfig;
 use crate::error::Error;
+use crate::limits::Limits;
 use crate::proxy::Plane;
 
 /// A file with the hash of its contents.
@@ -92,6 +93,9 @@ pub struct SceneDescription {
     pub proxy: ProxyRecord,
     /// What the user says about effects.
     pub effects: EffectsConfig,
+    /// How much files may ask for.
+    #[serde(default, skip_serializing_if = "Limits::is_default")]
+    pub limits: Limits,
 }
 
 impl SceneDescription {
@@ -112,7 +116,7 @@ impl SceneDescription {
     /// Reads a description.
     pub fn read(path: &Path) -> Result<Self, Error> {
         const AGAIN: &str = "run dipir-scene again";
-        let bytes = std::fs::read(path).map_err(|source| Error::Read {
+        let bytes = dipir_files::read(path).map_err(|source| Error::Read {
             role: "the scene description".into(),
             path: path.into(),
             source,

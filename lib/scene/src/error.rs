@@ -3,11 +3,14 @@ use std::path::PathBuf;
 
 use dipir_imaging::ImagingError;
 
-/// Every message names the offending key, file or element, the accepted form, and one remedy.
+use crate::printable::printable;
+
+/// Every message names the key, file or element that is wrong, what is accepted, and one remedy.
+/// Control characters in names and values are printed as escapes.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A key of the `[scene]` table holds a value that makes no sense.
-    #[error("{key} is {value}; accepted: {accepted}")]
+    #[error("{key} is {}; accepted: {accepted}", printable(value))]
     Config {
         /// Dotted path of the key, `scene.camera.fov_deg`.
         key: String,
@@ -33,7 +36,7 @@ pub enum Error {
         second: String,
     },
     /// A file cannot be read.
-    #[error("cannot read {role} \"{path}\": {source}", path = path.display())]
+    #[error("cannot read {} \"{}\": {source}", printable(role), printable(path.display()))]
     Read {
         /// What the file was wanted for.
         role: String,
@@ -43,7 +46,7 @@ pub enum Error {
         source: std::io::Error,
     },
     /// A file cannot be written.
-    #[error("cannot write \"{path}\": {source}", path = path.display())]
+    #[error("cannot write \"{}\": {source}", printable(path.display()))]
     Write {
         /// The file.
         path: PathBuf,
@@ -51,7 +54,7 @@ pub enum Error {
         source: std::io::Error,
     },
     /// Something is wrong inside a file.
-    #[error("\"{path}\": {source}", path = path.display())]
+    #[error("\"{}\": {source}", printable(path.display()))]
     InFile {
         /// The file.
         path: PathBuf,
@@ -61,8 +64,8 @@ pub enum Error {
     /// An image cannot be decoded.
     #[error(transparent)]
     Image(#[from] ImagingError),
-    /// The file is not of the kind that its extension or header promises.
-    #[error("{detail}; {remedy}")]
+    /// The contents of a file do not make sense.
+    #[error("{}; {remedy}", printable(detail))]
     Malformed {
         /// What is wrong and where.
         detail: String,
@@ -70,7 +73,10 @@ pub enum Error {
         remedy: &'static str,
     },
     /// The file needs an extension that cannot be ignored.
-    #[error("the file requires the glTF extension {extension}, which is not supported; {remedy}")]
+    #[error(
+        "the file requires the glTF extension {}, which is not supported; {remedy}",
+        printable(extension)
+    )]
     UnsupportedExtension {
         /// Name of the extension.
         extension: String,
@@ -78,7 +84,10 @@ pub enum Error {
         remedy: &'static str,
     },
     /// A reference points past the end of what it refers to.
-    #[error("{place} is {index}, but the file has {count} {things}; export the file again")]
+    #[error(
+        "{} is {index}, but the file has {count} {things}; export the file again",
+        printable(place)
+    )]
     Dangling {
         /// Where the reference stands, `nodes[3].mesh`.
         place: String,
@@ -91,7 +100,8 @@ pub enum Error {
     },
     /// A value is NaN or infinite.
     #[error(
-        "{place}, element {element} is ({value}), which is not finite; repair the mesh and export it again"
+        "{}, element {element} is ({value}), which is not finite; repair the mesh and export it again",
+        printable(place)
     )]
     NotFinite {
         /// Which attribute.
@@ -101,11 +111,16 @@ pub enum Error {
         /// The value.
         value: String,
     },
-    /// The file would need more memory than allowed.
-    #[error("{what}: more than the limit of {limit}; simplify the object")]
+    /// The file asks for more than is allowed.
+    #[error(
+        "{}: more than the limit of {limit}; simplify the object, or raise {key}",
+        printable(what)
+    )]
     TooLarge {
         /// What is too large and how large.
         what: String,
+        /// The key of the configuration that raises the limit.
+        key: &'static str,
         /// The limit.
         limit: u64,
     },
@@ -117,8 +132,8 @@ pub enum Error {
     },
     /// An input is not what it was when the scene description was written.
     #[error(
-        "{role} \"{path}\" changed since the scene was set up: its BLAKE3 hash is {found}, the scene description has {expected}; run dipir-scene again",
-        path = path.display()
+        "{role} \"{}\" changed since the scene was set up: its BLAKE3 hash is {found}, the scene description has {expected}; run dipir-scene again",
+        printable(path.display())
     )]
     Changed {
         /// What the file was wanted for.

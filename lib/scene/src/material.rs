@@ -53,6 +53,120 @@ pub struct Transmission {
     pub texture: Option<TextureRef>,
 }
 
+/// Strength and colour of the dielectric's reflection (`KHR_materials_specular`).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Specular {
+    /// Reflectance at grazing incidence, which scales all of the reflection, `[0, 1]`.
+    pub factor: f32,
+    /// Multiplies `factor`, alpha channel.
+    pub factor_texture: Option<TextureRef>,
+    /// Multiplies the reflectance at normal incidence, linear, 0 or more; the product is at most 1.
+    pub color: Vec3,
+    /// sRGB-encoded texture that multiplies `color`.
+    pub color_texture: Option<TextureRef>,
+}
+
+/// Fibres that scatter light at grazing angles (`KHR_materials_sheen`).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sheen {
+    /// Linear, in `[0, 1]`.
+    pub color: Vec3,
+    /// sRGB-encoded texture that multiplies `color`.
+    pub color_texture: Option<TextureRef>,
+    /// Perceptual roughness in `[0, 1]`.
+    pub roughness: f32,
+    /// Multiplies `roughness`, alpha channel.
+    pub roughness_texture: Option<TextureRef>,
+}
+
+/// Highlights that are longer in one direction (`KHR_materials_anisotropy`).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Anisotropy {
+    /// How much rougher the surface is along the direction, `[0, 1]`.
+    pub strength: f32,
+    /// The direction, from the tangent towards the bitangent, radians.
+    pub rotation_rad: f32,
+    /// Red and green turn the direction, as a vector in `[-1, 1]`; blue multiplies `strength`.
+    pub texture: Option<TextureRef>,
+}
+
+/// A thin film over the base (`KHR_materials_iridescence`).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Iridescence {
+    /// Share of the surface that has the film, `[0, 1]`.
+    pub factor: f32,
+    /// Multiplies `factor`, red channel.
+    pub factor_texture: Option<TextureRef>,
+    /// Index of refraction of the film.
+    pub ior: f32,
+    /// Thickness where the texture is 0 and where it is 1, or is missing, nanometres.
+    pub thickness_nm: [f32; 2],
+    /// Thickness between the two, green channel.
+    pub thickness_texture: Option<TextureRef>,
+}
+
+/// What fills a transmissive object (`KHR_materials_volume`).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Volume {
+    /// Length of the way through a sheet that has no inner side, metres; above 0.
+    pub thickness: f32,
+    /// Multiplies `thickness`, green channel.
+    pub thickness_texture: Option<TextureRef>,
+    /// What white light turns into on a way of `attenuation_distance`, linear, in `(0, 1]`.
+    pub attenuation_color: Vec3,
+    /// Metres; infinite for a clear volume.
+    pub attenuation_distance: f32,
+}
+
+/// Extensions of the metallic-roughness model beside coat and transmission.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct MaterialExtensions {
+    /// Strength and colour of the dielectric's reflection.
+    pub specular: Option<Specular>,
+    /// Fibres.
+    pub sheen: Option<Sheen>,
+    /// Longer highlights.
+    pub anisotropy: Option<Anisotropy>,
+    /// A thin film.
+    pub iridescence: Option<Iridescence>,
+    /// What fills the object.
+    pub volume: Option<Volume>,
+}
+
+impl MaterialExtensions {
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// All uses of textures.
+    pub fn textures_mut(&mut self) -> impl Iterator<Item = &mut Option<TextureRef>> {
+        let specular = self.specular.iter_mut();
+        let sheen = self.sheen.iter_mut();
+        let film = self.iridescence.iter_mut();
+        specular
+            .flat_map(|s| [&mut s.factor_texture, &mut s.color_texture])
+            .chain(sheen.flat_map(|s| [&mut s.color_texture, &mut s.roughness_texture]))
+            .chain(self.anisotropy.iter_mut().map(|a| &mut a.texture))
+            .chain(film.flat_map(|f| [&mut f.factor_texture, &mut f.thickness_texture]))
+            .chain(self.volume.iter_mut().map(|v| &mut v.thickness_texture))
+    }
+
+    /// All uses of textures.
+    pub fn textures(&self) -> impl Iterator<Item = &TextureRef> {
+        let specular = self.specular.iter();
+        let sheen = self.sheen.iter();
+        let film = self.iridescence.iter();
+        specular
+            .flat_map(|s| [&s.factor_texture, &s.color_texture])
+            .chain(sheen.flat_map(|s| [&s.color_texture, &s.roughness_texture]))
+            .chain(self.anisotropy.iter().map(|a| &a.texture))
+            .chain(film.flat_map(|f| [&f.factor_texture, &f.thickness_texture]))
+            .chain(self.volume.iter().map(|v| &v.thickness_texture))
+            .flatten()
+    }
+}
+
 /// One surface. Colours are linear Rec.709.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Material {
@@ -85,6 +199,8 @@ pub struct Material {
     pub clearcoat: Option<Clearcoat>,
     /// Transmission, if any.
     pub transmission: Option<Transmission>,
+    /// Further extensions.
+    pub extensions: MaterialExtensions,
     /// `KHR_materials_unlit`: radiance is the base colour, whatever the light.
     pub unlit: bool,
 }
@@ -114,6 +230,7 @@ impl Default for Material {
             ior: 1.5,
             clearcoat: None,
             transmission: None,
+            extensions: MaterialExtensions::default(),
             unlit: false,
         }
     }
@@ -122,7 +239,8 @@ impl Default for Material {
 impl Material {
     /// All uses of textures.
     pub fn texture_refs(&self) -> impl Iterator<Item = &TextureRef> {
-        self.textures().into_iter().flatten()
+        let own = self.textures().into_iter().flatten();
+        own.chain(self.extensions.textures())
     }
 
     /// Adds `offset` to the index of every texture, as is needed when the textures of several
@@ -147,7 +265,8 @@ impl Material {
             coat_normal,
             self.transmission.as_mut().and_then(|t| t.texture.as_mut()),
         ];
-        for texture in all.into_iter().flatten() {
+        let further = self.extensions.textures_mut().flatten();
+        for texture in all.into_iter().flatten().chain(further) {
             texture.texture += offset;
         }
     }

@@ -1,5 +1,5 @@
 //! Everything that a renderer needs of a scene, but the light.
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use dipir_imaging::file::{self, Photo};
@@ -13,10 +13,14 @@ use crate::description::{FileRecord, ObjectRecord, PhotoRecord, ProxyRecord, Sce
 use crate::error::Error;
 use crate::features::SceneFeatures;
 use crate::import::{self, Imported};
+use crate::light::PunctualLight;
+use crate::limits::Limits;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
+use crate::printable::printable;
 use crate::proxy::Proxy;
 use crate::texture::Texture;
+use crate::visibility;
 
 /// Objects to insert, the camera that took the photo, and the proxy that catches the shadow.
 #[derive(Clone, Debug)]
@@ -55,6 +59,8 @@ pub struct LoadedScene {
     pub occluders: Option<Raster<f32>>,
     /// From which the same scene can be rebuilt.
     pub description: SceneDescription,
+    /// Lights that the objects' files bring along, as placed. They are not rendered.
+    pub lights: Vec<PunctualLight>,
     /// All files that were read.
     pub inputs: Vec<Input>,
     /// One sentence each.
@@ -65,7 +71,7 @@ impl Scene {
     /// Reads all files that `config` names, relative to `base_dir`, and places the objects.
     pub fn load(config: &SceneConfig, base_dir: &Path) -> Result<LoadedScene, Error> {
         let settings = config.validate()?;
-        let mut files = Files::new(base_dir);
+        let mut files = Files::new(base_dir, settings.limits);
         let (photo, background) = files.photo(&settings.background, settings.transfer)?;
         let resolution = [background.width, background.height];
         let occluders = match &settings.occluders {
@@ -78,7 +84,10 @@ impl Scene {
         if let CameraSettings::Transforms { path, .. } = &settings.camera {
             files.input("camera", path);
         }
-        let (camera, warnings) = settings.camera.resolve(resolution, base_dir)?;
+        let (camera, warnings) = settings
+            .camera
+            .with_facts(&photo.facts)?
+            .resolve(resolution, base_dir)?;
         files.warnings.extend(warnings);
         let (proxy, proxy_record) = match &settings.proxy {
             ProxySettings::None => (Proxy::None, ProxyRecord::None),
@@ -88,7 +97,7 @@ impl Scene {
                 (Proxy::Mesh(mesh), ProxyRecord::Mesh(record))
             }
         };
-        let mut assembly = Assembly::new(settings.objects.iter().map(|o| o.path.clone()));
+        let mut assembly = Assembly::new(camera, settings.objects.iter().map(|o| o.path.clone()));
         let mut objects = Vec::new();
         for (i, object) in settings.objects.iter().enumerate() {
             let key = format!("scene.objects[{i}]");
@@ -103,7 +112,14 @@ impl Scene {
             files.warnings.extend(warning);
             objects.push(placed);
         }
-        let (mesh, materials, textures) = assembly.into_parts();
+        files.warnings.extend(repeated(&objects));
+        let Assembly {
+            mesh,
+            materials,
+            textures,
+            lights,
+            ..
+        } = assembly;
         let (occluders, occluders_record) = occluders.unzip();
         Ok(LoadedScene {
             scene: Scene {
@@ -124,7 +140,9 @@ impl Scene {
                 camera,
                 proxy: proxy_record,
                 effects: settings.effects,
+                limits: settings.limits,
             },
+            lights,
             inputs: files.inputs,
             warnings: files.warnings,
         })
@@ -139,7 +157,7 @@ impl Scene {
 impl SceneDescription {
     /// Rebuilds the scene from the files it was made of; an error if one of them changed.
     pub fn load(&self, base_dir: &Path) -> Result<LoadedScene, Error> {
-        let mut files = Files::new(base_dir);
+        let mut files = Files::new(base_dir, self.limits);
         files.check("the background", &self.background.file)?;
         let (photo, background) =
             files.photo(&self.background.file.path, self.background.transfer)?;
@@ -160,14 +178,23 @@ impl SceneDescription {
                 Proxy::Mesh(files.proxy_mesh(&record.file.path)?.0)
             }
         };
-        let mut assembly = Assembly::new(self.objects.iter().map(|o| o.file.path.clone()));
+        let mut assembly = Assembly::new(
+            self.camera,
+            self.objects.iter().map(|o| o.file.path.clone()),
+        );
         for object in &self.objects {
             files.check_object("the object", object)?;
             assembly.add(&mut files, &object.file.path, |_| {
                 Ok((object.transform(), ()))
             })?;
         }
-        let (mesh, materials, textures) = assembly.into_parts();
+        let Assembly {
+            mesh,
+            materials,
+            textures,
+            lights,
+            ..
+        } = assembly;
         Ok(LoadedScene {
             scene: Scene {
                 mesh,
@@ -179,6 +206,7 @@ impl SceneDescription {
             photo,
             occluders,
             description: self.clone(),
+            lights,
             inputs: files.inputs,
             warnings: files.warnings,
         })
@@ -190,21 +218,48 @@ impl SceneDescription {
     }
 }
 
+/// Says how many objects stand where one of the same file stands already.
+fn repeated(objects: &[ObjectRecord]) -> Option<String> {
+    let mut seen = HashSet::new();
+    for object in objects {
+        seen.insert((
+            &object.file.path,
+            object.transform.map(|row| row.map(f64::to_bits)),
+        ));
+    }
+    match objects.len() - seen.len() {
+        0 => None,
+        n => Some(format!(
+            "scene.objects: {n} of them stand where the same file stands already, and are drawn once"
+        )),
+    }
+}
+
 /// Reads files relative to a folder and keeps the list.
 struct Files<'a> {
     base_dir: &'a Path,
+    limits: Limits,
     inputs: Vec<Input>,
     warnings: Vec<String>,
     hashes: HashMap<PathBuf, String>,
 }
 
 impl<'a> Files<'a> {
-    fn new(base_dir: &'a Path) -> Self {
+    fn new(base_dir: &'a Path, limits: Limits) -> Self {
         Self {
             base_dir,
+            limits,
             inputs: Vec::new(),
             warnings: Vec::new(),
             hashes: HashMap::new(),
+        }
+    }
+
+    /// Adds a warning, once, with the names in it made printable.
+    fn warn(&mut self, warning: String) {
+        let warning = printable(warning);
+        if !self.warnings.contains(&warning) {
+            self.warnings.push(warning);
         }
     }
 
@@ -234,7 +289,7 @@ impl<'a> Files<'a> {
             return Ok(known.clone());
         }
         let mut hasher = blake3::Hasher::new();
-        std::fs::File::open(&location)
+        dipir_files::open(&location)
             .and_then(|file| hasher.update_reader(file).map(|_| ()))
             .map_err(|source| Error::Read {
                 role: role.into(),
@@ -269,6 +324,7 @@ impl<'a> Files<'a> {
 
     fn photo(&mut self, path: &Path, transfer: Transfer) -> Result<(Photo, PhotoRecord), Error> {
         let photo = file::read_photo(self.base_dir.join(path), transfer)?;
+        self.warnings.extend(photo.warnings.iter().cloned());
         let record = PhotoRecord {
             file: self.record("background", path)?,
             width: photo.image.0.width() as u32,
@@ -297,8 +353,8 @@ impl<'a> Files<'a> {
 
     /// Imports an object and notes all files that it consists of.
     fn import(&mut self, role: &str, path: &Path) -> Result<(Imported, ObjectRecord), Error> {
-        let imported = import::load_object(&self.base_dir.join(path))?;
-        let shown = path.display();
+        let imported = import::load_object_within(&self.base_dir.join(path), &self.limits)?;
+        let shown = printable(path.display());
         self.warnings.extend(
             imported
                 .warnings
@@ -333,24 +389,28 @@ impl<'a> Files<'a> {
 /// Objects put together into one mesh; a file that several objects use is read once and its
 /// materials are shared.
 struct Assembly {
+    camera: Camera,
     mesh: TriangleMesh,
     materials: Vec<Material>,
     textures: Vec<Texture>,
+    lights: Vec<PunctualLight>,
     /// How many objects of each file are still to come.
     pending: HashMap<PathBuf, usize>,
     kept: HashMap<PathBuf, (Imported, ObjectRecord, u32)>,
 }
 
 impl Assembly {
-    fn new(paths: impl Iterator<Item = PathBuf>) -> Self {
+    fn new(camera: Camera, paths: impl Iterator<Item = PathBuf>) -> Self {
         let mut pending = HashMap::new();
         for path in paths {
             *pending.entry(path).or_insert(0) += 1;
         }
         Self {
+            camera,
             mesh: TriangleMesh::default(),
             materials: Vec::new(),
             textures: Vec::new(),
+            lights: Vec::new(),
             pending,
             kept: HashMap::new(),
         }
@@ -380,6 +440,8 @@ impl Assembly {
         let (map, extra) = place(&imported)?;
         let pending = self.pending.entry(path.into()).or_insert(1);
         *pending -= 1;
+        self.lights
+            .extend(imported.lights.iter().map(|light| light.placed(&map)));
         let origin = imported.origin;
         let mut mesh = if *pending > 0 {
             let mesh = imported.mesh.clone();
@@ -397,14 +459,16 @@ impl Assembly {
                 value: format!("{:?}", mesh.positions[bad].to_array()),
             });
         }
+        let materials = &self.materials[first_material as usize..];
+        for why in visibility::hidden(&mesh, materials, &self.camera) {
+            files.warn(format!("\"{}\": {why}", path.display()));
+        }
         record.transform = ObjectRecord::rows(&map);
         let total = self.mesh.positions.len() as u64 + mesh.positions.len() as u64;
-        import::Limits::default().check(total, self.mesh.indices.len() as u64)?;
+        files
+            .limits
+            .check_mesh(total, (self.mesh.indices.len() + mesh.indices.len()) as u64)?;
         self.mesh.append(mesh, first_material);
         Ok((record, extra))
-    }
-
-    fn into_parts(self) -> (TriangleMesh, Vec<Material>, Vec<Texture>) {
-        (self.mesh, self.materials, self.textures)
     }
 }

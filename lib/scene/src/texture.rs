@@ -1,12 +1,18 @@
 //! Textures: kept as their source file holds them, decoded only for the effects that need them.
+use std::collections::HashSet;
+use std::collections::hash_map::{Entry, HashMap};
+use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use dipir_imaging::raster::Raster;
 use dipir_imaging::transfer::Transfer;
 use glam::{Vec2, Vec4};
+use image::{ImageFormat, ImageReader};
 
 use crate::error::Error;
+use crate::limits::Limits;
+use crate::printable::printable;
 
 /// What happens to texture coordinates outside `[0, 1)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -58,9 +64,9 @@ pub enum Encoding {
 /// An image as a file holds it, encoded.
 #[derive(Clone, Debug)]
 pub enum ImageSource {
-    /// A PNG or JPEG file, read when it is decoded.
+    /// A PNG, JPEG or WebP file, read when it is decoded.
     File(PathBuf),
-    /// The bytes of a PNG or JPEG file that is embedded in another.
+    /// The bytes of such a file that is embedded in another.
     Bytes {
         /// What to call the image in messages.
         name: String,
@@ -69,41 +75,103 @@ pub enum ImageSource {
     },
 }
 
+/// What tells images apart without looking into them.
+#[derive(PartialEq, Eq, Hash)]
+enum Identity<'a> {
+    File(&'a Path),
+    Bytes(*const u8),
+}
+
 impl ImageSource {
     /// What to call the image in messages.
     pub fn name(&self) -> String {
         match self {
-            Self::File(path) => format!("\"{}\"", path.display()),
-            Self::Bytes { name, .. } => name.clone(),
+            Self::File(path) => format!("\"{}\"", printable(path.display())),
+            Self::Bytes { name, .. } => printable(name),
         }
     }
 
     /// Whether both are the same file or share the same bytes.
     pub fn is_same(&self, other: &Self) -> bool {
-        match (self, other) {
-            (Self::File(a), Self::File(b)) => a == b,
-            (Self::Bytes { bytes: a, .. }, Self::Bytes { bytes: b, .. }) => Arc::ptr_eq(a, b),
-            _ => false,
+        self.identity() == other.identity()
+    }
+
+    fn identity(&self) -> Identity<'_> {
+        match self {
+            Self::File(path) => Identity::File(path),
+            Self::Bytes { bytes, .. } => Identity::Bytes(bytes.as_ptr()),
         }
     }
 
     fn decode(&self) -> Result<Raster<[u8; 4]>, Error> {
-        let decode = |bytes: &[u8]| {
-            dipir_imaging::file::decode_texture(bytes, &self.name()).map_err(Error::Image)
-        };
         match self {
-            Self::File(path) => decode(&read(path, "the texture")?),
-            Self::Bytes { bytes, .. } => decode(bytes),
+            Self::File(path) => {
+                let bytes = dipir_files::read(path).map_err(|e| self.unreadable(e))?;
+                decode(&bytes, &self.name())
+            }
+            Self::Bytes { bytes, .. } => decode(bytes, &self.name()),
+        }
+    }
+
+    /// The number of pixels that the header tells of; `None` if it cannot be read, of which decoding
+    /// will say more.
+    fn pixels(&self) -> Result<Option<u64>, Error> {
+        let size = match self {
+            Self::File(path) => {
+                let file = dipir_files::open(path).map_err(|e| self.unreadable(e))?;
+                size_in_header(BufReader::new(file))
+            }
+            Self::Bytes { bytes, .. } => size_in_header(Cursor::new(bytes)),
+        };
+        Ok(size.map(|(width, height)| u64::from(width) * u64::from(height)))
+    }
+
+    fn unreadable(&self, source: std::io::Error) -> Error {
+        Error::Read {
+            role: "the texture".into(),
+            path: match self {
+                Self::File(path) => path.clone(),
+                Self::Bytes { name, .. } => name.into(),
+            },
+            source,
         }
     }
 }
 
-fn read(path: &Path, role: &str) -> Result<Vec<u8>, Error> {
-    std::fs::read(path).map_err(|source| Error::Read {
-        role: role.into(),
-        path: path.into(),
-        source,
-    })
+fn size_in_header(bytes: impl BufRead + Seek) -> Option<(u32, u32)> {
+    let reader = ImageReader::new(bytes).with_guessed_format().ok()?;
+    reader.into_dimensions().ok()
+}
+
+fn decode(bytes: &[u8], name: &str) -> Result<Raster<[u8; 4]>, Error> {
+    if !(bytes.starts_with(b"RIFF") && bytes.get(8..12) == Some(b"WEBP")) {
+        return Ok(dipir_imaging::file::decode_texture(bytes, name)?);
+    }
+    let decoded = image::load_from_memory_with_format(bytes, ImageFormat::WebP).map_err(|e| {
+        Error::malformed(
+            format!("the WebP image {name} cannot be decoded: {e}"),
+            "export it as PNG or JPEG",
+        )
+    })?;
+    let rgba = decoded.into_rgba8();
+    let (width, height) = (rgba.width() as usize, rgba.height() as usize);
+    let texels = rgba.as_raw().as_chunks::<4>().0.to_vec();
+    Ok(Raster::from_pixels(width, height, texels))
+}
+
+/// Refuses images larger than `limits`, by their headers. What several textures share counts once.
+pub fn check_sizes(textures: &[Texture], limits: &Limits) -> Result<(), Error> {
+    let mut all = 0u64;
+    let mut seen = HashSet::new();
+    for Texture { image, .. } in textures {
+        if seen.insert(image.identity())
+            && let Some(pixels) = image.pixels()?
+        {
+            all = all.saturating_add(pixels);
+            limits.check_pixels(pixels, all, &image.name())?;
+        }
+    }
+    Ok(())
 }
 
 /// A texture as the source file holds it: the encoded image and how to look it up.
@@ -120,7 +188,7 @@ pub struct Texture {
 }
 
 impl Texture {
-    /// Reads and decodes the image. Fails on anything but a readable PNG or JPEG.
+    /// Reads and decodes the image. Fails on anything but a readable PNG, JPEG or WebP.
     pub fn decode(&self) -> Result<DecodedTexture, Error> {
         Ok(self.with_texels(Arc::new(self.image.decode()?)))
     }
@@ -148,22 +216,17 @@ pub fn decode_textures(
     wanted: impl Fn(usize) -> bool,
 ) -> Result<Vec<Option<DecodedTexture>>, Error> {
     let mut decoded: Vec<Option<DecodedTexture>> = Vec::with_capacity(textures.len());
+    let mut known = HashMap::new();
     for (i, texture) in textures.iter().enumerate() {
         if !wanted(i) {
             decoded.push(None);
             continue;
         }
-        let shared = (0..i).find_map(|j| {
-            let earlier = decoded[j].as_ref()?;
-            textures[j]
-                .image
-                .is_same(&texture.image)
-                .then(|| earlier.texels.clone())
-        });
-        decoded.push(Some(match shared {
-            Some(texels) => texture.with_texels(texels),
-            None => texture.decode()?,
-        }));
+        let texels: &Arc<Raster<[u8; 4]>> = match known.entry(texture.image.identity()) {
+            Entry::Occupied(earlier) => earlier.into_mut(),
+            Entry::Vacant(new) => new.insert(Arc::new(texture.image.decode()?)),
+        };
+        decoded.push(Some(texture.with_texels(texels.clone())));
     }
     Ok(decoded)
 }

@@ -11,18 +11,19 @@ use dipir_pipeline::stage::StagePlan;
 use dipir_pipeline::status::{self, StageStatus, State};
 use dipir_scene::config::SceneConfig;
 
-use crate::composite::CompositeTable;
+use crate::composite::table::CompositeTable;
 use crate::light::materials;
 use crate::model::ModelTable;
+use crate::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE, StageName};
 use crate::truth::ReportTable;
 use crate::{composite, concepts, light, lora, scene};
 
 /// The stage that everything leads to.
-pub const LAST: &str = composite::STAGE;
+pub const LAST: &str = COMPOSITE.name;
 
 /// The graph of the session's configuration.
 pub fn graph(session: &Session) -> anyhow::Result<Graph> {
-    let optimize: LightTable = session.config.table("light")?;
+    let table: LightTable = session.config.table("light")?;
     let composite: CompositeTable = session.config.table("composite")?;
     // Read here so that a slip in them is told before anything runs.
     let _: (SceneConfig, ModelTable, ReportTable) = (
@@ -32,8 +33,8 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
     );
     let materials = materials::are_asked_for(session)?;
     let light_is_given = composite.environment.is_some() && !materials;
-    let is_guided_by_model = optimize.guidance != GuidanceKind::Reference && !materials;
-    let is_adapted = optimize.adapt.unwrap_or(true);
+    let is_guided_by_model = table.guidance != GuidanceKind::Reference && !materials;
+    let is_adapted = table.adapt.unwrap_or(true);
 
     let no_model = match (light_is_given, is_guided_by_model) {
         _ if materials => Some("[light] materials asks no diffusion model"),
@@ -50,34 +51,31 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
         let chosen = stages.iter().filter(|(_, on)| *on);
         chosen.map(|(stage, _)| *stage).collect()
     };
-    let node = |stage, executable, reads, unneeded| Node {
-        stage,
-        executable,
+    let node = |stage: &StageName, reads, unneeded| Node {
+        stage: stage.name,
+        executable: stage.executable,
         reads,
         unneeded,
     };
     Ok(Graph::new(vec![
-        node(scene::STAGE, scene::EXECUTABLE, vec![], None),
-        node(concepts::STAGE, concepts::EXECUTABLE, vec![], no_concepts),
+        node(&SCENE, vec![], None),
+        node(&CONCEPTS, vec![], no_concepts),
         node(
-            lora::STAGE,
-            lora::EXECUTABLE,
-            chosen(&[(concepts::STAGE, lora::preserves_concepts(session)?)]),
+            &LORA,
+            chosen(&[(CONCEPTS.name, lora::preserves_concepts(session)?)]),
             no_model,
         ),
         node(
-            light::STAGE,
-            light::EXECUTABLE,
+            &LIGHT,
             chosen(&[
-                (scene::STAGE, true),
-                (lora::STAGE, is_guided_by_model && is_adapted),
+                (SCENE.name, true),
+                (LORA.name, is_guided_by_model && is_adapted),
             ]),
             light_is_given.then_some("[composite] environment gives the light"),
         ),
         node(
-            composite::STAGE,
-            composite::EXECUTABLE,
-            chosen(&[(scene::STAGE, true), (light::STAGE, !light_is_given)]),
+            &COMPOSITE,
+            chosen(&[(SCENE.name, true), (LIGHT.name, !light_is_given)]),
             None,
         ),
     ]))
@@ -86,15 +84,16 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
 /// What a run of the stage would be, from the configuration, the files that it names, and the
 /// manifests of the stages that it reads.
 pub fn plan(session: &Session, stage: &str) -> anyhow::Result<StagePlan> {
-    match stage {
-        scene::STAGE => scene::plan(session),
-        concepts::STAGE => concepts::plan(session),
-        lora::STAGE => lora::plan(session),
-        light::STAGE if materials::are_asked_for(session)? => materials::plan(session),
-        light::STAGE => light::plan(session),
-        composite::STAGE => composite::plan(session, &session.config.table("composite")?),
+    let plan: fn(&Session) -> anyhow::Result<StagePlan> = match stage {
+        s if s == SCENE.name => scene::plan,
+        s if s == CONCEPTS.name => concepts::plan,
+        s if s == LORA.name => lora::plan,
+        s if s == LIGHT.name && materials::are_asked_for(session)? => materials::plan,
+        s if s == LIGHT.name => light::plan,
+        s if s == COMPOSITE.name => composite::plan_of,
         other => anyhow::bail!("there is no stage \"{other}\""),
-    }
+    };
+    plan(session)
 }
 
 /// The states of all stages, as far as `needed` asks for them; an error if the configuration is

@@ -5,17 +5,12 @@ use std::sync::Arc;
 use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::LinearImage;
-use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentMap;
-use dipir_light::gaussian::{SgMixture, SphericalGaussian};
-use dipir_optimize::lighting::Lighting;
-use dipir_pipeline::manifest::{FILE_NAME, Manifest};
 use dipir_scene::camera::Camera;
-use glam::{Quat, Vec2, Vec3};
+use glam::{Vec2, Vec3};
 use serde_json::{Value, json};
 
-use crate::composite::CompositeTable;
-use crate::light;
+use crate::composite::table::CompositeTable;
 
 /// A light that is a map.
 pub struct Light {
@@ -33,15 +28,6 @@ pub fn known_params(table: &CompositeTable) -> Option<(Value, &Path)> {
         "rotation_deg": table.rotation_deg,
     });
     Some((params, path))
-}
-
-/// What decides the recovered light beside the light stage's files.
-pub fn recovered_params(table: &CompositeTable) -> Value {
-    json!({
-        "recovered": true,
-        "exposure_ev": table.exposure_ev,
-        "rotation_deg": table.rotation_deg,
-    })
 }
 
 /// The map of `[composite] environment`, exposed and turned; `None` if the key is not set.
@@ -74,69 +60,6 @@ pub fn known(session: &Session, table: &CompositeTable) -> anyhow::Result<Option
         .scaled(exposure)
         .rotated_y(f64::from(table.rotation_deg).to_radians());
     Ok(Some(Light { map: Arc::new(map) }))
-}
-
-/// A light that the light stage recovered.
-pub struct Recovered {
-    /// The lobes, on the photograph's scale.
-    pub lobes: SgMixture,
-    /// The tone curves that were recovered with it.
-    pub tone: ToneCurves,
-}
-
-/// What the light stage left, exposed and turned; an error that says what to do if there is
-/// nothing. `scene` is the manifest of the scene that is lit.
-pub fn recovered(
-    session: &Session,
-    table: &CompositeTable,
-    scene: &Manifest,
-) -> anyhow::Result<Recovered> {
-    let folder = session.stage_folder(light::STAGE);
-    let manifest = manifest(session)?;
-    warn_of_another_scene(session, &manifest, scene);
-    let lighting_file = manifest.output(&folder, "lighting")?;
-    let tone_file = manifest.output(&folder, "tone")?;
-    let exposure = table.exposure_ev.exp2();
-    let turn = Quat::from_rotation_y(table.rotation_deg.to_radians());
-    let lobes = Lighting::read(&lighting_file)?.exposed_lobes();
-    let lobes = lobes.into_iter().map(|lobe| SphericalGaussian {
-        direction: turn * lobe.direction,
-        radiance: lobe.radiance * exposure,
-        ..lobe
-    });
-    Ok(Recovered {
-        lobes: SgMixture::new(lobes.collect()).map_err(|e| {
-            let message = format!(
-                "{} stops make a light that cannot be used: {e}",
-                table.exposure_ev
-            );
-            session.config.invalid("composite.exposure_ev", message)
-        })?,
-        tone: ToneCurves::read_json(&tone_file)?,
-    })
-}
-
-/// The manifest of the light stage; an error that says what to do if it has not run.
-pub fn manifest(session: &Session) -> anyhow::Result<Manifest> {
-    let folder = session.stage_folder(light::STAGE);
-    if !folder.join(FILE_NAME).exists() {
-        return Err(missing(&folder.join("lighting.json")));
-    }
-    Ok(Manifest::read(&folder, light::EXECUTABLE)?)
-}
-
-/// The light may have been recovered before the scene was set up anew.
-pub fn warn_of_another_scene(session: &Session, light: &Manifest, scene: &Manifest) {
-    let of = |list: &[dipir_pipeline::manifest::Artifact]| {
-        let found = list.iter().find(|a| a.role == "scene");
-        found.map(|a| a.blake3.clone())
-    };
-    if of(&light.inputs) != of(&scene.outputs) {
-        session.warn(
-            "the light was recovered for another set-up of the scene; run dipir-light again to \
-             recover it for this one",
-        );
-    }
 }
 
 /// Irradiance of the pilot light's sun on a surface that faces it; with the sky's, a white
@@ -173,15 +96,6 @@ pub fn pilot() -> Light {
 /// What stands for the pilot light among a stage's parameters.
 pub fn pilot_params() -> Value {
     json!("pilot: sun and sky")
-}
-
-/// The error of a stage that needs a light where there is none.
-pub fn missing(recovered: &Path) -> anyhow::Error {
-    anyhow::anyhow!(
-        "there is no light: [composite] environment is not set and {} is missing; name a map, as \
-         in --set composite.environment=sky.hdr, or run dipir-light first",
-        recovered.display()
-    )
 }
 
 /// The photograph in the directions that it shows, mirrored behind the camera, its borders drawn out: a

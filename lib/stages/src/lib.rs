@@ -1,5 +1,4 @@
 //! The stages behind the executables: each a function from a session to a folder of artifacts.
-pub mod children;
 pub mod command_line;
 pub mod composite;
 pub mod concepts;
@@ -8,6 +7,7 @@ pub mod known_light;
 pub mod light;
 pub mod lora;
 pub mod model;
+pub mod names;
 pub mod presets;
 pub mod preview;
 pub mod report;

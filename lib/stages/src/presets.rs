@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use dipir_cli::session::duration;
-use dipir_optimize::settings::LightTable;
+use dipir_optimize::settings::{LightTable, Preset as LightPreset};
 use dipir_pipeline::config::Quality;
 use dipir_scene::config::EffectsMode;
 use serde::Deserialize;
@@ -32,9 +32,9 @@ pub struct Preset {
     /// Of `[composite]`.
     pub composite: CompositePreset,
     /// Of `[light]`.
-    pub optimize: LightPreset,
+    pub light: LightPreset,
     /// What recovering light was measured to cost.
-    pub light: Option<Measured>,
+    pub recovery: Option<Measured>,
 }
 
 /// Of `[scene]`.
@@ -53,18 +53,6 @@ pub struct CompositePreset {
     pub target_error: f32,
 }
 
-/// Of `[light]`; see its table for what each is.
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[allow(missing_docs)]
-pub struct LightPreset {
-    pub iterations: usize,
-    pub lobes: usize,
-    pub environment: [usize; 2],
-    pub samples: u32,
-    pub size: usize,
-}
-
 /// Means over the measured scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -73,20 +61,6 @@ pub struct Measured {
     pub cost_s: f64,
     /// Display-referred RMSE of the composite under the recovered light.
     pub error: f64,
-}
-
-impl LightPreset {
-    /// Fills what `table` leaves open.
-    pub fn fill(&self, table: &LightTable) -> LightTable {
-        LightTable {
-            iterations: table.iterations.or(Some(self.iterations)),
-            lobes: table.lobes.or(Some(self.lobes)),
-            environment: table.environment.or(Some(self.environment)),
-            samples: table.samples.or(Some(self.samples)),
-            size: table.size.or(Some(self.size)),
-            ..table.clone()
-        }
-    }
 }
 
 /// All presets.
@@ -238,13 +212,13 @@ impl LightRun {
     /// The presets beside `quality`, as far as `table` leaves to them.
     pub fn outlook(&self, quality: Quality, table: &LightTable) -> Outlook {
         // Measured with a reference; what a model guides to is another matter.
-        let error = |p: &Preset| p.light.filter(|_| !self.by_model).map(|l| l.error);
+        let error = |p: &Preset| p.recovery.filter(|_| !self.by_model).map(|l| l.error);
         Outlook::beside(quality, |p| {
             let there = LightPreset {
-                iterations: table.iterations.unwrap_or(p.optimize.iterations),
-                samples: table.samples.unwrap_or(p.optimize.samples),
-                size: table.size.unwrap_or(p.optimize.size),
-                ..p.optimize
+                iterations: table.iterations.unwrap_or(p.light.iterations),
+                samples: table.samples.unwrap_or(p.light.samples),
+                size: table.size.unwrap_or(p.light.size),
+                ..p.light
             };
             Some((self.seconds_with(&there), error(p)))
         })
@@ -253,8 +227,6 @@ impl LightRun {
 
 #[cfg(test)]
 mod tests {
-    use dipir_optimize::settings::{Preset as LibraryPreset, Settings};
-
     use super::*;
 
     #[test]
@@ -266,33 +238,19 @@ mod tests {
         );
         assert!(draft.composite.target_error > standard.composite.target_error);
         assert!(standard.composite.target_error > high.composite.target_error);
-        assert!(draft.optimize.samples <= standard.optimize.samples);
+        assert!(draft.light.samples <= standard.light.samples);
         assert_eq!(draft.scene.effects, EffectsMode::All);
+        for preset in &all().presets {
+            assert!(LightTable::default().settings(&preset.light, 0).is_ok());
+        }
         assert!(all().measured.is_some() && all().command.is_some());
-        let [draft, standard, high] = [draft, standard, high].map(|p| p.light.unwrap());
+        let [draft, standard, high] = [draft, standard, high].map(|p| p.recovery.unwrap());
         assert!(draft.cost_s < standard.cost_s && standard.cost_s < high.cost_s);
         assert!(draft.error > standard.error && standard.error > high.error);
     }
 
-    #[test]
-    fn the_library_s_own_presets_are_these() {
-        let table = LightTable::default();
-        for (quality, preset) in [
-            (Quality::Draft, LibraryPreset::Draft),
-            (Quality::Standard, LibraryPreset::Standard),
-            (Quality::High, LibraryPreset::High),
-        ] {
-            let library: Settings = table.settings(preset, 0).unwrap();
-            let filled = of(quality).optimize.fill(&table);
-            assert_eq!(
-                filled.settings(LibraryPreset::Standard, 0).unwrap(),
-                library
-            );
-        }
-    }
-
     fn standard_run(by_model: bool) -> LightRun {
-        let here = of(Quality::Standard).optimize;
+        let here = of(Quality::Standard).light;
         LightRun {
             iterations: Some(here.iterations),
             samples: here.samples,
@@ -312,20 +270,6 @@ mod tests {
             assert_eq!(outlook.0.len(), 2);
             assert!(outlook.0.iter().all(|e| e.error.is_none() == by_model));
         }
-    }
-
-    #[test]
-    fn what_the_table_says_goes_first() {
-        let table = LightTable {
-            samples: Some(7),
-            ..LightTable::default()
-        };
-        let filled = of(Quality::Draft).optimize.fill(&table);
-        assert_eq!(filled.samples, Some(7));
-        assert_eq!(
-            filled.iterations,
-            Some(of(Quality::Draft).optimize.iterations)
-        );
     }
 
     #[test]
@@ -359,7 +303,7 @@ mod tests {
 
     #[test]
     fn a_light_run_costs_what_its_steps_and_paths_cost() {
-        let here = of(Quality::Standard).optimize;
+        let here = of(Quality::Standard).light;
         let run = standard_run(false);
         assert!((run.seconds_with(&here) - 12.0).abs() < 1e-9);
         let more = LightPreset {

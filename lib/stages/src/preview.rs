@@ -1,4 +1,4 @@
-//! Pictures of what is no picture: depths, normals, environment maps.
+//! Depths, normals and environment maps as pictures.
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;

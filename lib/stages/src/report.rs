@@ -1,11 +1,11 @@
 //! `report.html`: one page that shows a run, complete in itself.
 //!
 //! Whatever stages there are is shown; what cannot be read is said where it would stand.
+mod curves;
 pub mod html;
 mod learning;
 mod lighting;
 pub mod picture;
-mod plot;
 mod result;
 mod stages;
 
@@ -22,10 +22,13 @@ use crate::truth::Truth;
 use html::Html;
 pub use stages::quoted;
 
+/// How every page begins: what tells a page of ours from another's.
+pub const MARK: &[u8] =
+    b"<!doctype html>\n<html lang=\"en\"><head><meta name=\"generator\" content=\"dipir ";
 /// Name of the file in the folder of artifacts.
 pub const FILE: &str = "report.html";
 /// Raised whenever the same artifacts give another page.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 /// What the page says beside what the artifacts hold.
 pub struct Report<'a> {
@@ -46,14 +49,16 @@ impl Report<'_> {
     /// Writes the page and returns where it is.
     pub fn write(&self) -> anyhow::Result<PathBuf> {
         let path = self.session.out.join(FILE);
-        let partial = self.session.out.join(format!(".{FILE}.partial"));
-        std::fs::write(&partial, self.page()?)
-            .and_then(|()| std::fs::rename(&partial, &path))
-            .map_err(|e| {
-                let _ = std::fs::remove_file(&partial);
-                let reason = dipir_pipeline::manifest::plain_reason(&e);
-                anyhow::anyhow!("cannot write {}: {reason}", path.display())
-            })?;
+        dipir_files::replace(&path, self.page()?.as_bytes(), MARK).map_err(|e| {
+            let way_out = match e.kind() {
+                std::io::ErrorKind::AlreadyExists => {
+                    "; move it away or choose another folder with --out"
+                }
+                _ => "",
+            };
+            let reason = dipir_pipeline::manifest::plain_reason(&e);
+            anyhow::anyhow!("cannot write {}: {reason}{way_out}", path.display())
+        })?;
         Ok(path)
     }
 
@@ -85,6 +90,14 @@ impl Report<'_> {
             Some(Html::all(head.into_iter().chain([content])))
         });
         let head = [
+            Html::element(
+                "meta",
+                &[
+                    ("name", "generator"),
+                    ("content", concat!("dipir ", env!("CARGO_PKG_VERSION"))),
+                ],
+                [],
+            ),
             Html::element("meta", &[("charset", "utf-8")], []),
             Html::element(
                 "meta",
@@ -101,6 +114,7 @@ impl Report<'_> {
             ),
             Html::of("title", format!("{title} – dipir")),
             Html::code("style", include_str!("report/style.css")),
+            Html::code("style", dipir_plotting::STYLE),
         ];
         let intro = [
             Html::of("h1", &title),
@@ -144,7 +158,7 @@ const KEY: &str = "dipir-made-of";
 
 /// Whether the page that is there shows the artifacts that are there.
 pub fn is_current(session: &Session) -> bool {
-    let page = std::fs::read_to_string(session.out.join(FILE));
+    let page = dipir_files::read_to_string(session.out.join(FILE));
     match (page, key(session)) {
         (Ok(page), Ok(key)) => page.contains(&format!("name=\"{KEY}\" content=\"{key}\"")),
         _ => false,

@@ -17,7 +17,7 @@ use dipir_optimize::guidance::{rmse, touched};
 use dipir_optimize::lighting::Lighting;
 use dipir_optimize::objective::{Objective, Weights};
 use dipir_optimize::parameters::ambient_of;
-use dipir_pipeline::manifest::{FILE_NAME, Manifest, hash_file};
+use dipir_pipeline::manifest::{FILE_NAME, hash_file};
 use dipir_render::adaptive::Stop;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
@@ -25,10 +25,11 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::composite::{CompositeTable, Tone};
+use crate::composite::table::{CompositeTable, Tone};
+use crate::interruption;
+use crate::names::{COMPOSITE, LIGHT, SCENE};
 use crate::scene::folder::SceneFolder;
 use crate::scene::transport::{self, Frame};
-use crate::{composite, interruption, light, scene};
 
 /// Display-referred RMSE, as a 95% bound, to which the picture under the true light is rendered: in
 /// quadrature, a small part of any difference worth telling.
@@ -80,12 +81,12 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
     };
     let lit: CompositeTable = session.config.table("composite")?;
     let is_there = |stage: &str| session.stage_folder(stage).join(FILE_NAME).is_file();
-    let needed = [scene::STAGE, light::STAGE, composite::STAGE];
+    let needed = [SCENE.name, LIGHT.name, COMPOSITE.name];
     if lit.environment.is_some() || !needed.into_iter().all(is_there) {
         return Ok(None);
     }
-    let folder = session.stage_folder(light::STAGE);
-    let manifest = Manifest::read(&folder, light::EXECUTABLE)?;
+    let folder = LIGHT.folder(session);
+    let manifest = LIGHT.manifest(session)?;
     let recovered = Lighting::read(&manifest.output(&folder, "lighting")?)?;
     let truth = EnvironmentMap::read(session.resolve(path))
         .with_context(|| format!("cannot use report.truth = \"{}\"", path.display()))?
@@ -122,8 +123,8 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
 
 /// The composite stage's picture, linear.
 fn picture(session: &Session, frame: &Frame) -> anyhow::Result<LinearImage> {
-    let folder = session.stage_folder(composite::STAGE);
-    let manifest = Manifest::read(&folder, composite::EXECUTABLE)?;
+    let folder = COMPOSITE.folder(session);
+    let manifest = COMPOSITE.manifest(session)?;
     let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
     Ok(frame.scale(&LinearImage(layers.rgb("")?)))
 }

@@ -4,7 +4,7 @@
 
 use rayon::prelude::*;
 
-use super::matmul::{Columns, Threads, View, product_at, product_columns};
+use super::matmul::{Columns, Matrix, Threads, product_at, product_columns};
 use super::simd::{exp, sum_of_2, vectorized};
 use super::{SharedMut, with_scratch};
 
@@ -46,9 +46,9 @@ impl AttentionShape {
         item: usize,
         head: usize,
         first: usize,
-    ) -> View<'a> {
+    ) -> Matrix<'a> {
         let offset = (item * length + first) * self.width() + head * self.head_dim;
-        View {
+        Matrix {
             data: &data[offset..],
             row: self.width(),
             column: 1,
@@ -177,7 +177,7 @@ pub(crate) fn attention(shape: AttentionShape, q: &[f32], k: &[f32], v: &[f32]) 
                 shape.probabilities(scores, place, q, keys, &mut inverse, Threads::One);
                 let offset = (item * shape.queries + first) * width + head * shape.head_dim;
                 let size = (rows, shape.head_dim, shape.keys);
-                let p = View::rows(scores, shape.keys);
+                let p = Matrix::rows(scores, shape.keys);
                 // SAFETY: each job writes its own rows and head columns of `out`.
                 unsafe {
                     let out = target.at(offset);
@@ -253,11 +253,11 @@ pub(crate) fn attention_vjp(
         unsafe {
             let out = dp.as_mut_ptr();
             product_columns(scores, out, shape.keys, 0.0, 1.0, g, values_t, threads);
-            let weights = View::rows(p, shape.keys).transposed();
+            let weights = Matrix::rows(p, shape.keys).transposed();
             let out = targets.2.at(key_offset);
             product_at(by_key, out, width, keep, 1.0, weights, g, threads);
             softmax_rows_vjp(p, dp, shape.keys);
-            let ds = View::rows(dp, shape.keys);
+            let ds = Matrix::rows(dp, shape.keys);
             let out = targets.0.at(query_offset);
             product_columns(by_query, out, width, 0.0, shape.scale, ds, keys, threads);
             let out = targets.1.at(key_offset);

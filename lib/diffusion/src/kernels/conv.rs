@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use super::matmul::{Threads, View, product, product_at};
+use super::matmul::{Matrix, Threads, product, product_at};
 use super::winograd;
 use super::{SharedMut, with_scratch};
 
@@ -138,7 +138,7 @@ pub(crate) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], bias: Option<&[f32]
     }
     let keep = if bias.is_some() { 1.0 } else { 0.0 };
     let depth = shape.depth();
-    let weights = View::rows(w, depth);
+    let weights = Matrix::rows(w, depth);
     let image_len = shape.inputs * shape.height * shape.width;
     if shape.is_pointwise() {
         for (x, out) in x
@@ -150,7 +150,7 @@ pub(crate) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], bias: Option<&[f32]
                 out,
                 keep,
                 weights,
-                View::rows(x, pixels),
+                Matrix::rows(x, pixels),
                 Threads::All,
             );
         }
@@ -177,7 +177,7 @@ pub(crate) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], bias: Option<&[f32]
         // SAFETY: each job writes its own pixels of its own image.
         unsafe {
             let size = (shape.outputs, rows * out_width, depth);
-            let columns = View::rows(columns, rows * out_width);
+            let columns = Matrix::rows(columns, rows * out_width);
             product_at(
                 size,
                 target.at(offset),
@@ -209,7 +209,7 @@ pub(crate) fn conv2d_vjp_input(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f3
     let image_len = shape.inputs * shape.height * shape.width;
     if shape.is_pointwise() {
         let mut dx = vec![0.0; shape.batch * image_len];
-        let weights = View::rows(w, shape.inputs).transposed();
+        let weights = Matrix::rows(w, shape.inputs).transposed();
         for (g, dx) in g
             .chunks_exact(shape.outputs * pixels)
             .zip(dx.chunks_exact_mut(image_len))
@@ -219,7 +219,7 @@ pub(crate) fn conv2d_vjp_input(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f3
                 dx,
                 0.0,
                 weights,
-                View::rows(g, pixels),
+                Matrix::rows(g, pixels),
                 Threads::All,
             );
         }
@@ -285,12 +285,12 @@ fn fold_product(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f32> {
             let (item, first) = (job / blocks, job % blocks * channels);
             let count = channels.min(shape.inputs - first);
             let columns = &mut columns[..count * taps * pixels];
-            let weights = View {
+            let weights = Matrix {
                 data: &w[first * taps..],
                 row: 1,
                 column: shape.inputs * taps,
             };
-            let g = View::rows(&g[item * shape.outputs * pixels..], pixels);
+            let g = Matrix::rows(&g[item * shape.outputs * pixels..], pixels);
             product(
                 (count * taps, pixels, shape.outputs),
                 columns,
@@ -347,7 +347,7 @@ pub(crate) fn conv2d_vjp_weight(shape: ConvShape, g: &[f32], x: &[f32]) -> Vec<f
             unfold_images(shape, &x[item * image_len..], first, rows, images, columns);
             let offset = item * outputs * pixels + first * out_width;
             let g = if images == 1 {
-                View::rows(&g[offset..], pixels)
+                Matrix::rows(&g[offset..], pixels)
             } else {
                 let gathered = &mut gathered[..outputs * count];
                 for (output, target) in gathered.chunks_exact_mut(count).enumerate() {
@@ -356,13 +356,13 @@ pub(crate) fn conv2d_vjp_weight(shape: ConvShape, g: &[f32], x: &[f32]) -> Vec<f
                         target.copy_from_slice(&g[start..start + each]);
                     }
                 }
-                View::rows(gathered, count)
+                Matrix::rows(gathered, count)
             };
             product(
                 (depth, outputs, count),
                 &mut turned,
                 keep,
-                View::rows(columns, count),
+                Matrix::rows(columns, count),
                 g.transposed(),
                 Threads::All,
             );

@@ -8,13 +8,13 @@ use super::packed::{self, PackedColumns};
 
 /// A row-major view: element (i, j) at `i * row + j * column`.
 #[derive(Clone, Copy)]
-pub(crate) struct View<'a> {
+pub(crate) struct Matrix<'a> {
     pub data: &'a [f32],
     pub row: usize,
     pub column: usize,
 }
 
-impl<'a> View<'a> {
+impl<'a> Matrix<'a> {
     /// Rows of `width` contiguous elements.
     pub(crate) fn rows(data: &'a [f32], width: usize) -> Self {
         Self {
@@ -50,6 +50,25 @@ pub(crate) enum Threads {
     All,
 }
 
+/// What multiplies. docs/diffusion.md has the times of both by shape.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Engine {
+    /// `packed.rs`; needs AVX-512.
+    Panels,
+    /// The `gemm` crate; runs everywhere.
+    Gemm,
+}
+
+impl Engine {
+    /// The faster one of those that this processor can run.
+    pub(crate) fn best() -> Self {
+        match packed::available() {
+            true => Self::Panels,
+            false => Self::Gemm,
+        }
+    }
+}
+
 /// `out[m x n] = keep * out + scale * a[m x k] b[k x n]`, where `out` has rows
 /// of stride `out_row` and contiguous columns.
 ///
@@ -57,18 +76,39 @@ pub(crate) enum Threads {
 /// `out` is valid for writes of m rows of n elements at stride `out_row`, and
 /// for reads if `keep` is not 0, and nobody else uses them meanwhile.
 pub(crate) unsafe fn product_at(
+    size: (usize, usize, usize),
+    out: *mut f32,
+    out_row: usize,
+    keep: f32,
+    scale: f32,
+    a: Matrix,
+    b: Matrix,
+    threads: Threads,
+) {
+    let engine = Engine::best();
+    // SAFETY: the caller's contract.
+    unsafe { product_by(engine, size, out, out_row, keep, scale, a, b, threads) }
+}
+
+/// [`product_at`] by a chosen engine, which this processor must be able to run.
+///
+/// # Safety
+/// As [`product_at`].
+pub(crate) unsafe fn product_by(
+    engine: Engine,
     (m, n, k): (usize, usize, usize),
     out: *mut f32,
     out_row: usize,
     keep: f32,
     scale: f32,
-    a: View,
-    b: View,
+    a: Matrix,
+    b: Matrix,
     threads: Threads,
 ) {
     a.check(m, k);
     b.check(k, n);
-    if packed::available() {
+    if engine == Engine::Panels {
+        assert!(packed::available(), "panels need AVX-512");
         // SAFETY: both views were checked, `out` is the caller's contract.
         return unsafe { packed::product((m, n, k), out, out_row, keep, scale, a, b, threads) };
     }
@@ -106,17 +146,17 @@ pub(crate) unsafe fn product_at(
 /// pays.
 pub(crate) enum Columns<'a> {
     Packed(PackedColumns),
-    View(View<'a>),
+    Matrix(Matrix<'a>),
 }
 
 impl<'a> Columns<'a> {
     /// The k x n elements of `b`.
-    pub(crate) fn new(b: View<'a>, (k, n): (usize, usize)) -> Self {
+    pub(crate) fn new(b: Matrix<'a>, (k, n): (usize, usize)) -> Self {
         b.check(k, n);
         if packed::available() {
             Self::Packed(PackedColumns::new(b, (k, n)))
         } else {
-            Self::View(b)
+            Self::Matrix(b)
         }
     }
 }
@@ -131,7 +171,7 @@ pub(crate) unsafe fn product_columns(
     out_row: usize,
     keep: f32,
     scale: f32,
-    a: View,
+    a: Matrix,
     b: &Columns,
     threads: Threads,
 ) {
@@ -142,7 +182,7 @@ pub(crate) unsafe fn product_columns(
             unsafe { packed::product_packed(m, out, out_row, keep, scale, a, b, threads) }
         }
         // SAFETY: by the caller's contract.
-        Columns::View(b) => unsafe {
+        Columns::Matrix(b) => unsafe {
             product_at((m, n, k), out, out_row, keep, scale, a, *b, threads)
         },
     }
@@ -153,8 +193,8 @@ pub(crate) fn product(
     (m, n, k): (usize, usize, usize),
     out: &mut [f32],
     keep: f32,
-    a: View,
-    b: View,
+    a: Matrix,
+    b: Matrix,
     threads: Threads,
 ) {
     assert!(out.len() >= m * n, "product: output too short");
@@ -178,7 +218,10 @@ pub(crate) fn linear(
             .for_each(|y| y.copy_from_slice(bias));
     }
     let keep = if bias.is_some() { 1.0 } else { 0.0 };
-    let (a, b) = (View::rows(x, inputs), View::rows(w, inputs).transposed());
+    let (a, b) = (
+        Matrix::rows(x, inputs),
+        Matrix::rows(w, inputs).transposed(),
+    );
     product((rows, outputs, inputs), &mut y, keep, a, b, Threads::All);
     y
 }
@@ -196,8 +239,8 @@ pub(crate) fn linear_vjp_input(
         (rows, inputs, outputs),
         &mut dx,
         0.0,
-        View::rows(g, outputs),
-        View::rows(w, inputs),
+        Matrix::rows(g, outputs),
+        Matrix::rows(w, inputs),
         Threads::All,
     );
     dx
@@ -212,7 +255,10 @@ pub(crate) fn linear_vjp_weight(
     x: &[f32],
 ) -> Vec<f32> {
     let mut dw = vec![0.0; outputs * inputs];
-    let (a, b) = (View::rows(g, outputs).transposed(), View::rows(x, inputs));
+    let (a, b) = (
+        Matrix::rows(g, outputs).transposed(),
+        Matrix::rows(x, inputs),
+    );
     product((outputs, inputs, rows), &mut dw, 0.0, a, b, Threads::All);
     dw
 }

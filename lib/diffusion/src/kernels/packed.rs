@@ -6,7 +6,7 @@
 
 use rayon::prelude::*;
 
-use super::matmul::{Threads, View};
+use super::matmul::{Matrix, Threads};
 use super::{SharedMut, with_scratch};
 
 /// Rows of the register tile: 14 x 2 registers of sums, 2 of B, of 32.
@@ -56,7 +56,7 @@ pub(crate) struct PackedColumns {
 }
 
 impl PackedColumns {
-    pub(super) fn new(b: View, (k, n): (usize, usize)) -> Self {
+    pub(super) fn new(b: Matrix, (k, n): (usize, usize)) -> Self {
         let width = n.div_ceil(NR) * NR;
         let mut panels = vec![0.0; width * k];
         let pass = depth_of_pass(k);
@@ -70,7 +70,7 @@ impl PackedColumns {
 
 /// Packs `count` columns from `first`, `depth` deep, panel by panel.
 fn pack_pass(
-    b: View,
+    b: Matrix,
     (first_depth, depth): (usize, usize),
     (first, count): (usize, usize),
     target: &mut [f32],
@@ -102,8 +102,8 @@ pub(super) unsafe fn product(
     out_row: usize,
     keep: f32,
     scale: f32,
-    a: View,
-    b: View,
+    a: Matrix,
+    b: Matrix,
     threads: Threads,
 ) {
     if m == 0 || n == 0 {
@@ -156,7 +156,7 @@ pub(super) unsafe fn product_packed(
     out_row: usize,
     keep: f32,
     scale: f32,
-    a: View,
+    a: Matrix,
     b: &PackedColumns,
     threads: Threads,
 ) {
@@ -197,7 +197,7 @@ unsafe fn one_pass(
     (m, columns, depth): (usize, usize, usize),
     n: usize,
     output: Output,
-    a: View,
+    a: Matrix,
     first_depth: usize,
     packed_b: &[f32],
     parallel: bool,
@@ -249,7 +249,7 @@ unsafe fn one_pass(
 
 /// Packs `count` columns of B, `depth` deep: depth rows of NR elements.
 fn pack_columns(
-    b: View,
+    b: Matrix,
     first_depth: usize,
     depth: usize,
     first: usize,
@@ -276,7 +276,7 @@ fn pack_columns(
 
 /// Packs rows of A in panels of MR: for each panel depth columns of MR.
 fn pack_rows(
-    a: View,
+    a: Matrix,
     first: usize,
     rows: usize,
     first_depth: usize,
@@ -470,13 +470,20 @@ unsafe fn tile<const HALVES: usize, const PACKED: bool>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::matmul::{Columns, product as either, product_columns};
+    use super::super::matmul::{Columns, Engine, product_by, product_columns};
     use super::*;
 
     /// Against sums in f64, for sizes at and off every block's border, all
-    /// four orders of storage, and both ways of treating what was there.
+    /// four orders of storage, both ways of treating what was there, and
+    /// every engine that this processor can run.
     #[test]
-    fn products_match_f64_for_odd_sizes_and_strides() {
+    fn products_of_every_engine_match_f64_for_odd_sizes_and_strides() {
+        let mut engines = vec![Engine::Gemm];
+        if available() {
+            engines.push(Engine::Panels);
+        }
+        let threads = |engine| [(engine, Threads::One), (engine, Threads::All)];
+        let runs: Vec<_> = engines.into_iter().flat_map(threads).collect();
         let value = |i: usize| ((i * 2_654_435_761) % 1000) as f32 / 500.0 - 1.0;
         for (m, n, k) in [
             (1, 1, 1),
@@ -499,40 +506,39 @@ mod tests {
                     } else {
                         (0..m * n).map(value).collect()
                     };
-                    for threads in [Threads::One, Threads::All] {
-                        let mut out = start.clone();
-                        let a_view = View {
+                    for (engine, threads) in &runs {
+                        let a_view = Matrix {
                             data: &a,
                             row: a_row,
                             column: a_column,
                         };
-                        let b_view = View {
+                        let b_view = Matrix {
                             data: &b,
                             row: b_row,
                             column: b_column,
                         };
-                        either((m, n, k), &mut out, keep, a_view, b_view, threads);
-                        let mut again = start.clone();
-                        let columns = Columns::new(b_view, (k, n));
-                        // SAFETY: `again` holds m rows of n elements.
+                        let (size, mut out) = ((m, n, k), start.clone());
+                        // SAFETY: `out` holds m rows of n elements.
                         unsafe {
-                            product_columns(
-                                (m, n, k),
-                                again.as_mut_ptr(),
-                                n,
-                                keep,
-                                1.0,
-                                a_view,
-                                &columns,
-                                threads,
-                            );
+                            let out = out.as_mut_ptr();
+                            product_by(*engine, size, out, n, keep, 1.0, a_view, b_view, *threads);
                         }
-                        assert!(
-                            out.iter()
-                                .zip(&again)
-                                .all(|(a, b)| a.to_bits() == b.to_bits()),
-                            "{m}x{n}x{k}: packed ahead gives other bytes"
-                        );
+                        if *engine == Engine::best() {
+                            for columns in [Columns::new(b_view, (k, n)), Columns::Matrix(b_view)] {
+                                let mut again = start.clone();
+                                // SAFETY: as above.
+                                unsafe {
+                                    let out = again.as_mut_ptr();
+                                    let b = &columns;
+                                    product_columns(size, out, n, keep, 1.0, a_view, b, *threads);
+                                }
+                                let same = |(a, b): (&f32, &f32)| a.to_bits() == b.to_bits();
+                                assert!(
+                                    out.iter().zip(&again).all(same),
+                                    "{m}x{n}x{k}: packed ahead gives other bytes"
+                                );
+                            }
+                        }
                         for i in 0..m {
                             for j in 0..n {
                                 let mut sum = if keep == 0.0 {
@@ -552,7 +558,7 @@ mod tests {
                                 let error = (out[i * n + j] as f64 - sum).abs();
                                 assert!(
                                     error <= tolerance,
-                                    "{m}x{n}x{k} at {i},{j}: {} not {sum}",
+                                    "{engine:?} {m}x{n}x{k} at {i},{j}: {} not {sum}",
                                     out[i * n + j]
                                 );
                             }

@@ -5,7 +5,7 @@
 use rayon::prelude::*;
 
 use super::conv::ConvShape;
-use super::matmul::{Threads, View, product_at};
+use super::matmul::{Matrix, Threads, product_at};
 use super::simd::vectorized;
 use super::{SharedMut, with_scratch};
 
@@ -110,8 +110,8 @@ fn multiply((outputs, count, inputs): (usize, usize, usize), u: &[f32], v: &[f32
         if rows == 0 {
             return;
         }
-        let u = View::rows(&u[(point * outputs + first) * inputs..], inputs);
-        let v = View::rows(&v[point * inputs * count..], count);
+        let u = Matrix::rows(&u[(point * outputs + first) * inputs..], inputs);
+        let v = Matrix::rows(&v[point * inputs * count..], count);
         // SAFETY: each job owns its rows of its point.
         unsafe {
             let out = target.at((point * outputs + first) * count);

@@ -193,19 +193,6 @@ impl Vae {
         }
     }
 
-    /// Scaled latents with the encoder's own noise: mean + deviation * noise,
-    /// for `noise` of the latents' shape. Exact autoencoders ignore it.
-    pub fn encode_sampled(&self, image: &Tensor, noise: &Tensor) -> Result<Tensor> {
-        match self {
-            Self::Kl(vae) => {
-                let moments = vae.encode(image, None)?;
-                let deviation = (moments.log_variance * 0.5)?.exp()?;
-                Ok(((moments.mean + (deviation * noise)?)? * vae.config.scaling_factor)?)
-            }
-            Self::PixelUnshuffle { .. } => self.encode(image, None),
-        }
-    }
-
     /// Images of scaled latents, nominally in [-1, 1].
     pub fn decode(&self, latents: &Tensor) -> Result<Tensor> {
         match self {

@@ -245,3 +245,40 @@ fn a_missing_key_is_placed_at_the_table_that_lacks_it() {
     assert_eq!(at("scene.camera.fov_deg"), "pipeline.toml:5");
     assert_eq!(at("composite.tone"), "pipeline.toml");
 }
+
+#[test]
+fn an_earlier_name_is_answered_with_the_present_one() {
+    let message = |text: &str, set: &[&str]| parse(text, set).unwrap_err().to_string();
+    assert_eq!(
+        message("[optimize]\niterations = 3\n", &[]),
+        "pipeline.toml:1: [optimize] is called [light] now"
+    );
+    assert_eq!(
+        message("\n[optimize]\nlight = false\n", &[]),
+        "pipeline.toml:3: optimize.light is called light.recover_light now"
+    );
+    assert_eq!(
+        message("[light]\n", &["light.tone=false"]),
+        "--set light.tone=false: light.tone is called light.recover_tone now"
+    );
+    assert_eq!(
+        message("", &["optimize.iterations=3"]),
+        "--set optimize.iterations=3: [optimize] is called [light] now"
+    );
+    assert_eq!(renamed("optimize"), Some("light"));
+}
+
+#[cfg(unix)]
+#[test]
+fn a_configuration_that_is_a_device_or_a_folder_is_refused_at_once() {
+    for (path, cause) in [
+        ("/dev/zero", "not a regular file"),
+        ("/", "a folder, not a regular file"),
+    ] {
+        let error = Config::read(Path::new(path), &[]).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            format!("cannot read {path}: {cause}; name another file with --pipeline")
+        );
+    }
+}

@@ -39,7 +39,7 @@ fn a_finished_stage_has_its_files_and_a_manifest_that_verifies() {
     );
     assert_eq!(read.estimated_error, Some(0.25));
     assert_eq!(read.damages(&target).unwrap(), []);
-    assert_eq!(names(out.path()), [".scene.lock", "scene"]);
+    assert_eq!(names(out.path()), ["scene"]);
 }
 
 #[test]
@@ -54,18 +54,138 @@ fn an_unfinished_stage_leaves_the_earlier_result_untouched() {
     }
     assert_eq!(fs::read(target.join(FILE_NAME)).unwrap(), before);
     assert_eq!(fs::read(target.join("images/0000.png")).unwrap(), b"first");
-    assert_eq!(names(out.path()), [".scene.lock", "scene"]);
+    assert_eq!(names(out.path()), ["scene"]);
 }
 
 #[test]
-fn a_rerun_replaces_the_folder_as_a_whole() {
+fn a_rerun_replaces_what_it_wrote_and_keeps_what_others_put_beside_it() {
     let out = tempfile::tempdir().unwrap();
     let target = out.path().join("scene");
     run(&target, "first");
-    fs::write(target.join("stray.txt"), "x").unwrap();
-    run(&target, "second");
+    fs::write(target.join("notes.txt"), "mine").unwrap();
+    fs::write(target.join("images/9.psd"), "mine").unwrap();
+    fs::create_dir_all(target.join("versions/old")).unwrap();
+    fs::write(target.join("versions/old/a.psd"), "mine").unwrap();
+    for content in ["second", "third"] {
+        run(&target, content);
+        let image = fs::read_to_string(target.join("images/0000.png")).unwrap();
+        assert_eq!(image, content);
+        assert_eq!(
+            names(&target),
+            [".dipir", "images", "notes.txt", "stage.json", "versions"]
+        );
+        assert_eq!(names(&target.join("images")), ["0000.png", "9.psd"]);
+        assert!(target.join("versions/old/a.psd").exists());
+        assert_eq!(names(out.path()), ["scene"]);
+    }
+}
+
+#[test]
+fn a_file_of_a_new_output_s_name_is_kept_under_another() {
+    let out = tempfile::tempdir().unwrap();
+    let target = out.path().join("scene");
+    run(&target, "first");
+    fs::write(target.join("a.png"), "mine").unwrap();
+    for _ in 0..2 {
+        let mut writer = StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap();
+        fs::write(writer.output("image", "a.png").unwrap(), "ours").unwrap();
+        writer.finish().unwrap();
+        assert_eq!(
+            names(&target),
+            [".dipir", "a.png", "a.png.kept", "stage.json"]
+        );
+        assert_eq!(fs::read(target.join("a.png.kept")).unwrap(), b"mine");
+    }
+}
+
+#[test]
+fn a_kill_after_the_swap_loses_nothing_of_others() {
+    let out = tempfile::tempdir().unwrap();
+    let (target, partial) = (out.path().join("scene"), out.path().join(".scene.partial"));
+    run(&target, "first");
+    fs::write(target.join("notes.txt"), "mine").unwrap();
+    fs::rename(&target, &partial).unwrap();
+    run(&out.path().join("other"), "second");
+    fs::rename(out.path().join("other"), &target).unwrap();
+    // A process that is asked to stop now must not take it for its own unfinished work.
+    discard(&partial);
+    drop(StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap());
+    assert_eq!(fs::read(target.join("notes.txt")).unwrap(), b"mine");
     assert_eq!(fs::read(target.join("images/0000.png")).unwrap(), b"second");
-    assert_eq!(names(&target), ["images", "stage.json"]);
+    assert_eq!(names(out.path()), ["scene"]);
+}
+
+#[test]
+fn a_folder_with_another_s_stage_json_is_left_alone() {
+    let out = tempfile::tempdir().unwrap();
+    let target = out.path().join("scene");
+    for (name, text) in [
+        ("stage.json", "{\"stage\": \"scene\"}".to_string()),
+        ("stage.json", other_manifest()),
+    ] {
+        fs::create_dir_all(&target).unwrap();
+        fs::write(target.join(name), &text).unwrap();
+        fs::write(target.join("painting.psd"), "years of work").unwrap();
+        let error = StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            format!(
+                "{} is there already and its stage.json is not one that the stage \"scene\" \
+                 wrote, so it is left alone; move it away or choose another folder with --out",
+                target.display()
+            )
+        );
+        assert_eq!(names(&target), ["painting.psd", "stage.json"]);
+        assert_eq!(names(out.path()), ["scene"]);
+    }
+}
+
+/// A manifest of another stage.
+fn other_manifest() -> String {
+    let out = tempfile::tempdir().unwrap();
+    let plan = StagePlan::new("lora", 1, json!({}), 0);
+    let target = out.path().join("lora");
+    let writer = StageWriter::begin(&target, plan, WhenLocked::Refuse).unwrap();
+    writer.finish().unwrap().to_text().unwrap()
+}
+
+#[test]
+fn a_damaged_manifest_of_ours_is_written_anew_and_others_files_stay() {
+    let out = tempfile::tempdir().unwrap();
+    let target = out.path().join("scene");
+    run(&target, "first");
+    fs::write(target.join("notes.txt"), "mine").unwrap();
+    fs::write(target.join(FILE_NAME), "damaged").unwrap();
+    run(&target, "second");
+    assert_eq!(
+        names(&target),
+        [".dipir", "images", "notes.txt", "stage.json"]
+    );
+    // The other way round.
+    fs::write(target.join(".dipir"), "damaged").unwrap();
+    run(&target, "third");
+    assert_eq!(
+        names(&target),
+        [".dipir", "images", "notes.txt", "stage.json"]
+    );
+}
+
+#[cfg(unix)]
+#[test]
+fn links_at_the_names_of_a_stage_s_folders_are_left_alone() {
+    let out = tempfile::tempdir().unwrap();
+    let (target, mine) = (out.path().join("scene"), out.path().join("mine"));
+    run(&mine, "first");
+    for name in ["scene", ".scene.partial", ".scene.previous"] {
+        let link = out.path().join(name);
+        std::os::unix::fs::symlink(&mine, &link).unwrap();
+        let begun = StageWriter::begin(&target, plan(3), WhenLocked::Refuse);
+        assert!(begun.is_err() || name == ".scene.previous", "{name}");
+        drop(begun);
+        assert!(fs::symlink_metadata(&link).unwrap().is_symlink(), "{name}");
+        assert_eq!(names(&mine), [".dipir", "images", "stage.json"]);
+        fs::remove_file(&link).unwrap();
+    }
 }
 
 #[test]
@@ -74,9 +194,29 @@ fn leftovers_of_a_killed_run_are_cleared() {
     let target = out.path().join("scene");
     let partial = out.path().join(".scene.partial");
     fs::create_dir(&partial).unwrap();
-    fs::write(partial.join("stale.png"), "x").unwrap();
-    run(&target, "new");
-    assert_eq!(names(&target), ["images", "stage.json"]);
+    for left in [None, Some(""), Some("stale.png")] {
+        if let Some(name) = left {
+            Mark::new(Kind::Unfinished, "scene", vec![])
+                .make(&partial)
+                .unwrap();
+            fs::write(partial.join(name).with_extension("png"), "x").unwrap();
+        }
+        run(&target, "new");
+        assert_eq!(names(&target), [".dipir", "images", "stage.json"]);
+        assert_eq!(names(out.path()), ["scene"]);
+        fs::create_dir_all(&partial).unwrap();
+    }
+}
+
+#[test]
+fn a_folder_at_the_name_of_the_unfinished_one_that_is_not_ours_is_left_alone() {
+    let out = tempfile::tempdir().unwrap();
+    let target = out.path().join("scene");
+    let partial = out.path().join(".scene.partial");
+    fs::create_dir(&partial).unwrap();
+    fs::write(partial.join("thesis.tex"), "years of work").unwrap();
+    StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap_err();
+    assert_eq!(names(&partial), ["thesis.tex"]);
 }
 
 #[test]

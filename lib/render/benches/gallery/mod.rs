@@ -87,7 +87,7 @@ fn gold(roughness: f32) -> Material {
 
 /// Name and scene, two more kinds, in which a sun is mirrored in places much smaller than a pixel.
 #[allow(dead_code, reason = "not every bench renders them")]
-pub fn glinting(size: u32) -> Vec<(&'static str, Scene)> {
+pub fn with_highlights(size: u32) -> Vec<(&'static str, Scene)> {
     let lacquer = Material {
         clearcoat: coat(1.0, 0.03),
         ..matte(0.3)

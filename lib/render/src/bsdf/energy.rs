@@ -230,10 +230,11 @@ impl LobeEnergy {
         }
     }
 
-    /// Cosine-weighted mean of single scattering with Schlick's Fresnel factor from `f0`.
+    /// Cosine-weighted mean of single scattering with Schlick's Fresnel factor between `f0` and
+    /// `f90`.
     #[inline]
-    pub fn mean_albedo(&self, f0: f32) -> f32 {
-        f0 * (1.0 - self.mean_loss) + (1.0 - f0) * self.mean_e5
+    pub fn mean_albedo(&self, f0: f32, f90: f32) -> f32 {
+        f0 * (1.0 - self.mean_loss) + (f90 - f0) * self.mean_e5
     }
 
     /// The share of lost light that returns after further bounces, each attenuated by the
@@ -241,7 +242,13 @@ impl LobeEnergy {
     /// Turquin 2019]; 1 for `f0 = 1`.
     #[inline]
     pub fn further_fresnel(&self, f0: f32) -> f32 {
-        let mean = f0 + (1.0 - f0) * MEAN_SCHLICK;
+        self.further_fresnel_between(f0, 1.0)
+    }
+
+    /// The same where facets reflect `f90` at grazing incidence instead of everything.
+    #[inline]
+    pub fn further_fresnel_between(&self, f0: f32, f90: f32) -> f32 {
+        let mean = f0 + (f90 - f0) * MEAN_SCHLICK;
         mean * mean * (1.0 - self.mean_loss) / (1.0 - mean * self.mean_loss)
     }
 

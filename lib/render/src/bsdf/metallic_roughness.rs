@@ -14,10 +14,11 @@
 //! interpolation of the energy table, and every lobe is reciprocal.
 use std::f32::consts::FRAC_1_PI;
 
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
 use super::energy::LobeEnergy;
-use super::features::{PLAIN_GGX, SPECULAR, TRANSMISSION, has};
+use super::extended::Interface;
+use super::features::{EXTENSIONS, PLAIN_GGX, SPECULAR, TRANSMISSION, has};
 use super::fresnel::{f0_from_ior, schlick, schlick_weight};
 use super::ggx::Ggx;
 use super::lambert;
@@ -54,6 +55,8 @@ pub(super) struct Base {
     pub transmitted: Transmitted,
     /// Directional albedo of the lobes at `wo`.
     pub albedo: BaseAlbedo,
+    /// What extensions change.
+    pub interface: Interface,
 }
 
 /// How much light each lobe returns towards `wo` from a white sky.
@@ -97,6 +100,10 @@ impl Base {
             return Self::lambertian(wo, diffuse_color);
         }
 
+        if has(F, EXTENSIONS) && glossy {
+            return Self::extended::<F>(surface, wo, diffuse_color, passing);
+        }
+
         let energy = LobeEnergy::new(surface.roughness);
         let ggx = Ggx::new(surface.roughness);
         let f0_dielectric = if glossy {
@@ -119,6 +126,7 @@ impl Base {
             diffuse: diffuse_color * FRAC_1_PI,
             transmitted: Transmitted::default(),
             albedo: BaseAlbedo::default(),
+            interface: Interface::PLAIN,
         };
         if plain {
             base.albedo.specular = f0 * (1.0 - loss);
@@ -173,6 +181,94 @@ impl Base {
                 diffuse: color,
                 ..BaseAlbedo::default()
             },
+            interface: Interface::PLAIN,
+        }
+    }
+
+    /// A base whose interface has extensions; `passing` is the share of light that is transmitted
+    /// instead of diffusely reflected.
+    fn extended<const F: u32>(
+        surface: &SurfacePoint,
+        wo: Vec3,
+        diffuse_color: Vec3,
+        passing: f32,
+    ) -> Self {
+        let interface = Interface::new(surface);
+        let energy = LobeEnergy::new(interface.roughness);
+        let ggx = Ggx::new(interface.roughness);
+        let (f0_dielectric, f90) = interface.dielectric;
+        let (loss, share) = (energy.loss(wo.z), energy.share(wo.z));
+        let broad = loss * energy.inverse_mean_loss() * FRAC_1_PI;
+        let (f0, grazing) = (interface.f0_bound, interface.f90);
+        let further = |c: usize| energy.further_fresnel_between(f0[c], grazing[c]);
+        let further = Vec3::new(further(0), further(1), further(2));
+        let mut base = Self {
+            wo,
+            wo_length: ggx.map_or(wo.z, |g| g.stretched_length(interface.stretched(wo))),
+            ggx,
+            energy,
+            f0,
+            f0_dielectric,
+            f90,
+            further_dielectric: energy.further_fresnel_between(f0_dielectric, f90),
+            further: further * broad,
+            diffuse: Vec3::ZERO,
+            transmitted: Transmitted::default(),
+            albedo: BaseAlbedo {
+                specular: (f0 + (grazing - f0) * share) * (1.0 - loss),
+                further: further * loss,
+                ..BaseAlbedo::default()
+            },
+            interface,
+        };
+        let left = 1.0 - base.dielectric_albedo(loss, share);
+        base.albedo.diffuse = diffuse_color * left;
+        base.diffuse = diffuse_color * (left * lambert::coupling(base.mean_dielectric_albedo()));
+        if has(F, TRANSMISSION) {
+            let color = surface.base_color * ((1.0 - surface.metallic) * passing);
+            let below = 1.0 - base.further_dielectric;
+            base.transmitted = Transmitted {
+                color,
+                further: color * (below * broad),
+            };
+            base.albedo.transmitted =
+                color * ((1.0 - base.dielectric_fresnel(share)) * (1.0 - loss));
+            base.albedo.transmitted_further = color * (below * loss);
+        }
+        base
+    }
+
+    /// Reflectance of a facet at Schlick's `weight` for its `cosine`.
+    #[inline]
+    pub fn fresnel<const F: u32>(&self, weight: f32, cosine: f32) -> Vec3 {
+        match has(F, EXTENSIONS) {
+            true => self.interface.fresnel(weight, cosine),
+            false => schlick(self.f0, weight),
+        }
+    }
+
+    /// A normal of `ggx` that is visible from `wo`.
+    #[inline]
+    pub fn visible_normal<const F: u32>(&self, ggx: &Ggx, u: Vec2) -> Vec3 {
+        if !has(F, EXTENSIONS) {
+            return ggx.sample(self.wo, u);
+        }
+        // Normals of the stretched surface, seen from the stretched direction.
+        let h = ggx.sample(self.interface.stretched(self.wo), u);
+        self.interface.stretched(h).normalize()
+    }
+
+    /// The microfacet that reflects `wo` to `wi`; see [`Facet::new`].
+    #[inline]
+    pub fn facet<const F: u32>(&self, ggx: &Ggx, wi: Vec3, sum: Vec3) -> Facet {
+        if !has(F, EXTENSIONS) {
+            return Facet::new(ggx, wi, sum);
+        }
+        let length = sum.length();
+        Facet {
+            cosine: (0.5 * length).min(1.0),
+            d: self.interface.d(ggx, sum / length),
+            wi_length: ggx.stretched_length(self.interface.stretched(wi)),
         }
     }
 
@@ -191,7 +287,7 @@ impl Base {
 
     /// Cosine-weighted mean of [`Self::dielectric_albedo`].
     pub fn mean_dielectric_albedo(&self) -> f32 {
-        self.energy.mean_albedo(self.f0_dielectric)
+        self.energy.mean_albedo(self.f0_dielectric, self.f90)
             + self.further_dielectric * self.energy.mean_loss
     }
 
@@ -312,14 +408,14 @@ impl Base {
             ..Reflected::default()
         };
         if let Some(ggx) = self.ggx {
-            let facet = Facet::new(&ggx, wi, sum);
+            let facet = self.facet::<F>(&ggx, wi, sum);
             let visibility = match has(F, PLAIN_GGX) {
                 true => Ggx::separable_visibility,
                 false => Ggx::visibility,
             };
             let fresnel = match has(F, PLAIN_GGX) {
                 true => self.f0,
-                false => schlick(self.f0, schlick_weight(facet.cosine)),
+                false => self.fresnel::<F>(schlick_weight(facet.cosine), facet.cosine),
             };
             let v = visibility(self.wo.z, self.wo_length, wi.z, facet.wi_length);
             result.specular = fresnel * (facet.d * v * wi.z);

@@ -7,11 +7,14 @@
 mod clearcoat;
 pub mod energy;
 mod energy_table;
+mod extended;
 pub mod fresnel;
 pub mod ggx;
 mod lambert;
 mod metallic_roughness;
+mod sheen;
 pub mod slopes;
+mod thin_film;
 mod transmission;
 
 #[cfg(test)]
@@ -27,10 +30,11 @@ use dipir_numerics::warp::{Frame, square_to_cosine_hemisphere};
 use glam::{Vec2, Vec3};
 
 use self::clearcoat::Coat;
-use self::features::{CLEARCOAT, PLAIN_GGX, SPECULAR, TRANSMISSION, has};
-use self::fresnel::{schlick, schlick_weight};
+use self::features::{CLEARCOAT, EXTENSIONS, PLAIN_GGX, SPECULAR, TRANSMISSION, has};
+use self::fresnel::schlick_weight;
 use self::ggx::reflect;
 use self::metallic_roughness::Base;
+use self::sheen::Sheen;
 use crate::surface::SurfacePoint;
 
 /// What a kernel simulates: a bit mask that is a const parameter of [`Bsdf`] and of
@@ -51,10 +55,13 @@ pub mod features {
     pub const ALPHA: u32 = 1 << 5;
     /// Emitted radiance.
     pub const EMISSION: u32 = 1 << 6;
+    /// What [`MaterialExtensions`](dipir_scene::material::MaterialExtensions) adds: not a part of
+    /// [`ALL`], but set where a scene's materials have them.
+    pub const EXTENSIONS: u32 = 1 << 7;
     /// For validation alone: separable Smith masking, constant Fresnel factor F0, no
     /// multiple-scattering compensation, an uncoupled Lambertian base.
     pub const PLAIN_GGX: u32 = 1 << 31;
-    /// Everything but the validation switch.
+    /// Everything but extensions and the validation switch.
     pub const ALL: u32 =
         SPECULAR | CLEARCOAT | TRANSMISSION | TEXTURES | NORMAL_MAPPING | ALPHA | EMISSION;
 
@@ -97,9 +104,11 @@ enum Technique {
     Coat,
     /// Further bounces between the coat's facets.
     CoatFurther,
+    /// Uniform: sheen.
+    Sheen,
 }
 
-const TECHNIQUES: [Technique; 7] = [
+const TECHNIQUES: [Technique; 8] = [
     Technique::Diffuse,
     Technique::Specular,
     Technique::Further,
@@ -107,6 +116,7 @@ const TECHNIQUES: [Technique; 7] = [
     Technique::TransmitFurther,
     Technique::Coat,
     Technique::CoatFurther,
+    Technique::Sheen,
 ];
 
 /// The scattering function of one surface point for one `wo`.
@@ -121,19 +131,24 @@ pub struct Bsdf<const F: u32> {
     wo: Vec3,
     base: Base,
     coat: Option<Coat>,
+    /// Between base and coat.
+    sheen: Option<Sheen>,
     albedo: Vec3,
     /// Chance of each of [`TECHNIQUES`]; all 0 where nothing is reflected.
     chances: [f32; TECHNIQUES.len()],
 }
 
-/// Share of the paths through a surface that others reflected by it are at least, whatever light it reflects.
+/// Fewest paths that a transmissive surface reflects, as a share of those that it lets pass.
 const LEAST_REFLECTED: f32 = 0.25;
 
 impl<const F: u32> Bsdf<F> {
     /// Prepares what depends on the unit vector `wo` alone. `wo` lies on the side of
     /// `surface.geometric_normal`.
     pub fn new(surface: &SurfacePoint, wo: Vec3) -> Self {
-        let frame = Frame::from_normal(surface.normal);
+        let frame = match has(F, EXTENSIONS) {
+            true => surface.extension.frame(surface.normal),
+            false => Frame::from_normal(surface.normal),
+        };
         let local = frame.to_local(wo);
         let base = Base::new::<F>(surface, local);
         let coat = match has(F, CLEARCOAT) {
@@ -145,12 +160,24 @@ impl<const F: u32> Bsdf<F> {
             None => (1.0, [0.0; 2]),
         };
         let a = &base.albedo;
-        let below_coat = a.diffuse + a.specular + a.further + a.transmitted + a.transmitted_further;
-        let mut albedo = below_coat * below + Vec3::splat(coat_albedo[0] + coat_albedo[1]);
+        let mut below_coat =
+            a.diffuse + a.specular + a.further + a.transmitted + a.transmitted_further;
+        let sheen = match has(F, EXTENSIONS) {
+            true => Sheen::new(surface, base.wo.z),
+            false => None,
+        };
+        let (mut sheen_chance, mut base_share) = (0.0, 1.0);
         let grey = |c: Vec3| c.element_sum() * (1.0 / 3.0);
+        if let Some(sheen) = &sheen {
+            base_share = sheen.passing_o;
+            below_coat = below_coat * base_share + sheen.albedo();
+            sheen_chance = grey(sheen.albedo()) * below;
+        }
+        let mut albedo = below_coat * below + Vec3::splat(coat_albedo[0] + coat_albedo[1]);
         // A black metal seen from above reflects nothing there, but something elsewhere.
         let least = if has(F, SPECULAR) { 1e-3 } else { 0.0 };
-        // The little that glass reflects may be a sun, seen by way of a second reflection: few paths would look for it.
+        // Glass reflects little, but that may be the sun by way of a second reflection: too few paths
+        // would find it.
         let least = match grey(a.specular) > 0.0 {
             true => f32::max(least, LEAST_REFLECTED * grey(a.transmitted)),
             false => least,
@@ -163,7 +190,11 @@ impl<const F: u32> Bsdf<F> {
             grey(a.transmitted_further) * below,
             coat_albedo[0],
             coat_albedo[1],
+            sheen_chance,
         ];
+        if sheen.is_some() {
+            chances[..5].iter_mut().for_each(|c| *c *= base_share);
+        }
         let sum: f32 = chances.iter().sum();
         let unseen = has(F, PLAIN_GGX) && local.z <= 0.0;
         let scale = if sum > 0.0 && !unseen { 1.0 / sum } else { 0.0 };
@@ -179,6 +210,7 @@ impl<const F: u32> Bsdf<F> {
             wo,
             base,
             coat,
+            sheen,
             albedo,
             chances,
         }
@@ -196,8 +228,9 @@ impl<const F: u32> Bsdf<F> {
     pub fn is_delta(&self) -> bool {
         let smooth_base = self.base.ggx.is_none();
         let smooth_coat = self.coat.as_ref().is_none_or(|c| c.ggx.is_none());
-        let [diffuse, specular, _, transmit, _, coat, _] = self.chances;
+        let [diffuse, specular, _, transmit, _, coat, _, sheen] = self.chances;
         diffuse == 0.0
+            && sheen == 0.0
             && (smooth_base || (specular == 0.0 && transmit == 0.0))
             && (smooth_coat || coat == 0.0)
     }
@@ -227,6 +260,7 @@ impl<const F: u32> Bsdf<F> {
             transmit_further,
             coat,
             coat_further,
+            sheen,
         ] = self.chances;
         let (mut value, mut pdf) = (Vec3::ZERO, 0.0);
         // Added in world space: see `Facet::new`.
@@ -238,7 +272,14 @@ impl<const F: u32> Bsdf<F> {
             let coat_at = self.coat_at(wi);
             if local.z > 0.0 && diffuse + specular > 0.0 {
                 let sum = half(&self.frame, self.base.wo.z + local.z);
-                let r = self.base.reflected::<F>(local, sum);
+                let mut r = self.base.reflected::<F>(local, sum);
+                if has(F, EXTENSIONS)
+                    && let Some(fibres) = &self.sheen
+                {
+                    let over = fibres.over(local.z);
+                    r.diffuse *= over;
+                    r.specular = r.specular * over + fibres.value(local.z, sum);
+                }
                 value = match &coat_at {
                     Some((c, _, p)) => {
                         r.specular * c.over_specular(*p) + r.diffuse * c.over_diffuse(*p)
@@ -246,6 +287,9 @@ impl<const F: u32> Bsdf<F> {
                     None => r.specular + r.diffuse,
                 };
                 pdf = diffuse * r.cosine_pdf + specular * r.specular_pdf + further * r.further_pdf;
+                if has(F, EXTENSIONS) {
+                    pdf += sheen * Sheen::PDF;
+                }
             }
             if let Some((c, wi, _)) = coat_at
                 && wi.z > 0.0
@@ -256,7 +300,12 @@ impl<const F: u32> Bsdf<F> {
             }
         } else if has(F, TRANSMISSION) && transmit > 0.0 && local.z < 0.0 && side < 0.0 {
             let sum = half(&self.frame, self.base.wo.z - local.z);
-            let (transmitted, visible_pdf) = self.base.transmitted(local, sum);
+            let (mut transmitted, visible_pdf) = self.base.transmitted::<F>(local, sum);
+            if has(F, EXTENSIONS)
+                && let Some(fibres) = &self.sheen
+            {
+                transmitted *= fibres.over(-local.z);
+            }
             let passing = self.coat_at(wi).map_or(1.0, |(c, _, p)| c.over_specular(p));
             value = transmitted * passing;
             pdf =
@@ -294,7 +343,7 @@ impl<const F: u32> Bsdf<F> {
                 let Some(ggx) = &self.base.ggx else {
                     return self.sample_delta(technique);
                 };
-                let (wi, _) = reflect(wo, ggx.sample(wo, u));
+                let (wi, _) = reflect(wo, self.base.visible_normal::<F>(ggx, u));
                 if wi.z <= 0.0 {
                     return None;
                 }
@@ -304,6 +353,7 @@ impl<const F: u32> Bsdf<F> {
                 }
             }
             Technique::Coat | Technique::CoatFurther => return self.sample_coat(technique, u),
+            Technique::Sheen => Sheen::sample(u),
         };
         self.weigh(self.frame.to_world(local))
     }
@@ -361,7 +411,7 @@ impl<const F: u32> Bsdf<F> {
             Technique::Specular => {
                 let f = match has(F, PLAIN_GGX) {
                     true => base.f0,
-                    false => schlick(base.f0, fresnel),
+                    false => base.fresnel::<F>(fresnel, base.wo.z),
                 };
                 (self.frame.to_world(mirrored(base.wo)), f, self.chances[1])
             }
@@ -381,13 +431,19 @@ impl<const F: u32> Bsdf<F> {
         if transmitted != (side < 0.0) {
             return None;
         }
+        let over_base = match (&self.sheen, technique) {
+            (Some(fibres), Technique::Specular | Technique::Transmit) if has(F, EXTENSIONS) => {
+                fibres.passing_o
+            }
+            _ => 1.0,
+        };
         let attenuation = match (technique, self.coat_at(wi)) {
             (Technique::Specular | Technique::Transmit, Some((c, _, p))) => c.over_specular(p),
             _ => 1.0,
         };
         Some(BsdfSample {
             wi,
-            weight: value * (attenuation / chance),
+            weight: value * (over_base * attenuation / chance),
             pdf: f32::INFINITY,
             delta: true,
             transmitted,

@@ -25,12 +25,12 @@ impl Base {
     /// Value (cosine included) and density of sampling visible normals, for `wi` below the
     /// surface; delta lobes left out. `sum` is `wo` plus the mirrored `wi`.
     #[inline]
-    pub fn transmitted(&self, wi: Vec3, sum: Vec3) -> (Vec3, f32) {
+    pub fn transmitted<const F: u32>(&self, wi: Vec3, sum: Vec3) -> (Vec3, f32) {
         let mirrored = Vec3::new(wi.x, wi.y, -wi.z);
         let mut value = self.transmitted.further * (self.energy.loss(mirrored.z) * mirrored.z);
         let mut pdf = 0.0;
         if let Some(ggx) = self.ggx {
-            let facet = Facet::new(&ggx, mirrored, sum);
+            let facet = self.facet::<F>(&ggx, mirrored, sum);
             let v = Ggx::visibility(self.wo.z, self.wo_length, mirrored.z, facet.wi_length);
             let passing = 1.0 - self.dielectric_fresnel(schlick_weight(facet.cosine));
             value += self.transmitted.color * (passing * facet.d * v * mirrored.z);

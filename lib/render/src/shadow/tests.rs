@@ -65,7 +65,7 @@ fn compare(
     for y in 0..n {
         for x in 0..n {
             let found = f64::from(r.film.shadow.get(x, y).x);
-            let se = f64::from(r.film.shadow_variance.get(x, y).x).sqrt();
+            let se = f64::from(r.film.shadow_variance(x, y).x).sqrt();
             let wanted = over_pixel(view, x, y, &expected);
             assert!(
                 (found - wanted).abs() < geometric + noise,

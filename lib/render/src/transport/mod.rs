@@ -28,11 +28,12 @@ mod file;
 mod record;
 mod replay;
 mod rows;
+mod settings;
 #[cfg(test)]
 mod tests;
 mod unit_light;
 
-pub use record::RecordSettings;
+pub use settings::RecordSettings;
 
 use crate::shadow::LightOnProxy;
 

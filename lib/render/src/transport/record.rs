@@ -1,10 +1,9 @@
 //! Recording: the renderer's own loops, with rows of weights in the place of pixel sums.
 use std::ops::ControlFlow;
 
-use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_imaging::raster::Raster;
 use dipir_light::cosine::{CosineCells, CosineWeightedMap};
-use dipir_light::environment::{EnvironmentMap, EnvironmentSampler, solid_angle, texel_of};
-use dipir_light::luminance::{luminance, luminance_f64};
+use dipir_light::environment::{EnvironmentMap, EnvironmentSampler, texel_of};
 use dipir_light::plane::PlaneLight;
 use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::{Sampler, Stream};
@@ -12,6 +11,7 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
 use super::rows::{Entry, Part, RowBuilder, Rows};
+use super::settings::{LEAST_UNIFORM_SHARE, RecordSettings};
 use super::unit_light::{UnitLight, UnitOnPlane};
 use super::{Header, Precision, RowSet, Sent, Shadow, ShadowKind, Transport, Weights};
 use crate::blocker::Blocker;
@@ -21,117 +21,9 @@ use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
 use crate::footprint::Footprint;
 use crate::foreground::{Gather, PathContext, PathStart};
 use crate::photo::Photo;
-use crate::render::{ROULETTE_DEPTH, Renderer, Simulation};
+use crate::render::{ROULETTE_DEPTH, Renderer, pixels_of};
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowGather};
 use crate::world::{ProxyGeometry, World};
-
-/// How transport is recorded.
-#[derive(Clone, Debug)]
-pub struct RecordSettings<'a> {
-    /// Columns and rows of the environments that the record takes.
-    pub environment: [usize; 2],
-    /// Paths per pixel of the object; powers of two are stratified best.
-    pub samples: u32,
-    /// Samples per pixel of the shadow.
-    pub shadow_samples: u32,
-    /// How weights are stored.
-    pub precision: Precision,
-    /// Seed of all random numbers.
-    pub seed: u64,
-    /// A light like those that the record will be replayed under, of any size.
-    pub light: Option<&'a EnvironmentMap>,
-    /// Share of a plane's shadow samples that are uniform over the sphere, in (0, 1]; the others
-    /// follow `light`. 1 without a light.
-    pub uniform_share: f32,
-    /// Which phenomena are simulated.
-    pub simulation: Simulation,
-    /// The photograph, linear, of the camera's size: what the proxy looks like from the object.
-    pub background: Option<&'a LinearImage>,
-    /// 1 where the photograph's own foreground hides the object, 0 where it does not.
-    pub occluders: Option<&'a Raster<f32>>,
-    /// What the caller knows the scene by; kept in the file.
-    pub scene_hash: String,
-}
-
-impl RecordSettings<'_> {
-    /// Settings for a first record, before anything is known of the light.
-    pub fn new(simulation: Simulation) -> Self {
-        Self {
-            // 2.8 degrees a texel: the lobes that guidance can recover are wider.
-            environment: [128, 64],
-            samples: 128,
-            shadow_samples: 128,
-            precision: Precision::Half,
-            seed: 0,
-            light: None,
-            // With a light, half of the samples keep an eye on where it may go.
-            uniform_share: 0.5,
-            simulation,
-            background: None,
-            occluders: None,
-            scene_hash: String::new(),
-        }
-    }
-
-    fn texels(&self) -> usize {
-        self.environment[0] * self.environment[1]
-    }
-
-    /// `light` on the record's grid; black if there is none.
-    fn light_here(&self) -> EnvironmentMap {
-        let [width, height] = self.environment;
-        match self.light {
-            Some(map) => map.resampled(width, height),
-            None => EnvironmentMap::constant(width, height, Vec3::ZERO),
-        }
-    }
-
-    /// Density per steradian of the light samples of paths, by texel: in proportion to what is
-    /// brighter than the mean. The rest is dim and wide, and BSDF sampling finds it better.
-    fn bright_density(&self, light: &EnvironmentMap) -> Vec<f32> {
-        let mean = luminance_f64(light.integral()) / SPHERE;
-        let excess = |t: &Vec3| {
-            let excess = f64::from(luminance(*t)) - mean;
-            if excess > LEAST_EXCESS * mean {
-                excess
-            } else {
-                0.0
-            }
-        };
-        let [width, height] = self.environment;
-        let texels = light.texels().iter().enumerate();
-        let total: f64 = texels
-            .map(|(k, t)| excess(t) * solid_angle(width, height, k / width))
-            .sum();
-        let scale = if total > 0.0 { 1.0 / total } else { 0.0 };
-        light
-            .texels()
-            .iter()
-            .map(|t| (excess(t) * scale) as f32)
-            .collect()
-    }
-
-    /// Density per steradian, up to a factor, before the cosine and the cone, of light samples
-    /// of a plane: a mixture of `light` and uniform, because nothing else would look elsewhere.
-    fn plane_density(&self, light: &EnvironmentMap) -> Vec<f32> {
-        let total = luminance_f64(light.integral());
-        if total <= 0.0 {
-            return vec![1.0; self.texels()];
-        }
-        let uniform = f64::from(self.uniform_share.clamp(LEAST_UNIFORM_SHARE, 1.0));
-        let density =
-            |t: &Vec3| uniform + (1.0 - uniform) * SPHERE * f64::from(luminance(*t)) / total;
-        light.texels().iter().map(|t| density(t) as f32).collect()
-    }
-}
-
-const SPHERE: f64 = 4.0 * std::f64::consts::PI;
-
-/// Luminance above the mean by less than this share counts as the mean itself: rounding.
-const LEAST_EXCESS: f64 = 1e-3;
-
-/// The record of a shadow must be able to see light wherever it appears.
-const LEAST_UNIFORM_SHARE: f32 = 0.01;
 
 fn grey_map([width, height]: [usize; 2], values: &[f32]) -> Result<EnvironmentMap, RenderError> {
     let texels = values.iter().map(|&v| Vec3::splat(v)).collect();
@@ -633,9 +525,4 @@ impl Recorder<'_> {
             out.emitted.push((pixel, found.local * scale));
         }
     }
-}
-
-fn pixels_of(block: Block) -> impl Iterator<Item = (u32, u32)> {
-    (block.y..block.y + block.height)
-        .flat_map(move |y| (block.x..block.x + block.width).map(move |x| (x, y)))
 }

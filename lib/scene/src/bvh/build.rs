@@ -1,15 +1,14 @@
 //! From boxes of triangles to nodes of eight children.
 //!
-//! obvhs makes a binary hierarchy (parallel locally-ordered clustering, improved by
-//! reinsertion). It is cut into nodes of at most eight children and packs of at most eight
-//! triangles at the least expected cost of a random ray, by dynamic programming [Ylitie,
-//! Karras, Laine 2017, section 3.1].
-use glam::Vec3;
-use obvhs::aabb::Aabb;
-use obvhs::bvh2::Bvh2;
-use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
-use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
+//! A binary hierarchy, improved by the reinsertion of obvhs, is cut into nodes of at most eight
+//! children and packs of at most eight triangles at the least expected cost of a random ray, by
+//! dynamic programming [Ylitie, Karras, Laine 2017, section 3.1].
+use std::cmp::Ordering;
 
+use glam::Vec3;
+use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
+
+use super::cluster::{cluster, order};
 use super::lanes::LANES;
 use super::node::{ChildRef, Node, PackBuilder};
 use super::traverse::{MAX_DEPTH, Tree};
@@ -59,8 +58,13 @@ impl Binary {
     }
 }
 
-/// Builds the tree over `triangles`, whose mesh indices are `ids`.
-pub fn build(triangles: &[[Vec3; 3]], ids: &[u32]) -> Tree {
+/// Builds the tree over `triangles`, whose mesh indices are `ids`. Of those that `compare`, given
+/// two indices into `triangles`, calls equal, only the first is kept.
+pub fn build(
+    triangles: &[[Vec3; 3]],
+    ids: &[u32],
+    compare: impl Fn(u32, u32) -> Ordering + Sync,
+) -> Tree {
     let mut tree = Tree {
         nodes: Vec::new(),
         packs: Vec::new(),
@@ -70,7 +74,7 @@ pub fn build(triangles: &[[Vec3; 3]], ids: &[u32]) -> Tree {
     if triangles.is_empty() {
         return tree;
     }
-    let binary = cluster(triangles);
+    let binary = binary(triangles, compare);
     let costs = Costs::new(&binary, triangles);
     let mut emitter = Emitter {
         binary: &binary,
@@ -84,41 +88,25 @@ pub fn build(triangles: &[[Vec3; 3]], ids: &[u32]) -> Tree {
     tree
 }
 
-fn cluster(triangles: &[[Vec3; 3]]) -> Binary {
-    let boxes: Vec<Aabb> = triangles
-        .iter()
-        .map(|[a, b, c]| {
-            let (min, max) = (a.min(*b).min(*c), a.max(*b).max(*c));
-            // By way of arrays: obvhs may use another version of glam.
-            Aabb::new(min.to_array().into(), max.to_array().into())
-        })
-        .collect();
-    let mut tree: Bvh2 = PlocBuilder::with_capacity(boxes.len()).build(
-        PlocSearchDistance::Medium,
-        &boxes,
-        (0..boxes.len() as u32).collect(),
-        SortPrecision::U64,
-        3,
-    );
+fn binary(triangles: &[[Vec3; 3]], compare: impl Fn(u32, u32) -> Ordering + Sync) -> Binary {
+    let (mut tree, _) = cluster(triangles, &order(triangles, compare));
     ReinsertionOptimizer::default().run(&mut tree, REINSERTION, None);
+    let corner = |p: [f32; 3]| Vec3::from_array(p);
     Binary {
         boxes: tree
             .nodes
             .iter()
             .map(|n| {
                 let b = n.aabb();
-                [Vec3::from(b.min.to_array()), Vec3::from(b.max.to_array())]
+                [corner(b.min.to_array()), corner(b.max.to_array())]
             })
             .collect(),
         links: tree
             .nodes
             .iter()
-            .map(|n| {
-                if n.is_leaf() {
-                    tree.primitive_indices[n.first_index as usize] | Binary::LEAF
-                } else {
-                    n.first_index
-                }
+            .map(|n| match n.is_leaf() {
+                true => n.first_index | Binary::LEAF,
+                false => n.first_index,
             })
             .collect(),
     }

@@ -1,5 +1,7 @@
 use std::f32::consts::TAU;
 
+use glam::Vec2;
+
 use super::*;
 use crate::ray_offset::spawn_origin;
 
@@ -331,20 +333,70 @@ fn triangles_without_area_are_not_hit_and_hide_nothing() {
 }
 
 #[test]
-fn ten_thousand_copies_of_a_triangle_are_one_to_a_ray() {
-    let m = mesh(vec![Vec3::ZERO, Vec3::X, Vec3::Y], vec![[0, 1, 2]; 10_000]);
-    let bvh = Bvh::build(&m);
+fn a_ray_is_asked_once_about_ten_thousand_copies_of_a_triangle() {
+    let mut m = mesh(vec![Vec3::ZERO, Vec3::X, Vec3::Y], vec![[0, 1, 2]; 10_000]);
+    // The same corners in another order, from a vertex of their own.
+    m.positions.push(Vec3::new(-0.0, 0.0, 0.0));
+    m.indices[9_000] = [2, 3, 1];
     let ray = Ray {
         origin: Vec3::new(0.25, 0.25, 1.0),
         direction: Vec3::NEG_Z,
     };
-    assert_eq!(bvh.closest(&ray, f32::INFINITY, any).unwrap().t, 1.0);
-    // Each copy is there: with all but one rejected, that one is hit.
-    let hit = bvh
-        .closest(&ray, f32::INFINITY, |t, _, _| t == 7777)
-        .unwrap();
-    assert_eq!(hit.triangle, 7777);
-    assert!(bvh.occluded(&ray, 1.0, |t, _, _| t == 1234));
+    let asked = |m: &TriangleMesh| {
+        let count = std::cell::Cell::new(0);
+        let hit = Bvh::build(m).closest(&ray, f32::INFINITY, |_, _, _| {
+            count.set(count.get() + 1);
+            true
+        });
+        assert_eq!(hit.unwrap().t, 1.0);
+        count.get()
+    };
+    assert_eq!(asked(&m), 1);
+    // What a ray can tell apart is kept: a back, another material.
+    m.indices[5_000] = [0, 2, 1];
+    m.materials = vec![0; 10_000];
+    m.materials[7_777] = 1;
+    assert_eq!(asked(&m), 3);
+    let bvh = Bvh::build(&m);
+    for kept in [5_000, 7_777] {
+        assert!(bvh.occluded(&ray, 1.0, |t, _, _| t == kept));
+    }
+}
+
+#[test]
+fn triangles_that_share_a_centre_make_a_tree_of_bounded_depth_and_size() {
+    // Nested and slightly turned, so that no two are equal.
+    let mut m = mesh(Vec::new(), Vec::new());
+    for i in 0..30_000u32 {
+        let (s, c) = (i as f32 * 1e-4).sin_cos();
+        let size = 1.0 + i as f32 * 1e-3;
+        for corner in [
+            Vec2::new(-1.0, -1.0),
+            Vec2::new(1.0, 0.0),
+            Vec2::new(0.0, 1.0),
+        ] {
+            let p = Vec2::new(c, s).rotate(corner) * size;
+            m.positions.push(p.extend(0.0));
+        }
+        m.indices.push([3 * i, 3 * i + 1, 3 * i + 2]);
+    }
+    let tree = Bvh::build(&m).tree;
+    let (mut deepest, mut held) = (0, 0);
+    let mut stack = vec![(tree.root, 1)];
+    while let Some((child, level)) = stack.pop() {
+        deepest = deepest.max(level);
+        if child.is_pack() {
+            let ids = tree.triangles[child.index()];
+            held += ids.iter().filter(|id| **id != u32::MAX).count();
+        } else {
+            let children = tree.nodes[child.index()].half_areas();
+            stack.extend(children.map(|(_, c)| (c, level + 1)));
+        }
+    }
+    assert_eq!(held, 30_000);
+    assert!(deepest <= traverse::MAX_DEPTH, "{deepest}");
+    // A node has two children or more, a pack a triangle or more.
+    assert!(tree.packs.len() <= 30_000 && tree.nodes.len() < tree.packs.len());
 }
 
 #[test]

@@ -1,23 +1,49 @@
 //! Typed arrays out of a glTF document's buffers: bounds checked once an accessor, then decoded
 //! without a branch an element.
 use std::borrow::Cow;
+use std::cell::OnceCell;
 
 use gltf::json::accessor::{ComponentType, GenericComponentType, IndexComponentType, Type};
 use gltf::json::validation::Checked;
 use gltf::json::{Accessor, Index, buffer};
+use serde::Deserialize;
 
-use super::document::Document;
+use super::Limits;
+use super::document::{Document, raw_extension};
+use super::meshopt;
 use crate::error::Error;
 
 const EXPORT: &str = "export the file again";
+
+/// So many zeros are no burden, whatever the file.
+const FEW_ZEROS: u64 = 1 << 16;
 
 /// The buffers of a document.
 pub(super) struct Buffers<'a> {
     document: &'a Document<'a>,
     /// `None`: not to be had; an error once it is needed.
     bytes: Vec<Option<Cow<'a, [u8]>>>,
-    /// Most elements that an accessor may have.
+    /// The views that are compressed, by index, once they were needed.
+    decoded: Vec<OnceCell<Vec<u8>>>,
+    /// Most elements that an accessor may have: no honest one has more than three indices or
+    /// vertices a triangle.
     max_count: u64,
+}
+
+const MESHOPT: &str = "EXT_meshopt_compression";
+
+/// That extension of a buffer view.
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Compressed {
+    buffer: u32,
+    #[serde(default)]
+    byte_offset: u64,
+    byte_length: u64,
+    byte_stride: usize,
+    count: u64,
+    mode: String,
+    filter: Option<String>,
 }
 
 /// A checked run of elements: `bytes[i * stride..][..size]` is element `i`.
@@ -39,12 +65,13 @@ impl<'a> Buffers<'a> {
     pub fn new(
         document: &'a Document<'a>,
         bytes: Vec<Option<Cow<'a, [u8]>>>,
-        max_count: u64,
+        limits: &Limits,
     ) -> Self {
         Self {
             document,
             bytes,
-            max_count,
+            decoded: vec![OnceCell::new(); document.buffer_views.len()],
+            max_count: limits.vertices(),
         }
     }
 
@@ -62,16 +89,38 @@ impl<'a> Buffers<'a> {
         let views = &self.document.buffer_views;
         let view = get(views, index.value(), place, "buffer views")?;
         let at = format!("bufferViews[{index}]");
-        let owner = view.buffer.value();
+        let stride = view.byte_stride.map(|stride| stride.0);
+        let extension = match &view.extensions {
+            Some(e) => raw_extension::<Compressed>(&e.others, MESHOPT, &at)?,
+            None => None,
+        };
+        let Some(compressed) = extension else {
+            let owner = view.buffer.value();
+            let (offset, length) = (view.byte_offset.unwrap_or_default().0, view.byte_length.0);
+            return Ok((self.part(owner, offset, length, &at)?, stride));
+        };
+        let cell = &self.decoded[index.value()];
+        if cell.get().is_none() {
+            // Nobody else can have set it in the meantime.
+            let _ = cell.set(self.decompress(&compressed, &at)?);
+        }
+        let bytes = cell.get().map_or(&[][..], Vec::as_slice);
+        let attributes = compressed.mode == "ATTRIBUTES";
+        Ok((
+            bytes,
+            stride.or(attributes.then_some(compressed.byte_stride)),
+        ))
+    }
+
+    /// A range of a buffer; `at` is who wants it.
+    fn part(&self, owner: usize, offset: u64, length: u64, at: &str) -> Result<&[u8], Error> {
         let buffers = &self.document.buffers;
         get(buffers, owner, &format!("{at}.buffer"), "buffers")?;
         let buffer = self.bytes[owner].as_deref().ok_or_else(|| {
             Error::malformed(format!("buffers[{owner}] has no data in the file"), EXPORT)
         })?;
-        let (offset, length) = (view.byte_offset.unwrap_or_default().0, view.byte_length.0);
         let end = offset.checked_add(length);
         end.and_then(|end| buffer.get(offset as usize..usize::try_from(end).ok()?))
-            .map(|bytes| (bytes, view.byte_stride.map(|stride| stride.0)))
             .ok_or_else(|| {
                 Error::malformed(
                     format!(
@@ -81,6 +130,25 @@ impl<'a> Buffers<'a> {
                     EXPORT,
                 )
             })
+    }
+
+    fn decompress(&self, view: &Compressed, at: &str) -> Result<Vec<u8>, Error> {
+        let at = format!("{at}.extensions.{MESHOPT}");
+        self.bounded(view.count, &at)?;
+        let stream = meshopt::Stream {
+            bytes: self.part(
+                view.buffer as usize,
+                view.byte_offset,
+                view.byte_length,
+                &at,
+            )?,
+            mode: &view.mode,
+            filter: view.filter.as_deref().unwrap_or("NONE"),
+            count: view.count as usize,
+            stride: view.byte_stride,
+        };
+        meshopt::decode(&stream)
+            .map_err(|what| Error::malformed(format!("{at} has {what}"), EXPORT))
     }
 
     fn run(
@@ -157,10 +225,27 @@ impl<'a> Buffers<'a> {
         if count > self.max_count {
             return Err(Error::TooLarge {
                 what: format!("{what} has {count} elements"),
+                key: "scene.limits.triangles, of which a triangle has three",
                 limit: self.max_count,
             });
         }
         Ok(())
+    }
+
+    /// Refuses zeros without bytes behind them, unless there are no more than a few or than the file
+    /// has bytes: a file of a kilobyte shall not take gigabytes.
+    fn bounded_zeros(&self, count: u64, what: &str) -> Result<(), Error> {
+        let lengths = self.bytes.iter().flatten().map(|b| b.len() as u64);
+        let bytes: u64 = lengths.sum();
+        if count <= bytes.max(FEW_ZEROS) {
+            return Ok(());
+        }
+        Err(Error::malformed(
+            format!(
+                "{what} has {count} elements but no bufferView, and the file only {bytes} bytes"
+            ),
+            EXPORT,
+        ))
     }
 
     /// Every element as `N` floats through `map`. Integers become `[0, 1]` or `[-1, 1]` where the
@@ -201,7 +286,10 @@ impl<'a> Buffers<'a> {
                 normalize,
                 &map,
             ),
-            None => (0..accessor.count.0).map(|_| map([0.0; N])).collect(),
+            None => {
+                self.bounded_zeros(accessor.count.0, &what)?;
+                (0..accessor.count.0).map(|_| map([0.0; N])).collect()
+            }
         };
         if let Some(sparse) = &accessor.sparse {
             let targets = self.sparse_targets(index, accessor)?;
@@ -291,7 +379,10 @@ impl<'a> Buffers<'a> {
                 )?;
                 decode_unsigned(run, component, &what)?
             }
-            None => vec![0; accessor.count.0 as usize],
+            None => {
+                self.bounded_zeros(accessor.count.0, &what)?;
+                vec![0; accessor.count.0 as usize]
+            }
         };
         if let Some(sparse) = &accessor.sparse {
             let targets = self.sparse_targets(index, accessor)?;

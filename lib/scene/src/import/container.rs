@@ -2,10 +2,12 @@
 use std::borrow::Cow;
 use std::cell::RefCell;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
 use crate::error::Error;
+use crate::limits::Limits;
+use crate::printable::printable;
 use crate::texture::ImageSource;
 
 /// Finds the files that a document refers to.
@@ -16,7 +18,7 @@ pub trait Resolver {
     /// The image that `uri` names, not decoded; it must exist.
     fn image(&self, uri: &str) -> io::Result<ImageSource> {
         Ok(ImageSource::Bytes {
-            name: format!("\"{uri}\""),
+            name: format!("\"{}\"", printable(uri)),
             bytes: Arc::from(self.read(uri)?),
         })
     }
@@ -39,14 +41,17 @@ impl Resolver for NoFiles {
 #[derive(Debug)]
 pub struct Folder {
     path: PathBuf,
+    limits: Limits,
     used: RefCell<Vec<PathBuf>>,
 }
 
 impl Folder {
-    /// Files are found relative to `path`.
-    pub fn new(path: impl Into<PathBuf>) -> Self {
+    /// Files are found relative to `path`; `limits` says how large they may be and whether they may
+    /// lie outside.
+    pub fn new(path: impl Into<PathBuf>, limits: &Limits) -> Self {
         Self {
             path: path.into(),
+            limits: *limits,
             used: RefCell::default(),
         }
     }
@@ -64,14 +69,24 @@ impl Folder {
             ));
         }
         // Some exporters forget to encode: the name as it stands is the second guess.
-        let decoded = self.path.join(percent_decoded(uri));
-        let literal = self.path.join(uri);
+        let decoded = percent_decoded(uri);
+        if !self.limits.allow_outside && (leaves_folder(&decoded) || leaves_folder(uri)) {
+            return Err(io::Error::new(
+                io::ErrorKind::PermissionDenied,
+                "it lies outside of the object's folder; copy it into that, or set scene.limits.allow_outside = true",
+            ));
+        }
+        let (decoded, literal) = (self.path.join(decoded), self.path.join(uri));
         let found = if decoded.is_file() || !literal.is_file() {
             decoded
         } else {
             literal
         };
-        std::fs::metadata(&found)?;
+        // Opened to refuse now what is no regular file, though it be read later.
+        let bytes = dipir_files::open(&found)?.metadata()?.len();
+        self.limits
+            .check_bytes(bytes)
+            .map_err(|e| io::Error::new(io::ErrorKind::FileTooLarge, e.to_string()))?;
         let mut used = self.used.borrow_mut();
         if !used.contains(&found) {
             used.push(found.clone());
@@ -80,9 +95,23 @@ impl Folder {
     }
 }
 
+/// Whether a relative path climbs out of the folder that it starts from.
+fn leaves_folder(path: &str) -> bool {
+    let mut depth = 0i64;
+    Path::new(path).components().any(|part| {
+        match part {
+            Component::Prefix(_) | Component::RootDir => depth = i64::MIN,
+            Component::ParentDir => depth -= 1,
+            Component::Normal(_) => depth += 1,
+            Component::CurDir => {}
+        }
+        depth < 0
+    })
+}
+
 impl Resolver for Folder {
     fn read(&self, uri: &str) -> io::Result<Vec<u8>> {
-        std::fs::read(self.find(uri)?)
+        dipir_files::read(self.find(uri)?)
     }
 
     fn image(&self, uri: &str) -> io::Result<ImageSource> {
@@ -191,6 +220,24 @@ pub(super) fn split(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), Error> {
     }
 }
 
+/// Whether a JSON document is glTF 1.0, in which what are lists now were maps.
+pub(super) fn is_gltf_1(json: &[u8]) -> bool {
+    let document: serde_json::Value = serde_json::from_slice(json).unwrap_or_default();
+    let version = document.pointer("/asset/version");
+    match version.and_then(|v| v.as_str().map(str::to_owned).or(Some(v.to_string()))) {
+        Some(version) => version.starts_with('1'),
+        None => document["meshes"].is_object() || document["buffers"].is_object(),
+    }
+}
+
+/// The refusal of glTF 1.
+pub(super) fn old_version(version: &str) -> Error {
+    Error::malformed(
+        format!("the file is glTF {version}, which is not read"),
+        "convert it to glTF 2.0: gltf-pipeline -i OLD.gltf -o NEW.glb",
+    )
+}
+
 /// The bytes that a GLB header announces; the reader takes more for chunks and subtracts the
 /// header's size unchecked.
 fn whole(bytes: &[u8]) -> Result<&[u8], Error> {
@@ -200,6 +247,9 @@ fn whole(bytes: &[u8]) -> Result<&[u8], Error> {
             COPY,
         ));
     };
+    if version == 1 {
+        return Err(old_version("1.0"));
+    }
     if version != 2 {
         return Err(Error::malformed(
             format!("the GLB header says version {version}; accepted: 2"),

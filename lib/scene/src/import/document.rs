@@ -67,6 +67,93 @@ pub(super) struct Clearcoat {
     pub clearcoat_normal_texture: Option<model::material::NormalTexture>,
 }
 
+/// `KHR_materials_specular` of a material.
+#[derive(Debug, Deserialize)]
+#[serde(default, rename_all = "camelCase")]
+pub(super) struct Specular {
+    pub specular_factor: f32,
+    pub specular_texture: Option<model::texture::Info>,
+    pub specular_color_factor: [f32; 3],
+    pub specular_color_texture: Option<model::texture::Info>,
+}
+
+impl Default for Specular {
+    fn default() -> Self {
+        Self {
+            specular_factor: 1.0,
+            specular_texture: None,
+            specular_color_factor: [1.0; 3],
+            specular_color_texture: None,
+        }
+    }
+}
+
+/// `KHR_materials_sheen` of a material.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default, rename_all = "camelCase")]
+pub(super) struct Sheen {
+    pub sheen_color_factor: [f32; 3],
+    pub sheen_color_texture: Option<model::texture::Info>,
+    pub sheen_roughness_factor: f32,
+    pub sheen_roughness_texture: Option<model::texture::Info>,
+}
+
+/// `KHR_materials_anisotropy` of a material.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default, rename_all = "camelCase")]
+pub(super) struct Anisotropy {
+    pub anisotropy_strength: f32,
+    pub anisotropy_rotation: f32,
+    pub anisotropy_texture: Option<model::texture::Info>,
+}
+
+/// `KHR_materials_iridescence` of a material.
+#[derive(Debug, Deserialize)]
+#[serde(default, rename_all = "camelCase")]
+pub(super) struct Iridescence {
+    pub iridescence_factor: f32,
+    pub iridescence_texture: Option<model::texture::Info>,
+    pub iridescence_ior: f32,
+    pub iridescence_thickness_minimum: f32,
+    pub iridescence_thickness_maximum: f32,
+    pub iridescence_thickness_texture: Option<model::texture::Info>,
+}
+
+impl Default for Iridescence {
+    fn default() -> Self {
+        Self {
+            iridescence_factor: 0.0,
+            iridescence_texture: None,
+            iridescence_ior: 1.3,
+            iridescence_thickness_minimum: 100.0,
+            iridescence_thickness_maximum: 400.0,
+            iridescence_thickness_texture: None,
+        }
+    }
+}
+
+/// `KHR_materials_volume` of a material.
+#[derive(Debug, Deserialize)]
+#[serde(default, rename_all = "camelCase")]
+pub(super) struct Volume {
+    pub thickness_factor: f32,
+    pub thickness_texture: Option<model::texture::Info>,
+    /// Infinite where it is missing.
+    pub attenuation_distance: Option<f32>,
+    pub attenuation_color: [f32; 3],
+}
+
+impl Default for Volume {
+    fn default() -> Self {
+        Self {
+            thickness_factor: 0.0,
+            thickness_texture: None,
+            attenuation_distance: None,
+            attenuation_color: [1.0; 3],
+        }
+    }
+}
+
 impl Deref for Document<'_> {
     type Target = model::Root;
 
@@ -196,9 +283,14 @@ impl IndexGuard {
             (
                 Self::Extensions,
                 "EXT_mesh_gpu_instancing"
+                | "KHR_materials_anisotropy"
                 | "KHR_materials_clearcoat"
+                | "KHR_materials_iridescence"
                 | "KHR_materials_pbrSpecularGlossiness"
-                | "KHR_materials_transmission",
+                | "KHR_materials_sheen"
+                | "KHR_materials_specular"
+                | "KHR_materials_transmission"
+                | "KHR_materials_volume",
             ) => Some(Self::Elsewhere),
             (Self::Extensions, _) | (_, "extras") => None,
             (_, "extensions") => Some(Self::Extensions),

@@ -4,18 +4,19 @@
 //! Nothing in a file is trusted: every index, length and offset is checked before it is followed,
 //! so that any bytes end in an object or in one error that says where the file is wrong.
 use std::borrow::Cow;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use glam::{DMat4, DQuat, DVec3};
 use gltf::json::mesh::{Mode, Semantic};
 use gltf::json::validation::Checked;
+use serde::Deserialize;
 
 use super::accessor::{Buffers, get};
 use super::container::{self, Resolver};
 use super::document::{Document, Instancing, Placement, raw_extension};
-use super::gltf_material::{IMAGE_EXTENSIONS, MaterialReader, PLAIN_IMAGES};
+use super::gltf_material::{IMAGE_EXTENSIONS, MaterialReader, image_remedy};
 use super::gltf_mesh::MeshReader;
-use super::{Imported, Limits};
+use super::{Imported, Limits, lights};
 use crate::error::Error;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
@@ -24,21 +25,45 @@ const EXPORT: &str = "export the file again";
 
 const INSTANCING: &str = "EXT_mesh_gpu_instancing";
 
-/// Extensions that a file may require; those of materials that are not read change the look, not
-/// the shape, and are warned about.
-const ACCEPTED: [&str; 8] = [
+const VISIBILITY: &str = "KHR_node_visibility";
+
+/// Extensions that a file may require.
+const ACCEPTED: [&str; 22] = [
     INSTANCING,
-    "EXT_texture_transform",
+    VISIBILITY,
+    "EXT_meshopt_compression",
+    "EXT_texture_webp",
     "KHR_animation_pointer",
     "KHR_lights_punctual",
+    "KHR_materials_anisotropy",
+    "KHR_materials_clearcoat",
+    "KHR_materials_dispersion",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_ior",
+    "KHR_materials_iridescence",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_sheen",
+    "KHR_materials_specular",
+    "KHR_materials_transmission",
+    "KHR_materials_unlit",
+    "KHR_materials_volume",
     "KHR_mesh_quantization",
     "KHR_texture_transform",
+    "KHR_xmp",
     "KHR_xmp_json_ld",
-    "KHR_node_visibility",
 ];
 
-/// Beyond this many copies in all a file is broken or hostile.
-const MAX_INSTANCES: u64 = 1 << 22;
+/// What becomes of the look where an extension that a file does not require is not read.
+const INSTEAD: [(&str, &str); 5] = [
+    ("EXT_lights_ies", "lights of the file are not rendered"),
+    ("EXT_lights_image_based", "the photo lights the object"),
+    ("KHR_materials_variants", "the default materials are shown"),
+    ("MSFT_lod", "the most detailed level is shown"),
+    (
+        "MSFT_packing_occlusionRoughnessMetallic",
+        "the plain textures are used",
+    ),
+];
 
 /// Reads a glTF or GLB file from memory; `resolver` finds the files that it names.
 pub fn load_gltf_bytes(
@@ -47,18 +72,17 @@ pub fn load_gltf_bytes(
     limits: &Limits,
 ) -> Result<Imported, Error> {
     let (json, binary) = container::split(bytes)?;
-    let document = Document::read(json)?;
+    let document = Document::read(json).map_err(|e| match container::is_gltf_1(json) {
+        true => container::old_version("1.0"),
+        false => e,
+    })?;
     check_header(&document)?;
     let data = buffer_data(&document, binary, resolver)?;
-    // A quantity per vertex or three indices a triangle: no honest accessor is longer.
-    let buffers = Buffers::new(
-        &document,
-        data,
-        3 * limits.max_triangles.max(limits.max_vertices),
-    );
+    let buffers = Buffers::new(&document, data, limits);
 
-    let globals = global_transforms(&document)?;
-    let groups = instances(&document, &buffers, &globals)?;
+    let (globals, hidden) = global_transforms(&document)?;
+    let groups = instances(&document, &buffers, &globals, &hidden, limits)?;
+    let lights = lights::read(&document, &globals, &hidden)?;
     let mut materials = MaterialReader::new(&document, &buffers, resolver);
     let mut list = Vec::with_capacity(document.materials.len() + 1);
     for i in 0..document.materials.len() {
@@ -73,27 +97,74 @@ pub fn load_gltf_bytes(
     }
     if mesh.indices.is_empty() {
         return Err(Error::Empty {
-            remedy: "check that the file's default scene contains a mesh",
+            remedy: "check that the file's default scene contains a visible mesh",
         });
+    }
+    warnings.extend(left_out(&document));
+    if !lights.is_empty() {
+        warnings.push(format!(
+            "the file's lights ({}) are not rendered: the light is that of the photo ({})",
+            lights.len(),
+            lights::LIGHTS
+        ));
     }
     if !document.animations.is_empty() {
         warnings.push("animations are ignored: the object stands still in its rest pose".into());
     }
     warnings.append(&mut materials.warnings);
-    let mut seen = std::collections::HashSet::new();
-    warnings.retain(|w| seen.insert(w.clone()));
-    Ok(Imported {
+    Imported {
         mesh,
         origin,
         materials: list,
         textures: materials.textures,
+        lights,
         warnings,
         dependencies: Vec::new(),
-    })
+    }
+    .checked(limits)
+}
+
+/// What the file says and we do not read, one sentence each.
+fn left_out(document: &Document) -> Vec<String> {
+    let mut names: BTreeSet<&str> = document
+        .extensions_used
+        .iter()
+        .map(String::as_str)
+        .collect();
+    let root = document.extensions.iter().flat_map(|e| e.others.keys());
+    let nodes = document.nodes.iter().filter_map(|n| n.extensions.as_ref());
+    let nodes = nodes.flat_map(|e| e.others.keys());
+    names.extend(root.chain(nodes).map(String::as_str));
+    let mut all = Vec::new();
+    for name in names {
+        // Of other materials, images and compressed meshes it is said where they are used.
+        let said_elsewhere = name.starts_with("KHR_materials_") && name != "KHR_materials_variants"
+            || IMAGE_EXTENSIONS.contains(&name)
+            || name.contains("compression");
+        if said_elsewhere || ACCEPTED.contains(&name) {
+            continue;
+        }
+        let instead = INSTEAD.iter().find(|(known, _)| *known == name);
+        all.push(match instead {
+            Some((_, what)) => format!("the extension {name} is not read: {what}"),
+            None => format!("the extension {name} is not read"),
+        });
+    }
+    let occluded = |m: &&gltf::json::Material| m.occlusion_texture.is_some();
+    let occlusion = document.materials.iter().filter(occluded).count();
+    if occlusion > 0 {
+        all.push(format!(
+            "the occlusion maps of {occlusion} materials are not read: occlusion is simulated"
+        ));
+    }
+    all
 }
 
 fn check_header(document: &Document) -> Result<(), Error> {
     let version = &document.asset.version;
+    if version.starts_with("1.") {
+        return Err(container::old_version(version));
+    }
     if !version.starts_with("2.") {
         return Err(Error::malformed(
             format!("asset.version is \"{version}\"; accepted: 2.0"),
@@ -101,15 +172,16 @@ fn check_header(document: &Document) -> Result<(), Error> {
         ));
     }
     for name in &document.extensions_required {
-        if ACCEPTED.contains(&name.as_str()) || name.starts_with("KHR_materials_") {
+        if ACCEPTED.contains(&name.as_str()) {
             continue;
         }
-        let remedy = if IMAGE_EXTENSIONS.contains(&name.as_str()) {
-            PLAIN_IMAGES
-        } else if name.contains("compression") {
-            "export the object without mesh compression"
-        } else {
-            "export the object without it"
+        let remedy = match name.as_str() {
+            "KHR_draco_mesh_compression" => "convert the file: gltf-transform copy IN.glb OUT.glb",
+            name if name.contains("compression") => {
+                "convert the file: gltf-transform meshopt IN.glb OUT.glb"
+            }
+            name if IMAGE_EXTENSIONS.contains(&name) => image_remedy(name),
+            _ => "export the object without it",
         };
         return Err(Error::UnsupportedExtension {
             extension: name.clone(),
@@ -155,10 +227,18 @@ fn buffer_data<'a>(
     Ok(all)
 }
 
-/// Node to file coordinates, for the nodes of the scene that is shown; `None` for the others.
-fn global_transforms(document: &Document) -> Result<Vec<Option<DMat4>>, Error> {
+/// `KHR_node_visibility` of a node.
+#[derive(Deserialize)]
+struct Visibility {
+    visible: Option<bool>,
+}
+
+/// Node to file coordinates, for the nodes of the scene that is shown, `None` for the others; and
+/// which nodes are hidden.
+fn global_transforms(document: &Document) -> Result<(Vec<Option<DMat4>>, Vec<bool>), Error> {
     let mut globals = vec![None; document.nodes.len()];
-    let mut stack: Vec<(usize, DMat4, String)> = Vec::new();
+    let mut hidden = vec![false; document.nodes.len()];
+    let mut stack: Vec<(usize, DMat4, bool, String)> = Vec::new();
     match document.scene {
         None if document.scenes.is_empty() => {
             let mut is_child = vec![false; document.nodes.len()];
@@ -168,7 +248,7 @@ fn global_transforms(document: &Document) -> Result<Vec<Option<DMat4>>, Error> {
                 }
             }
             for root in (0..document.nodes.len()).rev().filter(|&i| !is_child[i]) {
-                stack.push((root, DMat4::IDENTITY, "nodes".into()));
+                stack.push((root, DMat4::IDENTITY, false, "nodes".into()));
             }
         }
         index => {
@@ -176,11 +256,11 @@ fn global_transforms(document: &Document) -> Result<Vec<Option<DMat4>>, Error> {
             let scene = get(&document.scenes, index, "scene", "scenes")?;
             let place = format!("scenes[{index}].nodes");
             for root in scene.nodes.iter().rev() {
-                stack.push((root.value(), DMat4::IDENTITY, place.clone()));
+                stack.push((root.value(), DMat4::IDENTITY, false, place.clone()));
             }
         }
     }
-    while let Some((index, parent, place)) = stack.pop() {
+    while let Some((index, parent, parent_hidden, place)) = stack.pop() {
         let node = get(&document.nodes, index, &place, "nodes")?;
         if globals[index].is_some() {
             return Err(Error::malformed(
@@ -197,11 +277,18 @@ fn global_transforms(document: &Document) -> Result<Vec<Option<DMat4>>, Error> {
             });
         }
         globals[index] = Some(global);
+        let own: Option<Visibility> = match &node.extensions {
+            Some(e) => raw_extension(&e.others, VISIBILITY, &format!("nodes[{index}]"))?,
+            None => None,
+        };
+        let shown = own.and_then(|v| v.visible).unwrap_or(true);
+        hidden[index] = parent_hidden || !shown;
         for child in node.children.iter().flatten().rev() {
-            stack.push((child.value(), global, format!("nodes[{index}].children")));
+            let place = format!("nodes[{index}].children");
+            stack.push((child.value(), global, hidden[index], place));
         }
     }
-    Ok(globals)
+    Ok((globals, hidden))
 }
 
 fn local_transform(node: &Placement) -> DMat4 {
@@ -235,11 +322,13 @@ fn instances(
     document: &Document,
     buffers: &Buffers,
     globals: &[Option<DMat4>],
+    hidden: &[bool],
+    limits: &Limits,
 ) -> Result<Vec<Group>, Error> {
     let mut groups: BTreeMap<(usize, Option<usize>), Vec<DMat4>> = BTreeMap::new();
     let mut copies = 0;
     for (i, node) in document.nodes.iter().enumerate() {
-        let (Some(global), Some(mesh)) = (globals[i], node.mesh) else {
+        let (Some(global), Some(mesh), false) = (globals[i], node.mesh, hidden[i]) else {
             continue;
         };
         let mesh = mesh.value();
@@ -255,7 +344,7 @@ fn instances(
             // The joints alone place a skinned mesh (glTF 2.0, 3.7.3.3).
             transforms.push(DMat4::IDENTITY);
         } else if let Some(instancing) = instancing {
-            let local = gpu_instances(&instancing, i, buffers, MAX_INSTANCES - copies)?;
+            let local = gpu_instances(&instancing, i, buffers, limits, copies)?;
             copies += local.len() as u64;
             transforms.extend(local.iter().map(|m| global * *m));
         } else {
@@ -272,26 +361,20 @@ fn instances(
         .collect())
 }
 
-/// `EXT_mesh_gpu_instancing`: the copies' transforms relative to the node, `most` of them.
+/// `EXT_mesh_gpu_instancing`: the copies' transforms relative to the node; `before` is how many
+/// copies other nodes have.
 fn gpu_instances(
     instancing: &Instancing,
     index: usize,
     buffers: &Buffers,
-    most: u64,
+    limits: &Limits,
+    before: u64,
 ) -> Result<Vec<DMat4>, Error> {
     let at = format!("nodes[{index}].extensions.{INSTANCING}.attributes");
     let mut count = None;
     for (name, &accessor) in &instancing.attributes {
         let n = buffers.accessor(accessor, &format!("{at}.{name}"))?.count.0;
-        if n > most {
-            return Err(Error::TooLarge {
-                what: format!(
-                    "{at} has {n} copies, with those before {}",
-                    MAX_INSTANCES - most + n
-                ),
-                limit: MAX_INSTANCES,
-            });
-        }
+        limits.check_instances(before.saturating_add(n), &at)?;
         if *count.get_or_insert(n) != n {
             return Err(Error::malformed(
                 format!("{at} have different counts"),
@@ -371,7 +454,7 @@ fn assemble(
             parts += copies;
         }
     }
-    limits.check(vertices, triangles)?;
+    limits.check_mesh(vertices, triangles)?;
     let origin = far_origin(&groups);
     let mut all = TriangleMesh::default();
     for group in groups.iter().filter(|g| !g.transforms.is_empty()) {
@@ -396,7 +479,7 @@ fn assemble(
                         value: format!("{:?}", copy.positions[bad].to_array()),
                     });
                 }
-                limits.check(
+                limits.check_mesh(
                     (all.positions.len() + copy.positions.len()) as u64,
                     (all.indices.len() + copy.indices.len()) as u64,
                 )?;

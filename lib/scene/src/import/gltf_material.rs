@@ -8,26 +8,41 @@ use gltf::json::material::NormalTexture;
 use gltf::json::texture::{Info, MagFilter, Sampler, WrappingMode};
 use gltf::json::validation::Checked;
 use gltf::json::{self, Index};
+use serde::Deserialize;
 
 use super::accessor::{Buffers, get};
 use super::container::{self, Resolver};
 use super::document::{self, Document, raw_extension};
 use crate::error::Error;
 use crate::material::{AlphaMode, Clearcoat, Material, TextureRef, Transmission};
+
+mod extensions;
 use crate::texture::{Encoding, Filter, ImageSource, Texture, Wrap};
 
 const EXPORT: &str = "export the file again";
 
-/// Image formats that hide behind a texture extension, each with what to do instead.
-pub(super) const IMAGE_EXTENSIONS: [&str; 4] = [
-    "KHR_texture_basisu",
-    "EXT_texture_webp",
-    "EXT_texture_avif",
-    "MSFT_texture_dds",
-];
+/// Image formats that hide behind a texture extension and are not read.
+pub(super) const IMAGE_EXTENSIONS: [&str; 3] =
+    ["KHR_texture_basisu", "EXT_texture_avif", "MSFT_texture_dds"];
 
-/// Remedy for those.
-pub(super) const PLAIN_IMAGES: &str = "export the textures as PNG or JPEG";
+const WEBP: &str = "EXT_texture_webp";
+
+/// That extension of a texture.
+#[derive(Deserialize)]
+struct Webp {
+    source: u32,
+}
+
+/// What to do about one of [`IMAGE_EXTENSIONS`].
+pub(super) fn image_remedy(extension: &str) -> &'static str {
+    match extension {
+        "KHR_texture_basisu" => {
+            "convert the textures to PNG: gltf-transform ktxdecompress IN.glb OUT.glb"
+        }
+        "EXT_texture_avif" => "convert the textures to PNG: gltf-transform png IN.glb OUT.glb",
+        _ => "export the textures as PNG or JPEG",
+    }
+}
 
 const CLEARCOAT: &str = "KHR_materials_clearcoat";
 
@@ -69,7 +84,7 @@ impl<'a> MaterialReader<'a> {
             .iter()
             .flat_map(|e| e.others.keys())
             .map(String::as_str)
-            .filter(|name| *name != CLEARCOAT)
+            .filter(|name| *name != CLEARCOAT && !extensions::READ.contains(name))
             .collect();
         unread.sort_unstable();
         if !unread.is_empty() {
@@ -113,6 +128,7 @@ impl<'a> MaterialReader<'a> {
         if let Some(coat) = raw_extension(&extensions.others, CLEARCOAT, &at)? {
             material.clearcoat = self.clearcoat(&coat, &at)?;
         }
+        material.extensions = self.extensions(&extensions.others, &at)?;
         if let Some(transmission) = &extensions.transmission {
             let factor = transmission.transmission_factor.0;
             let factor = self.factor(factor, 1.0, 0.0, &at, "transmissionFactor");
@@ -320,8 +336,18 @@ impl<'a> MaterialReader<'a> {
         }
         let source = &self.document.textures[index];
         let at = format!("textures[{index}]");
+        let webp: Option<Webp> = match &source.extensions {
+            Some(e) => raw_extension(&e.others, WEBP, &at)?,
+            None => None,
+        };
+        let mut image = source.source.value();
+        if image == u32::MAX as usize
+            && let Some(webp) = webp
+        {
+            image = webp.source as usize;
+        }
         // The model's way of saying that there is none.
-        if source.source.value() == u32::MAX as usize {
+        if image == u32::MAX as usize {
             let known = |e: &&&str| {
                 let extensions = source.extensions.as_ref();
                 extensions.is_some_and(|all| all.others.contains_key(**e))
@@ -329,7 +355,7 @@ impl<'a> MaterialReader<'a> {
             return match IMAGE_EXTENSIONS.iter().find(known) {
                 Some(extension) => Err(Error::UnsupportedExtension {
                     extension: (*extension).into(),
-                    remedy: PLAIN_IMAGES,
+                    remedy: image_remedy(extension),
                 }),
                 None => {
                     self.warnings
@@ -346,7 +372,7 @@ impl<'a> MaterialReader<'a> {
                 lookup(get(samplers, sampler.value(), &place, "samplers")?)
             }
         };
-        let image = self.image(source.source.value(), &format!("{at}.source"))?;
+        let image = self.image(image, &format!("{at}.source"))?;
         self.textures.push(Texture {
             image,
             encoding,

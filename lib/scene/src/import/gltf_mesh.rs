@@ -14,6 +14,9 @@ use crate::mesh::{TriangleMesh, normal_matrix};
 
 const EXPORT: &str = "export the file again";
 
+/// Four joints of every vertex, and their weights.
+type Influences = (Vec<[usize; 4]>, Vec<[f32; 4]>);
+
 /// Reads primitives; remembers what had to be ignored or repaired.
 pub(super) struct MeshReader<'a> {
     document: &'a Document<'a>,
@@ -295,6 +298,11 @@ impl<'a> MeshReader<'a> {
                 self.vertex_floats(primitive, Semantic::Colors(0), at, mesh, true, map)?
             };
         }
+        for set in (1..).take_while(|n| attribute(primitive, Semantic::Colors(*n)).is_some()) {
+            self.warnings.push(format!(
+                "{at}: COLOR_{set} is not read; only COLOR_0 is part of the surface"
+            ));
+        }
         if self.normal_map(material).is_some() && !mesh.normals.is_empty() {
             let unit = |[x, y, z, w]: [f32; 4]| {
                 let direction = DVec3::new(x.into(), y.into(), z.into());
@@ -368,23 +376,8 @@ impl<'a> MeshReader<'a> {
                 })?;
             joints.iter_mut().zip(inverse).for_each(|(j, i)| *j *= i);
         }
-        let indices = self.vertex_floats(
-            primitive,
-            Semantic::Joints(0),
-            at,
-            mesh,
-            false,
-            |j: [f32; 4]| j.map(|v| v as usize),
-        )?;
-        let weights = self.vertex_floats(
-            primitive,
-            Semantic::Weights(0),
-            at,
-            mesh,
-            true,
-            |w: [f32; 4]| w,
-        )?;
-        if indices.is_empty() || weights.is_empty() {
+        let influences = self.influences(primitive, at, mesh)?;
+        if influences.is_empty() {
             self.warnings.push(format!(
                 "{at} is skinned but has no joints or weights; it is left as stored"
             ));
@@ -395,16 +388,19 @@ impl<'a> MeshReader<'a> {
         for v in 0..mesh.positions.len() {
             let mut pose = DMat4::ZERO;
             let mut total = 0.0;
-            for (j, w) in indices[v].iter().zip(weights[v]) {
-                if w != 0.0 {
-                    let joint = get(
-                        &joints,
-                        *j,
-                        &format!("{at}.attributes.JOINTS_0"),
-                        "joints in its skin",
-                    )?;
-                    pose += *joint * f64::from(w);
-                    total += f64::from(w);
+            for (set, (indices, weights)) in influences.iter().enumerate() {
+                for (j, w) in indices[v].iter().zip(weights[v]) {
+                    if w != 0.0 {
+                        let place = || format!("{at}.attributes.JOINTS_{set}");
+                        let joint = joints.get(*j).ok_or_else(|| Error::Dangling {
+                            place: place(),
+                            index: *j as u64,
+                            count: joints.len() as u64,
+                            things: "joints in its skin",
+                        })?;
+                        pose += *joint * f64::from(w);
+                        total += f64::from(w);
+                    }
                 }
             }
             // A vertex that nothing holds stays; so does one whose pose is broken.
@@ -436,6 +432,27 @@ impl<'a> MeshReader<'a> {
             });
         }
         Ok(())
+    }
+
+    /// The joints of each vertex with their weights, four in each set.
+    fn influences(
+        &self,
+        primitive: &Primitive,
+        at: &str,
+        mesh: &TriangleMesh,
+    ) -> Result<Vec<Influences>, Error> {
+        let mut sets = Vec::new();
+        for set in 0.. {
+            let (joints, weights) = (Semantic::Joints(set), Semantic::Weights(set));
+            let index = |j: [f32; 4]| j.map(|v| v as usize);
+            let joints = self.vertex_floats(primitive, joints, at, mesh, false, index)?;
+            let weights = self.vertex_floats(primitive, weights, at, mesh, true, |w| w)?;
+            if joints.is_empty() || weights.is_empty() {
+                break;
+            }
+            sets.push((joints, weights));
+        }
+        Ok(sets)
     }
 
     /// Normals and tangents where the file has none or broken ones.

@@ -1,14 +1,20 @@
-//! Objects from files: glTF, GLB and OBJ.
+//! Objects from files: glTF, GLB, OBJ, PLY and STL.
 mod accessor;
 mod container;
 mod document;
 mod gltf;
 mod gltf_material;
 mod gltf_mesh;
+mod lights;
+mod meshopt;
 mod mtl;
 mod obj;
+mod ply;
+mod polygon;
+mod stl;
 pub mod tangents;
 
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
@@ -16,11 +22,17 @@ use glam::DVec3;
 pub use self::gltf::load_gltf_bytes;
 pub use container::{Folder, NoFiles, Resolver};
 pub use obj::load_obj_bytes;
+pub use ply::load_ply_bytes;
+pub use stl::load_stl_bytes;
+
+pub use crate::limits::Limits;
 
 use crate::error::Error;
+use crate::light::PunctualLight;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
-use crate::texture::Texture;
+use crate::printable::printable;
+use crate::texture::{Texture, check_sizes};
 
 /// An object as its file describes it, node transforms applied and instances expanded.
 #[derive(Clone, Debug)]
@@ -34,77 +46,99 @@ pub struct Imported {
     pub materials: Vec<Material>,
     /// Indexed by [`TextureRef::texture`](crate::material::TextureRef::texture).
     pub textures: Vec<Texture>,
+    /// In the file's coordinates. They are not rendered.
+    pub lights: Vec<PunctualLight>,
     /// What was ignored or repaired, one sentence each.
     pub warnings: Vec<String>,
     /// Further files that the object consists of (buffers, images, material libraries).
     pub dependencies: Vec<PathBuf>,
 }
 
-/// How large an object may be.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Limits {
-    /// Most vertices, copies counted.
-    pub max_vertices: u64,
-    /// Most triangles, copies counted.
-    pub max_triangles: u64,
-}
+/// Kinds of file that are not read, and how to convert them.
+const CONVERTED: [(&[&str], &str); 5] = [
+    (
+        &["fbx"],
+        "convert it: FBX2glTF -b -i IN.fbx -o OUT.glb, or open it in Blender and export a .glb file",
+    ),
+    (&["blend"], "open it in Blender and export a .glb file"),
+    (
+        &["usd", "usda", "usdc", "usdz"],
+        "open it in Blender and export a .glb file",
+    ),
+    (&["3ds", "dae"], "convert it: assimp export IN OUT.glb"),
+    (
+        &[
+            "vrml", "wrl", "x3d", "step", "stp", "iges", "igs", "max", "c4d", "ma", "mb", "3mf",
+        ],
+        "export it as a .glb file from the program that made it",
+    ),
+];
 
-impl Default for Limits {
-    /// 2^28 of each: some 30 GB, beyond which a file is more likely broken than wanted.
-    fn default() -> Self {
-        Self {
-            max_vertices: 1 << 28,
-            max_triangles: 1 << 28,
-        }
-    }
-}
-
-impl Limits {
-    pub(crate) fn check(&self, vertices: u64, triangles: u64) -> Result<(), Error> {
-        for (count, things, limit) in [
-            (vertices, "vertices", self.max_vertices),
-            (triangles, "triangles", self.max_triangles),
-        ] {
-            if count > limit {
-                return Err(Error::TooLarge {
-                    what: format!("the object has {count} {things}"),
-                    limit,
-                });
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Reads a `.gltf`, `.glb` or `.obj` file. Which of them it is follows from the extension.
+/// Reads an object from a file with the default [`Limits`]. See [`load_object_within`].
 pub fn load_object(path: &Path) -> Result<Imported, Error> {
+    load_object_within(path, &Limits::default())
+}
+
+/// Reads a `.gltf`, `.glb`, `.obj`, `.ply` or `.stl` file. Which of them it is follows from the
+/// extension.
+pub fn load_object_within(path: &Path, limits: &Limits) -> Result<Imported, Error> {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-    let is_obj = match extension.as_deref() {
-        Some("glb" | "gltf") => false,
-        Some("obj") => true,
-        _ => {
-            return Err(Error::malformed(
-                format!(
-                    "\"{}\" is not a kind of object that is read",
-                    path.display()
-                ),
-                "use a .glb, .gltf or .obj file",
-            ));
-        }
-    };
-    let bytes = std::fs::read(path).map_err(|source| Error::Read {
-        role: "the object".into(),
-        path: path.into(),
-        source,
-    })?;
-    let folder = Folder::new(path.parent().unwrap_or(Path::new("")));
-    let limits = Limits::default();
-    let loaded = if is_obj {
-        load_obj_bytes(&bytes, &folder, &limits)
-    } else {
-        load_gltf_bytes(&bytes, &folder, &limits)
+    let extension = extension.as_deref().unwrap_or("");
+    if !["glb", "gltf", "obj", "ply", "stl"].contains(&extension) {
+        let known = CONVERTED.iter().find(|(all, _)| all.contains(&extension));
+        return Err(Error::malformed(
+            format!(
+                "\"{}\" is not a kind of object that is read",
+                path.display()
+            ),
+            known.map_or("use a .glb, .gltf, .obj, .ply or .stl file", |(_, how)| how),
+        ));
+    }
+    let bytes = read_whole(path, limits)?;
+    let folder = Folder::new(path.parent().unwrap_or(Path::new("")), limits);
+    let loaded = match extension {
+        "obj" => load_obj_bytes(&bytes, &folder, limits),
+        "ply" => load_ply_bytes(&bytes, limits),
+        "stl" => load_stl_bytes(&bytes, limits),
+        _ => load_gltf_bytes(&bytes, &folder, limits),
     };
     let mut imported = loaded.map_err(|e| e.in_file(path))?;
     imported.dependencies = folder.into_used();
     Ok(imported)
+}
+
+fn read_whole(path: &Path, limits: &Limits) -> Result<Vec<u8>, Error> {
+    let unreadable = |source| Error::Read {
+        role: "the object".into(),
+        path: path.into(),
+        source,
+    };
+    let file = dipir_files::open(path).map_err(unreadable)?;
+    let length = file.metadata().map_err(unreadable)?.len();
+    limits.check_bytes(length).map_err(|e| e.in_file(path))?;
+    dipir_files::read(path).map_err(unreadable)
+}
+
+impl Imported {
+    /// A mesh of one material.
+    fn of(mesh: TriangleMesh, material: Material) -> Self {
+        Self {
+            mesh,
+            origin: DVec3::ZERO,
+            materials: vec![material],
+            textures: Vec::new(),
+            lights: Vec::new(),
+            warnings: Vec::new(),
+            dependencies: Vec::new(),
+        }
+    }
+
+    /// The object with its textures' sizes checked, and each warning once, the names in it printable.
+    fn checked(mut self, limits: &Limits) -> Result<Self, Error> {
+        check_sizes(&self.textures, limits)?;
+        let mut seen = HashSet::new();
+        self.warnings.retain(|w| seen.insert(w.clone()));
+        self.warnings.iter_mut().for_each(|w| *w = printable(&*w));
+        Ok(self)
+    }
 }

@@ -1,6 +1,6 @@
 //! Wavefront OBJ files.
 //!
-//! Read line by line, so that an error names its line; polygons become fans of triangles, texture
+//! Read line by line, so that an error names its line; faces are cut into triangles, texture
 //! coordinates are turned to glTF's convention (v down).
 use std::borrow::Cow;
 use std::collections::{HashMap, HashSet};
@@ -11,7 +11,7 @@ use glam::{DVec3, Mat3, Vec2, Vec3, Vec4};
 use super::container::{self, Resolver};
 use super::mtl::Library;
 use super::tangents;
-use super::{Imported, Limits};
+use super::{Imported, Limits, polygon};
 use crate::error::Error;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
@@ -186,14 +186,11 @@ impl Reader {
             self.uses_default = true;
             u32::MAX
         });
-        for k in 1..n - 1 {
-            let [a, b, c] = [self.corners[0], self.corners[k], self.corners[k + 1]];
-            if a != b && b != c && c != a {
-                self.mesh.indices.push([a, b, c]);
-                self.mesh.materials.push(material);
-            }
-        }
-        self.limits.check(
+        polygon::triangulate(&self.corners, |triangle| {
+            self.mesh.indices.push(triangle);
+            self.mesh.materials.push(material);
+        });
+        self.limits.check_mesh(
             self.mesh.positions.len() as u64,
             self.mesh.indices.len() as u64,
         )?;
@@ -261,16 +258,16 @@ impl Reader {
         self.gather(&materials);
         let mut warnings = self.warnings;
         warnings.append(&mut self.library.warnings);
-        let mut seen = HashSet::new();
-        warnings.retain(|w| seen.insert(w.clone()));
-        Ok(Imported {
+        Imported {
             mesh: self.mesh,
             origin: DVec3::ZERO,
             materials,
             textures: self.library.textures,
+            lights: Vec::new(),
             warnings,
             dependencies: Vec::new(),
-        })
+        }
+        .checked(&self.limits)
     }
 
     /// Fills the attributes of the vertices that faces use.

@@ -1,5 +1,7 @@
 //! One clear message each: what is wrong, where, and what to do.
-use dipir_scene::import::{Limits, NoFiles, load_gltf_bytes, load_object};
+use dipir_scene::import::{
+    Limits, NoFiles, load_gltf_bytes, load_obj_bytes, load_object, load_object_within,
+};
 use dipir_scene::texture::{Encoding, Filter, ImageSource, Texture};
 use serde_json::json;
 
@@ -38,7 +40,7 @@ fn a_broken_glb_says_where_it_breaks() {
     old[4] = 1;
     assert_eq!(
         message_of(&old),
-        "the GLB header says version 1; accepted: 2; export the file as glTF 2.0"
+        "the file is glTF 1.0, which is not read; convert it to glTF 2.0: gltf-pipeline -i OLD.gltf -o NEW.glb"
     );
     let mut short = whole.clone();
     short[8..12].copy_from_slice(&11u32.to_le_bytes());
@@ -157,7 +159,7 @@ fn an_accessor_that_overruns_its_view_is_refused() {
     glb.json["accessors"][0]["count"] = json!(1u64 << 40);
     assert_eq!(
         message(&glb),
-        "the object has 1099511627776 vertices: more than the limit of 268435456; simplify the object"
+        "there are 366503875925 triangles: more than the limit of 20000000; simplify the object, or raise scene.limits.triangles"
     );
 }
 
@@ -182,18 +184,6 @@ fn lengths_without_bytes_behind_them_are_refused_before_memory_is_taken() {
         message(&skin),
         "skins[0].inverseBindMatrices refers to accessors[1], which has no bufferView; export the file again"
     );
-    let mut copies = Glb::triangle(json!({}));
-    let accessor = copies.push(
-        "accessors",
-        json!({ "componentType": 5126, "type": "VEC3", "count": 4_000_000 }),
-    );
-    let extension = json!({ "EXT_mesh_gpu_instancing": { "attributes": { "SCALE": accessor } } });
-    copies.json["nodes"][0]["extensions"] = extension.clone();
-    copies.push("nodes", json!({ "mesh": 0, "extensions": extension }));
-    assert_eq!(
-        message(&copies),
-        "nodes[1].extensions.EXT_mesh_gpu_instancing.attributes has 4000000 copies, with those before 8000000: more than the limit of 4194304; simplify the object"
-    );
 }
 
 #[test]
@@ -215,15 +205,24 @@ fn required_extensions_that_cannot_be_ignored_are_refused_by_name() {
     for (extension, remedy) in [
         (
             "KHR_draco_mesh_compression",
-            "export the object without mesh compression",
+            "convert the file: gltf-transform copy IN.glb OUT.glb",
         ),
         (
-            "EXT_meshopt_compression",
-            "export the object without mesh compression",
+            "KHR_texture_basisu",
+            "convert the textures to PNG: gltf-transform ktxdecompress IN.glb OUT.glb",
         ),
-        ("KHR_texture_basisu", "export the textures as PNG or JPEG"),
-        ("EXT_texture_webp", "export the textures as PNG or JPEG"),
+        (
+            "EXT_texture_avif",
+            "convert the textures to PNG: gltf-transform png IN.glb OUT.glb",
+        ),
+        ("MSFT_texture_dds", "export the textures as PNG or JPEG"),
         ("ACME_shapes", "export the object without it"),
+        ("EXT_texture_transform", "export the object without it"),
+        ("KHR_materials_variants", "export the object without it"),
+        (
+            "KHR_materials_diffuse_transmission",
+            "export the object without it",
+        ),
     ] {
         let mut glb = Glb::triangle(json!({}));
         glb.json["extensionsRequired"] = json!([extension]);
@@ -311,18 +310,148 @@ fn a_file_without_triangles_is_refused() {
     glb.push("nodes", json!({}));
     assert_eq!(
         message(&glb),
-        "the file holds no triangles; check that the file's default scene contains a mesh"
+        "the file holds no triangles; check that the file's default scene contains a visible mesh"
     );
 }
 
 #[test]
-fn an_unknown_kind_of_file_names_the_known_ones() {
-    assert_eq!(
-        load_object("car.fbx".as_ref()).unwrap_err().to_string(),
-        "\"car.fbx\" is not a kind of object that is read; use a .glb, .gltf or .obj file"
-    );
+fn a_kind_of_file_that_is_not_read_says_how_to_convert_it() {
+    for (name, remedy) in [
+        ("car.xyz", "use a .glb, .gltf, .obj, .ply or .stl file"),
+        (
+            "car.FBX",
+            "convert it: FBX2glTF -b -i IN.fbx -o OUT.glb, or open it in Blender and export a .glb file",
+        ),
+        ("car.blend", "open it in Blender and export a .glb file"),
+        ("car.usdz", "open it in Blender and export a .glb file"),
+        ("car.3ds", "convert it: assimp export IN OUT.glb"),
+        ("car.dae", "convert it: assimp export IN OUT.glb"),
+        (
+            "car.3mf",
+            "export it as a .glb file from the program that made it",
+        ),
+    ] {
+        assert_eq!(
+            load_object(name.as_ref()).unwrap_err().to_string(),
+            format!("\"{name}\" is not a kind of object that is read; {remedy}")
+        );
+    }
     assert_eq!(
         load_object("nowhere.glb".as_ref()).unwrap_err().to_string(),
         "cannot read the object \"nowhere.glb\": No such file or directory (os error 2)"
+    );
+}
+
+#[test]
+fn gltf_1_is_named_with_how_to_convert_it() {
+    let expected = "the file is glTF 1.0, which is not read; convert it to glTF 2.0: gltf-pipeline -i OLD.gltf -o NEW.glb";
+    let maps = r#"{ "meshes": { "a": { "primitives": [] } }, "nodes": {}"#;
+    for text in [
+        format!("{maps}, \"asset\": {{ \"version\": \"1.0\" }} }}"),
+        format!("{maps}, \"asset\": {{ \"version\": 1.0 }} }}"),
+        format!("{maps} }}"),
+        r#"{ "asset": { "version": "1.0" } }"#.to_owned(),
+    ] {
+        assert_eq!(message_of(text.as_bytes()), expected, "{text}");
+    }
+}
+
+#[test]
+fn files_outside_of_the_objects_folder_are_refused_unless_allowed() {
+    let folder = tempfile::tempdir().unwrap();
+    let inside = folder.path().join("models");
+    std::fs::create_dir(&inside).unwrap();
+    let outside = folder.path().join("t.bin");
+    std::fs::write(&outside, TRIANGLE.map(f32::to_le_bytes).as_flattened()).unwrap();
+    std::fs::copy(&outside, inside.join("t.bin")).unwrap();
+    let path = inside.join("t.gltf");
+    let load = |uri: &str, allow_outside: bool| {
+        let mut glb = Glb::triangle(json!({}));
+        glb.json["buffers"] = json!([{ "uri": uri, "byteLength": 36 }]);
+        std::fs::write(&path, glb.json.to_string()).unwrap();
+        let limits = Limits {
+            allow_outside,
+            ..Limits::default()
+        };
+        load_object_within(&path, &limits).map_err(|e| e.to_string())
+    };
+    let absolute = outside.to_str().unwrap();
+    for uri in ["../t.bin", "%2e%2e/t.bin", "x/../../t.bin", absolute] {
+        let error = load(uri, false).unwrap_err();
+        assert!(
+            error.ends_with(
+                ": it lies outside of the object's folder; copy it into that, or set scene.limits.allow_outside = true"
+            ),
+            "{uri}: {error}"
+        );
+    }
+    assert!(load("../t.bin", true).is_ok());
+    assert!(load(absolute, true).is_ok());
+    assert!(load("./x/../t.bin", false).is_err(), "x does not exist");
+    assert!(load("./t.bin", false).is_ok());
+}
+
+#[test]
+fn names_in_messages_cannot_command_a_terminal() {
+    let mut glb = Glb::triangle(json!({ "material": 0 }));
+    glb.push(
+        "images",
+        json!({ "name": "\u{1b}[2J", "uri": "\u{1b}]0;x\u{7}.png" }),
+    );
+    glb.push("textures", json!({ "source": 0 }));
+    glb.push("materials", json!({ "normalTexture": { "index": 0 } }));
+    assert_eq!(
+        message(&glb),
+        "cannot read the texture images[0] (\\u{1b}[2J) \"\\u{1b}]0;x\\u{7}.png\": no other files are read here"
+    );
+    let obj = "usemtl \u{1b}[31m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+    let imported = load_obj_bytes(obj.as_bytes(), &NoFiles, &Limits::default()).unwrap();
+    assert_eq!(
+        imported.warnings,
+        ["material \"\\u{1b}[31m\" is not defined; grey is used"]
+    );
+    let mut used = Glb::triangle(json!({}));
+    used.json["extensionsUsed"] = json!(["A\u{9b}1m"]);
+    assert_eq!(
+        used.load().warnings,
+        ["the extension A\\u{9b}1m is not read"]
+    );
+}
+
+#[cfg(unix)]
+#[test]
+fn pipes_and_devices_are_refused_at_once_wherever_a_file_is_named() {
+    use rustix::fs::{CWD, FileType, Mode, mknodat};
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["pipe.glb", "pipe.bin", "pipe.png", "pipe.mtl"] {
+        mknodat(
+            CWD,
+            folder.path().join(name),
+            FileType::Fifo,
+            Mode::RUSR | Mode::WUSR,
+            0,
+        )
+        .unwrap();
+    }
+    let message = |name: &str| {
+        let path = folder.path().join(name);
+        load_object(&path).unwrap_err().to_string()
+    };
+    assert!(message("pipe.glb").ends_with("not a regular file"));
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    let mut buffer = Glb::triangle(json!({}));
+    buffer.json["buffers"] = json!([{ "uri": "pipe.bin", "byteLength": 36 }]);
+    write("buffer.gltf", &buffer.json.to_string());
+    assert!(message("buffer.gltf").ends_with("not a regular file"));
+    const FACE: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n";
+    write("paint.mtl", "newmtl a\nmap_Kd pipe.png\n");
+    write("paint.obj", &format!("mtllib paint.mtl\n{FACE}"));
+    assert!(message("paint.obj").ends_with("not a regular file"));
+    // Without its materials an object is still shown.
+    write("library.obj", &format!("mtllib pipe.mtl\n{FACE}"));
+    let imported = load_object(&folder.path().join("library.obj")).unwrap();
+    assert_eq!(
+        imported.warnings[0],
+        "material library \"pipe.mtl\" cannot be read (not a regular file); grey is used"
     );
 }

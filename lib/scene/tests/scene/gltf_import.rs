@@ -1,5 +1,5 @@
 //! What a glTF file says is what arrives.
-use dipir_scene::import::{Folder, Limits, load_gltf_bytes, load_object};
+use dipir_scene::import::{Folder, Limits, NoFiles, load_gltf_bytes, load_object};
 use dipir_scene::material::AlphaMode;
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::texture::{Filter, Wrap, decode_textures};
@@ -286,7 +286,7 @@ fn chunks_of_unknown_kinds_are_passed_over() {
     whole.extend([4, 0, 0, 0, b'A', b'C', b'M', b'E', 1, 2, 3, 4]);
     let length = (whole.len() as u32).to_le_bytes();
     whole[8..12].copy_from_slice(&length);
-    let load = |bytes: &[u8]| load_gltf_bytes(bytes, &Folder::new(""), &Limits::default());
+    let load = |bytes: &[u8]| load_gltf_bytes(bytes, &NoFiles, &Limits::default());
     assert_eq!(load(&whole).unwrap().mesh.indices, [[0, 1, 2]]);
 
     // Directly behind the JSON, where only a binary chunk would be read.
@@ -346,6 +346,7 @@ fn material_parameters_and_extensions_arrive() {
                 "KHR_materials_transmission": { "transmissionFactor": 0.7 },
                 "KHR_materials_ior": { "ior": 1.33 },
                 "KHR_materials_sheen": {},
+                "KHR_materials_dispersion": { "dispersion": 0.1 },
             },
         }),
     );
@@ -362,8 +363,57 @@ fn material_parameters_and_extensions_arrive() {
     assert_eq!(m.transmission.unwrap().factor, 0.7);
     assert_eq!(
         imported.warnings,
-        ["materials[0]: KHR_materials_sheen not supported and left out"]
+        ["materials[0]: KHR_materials_dispersion not supported and left out"]
     );
+}
+
+#[test]
+fn extensions_of_the_reflection_arrive_and_those_without_effect_do_not() {
+    let mut glb = Glb::triangle(json!({ "material": 0 }));
+    glb.push(
+        "materials",
+        json!({ "extensions": {
+            "KHR_materials_specular": { "specularFactor": 0.5, "specularColorFactor": [2.0, 1.0, 0.5] },
+            "KHR_materials_sheen": { "sheenColorFactor": [0.1, 0.2, 0.3], "sheenRoughnessFactor": 0.4 },
+            "KHR_materials_anisotropy": { "anisotropyStrength": 0.6, "anisotropyRotation": 1.5 },
+            "KHR_materials_iridescence": { "iridescenceFactor": 0.7, "iridescenceThicknessMaximum": 500.0 },
+            "KHR_materials_volume": {
+                "thicknessFactor": 0.2, "attenuationDistance": 3.0, "attenuationColor": [1.0, 0.5, 0.0]
+            },
+        } }),
+    );
+    let imported = glb.load();
+    let e = imported.materials[0].extensions;
+    let (specular, sheen) = (e.specular.unwrap(), e.sheen.unwrap());
+    assert_eq!(specular.factor, 0.5);
+    assert_eq!(specular.color, Vec3::new(2.0, 1.0, 0.5));
+    assert_eq!(
+        (sheen.color, sheen.roughness),
+        (Vec3::new(0.1, 0.2, 0.3), 0.4)
+    );
+    let anisotropy = e.anisotropy.unwrap();
+    assert_eq!((anisotropy.strength, anisotropy.rotation_rad), (0.6, 1.5));
+    let film = e.iridescence.unwrap();
+    assert_eq!(
+        (film.factor, film.ior, film.thickness_nm),
+        (0.7, 1.3, [100.0, 500.0])
+    );
+    let volume = e.volume.unwrap();
+    assert_eq!((volume.thickness, volume.attenuation_distance), (0.2, 3.0));
+    assert_eq!(volume.attenuation_color, Vec3::new(1.0, 0.5, 1e-6));
+    assert!(imported.warnings.is_empty(), "{:?}", imported.warnings);
+
+    let mut glb = Glb::triangle(json!({ "material": 0 }));
+    glb.push(
+        "materials",
+        json!({ "extensions": {
+            "KHR_materials_specular": {}, "KHR_materials_sheen": {}, "KHR_materials_anisotropy": {},
+            "KHR_materials_iridescence": {}, "KHR_materials_volume": {},
+        } }),
+    );
+    let imported = glb.load();
+    assert!(imported.materials[0].extensions.is_empty());
+    assert!(imported.warnings.is_empty());
 }
 
 #[test]
@@ -519,7 +569,7 @@ fn data_uris_and_percent_encoded_files_are_found() {
     let text = glb.json.to_string();
     let imported = load_gltf_bytes(
         text.as_bytes(),
-        &Folder::new(folder.path()),
+        &Folder::new(folder.path(), &Limits::default()),
         &Limits::default(),
     )
     .unwrap();

@@ -1,15 +1,23 @@
 //! Any bytes end in an object or in an error, never in a panic or in unbounded memory.
 use std::path::Path;
 
-use dipir_scene::import::{Limits, NoFiles, Resolver, load_gltf_bytes, load_obj_bytes};
+use dipir_scene::import::{
+    Imported, Limits, NoFiles, Resolver, load_gltf_bytes, load_obj_bytes, load_ply_bytes,
+    load_stl_bytes,
+};
+use dipir_scene::texture::decode_textures;
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use crate::glb::{Glb, U8, one_texel_png};
 
 const SMALL: Limits = Limits {
-    max_vertices: 1 << 16,
-    max_triangles: 1 << 16,
+    triangles: 1 << 16,
+    instances: 1 << 10,
+    texture_pixels: 1 << 20,
+    all_texture_pixels: 1 << 20,
+    file_bytes: 1 << 30,
+    allow_outside: false,
 };
 
 /// A file that uses much of the format.
@@ -97,6 +105,13 @@ fn leaves(value: &Value, at: String, out: &mut Vec<String>) {
 
 fn survives(bytes: &[u8]) {
     if let Ok(imported) = load_gltf_bytes(bytes, &NoFiles, &SMALL) {
+        is_whole(&imported);
+    }
+}
+
+/// Every index of an object refers to something, and every number is finite.
+fn is_whole(imported: &Imported) {
+    {
         let mesh = &imported.mesh;
         let vertices = mesh.positions.len();
         assert!(mesh.first_non_finite().is_none());
@@ -155,9 +170,68 @@ fn the_seeds_of_the_fuzz_targets_load() {
     for bytes in seeds("gltf") {
         load_gltf_bytes(&bytes, &NoFiles, &SMALL).unwrap();
     }
-    for bytes in seeds("obj") {
-        load_obj_bytes(&bytes, &Itself(&bytes), &SMALL).unwrap();
+    for kind in ["obj", "mtl"] {
+        for bytes in seeds(kind) {
+            load_obj_bytes(&object_of(kind, &bytes), &Itself(&bytes), &SMALL).unwrap();
+        }
     }
+    for bytes in seeds("ply") {
+        load_ply_bytes(&bytes, &SMALL).unwrap();
+    }
+    for bytes in seeds("stl") {
+        load_stl_bytes(&bytes, &SMALL).unwrap();
+    }
+}
+
+/// The OBJ file whose libraries a seed stands for.
+fn object_of(kind: &str, bytes: &[u8]) -> Vec<u8> {
+    match kind {
+        "mtl" => {
+            b"mtllib m.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n".to_vec()
+        }
+        _ => bytes.to_vec(),
+    }
+}
+
+/// What the fuzz target of that name does.
+fn drive(kind: &str, bytes: &[u8]) {
+    let read = match kind {
+        "gltf" => load_gltf_bytes(bytes, &NoFiles, &SMALL),
+        "ply" => load_ply_bytes(bytes, &SMALL),
+        "stl" => load_stl_bytes(bytes, &SMALL),
+        _ => load_obj_bytes(&object_of(kind, bytes), &Itself(bytes), &SMALL),
+    };
+    if let Ok(imported) = read {
+        is_whole(&imported);
+        let _ = decode_textures(&imported.textures, |_| true);
+    }
+}
+
+/// Changes bytes, and copies, swaps or removes runs of them.
+fn mutated(seed: &[u8], changes: &[(u8, u16, u16, u8)]) -> Vec<u8> {
+    let mut bytes = seed.to_vec();
+    for &(how, from, to, value) in changes {
+        if bytes.is_empty() {
+            break;
+        }
+        let from = usize::from(from) % bytes.len();
+        let to = usize::from(to) % bytes.len();
+        let run = (usize::from(value) % 32).min(bytes.len() - from);
+        match how % 5 {
+            0 => bytes[from] = value,
+            1 => bytes[from] ^= 1 << (value % 8),
+            2 => {
+                bytes.drain(from..from + run);
+            }
+            3 => {
+                let copy = bytes[from..from + run].to_vec();
+                bytes.splice(to..to, copy);
+            }
+            // Digits and signs, of which texts are made.
+            _ => bytes[from] = b"0123456789-.e/\n "[usize::from(value) % 16],
+        }
+    }
+    bytes
 }
 
 proptest! {
@@ -211,6 +285,18 @@ proptest! {
             }
         }
         survives(&glb.bytes());
+    }
+
+    #[test]
+    fn mutated_seeds_of_the_fuzz_targets_never_panic(
+        which in any::<prop::sample::Index>(),
+        changes in proptest::collection::vec(any::<(u8, u16, u16, u8)>(), 1..12),
+    ) {
+        for kind in ["gltf", "obj", "mtl", "ply", "stl"] {
+            let mut all = seeds(kind);
+            all.sort();
+            drive(kind, &mutated(&all[which.index(all.len())], &changes));
+        }
     }
 
     #[test]

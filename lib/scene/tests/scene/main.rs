@@ -1,8 +1,14 @@
 //! Importers and whole scenes through the public interface.
 mod bad_input;
+mod compressed;
 mod config_table;
 mod glb;
 mod gltf_import;
 mod hostile_input;
+mod left_out;
+mod limits;
 mod obj_import;
+mod obj_reference;
+mod ply_and_stl;
 mod scene_load;
+mod visibility;

@@ -1,16 +1,17 @@
 //! The composite stage: the object at full quality, its shadow, and the layers of both.
+pub mod table;
+
 use std::fmt;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use dipir_cli::session::{Session, duration};
 use dipir_imaging::composite::composite;
-use dipir_imaging::file::write_png;
+use dipir_imaging::file::write_picture;
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentSampler;
-use dipir_pipeline::config::{Config, Quality};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_render::adaptive::Stop;
@@ -18,52 +19,16 @@ use dipir_render::film::Film;
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings};
 use glam::Vec3;
-use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::interruption;
-use crate::known_light::{self, Light, Recovered};
+use crate::known_light::{self, Light};
+use crate::light::folder::{self as light_folder, Recovered};
 use crate::light::materials;
-use crate::presets::{self, Outlook};
-use crate::scene::folder::{self, SceneFolder};
-
-/// Name of the stage and of its folder.
-pub const STAGE: &str = "composite";
-/// The executable that runs it.
-pub const EXECUTABLE: &str = "dipir-composite";
-/// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 5;
-
-/// The `[composite]` table.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct CompositeTable {
-    /// Environment map that lights the object, HDR or EXR; else the recovered light does.
-    pub environment: Option<PathBuf>,
-    /// Stops of exposure that bring the map to the photograph's scale.
-    pub exposure_ev: f32,
-    /// Turn of the map about the vertical, degrees, counter-clockwise from above.
-    pub rotation_deg: f32,
-    /// Stop at this display-referred RMSE; the quality's by default.
-    pub target_error: Option<f32>,
-    /// Or stop after about this many seconds.
-    pub time_budget_s: Option<f64>,
-    /// Most samples in any pixel.
-    pub max_samples: Option<u32>,
-    /// Curve on the object's light before it is laid over the photograph. By default the recovered
-    /// curves with the recovered light, and none with a map.
-    pub tone: Option<Tone>,
-}
-
-/// A curve on the object's light.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Tone {
-    /// None: the photograph is linear light, exposed.
-    None,
-    /// `x / (1 + x)` on every channel, for photographs whose highlights are compressed.
-    Reinhard,
-}
+use crate::names::COMPOSITE;
+use crate::presets::Outlook;
+use crate::scene::folder::{self as scene_folder, SceneFolder};
+use table::{CompositeTable, MAX_SAMPLES, Tone};
 
 /// When to stop, from the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -72,70 +37,6 @@ pub struct StopArgs {
     pub target_error: Option<f32>,
     /// Stop after about this many seconds.
     pub time_budget_s: Option<f64>,
-}
-
-/// Most samples in any pixel, unless the table says otherwise.
-const MAX_SAMPLES: u32 = 1 << 14;
-
-impl CompositeTable {
-    /// Refuses what no run can work with.
-    pub fn check(&self, config: &Config) -> anyhow::Result<()> {
-        let wrong = |key: &str, message: String| {
-            Err(anyhow::Error::new(
-                config.invalid(&format!("composite.{key}"), message),
-            ))
-        };
-        if let Some(e) = self.target_error
-            && !(e > 0.0 && e <= 1.0)
-        {
-            let range = "a display-referred RMSE above 0, at most 1, as in 0.004";
-            return wrong(
-                "target_error",
-                format!("{e} is out of range; accepted: {range}"),
-            );
-        }
-        if let Some(t) = self.time_budget_s
-            && !(t > 0.0 && t < 1e9)
-        {
-            return wrong(
-                "time_budget_s",
-                format!("{t} is out of range; accepted: seconds above 0"),
-            );
-        }
-        if self.target_error.is_some() && self.time_budget_s.is_some() {
-            return wrong(
-                "time_budget_s",
-                "excludes target_error; keep one of the two".into(),
-            );
-        }
-        if self.max_samples == Some(0) {
-            return wrong(
-                "max_samples",
-                "0 is out of range; accepted: 1 or more".into(),
-            );
-        }
-        if !(self.exposure_ev.abs() <= 64.0) {
-            return wrong(
-                "exposure_ev",
-                format!(
-                    "{} is out of range; accepted: stops from -64 to 64",
-                    self.exposure_ev
-                ),
-            );
-        }
-        if !self.rotation_deg.is_finite() {
-            return wrong("rotation_deg", "must be a finite angle in degrees".into());
-        }
-        Ok(())
-    }
-
-    fn stop(&self, quality: Quality) -> Stop {
-        match (self.target_error, self.time_budget_s) {
-            (Some(error), _) => Stop::TargetError(error),
-            (None, Some(seconds)) => Stop::TimeBudget(Duration::from_secs_f64(seconds)),
-            (None, None) => Stop::TargetError(presets::of(quality).composite.target_error),
-        }
-    }
 }
 
 /// What the stage did.
@@ -191,14 +92,14 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     materials::use_recovered(session, &mut inputs.scene)?;
     let light = match known_light::known(session, &table)? {
         Some(light) => Source::Map(light),
-        None => Source::Recovered(Box::new(known_light::recovered(
+        None => Source::Recovered(Box::new(light_folder::recovered(
             session,
             &table,
             &inputs.scene.manifest,
         )?)),
     };
     let stop = table.stop(session.pipeline.quality);
-    let folder = session.stage_folder(STAGE);
+    let folder = COMPOSITE.folder(session);
     let mut writer = session.begin(plan(session, &table)?)?;
     let course = render(
         session,
@@ -210,10 +111,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let Course { rendered, .. } = course;
     let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light))?;
     let png = writer.output("picture", "composite.png")?;
-    write_png(
-        png,
-        &inputs.scene.loaded.photo.transfer.encode(&layers.beauty),
-    )?;
+    write_picture(png, &layers.beauty, &inputs.scene.loaded.photo)?;
     let exr = writer.output("layers", "composite.exr")?;
     layers.to_layers(&inputs.gbuffer)?.write_exr(exr)?;
     writer.set_estimated_error(rendered.error.upper_95);
@@ -256,12 +154,17 @@ fn read(session: &Session) -> anyhow::Result<Inputs> {
 }
 
 /// What a run would be, from the configuration and the manifests of the stages that it reads.
-pub fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> {
+pub fn plan_of(session: &Session) -> anyhow::Result<StagePlan> {
+    plan(session, &session.config.table("composite")?)
+}
+
+/// What a run with `table` would be.
+fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> {
     table.check(&session.config)?;
-    let scene = folder::manifest(session)?;
+    let scene = scene_folder::manifest(session)?;
     let known = known_light::known_params(table);
     let params = json!({
-        "light": known.as_ref().map_or_else(|| known_light::recovered_params(table), |k| k.0.clone()),
+        "light": known.as_ref().map_or_else(|| light_folder::recovered_params(table), |k| k.0.clone()),
         "tone": table.tone,
         "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
         "stop": match table.stop(session.pipeline.quality) {
@@ -270,11 +173,11 @@ pub fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePl
             Stop::TimeBudget(t) => json!({"time_budget_s": t.as_secs_f64()}),
         },
     });
-    let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
-    folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
+    let mut plan = COMPOSITE.plan(session, params);
+    scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
     match known {
         Some((_, path)) => plan.input("environment", path, &session.resolve(path))?,
-        None => plan.outputs_of(&known_light::manifest(session)?, &["lighting", "tone"])?,
+        None => plan.outputs_of(&light_folder::manifest(session)?, &["lighting", "tone"])?,
     }
     materials::add_input(session, &mut plan)?;
     Ok(plan)
@@ -362,17 +265,20 @@ struct Composite<'a> {
     alpha: Raster<f32>,
     shadow: LinearImage,
     beauty: LinearImage,
+    /// How the object's and the shadow's colours are stored.
+    precision: [Precision; 2],
 }
 
 impl<'a> Composite<'a> {
     fn new(inputs: &'a Inputs, film: Film, curve: &Curve) -> anyhow::Result<Self> {
         let background = &inputs.scene.loaded.photo.image;
         let (object, shadow) = curve.apply(film.object, &film.alpha, film.shadow);
-        // Stored in half precision: rounded before they are put together, so that whoever does it
-        // again from the file gets the same picture.
-        let object = LinearImage(object.map(|v| half_vec(*v)));
-        let alpha = film.alpha.map(|a| half::f16::from_f32(*a).to_f32());
-        let shadow = LinearImage(shadow.map(|v| half_vec(*v)));
+        // Rounded to what the file stores before they are put together, so that whoever does it
+        // again from the file gets the same picture. Light beyond half precision is stored in full.
+        let precision = [Precision::of_colour(&object), Precision::of_colour(&shadow)];
+        let object = LinearImage(object.map(|v| precision[0].round_colour(*v)));
+        let alpha = film.alpha.map(|a| Precision::Half.round(*a));
+        let shadow = LinearImage(shadow.map(|v| precision[1].round_colour(*v)));
         let beauty = composite(background, &object, &alpha, &shadow)?;
         Ok(Self {
             background,
@@ -380,18 +286,20 @@ impl<'a> Composite<'a> {
             alpha,
             shadow,
             beauty,
+            precision,
         })
     }
 
     fn to_layers(&self, gbuffer: &Layers) -> anyhow::Result<Layers> {
         let (width, height) = (self.alpha.width(), self.alpha.height());
         let mut layers = Layers::new(width, height);
-        layers.insert_rgb("", Precision::Half, &self.beauty.0)?;
+        let of = |image: &LinearImage| Precision::of_colour(&image.0);
+        layers.insert_rgb("", of(&self.beauty), &self.beauty.0)?;
         layers.insert("A", Precision::Half, Raster::filled(width, height, 1.0))?;
-        layers.insert_rgb("object", Precision::Half, &self.object.0)?;
+        layers.insert_rgb("object", self.precision[0], &self.object.0)?;
         layers.insert("object.A", Precision::Half, self.alpha.clone())?;
-        layers.insert_rgb("shadow", Precision::Half, &self.shadow.0)?;
-        layers.insert_rgb("background", Precision::Half, &self.background.0)?;
+        layers.insert_rgb("shadow", self.precision[1], &self.shadow.0)?;
+        layers.insert_rgb("background", of(self.background), &self.background.0)?;
         layers.insert(
             "depth.Z",
             Precision::Full,
@@ -401,11 +309,6 @@ impl<'a> Composite<'a> {
         layers.insert_rgb("albedo", Precision::Half, &gbuffer.rgb("albedo")?)?;
         Ok(layers)
     }
-}
-
-fn half_vec(v: Vec3) -> Vec3 {
-    let half = |x: f32| half::f16::from_f32(x).to_f32();
-    Vec3::new(half(v.x), half(v.y), half(v.z))
 }
 
 /// What is done to the light of the object and to the shadow before they are laid over the

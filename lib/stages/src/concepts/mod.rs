@@ -1,4 +1,7 @@
 //! The concepts stage: images of the object's class, made by the un-adapted model.
+pub mod folder;
+pub mod table;
+
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -12,76 +15,30 @@ use dipir_diffusion::generate::{GenerateSettings, generate};
 use dipir_diffusion::model::Model;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
-use dipir_diffusion::weights::{Weights, write_safetensors};
+use dipir_diffusion::weights::write_safetensors;
 use dipir_imaging::file::write_png;
 use dipir_pipeline::error::StageError;
+use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::{Manifest, hash_file};
+use dipir_pipeline::mark::Kind;
+use dipir_pipeline::resume::Resume;
 use dipir_pipeline::stage::StagePlan;
 use dipir_scene::config::SceneConfig;
-use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::model::{self, ModelTable};
+use crate::names::CONCEPTS;
+use folder::{ConceptEntry, ConceptList, read_latents};
+use table::ConceptsTable;
 
-/// Name of the stage and of its folder.
-pub const STAGE: &str = "concepts";
-/// The executable that runs it.
-pub const EXECUTABLE: &str = "dipir-concepts";
-/// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 1;
-
-/// The `[concepts]` table.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ConceptsTable {
-    /// Images; 0 switches concept preservation off.
-    pub count: usize,
-    /// Steps of the sampler.
-    pub steps: usize,
-    /// Classifier-free guidance scale, 1 for none.
-    pub guidance: f64,
-    /// Side of the images in pixels; the model's own by default.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub size: Option<usize>,
-    /// Folder of finished images that scenes of one class and model share, and in which an
-    /// interrupted run goes on; `concepts-cache` in the folder of artifacts by default.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub cache: Option<PathBuf>,
-}
-
-impl Default for ConceptsTable {
-    fn default() -> Self {
-        Self {
-            count: 32,
-            // DPM-Solver++ changes little beyond 20 to 30 steps.
-            steps: 25,
-            guidance: 7.5,
-            size: None,
-            cache: None,
-        }
-    }
-}
-
-/// One entry of `concepts.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ConceptEntry {
-    /// Relative to the stage's folder.
-    pub image: PathBuf,
-    /// What was asked for, and the key of its noise.
-    #[serde(flatten)]
-    pub concept: Concept,
-}
-
-/// `concepts.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ConceptList {
-    /// The class.
-    pub class: String,
-    /// The caption under which the images are trained.
-    pub class_prompt: String,
-    /// In the order of `latents.safetensors`.
-    pub concepts: Vec<ConceptEntry>,
-}
+/// The files of an image in the cache, and the names under which they are written.
+const CACHED: [&str; 5] = [
+    "#.png",
+    "#.safetensors",
+    "#.blake3",
+    "#.partial",
+    "#.partial.png",
+];
 
 /// What the stage did.
 pub struct Done {
@@ -111,7 +68,7 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let params = json!({
         "concepts": without_cache, "class": class(session)?, "precision": model_table.precision,
     });
-    let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
+    let mut plan = CONCEPTS.plan(session, params);
     plan.device = session.pipeline.device.clone();
     model::inputs(session, &model_table, &mut plan)?;
     Ok(plan)
@@ -129,10 +86,10 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let class = class(session)?;
     let plan = plan(session)?;
     let cache = cache_folder(session, &table, &plan, &class)?;
-    let folder = session.stage_folder(STAGE);
+    let folder = CONCEPTS.folder(session);
     let mut writer = session.begin(plan)?;
     let model = model::load(session, &model_table)?;
-    let side = table.size.unwrap_or_else(|| model::native_size(&model));
+    let side = table.size.unwrap_or_else(|| model.native_size());
 
     let mut list = ConceptList {
         class_prompt: class_prompt(&class),
@@ -146,10 +103,10 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         let concept = concept(&list.class, index, session.pipeline.seed);
         let stem = format!("{index:04}");
         let (png, tensor) = (
-            cache.join(format!("{stem}.png")),
-            cache.join(format!("{stem}.safetensors")),
+            cache.file(format!("{stem}.png")),
+            cache.file(format!("{stem}.safetensors")),
         );
-        let seal = cache.join(format!("{stem}.blake3"));
+        let seal = cache.file(format!("{stem}.blake3"));
         if !is_whole(&seal, &png, &tensor) {
             let settings = GenerateSettings {
                 solver: Solver::DpmSolver2M,
@@ -197,20 +154,24 @@ fn cache_folder(
     table: &ConceptsTable,
     plan: &StagePlan,
     class: &str,
-) -> anyhow::Result<PathBuf> {
+) -> anyhow::Result<Resume> {
     let root = match &table.cache {
         Some(path) => session.resolve(path),
         None => session.out.join("concepts-cache"),
     };
-    let setting = json!({
-        "version": VERSION, "class": class, "steps": table.steps, "guidance": table.guidance, "size": table.size,
-        "seed": plan.seed, "device": plan.device, "precision": plan.params["precision"],
-        "model": plan.inputs.iter().map(|i| &i.blake3).collect::<Vec<_>>(),
+    // How many images there are does not show in any of them.
+    let params = json!({
+        "class": class, "steps": table.steps, "guidance": table.guidance, "size": table.size,
+        "precision": plan.params["precision"],
     });
-    let key = blake3::hash(setting.to_string().as_bytes()).to_hex();
-    let folder = root.join(&key.as_str()[..16]);
-    model::create_folder(&folder)?;
-    Ok(folder)
+    let fingerprint = Fingerprint::of_plan(plan).params(params).finish();
+    Ok(Resume::open(
+        &root,
+        Kind::Cache,
+        CONCEPTS.name,
+        &fingerprint,
+        &CACHED,
+    )?)
 }
 
 /// Whether both files of an image are there with the hashes that were noted when they were made.
@@ -254,7 +215,7 @@ fn make(
     interrupt::check()?;
     let generated = outcome?;
     let partial = png.with_extension("partial.png");
-    write_png(&partial, &model::to_display(&generated.image)?)?;
+    write_png(&partial, &dipir_tensors::model_output(&generated.image)?)?;
     std::fs::rename(&partial, png).with_context(|| format!("cannot write {}", png.display()))?;
     let latents = generated
         .latents
@@ -266,18 +227,6 @@ fn make(
         &BTreeMap::new(),
     )?;
     Ok(())
-}
-
-/// The tensor `latents` of a file of this stage.
-pub fn read_latents(path: &Path) -> anyhow::Result<Tensor> {
-    Weights::open_file(path)?
-        .tensor("latents", DType::F32, &Device::Cpu)?
-        .with_context(|| {
-            format!(
-                "{} holds no tensor \"latents\"; delete it and run {EXECUTABLE} again",
-                path.display()
-            )
-        })
 }
 
 impl Done {

@@ -19,12 +19,15 @@ use dipir_render::render::{Renderer, Settings, Simulation};
 use dipir_scene::material::Material;
 use serde_json::{Value, json};
 
-use crate::composite::{CompositeTable, Tone};
+use crate::composite::table::{CompositeTable, Tone};
+use crate::interruption;
 use crate::known_light;
+use crate::light::folder::warn_of_another_scene;
+use crate::light::request::{read_reference, reference_of};
 use crate::light::resume::{self, Resume};
-use crate::scene::folder::{self, SceneFolder};
+use crate::names::LIGHT;
+use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::scene::transport::{self, Frame};
-use crate::{interruption, light};
 
 /// Role of the file among the light stage's outputs.
 const ROLE: &str = "materials";
@@ -53,12 +56,12 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
     let settings = transport::settings(session, &table)?;
-    let (_, reference_file) = light::reference_of(session, &table)?;
+    let (_, reference_file) = reference_of(session, &table)?;
     let light = known_light::known(session, &composite)?.ok_or_else(|| needs_light(session))?;
     let scene = SceneFolder::read(session)?;
     let materials = indices(session, &scene.loaded.scene.materials, &table.materials)?;
     let frame = Frame::new(&scene.loaded, settings.size);
-    let reference = light::read_reference(session, &scene, &frame, &reference_file)?;
+    let reference = read_reference(session, &scene, &frame, &reference_file)?;
     let material_settings = MaterialSettings {
         checkpoint_every: settings.checkpoint_every,
         ..settings_of(&table, settings.seed)
@@ -66,7 +69,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let plan = plan(session)?;
     let decisive = settings_of(&table, settings.seed);
     let fingerprint = resume::run_fingerprint(&plan, &json!(decisive))?;
-    let folder = session.stage_folder(light::STAGE);
+    let folder = LIGHT.folder(session);
     let mut writer = session.begin(plan)?;
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
     let sampler = EnvironmentSampler::new(light.map.clone());
@@ -116,7 +119,7 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
     let settings = transport::settings(session, &table)?;
-    let (reference_path, reference_file) = light::reference_of(session, &table)?;
+    let (reference_path, reference_file) = reference_of(session, &table)?;
     let (light, environment) =
         known_light::known_params(&composite).ok_or_else(|| needs_light(session))?;
     let params = json!({
@@ -127,10 +130,9 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
         "light": light,
         "tone": composite.tone,
     });
-    let (stage, version) = (light::STAGE, light::VERSION);
-    let mut plan = StagePlan::new(stage, version, params, session.pipeline.seed);
-    let scene = folder::manifest(session)?;
-    folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
+    let mut plan = LIGHT.plan(session, params);
+    let scene = scene_folder::manifest(session)?;
+    scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
     plan.input("reference", &reference_path, &reference_file)?;
     plan.input("environment", environment, &session.resolve(environment))?;
     Ok(plan)
@@ -209,8 +211,7 @@ fn recovery(session: &Session) -> anyhow::Result<Option<Manifest>> {
     if !are_asked_for(session)? {
         return Ok(None);
     }
-    let folder = session.stage_folder(light::STAGE);
-    Ok(Some(Manifest::read(&folder, light::EXECUTABLE)?))
+    Ok(Some(LIGHT.manifest(session)?))
 }
 
 /// Notes the recovered materials as an input, if the configuration asks for them.
@@ -227,11 +228,11 @@ pub fn use_recovered(session: &Session, scene: &mut SceneFolder) -> anyhow::Resu
     let Some(manifest) = recovery(session)? else {
         return Ok(());
     };
-    known_light::warn_of_another_scene(session, &manifest, &scene.manifest);
-    let file = manifest.output(&session.stage_folder(light::STAGE), ROLE)?;
+    warn_of_another_scene(session, &manifest, &scene.manifest);
+    let file = manifest.output(&LIGHT.folder(session), ROLE)?;
     let text = std::fs::read_to_string(&file)?;
     let found: Vec<RecoveredMaterial> = serde_json::from_str(&text).map_err(|e| {
-        let tool = light::EXECUTABLE;
+        let tool = LIGHT.executable;
         anyhow::anyhow!(
             "{}: {e}; it was written by another version: run {tool} again",
             file.display()

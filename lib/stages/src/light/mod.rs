@@ -1,204 +1,209 @@
 //! The light stage: recovers the light and the tone curves under which the object looks as the
 //! guidance wants it to.
-pub mod distillation;
-mod guide;
+pub mod folder;
 pub mod materials;
-pub mod reading;
+mod request;
 mod resume;
 
 use std::fmt;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use std::time::Instant;
 
 use anyhow::Context;
 use dipir_cli::interrupt::Interrupted;
+use dipir_cli::progress::Progress;
 use dipir_cli::session::{Session, duration};
-use dipir_imaging::file::{read_photo, write_png};
+use dipir_guidance::distillation::Adapter;
+use dipir_guidance::recover::{Event, ModelGuidance, Problem, Recovery, Target, recover_light};
+use dipir_imaging::file::write_png;
 use dipir_imaging::raster::DisplayImage;
-use dipir_optimize::OptimizeError;
-use dipir_optimize::crop::{Framing, USUAL_SCALE, bounding_box};
-use dipir_optimize::guidance::{Guidance, Reference, rmse, touched};
 use dipir_optimize::history::Row;
 use dipir_optimize::lighting::Lighting;
-use dipir_optimize::objective::Objective;
-use dipir_optimize::optimization::{Event, Optimization, Outcome};
-use dipir_optimize::parameters::{Parameters, ambient_of};
-use dipir_optimize::recorder::SceneRecorder;
-use dipir_optimize::settings::{GuidanceKind, LightTable, Settings, Start};
+use dipir_optimize::optimization::{self, Outcome};
+use dipir_optimize::settings::{Settings, Start};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
-use dipir_prior::reader::{ReaderSettings, Reading};
 use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
 use glam::Vec3;
 use serde_json::{Value, json};
 
-use crate::light::distillation::Adapter;
-use crate::light::guide::{Asked, Guide, Judge};
+use crate::light::request::{Guide, Request, first_light, read_reference};
 use crate::light::resume::{Resume, fingerprint};
+use crate::model::{self, Loaded};
+use crate::names::LIGHT;
 use crate::presets::{LightRun, Outlook};
-use crate::scene::folder::{self, SceneFolder};
+use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::scene::transport::{self, Frame};
-use crate::{interruption, model};
-
-/// Name of the stage and of its folder.
-pub const STAGE: &str = "light";
-/// The executable that runs it.
-pub const EXECUTABLE: &str = "dipir-light";
-/// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 3;
-
-/// Side of the crops of a reference, when it is compared on crops.
-const CROP_SIDE: usize = 128;
+use crate::{interruption, lora};
 
 /// What the stage did.
 pub struct Done {
     folder: PathBuf,
     manifest: Manifest,
-    outcome: Outcome,
+    recovery: Recovery,
     size: [u32; 2],
     resumed_at: usize,
-    /// Display-referred RMSE against the reference, over what the object or its shadow touches.
-    rmse: Option<f64>,
-    reading: Option<Reading>,
     /// What other presets would have taken; empty for a run that went on from a checkpoint.
     outlook: Outlook,
 }
 
+/// What the stage reads.
+struct Inputs {
+    scene: SceneFolder,
+    /// The picture at the size at which light is recovered.
+    frame: Frame,
+    /// The light of `[light] start`, if that is a file.
+    first: Option<Lighting>,
+    /// With `guidance = "reference"`.
+    reference: Option<DisplayImage>,
+}
+
+impl Inputs {
+    fn read(session: &Session, request: &Request) -> anyhow::Result<Self> {
+        let first = first_light(session, &request.table)?;
+        let scene = SceneFolder::read(session)?;
+        let frame = Frame::new(&scene.loaded, request.settings.size);
+        let reference = match &request.guide {
+            Guide::Reference { file, .. } => Some(read_reference(session, &scene, &frame, file)?),
+            Guide::Model { .. } => None,
+        };
+        Ok(Self {
+            scene,
+            frame,
+            first,
+            reference,
+        })
+    }
+}
+
+/// The loaded model, if one guides.
+struct Model {
+    loaded: Loaded,
+    adapter: Option<Adapter>,
+}
+
+impl Model {
+    fn load(session: &Session, guide: &Guide) -> anyhow::Result<Option<Self>> {
+        let Guide::Model {
+            table,
+            settings,
+            reading,
+            ..
+        } = guide
+        else {
+            return Ok(None);
+        };
+        let mut loaded = model::load(session, table)?;
+        let adapter = settings
+            .adapt
+            .then(|| lora::folder::read(session, &mut loaded))
+            .transpose()?;
+        if reading.is_some() {
+            dipir_prior::text_conditioning::add_placeholders(&mut loaded.tokenizer);
+        }
+        Ok(Some(Self { loaded, adapter }))
+    }
+}
+
 /// Runs the stage.
 pub fn run(session: &Session) -> anyhow::Result<Done> {
-    let Asked {
-        table,
-        settings,
-        judge,
-    } = Asked::of(session)?;
-    let first = first_light(session, &table)?;
-    let scene = SceneFolder::read(session)?;
-    let frame = Frame::new(&scene.loaded, settings.size);
-    let reference = match &judge {
-        Judge::Reference { file, .. } => Some(read_reference(session, &scene, &frame, file)?),
-        Judge::Diffusion { .. } => None,
-    };
-
+    let request = Request::of(session)?;
+    let inputs = Inputs::read(session, &request)?;
     let plan = plan(session)?;
-    let fingerprint = fingerprint(&plan, &settings)?;
-    let folder = session.stage_folder(STAGE);
+    let fingerprint = fingerprint(&plan, &request.settings)?;
     let mut writer = session.begin(plan)?;
-
-    let simulation = scene.effects.simulation();
-    let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
-    let hash = transport::scene_hash(&scene.loaded, &simulation)?;
-    let record = frame.record_settings(&settings, simulation, hash);
-    let clock = Instant::now();
-    let recorded = recorded(session, &scene, &renderer, &record)?;
-    writer.set_timing("transport", clock.elapsed().as_secs_f64());
-
-    let neutral = Parameters::neutral(settings.lobes, ambient_of(&frame.background));
-    let transfer = scene.loaded.photo.transfer;
-    let coverage = recorded.coverage().clone();
-    let objective = Objective::new(
-        Box::new(recorded),
-        frame.background.clone(),
-        transfer,
-        settings.weights(),
-    )?;
-    let mask = touched(&objective);
-    let shown = transfer.encode(&frame.background);
-    let clock = Instant::now();
-    let mut guide = Guide::open(session, &judge)?;
-    let reading = guide.read(session, &judge, &shown, &renderer, &coverage, settings.seed)?;
-    writer.set_timing("reading", clock.elapsed().as_secs_f64());
-    let start = match (&first, &reading) {
-        (Some((_, _, light)), _) => Parameters::of_lobes(&light.exposed_lobes()),
-        (None, Some(reading)) => reading::start(&reading.light, &frame.camera, settings.lobes),
-        (None, None) => neutral,
-    };
     let resume = Resume::open(session, &fingerprint)?;
-    let resumed_at = resume.restored(session, &settings, &start)?;
-    let mut guidance: Box<dyn Guidance> = match (&judge, &reference) {
-        (_, Some(reference)) => {
-            let framing = match settings.crops {
-                true => Framing::Crops {
-                    side: CROP_SIDE,
-                    scale: USUAL_SCALE,
-                },
-                false => Framing::Whole,
-            };
-            Box::new(Reference::new(reference.clone(), &objective, framing)?)
-        }
-        (Judge::Reference { .. }, None) => anyhow::bail!("the reference was not read"),
-        (
-            Judge::Diffusion {
-                settings, class, ..
-            },
-            None,
-        ) => {
-            // A model that knows light sees the ground on which the shadow will fall.
-            let paint = if reading.is_some() { &coverage } else { &mask };
-            let seen = reading.as_ref().zip(bounding_box(&coverage));
-            let seen = seen.map(|(r, object)| {
-                let gaze = reading::gaze(&frame.camera, object);
-                r.light.words.seen_from(gaze.heading)
-            });
-            Box::new(guide.distillation(settings, class, seen.as_ref(), &shown, paint)?)
-        }
-    };
-    let mut go_on = |_: f64| interruption();
-    let mut recorder = SceneRecorder {
-        renderer: &renderer,
-        settings: record,
-        progress: &mut go_on,
-    };
-    let clock = Instant::now();
-    let optimization = Optimization {
-        objective,
-        guidance: &mut *guidance,
-        recorder: Some(&mut recorder),
-        settings: settings.clone(),
-        start,
-        checkpoint: Some(&resume.checkpoint()),
-    };
-    let outcome = follow(session, &settings, &resume, optimization)?;
-    writer.set_timing("optimization", clock.elapsed().as_secs_f64());
-    write_results(&settings, &outcome, &resume, &mut writer)?;
-    if let Some(reading) = &reading {
-        writer.write_json("reading", "reading.json", reading)?;
-    }
-    let rmse = reference.map(|reference| rmse(&outcome.picture, &reference, &mask, None));
-    if let Some(rmse) = rmse {
-        writer.set_estimated_error(rmse);
-    }
+    let (recovery, resumed_at) = recover(session, &request, &inputs, &resume, &mut writer)?;
+    write_results(&request.settings, &recovery, &resume, &mut writer)?;
     let manifest = writer.finish()?;
     resume.remove();
     let outlook = match resumed_at {
-        0 => light_run(&scene, &settings, &judge, &manifest)
-            .outlook(session.pipeline.quality, &table),
+        0 => light_run(&inputs.scene, &request, &manifest)
+            .outlook(session.pipeline.quality, &request.table),
         _ => Outlook::default(),
     };
     Ok(Done {
-        folder,
+        folder: LIGHT.folder(session),
         manifest,
-        outcome,
-        size: frame.camera.resolution,
+        recovery,
+        size: inputs.frame.camera.resolution,
         resumed_at,
-        rmse,
-        reading,
         outlook,
     })
 }
 
+/// Recovers light and tone curves; says at which iteration it went on.
+fn recover(
+    session: &Session,
+    request: &Request,
+    inputs: &Inputs,
+    resume: &Resume,
+    writer: &mut StageWriter,
+) -> anyhow::Result<(Recovery, usize)> {
+    let (settings, frame, loaded) = (&request.settings, &inputs.frame, &inputs.scene.loaded);
+    let simulation = inputs.scene.effects.simulation();
+    let renderer = Renderer::new(&loaded.scene).with_camera(frame.camera);
+    let hash = transport::scene_hash(loaded, &simulation)?;
+    let record = frame.record_settings(settings, simulation, hash);
+    let clock = Instant::now();
+    let recorded = recorded(session, &inputs.scene, &renderer, &record)?;
+    writer.set_timing("transport", clock.elapsed().as_secs_f64());
+    let clock = Instant::now();
+    let model = Model::load(session, &request.guide)?;
+    let loading_s = clock.elapsed().as_secs_f64();
+    let target = match (&request.guide, &model, &inputs.reference) {
+        (
+            Guide::Model {
+                settings,
+                class,
+                reading,
+                ..
+            },
+            Some(model),
+            _,
+        ) => Target::Model(ModelGuidance {
+            model: &model.loaded,
+            adapter: model.adapter.as_ref(),
+            settings,
+            class,
+            reading: reading.as_ref(),
+        }),
+        (_, _, Some(reference)) => Target::Reference(reference),
+        _ => anyhow::bail!("neither model nor reference was read"),
+    };
+    let first = inputs.first.as_ref().map(Lighting::exposed_lobes);
+    let checkpoint = resume.checkpoint();
+    let problem = Problem {
+        renderer: &renderer,
+        transport: recorded,
+        record,
+        background: &frame.background,
+        transfer: loaded.photo.transfer,
+        settings,
+        start: first.as_deref(),
+        checkpoint: Some(&checkpoint),
+    };
+    let (recovery, resumed_at) = follow(session, settings, resume, |watch| {
+        recover_light(problem, &target, watch)
+    })?;
+    writer.set_timing("reading", loading_s + recovery.reading_s);
+    writer.set_timing("optimization", recovery.optimization_s);
+    Ok((recovery, resumed_at))
+}
+
 /// What took how long.
-fn light_run(
-    scene: &SceneFolder,
-    settings: &Settings,
-    judge: &Judge,
-    manifest: &Manifest,
-) -> LightRun {
+fn light_run(scene: &SceneFolder, request: &Request, manifest: &Manifest) -> LightRun {
+    let settings = &request.settings;
     let seconds = |manifest: &Manifest, name: &str| manifest.timings_s.get(name).copied();
     let resolution = scene.loaded.scene.camera.resolution;
     let photo_side = resolution[0].max(resolution[1]) as usize;
-    let refines = matches!(judge, Judge::Diffusion { reads: Some(_), .. });
+    let (by_model, refines) = match &request.guide {
+        Guide::Reference { .. } => (false, false),
+        Guide::Model { reading, .. } => (true, reading.is_some()),
+    };
     LightRun {
         iterations: (!refines).then_some(settings.iterations),
         samples: settings.samples,
@@ -208,129 +213,32 @@ fn light_run(
             .or(seconds(manifest, "transport"))
             .unwrap_or(0.0),
         optimization_s: seconds(manifest, "optimization").unwrap_or(0.0),
-        by_model: matches!(judge, Judge::Diffusion { .. }),
+        by_model,
     }
 }
 
 /// What a run would be, from the configuration and the manifests of the stages that it reads.
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
-    let Asked {
-        table,
-        settings,
-        judge,
-    } = Asked::of(session)?;
-    let mut plan = StagePlan::new(
-        STAGE,
-        VERSION,
-        params(&settings, &judge),
-        session.pipeline.seed,
-    );
-    let scene = folder::manifest(session)?;
-    folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
-    match &judge {
-        Judge::Reference { path, file } => plan.input("reference", path, file)?,
-        Judge::Diffusion {
+    let request = Request::of(session)?;
+    let mut plan = LIGHT.plan(session, request.params());
+    let scene = scene_folder::manifest(session)?;
+    scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects"])?;
+    match &request.guide {
+        Guide::Reference { path, file } => plan.input("reference", path, file)?,
+        Guide::Model {
             table, settings, ..
         } => {
             plan.device = session.pipeline.device.clone();
             model::inputs(session, table, &mut plan)?;
             if settings.adapt {
-                Adapter::add_inputs(session, &mut plan)?;
+                lora::folder::add_inputs(session, &mut plan)?;
             }
         }
     }
-    if let Start::File(path) = &table.start {
+    if let Start::File(path) = &request.table.start {
         plan.input("start", path, &session.resolve(path))?;
     }
     Ok(plan)
-}
-
-/// The light of `[light] start`: its file as the configuration names it, where it is, and what it
-/// holds.
-fn first_light(
-    session: &Session,
-    table: &LightTable,
-) -> anyhow::Result<Option<(PathBuf, PathBuf, Lighting)>> {
-    let Start::File(path) = &table.start else {
-        return Ok(None);
-    };
-    let file = session.resolve(path);
-    let light = Lighting::read(&file)
-        .with_context(|| format!("cannot use light.start = \"{}\"", path.display()))?;
-    if light.lobes.is_empty() {
-        let message = format!(
-            "\"{}\" holds no lobes; accepted: a lighting.json that holds some",
-            path.display()
-        );
-        return Err(session.config.invalid("light.start", message).into());
-    }
-    Ok(Some((path.clone(), file, light)))
-}
-
-/// The reference, as the configuration names it and where it is.
-pub fn reference_of(session: &Session, table: &LightTable) -> anyhow::Result<(PathBuf, PathBuf)> {
-    let path = table.reference.clone().ok_or_else(|| {
-        let message = "is missing: name the picture that the composite should equal, as in \
-                       reference = \"image.exr\"";
-        session.config.invalid("light.reference", message)
-    })?;
-    let file = session.resolve(&path);
-    Ok((path, file))
-}
-
-/// The reference at the size of `frame`, as it is displayed.
-pub fn read_reference(
-    session: &Session,
-    scene: &SceneFolder,
-    frame: &Frame,
-    file: &Path,
-) -> anyhow::Result<DisplayImage> {
-    let transfer = scene.loaded.photo.transfer;
-    let image = read_photo(file, transfer)?.image;
-    let found = [image.0.width() as u32, image.0.height() as u32];
-    let expected = scene.loaded.scene.camera.resolution;
-    if found != expected {
-        let message = format!(
-            "\"{}\" has {} x {} pixels; accepted: a picture of the photograph's size, {} x {}",
-            file.display(),
-            found[0],
-            found[1],
-            expected[0],
-            expected[1]
-        );
-        return Err(session.config.invalid("light.reference", message).into());
-    }
-    Ok(transfer.encode(&frame.scale(&image)))
-}
-
-/// How light is read, as far as it decides.
-fn read_param(reads: &Option<ReaderSettings>) -> Value {
-    match reads {
-        Some(settings) if settings.draws == 0 => json!("encoder"),
-        other => json!(other.is_some()),
-    }
-}
-
-/// What decides the outputs; how often the state is kept does not.
-fn params(settings: &Settings, judge: &Judge) -> Value {
-    let settings = Settings {
-        checkpoint_every: 0,
-        ..settings.clone()
-    };
-    match judge {
-        Judge::Reference { .. } => {
-            json!({"optimize": settings, "guidance": GuidanceKind::Reference})
-        }
-        Judge::Diffusion {
-            table,
-            settings: distillation,
-            class,
-            reads,
-        } => json!({
-            "optimize": settings, "guidance": distillation, "class": class,
-            "precision": table.precision, "read": read_param(reads),
-        }),
-    }
 }
 
 /// The scene stage's record if it was made for these settings, else a new one.
@@ -352,53 +260,102 @@ fn recorded(
     transport::record(session, renderer, settings)
 }
 
-/// Runs the loop, showing how far it is and keeping its previews.
+/// Runs `recover` with progress bars, keeps its previews, and says at which iteration it went on.
 fn follow(
     session: &Session,
     settings: &Settings,
     resume: &Resume,
-    optimization: Optimization,
-) -> anyhow::Result<Outcome> {
-    let progress = session.progress("light");
-    let mut unwritten: Option<anyhow::Error> = None;
-    let mut watch = |event: Event| -> ControlFlow<()> {
-        match event {
-            Event::Step(row) => {
-                progress.set((row.iteration + 1) as f64 / settings.iterations as f64);
-                match (row.loss, &row.skipped) {
-                    (Some(loss), _) => progress.say(format!("loss {loss:.4}")),
-                    (None, bad) => progress.say(format!("skipped: {bad:?}")),
-                }
-                if row.recorded {
-                    session.remark(|| format!("iteration {}: recorded anew", row.iteration));
-                }
-            }
-            Event::Preview { iteration, picture } => {
-                if let Err(e) = write_png(resume.preview(iteration), picture) {
-                    unwritten = Some(e.into());
-                    return ControlFlow::Break(());
-                }
+    recover: impl FnOnce(&(dyn Fn(Event) -> ControlFlow<()> + Sync)) -> dipir_guidance::Result<Recovery>,
+) -> anyhow::Result<(Recovery, usize)> {
+    let watch = Watch {
+        session,
+        settings,
+        resume,
+        state: Mutex::default(),
+    };
+    let recovered = recover(&|event| watch.event(event));
+    let state = watch.state.into_inner().unwrap_or_else(|e| e.into_inner());
+    if let Some(error) = state.failed {
+        return Err(error);
+    }
+    if let Some(bar) = state.bar {
+        bar.done();
+    }
+    match recovered {
+        Err(dipir_guidance::Error::Interrupted) => Err(Interrupted.into()),
+        other => Ok((other?, state.resumed_at)),
+    }
+}
+
+/// Follows the recovery of light.
+struct Watch<'a> {
+    session: &'a Session,
+    settings: &'a Settings,
+    resume: &'a Resume,
+    state: Mutex<WatchState>,
+}
+
+#[derive(Default)]
+struct WatchState {
+    bar: Option<Progress>,
+    resumed_at: usize,
+    /// Why the recovery was broken off.
+    failed: Option<anyhow::Error>,
+}
+
+impl Watch<'_> {
+    fn event(&self, event: Event) -> ControlFlow<()> {
+        let mut state = self.state.lock().unwrap_or_else(|e| e.into_inner());
+        match self.handle(event, &mut state) {
+            Ok(()) => interruption(),
+            Err(error) => {
+                state.failed = Some(error);
+                ControlFlow::Break(())
             }
         }
-        interruption()
-    };
-    let outcome = optimization.run(&mut watch);
-    if let Some(e) = unwritten {
-        return Err(e);
     }
-    progress.done();
-    match outcome {
-        Err(OptimizeError::Interrupted) => Err(Interrupted.into()),
-        other => Ok(other?),
+
+    fn handle(&self, event: Event, state: &mut WatchState) -> anyhow::Result<()> {
+        match event {
+            Event::Reading(share) => {
+                let bar = state
+                    .bar
+                    .get_or_insert_with(|| self.session.progress("reading"));
+                bar.set(share);
+            }
+            Event::Start(start) => {
+                state.resumed_at = self.resume.restored(self.session, self.settings, start)?;
+                state.bar = Some(self.session.progress("light"));
+            }
+            Event::Recording => {}
+            Event::Optimization(optimization::Event::Step(row)) => {
+                if let Some(bar) = &state.bar {
+                    bar.set((row.iteration + 1) as f64 / self.settings.iterations as f64);
+                    match (row.loss, &row.skipped) {
+                        (Some(loss), _) => bar.say(format!("loss {loss:.4}")),
+                        (None, bad) => bar.say(format!("skipped: {bad:?}")),
+                    }
+                }
+                if row.recorded {
+                    let line = || format!("iteration {}: recorded anew", row.iteration);
+                    self.session.remark(line);
+                }
+            }
+            Event::Optimization(optimization::Event::Preview { iteration, picture }) => {
+                write_png(self.resume.preview(iteration), picture)?;
+            }
+        }
+        Ok(())
     }
 }
 
 fn write_results(
     settings: &Settings,
-    outcome: &Outcome,
+    recovery: &Recovery,
     resume: &Resume,
     writer: &mut StageWriter,
 ) -> anyhow::Result<()> {
+    let outcome = &recovery.outcome;
     writer.write_json("lighting", "lighting.json", &outcome.lighting)?;
     let [columns, rows] = settings.environment;
     let path = writer.output("environment", "environment.exr")?;
@@ -409,6 +366,12 @@ fn write_results(
         let path = writer.output("preview", Path::new("previews").join(&name))?;
         let kept = resume.folder.join("previews").join(&name);
         std::fs::copy(&kept, path).with_context(|| format!("cannot copy {}", kept.display()))?;
+    }
+    if let Some(reading) = &recovery.reading {
+        writer.write_json("reading", "reading.json", reading)?;
+    }
+    if let Some(rmse) = recovery.rmse {
+        writer.set_estimated_error(rmse);
     }
     Ok(())
 }
@@ -434,7 +397,12 @@ fn angles_deg(direction: Vec3) -> [f32; 2] {
 
 impl Done {
     fn records(&self) -> usize {
-        self.outcome.history.iter().filter(|r| r.recorded).count()
+        self.recovery
+            .outcome
+            .history
+            .iter()
+            .filter(|r| r.recorded)
+            .count()
     }
 
     fn guidance(&self, row: Option<&Row>) -> Option<f64> {
@@ -443,22 +411,22 @@ impl Done {
 
     /// For programs.
     pub fn to_json(&self) -> Value {
-        let history = &self.outcome.history;
+        let history = &self.recovery.outcome.history;
         json!({
             "folder": self.folder,
             "size": self.size,
             "iterations": history.len(),
             "resumed_at": self.resumed_at,
-            "skipped": self.outcome.skipped(),
-            "stopped_early": self.outcome.stopped_early,
+            "skipped": self.recovery.outcome.skipped(),
+            "stopped_early": self.recovery.outcome.stopped_early,
             "recorded_anew": self.records(),
             "guidance_at_start": self.guidance(history.first()),
             "guidance_at_end": self.guidance(history.last()),
-            "rmse": self.rmse,
-            "reading": self.reading,
+            "rmse": self.recovery.rmse,
+            "reading": self.recovery.reading,
             "other_presets": self.outlook.to_json(),
-            "peak_direction": self.outcome.lighting.peak_direction(),
-            "fusion_residual": self.outcome.lighting.fusion_residual,
+            "peak_direction": self.recovery.outcome.lighting.peak_direction(),
+            "fusion_residual": self.recovery.outcome.lighting.fusion_residual,
             "elapsed_s": self.manifest.elapsed_s,
             "timings_s": self.manifest.timings_s,
             "peak_rss_bytes": self.manifest.peak_rss_bytes,
@@ -477,14 +445,14 @@ impl fmt::Display for Done {
         write!(
             f,
             "  {} iterations on {} x {} pixels",
-            self.outcome.history.len(),
+            self.recovery.outcome.history.len(),
             self.size[0],
             self.size[1]
         )?;
-        if let Some(rmse) = self.rmse {
+        if let Some(rmse) = self.recovery.rmse {
             write!(f, ", {rmse:.5} of display-referred RMSE from the reference")?;
         }
-        if let Some(peak) = self.outcome.lighting.peak_direction() {
+        if let Some(peak) = self.recovery.outcome.lighting.peak_direction() {
             let [elevation, azimuth] = angles_deg(peak);
             write!(
                 f,
@@ -492,7 +460,7 @@ impl fmt::Display for Done {
                  degrees from +z towards +x"
             )?;
         }
-        let skipped = self.outcome.skipped();
+        let skipped = self.recovery.outcome.skipped();
         if skipped > 0 {
             write!(
                 f,

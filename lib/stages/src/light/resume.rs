@@ -1,49 +1,56 @@
 //! Where an interrupted recovery goes on: its checkpoint and the previews it has kept.
 use std::path::PathBuf;
 
-use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_optimize::OptimizeError;
 use dipir_optimize::checkpoint::State;
 use dipir_optimize::parameters::Parameters;
 use dipir_optimize::settings::Settings;
+use dipir_pipeline::fingerprint::Fingerprint;
+use dipir_pipeline::mark::Kind;
+use dipir_pipeline::resume;
 use dipir_pipeline::stage::StagePlan;
 use serde_json::{Value, json};
 
-use crate::model;
+use crate::names::LIGHT;
+
+/// Name of the checkpoint's file.
+const CHECKPOINT: &str = "checkpoint.safetensors";
+/// Folder of the previews.
+const PREVIEWS: &str = "previews";
 
 /// Tells one run from another, so that a checkpoint is found by the run that it belongs to alone.
-pub(crate) fn fingerprint(plan: &StagePlan, settings: &Settings) -> anyhow::Result<String> {
+pub(crate) fn fingerprint(plan: &StagePlan, settings: &Settings) -> anyhow::Result<Fingerprint> {
     run_fingerprint(plan, &serde_json::to_value(settings)?)
 }
 
 /// As [`fingerprint`], for settings of any kind.
-pub(crate) fn run_fingerprint(plan: &StagePlan, settings: &Value) -> anyhow::Result<String> {
-    let all = json!([plan.version, plan.inputs, plan.params, settings]);
-    let hash = blake3::hash(serde_json::to_string(&all)?.as_bytes());
-    Ok(hash.to_hex()[..16].to_owned())
+pub(crate) fn run_fingerprint(plan: &StagePlan, settings: &Value) -> anyhow::Result<Fingerprint> {
+    let params = json!({"params": plan.params, "settings": settings});
+    Ok(Fingerprint::of_plan(plan).params(params).finish())
 }
 
 /// Where an interrupted run goes on: a folder beside the stage's own.
 pub(crate) struct Resume {
+    kept: resume::Resume,
     pub(crate) folder: PathBuf,
 }
 
 impl Resume {
-    pub(crate) fn open(session: &Session, fingerprint: &str) -> anyhow::Result<Self> {
-        let folder = session.out.join("light-checkpoints").join(fingerprint);
-        model::create_folder(&folder.join("previews"))?;
-        Ok(Self { folder })
+    pub(crate) fn open(session: &Session, fingerprint: &Fingerprint) -> anyhow::Result<Self> {
+        let root = session.out.join("light-checkpoints");
+        let files = [CHECKPOINT, "checkpoint.partial", "previews/#.png"];
+        let kept = resume::Resume::open(&root, Kind::Checkpoints, LIGHT.name, fingerprint, &files)?;
+        let folder = kept.folder().to_owned();
+        Ok(Self { kept, folder })
     }
 
     pub(crate) fn checkpoint(&self) -> PathBuf {
-        self.folder.join("checkpoint.safetensors")
+        self.kept.file(CHECKPOINT)
     }
 
     pub(crate) fn preview(&self, iteration: usize) -> PathBuf {
-        self.folder
-            .join("previews")
-            .join(format!("{iteration:06}.png"))
+        self.kept.file(format!("{PREVIEWS}/{iteration:06}.png"))
     }
 
     /// The iteration at which the checkpoint stands; 0 without one. A damaged one is removed.
@@ -72,9 +79,7 @@ impl Resume {
             }
             Err(e) => {
                 session.warn(&format!("{e}; starting from the beginning"));
-                let path = self.checkpoint();
-                std::fs::remove_file(&path)
-                    .with_context(|| format!("cannot remove {}", path.display()))?;
+                self.kept.remove_file(CHECKPOINT)?;
                 Ok(0)
             }
         }
@@ -82,20 +87,10 @@ impl Resume {
 
     /// Names of the pictures that were kept, in the order of their iterations.
     pub(crate) fn previews(&self) -> anyhow::Result<Vec<String>> {
-        let folder = self.folder.join("previews");
-        let failed = || format!("cannot read {}", folder.display());
-        let mut names = Vec::new();
-        for entry in std::fs::read_dir(&folder).with_context(failed)? {
-            let name = entry.with_context(failed)?.file_name();
-            names.push(name.to_string_lossy().into_owned());
-        }
-        names.sort();
-        Ok(names)
+        Ok(self.kept.files_in(PREVIEWS)?)
     }
 
     pub(crate) fn remove(&self) {
-        let _ = std::fs::remove_dir_all(&self.folder);
-        // Only if nothing else is in it.
-        let _ = self.folder.parent().map(std::fs::remove_dir);
+        self.kept.remove();
     }
 }

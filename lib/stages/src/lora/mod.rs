@@ -1,6 +1,8 @@
 //! The LoRA stage: personalises the model to the photograph, keeping the object's class.
 mod data;
+pub mod folder;
 mod resume;
+pub mod table;
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -14,108 +16,22 @@ use dipir_diffusion::lora::{LoraInfo, LoraStyle};
 use dipir_diffusion::model::Model;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
-use dipir_diffusion::text_encoder::LearnedTokens;
-use dipir_diffusion::training::{LoraTrainer, StepReport, TrainingConfig};
-use dipir_diffusion::weights::Weights;
+use dipir_diffusion::training::{LoraTrainer, StepReport};
 use dipir_imaging::file::{read_photo, write_png};
 use dipir_imaging::transfer::Transfer;
+use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
 use dipir_scene::config::SceneConfig;
-use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use self::data::Data;
 use self::resume::Resume;
-use crate::concepts::{self, ConceptList, read_latents};
+use self::table::LoraTable;
+use crate::concepts::folder::{ConceptsFolder, read_latents};
+use crate::concepts::table::ConceptsTable;
 use crate::model::{self, ModelTable};
-
-/// Name of the stage and of its folder.
-pub const STAGE: &str = "lora";
-/// The executable that runs it.
-pub const EXECUTABLE: &str = "dipir-lora";
-/// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 1;
-
-/// The `[lora]` table.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct LoraTable {
-    /// Rank of the adapters.
-    pub rank: usize,
-    /// Scale times rank; the rank by default.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub alpha: Option<f64>,
-    /// Updates.
-    pub steps: usize,
-    /// Learning rate of the adapters.
-    pub learning_rate: f64,
-    /// Updates over which it rises from 0.
-    pub warmup_steps: usize,
-    /// Examples of each kind for one update.
-    pub accumulation: usize,
-    /// Weight of the concept images' loss.
-    pub prior_weight: f64,
-    /// Smallest crop of the photograph, as a share of its shorter side.
-    pub min_crop: f64,
-    /// The word that stands for the photograph's light.
-    pub word: String,
-    /// Learn an embedding for that word, too.
-    pub learn_word: bool,
-    /// Learning rate of the embedding.
-    pub word_learning_rate: f64,
-    /// Recompute activations: less memory, a third more time.
-    pub recompute: bool,
-    /// Updates between checkpoints; 0 for none.
-    pub checkpoint_every: usize,
-    /// Updates between sample images; 0 for none.
-    pub sample_every: usize,
-}
-
-impl Default for LoraTable {
-    fn default() -> Self {
-        let training = TrainingConfig::default();
-        Self {
-            rank: training.rank,
-            alpha: None,
-            steps: training.steps,
-            learning_rate: training.learning_rate,
-            warmup_steps: training.warmup_steps,
-            accumulation: training.accumulation,
-            prior_weight: training.prior_weight,
-            min_crop: 0.5,
-            word: "sks".into(),
-            learn_word: false,
-            word_learning_rate: training.token_learning_rate,
-            recompute: training.recompute,
-            checkpoint_every: 50,
-            sample_every: 0,
-        }
-    }
-}
-
-impl LoraTable {
-    fn training(&self, seed: u64) -> TrainingConfig {
-        TrainingConfig {
-            rank: self.rank,
-            alpha: self.alpha.unwrap_or(self.rank as f64),
-            steps: self.steps,
-            learning_rate: self.learning_rate,
-            token_learning_rate: self.word_learning_rate,
-            warmup_steps: self.warmup_steps,
-            accumulation: self.accumulation,
-            prior_weight: self.prior_weight,
-            recompute: self.recompute,
-            seed,
-            ..TrainingConfig::default()
-        }
-    }
-
-    /// The caption of the photograph's crops.
-    fn instance_prompt(&self) -> String {
-        format!("a scene in the style of {} rendering", self.word)
-    }
-}
+use crate::names::{CONCEPTS, LORA};
 
 /// What the stage did.
 pub struct Done {
@@ -144,12 +60,11 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let params = json!({
         "lora": table, "transfer": transfer, "precision": model_table.precision,
     });
-    let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
+    let mut plan = LORA.plan(session, params);
     plan.device = session.pipeline.device.clone();
     plan.input("background", &background, &session.resolve(&background))?;
     if preserves_concepts(session)? {
-        let folder = session.stage_folder(concepts::STAGE);
-        let concepts = Manifest::read(&folder, concepts::EXECUTABLE)?;
+        let concepts = CONCEPTS.manifest(session)?;
         plan.outputs_of(&concepts, &["concepts", "latents"])?;
     }
     model::inputs(session, &model_table, &mut plan)?;
@@ -159,7 +74,7 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
 /// Whether concept images are trained on beside the photograph.
 pub fn preserves_concepts(session: &Session) -> anyhow::Result<bool> {
     let table: LoraTable = session.config.table("lora")?;
-    let concepts: concepts::ConceptsTable = session.config.table("concepts")?;
+    let concepts: ConceptsTable = session.config.table("concepts")?;
     Ok(concepts.count > 0 && table.prior_weight != 0.0)
 }
 
@@ -187,23 +102,19 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let photo_file = session.resolve(&background);
     // First, for it checks the configuration.
     let plan = plan(session)?;
-    let (list, latents) = read_concepts(session)?.unzip();
+    let concepts = preserves_concepts(session)?
+        .then(|| ConceptsFolder::read(session))
+        .transpose()?;
     let base_hash = plan
         .inputs
         .iter()
         .find(|i| i.path.to_string_lossy().contains("unet/diffusion"))
         .map(|i| i.blake3.clone());
-    let folder = session.stage_folder(STAGE);
-    let decides = json!([
-        plan.version,
-        plan.seed,
-        plan.device,
-        plan.inputs,
-        without_steps(&table),
-        transfer,
-        model_table.precision
-    ]);
-    let fingerprint = blake3::hash(decides.to_string().as_bytes());
+    let folder = LORA.folder(session);
+    let decides = json!({
+        "lora": table.without_steps(), "transfer": transfer, "precision": model_table.precision,
+    });
+    let fingerprint = Fingerprint::of_plan(&plan).params(decides).finish();
     let mut writer = session.begin(plan)?;
 
     let mut model = model::load(session, &model_table)?;
@@ -213,15 +124,18 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         .transpose()?;
     let photo = read_photo(&photo_file, transfer)?;
     let data = Data {
-        photo: model::from_display(&photo.transfer.encode(&photo.image))?,
-        size: model::native_size(&model),
+        photo: dipir_tensors::model_input(&photo.transfer.encode(&photo.image))?,
+        size: model.native_size(),
         min_crop: table.min_crop,
         prompt: table.instance_prompt(),
-        class_prompt: list
+        class_prompt: concepts
             .as_ref()
-            .map(|l| l.class_prompt.clone())
+            .map(|c| c.list.class_prompt.clone())
             .unwrap_or_default(),
-        concepts: latents.as_deref().map(read_latents).transpose()?,
+        concepts: concepts
+            .as_ref()
+            .map(|c| read_latents(&c.latents))
+            .transpose()?,
         model: &model,
     };
     let mut trainer = LoraTrainer::new(
@@ -229,7 +143,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         table.training(session.pipeline.seed),
         start.as_ref(),
     )?;
-    let resume = Resume::open(session, fingerprint.to_hex().as_str())?;
+    let resume = Resume::open(session, &fingerprint)?;
     let mut history = resume.restore(session, &mut trainer, table.steps);
     let resumed_at = trainer.steps();
     if resumed_at > 0 {
@@ -280,15 +194,6 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     })
 }
 
-/// What decides the course of a run; how long it is does not.
-fn without_steps(table: &LoraTable) -> LoraTable {
-    LoraTable {
-        steps: 0,
-        checkpoint_every: 0,
-        ..table.clone()
-    }
-}
-
 /// Gives `word` a token of its own and returns the embedding that it starts from: the mean of
 /// the tokens that the word had.
 fn learnable(model: &mut Model, word: &str) -> anyhow::Result<Tensor> {
@@ -304,42 +209,6 @@ fn learnable(model: &mut Model, word: &str) -> anyhow::Result<Tensor> {
     let token = model.text_encoder.config().vocab_size as u32;
     model.tokenizer.add_placeholder(word, token);
     Ok(Tensor::stack(&rows, 0)?.mean(0)?)
-}
-
-/// The embedding that a run learned for `word`; the word becomes a token of its own.
-pub fn learned_word(model: &mut Model, word: &str, path: &Path) -> anyhow::Result<LearnedTokens> {
-    let weights = Weights::open_file(path)?;
-    let embeddings = weights
-        .tensor(word, model.dtype(), model.device())?
-        .with_context(|| {
-            format!(
-                "{} holds no embedding of lora.word = \"{word}\"; run {EXECUTABLE} again",
-                path.display()
-            )
-        })?;
-    let token = model.text_encoder.config().vocab_size as u32;
-    model.tokenizer.add_placeholder(word, token);
-    Ok(LearnedTokens { embeddings })
-}
-
-/// The concept list and the file of latents, checked by hash, unless concept preservation is off.
-fn read_concepts(session: &Session) -> anyhow::Result<Option<(ConceptList, PathBuf)>> {
-    if !preserves_concepts(session)? {
-        return Ok(None);
-    }
-    let folder = session.stage_folder(concepts::STAGE);
-    let manifest = Manifest::read(&folder, concepts::EXECUTABLE)?;
-    let path = manifest.output(&folder, "concepts")?;
-    let text = std::fs::read_to_string(&path)
-        .with_context(|| format!("cannot read {}", path.display()))?;
-    let list: ConceptList = serde_json::from_str(&text).with_context(|| {
-        format!(
-            "{} was written by another version; run {} again",
-            path.display(),
-            concepts::EXECUTABLE
-        )
-    })?;
-    Ok(Some((list, manifest.output(&folder, "latents")?)))
 }
 
 /// A sample under the photograph's caption.
@@ -363,7 +232,7 @@ fn show(model: &Model, trainer: &LoraTrainer, data: &Data, path: &Path) -> anyho
     interrupt::check()?;
     // Beside its place and renamed: a sample that is there is whole.
     let partial = path.with_extension("partial.png");
-    write_png(&partial, &model::to_display(&generated?.image)?)?;
+    write_png(&partial, &dipir_tensors::model_output(&generated?.image)?)?;
     std::fs::rename(&partial, path).with_context(|| format!("cannot write {}", path.display()))
 }
 

@@ -4,27 +4,39 @@ use std::path::PathBuf;
 use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_diffusion::training::{LoraTrainer, StepReport};
+use dipir_pipeline::fingerprint::Fingerprint;
+use dipir_pipeline::mark::Kind;
+use dipir_pipeline::resume;
 
-use crate::model;
+use crate::names::LORA;
+
+/// The files of a run: the checkpoint, the losses so far, and samples, each with the name under
+/// which it is written.
+const FILES: [&str; 6] = [
+    "checkpoint.safetensors",
+    "checkpoint.partial",
+    "history.json",
+    "history.partial",
+    "sample-#.png",
+    "sample-#.partial.png",
+];
 
 /// Where an interrupted run goes on.
 pub(super) struct Resume {
-    folder: PathBuf,
+    kept: resume::Resume,
 }
 
 impl Resume {
-    pub(super) fn open(session: &Session, fingerprint: &str) -> anyhow::Result<Self> {
-        let folder = session
-            .out
-            .join("lora-checkpoints")
-            .join(&fingerprint[..16]);
-        model::create_folder(&folder)?;
-        Ok(Self { folder })
+    pub(super) fn open(session: &Session, fingerprint: &Fingerprint) -> anyhow::Result<Self> {
+        let root = session.out.join("lora-checkpoints");
+        let kind = Kind::Checkpoints;
+        let kept = resume::Resume::open(&root, kind, LORA.name, fingerprint, &FILES)?;
+        Ok(Self { kept })
     }
 
     /// Where the sample after an update is kept until the end.
     pub(super) fn sample(&self, step: usize) -> PathBuf {
-        self.folder.join(format!("sample-{step:06}.png"))
+        self.kept.file(format!("sample-{step:06}.png"))
     }
 
     /// Loads the last checkpoint, if there is a usable one; returns its history.
@@ -34,8 +46,8 @@ impl Resume {
         trainer: &mut LoraTrainer,
         steps: usize,
     ) -> Vec<StepReport> {
-        let path = self.folder.join("checkpoint.safetensors");
-        let history = std::fs::read(self.folder.join("history.json"))
+        let path = self.kept.file("checkpoint.safetensors");
+        let history = std::fs::read(self.kept.file("history.json"))
             .ok()
             .and_then(|text| serde_json::from_slice::<Vec<StepReport>>(&text).ok())
             .unwrap_or_default();
@@ -71,18 +83,16 @@ impl Resume {
 
     /// The history first: it may be longer than the checkpoint, never shorter.
     pub(super) fn save(&self, trainer: &LoraTrainer, history: &[StepReport]) -> anyhow::Result<()> {
-        let path = self.folder.join("history.json");
-        let partial = self.folder.join("history.partial");
+        let path = self.kept.file("history.json");
+        let partial = self.kept.file("history.partial");
         std::fs::write(&partial, serde_json::to_vec(history)?)
             .and_then(|()| std::fs::rename(&partial, &path))
             .with_context(|| format!("cannot write {}", path.display()))?;
-        trainer.save_checkpoint(&self.folder.join("checkpoint.safetensors"))?;
+        trainer.save_checkpoint(&self.kept.file("checkpoint.safetensors"))?;
         Ok(())
     }
 
     pub(super) fn remove(&self) {
-        let _ = std::fs::remove_dir_all(&self.folder);
-        // Only if nothing else is in it.
-        let _ = self.folder.parent().map(std::fs::remove_dir);
+        self.kept.remove();
     }
 }

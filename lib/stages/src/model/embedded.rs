@@ -1,8 +1,11 @@
 //! The small model that is part of the executables, for configurations that name no other.
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 
 use anyhow::Context;
+use dipir_pipeline::manifest::Artifact;
 use dipir_pipeline::stage::StagePlan;
+use serde_json::Value;
 use tempfile::TempDir;
 
 macro_rules! files {
@@ -30,11 +33,18 @@ const FILES: [(&str, &[u8]); 13] = files! {
 
 /// Enters its files into the plan of a stage, as `embedded/…`.
 pub fn inputs(plan: &mut StagePlan) {
-    for (name, content) in FILES {
-        if name != "README.md" {
-            plan.input_of_bytes("model", &Path::new("embedded").join(name), content);
+    // The content does not change while the process runs.
+    static INPUTS: OnceLock<Vec<Artifact>> = OnceLock::new();
+    let inputs = INPUTS.get_or_init(|| {
+        let mut plan = StagePlan::new("model", 0, Value::Null, 0);
+        for (name, content) in FILES {
+            if name != "README.md" {
+                plan.input_of_bytes("model", &Path::new("embedded").join(name), content);
+            }
         }
-    }
+        plan.inputs
+    });
+    plan.inputs.extend(inputs.iter().cloned());
 }
 
 /// The model as a folder, which lasts as long as what is returned.

@@ -5,14 +5,13 @@ use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Device};
 use dipir_cli::exit::Usage;
 use dipir_cli::session::Session;
 use dipir_diffusion::model::Model;
-use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::stage::StagePlan;
 use dipir_prior::encoder;
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tempfile::TempDir;
@@ -166,49 +165,6 @@ pub fn digest(folder: Option<&Path>) -> anyhow::Result<String> {
         Some(folder) => files(Path::new(""), folder, &mut plan)?,
         None => embedded::inputs(&mut plan),
     }
-    let mut hasher = blake3::Hasher::new();
-    for input in &plan.inputs {
-        hasher.update(input.blake3.as_bytes());
-    }
-    Ok(hasher.finalize().to_hex().to_string())
-}
-
-/// An image tensor [1, 3, h, w] in [-1, 1] as display values.
-pub fn to_display(image: &Tensor) -> anyhow::Result<DisplayImage> {
-    let (_, _, height, width) = image.dims4()?;
-    let planes = image
-        .to_device(&Device::Cpu)?
-        .to_dtype(DType::F32)?
-        .flatten_all()?
-        .to_vec1::<f32>()?;
-    let n = height * width;
-    let at = |i: usize| (planes[i] * 0.5 + 0.5).clamp(0.0, 1.0);
-    let pixels = (0..n)
-        .map(|i| Vec3::new(at(i), at(n + i), at(2 * n + i)))
-        .collect();
-    Ok(DisplayImage(Raster::from_pixels(width, height, pixels)))
-}
-
-/// Display values as an image tensor [3, h, w] in [-1, 1].
-pub fn from_display(image: &DisplayImage) -> anyhow::Result<Tensor> {
-    let raster = &image.0;
-    let mut planes = Vec::with_capacity(3 * raster.pixels().len());
-    for channel in 0..3 {
-        planes.extend(raster.pixels().iter().map(|p| p[channel] * 2.0 - 1.0));
-    }
-    Ok(Tensor::from_vec(
-        planes,
-        (3, raster.height(), raster.width()),
-        &Device::Cpu,
-    )?)
-}
-
-/// The side of the images that the model was trained on, in pixels.
-pub fn native_size(model: &Model) -> usize {
-    model.unet.config().sample_size * model.vae.downscale()
-}
-
-/// Creates a folder and its parents.
-pub fn create_folder(path: &Path) -> anyhow::Result<()> {
-    std::fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))
+    let fingerprint = Fingerprint::of("model").inputs(&plan.inputs).finish();
+    Ok(fingerprint.as_str().to_owned())
 }

@@ -2,6 +2,9 @@
 //! module put together is markup.
 use std::fmt::Write;
 
+use base64::prelude::{BASE64_STANDARD, Engine};
+use dipir_plotting::chart::Chart;
+
 /// Finished markup.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Html(String);
@@ -49,6 +52,26 @@ impl Html {
         Self(format!("<{tag}>{code}</{tag}>"))
     }
 
+    /// A chart under its title, with its numbers as a CSV file; nothing if there are no two points
+    /// to draw.
+    pub fn chart(title: &str, chart: &Chart) -> Option<Self> {
+        if chart.visible_points() < 2 {
+            return None;
+        }
+        let numbers = BASE64_STANDARD.encode(chart.to_csv());
+        let address = format!("data:text/csv;base64,{numbers}");
+        let name = title.split([':', ',']).next().unwrap_or(title);
+        let file = format!("{}.csv", name.to_lowercase().replace(' ', "-"));
+        let link = [("href", address.as_str()), ("download", file.as_str())];
+        let caption = [
+            Self::text(format!("{title} ")),
+            Self::element("a", &link, [Self::text("CSV")]),
+        ];
+        let drawing = Self(chart.draw().to_inline_svg(title));
+        let figure = [Self::element("figcaption", &[], caption), drawing];
+        Some(Self::element("figure", &[("class", "plot")], figure))
+    }
+
     /// One after the other.
     pub fn all(parts: impl IntoIterator<Item = Html>) -> Self {
         Self(parts.into_iter().map(|p| p.0).collect())
@@ -75,18 +98,23 @@ fn escape(text: &str, html: &mut String) {
     }
 }
 
-/// A table; columns whose head begins with `>` are aligned to the right.
+/// A table; columns whose head begins with `>` are aligned to the right. Every cell names its column,
+/// which the style shows where the page is too narrow for columns.
 pub fn table(heads: &[&str], rows: Vec<Vec<Html>>) -> Html {
     let class = |k: usize| match heads[k].starts_with('>') {
         true => "number",
         false => "",
     };
-    let cell = |tag, k: usize, content| Html::element(tag, &[("class", class(k))], [content]);
-    let head = heads.iter().enumerate();
-    let head = head.map(|(k, h)| cell("th", k, Html::text(h.trim_start_matches('>'))));
+    let name = |k: usize| heads[k].trim_start_matches('>');
+    let cell = |k: usize, content| {
+        let attributes = [("class", class(k)), ("data-head", name(k))];
+        Html::element("td", &attributes, [content])
+    };
+    let head = (0..heads.len())
+        .map(|k| Html::element("th", &[("class", class(k))], [Html::text(name(k))]));
     let body = rows.into_iter().map(|row| {
         let cells = row.into_iter().enumerate();
-        Html::element("tr", &[], cells.map(|(k, content)| cell("td", k, content)))
+        Html::element("tr", &[], cells.map(|(k, content)| cell(k, content)))
     });
     let head = Html::element("thead", &[], [Html::element("tr", &[], head)]);
     let table = Html::element("table", &[], [head, Html::element("tbody", &[], body)]);
@@ -116,7 +144,10 @@ mod tests {
     fn a_table_aligns_numbers() {
         let rows = vec![vec![Html::text("a"), Html::text("1")]];
         let html = table(&["name", ">n"], rows).into_string();
-        assert!(html.contains("<td class=\"number\">1</td>"), "{html}");
+        assert!(
+            html.contains("<td class=\"number\" data-head=\"n\">1</td>"),
+            "{html}"
+        );
         assert!(html.contains("<th class=\"number\">n</th>"), "{html}");
     }
 }

@@ -1,14 +1,15 @@
 //! Concept images, and how the model was personalised.
 use dipir_imaging::file::read_photo;
 use dipir_imaging::transfer::Transfer;
+use dipir_plotting::chart::Chart;
 use serde_json::Value;
 
+use super::curves::{noisy, over};
 use super::html::Html;
 use super::picture::figure;
-use super::plot::{Mark, Plot, Series, running_mean};
 use super::{Report, Section, json, outputs};
-use crate::concepts::ConceptList;
-use crate::{concepts, lora};
+use crate::concepts::folder::ConceptList;
+use crate::names::{CONCEPTS, LORA};
 
 /// Longest side of a concept image.
 const CONCEPT: usize = 128;
@@ -20,7 +21,7 @@ const MOST_CONCEPTS: usize = 64;
 /// Concept images, the course of the loss, samples.
 pub fn section(report: &Report) -> Section {
     let mut parts = Vec::new();
-    if let Some(run) = report.stage(concepts::STAGE)? {
+    if let Some(run) = report.stage(CONCEPTS.name)? {
         let list: ConceptList = json(&run, "concepts")?;
         let mut figures = Vec::new();
         for entry in list.concepts.iter().take(MOST_CONCEPTS) {
@@ -36,9 +37,10 @@ pub fn section(report: &Report) -> Section {
         parts.push(Html::element("p", &[("class", "soft")], [Html::text(note)]));
         parts.push(Html::element("div", &[("class", "grid-of small")], figures));
     }
-    if let Some(run) = report.stage(lora::STAGE)? {
+    if let Some(run) = report.stage(LORA.name)? {
         let training: Value = json(&run, "training")?;
-        let plots = losses(&training).into_iter().filter_map(|p| p.render());
+        let plots = losses(&training);
+        let plots = plots.iter().filter_map(|(t, c)| Html::chart(t, c));
         parts.push(Html::element("div", &[("class", "plots")], plots));
         let mut samples = Vec::new();
         for (name, path) in outputs(&run, "sample") {
@@ -51,42 +53,15 @@ pub fn section(report: &Report) -> Section {
     Ok((!parts.is_empty()).then(|| Html::all(parts)))
 }
 
-fn losses(training: &Value) -> Vec<Plot> {
+fn losses(training: &Value) -> Vec<(&'static str, Chart)> {
     let none = Vec::new();
     let history = training["history"].as_array().unwrap_or(&none);
-    let window = (history.len() / 20).max(1);
-    let noisy = |key: &str, name: &str, color| {
-        let at = |row: &Value| Some((row["step"].as_f64()?, row[key].as_f64()?));
-        let points: Vec<_> = history.iter().filter_map(at).collect();
-        let mean = running_mean(&points, window);
-        let of = |name: String, mark, points| Series {
-            name,
-            color,
-            mark,
-            points,
-        };
-        [
-            of(String::new(), Mark::Faint, points),
-            of(format!("{name}, mean of {window}"), Mark::Line, mean),
-        ]
-    };
-    let plot = |title: &str, series: Vec<Series>| Plot {
-        title: title.into(),
-        x_label: "update".into(),
-        log_y: true,
-        series,
-        ..Plot::default()
-    };
-    let photograph = noisy("instance_loss", "the photograph", 0);
-    let class = noisy("prior_loss", "the class", 1);
+    let photograph = noisy(history, "step", "instance_loss", "the photograph", 0);
+    let class = noisy(history, "step", "prior_loss", "the class", 1);
+    let losses = photograph.into_iter().chain(class).collect();
+    let norm = noisy(history, "step", "gradient_norm", "all", 2).into();
     vec![
-        plot(
-            "Loss of the personalisation",
-            photograph.into_iter().chain(class).collect(),
-        ),
-        plot(
-            "Norm of its gradient",
-            noisy("gradient_norm", "all", 2).into(),
-        ),
+        ("Loss of the personalisation", over("update", true, losses)),
+        ("Norm of its gradient", over("update", true, norm)),
     ]
 }

@@ -7,15 +7,19 @@ use dipir_light::environment::{EnvironmentMap, texel_of};
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::luminance::luminance_f64;
 use dipir_optimize::lighting::Lighting;
+use dipir_plotting::chart::{Chart, Mark, Series};
+use dipir_plotting::number;
 use glam::Vec3;
 use serde_json::Value;
 
+use super::curves::{column, noisy, over};
 use super::html::{Html, table};
 use super::picture::{figure, image};
-use super::plot::{Mark, Plot, Series, number, running_mean};
 use super::{Report, Section, json, outputs};
+use crate::composite::table::CompositeTable;
+use crate::known_light;
+use crate::names::LIGHT;
 use crate::preview::environment;
-use crate::{composite, known_light, light};
 
 /// Columns of the map as it is shown.
 const MAP_WIDTH: usize = 512;
@@ -26,7 +30,7 @@ const PREVIEW: usize = 256;
 
 /// The light that was recovered, else the one that was given.
 pub fn section(report: &Report) -> Section {
-    let Some(run) = report.stage(light::STAGE)? else {
+    let Some(run) = report.stage(LIGHT.name)? else {
         return given(report);
     };
     if !run.1.outputs.iter().any(|o| o.role == "lighting") {
@@ -42,10 +46,11 @@ pub fn section(report: &Report) -> Section {
         "the recovered light: latitude and longitude, +z in the middle, +x to its left",
     )?];
     parts.push(lobes(&strongest(&lighting.exposed_lobes())));
-    let plots = [tone(&curves)]
+    let plots: Vec<_> = [tone(&curves)]
         .into_iter()
         .chain(losses(&history))
-        .filter_map(|p| p.render());
+        .collect();
+    let plots = plots.iter().filter_map(|(t, c)| Html::chart(t, c));
     parts.push(Html::element("div", &[("class", "plots")], plots));
     let mut previews = Vec::new();
     for (name, path) in outputs(&run, "preview") {
@@ -64,7 +69,7 @@ pub fn section(report: &Report) -> Section {
 /// The map of `[composite] environment`.
 fn given(report: &Report) -> Section {
     let table = report.session.config.table("composite")?;
-    let table: composite::CompositeTable = table;
+    let table: CompositeTable = table;
     let Some(known) = known_light::known(report.session, &table)? else {
         return Ok(None);
     };
@@ -102,14 +107,9 @@ fn materials(run: &(std::path::PathBuf, dipir_pipeline::manifest::Manifest)) -> 
     ];
     let losses: Vec<f64> = json(run, "history")?;
     let points = losses.iter().enumerate();
-    let plot = Plot {
-        title: "Loss of the materials".into(),
-        x_label: "iteration".into(),
-        log_y: true,
-        series: vec![series("", 0, points.map(|(k, &l)| (k as f64, l)).collect())],
-        ..Plot::default()
-    };
-    let plot = plot.render().into_iter();
+    let series = Series::line("", 0, points.map(|(k, &l)| (k as f64, l)));
+    let chart = over("iteration", true, vec![series]);
+    let plot = Html::chart("Loss of the materials", &chart);
     Ok(Some(Html::all(
         [table(&heads, rows.collect())].into_iter().chain(plot),
     )))
@@ -229,91 +229,48 @@ fn lobes(lobes: &[(SphericalGaussian, f64)]) -> Html {
     table(&heads, rows.collect())
 }
 
-fn series(name: &str, color: usize, points: Vec<(f64, f64)>) -> Series {
-    Series {
-        name: name.into(),
-        color,
-        mark: Mark::Line,
-        points,
-    }
-}
-
-fn tone(curves: &ToneCurves) -> Plot {
-    let sampled = |knots: &Knots| {
+fn tone(curves: &ToneCurves) -> (&'static str, Chart) {
+    let line = |name, color, knots: &Knots| {
         let curve = knots.curve();
-        (0..=64)
-            .map(|k| f64::from(k) / 64.0)
-            .map(|x| (x, curve.eval(x)))
-            .collect()
+        let inputs = (0..=64).map(|k| f64::from(k) / 64.0);
+        Series::line(name, color, inputs.map(|x| (x, curve.eval(x))))
     };
     let [red, green, blue] = &curves.shadow;
-    Plot {
-        title: "Tone curves, on [0, 1]: object after x / (1 + x), shadow ratio by channel".into(),
-        x_label: "before".into(),
-        y_range: Some((0.0, 1.0)),
-        series: vec![
-            series("shadow, red", 1, sampled(red)),
-            series("shadow, green", 2, sampled(green)),
-            series("shadow, blue", 0, sampled(blue)),
-            series("object", 3, sampled(&curves.foreground)),
-        ],
-        ..Plot::default()
-    }
+    let series = vec![
+        line("shadow, red", 1, red),
+        line("shadow, green", 2, green),
+        line("shadow, blue", 0, blue),
+        line("object", 3, &curves.foreground),
+    ];
+    let mut chart = over("before", false, series);
+    chart.y.range = Some((0.0, 1.0));
+    let title = "Tone curves, on [0, 1]: object after x / (1 + x), shadow ratio by channel";
+    (title, chart)
 }
 
-/// One term of every iteration, where it is a number.
-fn column(history: &[Value], key: &str) -> Vec<(f64, f64)> {
-    let at = |row: &Value| Some((row["iteration"].as_f64()?, row[key].as_f64()?));
-    history.iter().filter_map(at).collect()
-}
-
-fn losses(history: &[Value]) -> Vec<Plot> {
-    let plot = |title: &str, log_y: bool, series: Vec<Series>| Plot {
-        title: title.into(),
-        x_label: "iteration".into(),
-        log_y,
-        series,
-        ..Plot::default()
-    };
-    // Wide enough to see a trend through the noise of distillation, narrow against the run.
-    let window = (history.len() / 20).max(1);
-    let noisy = |key: &str| {
-        let raw = column(history, key);
-        let mean = running_mean(&raw, window);
-        let raw = Series {
-            mark: Mark::Faint,
-            ..series("", 0, raw)
-        };
-        vec![raw, series(&format!("mean of {window}"), 0, mean)]
-    };
+fn losses(history: &[Value]) -> Vec<(&'static str, Chart)> {
+    let column = |key, name, color| column(history, "iteration", key, name, color);
+    let noisy = |key| noisy(history, "iteration", key, "", 0).into();
+    let over = |title, log_y, series| (title, over("iteration", log_y, series));
+    let light = |title, key| over(title, false, vec![column(key, "", 1)]);
+    let terms = vec![
+        column("consistency", "consistency", 1),
+        column("regularizer", "regulariser", 2),
+    ];
     let timesteps = Series {
         mark: Mark::Dots,
-        ..series("", 3, column(history, "t"))
+        ..column("t", "", 3)
     };
-    let light = ["irradiance", "elevation_deg", "azimuth_deg"];
-    let names = [
-        "Light over iterations: irradiance on a horizontal plane",
-        "Light over iterations: height of the peak above the horizon, degrees",
-        "Light over iterations: azimuth of the peak, degrees",
-    ];
-    let light = light
-        .iter()
-        .zip(names)
-        .map(|(key, name)| plot(name, false, vec![series("", 1, column(history, key))]));
-    [
-        plot("Guidance", true, noisy("guidance")),
-        plot(
-            "Consistency and regulariser, weighted",
-            true,
-            vec![
-                series("consistency", 1, column(history, "consistency")),
-                series("regulariser", 2, column(history, "regularizer")),
-            ],
+    vec![
+        over("Guidance", true, noisy("guidance")),
+        over("Consistency and regulariser, weighted", true, terms),
+        over("Norm of the gradient", true, noisy("gradient_norm")),
+        over("Timestep of the diffusion model", false, vec![timesteps]),
+        light("Irradiance on a horizontal plane", "irradiance"),
+        light(
+            "Height of the peak above the horizon, degrees",
+            "elevation_deg",
         ),
-        plot("Norm of the gradient", true, noisy("gradient_norm")),
-        plot("Timestep of the diffusion model", false, vec![timesteps]),
+        light("Azimuth of the peak, degrees", "azimuth_deg"),
     ]
-    .into_iter()
-    .chain(light)
-    .collect()
 }

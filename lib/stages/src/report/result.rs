@@ -1,15 +1,17 @@
 //! The picture, its layers, and how it compares with the true light.
+use anyhow::Context;
 use dipir_imaging::file::read_photo;
 use dipir_imaging::layers::Layers;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
+use dipir_plotting::number;
+use dipir_scene::description::SceneDescription;
 use glam::Vec3;
 
 use super::html::{Html, table};
 use super::picture::{figure, image};
-use super::plot::number;
 use super::{Report, Section};
-use crate::composite;
+use crate::names::{COMPOSITE, SCENE};
 use crate::preview::{normals, stretched};
 use crate::truth::Truth;
 
@@ -18,15 +20,23 @@ const LARGE: usize = 1152;
 /// Longest side of a layer.
 const LAYER: usize = 480;
 
+/// How the photograph is encoded, and so the picture.
+fn transfer(report: &Report) -> anyhow::Result<Transfer> {
+    let scene = report.stage(SCENE.name)?;
+    let (folder, manifest) = scene.context("the scene's folder is missing")?;
+    let scene = SceneDescription::read(&manifest.output(&folder, "scene")?)?;
+    Ok(scene.background.transfer)
+}
+
 /// The photograph and the picture, one over the other.
 pub fn before_and_after(report: &Report) -> Section {
-    let Some((folder, manifest)) = report.stage(composite::STAGE)? else {
+    let Some((folder, manifest)) = report.stage(COMPOSITE.name)? else {
         return Ok(None);
     };
     let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
     let picture = manifest.output(&folder, "picture")?;
     let after = Transfer::Srgb.encode(&read_photo(picture, Transfer::Srgb)?.image);
-    let before = Transfer::Srgb.encode(&LinearImage(layers.rgb("background")?));
+    let before = transfer(report)?.encode(&LinearImage(layers.rgb("background")?));
     let before = Html::element(
         "div",
         &[("class", "before")],
@@ -59,11 +69,12 @@ pub fn before_and_after(report: &Report) -> Section {
 
 /// The layers that a compositor gets.
 pub fn layers(report: &Report) -> Section {
-    let Some((folder, manifest)) = report.stage(composite::STAGE)? else {
+    let Some((folder, manifest)) = report.stage(COMPOSITE.name)? else {
         return Ok(None);
     };
     let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
-    let shown = |raster: Raster<Vec3>| Transfer::Srgb.encode(&LinearImage(raster));
+    let transfer = transfer(report)?;
+    let shown = |raster: Raster<Vec3>| transfer.encode(&LinearImage(raster));
     let grey = |name: &str| -> anyhow::Result<DisplayImage> {
         Ok(DisplayImage(layers.channel(name)?.map(|&a| Vec3::splat(a))))
     };

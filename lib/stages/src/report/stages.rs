@@ -2,12 +2,12 @@
 use dipir_cli::session::{duration, size};
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::status::State;
+use dipir_plotting::number;
 use dipir_render::effects::EffectsPlan;
 
 use super::html::{self, Html};
-use super::plot::number;
 use super::{Report, Section, json};
-use crate::{composite, light, scene};
+use crate::names::{COMPOSITE, LIGHT, SCENE};
 
 /// Every stage with its state, error, time and memory.
 pub fn table(report: &Report) -> Section {
@@ -60,9 +60,9 @@ pub fn table(report: &Report) -> Section {
 /// What a stage's error is an error of.
 fn error_in_words(stage: &str, error: f64) -> String {
     let unit = match stage {
-        scene::STAGE => "left out",
-        light::STAGE => "from the guidance's reference",
-        composite::STAGE => "95% bound",
+        s if s == SCENE.name => "left out",
+        s if s == LIGHT.name => "from the guidance's reference",
+        s if s == COMPOSITE.name => "95% bound",
         _ => "",
     };
     format!("{} RMSE {unit}", number(error)).trim_end().into()
@@ -70,7 +70,7 @@ fn error_in_words(stage: &str, error: f64) -> String {
 
 /// What is simulated, and why.
 pub fn effects(report: &Report) -> Section {
-    let Some(run) = report.stage(scene::STAGE)? else {
+    let Some(run) = report.stage(SCENE.name)? else {
         return Ok(None);
     };
     let plan: EffectsPlan = json(&run, "effects")?;

@@ -12,6 +12,7 @@ use dipir_scene::scene::LoadedScene;
 use serde::Deserialize;
 use serde_json::json;
 
+use crate::names::SCENE;
 use crate::scene;
 
 /// The scene stage's folder, its files checked by hash, and the scene that they describe.
@@ -29,7 +30,7 @@ pub struct SceneFolder {
 impl SceneFolder {
     /// Reads what the scene stage wrote and the files that it names.
     pub fn read(session: &Session) -> anyhow::Result<Self> {
-        let folder = session.stage_folder(scene::STAGE);
+        let folder = SCENE.folder(session);
         let manifest = manifest(session)?;
         warn_of_other_settings(session, &manifest)?;
         let description = SceneDescription::read(&manifest.output(&folder, "scene")?)?;
@@ -46,7 +47,7 @@ impl SceneFolder {
 
 /// The manifest of the scene stage.
 pub fn manifest(session: &Session) -> Result<Manifest, StageError> {
-    Manifest::read(&session.stage_folder(scene::STAGE), scene::EXECUTABLE)
+    SCENE.manifest(session)
 }
 
 /// Notes the scene stage's outputs of the given roles, and the files that the scene is made of, as
@@ -84,7 +85,7 @@ fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> anyhow::Result<T> {
         anyhow::anyhow!(
             "{}: {e}; it was written by another version: run {} again",
             path.display(),
-            scene::EXECUTABLE
+            SCENE.executable
         )
     })
 }

@@ -11,7 +11,7 @@ use dipir_cli::exit::Usage;
 use dipir_cli::interrupt;
 use dipir_cli::session::{Session, duration, size};
 use dipir_light::environment::EnvironmentSampler;
-use dipir_optimize::settings::{LightTable, Settings as OptimizeSettings};
+use dipir_optimize::settings::{LightTable, Settings as RecoverySettings};
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
@@ -20,21 +20,16 @@ use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
 use dipir_scene::config::SceneConfig;
+use dipir_scene::plausibility::implausible;
 use dipir_scene::scene::{LoadedScene, Scene};
 use serde_json::{Value, json};
 
-use crate::composite::CompositeTable;
+use crate::composite::table::CompositeTable;
 use crate::interruption;
 use crate::known_light;
+use crate::names::SCENE;
 use crate::presets::{self, Outlook};
 use crate::scene::transport::Frame;
-
-/// Name of the stage and of its folder.
-pub const STAGE: &str = "scene";
-/// The executable that runs it.
-pub const EXECUTABLE: &str = "dipir-scene";
-/// Raised whenever the same inputs give other outputs.
-pub const VERSION: u32 = 6;
 
 /// What the stage did.
 pub struct Done {
@@ -80,20 +75,20 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     composite.check(&session.config)?;
     let mut loaded = Scene::load(&config, &session.config.base_dir())
         .map_err(|e| with_place(e, &session.config))?;
-    for warning in &loaded.warnings {
+    for warning in loaded.warnings.iter().chain(&implausible(&loaded.scene)) {
         session.warn(warning);
     }
-    let optimize: LightTable = session.config.table("light")?;
-    let optimize = transport::settings(session, &optimize)?;
+    let table: LightTable = session.config.table("light")?;
+    let recovery = transport::settings(session, &table)?;
     let known = known_light::known(session, &composite)?;
-    let recorded = known.is_none().then_some(&optimize);
+    let recorded = known.is_none().then_some(&recovery);
     let light = known.unwrap_or_else(known_light::pilot);
     let read = loaded.inputs.iter();
     let plan_of_this = plan_with(
         session,
         read.map(|i| (i.role.as_str(), i.path.as_path(), i.location.as_path())),
     )?;
-    let folder = session.stage_folder(STAGE);
+    let folder = SCENE.folder(session);
     let mut writer = session.begin(plan_of_this)?;
 
     let settings = Settings {
@@ -163,7 +158,7 @@ fn outlook(session: &Session, record: &Record, resolution: [u32; 2], elapsed_s: 
     let paths = |samples: u32, side: usize| f64::from(samples) * (side.min(longest) as f64).powi(2);
     let here = paths(record.samples, record.size[0].max(record.size[1]));
     Outlook::beside(session.pipeline.quality, |p| {
-        let there = paths(p.optimize.samples, p.optimize.size);
+        let there = paths(p.light.samples, p.light.size);
         Some((
             elapsed_s - record.seconds + record.seconds * there / here,
             None,
@@ -177,7 +172,7 @@ fn record(
     loaded: &LoadedScene,
     renderer: &Renderer,
     effects: &EffectsPlan,
-    settings: &OptimizeSettings,
+    settings: &RecoverySettings,
 ) -> anyhow::Result<Transport> {
     let frame = Frame::new(loaded, settings.size);
     let simulation = effects.simulation();
@@ -191,7 +186,7 @@ fn record(
 /// manifest of the last run has them, and as long as the object is the same, so are they.
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let config: SceneConfig = session.config.table("scene")?;
-    let recorded = match Manifest::read(&session.stage_folder(STAGE), EXECUTABLE) {
+    let recorded = match SCENE.manifest(session) {
         Ok(manifest) => manifest.inputs,
         Err(_) => Vec::new(),
     };
@@ -256,15 +251,15 @@ fn plan_with<'a>(
 ) -> anyhow::Result<StagePlan> {
     let config = settings(session)?;
     let composite: CompositeTable = session.config.table("composite")?;
-    let optimize: LightTable = session.config.table("light")?;
-    let optimize = transport::settings(session, &optimize)?;
+    let table: LightTable = session.config.table("light")?;
+    let recovery = transport::settings(session, &table)?;
     let known = known_light::known_params(&composite);
     // Where the light is given, nothing is recovered: the record would be made for nobody.
     let transport = known.is_none().then(|| {
         json!({
-            "size": optimize.size, "environment": optimize.environment,
-            "samples": optimize.samples, "precision": optimize.precision,
-            "seed": optimize.seed,
+            "size": recovery.size, "environment": recovery.environment,
+            "samples": recovery.samples, "precision": recovery.precision,
+            "seed": recovery.seed,
         })
     });
     let light = known
@@ -273,7 +268,7 @@ fn plan_with<'a>(
     let params = json!({
         "scene": serde_json::to_value(&config)?, "light": light, "transport": transport,
     });
-    let mut plan = StagePlan::new(STAGE, VERSION, params, session.pipeline.seed);
+    let mut plan = SCENE.plan(session, params);
     for (role, path, location) in files {
         plan.input(role, path, location)?;
     }

@@ -8,7 +8,7 @@ use std::ops::ControlFlow;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::resize::{Filter, resize};
-use dipir_optimize::settings::{LightTable, Preset, Settings};
+use dipir_optimize::settings::{LightTable, Settings};
 use dipir_render::error::RenderError;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
@@ -24,8 +24,8 @@ pub const ROLE: &str = "transport";
 
 /// The `[light]` table with the quality's values for what it leaves open.
 pub fn settings(session: &Session, table: &LightTable) -> anyhow::Result<Settings> {
-    let filled = presets::of(session.pipeline.quality).optimize.fill(table);
-    let settings = filled.settings(Preset::Standard, session.pipeline.seed);
+    let preset = presets::of(session.pipeline.quality).light;
+    let settings = table.settings(&preset, session.pipeline.seed);
     settings.map_err(|e| {
         let key = format!("optimize.{}", e.key);
         session.config.invalid(&key, e.message).into()

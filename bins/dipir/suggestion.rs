@@ -1,0 +1,61 @@
+//! What a command line that cannot be understood was probably meant to be.
+use std::ffi::OsStr;
+use std::path::Path;
+
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::{CommandFactory, Parser};
+use dipir_cli::exit::Usage;
+use dipir_pipeline::config::renamed;
+
+use crate::Cli;
+
+/// Reads the command line. What clap has no better word for than that it is wrong is answered with
+/// what was meant.
+pub fn parse() -> anyhow::Result<Cli> {
+    let error = match Cli::try_parse() {
+        Ok(cli) => return Ok(cli),
+        Err(error) => error,
+    };
+    match meant(&error) {
+        Some(message) => Err(Usage(message).into()),
+        None => error.exit(),
+    }
+}
+
+fn meant(error: &clap::Error) -> Option<String> {
+    let said = |kind| match error.get(kind) {
+        Some(ContextValue::String(text)) => Some(text.as_str()),
+        _ => None,
+    };
+    match error.kind() {
+        ErrorKind::InvalidSubcommand => file(said(ContextKind::InvalidSubcommand)?),
+        ErrorKind::InvalidValue => {
+            let value = said(ContextKind::InvalidValue)?;
+            let option = said(ContextKind::InvalidArg)?;
+            let option = option.split(' ').next()?;
+            renamed(value).map(|now| format!("{option} {value}: that stage is called {now} now"))
+        }
+        _ => None,
+    }
+}
+
+/// For a file where a command should stand.
+fn file(name: &str) -> Option<String> {
+    let extension = Path::new(name).extension().and_then(OsStr::to_str)?;
+    if extension == "toml" {
+        return Some(format!(
+            "{name} is no command of dipir; to run it: dipir run {name}"
+        ));
+    }
+    let has_init = Cli::command().find_subcommand("init").is_some();
+    Some(match has_init {
+        true => format!(
+            "{name} is no command of dipir; to begin with a photograph and an object: dipir init \
+             PHOTO MODEL"
+        ),
+        false => format!(
+            "{name} is no command of dipir; name the photograph in a pipeline.toml, as [scene] \
+             background, and its object, as in the README, and run it: dipir run pipeline.toml"
+        ),
+    })
+}

@@ -1,0 +1,133 @@
+//! The folder of an evaluation: its scenes, and where runs leave their results.
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use dipir_cli::exit::Usage;
+use dipir_evaluation::results::read_json;
+use dipir_stages::composite::table::Tone;
+use serde::{Deserialize, Serialize};
+
+/// The folder.
+#[derive(Clone, Debug)]
+pub struct EvaluationFolder {
+    root: PathBuf,
+}
+
+/// The folder of the truth among the runs; no method may be called so.
+pub const TRUTH: &str = "truth";
+
+/// What is known of a scene, beside its `pipeline.toml`: the content of `scene.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneInfo {
+    /// Name, which is that of its folder.
+    pub name: String,
+    /// What it was made from, in words.
+    pub made_from: String,
+    /// The true light, relative to the scene's folder.
+    pub map: PathBuf,
+    /// Stops that bring it to the photograph's scale.
+    pub exposure_ev: f64,
+    /// The camera's curve, known to methods whose light is a map.
+    pub tone: Tone,
+    /// The kind of place, if it is known: the report has a table by kind.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub kind: Option<String>,
+}
+
+impl EvaluationFolder {
+    /// The evaluation in `root`.
+    pub fn new(root: &Path) -> Self {
+        Self { root: root.into() }
+    }
+
+    /// Where it is.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// A scene's own folder.
+    pub fn scene(&self, name: &str) -> PathBuf {
+        self.root.join("scenes").join(name)
+    }
+
+    /// Where a method leaves what it made of a scene.
+    pub fn run(&self, method: &str, scene: &str) -> PathBuf {
+        self.root.join("runs").join(method).join(scene)
+    }
+
+    /// A method's picture of a scene.
+    pub fn picture(&self, method: &str, scene: &str) -> PathBuf {
+        self.run(method, scene).join("composite/composite.png")
+    }
+
+    /// Where stages work.
+    pub fn work(&self, scene: &str, key: &str) -> PathBuf {
+        self.root.join("work").join(scene).join(key)
+    }
+
+    /// All scenes by name.
+    ///
+    /// # Errors
+    /// If there is none, or one cannot be read.
+    pub fn scenes(&self) -> anyhow::Result<Vec<SceneInfo>> {
+        let folder = self.root.join("scenes");
+        let names = folders(&folder)?;
+        if names.is_empty() {
+            bail!(
+                "there is no scene in {}; make some with dipir-evaluate make",
+                folder.display()
+            );
+        }
+        names
+            .iter()
+            .map(|n| read_json(&folder.join(n).join("scene.json")))
+            .collect()
+    }
+
+    /// The scenes whose names begin with one of `prefixes`; all if there are no prefixes.
+    ///
+    /// # Errors
+    /// If no scene begins with one of `prefixes`.
+    pub fn chosen(&self, prefixes: &[String]) -> anyhow::Result<Vec<SceneInfo>> {
+        let all = self.scenes()?;
+        for prefix in prefixes {
+            if !all.iter().any(|s| s.name.starts_with(prefix)) {
+                let names: Vec<&str> = all.iter().map(|s| s.name.as_str()).collect();
+                let text = format!("--scene {prefix}: accepted: {}", names.join(", "));
+                return Err(Usage(text).into());
+            }
+        }
+        let wanted = |s: &SceneInfo| prefixes.iter().any(|p| s.name.starts_with(p));
+        let chosen = all.into_iter().filter(|s| prefixes.is_empty() || wanted(s));
+        Ok(chosen.collect())
+    }
+
+    /// Names of the methods that ran, sorted.
+    ///
+    /// # Errors
+    /// If the folder cannot be read.
+    pub fn methods(&self) -> anyhow::Result<Vec<String>> {
+        folders(&self.root.join("runs"))
+    }
+}
+
+/// Names of the folders in `folder`, sorted; none if it is not there.
+fn folders(folder: &Path) -> anyhow::Result<Vec<String>> {
+    let failed = || format!("cannot read {}", folder.display());
+    let mut names = Vec::new();
+    match fs::read_dir(folder) {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(names),
+        entries => {
+            for entry in entries.with_context(failed)? {
+                let entry = entry.with_context(failed)?;
+                if entry.path().is_dir() {
+                    names.push(entry.file_name().to_string_lossy().into_owned());
+                }
+            }
+        }
+    }
+    names.sort();
+    Ok(names)
+}

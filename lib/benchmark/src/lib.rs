@@ -1,0 +1,22 @@
+//! How good the light of a method is, where the true light is known: scenes are made, methods run on
+//! them through the executables, and pictures and lights compared with the true ones. Nothing of the
+//! pipeline imports this.
+//!
+//! Everything is in one folder: `scenes/`, `maps/` and `objects/` that are made, `runs/METHOD/SCENE/`
+//! with pictures and scores, `work/` where stages run, and the report.
+pub mod command_line;
+pub mod folder;
+mod generated;
+mod lights;
+pub mod make;
+pub mod methods;
+mod metrics;
+mod page;
+mod panoramas;
+pub mod report;
+mod report_page;
+pub mod run;
+mod runner;
+pub mod score;
+pub mod spheres;
+pub mod study;

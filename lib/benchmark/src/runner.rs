@@ -1,0 +1,376 @@
+//! One method on one scene, through the executables.
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, anyhow};
+use dipir_cli::executables::Executables;
+use dipir_cli::interrupt;
+use dipir_evaluation::results::write_json;
+use dipir_evaluation::scores::{DisplayedComposite, compare_lights, compare_pictures};
+use dipir_imaging::file::read_photo;
+use dipir_imaging::transfer::Transfer;
+use dipir_light::environment::EnvironmentMap;
+use dipir_pipeline::fingerprint::Fingerprint;
+use dipir_pipeline::manifest::{Artifact, FILE_NAME};
+use dipir_pipeline::stage::StagePlan;
+use dipir_scene::description::SceneDescription;
+use dipir_stages::composite::table::Tone;
+use dipir_stages::names::{self, StageName};
+use serde_json::{Value, json};
+
+use crate::command_line::RunArgs;
+use crate::folder::{EvaluationFolder, SceneInfo, TRUTH};
+use crate::lights;
+use crate::methods::{BEFORE_COMPOSITE, Method, Source};
+use crate::score::{Score, Truth};
+
+/// Raised whenever the same run would get another score.
+const VERSION: u32 = 2;
+/// Seed of the true pictures. The methods' seed is another one, so that they share no noise.
+const TRUTH_SEED: u64 = 1_000_003;
+
+/// What every run needs.
+pub struct Runner<'a> {
+    /// Where scenes and results are.
+    pub evaluation: EvaluationFolder,
+    /// What runs.
+    pub executables: Executables,
+    /// What was asked for.
+    pub args: &'a RunArgs,
+    /// Methods, with the folder of their maps if those are imported.
+    pub methods: Vec<(Method, Option<PathBuf>)>,
+    /// Hash of the diffusion model.
+    pub model: String,
+    /// Worker threads of each executable.
+    pub threads: usize,
+}
+
+impl Runner<'_> {
+    /// All methods on one scene; failures are reported and the others go on.
+    pub fn scene(&self, scene: &SceneInfo, report: &dyn Fn(&str, Option<anyhow::Error>)) {
+        let truth = match self.truth(scene) {
+            Ok(truth) => truth,
+            Err(e) => {
+                let text = format!("{e:#}");
+                for (method, _) in &self.methods {
+                    report(&method.name, Some(anyhow!("{text}")));
+                }
+                return;
+            }
+        };
+        for (method, maps) in &self.methods {
+            let result = self.method(scene, method, maps.as_deref(), &truth);
+            report(&method.name, result.err());
+            if interrupt::asked() {
+                return;
+            }
+        }
+    }
+
+    /// The picture under the true light.
+    fn truth(&self, scene: &SceneInfo) -> anyhow::Result<Truth> {
+        let folder = self.evaluation.run(TRUTH, &scene.name);
+        let score_file = folder.join("score.json");
+        let key = self.fingerprint(scene, json!(TRUTH), None)?;
+        let map_file = self.evaluation.scene(&scene.name).join(&scene.map);
+        if !Score::is_done(&score_file, &key) {
+            let work = self.evaluation.work(&scene.name, TRUTH);
+            let mut run = StageRuns::new(self, scene, &work, TRUTH_SEED);
+            run.set("composite.environment", &toml_string(&map_file)?);
+            run.set("composite.exposure_ev", &scene.exposure_ev.to_string());
+            run.set("composite.tone", tone_key(scene.tone));
+            run.set(
+                "composite.target_error",
+                &(0.5 * self.args.target_error).to_string(),
+            );
+            run.stage(&names::SCENE)?;
+            run.stage(&names::COMPOSITE)?;
+            run.keep(&folder)?;
+            let score = Score {
+                key,
+                method: TRUTH.into(),
+                title: "Truth".into(),
+                scene: scene.name.clone(),
+                picture: None,
+                lpips: None,
+                light: None,
+                seconds: run.seconds,
+                peak_rss_bytes: run.peak_rss_bytes,
+            };
+            write_json(&score_file, &score)?;
+        }
+        Truth::read(
+            &folder.join("composite/composite.exr"),
+            &map_file,
+            scene.exposure_ev,
+        )
+    }
+
+    fn method(
+        &self,
+        scene: &SceneInfo,
+        method: &Method,
+        maps: Option<&Path>,
+        truth: &Truth,
+    ) -> anyhow::Result<()> {
+        let folder = self.evaluation.run(&method.name, &scene.name);
+        let score_file = folder.join("score.json");
+        let imported = maps.map(|f| map_in(f, &scene.name)).transpose()?;
+        let model = method.model.then_some(&self.model);
+        let params = json!({"method": method, "model": model});
+        let key = self.fingerprint(scene, params, imported.as_deref())?;
+        if Score::is_done(&score_file, &key) {
+            return Ok(());
+        }
+        let work = self.shared_work(scene, method)?;
+        let mut run = StageRuns::new(self, scene, &work, 0);
+        self.configure(&mut run, method)?;
+        let given = match method.light {
+            Source::Recovered => None,
+            _ => Some(self.map(scene, method, imported.as_deref(), &truth.map)?),
+        };
+        if let Some(map) = &given {
+            let file = work.join("given.exr");
+            fs::create_dir_all(&work)
+                .with_context(|| format!("cannot create {}", work.display()))?;
+            map.write(&file)?;
+            run.set("composite.environment", &toml_string(&file)?);
+            run.set("composite.tone", tone_key(scene.tone));
+        }
+        for stage in BEFORE_COMPOSITE {
+            let runs = method.stages.iter().any(|s| s == stage.name);
+            // The light is the method's own; what comes before may be there already.
+            let is_there = work.join(stage.name).join(FILE_NAME).is_file();
+            if runs && (*stage == names::LIGHT || !is_there) {
+                run.stage(stage)?;
+            }
+        }
+        run.stage(&names::COMPOSITE)?;
+        run.keep(&folder)?;
+        let light = match given {
+            Some(map) => map,
+            None => EnvironmentMap::read(folder.join("light/environment.exr"))?,
+        };
+        let found = DisplayedComposite::read(&folder.join("composite/composite.exr"))?.picture;
+        let score = Score {
+            key,
+            method: method.name.clone(),
+            title: method.title.clone(),
+            scene: scene.name.clone(),
+            picture: Some(compare_pictures(&found, &truth.picture, &truth.touched)),
+            lpips: None,
+            light: Some(compare_lights(&light, &truth.map)),
+            seconds: run.seconds,
+            peak_rss_bytes: run.peak_rss_bytes,
+        };
+        write_json(&score_file, &score)
+    }
+
+    /// Where the stages of a method work. Methods that differ in `[light]` and `[composite]` alone share
+    /// what runs before.
+    fn shared_work(&self, scene: &SceneInfo, method: &Method) -> anyhow::Result<PathBuf> {
+        let before_light = |s: &&String| !s.starts_with("light.") && !s.starts_with("composite.");
+        let params = json!({
+            // Under a given light effects are planned for it, so no two such methods share a scene.
+            "light": match method.light {
+                Source::Recovered => "recovered",
+                _ => &method.name,
+            },
+            "set": method.set.iter().filter(before_light).collect::<Vec<_>>(),
+            "is_adapted": method.stages.len() > 2,
+            "model": method.model.then_some(&self.model),
+        });
+        let key = self.fingerprint(scene, params, None)?;
+        Ok(self.evaluation.work(&scene.name, &key[..16]))
+    }
+
+    /// The keys of `pipeline.toml` that method and command line set.
+    fn configure(&self, run: &mut StageRuns, method: &Method) -> anyhow::Result<()> {
+        run.set(
+            "composite.target_error",
+            &self.args.target_error.to_string(),
+        );
+        run.set
+            .extend(method.set.iter().chain(&self.args.set).cloned());
+        if let (true, Some(model)) = (method.model, &self.args.model) {
+            let model = model
+                .canonicalize()
+                .with_context(|| format!("there is no model in {}", model.display()))?;
+            run.set("model.path", &toml_string(&model)?);
+        }
+        Ok(())
+    }
+
+    /// The map of a method that recovers nothing, on the photograph's scale.
+    fn map(
+        &self,
+        scene: &SceneInfo,
+        method: &Method,
+        imported: Option<&Path>,
+        truth: &EnvironmentMap,
+    ) -> anyhow::Result<EnvironmentMap> {
+        let folder = self.evaluation.scene(&scene.name);
+        let photo = || read_photo(folder.join("photo.png"), Transfer::Srgb);
+        Ok(match (&method.light, imported) {
+            (Source::Imported, Some(file)) => EnvironmentMap::read(file)?,
+            (Source::Projected, _) => {
+                let described = self.evaluation.run(TRUTH, &scene.name).join("scene.json");
+                let camera = SceneDescription::read(&described)?.camera;
+                lights::projected(&photo()?.image, scene.tone, &camera)?
+            }
+            (Source::Fitted, _) => lights::fitted(truth),
+            (Source::Truth, _) => truth.clone(),
+            _ => lights::neutral(&photo()?.image, scene.tone),
+        })
+    }
+
+    /// Hash of what decides a run: the scene's files, the settings, `params`, and an imported map.
+    fn fingerprint(
+        &self,
+        scene: &SceneInfo,
+        params: Value,
+        imported: Option<&Path>,
+    ) -> anyhow::Result<String> {
+        let folder = self.evaluation.scene(&scene.name);
+        let versions = names::ALL.map(|s| (s.name, s.version));
+        let params = json!({
+            "scene": scene,
+            "run": params,
+            "set": self.args.set,
+            "target_error": self.args.target_error,
+            "stages": versions,
+        });
+        let mut plan = StagePlan::new("evaluate", VERSION, params, 0);
+        let mut add = |role: &str, path: &Path| -> anyhow::Result<()> {
+            plan.inputs.push(Artifact::of(role, path, path)?);
+            Ok(())
+        };
+        add("pipeline", &folder.join("pipeline.toml"))?;
+        add("photo", &folder.join("photo.png"))?;
+        add("truth", &folder.join(&scene.map))?;
+        for (n, object) in objects(&folder.join("pipeline.toml"))?.iter().enumerate() {
+            add(&format!("object {n}"), object)?;
+        }
+        if let Some(map) = imported {
+            add("map", map)?;
+        }
+        Ok(Fingerprint::of_plan(&plan).finish().as_str().to_owned())
+    }
+}
+
+/// The value of `composite.tone`.
+fn tone_key(tone: Tone) -> &'static str {
+    match tone {
+        Tone::None => "none",
+        Tone::Reinhard => "reinhard",
+    }
+}
+
+/// The map of `scene` in a folder of imported ones.
+fn map_in(folder: &Path, scene: &str) -> anyhow::Result<PathBuf> {
+    let candidates = ["exr", "hdr"].map(|e| folder.join(format!("{scene}.{e}")));
+    candidates
+        .into_iter()
+        .find(|f| f.is_file())
+        .with_context(|| {
+            format!(
+                "there is no map of this scene in {}: accepted: {scene}.exr or {scene}.hdr",
+                folder.display()
+            )
+        })
+}
+
+/// An absolute path as a TOML string: relative ones would start from the scene's folder.
+fn toml_string(path: &Path) -> anyhow::Result<String> {
+    let absolute =
+        std::path::absolute(path).with_context(|| format!("cannot find {}", path.display()))?;
+    let text = absolute
+        .to_string_lossy()
+        .replace('\\', "\\\\")
+        .replace('"', "\\\"");
+    Ok(format!("\"{text}\""))
+}
+
+/// The files of the objects that `pipeline` names.
+fn objects(pipeline: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let text = fs::read_to_string(pipeline)
+        .with_context(|| format!("cannot read {}", pipeline.display()))?;
+    let table: toml::Table =
+        toml::from_str(&text).with_context(|| format!("cannot read {}", pipeline.display()))?;
+    let objects = table.get("scene").and_then(|s| s.get("objects"));
+    let paths = objects
+        .and_then(|o| o.as_array())
+        .into_iter()
+        .flatten()
+        .filter_map(|o| o.get("path")?.as_str());
+    let folder = pipeline.parent().unwrap_or(Path::new(""));
+    Ok(paths.map(|p| folder.join(p)).collect())
+}
+
+/// Stages that run in one folder with the same settings.
+struct StageRuns<'a> {
+    runner: &'a Runner<'a>,
+    pipeline: PathBuf,
+    work: PathBuf,
+    seed: u64,
+    set: Vec<String>,
+    seconds: Vec<(String, f64)>,
+    peak_rss_bytes: u64,
+}
+
+impl<'a> StageRuns<'a> {
+    fn new(runner: &'a Runner<'a>, scene: &SceneInfo, work: &Path, seed: u64) -> Self {
+        Self {
+            runner,
+            pipeline: runner.evaluation.scene(&scene.name).join("pipeline.toml"),
+            work: work.into(),
+            seed,
+            set: Vec::new(),
+            seconds: Vec::new(),
+            peak_rss_bytes: 0,
+        }
+    }
+
+    fn set(&mut self, key: &str, value: &str) {
+        self.set.push(format!("{key}={value}"));
+    }
+
+    fn stage(&mut self, stage: &StageName) -> anyhow::Result<()> {
+        let mut arguments: Vec<String> = vec![
+            "-p".into(),
+            self.pipeline.to_string_lossy().into(),
+            "-o".into(),
+            self.work.to_string_lossy().into(),
+            "--seed".into(),
+            self.seed.to_string(),
+            "-j".into(),
+            self.runner.threads.to_string(),
+        ];
+        for pair in &self.set {
+            arguments.extend(["--set".into(), pair.clone()]);
+        }
+        let ran = self.runner.executables.run(stage.executable, &arguments)?;
+        self.seconds.push((stage.executable.into(), ran.wall_s));
+        let rss = ran.json["peak_rss_bytes"].as_u64().unwrap_or(0);
+        self.peak_rss_bytes = self.peak_rss_bytes.max(rss);
+        Ok(())
+    }
+
+    /// Moves what is worth keeping to `folder`, whatever was there before.
+    fn keep(&self, folder: &Path) -> anyhow::Result<()> {
+        let failed = || format!("cannot write {}", folder.display());
+        if folder.is_dir() {
+            fs::remove_dir_all(folder).with_context(failed)?;
+        }
+        fs::create_dir_all(folder).with_context(failed)?;
+        let described = self.work.join("scene/scene.json");
+        fs::copy(described, folder.join("scene.json")).with_context(failed)?;
+        for stage in ["light", "composite"] {
+            let from = self.work.join(stage);
+            if from.is_dir() {
+                fs::rename(&from, folder.join(stage)).with_context(failed)?;
+            }
+        }
+        Ok(())
+    }
+}

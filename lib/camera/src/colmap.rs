@@ -1,0 +1,290 @@
+//! COLMAP's sparse models, as text (`cameras.txt`, `images.txt`, `points3D.txt`) or binary (`.bin`).
+//!
+//! Images map world to camera in image axes. The world has no known up and scale.
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use glam::{DMat3, DQuat, DVec2, DVec3};
+
+use crate::camera::{Camera, Lens, Pose, WorldUp};
+use crate::distortion::Distortion;
+use crate::error::CameraError;
+
+const FORMAT: &str = "COLMAP";
+
+/// Cameras by the names of their images, and the points of the scene.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Model {
+    /// In the order of the file.
+    pub images: Vec<(String, Camera)>,
+    /// World positions.
+    pub points: Vec<DVec3>,
+}
+
+/// Reads the model in `folder`, binary files first. Points may be missing. `up` is the axis of the
+/// model's world that points up.
+///
+/// # Errors
+/// If a file is missing, cut short, or of a camera model that is not known.
+pub fn read(folder: &Path, up: WorldUp) -> Result<Model, CameraError> {
+    let binary = folder.join("cameras.bin").exists();
+    let name = |stem: &str| folder.join(format!("{stem}.{}", if binary { "bin" } else { "txt" }));
+    let bytes = |stem: &str| {
+        let path = name(stem);
+        dipir_files::read(&path).map_err(|source| CameraError::Read { path, source })
+    };
+    let (cameras, images) = (bytes("cameras")?, bytes("images")?);
+    let points = match name("points3D").exists() {
+        true => bytes("points3D")?,
+        false => Vec::new(),
+    };
+    match binary {
+        true => read_binary(&cameras, &images, &points, up),
+        false => {
+            let text = |bytes| {
+                String::from_utf8(bytes).map_err(|_| CameraError::new(FORMAT, "it is not UTF-8"))
+            };
+            read_text(&text(cameras)?, &text(images)?, &text(points)?, up)
+        }
+    }
+}
+
+/// Reads the contents of the text files; `points` may be empty. Errors as [`read`].
+pub fn read_text(
+    cameras: &str,
+    images: &str,
+    points: &str,
+    up: WorldUp,
+) -> Result<Model, CameraError> {
+    let wrong = |what: &str, line: &str| {
+        let line: String = line.chars().take(60).collect();
+        CameraError::new(
+            FORMAT,
+            format!("{what} \"{}\" cannot be read", line.escape_debug()),
+        )
+    };
+    let mut lenses = BTreeMap::new();
+    for line in records(cameras).filter(|l| !l.is_empty()) {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let numbers: Option<Vec<f64>> = words.iter().skip(2).map(|w| w.parse().ok()).collect();
+        let id = words.first().and_then(|w| w.parse::<u32>().ok());
+        let (Some(id), Some(model), Some(numbers)) = (id, words.get(1), numbers) else {
+            return Err(wrong("the camera", line));
+        };
+        let [w, h, parameters @ ..] = &numbers[..] else {
+            return Err(wrong("the camera", line));
+        };
+        lenses.insert(id, lens(model, [*w, *h], parameters)?);
+    }
+    let mut model = Model::default();
+    // Each image is a line followed by one of its points, which may be empty.
+    let mut lines = records(images).skip_while(|l| l.is_empty());
+    while let Some(line) = lines.next() {
+        let words: Vec<&str> = line.splitn(10, char::is_whitespace).collect();
+        let numbers: Option<Vec<f64>> = words
+            .iter()
+            .skip(1)
+            .take(7)
+            .map(|w| w.parse().ok())
+            .collect();
+        let id = words.get(8).and_then(|w| w.parse::<u32>().ok());
+        let (Some(numbers), Some(id), Some(name)) = (numbers, id, words.get(9)) else {
+            return Err(wrong("the image", line));
+        };
+        let [q0, q1, q2, q3, x, y, z] = numbers[..] else {
+            return Err(wrong("the image", line));
+        };
+        let camera = image([q0, q1, q2, q3], DVec3::new(x, y, z), lenses.get(&id), up)?;
+        model.images.push((name.trim().to_string(), camera));
+        lines.next();
+    }
+    for line in records(points).filter(|l| !l.is_empty()) {
+        let numbers = line.split_whitespace().skip(1).take(3);
+        let numbers: Option<Vec<f64>> = numbers.map(|w| w.parse().ok()).collect();
+        let Some([x, y, z]) = numbers.as_deref() else {
+            return Err(wrong("the point", line));
+        };
+        model.points.push(up.to_ours() * DVec3::new(*x, *y, *z));
+    }
+    Ok(model)
+}
+
+/// Lines that are no comments.
+fn records(text: &str) -> impl Iterator<Item = &str> {
+    text.lines()
+        .map(str::trim)
+        .filter(|line| !line.starts_with('#'))
+}
+
+/// Reads the contents of the binary files; `points` may be empty. Errors as [`read`].
+pub fn read_binary(
+    cameras: &[u8],
+    images: &[u8],
+    points: &[u8],
+    up: WorldUp,
+) -> Result<Model, CameraError> {
+    let mut lenses = BTreeMap::new();
+    let mut at = Bytes(cameras);
+    for _ in 0..at.u64()? {
+        let (id, kind) = (at.u32()?, at.u32()?);
+        let size = [at.u64()? as f64, at.u64()? as f64];
+        let Some((name, count)) = MODELS.iter().find(|m| m.0 == kind).map(|m| (m.1, m.2)) else {
+            return Err(unknown(&kind.to_string()));
+        };
+        let parameters: Vec<f64> = (0..count).map(|_| at.f64()).collect::<Result<_, _>>()?;
+        lenses.insert(id, lens(name, size, &parameters)?);
+    }
+    let mut model = Model::default();
+    let mut at = Bytes(images);
+    for _ in 0..at.u64()? {
+        at.u32()?;
+        let q = [at.f64()?, at.f64()?, at.f64()?, at.f64()?];
+        let t = DVec3::new(at.f64()?, at.f64()?, at.f64()?);
+        let id = at.u32()?;
+        let name = at.text()?;
+        let seen = at.u64()?;
+        at.skip(seen, 24)?;
+        let camera = image(q, t, lenses.get(&id), up)?;
+        model.images.push((name, camera));
+    }
+    if !points.is_empty() {
+        let mut at = Bytes(points);
+        for _ in 0..at.u64()? {
+            at.u64()?;
+            let point = DVec3::new(at.f64()?, at.f64()?, at.f64()?);
+            at.skip(1, 3 + 8)?;
+            let track = at.u64()?;
+            at.skip(track, 8)?;
+            model.points.push(up.to_ours() * point);
+        }
+    }
+    Ok(model)
+}
+
+/// Little-endian values from the front of a slice.
+struct Bytes<'a>(&'a [u8]);
+
+impl<'a> Bytes<'a> {
+    fn take(&mut self, count: usize) -> Result<&'a [u8], CameraError> {
+        let (front, rest) = self
+            .0
+            .split_at_checked(count)
+            .ok_or_else(|| CameraError::new(FORMAT, "it is cut short"))?;
+        self.0 = rest;
+        Ok(front)
+    }
+
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], CameraError> {
+        let mut out = [0; N];
+        out.copy_from_slice(self.take(N)?);
+        Ok(out)
+    }
+
+    fn u32(&mut self) -> Result<u32, CameraError> {
+        Ok(u32::from_le_bytes(self.array()?))
+    }
+
+    fn u64(&mut self) -> Result<u64, CameraError> {
+        Ok(u64::from_le_bytes(self.array()?))
+    }
+
+    fn f64(&mut self) -> Result<f64, CameraError> {
+        Ok(f64::from_le_bytes(self.array()?))
+    }
+
+    /// Up to a byte 0.
+    fn text(&mut self) -> Result<String, CameraError> {
+        let end = self.0.iter().position(|&b| b == 0);
+        let end = end.ok_or_else(|| CameraError::new(FORMAT, "it is cut short"))?;
+        let text = String::from_utf8_lossy(self.take(end)?).into_owned();
+        self.take(1)?;
+        Ok(text)
+    }
+
+    fn skip(&mut self, count: u64, size: u64) -> Result<(), CameraError> {
+        let bytes = count.saturating_mul(size);
+        self.take(usize::try_from(bytes).unwrap_or(usize::MAX))?;
+        Ok(())
+    }
+}
+
+/// Number, name and count of parameters of the models that are read.
+const MODELS: [(u32, &str, usize); 9] = [
+    (0, "SIMPLE_PINHOLE", 3),
+    (1, "PINHOLE", 4),
+    (2, "SIMPLE_RADIAL", 4),
+    (3, "RADIAL", 5),
+    (4, "OPENCV", 8),
+    (5, "OPENCV_FISHEYE", 8),
+    (6, "FULL_OPENCV", 12),
+    (8, "SIMPLE_RADIAL_FISHEYE", 4),
+    (9, "RADIAL_FISHEYE", 5),
+];
+
+fn unknown(model: &str) -> CameraError {
+    let names: Vec<&str> = MODELS.iter().map(|m| m.1).collect();
+    let detail = format!(
+        "its camera model is {}; accepted: {}",
+        model.escape_debug(),
+        names.join(", ")
+    );
+    let remedy = "undistort the images with `colmap image_undistorter`";
+    CameraError::with_remedy(FORMAT, detail, remedy)
+}
+
+fn lens(model: &str, size: [f64; 2], p: &[f64]) -> Result<Lens, CameraError> {
+    let Some((_, _, count)) = MODELS.iter().find(|m| m.1 == model) else {
+        return Err(unknown(model));
+    };
+    if p.len() != *count {
+        let detail = format!("{model} has {} parameters, and needs {count}", p.len());
+        return Err(CameraError::new(FORMAT, detail));
+    }
+    // One focal length, or two.
+    let single = matches!(*count, 3 | 5) || model.starts_with("SIMPLE");
+    let (focal, rest) = match single {
+        true => (DVec2::splat(p[0]), &p[1..]),
+        false => (DVec2::new(p[0], p[1]), &p[2..]),
+    };
+    let (principal_px, c) = (DVec2::new(rest[0], rest[1]), &rest[2..]);
+    let k = |i: usize| c.get(i).copied().unwrap_or(0.0);
+    let distortion = match model {
+        "SIMPLE_PINHOLE" | "PINHOLE" => Some(Distortion::NONE),
+        "SIMPLE_RADIAL" | "RADIAL" => {
+            Distortion::brown_conrady([k(0), k(1), 0.0, 0.0], [0.0; 3], [0.0; 2])
+        }
+        "OPENCV" | "FULL_OPENCV" => {
+            Distortion::brown_conrady([k(0), k(1), k(4), 0.0], [k(5), k(6), k(7)], [k(2), k(3)])
+        }
+        _ => Distortion::kannala_brandt([k(0), k(1), k(2), k(3)]),
+    };
+    let distortion =
+        distortion.ok_or_else(|| CameraError::new(FORMAT, "its distortion is not finite"))?;
+    let lens = Lens {
+        principal_px,
+        distortion,
+        ..Lens::pinhole(size, focal)
+    };
+    lens.check(FORMAT)?;
+    Ok(lens)
+}
+
+fn image(q: [f64; 4], t: DVec3, lens: Option<&Lens>, up: WorldUp) -> Result<Camera, CameraError> {
+    let Some(lens) = lens else {
+        return Err(CameraError::new(
+            FORMAT,
+            "an image names a camera that is not there",
+        ));
+    };
+    let quaternion = DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
+    let length = quaternion.length();
+    let pose = match length > 1e-6 && length.is_finite() {
+        true => Pose::from_world_to_image(DMat3::from_quat(quaternion / length), t),
+        false => None,
+    };
+    let pose = pose.ok_or_else(|| CameraError::new(FORMAT, "an image has no rotation"))?;
+    Ok(Camera {
+        pose: pose.in_our_world(up),
+        lens: *lens,
+    })
+}

@@ -1,0 +1,51 @@
+//! KITTI's `calib` texts.
+//!
+//! `P2: …` (or `P_rect_02: …`) is a projection of twelve numbers by rows, from the rectified frame of
+//! the first camera, in image axes, to pixels.
+use glam::{DMat3, DVec2, DVec3};
+
+use crate::camera::{Camera, Lens, Pose, WorldUp};
+use crate::error::CameraError;
+
+const FORMAT: &str = "KITTI calibration";
+
+/// Reads camera `index` (2 is the left one in colour). Its world is the rectified frame of camera 0
+/// with +y up: the ground lies about 1.65 m below its origin. `size` is that of the image.
+///
+/// # Errors
+/// If the file has no such camera, or its matrix is no projection.
+pub fn read(text: &str, index: u32, size: [f64; 2]) -> Result<Camera, CameraError> {
+    let names = [format!("P{index}"), format!("P_rect_{index:02}")];
+    let line = text.lines().find_map(|line| {
+        let (name, values) = line.split_once(':')?;
+        names.iter().any(|n| n == name.trim()).then_some(values)
+    });
+    let Some(line) = line else {
+        let detail = format!("it has neither {} nor {}", names[0], names[1]);
+        return Err(CameraError::new(FORMAT, detail));
+    };
+    let values: Option<Vec<f64>> = line.split_whitespace().map(|v| v.parse().ok()).collect();
+    let values = values.filter(|v| v.len() == 12 && v.iter().all(|v| v.is_finite()));
+    let wrong = |what: &str| CameraError::new(FORMAT, format!("{} {what}", names[0]));
+    let Some(p) = values else {
+        return Err(wrong("is not twelve finite numbers"));
+    };
+    // K (I | t) with an upper triangular K that ends in 1.
+    let upright = p[4].abs() < 1e-6 && p[8].abs() < 1e-6 && p[9].abs() < 1e-6;
+    if !(upright && (p[10] - 1.0).abs() < 1e-6 && p[1].abs() < 1e-3 * p[0].abs()) {
+        return Err(wrong("is not a projection of a rectified camera"));
+    }
+    let lens = Lens {
+        principal_px: DVec2::new(p[2], p[6]),
+        ..Lens::pinhole(size, DVec2::new(p[0], p[5]))
+    };
+    lens.check(FORMAT)?;
+    let tz = p[11];
+    let shift = DVec3::new((p[3] - p[2] * tz) / p[0], (p[7] - p[6] * tz) / p[5], tz);
+    let pose = Pose::from_world_to_image(DMat3::IDENTITY, shift)
+        .ok_or_else(|| wrong("has no finite shift"))?;
+    Ok(Camera {
+        pose: pose.in_our_world(WorldUp::MinusY),
+        lens,
+    })
+}

@@ -1,0 +1,18 @@
+//! Cameras that other programs know: lenses with distortion, and the files that poses come in.
+//!
+//! World and camera are those of dipir: right-handed, +y up, metres; a camera looks down its own -z
+//! with +y up in the picture; pixel (0, 0) is the top left corner. Lenses count in image axes: +x to
+//! the right, +y down, +z forward.
+pub mod camera;
+pub mod chan;
+pub mod colmap;
+pub mod distortion;
+pub mod error;
+pub mod fspy;
+pub mod kitti;
+pub mod opencv;
+pub mod transforms;
+
+pub use camera::{Camera, Lens, Pose, WorldUp};
+pub use distortion::Distortion;
+pub use error::CameraError;

@@ -1,0 +1,167 @@
+//! Lenses that OpenCV and ROS calibrate: `camera_matrix`, `distortion_coefficients`, and the image's
+//! size, as YAML or JSON.
+use glam::DVec2;
+use serde_json::Value;
+
+use crate::camera::Lens;
+use crate::distortion::Distortion;
+use crate::error::CameraError;
+
+const FORMAT: &str = "OpenCV calibration";
+/// Names under which programs write them.
+const MATRIX: [&str; 4] = ["camera_matrix", "Camera_Matrix", "cameraMatrix", "K"];
+const COEFFICIENTS: [&str; 5] = [
+    "distortion_coefficients",
+    "Distortion_Coefficients",
+    "distCoeffs",
+    "dist_coeffs",
+    "D",
+];
+const WIDTH: [&str; 3] = ["image_width", "image_Width", "width"];
+const HEIGHT: [&str; 3] = ["image_height", "image_Height", "height"];
+const MODEL: [&str; 2] = ["distortion_model", "camera_model"];
+/// More numbers than any matrix of a calibration has.
+const MOST_NUMBERS: usize = 1 << 12;
+
+/// Reads the lens. Coefficients are k1 k2 p1 p2 and up to k3, k4 k5 k6, or k1 to k4 of a fisheye where
+/// the model is `fisheye` or `equidistant`. `size` is that of the image, where the file does not say it.
+///
+/// # Errors
+/// If the matrix or the size is missing, or the coefficients are of another model.
+pub fn read(text: &str, size: Option<[f64; 2]>) -> Result<Lens, CameraError> {
+    let found = match text.trim_start().starts_with('{') {
+        true => Found::in_json(text)?,
+        false => Found::in_yaml(text),
+    };
+    let wrong = |detail: &str| CameraError::new(FORMAT, detail);
+    let [fx, skew, cx, _, fy, cy, _, _, _] = found.matrix[..] else {
+        return Err(wrong("it has no camera_matrix of nine numbers"));
+    };
+    if skew.abs() > 1e-3 * fx.abs() {
+        return Err(wrong("its pixels are skewed"));
+    }
+    let Some(size) = found.size.or(size) else {
+        return Err(wrong("it has no image_width and image_height"));
+    };
+    let lens = Lens {
+        principal_px: DVec2::new(cx, cy),
+        distortion: found.distortion()?,
+        ..Lens::pinhole(size, DVec2::new(fx, fy))
+    };
+    lens.check(FORMAT)?;
+    Ok(lens)
+}
+
+#[derive(Default)]
+struct Found {
+    matrix: Vec<f64>,
+    coefficients: Vec<f64>,
+    size: Option<[f64; 2]>,
+    model: String,
+}
+
+impl Found {
+    fn in_json(text: &str) -> Result<Self, CameraError> {
+        let json: Value =
+            serde_json::from_str(text).map_err(|e| CameraError::new(FORMAT, e.to_string()))?;
+        let get = |names: &[&str]| names.iter().find_map(|name| json.get(name));
+        let numbers = |names: &[&str]| {
+            let mut out = Vec::new();
+            if let Some(value) = get(names) {
+                flatten(value.get("data").unwrap_or(value), &mut out);
+            }
+            out
+        };
+        let number = |names: &[&str]| get(names).and_then(Value::as_f64);
+        Ok(Self {
+            matrix: numbers(&MATRIX),
+            coefficients: numbers(&COEFFICIENTS),
+            size: number(&WIDTH).zip(number(&HEIGHT)).map(|(w, h)| [w, h]),
+            model: get(&MODEL).and_then(Value::as_str).unwrap_or("").into(),
+        })
+    }
+
+    /// The few forms of YAML that calibrations are written in: `key: value`, and matrices as
+    /// `data: [ … ]` below their key.
+    fn in_yaml(text: &str) -> Self {
+        let value = |names: &[&str]| {
+            let mut lines = text.lines();
+            lines.find_map(|line| {
+                let (name, value) = line.split_once(':')?;
+                names.contains(&name.trim()).then(|| value.trim())
+            })
+        };
+        let number = |names: &[&str]| value(names)?.parse().ok();
+        let model = value(&MODEL).unwrap_or("");
+        Self {
+            matrix: yaml_list(text, &MATRIX),
+            coefficients: yaml_list(text, &COEFFICIENTS),
+            size: number(&WIDTH).zip(number(&HEIGHT)).map(|(w, h)| [w, h]),
+            model: model.trim_matches(['"', '\'']).into(),
+        }
+    }
+
+    fn distortion(&self) -> Result<Distortion, CameraError> {
+        let c = &self.coefficients[..];
+        let at = |i: usize| c.get(i).copied().unwrap_or(0.0);
+        let fisheye = ["fisheye", "equidistant"].contains(&self.model.as_str());
+        let known = ["", "plumb_bob", "rational_polynomial", "pinhole"];
+        if !fisheye && !known.contains(&self.model.as_str()) {
+            let detail = format!("its distortion model is \"{}\"", self.model.escape_debug());
+            return Err(CameraError::new(FORMAT, detail));
+        }
+        let rest = if fisheye { 4 } else { 8 };
+        if c.iter().skip(rest).any(|&v| v != 0.0) {
+            let detail = "it has coefficients of a thin prism or a tilted sensor";
+            return Err(CameraError::new(FORMAT, detail));
+        }
+        let lens = match fisheye {
+            true => Distortion::kannala_brandt([at(0), at(1), at(2), at(3)]),
+            false => Distortion::brown_conrady(
+                [at(0), at(1), at(4), 0.0],
+                [at(5), at(6), at(7)],
+                [at(2), at(3)],
+            ),
+        };
+        lens.ok_or_else(|| CameraError::new(FORMAT, "its distortion is not finite"))
+    }
+}
+
+/// All numbers of nested lists.
+fn flatten(value: &Value, out: &mut Vec<f64>) {
+    match value {
+        Value::Array(items) => items.iter().for_each(|item| flatten(item, out)),
+        other if out.len() < MOST_NUMBERS => out.extend(other.as_f64()),
+        _ => {}
+    }
+}
+
+/// The numbers between the first brackets at or below a key, before the next key of its level.
+fn yaml_list(text: &str, names: &[&str]) -> Vec<f64> {
+    let mut at = 0;
+    for line in text.split_inclusive('\n') {
+        let key = line.split_once(':').map(|(name, _)| name.trim());
+        let after = at + line.len();
+        if key.is_some_and(|key| names.contains(&key)) {
+            let own = line.split_once(':').map_or("", |(_, value)| value);
+            let list = match own.contains('[') {
+                true => &text[after - own.len()..],
+                false => {
+                    let below = &text[after..];
+                    below.find("data:").map_or("", |data| &below[data..])
+                }
+            };
+            let inside = list
+                .split_once('[')
+                .and_then(|(_, rest)| rest.split_once(']'));
+            let inside = inside.map_or("", |(inside, _)| inside);
+            let items = inside
+                .split([',', '\n', ' '])
+                .filter(|v| !v.trim().is_empty());
+            let numbers = items.map(|v| v.trim().parse()).take(MOST_NUMBERS);
+            return numbers.collect::<Result<_, _>>().unwrap_or_default();
+        }
+        at = after;
+    }
+    Vec::new()
+}

@@ -1,0 +1,75 @@
+//! Ends that the system brings: why, in words.
+use std::process::ExitStatus;
+
+/// What is said when the process aborts, as Rust does when an allocation fails.
+#[cfg(unix)]
+const ABORTED: &[u8] = b"error: the process cannot go on; where the line above speaks of an \
+    allocation, memory ran out: give it more (ulimit -v), or ask for less, as with --set \
+    pipeline.quality=draft; earlier results are as they were\n";
+
+/// Lets what would end the process without a word name its cause: a file that grows beyond the
+/// limit on its size becomes an error of the write, and an abort says what it comes from.
+pub(crate) fn prepare() {
+    // SAFETY: called first thing in main. To ignore a signal runs no code of ours, and the handler
+    // only calls `write`, which handlers may.
+    #[cfg(unix)]
+    unsafe {
+        libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
+        let handler: extern "C" fn(libc::c_int) = say_aborted;
+        libc::signal(libc::SIGABRT, handler as libc::sighandler_t);
+    }
+}
+
+/// Returns to `abort`, which then ends the process by the signal.
+#[cfg(unix)]
+extern "C" fn say_aborted(_: libc::c_int) {
+    // SAFETY: the bytes outlive the call.
+    unsafe {
+        libc::write(libc::STDERR_FILENO, ABORTED.as_ptr().cast(), ABORTED.len());
+    }
+}
+
+/// What ended a process that gave no exit code, as far as the system tells.
+pub fn cause(status: ExitStatus) -> &'static str {
+    #[cfg(unix)]
+    {
+        use std::os::unix::process::ExitStatusExt;
+        match status.signal() {
+            Some(libc::SIGKILL) => {
+                return "somebody killed it, or the system did for want of memory";
+            }
+            Some(libc::SIGABRT) => {
+                return "it could not go on, as the lines above say";
+            }
+            Some(libc::SIGXFSZ) => return "a file grew beyond the limit (ulimit -f)",
+            Some(libc::SIGXCPU) => return "it used more processor time than the limit (ulimit -t)",
+            Some(libc::SIGTERM | libc::SIGHUP) => return "another program asked it to end",
+            Some(libc::SIGSEGV | libc::SIGBUS | libc::SIGILL) => {
+                return "a defect of dipir, or a stack or a mapped file that was cut short";
+            }
+            _ => {}
+        }
+    }
+    let _ = status;
+    "the system does not say why"
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use std::process::Command;
+
+    use super::*;
+
+    #[test]
+    fn a_killed_process_and_a_limit_are_told_apart() {
+        let ended = |signal: &str| {
+            let script = format!("kill -{signal} $$");
+            cause(Command::new("sh").args(["-c", &script]).status().unwrap())
+        };
+        assert!(ended("KILL").contains("want of memory"));
+        assert!(ended("XCPU").contains("ulimit -t"));
+        assert!(ended("TERM").contains("another program"));
+        let done = Command::new("true").status().unwrap();
+        assert_eq!(cause(done), "the system does not say why");
+    }
+}

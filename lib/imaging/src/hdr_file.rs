@@ -1,0 +1,50 @@
+//! Radiance HDR files.
+use crate::{
+    decode::{SizeLimit, image_error},
+    error::ImagingError,
+    file::check_finite,
+    format::Format,
+    raster::{LinearImage, Raster},
+};
+use glam::Vec3;
+use image::{ImageDecoder, codecs::hdr::HdrDecoder};
+use std::{io::Cursor, path::Path};
+
+/// Decodes a file in RGBE. Its `EXPOSURE` and `COLORCORR` say by what the stored values were
+/// multiplied, over all of its lines; they are divided by it [Radiance file formats, "pictures"].
+pub(crate) fn decode(
+    bytes: &[u8],
+    path: &Path,
+    limit: SizeLimit,
+) -> Result<LinearImage, ImagingError> {
+    let failed = |error| image_error(path, Format::Hdr, error);
+    // Some programs sign with `#?RGBE`, which the strict decoder does not know.
+    let decoder = if bytes.starts_with(b"#?RADIANCE") {
+        HdrDecoder::new(Cursor::new(bytes))
+    } else {
+        HdrDecoder::new_nonstrict(Cursor::new(bytes))
+    };
+    let decoder = decoder.map_err(failed)?;
+    let (width, height) = decoder.dimensions();
+    let (width, height) = (width as usize, height as usize);
+    limit.check(path, width, height)?;
+    let header = decoder.metadata();
+    let (r, g, b) = header.color_correction.unwrap_or((1.0, 1.0, 1.0));
+    let stored_over_light = Vec3::new(r, g, b) * header.exposure.unwrap_or(1.0);
+    if !(stored_over_light.min_element() > 0.0 && stored_over_light.is_finite()) {
+        return Err(ImagingError::Damaged {
+            path: path.to_owned(),
+            format: Format::Hdr.name(),
+            detail: format!("its EXPOSURE and COLORCORR are {stored_over_light}, not above 0"),
+        });
+    }
+    let mut samples = vec![[0.0f32; 3]; width * height];
+    let bytes = bytemuck::cast_slice_mut(&mut samples);
+    decoder.read_image(bytes).map_err(failed)?;
+    // Collected in place: a 4k map is 100 MB.
+    let light = |v: [f32; 3]| Vec3::from_array(v) / stored_over_light;
+    let pixels = samples.into_iter().map(light).collect();
+    let image = Raster::from_pixels(width, height, pixels);
+    check_finite(path, &image)?;
+    Ok(LinearImage(image))
+}

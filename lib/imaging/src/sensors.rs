@@ -1,0 +1,221 @@
+//! Sizes of the sensors of common cameras, for files that name the camera and not its field of view.
+//!
+//! Makers publish them in their cameras' specifications. A family of cameras has one row.
+
+/// Long and short side, millimetres, of cameras whose maker and name contain these words.
+struct Row {
+    make: &'static str,
+    /// Any of these, at the beginning of the name after the maker's.
+    models: &'static [&'static str],
+    size_mm: [f64; 2],
+}
+
+const FULL_FRAME: [f64; 2] = [36.0, 24.0];
+const APS_C: [f64; 2] = [23.5, 15.6];
+const APS_C_CANON: [f64; 2] = [22.3, 14.9];
+const FOUR_THIRDS: [f64; 2] = [17.3, 13.0];
+const ONE_INCH: [f64; 2] = [13.2, 8.8];
+
+/// Names that begin with a longer word come first.
+const ROWS: &[Row] = &[
+    Row {
+        make: "canon",
+        models: &[
+            "eos-1d x", "eos-1ds", "eos 5d", "eos 6d", "eos rp", "eos r3", "eos r5", "eos r6",
+            "eos r8", "eos r1",
+        ],
+        size_mm: FULL_FRAME,
+    },
+    Row {
+        make: "canon",
+        models: &["eos r7", "eos r10", "eos r50", "eos r100", "eos m"],
+        size_mm: APS_C_CANON,
+    },
+    Row {
+        make: "canon",
+        models: &["eos-1d"],
+        size_mm: [27.9, 18.6],
+    },
+    Row {
+        make: "canon",
+        models: &["eos r"],
+        size_mm: FULL_FRAME,
+    },
+    Row {
+        make: "canon",
+        models: &["eos"],
+        size_mm: APS_C_CANON,
+    },
+    Row {
+        make: "canon",
+        models: &["powershot g1 x"],
+        size_mm: [18.7, 14.0],
+    },
+    Row {
+        make: "canon",
+        models: &[
+            "powershot g3 x",
+            "powershot g5 x",
+            "powershot g7 x",
+            "powershot g9 x",
+        ],
+        size_mm: ONE_INCH,
+    },
+    Row {
+        make: "nikon",
+        models: &[
+            "d3", "d4", "d5", "d6", "d600", "d610", "d700", "d750", "d780", "d800", "d810", "d850",
+            "df", "z 5", "z 6", "z 7", "z 8", "z 9", "z f",
+        ],
+        size_mm: FULL_FRAME,
+    },
+    Row {
+        make: "nikon",
+        models: &["d", "z 30", "z 50", "z50", "z fc"],
+        size_mm: APS_C,
+    },
+    Row {
+        make: "nikon",
+        models: &["coolpix p6000"],
+        size_mm: [7.44, 5.58],
+    },
+    Row {
+        make: "sony",
+        models: &[
+            "ilce-1", "ilce-7", "ilce-9", "ilca-99", "slt-a99", "dslr-a8", "dslr-a9", "dsc-rx1",
+        ],
+        size_mm: FULL_FRAME,
+    },
+    Row {
+        make: "sony",
+        models: &["ilce-", "ilca-", "slt-", "dslr-", "nex-", "zv-e10"],
+        size_mm: APS_C,
+    },
+    Row {
+        make: "sony",
+        models: &["dsc-rx10", "zv-1"],
+        size_mm: ONE_INCH,
+    },
+    Row {
+        make: "fujifilm",
+        models: &["gfx"],
+        size_mm: [43.8, 32.9],
+    },
+    Row {
+        make: "fujifilm",
+        models: &["x-", "x100", "x70"],
+        size_mm: APS_C,
+    },
+    Row {
+        make: "olympus",
+        models: &["e-"],
+        size_mm: FOUR_THIRDS,
+    },
+    Row {
+        make: "om digital",
+        models: &["om-"],
+        size_mm: FOUR_THIRDS,
+    },
+    Row {
+        make: "panasonic",
+        models: &["dc-s"],
+        size_mm: FULL_FRAME,
+    },
+    Row {
+        make: "panasonic",
+        models: &["dmc-g", "dc-g", "dmc-gh", "dc-gh"],
+        size_mm: FOUR_THIRDS,
+    },
+    Row {
+        make: "leica",
+        models: &["m8"],
+        size_mm: [27.0, 18.0],
+    },
+    Row {
+        make: "leica",
+        models: &["m", "q", "sl"],
+        size_mm: FULL_FRAME,
+    },
+    Row {
+        make: "pentax",
+        models: &["k-1"],
+        size_mm: FULL_FRAME,
+    },
+    Row {
+        make: "pentax",
+        models: &["k-", "k10", "k20", "k100", "k200"],
+        size_mm: APS_C,
+    },
+    Row {
+        make: "ricoh",
+        models: &["pentax k-1"],
+        size_mm: FULL_FRAME,
+    },
+    Row {
+        make: "ricoh",
+        models: &["gr", "pentax k"],
+        size_mm: APS_C,
+    },
+    Row {
+        make: "sigma",
+        models: &["fp"],
+        size_mm: FULL_FRAME,
+    },
+    Row {
+        make: "dji",
+        models: &["fc6310", "l1d"],
+        size_mm: ONE_INCH,
+    },
+    Row {
+        make: "dji",
+        models: &["fc220", "fc330", "fc300"],
+        size_mm: [6.17, 4.55],
+    },
+];
+
+/// Long and short side of the sensor of a camera, millimetres, if the table has it.
+pub(crate) fn size_mm(make: Option<&str>, model: Option<&str>) -> Option<[f64; 2]> {
+    let (make, model) = (make?.to_lowercase(), model?.to_lowercase());
+    // Some makers begin the name with their own.
+    let first = make.split_whitespace().next().unwrap_or_default();
+    let name = model
+        .strip_prefix(&make)
+        .or_else(|| model.strip_prefix(first))
+        .unwrap_or(&model)
+        .trim_start();
+    let fits =
+        |row: &&Row| make.starts_with(row.make) && row.models.iter().any(|m| begins(name, m));
+    ROWS.iter().find(fits).map(|row| row.size_mm)
+}
+
+/// Whether `name` begins with `word`, which does not end within a number of the name.
+fn begins(name: &str, word: &str) -> bool {
+    let Some(rest) = name.strip_prefix(word) else {
+        return false;
+    };
+    let digit = |c: Option<char>| c.is_some_and(|c| c.is_ascii_digit());
+    !(digit(word.chars().last()) && digit(rest.chars().next()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cameras_are_found_by_family_and_unknown_ones_are_not() {
+        let size = |make, model| size_mm(Some(make), Some(model));
+        assert_eq!(size("Canon", "Canon EOS 5D Mark IV"), Some(FULL_FRAME));
+        assert_eq!(size("Canon", "Canon EOS R10"), Some(APS_C_CANON));
+        assert_eq!(size("Canon", "Canon EOS R"), Some(FULL_FRAME));
+        assert_eq!(size("Canon", "Canon EOS 550D"), Some(APS_C_CANON));
+        assert_eq!(size("NIKON CORPORATION", "NIKON D5"), Some(FULL_FRAME));
+        assert_eq!(size("NIKON CORPORATION", "NIKON D5600"), Some(APS_C));
+        assert_eq!(size("NIKON", "COOLPIX P6000"), Some([7.44, 5.58]));
+        assert_eq!(size("SONY", "ILCE-7M3"), Some(FULL_FRAME));
+        assert_eq!(size("SONY", "ILCE-6000"), Some(APS_C));
+        assert_eq!(size("FUJIFILM", "X-T3"), Some(APS_C));
+        assert_eq!(size("OLYMPUS CORPORATION", "E-M1MarkII"), Some(FOUR_THIRDS));
+        assert_eq!(size("Apple", "iPhone 12"), None);
+        assert_eq!(size_mm(None, Some("E-M1")), None);
+    }
+}

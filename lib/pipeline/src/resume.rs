@@ -1,0 +1,149 @@
+//! Where an interrupted run goes on: a folder named by the fingerprint of the run that it belongs
+//! to, so that no other run finds it.
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::error::StageError;
+use crate::fingerprint::Fingerprint;
+use crate::lock::create_folder;
+use crate::mark::{Kind, Mark, Owned, is_folder};
+
+/// A folder of checkpoints, or of a cache, of one fingerprint.
+#[derive(Clone, Debug)]
+pub struct Resume {
+    root: PathBuf,
+    folder: PathBuf,
+    owned: Owned,
+    files: Vec<String>,
+}
+
+impl Resume {
+    /// Opens the folder of `fingerprint` in `root`, and makes it if it is not there. `files` are
+    /// the names that `stage` writes in it, `#` for any row of digits.
+    pub fn open(
+        root: &Path,
+        kind: Kind,
+        stage: &str,
+        fingerprint: &Fingerprint,
+        files: &[&str],
+    ) -> Result<Self, StageError> {
+        let folder = root.join(fingerprint.short());
+        let files: Vec<String> = files.iter().map(|f| f.to_string()).collect();
+        let mark = Mark::new(kind, stage, files.clone());
+        mark.make(&folder)?;
+        for file in &files {
+            if let Some(parent) = folder.join(file).parent() {
+                create_folder(parent)?;
+            }
+        }
+        Ok(Self {
+            root: root.into(),
+            folder,
+            owned: mark.owned(),
+            files,
+        })
+    }
+
+    /// The folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Where the file `name`, one of those that were named when it was opened, lies.
+    pub fn file(&self, name: impl AsRef<Path>) -> PathBuf {
+        self.folder.join(name)
+    }
+
+    /// Those of its files that lie in its folder `below`, by name, sorted.
+    pub fn files_in(&self, below: &str) -> Result<Vec<String>, StageError> {
+        let contents = self.owned.contents(&self.folder)?;
+        let inside = contents
+            .ours
+            .iter()
+            .filter_map(|name| name.strip_prefix(below).ok());
+        Ok(inside
+            .map(|name| name.to_string_lossy().into_owned())
+            .collect())
+    }
+
+    /// Removes the file `name` if it is there.
+    pub fn remove_file(&self, name: &str) -> Result<(), StageError> {
+        debug_assert!(self.files.iter().any(|f| f == name), "{name} is not listed");
+        let path = self.file(name);
+        match fs::remove_file(&path) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                Err(StageError::io("remove", path, e))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Removes what is ours, and the folders if nothing else is in them. What cannot be removed
+    /// now is of no harm: `dipir clean` removes it.
+    pub fn remove(&self) {
+        let _ = self.owned.remove(&self.folder);
+        let _ = fs::remove_dir(&self.root);
+    }
+}
+
+/// The folders of `kind` that `stage` made in `root`, with what in them is its own.
+pub fn folders_in(
+    root: &Path,
+    kind: Kind,
+    stage: &str,
+) -> Result<Vec<(PathBuf, Owned)>, StageError> {
+    if !is_folder(root) {
+        return Ok(Vec::new());
+    }
+    let failed = |e| StageError::io("read", root, e);
+    let mut found = Vec::new();
+    for entry in fs::read_dir(root).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        if let Some(mark) = Mark::read(&path).filter(|m| m.kind == kind && m.stage == stage) {
+            found.push((path, mark.owned()));
+        }
+    }
+    found.sort_by(|a, b| a.0.cmp(&b.0));
+    Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_checkpoint_is_found_by_its_run_alone_and_goes_without_what_others_put_there() {
+        let out = tempfile::tempdir().unwrap();
+        let root = out.path().join("light-checkpoints");
+        let of = |seed| Fingerprint::of("light").seed(seed).finish();
+        let open = |seed| {
+            let files = ["checkpoint", "previews/#.png"];
+            Resume::open(&root, Kind::Checkpoints, "light", &of(seed), &files).unwrap()
+        };
+        let resume = open(1);
+        fs::write(resume.file("checkpoint"), "x").unwrap();
+        for name in ["previews/2.png", "previews/1.png", "previews/mine.png"] {
+            fs::write(resume.file(name), "x").unwrap();
+        }
+        assert!(!open(2).file("checkpoint").exists());
+        open(2).remove();
+        assert!(open(1).file("checkpoint").exists());
+        assert_eq!(resume.files_in("previews").unwrap(), ["1.png", "2.png"]);
+        assert_eq!(
+            folders_in(&root, Kind::Checkpoints, "light").unwrap().len(),
+            1
+        );
+        assert!(folders_in(&root, Kind::Cache, "light").unwrap().is_empty());
+        assert!(
+            folders_in(&root, Kind::Checkpoints, "lora")
+                .unwrap()
+                .is_empty()
+        );
+        resume.remove();
+        assert!(!resume.file("checkpoint").exists());
+        assert!(resume.file("previews/mine.png").exists());
+        fs::remove_file(resume.file("previews/mine.png")).unwrap();
+        open(1).remove();
+        assert!(!root.exists());
+    }
+}

@@ -1,0 +1,252 @@
+//! The command line of `dipir-pretrain`, and the settings that it asks for.
+#![allow(missing_docs)] // clap shows doc comments to users: what is flattened has none
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+use dipir_cli::args::OutputArgs;
+use dipir_cli::exit::Usage;
+use dipir_prior::energy::TIMESTEP_SHARES;
+
+use crate::architecture::Architecture;
+use crate::encoder_training::EncoderSettings;
+use crate::examples::Recipe;
+use crate::trainer::TrainerSettings;
+use crate::training_run::{EncoderRun, ModelRunSettings};
+
+const EXAMPLES: &str = "\
+Examples:
+  dipir-pretrain train --out model --cache scenes      render scenes, train, write a model folder
+  dipir-pretrain encoder --out model --cache scenes    train its light encoder
+  dipir-pretrain train --out model --cache scenes --from data/prior --relit 0.4 --learning-rate 4e-4
+                                                       continue the training of a model
+  dipir-pretrain check model                           how well it recognises light in new scenes
+  dipir-pretrain check model --first 1000 --scenes 48  the same on other scenes, to tune on
+  dipir-pretrain sheet model sheet.png                 pictures under captions of light
+
+An interrupted training goes on from CACHE/checkpoint.safetensors. data/prior/README.md says how
+that model was made.
+Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted.";
+
+/// Train the small model that estimates light, and measure it
+#[derive(Parser)]
+#[command(name = "dipir-pretrain", version, after_help = EXAMPLES)]
+pub struct Cli {
+    #[command(subcommand)]
+    pub command: Command,
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
+#[derive(Subcommand)]
+pub enum Command {
+    /// Render training scenes and train text encoder and UNet
+    Train(TrainArgs),
+    /// Train the light encoder of a model
+    Encoder(EncoderArgs),
+    /// Measure how well a model recognises light, on held-out scenes
+    Check(CheckArgs),
+    /// Sample pictures under captions of light
+    Sheet(SheetArgs),
+}
+
+#[derive(Args)]
+pub struct DataArgs {
+    /// Folder of the model to be written
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Folder that keeps scenes and checkpoints
+    #[arg(long, value_name = "DIR")]
+    pub cache: PathBuf,
+    /// Scenes to render, 350 kB each
+    #[arg(long, default_value_t = 6144)]
+    pub scenes: usize,
+}
+
+impl DataArgs {
+    fn check(&self) -> Result<(), Usage> {
+        match self.scenes {
+            0 => Err(Usage("--scenes 0: at least one scene is needed".into())),
+            _ => Ok(()),
+        }
+    }
+}
+
+#[derive(Args)]
+#[command(allow_negative_numbers = true)]
+pub struct TrainArgs {
+    #[command(flatten)]
+    pub data: DataArgs,
+    /// Examples to train on
+    #[arg(long, default_value_t = TrainerSettings::default().samples)]
+    pub samples: usize,
+    /// Examples of an update
+    #[arg(long, default_value_t = TrainerSettings::default().batch)]
+    pub batch: usize,
+    /// Key of all random numbers
+    #[arg(long, default_value_t = TrainerSettings::default().seed)]
+    pub seed: u64,
+    /// Residual blocks of each level of the UNet's downward half; the upward half has one more. A model that a run
+    /// starts from may have fewer
+    #[arg(long, default_value_t = Architecture::default().layers)]
+    pub layers: usize,
+    /// Share of captions that describe the light
+    #[arg(long, default_value_t = Recipe::default().light_captions)]
+    pub light_captions: f64,
+    /// Share of examples in which the surroundings of the object are visible
+    #[arg(long, default_value_t = Recipe::default().background)]
+    pub background: f64,
+    /// Weight of the contrastive loss of the right caption among three alternatives, which is 1 at chance. 0: none.
+    /// Otherwise three rows of four are groups of one noisy picture with four captions
+    #[arg(long, default_value_t = TrainerSettings::default().contrast)]
+    pub contrast: f64,
+    /// Share of examples whose noisy picture has another light than the caption and the target
+    #[arg(long, default_value_t = Recipe::default().relit)]
+    pub relit: f64,
+    /// Learning rate after the warm-up
+    #[arg(long, default_value_t = TrainerSettings::default().learning_rate)]
+    pub learning_rate: f64,
+    /// Model folder whose weights a new run starts from; a run with a checkpoint continues from that
+    #[arg(long, value_name = "MODEL")]
+    pub from: Option<PathBuf>,
+    /// Updates between checkpoints
+    #[arg(long, default_value_t = 200)]
+    pub checkpoint_every: usize,
+}
+
+impl TrainArgs {
+    /// The run of these arguments. An error names a value that is out of range.
+    pub fn run(&self) -> Result<ModelRunSettings, Usage> {
+        for (name, share) in [
+            ("light-captions", self.light_captions),
+            ("background", self.background),
+            ("relit", self.relit),
+        ] {
+            if !(0.0..=1.0).contains(&share) {
+                return Err(Usage(format!("--{name} {share}: accepted are 0 to 1")));
+            }
+        }
+        let contrast = self.contrast;
+        if !(contrast >= 0.0 && contrast.is_finite()) {
+            let message = format!("--contrast {contrast}: accepted are 0 and more");
+            return Err(Usage(message));
+        }
+        check_rate(self.learning_rate)?;
+        if !(1..=8).contains(&self.layers) {
+            let message = format!("--layers {}: accepted are 1 to 8", self.layers);
+            return Err(Usage(message));
+        }
+        self.data.check()?;
+        Ok(ModelRunSettings {
+            out: self.data.out.clone(),
+            cache: self.data.cache.clone(),
+            from: self.from.clone(),
+            checkpoint_every: self.checkpoint_every,
+            architecture: Architecture {
+                layers: self.layers,
+                ..Architecture::default()
+            },
+            settings: TrainerSettings {
+                samples: self.samples,
+                batch: self.batch,
+                seed: self.seed,
+                contrast,
+                learning_rate: self.learning_rate,
+            },
+            recipe: Recipe {
+                light_captions: self.light_captions,
+                background: self.background,
+                relit: self.relit,
+                ..Recipe::default()
+            },
+        })
+    }
+}
+
+#[derive(Args)]
+#[command(allow_negative_numbers = true)]
+pub struct EncoderArgs {
+    #[command(flatten)]
+    pub data: DataArgs,
+    /// Pictures to train on
+    #[arg(long, default_value_t = EncoderSettings::default().samples)]
+    pub samples: usize,
+    /// Key of all random numbers
+    #[arg(long, default_value_t = EncoderSettings::default().seed)]
+    pub seed: u64,
+    /// Learning rate after the warm-up
+    #[arg(long, default_value_t = EncoderSettings::default().learning_rate)]
+    pub learning_rate: f64,
+    /// Model folder whose encoder the run starts from
+    #[arg(long, value_name = "MODEL")]
+    pub from: Option<PathBuf>,
+    /// Also write some of the training's pictures, side by side
+    #[arg(long, value_name = "PNG")]
+    pub sheet: Option<PathBuf>,
+}
+
+impl EncoderArgs {
+    /// The run of these arguments. An error names a value that is out of range.
+    pub fn run(&self) -> Result<EncoderRun, Usage> {
+        check_rate(self.learning_rate)?;
+        self.data.check()?;
+        Ok(EncoderRun {
+            out: self.data.out.clone(),
+            from: self.from.clone(),
+            sheet: self.sheet.clone(),
+            settings: EncoderSettings {
+                samples: self.samples,
+                seed: self.seed,
+                learning_rate: self.learning_rate,
+            },
+        })
+    }
+}
+
+#[derive(Args)]
+pub struct CheckArgs {
+    /// Folder of the model
+    pub model: PathBuf,
+    /// Held-out scenes
+    #[arg(long, default_value_t = 100)]
+    pub scenes: usize,
+    /// Number of the first scene; published figures are of 0 to 99, so choose others to tune on
+    #[arg(long, default_value_t = 0)]
+    pub first: u64,
+    /// Draws of noise at each timestep
+    #[arg(long, default_value_t = 4)]
+    pub draws: usize,
+    /// Timesteps at which lights are compared, shares of all
+    #[arg(long, value_delimiter = ',', default_values_t = TIMESTEP_SHARES)]
+    pub timesteps: Vec<f64>,
+}
+
+impl CheckArgs {
+    /// Refuses values that are out of range.
+    pub fn check(&self) -> Result<(), Usage> {
+        if self.scenes == 0 || self.draws == 0 {
+            return Err(Usage("--scenes and --draws must be at least 1".into()));
+        }
+        match self.timesteps.iter().find(|t| !(0.0..1.0).contains(*t)) {
+            Some(t) => Err(Usage(format!("--timesteps {t}: accepted are 0 to below 1"))),
+            None => Ok(()),
+        }
+    }
+}
+
+#[derive(Args)]
+pub struct SheetArgs {
+    /// Folder of the model
+    pub model: PathBuf,
+    /// The picture to write
+    pub png: PathBuf,
+}
+
+fn check_rate(rate: f64) -> Result<(), Usage> {
+    match rate > 0.0 && rate.is_finite() {
+        true => Ok(()),
+        false => {
+            let message = format!("--learning-rate {rate}: accepted are numbers above 0");
+            Err(Usage(message))
+        }
+    }
+}

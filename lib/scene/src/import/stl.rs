@@ -1,0 +1,147 @@
+//! STL files, binary and ASCII.
+use std::collections::HashMap;
+
+use glam::Vec3;
+
+use super::mtl::grey;
+use super::{Imported, Limits};
+use crate::error::Error;
+use crate::mesh::TriangleMesh;
+
+const EXPORT: &str = "export the file again";
+
+/// A header of 80 bytes and the number of triangles.
+const HEADER: usize = 84;
+
+/// A normal, three corners and two bytes without meaning.
+const RECORD: usize = 50;
+
+/// Reads an STL file from memory. Stored normals are not used: they are those of the triangles.
+pub fn load_stl_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> {
+    let announced = bytes
+        .get(80..HEADER)
+        .map(|b| u64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]])));
+    let needed = announced.map(|n| HEADER as u64 + n * RECORD as u64);
+    let is_text = bytes.trim_ascii_start().starts_with(b"solid");
+    let mut mesh = Mesh::new(limits);
+    match (announced, needed) {
+        // Some binary files start with "solid", too.
+        (Some(n), Some(needed)) if needed == bytes.len() as u64 || !is_text => {
+            if needed > bytes.len() as u64 {
+                return Err(Error::malformed(
+                    format!(
+                        "{n} triangles are announced, which take {needed} bytes, but the file has {}",
+                        bytes.len()
+                    ),
+                    "export or copy the file again",
+                ));
+            }
+            limits.check_mesh(0, n)?;
+            for record in bytes[HEADER..needed as usize].as_chunks::<RECORD>().0 {
+                let float = |at: usize| {
+                    f32::from_le_bytes([record[at], record[at + 1], record[at + 2], record[at + 3]])
+                };
+                let corner = |k: usize| Vec3::from_array([0, 4, 8].map(|c| float(12 * k + c)));
+                mesh.push([corner(1), corner(2), corner(3)])?;
+            }
+        }
+        _ if is_text => read_text(bytes, &mut mesh)?,
+        _ => {
+            return Err(Error::malformed(
+                format!(
+                    "an STL file has {HEADER} bytes or more, this one {}",
+                    bytes.len()
+                ),
+                "export or copy the file again",
+            ));
+        }
+    }
+    mesh.finish()
+}
+
+fn read_text(bytes: &[u8], mesh: &mut Mesh) -> Result<(), Error> {
+    let mut corners: Vec<Vec3> = Vec::new();
+    for (i, line) in bytes.split(|b| *b == b'\n').enumerate() {
+        let line = String::from_utf8_lossy(line);
+        let wrong = |what: String| Err(Error::malformed(format!("line {}: {what}", i + 1), EXPORT));
+        let mut words = line.split_ascii_whitespace();
+        match words.next().map(str::to_ascii_lowercase).as_deref() {
+            Some("vertex") => {
+                let numbers: Vec<f32> = words.map_while(|w| w.parse().ok()).collect();
+                match numbers[..] {
+                    [x, y, z, ..] => corners.push(Vec3::new(x, y, z)),
+                    _ => return wrong("accepted: vertex x y z".into()),
+                }
+            }
+            Some("endfacet") => {
+                match corners[..] {
+                    [a, b, c] => mesh.push([a, b, c])?,
+                    _ => {
+                        return wrong(format!("a facet of {} corners; accepted: 3", corners.len()));
+                    }
+                }
+                corners.clear();
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Collects triangles; corners at the same place become one vertex.
+struct Mesh<'a> {
+    mesh: TriangleMesh,
+    known: HashMap<[u32; 3], u32>,
+    limits: &'a Limits,
+}
+
+impl<'a> Mesh<'a> {
+    fn new(limits: &'a Limits) -> Self {
+        Self {
+            mesh: TriangleMesh::default(),
+            known: HashMap::new(),
+            limits,
+        }
+    }
+
+    fn push(&mut self, corners: [Vec3; 3]) -> Result<(), Error> {
+        let number = self.mesh.indices.len() as u64;
+        if let Some(bad) = corners.iter().find(|p| !p.is_finite()) {
+            return Err(Error::NotFinite {
+                place: "triangles".into(),
+                element: number,
+                value: format!("{}, {}, {}", bad.x, bad.y, bad.z),
+            });
+        }
+        let indices = corners.map(|p| {
+            let next = self.mesh.positions.len() as u32;
+            let key = p.to_array().map(|v| (v + 0.0).to_bits());
+            let index = *self.known.entry(key).or_insert(next);
+            if index == next {
+                self.mesh.positions.push(p);
+            }
+            index
+        });
+        self.mesh.indices.push(indices);
+        self.limits.check_mesh(0, number + 1)
+    }
+
+    fn finish(mut self) -> Result<Imported, Error> {
+        self.mesh
+            .indices
+            .retain(|[a, b, c]| a != b && b != c && c != a);
+        if self.mesh.indices.is_empty() {
+            return Err(Error::Empty {
+                remedy: "check that the file has facets",
+            });
+        }
+        self.mesh.materials = vec![0; self.mesh.indices.len()];
+        Ok(Imported {
+            warnings: vec![
+                "STL has no unit; its numbers are read as metres (for millimetres write scale = 0.001)"
+                    .into(),
+            ],
+            ..Imported::of(self.mesh, grey())
+        })
+    }
+}

@@ -1,0 +1,104 @@
+//! How much a file may ask for before it is refused.
+use serde::{Deserialize, Serialize};
+
+use crate::error::Error;
+
+/// The `[scene.limits]` table. Every limit is checked before memory is taken; what exceeds one is
+/// refused by an error that names its key.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Limits {
+    /// Triangles of all objects together, copies counted: a scene needs some 150 bytes for each.
+    /// There may be three times as many vertices.
+    pub triangles: u64,
+    /// Copies of meshes (`EXT_mesh_gpu_instancing`) in a file.
+    pub instances: u64,
+    /// Pixels of a texture; decoded, one takes four bytes.
+    pub texture_pixels: u64,
+    /// Pixels of all textures of a file together.
+    pub all_texture_pixels: u64,
+    /// Bytes of an object's file, or of another that it names.
+    pub file_bytes: u64,
+    /// Whether a file may name others outside of its folder, as `../wood.png` or `/tmp/wood.png`.
+    pub allow_outside: bool,
+}
+
+impl Default for Limits {
+    /// Together some 6 GB.
+    fn default() -> Self {
+        Self {
+            triangles: 20_000_000,
+            instances: 1_000_000,
+            texture_pixels: 8192 * 8192,
+            all_texture_pixels: 4 * 8192 * 8192,
+            file_bytes: 4 << 30,
+            allow_outside: false,
+        }
+    }
+}
+
+impl Limits {
+    /// Most vertices: as many as triangles without a common one have.
+    pub fn vertices(&self) -> u64 {
+        self.triangles.saturating_mul(3)
+    }
+
+    /// Whether nothing was changed.
+    pub fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    pub(crate) fn check_mesh(&self, vertices: u64, triangles: u64) -> Result<(), Error> {
+        let key = "scene.limits.triangles";
+        at_most(self.triangles, key, triangles, |n| {
+            format!("there are {n} triangles")
+        })?;
+        at_most(self.vertices(), key, vertices, |n| {
+            format!("there are {n} vertices, of which a triangle has three")
+        })
+    }
+
+    pub(crate) fn check_instances(&self, count: u64, place: &str) -> Result<(), Error> {
+        at_most(self.instances, "scene.limits.instances", count, |n| {
+            format!("{place} asks for {n} copies, those before counted")
+        })
+    }
+
+    /// The pixels of one texture and of all up to it.
+    pub(crate) fn check_pixels(&self, one: u64, all: u64, name: &str) -> Result<(), Error> {
+        at_most(
+            self.texture_pixels,
+            "scene.limits.texture_pixels",
+            one,
+            |n| format!("the texture {name} has {n} pixels"),
+        )?;
+        at_most(
+            self.all_texture_pixels,
+            "scene.limits.all_texture_pixels",
+            all,
+            |n| format!("the textures up to {name} have {n} pixels together"),
+        )
+    }
+
+    pub(crate) fn check_bytes(&self, bytes: u64) -> Result<(), Error> {
+        at_most(self.file_bytes, "scene.limits.file_bytes", bytes, |n| {
+            format!("the file has {n} bytes")
+        })
+    }
+}
+
+fn at_most(
+    limit: u64,
+    key: &'static str,
+    count: u64,
+    what: impl FnOnce(u64) -> String,
+) -> Result<(), Error> {
+    if count <= limit {
+        return Ok(());
+    }
+    Err(Error::TooLarge {
+        what: what(count),
+        key,
+        limit,
+    })
+}

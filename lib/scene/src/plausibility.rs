@@ -1,0 +1,253 @@
+//! Set-ups that can be meant but seldom are: a field of view in radians, a camera under the ground,
+//! an object that no pixel shows. Each is one sentence with the value that was found and the key
+//! to look at.
+use glam::{Vec2, Vec3};
+
+use crate::camera::Camera;
+use crate::mesh::TriangleMesh;
+use crate::proxy::{Plane, Proxy};
+use crate::scene::Scene;
+
+/// Vertical fields of view of lenses that people have: an 800 mm lens has 1.7 degrees.
+const FIELD_OF_VIEW_DEG: [f32; 2] = [1.5, 140.0];
+/// Heights of objects that people insert, metres.
+const HEIGHT_M: [f32; 2] = [0.002, 60.0];
+/// An object smaller than this in the picture cannot be judged, pixels.
+const SMALLEST_PX: f32 = 3.0;
+
+/// What is unlikely about `scene`, one sentence each.
+pub fn implausible(scene: &Scene) -> Vec<String> {
+    let mut found = Vec::new();
+    found.extend(field_of_view(&scene.camera));
+    let ground = match &scene.proxy {
+        Proxy::Plane(plane) => Some(plane),
+        Proxy::None | Proxy::Mesh(_) => None,
+    };
+    found.extend(ground.and_then(|plane| camera_below(&scene.camera, plane)));
+    let Some((low, high)) = scene.mesh.bounds() else {
+        return found;
+    };
+    found.extend(height(high.y - low.y));
+    found.extend(ground.and_then(|plane| object_below(&scene.mesh, plane)));
+    found.extend(visibility(&scene.mesh, &scene.camera));
+    found
+}
+
+fn field_of_view(camera: &Camera) -> Option<String> {
+    let half = 0.5 * camera.resolution[1] as f32 / camera.focal_px.y;
+    let degrees = (2.0 * half.atan()).to_degrees();
+    let [least, most] = FIELD_OF_VIEW_DEG;
+    if (least..=most).contains(&degrees) {
+        return None;
+    }
+    // 0.2 to 2.5 radians are fields of view that lenses have.
+    let as_radians = degrees.to_degrees();
+    let meant = match (10.0..=150.0).contains(&as_radians) {
+        true => format!("; if {degrees:.3} was meant in radians, write {as_radians:.1}"),
+        false => String::new(),
+    };
+    Some(format!(
+        "the camera's vertical field of view is {degrees:.2} degrees; lenses have {least} to {most}: \
+         see [scene.camera] fov_deg, in degrees{meant}"
+    ))
+}
+
+fn camera_below(camera: &Camera, plane: &Plane) -> Option<String> {
+    let above = (camera.position - plane.point).dot(plane.normal);
+    if above > 0.0 {
+        return None;
+    }
+    let [x, y, z] = plane.normal.to_array();
+    Some(match plane.normal.y < 0.0 {
+        true => format!(
+            "the ground's normal [{x:.2}, {y:.2}, {z:.2}] points down, away from the camera, so no \
+             shadow is caught; turn it round: [scene.proxy] plane normal = [{:.2}, {:.2}, {:.2}]",
+            -x, -y, -z
+        ),
+        false => format!(
+            "the camera is {:.2} m below the ground, so no shadow is caught; raise [scene.camera] \
+             position, or lower [scene.proxy] plane point",
+            -above
+        ),
+    })
+}
+
+fn height(height: f32) -> Option<String> {
+    let [least, most] = HEIGHT_M;
+    if !height.is_finite() || height == 0.0 || (least..=most).contains(&height) {
+        return None;
+    }
+    let unit = match height > most {
+        true => "a model in centimetres needs scale = 0.01, one in millimetres 0.001",
+        false => "a model in kilometres needs scale = 1000",
+    };
+    Some(format!(
+        "the objects are {height:.4} m tall; {unit}: see [[scene.objects]] scale or height_m"
+    ))
+}
+
+fn object_below(mesh: &TriangleMesh, plane: &Plane) -> Option<String> {
+    let above = |p: &Vec3| (*p - plane.point).dot(plane.normal);
+    let highest = mesh.positions.iter().map(above).fold(f32::MIN, f32::max);
+    (highest < 0.0).then(|| {
+        format!(
+            "the objects lie {:.2} m or more below the ground, which hides them; raise \
+             [[scene.objects]] position",
+            -highest
+        )
+    })
+}
+
+fn visibility(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
+    let (mut low, mut high) = (Vec2::INFINITY, Vec2::NEG_INFINITY);
+    let mut behind = 0;
+    for &point in &mesh.positions {
+        match camera.project(point) {
+            Some(pixel) => (low, high) = (low.min(pixel), high.max(pixel)),
+            None => behind += 1,
+        }
+    }
+    if behind == mesh.positions.len() {
+        return Some(
+            "the objects are behind the camera, so the picture does not show them; see \
+             [scene.camera] look_at and [[scene.objects]] position"
+                .into(),
+        );
+    }
+    // What reaches behind the camera can cover any pixel.
+    if behind > 0 {
+        return None;
+    }
+    let [width, height] = camera.resolution.map(|n| n as f32);
+    let sides = [
+        (high.x <= 0.0, "left of"),
+        (low.x >= width, "right of"),
+        (high.y <= 0.0, "above"),
+        (low.y >= height, "below"),
+    ];
+    if let Some((_, side)) = sides.iter().find(|(out, _)| *out) {
+        return Some(format!(
+            "the objects are {side} the picture (pixels {:.0} to {:.0} across and {:.0} to {:.0} down, of \
+             {width} x {height}), so it does not show them; move [[scene.objects]] position or turn \
+             [scene.camera] look_at",
+            low.x, high.x, low.y, high.y
+        ));
+    }
+    let size = high - low;
+    (size.max_element() < SMALLEST_PX).then(|| {
+        format!(
+            "the objects take {:.1} x {:.1} pixels of the picture; see [[scene.objects]] scale and \
+             position, in metres",
+            size.x, size.y
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::FieldOfView;
+
+    fn scene() -> Scene {
+        let corners = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
+        let mesh = TriangleMesh {
+            positions: corners.to_vec(),
+            indices: vec![[0, 1, 2], [0, 2, 3]],
+            normals: vec![Vec3::Z; 4],
+            tangents: vec![glam::Vec4::X; 4],
+            uvs: [vec![Vec2::ZERO; 4], vec![Vec2::ZERO; 4]],
+            colors: vec![glam::Vec4::ONE; 4],
+            materials: vec![0; 2],
+        };
+        Scene {
+            mesh,
+            materials: vec![],
+            textures: vec![],
+            camera: Camera::look_at(
+                Vec3::new(0.3, 1.6, 5.0),
+                Vec3::new(0.3, 0.5, 0.0),
+                Vec3::Y,
+                FieldOfView::Vertical(0.7),
+                [96, 64],
+            ),
+            proxy: Proxy::Plane(Plane {
+                point: Vec3::ZERO,
+                normal: Vec3::Y,
+            }),
+        }
+    }
+
+    fn one(scene: &Scene, part: &str) {
+        let found = implausible(scene);
+        assert!(
+            found.len() == 1 && found[0].contains(part),
+            "{part:?}: {found:?}"
+        );
+    }
+
+    #[test]
+    fn nothing_is_said_of_an_object_on_the_ground_before_the_camera() {
+        assert_eq!(implausible(&scene()), Vec::<String>::new());
+    }
+
+    #[test]
+    fn a_field_of_view_in_radians_is_said_in_degrees() {
+        let mut scene = scene();
+        // 0.7 degrees: 0.7 radians are 40.1 degrees. Only the middle of the object is seen.
+        scene.camera = Camera::look_at(
+            Vec3::new(0.3, 1.6, 5.0),
+            Vec3::new(0.3, 0.5, 0.0),
+            Vec3::Y,
+            FieldOfView::Vertical(0.7f32.to_radians()),
+            [96, 64],
+        );
+        one(&scene, "if 0.700 was meant in radians, write 40.1");
+    }
+
+    #[test]
+    fn a_camera_under_the_ground_and_a_ground_upside_down_are_told_apart() {
+        let mut below = scene();
+        below.proxy = Proxy::Plane(Plane {
+            point: Vec3::new(0.0, 1.9, 0.0),
+            normal: Vec3::Y,
+        });
+        assert!(implausible(&below)[0].contains("the camera is 0.30 m below the ground"));
+        let mut turned = scene();
+        turned.proxy = Proxy::Plane(Plane {
+            point: Vec3::ZERO,
+            normal: Vec3::NEG_Y,
+        });
+        assert!(implausible(&turned)[0].contains("points down"));
+        assert!(implausible(&turned)[0].contains("normal = [-0.00, 1.00, -0.00]"));
+    }
+
+    #[test]
+    fn an_object_as_tall_as_a_tower_is_measured() {
+        let mut scene = scene();
+        for p in &mut scene.mesh.positions {
+            *p *= 350.0;
+        }
+        let found = implausible(&scene);
+        assert!(found[0].contains("350.0000 m tall"), "{found:?}");
+        assert!(found[0].contains("scale = 0.01"), "{found:?}");
+    }
+
+    #[test]
+    fn an_object_that_no_pixel_shows_is_said_to_be_where_it_is() {
+        for (offset, part) in [
+            (Vec3::new(0.0, 0.0, 20.0), "behind the camera"),
+            (Vec3::new(-40.0, 0.0, 0.0), "left of the picture"),
+            (Vec3::new(40.0, 0.0, 0.0), "right of the picture"),
+            (Vec3::new(0.0, 40.0, 0.0), "above the picture"),
+            (Vec3::new(0.0, -5.0, 0.0), "below the ground"),
+            (Vec3::new(0.3, 0.0, -4000.0), "pixels of the picture"),
+        ] {
+            let mut scene = scene();
+            for p in &mut scene.mesh.positions {
+                *p += offset;
+            }
+            let found = implausible(&scene);
+            assert!(found.iter().any(|f| f.contains(part)), "{part}: {found:?}");
+        }
+    }
+}

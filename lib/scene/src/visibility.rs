@@ -1,0 +1,72 @@
+//! Why nothing of an object can be seen.
+use crate::camera::Camera;
+use crate::material::{AlphaMode, Material};
+use crate::mesh::TriangleMesh;
+
+/// What hides the whole of `mesh`, which is placed and whose material `i` is `materials[i]`, or
+/// some of its materials; one sentence each. Whether it lies in the picture is not looked at.
+pub fn hidden(mesh: &TriangleMesh, materials: &[Material], camera: &Camera) -> Vec<String> {
+    let nothing = |why: String| vec![format!("nothing of it can be seen: {why}")];
+    if let Some(why) = without_extent(mesh, camera) {
+        return nothing(why);
+    }
+    let mut used = vec![false; materials.len()];
+    for &m in &mesh.materials {
+        used[m as usize] = true;
+    }
+    let used: Vec<&Material> = materials
+        .iter()
+        .zip(used)
+        .filter_map(|(m, used)| used.then_some(m))
+        .collect();
+    // Colours multiply the material's alpha.
+    let most = mesh.colors.iter().map(|c| c.w).reduce(f32::max);
+    let most = most.unwrap_or(1.0);
+    let without: Vec<&Material> = used
+        .iter()
+        .copied()
+        .filter(|m| is_transparent(m, most))
+        .collect();
+    if !used.is_empty() && without.len() == used.len() {
+        return nothing(
+            "its materials are fully transparent (alpha 0, in an MTL file \"d 0\")".into(),
+        );
+    }
+    without
+        .iter()
+        .map(|m| {
+            format!(
+                "the material \"{}\" is fully transparent (alpha 0, in an MTL file \"d 0\"): its triangles cannot be seen",
+                m.name
+            )
+        })
+        .collect()
+}
+
+fn is_transparent(material: &Material, most_alpha: f32) -> bool {
+    let alpha = material.base_color.w * most_alpha;
+    match material.alpha_mode {
+        AlphaMode::Opaque => false,
+        AlphaMode::Mask { cutoff } => alpha < cutoff,
+        AlphaMode::Blend => alpha <= 0.0,
+    }
+}
+
+fn without_extent(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
+    let (low, high) = mesh.bounds()?;
+    let (low, high) = (low.as_dvec3(), high.as_dvec3());
+    let size = low.distance(high);
+    if size == 0.0 {
+        return Some("all its vertices lie in one point (is a scale or a matrix zero?)".into());
+    }
+    if (0..mesh.indices.len()).all(|t| mesh.scaled_normal(t).length_squared() == 0.0) {
+        return Some("none of its triangles has an area (is a scale zero along an axis?)".into());
+    }
+    let distance = camera.position.as_dvec3().distance((low + high) * 0.5);
+    let pixels = size * f64::from(camera.focal_px.max_element()) / distance;
+    (distance > size && pixels < 1.0).then(|| {
+        format!(
+            "it is {size:.1e} m across, {pixels:.1e} of a pixel; raise its scale, or write height_m"
+        )
+    })
+}

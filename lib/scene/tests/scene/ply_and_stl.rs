@@ -1,0 +1,229 @@
+//! PLY and STL files.
+use dipir_scene::import::{Imported, Limits, load_ply_bytes, load_stl_bytes};
+use glam::{Vec3, Vec4};
+
+fn ply(text: &str) -> Result<Imported, String> {
+    load_ply_bytes(text.as_bytes(), &Limits::default()).map_err(|e| e.to_string())
+}
+
+fn stl(bytes: &[u8]) -> Result<Imported, String> {
+    load_stl_bytes(bytes, &Limits::default()).map_err(|e| e.to_string())
+}
+
+const SQUARE: &str = "ply\r\nformat ascii 1.0\ncomment made by hand\nelement vertex 4\n\
+    property float x\nproperty float y\nproperty double z\nproperty uchar red\n\
+    property uchar green\nproperty uchar blue\nelement face 1\nproperty uchar quality\n\
+    property list uchar int vertex_indices\nend_header\n\
+    0 0 0 255 0 188\n1 0 0 255 0 188\n1 1 0 255 0 188\n0 1 0 255 0 188\n7 4 0 1 2 3\n";
+
+#[test]
+fn an_ascii_ply_arrives_with_its_colours() {
+    let imported = ply(SQUARE).unwrap();
+    assert_eq!(imported.mesh.indices, [[0, 1, 2], [0, 2, 3]]);
+    assert_eq!(imported.mesh.positions[2], Vec3::new(1.0, 1.0, 0.0));
+    // The sRGB value 188 / 255 is ((188 / 255 + 0.055) / 1.055)^2.4 in linear light.
+    let blue = ((188.0f32 / 255.0 + 0.055) / 1.055).powf(2.4);
+    let expected = Vec4::new(1.0, 0.0, blue, 1.0);
+    for color in &imported.mesh.colors {
+        assert!((*color - expected).length() < 8.0 * f32::EPSILON);
+    }
+    assert_eq!(imported.materials[0].base_color, Vec4::ONE);
+}
+
+/// A triangle as binary, with normals and a list of another element in between.
+fn binary(little: bool) -> Vec<u8> {
+    let name = if little { "little" } else { "big" };
+    let mut bytes = format!(
+        "ply\nformat binary_{name}_endian 1.0\nelement vertex 3\nproperty short x\n\
+         property float y\nproperty double z\nproperty float nx\nproperty float ny\n\
+         property float nz\nelement edge 2\nproperty list ushort char names\n\
+         element face 1\nproperty list uint uint vertex_index\nend_header\n"
+    )
+    .into_bytes();
+    macro_rules! put {
+        ($value:expr) => {
+            bytes.extend(match little {
+                true => $value.to_le_bytes(),
+                false => $value.to_be_bytes(),
+            })
+        };
+    }
+    for (x, y) in [(0i16, 0.0f32), (256, 0.0), (0, 0.5)] {
+        put!(x);
+        put!(y);
+        put!(-2.0f64);
+        for n in [0.0f32, 0.0, 3.0] {
+            put!(n);
+        }
+    }
+    for length in [0u16, 2] {
+        put!(length);
+        (0..length).for_each(|_| bytes.push(9));
+    }
+    for value in [3u32, 0, 1, 2] {
+        put!(value);
+    }
+    bytes
+}
+
+#[test]
+fn binary_plys_of_both_byte_orders_mean_the_same() {
+    for little in [true, false] {
+        let mesh = load_ply_bytes(&binary(little), &Limits::default())
+            .unwrap()
+            .mesh;
+        assert_eq!(mesh.indices, [[0, 1, 2]]);
+        let expected = [
+            Vec3::new(0.0, 0.0, -2.0),
+            Vec3::new(256.0, 0.0, -2.0),
+            Vec3::new(0.0, 0.5, -2.0),
+        ];
+        assert_eq!(mesh.positions, expected);
+        assert_eq!(mesh.normals, [Vec3::Z; 3]);
+    }
+    let whole = binary(true);
+    let short = load_ply_bytes(&whole[..whole.len() - 1], &Limits::default());
+    assert_eq!(
+        short.unwrap_err().to_string(),
+        "element face 0: the file ends here; export or copy the file again"
+    );
+}
+
+#[test]
+fn a_cloud_of_points_is_refused_with_what_to_do() {
+    let cloud = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n\
+        property float z\nend_header\n0 0 0\n1 1 1\n";
+    assert_eq!(
+        ply(cloud).unwrap_err(),
+        "the file is a cloud of 2 points without faces; make a mesh of it, for instance by MeshLab's screened Poisson reconstruction"
+    );
+}
+
+#[test]
+fn broken_plys_say_where() {
+    for (from, to, expected) in [
+        (
+            "7 4 0 1 2 3",
+            "7 4 0 1 2 4",
+            "element face 0: corner 4, but 4 vertices stand before the faces; export or copy the file again",
+        ),
+        (
+            "1 1 0 255",
+            "1 nan 0 255",
+            "element vertex 2: the position (1, NaN, 0) is not finite; export or copy the file again",
+        ),
+        (
+            "1 1 0 255",
+            "1 one 0 255",
+            "element vertex 2: \"one\" is not a number; export or copy the file again",
+        ),
+        (
+            "property double z",
+            "property complex z",
+            "line 7: \"property complex z\" is not understood; export the file again",
+        ),
+        (
+            "property double z",
+            "property double w",
+            "element vertex has no x, y and z; export the file again",
+        ),
+        (
+            "element vertex 4",
+            "element vertex 90000000",
+            "there are 90000000 vertices, of which a triangle has three: more than the limit of 60000000; simplify the object, or raise scene.limits.triangles",
+        ),
+        (
+            "element face 1",
+            "element face 18446744073709551615",
+            "there are 18446744073709551615 triangles: more than the limit of 20000000; simplify the object, or raise scene.limits.triangles",
+        ),
+        (
+            "7 4 0 1 2 3",
+            "7 -1 0 1 2 3",
+            "element face 0: a list of -1 numbers; export or copy the file again",
+        ),
+        (
+            "end_header\n",
+            "",
+            "line 14: \"0 0 0 255 0 188\" is not understood; export the file again",
+        ),
+    ] {
+        let text = SQUARE.replacen(from, to, 1);
+        assert_ne!(text, SQUARE);
+        // The list's length is unsigned, but a text may say anything.
+        assert_eq!(ply(&text).unwrap_err(), expected, "{to}");
+    }
+}
+
+/// Two triangles of a square, binary.
+fn square_stl(header: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![b' '; 80];
+    bytes[..header.len()].copy_from_slice(header);
+    bytes.extend(2u32.to_le_bytes());
+    for corners in [
+        [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]],
+        [[0.0, -0.0], [1.0, 1.0], [0.0, 1.0f32]],
+    ] {
+        bytes.extend([0; 12]);
+        for [x, y] in corners {
+            bytes.extend([x, y, 0.5].map(f32::to_le_bytes).as_flattened());
+        }
+        bytes.extend([0; 2]);
+    }
+    bytes
+}
+
+#[test]
+fn binary_and_ascii_stls_share_vertices_and_name_their_missing_unit() {
+    let text = "solid square\nfacet normal 0 0 1\n outer loop\n  vertex 0 0 0.5\n  vertex 1 0 0.5\n\
+        vertex 1 1 0.5\nendloop\nendfacet\nfacet normal 0 0 1\nouter loop\nvertex 0 0 5e-1\n\
+        VERTEX 1 1 0.5\nvertex 0 1 0.5\nendloop\nendfacet\nendsolid\n";
+    for bytes in [
+        text.as_bytes().to_vec(),
+        square_stl(b"made by hand"),
+        // Some exporters call a binary file solid.
+        square_stl(b"solid binary"),
+    ] {
+        let imported = stl(&bytes).unwrap();
+        assert_eq!(imported.mesh.indices, [[0, 1, 2], [0, 2, 3]]);
+        assert_eq!(imported.mesh.positions.len(), 4);
+        assert_eq!(imported.mesh.scaled_normal(0).z, 1.0);
+        assert_eq!(
+            imported.warnings,
+            [
+                "STL has no unit; its numbers are read as metres (for millimetres write scale = 0.001)"
+            ]
+        );
+    }
+}
+
+#[test]
+fn broken_stls_say_where() {
+    let whole = square_stl(b"x");
+    assert_eq!(
+        stl(&whole[..150]).unwrap_err(),
+        "2 triangles are announced, which take 184 bytes, but the file has 150; export or copy the file again"
+    );
+    assert_eq!(
+        stl(b"nothing").unwrap_err(),
+        "an STL file has 84 bytes or more, this one 7; export or copy the file again"
+    );
+    assert_eq!(
+        stl(b"solid a\nvertex 1 2\n").unwrap_err(),
+        "line 2: accepted: vertex x y z; export the file again"
+    );
+    assert_eq!(
+        stl(b"solid a\nvertex 1 2 3\nendfacet\n").unwrap_err(),
+        "line 3: a facet of 1 corners; accepted: 3; export the file again"
+    );
+    assert_eq!(
+        stl(b"solid a\nendsolid\n").unwrap_err(),
+        "the file holds no triangles; check that the file has facets"
+    );
+    let mut infinite = whole.clone();
+    infinite[96..100].copy_from_slice(&f32::INFINITY.to_le_bytes());
+    assert_eq!(
+        stl(&infinite).unwrap_err(),
+        "triangles, element 0 is (inf, 0, 0.5), which is not finite; repair the mesh and export it again"
+    );
+}

@@ -1,0 +1,104 @@
+//! The `[composite]` table.
+use std::path::PathBuf;
+use std::time::Duration;
+
+use dipir_pipeline::config::{Config, Quality};
+use dipir_render::adaptive::Stop;
+use serde::{Deserialize, Serialize};
+
+use crate::presets;
+
+/// The `[composite]` table.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CompositeTable {
+    /// Environment map that lights the object, HDR or EXR; else the recovered light does.
+    pub environment: Option<PathBuf>,
+    /// Stops of exposure that bring the map to the photograph's scale.
+    pub exposure_ev: f32,
+    /// Turn of the map about the vertical, degrees, counter-clockwise from above.
+    pub rotation_deg: f32,
+    /// Stop at this display-referred RMSE; the quality's by default.
+    pub target_error: Option<f32>,
+    /// Or stop after about this many seconds.
+    pub time_budget_s: Option<f64>,
+    /// Most samples in any pixel.
+    pub max_samples: Option<u32>,
+    /// Curve on the object's light before it is laid over the photograph. By default the recovered
+    /// curves with the recovered light, and none with a map.
+    pub tone: Option<Tone>,
+}
+
+/// A curve on the object's light.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Tone {
+    /// None: the photograph is linear light, exposed.
+    None,
+    /// `x / (1 + x)` on every channel, for photographs whose highlights are compressed.
+    Reinhard,
+}
+
+/// Most samples in any pixel, unless the table says otherwise.
+pub(super) const MAX_SAMPLES: u32 = 1 << 14;
+
+impl CompositeTable {
+    /// Refuses what no run can work with.
+    pub fn check(&self, config: &Config) -> anyhow::Result<()> {
+        let wrong = |key: &str, message: String| {
+            Err(anyhow::Error::new(
+                config.invalid(&format!("composite.{key}"), message),
+            ))
+        };
+        if let Some(e) = self.target_error
+            && !(e > 0.0 && e <= 1.0)
+        {
+            let range = "a display-referred RMSE above 0, at most 1, as in 0.004";
+            return wrong(
+                "target_error",
+                format!("{e} is out of range; accepted: {range}"),
+            );
+        }
+        if let Some(t) = self.time_budget_s
+            && !(t > 0.0 && t < 1e9)
+        {
+            return wrong(
+                "time_budget_s",
+                format!("{t} is out of range; accepted: seconds above 0"),
+            );
+        }
+        if self.target_error.is_some() && self.time_budget_s.is_some() {
+            return wrong(
+                "time_budget_s",
+                "excludes target_error; keep one of the two".into(),
+            );
+        }
+        if self.max_samples == Some(0) {
+            return wrong(
+                "max_samples",
+                "0 is out of range; accepted: 1 or more".into(),
+            );
+        }
+        if !(self.exposure_ev.abs() <= 64.0) {
+            return wrong(
+                "exposure_ev",
+                format!(
+                    "{} is out of range; accepted: stops from -64 to 64",
+                    self.exposure_ev
+                ),
+            );
+        }
+        if !self.rotation_deg.is_finite() {
+            return wrong("rotation_deg", "must be a finite angle in degrees".into());
+        }
+        Ok(())
+    }
+
+    pub(super) fn stop(&self, quality: Quality) -> Stop {
+        match (self.target_error, self.time_budget_s) {
+            (Some(error), _) => Stop::TargetError(error),
+            (None, Some(seconds)) => Stop::TimeBudget(Duration::from_secs_f64(seconds)),
+            (None, None) => Stop::TargetError(presets::of(quality).composite.target_error),
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! What the light stage leaves, for the composite and the report.
+use std::path::Path;
+
+use dipir_cli::session::Session;
+use dipir_imaging::tone::ToneCurves;
+use dipir_light::gaussian::{SgMixture, SphericalGaussian};
+use dipir_optimize::lighting::Lighting;
+use dipir_pipeline::manifest::{Artifact, FILE_NAME, Manifest};
+use glam::Quat;
+use serde_json::{Value, json};
+
+use crate::composite::table::CompositeTable;
+use crate::names::LIGHT;
+
+/// What decides the recovered light beside the light stage's files.
+pub fn recovered_params(table: &CompositeTable) -> Value {
+    json!({
+        "recovered": true,
+        "exposure_ev": table.exposure_ev,
+        "rotation_deg": table.rotation_deg,
+    })
+}
+
+/// A light that the light stage recovered.
+pub struct Recovered {
+    /// The lobes, on the photograph's scale.
+    pub lobes: SgMixture,
+    /// The tone curves that were recovered with it.
+    pub tone: ToneCurves,
+}
+
+/// What the light stage left, exposed and turned; an error that says what to do if there is
+/// nothing. `scene` is the manifest of the scene that is lit.
+pub fn recovered(
+    session: &Session,
+    table: &CompositeTable,
+    scene: &Manifest,
+) -> anyhow::Result<Recovered> {
+    let folder = LIGHT.folder(session);
+    let manifest = manifest(session)?;
+    warn_of_another_scene(session, &manifest, scene);
+    let lighting_file = manifest.output(&folder, "lighting")?;
+    let tone_file = manifest.output(&folder, "tone")?;
+    let exposure = table.exposure_ev.exp2();
+    let turn = Quat::from_rotation_y(table.rotation_deg.to_radians());
+    let lobes = Lighting::read(&lighting_file)?.exposed_lobes();
+    let lobes = lobes.into_iter().map(|lobe| SphericalGaussian {
+        direction: turn * lobe.direction,
+        radiance: lobe.radiance * exposure,
+        ..lobe
+    });
+    Ok(Recovered {
+        lobes: SgMixture::new(lobes.collect()).map_err(|e| {
+            let message = format!(
+                "{} stops make a light that cannot be used: {e}",
+                table.exposure_ev
+            );
+            session.config.invalid("composite.exposure_ev", message)
+        })?,
+        tone: ToneCurves::read_json(&tone_file)?,
+    })
+}
+
+/// The manifest of the light stage; an error that says what to do if it has not run.
+pub fn manifest(session: &Session) -> anyhow::Result<Manifest> {
+    let folder = LIGHT.folder(session);
+    if !folder.join(FILE_NAME).exists() {
+        return Err(missing(&folder.join("lighting.json")));
+    }
+    Ok(LIGHT.manifest(session)?)
+}
+
+/// The light may have been recovered before the scene was set up anew.
+pub fn warn_of_another_scene(session: &Session, light: &Manifest, scene: &Manifest) {
+    let of = |list: &[Artifact]| {
+        let found = list.iter().find(|a| a.role == "scene");
+        found.map(|a| a.blake3.clone())
+    };
+    if of(&light.inputs) != of(&scene.outputs) {
+        session.warn(
+            "the light was recovered for another set-up of the scene; run dipir-light again to \
+             recover it for this one",
+        );
+    }
+}
+
+/// The error of a stage that needs a light where there is none.
+pub fn missing(recovered: &Path) -> anyhow::Error {
+    anyhow::anyhow!(
+        "there is no light: [composite] environment is not set and {} is missing; name a map, as \
+         in --set composite.environment=sky.hdr, or run dipir-light first",
+        recovered.display()
+    )
+}

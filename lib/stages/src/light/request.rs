@@ -1,0 +1,208 @@
+//! What the configuration asks of the light stage.
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use dipir_cli::session::Session;
+use dipir_guidance::distillation::DistillationSettings;
+use dipir_imaging::file::read_photo;
+use dipir_imaging::raster::DisplayImage;
+use dipir_optimize::lighting::Lighting;
+use dipir_optimize::settings::{GuidanceKind, LearningRates, LightTable, Settings, Start};
+use dipir_prior::inversion::InversionSettings;
+use dipir_scene::config::SceneConfig;
+use serde_json::{Value, json};
+
+use crate::model::ModelTable;
+use crate::scene::folder::SceneFolder;
+use crate::scene::transport::{self, Frame};
+
+/// What guides, as far as files go.
+pub(crate) enum Guide {
+    /// A picture that the composite should equal.
+    Reference {
+        /// As the configuration names it.
+        path: PathBuf,
+        /// Where it is.
+        file: PathBuf,
+    },
+    /// A diffusion model.
+    Model {
+        table: ModelTable,
+        settings: DistillationSettings,
+        class: String,
+        /// How light is read off the photograph, if it is.
+        reading: Option<InversionSettings>,
+    },
+}
+
+/// What the configuration asks for.
+pub(crate) struct Request {
+    pub(crate) table: LightTable,
+    pub(crate) settings: Settings,
+    pub(crate) guide: Guide,
+}
+
+impl Request {
+    pub(crate) fn of(session: &Session) -> anyhow::Result<Self> {
+        let table: LightTable = session.config.table("light")?;
+        let mut settings = transport::settings(session, &table)?;
+        let guide = match table.guidance {
+            GuidanceKind::Reference => {
+                let (path, file) = reference_of(session, &table)?;
+                Guide::Reference { path, file }
+            }
+            _ => model_guide(session, &table)?,
+        };
+        if let Guide::Model {
+            reading: Some(_), ..
+        } = &guide
+        {
+            refine(&table, &mut settings);
+        }
+        Ok(Self {
+            table,
+            settings,
+            guide,
+        })
+    }
+
+    /// What decides the outputs. How often the state is kept does not.
+    pub(super) fn params(&self) -> Value {
+        let settings = Settings {
+            checkpoint_every: 0,
+            ..self.settings.clone()
+        };
+        match &self.guide {
+            Guide::Reference { .. } => {
+                json!({"light": settings, "guidance": GuidanceKind::Reference})
+            }
+            Guide::Model {
+                table,
+                settings: distillation,
+                class,
+                reading,
+            } => json!({
+                "light": settings, "guidance": distillation, "class": class,
+                "precision": table.precision, "reading": reading_param(reading),
+            }),
+        }
+    }
+}
+
+/// How light is read, as far as it decides.
+fn reading_param(reading: &Option<InversionSettings>) -> Value {
+    match reading {
+        Some(settings) if settings.draws == 0 => json!("encoder"),
+        other => json!(other.is_some()),
+    }
+}
+
+/// Iterations that refine a light that was read off the photograph.
+const REFINEMENT: usize = 50;
+/// Their learning rates beside those that find a light from a neutral start: the difference of two
+/// predictions has a bias in everything that the caption does not say (docs/prior.md).
+const REFINEMENT_RATE: f64 = 0.05;
+
+/// What `table` leaves open, for a start that is near.
+fn refine(table: &LightTable, settings: &mut Settings) {
+    settings.iterations = table.iterations.unwrap_or(REFINEMENT);
+    if table.learning_rates == LearningRates::default() {
+        settings.learning_rates = settings.learning_rates.scaled(REFINEMENT_RATE);
+    }
+}
+
+/// The model that guides and how it is used.
+fn model_guide(session: &Session, table: &LightTable) -> anyhow::Result<Guide> {
+    let model: ModelTable = session.config.table("model")?;
+    let scene: SceneConfig = session.config.table("scene")?;
+    let knows_light = model.knows_light(session);
+    let reading = match &table.start {
+        Start::Auto => knows_light.then(InversionSettings::default),
+        Start::Neutral | Start::File(_) => None,
+        Start::Read | Start::Encoder if !knows_light => {
+            let message = format!(
+                "\"{}\" needs a model that knows light, and {} has no {}; accepted: auto, neutral, or \
+                 a lighting.json",
+                String::from(table.start.clone()),
+                model.name(),
+                dipir_prior::encoder::FILE
+            );
+            return Err(session.config.invalid("light.start", message).into());
+        }
+        Start::Read => Some(InversionSettings::default()),
+        Start::Encoder => Some(InversionSettings {
+            draws: 0,
+            ..InversionSettings::default()
+        }),
+    };
+    let settings = DistillationSettings::new(table, reading.is_some()).map_err(|e| {
+        session
+            .config
+            .invalid(&format!("light.{}", e.key), e.message)
+    })?;
+    Ok(Guide::Model {
+        settings,
+        class: scene.class.unwrap_or_else(|| "object".into()),
+        table: model,
+        reading,
+    })
+}
+
+/// The light of `[light] start`, if that is a file.
+pub(super) fn first_light(
+    session: &Session,
+    table: &LightTable,
+) -> anyhow::Result<Option<Lighting>> {
+    let Start::File(path) = &table.start else {
+        return Ok(None);
+    };
+    let light = Lighting::read(&session.resolve(path))
+        .with_context(|| format!("cannot use light.start = \"{}\"", path.display()))?;
+    if light.lobes.is_empty() {
+        let message = format!(
+            "\"{}\" holds no lobes; accepted: a lighting.json that holds some",
+            path.display()
+        );
+        return Err(session.config.invalid("light.start", message).into());
+    }
+    Ok(Some(light))
+}
+
+/// The reference, as the configuration names it and where it is.
+pub(super) fn reference_of(
+    session: &Session,
+    table: &LightTable,
+) -> anyhow::Result<(PathBuf, PathBuf)> {
+    let path = table.reference.clone().ok_or_else(|| {
+        let message = "is missing: name the picture that the composite should equal, as in \
+                       reference = \"image.exr\"";
+        session.config.invalid("light.reference", message)
+    })?;
+    let file = session.resolve(&path);
+    Ok((path, file))
+}
+
+/// The reference at the size of `frame`, as it is displayed.
+pub(super) fn read_reference(
+    session: &Session,
+    scene: &SceneFolder,
+    frame: &Frame,
+    file: &Path,
+) -> anyhow::Result<DisplayImage> {
+    let transfer = scene.loaded.photo.transfer;
+    let image = read_photo(file, transfer)?.image;
+    let found = [image.0.width() as u32, image.0.height() as u32];
+    let expected = scene.loaded.scene.camera.resolution;
+    if found != expected {
+        let message = format!(
+            "\"{}\" has {} x {} pixels; accepted: a picture of the photograph's size, {} x {}",
+            file.display(),
+            found[0],
+            found[1],
+            expected[0],
+            expected[1]
+        );
+        return Err(session.config.invalid("light.reference", message).into());
+    }
+    Ok(transfer.encode(&frame.scale(&image)))
+}

@@ -1,0 +1,92 @@
+//! The `[lora]` table.
+use dipir_diffusion::training::TrainingConfig;
+use serde::{Deserialize, Serialize};
+
+/// The `[lora]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LoraTable {
+    /// Rank of the adapters.
+    pub rank: usize,
+    /// Scale times rank; the rank by default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alpha: Option<f64>,
+    /// Updates.
+    pub steps: usize,
+    /// Learning rate of the adapters.
+    pub learning_rate: f64,
+    /// Updates over which it rises from 0.
+    pub warmup_steps: usize,
+    /// Examples of each kind for one update.
+    pub accumulation: usize,
+    /// Weight of the concept images' loss.
+    pub prior_weight: f64,
+    /// Smallest crop of the photograph, as a share of its shorter side.
+    pub min_crop: f64,
+    /// The word that stands for the photograph's light.
+    pub word: String,
+    /// Learn an embedding for that word, too.
+    pub learn_word: bool,
+    /// Learning rate of the embedding.
+    pub word_learning_rate: f64,
+    /// Recompute activations: less memory, a third more time.
+    pub recompute: bool,
+    /// Updates between checkpoints; 0 for none.
+    pub checkpoint_every: usize,
+    /// Updates between sample images; 0 for none.
+    pub sample_every: usize,
+}
+
+impl Default for LoraTable {
+    fn default() -> Self {
+        let training = TrainingConfig::default();
+        Self {
+            rank: training.rank,
+            alpha: None,
+            steps: training.steps,
+            learning_rate: training.learning_rate,
+            warmup_steps: training.warmup_steps,
+            accumulation: training.accumulation,
+            prior_weight: training.prior_weight,
+            min_crop: 0.5,
+            word: "sks".into(),
+            learn_word: false,
+            word_learning_rate: training.token_learning_rate,
+            recompute: training.recompute,
+            checkpoint_every: 50,
+            sample_every: 0,
+        }
+    }
+}
+
+impl LoraTable {
+    pub(super) fn training(&self, seed: u64) -> TrainingConfig {
+        TrainingConfig {
+            rank: self.rank,
+            alpha: self.alpha.unwrap_or(self.rank as f64),
+            steps: self.steps,
+            learning_rate: self.learning_rate,
+            token_learning_rate: self.word_learning_rate,
+            warmup_steps: self.warmup_steps,
+            accumulation: self.accumulation,
+            prior_weight: self.prior_weight,
+            recompute: self.recompute,
+            seed,
+            ..TrainingConfig::default()
+        }
+    }
+
+    /// The caption of the photograph's crops.
+    pub(super) fn instance_prompt(&self) -> String {
+        format!("a scene in the style of {} rendering", self.word)
+    }
+
+    /// What decides the course of a run; how long it is does not.
+    pub(super) fn without_steps(&self) -> Self {
+        Self {
+            steps: 0,
+            checkpoint_every: 0,
+            ..self.clone()
+        }
+    }
+}

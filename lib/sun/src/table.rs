@@ -1,0 +1,458 @@
+//! What somebody says of the sun: `[light] sun = { … }` and `[light] shadow = { … }`.
+use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::direction::azimuth_of_bearing;
+use crate::error::SunError;
+use crate::position::{self, Position};
+use crate::shadow::{Angle, CLICK_SIGMA_PX, HEIGHT_SIGMA, Shadow};
+use crate::time::Time;
+
+/// `sun = { … }`: each part is optional, and what is not said stays unknown.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SunTable {
+    /// When the photograph was taken, ISO 8601: `"2026-06-21T12:34:56+02:00"`; by default its own.
+    pub time: Option<String>,
+    /// Degrees north; by default the photograph's own.
+    pub latitude: Option<f64>,
+    /// Degrees east; by default the photograph's own.
+    pub longitude: Option<f64>,
+    /// Where the camera looked, degrees clockwise from north; by default the photograph's own.
+    pub heading_deg: Option<f64>,
+    /// Standard deviation of the heading, degrees; 10 by default.
+    pub heading_sure_deg: Option<f64>,
+    /// Instead of time and place: degrees clockwise, counted from `relative_to`.
+    pub azimuth_deg: Option<f64>,
+    /// Degrees above the horizon.
+    pub elevation_deg: Option<f64>,
+    /// From where `azimuth_deg` counts.
+    pub relative_to: RelativeTo,
+    /// Standard deviation of `azimuth_deg` and `elevation_deg`, degrees; 3 by default.
+    pub sure_deg: Option<f64>,
+    /// Angular radius, degrees: 0.27 is the sun in a clear sky.
+    pub size_deg: Option<f64>,
+    /// Share of the light on a surface that faces the sun that comes from the sun, 0 to 1.
+    pub share: Option<f64>,
+}
+
+/// From where an azimuth counts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RelativeTo {
+    /// Where the camera looks: 90 is on the right.
+    #[default]
+    View,
+    /// The world's -z: 90 is +x.
+    World,
+    /// North; needs a heading.
+    North,
+}
+
+/// Standard deviation of an angle that somebody says, degrees.
+const SAID_SIGMA_DEG: f64 = 3.0;
+/// Standard deviation of a compass in a telephone or a hand, degrees.
+const COMPASS_SIGMA_DEG: f64 = 10.0;
+/// By how much a clock of an unknown zone may be off the zone of its place: summer time.
+const ZONE_SIGMA_S: f64 = 3600.0;
+
+/// What the photograph's own data say; the table comes first.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Taken {
+    /// ISO 8601.
+    pub time: Option<String>,
+    /// Degrees north.
+    pub latitude_deg: Option<f64>,
+    /// Degrees east.
+    pub longitude_deg: Option<f64>,
+    /// Degrees clockwise from north.
+    pub heading_deg: Option<f64>,
+}
+
+/// What is known of the sun, in angles of the world.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Known {
+    /// Azimuth, clockwise from -z.
+    pub azimuth: Option<Angle>,
+    /// Elevation.
+    pub elevation: Option<Angle>,
+    /// Angular radius, degrees.
+    pub radius_deg: Option<f64>,
+    /// Share of the light, 0 to 1.
+    pub share: Option<f64>,
+}
+
+impl SunTable {
+    /// Errors on values that no sun has. `at` is the table's path, `light.sun`.
+    ///
+    /// # Errors
+    /// The first key that is wrong, with its value and the accepted form.
+    pub fn check(&self, at: &str) -> Result<(), SunError> {
+        let degrees = "degrees";
+        let ranges: [(&str, Option<f64>, f64, f64, &'static str); 9] = [
+            (
+                "latitude",
+                self.latitude,
+                -90.0,
+                90.0,
+                "degrees north from -90 to 90",
+            ),
+            (
+                "longitude",
+                self.longitude,
+                -180.0,
+                360.0,
+                "degrees east from -180 to 360",
+            ),
+            (
+                "heading_deg",
+                self.heading_deg,
+                -360.0,
+                360.0,
+                "degrees clockwise from north",
+            ),
+            (
+                "azimuth_deg",
+                self.azimuth_deg,
+                -360.0,
+                360.0,
+                "degrees clockwise from -360 to 360",
+            ),
+            (
+                "elevation_deg",
+                self.elevation_deg,
+                -90.0,
+                90.0,
+                "degrees above the horizon, -90 to 90",
+            ),
+            (
+                "size_deg",
+                self.size_deg,
+                0.01,
+                90.0,
+                "an angular radius from 0.01 to 90 degrees, 0.27 for a clear sky",
+            ),
+            (
+                "share",
+                self.share,
+                0.0,
+                1.0,
+                "a share of the light from 0 to 1",
+            ),
+            ("sure_deg", self.sure_deg, 0.0, 180.0, degrees),
+            (
+                "heading_sure_deg",
+                self.heading_sure_deg,
+                0.0,
+                180.0,
+                degrees,
+            ),
+        ];
+        for (name, value, least, most, accepted) in ranges {
+            in_range(at, name, value, least, most, accepted)?;
+        }
+        if let Some(text) = &self.time
+            && Time::parse(text).is_none()
+        {
+            return Err(SunError::Value {
+                key: format!("{at}.time"),
+                value: format!("\"{}\"", text.escape_debug()),
+                accepted: "a date and time with its offset, \"2026-06-21T12:34:56+02:00\"",
+            });
+        }
+        if self.latitude.is_some() != self.longitude.is_some() {
+            return Err(SunError::Missing {
+                key: format!(
+                    "{at}.{}",
+                    if self.latitude.is_some() {
+                        "longitude"
+                    } else {
+                        "latitude"
+                    }
+                ),
+                remedy: "write both, or leave both to the photograph",
+            });
+        }
+        let angles = [
+            ("azimuth_deg", self.azimuth_deg),
+            ("elevation_deg", self.elevation_deg),
+        ];
+        for (name, value) in angles {
+            if value.is_some() && self.time.is_some() {
+                return Err(SunError::Conflict {
+                    first: format!("{at}.time"),
+                    second: format!("{at}.{name}"),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// What this table and the photograph's own data say of the sun, for a camera that looks along
+    /// `forward`. Without a heading time and place give the elevation alone.
+    ///
+    /// # Errors
+    /// As [`check`](Self::check), and if an azimuth from north has no heading.
+    pub fn resolve(&self, at: &str, taken: &Taken, forward: DVec3) -> Result<Known, SunError> {
+        self.check(at)?;
+        let heading = self.heading(taken);
+        let mut known = Known {
+            radius_deg: self.size_deg,
+            share: self.share,
+            ..Known::default()
+        };
+        let said_nothing = self.azimuth_deg.is_none() && self.elevation_deg.is_none();
+        if said_nothing && let Some((sun, sigma_deg)) = self.by_time(taken) {
+            known.elevation = Some(Angle {
+                deg: sun.elevation_deg,
+                sigma_deg: sigma_deg[1],
+            });
+            known.azimuth = heading.map(|heading| Angle {
+                deg: azimuth_of_bearing(sun.azimuth_deg, heading.deg, forward),
+                sigma_deg: sigma_deg[0].hypot(heading.sigma_deg),
+            });
+        }
+        let sigma_deg = self.sure_deg.unwrap_or(SAID_SIGMA_DEG);
+        if let Some(deg) = self.elevation_deg {
+            known.elevation = Some(Angle { deg, sigma_deg });
+        }
+        if let Some(azimuth) = self.azimuth_deg {
+            let (deg, more) = match (self.relative_to, heading) {
+                (RelativeTo::View, _) => (azimuth_of_bearing(azimuth, 0.0, forward), 0.0),
+                (RelativeTo::World, _) => (azimuth.rem_euclid(360.0), 0.0),
+                (RelativeTo::North, Some(heading)) => {
+                    let deg = azimuth_of_bearing(azimuth, heading.deg, forward);
+                    (deg, heading.sigma_deg)
+                }
+                (RelativeTo::North, None) => {
+                    return Err(SunError::Missing {
+                        key: format!("{at}.heading_deg"),
+                        remedy: "an azimuth from north needs the camera's own bearing",
+                    });
+                }
+            };
+            known.azimuth = Some(Angle {
+                deg,
+                sigma_deg: sigma_deg.hypot(more),
+            });
+        }
+        Ok(known)
+    }
+
+    fn heading(&self, taken: &Taken) -> Option<Angle> {
+        let deg = self
+            .heading_deg
+            .or(taken.heading_deg)
+            .filter(|d| d.is_finite())?;
+        let sigma_deg = self.heading_sure_deg.unwrap_or(COMPASS_SIGMA_DEG);
+        Some(Angle { deg, sigma_deg })
+    }
+
+    /// The sun by time and place, and the standard deviations of azimuth and elevation.
+    fn by_time(&self, taken: &Taken) -> Option<(Position, [f64; 2])> {
+        let time = self.time.as_deref().or(taken.time.as_deref())?;
+        let time = Time::parse(time)?;
+        let (latitude, longitude) = match (self.latitude, self.longitude) {
+            (Some(latitude), Some(longitude)) => (latitude, longitude),
+            _ => (taken.latitude_deg?, taken.longitude_deg?),
+        };
+        let unix_s = time.at_longitude(longitude);
+        let at = |unix_s| position::position(unix_s, latitude, longitude);
+        let sun = at(unix_s);
+        if time.zone_known {
+            return Some((sun, [position::ERROR_DEG; 2]));
+        }
+        let (early, late) = (at(unix_s - ZONE_SIGMA_S), at(unix_s + ZONE_SIGMA_S));
+        let turn = (late.azimuth_deg - early.azimuth_deg + 180.0).rem_euclid(360.0) - 180.0;
+        let climb = [early, late].map(|p| (p.elevation_deg - sun.elevation_deg).abs());
+        Some((sun, [0.5 * turn.abs(), climb[0].max(climb[1])]))
+    }
+}
+
+/// `shadow = { … }`: a shadow that somebody drew.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ShadowTable {
+    /// Pixel where the thing stands on the ground.
+    pub foot: [f64; 2],
+    /// Pixel where the shadow of its top falls.
+    pub tip: [f64; 2],
+    /// Height of the thing, metres; without it the elevation stays unknown.
+    #[serde(default)]
+    pub height_m: Option<f64>,
+    /// Standard deviation of each coordinate, pixels; 2 by default.
+    #[serde(default)]
+    pub sure_px: Option<f64>,
+}
+
+impl ShadowTable {
+    /// The shadow. `at` is the table's path, `light.shadow`.
+    ///
+    /// # Errors
+    /// The first key that is wrong, with its value and the accepted form.
+    pub fn resolve(&self, at: &str) -> Result<Shadow, SunError> {
+        let pixels = self.foot.into_iter().chain(self.tip);
+        for (name, v) in ["foot", "foot", "tip", "tip"].into_iter().zip(pixels) {
+            let accepted = "a pixel [column, row], for instance [640.0, 480.0]";
+            in_range(at, name, Some(v), -1e6, 1e6, accepted)?;
+        }
+        in_range(
+            at,
+            "height_m",
+            self.height_m,
+            1e-3,
+            1e4,
+            "metres above 0, as in 1.8",
+        )?;
+        in_range(at, "sure_px", self.sure_px, 0.0, 1e4, "pixels, as in 2.0")?;
+        Ok(Shadow {
+            foot: DVec2::from_array(self.foot),
+            tip: DVec2::from_array(self.tip),
+            height_m: self.height_m,
+            sigma_px: self.sure_px.unwrap_or(CLICK_SIGMA_PX),
+            sigma_height: HEIGHT_SIGMA,
+        })
+    }
+}
+
+fn in_range(
+    at: &str,
+    name: &str,
+    value: Option<f64>,
+    least: f64,
+    most: f64,
+    accepted: &'static str,
+) -> Result<(), SunError> {
+    match value {
+        Some(v) if !(least..=most).contains(&v) => Err(SunError::Value {
+            key: format!("{at}.{name}"),
+            value: v.to_string(),
+            accepted,
+        }),
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn sun(text: &str) -> SunTable {
+        toml::from_str(text).unwrap()
+    }
+
+    fn known(text: &str, taken: &Taken, forward: DVec3) -> Result<Known, String> {
+        let known = sun(text).resolve("light.sun", taken, forward);
+        known.map_err(|e| e.to_string())
+    }
+
+    /// A noon in June at 48 degrees north, in which the sun stands in the south.
+    const NOON: &str = "time = \"2026-06-21T12:02:00Z\"\nlatitude = 48.0\nlongitude = 0.0\n";
+
+    #[test]
+    fn time_place_and_heading_give_both_angles_and_without_heading_the_elevation() {
+        let nothing = Taken::default();
+        let alone = known(NOON, &nothing, DVec3::NEG_Z).unwrap();
+        let elevation = alone.elevation.unwrap();
+        // 90 - 48 + 23.4.
+        assert!((elevation.deg - 65.43).abs() < 0.05 && elevation.sigma_deg < 0.05);
+        assert_eq!(alone.azimuth, None);
+        // Looking east, along the world's -z: south is on the right.
+        let text = format!("{NOON}heading_deg = 90.0\nheading_sure_deg = 4.0\nshare = 0.7");
+        let turned = known(&text, &nothing, DVec3::NEG_Z).unwrap();
+        let azimuth = turned.azimuth.unwrap();
+        assert!((azimuth.deg - 90.0).abs() < 1.0, "{azimuth:?}");
+        assert!((azimuth.sigma_deg - 4.0).abs() < 0.01);
+        assert_eq!(turned.share, Some(0.7));
+    }
+
+    #[test]
+    fn the_photographs_own_data_fill_in_and_an_unknown_zone_makes_unsure() {
+        let taken = Taken {
+            time: Some("2026-06-21T12:02:00".into()),
+            latitude_deg: Some(48.0),
+            longitude_deg: Some(0.0),
+            heading_deg: Some(180.0),
+        };
+        let got = known("", &taken, DVec3::NEG_Z).unwrap();
+        let (azimuth, elevation) = (got.azimuth.unwrap(), got.elevation.unwrap());
+        let off = (azimuth.deg + 180.0).rem_euclid(360.0) - 180.0;
+        assert!(off.abs() < 1.0 && azimuth.sigma_deg > 20.0, "{azimuth:?}");
+        assert!(elevation.sigma_deg > 2.0, "{elevation:?}");
+        assert_eq!(
+            known("", &Taken::default(), DVec3::NEG_Z).unwrap(),
+            Known::default()
+        );
+    }
+
+    #[test]
+    fn angles_count_from_the_view_the_world_or_north() {
+        let forward = DVec3::X;
+        let azimuth = |text: &str| {
+            let known = known(text, &Taken::default(), forward)?;
+            Ok::<f64, String>(known.azimuth.unwrap().deg)
+        };
+        assert!((azimuth("azimuth_deg = -30").unwrap() - 60.0).abs() < 1e-9);
+        let world = "azimuth_deg = -30\nrelative_to = \"world\"";
+        assert_eq!(azimuth(world).unwrap(), 330.0);
+        let north = "azimuth_deg = 180\nrelative_to = \"north\"";
+        assert_eq!(
+            azimuth(north).unwrap_err(),
+            "light.sun.heading_deg is missing; an azimuth from north needs the camera's own bearing"
+        );
+        let north = format!("{north}\nheading_deg = 90");
+        assert!((azimuth(&north).unwrap() - 180.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn wrong_values_are_named() {
+        let words = |text: &str| sun(text).check("light.sun").unwrap_err().to_string();
+        assert_eq!(
+            words("elevation_deg = 100"),
+            "light.sun.elevation_deg is 100; accepted: degrees above the horizon, -90 to 90"
+        );
+        assert_eq!(
+            words("time = \"noon\""),
+            "light.sun.time is \"noon\"; accepted: a date and time with its offset, \"2026-06-21T12:34:56+02:00\""
+        );
+        assert_eq!(
+            words("latitude = 48"),
+            "light.sun.longitude is missing; write both, or leave both to the photograph"
+        );
+        assert_eq!(
+            words("time = \"2026-06-21T12:34Z\"\nazimuth_deg = 3"),
+            "light.sun.time and light.sun.azimuth_deg cannot both be given; keep one of them"
+        );
+        assert!(words("share = nan").starts_with("light.sun.share is NaN"));
+        assert!(toml::from_str::<SunTable>("azimut_deg = 3").is_err());
+        let shadow: ShadowTable =
+            toml::from_str("foot = [1, 2]\ntip = [3, 4]\nheight_m = -1").unwrap();
+        assert_eq!(
+            shadow.resolve("light.shadow").unwrap_err().to_string(),
+            "light.shadow.height_m is -1; accepted: metres above 0, as in 1.8"
+        );
+        assert!(toml::from_str::<ShadowTable>("foot = [1, 2]").is_err());
+    }
+
+    proptest! {
+        /// A sun or an error, never a panic; angles are finite.
+        #[test]
+        fn no_table_makes_it_panic(
+            numbers in proptest::collection::vec(
+                proptest::option::of(prop_oneof![-400.0..400.0, Just(f64::NAN), Just(f64::INFINITY)]), 9),
+            time in proptest::option::of("[0-9]{4}-[01][0-9]-[0-3][0-9]T[0-2][0-9]:[0-5][0-9]Z?"),
+        ) {
+            let n = |i: usize| numbers[i];
+            let table = SunTable {
+                time, latitude: n(0), longitude: n(1), heading_deg: n(2), heading_sure_deg: n(3),
+                azimuth_deg: n(4), elevation_deg: n(5), relative_to: RelativeTo::View,
+                sure_deg: n(6), size_deg: n(7), share: n(8),
+            };
+            if let Ok(known) = table.resolve("light.sun", &Taken::default(), DVec3::NEG_Z) {
+                let angles = [known.azimuth, known.elevation];
+                prop_assert!(angles.iter().flatten().all(|a| a.deg.is_finite()));
+            }
+        }
+    }
+}

@@ -1,0 +1,341 @@
+//! Measures variants by running the executables, once for every seed. What is measured is kept, so that
+//! an interrupted sweep goes on.
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use dipir_cli::executables::{Executables, Ran};
+use dipir_evaluation::results::{read_json, write_json};
+use dipir_evaluation::scores::{DisplayedComposite, rmse_over};
+use dipir_imaging::raster::DisplayImage;
+use dipir_render::effects::EffectsPlan;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::knobs::{Part, Variant, beyond_standard};
+use crate::scenes::Scene;
+
+/// What one run of a variant showed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Sample {
+    /// Its seed.
+    pub seed: u64,
+    /// Display-referred RMSE against the reference, over what object or shadow touch.
+    pub error: f64,
+    /// The error that the stage itself stated: a 95% bound.
+    pub stated_error: Option<f64>,
+    /// Processor seconds of the stages that the variant concerns; wall seconds where the system does
+    /// not count the former.
+    pub cost_s: f64,
+    /// Wall seconds of the same.
+    pub wall_s: f64,
+    /// Most memory of any of them.
+    pub peak_rss_bytes: u64,
+}
+
+/// All runs of a variant in a scene.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Point {
+    /// The scene.
+    pub scene: String,
+    /// `render` or `light`.
+    pub part: String,
+    /// The series it is drawn in.
+    pub series: String,
+    /// Its values.
+    pub label: String,
+    /// Keys and values.
+    pub set: Vec<(String, String)>,
+    /// A run a seed.
+    pub samples: Vec<Sample>,
+}
+
+impl Point {
+    /// All runs of `variant` in `scene`.
+    pub fn new(scene: &str, variant: &Variant, samples: Vec<Sample>) -> Self {
+        Self {
+            scene: scene.into(),
+            part: variant.part.name().into(),
+            series: variant.series.clone(),
+            label: variant.label.clone(),
+            set: variant.set.clone(),
+            samples,
+        }
+    }
+}
+
+/// A converged picture.
+struct Reference {
+    picture: DisplayImage,
+    /// Whether object or shadow touch each pixel.
+    touched: Vec<bool>,
+}
+
+impl Reference {
+    /// Display-referred RMSE over what the reference's object or shadow touch.
+    fn error_of(&self, picture: &DisplayImage) -> f64 {
+        rmse_over(picture, &self.picture, &self.touched)
+    }
+}
+
+/// Measures one scene.
+pub struct SceneMeasurement<'a> {
+    /// What runs.
+    pub executables: &'a Executables,
+    /// Where everything goes.
+    pub out: &'a Path,
+    /// Which scene.
+    pub scene: &'a Scene,
+    /// `--threads`.
+    pub threads: usize,
+    /// Where the reference of the render track stops.
+    pub reference_error: f64,
+}
+
+/// Seed of references: apart from those of points.
+const REFERENCE_SEED: u64 = 1_000_003;
+/// Error at which the pictures under recovered lights, and the truth that they are recovered from,
+/// stop.
+const PICTURE_ERROR: &str = "0.003";
+
+impl SceneMeasurement<'_> {
+    fn work(&self) -> PathBuf {
+        self.out.join("work").join(folder_name(&self.scene.name))
+    }
+
+    fn stage(
+        &self,
+        name: &str,
+        pipeline: &Path,
+        out: &Path,
+        seed: u64,
+        set: &[(String, String)],
+    ) -> anyhow::Result<Ran> {
+        let mut arguments: Vec<String> = vec![
+            "-p".into(),
+            pipeline.to_string_lossy().into(),
+            "-o".into(),
+            out.to_string_lossy().into(),
+            "--seed".into(),
+            seed.to_string(),
+            "-j".into(),
+            self.threads.to_string(),
+        ];
+        for (key, value) in set {
+            arguments.extend(["--set".into(), format!("{key}={value}")]);
+        }
+        self.executables.run(name, &arguments)
+    }
+
+    /// The render track's reference: everything simulated, sampled to the reference's error.
+    fn converged_picture(&self) -> anyhow::Result<Reference> {
+        let folder = self.work().join("reference");
+        let done = folder.join("done.json");
+        if !done.is_file() {
+            let set = settings(&[
+                ("scene.effects.mode", "all"),
+                ("composite.target_error", &self.reference_error.to_string()),
+                ("composite.max_samples", "4194304"),
+            ]);
+            let ran = self.composite(&folder, &set)?;
+            write_json(&done, &ran.json)?;
+        }
+        load(&folder.join("composite/composite.exr"))
+    }
+
+    /// The scene under its known light, made in `folder` with the reference's seed.
+    fn composite(&self, folder: &Path, set: &[(String, String)]) -> anyhow::Result<Ran> {
+        let lit = &self.scene.lit;
+        self.stage("dipir-scene", lit, folder, REFERENCE_SEED, set)?;
+        self.stage("dipir-composite", lit, folder, REFERENCE_SEED, set)
+    }
+
+    /// Names of the effects that planning leaves on.
+    pub fn effects_on(&self) -> anyhow::Result<Vec<String>> {
+        let folder = self.work().join("planned");
+        let path = folder.join("scene/effects.json");
+        if !path.is_file() {
+            self.stage("dipir-scene", &self.scene.lit, &folder, 0, &[])?;
+        }
+        let plan: EffectsPlan = read_json(&path)?;
+        let on = plan.effects.iter().filter(|e| e.enabled);
+        let names = on.map(|e| e.name.name().to_owned());
+        Ok(names.filter(|n| n != "occluders").collect())
+    }
+
+    /// The picture that light is recovered from, made under the known light.
+    fn true_picture(&self, recover: &Path) -> anyhow::Result<Reference> {
+        let folder = self.work().join("truth");
+        let picture = folder.join("composite/composite.exr");
+        let beside = recover.with_file_name("truth.exr");
+        if !beside.is_file() {
+            let set = settings(&[("composite.target_error", PICTURE_ERROR)]);
+            self.composite(&folder, &set)?;
+            fs::copy(&picture, &beside)
+                .with_context(|| format!("cannot write {}", beside.display()))?;
+        }
+        load(&beside)
+    }
+
+    /// Measures `variant` with the seeds below `repeats`, or reads what was measured; `None` for the
+    /// light of a scene whose light is not known.
+    pub fn measure(&self, variant: &Variant, repeats: u64) -> anyhow::Result<Option<Point>> {
+        if variant.part == Part::Light && self.scene.recover.is_none() {
+            return Ok(None);
+        }
+        let mut reference = None;
+        let mut samples = Vec::new();
+        for seed in 0..repeats {
+            let file = self.sample_file(variant, seed);
+            if !file.is_file() {
+                let reference = match &mut reference {
+                    Some(reference) => reference,
+                    none => none.insert(self.reference(variant.part)?),
+                };
+                write_json(&file, &self.sample(variant, seed, reference)?)?;
+            }
+            samples.push(read_json(&file)?);
+        }
+        Ok(Some(Point::new(&self.scene.name, variant, samples)))
+    }
+
+    /// What a track is compared with.
+    fn reference(&self, part: Part) -> anyhow::Result<Reference> {
+        match (part, &self.scene.recover) {
+            (Part::Light, Some(recover)) => self.true_picture(recover),
+            _ => self.converged_picture(),
+        }
+    }
+
+    fn sample(
+        &self,
+        variant: &Variant,
+        seed: u64,
+        reference: &Reference,
+    ) -> anyhow::Result<Sample> {
+        match (variant.part, &self.scene.recover) {
+            (Part::Light, Some(recover)) => self.light(recover, variant, seed, reference),
+            _ => self.render(variant, seed, reference),
+        }
+    }
+
+    /// What is already measured of `variant`.
+    pub fn measured(&self, variant: &Variant) -> anyhow::Result<Vec<Sample>> {
+        (0..)
+            .map(|seed| self.sample_file(variant, seed))
+            .take_while(|file| file.is_file())
+            .map(|file| read_json(&file))
+            .collect()
+    }
+
+    fn sample_file(&self, variant: &Variant, seed: u64) -> PathBuf {
+        let name = format!("{}-{seed}.json", key(&beyond_standard(&variant.set)));
+        let folder = self.out.join("points").join(folder_name(&self.scene.name));
+        folder.join(variant.part.name()).join(name)
+    }
+
+    fn render(
+        &self,
+        variant: &Variant,
+        seed: u64,
+        reference: &Reference,
+    ) -> anyhow::Result<Sample> {
+        // Runs that differ in [composite] alone share what dipir-scene made.
+        let concerns_scene = |key: &str| !key.starts_with("composite.");
+        let set_up: Vec<_> = variant
+            .set
+            .iter()
+            .filter(|(k, _)| concerns_scene(k))
+            .cloned()
+            .collect();
+        let folder = self.work().join(format!("{}-{seed}", key(&set_up)));
+        let kept = folder.join("cost.json");
+        if !kept.is_file() {
+            let ran = self.stage("dipir-scene", &self.scene.lit, &folder, seed, &set_up)?;
+            write_json(
+                &kept,
+                &[ran.cpu_s.unwrap_or(ran.wall_s), ran.wall_s, rss(&ran.json)],
+            )?;
+        }
+        let [scene_cost, scene_wall, scene_rss]: [f64; 3] = read_json(&kept)?;
+        let ran = self.stage(
+            "dipir-composite",
+            &self.scene.lit,
+            &folder,
+            seed,
+            &variant.set,
+        )?;
+        let found = DisplayedComposite::read(&folder.join("composite/composite.exr"))?;
+        let _ = fs::remove_dir_all(folder.join("composite"));
+        Ok(Sample {
+            seed,
+            error: reference.error_of(&found.picture),
+            stated_error: ran.json["estimated_error"].as_f64(),
+            cost_s: scene_cost + ran.cpu_s.unwrap_or(ran.wall_s),
+            wall_s: scene_wall + ran.wall_s,
+            peak_rss_bytes: rss(&ran.json).max(scene_rss) as u64,
+        })
+    }
+
+    fn light(
+        &self,
+        recover: &Path,
+        variant: &Variant,
+        seed: u64,
+        reference: &Reference,
+    ) -> anyhow::Result<Sample> {
+        // A record too small to use: dipir-light makes its own, so that its cost is that of recording
+        // and optimising, without planning.
+        let folder = self.work().join(format!("recover-{seed}"));
+        if !folder.join("scene/stage.json").is_file() {
+            let tiny = settings(&[
+                ("light.samples", "1"),
+                ("light.size", "8"),
+                ("light.environment", "[8, 4]"),
+            ]);
+            self.stage("dipir-scene", recover, &folder, seed, &tiny)?;
+        }
+        let ran = self.stage("dipir-light", recover, &folder, seed, &variant.set)?;
+        let picture = settings(&[("composite.target_error", PICTURE_ERROR)]);
+        self.stage("dipir-composite", recover, &folder, seed, &picture)?;
+        let found = DisplayedComposite::read(&folder.join("composite/composite.exr"))?;
+        Ok(Sample {
+            seed,
+            error: reference.error_of(&found.picture),
+            stated_error: ran.json["rmse"].as_f64(),
+            cost_s: ran.cpu_s.unwrap_or(ran.wall_s),
+            wall_s: ran.wall_s,
+            peak_rss_bytes: rss(&ran.json) as u64,
+        })
+    }
+}
+
+fn load(exr: &Path) -> anyhow::Result<Reference> {
+    let composite = DisplayedComposite::read(exr)?;
+    Ok(Reference {
+        touched: composite.touched().any,
+        picture: composite.picture,
+    })
+}
+
+/// Keys and values.
+fn settings(set: &[(&str, &str)]) -> Vec<(String, String)> {
+    set.iter()
+        .map(|(k, v)| (k.to_string(), v.to_string()))
+        .collect()
+}
+
+fn rss(json: &Value) -> f64 {
+    json["peak_rss_bytes"].as_f64().unwrap_or(0.0)
+}
+
+/// A short name for settings.
+fn key(set: &[(String, String)]) -> String {
+    let text: Vec<String> = set.iter().map(|(k, v)| format!("{k}={v}")).collect();
+    blake3::hash(text.join("\n").as_bytes()).to_hex()[..12].to_owned()
+}
+
+fn folder_name(scene: &str) -> String {
+    let keep = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
+    scene.chars().map(keep).collect()
+}

@@ -1,0 +1,139 @@
+//! The whole sweep: which points are measured, and what is written of them.
+use std::path::PathBuf;
+
+use dipir_cli::executables::Executables;
+use dipir_cli::exit::Usage;
+use dipir_cli::interrupt;
+use serde_json::json;
+
+use crate::command_line::{Cli, Track};
+use crate::knobs::{self, Part, Variant};
+use crate::measure::{Point, SceneMeasurement};
+use crate::scenes::{self, Scene};
+use crate::tables;
+
+/// The point that is measured next.
+pub struct Step<'a> {
+    /// Points before it.
+    pub done: usize,
+    /// Points in all.
+    pub total: usize,
+    /// The scene.
+    pub scene: &'a str,
+    /// The series.
+    pub series: &'a str,
+    /// What tells it from others of the series.
+    pub label: &'a str,
+}
+
+/// What was measured.
+pub struct Outcome {
+    /// Points.
+    pub points: usize,
+    /// Tables and plots.
+    pub files: Vec<PathBuf>,
+}
+
+/// Measures what is not measured yet, and writes tables and plots. `report` is told of every point
+/// before it is measured.
+///
+/// # Errors
+/// If the arguments name what is not there, an executable fails, or the user interrupts.
+pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome> {
+    if !(cli.reference_error > 0.0 && cli.reference_error < 1.0) || cli.repeats == 0 {
+        let text = "--reference-error must lie above 0 and below 1, --repeats must be at least 1";
+        return Err(Usage(text.into()).into());
+    }
+    interrupt::listen()?;
+    let executables = Executables::beside_this()?;
+    let scenes = chosen_scenes(cli)?;
+    let parts = chosen_parts(cli)?;
+    // A scene of another size is another scene.
+    let [width, height] = cli.size;
+    let out = cli.out.join(match cli.pipeline.is_empty() {
+        true => format!("{width}x{height}"),
+        false => "projects".into(),
+    });
+    let measurement = |scene| SceneMeasurement {
+        executables: &executables,
+        out: &out,
+        scene,
+        threads: cli.threads,
+        reference_error: cli.reference_error,
+    };
+    let mut work: Vec<(&Scene, Variant)> = Vec::new();
+    for &part in parts {
+        for scene in &scenes {
+            let effects = match part {
+                Part::Render => measurement(scene).effects_on()?,
+                Part::Light => Vec::new(),
+            };
+            let variants = knobs::variants(part, &effects, cli.joint).into_iter();
+            let wanted = |v: &Variant| cli.knob.is_empty() || cli.knob.contains(&v.series);
+            work.extend(variants.filter(wanted).map(|v| (scene, v)));
+        }
+    }
+    if work.is_empty() {
+        let known = knobs::names().join(", ");
+        let text = format!("no point is left to measure; --knob accepts: {known}");
+        return Err(Usage(text).into());
+    }
+    let mut points: Vec<Point> = Vec::new();
+    for (n, (scene, variant)) in work.iter().enumerate() {
+        report(Step {
+            done: n,
+            total: work.len(),
+            scene: &scene.name,
+            series: &variant.series,
+            label: &variant.label,
+        });
+        let measurement = measurement(scene);
+        points.extend(match cli.report_only {
+            false => measurement.measure(variant, cli.repeats)?,
+            true => Some(measurement.measured(variant)?)
+                .filter(|samples| !samples.is_empty())
+                .map(|samples| Point::new(&scene.name, variant, samples)),
+        });
+    }
+    let about = json!({
+        "size": cli.size, "repeats": cli.repeats, "joint": cli.joint,
+        "reference_error": cli.reference_error, "threads": cli.threads,
+        "version": env!("CARGO_PKG_VERSION"),
+    });
+    Ok(Outcome {
+        points: points.len(),
+        files: tables::write_all(&points, &about, &cli.out)?,
+    })
+}
+
+fn chosen_parts(cli: &Cli) -> anyhow::Result<&'static [Part]> {
+    Ok(match (cli.track, cli.pipeline.is_empty()) {
+        (Track::Light, false) => {
+            let text = "--track light measures the built-in scenes alone: leave out --pipeline";
+            return Err(Usage(text.into()).into());
+        }
+        (Track::Render, _) | (Track::All, false) => &[Part::Render],
+        (Track::Light, true) => &[Part::Light],
+        (Track::All, true) => &[Part::Render, Part::Light],
+    })
+}
+
+fn chosen_scenes(cli: &Cli) -> anyhow::Result<Vec<Scene>> {
+    if !cli.pipeline.is_empty() {
+        return Ok(cli.pipeline.iter().map(|p| scenes::given(p)).collect());
+    }
+    let names: Vec<&str> = match cli.scene.is_empty() {
+        true => scenes::NAMES.to_vec(),
+        false => cli.scene.iter().map(String::as_str).collect(),
+    };
+    let [width, height] = cli.size;
+    let folder = cli.out.join(format!("{width}x{height}")).join("scenes");
+    let make = |name: &str| {
+        if !scenes::NAMES.contains(&name) {
+            let text = format!("--scene \"{name}\": accepted: {}", scenes::NAMES.join(", "));
+            return Err(Usage(text).into());
+        }
+        scenes::built_in(name, &folder.join(name.replace(' ', "-")), cli.size)
+    };
+    names.into_iter().map(make).collect()
+}
