@@ -32,7 +32,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let outcome = run(&settings, &|p| {
         match p {
             Progress::Training(f, done, loss) => {
-                if shown.fetch_add(1, Ordering::Relaxed) % 40 == 0 {
+                if shown.fetch_add(1, Ordering::Relaxed).is_multiple_of(40) {
                     eprintln!("fold {f}: {:.0}%, loss {loss:.4}", 100.0 * done);
                 }
             }

@@ -16,6 +16,7 @@ use crate::{PlacesError, Settings, run};
 fn panorama(grey: f32) -> EnvironmentMap {
     let sun = dipir_estimator::grid::direction(std::f32::consts::FRAC_PI_2, 0.698);
     let black = EnvironmentMap::constant(128, 64, Vec3::ZERO);
+    let disc = black.texel_of(sun);
     let texel = |k: usize| {
         let d = black.direction_of(k / 128, k % 128);
         let sky = if d.y > 0.0 {
@@ -24,8 +25,8 @@ fn panorama(grey: f32) -> EnvironmentMap {
             Vec3::splat(grey)
         };
         let lit = sky * (1.0 + 0.3 * d.x);
-        if d.dot(sun) > 0.9985 {
-            lit + Vec3::splat(400.0)
+        if (k / 128, k % 128) == disc {
+            lit + Vec3::splat(2000.0)
         } else {
             lit
         }
