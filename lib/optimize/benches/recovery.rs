@@ -130,6 +130,7 @@ fn truth(name: &str) -> (Truth, Vec3) {
         let lobes = [&[peak], others].concat();
         // Not the first lobe's own direction: where it is wide, the others move the sum's peak.
         let light = Lighting {
+            sources: 0,
             exposure: 1.0,
             lobes: lobes.clone(),
             fusion_residual: 0.0,
