@@ -188,6 +188,7 @@ mod tests {
 
     fn light(lobes: Vec<SphericalGaussian>) -> Lighting {
         Lighting {
+            sources: 0,
             exposure: 1.0,
             lobes,
             fusion_residual: 0.0,
