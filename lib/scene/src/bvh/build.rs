@@ -89,8 +89,11 @@ pub fn build(
 }
 
 fn binary(triangles: &[[Vec3; 3]], compare: impl Fn(u32, u32) -> Ordering + Sync) -> Binary {
-    let (mut tree, _) = cluster(triangles, &order(triangles, compare));
-    ReinsertionOptimizer::default().run(&mut tree, REINSERTION, None);
+    let clustering = cluster(triangles, &order(triangles, compare));
+    let mut tree = clustering.tree;
+    if !clustering.stalled {
+        ReinsertionOptimizer::default().run(&mut tree, REINSERTION, None);
+    }
     let corner = |p: [f32; 3]| Vec3::from_array(p);
     Binary {
         boxes: tree

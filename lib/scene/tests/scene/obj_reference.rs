@@ -118,8 +118,12 @@ proptest! {
     fn triangles_and_normals_are_those_that_tobj_reads(
         positions in proptest::collection::vec([number(), number(), number()], 3..12),
         normals in proptest::collection::vec(normal(), 1..6),
-        faces in proptest::collection::vec(face(), 1..8),
+        mut faces in proptest::collection::vec(face(), 1..8),
+        with_normals in any::<bool>(),
     ) {
+        // In a file with normals `tobj` gives some to every corner.
+        faces.iter_mut().for_each(|f| f.with_normals = with_normals);
+        let normals = if with_normals { normals } else { Vec::new() };
         let text = text(&positions, &normals, &faces);
         let expected = reference(&text);
         let read = load_obj_bytes(text.as_bytes(), &NoFiles, &Limits::default());
