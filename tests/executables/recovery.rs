@@ -190,7 +190,7 @@ fn a_scene_without_a_record_is_recorded_when_light_is_recovered() {
     assert!(!project.path("known/scene/transport.safetensors").exists());
     assert!(
         run.stdout
-            .contains("light transport: not recorded, for [composite] environment gives the light"),
+            .contains("light transport: not recorded, for no light is optimised"),
         "{}",
         run.stdout
     );

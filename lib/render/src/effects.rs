@@ -59,13 +59,11 @@ pub enum Effect {
     BounceFromProxy,
     /// The photo's own foreground in front of the object.
     Occluders,
-    /// Blur of a moving camera or object.
-    Motion,
 }
 
 impl Effect {
     /// Every effect, in the order of the files.
-    pub const ALL: [Effect; 15] = [
+    pub const ALL: [Effect; 14] = [
         Effect::Shadow,
         Effect::ProxyOcclusion,
         Effect::Interreflection,
@@ -80,7 +78,6 @@ impl Effect {
         Effect::BounceToProxy,
         Effect::BounceFromProxy,
         Effect::Occluders,
-        Effect::Motion,
     ];
 
     /// The name in configuration and files.
@@ -100,7 +97,6 @@ impl Effect {
             Effect::BounceToProxy => "bounce_to_proxy",
             Effect::BounceFromProxy => "bounce_from_proxy",
             Effect::Occluders => "occluders",
-            Effect::Motion => "motion",
         }
     }
 
@@ -308,7 +304,6 @@ fn absence(scene: &Scene, settings: &Settings, effect: Effect) -> Option<&'stati
             settings.occluders.is_none(),
             "no mask of the photo's foreground is given",
         ),
-        Effect::Motion => Some("camera and object stand still"),
     }
 }
 

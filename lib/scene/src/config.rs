@@ -190,7 +190,6 @@ effects_config! {
     bounce_to_proxy: "Light that the object reflects onto the proxy.",
     bounce_from_proxy: "Light that the proxy reflects onto the object.",
     occluders: "The photo's own foreground in front of the object.",
-    motion: "Blur of a moving camera or object.",
 }
 
 impl EffectsConfig {

@@ -238,7 +238,7 @@ mod tests {
             (Vec3::new(0.0, 0.0, 20.0), "behind the camera"),
             (Vec3::new(-40.0, 0.0, 0.0), "left of the picture"),
             (Vec3::new(40.0, 0.0, 0.0), "right of the picture"),
-            (Vec3::new(0.0, 40.0, 0.0), "above the picture"),
+            (Vec3::new(0.0, 4.0, 0.0), "above the picture"),
             (Vec3::new(0.0, -5.0, 0.0), "below the ground"),
             (Vec3::new(0.3, 0.0, -4000.0), "pixels of the picture"),
         ] {

@@ -67,7 +67,6 @@ fn a_matte_convex_object_needs_no_interreflection_and_only_what_it_has() {
             Effect::Occluders,
             "no mask of the photo's foreground is given",
         ),
-        (Effect::Motion, "camera and object stand still"),
     ] {
         let e = find(&p, effect);
         assert_eq!((e.enabled, e.reason.as_str()), (false, reason));

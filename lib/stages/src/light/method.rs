@@ -35,14 +35,18 @@ impl Method {
             return Ok(Self::Given);
         }
         let stands = table.iterations == Some(0);
-        Ok(match table.guidance.resolved(model.path.is_some()) {
-            GuidanceKind::Reference => Self::Reference,
-            GuidanceKind::None | GuidanceKind::Auto => Self::Start,
-            _ if stands && !asks_model(&table) => Self::Start,
-            _ => Self::Model {
-                adapted: table.adapt.unwrap_or(true) && !stands,
+        // Who asks for what a model reads asks for the model.
+        let asks_model = asks_model(&table);
+        Ok(
+            match table.guidance.resolved(model.path.is_some() || asks_model) {
+                GuidanceKind::Reference => Self::Reference,
+                GuidanceKind::None | GuidanceKind::Auto => Self::Start,
+                _ if stands && !asks_model => Self::Start,
+                _ => Self::Model {
+                    adapted: table.adapt.unwrap_or(true) && !stands,
+                },
             },
-        })
+        )
     }
 
     /// Why no diffusion model is asked; `None` if one is.

@@ -197,7 +197,7 @@ fn model_guide(session: &Session, table: &LightTable, adapted: bool) -> anyhow::
         }),
     };
     let table = LightTable {
-        guidance: table.guidance.resolved(model.path.is_some()),
+        guidance: table.guidance.resolved(true),
         adapt: Some(adapted),
         ..table.clone()
     };
