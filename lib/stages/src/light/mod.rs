@@ -542,7 +542,7 @@ fn rows_without_times(history: &[Row]) -> anyhow::Result<Vec<Value>> {
 }
 
 /// An estimate in a sentence.
-fn in_words(estimate: &LightEstimate) -> String {
+pub(crate) fn in_words(estimate: &LightEstimate) -> String {
     let (azimuth, elevation) = (estimate.azimuth_deg, estimate.elevation_deg);
     format!(
         "estimated: most light {}; in four photographs of five its azimuth is {:.0} to {:.0} degrees to the \

@@ -1,4 +1,7 @@
 //! The light with its lobes, the tone curves, and how both were found.
+use std::path::PathBuf;
+
+use dipir_estimator::LightEstimate;
 use dipir_imaging::file::read_photo;
 use dipir_imaging::spline::Knots;
 use dipir_imaging::tone::ToneCurves;
@@ -7,6 +10,7 @@ use dipir_light::environment::{EnvironmentMap, texel_of};
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::luminance::luminance_f64;
 use dipir_optimize::lighting::Lighting;
+use dipir_pipeline::manifest::Manifest;
 use dipir_plotting::chart::{Chart, Mark, Series};
 use dipir_plotting::number;
 use glam::Vec3;
@@ -38,14 +42,31 @@ pub fn section(report: &Report) -> Section {
     }
     let lighting = Lighting::read(&run.1.output(&run.0, "lighting")?)?;
     let curves = ToneCurves::read_json(run.1.output(&run.0, "tone")?)?;
-    let history: Vec<Value> = json(&run, "history")?;
-    let mut parts = vec![map(
-        &lighting.map(MAP_WIDTH, MAP_WIDTH / 2),
-        &strongest(&lighting.exposed_lobes()),
+    let has = |role: &str| run.1.outputs.iter().any(|o| o.role == role);
+    let history: Vec<Value> = match has("history") {
+        true => json(&run, "history")?,
+        false => vec![],
+    };
+    let environment = EnvironmentMap::read(run.1.output(&run.0, "environment")?)?;
+    // Where the surroundings are a map, the lobes that belong to the light are its sources.
+    let mut own = lighting.exposed_lobes();
+    if has("surroundings") {
+        own.truncate(lighting.sources);
+    }
+    let own = strongest(&own);
+    let mut parts = vec![];
+    if has("estimate") {
+        parts.push(estimate(&run)?);
+    }
+    parts.push(map(
+        &environment.resampled(MAP_WIDTH, MAP_WIDTH / 2),
+        &own,
         report.truth.and_then(|t| t.peak),
         "the recovered light: latitude and longitude, +z in the middle, +x to its left",
-    )?];
-    parts.push(lobes(&strongest(&lighting.exposed_lobes())));
+    )?);
+    if !own.is_empty() {
+        parts.push(lobes(&own));
+    }
     let plots: Vec<_> = [tone(&curves)]
         .into_iter()
         .chain(losses(&history))
@@ -66,6 +87,24 @@ pub fn section(report: &Report) -> Section {
     Ok(Some(Html::all(parts)))
 }
 
+/// What was estimated from the photograph, with how sure it is, and the lights to choose among.
+fn estimate(run: &(PathBuf, Manifest)) -> anyhow::Result<Html> {
+    let estimate: LightEstimate = json(run, "estimate")?;
+    let sentence = Html::of("p", crate::light::in_words(&estimate));
+    let candidates: Vec<Value> = json(run, "candidates")?;
+    let rows = candidates.iter().map(|c| {
+        let chance = c["probability"].as_f64().unwrap_or(0.0);
+        vec![
+            Html::text(c["candidate"].to_string()),
+            Html::text(format!("{:.0}%", 100.0 * chance)),
+            Html::text(c["words"].as_str().unwrap_or_default()),
+            Html::of("code", format!("--set light.candidate={}", c["candidate"])),
+        ]
+    });
+    let heads = [">candidate", ">probability", "light", "to use it"];
+    Ok(Html::all([sentence, table(&heads, rows.collect())]))
+}
+
 /// The map of `[composite] environment`.
 fn given(report: &Report) -> Section {
     let table = report.session.config.table("composite")?;
@@ -78,7 +117,7 @@ fn given(report: &Report) -> Section {
 }
 
 /// What was recovered of materials.
-fn materials(run: &(std::path::PathBuf, dipir_pipeline::manifest::Manifest)) -> Section {
+fn materials(run: &(PathBuf, Manifest)) -> Section {
     let found: Vec<Value> = json(run, "materials")?;
     let rows = found.iter().map(|m| {
         let text = |key: &str| match &m[key] {
