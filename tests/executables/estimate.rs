@@ -1,0 +1,127 @@
+//! Light estimated from the photograph alone: what happens where a configuration names none.
+use dipir_light::environment::EnvironmentMap;
+use dipir_optimize::lighting::Lighting;
+use serde_json::{Value, json};
+
+use crate::project::*;
+
+/// A project that names no light.
+fn project() -> Project {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write(
+        "pipeline.toml",
+        text.replace("environment = \"sky.exr\"\n", ""),
+    );
+    project
+}
+
+fn lit(project: &Project, args: &[&str]) -> Value {
+    project.run(SCENE, &[]).expect_success();
+    project.run(OPTIMIZE, args).expect_success();
+    serde_json::from_slice(&project.read("out/light/estimate.json")).unwrap()
+}
+
+#[test]
+fn a_photograph_without_a_light_asks_no_model_and_records_nothing() {
+    let project = project();
+    let run = project.run(DIPIR, &["run", "--json"]);
+    run.expect_success();
+    let value: Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!(value["ran"], json!(["scene", "light", "composite"]));
+    assert!(!project.path("out/scene/transport.safetensors").exists());
+    for name in [
+        "estimate.json",
+        "candidates.json",
+        "surroundings.exr",
+        "environment.exr",
+        "tone.json",
+    ] {
+        assert!(project.path("out/light").join(name).is_file(), "{name}");
+    }
+    let page = String::from_utf8(project.read("out/report.html")).unwrap();
+    assert!(page.contains("estimated: most light") && !page.contains("Not shown"));
+}
+
+#[test]
+fn the_estimate_depends_on_photograph_and_camera_alone() {
+    let project = project();
+    lit(&project, &[]);
+    let first = project.read("out/light/estimate.json");
+    project.write("object.obj", OBJECT.replace("1.1", "0.4"));
+    lit(
+        &project,
+        &["-s", "pipeline.seed=7", "-s", "pipeline.quality=high"],
+    );
+    assert!(project.read("out/light/estimate.json") == first);
+    lit(
+        &project,
+        &["-s", "scene.class=car", "-s", "pipeline.threads=1"],
+    );
+    assert!(project.read("out/light/estimate.json") == first);
+}
+
+#[test]
+fn a_sun_that_is_known_becomes_a_source_where_it_is() {
+    let project = project();
+    let sun =
+        "light.sun={azimuth_deg = 60.0, elevation_deg = 40.0, sure_deg = 1.0, size_deg = 0.27}";
+    lit(&project, &["-s", sun]);
+    let light = Lighting::read(&project.path("out/light/lighting.json")).unwrap();
+    assert_eq!(light.sources, 1);
+    // The camera looks along -z, slightly down: 60 degrees to the right of it and 40 up.
+    let (azimuth, elevation) = (60f32.to_radians(), 40f32.to_radians());
+    let wanted = glam::Vec3::new(
+        azimuth.sin() * elevation.cos(),
+        elevation.sin(),
+        -azimuth.cos() * elevation.cos(),
+    );
+    let apart = light.lobes[0].direction.angle_between(wanted).to_degrees();
+    assert!(apart < 0.1, "{apart} degrees");
+    let map = EnvironmentMap::read(project.path("out/light/environment.exr")).unwrap();
+    assert!(map.peak().0.angle_between(wanted).to_degrees() < 1.0);
+    project.run(COMPOSITE, &[]).expect_success();
+}
+
+#[test]
+fn candidates_are_chosen_by_number_and_one_that_is_not_there_is_refused() {
+    let project = project();
+    lit(&project, &[]);
+    let mean = project.read("out/light/lighting.json");
+    lit(&project, &["-s", "light.candidate=2"]);
+    assert!(project.read("out/light/lighting.json") != mean);
+    let run = project.run(OPTIMIZE, &["-s", "light.candidate=9"]);
+    assert_eq!(run.code, Some(2));
+    assert!(run.stderr.contains("accepted: 1 to 8"), "{}", run.stderr);
+}
+
+#[test]
+fn what_the_photograph_shows_is_in_the_map_unless_it_is_turned_off() {
+    let project = project();
+    lit(&project, &[]);
+    let ahead = |project: &Project| {
+        let map = EnvironmentMap::read(project.path("out/light/environment.exr")).unwrap();
+        map.eval(glam::Vec3::NEG_Z)
+    };
+    let with = ahead(&project);
+    lit(&project, &["-s", "light.visible=false"]);
+    let without = ahead(&project);
+    // The photograph is greenish there: display values of about .55, .57, .55.
+    assert!(with.y > with.x && with != without, "{with} {without}");
+}
+
+#[test]
+fn a_lighting_of_lobes_alone_written_by_hand_is_enough() {
+    let project = project();
+    project.write(
+        "mine.json",
+        r#"{"lobes": [{"direction": [0, 1, 0], "radiance": [1, 1, 1], "sigma": 10}]}"#,
+    );
+    project.run(SCENE, &[]).expect_success();
+    project
+        .run(OPTIMIZE, &["-s", "light.start=mine.json"])
+        .expect_success();
+    let light = Lighting::read(&project.path("out/light/lighting.json")).unwrap();
+    assert_eq!((light.lobes.len(), light.exposure), (1, 1.0));
+    project.run(COMPOSITE, &[]).expect_success();
+}
