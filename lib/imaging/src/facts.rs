@@ -219,16 +219,28 @@ impl Fields<'_> {
         (!text.is_empty()).then(|| text.chars().filter(|c| !c.is_control()).collect())
     }
 
+    /// Fractions. Some makers write the signed type where the standard has the unsigned one.
     fn rationals(&self, tag: Tag) -> Option<Vec<f64>> {
-        let Value::Rational(parts) = self.value(tag)? else {
-            return None;
-        };
         // The seconds of a place may be left out as 0/0.
-        let of = |r: &exif::Rational| match r.denom {
-            0 => 0.0,
-            _ => r.to_f64(),
+        let quotient = |numerator: f64, denominator: f64| match denominator == 0.0 {
+            true => 0.0,
+            false => numerator / denominator,
         };
-        Some(parts.iter().map(of).collect())
+        match self.value(tag)? {
+            Value::Rational(parts) => Some(
+                parts
+                    .iter()
+                    .map(|r| quotient(f64::from(r.num), f64::from(r.denom)))
+                    .collect(),
+            ),
+            Value::SRational(parts) => Some(
+                parts
+                    .iter()
+                    .map(|r| quotient(f64::from(r.num), f64::from(r.denom)))
+                    .collect(),
+            ),
+            _ => None,
+        }
     }
 
     /// A finite number, as a fraction or whole.

@@ -606,13 +606,14 @@ impl fmt::Display for Done {
             self.folder.display(),
             duration(self.manifest.elapsed_s)
         )?;
-        write!(
-            f,
-            "  {} iterations on {} x {} pixels",
-            self.found.history.len(),
-            self.size[0],
-            self.size[1]
-        )?;
+        match self.found.history.len() {
+            0 => write!(f, "  nothing was optimised: the start is the light")?,
+            n => write!(
+                f,
+                "  {n} iterations on {} x {} pixels",
+                self.size[0], self.size[1]
+            )?,
+        }
         if let Some(rmse) = self.found.rmse {
             write!(f, ", {rmse:.5} of display-referred RMSE from the reference")?;
         }
