@@ -1,5 +1,4 @@
 //! `dipir keys`.
-use anyhow::anyhow;
 use clap::Args;
 use dipir_cli::args::OutputArgs;
 use dipir_cli::exit::Usage;
@@ -48,9 +47,10 @@ pub fn run(args: &KeysArgs) -> anyhow::Result<()> {
 
 fn none(word: &str) -> anyhow::Error {
     let meant = keys::like(word).map_or(String::new(), |key| format!("did you mean {key}? "));
-    anyhow!(Usage(format!(
+    Usage(format!(
         "no key has \"{word}\" in its name or description; {meant}dipir keys shows all of them"
-    )))
+    ))
+    .into()
 }
 
 fn in_words(tables: &[Table]) -> String {

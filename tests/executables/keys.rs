@@ -36,7 +36,7 @@ fn keys_are_found_by_a_word_of_their_name_or_description() {
     let camera = tables.iter().find(|t| t["name"] == "scene.camera").unwrap();
     let key = &camera["keys"][0];
     assert_eq!(key["key"], "scene.camera.fov_deg");
-    assert_eq!(key["accepted"], "number, above 0 below 180");
+    assert_eq!(key["accepted"], "number, above 0, below 180");
     assert_eq!(key["example"], "40.0");
 }
 

@@ -107,10 +107,9 @@ pub struct LightTable {
     /// Where the optimisation starts, and what `recover_light = false` keeps: `auto`, `estimated`
     /// (from the photograph), `read` or `encoder` (by a model that knows light), `neutral` (nearly
     /// uniform), or a `lighting.json`.
-    #[schemars(with = "String", extend("format" = "path"), example = &"neutral")]
+    #[schemars(with = "String", extend("anyOf" = [{"enum": ["auto", "estimated", "read", "encoder", "neutral"]}, {"format": "path"}]), example = &"neutral")]
     pub start: Start,
-    /// With an estimated start: number of the candidate that is used, from 1, as `out/light` lists
-    /// them.
+    /// With an estimated start: the candidate of `candidates.json` that is used, counted from 1.
     #[schemars(range(min = 1), extend("x-default" = "the mean of all"), example = 2)]
     pub candidate: Option<usize>,
     /// With an estimated start: what is known of the sun. Without it, what the photograph's own
@@ -119,11 +118,11 @@ pub struct LightTable {
     /// With an estimated start: a shadow drawn on the photograph, from an object's foot to the tip.
     pub shadow: Option<ShadowTable>,
     /// Whether what the photograph shows belongs to the light.
-    #[schemars(extend("x-default" = "true with an estimated start, else false"), example = false)]
+    #[schemars(extend("x-default" = "true with an estimated start that no model guides, else false"), example = false)]
     pub visible: Option<bool>,
     /// With a diffusion model: least and largest noise that it is asked at, as shares of its
     /// timesteps from 0 to 1. A second pair is reached linearly in the last iteration.
-    #[schemars(extend("x-default" = "the model's own"), extend("examples" = [[[0.02, 0.6], [0.02, 0.3]]]))]
+    #[schemars(extend("x-default" = "`[[0.5, 0.9]]` with a model that knows light, else `[[0.02, 0.6], [0.02, 0.3]]`"), extend("examples" = [[[0.02, 0.6], [0.02, 0.3]]]))]
     pub timesteps: Option<Vec<[f64; 2]>>,
     /// With a diffusion model: what the picture should show.
     #[schemars(extend("x-default" = "from `scene.class`, `lora.word` and the light"), example = &"a photo of a red car at noon")]
@@ -201,20 +200,20 @@ pub struct LightTable {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearningRates {
-    /// Of log-radiance, nats a step: 0.1 is 10%.
+    /// Rate of log-radiance, nats a step: 0.1 is 10%.
     #[schemars(range(min = 0.0, max = 1.0), example = 0.05)]
     pub radiance: f64,
-    /// Of directions, about radians a step: 0.02 is 1.1 degrees.
+    /// Rate of directions, about radians a step: 0.02 is 1.1 degrees.
     #[schemars(range(min = 0.0, max = 1.0), example = 0.01)]
     pub direction: f64,
-    /// Of the log of a lobe's width, nats a step: 0.04 is 4%.
+    /// Rate of the log of a lobe's width, nats a step: 0.04 is 4%.
     #[schemars(range(min = 0.0, max = 1.0), example = 0.02)]
     pub sigma: f64,
-    /// Of the parameters of the tone curve, a step: slower than the light, which should explain
-    /// what it can.
+    /// Rate of the parameters of the tone curve, their own units a step: slower than the light,
+    /// which should explain what it can.
     #[schemars(range(min = 0.0, max = 1.0), example = 0.001)]
     pub tone: f64,
-    /// Of the log of the exposure, nats a step. It scales all radiance at once.
+    /// Rate of the log of the exposure, nats a step. It scales all radiance at once.
     #[schemars(range(min = 0.0, max = 1.0), example = 0.01)]
     pub exposure: f64,
 }

@@ -33,14 +33,14 @@ pub struct SceneConfig {
     /// size: white hides the object, black shows it.
     #[schemars(extend("format" = "path"), example = &"foreground.png")]
     pub occluders: Option<PathBuf>,
-    /// At least one.
+    /// The objects that are put into the photograph; at least one.
     #[serde(default)]
     pub objects: Vec<ObjectConfig>,
-    /// Required.
+    /// Where the photograph was taken from; required.
     pub camera: Option<CameraConfig>,
-    /// What receives the shadow; nothing if absent.
+    /// What receives the shadow: a plane or a mesh. Without this table nothing does.
     pub proxy: Option<ProxyConfig>,
-    /// What to simulate.
+    /// Which effects are simulated: `on`, `off`, or `auto`, for planning to decide.
     #[serde(default)]
     pub effects: EffectsConfig,
     /// How much files may ask for.
@@ -105,7 +105,7 @@ pub struct CameraConfig {
     /// Width of the sensor, millimetres; 36 is full frame. It belongs to `focal_mm`.
     #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "the photograph's own, from its Exif data"), example = 36.0)]
     pub sensor_mm: Option<f32>,
-    /// A nerfstudio `transforms.json` that holds the camera. It replaces the keys above.
+    /// A nerfstudio `transforms.json` that holds the camera. It replaces position, direction and field of view.
     #[schemars(extend("format" = "path"), example = &"transforms.json")]
     pub transforms: Option<PathBuf>,
     /// Which frame of `transforms` is the photograph, from 0.

@@ -28,7 +28,7 @@ pub struct Limits {
     /// Pixels of the photograph, millions. A pixel takes 18 bytes while it is read.
     #[schemars(example = 400)]
     pub photo_megapixels: u64,
-    /// Whether a file may name others outside of its folder, as `../wood.png` or `/tmp/wood.png`.
+    /// Whether a file may name others outside of its folder, as `../wood.png` or `/models/wood.png`.
     #[schemars(example = true)]
     pub allow_outside: bool,
 }

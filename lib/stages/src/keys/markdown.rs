@@ -3,15 +3,17 @@ use super::{Key, Table, tables};
 
 const HEAD: &str = "\
 # Keys
-Every key of `pipeline.toml`. `dipir keys WORD` finds those that a word names or describes, and `dipir keys
---schema > pipeline.schema.json` writes a JSON schema with which an editor completes and checks the file: Taplo
-takes it where the first line is `#:schema pipeline.schema.json`.
+Every key of `pipeline.toml`: what it accepts, what holds without it, an example, and what it is.
+`dipir keys WORD` shows the keys whose name or description contains the word.
 
-On the command line a key is set by its dotted name, as in `--set scene.camera.fov_deg=40.0`; `N` is the number
-of an object, from 0. Relative paths start from the folder of the file. A file of [demo](../pipeline.toml) size
-is enough for most photographs.
+On the command line a key is set by its dotted name, as in `--set scene.camera.fov_deg=40.0`; a number stands for
+`N`, 0 for the first object. Relative paths start from the folder of the file. The
+[demo's file](../pipeline.toml) is one to begin with.
 
-This page is written by `dipir keys --markdown`.
+An editor that knows Taplo completes and checks the file with the schema that
+`dipir keys --schema > pipeline.schema.json` writes, where the first line is `#:schema ./pipeline.schema.json`.
+
+`dipir keys --markdown` writes this page.
 ";
 
 /// All keys as a page of Markdown.

@@ -41,7 +41,7 @@ pub fn table_in_list(schema: &Value) -> Option<&Value> {
         .find_map(|s| table_in(&s["items"]))
 }
 
-/// The words that a key accepts, if it accepts no others.
+/// The words that a key accepts; it may accept more.
 pub fn words(schema: &Value) -> Vec<&str> {
     let all = alternatives(schema);
     let listed = all.iter().flat_map(|s| s["enum"].as_array());
@@ -52,25 +52,27 @@ pub fn words(schema: &Value) -> Vec<&str> {
 
 /// Type and range, in words.
 pub fn in_words(schema: &Value) -> String {
-    let words = words(schema);
-    if !words.is_empty() {
-        let words: Vec<String> = words.iter().map(|w| format!("`\"{w}\"`")).collect();
-        return words.join(", ");
-    }
-    let Some(one) = alternatives(schema).into_iter().next() else {
-        return "anything".into();
-    };
-    let kind = match () {
+    let mut all: Vec<String> = words(schema).iter().map(|w| format!("`\"{w}\"`")).collect();
+    let others = alternatives(schema).into_iter();
+    let others = others.filter(|s| s["enum"].is_null() && s["const"].is_null());
+    all.extend(
+        others.map(|one| match range(schema).or_else(|| range(one)) {
+            Some(range) => format!("{}, {range}", kind(schema, one)),
+            None => kind(schema, one),
+        }),
+    );
+    all.join(", ")
+}
+
+/// The type of one alternative of the schema.
+fn kind(schema: &Value, one: &Value) -> String {
+    match () {
         () if is(one, "boolean") => "`true` or `false`".into(),
         () if is(one, "integer") => "whole number".into(),
         () if is(one, "number") => "number".into(),
         () if is(one, "array") => list(one),
         () if one["format"] == "path" || schema["format"] == "path" => "path".into(),
-        () => "text".to_string(),
-    };
-    match range(schema).or_else(|| range(one)) {
-        Some(range) => format!("{kind}, {range}"),
-        None => kind,
+        () => "text".into(),
     }
 }
 
@@ -91,21 +93,23 @@ fn list(schema: &Value) -> String {
 
 fn range(schema: &Value) -> Option<String> {
     let bound = |keyword: &str| schema[keyword].as_f64();
-    let least = match (bound("exclusiveMinimum"), bound("minimum")) {
-        (Some(bound), _) => Some(format!("above {bound}")),
-        // What the type of the number refuses goes without saying.
-        (None, Some(0.0)) if bound("maximum").is_none() && is(schema, "integer") => None,
-        (None, least) => least.map(|bound| format!("from {bound}")),
-    };
-    let most = match (bound("exclusiveMaximum"), bound("maximum")) {
-        (Some(bound), _) => Some(format!("below {bound}")),
-        (None, most) => most.map(|bound| format!("to {bound}")),
-    };
-    match (least, most) {
-        (None, None) => None,
-        (Some(one), None) | (None, Some(one)) => Some(one),
-        (Some(least), Some(most)) => Some(format!("{least} {most}")),
+    let (least, most) = (bound("minimum"), bound("maximum"));
+    // What an unsigned number refuses goes without saying.
+    let least = least.filter(|b| *b != 0.0 || most.is_some() || !is(schema, "integer"));
+    if let (Some(least), Some(most)) = (least, most) {
+        return Some(format!("from {least} to {most}"));
     }
+    let limits = [
+        (bound("exclusiveMinimum"), "above"),
+        (least, "at least"),
+        (bound("exclusiveMaximum"), "below"),
+        (most, "at most"),
+    ];
+    let limits = limits
+        .iter()
+        .filter_map(|(b, word)| b.map(|b| format!("{word} {b}")));
+    let limits: Vec<String> = limits.collect();
+    (!limits.is_empty()).then(|| limits.join(", "))
 }
 
 /// The value as TOML.
