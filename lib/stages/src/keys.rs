@@ -107,20 +107,21 @@ pub fn schema() -> &'static Value {
         let settings = SchemaSettings::draft07().with(|s| s.inline_subschemas = true);
         let schema = settings.into_generator().into_root_schema_for::<File>();
         let mut schema = schema.to_value();
-        drop_defaults_of_tables(&mut schema);
+        drop_empty_defaults(&mut schema);
         schema
     })
 }
 
-/// The defaults of a table's keys stand with the keys.
-fn drop_defaults_of_tables(schema: &mut Value) {
+/// Drops the defaults of tables, which stand with their keys, and those that TOML cannot write.
+fn drop_empty_defaults(schema: &mut Value) {
     if let Some(fields) = schema.as_object_mut() {
-        if fields.contains_key("properties") {
+        let is_null = fields.get("default").is_some_and(Value::is_null);
+        if is_null || fields.contains_key("properties") {
             fields.shift_remove("default");
         }
-        fields.values_mut().for_each(drop_defaults_of_tables);
+        fields.values_mut().for_each(drop_empty_defaults);
     } else if let Some(items) = schema.as_array_mut() {
-        items.iter_mut().for_each(drop_defaults_of_tables);
+        items.iter_mut().for_each(drop_empty_defaults);
     }
 }
 
