@@ -1,5 +1,6 @@
 //! `dipir`: all stages with one command, each only if it has to run.
 mod clean;
+mod keys;
 mod manual;
 mod project;
 mod report;
@@ -21,6 +22,7 @@ Examples:
   dipir run --from light --force            that stage and all that read it, once more
   dipir status                              what would run, and why
   dipir report                              show the run as one page, out/report.html
+  dipir keys shadow                         keys of pipeline.toml that are about shadows
   dipir clean                               remove what the stages wrote
 
 Stages: scene concepts lora light composite. Each is an executable of its own and can be run by
@@ -47,6 +49,8 @@ enum Command {
     Report(report::ReportArgs),
     /// Remove what stages wrote
     Clean(clean::CleanArgs),
+    /// Show the keys of pipeline.toml: what they accept, their defaults, what they are
+    Keys(keys::KeysArgs),
     /// Print what makes a shell complete the options of an executable
     Completions(manual::CompletionsArgs),
     /// Print the manual page of an executable, or write those of all
@@ -60,6 +64,7 @@ fn main() -> ExitCode {
         Command::Graph(args) => status::graph(&args),
         Command::Report(args) => report::run(&args),
         Command::Clean(args) => clean::run(&args),
+        Command::Keys(args) => keys::run(&args),
         Command::Completions(args) => manual::completions(&args),
         Command::Man(args) => manual::man(&args),
     })

@@ -3,12 +3,14 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use dipir_cli::args::{CommonArgs, OutputArgs};
-use dipir_cli::exit::Usage;
+use dipir_cli::exit::{Usage, printable};
 use dipir_cli::session::Session;
 use dipir_pipeline::graph::Graph;
 use dipir_stages::graph;
 use dipir_stages::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE};
 use dipir_stages::report::quoted;
+
+use crate::suggestion;
 
 #[derive(Args, Clone, Debug)]
 pub struct ProjectArgs {
@@ -98,6 +100,15 @@ impl ProjectArgs {
                 second.display()
             );
             return Err(Usage(message).into());
+        }
+        let file = self.file();
+        if matches!(file.try_exists(), Ok(false)) {
+            let message = format!(
+                "there is no {}; name another file, as in dipir run photo/pipeline.toml, or {}",
+                file.display(),
+                suggestion::beginning()
+            );
+            return Err(Usage(printable(&message)).into());
         }
         let session = Session::open(&self.common())?;
         let graph = graph::graph(&session)?;

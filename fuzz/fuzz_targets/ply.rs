@@ -9,6 +9,7 @@ const LIMITS: Limits = Limits {
     texture_pixels: 1 << 22,
     all_texture_pixels: 1 << 22,
     file_bytes: 1 << 30,
+    photo_megapixels: 200,
     allow_outside: false,
 };
 

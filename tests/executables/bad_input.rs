@@ -19,7 +19,8 @@ fn a_misspelt_key_is_named_with_its_line() {
     project.run(SCENE, &[]).expect_error(
         2,
         "error: pipeline.toml:2: unknown key \"scene.backgruond\" (did you mean \"background\"?); \
-         [scene] accepts: background, transfer, class, occluders, objects, camera, proxy, effects",
+         [scene] accepts: background, transfer, class, occluders, objects, camera, proxy, effects, \
+         limits",
     );
 }
 
@@ -75,6 +76,17 @@ fn a_missing_configuration_points_at_the_option() {
     project.run(SCENE, &["-p", "none.toml"]).expect_error(
         2,
         "error: cannot read none.toml: no such file or directory; name another file with --pipeline",
+    );
+}
+
+#[test]
+fn a_photograph_beyond_the_configured_limit_is_refused() {
+    scene_fails(
+        &Project::new(),
+        "scene.limits.photo_megapixels=0",
+        1,
+        "error: the scene cannot be set up\n  caused by: `background.png` is 36 x 24 pixels (0.0 \
+         megapixels); the limit is 0: scale it down, or raise scene.limits.photo_megapixels",
     );
 }
 

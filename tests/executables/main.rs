@@ -6,6 +6,7 @@ mod evaluation;
 mod guidance;
 mod inspection;
 mod interruption;
+mod keys;
 mod kills;
 mod large;
 mod manual;

@@ -4,13 +4,14 @@ use std::path::PathBuf;
 
 use dipir_render::transport::Precision;
 use dipir_sun::table::{ShadowTable, SunTable};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::objective::Weights;
 use crate::tensors::Group;
 
 /// Where the gradient of the picture comes from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum GuidanceKind {
     /// `"auto"`: `"lds"` with a model of `[model] path`, `"none"` with the embedded one.
@@ -88,100 +89,132 @@ impl From<Start> for String {
 }
 
 /// The `[light]` table.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LightTable {
-    /// Steps of the optimiser; the quality's by default.
+    /// Steps of the optimiser; 0 keeps the light that it would start from.
+    #[schemars(range(min = 0, max = 1000000), example = 300)]
     pub iterations: Option<usize>,
-    /// Where the gradient of the picture comes from.
+    /// What guides the light. `auto`: `lds` with a model of `[model] path`, `none` with the
+    /// embedded one. `none`: the start is kept. `lds`, `sds`, `csd`: score distillation. `sdedit`:
+    /// what the model makes of the picture. `reference`: the picture `reference`.
+    #[schemars(example = &"lds")]
     pub guidance: GuidanceKind,
-    /// With `guidance = "reference"`: the picture that the composite should equal, EXR or HDR
-    /// (linear), PNG or JPEG (as the photograph is encoded), of the photograph's size.
+    /// With `guidance = "reference"`: the picture that the composite should equal, of the
+    /// photograph's size; EXR or HDR (linear), PNG or JPEG (encoded as the photograph).
+    #[schemars(extend("format" = "path"), example = &"reference.exr")]
     pub reference: Option<PathBuf>,
-    /// Where the optimisation starts, and what `recover_light = false` keeps: `"auto"`,
-    /// `"estimated"`, `"read"`, `"encoder"`, `"neutral"`, or a `lighting.json`.
+    /// Where the optimisation starts, and what `recover_light = false` keeps: `auto`, `estimated`
+    /// (from the photograph), `read` or `encoder` (by a model that knows light), `neutral` (nearly
+    /// uniform), or a `lighting.json`.
+    #[schemars(with = "String", extend("anyOf" = [{"enum": ["auto", "estimated", "read", "encoder", "neutral"]}, {"format": "path"}]), example = &"neutral")]
     pub start: Start,
-    /// With an estimated start: the number of one of its candidates, from 1, instead of their mean.
+    /// With an estimated start: the candidate of `candidates.json` that is used, counted from 1.
+    #[schemars(range(min = 1), extend("x-default" = "the mean of all"), example = 2)]
     pub candidate: Option<usize>,
     /// With an estimated start: what is known of the sun. Without it, what the photograph's own
     /// data say (time, place and heading).
     pub sun: Option<SunTable>,
     /// With an estimated start: a shadow drawn on the photograph, from an object's foot to the tip.
     pub shadow: Option<ShadowTable>,
-    /// Whether what the photograph shows belongs to the light; with an estimated start it does by
-    /// default.
+    /// Whether what the photograph shows belongs to the light.
+    #[schemars(extend("x-default" = "true with an estimated start that no model guides, else false"), example = false)]
     pub visible: Option<bool>,
     /// With a diffusion model: least and largest noise that it is asked at, as shares of its
-    /// timesteps. A second pair is reached linearly in the last iteration. The model's own by
-    /// default.
+    /// timesteps from 0 to 1. A second pair is reached linearly in the last iteration.
+    #[schemars(extend("x-default" = "`[[0.5, 0.9]]` with a model that knows light, else `[[0.02, 0.6], [0.02, 0.3]]`"), extend("examples" = [[[0.02, 0.6], [0.02, 0.3]]]))]
     pub timesteps: Option<Vec<[f64; 2]>>,
-    /// With a diffusion model: what the picture should show. From class, word and light by
-    /// default.
+    /// With a diffusion model: what the picture should show.
+    #[schemars(extend("x-default" = "from `scene.class`, `lora.word` and the light"), example = &"a photo of a red car at noon")]
     pub prompt: Option<String>,
-    /// With a diffusion model: draws of noise for each iteration.
+    /// With a diffusion model: draws of noise in each iteration.
+    #[schemars(range(min = 1, max = 64), extend("default" = 1), example = 4)]
     pub draws: Option<usize>,
-    /// With `guidance = "sds"`: scale of classifier-free guidance.
+    /// With `guidance = "sds"` or `"sdedit"`: scale of classifier-free guidance.
+    #[schemars(extend("default" = 7.5), example = 7.5)]
     pub guidance_scale: Option<f64>,
-    /// Whether the LoRA adapts the model that guides; it does by default.
+    /// Whether the LoRA adapts the model that guides.
+    #[schemars(extend("default" = true), example = false)]
     pub adapt: Option<bool>,
-    /// Lobes of each light set, where `start` does not say; the quality's by default.
+    /// Lobes of each light set, where `start` does not say.
+    #[schemars(range(min = 1, max = 1024), example = 48)]
     pub lobes: Option<usize>,
-    /// Longest side, in pixels, of the picture that is optimised: the photograph is scaled down to
-    /// it, never up. The quality's by default.
+    /// Longest side of the picture that is optimised, pixels: the photograph is scaled down to it,
+    /// never up.
+    #[schemars(range(min = 1, max = 16384), example = 256)]
     pub size: Option<usize>,
-    /// Columns and rows of the environment; the quality's by default.
+    /// Columns (2 to 2048) and rows (1 to 1024) of the environment map.
+    #[schemars(extend("examples" = [[128, 64]]))]
     pub environment: Option<[usize; 2]>,
-    /// Paths per pixel of the record; the quality's by default.
+    /// Paths per pixel of the record of light transport.
+    #[schemars(range(min = 1, max = 1 << 20), example = 256)]
     pub samples: Option<u32>,
-    /// How the record stores its weights; half where the environment has few enough texels.
+    /// How the record stores its weights: `half` takes half of the memory and holds at most 65536
+    /// texels.
+    #[schemars(extend("x-default" = "`half` where the environment has few enough texels, else `single`"), example = &"single")]
     pub precision: Option<Precision>,
     /// How far each parameter moves per step.
     pub learning_rates: LearningRates,
     /// Weight of the consistency of both light sets.
+    #[schemars(range(min = 0.0, max = 1e6), extend("default" = CONSISTENCY), example = 0.1)]
     pub consistency: Option<f64>,
     /// Weight of the regulariser of the shadow's light.
+    #[schemars(range(min = 0.0, max = 1e6), extend("default" = REGULARIZER), example = 0.05)]
     pub regularizer: Option<f64>,
-    /// Share of the iterations after which both light sets are fused, in (0, 1]; from there on one
-    /// light is optimised.
+    /// Share of the iterations after which both light sets are fused; from there on one light is
+    /// optimised.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1.0), extend("default" = FUSED_AFTER), example = 0.75)]
     pub fused_after: Option<f64>,
     /// Whether a reference is compared on random crops, as a diffusion model sees the picture,
     /// instead of as a whole.
+    #[schemars(example = true)]
     pub crops: bool,
     /// Names of materials to recover from the reference instead of the light, under the known light
-    /// of `[composite] environment`: base colour, metalness, roughness and strength of emission.
+    /// of `composite.environment`: base colour, metalness, roughness and strength of emission.
+    #[schemars(extend("examples" = [["paint"]]))]
     pub materials: Vec<String>,
-    /// Whether the light is recovered; it is by default.
+    /// Whether the light is recovered.
+    #[schemars(extend("default" = true), example = false)]
     pub recover_light: Option<bool>,
-    /// Whether the tone curves are recovered; they are by default.
+    /// Whether the tone curves are recovered.
+    #[schemars(extend("default" = true), example = false)]
     pub recover_tone: Option<bool>,
     /// Iterations between previews; 0 for none.
+    #[schemars(extend("default" = PREVIEW_EVERY), example = 10)]
     pub preview_every: Option<usize>,
     /// Iterations between checkpoints; 0 for none.
+    #[schemars(extend("default" = CHECKPOINT_EVERY), example = 100)]
     pub checkpoint_every: Option<usize>,
-    /// Stop when the loss has not fallen by a thousandth over this many iterations; 0 never.
+    /// Iterations over which the loss has to fall by a thousandth, or the optimisation stops; 0
+    /// never stops it.
+    #[schemars(example = 50)]
     pub patience: usize,
-    /// Key of every random number; the pipeline's by default.
+    /// Key of every random number of the light stage.
+    #[schemars(extend("x-default" = "that of `pipeline.seed`"), example = 7)]
     pub seed: Option<u64>,
 }
 
 /// How far each parameter moves in one of the first steps. Adam's steps have the size of the rate,
 /// whatever the scale of the gradient; the rates fall along a cosine. With half of these, a studio's
 /// lamp of 3 degrees is still 4 degrees wide after 600 iterations (docs/recovery.md).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearningRates {
-    /// Of log-radiance: 10% a step. 300 steps at three quarters of it on average reach a factor of
-    /// e^20, the sun from a candidate lobe.
+    /// Rate of log-radiance, nats a step: 0.1 is 10%.
+    #[schemars(range(min = 0.0, max = 1.0), example = 0.05)]
     pub radiance: f64,
-    /// Of directions, about radians: 1.1 degrees a step, so that a lobe crosses the gap to its
-    /// neighbour in 25 steps.
+    /// Rate of directions, about radians a step: 0.02 is 1.1 degrees.
+    #[schemars(range(min = 0.0, max = 1.0), example = 0.01)]
     pub direction: f64,
-    /// Of log sigma: 4% a step, slower than radiance, whose product with sigma^2 is what
-    /// a narrow lobe sends: brightness settles first.
+    /// Rate of the log of a lobe's width, nats a step: 0.04 is 4%.
+    #[schemars(range(min = 0.0, max = 1.0), example = 0.02)]
     pub sigma: f64,
-    /// Of tone parameters: slower than the light, which should explain what it can.
+    /// Rate of the parameters of the tone curve, their own units a step: slower than the light,
+    /// which should explain what it can.
+    #[schemars(range(min = 0.0, max = 1.0), example = 0.001)]
     pub tone: f64,
-    /// Of the log of the exposure, which scales all radiance at once: slower than that of one lobe.
+    /// Rate of the log of the exposure, nats a step. It scales all radiance at once.
+    #[schemars(range(min = 0.0, max = 1.0), example = 0.01)]
     pub exposure: f64,
 }
 
@@ -281,6 +314,18 @@ pub struct Settings {
 /// does not hang on the last step's noise.
 const LAST_RATE: f64 = 0.02;
 
+/// Weight of the consistency where the table does not say [DiPIR, section 4.3].
+const CONSISTENCY: f64 = 0.03;
+/// Weight of the regulariser where the table does not say [DiPIR, section 4.3].
+const REGULARIZER: f64 = 0.01;
+/// The paper's s reaches 1 in the last step; here the last half optimises exactly what is
+/// delivered. Two sets find a light more easily, one finds its width (docs/recovery.md).
+const FUSED_AFTER: f64 = 0.5;
+/// Iterations between previews where the table does not say.
+const PREVIEW_EVERY: usize = 50;
+/// Iterations between checkpoints where the table does not say.
+const CHECKPOINT_EVERY: usize = 25;
+
 /// Entries of a record in half precision number their texel in 16 bits.
 const MOST_TEXELS_IN_HALF: usize = 1 << 16;
 
@@ -300,17 +345,14 @@ impl LightTable {
                 false => Precision::Single,
             }),
             learning_rates: self.learning_rates,
-            // [DiPIR, section 4.3].
-            consistency: self.consistency.unwrap_or(0.03),
-            regularizer: self.regularizer.unwrap_or(0.01),
-            // The paper's s reaches 1 in the last step; here the last half optimises exactly what is
-            // delivered. Two sets find a light more easily, one finds its width (docs/recovery.md).
-            fused_after: self.fused_after.unwrap_or(0.5),
+            consistency: self.consistency.unwrap_or(CONSISTENCY),
+            regularizer: self.regularizer.unwrap_or(REGULARIZER),
+            fused_after: self.fused_after.unwrap_or(FUSED_AFTER),
             crops: self.crops,
             light: self.recover_light.unwrap_or(true),
             tone: self.recover_tone.unwrap_or(true),
-            preview_every: self.preview_every.unwrap_or(50),
-            checkpoint_every: self.checkpoint_every.unwrap_or(25),
+            preview_every: self.preview_every.unwrap_or(PREVIEW_EVERY),
+            checkpoint_every: self.checkpoint_every.unwrap_or(CHECKPOINT_EVERY),
             patience: self.patience,
             seed: self.seed.unwrap_or(seed),
         };

@@ -11,6 +11,7 @@ mod tree;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use schemars::JsonSchema;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -61,7 +62,7 @@ impl fmt::Display for Place {
 }
 
 /// How much work is done where the configuration does not say.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Quality {
     /// Quick looks.
@@ -77,19 +78,24 @@ pub enum Quality {
 pub const MAX_THREADS: usize = 1024;
 
 /// The `[pipeline]` table, which every executable reads.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PipelineTable {
     /// Folder of all artifacts; each stage writes a folder of its own in it.
+    #[schemars(extend("format" = "path"), example = &"out")]
     pub out: PathBuf,
-    /// Every random number follows from it.
+    /// Key of every random number; the same key gives the same files.
+    #[schemars(example = 7)]
     pub seed: u64,
-    /// Worker threads, at most [`MAX_THREADS`]; 0 means one for every core. Never changes a
-    /// result.
+    /// Worker threads; 0 is one for every core. They never change a result.
+    #[schemars(range(min = 0, max = MAX_THREADS), example = 8)]
     pub threads: usize,
-    /// `cpu`, `cuda:N` or `auto`.
+    /// What computes diffusion models: `cpu`, `cuda:N` (the N-th GPU, from 0) or `auto` (a GPU if
+    /// there is one).
+    #[schemars(example = &"auto")]
     pub device: String,
-    /// Sets what is not set elsewhere.
+    /// How much work is done where a key does not say it.
+    #[schemars(example = &"draft")]
     pub quality: Quality,
 }
 

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 
 use dipir_imaging::transfer::Transfer;
 use glam::Vec3;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{CameraSettings, FieldOfView, WorldUp};
@@ -16,25 +17,30 @@ use crate::placement::{Anchor, Placement, Rest, Size};
 use crate::proxy::Plane;
 
 /// The `[scene]` table as written.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SceneConfig {
-    /// The photograph, required.
+    /// The photograph: PNG, JPEG, EXR or HDR.
+    #[schemars(extend("format" = "path"), extend("x-default" = "none; required"), example = &"photo.jpg")]
     pub background: Option<PathBuf>,
-    /// How its values are encoded: `srgb` (default), `gamma22` or `linear`.
+    /// How the photograph's values are encoded; EXR and HDR are always linear.
+    #[schemars(extend("enum" = ["srgb", "gamma22", "linear"]), extend("default" = "srgb"), example = &"linear")]
     pub transfer: Option<String>,
-    /// What the object is called in prompts; `object` by default.
+    /// What the object is called in prompts to a diffusion model: a word or a few.
+    #[schemars(extend("default" = "object"), example = &"car")]
     pub class: Option<String>,
-    /// Mask of the photo's own foreground: white lies in front of the object.
+    /// Mask of what stands in front of the object in the photograph, a picture of the photograph's
+    /// size: white hides the object, black shows it.
+    #[schemars(extend("format" = "path"), example = &"foreground.png")]
     pub occluders: Option<PathBuf>,
-    /// At least one.
+    /// The objects that are put into the photograph; at least one.
     #[serde(default)]
     pub objects: Vec<ObjectConfig>,
-    /// Required.
+    /// Where the photograph was taken from; required.
     pub camera: Option<CameraConfig>,
-    /// What receives the shadow; nothing if absent.
+    /// What receives the shadow: a plane or a mesh. Without this table nothing does.
     pub proxy: Option<ProxyConfig>,
-    /// What to simulate.
+    /// Which effects are simulated: `on`, `off`, or `auto`, for planning to decide.
     #[serde(default)]
     pub effects: EffectsConfig,
     /// How much files may ask for.
@@ -43,74 +49,94 @@ pub struct SceneConfig {
 }
 
 /// One `[[scene.objects]]` table as written.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectConfig {
-    /// `.glb`, `.gltf`, `.obj`, `.ply` or `.stl`, required.
+    /// The object's file: `.glb`, `.gltf`, `.obj`, `.ply` or `.stl`.
+    #[schemars(extend("format" = "path"), extend("x-default" = "none; required"), example = &"car.glb")]
     pub path: Option<PathBuf>,
-    /// Where the object rests, metres; the origin by default.
+    /// Where the object rests, metres: x, y and z of the scene.
+    #[schemars(extend("default" = [0.0, 0.0, 0.0]), extend("examples" = [[0.5, 0.0, -1.0]]))]
     pub position: Option<[f32; 3]>,
-    /// Turn about the axis that points away from the proxy, counter-clockwise from above.
+    /// Turn about the axis that points away from the proxy, degrees, counter-clockwise from above.
+    #[schemars(extend("default" = 0.0), example = 40.0)]
     pub yaw_deg: Option<f32>,
-    /// Turn about the object's own x axis, before yaw.
+    /// Turn about the object's own x axis, degrees, before yaw.
+    #[schemars(extend("default" = 0.0), example = -90.0)]
     pub pitch_deg: Option<f32>,
-    /// Turn about the object's own z axis, before pitch.
+    /// Turn about the object's own z axis, degrees, before pitch.
+    #[schemars(extend("default" = 0.0), example = 5.0)]
     pub roll_deg: Option<f32>,
-    /// Factor on the file's metres, 1 by default.
+    /// Factor on the lengths of the file, which are taken as metres. It excludes `height_m`.
+    #[schemars(extend("exclusiveMinimum" = 0), extend("default" = 1.0), example = 0.01)]
     pub scale: Option<f32>,
-    /// Instead of `scale`: the height of the object as placed, metres.
+    /// Height of the object as it is placed, metres. It replaces `scale`.
+    #[schemars(extend("exclusiveMinimum" = 0), example = 1.4)]
     pub height_m: Option<f32>,
-    /// `proxy`: dropped onto the proxy at `position`'s x and z; `position`: the lowest point gets
-    /// `position`'s height, whatever the proxy. By default `position` where the proxy is a
-    /// horizontal plane or absent, else `proxy`.
+    /// What carries the object. `proxy`: it is dropped onto the proxy at the x and z of `position`.
+    /// `position`: its lowest point gets the y of `position`, whatever the proxy.
+    #[schemars(extend("enum" = ["proxy", "position"]), extend("x-default" = "`position` where the proxy is a horizontal plane or absent, else `proxy`"), example = &"proxy")]
     pub rest: Option<String>,
-    /// Which point of the object comes to lie at `position`'s x and z: the file's `origin`
-    /// (default) or the `center` of its bounding box.
+    /// Which point of the object comes to lie at the x and z of `position`: the origin of its file,
+    /// or the center of its bounding box.
+    #[schemars(extend("enum" = ["origin", "center"]), extend("default" = "origin"), example = &"center")]
     pub anchor: Option<String>,
 }
 
 /// The `[scene.camera]` table as written.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CameraConfig {
-    /// Centre of projection, metres.
+    /// Centre of projection, metres: x, y and z of the scene.
+    #[schemars(extend("x-default" = "none; required without `transforms`"), extend("examples" = [[0.0, 1.5, 4.0]]))]
     pub position: Option<[f32; 3]>,
-    /// The point in the centre of the image, metres.
+    /// The point that the centre of the image shows, metres.
+    #[schemars(extend("x-default" = "none; required without `transforms`"), extend("examples" = [[0.0, 0.5, 0.0]]))]
     pub look_at: Option<[f32; 3]>,
-    /// What is up in the image, +y by default.
+    /// The direction that is up in the image, of any length.
+    #[schemars(extend("default" = [0.0, 1.0, 0.0]), extend("examples" = [[0.0, 0.0, -1.0]]))]
     pub up: Option<[f32; 3]>,
-    /// Vertical field of view, degrees.
+    /// Vertical field of view, degrees. It excludes `focal_mm` and `sensor_mm`.
+    #[schemars(extend("exclusiveMinimum" = 0), extend("exclusiveMaximum" = 180), extend("x-default" = "none; required without `focal_mm` or `transforms`"), example = 40.0)]
     pub fov_deg: Option<f32>,
-    /// Focal length, millimetres; needs `sensor_mm` unless the photograph's Exif data tell it.
+    /// Focal length, millimetres. It replaces `fov_deg`.
+    #[schemars(extend("exclusiveMinimum" = 0), example = 35.0)]
     pub focal_mm: Option<f32>,
-    /// Width of the sensor, millimetres (36 for full frame).
+    /// Width of the sensor, millimetres; 36 is full frame. It belongs to `focal_mm`.
+    #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "the photograph's own, from its Exif data"), example = 36.0)]
     pub sensor_mm: Option<f32>,
-    /// A nerfstudio `transforms.json` instead of all of the above.
+    /// A nerfstudio `transforms.json` that holds the camera. It replaces position, direction and field of view.
+    #[schemars(extend("format" = "path"), example = &"transforms.json")]
     pub transforms: Option<PathBuf>,
-    /// Which of its frames, 0 by default.
+    /// Which frame of `transforms` is the photograph, from 0.
+    #[schemars(extend("default" = 0), example = 3)]
     pub frame: Option<u32>,
-    /// Which axis of its world is up: `z` (nerfstudio's, default) or `y`.
+    /// Which axis of the world of `transforms` is up.
+    #[schemars(extend("enum" = ["z", "y"]), extend("default" = "z"), example = &"y")]
     pub transforms_up: Option<String>,
 }
 
 /// The `[scene.proxy]` table as written.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ProxyConfig {
     /// An infinite plane.
     pub plane: Option<PlaneConfig>,
-    /// Or a mesh, in world coordinates.
+    /// A mesh in the coordinates of the scene, metres, in a format of objects. It replaces `plane`.
+    #[schemars(extend("format" = "path"), example = &"room.glb")]
     pub mesh: Option<PathBuf>,
 }
 
 /// `plane = { point = …, normal = … }`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PlaneConfig {
-    /// Any point of the plane, metres; the origin by default.
+    /// Any point of the plane, metres.
+    #[schemars(extend("examples" = [[0.0, 0.0, 0.0]]))]
     #[serde(default)]
     pub point: [f32; 3],
-    /// Points to the side that is seen, any length; +y by default.
+    /// Direction towards the side that is seen, of any length.
+    #[schemars(extend("examples" = [[0.0, 1.0, 0.0]]))]
     #[serde(default = "plus_y")]
     pub normal: [f32; 3],
 }
@@ -120,7 +146,7 @@ fn plus_y() -> [f32; 3] {
 }
 
 /// Whether planning decides what is simulated.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum EffectsMode {
     /// Only what the scene calls for.
@@ -131,7 +157,7 @@ pub enum EffectsMode {
 }
 
 /// What the user says about one effect.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum EffectSwitch {
     /// Simulated, whatever it contributes.
@@ -145,21 +171,25 @@ pub enum EffectSwitch {
 macro_rules! effects_config {
     ($($name:ident: $what:literal),* $(,)?) => {
         /// The `[scene.effects]` table.
-        #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
         #[serde(deny_unknown_fields)]
         pub struct EffectsConfig {
-            /// Whether planning decides what is simulated; by default it does.
+            /// Whether planning decides what is simulated: `planned` simulates what the picture
+            /// shows, `all` everything.
+            #[schemars(example = &"all")]
             #[serde(skip_serializing_if = "Option::is_none")]
             pub mode: Option<EffectsMode>,
-            /// Display-referred RMSE that may be left out, 0.002 by default.
+            /// Error that planning may leave, display-referred RMSE with white at 1.
+            #[schemars(range(min = 0.0, max = 1.0), extend("default" = EffectsConfig::DEFAULT_TOLERANCE), example = 0.002)]
             #[serde(skip_serializing_if = "Option::is_none")]
             pub tolerance: Option<f64>,
-            /// Most interactions of a path with the object, from 1; as few as the tolerance allows
-            /// by default.
+            /// Most interactions of a path with the object.
+            #[schemars(range(min = 1, max = EffectsConfig::MOST_DEPTH), extend("x-default" = "as few as `tolerance` allows"), example = 3)]
             #[serde(skip_serializing_if = "Option::is_none")]
             pub max_depth: Option<u32>,
             $(
                 #[doc = $what]
+                #[schemars(extend("default" = "auto"), example = &"off")]
                 #[serde(skip_serializing_if = "Option::is_none")]
                 pub $name: Option<EffectSwitch>,
             )*

@@ -1,24 +1,35 @@
 //! How much a file may ask for before it is refused.
+use dipir_imaging::file::PhotoLimits;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
 
 /// The `[scene.limits]` table. Every limit is checked before memory is taken. A file that exceeds one
 /// is refused, and the error names the key.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Limits {
     /// Triangles of all objects together, copies counted. Vertices may be three times as many.
+    #[schemars(example = 50_000_000)]
     pub triangles: u64,
     /// Copies of meshes (`EXT_mesh_gpu_instancing`) in a file.
+    #[schemars(example = 2_000_000)]
     pub instances: u64,
     /// Pixels of a texture; decoded, one takes four bytes.
+    #[schemars(example = 16384 * 16384)]
     pub texture_pixels: u64,
     /// Pixels of all textures of a file together.
+    #[schemars(example = 16384 * 16384)]
     pub all_texture_pixels: u64,
     /// Bytes of an object's file, or of another that it names.
+    #[schemars(example = 8_u64 << 30)]
     pub file_bytes: u64,
-    /// Whether a file may name others outside of its folder, as `../wood.png` or `/tmp/wood.png`.
+    /// Pixels of the photograph, millions. A pixel takes 18 bytes while it is read.
+    #[schemars(example = 400)]
+    pub photo_megapixels: u64,
+    /// Whether a file may name others outside of its folder, as `../wood.png` or `/models/wood.png`.
+    #[schemars(example = true)]
     pub allow_outside: bool,
 }
 
@@ -31,6 +42,7 @@ impl Default for Limits {
             texture_pixels: 8192 * 8192,
             all_texture_pixels: 4 * 8192 * 8192,
             file_bytes: 4 << 30,
+            photo_megapixels: 200,
             allow_outside: false,
         }
     }
@@ -40,6 +52,13 @@ impl Limits {
     /// Most vertices: as many as triangles without a common one have.
     pub fn vertices(&self) -> u64 {
         self.triangles.saturating_mul(3)
+    }
+
+    /// What the photograph may ask for.
+    pub fn photo(&self) -> PhotoLimits {
+        PhotoLimits {
+            megapixels: self.photo_megapixels as f64,
+        }
     }
 
     /// Whether nothing was changed.

@@ -323,7 +323,8 @@ impl<'a> Files<'a> {
     }
 
     fn photo(&mut self, path: &Path, transfer: Transfer) -> Result<(Photo, PhotoRecord), Error> {
-        let photo = file::read_photo(self.base_dir.join(path), transfer)?;
+        let photo =
+            file::read_photo_within(self.base_dir.join(path), transfer, self.limits.photo())?;
         self.warnings.extend(photo.warnings.iter().cloned());
         let record = PhotoRecord {
             file: self.record("background", path)?,

@@ -3,6 +3,7 @@ pub mod command_line;
 pub mod composite;
 pub mod concepts;
 pub mod graph;
+pub mod keys;
 pub mod known_light;
 pub mod light;
 pub mod lora;

@@ -22,6 +22,7 @@ use dipir_render::adaptive::Stop;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
 use glam::Vec3;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -36,16 +37,21 @@ use crate::scene::transport::{self, Frame};
 const ERROR: f32 = 0.01;
 
 /// The `[report]` table.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReportTable {
-    /// Environment map under which the photograph was made, HDR or EXR, if it is known.
+    /// Environment map under which the photograph was made, HDR or EXR, if it is known. The
+    /// recovered light is compared with it.
+    #[schemars(extend("format" = "path"), example = &"truth.exr")]
     pub truth: Option<PathBuf>,
-    /// Stops of exposure that bring it to the photograph's scale.
+    /// Exposure that brings that map to the photograph's scale, stops.
+    #[schemars(example = -1.5)]
     pub truth_exposure_ev: f32,
-    /// Turn of it about the vertical, degrees, counter-clockwise from above.
+    /// Turn of that map about the vertical, degrees, counter-clockwise from above.
+    #[schemars(example = 90.0)]
     pub truth_rotation_deg: f32,
-    /// Curve on the object's light under the true and the neutral light; none by default.
+    /// Curve on the object's light under the true and the neutral light, as `composite.tone`.
+    #[schemars(extend("default" = "none"), example = &"reinhard")]
     pub truth_tone: Option<Tone>,
 }
 

@@ -1,5 +1,6 @@
 //! What somebody says of the sun: `[light] sun = { … }` and `[light] shadow = { … }`.
 use glam::{DVec2, DVec3};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::direction::azimuth_of_bearing;
@@ -9,35 +10,46 @@ use crate::shadow::{Angle, CLICK_SIGMA_PX, HEIGHT_SIGMA, Shadow};
 use crate::time::Time;
 
 /// `sun = { … }`: each part is optional, and what is not said stays unknown.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SunTable {
-    /// When the photograph was taken, ISO 8601: `"2026-06-21T12:34:56+02:00"`; by default its own.
+    /// When the photograph was taken, ISO 8601 with the offset of its zone.
+    #[schemars(extend("x-default" = "the photograph's own"), example = &"2026-06-21T12:34:56+02:00")]
     pub time: Option<String>,
-    /// Degrees north; by default the photograph's own.
+    /// Latitude of the place, degrees north. It belongs to `longitude`.
+    #[schemars(range(min = -90.0, max = 90.0), extend("x-default" = "the photograph's own"), example = 48.1)]
     pub latitude: Option<f64>,
-    /// Degrees east; by default the photograph's own.
+    /// Longitude of the place, degrees east. It belongs to `latitude`.
+    #[schemars(range(min = -180.0, max = 360.0), extend("x-default" = "the photograph's own"), example = 11.6)]
     pub longitude: Option<f64>,
-    /// Where the camera looked, degrees clockwise from north; by default the photograph's own.
+    /// Where the camera looked, degrees clockwise from north.
+    #[schemars(range(min = -360.0, max = 360.0), extend("x-default" = "the photograph's own"), example = 225.0)]
     pub heading_deg: Option<f64>,
-    /// Standard deviation of the heading, degrees; 10 by default.
+    /// Standard deviation of the heading, degrees.
+    #[schemars(range(min = 0.0, max = 180.0), extend("default" = COMPASS_SIGMA_DEG), example = 5.0)]
     pub heading_sure_deg: Option<f64>,
-    /// Instead of time and place: degrees clockwise, counted from `relative_to`.
+    /// Azimuth of the sun, degrees clockwise, counted from `relative_to`. It replaces `time`.
+    #[schemars(range(min = -360.0, max = 360.0), example = 60.0)]
     pub azimuth_deg: Option<f64>,
-    /// Degrees above the horizon.
+    /// Elevation of the sun, degrees above the horizon. It replaces `time`.
+    #[schemars(range(min = -90.0, max = 90.0), example = 35.0)]
     pub elevation_deg: Option<f64>,
     /// From where `azimuth_deg` counts.
+    #[schemars(example = &"north")]
     pub relative_to: RelativeTo,
-    /// Standard deviation of `azimuth_deg` and `elevation_deg`, degrees; 3 by default.
+    /// Standard deviation of `azimuth_deg` and `elevation_deg`, degrees.
+    #[schemars(range(min = 0.0, max = 180.0), extend("default" = SAID_SIGMA_DEG), example = 5.0)]
     pub sure_deg: Option<f64>,
-    /// Angular radius, degrees: 0.27 is the sun in a clear sky.
+    /// Angular radius of the sun, degrees: 0.27 in a clear sky, more in haze.
+    #[schemars(range(min = 0.01, max = 90.0), extend("x-default" = "estimated"), example = 0.27)]
     pub size_deg: Option<f64>,
-    /// Share of the light on a surface that faces the sun that comes from the sun, 0 to 1.
+    /// Share of the sun in the light on a surface that faces it.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-default" = "estimated"), example = 0.7)]
     pub share: Option<f64>,
 }
 
 /// From where an azimuth counts.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum RelativeTo {
     /// Where the camera looks: 90 is on the right.
@@ -270,17 +282,21 @@ impl SunTable {
 }
 
 /// `shadow = { … }`: a shadow that somebody drew.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ShadowTable {
-    /// Pixel where the thing stands on the ground.
+    /// Pixel where the thing stands on the ground: column and row.
+    #[schemars(extend("x-default" = "none; required"), extend("examples" = [[640.0, 480.0]]))]
     pub foot: [f64; 2],
-    /// Pixel where the shadow of its top falls.
+    /// Pixel where the shadow of its top falls: column and row.
+    #[schemars(extend("x-default" = "none; required"), extend("examples" = [[820.0, 510.0]]))]
     pub tip: [f64; 2],
-    /// Height of the thing, metres; without it the elevation stays unknown.
+    /// Height of the thing, metres. Without it the elevation of the sun stays unknown.
+    #[schemars(range(min = 0.001, max = 10000.0), example = 1.8)]
     #[serde(default)]
     pub height_m: Option<f64>,
-    /// Standard deviation of each coordinate, pixels; 2 by default.
+    /// Standard deviation of each coordinate, pixels.
+    #[schemars(range(min = 0.0, max = 10000.0), extend("default" = CLICK_SIGMA_PX), example = 4.0)]
     #[serde(default)]
     pub sure_px: Option<f64>,
 }

@@ -22,6 +22,7 @@ use dipir_light::environment::solid_angle;
 use dipir_light::luminance::luminance;
 use dipir_numerics::sum::par_reduce;
 use glam::{DVec3, Vec3, Vec4};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 mod file;
@@ -41,7 +42,7 @@ use replay::{padded, ratio, ratio_vjp};
 use rows::{ColourHalf, ColourSingle, Entry, GreyHalf, GreySingle, Rows};
 
 /// How weights are stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
     /// 11 bits, each row with its own power of two: 8 bytes an entry of the object, 4 of the

@@ -17,6 +17,7 @@ const SMALL: Limits = Limits {
     texture_pixels: 1 << 20,
     all_texture_pixels: 1 << 20,
     file_bytes: 1 << 30,
+    photo_megapixels: 200,
     allow_outside: false,
 };
 

@@ -4,33 +4,41 @@ use std::time::Duration;
 
 use dipir_pipeline::config::{Config, Quality};
 use dipir_render::adaptive::Stop;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::presets;
 
 /// The `[composite]` table.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CompositeTable {
-    /// Environment map that lights the object, HDR or EXR; else the recovered light does.
+    /// Environment map that lights the object, equirectangular, HDR or EXR.
+    #[schemars(extend("format" = "path"), extend("x-default" = "none: the recovered light"), example = &"sky.exr")]
     pub environment: Option<PathBuf>,
-    /// Stops of exposure that bring the map to the photograph's scale.
+    /// Exposure that brings the map to the photograph's scale, stops.
+    #[schemars(range(min = -64.0, max = 64.0), example = -1.5)]
     pub exposure_ev: f32,
     /// Turn of the map about the vertical, degrees, counter-clockwise from above.
+    #[schemars(example = 90.0)]
     pub rotation_deg: f32,
-    /// Stop at this display-referred RMSE; the quality's by default.
+    /// Rendering stops at this error, display-referred RMSE with white at 1.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1.0), example = 0.002)]
     pub target_error: Option<f32>,
-    /// Or stop after about this many seconds.
+    /// Rendering stops after about this time, seconds. It replaces `target_error`.
+    #[schemars(extend("exclusiveMinimum" = 0), example = 60.0)]
     pub time_budget_s: Option<f64>,
     /// Most samples in any pixel.
+    #[schemars(range(min = 1), extend("default" = MAX_SAMPLES), example = 1024)]
     pub max_samples: Option<u32>,
-    /// Curve on the object's light before it is laid over the photograph. By default the recovered
-    /// curves with the recovered light, and none with a map.
+    /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
+    /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
+    #[schemars(extend("x-default" = "the recovered curves with the recovered light, `none` with a map"), example = &"reinhard")]
     pub tone: Option<Tone>,
 }
 
 /// A curve on the object's light.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Tone {
     /// None: the photograph is linear light, exposed.

@@ -1,23 +1,29 @@
 //! The `[concepts]` table.
 use std::path::PathBuf;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The `[concepts]` table.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ConceptsTable {
-    /// Images; 0 switches concept preservation off.
+    /// Images of the object's class; 0 switches concept preservation off.
+    #[schemars(example = 16)]
     pub count: usize,
-    /// Steps of the sampler.
+    /// Denoising steps of an image.
+    #[schemars(range(min = 1), example = 30)]
     pub steps: usize,
-    /// Classifier-free guidance scale, 1 for none.
+    /// Scale of classifier-free guidance; 1 is none.
+    #[schemars(range(min = 0.0), example = 5.0)]
     pub guidance: f64,
-    /// Side of the images in pixels; the model's own by default.
+    /// Side of the images, pixels.
+    #[schemars(extend("x-default" = "the model's own"), example = 512)]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub size: Option<usize>,
     /// Folder of finished images that scenes of one class and model share, and in which an
-    /// interrupted run goes on; `concepts-cache` in the folder of artifacts by default.
+    /// interrupted run goes on.
+    #[schemars(extend("format" = "path"), extend("x-default" = "`concepts-cache` in `pipeline.out`"), example = &"../concepts-cache")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cache: Option<PathBuf>,
 }

@@ -8,7 +8,7 @@ use dipir_optimize::settings::LightTable;
 use dipir_scene::proxy::Proxy;
 use dipir_scene::scene::LoadedScene;
 use dipir_sun::shadow::{Angle, Ground, sun_of_shadow};
-use dipir_sun::table::{SunTable, Taken};
+use dipir_sun::table::Taken;
 use glam::Vec2;
 use serde::Serialize;
 
@@ -108,7 +108,7 @@ fn known_sun(
         longitude_deg: facts.longitude_deg,
         heading_deg: facts.heading.map(|h| h.deg),
     };
-    let sun = table.sun.clone().unwrap_or_else(SunTable::default);
+    let sun = table.sun.clone().unwrap_or_default();
     let wrong = |key: &str, e: String| session.config.invalid(key, e);
     let mut known = sun
         .resolve("light.sun", &taken, forward)

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_guidance::distillation::DistillationSettings;
-use dipir_imaging::file::read_photo;
+use dipir_imaging::file::read_photo_within;
 use dipir_imaging::raster::DisplayImage;
 use dipir_optimize::lighting::Lighting;
 use dipir_optimize::settings::{GuidanceKind, LearningRates, LightTable, Settings, Start};
@@ -256,7 +256,8 @@ pub(super) fn read_reference(
     file: &Path,
 ) -> anyhow::Result<DisplayImage> {
     let transfer = scene.loaded.photo.transfer;
-    let image = read_photo(file, transfer)?.image;
+    let limits = session.config.table::<SceneConfig>("scene")?.limits;
+    let image = read_photo_within(file, transfer, limits.photo())?.image;
     let found = [image.0.width() as u32, image.0.height() as u32];
     let expected = scene.loaded.scene.camera.resolution;
     if found != expected {

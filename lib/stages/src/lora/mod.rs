@@ -17,7 +17,7 @@ use dipir_diffusion::model::Model;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
 use dipir_diffusion::training::{LoraTrainer, StepReport};
-use dipir_imaging::file::{read_photo, write_png};
+use dipir_imaging::file::{read_photo_within, write_png};
 use dipir_imaging::transfer::Transfer;
 use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::Manifest;
@@ -122,7 +122,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         .learn_word
         .then(|| learnable(&mut model, &table.word))
         .transpose()?;
-    let photo = read_photo(&photo_file, transfer)?;
+    let limits = session.config.table::<SceneConfig>("scene")?.limits;
+    let photo = read_photo_within(&photo_file, transfer, limits.photo())?;
     let data = Data {
         photo: dipir_tensors::model_input(&photo.transfer.encode(&photo.image))?,
         size: model.native_size(),

@@ -1,39 +1,54 @@
 //! The `[lora]` table.
 use dipir_diffusion::training::TrainingConfig;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The `[lora]` table.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LoraTable {
     /// Rank of the adapters.
+    #[schemars(range(min = 1), example = 8)]
     pub rank: usize,
-    /// Scale times rank; the rank by default.
+    /// Scale of the adapters times their rank.
+    #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "the rank"), example = 8.0)]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub alpha: Option<f64>,
-    /// Updates.
+    /// Updates of the training.
+    #[schemars(example = 300)]
     pub steps: usize,
     /// Learning rate of the adapters.
+    #[schemars(extend("exclusiveMinimum" = 0), example = 0.0002)]
     pub learning_rate: f64,
-    /// Updates over which it rises from 0.
+    /// Updates over which the learning rates rise from 0.
+    #[schemars(example = 50)]
     pub warmup_steps: usize,
-    /// Examples of each kind for one update.
+    /// Examples of each kind that an update averages.
+    #[schemars(range(min = 1), example = 4)]
     pub accumulation: usize,
-    /// Weight of the concept images' loss.
+    /// Weight of the loss of the concept images; 0 leaves them out.
+    #[schemars(range(min = 0.0), example = 0.5)]
     pub prior_weight: f64,
     /// Smallest crop of the photograph, as a share of its shorter side.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1.0), example = 0.7)]
     pub min_crop: f64,
-    /// The word that stands for the photograph's light.
+    /// The word that stands for the photograph's light in prompts.
+    #[schemars(example = &"sks")]
     pub word: String,
-    /// Learn an embedding for that word, too.
+    /// Whether an embedding for that word is learnt, too.
+    #[schemars(example = true)]
     pub learn_word: bool,
     /// Learning rate of the embedding.
+    #[schemars(range(min = 0.0), example = 0.001)]
     pub word_learning_rate: f64,
-    /// Recompute activations: less memory, a third more time.
+    /// Whether activations are computed again in the backward pass: less memory, a third more time.
+    #[schemars(example = false)]
     pub recompute: bool,
     /// Updates between checkpoints; 0 for none.
+    #[schemars(example = 100)]
     pub checkpoint_every: usize,
     /// Updates between sample images; 0 for none.
+    #[schemars(example = 100)]
     pub sample_every: usize,
 }
 

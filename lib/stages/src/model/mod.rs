@@ -12,17 +12,20 @@ use dipir_diffusion::model::Model;
 use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::stage::StagePlan;
 use dipir_prior::encoder;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tempfile::TempDir;
 
 /// The `[model]` table.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModelTable {
-    /// A folder in the diffusers layout; the embedded model if there is none.
+    /// Folder of a diffusion model in the diffusers layout.
+    #[schemars(extend("format" = "path"), extend("x-default" = "the embedded model"), example = &"models/sd15")]
     pub path: Option<PathBuf>,
-    /// `f32`, or on a GPU `bf16` or `f16`.
+    /// Numbers that the model computes with; `bf16` and `f16` need a GPU.
+    #[schemars(extend("enum" = ["f32", "bf16", "f16"]), example = &"bf16")]
     pub precision: String,
 }
 

@@ -1,0 +1,152 @@
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use dipir_pipeline::config::{Config, TABLES};
+use dipir_pipeline::error::ConfigError;
+
+use super::*;
+
+fn keys() -> impl Iterator<Item = &'static Key> {
+    tables().iter().flat_map(|table| &table.keys)
+}
+
+/// A file in which every key has its example.
+fn every_example() -> String {
+    let mut text = String::new();
+    for table in tables() {
+        text += &format!("{}\n", table.header());
+        for key in &table.keys {
+            text += &format!("{} = {}\n", key.name(), key.example);
+        }
+    }
+    text
+}
+
+fn parse(overrides: &[String]) -> Config {
+    Config::parse(Path::new("pipeline.toml"), &every_example(), overrides).unwrap()
+}
+
+/// Reads all tables by the types that the stages read them by.
+fn read(config: &Config) -> Result<(), ConfigError> {
+    config.pipeline()?;
+    config.table::<ModelTable>("model")?;
+    config.table::<SceneConfig>("scene")?;
+    config.table::<ConceptsTable>("concepts")?;
+    config.table::<LoraTable>("lora")?;
+    config.table::<LightTable>("light")?;
+    config.table::<CompositeTable>("composite")?;
+    config.table::<ReportTable>("report")?;
+    Ok(())
+}
+
+#[test]
+fn every_table_of_the_file_has_its_keys() {
+    let top: Vec<&str> = value::properties(schema()).map(|p| p.0).collect();
+    assert_eq!(top, TABLES);
+}
+
+#[test]
+fn the_keys_of_a_table_are_those_that_its_parser_accepts() {
+    for table in tables() {
+        let name = table.name.replace(".N", ".0");
+        let config = parse(&[format!("{name}.no_such_key=1")]);
+        let Err(ConfigError::UnknownKey { accepted, .. }) = read(&config) else {
+            panic!("{name} accepts any key");
+        };
+        let prefix = format!("{}.", table.name);
+        let names = keys()
+            .map(|k| &k.key)
+            .chain(tables().iter().map(|t| &t.name));
+        let inside = names.filter_map(|name| name.strip_prefix(&prefix));
+        let inside = inside.map(|rest| rest.split('.').next().unwrap_or(rest));
+        let listed: BTreeSet<&str> = inside.filter(|name| *name != "N").collect();
+        let accepted: BTreeSet<&str> = accepted.iter().map(String::as_str).collect();
+        assert_eq!(listed, accepted, "{name}");
+    }
+}
+
+#[test]
+fn every_example_is_accepted_in_the_file_and_on_the_command_line() {
+    read(&parse(&[])).unwrap();
+    for key in keys() {
+        let set = format!("{}={}", key.key.replace(".N.", ".0."), key.example);
+        read(&parse(&[set])).unwrap();
+    }
+}
+
+#[test]
+fn every_key_has_a_sentence_and_an_example() {
+    for key in keys() {
+        let sentence = &key.sentence;
+        assert!(sentence.ends_with('.'), "{}: {sentence}", key.key);
+        // Links of the source lead nowhere.
+        assert!(!sentence.contains("[`"), "{}: {sentence}", key.key);
+        assert!(!key.example.is_empty(), "{} has no example", key.key);
+    }
+    for table in tables() {
+        assert!(table.sentence.ends_with('.'), "{}", table.name);
+    }
+}
+
+#[test]
+fn examples_and_defaults_lie_in_their_range() {
+    for key in keys() {
+        let schema = &key.schema;
+        for value in [&schema["examples"][0], &schema["default"]] {
+            let bound = |keyword: &str, fallback: f64| schema[keyword].as_f64().unwrap_or(fallback);
+            if let Some(number) = value.as_f64() {
+                let least = bound("minimum", f64::NEG_INFINITY);
+                let most = bound("maximum", f64::INFINITY);
+                assert!((least..=most).contains(&number), "{}: {number}", key.key);
+                assert!(
+                    number > bound("exclusiveMinimum", f64::NEG_INFINITY),
+                    "{}",
+                    key.key
+                );
+                assert!(
+                    number < bound("exclusiveMaximum", f64::INFINITY),
+                    "{}",
+                    key.key
+                );
+            }
+            let words = value::words(schema);
+            if let Some(word) = value.as_str().filter(|_| !words.is_empty()) {
+                assert!(words.contains(&word), "{}: {word}", key.key);
+            }
+        }
+    }
+}
+
+#[test]
+fn defaults_are_values_words_or_the_qualities() {
+    let default = |name: &str| {
+        let key = keys().find(|k| k.key == name);
+        key.unwrap_or_else(|| panic!("no {name}")).default.clone()
+    };
+    assert_eq!(default("light.learning_rates.tone"), "`0.003`");
+    assert_eq!(default("scene.camera.transforms"), "none");
+    assert_eq!(default("light.seed"), "that of `pipeline.seed`");
+    assert_eq!(
+        default("light.environment"),
+        "the quality's: draft `[64, 32]`, standard `[256, 128]`, high `[256, 128]`"
+    );
+    assert!(default("scene.effects.mode").contains("draft `\"all\"`"));
+    assert!(default("composite.target_error").contains("standard `0.004`"));
+    for name in ["iterations", "lobes", "samples", "size"] {
+        let default = default(&format!("light.{name}"));
+        assert!(default.starts_with("the quality's: draft `"), "{default}");
+    }
+}
+
+#[test]
+fn a_word_finds_keys_by_name_and_by_sentence_and_a_slip_the_nearest() {
+    let found = |word: &str| -> Vec<String> {
+        let tables = about(word);
+        let keys = tables.into_iter().flat_map(|table| table.keys);
+        keys.map(|key| key.key).collect()
+    };
+    assert!(found("OCCLUDERS").contains(&"scene.occluders".into()));
+    assert!(found("nerfstudio").contains(&"scene.camera.transforms".into()));
+    assert!(found("no such thing").is_empty());
+    assert_eq!(like("ocluders"), Some("scene.occluders"));
+}
