@@ -16,8 +16,8 @@ const FITTED: [usize; 2] = [1024, 512];
 /// Lobes that are fitted to a map: as many as the optimiser has.
 const LOBES: usize = 32;
 
-/// Exposed light before the camera's curve. Values above .95, where Reinhard's curve is flat, are taken
-/// as .95.
+/// Exposed light before the camera's curve, from a value behind it. Values above .95, where Reinhard's
+/// curve is flat, count as .95.
 fn before_curve(tone: Tone, value: Vec3) -> Vec3 {
     match tone {
         Tone::None => value,

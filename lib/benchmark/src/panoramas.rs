@@ -192,7 +192,7 @@ fn pipeline_text(
     ))
 }
 
-/// Kinds of places by the panorama's file name without its extension.
+/// Kinds of places; the key is the panorama's file name without its extension.
 fn read_kinds(path: &Path) -> anyhow::Result<BTreeMap<String, String>> {
     let text =
         fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;

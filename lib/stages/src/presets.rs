@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 pub struct Presets {
     /// The day, as in 2026-11-21; absent where a preset is an assumption.
     pub measured: Option<String>,
-    /// What measured it.
+    /// The command that measured it.
     pub command: Option<String>,
     /// From the cheapest to the best.
     pub presets: [Preset; 3],

@@ -30,7 +30,7 @@ fn has_surroundings(manifest: &Manifest) -> bool {
     manifest.outputs.iter().any(|o| o.role == SURROUNDINGS)
 }
 
-/// Enters what lights the composite into its plan.
+/// Adds the files of the light that the composite reads to its plan.
 pub fn add_inputs(session: &Session, plan: &mut StagePlan) -> anyhow::Result<()> {
     let manifest = manifest(session)?;
     let roles: &[&str] = match has_surroundings(&manifest) {

@@ -63,7 +63,7 @@ impl Resume {
         self.resumed_at(session, read.map(|s| s.map(|s| s.iteration)))
     }
 
-    /// The iteration of a checkpoint that was read. A damaged one is removed.
+    /// The iteration of the checkpoint that was `read`, 0 without one. A damaged one is removed.
     pub(crate) fn resumed_at(
         &self,
         session: &Session,

@@ -124,7 +124,7 @@ fn device(name: &str) -> anyhow::Result<Device> {
     }
 }
 
-/// Enters every file of the model into the plan of a stage.
+/// Adds every file of the model to the plan of a stage.
 pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> anyhow::Result<()> {
     match &table.path {
         Some(path) => files(path, &session.resolve(path), plan),
