@@ -10,7 +10,7 @@ use crate::{generated, panoramas};
 /// the scenes' names.
 ///
 /// # Errors
-/// If nothing is asked for, or a panorama, a model or the table of kinds cannot be read.
+/// If no scene is asked for, or a panorama, a model or the table of kinds cannot be read.
 pub fn make(args: &MakeArgs, progress: &dyn Fn(f64)) -> anyhow::Result<Vec<String>> {
     let evaluation = EvaluationFolder::new(&args.folder.out);
     if args.hdri.is_none() && args.generated == 0 {

@@ -19,7 +19,7 @@ const CHECKPOINT: &str = "checkpoint.safetensors";
 /// Folder of the previews.
 const PREVIEWS: &str = "previews";
 
-/// Tells one run from another, so that a checkpoint is found by the run that it belongs to alone.
+/// Identifies a run, so that only the run that wrote a checkpoint finds it.
 pub(crate) fn fingerprint(plan: &StagePlan, settings: &Settings) -> anyhow::Result<Fingerprint> {
     run_fingerprint(plan, &serde_json::to_value(settings)?)
 }

@@ -135,7 +135,7 @@ pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> an
     }
 }
 
-/// Enters the files of the model in `folder`, which the configuration calls `path`.
+/// Adds the files of the model in `folder`, which the configuration calls `path`.
 fn files(path: &Path, folder: &Path, plan: &mut StagePlan) -> anyhow::Result<()> {
     for part in ["", "unet", "vae", "text_encoder", "tokenizer", "scheduler"] {
         let mut names: Vec<PathBuf> = match std::fs::read_dir(folder.join(part)) {
