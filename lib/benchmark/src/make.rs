@@ -6,7 +6,7 @@ use crate::command_line::{MakeArgs, Places};
 use crate::folder::EvaluationFolder;
 use crate::{generated, panoramas};
 
-/// Makes scenes; those that are there already stay. `progress` is told the share that is done. Returns
+/// Makes scenes; those that are there already stay. `progress` gets the share that is done. Returns
 /// the scenes' names.
 ///
 /// # Errors

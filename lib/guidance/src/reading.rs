@@ -20,7 +20,7 @@ use crate::error::{Error, Result};
 /// Side of a crop in longer sides of the object's box: as the model was trained, where the object
 /// takes about two fifths.
 const CROP: f32 = 2.6;
-/// Crops that the model is asked to explain.
+/// Most crops from which light is estimated.
 const CROPS: usize = 12;
 /// The first of them, around the place of the insertion.
 const NEAR: usize = 3;
@@ -322,7 +322,7 @@ mod tests {
                 .max_by(|a, b| a.radiance.x.total_cmp(&b.radiance.x));
             sun.expect("lobes").sigma
         };
-        // Who does not know where the sun is throws no hard shadow.
+        // An uncertain azimuth casts no hard shadow.
         let widths = [1.0, 0.95, 0.7, 0.0].map(width);
         assert!((widths[0] - SUN_SIGMA).abs() < 1e-3, "{widths:?}");
         assert!(widths.is_sorted_by(|a, b| a < b), "{widths:?}");

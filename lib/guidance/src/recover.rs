@@ -68,7 +68,7 @@ pub struct ModelGuidance<'a> {
     pub reading: Option<&'a InversionSettings>,
 }
 
-/// What is told while light is recovered.
+/// What `watch` gets while light is recovered.
 #[derive(Debug)]
 pub enum Event<'a> {
     /// Light is being read off the photograph; the share that is done.
@@ -196,7 +196,7 @@ pub fn recover_light(
     })
 }
 
-/// The light that the model sees in the photograph, if it is asked.
+/// The light that the model reads off the photograph; `None` if it should not read.
 fn read(
     model: &ModelGuidance,
     photo: &DisplayImage,

@@ -35,7 +35,7 @@ impl Method {
             return Ok(Self::Given);
         }
         let stands = table.iterations == Some(0);
-        // Who asks for what a model reads asks for the model.
+        // A start that a model reads needs the model.
         let asks_model = asks_model(&table);
         Ok(
             match table.guidance.resolved(model.path.is_some() || asks_model) {
