@@ -3,7 +3,7 @@
 #   make -f docs/pipeline.mk                             the root pipeline.toml
 #   make -f docs/pipeline.mk PIPELINE=photo/pipeline.toml OUT=photo/out INPUTS="photo/a.jpg photo/chair.glb"
 #   make -f docs/pipeline.mk GIVEN=1                     [composite] environment gives the light
-#   make -f docs/pipeline.mk REFERENCE=1                 [light] guidance = "reference": no model
+#   make -f docs/pipeline.mk REFERENCE=1                 no model guides: a reference, or the estimate alone
 #
 # Make goes by times of files, and by the whole of pipeline.toml: it runs more often than
 # `dipir run`, which goes by what is in the files and by the keys that a stage reads.

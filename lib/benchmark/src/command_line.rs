@@ -72,7 +72,7 @@ pub struct MakeArgs {
     #[arg(long, value_name = "DIR")]
     pub models: Option<PathBuf>,
 
-    /// Scenes to make of panoramas; they and models take turns, views and turns are drawn
+    /// Scenes to make of panoramas: every pair of panorama and model comes once before one comes again
     #[arg(long, value_name = "N", default_value_t = 10)]
     pub count: u64,
 

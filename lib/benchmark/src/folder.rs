@@ -14,7 +14,7 @@ pub struct EvaluationFolder {
     root: PathBuf,
 }
 
-/// The folder of the truth among the runs; no method may be called so.
+/// The folder of the truth among the runs; no method may have this name.
 pub const TRUTH: &str = "truth";
 
 /// What is known of a scene, beside its `pipeline.toml`: the content of `scene.json`.

@@ -10,14 +10,13 @@ use glam::{DVec3, Vec3};
 
 /// Columns and rows of projected maps.
 const PROJECTED: [usize; 2] = [256, 128];
-/// Columns and rows on which fitted lobes are written down: a texel of .35 degrees, so that a sun's
-/// edge is hardly wider than the sun.
+/// Columns and rows of the map of fitted lobes. A texel has .35 degrees, so that a sun hardly gets wider.
 const FITTED: [usize; 2] = [1024, 512];
 /// Lobes that are fitted to a map: as many as the optimiser has.
 const LOBES: usize = 32;
 
-/// Exposed light before the camera's curve. Values above .95, where Reinhard's curve is flat, are taken
-/// as .95.
+/// Exposed light before the camera's curve, from a value behind it. Values above .95, where Reinhard's
+/// curve is flat, count as .95.
 fn before_curve(tone: Tone, value: Vec3) -> Vec3 {
     match tone {
         Tone::None => value,

@@ -6,11 +6,11 @@ use crate::command_line::{MakeArgs, Places};
 use crate::folder::EvaluationFolder;
 use crate::{generated, panoramas};
 
-/// Makes scenes; those that are there already stay. `progress` is told the share that is done. Returns
+/// Makes scenes; those that are there already stay. `progress` gets the share that is done. Returns
 /// the scenes' names.
 ///
 /// # Errors
-/// If nothing is asked for, or a panorama, a model or the table of kinds cannot be read.
+/// If no scene is asked for, or a panorama, a model or the table of kinds cannot be read.
 pub fn make(args: &MakeArgs, progress: &dyn Fn(f64)) -> anyhow::Result<Vec<String>> {
     let evaluation = EvaluationFolder::new(&args.folder.out);
     if args.hdri.is_none() && args.generated == 0 {

@@ -37,7 +37,7 @@ impl Page {
     }
 }
 
-/// Text as markup, in elements and in attributes.
+/// Text with `&`, `<` and the like escaped, for elements and attributes.
 pub fn text(text: &str) -> String {
     Html::text(text).into_string()
 }

@@ -31,7 +31,7 @@ const EYE_M: f32 = 1.75;
 const AWAY_M: f32 = 4.2;
 /// Height of every object, metres.
 const OBJECT_M: f32 = 1.1;
-/// Columns of the true light that are kept at most.
+/// Most columns of the true light; wider panoramas are scaled down.
 const MOST_COLUMNS: usize = 1024;
 
 /// An object of the built-in ones: name, and material as an MTL file has it.
@@ -83,7 +83,7 @@ pub fn make(
     Ok(made)
 }
 
-/// Panorama and model of the scene number `n`: both change from scene to scene, and every pair comes once
+/// Panorama and model of scene number `n`. Both change from scene to scene, and every pair comes once
 /// before one comes again.
 fn pair(n: usize, panoramas: usize, models: usize) -> (usize, usize) {
     let (p, round) = (n % panoramas, n / panoramas);
@@ -192,7 +192,7 @@ fn pipeline_text(
     ))
 }
 
-/// Kinds of places by the panorama's file name without its extension.
+/// Kinds of places; the key is the panorama's file name without its extension.
 fn read_kinds(path: &Path) -> anyhow::Result<BTreeMap<String, String>> {
     let text =
         fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
@@ -212,7 +212,7 @@ fn read_kinds(path: &Path) -> anyhow::Result<BTreeMap<String, String>> {
     Ok(kinds)
 }
 
-/// Stops after which the log-average is displayed as mid-grey, `x / (1 + x)` coming after them.
+/// Stops of exposure after which `x / (1 + x)` displays the log-average as mid-grey.
 fn exposure_ev(image: &LinearImage) -> f64 {
     exposure_ev_to(image, MID_GREY / (1.0 - MID_GREY))
 }

@@ -59,7 +59,7 @@ pub(crate) struct Column {
     pub scores: BTreeMap<String, Score>,
 }
 
-/// Scores of all methods, in the order of the table of methods, others behind.
+/// Scores of all methods: those of the table of methods in its order, then the others.
 fn read(evaluation: &EvaluationFolder, scenes: &[SceneInfo]) -> anyhow::Result<Vec<Column>> {
     let mut columns = Vec::new();
     for name in evaluation.methods()?.into_iter().filter(|n| n != TRUTH) {

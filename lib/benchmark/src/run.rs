@@ -1,4 +1,4 @@
-//! Methods on scenes: what is done stays, scenes run side by side.
+//! Runs methods on scenes, several at a time. Results that are there are not made again.
 use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -12,7 +12,7 @@ use crate::folder::{EvaluationFolder, TRUTH};
 use crate::methods::{self, Method};
 use crate::runner::Runner;
 
-/// A method that has come to its end on a scene, for better or worse.
+/// A method that has ended on a scene, whether it failed or not.
 pub struct Step<'a> {
     /// Runs that have ended, this one included.
     pub done: usize,
@@ -36,7 +36,7 @@ pub struct Outcome {
     pub failures: Vec<(String, anyhow::Error)>,
 }
 
-/// Runs what is not done yet. `report` is told of every run that ends.
+/// Runs what is not done yet. `report` gets every run that ends.
 ///
 /// # Errors
 /// If there are no scenes, the arguments name what is not there, or the user interrupts. Runs that fail

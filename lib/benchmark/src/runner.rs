@@ -356,7 +356,7 @@ impl<'a> StageRuns<'a> {
         Ok(())
     }
 
-    /// Moves what is worth keeping to `folder`, whatever was there before.
+    /// Moves what is kept of a run to `folder`, and replaces what was there.
     fn keep(&self, folder: &Path) -> anyhow::Result<()> {
         let failed = || format!("cannot write {}", folder.display());
         if folder.is_dir() {

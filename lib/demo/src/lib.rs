@@ -28,8 +28,8 @@ const SIZE: [u32; 2] = [960, 640];
 /// Where the light is captured: in the middle of where the car will stand.
 const PROBE: Vec3 = Vec3::new(0.0, 0.7, 0.0);
 
-/// Writes `car.glb`, `background.png` and `environment.exr` into `folder`, `samples` paths a pixel.
-/// `report` is told of each when it is there.
+/// Writes `car.glb`, `background.png` and `environment.exr` into `folder`, traced with `samples` paths a
+/// pixel. `report` gets each file's name once it is written.
 ///
 /// # Errors
 /// If a file cannot be written.

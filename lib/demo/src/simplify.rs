@@ -232,7 +232,7 @@ impl Simplifier<'_> {
         }
     }
 
-    /// Whether the faces around `moved`, but those with `gone`, still face outwards with `moved`
+    /// Whether the faces around `moved` that do not touch `gone` still face outwards when `moved` is
     /// at `p`.
     fn stays_well_shaped(&self, moved: u32, gone: u32, p: Vec3, n: Vec3) -> bool {
         self.around[moved as usize]

@@ -19,8 +19,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
 
-/// The mean square of a picture's gradient is of order 1 / pixels times this: beside the
-/// regularisers it weighs as much as a reference does.
+/// Scale of the gradient: its mean square over the picture is about this over the number of pixels.
+/// So guidance weighs as much beside the regularisers as a reference does.
 const STRENGTH: f64 = 100.0;
 /// Sides of the crops that a model with light captions sees, in sides of the object's box: those of
 /// its training.
@@ -41,18 +41,17 @@ pub struct DistillationSettings {
     pub draws: usize,
     /// Classifier-free guidance of SDS and of edited pictures.
     pub guidance_scale: f64,
-    /// What the picture should show; from class, word and light if not given.
+    /// What the picture should show. If absent, the prompt is made of class, word and light.
     pub prompt: Option<String>,
     /// Whether a LoRA is used.
     pub adapt: bool,
-    /// Whether the estimated light is contrasted with the same light turned to other sides; else
-    /// with the empty caption.
+    /// The prediction for the estimated light is compared with that for the same light from other
+    /// sides; if false, with that for the empty caption.
     pub turned: bool,
 }
 
 impl DistillationSettings {
-    /// What `table` says. Where it is silent: the defaults for models with or without light
-    /// captions.
+    /// The settings of `table`, with defaults for models with or without light captions.
     ///
     /// # Errors
     /// A value out of range, with its key.
@@ -106,7 +105,7 @@ pub struct Adapter {
     pub word: String,
 }
 
-/// Text states of the wanted picture and of what it is contrasted with.
+/// Text states of the wanted picture and of those that it is compared with.
 struct Contrast {
     conditional: Tensor,
     unconditional: Tensor,
@@ -120,7 +119,7 @@ impl Contrast {
         }
     }
 
-    /// Contrasts a picture of `class` under the light `words` with others.
+    /// Compares a picture of `class` under the light `words` with pictures under other lights.
     fn of_light(
         model: &Model,
         settings: &DistillationSettings,
@@ -154,7 +153,7 @@ pub struct Distillation<'a> {
     settings: DistillationSettings,
     lora: Option<Arc<Lora>>,
     contrast: Contrast,
-    /// The same for the mirror image, if the light has a side.
+    /// The same for the mirror image of the picture, if a light is described.
     mirrored: Option<Contrast>,
     background: Raster<Vec3>,
     paint: Raster<Vec3>,
@@ -163,8 +162,8 @@ pub struct Distillation<'a> {
 }
 
 impl<'a> Distillation<'a> {
-    /// Guides towards `light`, as seen from where the object's crop looks, and the class;
-    /// `background` is the photograph, `paint` 1 where an inpainting model may paint.
+    /// Guides towards an object of `class` under `light`, whose azimuth is relative to the view of the
+    /// object's crop. `background` is the photograph; `paint` is 1 where an inpainting model may paint.
     pub fn new(
         model: &'a Model,
         settings: DistillationSettings,

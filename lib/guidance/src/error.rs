@@ -17,7 +17,7 @@ pub enum Error {
     /// The optimisation failed.
     #[error(transparent)]
     Optimize(OptimizeError),
-    /// A gradient is missing where one must pass.
+    /// No gradient arrived where one is needed.
     #[error("{0}")]
     Cut(&'static str),
     /// No pixel shows the object.

@@ -1,5 +1,5 @@
-//! The light that a model with light captions sees in crops of the photograph, and the start of the
-//! optimisation that follows from it.
+//! The light that a model with light captions estimates from crops of the photograph, and the start
+//! of the optimisation that is made of it.
 use std::ops::ControlFlow;
 
 use dipir_diffusion::model::Model;
@@ -20,24 +20,24 @@ use crate::error::{Error, Result};
 /// Side of a crop in longer sides of the object's box: as the model was trained, where the object
 /// takes about two fifths.
 const CROP: f32 = 2.6;
-/// Crops that the model is asked to explain.
+/// Most crops from which light is estimated.
 const CROPS: usize = 12;
 /// The first of them, around the place of the insertion.
 const NEAR: usize = 3;
-/// Width of the sun's lobe at the start, radians: that of the model's training, in the middle.
+/// Least width of the sun's lobe at the start, radians: the middle of the widths in training.
 const SUN_SIGMA: f32 = 0.07;
-/// Width of the sun's lobe for each radian by which its azimuth is unsure: a hard shadow would lie in the wrong
-/// place.
+/// Added width of the sun's lobe for each radian of the azimuth's uncertainty: a narrow lobe would cast
+/// a hard shadow in the wrong place.
 const HEDGE: f32 = 0.5;
 /// Largest width of the sun's lobe, radians.
 const WIDEST: f32 = 0.8;
-/// Share of the ground's light that it throws back at the object.
+/// Albedo of the ground: the share of its light that it reflects.
 const GROUND_ALBEDO: f32 = 0.3;
 
 /// Where an object is inserted.
 #[derive(Clone, Copy)]
 pub struct Place<'a> {
-    /// Took the photograph.
+    /// The camera that took the photograph.
     pub camera: &'a Camera,
     /// The ground that catches the shadow.
     pub proxy: &'a Proxy,
@@ -138,11 +138,12 @@ fn ground_depth(camera: &Camera, proxy: &Proxy, pixel: Vec2) -> Option<f32> {
     (depth.is_finite() && depth > 0.0).then_some(depth)
 }
 
-/// Sizes of the photograph's own objects that are looked for, in sizes of the inserted one.
+/// Sizes at which the photograph's own objects are searched for, as multiples of the inserted
+/// object's size.
 const OWN_SIZES: [f32; 4] = [0.2, 0.4, 0.7, 1.1];
 /// Smallest side of a crop, pixels: less holds too little of an object.
 const SMALLEST: f32 = 24.0;
-/// Crops whose middle stands out less are not taken for objects.
+/// Least contrast of a crop's middle with its surroundings for it to be taken for an object.
 const LEAST_INTEREST: f32 = 0.4;
 
 /// Squares of the photograph: the first three around the place of the insertion, the others where
@@ -211,10 +212,10 @@ fn crops(photo: &Raster<Vec3>, place: &Place<'_>) -> Vec<Crop> {
 }
 
 /// Estimates the light from `photo`, display values, around the place of the insertion; `None` if the
-/// model has no light encoder. `progress` is told the share that is done and may break off.
+/// model has no light encoder. `progress` gets the share that is done, and may stop the work.
 ///
 /// # Errors
-/// Those of the model; [`Error::Interrupted`] if `progress` broke off.
+/// Those of the model; [`Error::Interrupted`] if `progress` stopped the work.
 pub fn read_light(
     model: &Model,
     photo: &DisplayImage,
@@ -321,7 +322,7 @@ mod tests {
                 .max_by(|a, b| a.radiance.x.total_cmp(&b.radiance.x));
             sun.expect("lobes").sigma
         };
-        // Who does not know where the sun is throws no hard shadow.
+        // An uncertain azimuth casts no hard shadow.
         let widths = [1.0, 0.95, 0.7, 0.0].map(width);
         assert!((widths[0] - SUN_SIGMA).abs() < 1e-3, "{widths:?}");
         assert!(widths.is_sorted_by(|a, b| a < b), "{widths:?}");

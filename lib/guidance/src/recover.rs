@@ -31,13 +31,13 @@ pub struct Problem<'a> {
     pub renderer: &'a Renderer<'a>,
     /// How light reaches that picture.
     pub transport: Transport,
-    /// How it is recorded anew when the light has moved away.
+    /// How transport is recorded anew when the light differs too much from the recorded one.
     pub record: RecordSettings<'a>,
     /// The photograph at that size.
     pub background: &'a LinearImage,
     /// How the photograph is encoded.
     pub transfer: Transfer,
-    /// All numbers that can be chosen.
+    /// The settings of `[light]`.
     pub settings: &'a Settings,
     /// The light to start from; without it, the light that is read off the photograph, or neutral
     /// light.
@@ -64,11 +64,11 @@ pub struct ModelGuidance<'a> {
     pub settings: &'a DistillationSettings,
     /// What the object is called.
     pub class: &'a str,
-    /// How light is read off the photograph, if the model can and should.
+    /// How the model reads light off the photograph; `None` if it cannot or should not.
     pub reading: Option<&'a InversionSettings>,
 }
 
-/// What is told while light is recovered.
+/// What `watch` gets while light is recovered.
 #[derive(Debug)]
 pub enum Event<'a> {
     /// Light is being read off the photograph; the share that is done.
@@ -77,7 +77,7 @@ pub enum Event<'a> {
     Recording,
     /// The optimisation starts here, or goes on from the checkpoint.
     Start(&'a Parameters),
-    /// The optimisation's own.
+    /// An event of the optimisation.
     Optimization(optimization::Event<'a>),
 }
 
@@ -97,12 +97,11 @@ pub struct Recovery {
 
 /// Recovers the light and the tone curves under which the composite fits the target.
 ///
-/// A function of its arguments: the same problem gives the same light, whatever the number of
-/// threads and however often it was interrupted.
+/// The same problem gives the same light, for any number of threads and of interruptions.
 ///
 /// # Errors
-/// Those of model and optimisation; [`Error::Interrupted`] if `watch` broke off, with the state in the
-/// checkpoint.
+/// Those of model and optimisation; [`Error::Interrupted`] if `watch` stopped the work. The state is in
+/// the checkpoint then.
 pub fn recover_light(
     problem: Problem,
     target: &Target,
@@ -197,7 +196,7 @@ pub fn recover_light(
     })
 }
 
-/// The light that the model sees in the photograph, if it is asked.
+/// The light that the model reads off the photograph; `None` if it should not read.
 fn read(
     model: &ModelGuidance,
     photo: &DisplayImage,

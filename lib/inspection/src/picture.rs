@@ -77,7 +77,8 @@ fn layers_of_photo(path: &Path) -> anyhow::Result<Layers> {
     Ok(layers)
 }
 
-/// The image as a light, where it is one: marked as latitude-longitude, or an HDR panorama.
+/// The image as an environment map, if it is one: marked as latitude-longitude, or an HDR file twice as
+/// wide as high.
 fn environment(layers: &Layers, kind: Kind) -> Option<EnvironmentMap> {
     let panorama = kind == Kind::Hdr && layers.width() == 2 * layers.height();
     if !(layers.latlong || panorama) {

@@ -43,7 +43,7 @@ impl Range {
         })
     }
 
-    /// Cells of a table: min, mean, max, and what is not finite.
+    /// Cells of a table: least, mean, largest, and how many values are not finite.
     pub fn cells(self) -> [String; 4] {
         let strange = match (self.nan, self.infinite) {
             (0, 0) => String::new(),

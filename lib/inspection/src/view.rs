@@ -58,7 +58,7 @@ fn channel(layer: &str, suffix: &str) -> String {
     }
 }
 
-/// NaN and infinity as magenta: seen at once, and no light of that colour is likely.
+/// Colour of NaN and infinity: magenta, which is seen at once and which light seldom has.
 fn finite(raster: Raster<Vec3>) -> Raster<Vec3> {
     raster.map(|v| {
         if v.is_finite() {
@@ -77,7 +77,7 @@ fn environment(map: &EnvironmentMap, gain: f32) -> DisplayImage {
     shown
 }
 
-/// A red ring around a texel, across the seam where need be.
+/// A red ring around a texel; it continues across the map's left and right edge.
 fn ring(image: &mut Raster<Vec3>, column: usize, row: usize) {
     let (width, height) = (image.width() as i64, image.height() as i64);
     let radius = (height as f32 / 24.0).max(3.0);

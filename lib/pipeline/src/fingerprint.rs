@@ -199,7 +199,7 @@ impl fmt::Display for StaleReason {
     }
 }
 
-/// The reasons in words. What has happened to several files of one role is said once.
+/// The reasons in words. A reason that several files of one role share is named once.
 pub fn in_words(reasons: &[StaleReason]) -> String {
     let mut words: Vec<String> = Vec::new();
     let mut told: Vec<(&str, &str)> = Vec::new();

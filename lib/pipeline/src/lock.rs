@@ -13,7 +13,7 @@ use crate::error::StageError;
 /// How lock files begin; the number of the process follows.
 const HEAD: &str = "dipir lock ";
 
-/// What to do when somebody else writes the folder.
+/// What to do when another process writes the folder.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum WhenLocked {
     /// Fail, naming the other process.

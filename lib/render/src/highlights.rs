@@ -195,8 +195,8 @@ struct Candidate {
     counts: RayCounts,
 }
 
-/// Those of `pixels` with highlights that the samples in `film` missed or met by chance, with the density of their
-/// new samples. Traces nothing where the light has no bright source.
+/// The pixels among `pixels` with highlights that the samples in `film` missed or met by chance, and the
+/// density of new samples in each. Traces nothing where the light has no bright source.
 pub fn find<L: PathLight>(
     path: &PathContext<L>,
     film: &Film,

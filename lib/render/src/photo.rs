@@ -8,8 +8,8 @@ use crate::world::World;
 
 /// The photograph projected onto the proxy.
 ///
-/// A point of the proxy is taken to look the same from everywhere (Lambertian) and as it does
-/// without the object: its colour in the photograph is its radiance, on the photograph's own
+/// A point of the proxy is assumed to look the same from everywhere (Lambertian), and the same with
+/// the object as without it: its colour in the photograph is its radiance, on the photograph's own
 /// scale. The object's shadow on it is not subtracted.
 #[derive(Clone, Copy)]
 pub struct Photo<'a> {

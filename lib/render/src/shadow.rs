@@ -50,7 +50,7 @@ pub struct ShadowContext<'a, L, P> {
     pub proxy_occlusion: bool,
     /// Light of the object on the proxy, if it counts.
     pub light_on_proxy: Option<LightOnProxy>,
-    /// Share of the plane's light that may be blocked without being sampled.
+    /// Where the object can block at most this share of the plane's light, nothing is sampled.
     pub tolerance: f32,
 }
 
@@ -397,7 +397,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
         gather.sent(found, cosine / (chance * cone_pdf(cone.cos_half_angle)));
     }
 
-    /// Restricts the parts of the light to `cone`. Whether anything noticeable is there.
+    /// Restricts the parts of the light to `cone`, and says whether noticeable light is left.
     fn restrict(&self, cones: &mut [P::Cone<'p>], cone: &Cone) -> bool {
         let mut mass = 0.0;
         for part in cones {

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use crate::material::{AlphaMode, Material};
 use crate::scene::Scene;
 
-/// What a render may have to simulate. What is false here, no surface has.
+/// What a render may have to simulate. A feature that is false here is on no surface.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SceneFeatures {
     /// Textures other than normal maps.

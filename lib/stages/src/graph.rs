@@ -22,7 +22,7 @@ pub const LAST: &str = COMPOSITE.name;
 
 /// The graph of the session's configuration.
 pub fn graph(session: &Session) -> anyhow::Result<Graph> {
-    // Read here so that a slip in them is told before anything runs.
+    // Read here so that an error in them is reported before anything runs.
     let _: (SceneConfig, ModelTable, ReportTable) = (
         session.config.table("scene")?,
         session.config.table("model")?,

@@ -70,7 +70,7 @@ const PILOT_SKY: f32 = 0.35;
 /// Radiance of the ground below the pilot light's horizon.
 const PILOT_GROUND: f32 = 0.2;
 
-/// The light under which effects are planned as long as no other is known: a grey sky with a sun
+/// The light under which effects are planned if no other is known: a grey sky with a sun
 /// at 45 degrees, to the left of and behind a camera that looks down -z. Grey and sharp at once,
 /// it shows every effect of materials and shadows without favouring a colour.
 pub fn pilot() -> Light {

@@ -1,5 +1,5 @@
-//! What `[pipeline] quality` stands for, as data: `presets.json`, read off what `dipir-tradeoff`
-//! measured, with the day of the measurement. And what the presets beside a run would have cost.
+//! What `[pipeline] quality` stands for (`presets.json`, chosen by what `dipir-tradeoff` measured), and
+//! what a run would have cost with the next cheaper and the next better preset.
 use std::sync::OnceLock;
 
 use dipir_cli::session::duration;
@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 pub struct Presets {
     /// The day, as in 2026-11-21; absent where a preset is an assumption.
     pub measured: Option<String>,
-    /// What measured it.
+    /// The command that measured it.
     pub command: Option<String>,
     /// From the cheapest to the best.
     pub presets: [Preset; 3],
@@ -169,7 +169,7 @@ impl Outlook {
     }
 }
 
-/// A run of the light stage, to tell from it what another preset would have taken.
+/// A run of the light stage, from which the time under another preset is estimated.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LightRun {
     /// Steps; absent where no preset says how many.
@@ -184,7 +184,7 @@ pub struct LightRun {
     pub record_s: f64,
     /// Seconds of the optimisation.
     pub optimization_s: f64,
-    /// Whether a model judged the pictures: then its time is that of the steps, whatever the record.
+    /// Whether a model guided: then the time grows with the steps alone, whatever the record.
     pub by_model: bool,
 }
 
@@ -209,7 +209,7 @@ impl LightRun {
         self.record_s * pixels * samples + self.optimization_s * iterations * replay
     }
 
-    /// The presets beside `quality`, as far as `table` leaves to them.
+    /// The presets next to `quality`, for the keys that `table` does not set.
     pub fn outlook(&self, quality: Quality, table: &LightTable) -> Outlook {
         // Measured with a reference; what a model guides to is another matter.
         let error = |p: &Preset| p.recovery.filter(|_| !self.by_model).map(|l| l.error);

@@ -1,6 +1,6 @@
 //! `report.html`: one page that shows a run, complete in itself.
 //!
-//! Whatever stages there are is shown; what cannot be read is said where it would stand.
+//! It shows the stages that have run. Where an artifact cannot be read, its section says why.
 mod curves;
 pub mod html;
 mod learning;
@@ -22,7 +22,7 @@ use crate::truth::Truth;
 use html::Html;
 pub use stages::quoted;
 
-/// How every page begins: what tells a page of ours from another's.
+/// How every page begins. A file that begins otherwise is not the program's own, and stays.
 pub const MARK: &[u8] =
     b"<!doctype html>\n<html lang=\"en\"><head><meta name=\"generator\" content=\"dipir ";
 /// Name of the file in the folder of artifacts.
@@ -30,7 +30,7 @@ pub const FILE: &str = "report.html";
 /// Raised whenever the same artifacts give another page.
 const VERSION: u32 = 3;
 
-/// What the page says beside what the artifacts hold.
+/// What the page shows in addition to the artifacts.
 pub struct Report<'a> {
     /// The configuration and the folder of artifacts.
     pub session: &'a Session,

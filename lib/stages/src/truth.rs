@@ -1,8 +1,8 @@
 //! How far the recovered light is from the true one, where that is known.
 //!
 //! The picture is compared with the one that the true light makes, path traced at the size at which
-//! light is optimised. The recorded transport would not do: it samples a sun that nobody knew when
-//! it was recorded too rarely. For the neutral light, which has no peak, it does.
+//! light is optimised. The recorded transport cannot be used: it has too few samples towards a sun
+//! that was unknown when it was recorded. For neutral light, which has no peak, it is precise enough.
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -32,8 +32,8 @@ use crate::names::{COMPOSITE, LIGHT, SCENE};
 use crate::scene::folder::SceneFolder;
 use crate::scene::transport::{self, Frame};
 
-/// Display-referred RMSE, as a 95% bound, to which the picture under the true light is rendered: in
-/// quadrature, a small part of any difference worth telling.
+/// Error of the picture under the true light, display-referred RMSE, 95% bound: added in quadrature, a
+/// small part of any difference that matters.
 const ERROR: f32 = 0.01;
 
 /// The `[report]` table.

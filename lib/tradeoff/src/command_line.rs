@@ -51,7 +51,8 @@ pub struct Cli {
     #[arg(long, value_name = "WxH", default_value = "144x96", value_parser = parse_size)]
     pub size: [usize; 2],
 
-    /// Runs of every point, with seeds of their own: their median time, their mean squared error
+    /// Runs of every point, each with its own seed; tables have their median time and root mean square
+    /// error
     #[arg(long, value_name = "N", default_value_t = 3)]
     pub repeats: u64,
 
@@ -59,8 +60,8 @@ pub struct Cli {
     #[arg(long, value_name = "N", default_value_t = 12)]
     pub joint: usize,
 
-    /// Display-referred RMSE at which the reference of the render track stops: what is measured cannot
-    /// be told from it below
+    /// Display-referred RMSE at which the reference of the render track stops; smaller errors cannot
+    /// be measured
     #[arg(long, value_name = "RMSE", default_value_t = 0.0002)]
     pub reference_error: f64,
 

@@ -32,9 +32,9 @@ pub struct Knob {
     pub key: &'static str,
     /// As written behind `--set KEY=`.
     pub values: &'static [&'static str],
-    /// What is set beside it.
+    /// Other keys that are set with it.
     pub with: &'static [(&'static str, &'static str)],
-    /// Whether the joint search turns it.
+    /// Whether the joint search varies it.
     pub joint: bool,
 }
 
@@ -140,7 +140,7 @@ pub struct Variant {
     pub part: Part,
     /// The series it is drawn in.
     pub series: String,
-    /// What tells it from others of the series.
+    /// Its name within the series.
     pub label: String,
     /// Keys and values, for `--set`.
     pub set: Vec<(String, String)>,

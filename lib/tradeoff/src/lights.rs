@@ -12,7 +12,7 @@ fn map_of(radiance: impl Fn(Vec3) -> Vec3) -> EnvironmentMap {
     EnvironmentMap::new(width, height, texels.collect()).unwrap_or(empty)
 }
 
-/// Smoothly from 1 within `radius_deg` of `towards` to 0 at 1.3 times that.
+/// 1 within `radius_deg` of `towards`, falling smoothly to 0 at 1.3 times that angle.
 fn disc(direction: Vec3, towards: Vec3, radius_deg: f32) -> f32 {
     let angle = direction.angle_between(towards.normalize()).to_degrees();
     ((1.3 - angle / radius_deg) / 0.3).clamp(0.0, 1.0)

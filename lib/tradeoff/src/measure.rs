@@ -24,12 +24,12 @@ pub struct Sample {
     pub error: f64,
     /// The error that the stage itself stated: a 95% bound.
     pub stated_error: Option<f64>,
-    /// Processor seconds of the stages that the variant concerns; wall seconds where the system does
-    /// not count the former.
+    /// Processor seconds of the stages that the variant concerns. Wall seconds where the system does
+    /// not count processor seconds.
     pub cost_s: f64,
     /// Wall seconds of the same.
     pub wall_s: f64,
-    /// Most memory of any of them.
+    /// Peak memory of any of them, bytes.
     pub peak_rss_bytes: u64,
 }
 
@@ -42,11 +42,11 @@ pub struct Point {
     pub part: String,
     /// The series it is drawn in.
     pub series: String,
-    /// Its values.
+    /// Its name within the series.
     pub label: String,
     /// Keys and values.
     pub set: Vec<(String, String)>,
-    /// A run a seed.
+    /// One run for each seed.
     pub samples: Vec<Sample>,
 }
 
@@ -80,7 +80,7 @@ impl Reference {
 
 /// Measures one scene.
 pub struct SceneMeasurement<'a> {
-    /// What runs.
+    /// The programs that are measured.
     pub executables: &'a Executables,
     /// Where everything goes.
     pub out: &'a Path,
@@ -88,11 +88,11 @@ pub struct SceneMeasurement<'a> {
     pub scene: &'a Scene,
     /// `--threads`.
     pub threads: usize,
-    /// Where the reference of the render track stops.
+    /// Error at which the reference of the render track stops.
     pub reference_error: f64,
 }
 
-/// Seed of references: apart from those of points.
+/// Seed of references, which no point has.
 const REFERENCE_SEED: u64 = 1_000_003;
 /// Error at which the pictures under recovered lights, and the truth that they are recovered from,
 /// stop.

@@ -1,4 +1,4 @@
-//! The whole sweep: which points are measured, and what is written of them.
+//! The whole sweep: measures points, then writes tables and plots.
 use std::path::PathBuf;
 
 use dipir_cli::executables::Executables;
@@ -34,11 +34,12 @@ pub struct Outcome {
     pub files: Vec<PathBuf>,
 }
 
-/// Measures what is not measured yet, and writes tables and plots. `report` is told of every point
-/// before it is measured.
+/// Measures what is not measured yet, and writes tables and plots. `report` gets every point before
+/// it is measured.
 ///
 /// # Errors
-/// If the arguments name what is not there, an executable fails, or the user interrupts.
+/// If the arguments name a scene or a series that does not exist, an executable fails, or the user
+/// interrupts.
 pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome> {
     if !(cli.reference_error > 0.0 && cli.reference_error < 1.0) || cli.repeats == 0 {
         let text = "--reference-error must lie above 0 and below 1, --repeats must be at least 1";

@@ -27,13 +27,13 @@ pub struct Row {
     pub cost_s: f64,
     /// Median wall seconds.
     pub wall_s: f64,
-    /// Most memory, bytes.
+    /// Peak memory, bytes.
     pub peak_rss_bytes: u64,
     /// Whether no other setting beats it.
     pub on_front: bool,
-    /// Whether accuracy gets dear here.
+    /// Whether it is the elbow, beyond which accuracy gets dear.
     pub is_elbow: bool,
-    /// The factor by which the front's setting of the same cost has less error.
+    /// Its error over that of the front at the same cost.
     pub excess: f64,
 }
 
@@ -72,8 +72,8 @@ type TrackRows<'a> = (&'a str, Vec<SceneRows>);
 /// Name of the panel of means over scenes.
 const OVERALL: &str = "all scenes";
 
-/// Rows of one part by scene, fronts and elbows marked; with several scenes, their geometric means
-/// last.
+/// Rows of one part by scene, with fronts and elbows marked. With several scenes, their geometric
+/// means come last.
 fn by_scene(points: &[Point], part: &str) -> Vec<SceneRows> {
     let mut scenes: Vec<SceneRows> = Vec::new();
     for point in points.iter().filter(|p| p.part == part) {
@@ -95,7 +95,7 @@ fn by_scene(points: &[Point], part: &str) -> Vec<SceneRows> {
     scenes
 }
 
-/// Geometric means over scenes of the settings that all of them have.
+/// For each setting that all scenes have, the geometric means over the scenes.
 fn overall(scenes: &[SceneRows]) -> Vec<Row> {
     let mean = |values: Vec<f64>| {
         let n = values.len() as f64;
@@ -180,7 +180,7 @@ fn chart(part: &str, scenes: &[SceneRows]) -> Chart {
     }
 }
 
-/// Three rows of the front for the presets.
+/// Three rows of the front that the presets can take.
 fn suggestion(rows: &[Row]) -> Option<Value> {
     let places: Vec<_> = rows.iter().map(Row::place).collect();
     let chosen = three_presets(&places, &pareto(&places))?.map(|k| row_json(&rows[k]));
@@ -267,7 +267,7 @@ fn markdown(parts: &[TrackRows]) -> String {
     text
 }
 
-/// Writes all tables and plots of `points` to `out`; the files' names.
+/// Writes all tables and plots of `points` to `out`, and returns the files' names.
 pub fn write_all(points: &[Point], about: &Value, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let parts: Vec<_> = ["render", "light"]
         .into_iter()

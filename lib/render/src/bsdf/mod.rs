@@ -247,7 +247,7 @@ impl<const F: u32> Bsdf<F> {
         self.eval_pdf(wi).1
     }
 
-    /// Both at once, for multiple importance sampling.
+    /// [`Self::eval`] and [`Self::pdf`] at once, for multiple importance sampling.
     #[inline]
     pub fn eval_pdf(&self, wi: Vec3) -> (Vec3, f32) {
         let local = self.frame.to_local(wi);

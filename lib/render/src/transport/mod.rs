@@ -218,9 +218,9 @@ impl Transport {
         with_rows!(&self.weights, w => w.object.product_vjp(texels, &|p| gradient[p]))
     }
 
-    /// Light that reaches the proxy with the object over light without it, per channel, at least
-    /// 0, and at most 1 unless the object sends light there; 1 where there is no proxy and where
-    /// no light arrives. Panics on another number of texels than
+    /// Ratio of the light that reaches the proxy with the object to that without it, per channel. It
+    /// is at least 0, at most 1 unless the object sends light there, and 1 where there is no proxy or
+    /// no light arrives. Panics if `light` has not as many texels as
     /// [`environment_size`](Self::environment_size) says.
     pub fn shadow(&self, light: &[Vec3]) -> Raster<Vec3> {
         let light = self.checked(light);

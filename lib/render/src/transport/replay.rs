@@ -132,7 +132,7 @@ impl<E: Entry> Rows<E> {
     }
 }
 
-/// One over the scale of a row; exact, as is the product with it short of underflow.
+/// One over the scale of a row. It is exact, and so is a product with it that does not underflow.
 #[inline(always)]
 fn inverse_scale(exponent: i8) -> f32 {
     power_of_two(-exponent)

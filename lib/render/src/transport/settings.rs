@@ -20,7 +20,7 @@ pub struct RecordSettings<'a> {
     pub precision: Precision,
     /// Seed of all random numbers.
     pub seed: u64,
-    /// A light like those that the record will be replayed under, of any size.
+    /// A light similar to those under which the record will be replayed, of any size.
     pub light: Option<&'a EnvironmentMap>,
     /// Share of a plane's shadow samples that are uniform over the sphere, in (0, 1]; the others
     /// follow `light`. 1 without a light.

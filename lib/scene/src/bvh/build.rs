@@ -317,7 +317,7 @@ impl Emitter<'_> {
         slots
     }
 
-    /// The children that `node` becomes when it may use `slots`.
+    /// The nodes that take the place of `node` in its parent, which has `slots` places for it.
     fn gather(&self, node: u32, slots: usize, out: &mut Vec<u32>) {
         let table = &self.costs.table[node as usize];
         // Fewer slots at the same cost mean fewer children.

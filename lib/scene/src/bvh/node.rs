@@ -235,13 +235,13 @@ impl PackRay {
         }
     }
 
-    /// A superset of the triangles that the ray meets between 0 and `t_max`, one bit each:
-    /// [`Pack::intersect`], whose arithmetic this repeats, has the last word.
+    /// A superset of the triangles that the ray meets between 0 and `t_max`, one bit each.
+    /// [`Pack::intersect`], whose arithmetic this repeats, decides.
     ///
     /// Edge functions of zero, which that one settles in f64, pass. Distances are compared
     /// vertex by vertex: a hit lies between the nearest and the farthest, however thin the
-    /// triangle. Integer maxima order floats rightly but for two negative ones, of which all
-    /// that is asked here is that they are negative.
+    /// triangle. Integer maxima order floats correctly, except two negative ones; of these only
+    /// the sign is used.
     #[inline(always)]
     pub fn candidates(&self, pack: &Pack, t_max: F32x8) -> u32 {
         let [sx, sy, sz] = self.shear;

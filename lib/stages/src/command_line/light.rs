@@ -12,15 +12,17 @@ Examples:
                                                  a material, under [composite] environment
   dipir-light --set pipeline.quality=high     finer environment, more lobes
 
-Reads OUT/scene/, which dipir-scene writes. Writes OUT/light/: reading.json (of a model that knows
-light) lighting.json environment.exr tone.json history.json previews/ stage.json; for materials, materials.json history.json stage.json.
+Reads OUT/scene/, which dipir-scene writes. Writes OUT/light/: lighting.json environment.exr tone.json
+stage.json; of an estimate, estimate.json candidates.json surroundings.exr; under guidance, history.json
+previews/, and reading.json of a model that knows light; for materials, materials.json history.json.
 An interrupted run goes on where it stopped and ends with the same bytes.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 
-/// Recover the light and the tone curves under which the object belongs in the photograph
+/// Find the light under which the object belongs in the photograph
 ///
-/// Reads the [light] table. Every iteration replays recorded light transport; no path is
-/// traced unless the light moves away from what was recorded.
+/// Reads the [light] table. By default the light is estimated from the photograph alone. With a
+/// guidance, a picture or a diffusion model, light and tone curves are recovered: every iteration
+/// replays recorded light transport, which is recorded anew when the light has changed too much.
 #[derive(Parser)]
 #[command(name = "dipir-light", version, after_help = EXAMPLES)]
 pub struct Cli {

@@ -14,7 +14,7 @@ Examples:
                                                    a photograph out of a panorama
 
 Writes OUT/scene/: scene.json effects.json gbuffer.exr stage.json, and transport.safetensors
-where the light is not given.
+where a guidance recovers the light.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 
 /// Set up the scene: read photo, objects, camera and proxy, and plan which effects to simulate

@@ -57,14 +57,13 @@ pub struct Done {
 /// How a render went.
 struct Course {
     rendered: Rendered,
-    /// Seconds to the end of its first round, without which there is no picture.
+    /// Seconds to the end of its first round, the least that makes a picture.
     first_round_s: f64,
     /// Seconds in all.
     seconds: f64,
 }
 
-/// Seconds of putting the layers together and writing them, for each pixel: kept back of a time
-/// budget.
+/// Seconds a pixel to put the layers together and write them. A time budget keeps them back.
 const WRITING_S_PER_PIXEL: f64 = 1e-6;
 
 /// Everything that the stage reads.
@@ -137,8 +136,8 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     })
 }
 
-/// Of a time budget, what is left for sampling: it began with `clock`, and the result has to be
-/// written.
+/// The rest of a time budget, for sampling: less what has passed since `clock` began, and less the
+/// time that writing the result takes.
 fn within(stop: Stop, clock: Instant, inputs: &Inputs) -> Stop {
     let Stop::TimeBudget(budget) = stop else {
         return stop;

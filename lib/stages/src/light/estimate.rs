@@ -1,4 +1,4 @@
-//! The light that is estimated from the photograph alone, with what is known of the sun.
+//! The light that is estimated from the photograph and, where something is known of the sun, from that.
 use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_estimator::{Estimator, KnownAngle, KnownSun, LightEstimate};

@@ -30,7 +30,7 @@ fn has_surroundings(manifest: &Manifest) -> bool {
     manifest.outputs.iter().any(|o| o.role == SURROUNDINGS)
 }
 
-/// Enters what lights the composite into its plan.
+/// Adds the files of the light that the composite reads to its plan.
 pub fn add_inputs(session: &Session, plan: &mut StagePlan) -> anyhow::Result<()> {
     let manifest = manifest(session)?;
     let roles: &[&str] = match has_surroundings(&manifest) {
@@ -42,7 +42,8 @@ pub fn add_inputs(session: &Session, plan: &mut StagePlan) -> anyhow::Result<()>
 
 /// A light that the light stage recovered.
 pub struct Recovered {
-    /// The lobes, on the photograph's scale; with `surroundings` the sources that these lack.
+    /// The lobes, on the photograph's scale. Where there are `surroundings`, only the sources that are
+    /// not in them.
     pub lobes: SgMixture,
     /// The rest of the light, where it is a map.
     pub surroundings: Option<EnvironmentMap>,
@@ -102,7 +103,7 @@ pub fn manifest(session: &Session) -> anyhow::Result<Manifest> {
     Ok(LIGHT.manifest(session)?)
 }
 
-/// The light may have been recovered before the scene was set up anew.
+/// Warns if the light was recovered before the scene was set up anew.
 pub fn warn_of_another_scene(session: &Session, light: &Manifest, scene: &Manifest) {
     let of = |list: &[Artifact]| {
         let found = list.iter().find(|a| a.role == "scene");

@@ -153,7 +153,7 @@ fn needs_light(session: &Session) -> anyhow::Error {
     session.config.invalid("light.materials", message).into()
 }
 
-/// The photograph as the object shades it, at the frame's size.
+/// The photograph with the object's shadow, at the frame's size.
 fn shadowed(
     renderer: &Renderer,
     light: &EnvironmentSampler,
@@ -214,7 +214,7 @@ fn recovery(session: &Session) -> anyhow::Result<Option<Manifest>> {
     Ok(Some(LIGHT.manifest(session)?))
 }
 
-/// Notes the recovered materials as an input, if the configuration asks for them.
+/// Adds the recovered materials to the inputs of a plan, if the configuration asks for them.
 pub fn add_input(session: &Session, plan: &mut StagePlan) -> anyhow::Result<()> {
     match recovery(session)? {
         Some(manifest) => Ok(plan.outputs_of(&manifest, &[ROLE])?),

@@ -1,4 +1,4 @@
-//! Which way the configuration takes to a light, told before any file is looked at.
+//! How the configuration gets its light, decided from its tables alone, before any file is read.
 use dipir_cli::session::Session;
 use dipir_optimize::settings::{GuidanceKind, LightTable, Start};
 
@@ -12,7 +12,7 @@ pub(crate) enum Method {
     Materials,
     /// `[composite] environment` gives the light.
     Given,
-    /// The light is where an optimisation would start: nothing guides.
+    /// Nothing guides: the light is the one from which an optimisation would start.
     Start,
     /// A reference guides.
     Reference,
@@ -35,7 +35,7 @@ impl Method {
             return Ok(Self::Given);
         }
         let stands = table.iterations == Some(0);
-        // Who asks for what a model reads asks for the model.
+        // A start that a model reads needs the model.
         let asks_model = asks_model(&table);
         Ok(
             match table.guidance.resolved(model.path.is_some() || asks_model) {

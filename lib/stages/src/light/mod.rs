@@ -1,5 +1,5 @@
-//! The light stage: recovers the light and the tone curves under which the object looks as the
-//! guidance wants it to.
+//! The light stage: estimates the light of the photograph, or recovers light and tone curves under
+//! which the object looks as the guidance asks.
 mod estimate;
 pub mod folder;
 pub mod materials;
@@ -179,7 +179,7 @@ struct Found {
     rmse: Option<f64>,
     /// What the estimator said of the photograph.
     estimated: Option<Estimated>,
-    /// The light but the first lobes, where it is traced as a map.
+    /// The light without its sources, the first lobes, where it is traced as a map.
     surroundings: Option<EnvironmentMap>,
 }
 
@@ -235,7 +235,7 @@ impl Found {
     }
 }
 
-/// The light of the start, where nothing guides.
+/// The light where nothing guides: the start itself.
 fn start_alone(request: &Request, inputs: &Inputs, estimated: Option<&Estimated>) -> Found {
     let lighting = match (&inputs.first, estimated) {
         (Some(light), _) => light.clone(),
@@ -258,7 +258,7 @@ fn start_alone(request: &Request, inputs: &Inputs, estimated: Option<&Estimated>
     }
 }
 
-/// Recovers light and tone curves; says at which iteration it went on.
+/// Recovers light and tone curves, and returns the iteration at which it went on.
 fn recover(
     session: &Session,
     request: &Request,
@@ -385,7 +385,7 @@ fn recorded(
     transport::record(session, renderer, settings)
 }
 
-/// Runs `recover` with progress bars, keeps its previews, and says at which iteration it went on.
+/// Runs `recover` with progress bars, keeps its previews, and returns the iteration at which it went on.
 fn follow(
     session: &Session,
     settings: &Settings,

@@ -160,11 +160,11 @@ fn reading_param(reading: &Option<InversionSettings>) -> Value {
 
 /// Iterations that refine a light that was read off the photograph.
 const REFINEMENT: usize = 50;
-/// Their learning rates beside those that find a light from a neutral start: the difference of two
-/// predictions has a bias in everything that the caption does not say (docs/prior.md).
+/// Factor on the learning rates for such a start. Guidance has a bias in everything that the caption
+/// does not say, and full rates would follow it (docs/prior.md).
 const REFINEMENT_RATE: f64 = 0.05;
 
-/// What `table` leaves open, for a start that is near.
+/// Fills what `table` leaves open, for a start that is near the result.
 fn refine(table: &LightTable, settings: &mut Settings) {
     settings.iterations = table.iterations.unwrap_or(REFINEMENT);
     if table.learning_rates == LearningRates::default() {

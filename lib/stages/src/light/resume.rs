@@ -19,7 +19,7 @@ const CHECKPOINT: &str = "checkpoint.safetensors";
 /// Folder of the previews.
 const PREVIEWS: &str = "previews";
 
-/// Tells one run from another, so that a checkpoint is found by the run that it belongs to alone.
+/// Identifies a run, so that only the run that wrote a checkpoint finds it.
 pub(crate) fn fingerprint(plan: &StagePlan, settings: &Settings) -> anyhow::Result<Fingerprint> {
     run_fingerprint(plan, &serde_json::to_value(settings)?)
 }
@@ -63,7 +63,7 @@ impl Resume {
         self.resumed_at(session, read.map(|s| s.map(|s| s.iteration)))
     }
 
-    /// The iteration of a checkpoint that was read. A damaged one is removed.
+    /// The iteration of the checkpoint that was `read`, 0 without one. A damaged one is removed.
     pub(crate) fn resumed_at(
         &self,
         session: &Session,

@@ -1,4 +1,5 @@
-//! The light around the place as a map: what the photograph shows of it where it shows it.
+//! The light around the place as a map. Where the photograph shows the surroundings, the map shows
+//! them as the photograph does.
 use dipir_estimator::{Visible, merged};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::SphericalGaussian;

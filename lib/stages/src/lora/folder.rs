@@ -20,7 +20,7 @@ fn has_word(manifest: &Manifest) -> bool {
     manifest.outputs.iter().any(|o| o.role == "word")
 }
 
-/// Enters what the LoRA stage wrote into the plan of a stage that uses it.
+/// Adds what the LoRA stage wrote to the plan of a stage that uses it.
 pub fn add_inputs(session: &Session, plan: &mut StagePlan) -> anyhow::Result<()> {
     let manifest = LORA.manifest(session)?;
     let roles: &[&str] = match has_word(&manifest) {

@@ -71,7 +71,7 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     Ok(plan)
 }
 
-/// Whether concept images are trained on beside the photograph.
+/// Whether training uses concept images beside the photograph.
 pub fn preserves_concepts(session: &Session) -> anyhow::Result<bool> {
     let table: LoraTable = session.config.table("lora")?;
     let concepts: ConceptsTable = session.config.table("concepts")?;

@@ -81,7 +81,7 @@ impl Resume {
         }
     }
 
-    /// The history first: it may be longer than the checkpoint, never shorter.
+    /// Writes the history, then the checkpoint, so that the history is never the shorter one.
     pub(super) fn save(&self, trainer: &LoraTrainer, history: &[StepReport]) -> anyhow::Result<()> {
         let path = self.kept.file("history.json");
         let partial = self.kept.file("history.partial");

@@ -31,7 +31,7 @@ const FILES: [(&str, &[u8]); 13] = files! {
     "README.md"
 };
 
-/// Enters its files into the plan of a stage, as `embedded/…`.
+/// Adds its files to the plan of a stage, as `embedded/…`.
 pub fn inputs(plan: &mut StagePlan) {
     // The content does not change while the process runs.
     static INPUTS: OnceLock<Vec<Artifact>> = OnceLock::new();

@@ -127,7 +127,7 @@ fn device(name: &str) -> anyhow::Result<Device> {
     }
 }
 
-/// Enters every file of the model into the plan of a stage.
+/// Adds every file of the model to the plan of a stage.
 pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> anyhow::Result<()> {
     match &table.path {
         Some(path) => files(path, &session.resolve(path), plan),
@@ -138,7 +138,7 @@ pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> an
     }
 }
 
-/// Enters the files of the model in `folder`, which the configuration calls `path`.
+/// Adds the files of the model in `folder`, which the configuration calls `path`.
 fn files(path: &Path, folder: &Path, plan: &mut StagePlan) -> anyhow::Result<()> {
     for part in ["", "unet", "vae", "text_encoder", "tokenizer", "scheduler"] {
         let mut names: Vec<PathBuf> = match std::fs::read_dir(folder.join(part)) {

@@ -50,8 +50,8 @@ pub fn manifest(session: &Session) -> Result<Manifest, StageError> {
     SCENE.manifest(session)
 }
 
-/// Notes the scene stage's outputs of the given roles, and the files that the scene is made of, as
-/// inputs: with the hashes of the manifest, against which they are checked when they are read.
+/// Adds the scene stage's outputs of the given roles, and the files that the scene is made of, to the
+/// inputs of a plan. Their hashes come from the manifest, and are checked when the files are read.
 pub fn add_inputs(plan: &mut StagePlan, scene: &Manifest, roles: &[&str]) -> anyhow::Result<()> {
     plan.outputs_of(scene, roles)?;
     // The camera's file is in scene.json, the light's has a role of its own.
@@ -61,7 +61,7 @@ pub fn add_inputs(plan: &mut StagePlan, scene: &Manifest, roles: &[&str]) -> any
     Ok(())
 }
 
-/// The scene's folder may have been made before the last edit of `[scene]`.
+/// Warns if the scene's folder was made before the last edit of `[scene]`.
 fn warn_of_other_settings(session: &Session, manifest: &Manifest) -> anyhow::Result<()> {
     let config = scene::settings(session)?;
     let was = json!({"scene": manifest.params["scene"]});

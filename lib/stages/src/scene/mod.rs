@@ -183,8 +183,8 @@ fn record(
     transport::record(session, &renderer, &record_settings)
 }
 
-/// What a run would be. Which files an object consists of is known only when it has been read: the
-/// manifest of the last run has them, and as long as the object is the same, so are they.
+/// What a run would be. The files that an object consists of are known only once it has been read.
+/// They are taken from the manifest of the last run: the same object has the same files.
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let config: SceneConfig = session.config.table("scene")?;
     let recorded = match SCENE.manifest(session) {
@@ -208,8 +208,8 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     )
 }
 
-/// The keys of `[scene]` that decide what the stage writes, with what the quality says where they are silent: what
-/// the object is called concerns the stages that ask a model.
+/// The keys of `[scene]` that decide what the stage writes, with the quality's values where they are not
+/// set. `class` is left out: only stages that ask a model use it.
 pub fn settings(session: &Session) -> anyhow::Result<SceneConfig> {
     let mut config: SceneConfig = session.config.table("scene")?;
     let quality = presets::of(session.pipeline.quality).scene;
@@ -240,7 +240,7 @@ fn named_files(config: &SceneConfig) -> Vec<(&'static str, PathBuf)> {
     files
 }
 
-/// `part of object 2` is another `part of object`.
+/// A role without its number: `part of object` for `part of object 2`.
 fn unnumbered(role: &str) -> &str {
     role.trim_end_matches(|c: char| c.is_ascii_digit())
         .trim_end()
@@ -279,7 +279,7 @@ fn plan_with<'a>(
     Ok(plan)
 }
 
-/// An error about a key says where the key stands, and is the configuration's fault.
+/// Makes an error about a key one of usage that says where the key stands.
 fn with_place(error: dipir_scene::Error, config: &Config) -> anyhow::Error {
     use dipir_scene::Error::{Conflict, Missing};
     let key = match &error {

@@ -1,8 +1,8 @@
 //! The picture that is optimised, and the record of how light reaches it.
 //!
-//! Light is optimised on a picture whose longest side is `[light] size`: the photograph and
-//! its mask scaled down by the mean over each pixel's area, the camera with them. Light and tone
-//! curves have no resolution; what is recovered serves the photograph at its full one.
+//! Light is optimised on a picture whose longest side is `[light] size`: photograph and mask are
+//! scaled down by the mean over each pixel's area, and the camera with them. Light and tone curves
+//! have no resolution, so they serve the photograph at its full size.
 use std::ops::ControlFlow;
 
 use dipir_cli::session::Session;
@@ -97,7 +97,7 @@ fn scaled([width, height]: [u32; 2], longest: usize) -> [u32; 2] {
     [width, height].map(|n| ((f64::from(n) * scale).round() as u32).max(1))
 }
 
-/// What tells the record of one scene from that of another: the hash of what is simulated of what.
+/// Identifies the scene of a record: a hash of its description and of what is simulated.
 pub fn scene_hash(loaded: &LoadedScene, simulation: &Simulation) -> anyhow::Result<String> {
     let mut hasher = blake3::Hasher::new();
     hasher.update(&serde_json::to_vec(&loaded.description)?);
