@@ -60,15 +60,7 @@ fn file(name: &str) -> Option<String> {
             "{name} is no command of dipir; to run it: dipir run {name}"
         ));
     }
-    let has_init = Cli::command().find_subcommand("init").is_some();
-    Some(match has_init {
-        true => format!(
-            "{name} is no command of dipir; to begin with a photograph and an object: dipir init \
-             PHOTO MODEL"
-        ),
-        false => format!(
-            "{name} is no command of dipir; name the photograph in a pipeline.toml, as [scene] \
-             background, and its object, as in the README, and run it: dipir run pipeline.toml"
-        ),
-    })
+    Some(format!(
+        "{name} is no command of dipir; to begin with a photograph and an object: dipir init PHOTO MODEL"
+    ))
 }

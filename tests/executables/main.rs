@@ -3,6 +3,7 @@ mod bad_input;
 mod disk;
 mod evaluation;
 mod guidance;
+mod init;
 mod inspection;
 mod interruption;
 mod kills;
