@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use dipir_cli::args::OutputArgs;
-use dipir_cli::exit::Usage;
+use dipir_cli::exit::{Usage, printable};
 use dipir_setup::view::Asked;
 use dipir_setup::{Draft, Request, SetupError, draft};
 use dipir_stages::report::quoted;
@@ -110,7 +110,8 @@ pub fn run(args: &InitArgs) -> anyhow::Result<()> {
     for warning in &draft.warnings {
         args.output.warn(warning);
     }
-    args.output.result(|| said(&draft), || json(&draft));
+    args.output
+        .result(|| printable(&said(&draft)), || json(&draft));
     Ok(())
 }
 

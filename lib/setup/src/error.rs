@@ -48,7 +48,9 @@ pub enum SetupError {
         accepted: &'static str,
     },
     /// The camera sees no ground to put anything on.
-    #[error("the camera sees no ground: {detail}; look further down with --pitch -10")]
+    #[error(
+        "the camera sees no ground: {detail}; look further down with --pitch -10, or see whether --camera is right"
+    )]
     NoGround {
         /// Why not.
         detail: String,

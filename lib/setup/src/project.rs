@@ -122,9 +122,13 @@ impl Draft {
             },
         })?;
         file.write_all(self.document.text().as_bytes())
-            .map_err(|source| SetupError::Write {
-                path: path(),
-                source,
+            .map_err(|source| {
+                // What was just made and is cut short is of no use, and in the way of the next try.
+                let _ = std::fs::remove_file(&self.path);
+                SetupError::Write {
+                    path: path(),
+                    source,
+                }
             })
     }
 }
