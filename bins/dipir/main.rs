@@ -1,5 +1,6 @@
 //! `dipir`: all stages with one command, each only if it has to run.
 mod clean;
+mod init;
 mod keys;
 mod manual;
 mod project;
@@ -15,6 +16,7 @@ use dipir_cli::exit;
 
 const EXAMPLES: &str = "\
 Examples:
+  dipir init photo.jpg chair.glb            write a first pipeline.toml that runs
   dipir run                                 what ./pipeline.toml says, as far as it is not done yet
   dipir run photo/pipeline.toml             another project; several are run one after the other
   dipir run --set light.iterations=50       a key set for this run; only what it concerns runs
@@ -39,6 +41,8 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Write a first pipeline.toml from a photograph and models
+    Init(init::InitArgs),
     /// Run what is not up to date
     Run(run::RunArgs),
     /// Say of each stage whether it is up to date, and if not, why
@@ -59,6 +63,7 @@ enum Command {
 
 fn main() -> ExitCode {
     exit::run(|| match suggestion::parse()?.command {
+        Command::Init(args) => init::run(&args),
         Command::Run(args) => run::run(&args),
         Command::Status(args) => status::run(&args),
         Command::Graph(args) => status::graph(&args),

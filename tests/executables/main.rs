@@ -4,6 +4,7 @@ mod disk;
 mod estimate;
 mod evaluation;
 mod guidance;
+mod init;
 mod inspection;
 mod interruption;
 mod keys;

@@ -47,10 +47,12 @@ fn every_executable_and_subcommand_has_a_manual_page() {
         .run(DIPIR, &["man", "--dir", "man"])
         .expect_success();
     let page = |name: &str| String::from_utf8(project.read(&format!("man/{name}.1"))).unwrap();
-    for name in EXECUTABLES
-        .into_iter()
-        .chain(["dipir-run", "dipir-report", "dipir-model-fetch"])
-    {
+    for name in EXECUTABLES.into_iter().chain([
+        "dipir-init",
+        "dipir-run",
+        "dipir-report",
+        "dipir-model-fetch",
+    ]) {
         let text = page(name);
         assert!(text.contains(&format!(".TH {name} 1")), "{name}: {text}");
     }

@@ -79,6 +79,9 @@ pub enum FieldOfView {
     /// A lens before the sensor that the photograph's own data tell of, millimetres; without such
     /// data before one of 36 mm.
     Focal(f32),
+    /// What the photograph's own data tell; without such data as a lens of 35 mm before a sensor
+    /// of 36 mm.
+    Photograph,
 }
 
 /// Which axis of a camera file's world points up.
@@ -109,6 +112,7 @@ impl Camera {
                 sensor_mm,
             } => focal_mm / sensor_mm * w,
             FieldOfView::Focal(focal_mm) => focal_mm / 36.0 * w,
+            FieldOfView::Photograph => 35.0 / 36.0 * w,
         };
         Self {
             position,
@@ -121,23 +125,37 @@ impl Camera {
 }
 
 impl CameraSettings {
-    /// The same settings with what the photograph's own data say put in: the width of the sensor
-    /// behind a focal length. An error if it is wanted and the photograph does not say it.
+    /// The same settings with what the photograph's own data say put in: the field of view, or the
+    /// width of the sensor behind a focal length. An error if it is wanted and the photograph does
+    /// not say it.
     pub fn with_facts(&self, facts: &Facts) -> Result<Self, Error> {
         let mut settings = self.clone();
-        if let Self::LookAt { field_of_view, .. } = &mut settings
-            && let FieldOfView::Focal(focal_mm) = *field_of_view
-        {
-            let Some(sensor_mm) = facts.sensor_width_mm() else {
-                return Err(Error::Missing {
-                    key: "scene.camera.sensor_mm".into(),
-                    remedy: "the photograph does not say which sensor took it: write the sensor's width, for instance sensor_mm = 36.0".into(),
-                });
-            };
-            *field_of_view = FieldOfView::Lens {
-                focal_mm,
-                sensor_mm: sensor_mm as f32,
-            };
+        let Self::LookAt { field_of_view, .. } = &mut settings else {
+            return Ok(settings);
+        };
+        match *field_of_view {
+            FieldOfView::Focal(focal_mm) => {
+                let Some(sensor_mm) = facts.sensor_width_mm() else {
+                    return Err(Error::Missing {
+                        key: "scene.camera.sensor_mm".into(),
+                        remedy: "the photograph does not say which sensor took it: write the sensor's width, for instance sensor_mm = 36.0".into(),
+                    });
+                };
+                *field_of_view = FieldOfView::Lens {
+                    focal_mm,
+                    sensor_mm: sensor_mm as f32,
+                };
+            }
+            FieldOfView::Photograph => {
+                let Some([_, vertical]) = facts.field_of_view_rad() else {
+                    return Err(Error::Missing {
+                        key: "scene.camera.fov_deg".into(),
+                        remedy: "the photograph does not say it: write the vertical field of view, fov_deg = 40.0, or focal_mm with sensor_mm".into(),
+                    });
+                };
+                *field_of_view = FieldOfView::Vertical(vertical as f32);
+            }
+            FieldOfView::Vertical(_) | FieldOfView::Lens { .. } => {}
         }
         Ok(settings)
     }
@@ -155,8 +173,11 @@ impl CameraSettings {
                 look_at,
                 up,
                 field_of_view,
+                principal_px,
             } => {
-                let camera = Camera::look_at(*position, *look_at, *up, *field_of_view, resolution);
+                let mut camera =
+                    Camera::look_at(*position, *look_at, *up, *field_of_view, resolution);
+                camera.principal_px = principal_px.unwrap_or(camera.principal_px);
                 Ok((camera, Vec::new()))
             }
             Self::Transforms { path, frame, up } => {
@@ -185,6 +206,8 @@ pub enum CameraSettings {
         up: Vec3,
         /// How wide it sees.
         field_of_view: FieldOfView,
+        /// Where the optical axis meets the image, pixels; its middle if absent.
+        principal_px: Option<Vec2>,
     },
     /// A frame of a nerfstudio `transforms.json`.
     Transforms {
@@ -208,6 +231,7 @@ mod tests {
             look_at: Vec3::ZERO,
             up: Vec3::Y,
             field_of_view: FieldOfView::Focal(50.0),
+            principal_px: None,
         };
         let mut facts = Facts::of_size([600, 400]);
         let error = settings.with_facts(&facts).unwrap_err().to_string();
@@ -219,6 +243,29 @@ mod tests {
         let known = settings.with_facts(&facts).unwrap();
         let (camera, _) = known.resolve([600, 400], Path::new("")).unwrap();
         assert_eq!(camera.focal_px, Vec2::splat(1250.0));
+    }
+
+    #[test]
+    fn a_photograph_that_knows_its_focal_length_is_enough() {
+        let settings = CameraSettings::LookAt {
+            position: Vec3::Z,
+            look_at: Vec3::ZERO,
+            up: Vec3::Y,
+            field_of_view: FieldOfView::Photograph,
+            principal_px: Some(Vec2::new(310.0, 190.0)),
+        };
+        let mut facts = Facts::of_size([600, 400]);
+        let error = settings.with_facts(&facts).unwrap_err().to_string();
+        assert!(
+            error.starts_with("scene.camera.fov_deg is missing"),
+            "{error}"
+        );
+        facts.focal_px = Some(500.0);
+        let known = settings.with_facts(&facts).unwrap();
+        let (camera, _) = known.resolve([600, 400], Path::new("")).unwrap();
+        // An angle of single precision and back: a few roundings of 500.
+        assert!((camera.focal_px - Vec2::splat(500.0)).abs().max_element() < 1e-3);
+        assert_eq!(camera.principal_px, Vec2::new(310.0, 190.0));
     }
 
     #[test]

@@ -6,13 +6,14 @@
 use std::path::PathBuf;
 
 use dipir_imaging::transfer::Transfer;
-use glam::Vec3;
+use glam::{DMat3, Vec2, Vec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{CameraSettings, FieldOfView, WorldUp};
 use crate::error::Error;
 use crate::limits::Limits;
+use crate::pixels::Pixels;
 use crate::placement::{Anchor, Placement, Rest, Size};
 use crate::proxy::Plane;
 
@@ -58,6 +59,15 @@ pub struct ObjectConfig {
     /// Where the object rests, metres: x, y and z of the scene.
     #[schemars(extend("default" = [0.0, 0.0, 0.0]), extend("examples" = [[0.5, 0.0, -1.0]]))]
     pub position: Option<[f32; 3]>,
+    /// Instead of `position`: the pixel of the upright photograph, column and row from 0, at which the object
+    /// stands on the plane of `[scene.proxy]`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("examples" = [[960.0, 810.0]]))]
+    pub at_pixel: Option<[f32; 2]>,
+    /// Instead of `yaw_deg`: the pixel of the same plane, column and row from 0, that the object's front faces.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("examples" = [[1200.0, 900.0]]))]
+    pub to_pixel: Option<[f32; 2]>,
     /// Turn about the axis that points away from the proxy, degrees, counter-clockwise from above.
     #[schemars(extend("default" = 0.0), example = 40.0)]
     pub yaw_deg: Option<f32>,
@@ -96,8 +106,21 @@ pub struct CameraConfig {
     /// The direction that is up in the image, of any length.
     #[schemars(extend("default" = [0.0, 1.0, 0.0]), extend("examples" = [[0.0, 0.0, -1.0]]))]
     pub up: Option<[f32; 3]>,
+    /// Instead of `look_at` and `up`: turn upwards from looking along -z, degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = -90, max = 90), example = -8.0)]
+    pub pitch_deg: Option<f32>,
+    /// With `pitch_deg`: turn of the camera clockwise about its line of sight, degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = -180, max = 180), example = 1.5)]
+    pub roll_deg: Option<f32>,
+    /// Where the optical axis meets the photograph, pixels from its top left corner; its middle by
+    /// default.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("examples" = [[960.0, 640.0]]))]
+    pub principal_px: Option<[f32; 2]>,
     /// Vertical field of view, degrees. It excludes `focal_mm` and `sensor_mm`.
-    #[schemars(extend("exclusiveMinimum" = 0), extend("exclusiveMaximum" = 180), extend("x-default" = "none; required without `focal_mm` or `transforms`"), example = 40.0)]
+    #[schemars(extend("exclusiveMinimum" = 0), extend("exclusiveMaximum" = 180), extend("x-default" = "what the photograph's Exif data tell"), example = 40.0)]
     pub fov_deg: Option<f32>,
     /// Focal length, millimetres. It replaces `fov_deg`.
     #[schemars(extend("exclusiveMinimum" = 0), example = 35.0)]
@@ -268,8 +291,10 @@ pub struct SceneSettings {
 pub struct ObjectSettings {
     /// The object's file.
     pub path: PathBuf,
-    /// Where it goes.
+    /// Where it goes, but for what `pixels` say.
     pub placement: Placement,
+    /// Pixels that say where it goes.
+    pub pixels: Pixels,
 }
 
 /// A checked `[scene.proxy]` table.
@@ -396,8 +421,28 @@ impl ObjectConfig {
             }
             (None, Some(h)) => Size::Height(positive("height_m", h, "metres", "1.4")?),
         };
+        for (by_pixel, other, both) in [
+            (
+                "at_pixel",
+                "position",
+                self.at_pixel.is_some() && self.position.is_some(),
+            ),
+            (
+                "to_pixel",
+                "yaw_deg",
+                self.to_pixel.is_some() && self.yaw_deg.is_some(),
+            ),
+        ] {
+            if both {
+                return Err(conflict(&key(by_pixel), &key(other)));
+            }
+        }
         Ok(ObjectSettings {
             path,
+            pixels: Pixels {
+                at: finite_pixel(&key("at_pixel"), self.at_pixel)?,
+                to: finite_pixel(&key("to_pixel"), self.to_pixel)?,
+            },
             placement: Placement {
                 position: finite_point(&key("position"), self.position.unwrap_or_default())?,
                 yaw_rad: angle_rad("yaw_deg", self.yaw_deg)?,
@@ -437,6 +482,9 @@ impl CameraConfig {
             ("position", self.position.is_some()),
             ("look_at", self.look_at.is_some()),
             ("up", self.up.is_some()),
+            ("pitch_deg", self.pitch_deg.is_some()),
+            ("roll_deg", self.roll_deg.is_some()),
+            ("principal_px", self.principal_px.is_some()),
             ("fov_deg", self.fov_deg.is_some()),
             ("focal_mm", self.focal_mm.is_some()),
             ("sensor_mm", self.sensor_mm.is_some()),
@@ -483,6 +531,10 @@ impl CameraConfig {
             }
         };
         let position = point("position", self.position)?;
+        if self.pitch_deg.is_some() || self.roll_deg.is_some() {
+            let (look_at, up) = self.turned(position)?;
+            return self.looking(position, look_at, up);
+        }
         let look_at = point("look_at", self.look_at)?;
         let backward = position - look_at;
         if backward.length() < 1e-6 * (1.0 + position.length()) {
@@ -501,12 +553,49 @@ impl CameraConfig {
                 "a direction across the line of sight; looking straight down or up, write up = [0.0, 0.0, -1.0]",
             ));
         }
+        self.looking(position, look_at, up)
+    }
+
+    fn looking(&self, position: Vec3, look_at: Vec3, up: Vec3) -> Result<CameraSettings, Error> {
         Ok(CameraSettings::LookAt {
             position,
             look_at,
             up,
             field_of_view: self.field_of_view()?,
+            principal_px: finite_pixel("scene.camera.principal_px", self.principal_px)?,
         })
+    }
+
+    /// The point in the centre of the image and what is up in it, of a camera that looks along -z,
+    /// turned by `pitch_deg` and `roll_deg`.
+    fn turned(&self, position: Vec3) -> Result<(Vec3, Vec3), Error> {
+        let given = match self.pitch_deg {
+            Some(_) => "scene.camera.pitch_deg",
+            None => "scene.camera.roll_deg",
+        };
+        for (name, other) in [("look_at", self.look_at), ("up", self.up)] {
+            if other.is_some() {
+                return Err(conflict(given, &format!("scene.camera.{name}")));
+            }
+        }
+        let angle_rad = |name: &str, value: Option<f32>, most: f32| {
+            let value = value.unwrap_or(0.0);
+            match value.abs() <= most {
+                true => Ok(f64::from(value).to_radians()),
+                false => Err(wrong(
+                    &format!("scene.camera.{name}"),
+                    value,
+                    &format!("degrees from -{most} to {most}, for instance {name} = -5.0"),
+                )),
+            }
+        };
+        let pitch = angle_rad("pitch_deg", self.pitch_deg, 90.0)?;
+        let roll = angle_rad("roll_deg", self.roll_deg, 180.0)?;
+        let rotation = DMat3::from_rotation_x(pitch) * DMat3::from_rotation_z(-roll);
+        // Far enough that rounding the point does not turn the line of sight.
+        let distance = 1.0 + position.as_dvec3().length();
+        let look_at = position.as_dvec3() - distance * rotation.z_axis;
+        Ok((look_at.as_vec3(), rotation.y_axis.as_vec3()))
     }
 
     fn field_of_view(&self) -> Result<FieldOfView, Error> {
@@ -544,10 +633,8 @@ impl CameraConfig {
                 "scene.camera.focal_mm",
                 "scene.camera.sensor_mm needs the focal length, for instance focal_mm = 35.0",
             )),
-            (None, None, None) => Err(missing(
-                "scene.camera.fov_deg",
-                "write the vertical field of view, fov_deg = 40.0, or focal_mm with sensor_mm",
-            )),
+            // The photograph may know all of it.
+            (None, None, None) => Ok(FieldOfView::Photograph),
         }
     }
 }
@@ -587,6 +674,17 @@ fn finite_point(key: &str, value: [f32; 3]) -> Result<Vec3, Error> {
         Ok(point)
     } else {
         Err(wrong(key, triple(point), "three finite numbers [x, y, z]"))
+    }
+}
+
+fn finite_pixel(key: &str, value: Option<[f32; 2]>) -> Result<Option<Vec2>, Error> {
+    match value.map(Vec2::from_array) {
+        Some(p) if !p.is_finite() => Err(wrong(
+            key,
+            format!("[{:?}, {:?}]", p.x, p.y),
+            "two finite numbers [x, y], pixels from the photograph's top left corner",
+        )),
+        pixel => Ok(pixel),
     }
 }
 

@@ -12,6 +12,7 @@ pub mod light;
 pub mod limits;
 pub mod material;
 pub mod mesh;
+pub mod pixels;
 pub mod placement;
 pub mod plausibility;
 pub mod printable;

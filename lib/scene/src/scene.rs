@@ -101,11 +101,12 @@ impl Scene {
         let mut objects = Vec::new();
         for (i, object) in settings.objects.iter().enumerate() {
             let key = format!("scene.objects[{i}]");
+            let placement = object
+                .pixels
+                .place(&object.placement, &camera, &proxy, &key)?;
             let (placed, warning) = assembly.add(&mut files, &object.path, |imported| {
                 let (map, warning) =
-                    object
-                        .placement
-                        .resolve(&imported.mesh, imported.origin, &proxy, &key)?;
+                    placement.resolve(&imported.mesh, imported.origin, &proxy, &key)?;
                 // The record's map starts from the file's coordinates.
                 Ok((map * DMat4::from_translation(-imported.origin), warning))
             })?;

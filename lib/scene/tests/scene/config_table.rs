@@ -132,6 +132,38 @@ fn wrong_values_are_quoted_with_the_accepted_form() {
 }
 
 #[test]
+fn a_pixel_and_what_it_stands_for_exclude_each_other() {
+    let object = |lines: &str| format!("background = \"photo.jpg\"\n{OBJECT}{lines}\n{CAMERA}");
+    assert_eq!(
+        message(&object("position = [0, 0, 0]\nat_pixel = [3, 4]")),
+        "scene.objects[0].at_pixel and scene.objects[0].position cannot both be given; keep one of them"
+    );
+    assert_eq!(
+        message(&object("yaw_deg = 0\nto_pixel = [3, 4]")),
+        "scene.objects[0].to_pixel and scene.objects[0].yaw_deg cannot both be given; keep one of them"
+    );
+    assert_eq!(
+        message(&object("at_pixel = [nan, 4]")),
+        "scene.objects[0].at_pixel is [NaN, 4.0]; accepted: two finite numbers [x, y], pixels from the photograph's top left corner"
+    );
+}
+
+#[test]
+fn a_pitch_turns_the_camera_upwards_and_a_roll_clockwise() {
+    let text = format!(
+        "background = \"photo.jpg\"\n{OBJECT}[camera]\nposition = [3, 1, 5]\npitch_deg = 30\nroll_deg = 90\nfov_deg = 40"
+    );
+    let settings = parse(&text).validate().unwrap();
+    let (camera, _) = settings.camera.resolve([60, 40], "".as_ref()).unwrap();
+    let (sin, cos) = 30f32.to_radians().sin_cos();
+    let forward = -camera.rotation.z_axis;
+    // Roundings of the point that the camera looks at, a few units away.
+    assert!(forward.distance(glam::Vec3::new(0.0, sin, -cos)) < 1e-5);
+    // Clockwise: what was up in the image points to the right of the scene.
+    assert!(camera.rotation.y_axis.distance(glam::Vec3::X) < 1e-5);
+}
+
+#[test]
 fn wrong_cameras_are_explained() {
     let camera = |lines: &str| format!("background = \"photo.jpg\"\n{OBJECT}[camera]\n{lines}");
     let stands = "position = [0, 1, 5]\nlook_at = [0, 1, 0]\n";
@@ -139,15 +171,17 @@ fn wrong_cameras_are_explained() {
         message(&camera(&format!("{stands}fov_deg = 190"))),
         "scene.camera.fov_deg is 190; accepted: a vertical field of view between 0 and 180 degrees, for instance fov_deg = 40.0"
     );
+    // Whether the photograph knows its lens and its sensor is seen when it is read.
+    for lines in [stands.to_string(), format!("{stands}focal_mm = 35")] {
+        assert!(parse(&camera(&lines)).validate().is_ok());
+    }
     assert_eq!(
-        message(&camera(stands)),
-        "scene.camera.fov_deg is missing; write the vertical field of view, fov_deg = 40.0, or focal_mm with sensor_mm"
+        message(&camera(&format!("{stands}pitch_deg = -5"))),
+        "scene.camera.pitch_deg and scene.camera.look_at cannot both be given; keep one of them"
     );
-    // Whether the photograph knows its sensor is seen when it is read.
-    assert!(
-        parse(&camera(&format!("{stands}focal_mm = 35")))
-            .validate()
-            .is_ok()
+    assert_eq!(
+        message(&camera("position = [0, 1, 5]\npitch_deg = -95")),
+        "scene.camera.pitch_deg is -95; accepted: degrees from -90 to 90, for instance pitch_deg = -5.0"
     );
     assert_eq!(
         message(&camera(&format!("{stands}fov_deg = 40\nfocal_mm = 35"))),

@@ -78,6 +78,25 @@ fn the_lowest_point_rests_at_the_position() {
 }
 
 #[test]
+fn the_description_holds_the_position_that_a_pixel_said() {
+    let folder = folder();
+    let ground = "[proxy]\nplane = { normal = [0, 1, 0] }";
+    let loaded = load(folder.path(), "at_pixel = [20, 28]", ground);
+    // The foot of the object is its file's (0, -1, 0).
+    let foot = loaded.description.objects[0]
+        .transform()
+        .transform_point3(glam::DVec3::NEG_Y);
+    let pixel = loaded.scene.camera.project(foot.as_vec3()).unwrap();
+    assert!((pixel - Vec2::new(20.0, 28.0)).length() < 0.01, "{pixel}");
+    assert!(foot.y.abs() < 1e-5, "{foot}");
+    let error = message(folder.path(), "at_pixel = [20, 1]", ground);
+    assert!(
+        error.contains("accepted: a pixel below the horizon"),
+        "{error}"
+    );
+}
+
+#[test]
 fn height_sets_the_extent_along_up_and_center_the_middle() {
     let folder = folder();
     let loaded = load(folder.path(), "height_m = 3.0\nanchor = \"center\"", "");

@@ -1,0 +1,177 @@
+//! `dipir init`.
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use dipir_cli::args::OutputArgs;
+use dipir_cli::exit::{Usage, printable};
+use dipir_setup::view::Asked;
+use dipir_setup::{Draft, Request, SetupError, draft};
+use dipir_stages::report::quoted;
+use serde_json::{Value, json};
+
+#[derive(Args)]
+pub struct InitArgs {
+    /// The photograph
+    #[arg(value_name = "PHOTO")]
+    photo: PathBuf,
+
+    /// The objects, .glb, .gltf, .obj, .ply or .stl
+    #[arg(value_name = "MODEL", required = true)]
+    models: Vec<PathBuf>,
+
+    /// The file to write; a file that is there is never overwritten
+    #[arg(
+        long,
+        short = 'o',
+        value_name = "FILE",
+        default_value = "pipeline.toml"
+    )]
+    out: PathBuf,
+
+    /// Height of the objects, metres [default: their files' own size, if it can be metres, else 1]
+    #[arg(long, value_name = "H")]
+    height_m: Option<f64>,
+
+    /// What the object is called in prompts [default: the name of the first model's file]
+    #[arg(long, value_name = "WORD")]
+    class: Option<String>,
+
+    /// The photograph's camera from another program: fSpy's .fspy or .json, transforms.json, .chan,
+    /// or a folder of COLMAP's
+    #[arg(long, value_name = "FILE")]
+    camera: Option<PathBuf>,
+
+    /// Which axis of that camera's world points up [default: as the program that wrote it has it]
+    #[arg(long, value_name = "AXIS", requires = "camera")]
+    camera_up: Option<Axis>,
+
+    /// Field of view along the photograph's longer side, degrees [default: what the photograph
+    /// says, else 55]
+    #[arg(long, value_name = "DEG")]
+    fov: Option<f64>,
+
+    /// How far the camera looks up (or, below 0, down), degrees [default: from upright edges, else
+    /// with the horizon 40% from the top]
+    #[arg(
+        long,
+        value_name = "DEG",
+        allow_negative_numbers = true,
+        conflicts_with = "camera"
+    )]
+    pitch: Option<f64>,
+
+    /// Height of the camera over the ground, metres [default: 1.6]
+    #[arg(long, value_name = "M")]
+    eye_height: Option<f64>,
+
+    #[command(flatten)]
+    output: OutputArgs,
+}
+
+/// An axis of a camera's world.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Axis {
+    /// +y
+    Y,
+    /// +z
+    Z,
+    /// -y
+    MinusY,
+}
+
+impl From<Axis> for dipir_cameras::WorldUp {
+    fn from(axis: Axis) -> Self {
+        match axis {
+            Axis::Y => Self::Y,
+            Axis::Z => Self::Z,
+            Axis::MinusY => Self::MinusY,
+        }
+    }
+}
+
+/// Writes a first `pipeline.toml` and says what to do with it.
+pub fn run(args: &InitArgs) -> anyhow::Result<()> {
+    let request = Request {
+        photo: args.photo.clone(),
+        models: args.models.clone(),
+        out: args.out.clone(),
+        height_m: args.height_m,
+        class: args.class.clone(),
+        camera: args.camera.clone(),
+        camera_up: args.camera_up.map(Into::into),
+        asked: Asked {
+            fov_deg: args.fov,
+            pitch_deg: args.pitch,
+            eye_height_m: args.eye_height,
+        },
+    };
+    let draft = draft(&request).map_err(classified)?;
+    draft.write().map_err(classified)?;
+    for warning in &draft.warnings {
+        args.output.warn(warning);
+    }
+    args.output
+        .result(|| printable(&said(&draft)), || json(&draft));
+    Ok(())
+}
+
+/// What the command line can mend is its fault.
+fn classified(error: SetupError) -> anyhow::Error {
+    match error {
+        SetupError::Value { .. } | SetupError::Exists { .. } | SetupError::NoGround { .. } => {
+            Usage(error.to_string()).into()
+        }
+        other => other.into(),
+    }
+}
+
+/// The next two commands.
+fn commands(path: &Path) -> [String; 2] {
+    let file = match path == Path::new("pipeline.toml") {
+        true => String::new(),
+        false => format!(" {}", quoted(&path.display().to_string())),
+    };
+    [
+        format!("dipir run{file} --set pipeline.quality=draft"),
+        format!("dipir run{file}"),
+    ]
+}
+
+fn said(draft: &Draft) -> String {
+    let document = &draft.document;
+    let view = &document.view;
+    let mut text = format!(
+        "wrote {}\n  position: {}\n  direction: {}\n  field of view: {}\n",
+        draft.path.display(),
+        view.position_why,
+        view.aim_why,
+        view.fov_why
+    );
+    for object in &document.objects {
+        let [x, y] = object.at_pixel;
+        text += &format!(
+            "  {}: at pixel {x}, {y}; {}\n",
+            object.path, object.size_why
+        );
+    }
+    let [look, whole] = commands(&draft.path);
+    text + &format!("next:\n  {look}    a quick look\n  {whole}    the picture")
+}
+
+fn json(draft: &Draft) -> Value {
+    let document = &draft.document;
+    let view = &document.view;
+    let objects = document.objects.iter();
+    json!({
+        "file": draft.path,
+        "camera": {
+            "position": view.position.to_array(), "position_why": view.position_why,
+            "direction_why": view.aim_why,
+            "fov_deg": view.fov_deg, "fov_why": view.fov_why,
+        },
+        "objects": objects.map(|o| json!({
+            "path": o.path, "at_pixel": o.at_pixel, "size_why": o.size_why,
+        })).collect::<Vec<_>>(),
+        "next": commands(&draft.path),
+    })
+}

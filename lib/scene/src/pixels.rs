@@ -1,0 +1,247 @@
+//! Pixels of the photograph as points of the ground.
+use glam::{DQuat, DVec2, DVec3, Vec2};
+
+use crate::camera::Camera;
+use crate::error::Error;
+use crate::placement::Placement;
+use crate::proxy::{Plane, Proxy};
+
+/// Pixels of the upright photograph that say where an object goes.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Pixels {
+    /// Where it stands.
+    pub at: Option<Vec2>,
+    /// What its +z faces.
+    pub to: Option<Vec2>,
+}
+
+/// Sine of the angle between ray and plane below which they do not meet: at an eye's height the
+/// ground is a thousand kilometres away.
+const GRAZING: f64 = 1e-6;
+
+/// The point of `plane` that `camera` sees at `pixel`; `None` if it sees none there, or only the
+/// plane's back.
+pub fn ground_at(camera: &Camera, plane: &Plane, pixel: DVec2) -> Option<DVec3> {
+    let d = (pixel - camera.principal_px.as_dvec2()) / camera.focal_px.as_dvec2();
+    let direction = camera.rotation.as_dmat3() * DVec3::new(d.x, -d.y, -1.0);
+    let normal = plane.normal.as_dvec3();
+    let descent = -normal.dot(direction);
+    let height = height(camera, plane);
+    let sees = height > 0.0 && descent > GRAZING * direction.length();
+    sees.then(|| camera.position.as_dvec3() + height / descent * direction)
+}
+
+/// The row of the plane's horizon in a column of the image, pixels; `None` if the camera looks
+/// along the normal.
+pub fn horizon_row(camera: &Camera, plane: &Plane, column: f64) -> Option<f64> {
+    let n = camera.rotation.as_dmat3().transpose() * plane.normal.as_dvec3();
+    let principal = camera.principal_px.as_dvec2();
+    let focal = camera.focal_px.as_dvec2();
+    let x = (column - principal.x) / focal.x;
+    (n.y.abs() > 1e-9).then(|| principal.y + focal.y * (n.x * x - n.z) / n.y)
+}
+
+/// Metres from the plane to the camera, along the normal.
+fn height(camera: &Camera, plane: &Plane) -> f64 {
+    let from = camera.position.as_dvec3() - plane.point.as_dvec3();
+    plane.normal.as_dvec3().dot(from)
+}
+
+impl Pixels {
+    /// `placement` with the position and the yaw that the pixels say; `key` names the object's
+    /// table in messages.
+    pub fn place(
+        &self,
+        placement: &Placement,
+        camera: &Camera,
+        proxy: &Proxy,
+        key: &str,
+    ) -> Result<Placement, Error> {
+        let mut placed = *placement;
+        if let Some(at) = self.at {
+            placed.position = seen(camera, proxy, at, &format!("{key}.at_pixel"))?.as_vec3();
+        }
+        if let Some(to) = self.to {
+            let key = format!("{key}.to_pixel");
+            let target = seen(camera, proxy, to, &key)?;
+            let up = match proxy {
+                Proxy::Plane(plane) => plane.normal.as_dvec3(),
+                _ => DVec3::Y,
+            };
+            // In the frame in which the object stands upright.
+            let upright = DQuat::from_rotation_arc(DVec3::Y, up.normalize());
+            let ahead = upright.inverse() * (target - placed.position.as_dvec3());
+            if ahead.x.hypot(ahead.z) < 1e-6 {
+                return Err(Error::Config {
+                    key,
+                    value: shown(to),
+                    accepted: "a pixel away from where the object stands".into(),
+                });
+            }
+            placed.yaw_rad = ahead.x.atan2(ahead.z) as f32;
+        }
+        Ok(placed)
+    }
+}
+
+fn shown(pixel: Vec2) -> String {
+    format!("[{:?}, {:?}]", pixel.x, pixel.y)
+}
+
+/// The point of the proxy that is seen at `pixel`.
+fn seen(camera: &Camera, proxy: &Proxy, pixel: Vec2, key: &str) -> Result<DVec3, Error> {
+    let Proxy::Plane(plane) = proxy else {
+        return Err(Error::Missing {
+            key: "scene.proxy.plane".into(),
+            remedy: format!(
+                "{key} is a point of it: write plane = {{ point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }}"
+            ),
+        });
+    };
+    if let Some(point) = ground_at(camera, plane, pixel.as_dvec2()) {
+        return Ok(point);
+    }
+    let height = height(camera, plane);
+    let accepted = match horizon_row(camera, plane, pixel.x.into()) {
+        _ if height <= 0.0 => format!(
+            "a pixel of the plane's front, which the camera is {:.3} m behind: raise scene.camera.position",
+            -height
+        ),
+        Some(row) => {
+            let n = camera.rotation.as_dmat3().transpose() * plane.normal.as_dvec3();
+            let side = if n.y > 0.0 { "below" } else { "above" };
+            format!("a pixel {side} the horizon, which is at row {row:.1} in this column")
+        }
+        None => "a pixel that sees the plane of scene.proxy".into(),
+    };
+    Err(Error::Config {
+        key: key.into(),
+        value: format!("{}, where no ground is seen", shown(pixel)),
+        accepted,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::camera::FieldOfView;
+    use crate::placement::{Anchor, Size};
+
+    const GROUND: Plane = Plane {
+        point: Vec3::ZERO,
+        normal: Vec3::Y,
+    };
+
+    fn camera(look_at: Vec3) -> Camera {
+        let position = Vec3::new(0.3, 1.6, 2.0);
+        let view = FieldOfView::Vertical(0.7);
+        Camera::look_at(position, look_at, Vec3::Y, view, [4000, 3000])
+    }
+
+    fn placement() -> Placement {
+        Placement {
+            position: Vec3::ZERO,
+            yaw_rad: 0.0,
+            pitch_rad: 0.0,
+            roll_rad: 0.0,
+            size: Size::Scale(1.0),
+            rest: None,
+            anchor: Anchor::Origin,
+        }
+    }
+
+    fn place(camera: &Camera, proxy: &Proxy, pixels: Pixels) -> Result<Placement, String> {
+        let placed = pixels.place(&placement(), camera, proxy, "scene.objects[0]");
+        placed.map_err(|e| e.to_string())
+    }
+
+    fn at(x: f32, y: f32) -> Pixels {
+        Pixels {
+            at: Some(Vec2::new(x, y)),
+            to: None,
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn the_foot_is_seen_at_its_pixel(
+            x in 0.0f32..4000.0, y in 1900.0f32..3000.0, tilt in -0.1f32..0.1,
+        ) {
+            let normal = Vec3::new(tilt, 1.0, -tilt).normalize();
+            let proxy = Proxy::Plane(Plane { point: Vec3::new(0.0, 0.1, 0.0), normal });
+            let camera = camera(Vec3::new(0.0, 0.9, -3.0));
+            let placed = place(&camera, &proxy, at(x, y)).unwrap();
+            let pixel = camera.project(placed.position).unwrap();
+            // Single precision of positions a few metres away and of 4000 pixels: 4e-3 together.
+            prop_assert!(pixel.distance(Vec2::new(x, y)) < 0.01, "{} for {} {}", pixel, x, y);
+        }
+    }
+
+    #[test]
+    fn a_pixel_at_or_above_the_horizon_is_refused_with_its_row() {
+        // A level camera: the horizon is the middle row, and what is above it meets the ground
+        // behind the camera.
+        let camera = camera(Vec3::new(0.3, 1.6, -3.0));
+        for y in [1500.0, 1400.0, 0.0] {
+            let error = place(&camera, &Proxy::Plane(GROUND), at(2000.0, y)).unwrap_err();
+            assert_eq!(
+                error,
+                format!(
+                    "scene.objects[0].at_pixel is [2000.0, {y:?}], where no ground is seen; accepted: \
+                     a pixel below the horizon, which is at row 1500.0 in this column"
+                )
+            );
+        }
+    }
+
+    #[test]
+    fn a_camera_under_the_ground_is_told_to_rise() {
+        let camera = camera(Vec3::new(0.3, 1.6, -3.0));
+        let ceiling = Plane {
+            point: Vec3::new(0.0, 2.0, 0.0),
+            normal: Vec3::Y,
+        };
+        let error = place(&camera, &Proxy::Plane(ceiling), at(2000.0, 100.0)).unwrap_err();
+        assert!(
+            error.contains("0.400 m behind: raise scene.camera.position"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn a_pixel_needs_a_plane() {
+        let error = place(&camera(Vec3::ZERO), &Proxy::None, at(2000.0, 2000.0)).unwrap_err();
+        assert!(error.starts_with("scene.proxy.plane is missing"), "{error}");
+    }
+
+    #[test]
+    fn the_front_faces_its_pixel() {
+        let camera = camera(Vec3::new(0.0, 0.9, -3.0));
+        let proxy = Proxy::Plane(GROUND);
+        let both = Pixels {
+            at: Some(Vec2::new(1200.0, 2100.0)),
+            to: Some(Vec2::new(3000.0, 2600.0)),
+        };
+        let placed = place(&camera, &proxy, both).unwrap();
+        let target = ground_at(&camera, &GROUND, DVec2::new(3000.0, 2600.0)).unwrap();
+        let front = DQuat::from_rotation_y(placed.yaw_rad.into()) * DVec3::Z;
+        let ahead = (target - placed.position.as_dvec3()).normalize();
+        assert!(front.abs_diff_eq(ahead, 1e-5), "{front} {ahead}");
+        let error = place(
+            &camera,
+            &proxy,
+            Pixels {
+                to: both.at,
+                ..both
+            },
+        )
+        .unwrap_err();
+        assert!(
+            error.ends_with("a pixel away from where the object stands"),
+            "{error}"
+        );
+    }
+}

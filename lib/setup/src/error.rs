@@ -1,0 +1,86 @@
+//! What can keep a first configuration from being written.
+use std::path::PathBuf;
+
+use dipir_cameras::CameraError;
+use dipir_imaging::ImagingError;
+
+/// Every message names the file or option that is wrong and what to do.
+#[derive(Debug, thiserror::Error)]
+pub enum SetupError {
+    /// The photograph cannot be read.
+    #[error(transparent)]
+    Photo(#[from] ImagingError),
+    /// A model cannot be read.
+    #[error(transparent)]
+    Model(#[from] dipir_scene::Error),
+    /// A model has nothing to show.
+    #[error("\"{}\" holds no triangles; export it with its meshes", path.display())]
+    Empty {
+        /// The model.
+        path: PathBuf,
+    },
+    /// A camera's file is damaged.
+    #[error("\"{}\": {source}", path.display())]
+    CameraFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong there.
+        source: CameraError,
+    },
+    /// A camera's file says what `[scene.camera]` cannot.
+    #[error("the camera of \"{}\" cannot be used: {detail}; {remedy}", path.display())]
+    Camera {
+        /// The file.
+        path: PathBuf,
+        /// What of it.
+        detail: String,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// An option has a value that makes no sense.
+    #[error("{option} is {value}; accepted: {accepted}")]
+    Value {
+        /// As it is typed, `--fov`.
+        option: &'static str,
+        /// The value.
+        value: String,
+        /// The accepted form, with an example.
+        accepted: &'static str,
+    },
+    /// The camera sees no ground to put anything on.
+    #[error(
+        "the camera sees no ground: {detail}; look further down with --pitch -10, or see whether --camera is right"
+    )]
+    NoGround {
+        /// Why not.
+        detail: String,
+    },
+    /// The file to write is there already.
+    #[error("\"{}\" is there already and stays as it is; name another file with --out", path.display())]
+    Exists {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A path cannot stand in a TOML file.
+    #[error("the path \"{}\" is not UTF-8, as TOML files are; rename the file", path.display())]
+    NotUtf8 {
+        /// The path.
+        path: PathBuf,
+    },
+    /// A file cannot be read.
+    #[error("cannot read \"{}\": {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+    /// The file cannot be written.
+    #[error("cannot write \"{}\": {source}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+}

@@ -1,0 +1,17 @@
+//! From a photograph and models to a first `pipeline.toml`.
+//!
+//! What the photograph or a camera's file tells is used; the rest is a default that the file says
+//! is one. The world is dipir's: metres, +y up; without a camera's file the camera stands above the
+//! origin of the ground y = 0 and looks along -z, turned by pitch and roll.
+pub mod camera_file;
+pub mod document;
+pub mod error;
+pub mod project;
+pub mod segments;
+pub mod size;
+pub mod spots;
+pub mod verticals;
+pub mod view;
+
+pub use error::SetupError;
+pub use project::{Draft, Request, draft};

@@ -1,0 +1,209 @@
+//! From files to the text that names them.
+use std::fs::OpenOptions;
+use std::io::{ErrorKind, Write};
+use std::path::{Path, PathBuf};
+
+use dipir_cameras::WorldUp;
+use dipir_imaging::file::read_photo;
+use dipir_imaging::transfer::Transfer;
+use dipir_scene::import::load_object;
+
+use crate::camera_file;
+use crate::document::{Document, Object};
+use crate::error::SetupError;
+use crate::size::{Size, size};
+use crate::spots::spots;
+use crate::view::{Asked, View};
+
+/// What a first configuration is made from.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Request {
+    /// The photograph.
+    pub photo: PathBuf,
+    /// At least one.
+    pub models: Vec<PathBuf>,
+    /// The file to be written.
+    pub out: PathBuf,
+    /// Height of every object, metres.
+    pub height_m: Option<f64>,
+    /// What the object is called.
+    pub class: Option<String>,
+    /// Another program's camera.
+    pub camera: Option<PathBuf>,
+    /// Which axis of that camera's world points up.
+    pub camera_up: Option<WorldUp>,
+    /// Of the camera.
+    pub asked: Asked,
+}
+
+/// A configuration that is not written yet.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Draft {
+    /// What it says.
+    pub document: Document,
+    /// Where it goes.
+    pub path: PathBuf,
+    /// What of the photograph and the models could not be used, one sentence each.
+    pub warnings: Vec<String>,
+}
+
+/// Reads photograph, models and camera, and decides on everything that is not asked.
+///
+/// # Errors
+/// On files that cannot be used, options that make no sense, a file that is there already, and a
+/// camera that sees no ground.
+pub fn draft(request: &Request) -> Result<Draft, SetupError> {
+    if request.out.symlink_metadata().is_ok() {
+        return Err(SetupError::Exists {
+            path: request.out.clone(),
+        });
+    }
+    request.asked.check()?;
+    let folder = request.out.parent().unwrap_or(Path::new(""));
+    let mut warnings = Vec::new();
+    let mut sizes = Vec::new();
+    for path in &request.models {
+        sizes.push(size_of(path, request.height_m, &mut warnings)?);
+    }
+    let photo = read_photo(&request.photo, Transfer::Srgb)?;
+    warnings.extend(photo.warnings);
+    let view = match &request.camera {
+        Some(path) => camera_file::read(
+            path,
+            &request.photo,
+            photo.facts.size,
+            request.camera_up,
+            &request.asked,
+        )?,
+        None => View::of_photo(&photo.image, &photo.facts, &request.asked)?,
+    };
+    let widths: Vec<f64> = sizes.iter().map(|s| s.width_m).collect();
+    let spots = spots(&view.camera(photo.facts.size), &view.plane(), &widths)?;
+    let objects = request.models.iter().zip(sizes).zip(spots);
+    let objects = objects.map(|((path, size), at_pixel)| {
+        Ok(Object {
+            path: beside(path, folder)?,
+            at_pixel,
+            size_line: size.line,
+            size_why: size.why,
+        })
+    });
+    let (class, class_why) = class(request);
+    Ok(Draft {
+        document: Document {
+            photo: beside(&request.photo, folder)?,
+            facts: photo.facts,
+            class,
+            class_why,
+            objects: objects.collect::<Result<_, SetupError>>()?,
+            view,
+        },
+        path: request.out.clone(),
+        warnings,
+    })
+}
+
+impl Draft {
+    /// Writes the file, which must not be there.
+    ///
+    /// # Errors
+    /// If it is there, or cannot be written.
+    pub fn write(&self) -> Result<(), SetupError> {
+        let path = || self.path.clone();
+        let file = OpenOptions::new()
+            .write(true)
+            .create_new(true)
+            .open(&self.path);
+        let mut file = file.map_err(|source| match source.kind() {
+            ErrorKind::AlreadyExists => SetupError::Exists { path: path() },
+            _ => SetupError::Write {
+                path: path(),
+                source,
+            },
+        })?;
+        file.write_all(self.document.text().as_bytes())
+            .map_err(|source| {
+                // What was just made and is cut short is of no use, and in the way of the next try.
+                let _ = std::fs::remove_file(&self.path);
+                SetupError::Write {
+                    path: path(),
+                    source,
+                }
+            })
+    }
+}
+
+fn size_of(
+    path: &Path,
+    height_m: Option<f64>,
+    warnings: &mut Vec<String>,
+) -> Result<Size, SetupError> {
+    let imported = load_object(path)?;
+    let named = |w: &String| format!("\"{}\": {w}", path.display());
+    warnings.extend(imported.warnings.iter().map(named));
+    let bounds = imported.mesh.bounds();
+    let (low, high) = bounds.ok_or_else(|| SetupError::Empty { path: path.into() })?;
+    size(low.as_dvec3(), high.as_dvec3(), height_m)
+}
+
+/// The word for prompts: as asked, else the words of the first model's name.
+fn class(request: &Request) -> (String, &'static str) {
+    let asked = request.class.as_deref().map(str::trim);
+    if let Some(word) = asked.filter(|w| !w.is_empty()) {
+        return (word.into(), "as --class says");
+    }
+    let stem = request.models.first().and_then(|m| m.file_stem());
+    let stem = stem.unwrap_or_default().to_string_lossy().to_lowercase();
+    let words: Vec<&str> = stem
+        .split(|c: char| !c.is_alphabetic())
+        .filter(|word| word.chars().count() > 1)
+        .collect();
+    match words.is_empty() {
+        true => ("object".into(), "any word; or --class"),
+        false => (words.join(" "), "as the model's file; or --class"),
+    }
+}
+
+/// A path relative to the current folder, as a file in `folder` names it.
+fn beside(path: &Path, folder: &Path) -> Result<String, SetupError> {
+    let [path, folder] = [path, folder].map(|p| p.strip_prefix(".").unwrap_or(p));
+    let named = match path.strip_prefix(folder) {
+        Ok(rest) => rest.to_owned(),
+        Err(_) => std::path::absolute(path).map_err(|source| SetupError::Read {
+            path: path.into(),
+            source,
+        })?,
+    };
+    let text = named.into_os_string().into_string();
+    text.map_err(|_| SetupError::NotUtf8 { path: path.into() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_class_is_the_words_of_the_model_s_name() {
+        let of = |name: &str| {
+            class(&Request {
+                models: vec![name.into()],
+                ..Request::default()
+            })
+            .0
+        };
+        assert_eq!(of("models/Garden_Chair-2b.glb"), "garden chair");
+        assert_eq!(of("0001.obj"), "object");
+    }
+
+    #[test]
+    fn paths_are_named_from_the_folder_of_the_file() {
+        let named = |path: &str, folder: &str| beside(path.as_ref(), folder.as_ref()).unwrap();
+        assert_eq!(named("photo.jpg", ""), "photo.jpg");
+        assert_eq!(named("in/photo.jpg", "in"), "photo.jpg");
+        assert_eq!(named("in/photo.jpg", ""), "in/photo.jpg");
+        assert_eq!(named("photo.jpg", "."), "photo.jpg");
+        assert_eq!(named("./in/photo.jpg", "in"), "photo.jpg");
+        let elsewhere = named("photo.jpg", "projects");
+        assert!(Path::new(&elsewhere).is_absolute() && elsewhere.ends_with("photo.jpg"));
+    }
+}

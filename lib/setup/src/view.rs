@@ -1,0 +1,373 @@
+//! The camera of a photograph: what its file tells, what its edges tell, and defaults.
+use dipir_imaging::facts::{Facts, FocalSource};
+use dipir_imaging::raster::LinearImage;
+use dipir_scene::camera::Camera;
+use dipir_scene::proxy::Plane;
+use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
+
+use crate::error::SetupError;
+use crate::segments;
+use crate::verticals;
+
+/// How a camera is turned.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Aim {
+    /// From looking along -z.
+    Turned {
+        /// Upwards.
+        pitch_deg: f64,
+        /// Clockwise about the line of sight.
+        roll_deg: f64,
+    },
+    /// By what it sees.
+    At {
+        /// The point in the centre of the image, metres.
+        look_at: DVec3,
+        /// What is up in the image.
+        up: DVec3,
+    },
+}
+
+/// A camera over a level ground, and why it is this one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct View {
+    /// Centre of projection, metres.
+    pub position: DVec3,
+    /// How it is turned.
+    pub aim: Aim,
+    /// Vertical field of view, degrees.
+    pub fov_deg: f64,
+    /// Where the optical axis meets the image, pixels; its middle if absent.
+    pub principal_px: Option<DVec2>,
+    /// Height of the ground, metres.
+    pub ground_y: f64,
+    /// Where the position comes from.
+    pub position_why: String,
+    /// Where the turn comes from.
+    pub aim_why: String,
+    /// Where the field of view comes from.
+    pub fov_why: String,
+}
+
+/// Height of the eyes of somebody who stands, metres.
+pub const EYE_HEIGHT_M: f64 = 1.6;
+/// Field of view along the longer side of a picture that does not say it, degrees.
+pub const DEFAULT_FOV_DEG: f64 = 55.0;
+/// Row of the horizon where nothing tells it, of the height from the top.
+pub const DEFAULT_HORIZON: f64 = 0.4;
+/// A turn that leaves less ground than this share of the height is not believed.
+const LOWEST_HORIZON: f64 = 0.85;
+
+impl Default for View {
+    /// Level, at the height of the eyes, 40 degrees.
+    fn default() -> Self {
+        Self {
+            position: DVec3::new(0.0, EYE_HEIGHT_M, 0.0),
+            aim: Aim::Turned {
+                pitch_deg: 0.0,
+                roll_deg: 0.0,
+            },
+            fov_deg: 40.0,
+            principal_px: None,
+            ground_y: 0.0,
+            position_why: String::new(),
+            aim_why: String::new(),
+            fov_why: String::new(),
+        }
+    }
+}
+
+/// What the command line says of the camera.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Asked {
+    /// Field of view along the longer side, degrees.
+    pub fov_deg: Option<f64>,
+    /// Upwards, degrees.
+    pub pitch_deg: Option<f64>,
+    /// Metres over the ground.
+    pub eye_height_m: Option<f64>,
+}
+
+impl Asked {
+    /// Errors on values that no camera has.
+    ///
+    /// # Errors
+    /// The first option that is wrong, with the accepted form.
+    pub fn check(&self) -> Result<(), SetupError> {
+        let checks = [
+            (
+                "--fov",
+                self.fov_deg,
+                1.0..=170.0,
+                "degrees along the longer side from 1 to 170, for instance --fov 65",
+            ),
+            (
+                "--pitch",
+                self.pitch_deg,
+                -89.0..=89.0,
+                "degrees upwards from -89 to 89, for instance --pitch -10",
+            ),
+            (
+                "--eye-height",
+                self.eye_height_m,
+                0.01..=1e4,
+                "metres over the ground from 0.01 to 10000, for instance --eye-height 1.6",
+            ),
+        ];
+        for (option, value, range, accepted) in checks {
+            if let Some(value) = value
+                && !range.contains(&value)
+            {
+                return Err(SetupError::Value {
+                    option,
+                    value: value.to_string(),
+                    accepted,
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+impl View {
+    /// The camera of a photograph, from what is asked, its data and its edges.
+    ///
+    /// # Errors
+    /// As [`Asked::check`].
+    pub fn of_photo(image: &LinearImage, facts: &Facts, asked: &Asked) -> Result<Self, SetupError> {
+        asked.check()?;
+        let size = [image.0.width() as f64, image.0.height() as f64];
+        let lens = Lens::of(size, facts, asked.fov_deg);
+        let (aim, aim_why) = aim(image, size, &lens, asked.pitch_deg);
+        let (eye, position_why) = match asked.eye_height_m {
+            Some(height) => (height, "as --eye-height says"),
+            None => (
+                EYE_HEIGHT_M,
+                "a guess: the eyes of somebody who stands; with twice the height everything on \
+                 the ground is twice as large and as far",
+            ),
+        };
+        Ok(Self {
+            position: DVec3::new(0.0, eye, 0.0),
+            aim,
+            fov_deg: rounded(2.0 * (0.5 * size[1] / lens.focal_px).atan().to_degrees()),
+            aim_why,
+            position_why: position_why.into(),
+            fov_why: lens.why,
+            ..Self::default()
+        })
+    }
+
+    /// The camera for a picture of this size.
+    pub fn camera(&self, resolution: [u32; 2]) -> Camera {
+        let rotation = match self.aim {
+            Aim::Turned {
+                pitch_deg,
+                roll_deg,
+            } => {
+                DMat3::from_rotation_x(pitch_deg.to_radians())
+                    * DMat3::from_rotation_z(-roll_deg.to_radians())
+            }
+            Aim::At { look_at, up } => {
+                let backward = (self.position - look_at).normalize();
+                let right = up.cross(backward).normalize();
+                DMat3::from_cols(right, backward.cross(right), backward)
+            }
+        };
+        let [w, h] = resolution.map(f64::from);
+        let focal = 0.5 * h / (0.5 * self.fov_deg.to_radians()).tan();
+        let principal = self.principal_px.unwrap_or(0.5 * DVec2::new(w, h));
+        Camera {
+            position: self.position.as_vec3(),
+            rotation: rotation.as_mat3(),
+            focal_px: Vec2::splat(focal as f32),
+            principal_px: principal.as_vec2(),
+            resolution,
+        }
+    }
+
+    /// The ground.
+    pub fn plane(&self) -> Plane {
+        Plane {
+            point: Vec3::new(0.0, self.ground_y as f32, 0.0),
+            normal: Vec3::Y,
+        }
+    }
+}
+
+/// To a hundredth, which is what a file that is read by people should say.
+fn rounded(value: f64) -> f64 {
+    (value * 100.0).round() / 100.0
+}
+
+/// A focal length and how sure it is.
+struct Lens {
+    focal_px: f64,
+    /// One standard deviation, relative.
+    sigma: f64,
+    why: String,
+}
+
+impl Lens {
+    fn of(size: [f64; 2], facts: &Facts, asked_deg: Option<f64>) -> Self {
+        let longer = size[0].max(size[1]);
+        let of_angle = |deg: f64| 0.5 * longer / (0.5 * deg.to_radians()).tan();
+        if let Some(deg) = asked_deg {
+            return Self {
+                focal_px: of_angle(deg),
+                sigma: 0.02,
+                why: format!("--fov says {deg} degrees along the longer side"),
+            };
+        }
+        let known = facts.focal_px.filter(|f| f.is_finite());
+        let Some((focal_px, source)) = known.zip(facts.focal_source) else {
+            return Self {
+                focal_px: of_angle(DEFAULT_FOV_DEG),
+                sigma: 0.2,
+                why: format!(
+                    "a guess, for the photograph does not say it: {DEFAULT_FOV_DEG} degrees along \
+                     the longer side; telephones have 60 to 75, a zoom less; or --fov"
+                ),
+            };
+        };
+        let (sigma, from) = match source {
+            FocalSource::Equivalent35mm => (0.02, "the focal length for 35 mm"),
+            FocalSource::FocalPlaneResolution => {
+                (0.02, "the focal length and the sensor's resolution")
+            }
+            FocalSource::Table => (0.05, "the focal length and a table of sensors"),
+        };
+        let millimetres = match facts.focal_mm {
+            Some(mm) => format!(" (the lens has {mm} mm)"),
+            None => String::new(),
+        };
+        Self {
+            focal_px,
+            sigma,
+            why: format!(
+                "from {from} in the photograph's Exif data{millimetres}, sure to about {:.0}%",
+                100.0 * sigma
+            ),
+        }
+    }
+}
+
+/// How the camera is turned, and why.
+fn aim(image: &LinearImage, size: [f64; 2], lens: &Lens, asked: Option<f64>) -> (Aim, String) {
+    let turned = |pitch: f64, roll: f64| Aim::Turned {
+        pitch_deg: rounded(pitch),
+        roll_deg: rounded(roll),
+    };
+    if let Some(pitch) = asked {
+        return (turned(pitch, 0.0), "as --pitch says".into());
+    }
+    let found = verticals::turn(&segments::upright(image), size, lens.focal_px, lens.sigma);
+    let horizon = |pitch_deg: f64| 0.5 * size[1] + lens.focal_px * pitch_deg.to_radians().tan();
+    if let Some(turn) = found
+        && horizon(turn.pitch_deg) < LOWEST_HORIZON * size[1]
+    {
+        let why = format!(
+            "from {} upright edges: pitch +- {:.1}, roll +- {:.1} degrees, if these edges are \
+             vertical in the world; horizon at row {:.0}; or --pitch",
+            turn.edges,
+            turn.pitch_sigma_deg,
+            turn.roll_sigma_deg,
+            horizon(turn.pitch_deg)
+        );
+        return (turned(turn.pitch_deg, turn.roll_deg), why);
+    }
+    let pitch = (DEFAULT_HORIZON - 0.5) * size[1] / lens.focal_px;
+    let why = format!(
+        "a guess, for too few edges agree on what is upright: it puts the horizon at row {:.0}, \
+         40% from the top; a larger pitch moves it down; or --pitch",
+        DEFAULT_HORIZON * size[1]
+    );
+    (turned(pitch.atan().to_degrees(), 0.0), why)
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_imaging::raster::Raster;
+    use dipir_scene::pixels::horizon_row;
+
+    use super::*;
+
+    fn grey(w: usize, h: usize) -> LinearImage {
+        LinearImage(Raster::filled(w, h, Vec3::splat(0.2)))
+    }
+
+    #[test]
+    fn a_picture_that_tells_nothing_gets_the_defaults_and_is_told_so() {
+        for [w, h] in [[900, 600], [600, 900]] {
+            let facts = Facts::of_size([w as u32, h as u32]);
+            let view = View::of_photo(&grey(w, h), &facts, &Asked::default()).unwrap();
+            let camera = view.camera([w as u32, h as u32]);
+            // A pitch of a hundredth of a degree: a tenth of 900 pixels' focal length.
+            let row = horizon_row(&camera, &view.plane(), 0.5 * w as f64).unwrap();
+            assert!((row - 0.4 * h as f64).abs() < 0.2, "{row}");
+            let longer = f64::from(camera.focal_px.x) / w.max(h) as f64;
+            let fov = 2.0 * (0.5 / longer).atan().to_degrees();
+            assert!((fov - DEFAULT_FOV_DEG).abs() < 0.02, "{fov}");
+            assert!(view.fov_why.starts_with("a guess") && view.aim_why.starts_with("a guess"));
+            assert_eq!(view.position, DVec3::new(0.0, 1.6, 0.0));
+        }
+    }
+
+    #[test]
+    fn the_photograph_s_focal_length_and_what_is_asked_come_first() {
+        let facts = Facts {
+            focal_px: Some(800.0),
+            focal_source: Some(FocalSource::Equivalent35mm),
+            ..Facts::of_size([900, 600])
+        };
+        let mut asked = Asked {
+            pitch_deg: Some(-12.5),
+            eye_height_m: Some(3.0),
+            ..Asked::default()
+        };
+        let view = View::of_photo(&grey(900, 600), &facts, &asked).unwrap();
+        let focal = view.camera([900, 600]).focal_px.x;
+        // A hundredth of a degree of 41.
+        assert!((focal - 800.0).abs() < 0.3, "{focal}");
+        let pitch_deg = -12.5;
+        let roll_deg = 0.0;
+        assert_eq!(
+            view.aim,
+            Aim::Turned {
+                pitch_deg,
+                roll_deg
+            }
+        );
+        assert_eq!(view.position.y, 3.0);
+        asked.fov_deg = Some(90.0);
+        let view = View::of_photo(&grey(900, 600), &facts, &asked).unwrap();
+        let focal = view.camera([900, 600]).focal_px.x;
+        assert!((focal - 450.0).abs() < 0.2, "{focal}");
+    }
+
+    #[test]
+    fn options_that_no_camera_has_are_refused_by_name() {
+        let refused = |asked: Asked| asked.check().unwrap_err().to_string();
+        let fov_deg = Some(180.0);
+        let pitch_deg = Some(f64::NAN);
+        let eye_height_m = Some(-1.0);
+        let default = Asked::default();
+        assert!(
+            refused(Asked { fov_deg, ..default }).starts_with("--fov is 180; accepted: degrees")
+        );
+        assert!(
+            refused(Asked {
+                pitch_deg,
+                ..default
+            })
+            .starts_with("--pitch is NaN")
+        );
+        assert!(
+            refused(Asked {
+                eye_height_m,
+                ..default
+            })
+            .starts_with("--eye-height is -1")
+        );
+    }
+}
