@@ -184,8 +184,8 @@ fn a_required_extension_that_cannot_be_ignored_is_named() {
         "scene.objects.0.path=packed.gltf",
         1,
         "error: the scene cannot be set up\n  caused by: \"packed.gltf\": the file requires the glTF \
-         extension KHR_draco_mesh_compression, which is not supported; export the object without \
-         mesh compression",
+         extension KHR_draco_mesh_compression, which is not supported; convert the file: \
+         gltf-transform copy IN.glb OUT.glb",
     );
 }
 

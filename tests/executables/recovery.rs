@@ -304,8 +304,8 @@ fn what_cannot_be_optimised_is_refused_with_the_way_out() {
         &project,
         &["light.guidance=magic"],
         2,
-        "error: --set light.guidance=magic: light.guidance is \"magic\", accepted: \"lds\", \
-         \"sds\", \"csd\", \"sdedit\", \"reference\"",
+        "error: --set light.guidance=magic: light.guidance is \"magic\", accepted: \"auto\", \
+         \"none\", \"lds\", \"sds\", \"csd\", \"sdedit\", \"reference\"",
     );
     optimize_fails(
         &project,

@@ -56,7 +56,7 @@ fn the_scene_stage_writes_what_the_others_read() {
         .iter()
         .map(|e| e["name"].as_str().unwrap())
         .collect();
-    assert_eq!(names.len(), 15);
+    assert_eq!(names.len(), 14);
     assert!(effects["max_depth"].is_u64() && effects["rays"]["camera"].is_u64());
     let gbuffer = Layers::read_exr(project.path("out/scene/gbuffer.exr")).unwrap();
     for name in ["depth.Z", "normal.Y", "albedo.G", "object.A", "proxy.A"] {

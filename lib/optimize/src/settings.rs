@@ -504,11 +504,11 @@ mod tests {
             change(&mut table);
             table.settings(&PRESET, 0).unwrap_err()
         };
-        let error = refused(&|t| t.iterations = Some(0));
+        let error = refused(&|t| t.iterations = Some(1_000_001));
         assert_eq!(error.key, "iterations");
         assert_eq!(
             error.to_string(),
-            "0 is out of range; accepted: 1 to 1000000"
+            "1000001 is out of range; accepted: 0 to 1000000"
         );
         assert_eq!(refused(&|t| t.lobes = Some(0)).key, "lobes");
         assert_eq!(refused(&|t| t.size = Some(0)).key, "size");

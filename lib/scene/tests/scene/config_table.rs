@@ -58,7 +58,7 @@ fn the_documented_table_is_accepted() {
     assert_eq!(plane.normal, glam::Vec3::Y);
     assert_eq!(settings.effects.mode(), EffectsMode::Planned);
     let switches = settings.effects.switches();
-    assert_eq!(switches.len(), 15);
+    assert_eq!(switches.len(), 14);
     assert_eq!(switches[0], ("shadow", EffectSwitch::On));
     assert!(switches.contains(&("clearcoat", EffectSwitch::Off)));
     assert!(switches.contains(&("textures", EffectSwitch::Auto)));
