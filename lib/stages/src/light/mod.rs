@@ -1,5 +1,6 @@
 //! The light stage: estimates the light of the photograph, or recovers light and tone curves under
 //! which the object looks as the guidance asks.
+mod done;
 mod estimate;
 pub mod folder;
 pub mod materials;
@@ -8,7 +9,6 @@ mod request;
 mod resume;
 mod surroundings;
 
-use std::fmt;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -17,8 +17,7 @@ use std::time::Instant;
 use anyhow::Context;
 use dipir_cli::interrupt::Interrupted;
 use dipir_cli::progress::Progress;
-use dipir_cli::session::{Session, duration};
-use dipir_estimator::LightEstimate;
+use dipir_cli::session::Session;
 use dipir_guidance::distillation::Adapter;
 use dipir_guidance::recover::{Event, ModelGuidance, Problem, Recovery, Target, recover_light};
 use dipir_imaging::file::write_png;
@@ -36,8 +35,7 @@ use dipir_pipeline::stage::{StagePlan, StageWriter};
 use dipir_prior::inversion::Reading;
 use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
-use glam::Vec3;
-use serde_json::{Value, json};
+use serde_json::Value;
 
 use crate::light::estimate::Estimated;
 use crate::light::request::{First, Guide, Request, first_light, read_reference};
@@ -49,6 +47,8 @@ use crate::presets::{LightRun, Outlook};
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::scene::transport::{self, Frame};
 use crate::{interruption, lora};
+
+pub(crate) use done::in_words;
 
 /// What the stage did.
 pub struct Done {
@@ -539,118 +539,4 @@ fn rows_without_times(history: &[Row]) -> anyhow::Result<Vec<Value>> {
         Ok(value)
     };
     history.iter().map(row).collect()
-}
-
-/// An estimate in a sentence.
-pub(crate) fn in_words(estimate: &LightEstimate) -> String {
-    let (azimuth, elevation) = (estimate.azimuth_deg, estimate.elevation_deg);
-    format!(
-        "estimated: most light {}; in four photographs of five its azimuth is {:.0} to {:.0} degrees to the \
-         right of the view and its elevation {:.0} to {:.0}; a sun with a probability of {:.0}%",
-        estimate.words,
-        azimuth.low,
-        azimuth.high,
-        elevation.low,
-        elevation.high,
-        100.0 * estimate.sun_probability
-    )
-}
-
-/// Degrees above the horizon, and counter-clockwise from +z seen from above.
-fn angles_deg(direction: Vec3) -> [f32; 2] {
-    let elevation = direction.y.clamp(-1.0, 1.0).asin();
-    let azimuth = direction.x.atan2(direction.z);
-    [elevation.to_degrees(), azimuth.to_degrees()]
-}
-
-impl Done {
-    fn records(&self) -> usize {
-        self.found.history.iter().filter(|r| r.recorded).count()
-    }
-
-    fn guidance(&self, row: Option<&Row>) -> Option<f64> {
-        row.and_then(|r| r.guidance)
-    }
-
-    /// For programs.
-    pub fn to_json(&self) -> Value {
-        let history = &self.found.history;
-        json!({
-            "folder": self.folder,
-            "size": self.size,
-            "iterations": history.len(),
-            "resumed_at": self.resumed_at,
-            "skipped": self.found.skipped(),
-            "stopped_early": self.found.stopped_early,
-            "recorded_anew": self.records(),
-            "guidance_at_start": self.guidance(history.first()),
-            "guidance_at_end": self.guidance(history.last()),
-            "rmse": self.found.rmse,
-            "reading": self.found.reading,
-            "estimate": self.found.estimated.as_ref().map(|e| &e.estimate),
-            "other_presets": self.outlook.to_json(),
-            "peak_direction": self.found.lighting.peak_direction(),
-            "fusion_residual": self.found.lighting.fusion_residual,
-            "elapsed_s": self.manifest.elapsed_s,
-            "timings_s": self.manifest.timings_s,
-            "peak_rss_bytes": self.manifest.peak_rss_bytes,
-        })
-    }
-}
-
-impl fmt::Display for Done {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(
-            f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
-        match self.found.history.len() {
-            0 => write!(f, "  nothing was optimised: the start is the light")?,
-            n => write!(
-                f,
-                "  {n} iterations on {} x {} pixels",
-                self.size[0], self.size[1]
-            )?,
-        }
-        if let Some(rmse) = self.found.rmse {
-            write!(f, ", {rmse:.5} of display-referred RMSE from the reference")?;
-        }
-        if let Some(peak) = self.found.lighting.peak_direction() {
-            let [elevation, azimuth] = angles_deg(peak);
-            write!(
-                f,
-                "\n  most light comes from {elevation:.1} degrees above the horizon, {azimuth:.1} \
-                 degrees from +z towards +x"
-            )?;
-        }
-        if let Some(estimated) = &self.found.estimated {
-            write!(f, "\n  {}", in_words(&estimated.estimate))?;
-        }
-        let skipped = self.found.skipped();
-        if skipped > 0 {
-            write!(
-                f,
-                "\n  {skipped} steps were skipped, because something was not finite"
-            )?;
-        }
-        if !self.outlook.0.is_empty() {
-            write!(f, "\n  {}", self.outlook.text())?;
-        }
-        Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn directions_are_told_as_heights_and_turns() {
-        assert_eq!(angles_deg(Vec3::Y)[0], 90.0);
-        assert_eq!(angles_deg(Vec3::Z), [0.0, 0.0]);
-        assert_eq!(angles_deg(Vec3::X), [0.0, 90.0]);
-        assert_eq!(angles_deg(Vec3::NEG_X), [0.0, -90.0]);
-    }
 }

@@ -1,0 +1,177 @@
+//! What `[scene.camera]` says, checked.
+use super::*;
+
+impl CameraConfig {
+    pub(super) fn validate(&self) -> Result<CameraSettings, Error> {
+        match &self.transforms {
+            Some(path) => self.validate_transforms(path.clone()),
+            None => self.validate_look_at(),
+        }
+    }
+
+    pub(super) fn validate_transforms(&self, path: PathBuf) -> Result<CameraSettings, Error> {
+        let others = [
+            ("position", self.position.is_some()),
+            ("look_at", self.look_at.is_some()),
+            ("up", self.up.is_some()),
+            ("pitch_deg", self.pitch_deg.is_some()),
+            ("roll_deg", self.roll_deg.is_some()),
+            ("principal_px", self.principal_px.is_some()),
+            ("fov_deg", self.fov_deg.is_some()),
+            ("focal_mm", self.focal_mm.is_some()),
+            ("sensor_mm", self.sensor_mm.is_some()),
+        ];
+        if let Some((name, _)) = others.iter().find(|(_, given)| *given) {
+            return Err(conflict(
+                "scene.camera.transforms",
+                &format!("scene.camera.{name}"),
+            ));
+        }
+        Ok(CameraSettings::Transforms {
+            path,
+            frame: self.frame.unwrap_or(0),
+            up: match self.transforms_up.as_deref() {
+                None | Some("z") => WorldUp::Z,
+                Some("y") => WorldUp::Y,
+                Some(other) => {
+                    return Err(wrong_word("scene.camera.transforms_up", other, &["z", "y"]));
+                }
+            },
+        })
+    }
+
+    pub(super) fn validate_look_at(&self) -> Result<CameraSettings, Error> {
+        for (name, given) in [
+            ("frame", self.frame.is_some()),
+            ("transforms_up", self.transforms_up.is_some()),
+        ] {
+            if given {
+                return Err(missing(
+                    "scene.camera.transforms",
+                    &format!("name the transforms.json that scene.camera.{name} is about"),
+                ));
+            }
+        }
+        let point = |name: &str, value: Option<[f32; 3]>| {
+            let key = format!("scene.camera.{name}");
+            match value {
+                Some(p) => finite_point(&key, p),
+                None => Err(missing(
+                    &key,
+                    &format!("write {name} = [x, y, z] in metres"),
+                )),
+            }
+        };
+        let position = point("position", self.position)?;
+        if self.pitch_deg.is_some() || self.roll_deg.is_some() {
+            let (look_at, up) = self.turned(position)?;
+            return self.looking(position, look_at, up);
+        }
+        let look_at = point("look_at", self.look_at)?;
+        let backward = position - look_at;
+        if backward.length() < 1e-6 * (1.0 + position.length()) {
+            return Err(wrong(
+                "scene.camera.look_at",
+                triple(look_at),
+                "a point away from scene.camera.position",
+            ));
+        }
+        let up = finite_point("scene.camera.up", self.up.unwrap_or([0.0, 1.0, 0.0]))?;
+        // Below a thousandth of a radian between both directions roll is down to rounding.
+        if backward.normalize().cross(up.normalize_or_zero()).length() < 1e-3 {
+            return Err(wrong(
+                "scene.camera.up",
+                triple(up),
+                "a direction across the line of sight; looking straight down or up, write up = [0.0, 0.0, -1.0]",
+            ));
+        }
+        self.looking(position, look_at, up)
+    }
+
+    pub(super) fn looking(
+        &self,
+        position: Vec3,
+        look_at: Vec3,
+        up: Vec3,
+    ) -> Result<CameraSettings, Error> {
+        Ok(CameraSettings::LookAt {
+            position,
+            look_at,
+            up,
+            field_of_view: self.field_of_view()?,
+            principal_px: finite_pixel("scene.camera.principal_px", self.principal_px)?,
+        })
+    }
+
+    /// The point in the centre of the image and what is up in it, of a camera that looks along -z,
+    /// turned by `pitch_deg` and `roll_deg`.
+    pub(super) fn turned(&self, position: Vec3) -> Result<(Vec3, Vec3), Error> {
+        let given = match self.pitch_deg {
+            Some(_) => "scene.camera.pitch_deg",
+            None => "scene.camera.roll_deg",
+        };
+        for (name, other) in [("look_at", self.look_at), ("up", self.up)] {
+            if other.is_some() {
+                return Err(conflict(given, &format!("scene.camera.{name}")));
+            }
+        }
+        let angle_rad = |name: &str, value: Option<f32>, most: f32| {
+            let value = value.unwrap_or(0.0);
+            match value.abs() <= most {
+                true => Ok(f64::from(value).to_radians()),
+                false => Err(wrong(
+                    &format!("scene.camera.{name}"),
+                    value,
+                    &format!("degrees from -{most} to {most}, for instance {name} = -5.0"),
+                )),
+            }
+        };
+        let pitch = angle_rad("pitch_deg", self.pitch_deg, 90.0)?;
+        let roll = angle_rad("roll_deg", self.roll_deg, 180.0)?;
+        let rotation = DMat3::from_rotation_x(pitch) * DMat3::from_rotation_z(-roll);
+        // Far enough that rounding the point does not turn the line of sight.
+        let distance = 1.0 + position.as_dvec3().length();
+        let look_at = position.as_dvec3() - distance * rotation.z_axis;
+        Ok((look_at.as_vec3(), rotation.y_axis.as_vec3()))
+    }
+
+    pub(super) fn field_of_view(&self) -> Result<FieldOfView, Error> {
+        let millimetres = |name: &str, value: f32| {
+            if value.is_finite() && value > 0.0 {
+                Ok(value)
+            } else {
+                Err(wrong(
+                    &format!("scene.camera.{name}"),
+                    value,
+                    "millimetres above 0, for instance focal_mm = 35.0 with sensor_mm = 36.0",
+                ))
+            }
+        };
+        match (self.fov_deg, self.focal_mm, self.sensor_mm) {
+            (Some(_), Some(_), _) => Err(conflict("scene.camera.fov_deg", "scene.camera.focal_mm")),
+            (Some(_), _, Some(_)) => {
+                Err(conflict("scene.camera.fov_deg", "scene.camera.sensor_mm"))
+            }
+            (Some(fov), None, None) if fov > 0.0 && fov < 180.0 => {
+                Ok(FieldOfView::Vertical(fov.to_radians()))
+            }
+            (Some(fov), None, None) => Err(wrong(
+                "scene.camera.fov_deg",
+                fov,
+                "a vertical field of view between 0 and 180 degrees, for instance fov_deg = 40.0",
+            )),
+            (None, Some(focal), Some(sensor)) => Ok(FieldOfView::Lens {
+                focal_mm: millimetres("focal_mm", focal)?,
+                sensor_mm: millimetres("sensor_mm", sensor)?,
+            }),
+            // The photograph may know its sensor.
+            (None, Some(focal), None) => Ok(FieldOfView::Focal(millimetres("focal_mm", focal)?)),
+            (None, None, Some(_)) => Err(missing(
+                "scene.camera.focal_mm",
+                "scene.camera.sensor_mm needs the focal length, for instance focal_mm = 35.0",
+            )),
+            // The photograph may know all of it.
+            (None, None, None) => Ok(FieldOfView::Photograph),
+        }
+    }
+}
