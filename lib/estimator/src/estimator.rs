@@ -3,15 +3,19 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use dipir_imaging::raster::LinearImage;
+use dipir_light::luminance::luminance_f64;
 use dipir_scene::camera::Camera;
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::error::EstimatorError;
 use crate::estimate::{Interval, LightEstimate};
 use crate::features::Glance;
-use crate::grid::{BASE_TEXELS, BINS, heading, mirrored_bin, mirrored_texel};
+use crate::grid::{BASE_TEXELS, BINS, base_texel, heading, mirrored_bin, mirrored_texel};
+use crate::histogram::{SHARES, STOPS, Scale};
 use crate::network::{
-    ENERGY, HISTOGRAM, LOG_ENERGY, LOG_RADIANCE, MAP, Network, QUANTILES, SUN, from_bytes, to_bytes,
+    ENERGY, EXPOSURE, HISTOGRAM, LOG_ENERGY, LOG_RADIANCE, MAP, Network, SHARE, SUN, from_bytes,
+    to_bytes,
 };
 use crate::posterior::PeakPosterior;
 
@@ -24,21 +28,24 @@ const CALIBRATION: &str = "calibration";
 pub struct Calibration {
     /// Radiance is multiplied by this.
     pub exposure: f64,
+    /// Weight of the exposure's median in the map's exposure, 0 to 1; the rest is the map's own.
+    pub told: f64,
     /// The posterior's logarithm is divided by this, and so is the sun's score.
     pub temperature: f64,
-    /// Added to both ends of the exposure's interval, stops.
-    pub exposure_margin: f64,
-    /// Added to both ends of the share's interval.
-    pub share_margin: f64,
+    /// Probabilities below and above the exposure's interval, as the networks say them, at which it holds 80%.
+    pub exposure_tails: [f64; 2],
+    /// The same of the share's interval.
+    pub share_tails: [f64; 2],
 }
 
 impl Default for Calibration {
     fn default() -> Self {
         Self {
             exposure: 1.0,
+            told: 0.0,
             temperature: 1.0,
-            exposure_margin: 0.0,
-            share_margin: 0.0,
+            exposure_tails: [0.1; 2],
+            share_tails: [0.1; 2],
         }
     }
 }
@@ -96,6 +103,12 @@ impl Estimator {
         }
     }
 
+    /// What the networks say of the exposure and of the share, bin by bin, for the calibration of intervals.
+    pub fn histograms(&self, features: &[Vec<f32>; 2]) -> [Vec<f64>; 2] {
+        let sum = self.sum(features);
+        [sum.exposure, sum.share]
+    }
+
     /// The networks of all, with the calibration of the first.
     pub fn joined(all: &[Self]) -> Result<Self, EstimatorError> {
         let members = all.iter().flat_map(|e| e.members.iter().cloned()).collect();
@@ -130,18 +143,19 @@ impl Estimator {
         reference: f32,
         heading_rad: f64,
     ) -> LightEstimate {
+        let count = 2 * self.members.len();
+        self.sum(features)
+            .estimate(count, reference, heading_rad, &self.calibration)
+    }
+
+    fn sum(&self, features: &[Vec<f32>; 2]) -> Sum {
         let mut sum = Sum::default();
         for member in &self.members {
             let plain = self.read(&member.forward(&features[0]), false);
             let mirrored = self.read(&member.forward(&features[1]), true);
             sum.add(&plain.plus(&mirrored));
         }
-        sum.estimate(
-            2 * self.members.len(),
-            reference,
-            heading_rad,
-            &self.calibration,
-        )
+        sum
     }
 
     fn read(&self, o: &[f32], mirrored: bool) -> Sum {
@@ -153,17 +167,22 @@ impl Estimator {
         let scores: Vec<f64> = (0..BINS)
             .map(|k| f64::from(o[HISTOGRAM + bin(k)]) / temperature)
             .collect();
-        let best = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let weights: Vec<f64> = scores.iter().map(|s| (s - best).exp()).collect();
-        let total: f64 = weights.iter().sum();
+        let plain = |from: usize, count: usize| {
+            let scores: Vec<f64> = o[from..from + count]
+                .iter()
+                .map(|v| f64::from(*v))
+                .collect();
+            softmax(&scores)
+        };
         Sum {
             base: (0..BASE_TEXELS)
                 .map(|k| std::array::from_fn(|c| radiance(o[MAP + 3 * texel(k) + c])))
                 .collect(),
             peak: std::array::from_fn(|c| energy(o[ENERGY + c])),
-            weights: weights.iter().map(|w| w / total).collect(),
+            weights: softmax(&scores),
             sun: 1.0 / (1.0 + (-f64::from(o[SUN]) / temperature).exp()),
-            quantiles: std::array::from_fn(|k| f64::from(o[QUANTILES + k])),
+            exposure: plain(EXPOSURE, STOPS.count),
+            share: plain(SHARE, SHARES.count),
         }
     }
 }
@@ -175,7 +194,8 @@ struct Sum {
     peak: [f64; 3],
     weights: Vec<f64>,
     sun: f64,
-    quantiles: [f64; 6],
+    exposure: Vec<f64>,
+    share: Vec<f64>,
 }
 
 impl Sum {
@@ -187,13 +207,16 @@ impl Sum {
     fn add(&mut self, other: &Self) {
         self.base.resize(BASE_TEXELS, [0.0; 3]);
         self.weights.resize(BINS, 0.0);
+        self.exposure.resize(STOPS.count, 0.0);
+        self.share.resize(SHARES.count, 0.0);
         for (a, b) in self.base.iter_mut().zip(&other.base) {
             a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
         }
         let pairs = |a: &mut [f64], b: &[f64]| a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
         pairs(&mut self.peak, &other.peak);
         pairs(&mut self.weights, &other.weights);
-        pairs(&mut self.quantiles, &other.quantiles);
+        pairs(&mut self.exposure, &other.exposure);
+        pairs(&mut self.share, &other.share);
         self.sun += other.sun;
     }
 
@@ -205,25 +228,19 @@ impl Sum {
         c: &Calibration,
     ) -> LightEstimate {
         let n = count as f64;
-        let scale = c.exposure * f64::from(reference) / n;
-        let q = self.quantiles.map(|q| q / n);
-        let unit = |v: f64| v.clamp(0.0, 1.0);
+        let over = luminance_f64(DVec3::from(self.mean())) / n;
+        let told = STOPS.quantile(&self.exposure, 0.5) - over.max(1e-6).log2();
+        let scale = c.exposure * (c.told * told).exp2() * f64::from(reference) / n;
+        let texel = |t: &[f64; 3]| t.map(|v| (v * scale) as f32);
         LightEstimate {
             heading_rad,
             reference: f64::from(reference),
-            base: self
-                .base
-                .iter()
-                .map(|t| t.map(|v| (v * scale) as f32))
-                .collect(),
+            base: self.base.iter().map(texel).collect(),
             peak: self.peak.map(|v| (v * scale) as f32),
             posterior: PeakPosterior::normalised(self.weights),
             sun_probability: self.sun / n,
-            exposure_stops: widened([q[1], q[0], q[2]], c.exposure_margin),
-            share: {
-                let i = widened([q[4], q[3], q[5]], c.share_margin);
-                Interval::new(unit(i.low), unit(i.middle), unit(i.high))
-            },
+            exposure_stops: middle_of(&STOPS, &self.exposure, c.exposure_tails),
+            share: middle_of(&SHARES, &self.share, c.share_tails),
             azimuth_deg: Interval::new(0.0, 0.0, 0.0),
             elevation_deg: Interval::new(0.0, 0.0, 0.0),
             words: String::new(),
@@ -231,13 +248,28 @@ impl Sum {
         }
         .described()
     }
+
+    /// Mean radiance over the sphere.
+    fn mean(&self) -> [f64; 3] {
+        let sphere = 4.0 * std::f64::consts::PI;
+        std::array::from_fn(|c| {
+            let texel = |(k, t): (usize, &[f64; 3])| t[c] * f64::from(base_texel(k).1);
+            let base: f64 = self.base.iter().enumerate().map(texel).sum();
+            (base + self.peak[c]) / sphere
+        })
+    }
 }
 
-fn widened([low, middle, high]: [f64; 3], margin: f64) -> Interval {
-    let i = Interval::new(low, middle, high);
-    Interval::new(
-        (i.low - margin).min(i.middle),
-        i.middle,
-        (i.high + margin).max(i.middle),
-    )
+/// Probabilities of scores.
+fn softmax(scores: &[f64]) -> Vec<f64> {
+    let best = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let weights: Vec<f64> = scores.iter().map(|s| (s - best).exp()).collect();
+    let total: f64 = weights.iter().sum();
+    weights.iter().map(|w| w / total).collect()
+}
+
+/// A histogram's median and what lies between its tails.
+fn middle_of(scale: &Scale, weights: &[f64], [low, high]: [f64; 2]) -> Interval {
+    let at = |q: f64| scale.quantile(weights, q);
+    Interval::new(at(low.min(0.5)), at(0.5), at(1.0 - high.min(0.5)))
 }

@@ -6,6 +6,8 @@ use dipir_light::luminance::luminance;
 use dipir_scene::camera::Camera;
 use glam::{Vec2, Vec3};
 
+use crate::cues::{CUES, cues};
+
 /// Pixels along each side of the picture that is looked at, whatever the photograph's size.
 pub const SIDE: usize = 64;
 /// Parts of the picture along each side.
@@ -30,7 +32,8 @@ pub const FEATURES: usize = 6
     + 2 * COARSE * COARSE
     + QUANTILES.len()
     + 2
-    + PER_BAND * (BANDS_DEG.len() - 1);
+    + PER_BAND * (BANDS_DEG.len() - 1)
+    + CUES;
 
 /// A photograph and its camera at the size that is looked at.
 #[derive(Clone, Debug)]
@@ -132,6 +135,8 @@ impl Glance {
         for band in BANDS_DEG.windows(2) {
             all.extend(self.band([band[0], band[1]], &light, &log, reference));
         }
+        let relative: Vec<f32> = log.iter().map(|l| l - reference).collect();
+        all.extend(cues(&self.pixels, &light, &relative, &self.elevation_deg));
         debug_assert_eq!(all.len(), FEATURES);
         all
     }

@@ -3,7 +3,7 @@ use dipir_light::gaussian::SphericalGaussian;
 use glam::{Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
-use crate::estimate::LightEstimate;
+use crate::estimate::{Interval, LightEstimate};
 use crate::grid::{BINS, bin_direction, direction};
 use crate::posterior::PeakPosterior;
 
@@ -78,6 +78,7 @@ impl LightEstimate {
         known.posterior = PeakPosterior::normalised((0..BINS).map(weight).collect());
         if let Some(share) = sun.share {
             known.set_share(share);
+            known.share = Interval::new(share, share, share);
         }
         if let (Some(azimuth), Some(elevation)) = (sun.azimuth, sun.elevation)
             && azimuth.sigma_deg.max(elevation.sigma_deg) <= SHARP_DEG
@@ -139,4 +140,144 @@ fn angles_deg(towards: Vec3) -> (f64, f64) {
         towards.x.atan2(-towards.z).to_degrees(),
         towards.y.clamp(-1.0, 1.0).asin().to_degrees(),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::grid::BASE_TEXELS;
+
+    /// Grey light with a reddish source that may stand anywhere, seen by a camera that looks 70 degrees to the right.
+    fn open() -> LightEstimate {
+        let unknown = Interval::new(0.0, 0.5, 1.0);
+        LightEstimate {
+            heading_rad: 70f64.to_radians(),
+            reference: 0.3,
+            base: vec![[0.4, 0.5, 0.6]; BASE_TEXELS],
+            peak: [2.0, 1.5, 1.0],
+            posterior: PeakPosterior::uniform(),
+            sun_probability: 0.7,
+            exposure_stops: unknown,
+            share: unknown,
+            azimuth_deg: unknown,
+            elevation_deg: unknown,
+            words: String::new(),
+            source: None,
+        }
+        .described()
+    }
+
+    fn angle(deg: f64, sigma_deg: f64) -> Option<KnownAngle> {
+        Some(KnownAngle { deg, sigma_deg })
+    }
+
+    #[test]
+    fn a_known_direction_becomes_a_source_with_the_expected_energy() {
+        let sun = KnownSun {
+            azimuth: angle(-40.0, 5.0),
+            elevation: angle(35.0, 1.0),
+            ..KnownSun::default()
+        };
+        let known = open().knowing(&sun);
+        let lobe = known.source_lobe().unwrap();
+        let world = direction(30f32.to_radians(), 35f32.to_radians());
+        assert!(lobe.direction.distance(world) < 1e-5, "{}", lobe.direction);
+        let energy = lobe.radiance * lobe.solid_angle() as f32;
+        assert!(energy.distance(Vec3::new(2.0, 1.5, 1.0)) < 1e-4, "{energy}");
+        // The photograph looks sunny, so the lobe is as wide as the sun.
+        assert!((lobe.sigma.to_degrees() - 0.135).abs() < 1e-3);
+        let lobes = known.lobes(8);
+        assert!(lobes[0] == lobe && lobes.len() <= 8);
+    }
+
+    #[test]
+    fn a_direction_that_is_known_badly_is_no_source_of_its_own() {
+        let sun = KnownSun {
+            azimuth: angle(-40.0, 20.0),
+            elevation: angle(35.0, 1.0),
+            ..KnownSun::default()
+        };
+        let known = open().knowing(&sun);
+        assert!(known.source.is_none());
+        assert!(known.azimuth_deg.holds(-40.0), "{:?}", known.azimuth_deg);
+    }
+
+    #[test]
+    fn an_elevation_alone_narrows_the_elevation() {
+        let before = open();
+        let sun = KnownSun {
+            elevation: angle(42.0, 2.0),
+            ..KnownSun::default()
+        };
+        let after = before.knowing(&sun);
+        let length = |e: &LightEstimate| e.elevation_deg.high - e.elevation_deg.low;
+        // The bin around 42 degrees spans 32 to 52, of which the middle 80% are 16.
+        assert!(length(&before) > 60.0 && length(&after) < 17.0);
+        assert!(after.elevation_deg.holds(42.0) && after.source.is_none());
+        // Azimuths are as open as before.
+        for p in after.posterior.azimuths() {
+            assert!((p - 1.0 / 24.0).abs() < 1e-4, "{p}");
+        }
+    }
+
+    #[test]
+    fn a_sun_that_has_set_lights_nothing() {
+        let sun = KnownSun {
+            azimuth: angle(10.0, 1.0),
+            elevation: angle(-3.0, 1.0),
+            ..KnownSun::default()
+        };
+        let known = open().knowing(&sun);
+        assert_eq!((known.peak, known.sun_probability), ([0.0; 3], 0.0));
+        assert!(known.source_lobe().is_none());
+        assert_eq!(known.map(), known.base_map());
+    }
+
+    #[test]
+    fn a_known_share_is_reached_and_the_light_stays_as_bright() {
+        let total = |e: &LightEstimate| e.map().integral().element_sum();
+        let before = open();
+        for share in [0.0, 0.3, 0.6, 0.95] {
+            let sun = KnownSun {
+                share: Some(share),
+                ..KnownSun::default()
+            };
+            let after = before.knowing(&sun);
+            let source = Vec3::from(after.peak).as_dvec3().element_sum();
+            let found = source / (source + after.base_map().integral().element_sum());
+            assert!((found - share).abs() < 1e-4, "{share}: {found}");
+            // Maps are sums of some thousand f32 texels.
+            assert!((total(&after) / total(&before) - 1.0).abs() < 1e-3);
+            assert!(after.share.holds(share));
+        }
+    }
+
+    #[test]
+    fn what_is_known_never_makes_an_estimate_that_is_no_number() {
+        let black = LightEstimate {
+            base: vec![[0.0; 3]; BASE_TEXELS],
+            peak: [0.0; 3],
+            ..open()
+        };
+        for before in [open(), black] {
+            for deg in [-1e6, -180.0, 0.0, 90.0, 180.0, 720.0] {
+                for sigma in [0.0, 3.0, 1e9] {
+                    for share in [0.0, 1.0] {
+                        let sun = KnownSun {
+                            azimuth: angle(deg, sigma),
+                            elevation: angle(deg.clamp(-0.5, 90.0), sigma),
+                            radius_deg: Some(0.27),
+                            share: Some(share),
+                        };
+                        let after = before.knowing(&sun);
+                        let weights: f32 = after.posterior.weights.iter().sum();
+                        assert!((weights - 1.0).abs() < 1e-4, "{sun:?}");
+                        assert!(after.map().integral().is_finite(), "{sun:?}");
+                        let lobes = after.lobes(4);
+                        assert!(lobes.iter().all(|l| l.radiance.is_finite()), "{sun:?}");
+                    }
+                }
+            }
+        }
+    }
 }

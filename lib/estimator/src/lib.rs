@@ -5,11 +5,13 @@
 //! decides nothing the mean is soft. Objects, presets and seeds do not enter.
 mod candidates;
 mod combine;
+mod cues;
 pub mod error;
 mod estimate;
 mod estimator;
 pub mod features;
 pub mod grid;
+pub mod histogram;
 mod known;
 pub mod network;
 pub mod posterior;
@@ -27,4 +29,4 @@ pub use posterior::PeakPosterior;
 pub use visible::{Visible, merged};
 
 /// Raised whenever the same photograph and camera get another estimate.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;

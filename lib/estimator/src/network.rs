@@ -7,6 +7,7 @@ use safetensors::tensor::{SafeTensors, TensorView};
 use crate::error::EstimatorError;
 use crate::features::FEATURES;
 use crate::grid::{BASE_TEXELS, BINS};
+use crate::histogram::{SHARES, STOPS};
 
 /// Where the logarithms of the smooth part begin among the outputs, texel after texel, red, green, blue.
 pub const MAP: usize = 0;
@@ -16,11 +17,13 @@ pub const ENERGY: usize = MAP + 3 * BASE_TEXELS;
 pub const HISTOGRAM: usize = ENERGY + 3;
 /// The score of a sun-like source.
 pub const SUN: usize = HISTOGRAM + BINS;
-/// Median, 10% and 90% quantiles of the mean radiance, stops over the photograph's mean; then of the strongest
-/// source's share.
-pub const QUANTILES: usize = SUN + 1;
+/// Where the scores of the mean radiance begin, stops over the photograph's mean: bins of
+/// [`STOPS`](crate::histogram::STOPS).
+pub const EXPOSURE: usize = SUN + 1;
+/// Where the scores of the strongest source's share begin: bins of [`SHARES`](crate::histogram::SHARES).
+pub const SHARE: usize = EXPOSURE + STOPS.count;
 /// Outputs in all.
-pub const OUTPUTS: usize = QUANTILES + 6;
+pub const OUTPUTS: usize = SHARE + SHARES.count;
 /// Standardised features are cut off here, deviations: a camera or a picture that was never seen stays finite.
 pub const FEATURE_LIMIT: f32 = 5.0;
 /// Logarithms of radiance over the photograph's mean are kept between these.

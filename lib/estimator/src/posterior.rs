@@ -8,6 +8,9 @@ use crate::grid::{AZIMUTHS, BINS, ELEVATION_EDGES_DEG, ELEVATIONS, bin_direction
 /// Degrees of azimuth of one bin.
 const STEP_DEG: f64 = 360.0 / AZIMUTHS as f64;
 
+/// Width of the lobe whose support makes a direction the most probable one, radians: narrower ones follow chance.
+const MODE: f32 = 0.8;
+
 /// Probabilities of the bins of [`crate::grid`], summing to 1. Azimuth 0 is ahead and grows to the right.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PeakPosterior {
@@ -119,10 +122,16 @@ impl PeakPosterior {
             .sum()
     }
 
-    /// The most probable direction: the mean over the bins within 40 degrees of the best one.
+    /// The most probable direction: the mean over the bins within 40 degrees of the one with the most probability
+    /// around it, weighted by a lobe as wide as what photographs decide.
     pub fn mode(&self) -> Vec3 {
+        let support = |towards: Vec3| -> f32 {
+            let near = |k: usize| ((bin_direction(k).dot(towards) - 1.0) / (MODE * MODE)).exp();
+            (0..BINS).map(|k| self.weights[k] * near(k)).sum()
+        };
+        let all: Vec<f32> = (0..BINS).map(|k| support(bin_direction(k))).collect();
         let best = (0..BINS)
-            .max_by(|a, b| self.around(*a).total_cmp(&self.around(*b)))
+            .max_by(|a, b| all[*a].total_cmp(&all[*b]))
             .unwrap_or(0);
         let near =
             |k: &usize| bin_direction(*k).dot(bin_direction(best)) > 40f32.to_radians().cos();

@@ -334,6 +334,38 @@ fn a_merged_map_shows_the_photograph_and_keeps_clipped_sources() {
 }
 
 #[test]
+fn a_merged_map_is_continuous_across_the_photographs_border() {
+    // A sky that grows brighter to the right, a photograph of it, and an estimate that is a stop too dark.
+    let black = EnvironmentMap::constant(128, 64, Vec3::ZERO);
+    let sky = |d: Vec3| Vec3::splat(0.4 + 0.1 * d.x + 0.1 * d.y);
+    let map = |scale: f32| {
+        let texels = (0..128 * 64).map(|k| sky(black.direction_of(k / 128, k % 128)) * scale);
+        EnvironmentMap::new(128, 64, texels.collect()).unwrap()
+    };
+    let camera = camera(0.0, 120, 80);
+    let pixel = |k: usize| {
+        let at = glam::Vec2::new((k % 120) as f32 + 0.5, (k / 120) as f32 + 0.5);
+        sky(camera.ray(at).direction)
+    };
+    let photo = LinearImage(Raster::from_pixels(120, 80, (0..9600).map(pixel).collect()));
+    let seen = Visible::new(&photo, &camera, 128, 64, 5.0);
+    let (truth, merged) = (map(1.0), merged(&seen, &map(0.5)));
+    for (k, t) in merged.texels().iter().enumerate() {
+        if seen.alpha[k] > 0.999 {
+            // A pixel of the photograph is .5 degrees wide, over which the sky changes by .001.
+            assert!(t.distance(truth.texels()[k]) < 5e-3, "texel {k}");
+        }
+    }
+    let stops = |row: usize, column: usize| luminance(merged.texel(row, column % 128)).log2();
+    for (row, column) in (16..48).flat_map(|r| (0..128).map(move |c| (r, c))) {
+        // The border's factor falls from 2 to 1 as a logistic curve, by at most 1.9 stops a radian: .09 for a texel of
+        // .05 radians, and .02 more by the sky itself.
+        let step = (stops(row, column) - stops(row, column + 1)).abs();
+        assert!(step < 0.15, "row {row}, column {column}: {step}");
+    }
+}
+
+#[test]
 fn features_are_of_the_whole_photograph_at_any_size() {
     let camera = |n: u32| camera(0.0, n, n);
     let (small, large) = (

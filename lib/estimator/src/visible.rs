@@ -10,7 +10,7 @@ use crate::features::CLIPPED;
 
 /// Directions along each side of a texel at which the photograph is looked up.
 const SAMPLES: usize = 4;
-/// Columns and rows on which the two parts are brought to one exposure at their border.
+/// Columns and rows on which the two parts are compared at their border.
 const COARSE: [usize; 2] = [32, 16];
 /// How far the border's ratio reaches into the estimate, radians (15 degrees).
 const REACH: f32 = 0.26;
@@ -136,26 +136,23 @@ pub fn merged(visible: &Visible, estimate: &EnvironmentMap) -> EnvironmentMap {
     let (width, height) = (visible.map.width(), visible.map.height());
     let unseen = estimate.resampled(width, height);
     let ratios = border_ratios(visible, &unseen);
-    let ratio_grid = EnvironmentMap::constant(COARSE[0], COARSE[1], Vec3::ZERO);
     let texels = (0..width * height)
         .map(|k| {
-            let direction = visible.map.direction_of(k / width, k % width);
-            let (i, j) = ratio_grid.texel_of(direction);
             let other = unseen.texels()[k];
             let (alpha, white) = (visible.alpha[k], visible.clipped[k]);
             if alpha == 0.0 {
-                return other * ratios[i * COARSE[0] + j];
+                return other * ratios[k];
             }
             let seen = visible.map.texels()[k];
             let bounded = seen + (other - seen).max(Vec3::ZERO) * white;
-            other * ratios[i * COARSE[0] + j] * (1.0 - alpha) + bounded * alpha
+            other * ratios[k] * (1.0 - alpha) + bounded * alpha
         })
         .collect();
     EnvironmentMap::new(width, height, texels).unwrap_or(unseen)
 }
 
-/// What the estimate is multiplied by in each coarse direction: the mean ratio of what is seen nearby to what is
-/// estimated there, 1 far away.
+/// What each texel of the estimate is multiplied by: the mean ratio of what is seen nearby to what is estimated there,
+/// 1 far away.
 fn border_ratios(visible: &Visible, unseen: &EnvironmentMap) -> Vec<f32> {
     let width = unseen.width();
     let mut seen: Vec<(Vec3, f32, f32)> = Vec::new();
@@ -179,9 +176,9 @@ fn border_ratios(visible: &Visible, unseen: &EnvironmentMap) -> Vec<f32> {
             ));
         }
     }
-    (0..sums.len())
+    (0..unseen.texels().len())
         .map(|k| {
-            let direction = grid.direction_of(k / COARSE[0], k % COARSE[0]);
+            let direction = unseen.direction_of(k / width, k % width);
             let (mut total, mut sum) = (FAR, 0.0);
             for (towards, weight, stops) in &seen {
                 let w = weight * ((direction.dot(*towards) - 1.0) / (REACH * REACH)).exp();

@@ -1,5 +1,5 @@
 //! Trains the light estimator: `cargo run -p dipir-places --example train -- PANORAMAS OUT [key=value]...` with the keys
-//! folds, views, judged, places, seed, hidden, epochs, dropout, decay, rate.
+//! folds, networks, views, judged, places, seed, hidden, epochs, dropout, decay, rate.
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -15,6 +15,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for argument in arguments {
         let (key, value) = argument.split_once('=').ok_or("arguments are key=value")?;
         match key {
+            "networks" => settings.networks = value.parse()?,
             "folds" => settings.folds = value.parse()?,
             "views" => settings.views = value.parse()?,
             "judged" => settings.judged = value.parse()?,

@@ -1,5 +1,6 @@
 //! How good estimates are on places that nothing was trained on, and their calibration.
-use dipir_estimator::grid::BINS;
+use dipir_estimator::grid::{BINS, base_texel};
+use dipir_estimator::histogram::{SHARES, STOPS, Scale};
 use dipir_estimator::{Calibration, LightEstimate, PeakPosterior};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::luminance::luminance;
@@ -13,6 +14,9 @@ use crate::probes::{NORMALS, PROBES, Probes};
 /// Reflectance of the surfaces that are compared.
 const ALBEDO: f32 = 0.5;
 
+/// What a stop of wrong exposure counts beside errors of display values, where a calibration is chosen.
+const STOP: f64 = 0.1;
+
 /// An estimate beside its truth.
 #[derive(Clone, Debug)]
 pub struct Case {
@@ -24,6 +28,8 @@ pub struct Case {
     pub kind: String,
     /// Fold that was left out.
     pub fold: usize,
+    /// What the networks say of exposure and share, bin by bin.
+    pub histograms: [Vec<f64>; 2],
 }
 
 /// Figures over some photographs.
@@ -82,6 +88,13 @@ impl Case {
                 smooth + peak * spread
             })
             .collect()
+    }
+
+    /// Mean radiance of the estimated light over the sphere.
+    fn mean(&self) -> Vec3 {
+        let texel = |(k, t): (usize, &[f32; 3])| Vec3::from(*t) * base_texel(k).1;
+        let base: Vec3 = self.estimate.base.iter().enumerate().map(texel).sum();
+        (base + Vec3::from(self.estimate.peak)) / (4.0 * std::f32::consts::PI)
     }
 
     fn truth(&self) -> Vec<Vec3> {
@@ -255,19 +268,8 @@ fn summary<'a>(of: &str, cases: impl Iterator<Item = &'a (&'a Case, Errors)>) ->
 }
 
 /// A calibration from estimates that have none, each of a place that its network was not trained on.
-pub fn calibration(cases: &[Case], probes: &Probes) -> Calibration {
-    let pairs: Vec<(Vec<Vec3>, Vec<Vec3>)> =
-        cases.iter().map(|c| (c.found(probes), c.truth())).collect();
-    let error = |scale: f32| -> f64 {
-        let scaled = |light: &[Vec3]| light.iter().map(|p| *p * scale).collect::<Vec<_>>();
-        pairs
-            .iter()
-            .map(|(f, t)| picture_error(&scaled(f), t))
-            .sum()
-    };
-    let exposure = (0..25)
-        .map(|k| 0.6 * 1.04f32.powi(k))
-        .min_by(|a, b| error(*a).total_cmp(&error(*b)));
+pub fn calibration(cases: &[&Case], probes: &Probes) -> Calibration {
+    let [exposure, told] = exposure_calibration(cases, probes);
     let surprise = |temperature: f64| -> f64 {
         cases
             .iter()
@@ -288,21 +290,101 @@ pub fn calibration(cases: &[Case], probes: &Probes) -> Calibration {
     let temperature = (0..16)
         .map(|k| 0.7 * 1.1f64.powi(k))
         .min_by(|a, b| surprise(*a).total_cmp(&surprise(*b)));
-    let margin = |outside: &dyn Fn(&Case) -> f64| {
-        let mut all: Vec<f64> = cases.iter().map(outside).collect();
-        all.sort_by(f64::total_cmp);
-        all.get((0.8 * all.len() as f64) as usize)
-            .copied()
-            .unwrap_or(0.0)
-    };
-    let beyond =
-        |i: &dipir_estimator::Interval, v: f32| (i.low - f64::from(v)).max(f64::from(v) - i.high);
     Calibration {
-        exposure: exposure.map_or(1.0, f64::from),
+        exposure,
+        told,
         temperature: temperature.unwrap_or(1.0),
-        exposure_margin: margin(&|c| beyond(&c.estimate.exposure_stops, c.example.truth.stops)),
-        share_margin: margin(&|c| beyond(&c.estimate.share, c.example.truth.share)),
+        exposure_tails: {
+            let all = ranks(cases, |c| {
+                (&STOPS, &c.histograms[0], f64::from(c.example.truth.stops))
+            });
+            [outside(&all, 0.1), outside(&reversed(&all), 0.1)]
+        },
+        share_tails: share_tails(cases),
     }
+}
+
+/// Where each truth lies in the distribution that was said, 0 to 1.
+fn ranks<'c>(
+    cases: &[&'c Case],
+    of: impl Fn(&'c Case) -> (&'c Scale, &'c Vec<f64>, f64),
+) -> Vec<f64> {
+    let rank = |c: &&'c Case| {
+        let (scale, weights, value) = of(c);
+        scale.rank(weights, value)
+    };
+    cases.iter().map(rank).collect()
+}
+
+fn reversed(ranks: &[f64]) -> Vec<f64> {
+    ranks.iter().map(|r| 1.0 - r).collect()
+}
+
+/// The tail below which `share` of the ranks lie.
+fn outside(ranks: &[f64], share: f64) -> f64 {
+    let mut all = ranks.to_vec();
+    all.sort_by(f64::total_cmp);
+    let at = (share * all.len() as f64) as usize;
+    all.get(at).copied().unwrap_or(share).clamp(0.002, 0.4)
+}
+
+/// Shares are those of suns or those of everything else. The upper tail leaves out a fifth of the suns, the lower one
+/// a seventh of the rest, so that either kind is held about as often.
+fn share_tails(cases: &[&Case]) -> [f64; 2] {
+    let of = |sun: bool| {
+        let some: Vec<&Case> = cases
+            .iter()
+            .copied()
+            .filter(|c| c.example.truth.sun == sun)
+            .collect();
+        ranks(&some, |c| {
+            (&SHARES, &c.histograms[1], f64::from(c.example.truth.share))
+        })
+    };
+    [
+        outside(&of(false), 0.18),
+        outside(&reversed(&of(true)), 0.18),
+    ]
+}
+
+/// The exposure's factor and the weight of its median, by how surfaces look and by how far off they are in stops.
+fn exposure_calibration(cases: &[&Case], probes: &Probes) -> [f64; 2] {
+    let lights: Vec<(Vec<Vec3>, f64, Vec<Vec3>)> = cases
+        .iter()
+        .map(|c| {
+            let over = f64::from(luminance(c.mean()) / c.example.reference);
+            let told = c.estimate.exposure_stops.middle - over.max(1e-6).log2();
+            (c.found(probes), told, c.truth())
+        })
+        .collect();
+    let error = |[exposure, weight]: [f64; 2]| -> f64 {
+        let one = |(found, told, truth): &(Vec<Vec3>, f64, Vec<Vec3>)| {
+            let scale = (exposure * (weight * told).exp2()) as f32;
+            let light: Vec<Vec3> = found.iter().take(NORMALS).map(|p| *p * scale).collect();
+            let off = mean_irradiance(&light) / mean_irradiance(truth).max(1e-9);
+            picture_error(&light, truth) + STOP * off.max(1e-9).log2().abs()
+        };
+        lights.iter().map(one).sum()
+    };
+    let choices: [Vec<f64>; 2] = [
+        (0..25).map(|k| 0.6 * 1.04f64.powi(k)).collect(),
+        (0..6).map(|k| 0.2 * f64::from(k)).collect(),
+    ];
+    let mut best = [1.0, 0.0];
+    for _ in 0..3 {
+        for (n, choices) in choices.iter().enumerate() {
+            let with = |value: f64| {
+                let mut all = best;
+                all[n] = value;
+                (error(all), value)
+            };
+            let found = choices.iter().map(|v| with(*v));
+            if let Some(found) = found.min_by(|a, b| a.0.total_cmp(&b.0)) {
+                best[n] = found.1;
+            }
+        }
+    }
+    best
 }
 
 /// The figures as a table in Markdown.

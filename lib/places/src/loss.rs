@@ -2,8 +2,9 @@
 use std::f32::consts::PI;
 
 use dipir_estimator::grid::{BASE_TEXELS, BINS};
+use dipir_estimator::histogram::{SHARES, STOPS};
 use dipir_estimator::network::{
-    ENERGY, HISTOGRAM, LOG_ENERGY, LOG_RADIANCE, MAP, OUTPUTS, QUANTILES, SUN,
+    ENERGY, EXPOSURE, HISTOGRAM, LOG_ENERGY, LOG_RADIANCE, MAP, OUTPUTS, SHARE, SUN,
 };
 use dipir_estimator::posterior::soft_bins;
 
@@ -22,10 +23,8 @@ const SOURCE: f32 = 0.3;
 const DIRECTION: f32 = 0.05;
 /// Weight of whether there is a sun.
 const SUNNY: f32 = 0.05;
-/// Weights of the quantiles of exposure and of share.
-const SPREAD: [f32; 2] = [0.15, 0.3];
-/// What the quantiles are.
-const LEVELS: [f32; 3] = [0.5, 0.1, 0.9];
+/// Weight of the distributions of exposure and of share.
+const SPREAD: f32 = 0.03;
 /// Reflectance of the surfaces that are judged.
 const ALBEDO: f32 = 0.6;
 
@@ -60,13 +59,12 @@ pub(crate) fn loss(
     let is_sun = f32::from(u8::from(truth.sun));
     total -= SUNNY * (is_sun * sun.max(1e-12).ln() + (1.0 - is_sun) * (1.0 - sun).max(1e-12).ln());
     gradient[SUN] += weight * SUNNY * (sun - is_sun);
-    for (kind, value) in [truth.stops, truth.share].into_iter().enumerate() {
-        for (k, level) in LEVELS.into_iter().enumerate() {
-            let n = QUANTILES + 3 * kind + k;
-            let off = value - outputs[n];
-            let slope = if off > 0.0 { -level } else { 1.0 - level };
-            total += SPREAD[kind] * -slope * off;
-            gradient[n] += weight * SPREAD[kind] * slope;
+    for (from, scale, value) in [(EXPOSURE, STOPS, truth.stops), (SHARE, SHARES, truth.share)] {
+        let wanted = scale.soft(f64::from(value));
+        let probability = softmax(&outputs[from..from + scale.count]);
+        for k in 0..scale.count {
+            total -= SPREAD * wanted[k] * probability[k].max(1e-12).ln();
+            gradient[from + k] += weight * SPREAD * (probability[k] - wanted[k]);
         }
     }
     total

@@ -23,6 +23,8 @@ pub struct Settings {
     pub out: PathBuf,
     /// Folds of places; each is left out by one network.
     pub folds: usize,
+    /// Networks of each fold, whose answers are averaged.
+    pub networks: usize,
     /// Photographs drawn of each place.
     pub views: usize,
     /// Photographs of each place that figures are made of.
@@ -41,8 +43,9 @@ impl Settings {
         Self {
             panoramas,
             out,
-            folds: 5,
-            views: 240,
+            folds: 6,
+            networks: 2,
+            views: 128,
             judged: 8,
             places: None,
             seed: 1,
@@ -134,14 +137,19 @@ pub fn run(
 
 fn checked(s: &Settings) -> Result<(), PlacesError> {
     let t = &s.training;
-    let sound = s.folds >= 2 && s.views > 0 && s.judged > 0 && t.hidden > 0 && t.batch > 0;
+    let sound = s.folds >= 2
+        && s.networks > 0
+        && s.views > 0
+        && s.judged > 0
+        && t.hidden > 0
+        && t.batch > 0;
     let shares = [t.dropout, t.feature_dropout]
         .iter()
         .all(|d| (0.0..1.0).contains(d));
     match sound && shares {
         true => Ok(()),
         false => Err(PlacesError::Setting(
-            "training needs at least 2 folds, 1 view, 1 judged view, 1 hidden unit, a batch of 1, and dropouts in [0, 1)".into(),
+            "training needs at least 2 folds, 1 network, 1 view, 1 judged view, 1 hidden unit, a batch of 1, and dropouts in [0, 1)".into(),
         )),
     }
 }
@@ -169,16 +177,16 @@ fn one_fold(
         .iter()
         .filter(|e| seen.contains(&e.place))
         .collect();
-    let mut told = |done: f64, loss: f64| progress(Progress::Training(f, done, loss));
-    let network = train(
-        &examples,
-        &settings.training,
-        probes,
-        settings.seed ^ (f as u64 + 1) << 32,
-        &mut told,
-    )
-    .ok_or(PlacesError::Stopped)?;
-    let member = Estimator::new(vec![network], Calibration::default())?;
+    let mut networks = Vec::new();
+    for n in 0..settings.networks {
+        let count = settings.networks as f64;
+        let mut told =
+            |done: f64, loss: f64| progress(Progress::Training(f, (n as f64 + done) / count, loss));
+        let seed = settings.seed ^ (f as u64 + 1) << 32 ^ (n as u64) << 48;
+        let network = train(&examples, &settings.training, probes, seed, &mut told);
+        networks.push(network.ok_or(PlacesError::Stopped)?);
+    }
+    let member = Estimator::new(networks, Calibration::default())?;
     write(&file, &member.to_bytes()?)?;
     write(&note, wanted.as_bytes())?;
     Ok(member)
@@ -192,6 +200,7 @@ fn learned(settings: &Settings, f: usize, fold: &[usize]) -> Vec<usize> {
     seen
 }
 
+/// Estimates of photographs by the networks that `of` gives for each fold.
 fn cases<'m>(
     examples: &[&Example],
     places: &[Place],
@@ -202,11 +211,29 @@ fn cases<'m>(
         .par_iter()
         .map(|e| Case {
             estimate: of(fold[e.place]).of_features(&e.features, e.reference, 0.0),
+            histograms: of(fold[e.place]).histograms(&e.features),
             example: (*e).clone(),
             kind: places[e.place].kind.clone(),
             fold: fold[e.place],
         })
         .collect()
+}
+
+/// The networks with the calibration that is for use, and with those for figures: each fold's is chosen on the others.
+fn calibrations(
+    members: &[Estimator],
+    raw: &[Case],
+    probes: &Probes,
+) -> (Calibration, Vec<Estimator>) {
+    let all = calibration(&raw.iter().collect::<Vec<_>>(), probes);
+    let crossed = (0..members.len())
+        .into_par_iter()
+        .map(|f| {
+            let others: Vec<&Case> = raw.iter().filter(|c| c.fold != f).collect();
+            members[f].calibrated(calibration(&others, probes))
+        })
+        .collect();
+    (all, crossed)
 }
 
 fn finish(
@@ -221,10 +248,11 @@ fn finish(
     let every = (settings.views / settings.judged).max(1);
     let any: Vec<&Example> = photographs.iter().step_by(every).collect();
     let both: Vec<&Example> = judged.iter().chain(&any).copied().collect();
-    let found = calibration(&cases(&both, places, fold, |f| &members[f]), probes);
+    let raw = cases(&both, places, fold, |f| &members[f]);
+    let (found, crossed) = calibrations(members, &raw, probes);
     let calibrated: Vec<Estimator> = members.iter().map(|m| m.calibrated(found)).collect();
     let left_out =
-        |examples: &[&Example]| figures(&cases(examples, places, fold, |f| &calibrated[f]), probes);
+        |examples: &[&Example]| figures(&cases(examples, places, fold, |f| &crossed[f]), probes);
     let seen = cases(&judged, places, fold, |f| {
         &calibrated[(f + 1) % calibrated.len()]
     });

@@ -10,7 +10,7 @@ use crate::place::{Place, SMOOTH, folds};
 use crate::probes::{PROBES, Probes};
 use crate::trainer::Training;
 use crate::view::View;
-use crate::{PlacesError, Settings, run};
+use crate::{PlacesError, Progress, Settings, run};
 
 /// A sky over a ground, with a sun at azimuth 90 degrees, 40 high, and a wall of its own grey.
 fn panorama(grey: f32) -> EnvironmentMap {
@@ -119,6 +119,15 @@ fn places_seen_again_are_in_one_fold() {
     assert_eq!(fold.iter().max(), Some(&2));
 }
 
+fn write_panoramas(folder: &Path) {
+    for (n, grey) in [0.1, 0.2, 0.4, 0.6].into_iter().enumerate() {
+        let name = ["yard", "hall", "field", "street"][n];
+        panorama(grey)
+            .write(folder.join(format!("{name}.exr")))
+            .unwrap();
+    }
+}
+
 fn settings(folder: &Path, out: &str) -> Settings {
     let training = Training {
         hidden: 8,
@@ -138,12 +147,7 @@ fn settings(folder: &Path, out: &str) -> Settings {
 #[test]
 fn training_gives_the_same_bytes_for_any_number_of_threads_and_leaves_nothing_else() {
     let folder = tempfile::tempdir().unwrap();
-    for (n, grey) in [0.1, 0.2, 0.4, 0.6].into_iter().enumerate() {
-        let name = ["yard", "hall", "field", "street"][n];
-        panorama(grey)
-            .write(folder.path().join(format!("{name}.exr")))
-            .unwrap();
-    }
+    write_panoramas(folder.path());
     let whole = settings(folder.path(), "whole.safetensors");
     let outcome = run(&whole, &|_| true).unwrap();
     assert_eq!(outcome.places.len(), 4);
@@ -169,4 +173,37 @@ fn training_gives_the_same_bytes_for_any_number_of_threads_and_leaves_nothing_el
         run(&few, &|_| true),
         Err(PlacesError::TooFew { found: 4, .. })
     ));
+}
+
+#[test]
+fn training_goes_on_from_finished_folds_to_the_same_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    write_panoramas(folder.path());
+    let long = |out: &str| {
+        let mut s = settings(folder.path(), out);
+        // 3 steps a pass: progress is told at step 20.
+        s.training.epochs = 8;
+        s
+    };
+    let (whole, stopped) = (long("whole.safetensors"), long("stopped.safetensors"));
+    run(&whole, &|_| true).unwrap();
+    let one_thread = rayon::ThreadPoolBuilder::new()
+        .num_threads(1)
+        .build()
+        .unwrap();
+    // One thread trains fold 0 before fold 1.
+    let end = one_thread.install(|| run(&stopped, &|p| !matches!(p, Progress::Training(1, ..))));
+    assert!(matches!(end, Err(PlacesError::Stopped)));
+    assert!(!stopped.out.exists() && stopped.out.with_extension("fold0").exists());
+    let kept = std::sync::Mutex::new(Vec::new());
+    let note = |p: Progress| {
+        if let Progress::Kept(f) = p {
+            kept.lock().unwrap().push(f);
+        }
+        true
+    };
+    run(&stopped, &note).unwrap();
+    assert_eq!(kept.into_inner().unwrap(), [0]);
+    let bytes = |s: &Settings| std::fs::read(&s.out).unwrap();
+    assert_eq!(bytes(&whole), bytes(&stopped));
 }

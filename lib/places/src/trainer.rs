@@ -1,7 +1,8 @@
 //! Training one network on the photographs of some places.
 use dipir_estimator::features::FEATURES;
 use dipir_estimator::grid::{BASE_TEXELS, BINS};
-use dipir_estimator::network::{ENERGY, HISTOGRAM, MAP, Network, OUTPUTS, QUANTILES, SUN};
+use dipir_estimator::histogram::{SHARES, STOPS};
+use dipir_estimator::network::{ENERGY, EXPOSURE, HISTOGRAM, MAP, Network, OUTPUTS, SHARE, SUN};
 use dipir_estimator::posterior::soft_bins;
 use serde::{Deserialize, Serialize};
 
@@ -34,7 +35,7 @@ impl Default for Training {
     fn default() -> Self {
         Self {
             hidden: 96,
-            epochs: 6,
+            epochs: 5,
             batch: 128,
             learning_rate: 2e-3,
             weight_decay: 0.1,
@@ -192,12 +193,18 @@ fn mean_answer(rows: &[Row<'_>]) -> Vec<f32> {
     }
     bias[ENERGY..ENERGY + 3].fill(0.0);
     bias[SUN] = ((suns + 0.01) / (1.01 - suns)).ln();
-    let quantiles = |of: &dyn Fn(&Truth) -> f32| {
-        let mut all: Vec<f32> = rows.iter().map(|r| of(&r.truth)).collect();
-        all.sort_by(f32::total_cmp);
-        [0.5, 0.1, 0.9].map(|q: f32| all.get((q * count) as usize).copied().unwrap_or(0.0))
-    };
-    bias[QUANTILES..QUANTILES + 3].copy_from_slice(&quantiles(&|t| t.stops));
-    bias[QUANTILES + 3..QUANTILES + 6].copy_from_slice(&quantiles(&|t| t.share));
+    for row in rows {
+        let histograms = [
+            (EXPOSURE, STOPS.soft(f64::from(row.truth.stops))),
+            (SHARE, SHARES.soft(f64::from(row.truth.share))),
+        ];
+        for (from, soft) in histograms {
+            let span = &mut bias[from..from + soft.len()];
+            span.iter_mut().zip(soft).for_each(|(b, s)| *b += s / count);
+        }
+    }
+    bias[EXPOSURE..OUTPUTS]
+        .iter_mut()
+        .for_each(|b| *b = (*b + 1e-3).ln());
     bias
 }
