@@ -2,6 +2,7 @@
 //!
 //! It shows the stages that have run. Where an artifact cannot be read, its section says why.
 mod curves;
+mod direction;
 pub mod html;
 mod learning;
 mod lighting;
@@ -28,7 +29,7 @@ pub const MARK: &[u8] =
 /// Name of the file in the folder of artifacts.
 pub const FILE: &str = "report.html";
 /// Raised whenever the same artifacts give another page.
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 
 /// What the page shows in addition to the artifacts.
 pub struct Report<'a> {
