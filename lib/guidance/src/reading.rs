@@ -8,7 +8,7 @@ use dipir_imaging::resize::{CropResize, Filter, PixelBox};
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_optimize::parameters::Parameters;
 use dipir_prior::caption::ViewDirection;
-use dipir_prior::encoder::{LightEncoder, LightEstimate};
+use dipir_prior::encoder::{LightEncoder, SunSkyEstimate};
 use dipir_prior::inversion::{Crop, InversionSettings, Reading, invert};
 use dipir_prior::picture::SIZE;
 use dipir_scene::camera::Camera;
@@ -235,7 +235,7 @@ pub fn read_light(
 }
 
 /// The start of the optimisation under an estimate of the light.
-pub fn start(estimate: &LightEstimate, camera: &Camera, lobes: usize) -> Parameters {
+pub fn start(estimate: &SunSkyEstimate, camera: &Camera, lobes: usize) -> Parameters {
     let words = &estimate.description;
     let tint = |warmth: f32| {
         let v = Vec3::new((0.5 * warmth).exp(), 1.0, (-0.5 * warmth).exp());
@@ -293,7 +293,7 @@ mod tests {
             FieldOfView::Vertical(0.7),
             [64, 48],
         );
-        let estimate = LightEstimate {
+        let estimate = SunSkyEstimate {
             description: dipir_prior::caption::LightDescription {
                 azimuth: 0.4,
                 elevation: 0.8,
@@ -305,7 +305,7 @@ mod tests {
             sky_warmth: 0.0,
         };
         let width = |confidence: f32| {
-            let estimate = LightEstimate {
+            let estimate = SunSkyEstimate {
                 confidence,
                 ..estimate
             };
