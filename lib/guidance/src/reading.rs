@@ -36,7 +36,7 @@ const GROUND_ALBEDO: f32 = 0.3;
 
 /// Where an object is inserted.
 #[derive(Clone, Copy)]
-pub struct Place<'a> {
+pub struct Insertion<'a> {
     /// The camera that took the photograph.
     pub camera: &'a Camera,
     /// The ground that catches the shadow.
@@ -148,8 +148,8 @@ const LEAST_INTEREST: f32 = 0.4;
 
 /// Squares of the photograph: the first three around the place of the insertion, the others where
 /// something seems to stand on the ground.
-fn crops(photo: &Raster<Vec3>, place: &Place<'_>) -> Vec<Crop> {
-    let &Place {
+fn crops(photo: &Raster<Vec3>, place: &Insertion<'_>) -> Vec<Crop> {
+    let &Insertion {
         camera,
         proxy,
         object,
@@ -219,7 +219,7 @@ fn crops(photo: &Raster<Vec3>, place: &Place<'_>) -> Vec<Crop> {
 pub fn read_light(
     model: &Model,
     photo: &DisplayImage,
-    place: &Place<'_>,
+    place: &Insertion<'_>,
     settings: &InversionSettings,
     seed: u64,
     progress: &(dyn Fn(f64) -> ControlFlow<()> + Sync),
@@ -383,7 +383,7 @@ mod tests {
                 width: side,
                 height: side,
             };
-            let place = Place {
+            let place = Insertion {
                 camera: &camera,
                 proxy: &proxy,
                 object,
@@ -409,7 +409,7 @@ mod tests {
             width: 24,
             height: 24,
         };
-        let place = Place {
+        let place = Insertion {
             camera: &camera,
             proxy: &proxy,
             object,

@@ -15,8 +15,8 @@ use crate::error::OptimizeError;
 use crate::guidance::{Guidance, Guided, Step};
 use crate::history::{Row, stands_still};
 use crate::lighting::Lighting;
-use crate::objective::{Forward, Objective, Weights};
-use crate::parameters::{Bounds, Parameters};
+use crate::objective::{Forward, Objective, TermWeights};
+use crate::parameters::{ParameterBounds, Parameters};
 use crate::settings::Settings;
 use crate::tensors::Tensors;
 use crate::transport::Recorder;
@@ -101,8 +101,8 @@ impl Optimization<'_> {
         let settings = self.settings.clone();
         let (_, rows) = self.objective.transport().environment_size();
         let bounds = match settings.light {
-            true => Bounds::for_map(rows),
-            false => Bounds::for_map(rows).of_tone_alone(),
+            true => ParameterBounds::for_map(rows),
+            false => ParameterBounds::for_map(rows).of_tone_alone(),
         };
         let crops = CropSampler::new(self.objective.transport().coverage());
         let mut state = self.resume()?;
@@ -124,7 +124,7 @@ impl Optimization<'_> {
             // agree, and the shadow's sparsity would dim the object.
             let one_light = settings.light && iteration >= settings.fused_at();
             if one_light {
-                self.objective.set_weights(Weights::NONE);
+                self.objective.set_weights(TermWeights::NONE);
             }
             if one_light && iteration == settings.fused_at() {
                 self.join(&mut state);

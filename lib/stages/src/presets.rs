@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use dipir_cli::session::duration;
-use dipir_optimize::settings::{LightTable, Preset as LightPreset};
+use dipir_optimize::settings::{LightPreset, LightTable};
 use dipir_pipeline::config::Quality;
 use dipir_scene::config::EffectsMode;
 use serde::Deserialize;

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::knobs::{Part, Variant, beyond_standard};
-use crate::scenes::Scene;
+use crate::scenes::MeasuredScene;
 
 /// What one run of a variant showed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -86,7 +86,7 @@ pub struct SceneMeasurement<'a> {
     /// Where everything goes.
     pub out: &'a Path,
     /// Which scene.
-    pub scene: &'a Scene,
+    pub scene: &'a MeasuredScene,
     /// `--threads`.
     pub threads: usize,
     /// Error at which the reference of the render track stops.

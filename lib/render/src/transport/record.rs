@@ -20,7 +20,7 @@ use crate::error::RenderError;
 use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
 use crate::footprint::Footprint;
 use crate::foreground::{Gather, PathContext, PathStart};
-use crate::photo::Photo;
+use crate::photo::ProxyPhoto;
 use crate::render::{ROULETTE_DEPTH, Renderer, pixels_of};
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowGather};
 use crate::world::{ProxyGeometry, World};
@@ -189,7 +189,7 @@ impl Transport {
         let photo = settings
             .background
             .filter(|_| has(simulation.features, PROXY_RADIANCE))
-            .map(|image| Photo { image });
+            .map(|image| ProxyPhoto { image });
         let path = PathContext {
             world: &world,
             light: &light,

@@ -31,6 +31,7 @@ use crate::light::method::Method;
 use crate::names::SCENE;
 use crate::presets::{self, Outlook};
 use crate::scene::transport::Frame;
+use crate::written;
 
 /// What the stage did.
 pub struct Done {
@@ -323,15 +324,10 @@ impl fmt::Display for Done {
             .map(|e| e.name.name())
             .collect();
         let [width, height] = self.resolution;
+        written(f, &self.folder, &self.manifest)?;
         writeln!(
             f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
-        writeln!(
-            f,
-            "  {} triangles, {} materials, {width} x {height} pixels",
+            "\n  {} triangles, {} materials, {width} x {height} pixels",
             self.triangles, self.materials
         )?;
         write!(
