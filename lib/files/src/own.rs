@@ -23,7 +23,7 @@ pub fn open_own(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// Whether `path` is a regular file that begins with `mark`; not there is no.
+/// Whether `path` is a regular file that begins with `mark`; false if nothing is there.
 pub fn begins_with(path: &Path, mark: &[u8]) -> io::Result<bool> {
     Ok(beginning(path, mark.len())?.is_some_and(|found| found == mark))
 }

@@ -104,8 +104,8 @@ fn square(size: (usize, usize), center: Vec2, side: f32) -> PixelBox {
     }
 }
 
-/// How much the middle of a crop stands out from what surrounds it: the distance of their mean
-/// colours, in spreads of the surroundings.
+/// How much the middle of a crop stands out from what surrounds it: the distance of their mean colours, in standard
+/// deviations of the surroundings.
 fn interest(picture: &[f32]) -> f32 {
     let n = SIZE * SIZE;
     let inside = |i: usize, margin: usize| {

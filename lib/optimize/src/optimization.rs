@@ -24,12 +24,11 @@ use crate::transport::Recorder;
 /// Steps in a row that may be skipped because something was not finite. A guidance with noise
 /// may stumble; one that stumbles this often will not recover.
 const MOST_BAD_IN_A_ROW: usize = 5;
-/// Iterations between two looks at how well the record samples the light.
+/// Iterations between two checks of how well the record samples the light.
 const RECORD_EVERY: usize = 50;
-/// The light is recorded anew when a sample is worth less than this many samples drawn for it. 1
-/// is what a record for that very light reaches, so a lobe that narrows is followed closely: it
-/// would soon rest on few samples, and their noise, to which the optimiser then fits, keeps it
-/// from narrowing further.
+/// Transport is recorded anew when its effective sample size falls below this share of its samples. A record made for
+/// the current light reaches 1, so the record follows a lobe that narrows. Otherwise the lobe would soon rest on few
+/// samples, the optimiser would fit their noise, and the lobe would stop narrowing.
 const LEAST_EFFICIENCY: f64 = 1.0;
 /// The largest number of new records, so that recording stays a small part of the run.
 const MOST_RECORDS: usize = 8;

@@ -43,7 +43,7 @@ pub enum ConfigError {
         table: String,
         /// Keys that the table knows.
         accepted: Vec<String>,
-        /// The accepted key that looks most like it.
+        /// The accepted key with the most similar spelling.
         nearest: Option<String>,
     },
     /// A key or table by the name that it had before.
@@ -83,7 +83,7 @@ pub enum ConfigError {
         found: String,
         /// What may stand there.
         accepted: Vec<String>,
-        /// The accepted value that looks most like it.
+        /// The accepted value with the most similar spelling.
         nearest: Option<String>,
     },
     /// A key without a default is absent.

@@ -3,7 +3,8 @@
 //! Within a process, and from a run to the stages that it starts, a file's hash is known by the
 //! file's identity: device, inode, length, and the times of its last change. Any change of its
 //! bytes changes one of them, unless it follows the last within one tick of the file system's
-//! clock: a file that young is hashed anew each time. Nothing is remembered beyond a run.
+//! clock. So a file that changed that recently is hashed each time. Nothing is remembered beyond a
+//! run.
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{File, Metadata};
 use std::io::Read;

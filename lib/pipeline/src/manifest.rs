@@ -91,7 +91,7 @@ pub struct Manifest {
     /// from run to run is kept in this file, so that outputs can be compared byte by byte.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub timings_s: BTreeMap<String, f64>,
-    /// Largest resident memory of the process, where the operating system tells.
+    /// Largest resident memory of the process, where the operating system reports it.
     pub peak_rss_bytes: Option<u64>,
     /// The stage's own estimate of its error, in the unit that its documentation names.
     pub estimated_error: Option<f64>,

@@ -26,7 +26,7 @@ pub const MIDDLE_SHARE: f32 = 0.6;
 const CHANNELS: [usize; 4] = [3, 48, 96, 160];
 const HIDDEN: usize = 384;
 
-/// An estimate of the light of a picture.
+/// The light of a picture as one sun and a sky.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SunSkyEstimate {
     /// Azimuth and elevation of the sun, and its share.

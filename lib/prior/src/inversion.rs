@@ -254,7 +254,7 @@ pub fn combine(
         .chunks_exact(AZIMUTHS)
         .map(|row| row.iter().map(|e| e - least).collect())
         .collect();
-    // Nats against every candidate, from the model and from the encoder.
+    // The cost of every candidate in nats, from the model and from the encoder.
     let angle = |k: usize| TAU * k as f32 / AZIMUTHS as f32;
     let pull = settings.encoder_weight * prior.confidence as f64;
     let against = |(k, e): (usize, &f64)| {

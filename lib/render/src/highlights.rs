@@ -220,7 +220,7 @@ pub fn find<L: PathLight>(
 
 /// The sequence of `pixel`.
 fn sequence(seed: u64, (x, y): (u32, u32)) -> Sampler {
-    Sampler::new(seed, Stream::GLINTS, (y << 16) | (x & 0xffff), 0)
+    Sampler::new(seed, Stream::HIGHLIGHTS, (y << 16) | (x & 0xffff), 0)
 }
 
 /// Pixels in which a surface is smoother than it is curved.
@@ -299,7 +299,7 @@ fn bright_sources(light: &impl PathLight, seed: u64) -> Vec<Vec3> {
     let (mut drawn, mut rest) = (Vec::new(), 0.0);
     let n = 64;
     for sample in 0..n {
-        let mut sampler = Sampler::new(seed, Stream::GLINTS, u32::MAX, sample);
+        let mut sampler = Sampler::new(seed, Stream::HIGHLIGHTS, u32::MAX, sample);
         let source = light.sample(sampler.next_2d());
         if source.pdf > 0.0 {
             drawn.push((source.direction, luminance(source.radiance)));

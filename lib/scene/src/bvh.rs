@@ -129,7 +129,7 @@ impl Bvh {
             })
             .collect();
         let tree = build::build(&triangles, &ids, |a, b| {
-            look(mesh, ids[a as usize]).cmp(&look(mesh, ids[b as usize]))
+            visible_data(mesh, ids[a as usize]).cmp(&visible_data(mesh, ids[b as usize]))
         });
         let points = |ids: &[u32]| -> Vec<Vec3> {
             ids.iter()
@@ -239,7 +239,7 @@ impl Bvh {
 
 /// All that a ray can learn of a triangle: its material, and the bits of each corner's position,
 /// colour and texture coordinates, whichever corner comes first.
-fn look(mesh: &TriangleMesh, triangle: u32) -> (u32, [[u32; 11]; 3]) {
+fn visible_data(mesh: &TriangleMesh, triangle: u32) -> (u32, [[u32; 11]; 3]) {
     let corners = mesh.indices[triangle as usize].map(|i| {
         let i = i as usize;
         let [color, uv0, uv1] = [

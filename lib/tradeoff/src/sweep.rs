@@ -22,7 +22,7 @@ pub struct Step<'a> {
     pub scene: &'a str,
     /// The series.
     pub series: &'a str,
-    /// What tells it from others of the series.
+    /// What distinguishes it from others of the series.
     pub label: &'a str,
 }
 

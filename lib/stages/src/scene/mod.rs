@@ -256,7 +256,7 @@ fn plan_with<'a>(
     let table: LightTable = session.config.table("light")?;
     let recovery = transport::settings(session, &table)?;
     let known = known_light::known_params(&composite);
-    // Where nothing is optimised, the record would be made for nobody.
+    // Where nothing is optimised, nothing reads the record.
     let transport = Method::of(session)?.replays().then(|| {
         json!({
             "size": recovery.size, "environment": recovery.environment,
