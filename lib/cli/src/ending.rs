@@ -31,7 +31,7 @@ extern "C" fn say_aborted(_: libc::c_int) {
     }
 }
 
-/// What ended a process that gave no exit code, as far as the system tells.
+/// What ended a process that gave no exit code, as far as the system reports it.
 pub fn cause(status: ExitStatus) -> &'static str {
     #[cfg(unix)]
     {

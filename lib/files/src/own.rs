@@ -1,4 +1,4 @@
-//! Files that this program makes and replaces, told from others' by how they begin.
+//! Files that this program makes and replaces, recognised by how they begin.
 //!
 //! None of these functions follows a symbolic link at the name that it is given.
 use std::fs::{self, File, OpenOptions};
@@ -29,7 +29,7 @@ pub fn begins_with(path: &Path, mark: &[u8]) -> io::Result<bool> {
 }
 
 /// Writes `content`, which begins with `mark`, beside `path`, flushes it and renames it to `path`:
-/// whoever reads `path` finds the earlier content or this one, after a power cut, too.
+/// a reader of `path` finds the earlier content or this one, after a power cut, too.
 ///
 /// # Errors
 /// Those of the system, and [`io::ErrorKind::AlreadyExists`] if `path`, or `.NAME.partial` beside

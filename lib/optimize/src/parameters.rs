@@ -42,9 +42,9 @@ impl ParameterBounds {
     /// Bounds for maps of `height` rows.
     ///
     /// Radiance from 1e-6, which no display shows, to 1e6, the sun's. Sigma from a quarter of a
-    /// texel, since a texel seen from afar has a spread of .29 of its side and narrower lobes
-    /// cannot be told from it, to 10, a constant to 2%. Tone parameters of 8 give a bin e^8
-    /// of another's share, beyond the least width that the curves allow.
+    /// texel, since a texel seen from afar has a spread of .29 of its side and narrower lobes look
+    /// the same, to 10, a constant to 2%. Tone parameters of 8 give a bin e^8 of another's share,
+    /// beyond the least width that the curves allow.
     pub fn for_map(height: usize) -> Self {
         let narrowest = 0.25 * PI / height as f64;
         Self {

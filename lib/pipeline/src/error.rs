@@ -158,7 +158,7 @@ pub enum StageError {
     Foreign {
         /// The folder.
         folder: PathBuf,
-        /// What tells that it is not ours.
+        /// Why it is not ours.
         why: Foreign,
     },
     /// An earlier stage has not run.
@@ -205,7 +205,7 @@ impl StageError {
     }
 }
 
-/// What tells that a folder is not ours.
+/// Why a folder is not ours.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Foreign {
     /// Files, and no `stage.json` among them.

@@ -20,7 +20,7 @@ const PIECE: usize = 4 << 20;
 /// How files of hashes begin.
 const HEAD: &[u8] = b"{\"dipir_hashes\":1,";
 
-/// What tells the bytes of a file from others, without reading them.
+/// What identifies the bytes of a file without reading them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 struct Identity {
     device: u64,
@@ -44,7 +44,7 @@ impl Identity {
         })
     }
 
-    /// Elsewhere nothing tells a changed file for certain.
+    /// Elsewhere nothing identifies a changed file for certain.
     #[cfg(not(unix))]
     fn of(_: &Metadata) -> Option<Self> {
         None

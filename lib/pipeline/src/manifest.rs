@@ -1,7 +1,7 @@
 //! `stage.json`: what a stage read, with which settings, and what it wrote.
 //!
-//! The file ends with a checksum of all that stands before it, so that a damaged manifest is told
-//! from a whole one as surely as the files that it lists.
+//! The file ends with a checksum of all that stands before it, so that damage of the manifest is
+//! found as surely as damage of the files that it lists.
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Component, Path, PathBuf};

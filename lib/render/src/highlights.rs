@@ -54,7 +54,7 @@ const LEAST_SCANS: usize = 32;
 const EVEN: f32 = 0.5;
 /// The largest number below 1.
 const BELOW_1: f32 = 1.0 - f32::EPSILON / 2.0;
-/// The farthest place in a cell that is still told from the next one: eight bits number the cells of a row.
+/// The farthest place in a cell that does not round to the next one: eight bits number the cells of a row.
 const WITHIN_CELL: f32 = 1.0 - f32::EPSILON * 128.0;
 
 /// Density of the samples within a pixel, on the unit square: a mixture of a uniform one and one for each scan, which

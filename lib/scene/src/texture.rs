@@ -75,7 +75,7 @@ pub enum ImageSource {
     },
 }
 
-/// What tells images apart without looking into them.
+/// What identifies an image without its pixels.
 #[derive(PartialEq, Eq, Hash)]
 enum Identity<'a> {
     File(&'a Path),

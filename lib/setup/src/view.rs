@@ -53,7 +53,7 @@ pub struct View {
 pub const EYE_HEIGHT_M: f64 = 1.6;
 /// Field of view along the longer side where the picture does not state it, degrees.
 pub const DEFAULT_FOV_DEG: f64 = 55.0;
-/// Row of the horizon where nothing tells it, of the height from the top.
+/// Row of the horizon where it is unknown, of the height from the top.
 pub const DEFAULT_HORIZON: f64 = 0.4;
 /// A turn that leaves less ground than this share of the height is not believed.
 const LOWEST_HORIZON: f64 = 0.85;

@@ -27,7 +27,7 @@ pub struct Shadow {
     pub sigma_height: f64,
 }
 
-/// Standard deviation of a coordinate of a point that somebody clicked on, pixels.
+/// Standard deviation of a coordinate of a point that the user clicked on, pixels.
 pub const CLICK_SIGMA_PX: f64 = 2.0;
 /// Standard deviation of a stated height, as a share of it.
 pub const HEIGHT_SIGMA: f64 = 0.05;
@@ -50,7 +50,7 @@ pub struct FromShadow {
     pub elevation: Option<Angle>,
 }
 
-/// Why a shadow says nothing.
+/// Why a shadow gives no direction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NoShadow {
     /// A pixel sees no ground.

@@ -1,4 +1,4 @@
-//! What somebody says of the sun: `[light] sun = { … }` and `[light] shadow = { … }`.
+//! What the user states of the sun: `[light] sun = { … }` and `[light] shadow = { … }`.
 use glam::{DVec2, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

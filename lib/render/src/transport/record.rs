@@ -159,8 +159,8 @@ impl<C, G> Default for Recorded<C, G> {
 
 impl Transport {
     /// Traces the paths of every pixel of `renderer`'s picture and keeps what they found.
-    /// `progress` is told the share that is done and may break off. The result does not depend
-    /// on the number of threads.
+    /// `progress` gets the share that is done and may break off. The result does not depend on the
+    /// number of threads.
     pub fn record(
         renderer: &Renderer,
         settings: &RecordSettings,

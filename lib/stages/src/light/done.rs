@@ -1,4 +1,4 @@
-//! What the light stage says when it has run.
+//! What the light stage prints when it has run.
 use std::fmt;
 
 use dipir_estimator::LightEstimate;
