@@ -1,6 +1,7 @@
 //! Where most of the light comes from, drawn onto the photograph: an arrow on the ground and a disc in the sky.
 use dipir_estimator::LightEstimate;
-use dipir_estimator::posterior::{direction_deg, words};
+use dipir_estimator::grid::direction;
+use dipir_estimator::posterior::words;
 use dipir_imaging::transfer::Transfer;
 use dipir_scene::camera::Camera;
 use dipir_scene::description::SceneDescription;
@@ -98,7 +99,7 @@ impl Ground {
         let steps = ((arc.high - arc.low) / STEP_DEG).ceil().clamp(1.0, 72.0) as usize;
         let rim = (0..=steps).map(|k| {
             let azimuth = arc.low + (arc.high - arc.low) * k as f64 / steps as f64;
-            self.foot + 1.6 * self.radius * (turn * direction_deg(azimuth, 0.0))
+            self.foot + 1.6 * self.radius * (turn * direction(azimuth.to_radians() as f32, 0.0))
         });
         let corners: Option<Vec<Vec2>> = std::iter::once(self.foot)
             .chain(rim)
@@ -203,7 +204,10 @@ mod tests {
     fn the_disc_is_drawn_only_where_the_light_is_in_the_picture() {
         let html = ground().disc(Vec3::new(0.2, 0.4, -1.0), "towards").unwrap();
         let html = html.into_string();
-        assert!(html.contains("cx=\"100.0\"") && html.contains("cy=\"20.0\""), "{html}");
+        assert!(
+            html.contains("cx=\"100.0\"") && html.contains("cy=\"20.0\""),
+            "{html}"
+        );
         for outside in [Vec3::new(0.2, 0.9, -1.0), Vec3::Z] {
             assert!(ground().disc(outside, "towards").is_none());
         }
