@@ -3,12 +3,14 @@ mod clean;
 mod init;
 mod keys;
 mod manual;
+mod place;
 mod preview;
 mod project;
 mod report;
 mod run;
 mod status;
 mod suggestion;
+mod watch;
 
 use std::process::ExitCode;
 
@@ -18,6 +20,7 @@ use dipir_cli::exit;
 const EXAMPLES: &str = "\
 Examples:
   dipir init photo.jpg chair.glb            write a first pipeline.toml that runs
+  dipir place                               a page in the browser: put the objects where they belong
   dipir preview                             preview.png: grid, boxes and a draft, within seconds
   dipir run                                 what ./pipeline.toml says, as far as it is not done yet
   dipir run photo/pipeline.toml             another project; several are run one after the other
@@ -45,6 +48,8 @@ struct Cli {
 enum Command {
     /// Write a first pipeline.toml from a photograph and models
     Init(init::InitArgs),
+    /// Open a page in the browser on which objects are placed, and the camera and the light set
+    Place(place::PlaceArgs),
     /// Draw ground grid, horizon, boxes and a draft of the objects into a PNG
     Preview(preview::PreviewArgs),
     /// Run what is not up to date
@@ -68,6 +73,7 @@ enum Command {
 fn main() -> ExitCode {
     exit::run(|| match suggestion::parse()?.command {
         Command::Init(args) => init::run(&args),
+        Command::Place(args) => place::run(&args),
         Command::Preview(args) => preview::run(&args),
         Command::Run(args) => run::run(&args),
         Command::Status(args) => status::run(&args),

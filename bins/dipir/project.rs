@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::exit::{Usage, printable};
+use dipir_cli::interrupt;
 use dipir_cli::session::Session;
 use dipir_pipeline::graph::Graph;
 use dipir_stages::graph;
@@ -155,6 +156,14 @@ impl FileArgs {
         // An error in any table is told now.
         let _ = project.open()?;
         Session::start(&project.common())
+    }
+
+    /// As [`start`](Self::start), for work that ends by itself on Ctrl-C.
+    pub fn start_waiting(&self) -> anyhow::Result<Session> {
+        let (session, _) = self.project().open()?;
+        session.start_threads()?;
+        interrupt::listen_patiently()?;
+        Ok(session)
     }
 }
 

@@ -1,5 +1,6 @@
 //! A draft of the objects in the scaled photograph.
 use std::ops::ControlFlow;
+use std::sync::Arc;
 
 use dipir_imaging::composite::composite;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
@@ -15,7 +16,10 @@ use dipir_scene::scene::LoadedScene;
 use dipir_stages::light::at_hand::AtHand;
 
 /// Paths a pixel: the object's shape and shadow are clear, grain stays.
-pub const SAMPLES: u32 = 8;
+pub const SAMPLES: u32 = 4;
+/// Columns and rows of the map that lights a draft: preparing a larger one takes longer than the
+/// draft.
+const MAP: [usize; 2] = [256, 128];
 /// Interactions of a path: one of the object with itself shows in its creases.
 const DEPTH: u32 = 2;
 
@@ -44,7 +48,12 @@ impl Draft {
     ) -> Result<Self, RenderError> {
         let rendered = match &light.map {
             Some(map) => {
-                let map = EnvironmentSampler::new(map.clone());
+                let [width, height] = MAP;
+                let map = match map.width() > width {
+                    true => Arc::new(map.resampled(width, height)),
+                    false => map.clone(),
+                };
+                let map = EnvironmentSampler::new(map);
                 let light = MapWithLobes::new(map, light.lobes.clone());
                 render(loaded, &light, samples, go_on)
             }

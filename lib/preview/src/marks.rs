@@ -130,8 +130,8 @@ impl Family<'_> {
         };
         let crowded = ((apart / side - CLOSEST) / (APART - CLOSEST)).clamp(0.0, 1.0);
         let foot = self.origin + self.along * self.middle[0] + self.across * self.middle[1];
-        let rim = (1.0 - point.distance(foot) / (1.4 * radius)).clamp(0.0, 1.0);
-        (crowded * rim.sqrt()) as f32
+        let rim = (1.25 - 1.25 * point.distance(foot) / radius).clamp(0.0, 1.0);
+        (crowded * rim) as f32
     }
 }
 

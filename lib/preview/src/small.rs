@@ -1,12 +1,16 @@
 //! A project's scene with its photograph scaled down.
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use dipir_cli::session::Session;
+use dipir_imaging::facts::Facts;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::resize::{Filter, resize};
+use dipir_scene::camera::Camera;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::plausibility::implausible;
+use dipir_scene::proxy::Proxy;
 use dipir_scene::scene::{LoadedScene, Scene};
 use dipir_stages::scene::with_place;
 
@@ -16,10 +20,43 @@ use crate::arrangement::{Arrangement, Model};
 pub struct SmallScene {
     /// Photograph, mask and camera are scaled; objects stand as last arranged.
     pub loaded: LoadedScene,
+    /// What stays, however objects are arranged.
+    pub props: Arc<Props>,
+}
+
+/// What placing objects asks of the files that were read.
+pub struct Props {
     /// The objects' files.
     pub models: Vec<Model>,
+    facts: Facts,
+    proxy: Proxy,
     /// The folder that paths of the configuration start from.
     base_dir: PathBuf,
+}
+
+impl Props {
+    /// The camera of `config`, whatever its objects.
+    ///
+    /// # Errors
+    /// On a configuration that cannot be used.
+    pub fn camera(&self, config: &SceneConfig) -> anyhow::Result<Camera> {
+        let settings = config.validate()?.camera.with_facts(&self.facts)?;
+        Ok(settings.resolve(self.facts.size, &self.base_dir)?.0)
+    }
+
+    /// Where the objects of `config` stand; nothing is read but the camera's file.
+    ///
+    /// # Errors
+    /// On a configuration that cannot be used, or names other models than those that were read.
+    pub fn arranged(&self, config: &SceneConfig) -> anyhow::Result<Arrangement> {
+        Arrangement::new(
+            config,
+            &self.base_dir,
+            &self.facts,
+            &self.models,
+            &self.proxy,
+        )
+    }
 }
 
 impl SmallScene {
@@ -48,29 +85,16 @@ impl SmallScene {
                 .occluders
                 .map(|mask| resize(&mask, w, h, Filter::Area));
         }
-        let small = Self {
-            loaded,
+        let props = Arc::new(Props {
             models,
+            facts: loaded.photo.facts.clone(),
+            proxy: loaded.scene.proxy.clone(),
             base_dir,
-        };
-        let mut arrangement = small.arranged(&config)?;
+        });
+        let mut arrangement = props.arranged(&config)?;
         // What the scene says of itself holds these already.
         arrangement.warnings = warnings;
-        Ok((small, arrangement))
-    }
-
-    /// Where the objects of `config` stand; nothing is read but the camera's file.
-    ///
-    /// # Errors
-    /// On a configuration that cannot be used, or names other models than those that were read.
-    pub fn arranged(&self, config: &SceneConfig) -> anyhow::Result<Arrangement> {
-        Arrangement::new(
-            config,
-            &self.base_dir,
-            &self.loaded.photo.facts,
-            &self.models,
-            &self.loaded.scene.proxy,
-        )
+        Ok((Self { loaded, props }, arrangement))
     }
 
     /// Puts camera and objects where `arrangement` has them.
@@ -80,7 +104,7 @@ impl SmallScene {
         scene.proxy = arrangement.proxy.clone();
         let mut mesh = TriangleMesh::default();
         for object in &arrangement.objects {
-            let mut placed = self.models[object.model].mesh.clone();
+            let mut placed = self.props.models[object.model].mesh.clone();
             placed.transform(&object.map);
             mesh.append(placed, 0);
         }

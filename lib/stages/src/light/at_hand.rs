@@ -4,7 +4,7 @@ use std::sync::Arc;
 use dipir_cli::session::Session;
 use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentMap;
-use dipir_light::gaussian::SgMixture;
+use dipir_light::gaussian::{SgMixture, SphericalGaussian};
 use dipir_optimize::lighting::Lighting;
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::settings::{LightTable, Start};
@@ -12,7 +12,7 @@ use dipir_pipeline::status::State;
 use dipir_scene::scene::LoadedScene;
 
 use crate::composite::table::{CompositeTable, Tone};
-use crate::light::estimate::estimate;
+use crate::light::estimate::{distribution, estimate};
 use crate::light::folder::{self, Recovered};
 use crate::light::request::first_light;
 use crate::light::surroundings::surroundings;
@@ -122,7 +122,6 @@ fn start(
     loaded: &LoadedScene,
 ) -> anyhow::Result<(Recovered, Origin)> {
     let table: LightTable = session.config.table("light")?;
-    let settings = transport::settings(session, &table)?;
     let (lobes, map, origin) = match &table.start {
         Start::File(_) => {
             let light = first_light(session, &table)?;
@@ -130,20 +129,38 @@ fn start(
             (lobes.unwrap_or_default(), None, Origin::File)
         }
         Start::Neutral => {
+            let settings = transport::settings(session, &table)?;
             let ambient = ambient_of(&loaded.photo.image);
             let neutral = Parameters::neutral(settings.lobes, ambient);
             (neutral.foreground_lobes(), None, Origin::Neutral)
         }
         _ => {
-            let found = estimate(session, &table, loaded, settings.lobes)?;
+            let (lobes, smooth) = estimated(session, &table, loaded)?;
             let visible = table.visible.unwrap_or(true);
-            let map = surroundings(loaded, &found.smooth, visible);
-            let mut lobes = found.lobes;
-            lobes.truncate(found.sources);
+            let map = surroundings(loaded, &smooth, visible);
             (lobes, Some(map), Origin::Estimate)
         }
     };
     let tone = ToneCurves::identity();
     let light = folder::exposed(session, composite, lobes, map, tone)?;
     Ok((light, origin))
+}
+
+/// The sources of the estimated light, and the rest of it. Unlike the stage's, without fitting lobes
+/// to the rest, which takes most of its time.
+fn estimated(
+    session: &Session,
+    table: &LightTable,
+    loaded: &LoadedScene,
+) -> anyhow::Result<(Vec<SphericalGaussian>, EnvironmentMap)> {
+    if table.candidate.is_some() {
+        let mut found = estimate(session, table, loaded, 1)?;
+        found.lobes.truncate(found.sources);
+        return Ok((found.lobes, found.smooth));
+    }
+    let estimate = distribution(session, table, loaded)?;
+    Ok(match estimate.source_lobe() {
+        Some(source) => (vec![source], estimate.base_map()),
+        None => (Vec::new(), estimate.map()),
+    })
 }
