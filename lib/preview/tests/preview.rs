@@ -9,7 +9,6 @@ use dipir_preview::lines::Kind;
 use dipir_preview::marks::Marks;
 use dipir_preview::picture::Preview;
 use dipir_preview::small::SmallScene;
-use dipir_scene::config::SceneConfig;
 use glam::{DVec3, Vec3};
 use tempfile::TempDir;
 
