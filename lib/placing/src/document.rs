@@ -237,6 +237,9 @@ impl Document {
         }
         set(table, "azimuth_deg", rounded(sun.azimuth_deg, 1));
         set(table, "elevation_deg", rounded(sun.elevation_deg, 1));
+        if let Some(inline) = item.as_inline_table_mut() {
+            inline.fmt();
+        }
         Ok(())
     }
 

@@ -280,7 +280,9 @@ impl Answer {
             ("Cross-Origin-Opener-Policy", "same-origin"),
         ];
         let about = self.about.iter().map(|a| ("X-Draft", a.as_str()));
-        let mut response = Response::from_data(self.body.clone()).with_status_code(self.status);
+        let response = Response::from_data(self.body).with_status_code(self.status);
+        // Every length is known.
+        let mut response = response.with_chunked_threshold(usize::MAX);
         for (name, value) in headers.into_iter().chain(about) {
             // All are ASCII.
             if let Ok(header) = Header::from_bytes(name, value) {

@@ -318,7 +318,9 @@ fn a_mask_replaces_no_file_of_anothers() {
 #[test]
 fn the_draft_shows_the_object_where_the_projection_says() {
     let place = Running::new();
-    let edit = moved_to(190.0, 140.0);
+    let mut edit = moved_to(190.0, 140.0);
+    // Brighter than the photograph, whatever the box is made of.
+    edit["exposure_ev"] = json!(2.0);
     let view = place
         .post("view", &json!({"edit": edit, "grid": true}))
         .json();

@@ -203,7 +203,10 @@ mod tests {
     fn the_disc_is_drawn_only_where_the_light_is_in_the_picture() {
         let html = ground().disc(Vec3::new(0.2, 0.4, -1.0), "towards").unwrap();
         let html = html.into_string();
-        assert!(html.contains("cx=\"100.0\"") && html.contains("cy=\"20.0\""), "{html}");
+        assert!(
+            html.contains("cx=\"100.0\"") && html.contains("cy=\"20.0\""),
+            "{html}"
+        );
         for outside in [Vec3::new(0.2, 0.9, -1.0), Vec3::Z] {
             assert!(ground().disc(outside, "towards").is_none());
         }

@@ -65,7 +65,12 @@ pub fn section(report: &Report) -> Section {
     );
     let mut parts = vec![];
     if let Some(towards) = towards {
-        parts.extend(direction::figure(report, towards, estimated.as_ref(), truth)?);
+        parts.extend(direction::figure(
+            report,
+            towards,
+            estimated.as_ref(),
+            truth,
+        )?);
     }
     if let Some(estimated) = &estimated {
         parts.push(estimate(&run, estimated)?);
