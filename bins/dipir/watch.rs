@@ -8,7 +8,7 @@ use std::thread;
 use std::time::{Duration, SystemTime};
 
 use anyhow::Context;
-use dipir_cli::exit::{INTERRUPTED, Said};
+use dipir_cli::exit::{AlreadyReported, INTERRUPTED};
 use dipir_cli::interrupt;
 use dipir_cli::session::Session;
 use dipir_stages::names;
@@ -35,7 +35,7 @@ pub fn watch(project: &ProjectArgs) -> anyhow::Result<()> {
         let mut run = Command::new(&own);
         let status = run.args(&args).status().context("cannot run dipir")?;
         if interrupt::asked() || status.code() == Some(i32::from(INTERRUPTED)) {
-            return Err(Said(INTERRUPTED).into());
+            return Err(AlreadyReported(INTERRUPTED).into());
         }
         if !project.output.quiet {
             eprintln!("waiting for a change of the files that were read; Ctrl-C ends this");
