@@ -125,14 +125,15 @@ fn classified(error: SetupError) -> anyhow::Error {
     }
 }
 
-/// The next two commands.
-fn commands(path: &Path) -> [String; 2] {
+/// The next commands.
+fn commands(path: &Path) -> [String; 3] {
     let file = match path == Path::new("pipeline.toml") {
         true => String::new(),
         false => format!(" {}", quoted(&path.display().to_string())),
     };
     [
-        format!("dipir run{file} --set pipeline.quality=draft"),
+        format!("dipir place{file}"),
+        format!("dipir run{file} --draft"),
         format!("dipir run{file}"),
     ]
 }
@@ -154,8 +155,11 @@ fn said(draft: &Draft) -> String {
             object.path, object.size_why
         );
     }
-    let [look, whole] = commands(&draft.path);
-    text + &format!("next:\n  {look}    a quick look\n  {whole}    the picture")
+    let [place, look, whole] = commands(&draft.path);
+    text + &format!(
+        "next:\n  {place}    a page in the browser: put it where it belongs (dipir preview: the same as a PNG)\n  \
+         {look}    a quick look\n  {whole}    the picture"
+    )
 }
 
 fn json(draft: &Draft) -> Value {

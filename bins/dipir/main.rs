@@ -3,11 +3,14 @@ mod clean;
 mod init;
 mod keys;
 mod manual;
+mod place;
+mod preview;
 mod project;
 mod report;
 mod run;
 mod status;
 mod suggestion;
+mod watch;
 
 use std::process::ExitCode;
 
@@ -17,6 +20,8 @@ use dipir_cli::exit;
 const EXAMPLES: &str = "\
 Examples:
   dipir init photo.jpg chair.glb            write a first pipeline.toml that runs
+  dipir place                               a page in the browser: put the objects where they belong
+  dipir preview                             preview.png: grid, boxes and a draft, within seconds
   dipir run                                 what ./pipeline.toml says, as far as it is not done yet
   dipir run photo/pipeline.toml             another project; several are run one after the other
   dipir run --set light.iterations=50       a key set for this run; only what it concerns runs
@@ -43,6 +48,10 @@ struct Cli {
 enum Command {
     /// Write a first pipeline.toml from a photograph and models
     Init(init::InitArgs),
+    /// Open a page in the browser on which objects are placed, and the camera and the light set
+    Place(place::PlaceArgs),
+    /// Draw ground grid, horizon, boxes and a draft of the objects into a PNG
+    Preview(preview::PreviewArgs),
     /// Run what is not up to date
     Run(run::RunArgs),
     /// Say of each stage whether it is up to date, and if not, why
@@ -64,6 +73,8 @@ enum Command {
 fn main() -> ExitCode {
     exit::run(|| match suggestion::parse()?.command {
         Command::Init(args) => init::run(&args),
+        Command::Place(args) => place::run(&args),
+        Command::Preview(args) => preview::run(&args),
         Command::Run(args) => run::run(&args),
         Command::Status(args) => status::run(&args),
         Command::Graph(args) => status::graph(&args),

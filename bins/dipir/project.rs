@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::exit::{Usage, printable};
+use dipir_cli::interrupt;
 use dipir_cli::session::Session;
 use dipir_pipeline::graph::Graph;
 use dipir_stages::graph;
@@ -113,6 +114,56 @@ impl ProjectArgs {
         let session = Session::open(&self.common())?;
         let graph = graph::graph(&session)?;
         Ok((session, graph))
+    }
+}
+
+/// One project, for commands whose results are no artifacts.
+#[derive(Args, Clone, Debug)]
+pub struct FileArgs {
+    /// The file that configures all stages; relative paths in it start from its folder
+    /// [default: pipeline.toml]
+    #[arg(value_name = "FILE")]
+    file: Option<PathBuf>,
+
+    /// The same, as the executables of the stages name it
+    #[arg(long, short = 'p', value_name = "FILE", conflicts_with = "file")]
+    pipeline: Option<PathBuf>,
+
+    /// Set a key of the file, as in --set scene.class=car; may be repeated, the last one wins
+    #[arg(long = "set", short = 's', value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
+impl FileArgs {
+    /// The same as other commands take it.
+    pub fn project(&self) -> ProjectArgs {
+        ProjectArgs {
+            files: self.file.iter().chain(&self.pipeline).cloned().collect(),
+            pipeline: None,
+            set: self.set.clone(),
+            out: None,
+            seed: None,
+            output: self.output,
+        }
+    }
+
+    /// Reads the configuration, checks it, and starts the worker threads.
+    pub fn start(&self) -> anyhow::Result<Session> {
+        let project = self.project();
+        // An error in any table is told now.
+        let _ = project.open()?;
+        Session::start(&project.common())
+    }
+
+    /// As [`start`](Self::start), for work that ends by itself on Ctrl-C.
+    pub fn start_waiting(&self) -> anyhow::Result<Session> {
+        let (session, _) = self.project().open()?;
+        session.start_threads()?;
+        interrupt::listen_patiently()?;
+        Ok(session)
     }
 }
 

@@ -23,6 +23,7 @@ use serde_json::{Value, json};
 
 use crate::project::{ProjectArgs, Stage};
 use crate::report;
+use crate::watch;
 
 #[derive(Args)]
 pub struct RunArgs {
@@ -53,6 +54,14 @@ pub struct RunArgs {
     /// Wait for another run in the same folder instead of refusing
     #[arg(long)]
     wait: bool,
+
+    /// As --set pipeline.quality=draft
+    #[arg(long)]
+    draft: bool,
+
+    /// Run again whenever a file that is read changes, until Ctrl-C
+    #[arg(long)]
+    watch: bool,
 }
 
 /// Runs what is not up to date, in one project after the other. One that fails does not keep the
@@ -65,7 +74,15 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
         let threads = args.threads.unwrap_or_default();
         return Err(Usage(format!("--threads {threads}: {message}")).into());
     }
-    let projects = args.project.each();
+    if args.watch {
+        return watch::watch(&args.project);
+    }
+    let mut projects = args.project.each();
+    if args.draft {
+        for project in &mut projects {
+            project.set.push("pipeline.quality=draft".into());
+        }
+    }
     let output = args.project.output;
     if let [project] = &projects[..] {
         let done = run_one(args, project)?;

@@ -13,7 +13,8 @@ fn what_is_written_runs_as_it_is() {
     init.expect_success();
     for line in [
         "wrote first.toml",
-        "dipir run first.toml --set pipeline.quality=draft",
+        "dipir place first.toml",
+        "dipir run first.toml --draft",
         "a guess, for the photograph does not say it",
     ] {
         assert!(init.stdout.contains(line), "{line}: {}", init.stdout);

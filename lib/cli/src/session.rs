@@ -48,7 +48,7 @@ impl Session {
     /// Reads the configuration, starts the worker threads and listens for Ctrl-C.
     pub fn start(args: &CommonArgs) -> anyhow::Result<Self> {
         let session = Self::open(args)?;
-        start_threads(session.pipeline.threads)?;
+        session.start_threads()?;
         interrupt::listen()?;
         if args.supervised {
             interrupt::follow_standard_input();
@@ -91,6 +91,11 @@ impl Session {
             },
             output: args.output,
         })
+    }
+
+    /// Starts the worker threads; once a process.
+    pub fn start_threads(&self) -> anyhow::Result<()> {
+        start_threads(self.pipeline.threads)
     }
 
     /// The folder of a stage.

@@ -3,7 +3,7 @@
 mod axis;
 pub mod chart;
 pub mod drawing;
-mod glyphs;
+pub mod glyphs;
 mod pixels;
 
 pub use axis::number;

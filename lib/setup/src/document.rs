@@ -41,8 +41,10 @@ impl Document {
             "# Written by dipir init: a first guess that runs. Change what is wrong and run it again; what does\n\
              # not depend on it is kept. Paths are relative to this file. Lengths are in metres, +y is up, and\n\
              # pixels count from the top left corner of the upright photograph.\n\
-             #   dipir run --set pipeline.quality=draft    a quick look\n\
-             #   dipir run                                 the picture\n\n\
+             #   dipir place          a page in the browser: put objects, camera and light right\n\
+             #   dipir preview        the same view as preview.png\n\
+             #   dipir run --draft    a quick look; with --watch again after every change\n\
+             #   dipir run            the picture\n\n\
              [pipeline]\nout = \"out\"\nquality = \"standard\"            # draft | standard | high\n\n",
         );
         text += &self.scene();

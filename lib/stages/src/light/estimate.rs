@@ -48,13 +48,7 @@ pub(super) fn estimate(
     loaded: &LoadedScene,
     lobes: usize,
 ) -> anyhow::Result<Estimated> {
-    let camera = &loaded.scene.camera;
-    let estimator = Estimator::embedded().context("cannot read the embedded light estimator")?;
-    let estimate = estimator.estimate(&loaded.photo.image, camera);
-    let estimate = match known_sun(session, table, loaded, &estimate)? {
-        Some(sun) => estimate.knowing(&sun),
-        None => estimate,
-    };
+    let estimate = distribution(session, table, loaded)?;
     let candidates = estimate.candidates(CANDIDATES);
     let entry = |(k, c): (usize, &dipir_estimator::Candidate)| CandidateEntry {
         candidate: k + 1,
@@ -89,6 +83,20 @@ pub(super) fn estimate(
         lobes,
         sources,
         smooth,
+    })
+}
+
+/// The light as a distribution, with what is known of the sun.
+pub(super) fn distribution(
+    session: &Session,
+    table: &LightTable,
+    loaded: &LoadedScene,
+) -> anyhow::Result<LightEstimate> {
+    let estimator = Estimator::embedded().context("cannot read the embedded light estimator")?;
+    let estimate = estimator.estimate(&loaded.photo.image, &loaded.scene.camera);
+    Ok(match known_sun(session, table, loaded, &estimate)? {
+        Some(sun) => estimate.knowing(&sun),
+        None => estimate,
     })
 }
 

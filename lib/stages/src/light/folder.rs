@@ -63,19 +63,31 @@ pub fn recovered(
     warn_of_another_scene(session, &manifest, scene);
     let lighting_file = manifest.output(&folder, "lighting")?;
     let tone_file = manifest.output(&folder, "tone")?;
-    let exposure = table.exposure_ev.exp2();
-    let turn = Quat::from_rotation_y(table.rotation_deg.to_radians());
     let lighting = Lighting::read(&lighting_file)?;
     let mut lobes = lighting.exposed_lobes();
     let surroundings = match has_surroundings(&manifest) {
         true => {
             lobes.truncate(lighting.sources);
-            let map = EnvironmentMap::read(manifest.output(&folder, SURROUNDINGS)?)?;
-            let angle = f64::from(table.rotation_deg).to_radians();
-            Some(map.scaled(exposure).rotated_y(angle))
+            Some(EnvironmentMap::read(
+                manifest.output(&folder, SURROUNDINGS)?,
+            )?)
         }
         false => None,
     };
+    let tone = ToneCurves::read_json(&tone_file)?;
+    exposed(session, table, lobes, surroundings, tone)
+}
+
+/// A light on the photograph's scale, exposed and turned as `[composite]` says.
+pub(super) fn exposed(
+    session: &Session,
+    table: &CompositeTable,
+    lobes: Vec<SphericalGaussian>,
+    surroundings: Option<EnvironmentMap>,
+    tone: ToneCurves,
+) -> anyhow::Result<Recovered> {
+    let exposure = table.exposure_ev.exp2();
+    let turn = Quat::from_rotation_y(table.rotation_deg.to_radians());
     let lobes = lobes.into_iter().map(|lobe| SphericalGaussian {
         direction: turn * lobe.direction,
         radiance: lobe.radiance * exposure,
@@ -89,8 +101,11 @@ pub fn recovered(
             );
             session.config.invalid("composite.exposure_ev", message)
         })?,
-        surroundings,
-        tone: ToneCurves::read_json(&tone_file)?,
+        surroundings: surroundings.map(|map| {
+            let angle = f64::from(table.rotation_deg).to_radians();
+            map.scaled(exposure).rotated_y(angle)
+        }),
+        tone,
     })
 }
 

@@ -1,5 +1,6 @@
 //! The light stage: estimates the light of the photograph, or recovers light and tone curves under
 //! which the object looks as the guidance asks.
+pub mod at_hand;
 mod done;
 mod estimate;
 pub mod folder;

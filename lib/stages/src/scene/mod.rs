@@ -281,7 +281,7 @@ fn plan_with<'a>(
 }
 
 /// Makes an error about a key one of usage that says where the key stands.
-fn with_place(error: dipir_scene::Error, config: &Config) -> anyhow::Error {
+pub fn with_place(error: dipir_scene::Error, config: &Config) -> anyhow::Error {
     use dipir_scene::Error::{Conflict, Missing};
     let key = match &error {
         dipir_scene::Error::Config { key, .. } | Missing { key, .. } => key,

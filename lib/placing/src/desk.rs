@@ -1,0 +1,521 @@
+//! A project while it is being arranged.
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use anyhow::{Context, bail};
+use dipir_cli::session::Session;
+use dipir_imaging::raster::Raster;
+use dipir_imaging::resize::{Filter, resize};
+use dipir_light::gaussian::SphericalGaussian;
+use dipir_optimize::settings::LightTable;
+use dipir_pipeline::config::Config;
+use dipir_preview::arrangement::{Arrangement, Placed};
+use dipir_preview::draft::Draft;
+use dipir_preview::lines::{Kind, Piece};
+use dipir_preview::marks::{Grid, horizon, outline, stick};
+use dipir_preview::png;
+use dipir_preview::small::{Props, SmallScene};
+use dipir_render::error::RenderError;
+use dipir_scene::camera::Camera;
+use dipir_scene::config::SceneConfig;
+use dipir_scene::pixels::ground_at;
+use dipir_scene::proxy::{Plane, Proxy};
+use dipir_stages::composite::table::CompositeTable;
+use dipir_stages::graph;
+use dipir_stages::light::at_hand::{AtHand, at_hand};
+use glam::{DVec2, DVec3};
+use serde_json::{Value, json};
+
+use crate::document::Document;
+use crate::edit::Edit;
+use crate::vanishing::{Lines, Solution, solve, turn_of_camera};
+
+/// Longest side of the photograph on the page, pixels.
+const LONGEST: u32 = 1280;
+/// The mask's file, beside the project's.
+const MASK_FILE: &str = "holdout.png";
+/// Most objects that a page may ask for.
+const MOST_OBJECTS: usize = 200;
+
+/// The project, its photograph scaled, and what was painted.
+pub struct Desk {
+    path: PathBuf,
+    props: Arc<Props>,
+    /// The photograph as a PNG, and its size.
+    photo: Vec<u8>,
+    size: [usize; 2],
+    /// The file's text, as it was read or last saved.
+    text: Mutex<String>,
+    /// What the page painted, row by row; empty if nothing.
+    mask: Mutex<Vec<u8>>,
+    studio: Mutex<Studio>,
+    /// Counts drafts that were asked for: an older one is broken off.
+    drafts: AtomicU64,
+}
+
+/// What rendering changes.
+struct Studio {
+    session: Session,
+    small: SmallScene,
+    /// The mask of the file.
+    own_mask: Option<Raster<f32>>,
+    /// The light of a configuration and a camera.
+    light: Option<(String, AtHand)>,
+}
+
+/// A draft that was broken off by a newer one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Superseded;
+
+/// A part of the photograph with objects in it.
+pub struct Crop {
+    /// 8-bit RGB.
+    pub png: Vec<u8>,
+    /// First and one past the last column and row of the scaled photograph.
+    pub place: [usize; 4],
+    /// Where the light comes from, and its sun's azimuth from the view and elevation, degrees.
+    pub light: Value,
+}
+
+fn held<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // What a request that failed left is whole: it is replaced as one.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Desk {
+    /// Reads the session's project.
+    ///
+    /// # Errors
+    /// On a configuration or files that cannot be used.
+    pub fn open(session: Session) -> anyhow::Result<Self> {
+        let path = session.config.path().to_owned();
+        let text = dipir_files::read_to_string(&path)
+            .with_context(|| format!("cannot read \"{}\"", path.display()))?;
+        let (small, arrangement) = SmallScene::load(&session, LONGEST)?;
+        for warning in &arrangement.warnings {
+            session.warn(warning);
+        }
+        let photo = &small.loaded.photo;
+        let picture = photo.transfer.encode(&photo.image);
+        let size = [picture.0.width(), picture.0.height()];
+        let values = png::values(&picture, [0, 0, size[0], size[1]]);
+        Ok(Self {
+            path,
+            props: small.props.clone(),
+            photo: png::encode(size[0], size[1], &values)?,
+            size,
+            text: Mutex::new(text),
+            mask: Mutex::default(),
+            studio: Mutex::new(Studio {
+                session,
+                own_mask: small.loaded.occluders.clone(),
+                small,
+                light: None,
+            }),
+            drafts: AtomicU64::new(0),
+        })
+    }
+
+    /// The photograph as it is shown.
+    pub fn photo(&self) -> &[u8] {
+        &self.photo
+    }
+
+    /// Bytes of a mask: one a pixel of the photograph as it is shown.
+    pub fn mask_bytes(&self) -> usize {
+        self.size[0] * self.size[1]
+    }
+
+    /// The mask of the file, as it is shown; nothing if there is none.
+    pub fn own_mask(&self) -> Vec<u8> {
+        let studio = held(&self.studio);
+        let mask = studio.own_mask.as_ref();
+        let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+        mask.map_or_else(Vec::new, |m| m.pixels().iter().map(byte).collect())
+    }
+
+    /// Takes what the page painted.
+    ///
+    /// # Errors
+    /// If it has another size.
+    pub fn paint(&self, mask: Vec<u8>) -> anyhow::Result<()> {
+        if mask.len() != self.mask_bytes() {
+            bail!("a mask has a byte for each of {} pixels", self.mask_bytes());
+        }
+        *held(&self.mask) = mask;
+        Ok(())
+    }
+
+    /// The file's text with `edit`, and what it means.
+    fn edited(&self, edit: &Edit) -> anyhow::Result<(String, Config, Arrangement)> {
+        check(edit)?;
+        let mut document = Document::parse(&held(&self.text))?;
+        document.order_objects(&edit.objects)?;
+        document.apply_light(edit)?;
+        for (i, object) in edit.objects.iter().enumerate() {
+            document.shape(i, object)?;
+        }
+        if edit.turn.is_some() || edit.height_m.is_some() {
+            self.move_camera(&mut document, edit)?;
+        }
+        if edit.objects.iter().any(|o| o.at.is_some()) {
+            self.put_objects(&mut document, edit)?;
+        }
+        let text = document.text();
+        let (config, arrangement) = self.arranged(&text)?;
+        Ok((text, config, arrangement))
+    }
+
+    fn arranged(&self, text: &str) -> anyhow::Result<(Config, Arrangement)> {
+        let config = Config::parse(&self.path, text, &[])?;
+        let scene: SceneConfig = config.table("scene")?;
+        let arrangement = self.props.arranged(&scene)?;
+        Ok((config, arrangement))
+    }
+
+    /// Turns the camera, then lifts it.
+    fn move_camera(&self, document: &mut Document, edit: &Edit) -> anyhow::Result<()> {
+        // The camera alone: a turn may leave objects above the horizon that are put elsewhere.
+        let camera_of = |document: &Document| -> anyhow::Result<(Camera, Plane)> {
+            let (_, arranged) = self.arranged(&held(&self.text))?;
+            let config = Config::parse(&self.path, &document.text(), &[])?;
+            let scene: SceneConfig = config.table("scene")?;
+            let camera = self.props.camera(&scene)?;
+            Ok((camera, arranged.ground()))
+        };
+        if let Some(turn) = &edit.turn {
+            let (camera, _) = camera_of(document)?;
+            document.turn(turn, &camera)?;
+        }
+        if let Some(height) = edit.height_m {
+            let (camera, ground) = camera_of(document)?;
+            let normal = ground.normal.as_dvec3();
+            let lift = height - height_over(&camera, &ground);
+            document.shift_camera(&camera, normal * lift)?;
+        }
+        Ok(())
+    }
+
+    fn put_objects(&self, document: &mut Document, edit: &Edit) -> anyhow::Result<()> {
+        let config = Config::parse(&self.path, &document.text(), &[])?;
+        let camera = self.props.camera(&config.table("scene")?)?;
+        let (_, before) = self.arranged(&held(&self.text))?;
+        let ground = before.ground();
+        for (i, object) in edit.objects.iter().enumerate() {
+            let Some(at) = object.at else { continue };
+            let seen = ground_at(&camera, &ground, DVec2::from_array(at));
+            let point = seen.context("no ground is seen there: it is above the horizon")?;
+            match document.is_by_position(i)? || !matches!(before.proxy, Proxy::Plane(_)) {
+                true => document.put_at(i, point)?,
+                false => document.put_at_pixel(i, at)?,
+            }
+        }
+        Ok(())
+    }
+
+    /// What the page shows before anything is changed.
+    ///
+    /// # Errors
+    /// If the file cannot be used any more.
+    pub fn state(&self) -> anyhow::Result<Value> {
+        let text = held(&self.text).clone();
+        let (config, arrangement) = self.arranged(&text)?;
+        let exposure = config.table::<CompositeTable>("composite")?;
+        let models = &self.props.models;
+        let name = |o: &Placed| {
+            let name = models[o.model].path.file_stem().unwrap_or_default();
+            name.to_string_lossy().into_owned()
+        };
+        let edit = Edit::none(arrangement.objects.len());
+        Ok(json!({
+            "file": self.path,
+            "size": arrangement.camera.resolution,
+            "shown": self.size,
+            "names": arrangement.objects.iter().map(name).collect::<Vec<_>>(),
+            "exposure_ev": exposure.exposure_ev,
+            "edit": edit,
+            "view": view(&arrangement, true),
+        }))
+    }
+
+    /// Lines and numbers of an edit; with `grid`, the ground's, too.
+    ///
+    /// # Errors
+    /// If it cannot be.
+    pub fn view(&self, edit: &Edit, grid: bool) -> anyhow::Result<Value> {
+        let (_, _, arrangement) = self.edited(edit)?;
+        Ok(view(&arrangement, grid))
+    }
+
+    /// The camera that sees `lines`.
+    ///
+    /// # Errors
+    /// If there is none.
+    pub fn solve(&self, edit: &Edit, lines: &Lines) -> anyhow::Result<Solution> {
+        let (_, _, arrangement) = self.edited(edit)?;
+        solve(lines, &arrangement.camera)
+    }
+
+    /// The height of the camera at which two pixels of the ground are `length_m` apart.
+    ///
+    /// # Errors
+    /// If one of them sees no ground, or both the same.
+    pub fn measure(&self, edit: &Edit, ends: [[f64; 2]; 2], length_m: f64) -> anyhow::Result<f64> {
+        if !(length_m > 0.0 && length_m.is_finite()) {
+            bail!("a length is above 0 m");
+        }
+        let (_, _, arrangement) = self.edited(edit)?;
+        let (camera, ground) = (&arrangement.camera, arrangement.ground());
+        let point = |p| ground_at(camera, &ground, DVec2::from_array(p));
+        let [a, b] = ends.map(point);
+        let (Some(a), Some(b)) = (a, b) else {
+            bail!("both ends lie on the ground, below the horizon");
+        };
+        let found = a.distance(b);
+        if found < 1e-6 {
+            bail!("both ends are the same");
+        }
+        Ok(height_over(camera, &ground) * length_m / found)
+    }
+
+    /// Renders the objects; `None` if they change nothing. A newer call breaks an older one off.
+    ///
+    /// # Errors
+    /// If it cannot be, and [`Superseded`].
+    pub fn draft(
+        &self,
+        edit: &Edit,
+        samples: u32,
+    ) -> anyhow::Result<Result<Option<Crop>, Superseded>> {
+        let ticket = self.drafts.fetch_add(1, Ordering::SeqCst) + 1;
+        let (_, config, arrangement) = self.edited(edit)?;
+        let current = || self.drafts.load(Ordering::SeqCst) == ticket;
+        let mut studio = held(&self.studio);
+        if !current() {
+            return Ok(Err(Superseded));
+        }
+        let studio = &mut *studio;
+        studio.small.arrange(&arrangement);
+        studio.session.config = config;
+        studio.small.loaded.occluders = self.occluders(edit, studio.own_mask.as_ref());
+        studio.light_up()?;
+        let Some((_, light)) = &studio.light else {
+            bail!("there is no light");
+        };
+        let mut go_on = || match current() {
+            true => ControlFlow::Continue(()),
+            false => ControlFlow::Break(()),
+        };
+        let draft = match Draft::render(&studio.small.loaded, light, samples, &mut go_on) {
+            Err(RenderError::Interrupted) => return Ok(Err(Superseded)),
+            other => other?,
+        };
+        let Some(place) = draft.touched else {
+            return Ok(Ok(None));
+        };
+        let [x0, y0, x1, y1] = place;
+        let values = png::values(&draft.picture, place);
+        Ok(Ok(Some(Crop {
+            png: png::encode(x1 - x0, y1 - y0, &values)?,
+            place,
+            light: told(light, &arrangement.camera),
+        })))
+    }
+
+    fn occluders(&self, edit: &Edit, own: Option<&Raster<f32>>) -> Option<Raster<f32>> {
+        let painted = held(&self.mask);
+        match edit.mask && !painted.is_empty() {
+            true => Some(self.raster(&painted)),
+            false => own.cloned(),
+        }
+    }
+
+    fn raster(&self, painted: &[u8]) -> Raster<f32> {
+        let values = painted.iter().map(|&b| f32::from(b) / 255.0);
+        Raster::from_pixels(self.size[0], self.size[1], values.collect())
+    }
+
+    /// Writes the file and, if one was painted, the mask; what was written, one line each.
+    ///
+    /// # Errors
+    /// If it cannot be, or the file was changed by another program since it was read. Nothing is
+    /// written then.
+    pub fn save(&self, edit: &Edit) -> anyhow::Result<Vec<String>> {
+        let (text, _, arrangement) = self.edited(edit)?;
+        let mut document = Document::parse(&text)?;
+        let painted = held(&self.mask).clone();
+        let mask = (edit.mask && !painted.is_empty()).then(|| self.path.with_file_name(MASK_FILE));
+        if let Some(path) = &mask {
+            if !png::is_free(path)? {
+                bail!("{MASK_FILE} is there already and dipir did not make it; rename it");
+            }
+            document.occluders(MASK_FILE)?;
+        }
+        let text = document.text();
+        let config = Config::parse(&self.path, &text, &[])?;
+        config.table::<SceneConfig>("scene")?.validate()?;
+        let mut studio = held(&self.studio);
+        let mut base = held(&self.text);
+        let found = dipir_files::read_to_string(&self.path)?;
+        if found != *base {
+            bail!(
+                "the file was changed by another program; reload the page after starting dipir place anew"
+            );
+        }
+        studio.session.config = config;
+        // Every table is read once more, as a run would.
+        graph::graph(&studio.session)?;
+        let mut written = Vec::new();
+        if let Some(path) = &mask {
+            let [w, h] = arrangement.camera.resolution.map(|n| n as usize);
+            let whole = resize(&self.raster(&painted), w, h, Filter::Tent);
+            let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+            let values: Vec<u8> = whole.pixels().iter().map(byte).collect();
+            png::write(path, &png::encode(w, h, &values)?)?;
+            studio.own_mask = Some(self.raster(&painted));
+            written.push(path.display().to_string());
+        }
+        dipir_files::replace(&self.path, text.as_bytes(), b"")
+            .with_context(|| format!("cannot write \"{}\"", self.path.display()))?;
+        written.push(self.path.display().to_string());
+        *base = text;
+        Ok(written)
+    }
+}
+
+impl Studio {
+    /// Finds the light, unless it is that of the same camera and keys as before.
+    fn light_up(&mut self) -> anyhow::Result<()> {
+        let config = &self.session.config;
+        let light: LightTable = config.table("light")?;
+        let composite: CompositeTable = config.table("composite")?;
+        let camera = self.small.loaded.scene.camera;
+        let key = format!("{light:?} {composite:?} {camera:?}");
+        if self.light.as_ref().is_none_or(|(known, _)| *known != key) {
+            let found = at_hand(&self.session, &self.small.loaded)?;
+            self.light = Some((key, found));
+        }
+        Ok(())
+    }
+}
+
+/// Refuses numbers that make no sense before anything is computed from them.
+fn check(edit: &Edit) -> anyhow::Result<()> {
+    if edit.objects.len() > MOST_OBJECTS {
+        bail!("more than {MOST_OBJECTS} objects are not placed here");
+    }
+    let finite = |values: &[f64]| values.iter().all(|v| v.is_finite() && v.abs() < 1e7);
+    for object in &edit.objects {
+        let size = object.size.unwrap_or(1.0);
+        let yaw = object.yaw_deg.unwrap_or(0.0);
+        if !(finite(&object.at.unwrap_or_default()) && finite(&[yaw]) && size > 0.0 && size < 1e6) {
+            bail!("an object's pixel, turn or size is no usable number");
+        }
+    }
+    if let Some(height) = edit.height_m
+        && !(height > 1e-3 && height < 1e5)
+    {
+        bail!("the camera stands between a millimetre and 100 km above the ground");
+    }
+    if let Some(turn) = &edit.turn
+        && !(turn.pitch_deg.abs() <= 90.0
+            && turn.roll_deg.abs() <= 180.0
+            && (1.0..170.0).contains(&turn.fov_deg))
+    {
+        bail!(
+            "the camera's pitch is within 90 degrees, its roll within 180, its view from 1 to 170"
+        );
+    }
+    if !finite(&[edit.exposure_ev.unwrap_or(0.0)])
+        || edit.exposure_ev.is_some_and(|e| e.abs() > 20.0)
+    {
+        bail!("an exposure is within 20 stops");
+    }
+    Ok(())
+}
+
+fn height_over(camera: &Camera, ground: &Plane) -> f64 {
+    let from = camera.position.as_dvec3() - ground.point.as_dvec3();
+    ground.normal.as_dvec3().dot(from)
+}
+
+/// What the page draws and says.
+fn view(arrangement: &Arrangement, grid: bool) -> Value {
+    let camera = &arrangement.camera;
+    let ground = arrangement.ground();
+    let project = |p: DVec3| camera.project(p.as_vec3()).map(|p| p.to_array());
+    let object = |o: &Placed| {
+        let pieces = outline(camera, o);
+        let size = o.size();
+        json!({
+            "contact": project(o.contact),
+            "yaw_deg": o.yaw_rad.to_degrees(),
+            "size_m": size.to_array(),
+            "distance_m": o.contact.distance(camera.position.as_dvec3()),
+            "lines": pieces.iter().map(line).collect::<Vec<_>>(),
+        })
+    };
+    let focus = arrangement.objects.first();
+    let stick = focus.and_then(|o| stick(camera, o));
+    let (stick, label) = stick.unzip();
+    let turn = turn_of_camera(camera);
+    let mut view = json!({
+        "objects": arrangement.objects.iter().map(object).collect::<Vec<_>>(),
+        "horizon": horizon(camera, &ground).iter().map(line).collect::<Vec<_>>(),
+        "stick": stick.iter().flatten().map(line).collect::<Vec<_>>(),
+        "stick_label": label.map(|l| json!({"at": l.at.to_array(), "text": l.text})),
+        "camera": {
+            "pitch_deg": turn.pitch_deg, "roll_deg": turn.roll_deg, "fov_deg": turn.fov_deg,
+            "height_m": height_over(camera, &ground),
+        },
+        "warnings": arrangement.warnings,
+    });
+    if grid {
+        let found = Grid::new(camera, &ground, focus.map(|o| o.contact));
+        view["grid"] = found.pieces.iter().map(line).collect();
+        view["spacing_m"] = found.spacing_m.into();
+    }
+    view
+}
+
+/// Kind, ends and opacity.
+fn line(piece: &Piece) -> Value {
+    let kind = match piece.kind {
+        Kind::Grid => 0,
+        Kind::MainGrid => 1,
+        Kind::Horizon => 2,
+        Kind::Box => 3,
+        Kind::Front => 4,
+        Kind::Stick => 5,
+    };
+    let short = |x: f64| (x * 10.0).round() / 10.0;
+    let (a, b) = (piece.from, piece.to);
+    let opacity = (f64::from(piece.opacity) * 100.0).round() / 100.0;
+    json!([
+        kind,
+        short(a.x),
+        short(a.y),
+        short(b.x),
+        short(b.y),
+        opacity
+    ])
+}
+
+/// A light in words and numbers.
+fn told(light: &AtHand, camera: &Camera) -> Value {
+    let strongest = light.lobes.lobes().iter().max_by(|a, b| {
+        let power = |l: &SphericalGaussian| l.integral().element_sum();
+        power(a).total_cmp(&power(b))
+    });
+    let sun = strongest.map(|lobe| {
+        let d = lobe.direction.as_dvec3();
+        let forward = -camera.rotation.z_axis.as_dvec3();
+        let azimuth = |v: DVec3| v.x.atan2(-v.z);
+        let from_view = (azimuth(d) - azimuth(forward)).to_degrees();
+        let azimuth_deg = (from_view + 180.0).rem_euclid(360.0) - 180.0;
+        json!({"azimuth_deg": azimuth_deg, "elevation_deg": d.y.clamp(-1.0, 1.0).asin().to_degrees()})
+    });
+    json!({"origin": light.origin.words(), "sun": sun})
+}

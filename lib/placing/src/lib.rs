@@ -1,0 +1,10 @@
+//! `dipir place`: a page, served to this machine alone, on which objects are put into a photograph.
+//!
+//! The page draws and points; everything that is computed, it asks here: one camera, one
+//! parser, one renderer for page, preview and pipeline.
+pub mod desk;
+pub mod document;
+pub mod edit;
+pub mod gate;
+pub mod server;
+pub mod vanishing;

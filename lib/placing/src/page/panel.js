@@ -1,0 +1,60 @@
+// The fields beside the picture.
+
+const $ = (id) => document.getElementById(id);
+
+export const HELP = {
+  move: "Drag the object over the ground. Wheel: size. Shift and wheel, or R and drag: turn. Arrows, Q, E, + and - do the same.",
+  lines: "Drag the ends of the lines.",
+  measure: "Drag both ends of the line onto the ground.",
+  mask: "Paint over what stands in front of the object.",
+  shadow: "Drag one end to the foot, the other to the tip of the shadow.",
+};
+
+export function say(text, bad = false) {
+  $("status").textContent = text;
+  $("status").classList.toggle("bad", bad);
+}
+
+// A number field that reports finite numbers when they are entered.
+export function number(id, change) {
+  $(id).addEventListener("change", () => {
+    const value = $(id).valueAsNumber;
+    if (Number.isFinite(value)) change(value);
+  });
+}
+
+// Writes a value into a field that is not being typed in.
+export function put(id, value, digits = 2) {
+  if (document.activeElement === $(id)) return;
+  $(id).value = Number.isFinite(value) ? String(Number(value.toFixed(digits))) : "";
+}
+
+export function objects(names, edit, chosen, choose) {
+  const list = edit.objects.map((object, k) => {
+    const label = document.createElement("label");
+    const input = Object.assign(document.createElement("input"), { type: "radio", name: "object", checked: k === chosen });
+    input.addEventListener("change", () => choose(k));
+    label.append(input, `${k + 1} ${names[object.of]}`);
+    return label;
+  });
+  $("objects").replaceChildren(...list);
+}
+
+export function told(view, chosen) {
+  const object = view.objects[chosen];
+  const { pitch_deg, roll_deg, fov_deg, height_m } = view.camera;
+  const way = pitch_deg < 0 ? "down" : "up";
+  $("camera").textContent =
+    `${height_m.toFixed(2)} m above the ground, looks ${Math.abs(pitch_deg).toFixed(1)}° ${way}, ` +
+    `roll ${roll_deg.toFixed(1)}°, field of view ${fov_deg.toFixed(1)}° (vertical)`;
+  if (object) {
+    const [width, height, depth] = object.size_m;
+    put("yaw", object.yaw_deg, 1);
+    put("height", height, 3);
+    $("where").textContent =
+      `${width.toFixed(2)} × ${height.toFixed(2)} × ${depth.toFixed(2)} m (width, height, depth), ` +
+      `${object.distance_m.toFixed(1)} m from the camera`;
+  }
+  const warnings = view.warnings.map((text) => Object.assign(document.createElement("li"), { textContent: text }));
+  $("warnings").replaceChildren(...warnings);
+}

@@ -1,0 +1,192 @@
+// What the pointer and the keys do on the picture, tool by tool.
+
+const BLUE = "#5ab4ff";
+const GREEN = "#61d095";
+const YELLOW = "#ffd140";
+
+// A list of lines whose ends are dragged.
+class Ends {
+  constructor(lines, colors) {
+    Object.assign(this, { lines, colors, held: null });
+  }
+
+  draw(picture, count = this.lines.length) {
+    this.lines.slice(0, count).forEach((line, k) => {
+      picture.line(line, this.colors[k]);
+      line.forEach((end) => picture.handle(end, this.colors[k]));
+    });
+  }
+
+  // The end near a place, within 22 pixels of the screen.
+  grab([x, y], reach, count = this.lines.length) {
+    let best = reach;
+    this.held = null;
+    this.lines.slice(0, count).forEach((line) =>
+      line.forEach((end) => {
+        const far = Math.hypot(end[0] - x, end[1] - y);
+        if (far < best) {
+          best = far;
+          this.held = end;
+        }
+      }),
+    );
+    return this.held !== null;
+  }
+
+  move([x, y]) {
+    if (this.held) [this.held[0], this.held[1]] = [x, y];
+  }
+}
+
+export class Tools {
+  // `page` offers: picture, history, view, chosen, choose, change, redraw, linesChanged, paint.
+  constructor(page, size) {
+    this.page = page;
+    this.name = "move";
+    const [w, h] = size;
+    const of = (...p) => p.map(([x, y]) => [x * w, y * h]);
+    this.lines = new Ends(
+      [of([0.2, 0.95], [0.42, 0.6]), of([0.8, 0.95], [0.58, 0.6]), of([0.1, 0.72], [0.9, 0.7]), of([0.1, 0.85], [0.9, 0.86])],
+      [BLUE, BLUE, GREEN, GREEN],
+    );
+    this.measure = new Ends([of([0.4, 0.8], [0.6, 0.8])], [YELLOW]);
+    this.shadow = new Ends([of([0.4, 0.8], [0.55, 0.75])], [YELLOW]);
+    this.second = false;
+    this.keys = new Set();
+    this.pointers = new Map();
+    const canvas = page.picture.canvas;
+    canvas.addEventListener("pointerdown", (event) => this.down(event));
+    canvas.addEventListener("pointermove", (event) => this.moved(event));
+    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => this.up(event));
+    canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    canvas.addEventListener("keydown", (event) => this.key(event));
+    window.addEventListener("keydown", (event) => this.keys.add(event.key.toLowerCase()));
+    window.addEventListener("keyup", (event) => this.keys.delete(event.key.toLowerCase()));
+    window.addEventListener("blur", () => this.keys.clear());
+  }
+
+  get ends() {
+    return { lines: this.lines, measure: this.measure, shadow: this.shadow }[this.name];
+  }
+
+  get count() {
+    return this.name === "lines" && !this.second ? 2 : undefined;
+  }
+
+  draw() {
+    const { picture, view, chosen } = this.page;
+    this.ends?.draw(picture, this.count);
+    const contact = view.objects[chosen]?.contact;
+    if (this.name === "move" && contact) picture.handle(contact, "#ff801a", true);
+  }
+
+  down(event) {
+    const { page } = this;
+    page.picture.canvas.focus({ preventScroll: true });
+    page.picture.canvas.setPointerCapture(event.pointerId);
+    const at = page.picture.at(event);
+    this.pointers.set(event.pointerId, at);
+    this.before = page.history.now;
+    if (this.name === "mask") return page.paint(at, at, false);
+    if (this.ends) {
+      this.ends.grab(at, 22 / page.picture.scale, this.count);
+      return;
+    }
+    this.pick(at);
+    const object = page.history.now.edit.objects[page.chosen];
+    const shown = page.view.objects[page.chosen];
+    this.start = { at, contact: shown?.contact ?? at, yaw: shown?.yaw_deg ?? 0, size: object?.size ?? 1 };
+    this.turns = this.keys.has("r") || event.altKey || event.button === 2;
+  }
+
+  // Chooses the object whose box is at the place.
+  pick([x, y]) {
+    const { page } = this;
+    const holds = (object) => {
+      const xs = object.lines.flatMap((l) => [l[1], l[3]]);
+      const ys = object.lines.flatMap((l) => [l[2], l[4]]);
+      return x >= Math.min(...xs) && x <= Math.max(...xs) && y >= Math.min(...ys) && y <= Math.max(...ys);
+    };
+    if (page.view.objects[page.chosen] && holds(page.view.objects[page.chosen])) return;
+    const found = page.view.objects.findIndex(holds);
+    if (found >= 0) page.choose(found);
+  }
+
+  moved(event) {
+    const { page } = this;
+    if (!this.pointers.has(event.pointerId)) return;
+    const at = page.picture.at(event);
+    const last = this.pointers.get(event.pointerId);
+    if (this.pointers.size === 2 && this.name === "move") {
+      this.pinch(event.pointerId, at);
+      return;
+    }
+    this.pointers.set(event.pointerId, at);
+    if (this.name === "mask") return page.paint(last, at, false);
+    if (this.ends) {
+      this.ends.move(at);
+      page.linesChanged();
+      return page.redraw();
+    }
+    if (!this.start) return;
+    const [dx, dy] = [at[0] - this.start.at[0], at[1] - this.start.at[1]];
+    if (this.turns) return page.change({ yaw_deg: this.start.yaw + 0.5 * dx * page.picture.scale }, false);
+    page.change({ at: [this.start.contact[0] + dx, this.start.contact[1] + dy] }, false);
+  }
+
+  // Two fingers size the object.
+  pinch(id, at) {
+    const other = [...this.pointers].find(([k]) => k !== id)[1];
+    const before = this.pointers.get(id);
+    const far = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
+    const factor = far(at) / Math.max(1, far(before));
+    this.pointers.set(id, at);
+    const size = this.page.history.now.edit.objects[this.page.chosen]?.size ?? 1;
+    this.page.change({ size: size * factor }, false);
+    this.start = null;
+  }
+
+  up(event) {
+    const { page } = this;
+    if (!this.pointers.delete(event.pointerId) || this.pointers.size) return;
+    if (this.name === "mask") return page.paint(null, null, true);
+    if (this.ends) return;
+    this.start = null;
+    page.finish(this.before);
+  }
+
+  wheel(event) {
+    if (this.name !== "move") return;
+    event.preventDefault();
+    const step = Math.sign(event.deltaY || event.deltaX);
+    event.shiftKey ? this.turn(5 * step) : this.size(1.04 ** -step);
+  }
+
+  turn(degrees) {
+    const shown = this.page.view.objects[this.page.chosen];
+    if (shown) this.page.change({ yaw_deg: shown.yaw_deg + degrees }, true);
+  }
+
+  size(factor) {
+    const object = this.page.history.now.edit.objects[this.page.chosen];
+    if (object) this.page.change({ size: (object.size ?? 1) * factor }, true);
+  }
+
+  key(event) {
+    if (this.name !== "move" || event.ctrlKey || event.metaKey) return;
+    const { page } = this;
+    const step = (event.shiftKey ? 10 : 2) / page.picture.scale;
+    const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    const contact = page.view.objects[page.chosen]?.contact;
+    const other = {
+      q: () => this.turn(5), Q: () => this.turn(1), e: () => this.turn(-5), E: () => this.turn(-1),
+      "+": () => this.size(1.04), "=": () => this.size(1.04), "-": () => this.size(1 / 1.04),
+      "]": () => page.choose(page.chosen + 1), "[": () => page.choose(page.chosen - 1),
+      Delete: () => page.remove(), c: () => page.copy(),
+    }[event.key];
+    if (move && contact) page.change({ at: [contact[0] + move[0] * step, contact[1] + move[1] * step] }, true);
+    else if (other) other();
+    else return;
+    event.preventDefault();
+  }
+}

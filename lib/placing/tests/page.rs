@@ -1,0 +1,396 @@
+//! The server as a browser meets it.
+use std::fs;
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+
+use dipir_cli::args::{CommonArgs, OutputArgs};
+use dipir_cli::session::Session;
+use dipir_imaging::file::write_png;
+use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_placing::desk::Desk;
+use dipir_placing::server::Place;
+use glam::Vec3;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+/// A box of a metre on a grey photograph, seen from the height of the eyes, under neutral light.
+const TEXT: &str = "# The street.\n[scene]\nbackground = \"photo.png\" # mine\n\n\
+    [[scene.objects]]\npath = \"box.obj\"\nat_pixel = [150.0, 150.0] # at the kerb\n\n\
+    [scene.camera]\nposition = [0.0, 1.6, 0.0]\npitch_deg = -10.0 # guessed\nfov_deg = 50.0\n\n\
+    [scene.proxy]\nplane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }\n\n\
+    [light]\nstart = \"neutral\"\n";
+
+const BOX: &str = "v -.5 0 -.5\nv .5 0 -.5\nv .5 1 -.5\nv -.5 1 -.5\nv -.5 0 .5\nv .5 0 .5\nv .5 1 .5\nv -.5 1 .5\n\
+    f 1 4 3 2\nf 5 6 7 8\nf 1 5 8 4\nf 2 3 7 6\nf 4 8 7 3\nf 1 2 6 5\n";
+
+struct Running {
+    folder: TempDir,
+    authority: String,
+    token: String,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+struct Answer {
+    status: u16,
+    head: String,
+    body: Vec<u8>,
+}
+
+impl Answer {
+    fn json(&self) -> Value {
+        assert_eq!(self.status, 200, "{}", String::from_utf8_lossy(&self.body));
+        serde_json::from_slice(&self.body).unwrap()
+    }
+
+    fn header(&self, name: &str) -> Option<&str> {
+        let mut lines = self.head.lines();
+        lines.find_map(|l| l.strip_prefix(name)?.strip_prefix(": "))
+    }
+}
+
+impl Running {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let grey = Raster::filled(300, 200, Vec3::splat(0.5));
+        write_png(folder.path().join("photo.png"), &DisplayImage(grey)).unwrap();
+        fs::write(folder.path().join("box.obj"), BOX).unwrap();
+        fs::write(folder.path().join("pipeline.toml"), TEXT).unwrap();
+        let session = Session::open(&CommonArgs {
+            pipeline: folder.path().join("pipeline.toml"),
+            set: Vec::new(),
+            out: None,
+            threads: None,
+            seed: None,
+            wait: false,
+            supervised: false,
+            hashes: None,
+            output: OutputArgs {
+                json: false,
+                quiet: true,
+                verbose: false,
+            },
+        });
+        let desk = Desk::open(session.unwrap()).unwrap();
+        let place = Place::listen(desk, 0).unwrap();
+        let address = place.address();
+        let parts: Vec<&str> = address.split('/').collect();
+        let stop = Arc::new(AtomicBool::new(false));
+        Self {
+            authority: parts[2].into(),
+            token: parts[3].into(),
+            thread: Some({
+                let stop = stop.clone();
+                thread::spawn(move || place.serve(&stop))
+            }),
+            stop,
+            folder,
+        }
+    }
+
+    fn file(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Sends a request whose head is given, and reads the answer.
+    fn send(&self, head: &str, body: &[u8]) -> Answer {
+        let mut stream = TcpStream::connect(&self.authority).unwrap();
+        let head = format!("{head}\r\nConnection: close\r\n\r\n");
+        stream.write_all(head.as_bytes()).unwrap();
+        stream.write_all(body).unwrap();
+        let mut bytes = Vec::new();
+        stream.read_to_end(&mut bytes).unwrap();
+        let end = bytes.windows(4).position(|w| w == b"\r\n\r\n").unwrap();
+        let head = String::from_utf8(bytes[..end].to_vec()).unwrap();
+        Answer {
+            status: head.split(' ').nth(1).unwrap().parse().unwrap(),
+            head,
+            body: bytes[end + 4..].to_vec(),
+        }
+    }
+
+    fn get(&self, path: &str) -> Answer {
+        let (token, host) = (&self.token, &self.authority);
+        self.send(
+            &format!("GET /{token}/{path} HTTP/1.1\r\nHost: {host}"),
+            b"",
+        )
+    }
+
+    fn post_bytes(&self, path: &str, body: &[u8]) -> Answer {
+        let (token, host) = (&self.token, &self.authority);
+        let head = format!(
+            "POST /{token}/{path} HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n\
+             Content-Length: {}",
+            body.len()
+        );
+        self.send(&head, body)
+    }
+
+    fn post(&self, path: &str, body: &Value) -> Answer {
+        self.post_bytes(path, body.to_string().as_bytes())
+    }
+}
+
+fn moved_to(x: f64, y: f64) -> Value {
+    json!({"objects": [{"of": 0, "at": [x, y]}]})
+}
+
+#[test]
+fn the_page_and_all_its_files_are_served_and_may_load_nothing_else() {
+    let place = Running::new();
+    let page = place.get("");
+    assert_eq!(page.status, 200);
+    let policy = page.header("Content-Security-Policy").unwrap();
+    assert!(policy.starts_with("default-src 'none'"), "{policy}");
+    let text = String::from_utf8(page.body).unwrap();
+    assert!(!text.contains("http:") && !text.contains("https:"));
+    for name in [
+        "main.js",
+        "style.css",
+        "api.js",
+        "tools.js",
+        "photo.png",
+        "state",
+    ] {
+        assert_eq!(place.get(name).status, 200, "{name}");
+    }
+}
+
+#[test]
+fn what_is_not_the_page_is_refused() {
+    let place = Running::new();
+    let (token, host) = (&place.token, &place.authority);
+    let secret = fs::read_to_string(place.file("pipeline.toml")).unwrap();
+    for (head, status) in [
+        (format!("GET / HTTP/1.1\r\nHost: {host}"), 403),
+        (
+            format!("GET /{}/ HTTP/1.1\r\nHost: {host}", "0".repeat(32)),
+            403,
+        ),
+        (format!("GET /{token}/ HTTP/1.1\r\nHost: evil.example"), 403),
+        (
+            format!("GET /{token}/state HTTP/1.1\r\nHost: {host}\r\nOrigin: http://evil.example"),
+            403,
+        ),
+        (
+            format!("GET /{token}/../pipeline.toml HTTP/1.1\r\nHost: {host}"),
+            404,
+        ),
+        (
+            format!("GET /{token}/%2e%2e/pipeline.toml HTTP/1.1\r\nHost: {host}"),
+            404,
+        ),
+        (
+            format!("GET /{token}//etc/passwd HTTP/1.1\r\nHost: {host}"),
+            404,
+        ),
+        (format!("GET /{token}/save HTTP/1.1\r\nHost: {host}"), 405),
+        (
+            format!("DELETE /{token}/save HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}"),
+            405,
+        ),
+        (
+            format!("POST /{token}/save HTTP/1.1\r\nHost: {host}\r\nContent-Length: 0"),
+            403,
+        ),
+    ] {
+        let answer = place.send(&head, b"");
+        assert_eq!(answer.status, status, "{head}");
+        assert!(!String::from_utf8_lossy(&answer.body).contains("[scene]"));
+    }
+    assert_eq!(
+        fs::read_to_string(place.file("pipeline.toml")).unwrap(),
+        secret
+    );
+}
+
+#[test]
+fn a_body_of_100_megabytes_is_refused_before_it_is_sent() {
+    let place = Running::new();
+    let (token, host) = (&place.token, &place.authority);
+    for route in ["save", "mask", "draft"] {
+        let mut stream = TcpStream::connect(host).unwrap();
+        let head = format!(
+            "POST /{token}/{route} HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n\
+             Content-Length: 104857600\r\n\r\n"
+        );
+        stream.write_all(head.as_bytes()).unwrap();
+        let mut answer = [0; 12];
+        stream.read_exact(&mut answer).unwrap();
+        assert_eq!(&answer, b"HTTP/1.1 413");
+    }
+    // Others are served meanwhile.
+    assert_eq!(place.get("state").status, 200);
+    // A mask has a byte a pixel, no more and no less.
+    assert_eq!(place.post_bytes("mask", &[0; 60_000]).status, 200);
+    assert_eq!(place.post_bytes("mask", &[0; 60_001]).status, 413);
+    assert_eq!(place.post_bytes("mask", &[0; 59_999]).status, 422);
+}
+
+#[test]
+fn saving_keeps_comments_and_order() {
+    let place = Running::new();
+    let mut edit = moved_to(200.0, 120.0);
+    edit["turn"] = json!({"pitch_deg": -12.5, "roll_deg": 0.0, "fov_deg": 45.0});
+    edit["exposure_ev"] = json!(0.5);
+    let saved = place.post("save", &edit).json();
+    assert_eq!(saved["written"].as_array().unwrap().len(), 1);
+    let text = fs::read_to_string(place.file("pipeline.toml")).unwrap();
+    let expected = TEXT
+        .replace("[150.0, 150.0] #", "[200.0, 120.0] #")
+        .replace("pitch_deg = -10.0 #", "pitch_deg = -12.5 #")
+        .replace("fov_deg = 50.0\n", "fov_deg = 45.0\nroll_deg = 0.0\n")
+        + "\n[composite]\nexposure_ev = 0.5\n";
+    assert_eq!(text, expected);
+    // Nothing but the file is left in the folder.
+    assert_eq!(fs::read_dir(place.folder.path()).unwrap().count(), 3);
+}
+
+#[test]
+fn what_cannot_be_is_not_saved() {
+    let place = Running::new();
+    for edit in [
+        moved_to(150.0, 10.0),
+        moved_to(1e300, 10.0),
+        json!({"objects": []}),
+        json!({"objects": [{"of": 7}]}),
+        json!({"objects": [{"of": 0, "size": -1.0}]}),
+        json!({"objects": [{"of": 0}], "unknown": 1}),
+    ] {
+        assert_eq!(place.post("save", &edit).status, 422, "{edit}");
+    }
+    // Another program's changes are not written over.
+    let other = TEXT.replace("mine", "yours");
+    fs::write(place.file("pipeline.toml"), &other).unwrap();
+    let answer = place.post("save", &moved_to(200.0, 150.0));
+    assert_eq!(answer.status, 422);
+    assert!(String::from_utf8_lossy(&answer.body).contains("another program"));
+    assert_eq!(
+        fs::read_to_string(place.file("pipeline.toml")).unwrap(),
+        other
+    );
+}
+
+#[test]
+fn a_mask_replaces_no_file_of_anothers() {
+    let place = Running::new();
+    assert_eq!(place.post_bytes("mask", &[255; 60_000]).status, 200);
+    let edit = json!({"objects": [{"of": 0}], "mask": true});
+    fs::write(place.file("holdout.png"), "mine").unwrap();
+    assert_eq!(place.post("save", &edit).status, 422);
+    assert_eq!(
+        fs::read_to_string(place.file("holdout.png")).unwrap(),
+        "mine"
+    );
+    assert_eq!(
+        fs::read_to_string(place.file("pipeline.toml")).unwrap(),
+        TEXT
+    );
+    fs::remove_file(place.file("holdout.png")).unwrap();
+    place.post("save", &edit).json();
+    place.post("save", &edit).json();
+    let text = fs::read_to_string(place.file("pipeline.toml")).unwrap();
+    assert!(text.contains("occluders = \"holdout.png\""), "{text}");
+    let mask = dipir_imaging::file::read_mask(place.file("holdout.png")).unwrap();
+    assert!(mask.pixels().iter().all(|&v| v == 1.0));
+    // All is hidden: the objects change nothing.
+    let hidden = place.post(
+        "draft",
+        &json!({"edit": {"objects": [{"of": 0}]}, "samples": 1}),
+    );
+    assert_eq!(hidden.status, 204);
+}
+
+#[test]
+fn the_draft_shows_the_object_where_the_projection_says() {
+    let place = Running::new();
+    let mut edit = moved_to(190.0, 140.0);
+    // Brighter than the photograph, whatever the box is made of.
+    edit["exposure_ev"] = json!(2.0);
+    let view = place
+        .post("view", &json!({"edit": edit, "grid": true}))
+        .json();
+    let object = &view["objects"][0];
+    let contact = |k: usize| object["contact"][k].as_f64().unwrap();
+    // Written to a tenth of a pixel.
+    assert!(
+        (contact(0) - 190.0).abs() < 0.1 && (contact(1) - 140.0).abs() < 0.1,
+        "{object}"
+    );
+    assert!(!view["grid"].as_array().unwrap().is_empty());
+    let draft = place.post("draft", &json!({"edit": edit, "samples": 4}));
+    assert_eq!(draft.status, 200);
+    assert!(draft.body.starts_with(b"\x89PNG"));
+    let about: Value = serde_json::from_str(draft.header("X-Draft").unwrap()).unwrap();
+    let shown: Vec<f64> = serde_json::from_value(about["place"].clone()).unwrap();
+    let lines = object["lines"].as_array().unwrap().iter();
+    let lines: Vec<Vec<f64>> = lines
+        .filter(|l| l[0] == 3)
+        .map(|l| serde_json::from_value(l.clone()).unwrap())
+        .collect();
+    let least = |k: usize| {
+        lines
+            .iter()
+            .flat_map(|l| [l[k], l[k + 2]])
+            .fold(f64::MAX, f64::min)
+    };
+    let most = |k: usize| {
+        lines
+            .iter()
+            .flat_map(|l| [l[k], l[k + 2]])
+            .fold(f64::MIN, f64::max)
+    };
+    // The top of the box is the top of what changed, to a pixel and its rounding; its shadow reaches
+    // beyond the box elsewhere.
+    assert!((shown[1] - least(2)).abs() <= 2.0, "{shown:?} {}", least(2));
+    assert!(
+        shown[0] <= least(1) + 2.0 && shown[2] >= most(1) - 2.0,
+        "{shown:?}"
+    );
+    assert!(shown[3] >= most(2) - 2.0, "{shown:?}");
+}
+
+#[test]
+fn a_known_length_lifts_the_camera_and_lines_turn_it() {
+    let place = Running::new();
+    let edit = json!({"objects": [{"of": 0}]});
+    let ends = [[100.0, 160.0], [200.0, 160.0]];
+    let body = |length: f64| json!({"edit": edit, "ends": ends, "length_m": length});
+    let height = |length| {
+        place.post("measure", &body(length)).json()["height_m"]
+            .as_f64()
+            .unwrap()
+    };
+    assert!((height(2.0) / height(1.0) - 2.0).abs() < 1e-9);
+    let lifted = json!({"objects": [{"of": 0}], "height_m": height(1.0)});
+    let again = json!({"edit": lifted, "ends": ends, "length_m": 1.0});
+    let same = place.post("measure", &again).json()["height_m"]
+        .as_f64()
+        .unwrap();
+    // The position is written to a hundredth of a millimetre.
+    assert!((same - height(1.0)).abs() < 1e-4, "{same} {}", height(1.0));
+    // Kerbs that meet in the middle of row 100, the picture's: a level view.
+    let lines = json!({"first": [[[0.0, 200.0], [75.0, 150.0]], [[300.0, 200.0], [225.0, 150.0]]]});
+    let found = place
+        .post("solve", &json!({"edit": edit, "lines": lines}))
+        .json();
+    assert!(
+        found["turn"]["pitch_deg"].as_f64().unwrap().abs() < 1e-3,
+        "{found}"
+    );
+    assert_eq!(found["found_fov"], false);
+}

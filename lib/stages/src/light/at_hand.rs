@@ -1,0 +1,166 @@
+//! The light that is known without running a stage, for previews.
+use std::sync::Arc;
+
+use dipir_cli::session::Session;
+use dipir_imaging::tone::ToneCurves;
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::gaussian::{SgMixture, SphericalGaussian};
+use dipir_optimize::lighting::Lighting;
+use dipir_optimize::parameters::{Parameters, ambient_of};
+use dipir_optimize::settings::{LightTable, Start};
+use dipir_pipeline::status::State;
+use dipir_scene::scene::LoadedScene;
+
+use crate::composite::table::{CompositeTable, Tone};
+use crate::light::estimate::{distribution, estimate};
+use crate::light::folder::{self, Recovered};
+use crate::light::request::first_light;
+use crate::light::surroundings::surroundings;
+use crate::names::{LIGHT, SCENE};
+use crate::scene::{folder as scene_folder, transport};
+use crate::{graph, known_light};
+
+/// Where a light comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// The map of `[composite] environment`.
+    Map,
+    /// What the light stage left, which is up to date.
+    Stage,
+    /// The file of `[light] start`.
+    File,
+    /// The estimate of the photograph.
+    Estimate,
+    /// The same light from everywhere.
+    Neutral,
+}
+
+impl Origin {
+    /// In words.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::Map => "the map of [composite] environment",
+            Self::Stage => "as the light stage left it",
+            Self::File => "the file of [light] start",
+            Self::Estimate => "estimated from the photograph",
+            Self::Neutral => "neutral",
+        }
+    }
+}
+
+/// A light, exposed and turned as `[composite]` says.
+#[derive(Clone, Debug)]
+pub struct AtHand {
+    /// Lobes; with a map those that the map lacks.
+    pub lobes: SgMixture,
+    /// The rest of the light, or all of it.
+    pub map: Option<Arc<EnvironmentMap>>,
+    /// The curves of object and shadow, if there are any.
+    pub tone: Option<ToneCurves>,
+    /// Where it comes from.
+    pub origin: Origin,
+}
+
+/// The light of `loaded`, whose photograph and camera may be scaled: the map of `[composite]`, else
+/// what the light stage left if that is up to date, else the light of `[light] start`, by default the
+/// estimate of the photograph.
+///
+/// # Errors
+/// On tables and files that cannot be used.
+pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand> {
+    let composite: CompositeTable = session.config.table("composite")?;
+    composite.check(&session.config)?;
+    if let Some(light) = known_light::known(session, &composite)? {
+        return Ok(AtHand {
+            lobes: SgMixture::new(Vec::new())?,
+            map: Some(light.map),
+            tone: match composite.tone {
+                Some(Tone::Reinhard) => Some(ToneCurves::identity()),
+                Some(Tone::None) | None => None,
+            },
+            origin: Origin::Map,
+        });
+    }
+    let (light, origin) = match is_fresh(session) {
+        true => {
+            let scene = scene_folder::manifest(session)?;
+            (
+                folder::recovered(session, &composite, &scene)?,
+                Origin::Stage,
+            )
+        }
+        false => start(session, &composite, loaded)?,
+    };
+    Ok(AtHand {
+        lobes: light.lobes,
+        map: light.surroundings.map(Arc::new),
+        tone: match composite.tone {
+            Some(Tone::None) => None,
+            Some(Tone::Reinhard) => Some(ToneCurves::identity()),
+            None => Some(light.tone),
+        },
+        origin,
+    })
+}
+
+/// Whether what the scene and light stages left is up to date.
+fn is_fresh(session: &Session) -> bool {
+    let fresh = || {
+        let graph = graph::graph(session).ok()?;
+        let states = graph::assess(session, &graph, &graph.up_to(LIGHT.name)).ok()?;
+        let of = |stage: &str| states.iter().find(|s| s.stage == stage);
+        let both = [of(SCENE.name)?, of(LIGHT.name)?];
+        Some(both.iter().all(|s| s.state == State::Fresh))
+    };
+    fresh() == Some(true)
+}
+
+/// The light from which the light stage would start.
+fn start(
+    session: &Session,
+    composite: &CompositeTable,
+    loaded: &LoadedScene,
+) -> anyhow::Result<(Recovered, Origin)> {
+    let table: LightTable = session.config.table("light")?;
+    let (lobes, map, origin) = match &table.start {
+        Start::File(_) => {
+            let light = first_light(session, &table)?;
+            let lobes = light.as_ref().map(Lighting::exposed_lobes);
+            (lobes.unwrap_or_default(), None, Origin::File)
+        }
+        Start::Neutral => {
+            let settings = transport::settings(session, &table)?;
+            let ambient = ambient_of(&loaded.photo.image);
+            let neutral = Parameters::neutral(settings.lobes, ambient);
+            (neutral.foreground_lobes(), None, Origin::Neutral)
+        }
+        _ => {
+            let (lobes, smooth) = estimated(session, &table, loaded)?;
+            let visible = table.visible.unwrap_or(true);
+            let map = surroundings(loaded, &smooth, visible);
+            (lobes, Some(map), Origin::Estimate)
+        }
+    };
+    let tone = ToneCurves::identity();
+    let light = folder::exposed(session, composite, lobes, map, tone)?;
+    Ok((light, origin))
+}
+
+/// The sources of the estimated light, and the rest of it. Unlike the stage's, without fitting lobes
+/// to the rest, which takes most of its time.
+fn estimated(
+    session: &Session,
+    table: &LightTable,
+    loaded: &LoadedScene,
+) -> anyhow::Result<(Vec<SphericalGaussian>, EnvironmentMap)> {
+    if table.candidate.is_some() {
+        let mut found = estimate(session, table, loaded, 1)?;
+        found.lobes.truncate(found.sources);
+        return Ok((found.lobes, found.smooth));
+    }
+    let estimate = distribution(session, table, loaded)?;
+    Ok(match estimate.source_lobe() {
+        Some(source) => (vec![source], estimate.base_map()),
+        None => (Vec::new(), estimate.map()),
+    })
+}
