@@ -240,7 +240,7 @@ mod tests {
     #[test]
     fn a_tiny_object_is_warned_of_once() {
         // Below a pixel `visibility::hidden` warns of each object; above, its height or its pixels are told.
-        for (scale, warnings) in [(1e-7, 0), (1e-3, 0), (0.018, 1), (0.03, 1)] {
+        for (scale, warnings) in [(1e-7, 0), (1e-3, 0), (0.04, 1), (0.06, 1)] {
             let mut scene = scene();
             for p in &mut scene.mesh.positions {
                 *p = *p * scale + Vec3::new(0.3, 0.0, 0.0);
