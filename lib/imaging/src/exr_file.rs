@@ -126,7 +126,7 @@ impl SamplesWriter for Rows<'_> {
 }
 
 /// Opens `path` and reads as [`read`], after a look at its first bytes.
-pub(crate) fn open(path: &Path, names: Option<&[&str]>) -> Result<Layers, ImagingError> {
+pub(crate) fn open(path: &Path) -> Result<Layers, ImagingError> {
     let failed = |e| ImagingError::io("read", path, e);
     let file = dipir_files::open(path).map_err(failed)?;
     let length = file.metadata().map_err(failed)?.len();
@@ -139,7 +139,7 @@ pub(crate) fn open(path: &Path, names: Option<&[&str]>) -> Result<Layers, Imagin
         });
     }
     match Format::of(&start[..start.len().min(Format::SNIFF_LENGTH)]) {
-        Format::Exr => read(reader, length, path, names, SizeLimit::Any),
+        Format::Exr => read(reader, length, path, None, SizeLimit::Any),
         other => Err(other.refuse(path, EXPECTED)),
     }
 }

@@ -32,6 +32,7 @@ use crate::light::materials;
 use crate::names::COMPOSITE;
 use crate::presets::Outlook;
 use crate::scene::folder::{self as scene_folder, SceneFolder};
+use crate::written;
 use table::{CompositeTable, MAX_SAMPLES, Tone};
 
 /// When to stop, from the command line.
@@ -124,7 +125,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     write_picture(png, &picture, &inputs.scene.loaded.photo)?;
     let in_picture = Precision::of_colour(&picture.0);
     drop(picture);
-    let gbuffer = Layers::read_exr_channels(&inputs.gbuffer, &GEOMETRY)?;
+    let gbuffer = Layers::read_exr(&inputs.gbuffer)?;
     let exr = writer.output("layers", "composite.exr")?;
     layers.to_rows(in_picture, &gbuffer)?.write_exr(exr)?;
     writer.set_estimated_error(rendered.error.upper_95);
@@ -423,15 +424,10 @@ impl Done {
 
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(
-            f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
+        written(f, &self.folder, &self.manifest)?;
         write!(
             f,
-            "  estimated error {:.5} (display-referred RMSE, 95% bound), {:.1} million rays",
+            "\n  estimated error {:.5} (display-referred RMSE, 95% bound), {:.1} million rays",
             self.error,
             self.rays as f64 * 1e-6
         )?;
