@@ -101,6 +101,7 @@ fn find(args: &CleanArgs, out: &Path, stages: &[&'static str]) -> anyhow::Result
             stage,
         )?;
         let hashes = hashes_file(out, stage);
+        found.files.extend(Hashes::left_of_writing(&hashes));
         if Hashes::are_in(&hashes) {
             found.files.push(hashes);
         }
@@ -108,8 +109,13 @@ fn find(args: &CleanArgs, out: &Path, stages: &[&'static str]) -> anyhow::Result
     let page = out.join(report::FILE);
     // What is not a regular file is none of ours.
     let is_ours = dipir_files::begins_with(&page, report::MARK).unwrap_or(false);
-    if args.stages.is_empty() && is_ours {
-        found.files.push(page);
+    if args.stages.is_empty() {
+        found
+            .files
+            .extend(dipir_files::left_of_replacing(&page, report::MARK));
+        if is_ours {
+            found.files.push(page);
+        }
     }
     if args.cache {
         found.add_folders_in(&out.join("concepts-cache"), Kind::Cache, CONCEPTS.name)?;

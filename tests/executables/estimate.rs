@@ -96,6 +96,30 @@ fn candidates_are_chosen_by_number_and_one_that_is_not_there_is_refused() {
 }
 
 #[test]
+fn what_only_an_estimate_uses_is_refused_where_nothing_is_estimated() {
+    let project = project();
+    project.run(SCENE, &[]).expect_success();
+    let sun = "light.sun={azimuth_deg = 60.0, elevation_deg = 40.0}";
+    let shadow = "light.shadow={foot = [4.0, 6.0], tip = [6.0, 5.0], height_m = 1.0}";
+    for (start, set, key) in [
+        ("light.start=neutral", sun, "light.sun"),
+        ("light.start=mine.json", shadow, "light.shadow"),
+        (
+            "light.start=encoder",
+            "light.candidate=2",
+            "light.candidate",
+        ),
+    ] {
+        let run = project.run(OPTIMIZE, &["-s", start, "-s", set]);
+        assert_eq!(run.code, Some(2), "{key}: {}", run.stderr);
+        for part in [key, "remove it, or set light.start = \"estimated\""] {
+            assert!(run.stderr.contains(part), "{key}: {}", run.stderr);
+        }
+        assert!(!project.path("out/light").exists(), "{key}");
+    }
+}
+
+#[test]
 fn what_the_photograph_shows_is_in_the_map_unless_it_is_turned_off() {
     let project = project();
     lit(&project, &[]);

@@ -209,6 +209,29 @@ fn clean_removes_what_stages_wrote_and_nothing_else() {
 }
 
 #[test]
+fn what_a_kill_in_the_middle_of_replacing_left_goes_with_the_next_run_or_clean() {
+    let project = Project::new();
+    let page = "<!doctype html>\n<html lang=\"en\">";
+    let leave = || {
+        project.write("out/.report.html.partial", "");
+        project.write("out/..scene.hashes.partial", "{\"dipir_hashes\":1,");
+        project.write("out/..light.hashes.partial", page);
+    };
+    std::fs::create_dir(project.path("out")).unwrap();
+    leave();
+    project.run(DIPIR, &["run", "-q"]).expect_success();
+    for gone in [".report.html.partial", "..scene.hashes.partial"] {
+        assert!(!project.path("out").join(gone).exists(), "{gone}");
+    }
+    leave();
+    project.run(DIPIR, &["clean"]).expect_success();
+    // Another's file of such a name is kept; no lock is left.
+    assert_eq!(project.names("out"), ["..light.hashes.partial"]);
+    project.run(DIPIR, &["clean"]).expect_success();
+    assert_eq!(project.names("out"), ["..light.hashes.partial"]);
+}
+
+#[test]
 fn clean_says_what_it_removes_and_leaves_what_others_put_there() {
     let project = whole::project();
     project.write("pipeline.toml", {

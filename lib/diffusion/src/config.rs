@@ -65,7 +65,8 @@ impl ConfigFile {
             ),
             other => other.clone(),
         };
-        serde_json::from_value(present).map_err(|e| self.error(e.to_string()))
+        serde_path_to_error::deserialize(present)
+            .map_err(|e| self.error(format!("{}: {}", e.path(), e.inner())))
     }
 
     /// Refuses `key` unless it is absent, null or one of `accepted`.

@@ -6,6 +6,7 @@ pub mod config;
 pub mod crop;
 pub mod distillation;
 pub mod error;
+pub mod extent;
 pub mod generate;
 mod kernels;
 pub mod layers;

@@ -14,6 +14,10 @@ use crate::unet::{UNet, UNetConfig};
 use crate::vae::Vae;
 use crate::weights::Weights;
 
+/// Longest side of the images that a model is trained on, pixels: four times that of the largest published ones. The
+/// memory of attention grows with its fourth power.
+const MAX_SIDE: usize = 4096;
+
 /// Text encoder, UNet and autoencoder with their tokenizer and schedule.
 #[derive(Debug)]
 pub struct Model {
@@ -50,11 +54,12 @@ impl Model {
                 "precision {dtype:?} on the CPU: accepted is f32; half-precision files are converted while reading"
             ));
         }
+        // What is small comes first: its errors cost nothing.
+        let schedule = NoiseSchedule::load(&folder.join("scheduler"))?;
         let mut tokenizer = Tokenizer::load(&folder.join("tokenizer"))?;
         let text_encoder = TextEncoder::load(&folder.join("text_encoder"), dtype, device)?;
         let unet = load_unet(&folder.join("unet"), dtype, device)?;
         let vae = Vae::load(&folder.join("vae"), dtype, device)?;
-        let schedule = NoiseSchedule::load(&folder.join("scheduler"))?;
         tokenizer.limit_length(text_encoder.config().max_position_embeddings);
         let model = Self {
             folder: folder.to_owned(),
@@ -82,6 +87,14 @@ impl Model {
             return fail(format!(
                 "unet has cross_attention_dim {}, text_encoder has hidden_size {}",
                 unet.cross_attention_dim, text.hidden_size
+            ));
+        }
+        let (size, downscale) = (unet.sample_size, self.vae.downscale());
+        if size * downscale > MAX_SIDE {
+            return fail(format!(
+                "unet has sample_size {size}, and vae makes {downscale} pixels of each latent one: images of {} \
+                 pixels a side; accepted: up to {MAX_SIDE}",
+                size * downscale
             ));
         }
         let latent = self.vae.latent_channels();
@@ -134,8 +147,10 @@ impl Model {
 
 /// Loads the folder `unet/` of a model with frozen weights.
 pub fn load_unet(folder: &Path, dtype: DType, device: &Device) -> Result<UNet> {
-    let config = UNetConfig::from_file(&ConfigFile::read(&folder.join("config.json"))?)?;
+    let file = ConfigFile::read(&folder.join("config.json"))?;
+    let config = UNetConfig::from_file(&file)?;
     let weights = Weights::open(folder, "diffusion_pytorch_model")?;
+    config.fits(&weights.extent()).map_err(|m| file.error(m))?;
     UNet::new(
         config,
         Parameters::from_weights(weights, dtype, device, false),

@@ -96,6 +96,9 @@ impl Default for ScheduleConfig {
     }
 }
 
+/// Most timesteps of a training: a hundred times those of published models.
+const MAX_TIMESTEPS: usize = 100_000;
+
 /// Stands for "no signal" where a division by it follows, as diffusers has it.
 pub(crate) const ALMOST_NO_SIGNAL: f64 = 5.960_464_477_539_063e-8; // 2^-24
 
@@ -284,8 +287,16 @@ impl NoiseSchedule {
 
 fn betas(config: &ScheduleConfig) -> Result<Vec<f64>> {
     let n = config.num_train_timesteps;
-    if n == 0 {
-        return argument("num_train_timesteps must be at least 1");
+    if !(1..=MAX_TIMESTEPS).contains(&n) {
+        return argument(format!(
+            "num_train_timesteps = {n}; accepted: 1 to {MAX_TIMESTEPS}"
+        ));
+    }
+    if config.steps_offset > n {
+        return argument(format!(
+            "steps_offset = {}; accepted: up to num_train_timesteps = {n}",
+            config.steps_offset
+        ));
     }
     let (start, end) = (config.beta_start, config.beta_end);
     let between = |a: f64, b: f64, i: usize| {

@@ -9,6 +9,7 @@ use serde_json::json;
 
 use crate::config::ConfigFile;
 use crate::error::{Error, Result, argument};
+use crate::extent::Extent;
 use crate::layers::{Activation, Attention, Causality, Embedding, LayerNorm, Linear, activate};
 use crate::parameters::{Init, Parameters};
 use crate::weights::Weights;
@@ -59,6 +60,20 @@ impl TextEncoderConfig {
         let config: Self = file.parse()?;
         config.check().map_err(|message| file.error(message))?;
         Ok(config)
+    }
+
+    /// Checks the sizes against the weights.
+    fn fits(&self, extent: &Extent) -> Result<(), String> {
+        extent.layers("num_hidden_layers", self.num_hidden_layers)?;
+        for (key, value) in [
+            ("vocab_size", self.vocab_size),
+            ("hidden_size", self.hidden_size),
+            ("intermediate_size", self.intermediate_size),
+            ("max_position_embeddings", self.max_position_embeddings),
+        ] {
+            extent.width(key, value)?;
+        }
+        Ok(())
     }
 
     fn check(&self) -> Result<Activation, String> {
@@ -165,8 +180,10 @@ impl TextEncoder {
     /// Loads the folder `text_encoder/` of a model, whose tensors may have
     /// the prefix `text_model.` or not.
     pub fn load(folder: &Path, dtype: DType, device: &Device) -> Result<Self> {
-        let config = TextEncoderConfig::from_file(&ConfigFile::read(&folder.join("config.json"))?)?;
+        let file = ConfigFile::read(&folder.join("config.json"))?;
+        let config = TextEncoderConfig::from_file(&file)?;
         let weights = Weights::open(folder, "model")?;
+        config.fits(&weights.extent()).map_err(|m| file.error(m))?;
         Self::new(
             config,
             Parameters::from_weights(weights, dtype, device, false),

@@ -10,6 +10,7 @@ use safetensors::tensor::{Dtype, SafeTensors};
 use serde::Deserialize;
 
 use crate::error::{Error, Result, io};
+use crate::extent::Extent;
 
 /// Where one tensor lies.
 #[derive(Debug, Clone)]
@@ -162,6 +163,15 @@ impl Weights {
     /// The file or index that was opened.
     pub fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// How large a network these weights allow.
+    pub fn extent(&self) -> Extent {
+        let axes = self.entries.values().flat_map(|entry| &entry.shape);
+        Extent {
+            tensors: self.entries.len(),
+            axis: axes.copied().max().unwrap_or(0),
+        }
     }
 
     /// Names in byte order.

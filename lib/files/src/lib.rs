@@ -9,7 +9,7 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
 
-pub use own::{beginning, begins_with, open_own, replace, sync_folder};
+pub use own::{beginning, begins_with, left_of_replacing, open_own, replace, sync_folder};
 
 /// Opens a regular file for reading. Symbolic links are followed.
 ///

@@ -66,6 +66,15 @@ pub fn replace(path: &Path, content: &[u8], mark: &[u8]) -> io::Result<()> {
     }
 }
 
+/// What a killed [`replace`] of `path` left beside it: `.NAME.partial`, if it begins with `mark` or with a part of
+/// that.
+pub fn left_of_replacing(path: &Path, mark: &[u8]) -> Option<PathBuf> {
+    let partial = partial_of(path);
+    // What is not a regular file is none of ours.
+    let left = beginning(&partial, mark.len()).ok()??;
+    mark.starts_with(&left).then_some(partial)
+}
+
 /// Flushes the names in a folder to the disk, where the file system can.
 pub fn sync_folder(folder: &Path) -> io::Result<()> {
     if cfg!(not(unix)) {
@@ -171,11 +180,13 @@ mod tests {
         );
         for left in [&b""[..], &MARK[..4], MARK] {
             fs::write(&partial, left).unwrap();
+            assert_eq!(left_of_replacing(&path, MARK), Some(partial.clone()));
             replace(&path, &content("x"), MARK).unwrap();
             assert!(!partial.exists());
         }
         fs::write(&partial, "mine").unwrap();
         replace(&path, &content("y"), MARK).unwrap_err();
+        assert_eq!(left_of_replacing(&path, MARK), None);
         assert_eq!(fs::read(&partial).unwrap(), b"mine");
         assert_eq!(fs::read(&path).unwrap(), content("x"));
     }

@@ -3,30 +3,35 @@ use crate::{
     decode::SizeLimit,
     error::ImagingError,
     format::Format,
+    layer_rows::{LayerRows, RowChannel},
     layers::{Layers, Precision},
     raster::Raster,
 };
 use exr::{
-    block::{chunk::TileCoordinates, lines::LineRef},
+    block::{
+        chunk::TileCoordinates,
+        lines::{LineRef, LineRefMut},
+    },
     image::{
         read::{
             any_channels::{ReadAnyChannels, ReadSamples, SamplesReader},
             layers::ReadChannels,
         },
-        write::WritableImage,
+        write::{
+            WritableImage,
+            samples::{SamplesWriter, WritableSamples},
+        },
     },
-    math::Vec2,
+    math::{RoundingMode, Vec2},
     meta::{
-        attribute::{AttributeValue, ChannelDescription, EnvironmentMap, SampleType, Text},
+        attribute::{
+            AttributeValue, ChannelDescription, EnvironmentMap, LevelMode, SampleType, Text,
+        },
         header::{Header, LayerAttributes},
     },
-    prelude::{
-        AnyChannel, AnyChannels, Compression, Encoding, FlatSamples, Image, Layer, ReadLayers,
-        SmallVec,
-    },
+    prelude::{AnyChannel, AnyChannels, Compression, Encoding, Image, Layer, ReadLayers},
 };
 use half::{f16, slice::HalfFloatSliceExt};
-use rayon::prelude::*;
 use std::{
     cell::Cell,
     fs::File,
@@ -39,25 +44,18 @@ use std::{
 const FORMAT: &str = "OpenEXR";
 const EXPECTED: &str = "an OpenEXR image";
 
-/// Writes all channels as one part of scan lines, ZIP1.
-pub(crate) fn write(layers: &Layers, path: &Path) -> Result<(), ImagingError> {
+/// Writes all channels as one part of scan lines, ZIP1. Rows are asked for when they are due.
+pub(crate) fn write(layers: &LayerRows, path: &Path) -> Result<(), ImagingError> {
     // Names were checked when they were inserted: they fit the format's one byte a character.
-    let named: Vec<_> = layers.channels().collect();
-    let channels: Vec<AnyChannel<FlatSamples>> = named
-        .par_iter()
-        .map(|(name, channel)| {
-            let samples = match channel.precision {
-                Precision::Half => half_samples(channel.samples.pixels()),
-                Precision::Full => FlatSamples::F32(channel.samples.pixels().to_vec()),
-            };
-            AnyChannel::new(Text::new_or_panic(name), samples)
-        })
-        .collect();
+    let channels = layers
+        .channels
+        .iter()
+        .map(|(name, channel)| AnyChannel::new(Text::new_or_panic(name), Rows(channel)));
     let mut attributes = LayerAttributes::default();
     if layers.latlong {
         attributes.environment_map = Some(EnvironmentMap::LatitudeLongitude);
     }
-    for (name, value) in layers.attributes() {
+    for (name, value) in &layers.attributes {
         // Checked when they were set.
         attributes.other.insert(
             Text::new_or_panic(name),
@@ -69,14 +67,15 @@ pub(crate) fn write(layers: &Layers, path: &Path) -> Result<(), ImagingError> {
         ..Encoding::SMALL_LOSSLESS
     };
     let layer = Layer::new(
-        (layers.width(), layers.height()),
+        (layers.width, layers.height),
         attributes,
         encoding,
-        AnyChannels::sort(SmallVec::from_vec(channels)),
+        AnyChannels::sort(channels.collect()),
     );
     let file = File::create(path).map_err(|e| ImagingError::io("create", path, e))?;
     let mut writer = BufWriter::with_capacity(1 << 20, file);
-    Image::from_layer(layer)
+    let image = Image::from_layer(layer);
+    image
         .write()
         .to_buffered(&mut writer)
         .map_err(|error| write_error(path, error))?;
@@ -85,14 +84,45 @@ pub(crate) fn write(layers: &Layers, path: &Path) -> Result<(), ImagingError> {
         .map_err(|e| ImagingError::io("write", path, e))
 }
 
-/// Half floats, unless a finite value would overflow to infinity.
-fn half_samples(values: &[f32]) -> FlatSamples {
-    if Precision::half_if_it_fits(values.iter().copied()) == Precision::Full {
-        return FlatSamples::F32(values.to_vec());
+/// A channel whose samples are computed row by row.
+#[derive(Clone, Copy)]
+struct Rows<'a>(&'a RowChannel<'a>);
+
+impl<'s, 'a: 's> WritableSamples<'s> for Rows<'a> {
+    type Writer = Self;
+
+    fn sample_type(&self) -> SampleType {
+        match self.0.precision {
+            Precision::Half => SampleType::F16,
+            Precision::Full => SampleType::F32,
+        }
     }
-    let mut halves = vec![f16::ZERO; values.len()];
-    halves.convert_from_f32_slice(values);
-    FlatSamples::F16(halves)
+
+    fn infer_level_modes(&self) -> (LevelMode, RoundingMode) {
+        (LevelMode::Singular, RoundingMode::Down)
+    }
+
+    fn create_samples_writer(&'s self, _: &Header) -> Self {
+        *self
+    }
+}
+
+impl SamplesWriter for Rows<'_> {
+    fn extract_line(&self, line: LineRefMut<'_>) {
+        // Scan lines: a line is a whole row.
+        let mut row = vec![0.0; line.location.sample_count];
+        (self.0.fill)(line.location.position.1, &mut row);
+        let written = match self.0.precision {
+            Precision::Full => line.write_samples_from_slice(&row),
+            Precision::Half => {
+                let mut halves = vec![f16::ZERO; row.len()];
+                halves.convert_from_f32_slice(&row);
+                line.write_samples_from_slice(&halves)
+            }
+        };
+        // The line is memory of the length that was asked for.
+        written.expect("a row has the samples of a line");
+    }
 }
 
 /// Opens `path` and reads as [`read`], after a look at its first bytes.

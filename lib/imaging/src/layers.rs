@@ -1,9 +1,5 @@
 //! Images of named channels, as compositing programs exchange them: OpenEXR files.
-use crate::{
-    error::{ImagingError, MAX_PIXELS},
-    exr_file,
-    raster::Raster,
-};
+use crate::{error::ImagingError, exr_file, layer_rows::LayerRows, raster::Raster};
 use glam::Vec3;
 use half::f16;
 use std::{
@@ -256,15 +252,7 @@ impl Layers {
 
     /// Writes an OpenEXR file: one part, scan lines, ZIP1. Replaces an existing file.
     pub fn write_exr(&self, path: impl AsRef<Path>) -> Result<(), ImagingError> {
-        let path = path.as_ref();
-        if self.width == 0 || self.height == 0 || self.width * self.height > MAX_PIXELS {
-            return Err(ImagingError::BadSize {
-                what: format!("the image for `{}`", path.display()),
-                width: self.width,
-                height: self.height,
-            });
-        }
-        exr_file::write(self, path)
+        LayerRows::of(self).write_exr(path)
     }
 
     /// Reads all channels of an OpenEXR file.
@@ -321,7 +309,7 @@ fn channel_name(layer: &str, suffix: &str) -> String {
     }
 }
 
-fn check_name(name: &str) -> Result<(), ImagingError> {
+pub(crate) fn check_name(name: &str) -> Result<(), ImagingError> {
     let reason = if name.is_empty() {
         "is empty"
     } else if name.len() > 255 {

@@ -9,6 +9,7 @@ pub mod file;
 mod format;
 mod hdr_file;
 mod jpeg_header;
+pub mod layer_rows;
 pub mod layers;
 pub mod metrics;
 mod png_file;

@@ -2,6 +2,7 @@
 use dipir_imaging::{
     ImagingError,
     composite::composite,
+    layer_rows::LayerRows,
     layers::{Layers, Precision},
     raster::{LinearImage, Raster},
 };
@@ -72,6 +73,43 @@ fn the_file_declares_latlong_zip1_and_each_channels_type() {
         .collect();
     assert!(types.contains(&("depth.Z".to_string(), exr::prelude::SampleType::F32)));
     assert!(types.contains(&("shadow.G".to_string(), exr::prelude::SampleType::F16)));
+}
+
+#[test]
+fn rows_that_are_computed_give_the_bytes_of_layers_in_memory() {
+    let folder = tempfile::tempdir().unwrap();
+    let (width, height) = (37, 11);
+    let colour = |i: usize| Vec3::new(i as f32 * 0.1, 1.0 / (1.0 + i as f32), -3.0);
+    // One channel of three is beyond half precision and is stored in full.
+    let bright = |i: usize| Vec3::new(1.0, if i == 200 { 1e6 } else { 0.5 }, 2.0);
+    let raster = |f: &dyn Fn(usize) -> Vec3| {
+        Raster::from_pixels(width, height, (0..width * height).map(f).collect())
+    };
+    let mut layers = Layers::new(width, height);
+    let half = Precision::Half;
+    layers.insert_rgb("", half, &raster(&colour)).unwrap();
+    layers.insert_rgb("sun", half, &raster(&bright)).unwrap();
+    layers
+        .insert("A", half, Raster::filled(width, height, 1.0))
+        .unwrap();
+    layers
+        .insert("depth.Z", Precision::Full, ramp(width, height))
+        .unwrap();
+    let depth = ramp(width, height);
+    let mut rows = LayerRows::new(width, height);
+    rows.insert_pixels(["R", "G", "B"], half, colour).unwrap();
+    rows.insert_pixels(["sun.R", "sun.G", "sun.B"], half, bright)
+        .unwrap();
+    rows.insert_constant("A", half, 1.0).unwrap();
+    rows.insert("depth.Z", Precision::Full, &depth).unwrap();
+    let [one, other] = ["one.exr", "other.exr"].map(|name| folder.path().join(name));
+    layers.write_exr(&one).unwrap();
+    rows.write_exr(&other).unwrap();
+    assert!(std::fs::read(&one).unwrap() == std::fs::read(&other).unwrap());
+    assert_eq!(
+        Layers::read_exr(&other).unwrap().rgb("sun").unwrap(),
+        raster(&bright)
+    );
 }
 
 #[test]

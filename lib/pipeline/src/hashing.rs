@@ -150,6 +150,11 @@ impl Hashes {
     pub fn are_in(path: &Path) -> bool {
         dipir_files::begins_with(path, HEAD).unwrap_or(false)
     }
+
+    /// What a killed [`write`](Self::write) to `path` left beside it.
+    pub fn left_of_writing(path: &Path) -> Option<PathBuf> {
+        dipir_files::left_of_replacing(path, HEAD)
+    }
 }
 
 /// Length and BLAKE3 hash of a regular file. One that was hashed before and has not changed since

@@ -1,6 +1,7 @@
 //! Depth, normal, albedo and coverage of every pixel.
 use dipir_imaging::error::ImagingError;
-use dipir_imaging::layers::{Layers, Precision};
+use dipir_imaging::layer_rows::LayerRows;
+use dipir_imaging::layers::Precision;
 use dipir_imaging::raster::Raster;
 use dipir_numerics::sampler::{Sampler, Stream};
 use glam::{Vec2, Vec3};
@@ -28,7 +29,9 @@ pub struct GBuffer {
     pub proxy_alpha: Raster<f32>,
 }
 
-/// Samples per pixel: coverage in steps of a sixteenth.
+/// Samples per pixel: coverage in steps of a sixteenth. Fewer where rays are slow ([`affordable_share`]).
+///
+/// [`affordable_share`]: dipir_scene::bvh::Bvh::affordable_share
 const SAMPLES: u32 = 16;
 
 #[derive(Clone, Copy)]
@@ -48,6 +51,7 @@ impl GBuffer {
         let bvh = &world.geometry.bvh;
         let footprint = Footprint::new(world.camera(), bvh.bounds(), bvh.clusters());
         let size = (width as usize, height as usize);
+        let samples = (SAMPLES as f32 * bvh.affordable_share()).ceil() as u32;
         let mut all = Self {
             depth: Raster::filled(size.0, size.1, f32::INFINITY),
             normal: Raster::filled(size.0, size.1, Vec3::ZERO),
@@ -65,7 +69,7 @@ impl GBuffer {
                 for x in 0..size.0 {
                     let at = (x as u32, y as u32);
                     let held = footprint.holds(at.0, at.1);
-                    let seen = with_features!(world.mask, F => pixel::<F>(&world, at, held, seed));
+                    let seen = with_features!(world.mask, F => pixel::<F>(&world, at, held, (seed, samples)));
                     depth[x] = seen.depth;
                     normal[x] = seen.normal;
                     albedo[x] = seen.albedo;
@@ -78,25 +82,32 @@ impl GBuffer {
 
     /// As the channels `depth.Z normal.X/Y/Z albedo.R/G/B object.A proxy.A`; depth in full
     /// precision, the rest in half.
-    pub fn to_layers(&self) -> Result<Layers, ImagingError> {
-        let mut layers = Layers::new(self.depth.width(), self.depth.height());
-        layers.insert("depth.Z", Precision::Full, self.depth.clone())?;
-        layers.insert_xyz("normal", Precision::Half, &self.normal)?;
-        layers.insert_rgb("albedo", Precision::Half, &self.albedo)?;
-        layers.insert("object.A", Precision::Half, self.object_alpha.clone())?;
-        layers.insert("proxy.A", Precision::Half, self.proxy_alpha.clone())?;
-        Ok(layers)
+    pub fn to_rows(&self) -> Result<LayerRows<'_>, ImagingError> {
+        let (normal, albedo) = (self.normal.pixels(), self.albedo.pixels());
+        let mut rows = LayerRows::new(self.depth.width(), self.depth.height());
+        let half = Precision::Half;
+        rows.insert("depth.Z", Precision::Full, &self.depth)?;
+        rows.insert_pixels(["normal.X", "normal.Y", "normal.Z"], half, |i| normal[i])?;
+        rows.insert_pixels(["albedo.R", "albedo.G", "albedo.B"], half, |i| albedo[i])?;
+        rows.insert("object.A", half, &self.object_alpha)?;
+        rows.insert("proxy.A", half, &self.proxy_alpha)?;
+        Ok(rows)
     }
 }
 
-fn pixel<const F: u32>(world: &World, (x, y): (u32, u32), object: bool, seed: u64) -> Pixel {
+fn pixel<const F: u32>(
+    world: &World,
+    (x, y): (u32, u32),
+    object: bool,
+    (seed, samples): (u64, u32),
+) -> Pixel {
     let camera = world.camera();
     let axis = -camera.rotation.z_axis;
     let corner = Vec2::new(x as f32, y as f32);
     let (mut object_depth, mut proxy_depth) = (f32::INFINITY, f32::INFINITY);
     let (mut object_normal, mut proxy_normal) = (Vec3::ZERO, Vec3::ZERO);
     let (mut albedo, mut object_hits, mut proxy_hits) = (Vec3::ZERO, 0.0, 0.0);
-    for sample in 0..SAMPLES {
+    for sample in 0..samples {
         let mut sampler = Sampler::new(seed, Stream::FOREGROUND, (y << 16) | (x & 0xffff), sample);
         let ray = camera.ray(corner + sampler.next_2d());
         if let Some(point) = world.proxy_point(&ray) {
@@ -127,7 +138,7 @@ fn pixel<const F: u32>(world: &World, (x, y): (u32, u32), object: bool, seed: u6
         } else {
             Vec3::ZERO
         },
-        object: object_hits / SAMPLES as f32,
-        proxy: proxy_hits / SAMPLES as f32,
+        object: object_hits / samples as f32,
+        proxy: proxy_hits / samples as f32,
     }
 }

@@ -23,6 +23,8 @@ use crate::world::ProxyGeometry;
 /// Pixels of the object that a pilot render aims at: enough that a mean over them is precise to a
 /// few per cent.
 const OBJECT_PIXELS: f32 = 1024.0;
+/// Least pixels of the object, where a ray through it takes so long that fewer are affordable.
+const FEW_OBJECT_PIXELS: f32 = 64.0;
 /// Most pixels of a pilot render.
 const MAX_PIXELS: f32 = 16384.0;
 /// Samples per pixel of each of the two pictures.
@@ -245,10 +247,8 @@ fn pilot_camera(renderer: &Renderer) -> Camera {
         .count();
     let object = (16 * held).max(1) as f32;
     let all = width as f32 * height as f32;
-    let scale = (OBJECT_PIXELS / object)
-        .min(MAX_PIXELS / all)
-        .sqrt()
-        .min(1.0);
+    let wanted = (OBJECT_PIXELS * bvh.affordable_share()).max(FEW_OBJECT_PIXELS);
+    let scale = (wanted / object).min(MAX_PIXELS / all).sqrt().min(1.0);
     let resolution = camera
         .resolution
         .map(|n| ((n as f32 * scale).round() as u32).max(1));

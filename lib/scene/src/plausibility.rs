@@ -7,6 +7,7 @@ use crate::camera::Camera;
 use crate::mesh::TriangleMesh;
 use crate::proxy::{Plane, Proxy};
 use crate::scene::Scene;
+use crate::visibility::below_a_pixel;
 
 /// Vertical fields of view of lenses that people have: an 800 mm lens has 1.7 degrees.
 const FIELD_OF_VIEW_DEG: [f32; 2] = [1.5, 140.0];
@@ -27,9 +28,13 @@ pub fn implausible(scene: &Scene) -> Vec<String> {
     let Some((low, high)) = scene.mesh.bounds() else {
         return found;
     };
-    found.extend(height(high.y - low.y));
+    // What is smaller than a pixel was warned of when it was loaded, and one warning of its size is enough.
+    let tiny = below_a_pixel(&scene.mesh, &scene.camera).is_some();
+    let unusual = height(high.y - low.y).filter(|_| !tiny);
+    let size_is_told = tiny || unusual.is_some();
+    found.extend(unusual);
     found.extend(ground.and_then(|plane| object_below(&scene.mesh, plane)));
-    found.extend(visibility(&scene.mesh, &scene.camera));
+    found.extend(visibility(&scene.mesh, &scene.camera, size_is_told));
     found
 }
 
@@ -98,7 +103,7 @@ fn object_below(mesh: &TriangleMesh, plane: &Plane) -> Option<String> {
     })
 }
 
-fn visibility(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
+fn visibility(mesh: &TriangleMesh, camera: &Camera, size_is_told: bool) -> Option<String> {
     let (mut low, mut high) = (Vec2::INFINITY, Vec2::NEG_INFINITY);
     let mut behind = 0;
     for &point in &mesh.positions {
@@ -134,7 +139,7 @@ fn visibility(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
         ));
     }
     let size = high - low;
-    (size.max_element() < SMALLEST_PX).then(|| {
+    (size.max_element() < SMALLEST_PX && !size_is_told).then(|| {
         format!(
             "the objects take {:.1} x {:.1} pixels of the picture; see [[scene.objects]] scale and \
              position, in metres",
@@ -233,6 +238,21 @@ mod tests {
     }
 
     #[test]
+    fn a_tiny_object_is_warned_of_once() {
+        // Below a pixel `visibility::hidden` warns of each object; above, its height or its pixels are told.
+        for (scale, warnings) in [(1e-7, 0), (1e-3, 0), (0.04, 1), (0.06, 1)] {
+            let mut scene = scene();
+            for p in &mut scene.mesh.positions {
+                *p = *p * scale + Vec3::new(0.3, 0.0, 0.0);
+            }
+            let hidden = below_a_pixel(&scene.mesh, &scene.camera).is_some();
+            assert_eq!(hidden, warnings == 0, "{scale}");
+            let found = implausible(&scene);
+            assert_eq!(found.len(), warnings, "{scale}: {found:?}");
+        }
+    }
+
+    #[test]
     fn an_object_that_no_pixel_shows_is_said_to_be_where_it_is() {
         for (offset, part) in [
             (Vec3::new(0.0, 0.0, 20.0), "behind the camera"),
@@ -240,7 +260,7 @@ mod tests {
             (Vec3::new(40.0, 0.0, 0.0), "right of the picture"),
             (Vec3::new(0.0, 4.0, 0.0), "above the picture"),
             (Vec3::new(0.0, -5.0, 0.0), "below the ground"),
-            (Vec3::new(0.3, 0.0, -4000.0), "pixels of the picture"),
+            (Vec3::new(0.3, 0.0, -100.0), "pixels of the picture"),
         ] {
             let mut scene = scene();
             for p in &mut scene.mesh.positions {

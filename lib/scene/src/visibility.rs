@@ -62,11 +62,18 @@ fn without_extent(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
     if (0..mesh.indices.len()).all(|t| mesh.scaled_normal(t).length_squared() == 0.0) {
         return Some("none of its triangles has an area (is a scale zero along an axis?)".into());
     }
+    let pixels = below_a_pixel(mesh, camera)?;
+    Some(format!(
+        "it is {size:.1e} m across, {pixels:.1e} of a pixel; raise its scale, or write height_m"
+    ))
+}
+
+/// How much of a pixel the mesh takes, if that is less than one.
+pub(crate) fn below_a_pixel(mesh: &TriangleMesh, camera: &Camera) -> Option<f64> {
+    let (low, high) = mesh.bounds()?;
+    let (low, high) = (low.as_dvec3(), high.as_dvec3());
+    let size = low.distance(high);
     let distance = camera.position.as_dvec3().distance((low + high) * 0.5);
     let pixels = size * f64::from(camera.focal_px.max_element()) / distance;
-    (distance > size && pixels < 1.0).then(|| {
-        format!(
-            "it is {size:.1e} m across, {pixels:.1e} of a pixel; raise its scale, or write height_m"
-        )
-    })
+    (distance > size && pixels < 1.0).then_some(pixels)
 }

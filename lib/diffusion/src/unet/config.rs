@@ -5,6 +5,12 @@ use serde_json::json;
 
 use crate::config::{ConfigFile, PerLevel};
 use crate::error::Result;
+use crate::extent::Extent;
+
+/// Most resolution levels: each halves the picture, and 2^16 pixels a side are more than anything has.
+pub(crate) const MAX_LEVELS: usize = 16;
+/// Largest side of latents, four times that of the largest published models.
+const MAX_SAMPLE_SIZE: usize = 512;
 
 /// The keys of `unet/config.json` that shape the network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -164,11 +170,56 @@ impl UNetConfig {
         self.up_block_types[self.levels() - 1 - level] == "CrossAttnUpBlock2D"
     }
 
+    /// Checks the sizes against the weights.
+    pub(crate) fn fits(&self, extent: &Extent) -> Result<(), String> {
+        extent.layers("layers_per_block", self.layers_per_block)?;
+        for level in 0..self.levels() {
+            let middle = level + 1 == self.levels();
+            if middle || self.attends_down(level) || self.attends_up(level) {
+                let blocks = self.transformer_layers(level);
+                extent.layers("transformer_layers_per_block", blocks)?;
+            }
+            let channels = self.block_out_channels[level];
+            extent.width(&format!("block_out_channels[{level}]"), channels)?;
+        }
+        for (key, value) in [
+            ("in_channels", self.in_channels),
+            ("out_channels", self.out_channels),
+            ("cross_attention_dim", self.cross_attention_dim),
+        ] {
+            extent.width(key, value)?;
+        }
+        Ok(())
+    }
+
     /// Says what is impossible about this configuration.
     pub fn check(&self) -> Result<(), String> {
         let levels = self.levels();
-        if levels == 0 || self.layers_per_block == 0 {
-            return Err("block_out_channels and layers_per_block must not be empty or 0".into());
+        if levels == 0 || levels > MAX_LEVELS {
+            return Err(format!(
+                "block_out_channels has {levels} entries; accepted: 1 to {MAX_LEVELS}"
+            ));
+        }
+        if self.layers_per_block == 0 {
+            return Err("layers_per_block = 0; accepted: at least 1".into());
+        }
+        if !(1..=MAX_SAMPLE_SIZE).contains(&self.sample_size) {
+            return Err(format!(
+                "sample_size = {}; accepted: 1 to {MAX_SAMPLE_SIZE}",
+                self.sample_size
+            ));
+        }
+        if self.downsample_padding > 1 {
+            return Err(format!(
+                "downsample_padding = {}; accepted: 0 or 1",
+                self.downsample_padding
+            ));
+        }
+        if !(self.norm_eps > 0.0 && self.norm_eps < 1.0) {
+            return Err(format!(
+                "norm_eps = {}; accepted: above 0 and below 1",
+                self.norm_eps
+            ));
         }
         for (name, types, known) in [
             (
@@ -234,6 +285,12 @@ impl UNetConfig {
         }
         if !self.block_out_channels[0].is_multiple_of(2) {
             return Err("block_out_channels[0] must be even: half sines, half cosines".into());
+        }
+        if !(0.0..self.block_out_channels[0] as f64 / 2.0).contains(&self.freq_shift) {
+            return Err(format!(
+                "freq_shift = {}; accepted: 0 to half of block_out_channels[0], without that",
+                self.freq_shift
+            ));
         }
         Ok(())
     }

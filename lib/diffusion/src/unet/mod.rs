@@ -12,6 +12,7 @@ use std::sync::Arc;
 
 use candle_core::{Tensor, Var};
 
+pub(crate) use config::MAX_LEVELS;
 pub use config::UNetConfig;
 use pooled_text::PooledText;
 use timestep::TimestepEmbedding;

@@ -5,6 +5,8 @@ use serde_json::json;
 
 use crate::config::ConfigFile;
 use crate::error::Result;
+use crate::extent::Extent;
+use crate::unet::MAX_LEVELS;
 
 /// The keys of `vae/config.json` that shape an `AutoencoderKL`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -81,6 +83,22 @@ impl AutoencoderConfig {
         1 << (self.block_out_channels.len() - 1)
     }
 
+    /// Checks the sizes against the weights.
+    pub(super) fn fits(&self, extent: &Extent) -> Result<(), String> {
+        extent.layers("layers_per_block", self.layers_per_block)?;
+        for (level, &channels) in self.block_out_channels.iter().enumerate() {
+            extent.width(&format!("block_out_channels[{level}]"), channels)?;
+        }
+        for (key, value) in [
+            ("in_channels", self.in_channels),
+            ("out_channels", self.out_channels),
+            ("latent_channels", self.latent_channels),
+        ] {
+            extent.width(key, value)?;
+        }
+        Ok(())
+    }
+
     /// Says what is impossible about this configuration.
     pub fn check(&self) -> Result<(), String> {
         if self.block_out_channels.is_empty()
@@ -91,6 +109,12 @@ impl AutoencoderConfig {
                 "block_out_channels, layers_per_block and latent_channels must not be empty or 0"
                     .into(),
             );
+        }
+        let levels = self.block_out_channels.len();
+        if levels > MAX_LEVELS {
+            return Err(format!(
+                "block_out_channels has {levels} entries; accepted: 1 to {MAX_LEVELS}"
+            ));
         }
         let groups = self.norm_num_groups;
         if let Some(odd) = self

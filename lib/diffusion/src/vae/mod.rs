@@ -24,6 +24,9 @@ use crate::weights::Weights;
 /// Bounds of the encoder's log variance, as in training.
 const LOG_VARIANCE: (f64, f64) = (-30.0, 20.0);
 
+/// Largest factor, and most channels, of a rearrangement of pixels: it has no weights that would bound them.
+const MAX_UNSHUFFLE: usize = 64;
+
 /// The normal distribution that the encoder gives for an image.
 #[derive(Debug, Clone)]
 pub struct Moments {
@@ -132,6 +135,7 @@ impl Vae {
         if file.get("_class_name") != Some(&json!("PixelUnshuffle")) {
             let config = AutoencoderConfig::from_file(&file)?;
             let weights = Weights::open(folder, "diffusion_pytorch_model")?;
+            config.fits(&weights.extent()).map_err(|m| file.error(m))?;
             let parameters = Parameters::from_weights(weights, dtype, device, false);
             return Ok(Self::Kl(Box::new(AutoencoderKl::new(config, parameters)?)));
         }
@@ -149,9 +153,15 @@ impl Vae {
             in_channels,
             scaling_factor,
         } = three_channels;
-        if factor == 0 || in_channels == 0 || !(scaling_factor > 0.0 && scaling_factor.is_finite())
-        {
-            return Err(file.error("factor, in_channels and scaling_factor must be positive"));
+        for (key, value) in [("factor", factor), ("in_channels", in_channels)] {
+            if !(1..=MAX_UNSHUFFLE).contains(&value) {
+                return Err(file.error(format!("{key} = {value}; accepted: 1 to {MAX_UNSHUFFLE}")));
+            }
+        }
+        if !(scaling_factor > 0.0 && scaling_factor.is_finite()) {
+            return Err(file.error(format!(
+                "scaling_factor = {scaling_factor}; accepted: a positive number"
+            )));
         }
         Ok(Self::PixelUnshuffle {
             factor,

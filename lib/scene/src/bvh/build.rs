@@ -70,12 +70,18 @@ pub fn build(
         packs: Vec::new(),
         triangles: Vec::new(),
         root: ChildRef::NONE,
+        visits: 0.0,
     };
     if triangles.is_empty() {
         return tree;
     }
     let binary = binary(triangles, compare);
     let costs = Costs::new(&binary, triangles);
+    // A box without an area is met by no random ray.
+    let area = binary.half_area(0);
+    if area > 0.0 {
+        tree.visits = costs.table[0][0] / area;
+    }
     let mut emitter = Emitter {
         binary: &binary,
         costs: &costs,

@@ -472,3 +472,29 @@ fn the_bounding_sphere_and_the_clusters_hold_every_vertex() {
         bvh.clusters()
     );
 }
+
+#[test]
+fn shells_within_shells_are_told_from_surfaces_by_what_a_ray_visits() {
+    let visits = |m: &TriangleMesh| Bvh::build(m).expected_visits();
+    // Octahedra about one centre: no box of a face is free of the faces below.
+    let mut positions = Vec::new();
+    let mut indices = Vec::new();
+    for k in 0..2000u32 {
+        let r = 0.2 + 0.0004 * k as f32;
+        let corner = [Vec3::X, -Vec3::X, Vec3::Y, -Vec3::Y, Vec3::Z, -Vec3::Z];
+        positions.extend(corner.map(|c| c * r));
+        for octant in 0..8 {
+            let pick = |axis: u32| 6 * k + 2 * axis + (octant >> axis & 1);
+            indices.push([pick(0), pick(1), pick(2)]);
+        }
+    }
+    let shells = mesh(positions, indices);
+    // In proportion to the shells: half of the boxes of a face that lie below it are met, in packs of two triangles.
+    assert!(visits(&shells) > 800.0, "{}", visits(&shells));
+    assert!(Bvh::build(&shells).affordable_share() < 1.0);
+    for surface in [quad(), sphere(8, 0.0), sphere(100, 0.1)] {
+        assert!(visits(&surface) < 50.0, "{}", visits(&surface));
+        assert_eq!(Bvh::build(&surface).affordable_share(), 1.0);
+    }
+    assert_eq!(visits(&mesh(vec![], vec![])), 0.0);
+}

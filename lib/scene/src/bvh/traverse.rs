@@ -30,6 +30,8 @@ pub struct Tree {
     pub triangles: Vec<[u32; LANES]>,
     /// [`ChildRef::NONE`] if there is nothing to hit.
     pub root: ChildRef,
+    /// Records that a random ray through the root's box visits, on average.
+    pub visits: f32,
 }
 
 /// Entry `i` of a stack, which must have been written.

@@ -27,6 +27,29 @@ fn polygons_become_fans_and_negative_indices_count_from_the_end() {
     }
 }
 
+/// With work that grows with the square of the corners this would take hours.
+#[test]
+fn a_face_of_more_than_a_million_corners_becomes_a_fan_that_rays_meet() {
+    const CORNERS: u32 = 1_200_000;
+    let mut text = String::new();
+    for k in 0..CORNERS {
+        let angle = std::f32::consts::TAU * k as f32 / CORNERS as f32;
+        text += &format!("v {} {} 0\n", angle.cos(), angle.sin());
+    }
+    text += "f";
+    for k in 1..=CORNERS {
+        text += &format!(" {k}");
+    }
+    let mesh = load(&(text + "\n")).mesh;
+    assert_eq!(mesh.indices.len() as u32, CORNERS - 2);
+    let bvh = dipir_scene::bvh::Bvh::build(&mesh);
+    let ray = dipir_scene::camera::Ray {
+        origin: Vec3::new(0.1, -0.2, 1.0),
+        direction: Vec3::NEG_Z,
+    };
+    assert!(bvh.closest(&ray, f32::INFINITY, |_, _, _| true).is_some());
+}
+
 #[test]
 fn hostile_indices_are_refused_with_their_line() {
     for (face, number, things) in [

@@ -7,8 +7,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use dipir_cli::session::{Session, duration};
-use dipir_imaging::composite::composite;
+use dipir_imaging::composite::{composite, composite_pixel};
 use dipir_imaging::file::write_picture;
+use dipir_imaging::layer_rows::LayerRows;
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
@@ -21,6 +22,7 @@ use dipir_render::film::Film;
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings};
 use glam::Vec3;
+use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use crate::interruption;
@@ -70,8 +72,14 @@ const WRITING_S_PER_PIXEL: f64 = 1e-6;
 /// Everything that the stage reads.
 struct Inputs {
     scene: SceneFolder,
-    gbuffer: Layers,
+    /// Where the object's and the ground's geometry is. It is read when it is written again.
+    gbuffer: PathBuf,
 }
+
+/// What is taken over from the scene.
+const GEOMETRY: [&str; 7] = [
+    "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B",
+];
 
 /// What lights the object.
 enum Source {
@@ -111,11 +119,15 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         &light,
     )?;
     let Course { rendered, .. } = course;
-    let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light))?;
+    let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light));
+    let picture = layers.picture()?;
     let png = writer.output("picture", "composite.png")?;
-    write_picture(png, &layers.beauty, &inputs.scene.loaded.photo)?;
+    write_picture(png, &picture, &inputs.scene.loaded.photo)?;
+    let in_picture = Precision::of_colour(&picture.0);
+    drop(picture);
+    let gbuffer = Layers::read_exr(&inputs.gbuffer)?;
     let exr = writer.output("layers", "composite.exr")?;
-    layers.to_layers(&inputs.gbuffer)?.write_exr(exr)?;
+    layers.to_rows(in_picture, &gbuffer)?.write_exr(exr)?;
     writer.set_estimated_error(rendered.error.upper_95);
     let manifest = writer.finish()?;
     let seconds = clock.elapsed().as_secs_f64();
@@ -151,7 +163,7 @@ fn within(stop: Stop, clock: Instant, inputs: &Inputs) -> Stop {
 /// Reads what the scene stage wrote and the files that it names.
 fn read(session: &Session) -> anyhow::Result<Inputs> {
     let scene = SceneFolder::read(session)?;
-    let gbuffer = Layers::read_exr(scene.manifest.output(&scene.folder, "gbuffer")?)?;
+    let gbuffer = scene.manifest.output(&scene.folder, "gbuffer")?;
     Ok(Inputs { scene, gbuffer })
 }
 
@@ -267,56 +279,80 @@ fn render_under<L: SceneLight>(
     })
 }
 
-/// The picture and its layers, linear.
+/// The layers of the picture, linear.
 struct Composite<'a> {
     background: &'a LinearImage,
     object: LinearImage,
     alpha: Raster<f32>,
     shadow: LinearImage,
-    beauty: LinearImage,
     /// How the object's and the shadow's colours are stored.
     precision: [Precision; 2],
 }
 
 impl<'a> Composite<'a> {
-    fn new(inputs: &'a Inputs, film: Film, curve: &Curve) -> anyhow::Result<Self> {
+    fn new(inputs: &'a Inputs, film: Film, curve: &Curve) -> Self {
         let background = &inputs.scene.loaded.photo.image;
-        let (object, shadow) = curve.apply(film.object, &film.alpha, film.shadow);
+        let Film {
+            object,
+            mut alpha,
+            shadow,
+            ..
+        } = film;
+        let (mut object, mut shadow) = curve.apply(object, &alpha, shadow);
         // Rounded to what the file stores before they are put together, so that whoever does it
         // again from the file gets the same picture. Light beyond half precision is stored in full.
         let precision = [Precision::of_colour(&object), Precision::of_colour(&shadow)];
-        let object = LinearImage(object.map(|v| precision[0].round_colour(*v)));
-        let alpha = film.alpha.map(|a| Precision::Half.round(*a));
-        let shadow = LinearImage(shadow.map(|v| precision[1].round_colour(*v)));
-        let beauty = composite(background, &object, &alpha, &shadow)?;
-        Ok(Self {
+        for (layer, precision) in [(&mut object, precision[0]), (&mut shadow, precision[1])] {
+            let pixels = layer.pixels_mut().par_iter_mut();
+            pixels.for_each(|v| *v = precision.round_colour(*v));
+        }
+        let pixels = alpha.pixels_mut().par_iter_mut();
+        pixels.for_each(|a| *a = Precision::Half.round(*a));
+        Self {
             background,
-            object,
+            object: LinearImage(object),
             alpha,
-            shadow,
-            beauty,
+            shadow: LinearImage(shadow),
             precision,
-        })
+        }
     }
 
-    fn to_layers(&self, gbuffer: &Layers) -> anyhow::Result<Layers> {
-        let (width, height) = (self.alpha.width(), self.alpha.height());
-        let mut layers = Layers::new(width, height);
-        let of = |image: &LinearImage| Precision::of_colour(&image.0);
-        layers.insert_rgb("", of(&self.beauty), &self.beauty.0)?;
-        layers.insert("A", Precision::Half, Raster::filled(width, height, 1.0))?;
-        layers.insert_rgb("object", self.precision[0], &self.object.0)?;
-        layers.insert("object.A", Precision::Half, self.alpha.clone())?;
-        layers.insert_rgb("shadow", self.precision[1], &self.shadow.0)?;
-        layers.insert_rgb("background", of(self.background), &self.background.0)?;
-        layers.insert(
-            "depth.Z",
-            Precision::Full,
-            gbuffer.channel("depth.Z")?.clone(),
-        )?;
-        layers.insert_xyz("normal", Precision::Half, &gbuffer.xyz("normal")?)?;
-        layers.insert_rgb("albedo", Precision::Half, &gbuffer.rgb("albedo")?)?;
-        Ok(layers)
+    /// What they show together.
+    fn picture(&self) -> anyhow::Result<LinearImage> {
+        let picture = composite(self.background, &self.object, &self.alpha, &self.shadow)?;
+        Ok(picture)
+    }
+
+    /// All layers, the picture stored with `in_picture`.
+    fn to_rows<'b>(
+        &'b self,
+        in_picture: Precision,
+        gbuffer: &'b Layers,
+    ) -> anyhow::Result<LayerRows<'b>> {
+        let colours = [self.background, &self.object, &self.shadow];
+        let [background, object, shadow] = colours.map(|image| image.0.pixels());
+        let alpha = self.alpha.pixels();
+        let picture = |i: usize| composite_pixel(background[i], object[i], alpha[i], shadow[i]);
+        let half = Precision::Half;
+        let in_background = Precision::of_colour(&self.background.0);
+        let mut rows = LayerRows::new(self.alpha.width(), self.alpha.height());
+        rows.insert_pixels(["R", "G", "B"], in_picture, picture)?;
+        rows.insert_constant("A", half, 1.0)?;
+        let names = ["object.R", "object.G", "object.B"];
+        rows.insert_pixels(names, self.precision[0], |i| object[i])?;
+        rows.insert("object.A", half, &self.alpha)?;
+        let names = ["shadow.R", "shadow.G", "shadow.B"];
+        rows.insert_pixels(names, self.precision[1], |i| shadow[i])?;
+        let names = ["background.R", "background.G", "background.B"];
+        rows.insert_pixels(names, in_background, |i| background[i])?;
+        for name in GEOMETRY {
+            let precision = match name {
+                "depth.Z" => Precision::Full,
+                _ => half,
+            };
+            rows.insert(name, precision, gbuffer.channel(name)?)?;
+        }
+        Ok(rows)
     }
 }
 

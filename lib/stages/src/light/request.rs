@@ -79,6 +79,31 @@ impl First {
         };
         Ok(first)
     }
+
+    /// What an estimate alone makes use of is refused where nothing is estimated.
+    fn refuse_unused(self, session: &Session, table: &LightTable) -> anyhow::Result<()> {
+        let how = match self {
+            Self::Estimated => return Ok(()),
+            Self::Neutral => "from neutral light",
+            Self::Read => "from what the guiding model reads off the photograph",
+            Self::File => "from the light of a file",
+        };
+        let keys = [
+            ("light.sun", table.sun.is_some()),
+            ("light.shadow", table.shadow.is_some()),
+            ("light.candidate", table.candidate.is_some()),
+        ];
+        match keys.into_iter().find(|(_, given)| *given) {
+            None => Ok(()),
+            Some((key, _)) => {
+                let message = format!(
+                    "only an estimated light uses it, and this one starts {how}; remove it, or set \
+                     light.start = \"estimated\""
+                );
+                Err(session.config.invalid(key, message).into())
+            }
+        }
+    }
 }
 
 impl Request {
@@ -94,6 +119,7 @@ impl Request {
             Method::Start | Method::Materials | Method::Given => Guide::None,
         };
         let start = First::of(session, &table, &guide)?;
+        start.refuse_unused(session, &table)?;
         if let Guide::Model {
             reading: Some(_), ..
         } = &guide

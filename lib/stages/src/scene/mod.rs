@@ -101,6 +101,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         ..Settings::default()
     };
     let renderer = Renderer::new(&loaded.scene);
+    warn_of_slow_rays(session, &renderer);
     let progress = session.progress("effects");
     let clock = Instant::now();
     let effects = effects::plan(
@@ -122,7 +123,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let gbuffer = GBuffer::new(&renderer, session.pipeline.seed).map_err(crate::render_error)?;
     interrupt::check()?;
     let path = writer.output("gbuffer", "gbuffer.exr")?;
-    gbuffer.to_layers()?.write_exr(path)?;
+    gbuffer.to_rows()?.write_exr(path)?;
+    drop(gbuffer);
     let record = match recorded {
         Some(settings) => {
             let clock = Instant::now();
@@ -152,6 +154,19 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         record,
         outlook: outlook.unwrap_or_default(),
     })
+}
+
+/// Where planning does with fewer rays than usual, the render will want patience.
+fn warn_of_slow_rays(session: &Session, renderer: &Renderer) {
+    let bvh = &renderer.geometry().bvh;
+    if bvh.affordable_share() < 1.0 {
+        session.warn(&format!(
+            "a ray through the objects meets about {:.0} groups of triangles, where 20 are usual, so that rendering takes \
+             long: large triangles lie close above one another, as in shells within shells; remove those that cannot be \
+             seen, or set composite.time_budget_s",
+            bvh.expected_visits()
+        ));
+    }
 }
 
 /// What the presets beside this one would have cost: recording takes time in proportion to paths.

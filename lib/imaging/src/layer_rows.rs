@@ -1,0 +1,149 @@
+//! Layers that are computed row by row while they are written, so that none of them is held in memory.
+use crate::{
+    error::{ImagingError, MAX_PIXELS},
+    exr_file,
+    layers::{Layers, Precision, check_name},
+    raster::Raster,
+};
+use glam::Vec3;
+use rayon::prelude::*;
+use std::{collections::BTreeMap, path::Path};
+
+/// Fills a slice with the samples of a row.
+type FillRow<'a> = Box<dyn Fn(usize, &mut [f32]) + Sync + 'a>;
+
+/// Where the samples of a channel come from, and how a file stores them.
+pub(crate) struct RowChannel<'a> {
+    pub precision: Precision,
+    pub fill: FillRow<'a>,
+}
+
+/// Named channels of one size, as [`Layers`], whose samples are asked for when the file is written. A file holds the
+/// same bytes as that of [`Layers`] with the same samples.
+pub struct LayerRows<'a> {
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+    pub(crate) channels: BTreeMap<String, RowChannel<'a>>,
+    pub(crate) latlong: bool,
+    pub(crate) attributes: BTreeMap<String, String>,
+}
+
+impl<'a> LayerRows<'a> {
+    /// No channels yet, `width` x `height` pixels.
+    pub fn new(width: usize, height: usize) -> Self {
+        Self {
+            width,
+            height,
+            channels: BTreeMap::new(),
+            latlong: false,
+            attributes: BTreeMap::new(),
+        }
+    }
+
+    /// The channels of `layers`.
+    pub(crate) fn of(layers: &'a Layers) -> Self {
+        let mut rows = Self::new(layers.width(), layers.height());
+        rows.latlong = layers.latlong;
+        for (name, value) in layers.attributes() {
+            rows.attributes.insert(name.to_owned(), value.to_owned());
+        }
+        for (name, channel) in layers.channels() {
+            rows.add(name.to_owned(), channel.precision, &channel.samples);
+        }
+        rows
+    }
+
+    fn add(&mut self, name: String, precision: Precision, samples: &'a Raster<f32>) {
+        let fill: FillRow<'a> = Box::new(move |y, row| row.copy_from_slice(samples.row(y)));
+        self.channels.insert(name, RowChannel { precision, fill });
+    }
+
+    /// Adds the channel `name`, or replaces it. Errors if the size differs or the name is one that
+    /// compositing programs do not take (empty, only digits, over 255 bytes).
+    pub fn insert(
+        &mut self,
+        name: &str,
+        precision: Precision,
+        samples: &'a Raster<f32>,
+    ) -> Result<(), ImagingError> {
+        check_name(name)?;
+        if (samples.width(), samples.height()) != (self.width, self.height) {
+            return Err(ImagingError::SizeMismatch {
+                what: format!("channel `{name}`"),
+                found: (samples.width(), samples.height()),
+                expected: (self.width, self.height),
+                reference: "the other layers",
+            });
+        }
+        self.add(name.to_owned(), precision, samples);
+        Ok(())
+    }
+
+    /// Adds the channels `names`, the components of what `pixel` gives for a pixel's index, row by row from the top
+    /// left. Errors as [`insert`](Self::insert).
+    pub fn insert_pixels(
+        &mut self,
+        names: [&str; 3],
+        precision: Precision,
+        pixel: impl Fn(usize) -> Vec3 + Copy + Sync + 'a,
+    ) -> Result<(), ImagingError> {
+        let width = self.width;
+        for (k, name) in names.into_iter().enumerate() {
+            check_name(name)?;
+            let fill: FillRow<'a> = Box::new(move |y, row| {
+                for (x, sample) in row.iter_mut().enumerate() {
+                    *sample = pixel(y * width + x)[k];
+                }
+            });
+            let channel = RowChannel { precision, fill };
+            self.channels.insert(name.to_owned(), channel);
+        }
+        Ok(())
+    }
+
+    /// Adds a channel of one value.
+    pub fn insert_constant(
+        &mut self,
+        name: &str,
+        precision: Precision,
+        value: f32,
+    ) -> Result<(), ImagingError> {
+        check_name(name)?;
+        let fill: FillRow<'a> = Box::new(move |_, row| row.fill(value));
+        self.channels
+            .insert(name.to_owned(), RowChannel { precision, fill });
+        Ok(())
+    }
+
+    /// Writes an OpenEXR file: one part, scan lines, ZIP1. Replaces an existing file.
+    pub fn write_exr(mut self, path: impl AsRef<Path>) -> Result<(), ImagingError> {
+        let path = path.as_ref();
+        let (width, height) = (self.width, self.height);
+        if width == 0 || height == 0 || width.saturating_mul(height) > MAX_PIXELS {
+            return Err(ImagingError::BadSize {
+                what: format!("the image for `{}`", path.display()),
+                width,
+                height,
+            });
+        }
+        for channel in self.channels.values_mut() {
+            if channel.precision == Precision::Half {
+                channel.precision = fitting(&channel.fill, width, height);
+            }
+        }
+        exr_file::write(&self, path)
+    }
+}
+
+/// Half, unless a finite value would overflow to infinity.
+fn fitting(fill: &FillRow, width: usize, height: usize) -> Precision {
+    let overflows = (0..height).into_par_iter().any(|y| {
+        let mut row = vec![0.0; width];
+        fill(y, &mut row);
+        Precision::half_if_it_fits(row) == Precision::Full
+    });
+    match overflows {
+        true => Precision::Full,
+        false => Precision::Half,
+    }
+}
