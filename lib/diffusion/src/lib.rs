@@ -1,6 +1,7 @@
 //! Latent diffusion models at any size: model folders in the diffusers
 //! layout, layers whose gradients pass, samplers, LoRA and score distillation.
 
+pub mod check;
 pub mod concepts;
 pub mod config;
 pub mod crop;

@@ -2,6 +2,7 @@
 
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
 
+use super::backend::has_kernels;
 use crate::error::{Result, argument};
 use crate::kernels::matmul;
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -65,7 +66,7 @@ impl Linear {
     /// Applies the layer to x [..., inputs].
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
-        if !x.device().is_cpu() {
+        if !has_kernels(&x) {
             return self.forward_composed(&x);
         }
         Ok(match &self.bias {
