@@ -21,6 +21,7 @@ pub mod recompute;
 mod resnet;
 pub mod sampler;
 pub mod schedule;
+pub mod single_file;
 pub mod text_encoder;
 pub mod tokenizer;
 pub mod training;
