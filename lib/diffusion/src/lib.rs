@@ -27,6 +27,7 @@ pub mod tokenizer;
 pub mod training;
 pub mod unet;
 pub mod vae;
+pub mod validation;
 pub mod weights;
 
 pub use error::{Error, Result};

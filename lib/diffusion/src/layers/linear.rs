@@ -48,6 +48,14 @@ impl Linear {
         Ok(Self { weight, bias })
     }
 
+    /// The same layer of constants.
+    pub fn detached(&self) -> Self {
+        Self {
+            weight: self.weight.detach(),
+            bias: self.bias.as_ref().map(Tensor::detach),
+        }
+    }
+
     /// Number of inputs.
     pub fn inputs(&self) -> usize {
         self.weight.dims()[1]
