@@ -1,6 +1,6 @@
 //! `dipir-model check`.
 use std::fmt::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use candle_core::{DType, Device};
@@ -11,12 +11,13 @@ use dipir_cli::session::{Session, duration, size};
 use dipir_diffusion::check::{
     Agreement, PART_COUNT, Reference, Times, TimesSettings, compare, sizes, times,
 };
+use dipir_diffusion::model::Model;
 use dipir_diffusion::schedule::Prediction;
 use dipir_diffusion::training::TrainingConfig;
 use dipir_pipeline::manifest::peak_rss_bytes;
 use dipir_stages::command_line::model::CheckArgs;
 use dipir_stages::model::forecast::{self, Work};
-use dipir_stages::model::{self, Loaded};
+use dipir_stages::model::{self, Loaded, ModelTable};
 use serde::Serialize;
 use serde_json::json;
 
@@ -39,6 +40,7 @@ struct Report {
 pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     let output = args.common.output;
     let session = session(args)?;
+    let path = chosen(args, session.as_ref())?;
     if session.is_none() {
         interrupt::listen()?;
     }
@@ -56,15 +58,22 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     let prediction = prediction
         .transpose()
         .map_err(|m| Usage(format!("--prediction: {m}")))?;
-    let name = match &args.model {
+    let name = match &path {
         Some(path) => path.display().to_string(),
         None => "the embedded model".into(),
     };
-    let model = open(args, dtype, prediction, &device)?;
+    let open = |dtype, device: &Device| open(path.as_deref(), dtype, prediction, device);
+    let model = open(dtype, &device)?;
     let progress = Progress::new("comparing", output.quiet);
-    let agreement = agreement(args, &model, prediction, &progress).map_err(interrupted);
+    // What the model is compared with is gone before anything is timed.
+    let on_cpu = match device.is_cpu() {
+        true => None,
+        false => Some(open(DType::F32, &Device::Cpu)?),
+    };
+    let agreement = agreement(args.small, &model, on_cpu.as_deref(), &progress);
+    drop(on_cpu);
     progress.done();
-    let agreement = agreement?;
+    let agreement = agreement.map_err(interrupted)?;
     let progress = Progress::new("timing", output.quiet);
     let times = measure(session.as_ref(), &model, &progress).map_err(interrupted);
     progress.done();
@@ -98,45 +107,56 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     }
 }
 
-/// The configuration, if there is one: a file that is named has to be there.
+/// The configuration, if there is one, with the model that is checked: a file that is named has to be there.
 fn session(args: &CheckArgs) -> anyhow::Result<Option<Session>> {
     let usual = args.common.pipeline == Path::new("pipeline.toml");
-    match usual && !args.common.pipeline.exists() {
-        true => Ok(None),
-        false => Session::start(&args.common).map(Some),
+    if usual && !args.common.pipeline.exists() {
+        return Ok(None);
     }
+    let mut common = args.common.clone();
+    if let Some(path) = &args.model {
+        let path =
+            std::path::absolute(path).with_context(|| format!("cannot find {}", path.display()))?;
+        common
+            .set
+            .push(format!("model.path={:?}", path.display().to_string()));
+    }
+    Session::start(&common).map(Some)
+}
+
+/// Where the model is: named, or the configuration's; nothing is the embedded one.
+fn chosen(args: &CheckArgs, session: Option<&Session>) -> anyhow::Result<Option<PathBuf>> {
+    let Some(session) = session.filter(|_| args.model.is_none()) else {
+        return Ok(args.model.clone());
+    };
+    let table: ModelTable = session.config.table("model")?;
+    Ok(table.path.map(|path| session.resolve(&path)))
 }
 
 fn open(
-    args: &CheckArgs,
+    path: Option<&Path>,
     dtype: DType,
     prediction: Option<Prediction>,
     device: &Device,
 ) -> anyhow::Result<Loaded> {
-    model::open(args.model.as_deref(), dtype, prediction, device).with_context(|| {
-        match &args.model {
-            Some(path) => format!("cannot use {}", path.display()),
-            None => "cannot use the embedded model".into(),
-        }
+    model::open(path, dtype, prediction, device).with_context(|| match path {
+        Some(path) => format!("cannot use {}", path.display()),
+        None => "cannot use the embedded model".into(),
     })
 }
 
 /// Every part at every size.
 fn agreement(
-    args: &CheckArgs,
-    model: &Loaded,
-    prediction: Option<Prediction>,
+    small: bool,
+    model: &Model,
+    on_cpu: Option<&Model>,
     progress: &Progress,
 ) -> anyhow::Result<Vec<Agreement>> {
     let mut sides = sizes(model);
-    if args.small {
+    if small {
         sides.truncate(1);
     }
-    let on_cpu = match model.device().is_cpu() {
-        true => None,
-        false => Some(open(args, DType::F32, prediction, &Device::Cpu)?),
-    };
-    let reference = match &on_cpu {
+    let reference = match on_cpu {
         Some(other) => Reference::Cpu(other),
         None => Reference::Composed,
     };

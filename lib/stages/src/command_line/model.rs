@@ -53,7 +53,8 @@ pub enum Command {
 /// Options of `dipir-model check`.
 #[derive(Args)]
 pub struct CheckArgs {
-    /// A model's folder, or one .safetensors file [default: the embedded model]
+    /// A model's folder, or one .safetensors file [default: that of pipeline.toml, or the embedded
+    /// model]
     #[arg(value_name = "MODEL")]
     pub model: Option<PathBuf>,
 
