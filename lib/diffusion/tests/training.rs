@@ -276,11 +276,11 @@ fn training_lowers_the_loss_on_the_picture() -> Outcome {
 #[test]
 fn the_loss_at_fixed_noise_falls_and_is_the_same_after_a_resumption() -> Outcome {
     let model = model("sd15")?;
-    let data = Data { model: &model };
-    let config = TrainingConfig {
-        learning_rate: 2e-3,
-        ..config()
+    let data = Data {
+        inpaint: false,
+        prior: true,
     };
+    let config = config();
     let mut trainer = LoraTrainer::new(&model, config.clone(), None)?;
     let validation = Validation::new(&trainer, &data, 6)?;
     let start = validation.start();
