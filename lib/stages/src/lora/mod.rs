@@ -253,7 +253,7 @@ fn data<'a>(session: &Session, table: &LoraTable, model: &'a Model) -> anyhow::R
         .then(|| ConceptsFolder::read(session))
         .transpose()?;
     let limits = session.config.table::<SceneConfig>("scene")?.limits;
-    let photo = read_photo_within(&session.resolve(&background), transfer, limits.photo())?;
+    let photo = read_photo_within(session.resolve(&background), transfer, limits.photo())?;
     Ok(Data {
         photo: dipir_tensors::model_input(&photo.transfer.encode(&photo.image))?,
         size: model.native_size(),
