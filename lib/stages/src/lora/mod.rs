@@ -14,7 +14,7 @@ use std::time::Instant;
 use anyhow::Context;
 use candle_core::Tensor;
 use dipir_cli::interrupt;
-use dipir_cli::session::{Session, duration};
+use dipir_cli::session::Session;
 use dipir_diffusion::generate::{GenerateSettings, generate};
 use dipir_diffusion::lora::{LoraInfo, LoraStyle};
 use dipir_diffusion::model::Model;
@@ -40,6 +40,7 @@ use crate::concepts::folder::{ConceptsFolder, read_latents};
 use crate::concepts::table::ConceptsTable;
 use crate::model::{self, ModelTable};
 use crate::names::{CONCEPTS, LORA};
+use crate::written;
 
 /// Fixed examples of each kind. Their losses are compared with one another, so that few do.
 const VALIDATED: usize = 8;
@@ -460,14 +461,9 @@ impl Done {
 
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(
-            f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
+        written(f, &self.folder, &self.manifest)?;
         let updates = self.history.updates.len();
-        write!(f, "  {updates} updates")?;
+        write!(f, "\n  {updates} updates")?;
         if self.from_cache {
             write!(f, ", from the cache")?;
         } else if updates < self.wanted {
