@@ -1,6 +1,7 @@
 //! Where most of the light comes from, drawn onto the photograph: an arrow on the ground and a disc in the sky.
 use dipir_estimator::LightEstimate;
-use dipir_estimator::posterior::{direction_deg, words};
+use dipir_estimator::grid::direction;
+use dipir_estimator::posterior::words;
 use dipir_imaging::transfer::Transfer;
 use dipir_scene::camera::Camera;
 use dipir_scene::description::SceneDescription;
@@ -98,7 +99,7 @@ impl Ground {
         let steps = ((arc.high - arc.low) / STEP_DEG).ceil().clamp(1.0, 72.0) as usize;
         let rim = (0..=steps).map(|k| {
             let azimuth = arc.low + (arc.high - arc.low) * k as f64 / steps as f64;
-            self.foot + 1.6 * self.radius * (turn * direction_deg(azimuth, 0.0))
+            self.foot + 1.6 * self.radius * (turn * direction(azimuth.to_radians() as f32, 0.0))
         });
         let corners: Option<Vec<Vec2>> = std::iter::once(self.foot)
             .chain(rim)
