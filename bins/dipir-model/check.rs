@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use candle_core::{DType, Device};
-use dipir_cli::exit::{FAILED, Said, Usage};
+use dipir_cli::exit::{AlreadyReported, FAILED, Usage};
 use dipir_cli::interrupt;
 use dipir_cli::progress::Progress;
 use dipir_cli::session::{Session, duration, size};
@@ -103,7 +103,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     output.result(|| report.in_words(), || json!(report));
     match report.agreement.iter().all(Agreement::holds) {
         true => Ok(()),
-        false => Err(Said(FAILED).into()),
+        false => Err(AlreadyReported(FAILED).into()),
     }
 }
 
