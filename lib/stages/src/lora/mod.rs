@@ -75,8 +75,12 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
             .invalid("lora.time_budget_s", "accepted: above 0");
         return Err(wrong.into());
     }
+    // The class is in the prompts of the sheet.
+    let class = (table.sheet_steps > 0)
+        .then(|| class(session))
+        .transpose()?;
     let params = json!({
-        "lora": table.deciding(), "transfer": transfer, "precision": model_table.precision,
+        "class": class, "lora": table.deciding(), "transfer": transfer, "precision": model_table.precision,
     });
     let mut plan = LORA.plan(session, params);
     plan.device = session.pipeline.device.clone();
@@ -87,6 +91,12 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     }
     model::inputs(session, &model_table, &mut plan)?;
     Ok(plan)
+}
+
+/// What prompts call the object.
+fn class(session: &Session) -> anyhow::Result<String> {
+    let scene: SceneConfig = session.config.table("scene")?;
+    Ok(scene.class.unwrap_or_else(|| "object".into()))
 }
 
 /// Whether training uses concept images beside the photograph.
@@ -340,8 +350,7 @@ fn show_change(
     if table.sheet_steps == 0 {
         return Ok(Value::Null);
     }
-    let scene: SceneConfig = session.config.table("scene")?;
-    let class = scene.class.unwrap_or_else(|| "object".into());
+    let class = class(session)?;
     let own = format!(
         "a photo of a {class} in a scene in the style of {} rendering",
         table.word
