@@ -107,11 +107,17 @@ fn concepts_and_lora_run_on_every_kind_of_model() {
             "lora/lora_kohya.safetensors",
             "lora/word.safetensors",
             "lora/training.json",
+            "lora/training.csv",
+            "lora/sheet.png",
             "lora/samples/000003.png",
             "lora/stage.json",
         ] {
             assert!(path(name).is_file(), "{family}: {name}");
         }
+        // Before the first update, and after the last one.
+        let csv = fs::read_to_string(path("lora/training.csv")).unwrap();
+        assert_eq!(csv.lines().count(), 1 + 1 + 3, "{csv}");
+        assert!(done["loss_at_start"].as_f64().unwrap() > 0.0 && done["change"].is_number());
         assert!(
             !path("lora-checkpoints").exists(),
             "checkpoints go when the result is there"
@@ -160,6 +166,56 @@ fn scenes_of_one_class_share_a_cache() {
     assert_eq!(images("toy", "0"), (0.into(), 3), "another scene");
     assert_eq!(images("car", "0"), (3.into(), 3), "another class");
     assert_eq!(images("toy", "7"), (3.into(), 3), "other noise");
+}
+
+#[test]
+fn scenes_of_one_photograph_train_once_and_a_damaged_adapter_is_trained_anew() {
+    let cache = tempfile::tempdir().unwrap();
+    let setting = format!("lora.cache={:?}", cache.path());
+    let adapter = |more: &[&str]| {
+        let folder = project("sd15");
+        run(folder.path(), CONCEPTS, &[]);
+        let mut args = vec!["--set", setting.as_str()];
+        args.extend(more);
+        let done = run(folder.path(), LORA, &args);
+        assert_eq!(done["steps"], 3);
+        let found = done["from_cache"].as_bool().unwrap();
+        (
+            found,
+            fs::read(folder.path().join("out/lora/lora.safetensors")).unwrap(),
+        )
+    };
+    let (found, first) = adapter(&[]);
+    assert!(!found);
+    assert!(adapter(&[]) == (true, first.clone()), "another scene");
+    assert!(!adapter(&["--set", "lora.rank=2"]).0, "other settings");
+    for entry in fs::read_dir(cache.path()).unwrap() {
+        fs::write(entry.unwrap().path().join("lora.safetensors"), "mine").unwrap();
+    }
+    assert!(adapter(&[]) == (false, first), "a damaged one");
+}
+
+#[test]
+fn a_time_budget_ends_the_training_early_and_says_so() {
+    let folder = project("sd15");
+    let args = [
+        "--set",
+        "concepts.count=0",
+        "--set",
+        "lora.time_budget_s=1e-9",
+    ];
+    let output = command(folder.path(), LORA, &args).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(
+        text.contains("1 updates of 3 within lora.time_budget_s"),
+        "{text}"
+    );
+    // One update moves nothing.
+    let warning = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(
+        warning.contains("it changes nothing that can be seen"),
+        "{warning}"
+    );
 }
 
 #[test]

@@ -1,4 +1,6 @@
-//! `dipir-model`: brings diffusion models onto the disk. The only executable that uses the network.
+//! `dipir-model`: brings diffusion models onto the disk, and checks what they compute. The only executable that uses the
+//! network.
+mod check;
 mod fetch;
 
 use std::process::ExitCode;
@@ -10,5 +12,6 @@ use dipir_stages::command_line::model::{Cli, Command};
 fn main() -> ExitCode {
     exit::run(|| match Cli::parse().command {
         Command::Fetch(args) => fetch::run(&args),
+        Command::Check(args) => check::run(&args),
     })
 }

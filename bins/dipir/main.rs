@@ -4,6 +4,7 @@ mod init;
 mod keys;
 mod manual;
 mod place;
+mod plan;
 mod preview;
 mod project;
 mod report;
@@ -25,6 +26,7 @@ Examples:
   dipir run                                 what ./pipeline.toml says, as far as it is not done yet
   dipir run photo/pipeline.toml             another project; several are run one after the other
   dipir run --set light.iterations=50       a key set for this run; only what it concerns runs
+  dipir run --plan                          what would run, how long and with how much memory
   dipir run --until lora                    that stage and what it needs
   dipir run --from light --force            that stage and all that read it, once more
   dipir status                              what would run, and why

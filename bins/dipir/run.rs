@@ -21,6 +21,7 @@ use dipir_stages::graph;
 use dipir_stages::truth::Truth;
 use serde_json::{Value, json};
 
+use crate::plan;
 use crate::project::{ProjectArgs, Stage};
 use crate::report;
 use crate::watch;
@@ -41,6 +42,11 @@ pub struct RunArgs {
     /// Run every stage that is asked for, up to date or not
     #[arg(long)]
     force: bool,
+
+    /// Say which stages would run and what each takes, and start nothing. What did not run here yet and asks a diffusion
+    /// model is measured: a few steps of it
+    #[arg(long, conflicts_with = "jobs")]
+    plan: bool,
 
     /// Stages that may run at the same time, such as scene and concepts
     #[arg(long, value_name = "N", default_value_t = 1)]
@@ -127,6 +133,9 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
 fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String, Value)> {
     let (session, graph) = project.open()?;
     let nodes = selected(args, &graph)?;
+    if args.plan {
+        return plan::plan(&session, &graph, &nodes, args.force);
+    }
     let mut work = Pipeline::new(args, project, &session)?;
     let all_fresh = all_fresh(&session, &graph, &nodes)?;
     if args.force || !all_fresh {

@@ -136,7 +136,8 @@ pub struct RunArgs {
     #[arg(long, value_name = "DIR")]
     pub model: Option<PathBuf>,
 
-    /// Set a key for every method, as in --set light.iterations=100; may be repeated
+    /// Set a key for every method, as in --set light.iterations=100; may be repeated. Relative
+    /// concepts.cache and lora.cache start from the evaluation's folder
     #[arg(long = "set", short = 's', value_name = "KEY=VALUE")]
     pub set: Vec<String>,
 

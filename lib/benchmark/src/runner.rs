@@ -190,8 +190,9 @@ impl Runner<'_> {
             "composite.target_error",
             &self.args.target_error.to_string(),
         );
-        run.set
-            .extend(method.set.iter().chain(&self.args.set).cloned());
+        for set in method.set.iter().chain(&self.args.set) {
+            run.set.push(shared_cache(set, self.evaluation.root())?);
+        }
         if let (true, Some(model)) = (method.model, &self.args.model) {
             let model = model
                 .canonicalize()
@@ -256,6 +257,18 @@ impl Runner<'_> {
         }
         Ok(Fingerprint::of_plan(&plan).finish().as_str().to_owned())
     }
+}
+
+/// `set`, where it names a cache by a relative path, with that path from the evaluation's `folder`: all scenes share it.
+fn shared_cache(set: &str, folder: &Path) -> anyhow::Result<String> {
+    let Some((key, value)) = set.split_once('=') else {
+        return Ok(set.into());
+    };
+    if !["concepts.cache", "lora.cache"].contains(&key.trim()) {
+        return Ok(set.into());
+    }
+    let cache = folder.join(value.trim().trim_matches(['"', '\'']));
+    Ok(format!("{key}={}", toml_string(&cache)?))
 }
 
 /// The value of `composite.tone`.
@@ -372,5 +385,22 @@ impl<'a> StageRuns<'a> {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_relative_cache_starts_from_the_evaluation_and_nothing_else_changes() {
+        let of = |set| shared_cache(set, Path::new("/evaluation")).unwrap();
+        assert_eq!(
+            of("concepts.cache=\"cars\""),
+            "concepts.cache=\"/evaluation/cars\""
+        );
+        assert_eq!(of("lora.cache=loras"), "lora.cache=\"/evaluation/loras\"");
+        assert_eq!(of("lora.cache=/elsewhere"), "lora.cache=\"/elsewhere\"");
+        assert_eq!(of("lora.steps=3"), "lora.steps=3");
     }
 }

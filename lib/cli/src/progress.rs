@@ -20,6 +20,8 @@ const LINE_EVERY: Duration = Duration::from_secs(30);
 /// The time left is shown only after this share of the work and this time have passed.
 const SHARE_TO_JUDGE_BY: f64 = 0.02;
 const TIME_TO_JUDGE_BY: Duration = Duration::from_secs(2);
+/// Steps that take this long, as those of a large diffusion model, tell the pace before that share of them is done.
+const ENOUGH_TIME: Duration = Duration::from_secs(30);
 
 /// How far a piece of work has come.
 #[derive(Debug)]
@@ -67,7 +69,8 @@ impl Course {
         let (then, share) = self.last;
         let done = share - first;
         let worked = then.saturating_sub(start);
-        if done < SHARE_TO_JUDGE_BY || passed.saturating_sub(start) < TIME_TO_JUDGE_BY {
+        let enough = done >= SHARE_TO_JUDGE_BY || (done > 0.0 && worked >= ENOUGH_TIME);
+        if !enough || passed.saturating_sub(start) < TIME_TO_JUDGE_BY {
             return None;
         }
         let at_the_time = worked.as_secs_f64() * (1.0 - share) / done;

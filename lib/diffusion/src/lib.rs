@@ -1,6 +1,7 @@
 //! Latent diffusion models at any size: model folders in the diffusers
 //! layout, layers whose gradients pass, samplers, LoRA and score distillation.
 
+pub mod check;
 pub mod concepts;
 pub mod config;
 pub mod crop;
@@ -21,11 +22,13 @@ pub mod recompute;
 mod resnet;
 pub mod sampler;
 pub mod schedule;
+pub mod single_file;
 pub mod text_encoder;
 pub mod tokenizer;
 pub mod training;
 pub mod unet;
 pub mod vae;
+pub mod validation;
 pub mod weights;
 
 pub use error::{Error, Result};

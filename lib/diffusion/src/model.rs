@@ -7,7 +7,8 @@ use candle_core::{DType, Device, Tensor};
 use crate::config::ConfigFile;
 use crate::error::{Error, Result};
 use crate::parameters::Parameters;
-use crate::schedule::NoiseSchedule;
+use crate::schedule::{NoiseSchedule, Prediction};
+use crate::single_file::SingleFile;
 use crate::text_encoder::{LearnedTokens, TextEncoder};
 use crate::tokenizer::Tokenizer;
 use crate::unet::{UNet, UNetConfig};
@@ -21,7 +22,7 @@ const MAX_SIDE: usize = 4096;
 /// Text encoder, UNet and autoencoder with their tokenizer and schedule.
 #[derive(Debug)]
 pub struct Model {
-    /// Where it came from.
+    /// The folder, or the file, that it came from.
     pub folder: PathBuf,
     /// Text to tokens.
     pub tokenizer: Tokenizer,
@@ -48,21 +49,45 @@ impl Model {
     /// `dtype`, which has to be f32 on the CPU. Checks that the parts fit
     /// each other.
     pub fn load(folder: &Path, dtype: DType, device: &Device) -> Result<Self> {
+        check_precision(dtype, device)?;
         ConfigFile::read(&folder.join("model_index.json"))?;
-        if device.is_cpu() && dtype != DType::F32 {
-            return crate::error::argument(format!(
-                "precision {dtype:?} on the CPU: accepted is f32; half-precision files are converted while reading"
-            ));
-        }
         // What is small comes first: its errors cost nothing.
         let schedule = NoiseSchedule::load(&folder.join("scheduler"))?;
-        let mut tokenizer = Tokenizer::load(&folder.join("tokenizer"))?;
+        let tokenizer = Tokenizer::load(&folder.join("tokenizer"))?;
         let text_encoder = TextEncoder::load(&folder.join("text_encoder"), dtype, device)?;
         let unet = load_unet(&folder.join("unet"), dtype, device)?;
         let vae = Vae::load(&folder.join("vae"), dtype, device)?;
+        let placed = (dtype, device);
+        Self::of_parts(folder, tokenizer, text_encoder, unet, vae, schedule, placed)
+    }
+
+    /// Loads a whole model in one safetensors file of the original layout
+    /// ([`crate::single_file`]); `prediction` is what its UNet predicts,
+    /// where the file does not tell.
+    pub fn load_file(
+        path: &Path,
+        prediction: Option<Prediction>,
+        dtype: DType,
+        device: &Device,
+    ) -> Result<Self> {
+        check_precision(dtype, device)?;
+        SingleFile::open(path, prediction)?.load(dtype, device)
+    }
+
+    /// Puts parts together that are in memory; `path` is where they came
+    /// from. Checks that they fit each other.
+    pub(crate) fn of_parts(
+        path: &Path,
+        mut tokenizer: Tokenizer,
+        text_encoder: TextEncoder,
+        unet: UNet,
+        vae: Vae,
+        schedule: NoiseSchedule,
+        (dtype, device): (DType, &Device),
+    ) -> Result<Self> {
         tokenizer.limit_length(text_encoder.config().max_position_embeddings);
         let model = Self {
-            folder: folder.to_owned(),
+            folder: path.to_owned(),
             tokenizer,
             text_encoder,
             unet,
@@ -78,7 +103,10 @@ impl Model {
     fn check(&self) -> Result<()> {
         let fail = |message: String| {
             Err(Error::Config {
-                path: self.folder.join("model_index.json"),
+                path: match self.folder.is_file() {
+                    true => self.folder.clone(),
+                    false => self.folder.join("model_index.json"),
+                },
                 message: format!("the parts do not fit: {message}"),
             })
         };
@@ -143,6 +171,15 @@ impl Model {
             .collect::<Result<Vec<_>>>()?;
         self.text_encoder.forward(&tokens, learned)
     }
+}
+
+fn check_precision(dtype: DType, device: &Device) -> Result<()> {
+    if device.is_cpu() && dtype != DType::F32 {
+        return crate::error::argument(format!(
+            "precision {dtype:?} on the CPU: accepted is f32; half-precision files are converted while reading"
+        ));
+    }
+    Ok(())
 }
 
 /// Loads the folder `unet/` of a model with frozen weights.

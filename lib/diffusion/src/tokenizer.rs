@@ -28,6 +28,18 @@ const END: &str = "<|endoftext|>";
 /// Sequence length of every published CLIP, both markers included.
 const DEFAULT_LENGTH: usize = 77;
 
+/// CLIP's merges, by which every published Stable Diffusion 1 and 2 splits words.
+const CLIP_MERGES: &str = include_str!("../data/clip_merges.txt");
+
+/// What fills a sequence behind its end marker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Padding {
+    /// More end markers, as CLIP does.
+    End,
+    /// Token 0, as OpenCLIP does.
+    First,
+}
+
 type Inner = tokenizers::TokenizerImpl<
     BPE,
     NormalizerSequence,
@@ -97,6 +109,32 @@ impl Tokenizer {
             end,
             pad,
             length,
+            vocab_size,
+            placeholders: BTreeMap::new(),
+        })
+    }
+
+    /// CLIP's own tokenizer, for models that come without one.
+    pub fn clip(padding: Padding) -> Result<Self> {
+        let path = PathBuf::from("the built-in tokenizer");
+        let merges = read_merges(&path, CLIP_MERGES)?;
+        let vocab = vocab_of(&merges);
+        let vocab_size = vocab.len();
+        let (start, end) = (vocab_size as u32 - 2, vocab_size as u32 - 1);
+        let inner = build(vocab, merges).map_err(|e| Error::Tokenizer {
+            path: path.clone(),
+            message: e.to_string(),
+        })?;
+        Ok(Self {
+            inner,
+            path,
+            start,
+            end,
+            pad: match padding {
+                Padding::End => end,
+                Padding::First => 0,
+            },
+            length: DEFAULT_LENGTH,
             vocab_size,
             placeholders: BTreeMap::new(),
         })
@@ -208,6 +246,31 @@ fn read_vocab_and_merges(folder: &Path) -> Result<(Vocab, Merges)> {
     let vocab: Vocab = file.parse()?;
     let path = folder.join("merges.txt");
     let text = std::fs::read_to_string(&path).map_err(io("read", &path))?;
+    let merges = read_merges(&path, &text)?;
+    Ok((vocab, merges))
+}
+
+/// The vocabulary that merges mean: a character for every byte, the same at the end of a word, what each merge gives, and
+/// both markers.
+fn vocab_of(merges: &Merges) -> Vocab {
+    // Printable bytes stand for themselves, and come first.
+    let printable = |b: &u8| matches!(b, 33..=126 | 161..=172 | 174..=255);
+    let (first, others): (Vec<u8>, Vec<u8>) = (0..=255u8).partition(printable);
+    let stand_in = |i: u32| char::from_u32(256 + i).unwrap_or('\u{fffd}');
+    let symbols: Vec<char> = first
+        .into_iter()
+        .map(char::from)
+        .chain((0..others.len() as u32).map(stand_in))
+        .collect();
+    let single = symbols.iter().map(|c| c.to_string());
+    let last = symbols.iter().map(|c| format!("{c}</w>"));
+    let merged = merges.iter().map(|(a, b)| format!("{a}{b}"));
+    let markers = [START, END].map(String::from);
+    let words = single.chain(last).chain(merged).chain(markers);
+    words.zip(0..).collect()
+}
+
+fn read_merges(path: &Path, text: &str) -> Result<Merges> {
     let mut merges = Merges::new();
     for (number, line) in text.lines().enumerate() {
         if line.starts_with("#version") || line.is_empty() {
@@ -221,11 +284,14 @@ fn read_vocab_and_merges(folder: &Path) -> Result<(Vocab, Merges)> {
                     "line {}: {line:?} is not a pair of symbols with a space between",
                     number + 1
                 );
-                return Err(Error::Tokenizer { path, message });
+                return Err(Error::Tokenizer {
+                    path: path.to_owned(),
+                    message,
+                });
             }
         }
     }
-    Ok((vocab, merges))
+    Ok(merges)
 }
 
 fn read_tokenizer_json(path: &Path) -> Result<(Vocab, Merges)> {

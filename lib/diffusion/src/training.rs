@@ -145,8 +145,8 @@ const TOKEN: &str = "token";
 /// A fine-tuning run; [`LoraTrainer::step`] is one update.
 #[derive(Debug)]
 pub struct LoraTrainer<'a> {
-    model: &'a Model,
-    config: TrainingConfig,
+    pub(crate) model: &'a Model,
+    pub(crate) config: TrainingConfig,
     lora: Arc<Lora>,
     token: Option<Var>,
     initial_token: Option<Tensor>,
@@ -348,7 +348,8 @@ impl<'a> LoraTrainer<'a> {
             .collect()
     }
 
-    fn join_conditions(&self, examples: &[Example], noisy: &Tensor) -> Result<Tensor> {
+    /// What the network sees: noisy latents, for inpainting models with their conditions.
+    pub(crate) fn join_conditions(&self, examples: &[Example], noisy: &Tensor) -> Result<Tensor> {
         if !self.model.is_inpainting() {
             return Ok(noisy.clone());
         }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use candle_core::{DType, Device, Tensor};
 use memmap2::Mmap;
@@ -30,7 +31,7 @@ struct Entry {
 #[derive(Debug)]
 pub struct Weights {
     path: PathBuf,
-    files: Vec<Mmap>,
+    files: Vec<Arc<Mmap>>,
     entries: BTreeMap<String, Entry>,
     metadata: BTreeMap<String, String>,
 }
@@ -156,8 +157,57 @@ impl Weights {
             self.metadata
                 .extend(metadata.iter().map(|(k, v)| (k.clone(), v.clone())));
         }
-        self.files.push(map);
+        self.files.push(Arc::new(map));
         Ok(())
+    }
+
+    /// The same tensors under other names. Where `names` gives several for one, it is cut into as many equal parts along
+    /// its first dimension; where it gives none, the tensor is left out.
+    pub fn renamed(&self, names: impl Fn(&str) -> Vec<String>) -> Result<Self> {
+        let mut entries = BTreeMap::new();
+        for (name, entry) in &self.entries {
+            let new = names(name);
+            let rows = entry.shape.first().copied().unwrap_or(1);
+            if new.len() > 1 && !rows.is_multiple_of(new.len()) {
+                return Err(Error::Weights {
+                    path: self.path.clone(),
+                    problems: vec![format!(
+                        "tensor {name:?} of shape {:?} cannot be cut into {} equal parts",
+                        entry.shape,
+                        new.len()
+                    )],
+                });
+            }
+            let parts = new.len().max(1);
+            let bytes = entry.range.len() / parts;
+            for (part, new) in new.into_iter().enumerate() {
+                let start = entry.range.start + part * bytes;
+                let mut shape = entry.shape.clone();
+                if let Some(rows) = shape.first_mut() {
+                    *rows /= parts;
+                }
+                let cut = Entry {
+                    file: entry.file,
+                    dtype: entry.dtype,
+                    shape,
+                    range: start..start + bytes,
+                };
+                if entries.insert(new.clone(), cut).is_some() {
+                    return Err(Error::Weights {
+                        path: self.path.clone(),
+                        problems: vec![format!(
+                            "two tensors are both {new:?}, one of them {name:?}"
+                        )],
+                    });
+                }
+            }
+        }
+        Ok(Self {
+            path: self.path.clone(),
+            files: self.files.clone(),
+            entries,
+            metadata: self.metadata.clone(),
+        })
     }
 
     /// The file or index that was opened.

@@ -12,6 +12,7 @@ use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::{Sampler, Solver, edit, guided, sample};
 use dipir_diffusion::training::{Example, LoraTrainer, TrainingConfig, TrainingData};
+use dipir_diffusion::validation::Validation;
 
 type Outcome = Result<(), Box<dyn std::error::Error>>;
 
@@ -269,6 +270,39 @@ fn training_lowers_the_loss_on_the_picture() -> Outcome {
     }
     let after = average(&trainer)?;
     assert!(after < 0.9 * before, "loss {before} became {after}");
+    Ok(())
+}
+
+#[test]
+fn the_loss_at_fixed_noise_falls_and_is_the_same_after_a_resumption() -> Outcome {
+    let model = model("sd15")?;
+    let data = Data {
+        inpaint: false,
+        prior: true,
+    };
+    let config = config();
+    let mut trainer = LoraTrainer::new(&model, config.clone(), None)?;
+    let validation = Validation::new(&trainer, &data, 6)?;
+    let start = validation.start();
+    assert_eq!((start.step, start.change), (0, 0.0));
+    // A fresh adapter is the un-adapted model.
+    assert_eq!(
+        validation.evaluate(&trainer)?.instance_loss,
+        start.instance_loss
+    );
+    for _ in 0..40 {
+        trainer.step(&data)?;
+    }
+    let end = validation.evaluate(&trainer)?;
+    assert!(end.instance_loss < start.instance_loss, "{start:?} {end:?}");
+    assert!(end.change > 0.0 && end.step == 40, "{end:?}");
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("checkpoint.safetensors");
+    trainer.save_checkpoint(&path)?;
+    let mut resumed = LoraTrainer::new(&model, config, None)?;
+    let validation = Validation::new(&resumed, &data, 6)?;
+    resumed.resume(&path)?;
+    assert_eq!(validation.evaluate(&resumed)?, end);
     Ok(())
 }
 

@@ -182,7 +182,10 @@ impl<'a> Distillation<'a> {
             }
             (_, prompt) => {
                 let own = match word {
-                    Some(word) => format!("a photo of a {class} in the style of {word} rendering"),
+                    // [DiPIR, section 4.3].
+                    Some(word) => {
+                        format!("a photo of a {class} in a scene in the style of {word} rendering")
+                    }
                     None => format!("a photo of a {class}"),
                 };
                 let prompt = prompt.clone().unwrap_or(own);

@@ -5,6 +5,7 @@
 //! types; a type that refuses unknown fields makes a misspelt key an error that names the
 //! accepted keys and the nearest one.
 mod deserialize;
+mod methods;
 mod renamed;
 mod tree;
 
@@ -30,6 +31,7 @@ pub const TABLES: [&str; 8] = [
     "report",
 ];
 
+pub use methods::Method;
 pub use renamed::renamed;
 
 /// Where a value was written.
@@ -97,6 +99,11 @@ pub struct PipelineTable {
     /// How much work is done where a key does not say it.
     #[schemars(example = &"draft")]
     pub quality: Quality,
+    /// A published method whose settings hold where a key does not say otherwise: what the paper of DiPIR states for
+    /// Stable Diffusion 2.1.
+    #[schemars(extend("x-default" = "none: the defaults of each key"), example = &"dipir-outdoors")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub method: Option<Method>,
 }
 
 impl Default for PipelineTable {
@@ -107,6 +114,7 @@ impl Default for PipelineTable {
             threads: 0,
             device: "cpu".into(),
             quality: Quality::Standard,
+            method: None,
         }
     }
 }
@@ -135,6 +143,7 @@ impl Config {
         for text in overrides {
             tree::apply_override(&mut root, text)?;
         }
+        methods::fill(&mut root)?;
         let config = Self {
             path: path.into(),
             root,

@@ -34,13 +34,13 @@ pub const CONCEPTS: StageName = StageName {
 pub const LORA: StageName = StageName {
     name: "lora",
     executable: "dipir-lora",
-    version: 2,
+    version: 3,
 };
 /// Recovers light and tone curves.
 pub const LIGHT: StageName = StageName {
     name: "light",
     executable: "dipir-light",
-    version: 4,
+    version: 5,
 };
 /// Renders the picture and its layers.
 pub const COMPOSITE: StageName = StageName {

@@ -3,6 +3,7 @@
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp1, D, Layout, Shape, Tensor};
 
+use super::backend::has_kernels;
 use crate::error::{Result, argument};
 use crate::kernels::pointwise;
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -41,7 +42,7 @@ impl Activation {
 /// f(x), elementwise.
 pub fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
     let x = x.contiguous()?;
-    if x.device().is_cpu() {
+    if has_kernels(&x) {
         return Ok(x.apply_op1(ActivationOp(f))?);
     }
     activate_composed(f, &x)
@@ -68,7 +69,7 @@ pub fn geglu(x: &Tensor) -> Result<Tensor> {
             x.dims()
         ));
     }
-    if x.device().is_cpu() {
+    if has_kernels(&x) {
         return Ok(x.apply_op1(GegluOp)?);
     }
     geglu_composed(&x)

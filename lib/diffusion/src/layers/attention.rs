@@ -3,6 +3,7 @@
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, D, DType, Device, Layout, Shape, Tensor};
 
+use super::backend::has_kernels;
 use crate::error::{Result, argument};
 use crate::kernels::attention::{self, AttentionShape};
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -34,7 +35,7 @@ impl Attention {
     pub fn forward(&self, q: &Tensor, k: &Tensor, v: &Tensor) -> Result<Tensor> {
         let (q, k, v) = (q.contiguous()?, k.contiguous()?, v.contiguous()?);
         let shape = self.shape(q.shape(), k.shape(), v.shape())?;
-        if q.device().is_cpu() {
+        if has_kernels(&q) {
             return Ok(q.apply_op3(&k, &v, AttentionOp(*self))?);
         }
         self.forward_composed(&q, &k, &v, shape)

@@ -3,6 +3,7 @@
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
 
+use super::backend::has_kernels;
 use crate::error::{Result, argument};
 use crate::kernels::conv::{self, ConvShape};
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -81,7 +82,7 @@ impl Conv2d {
             Padding::Same(n) => (n, n),
             Padding::After(n) => (0, n),
         };
-        if x.device().is_cpu() {
+        if has_kernels(&x) {
             return Ok(x.apply_op3(
                 &self.weight,
                 &self.bias,

@@ -3,6 +3,7 @@
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
 
+use super::backend::has_kernels;
 use crate::error::{Result, argument};
 use crate::kernels::norm::{self, GroupShape};
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -57,7 +58,7 @@ impl GroupNorm {
     /// Applies the layer.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
-        if x.device().is_cpu() {
+        if has_kernels(&x) {
             let silu = self.activation == NormActivation::Silu;
             let op = GroupNormOp {
                 groups: self.groups,

@@ -3,6 +3,7 @@
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
 
+use super::backend::has_kernels;
 use crate::error::Result;
 use crate::kernels::norm;
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -27,7 +28,7 @@ impl LayerNorm {
     /// Applies the layer to x [..., size].
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
-        if x.device().is_cpu() {
+        if has_kernels(&x) {
             return Ok(x.apply_op3(
                 &self.gamma,
                 &self.beta,

@@ -2,6 +2,7 @@
 
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
 
+use super::backend::has_kernels;
 use crate::error::{Result, argument};
 use crate::kernels::matmul;
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -47,6 +48,14 @@ impl Linear {
         Ok(Self { weight, bias })
     }
 
+    /// The same layer of constants.
+    pub fn detached(&self) -> Self {
+        Self {
+            weight: self.weight.detach(),
+            bias: self.bias.as_ref().map(Tensor::detach),
+        }
+    }
+
     /// Number of inputs.
     pub fn inputs(&self) -> usize {
         self.weight.dims()[1]
@@ -65,7 +74,7 @@ impl Linear {
     /// Applies the layer to x [..., inputs].
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
-        if !x.device().is_cpu() {
+        if !has_kernels(&x) {
             return self.forward_composed(&x);
         }
         Ok(match &self.bias {

@@ -8,6 +8,7 @@
 
 mod activation;
 mod attention;
+mod backend;
 #[cfg(test)]
 mod composed;
 mod conv2d;
@@ -19,6 +20,7 @@ mod resample;
 
 pub use activation::{Activation, activate, geglu};
 pub use attention::{Attention, Causality};
+pub use backend::composed;
 pub use conv2d::{Conv2d, Padding};
 pub use embedding::Embedding;
 pub use group_norm::{GroupNorm, NormActivation};

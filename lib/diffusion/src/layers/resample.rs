@@ -7,6 +7,7 @@ use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
+use super::backend::has_kernels;
 use crate::error::Result;
 use crate::kernels::tensor::{floats, from_floats, read, store};
 
@@ -14,7 +15,7 @@ use crate::kernels::tensor::{floats, from_floats, read, store};
 /// nearest source pixel, floor(i * h / height), as PyTorch's "nearest".
 pub fn upsample_nearest(x: &Tensor, height: usize, width: usize) -> Result<Tensor> {
     let x = x.contiguous()?;
-    if x.device().is_cpu() {
+    if has_kernels(&x) {
         return Ok(x.apply_op1(NearestOp { height, width })?);
     }
     upsample_composed(&x, height, width)

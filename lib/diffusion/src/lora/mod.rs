@@ -151,6 +151,21 @@ impl Lora {
         self.adapters.insert(name.to_owned(), adapter);
     }
 
+    /// The same adapters as constants: predictions with them keep nothing for
+    /// a backward pass.
+    pub fn detached(&self) -> Self {
+        let detached = |adapter: &Adapter| Adapter {
+            down: adapter.down.detached(),
+            up: adapter.up.detached(),
+            scale: adapter.scale,
+        };
+        let adapters = self.adapters.iter();
+        Self {
+            adapters: adapters.map(|(n, a)| (n.clone(), detached(a))).collect(),
+            variables: BTreeMap::new(),
+        }
+    }
+
     /// The adapter of the layer `name`.
     pub fn adapter(&self, name: &str) -> Option<&Adapter> {
         self.adapters.get(name)

@@ -8,11 +8,13 @@ Examples:
   dipir-lora --set lora.steps=1000          train longer
   dipir-lora --set lora.learn_word=true     learn an embedding for the word, too
   dipir-lora --set lora.sample_every=100    look at samples on the way
+  dipir-lora --set lora.time_budget_s=600   train no longer than that
+  dipir-lora --set lora.cache=../loras      train once for all scenes of one photograph
   dipir-lora --set concepts.count=0         without concept preservation
 
 Reads OUT/concepts/, which dipir-concepts writes. Writes OUT/lora/: lora.safetensors (diffusers,
-PEFT) lora_kohya.safetensors (A1111, ComfyUI) word.safetensors (with lora.learn_word) samples/
-training.json stage.json.
+PEFT) lora_kohya.safetensors (A1111, ComfyUI) word.safetensors (with lora.learn_word) sheet.png
+(prompts without and with the adapter) samples/ training.json training.csv stage.json.
 An interrupted run goes on where it stopped and ends with the same bytes.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 

@@ -2,10 +2,25 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use dipir_cli::args::OutputArgs;
+use dipir_cli::args::{CommonArgs, OutputArgs};
+
+const CHECK_EXAMPLES: &str = "\
+Examples:
+  dipir-model check                                     the embedded model, on a GPU if there is one
+  dipir-model check models/sd21 --device cuda:0         in bf16, against the CPU in f32
+  dipir-model check v1-5.safetensors --device cpu       one file; kernels against composed operations
+  dipir-model check models/sd21 -p scene/pipeline.toml  and what that scene will take
+  dipir-model check models/sd21 --json > check.json     for a bug report
+
+Compares text encoder, UNet, autoencoder and the gradient of its encoder at a small size and at that
+of the model: on a GPU with the same model on the CPU in f32, on the CPU with the same layers made of
+candle's operations. Then times the parts, and says what the stages of pipeline.toml would take.
+Exit codes: 0 all parts agree, 1 failed or a part does not agree, 2 wrong usage, 130 interrupted.";
 
 const EXAMPLES: &str = "\
 Examples:
+  dipir-model check                                  the embedded model on this machine
+  dipir-model check models/sd21 --device cuda:0      what a bug report about a GPU should hold
   dipir-model fetch OWNER/NAME                       into ./NAME
   dipir-model fetch OWNER/NAME --to models/sd        into models/sd
   dipir-model fetch OWNER/NAME --revision fp16       a branch, tag or commit
@@ -30,6 +45,37 @@ pub enum Command {
     /// Fetch a model and check that it loads
     #[command(after_help = EXAMPLES)]
     Fetch(FetchArgs),
+    /// Compare a model's parts with a reference on this machine, time them, and say what a run would take
+    #[command(after_help = CHECK_EXAMPLES)]
+    Check(CheckArgs),
+}
+
+/// Options of `dipir-model check`.
+#[derive(Args)]
+pub struct CheckArgs {
+    /// A model's folder, or one .safetensors file [default: that of pipeline.toml, or the embedded
+    /// model]
+    #[arg(value_name = "MODEL")]
+    pub model: Option<PathBuf>,
+
+    /// What computes: cpu, cuda:N, or auto for a GPU if there is one
+    #[arg(long, default_value = "auto")]
+    pub device: String,
+
+    /// f32, bf16 or f16 [default: f32 on the CPU, bf16 on a GPU]
+    #[arg(long)]
+    pub precision: Option<String>,
+
+    /// With one file, what its UNet predicts: epsilon or v_prediction
+    #[arg(long)]
+    pub prediction: Option<String>,
+
+    /// Compare at the small size alone
+    #[arg(long)]
+    pub small: bool,
+
+    #[command(flatten)]
+    pub common: CommonArgs,
 }
 
 #[derive(Args)]

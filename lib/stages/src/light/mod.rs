@@ -6,7 +6,7 @@ mod estimate;
 pub mod folder;
 pub mod materials;
 pub(crate) mod method;
-mod request;
+pub(crate) mod request;
 mod resume;
 mod surroundings;
 

@@ -1,11 +1,15 @@
 //! The LoRA stage: personalises the model to the photograph, keeping the object's class.
+mod cache;
 mod data;
 pub mod folder;
+mod history;
 mod resume;
+mod sheet;
 pub mod table;
 
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use anyhow::Context;
 use candle_core::Tensor;
@@ -16,17 +20,21 @@ use dipir_diffusion::lora::{LoraInfo, LoraStyle};
 use dipir_diffusion::model::Model;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
-use dipir_diffusion::training::{LoraTrainer, StepReport};
+use dipir_diffusion::training::LoraTrainer;
+use dipir_diffusion::validation::Validation;
 use dipir_imaging::file::{read_photo_within, write_png};
 use dipir_imaging::transfer::Transfer;
 use dipir_pipeline::fingerprint::Fingerprint;
-use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::manifest::{Artifact, Manifest};
 use dipir_pipeline::stage::{StagePlan, StageWriter};
 use dipir_scene::config::SceneConfig;
 use serde_json::{Value, json};
 
+use self::cache::Cache;
 use self::data::Data;
+use self::history::History;
 use self::resume::Resume;
+use self::sheet::Sheet;
 use self::table::LoraTable;
 use crate::concepts::folder::{ConceptsFolder, read_latents};
 use crate::concepts::table::ConceptsTable;
@@ -34,12 +42,20 @@ use crate::model::{self, ModelTable};
 use crate::names::{CONCEPTS, LORA};
 use crate::written;
 
+/// Fixed examples of each kind. Their losses are compared with one another, so that few do.
+const VALIDATED: usize = 8;
+/// An adapter that moves the prediction by less than this share of its size changes nothing that can be seen: rounding the
+/// weights to f16 moves it by up to as much (docs/diffusion.md).
+const LEAST_CHANGE: f64 = 0.01;
+
 /// What the stage did.
 pub struct Done {
     folder: PathBuf,
     manifest: Manifest,
-    history: Vec<StepReport>,
+    history: History,
     resumed_at: usize,
+    wanted: usize,
+    from_cache: bool,
 }
 
 /// What a run would be, from the configuration and the concept stage's manifest.
@@ -53,13 +69,18 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
             .into());
     }
     let (background, transfer) = photo_of(session)?;
-    // How often the state is kept does not show in the result.
-    let table = LoraTable {
-        checkpoint_every: 0,
-        ..table
-    };
+    if table.time_budget_s.is_some_and(|s| !(s > 0.0)) {
+        let wrong = session
+            .config
+            .invalid("lora.time_budget_s", "accepted: above 0");
+        return Err(wrong.into());
+    }
+    // The class is in the prompts of the sheet.
+    let class = (table.sheet_steps > 0)
+        .then(|| class(session))
+        .transpose()?;
     let params = json!({
-        "lora": table, "transfer": transfer, "precision": model_table.precision,
+        "class": class, "lora": table.deciding(), "transfer": transfer, "precision": model_table.precision,
     });
     let mut plan = LORA.plan(session, params);
     plan.device = session.pipeline.device.clone();
@@ -70,6 +91,12 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     }
     model::inputs(session, &model_table, &mut plan)?;
     Ok(plan)
+}
+
+/// What prompts call the object.
+fn class(session: &Session) -> anyhow::Result<String> {
+    let scene: SceneConfig = session.config.table("scene")?;
+    Ok(scene.class.unwrap_or_else(|| "object".into()))
 }
 
 /// Whether training uses concept images beside the photograph.
@@ -98,34 +125,147 @@ fn photo_of(session: &Session) -> anyhow::Result<(PathBuf, Transfer)> {
 /// Runs the stage.
 pub fn run(session: &Session) -> anyhow::Result<Done> {
     let table: LoraTable = session.config.table("lora")?;
-    let model_table: ModelTable = session.config.table("model")?;
-    let (background, transfer) = photo_of(session)?;
-    let photo_file = session.resolve(&background);
     // First, for it checks the configuration.
     let plan = plan(session)?;
-    let concepts = preserves_concepts(session)?
-        .then(|| ConceptsFolder::read(session))
+    let cache = table.cache.as_deref();
+    let cache = cache
+        .map(|folder| Cache::open(session, folder, &plan))
         .transpose()?;
-    let base_hash = plan
-        .inputs
-        .iter()
-        .find(|i| i.path.to_string_lossy().contains("unet/diffusion"))
-        .map(|i| i.blake3.clone());
+    let fingerprint = resumable(session, &plan, &table)?;
+    let base_hash = base_hash(&plan);
+    let mut writer = session.begin(plan)?;
+    if let Some(cache) = &cache
+        && cache.restore(&mut writer)?
+    {
+        return from_cache(session, writer, table.steps);
+    }
+    let run = train(session, &table, &fingerprint, base_hash, &mut writer)?;
+    let manifest = writer.finish()?;
+    run.resume.remove();
     let folder = LORA.folder(session);
+    if let Some(cache) = &cache {
+        cache.keep(&folder, &manifest)?;
+    }
+    Ok(Done {
+        folder,
+        manifest,
+        history: run.history,
+        resumed_at: run.resumed_at,
+        wanted: table.steps,
+        from_cache: false,
+    })
+}
+
+/// The run that an interrupted one is continued by.
+fn resumable(
+    session: &Session,
+    plan: &StagePlan,
+    table: &LoraTable,
+) -> anyhow::Result<Fingerprint> {
+    let model_table: ModelTable = session.config.table("model")?;
+    let (_, transfer) = photo_of(session)?;
     let decides = json!({
         "lora": table.without_steps(), "transfer": transfer, "precision": model_table.precision,
     });
-    let fingerprint = Fingerprint::of_plan(&plan).params(decides).finish();
-    let mut writer = session.begin(plan)?;
+    Ok(Fingerprint::of_plan(plan).params(decides).finish())
+}
 
-    let mut model = model::load(session, &model_table)?;
+/// The hash of the weights that are adapted: of the UNet's file, or of the one file of the model.
+fn base_hash(plan: &StagePlan) -> Option<String> {
+    let is_model = |i: &&Artifact| i.role == "model";
+    let of_unet = |i: &&Artifact| i.path.to_string_lossy().contains("unet/diffusion");
+    let mut inputs = plan.inputs.iter().filter(is_model);
+    let found = inputs.clone().find(of_unet).or_else(|| inputs.next());
+    found.map(|i| i.blake3.clone())
+}
+
+/// Ends a run whose results another scene has made.
+fn from_cache(session: &Session, writer: StageWriter, wanted: usize) -> anyhow::Result<Done> {
+    let path = writer.partial().join("training.json");
+    let text = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+    let training: Value = serde_json::from_slice(&text)?;
+    let part = |key: &str| training[key].clone();
+    let history = History {
+        updates: serde_json::from_value(part("history"))?,
+        validation: serde_json::from_value(part("validation"))?,
+    };
+    Ok(Done {
+        folder: LORA.folder(session),
+        manifest: writer.finish()?,
+        history,
+        resumed_at: 0,
+        wanted,
+        from_cache: true,
+    })
+}
+
+/// A training that has ended.
+struct Run {
+    history: History,
+    resumed_at: usize,
+    resume: Resume,
+}
+
+fn train(
+    session: &Session,
+    table: &LoraTable,
+    fingerprint: &Fingerprint,
+    base_hash: Option<String>,
+    writer: &mut StageWriter,
+) -> anyhow::Result<Run> {
+    let mut model = model::load(session, &session.config.table("model")?)?;
     let start = table
         .learn_word
         .then(|| learnable(&mut model, &table.word))
         .transpose()?;
+    let data = data(session, table, &model)?;
+    let training = table.training(session.pipeline.seed);
+    let mut trainer = LoraTrainer::new(&model, training, start.as_ref())?;
+    let resume = Resume::open(session, fingerprint)?;
+    // Before anything is restored: it shows the un-adapted model.
+    let validation = Validation::new(&trainer, &data, VALIDATED)?;
+    let mut history = resume.restore(session, &mut trainer, table.steps);
+    history.add(validation.start());
+    let resumed_at = trainer.steps();
+    if resumed_at > 0 {
+        session.remark(|| format!("continuing after update {resumed_at}"));
+    }
+    let course = Course {
+        session,
+        table,
+        data: &data,
+        validation: &validation,
+        resume: &resume,
+    };
+    course.follow(&mut trainer, &mut history)?;
+    for step in 1..=trainer.steps() {
+        if table.sample_every > 0 && step % table.sample_every == 0 {
+            let kept = resume.sample(step);
+            let target = writer.output("sample", format!("samples/{step:06}.png"))?;
+            std::fs::copy(&kept, &target)
+                .with_context(|| format!("cannot copy {}", kept.display()))?;
+        }
+    }
+    let shown = show_change(session, table, &trainer, &data, &history, writer)?;
+    write_results(
+        session, table, &trainer, &data, base_hash, &history, shown, writer,
+    )?;
+    Ok(Run {
+        history,
+        resumed_at,
+        resume,
+    })
+}
+
+/// What the adapter is trained on: the photograph, and the images of the concepts stage.
+fn data<'a>(session: &Session, table: &LoraTable, model: &'a Model) -> anyhow::Result<Data<'a>> {
+    let (background, transfer) = photo_of(session)?;
+    let concepts = preserves_concepts(session)?
+        .then(|| ConceptsFolder::read(session))
+        .transpose()?;
     let limits = session.config.table::<SceneConfig>("scene")?.limits;
-    let photo = read_photo_within(&photo_file, transfer, limits.photo())?;
-    let data = Data {
+    let photo = read_photo_within(session.resolve(&background), transfer, limits.photo())?;
+    Ok(Data {
         photo: dipir_tensors::model_input(&photo.transfer.encode(&photo.image))?,
         size: model.native_size(),
         min_crop: table.min_crop,
@@ -138,62 +278,93 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
             .as_ref()
             .map(|c| read_latents(&c.latents))
             .transpose()?,
-        model: &model,
-    };
-    let mut trainer = LoraTrainer::new(
-        &model,
-        table.training(session.pipeline.seed),
-        start.as_ref(),
-    )?;
-    let resume = Resume::open(session, &fingerprint)?;
-    let mut history = resume.restore(session, &mut trainer, table.steps);
-    let resumed_at = trainer.steps();
-    if resumed_at > 0 {
-        session.remark(|| format!("continuing after update {resumed_at}"));
-    }
-    let progress = session.progress("lora");
-    while trainer.steps() < table.steps {
-        if interrupt::asked() {
-            resume.save(&trainer, &history)?;
-            interrupt::check()?;
-        }
-        let report = trainer.step(&data).context("fine-tuning stopped")?;
-        progress.set(report.step as f64 / table.steps as f64);
-        progress.say(format!("loss {:.4}", report.loss));
-        history.push(report);
-        if table.sample_every > 0 && report.step % table.sample_every == 0 {
-            show(&model, &trainer, &data, &resume.sample(report.step))?;
-        }
-        if table.checkpoint_every > 0 && report.step % table.checkpoint_every == 0 {
-            resume.save(&trainer, &history)?;
-        }
-    }
-    progress.done();
-    for step in 1..=table.steps {
-        if table.sample_every > 0 && step % table.sample_every == 0 {
-            let kept = resume.sample(step);
-            let target = writer.output("sample", format!("samples/{step:06}.png"))?;
-            std::fs::copy(&kept, &target)
-                .with_context(|| format!("cannot copy {}", kept.display()))?;
-        }
-    }
-    write_results(
-        session,
-        &table,
-        &trainer,
-        &data,
-        base_hash,
-        &history,
-        &mut writer,
-    )?;
-    let manifest = writer.finish()?;
-    resume.remove();
-    Ok(Done {
-        folder,
-        manifest,
-        history,
-        resumed_at,
+        model,
     })
+}
+
+/// The updates of a run, with what is kept and looked at on the way.
+struct Course<'a> {
+    session: &'a Session,
+    table: &'a LoraTable,
+    data: &'a Data<'a>,
+    validation: &'a Validation,
+    resume: &'a Resume,
+}
+
+impl Course<'_> {
+    fn follow(&self, trainer: &mut LoraTrainer, history: &mut History) -> anyhow::Result<()> {
+        let table = self.table;
+        let progress = self.session.progress("lora");
+        let budget = table.time_budget_s.unwrap_or(f64::INFINITY);
+        let (mut spent_s, mut last_s) = (0.0, 0.0);
+        while trainer.steps() < table.steps && (spent_s == 0.0 || spent_s + last_s <= budget) {
+            if interrupt::asked() {
+                self.resume.save(trainer, history)?;
+                interrupt::check()?;
+            }
+            let clock = Instant::now();
+            let report = trainer.step(self.data).context("fine-tuning stopped")?;
+            last_s = clock.elapsed().as_secs_f64();
+            spent_s += last_s;
+            let of_steps = report.step as f64 / table.steps as f64;
+            progress.set(of_steps.max((spent_s / budget).min(1.0)));
+            progress.say(format!("loss {:.4}", report.loss));
+            history.updates.push(report);
+            let every = |n: usize| n > 0 && report.step % n == 0;
+            if every(table.sample_every) {
+                let path = self.resume.sample(report.step);
+                show(self.data.model, trainer, self.data, &path)?;
+            }
+            if every(table.validate_every) {
+                history.add(self.validation.evaluate(trainer)?);
+            }
+            if every(table.checkpoint_every) {
+                self.resume.save(trainer, history)?;
+            }
+        }
+        history.add(self.validation.evaluate(trainer)?);
+        progress.done();
+        Ok(())
+    }
+}
+
+/// Writes the sheet, and warns where the adapter changes nothing. What the sheet shows.
+fn show_change(
+    session: &Session,
+    table: &LoraTable,
+    trainer: &LoraTrainer,
+    data: &Data,
+    history: &History,
+    writer: &mut StageWriter,
+) -> anyhow::Result<Value> {
+    if let Some((_, end)) = history.ends()
+        && end.change < LEAST_CHANGE
+    {
+        session.warn(&format!(
+            "the adapter moves the prediction by {:.2}% of its size, less than {:.0}%: it changes nothing that can be seen; \
+             raise lora.steps or lora.learning_rate",
+            100.0 * end.change,
+            100.0 * LEAST_CHANGE
+        ));
+    }
+    if table.sheet_steps == 0 {
+        return Ok(Value::Null);
+    }
+    let class = class(session)?;
+    let own = format!(
+        "a photo of a {class} in a scene in the style of {} rendering",
+        table.word
+    );
+    let prompts = vec![data.prompt.clone(), own, format!("a photo of a {class}")];
+    let sheet = Sheet {
+        prompts,
+        steps: table.sheet_steps,
+    };
+    let progress = session.progress("sheet");
+    let path = writer.output("sheet", "sheet.png")?;
+    let difference = sheet.write(data.model, trainer, &path, |share| progress.set(share))?;
+    progress.done();
+    Ok(json!({"prompts": sheet.prompts, "steps": sheet.steps, "rms_difference": difference}))
 }
 
 /// Gives `word` a token of its own and returns the embedding that it starts from: the mean of
@@ -244,7 +415,8 @@ fn write_results(
     trainer: &LoraTrainer,
     data: &Data,
     base_hash: Option<String>,
-    history: &[StepReport],
+    history: &History,
+    sheet: Value,
     writer: &mut StageWriter,
 ) -> anyhow::Result<()> {
     let info = LoraInfo::from([
@@ -271,28 +443,26 @@ fn write_results(
     }
     let training = json!({
         "settings": table.training(session.pipeline.seed), "word": table.word,
-        "instance_prompt": data.prompt, "class_prompt": data.class_prompt, "history": history,
+        "instance_prompt": data.prompt, "class_prompt": data.class_prompt, "history": history.updates,
+        "validation": history.validation, "sheet": sheet,
     });
     writer.write_json("training", "training.json", &training)?;
+    let path = writer.output("history", "training.csv")?;
+    std::fs::write(&path, history.to_csv())
+        .with_context(|| format!("cannot write {}", path.display()))?;
     Ok(())
 }
 
 impl Done {
-    /// Mean loss over a tenth of the run, at its end or its start.
-    fn loss(&self, at_end: bool) -> f64 {
-        let n = self.history.len().div_ceil(10).max(1);
-        let reports: Vec<f64> = match at_end {
-            true => self.history.iter().rev().take(n).map(|r| r.loss).collect(),
-            false => self.history.iter().take(n).map(|r| r.loss).collect(),
-        };
-        reports.iter().sum::<f64>() / reports.len().max(1) as f64
-    }
-
     /// For programs.
     pub fn to_json(&self) -> Value {
+        let ends = self.history.ends();
         json!({
-            "folder": self.folder, "steps": self.history.len(), "resumed_at": self.resumed_at,
-            "loss_at_start": self.loss(false), "loss_at_end": self.loss(true),
+            "folder": self.folder, "steps": self.history.updates.len(), "resumed_at": self.resumed_at,
+            "from_cache": self.from_cache,
+            "loss_at_start": ends.map(|e| e.0.instance_loss), "loss_at_end": ends.map(|e| e.1.instance_loss),
+            "class_loss_at_start": ends.map(|e| e.0.prior_loss), "class_loss_at_end": ends.map(|e| e.1.prior_loss),
+            "change": ends.map(|e| e.1.change),
             "elapsed_s": self.manifest.elapsed_s, "peak_rss_bytes": self.manifest.peak_rss_bytes,
         })
     }
@@ -301,12 +471,32 @@ impl Done {
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         written(f, &self.folder, &self.manifest)?;
+        let updates = self.history.updates.len();
+        write!(f, "\n  {updates} updates")?;
+        if self.from_cache {
+            write!(f, ", from the cache")?;
+        } else if updates < self.wanted {
+            write!(f, " of {} within lora.time_budget_s", self.wanted)?;
+        }
+        let Some((start, end)) = self.history.ends() else {
+            return Ok(());
+        };
         write!(
             f,
-            "\n  {} updates, loss {:.4} at the start, {:.4} at the end (means of a tenth)",
-            self.history.len(),
-            self.loss(false),
-            self.loss(true)
+            "; at fixed noise the photograph's loss went from {:.4} to {:.4}",
+            start.instance_loss, end.instance_loss
+        )?;
+        if start.prior_loss > 0.0 {
+            write!(
+                f,
+                ", the class's from {:.4} to {:.4}",
+                start.prior_loss, end.prior_loss
+            )?;
+        }
+        write!(
+            f,
+            "\n  the adapter moves the prediction by {:.1}% of its size",
+            100.0 * end.change
         )
     }
 }

@@ -3,11 +3,12 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use dipir_cli::session::Session;
-use dipir_diffusion::training::{LoraTrainer, StepReport};
+use dipir_diffusion::training::LoraTrainer;
 use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::mark::Kind;
 use dipir_pipeline::resume;
 
+use super::history::History;
 use crate::names::LORA;
 
 /// The files of a run: the checkpoint, the losses so far, and samples, each with the name under
@@ -45,14 +46,14 @@ impl Resume {
         session: &Session,
         trainer: &mut LoraTrainer,
         steps: usize,
-    ) -> Vec<StepReport> {
+    ) -> History {
         let path = self.kept.file("checkpoint.safetensors");
         let history = std::fs::read(self.kept.file("history.json"))
             .ok()
-            .and_then(|text| serde_json::from_slice::<Vec<StepReport>>(&text).ok())
+            .and_then(|text| serde_json::from_slice::<History>(&text).ok())
             .unwrap_or_default();
         if !path.is_file() {
-            return vec![];
+            return History::default();
         }
         let usable = trainer
             .resume(&path)
@@ -64,25 +65,25 @@ impl Resume {
                     trainer.steps()
                 );
                 anyhow::ensure!(
-                    history.len() >= trainer.steps(),
+                    history.updates.len() >= trainer.steps(),
                     "its history is incomplete"
                 );
                 Ok(())
             });
         match usable {
-            Ok(()) => history[..trainer.steps()].to_vec(),
+            Ok(()) => history.up_to(trainer.steps()),
             Err(e) => {
                 session.warn(&format!("{} is not used: {e}", path.display()));
                 if trainer.steps() > 0 {
                     let _ = trainer.reset();
                 }
-                vec![]
+                History::default()
             }
         }
     }
 
     /// Writes the history, then the checkpoint, so that the history is never the shorter one.
-    pub(super) fn save(&self, trainer: &LoraTrainer, history: &[StepReport]) -> anyhow::Result<()> {
+    pub(super) fn save(&self, trainer: &LoraTrainer, history: &History) -> anyhow::Result<()> {
         let path = self.kept.file("history.json");
         let partial = self.kept.file("history.partial");
         std::fs::write(&partial, serde_json::to_vec(history)?)

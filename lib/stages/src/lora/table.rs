@@ -1,4 +1,6 @@
 //! The `[lora]` table.
+use std::path::PathBuf;
+
 use dipir_diffusion::training::TrainingConfig;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -50,6 +52,22 @@ pub struct LoraTable {
     /// Updates between sample images; 0 for none.
     #[schemars(example = 100)]
     pub sample_every: usize,
+    /// Updates between two looks at the loss of the same crops at the same noise, beside those before the first and after
+    /// the last; 0 for these alone.
+    #[schemars(example = 50)]
+    pub validate_every: usize,
+    /// Denoising steps of each picture of `sheet.png`, which shows what the adapter changes; 0 for no sheet.
+    #[schemars(example = 25)]
+    pub sheet_steps: usize,
+    /// Seconds after which no further update begins, however many `steps` asks for. Loading the model, validation and the
+    /// sheet are not counted.
+    #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "no limit"), example = 600.0)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub time_budget_s: Option<f64>,
+    /// Folder in which adapters are kept and found again: scenes of one photograph, class, model and settings train once.
+    #[schemars(extend("format" = "path"), extend("x-default" = "none: every scene trains its own"), example = &"../lora-cache")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cache: Option<PathBuf>,
 }
 
 impl Default for LoraTable {
@@ -70,12 +88,18 @@ impl Default for LoraTable {
             recompute: training.recompute,
             checkpoint_every: 50,
             sample_every: 0,
+            validate_every: 100,
+            // DPM-Solver++ is recognisable from 10 steps on.
+            sheet_steps: 12,
+            time_budget_s: None,
+            cache: None,
         }
     }
 }
 
 impl LoraTable {
-    pub(super) fn training(&self, seed: u64) -> TrainingConfig {
+    /// The settings of the training.
+    pub(crate) fn training(&self, seed: u64) -> TrainingConfig {
         TrainingConfig {
             rank: self.rank,
             alpha: self.alpha.unwrap_or(self.rank as f64),
@@ -96,11 +120,23 @@ impl LoraTable {
         format!("a scene in the style of {} rendering", self.word)
     }
 
+    /// What decides what is written: neither how often the state is kept nor where finished adapters are does.
+    pub(super) fn deciding(self) -> Self {
+        Self {
+            checkpoint_every: 0,
+            cache: None,
+            ..self
+        }
+    }
+
     /// The settings that determine each step of a run, so not the number of steps.
     pub(super) fn without_steps(&self) -> Self {
         Self {
             steps: 0,
             checkpoint_every: 0,
+            sheet_steps: 0,
+            time_budget_s: None,
+            cache: None,
             ..self.clone()
         }
     }

@@ -1,5 +1,6 @@
 //! The diffusion model of the `[model]` table.
 mod embedded;
+pub mod forecast;
 
 use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
@@ -9,6 +10,7 @@ use candle_core::{DType, Device};
 use dipir_cli::exit::Usage;
 use dipir_cli::session::Session;
 use dipir_diffusion::model::Model;
+use dipir_diffusion::schedule::Prediction;
 use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::stage::StagePlan;
 use dipir_prior::encoder;
@@ -21,12 +23,17 @@ use tempfile::TempDir;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModelTable {
-    /// Folder of a diffusion model in the diffusers layout.
+    /// A diffusion model: a folder in the layout of diffusers, or one `.safetensors` file of Stable Diffusion 1 or 2 in the
+    /// original layout.
     #[schemars(extend("format" = "path"), extend("x-default" = "the embedded model"), example = &"models/sd15")]
     pub path: Option<PathBuf>,
     /// Numbers that the model computes with; `bf16` and `f16` need a GPU.
     #[schemars(extend("enum" = ["f32", "bf16", "f16"]), example = &"bf16")]
     pub precision: String,
+    /// With a model in one file: what its UNet predicts.
+    #[schemars(extend("enum" = ["epsilon", "v_prediction"]), extend("x-default" = "what its header or a `.yaml` beside it says; `epsilon` for Stable Diffusion 1"), example = &"v_prediction")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub prediction: Option<String>,
 }
 
 impl Default for ModelTable {
@@ -34,6 +41,7 @@ impl Default for ModelTable {
         Self {
             path: None,
             precision: "f32".into(),
+            prediction: None,
         }
     }
 }
@@ -77,58 +85,129 @@ impl DerefMut for Loaded {
 
 /// Loads the model onto the session's device.
 pub fn load(session: &Session, table: &ModelTable) -> anyhow::Result<Loaded> {
-    let device = device(&session.pipeline.device)?;
-    let dtype = match table.precision.as_str() {
-        "f32" => DType::F32,
-        "bf16" => DType::BF16,
-        "f16" => DType::F16,
-        other => {
-            let message = format!("\"{other}\" is no precision; accepted: f32, bf16, f16");
-            return Err(session.config.invalid("model.precision", message).into());
-        }
-    };
+    let placed = device(&session.pipeline.device, "pipeline.device = ")?;
+    if let Some(why) = &placed.fallback {
+        session.warn(why);
+    }
+    let dtype = precision(&table.precision)
+        .map_err(|message| session.config.invalid("model.precision", message))?;
+    let prediction = table.prediction.as_deref().map(prediction).transpose();
+    let prediction = prediction.map_err(|m| session.config.invalid("model.prediction", m))?;
+    let path = table.path.as_ref().map(|path| session.resolve(path));
+    open(path.as_deref(), dtype, prediction, &placed.device)
+        .with_context(|| format!("cannot use {}", table.name()))
+}
+
+/// Loads the model at `path`, a folder or one file, or the embedded one.
+pub fn open(
+    path: Option<&Path>,
+    dtype: DType,
+    prediction: Option<Prediction>,
+    device: &Device,
+) -> anyhow::Result<Loaded> {
     dipir_diffusion::memory::keep_freed();
-    let (folder, unpacked) = match &table.path {
-        Some(path) => (session.resolve(path), None),
+    let (path, unpacked) = match path {
+        Some(path) => (path.to_owned(), None),
         None => {
             let unpacked = embedded::unpack()?;
             (unpacked.path().to_owned(), Some(unpacked))
         }
     };
-    let model = Model::load(&folder, dtype, &device)
-        .with_context(|| format!("cannot use {}", table.name()))?;
+    let one_file = path.is_file() || path.extension().is_some_and(|e| e == "safetensors");
+    let model = match one_file {
+        true => Model::load_file(&path, prediction, dtype, device)?,
+        false => Model::load(&path, dtype, device)?,
+    };
     Ok(Loaded {
         model,
         _unpacked: unpacked,
     })
 }
 
-fn device(name: &str) -> anyhow::Result<Device> {
+/// The precision that a word of the configuration names.
+pub fn precision(word: &str) -> Result<DType, String> {
+    match word {
+        "f32" => Ok(DType::F32),
+        "bf16" => Ok(DType::BF16),
+        "f16" => Ok(DType::F16),
+        other => Err(format!(
+            "\"{other}\" is no precision; accepted: f32, bf16, f16"
+        )),
+    }
+}
+
+/// What a UNet predicts, as a word of the configuration names it.
+pub fn prediction(word: &str) -> Result<Prediction, String> {
+    match word {
+        "epsilon" => Ok(Prediction::Epsilon),
+        "v_prediction" => Ok(Prediction::Velocity),
+        other => Err(format!(
+            "\"{other}\" is no prediction; accepted: epsilon, v_prediction"
+        )),
+    }
+}
+
+/// A device, and why it is not the one that `auto` prefers.
+pub struct Placed {
+    /// Where models are computed.
+    pub device: Device,
+    /// One line, if `auto` found no GPU.
+    pub fallback: Option<String>,
+}
+
+/// The device that `name` stands for: `cpu`, `cuda:N`, or `auto`, which is the first GPU if there is one. `asked` is what
+/// stands before the name in messages.
+pub fn device(name: &str, asked: &str) -> anyhow::Result<Placed> {
+    let placed = |device| Placed {
+        device,
+        fallback: None,
+    };
     match name.split_once(':') {
-        None if name == "cpu" => Ok(Device::Cpu),
-        None if name == "auto" => Ok(if candle_core::utils::cuda_is_available() {
-            Device::new_cuda(0)?
-        } else {
-            Device::Cpu
+        None if name == "cpu" => Ok(placed(Device::Cpu)),
+        None if name == "auto" => Ok(match gpu(0) {
+            Ok(device) => placed(device),
+            Err(why) => Placed {
+                device: Device::Cpu,
+                fallback: Some(format!("{asked}\"auto\": {why}, so the CPU computes")),
+            },
         }),
         Some(("cuda", number)) if number.parse::<usize>().is_ok() => {
-            if !candle_core::utils::cuda_is_available() {
-                let message = format!(
-                    "pipeline.device = \"{name}\": this build has no CUDA; use \"cpu\", or build with --features cuda"
-                );
-                return Err(Usage(message).into());
-            }
-            Ok(Device::new_cuda(number.parse()?)?)
+            let device = gpu(number.parse()?).map_err(|why| {
+                Usage(format!(
+                    "{asked}\"{name}\": {why}; use \"cpu\", or \"auto\" for a GPU where there is one"
+                ))
+            })?;
+            Ok(placed(device))
         }
         _ => {
-            let message = format!("pipeline.device = \"{name}\"; accepted: cpu, cuda:N, auto");
+            let message = format!("{asked}\"{name}\"; accepted: cpu, cuda:N, auto");
             Err(Usage(message).into())
         }
     }
 }
 
+/// The N-th GPU, or why it cannot be used.
+fn gpu(number: usize) -> Result<Device, String> {
+    if !candle_core::utils::cuda_is_available() {
+        return Err("this build has no CUDA (it was built without --features cuda)".into());
+    }
+    // Where the driver's library is missing, what looks for it panics.
+    let hook = std::panic::take_hook();
+    std::panic::set_hook(Box::new(|_| {}));
+    let found = std::panic::catch_unwind(|| Device::new_cuda(number));
+    std::panic::set_hook(hook);
+    match found {
+        Ok(Ok(device)) => Ok(device),
+        Ok(Err(e)) => Err(format!("GPU {number} cannot be used ({e})")),
+        Err(_) => Err("no NVIDIA driver was found (libcuda.so)".into()),
+    }
+}
+
 /// Adds every file of the model to the plan of a stage.
 pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> anyhow::Result<()> {
+    if let (Some(prediction), Some(params)) = (&table.prediction, plan.params.as_object_mut()) {
+        params.insert("prediction".into(), prediction.clone().into());
+    }
     match &table.path {
         Some(path) => files(path, &session.resolve(path), plan),
         None => {
@@ -140,6 +219,15 @@ pub fn inputs(session: &Session, table: &ModelTable, plan: &mut StagePlan) -> an
 
 /// Adds the files of the model in `folder`, which the configuration calls `path`.
 fn files(path: &Path, folder: &Path, plan: &mut StagePlan) -> anyhow::Result<()> {
+    if folder.is_file() {
+        plan.input("model", path, folder)?;
+        // It may say what the model predicts.
+        let beside = folder.with_extension("yaml");
+        if beside.is_file() {
+            plan.input("model", &path.with_extension("yaml"), &beside)?;
+        }
+        return Ok(());
+    }
     for part in ["", "unet", "vae", "text_encoder", "tokenizer", "scheduler"] {
         let mut names: Vec<PathBuf> = match std::fs::read_dir(folder.join(part)) {
             Ok(entries) => entries

@@ -1,0 +1,27 @@
+//! Which of its two forms a layer uses.
+
+use std::cell::Cell;
+
+use candle_core::Tensor;
+
+thread_local! {
+    static COMPOSED: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Runs `work` with every layer composed of candle's operations, as on a GPU, instead of the crate's own kernels. Holds for
+/// this thread. It is slower and takes more memory: it is what the kernels are compared with.
+pub fn composed<T>(work: impl FnOnce() -> T) -> T {
+    struct Restore(bool);
+    impl Drop for Restore {
+        fn drop(&mut self) {
+            COMPOSED.set(self.0);
+        }
+    }
+    let _restore = Restore(COMPOSED.replace(true));
+    work()
+}
+
+/// Whether the kernels compute what is asked of `x`.
+pub(super) fn has_kernels(x: &Tensor) -> bool {
+    x.device().is_cpu() && !COMPOSED.get()
+}

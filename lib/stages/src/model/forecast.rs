@@ -1,0 +1,129 @@
+//! How long the stages that ask a diffusion model will take, from measured parts of it.
+use dipir_cli::session::Session;
+use dipir_diffusion::check::{Times, TimesSettings, times};
+use dipir_diffusion::model::Model;
+use dipir_optimize::settings::GuidanceKind;
+use serde::Serialize;
+
+use crate::concepts::table::ConceptsTable;
+use crate::light::request::{Guide, Request};
+use crate::lora::preserves_concepts;
+use crate::lora::table::LoraTable;
+use crate::names::{CONCEPTS, LIGHT, LORA};
+
+/// What a stage has to do with the model.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Work {
+    /// The stage.
+    pub stage: &'static str,
+    /// In words: `32 images of 25 steps`.
+    pub what: String,
+    /// Seconds of it; loading the model and what asks no model come on top.
+    pub seconds: f64,
+    /// Keys of which each halves the time, with the value that does.
+    pub halved_by: Vec<String>,
+}
+
+/// What is timed for a session: its adapter, at the size that the model was trained on.
+pub fn settings(session: &Session, model: &Model) -> anyhow::Result<TimesSettings> {
+    let table: LoraTable = session.config.table("lora")?;
+    Ok(TimesSettings {
+        side: model.unet.config().sample_size,
+        training: table.training(session.pipeline.seed),
+        with_prior: preserves_concepts(session)?,
+    })
+}
+
+/// Times the parts of the session's model. `progress` gets the share done, and returns false to stop.
+pub fn measure(
+    session: &Session,
+    model: &Model,
+    progress: impl FnMut(f64) -> bool,
+) -> anyhow::Result<Times> {
+    Ok(times(model, &settings(session, model)?, progress)?)
+}
+
+/// Whether a stage asks a model under the session's configuration.
+pub fn asks_model(session: &Session) -> anyhow::Result<bool> {
+    Ok(matches!(Request::of(session)?.guide, Guide::Model { .. }))
+}
+
+/// The work of each stage that asks the model under the session's configuration; none if nothing guides.
+pub fn works(session: &Session, times: &Times) -> anyhow::Result<Vec<Work>> {
+    let request = Request::of(session)?;
+    let Guide::Model { settings, .. } = &request.guide else {
+        return Ok(vec![]);
+    };
+    let mut works = vec![];
+    if settings.adapt {
+        if preserves_concepts(session)? {
+            works.push(concepts(session, times)?);
+        }
+        works.push(lora(session, times)?);
+    }
+    let iterations = request.settings.iterations;
+    // Ten steps of a sampler take the place of one, from the drawn timestep down: half of them on average.
+    let one = match settings.guidance {
+        GuidanceKind::SdEdit => times.guidance_s + 4.0 * times.sampling_step_s,
+        _ => times.guidance_s,
+    };
+    works.push(Work {
+        stage: LIGHT.name,
+        what: format!(
+            "{iterations} iterations of {} {}",
+            settings.draws,
+            draws(settings.draws)
+        ),
+        seconds: (iterations * settings.draws) as f64 * one,
+        halved_by: vec![format!("light.iterations = {}", iterations.div_ceil(2))],
+    });
+    Ok(works)
+}
+
+fn draws(count: usize) -> &'static str {
+    match count {
+        1 => "draw of noise",
+        _ => "draws of noise",
+    }
+}
+
+fn concepts(session: &Session, times: &Times) -> anyhow::Result<Work> {
+    let table: ConceptsTable = session.config.table("concepts")?;
+    let side = table.size.unwrap_or(times.size) as f64;
+    // The time of convolutions, which are most of it, goes with the pixels.
+    let scale = (side / times.size as f64).powi(2);
+    let image = table.steps as f64 * times.sampling_step_s + times.decode_s;
+    Ok(Work {
+        stage: CONCEPTS.name,
+        what: format!("{} images of {} steps", table.count, table.steps),
+        seconds: table.count as f64 * (image * scale + times.text_s),
+        halved_by: vec![
+            format!("concepts.count = {}", table.count.div_ceil(2)),
+            format!("concepts.steps = {}", table.steps.div_ceil(2)),
+            "concepts.cache shares images among scenes".into(),
+        ],
+    })
+}
+
+fn lora(session: &Session, times: &Times) -> anyhow::Result<Work> {
+    let table: LoraTable = session.config.table("lora")?;
+    let updates = (table.steps * table.accumulation) as f64 * times.lora_step_s;
+    let mut halved_by = vec![format!("lora.steps = {}", table.steps.div_ceil(2))];
+    if table.prior_weight != 0.0 {
+        halved_by.push("lora.prior_weight = 0 (without the class's images)".into());
+    }
+    if table.recompute {
+        halved_by.push("lora.recompute = false saves a quarter for more memory".into());
+    }
+    halved_by.push("lora.cache shares adapters among scenes of one photograph".into());
+    let what = match table.accumulation {
+        1 => format!("{} updates", table.steps),
+        n => format!("{} updates of {n} examples", table.steps),
+    };
+    Ok(Work {
+        stage: LORA.name,
+        what,
+        seconds: updates.min(table.time_budget_s.unwrap_or(f64::INFINITY)),
+        halved_by,
+    })
+}

@@ -1,0 +1,82 @@
+//! `dipir-model check` and `dipir run --plan` as a user runs them.
+
+use std::path::PathBuf;
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn check(args: &[&str]) -> Output {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_dipir-model"));
+    command.arg("check").args(args).current_dir(folder.path());
+    command.output().unwrap()
+}
+
+fn reference(family: &str) -> String {
+    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("lib/diffusion/tests/references");
+    folder.join(family).display().to_string()
+}
+
+#[test]
+fn every_part_agrees_and_is_timed_on_the_cpu() {
+    let output = check(&[&reference("sd21"), "--device", "cpu", "--json"]);
+    assert_eq!(output.status.code(), Some(0));
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(
+        (&report["device"], &report["precision"]),
+        (&"cpu".into(), &"f32".into())
+    );
+    let parts = report["agreement"].as_array().unwrap();
+    assert!(parts.len() >= 5 && parts.iter().all(|p| p["error"].as_f64().unwrap() < 1e-4));
+    assert!(report["times"]["lora_step_s"].as_f64().unwrap() > 0.0);
+    let output = check(&[&reference("sd15"), "--small", "--device", "cpu"]);
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    for part in [
+        "text encoder",
+        "VAE encoder's gradient",
+        "one update of a LoRA",
+    ] {
+        assert!(text.contains(part), "{text}");
+    }
+}
+
+#[test]
+fn a_gpu_that_is_not_there_is_an_error_if_it_was_named_and_a_line_if_not() {
+    let output = check(&[&reference("sd15"), "--small", "--device", "cuda:7"]);
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(
+        text.contains("--device \"cuda:7\"") && text.contains("\"auto\""),
+        "{text}"
+    );
+    let output = check(&["missing.safetensors", "--device", "cpu"]);
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert!(text.contains("missing.safetensors"), "{text}");
+}
+
+#[test]
+fn a_plan_tells_time_and_memory_of_every_stage_and_starts_none() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_dipir"));
+    command.args(["run", "--plan", "--json", "--pipeline"]);
+    command.arg(root.join("pipeline.toml"));
+    command
+        .arg("--set")
+        .arg(format!("model.path={:?}", reference("sd15")));
+    command
+        .args(["--set", "light.start=neutral", "--out"])
+        .arg(folder.path().join("out"));
+    let output = command.output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(0), "{text}");
+    let plan: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let stages = plan["plan"].as_array().unwrap();
+    let of = |name: &str| stages.iter().find(|s| s["stage"] == name).unwrap();
+    for stage in ["concepts", "lora", "light"] {
+        assert!(of(stage)["seconds"].as_f64().unwrap() > 0.0, "{plan}");
+    }
+    assert!(of("composite")["seconds"].is_null());
+    assert!(!folder.path().join("out/scene").exists());
+}
