@@ -4,8 +4,9 @@
 //! optional that has a default; [`SceneConfig::validate`] turns it into [`SceneSettings`], in which
 //! nothing contradicts anything else. Unknown keys are refused while parsing.
 mod camera;
+mod lens;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use dipir_imaging::transfer::Transfer;
 use glam::{DMat3, Vec2, Vec3};
@@ -18,6 +19,8 @@ use crate::limits::Limits;
 use crate::pixels::Pixels;
 use crate::placement::{Anchor, Placement, Rest, Size};
 use crate::proxy::Plane;
+
+pub use lens::DistortionConfig;
 
 /// The `[scene]` table as written.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -100,10 +103,10 @@ pub struct ObjectConfig {
 #[serde(deny_unknown_fields)]
 pub struct CameraConfig {
     /// Centre of projection, metres: x, y and z of the scene.
-    #[schemars(extend("x-default" = "none; required without `transforms`"), extend("examples" = [[0.0, 1.5, 4.0]]))]
+    #[schemars(extend("x-default" = "none; required without `file`"), extend("examples" = [[0.0, 1.5, 4.0]]))]
     pub position: Option<[f32; 3]>,
     /// The point that the centre of the image shows, metres.
-    #[schemars(extend("x-default" = "none; required without `transforms`"), extend("examples" = [[0.0, 0.5, 0.0]]))]
+    #[schemars(extend("x-default" = "none; required without `file`"), extend("examples" = [[0.0, 0.5, 0.0]]))]
     pub look_at: Option<[f32; 3]>,
     /// The direction that is up in the image, of any length.
     #[schemars(extend("default" = [0.0, 1.0, 0.0]), extend("examples" = [[0.0, 0.0, -1.0]]))]
@@ -130,14 +133,38 @@ pub struct CameraConfig {
     /// Width of the sensor, millimetres; 36 is full frame. It belongs to `focal_mm`.
     #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "the photograph's own, from its Exif data"), example = 36.0)]
     pub sensor_mm: Option<f32>,
-    /// A nerfstudio `transforms.json` that holds the camera. It replaces position, direction and field of view.
+    /// How the lens bends lines. The photograph is undistorted for everything that is computed, and the
+    /// result is bent back onto it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub distortion: Option<DistortionConfig>,
+    /// The camera's file of another program: fSpy (`.fspy`, `.json`), nerfstudio (`transforms.json`),
+    /// `.chan`, `.glb`, `.gltf`, a folder of COLMAP's, nuScenes (`.json`), KITTI (`.txt`); OpenCV's
+    /// (`.yaml`, `.json`) has the lens alone, and position and direction are written beside it.
+    /// It replaces position, direction and field of view.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("format" = "path"), example = &"shot.fspy")]
+    pub file: Option<PathBuf>,
+    /// Which camera of `file` is the photograph's, by the name of its picture or its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-default" = "the one with the photograph's name, else the only one"), example = &"IMG_0042.jpg")]
+    pub image: Option<String>,
+    /// Which axis of the world of `file` points up.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("enum" = ["z", "y", "-y"]), extend("x-default" = "as the program that wrote it has it: COLMAP `-y`, glTF and `.chan` `y`, others `z`"), example = &"z")]
+    pub file_up: Option<String>,
+    /// Metres of a unit of the world of `file`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("exclusiveMinimum" = 0), extend("default" = 1.0), example = 0.01)]
+    pub file_scale: Option<f32>,
+    /// As `file`, a nerfstudio `transforms.json` whose frame is named by its number.
     #[schemars(extend("format" = "path"), example = &"transforms.json")]
     pub transforms: Option<PathBuf>,
-    /// Which frame of `transforms` is the photograph, from 0.
-    #[schemars(extend("default" = 0), example = 3)]
+    /// Which camera of `transforms` or `file` is the photograph's, from 0; in a `.chan` file the number of
+    /// the frame, in KITTI's that of the camera.
+    #[schemars(extend("x-default" = "`0` of `transforms`; of `file` as `image`"), example = 3)]
     pub frame: Option<u32>,
     /// Which axis of the world of `transforms` is up.
-    #[schemars(extend("enum" = ["z", "y"]), extend("default" = "z"), example = &"y")]
+    #[schemars(extend("enum" = ["z", "y", "-y"]), extend("default" = "z"), example = &"y")]
     pub transforms_up: Option<String>,
 }
 
@@ -354,7 +381,7 @@ impl SceneConfig {
         let camera = self.camera.as_ref().ok_or_else(|| {
             missing(
                 "scene.camera",
-                "add a table [scene.camera] with position, look_at and fov_deg, or with transforms",
+                "add a table [scene.camera] with position, look_at and fov_deg, or with file",
             )
         })?;
         if let Some(t) = self.effects.tolerance
@@ -375,13 +402,14 @@ impl SceneConfig {
                 "interactions from 1 to 8, for instance max_depth = 3",
             ));
         }
+        let camera = camera.validate(&background)?;
         Ok(SceneSettings {
             background,
             transfer,
             class: class.into(),
             occluders: self.occluders.clone(),
             objects,
-            camera: camera.validate()?,
+            camera,
             proxy: match &self.proxy {
                 None => ProxySettings::None,
                 Some(proxy) => proxy.validate()?,

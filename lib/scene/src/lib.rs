@@ -20,8 +20,8 @@ pub mod proxy;
 pub mod ray_offset;
 pub mod scene;
 pub mod texture;
-pub mod transforms;
 pub mod triangle;
+pub mod undistortion;
 pub mod visibility;
 
 pub use error::Error;

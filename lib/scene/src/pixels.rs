@@ -5,6 +5,7 @@ use crate::camera::Camera;
 use crate::error::Error;
 use crate::placement::Placement;
 use crate::proxy::{Plane, Proxy};
+use crate::undistortion::Undistortion;
 
 /// Pixels of the upright photograph that say where an object goes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -48,6 +49,23 @@ fn height(camera: &Camera, plane: &Plane) -> f64 {
 }
 
 impl Pixels {
+    /// The pixels of the undistorted photograph that show what these show of a photograph whose
+    /// distortion `undistortion` undoes; `key` names the object's table in messages.
+    pub fn undistorted(&self, undistortion: &Undistortion, key: &str) -> Result<Self, Error> {
+        let moved = |pixel: Option<Vec2>, name: &str| {
+            let moved = pixel.map(|p| undistortion.to_working(p.as_dvec2()).ok_or(p));
+            moved.transpose().map_err(|p| Error::Config {
+                key: format!("{key}.{name}"),
+                value: shown(p),
+                accepted: "a pixel that the lens and the undistorted picture show".into(),
+            })
+        };
+        Ok(Self {
+            at: moved(self.at, "at_pixel")?.map(|p| p.as_vec2()),
+            to: moved(self.to, "to_pixel")?.map(|p| p.as_vec2()),
+        })
+    }
+
     /// `placement` with the position and the yaw that the pixels say; `key` names the object's
     /// table in messages.
     pub fn place(

@@ -1,4 +1,5 @@
 //! The composite stage: the object at full quality, its shadow, and the layers of both.
+mod lens;
 pub mod table;
 
 use std::fmt;
@@ -112,9 +113,14 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let Course { rendered, .. } = course;
     let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light))?;
     let png = writer.output("picture", "composite.png")?;
-    write_picture(png, &layers.beauty, &inputs.scene.loaded.photo)?;
+    write_picture(png, &layers.beauty, inputs.scene.loaded.taken())?;
     let exr = writer.output("layers", "composite.exr")?;
     layers.to_layers(&inputs.gbuffer)?.write_exr(exr)?;
+    if let Some(original) = &inputs.scene.loaded.original {
+        let [distort, undistort] = original.undistortion.st_maps()?;
+        distort.write_exr(writer.output("st_distort", "st_distort.exr")?)?;
+        undistort.write_exr(writer.output("st_undistort", "st_undistort.exr")?)?;
+    }
     writer.set_estimated_error(rendered.error.upper_95);
     let manifest = writer.finish()?;
     let seconds = clock.elapsed().as_secs_f64();
@@ -142,7 +148,7 @@ fn within(stop: Stop, clock: Instant, inputs: &Inputs) -> Stop {
     let Stop::TimeBudget(budget) = stop else {
         return stop;
     };
-    let pixels = inputs.scene.loaded.photo.image.0.pixels().len();
+    let pixels = inputs.scene.loaded.taken().image.0.pixels().len();
     let writing = Duration::from_secs_f64(WRITING_S_PER_PIXEL * pixels as f64);
     Stop::TimeBudget(budget.saturating_sub(clock.elapsed() + writing))
 }
@@ -150,7 +156,10 @@ fn within(stop: Stop, clock: Instant, inputs: &Inputs) -> Stop {
 /// Reads what the scene stage wrote and the files that it names.
 fn read(session: &Session) -> anyhow::Result<Inputs> {
     let scene = SceneFolder::read(session)?;
-    let gbuffer = Layers::read_exr(scene.manifest.output(&scene.folder, "gbuffer")?)?;
+    let mut gbuffer = Layers::read_exr(scene.manifest.output(&scene.folder, "gbuffer")?)?;
+    if let Some(original) = &scene.loaded.original {
+        gbuffer = lens::gbuffer(&gbuffer, &original.undistortion)?;
+    }
     Ok(Inputs { scene, gbuffer })
 }
 
@@ -279,7 +288,12 @@ struct Composite<'a> {
 
 impl<'a> Composite<'a> {
     fn new(inputs: &'a Inputs, film: Film, curve: &Curve) -> anyhow::Result<Self> {
-        let background = &inputs.scene.loaded.photo.image;
+        let loaded = &inputs.scene.loaded;
+        let background = &loaded.taken().image;
+        let film = match &loaded.original {
+            Some(original) => lens::film(film, &original.undistortion),
+            None => film,
+        };
         let (object, shadow) = curve.apply(film.object, &film.alpha, film.shadow);
         // Rounded to what the file stores before they are put together, so that whoever does it
         // again from the file gets the same picture. Light beyond half precision is stored in full.

@@ -126,6 +126,7 @@ fn known_sun(
             normal: plane.normal.as_dvec3(),
         };
         let ray = |pixel: glam::DVec2| {
+            let pixel = loaded.undistorted_pixel(pixel);
             let ray = camera.ray(Vec2::new(pixel.x as f32, pixel.y as f32));
             (ray.origin.as_dvec3(), ray.direction.as_dvec3())
         };

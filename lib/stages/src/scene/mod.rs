@@ -19,6 +19,7 @@ use dipir_render::effects::{self, EffectsPlan};
 use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
+use dipir_scene::camera::parts;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::plausibility::implausible;
 use dipir_scene::scene::{LoadedScene, Scene};
@@ -192,7 +193,7 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
         Err(_) => Vec::new(),
     };
     let parts = recorded.iter().filter(|a| a.role.starts_with("part of "));
-    let named = named_files(&config);
+    let named = named_files(&config, &session.config.base_dir());
     let files = named
         .iter()
         .map(|(role, path)| (*role, path.as_path()))
@@ -219,18 +220,20 @@ pub fn settings(session: &Session) -> anyhow::Result<SceneConfig> {
 }
 
 /// The files that the configuration itself names, every one once.
-fn named_files(config: &SceneConfig) -> Vec<(&'static str, PathBuf)> {
-    let camera = config.camera.as_ref().and_then(|c| c.transforms.clone());
+fn named_files(config: &SceneConfig, base_dir: &Path) -> Vec<(&'static str, PathBuf)> {
+    let camera = config.camera.as_ref();
+    let camera = camera.and_then(|c| c.transforms.as_ref().or(c.file.as_ref()));
+    let camera = camera.map_or(Vec::new(), |path| parts(path, base_dir));
     let proxy = config.proxy.as_ref().and_then(|p| p.mesh.clone());
     let single = [
         ("background", config.background.clone()),
         ("occluders", config.occluders.clone()),
-        ("camera", camera),
         ("proxy", proxy),
     ];
+    let camera = camera.into_iter().map(|path| ("camera", Some(path)));
     let objects = config.objects.iter().map(|o| ("object", o.path.clone()));
     let mut files: Vec<(&str, PathBuf)> = Vec::new();
-    for (role, path) in single.into_iter().chain(objects) {
+    for (role, path) in single.into_iter().chain(camera).chain(objects) {
         if let Some(path) = path
             && !files.contains(&(role, path.clone()))
         {
