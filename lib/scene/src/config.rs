@@ -5,6 +5,7 @@
 //! nothing contradicts anything else. Unknown keys are refused while parsing.
 mod camera;
 mod lens;
+mod proxy;
 
 use std::path::{Path, PathBuf};
 
@@ -18,9 +19,9 @@ use crate::error::Error;
 use crate::limits::Limits;
 use crate::pixels::Pixels;
 use crate::placement::{Anchor, Placement, Rest, Size};
-use crate::proxy::Plane;
 
 pub use lens::DistortionConfig;
+pub use proxy::{PlaneConfig, ProxyConfig, ProxySettings};
 
 /// The `[scene]` table as written.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -69,6 +70,15 @@ pub struct ObjectConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("examples" = [[960.0, 810.0]]))]
     pub at_pixel: Option<[f32; 2]>,
+    /// Instead of `position`: `auto` looks for a place on the ground that is free and seen, in the lower
+    /// middle of the picture. With `[scene.proxy] points` nothing of them is in the object.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("enum" = ["auto"]), example = &"auto")]
+    pub place: Option<String>,
+    /// Another place than the best one: any number above 0 draws one of those that are free.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("default" = 0), example = 3)]
+    pub place_draw: Option<u32>,
     /// Instead of `yaw_deg`: the pixel of the same plane, column and row from 0, that the object's front faces.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("examples" = [[1200.0, 900.0]]))]
@@ -166,35 +176,6 @@ pub struct CameraConfig {
     /// Which axis of the world of `transforms` is up.
     #[schemars(extend("enum" = ["z", "y", "-y"]), extend("default" = "z"), example = &"y")]
     pub transforms_up: Option<String>,
-}
-
-/// The `[scene.proxy]` table as written.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ProxyConfig {
-    /// An infinite plane.
-    pub plane: Option<PlaneConfig>,
-    /// A mesh in the coordinates of the scene, metres, in a format of objects. It replaces `plane`.
-    #[schemars(extend("format" = "path"), example = &"room.glb")]
-    pub mesh: Option<PathBuf>,
-}
-
-/// `plane = { point = …, normal = … }`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct PlaneConfig {
-    /// Any point of the plane, metres.
-    #[schemars(extend("examples" = [[0.0, 0.0, 0.0]]))]
-    #[serde(default)]
-    pub point: [f32; 3],
-    /// Direction towards the side that is seen, of any length.
-    #[schemars(extend("examples" = [[0.0, 1.0, 0.0]]))]
-    #[serde(default = "plus_y")]
-    pub normal: [f32; 3],
-}
-
-fn plus_y() -> [f32; 3] {
-    [0.0, 1.0, 0.0]
 }
 
 /// Whether planning decides what is simulated.
@@ -324,17 +305,8 @@ pub struct ObjectSettings {
     pub placement: Placement,
     /// Pixels that say where it goes.
     pub pixels: Pixels,
-}
-
-/// A checked `[scene.proxy]` table.
-#[derive(Clone, Debug, PartialEq)]
-pub enum ProxySettings {
-    /// No proxy.
-    None,
-    /// A plane with a unit normal.
-    Plane(Plane),
-    /// A mesh file.
-    Mesh(PathBuf),
+    /// Number of the draw, where its place is looked for.
+    pub auto: Option<u32>,
 }
 
 impl SceneConfig {
@@ -402,6 +374,10 @@ impl SceneConfig {
                 "interactions from 1 to 8, for instance max_depth = 3",
             ));
         }
+        let proxy = match &self.proxy {
+            None => ProxySettings::None,
+            Some(proxy) => proxy.validate(camera)?,
+        };
         let camera = camera.validate(&background)?;
         Ok(SceneSettings {
             background,
@@ -410,10 +386,7 @@ impl SceneConfig {
             occluders: self.occluders.clone(),
             objects,
             camera,
-            proxy: match &self.proxy {
-                None => ProxySettings::None,
-                Some(proxy) => proxy.validate()?,
-            },
+            proxy,
             effects: self.effects,
             limits: self.limits,
         })
@@ -451,7 +424,19 @@ impl ObjectConfig {
             }
             (None, Some(h)) => Size::Height(positive("height_m", h, "metres", "1.4")?),
         };
+        let auto = match (self.place.as_deref(), self.place_draw) {
+            (None, None) => None,
+            (Some("auto"), draw) => Some(draw.unwrap_or(0)),
+            (Some(other), _) => return Err(wrong_word(&key("place"), other, &["auto"])),
+            (None, Some(_)) => {
+                return Err(missing(&key("place"), "place_draw needs place = \"auto\""));
+            }
+        };
+        let placed = auto.is_some();
         for (by_pixel, other, both) in [
+            ("place", "position", placed && self.position.is_some()),
+            ("place", "at_pixel", placed && self.at_pixel.is_some()),
+            ("place", "anchor", placed && self.anchor.is_some()),
             (
                 "at_pixel",
                 "position",
@@ -469,6 +454,7 @@ impl ObjectConfig {
         }
         Ok(ObjectSettings {
             path,
+            auto,
             pixels: Pixels {
                 at: finite_pixel(&key("at_pixel"), self.at_pixel)?,
                 to: finite_pixel(&key("to_pixel"), self.to_pixel)?,
@@ -496,35 +482,6 @@ impl ObjectConfig {
                 },
             },
         })
-    }
-}
-
-impl ProxyConfig {
-    fn validate(&self) -> Result<ProxySettings, Error> {
-        match (&self.plane, &self.mesh) {
-            (Some(_), Some(_)) => Err(conflict("scene.proxy.plane", "scene.proxy.mesh")),
-            (None, Some(path)) => Ok(ProxySettings::Mesh(path.clone())),
-            (None, None) => Err(missing(
-                "scene.proxy.plane",
-                "write plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] } or mesh = \"proxy.glb\", or leave the table out",
-            )),
-            (Some(plane), None) => {
-                let point = finite_point("scene.proxy.plane.point", plane.point)?;
-                let normal = finite_point("scene.proxy.plane.normal", plane.normal)?;
-                let unit = normal.as_dvec3().normalize_or_zero().as_vec3();
-                if unit == Vec3::ZERO {
-                    return Err(wrong(
-                        "scene.proxy.plane.normal",
-                        triple(normal),
-                        "a direction that is not zero, for instance normal = [0.0, 1.0, 0.0]",
-                    ));
-                }
-                Ok(ProxySettings::Plane(Plane {
-                    point,
-                    normal: unit,
-                }))
-            }
-        }
     }
 }
 

@@ -3,6 +3,7 @@ use std::path::{Path, PathBuf};
 
 use dipir_cameras::Lens;
 use dipir_imaging::transfer::Transfer;
+use dipir_points::Ground;
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
 
@@ -72,6 +73,8 @@ pub enum ProxyRecord {
     Plane(Plane),
     /// A mesh in world coordinates.
     Mesh(ObjectRecord),
+    /// The ground through points.
+    Ground(Box<Ground>),
 }
 
 /// The content of `scene.json`.

@@ -3,6 +3,7 @@ use std::path::PathBuf;
 
 use dipir_cameras::CameraError;
 use dipir_imaging::ImagingError;
+use dipir_points::PointsError;
 
 use crate::printable::printable;
 
@@ -68,6 +69,9 @@ pub enum Error {
     /// A camera's file cannot be used.
     #[error("{}", printable(_0))]
     Camera(CameraError),
+    /// Points cannot be used.
+    #[error("{}", printable(_0))]
+    Points(PointsError),
     /// The contents of a file do not make sense.
     #[error("{}; {remedy}", printable(detail))]
     Malformed {

@@ -2,9 +2,11 @@
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
+use dipir_cameras::Camera as LensCamera;
 use dipir_imaging::file::{self, Photo};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
+use dipir_points::Cloud;
 use glam::{DMat4, DVec2};
 
 use crate::camera::{Camera, CameraSettings};
@@ -12,11 +14,13 @@ use crate::config::{EffectsConfig, ProxySettings, SceneConfig};
 use crate::description::{FileRecord, ObjectRecord, PhotoRecord, ProxyRecord, SceneDescription};
 use crate::error::Error;
 use crate::features::SceneFeatures;
+use crate::ground::{self, Places};
 use crate::import::{self, Imported};
 use crate::light::PunctualLight;
 use crate::limits::Limits;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
+use crate::placement::Anchor;
 use crate::printable::printable;
 use crate::proxy::Proxy;
 use crate::texture::Texture;
@@ -155,13 +159,19 @@ impl Scene {
             .resolve(resolution, base_dir)?;
         let (occluders, occluders_record) = occluders.unzip();
         let (photo, occluders, original) = undistort(photo, occluders, undistortion);
-        let (proxy, proxy_record) = match &settings.proxy {
-            ProxySettings::None => (Proxy::None, ProxyRecord::None),
-            ProxySettings::Plane(plane) => (Proxy::Plane(*plane), ProxyRecord::Plane(*plane)),
-            ProxySettings::Mesh(path) => {
-                let (mesh, record) = files.proxy_mesh(path)?;
-                (Proxy::Mesh(mesh), ProxyRecord::Mesh(record))
-            }
+        let view = ground::view(&camera, undistortion.as_ref());
+        let (proxy, proxy_record, cloud) = files.proxy(&settings.proxy, &view)?;
+        let mut places = Places {
+            view,
+            ground: match (&proxy_record, &proxy) {
+                (ProxyRecord::Ground(ground), _) => Some(ground.as_ref().clone()),
+                (_, Proxy::Plane(plane)) => Some(ground::of_plane(plane)),
+                _ => None,
+            },
+            cloud,
+            occluders: occluders.as_ref(),
+            undistortion: undistortion.as_ref(),
+            taken: Vec::new(),
         };
         let mut assembly = Assembly::new(camera, settings.objects.iter().map(|o| o.path.clone()));
         let mut objects = Vec::new();
@@ -171,8 +181,14 @@ impl Scene {
                 Some(way) => object.pixels.undistorted(way, &key)?,
                 None => object.pixels,
             };
-            let placement = pixels.place(&object.placement, &camera, &proxy, &key)?;
             let (placed, warning) = assembly.add(&mut files, &object.path, |imported| {
+                let mut placement = object.placement;
+                if let Some(draw) = object.auto {
+                    let body = placement.body(&imported.mesh, &key)?;
+                    placement.position = places.find(body, draw, &key)?.as_vec3();
+                    placement.anchor = Anchor::Center;
+                }
+                let placement = pixels.place(&placement, &camera, &proxy, &key)?;
                 let (map, warning) =
                     placement.resolve(&imported.mesh, imported.origin, &proxy, &key)?;
                 // The record's map starts from the file's coordinates.
@@ -249,6 +265,7 @@ impl SceneDescription {
                 files.check_object("the proxy mesh", record)?;
                 Proxy::Mesh(files.proxy_mesh(&record.file.path)?.0)
             }
+            ProxyRecord::Ground(ground) => ground::proxy(ground),
         };
         let mut assembly = Assembly::new(
             self.camera,
@@ -449,6 +466,36 @@ impl<'a> Files<'a> {
             triangles: imported.mesh.indices.len() as u64,
         };
         Ok((imported, record))
+    }
+
+    /// The proxy, its record, and the points that it was made from.
+    fn proxy(
+        &mut self,
+        settings: &ProxySettings,
+        view: &LensCamera,
+    ) -> Result<(Proxy, ProxyRecord, Option<Cloud>), Error> {
+        let of_plane = |plane| (Proxy::Plane(plane), ProxyRecord::Plane(plane), None);
+        Ok(match settings {
+            ProxySettings::None => (Proxy::None, ProxyRecord::None, None),
+            ProxySettings::Plane(plane) => of_plane(*plane),
+            ProxySettings::Mesh(path) => {
+                let (mesh, record) = self.proxy_mesh(path)?;
+                (Proxy::Mesh(mesh), ProxyRecord::Mesh(record), None)
+            }
+            ProxySettings::Pixels(pixels) => {
+                let (plane, warning) = ground::plane_of(pixels, view)?;
+                self.warnings.extend(warning);
+                of_plane(plane)
+            }
+            ProxySettings::Points(points) => {
+                for part in points.parts(self.base_dir) {
+                    self.input("points", &part);
+                }
+                let (cloud, ground) = points.read(self.base_dir, view)?;
+                let proxy = ground::proxy(&ground);
+                (proxy, ProxyRecord::Ground(Box::new(ground)), Some(cloud))
+            }
+        })
     }
 
     fn proxy_mesh(&mut self, path: &Path) -> Result<(TriangleMesh, ObjectRecord), Error> {

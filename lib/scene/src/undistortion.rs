@@ -260,7 +260,7 @@ mod tests {
         for lens in lenses() {
             let way = Undistortion::of(&lens).unwrap();
             let pose = Pose {
-                position: DVec3::new(0.3, 1.5, 2.0),
+                position: DVec3::new(0.1, 1.0, 4.0),
                 ..Pose::IDENTITY
             };
             let (pinhole, real) = (way.camera(&pose), LensCamera { pose, lens });

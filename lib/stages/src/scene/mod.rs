@@ -15,12 +15,15 @@ use dipir_optimize::settings::{LightTable, Settings as RecoverySettings};
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
+use dipir_points::Ground;
 use dipir_render::effects::{self, EffectsPlan};
 use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
 use dipir_scene::camera::parts;
 use dipir_scene::config::SceneConfig;
+use dipir_scene::description::ProxyRecord;
+use dipir_scene::ground::points_parts;
 use dipir_scene::plausibility::implausible;
 use dipir_scene::scene::{LoadedScene, Scene};
 use serde_json::{Value, json};
@@ -41,6 +44,8 @@ pub struct Done {
     triangles: usize,
     materials: usize,
     resolution: [u32; 2],
+    /// Of the ground, where it was found in points.
+    ground: Option<Ground>,
     /// Absent where the light is given.
     record: Option<Record>,
     /// Other qualities differ in the record alone.
@@ -149,6 +154,10 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         triangles: loaded.scene.mesh.indices.len(),
         materials: loaded.scene.materials.len(),
         resolution,
+        ground: match loaded.description.proxy {
+            ProxyRecord::Ground(ground) => Some(*ground),
+            _ => None,
+        },
         record,
         outlook: outlook.unwrap_or_default(),
     })
@@ -231,9 +240,20 @@ fn named_files(config: &SceneConfig, base_dir: &Path) -> Vec<(&'static str, Path
         ("proxy", proxy),
     ];
     let camera = camera.into_iter().map(|path| ("camera", Some(path)));
+    let points = config.proxy.as_ref().and_then(|p| {
+        let path = p.points.as_deref()?;
+        Some(points_parts(path, p.points_pose.as_deref(), base_dir))
+    });
+    let points = points.into_iter().flatten();
+    let points = points.map(|path| ("points", Some(path)));
     let objects = config.objects.iter().map(|o| ("object", o.path.clone()));
     let mut files: Vec<(&str, PathBuf)> = Vec::new();
-    for (role, path) in single.into_iter().chain(camera).chain(objects) {
+    for (role, path) in single
+        .into_iter()
+        .chain(camera)
+        .chain(points)
+        .chain(objects)
+    {
         if let Some(path) = path
             && !files.contains(&(role, path.clone()))
         {
@@ -244,7 +264,7 @@ fn named_files(config: &SceneConfig, base_dir: &Path) -> Vec<(&'static str, Path
 }
 
 /// A role without its number: `part of object` for `part of object 2`.
-fn unnumbered(role: &str) -> &str {
+pub(crate) fn unnumbered(role: &str) -> &str {
     role.trim_end_matches(|c: char| c.is_ascii_digit())
         .trim_end()
 }
@@ -302,6 +322,10 @@ impl Done {
             "triangles": self.triangles,
             "materials": self.materials,
             "resolution": self.resolution,
+            "ground": self.ground.as_ref().map(|g| json!({
+                "point": g.point, "normal": g.normal, "points": g.points, "inliers": g.inliers,
+                "residual_m": g.residual_m, "relief": g.relief.is_some(),
+            })),
             "effects": self.effects.effects,
             "max_depth": self.effects.max_depth,
             "transport": self.record.as_ref().map(|r| json!({
@@ -337,6 +361,9 @@ impl fmt::Display for Done {
             "  {} triangles, {} materials, {width} x {height} pixels",
             self.triangles, self.materials
         )?;
+        if let Some(ground) = &self.ground {
+            writeln!(f, "  ground: {}", ground.words())?;
+        }
         write!(
             f,
             "  effects: {} (depth {})",
