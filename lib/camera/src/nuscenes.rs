@@ -18,8 +18,9 @@ struct Record {
     #[serde(default)]
     camera_intrinsic: Vec<[f64; 3]>,
     ego_pose: Option<Stand>,
-    #[serde(default, alias = "filename", alias = "token")]
-    channel: String,
+    channel: Option<String>,
+    filename: Option<String>,
+    token: Option<String>,
     width: Option<f64>,
     height: Option<f64>,
 }
@@ -98,7 +99,8 @@ pub fn read(
         let pose = Pose::from_axes(axes, position)
             .ok_or_else(|| CameraError::new(FORMAT, "a record does not rotate"))?;
         let pose = pose.in_our_world(up);
-        cameras.push((record.channel, Camera { pose, lens }));
+        let name = record.channel.or(record.filename).or(record.token);
+        cameras.push((name.unwrap_or_default(), Camera { pose, lens }));
     }
     Ok(cameras)
 }

@@ -214,7 +214,7 @@ fn nuscenes_json(rig: &[Camera]) -> String {
         let flip = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
         let q = DQuat::from_mat3(&(to_z_up * camera.pose.rotation * flip));
         records.push(json!({
-            "channel": format!("CAM_{i}"), "rotation": [q.w, q.x, q.y, q.z],
+            "token": "a camera", "channel": format!("CAM_{i}"), "rotation": [q.w, q.x, q.y, q.z],
             "translation": (to_z_up * camera.pose.position).to_array(),
             "camera_intrinsic": [[520, 0, 320], [0, 520, 240], [0, 0, 1]],
         }));

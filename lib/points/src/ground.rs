@@ -17,9 +17,9 @@ pub struct Ground {
     pub normal: DVec3,
     /// Points on which the plane was looked for.
     pub points: u64,
-    /// Those of them that lie on it, within three standard deviations.
+    /// Those of them that lie on the ground, within three standard deviations.
     pub inliers: u64,
-    /// Root mean square of their distances from the plane, metres.
+    /// Root mean square of their distances from it, metres.
     pub residual_m: f64,
     /// Heights over the plane, where the ground is not flat.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -93,29 +93,31 @@ pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     };
     let (plane, sigma) =
         found.ok_or_else(|| none("no three of them make a plane that lies flat".into()))?;
-    let on: Vec<f64> = points.iter().map(|p| plane.height(*p)).collect();
-    let on: Vec<f64> = on.into_iter().filter(|h| h.abs() <= 3.0 * sigma).collect();
-    let share = on.len() as f64 / points.len() as f64;
-    if share < LEAST_SHARE || plane.height(camera.pose.position) <= 0.0 {
+    let under = plane.height(camera.pose.position);
+    let mut ground = Ground {
+        point: camera.pose.position - under * plane.normal,
+        normal: plane.normal,
+        points: points.len() as u64,
+        inliers: 0,
+        residual_m: 0.0,
+        relief: None,
+    };
+    ground.count(&points, 3.0 * sigma);
+    let share = ground.inliers as f64 / points.len() as f64;
+    if share < LEAST_SHARE || under <= 0.0 {
         let percent = 100.0 * share;
         return Err(none(format!(
             "only {percent:.1}% lie on a plane below the camera"
         )));
     }
-    let residual = (on.iter().map(|h| h * h).sum::<f64>() / on.len() as f64).sqrt();
-    let point = camera.pose.position - plane.height(camera.pose.position) * plane.normal;
-    let mut ground = Ground {
-        point,
-        normal: plane.normal,
-        points: points.len() as u64,
-        inliers: on.len() as u64,
-        residual_m: residual,
-        relief: None,
-    };
     if search.shape != Shape::Plane {
         let ahead = -camera.pose.rotation.z_axis;
-        let found = relief(&points, &ground, ahead, sigma);
-        ground.relief = found.filter(|r| search.shape == Shape::Relief || !r.is_flat(3.0 * sigma));
+        if let Some((found, noise)) = relief(&points, &ground, ahead, sigma)
+            && (search.shape == Shape::Relief || !found.is_flat(3.0 * noise))
+        {
+            ground.relief = Some(found);
+            ground.count(&points, 3.0 * noise);
+        }
     }
     Ok(ground)
 }
@@ -143,6 +145,15 @@ fn used(cloud: &Cloud, camera: &Camera, up: DVec3) -> Vec<DVec3> {
 }
 
 impl Ground {
+    /// Counts the points within `reach` of the ground, and their distances from it.
+    fn count(&mut self, points: &[DVec3], reach: f64) {
+        let off = points.iter().map(|p| self.height(*p));
+        let on: Vec<f64> = off.filter(|h| h.abs() <= reach).collect();
+        let squares = on.iter().map(|h| h * h).sum::<f64>();
+        self.inliers = on.len() as u64;
+        self.residual_m = (squares / on.len().max(1) as f64).sqrt();
+    }
+
     /// Metres over the ground, along the plane's normal.
     pub fn height(&self, point: DVec3) -> f64 {
         let over_plane = self.normal.dot(point - self.point);

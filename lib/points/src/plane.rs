@@ -28,7 +28,7 @@ const BELOW: f64 = 2.0;
 /// Tukey's constant: 95% efficient where errors are normal.
 const TUKEY: f64 = 4.685;
 /// Standard deviations in a median absolute deviation of normal errors.
-const MAD: f64 = 1.4826;
+pub(crate) const MAD: f64 = 1.4826;
 
 /// The plane that most of `points` lie on within `threshold`, with a normal within `most_tilt_rad` of
 /// `up` (RANSAC, judged as MSAC).

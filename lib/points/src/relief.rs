@@ -3,6 +3,7 @@ use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::ground::Ground;
+use crate::plane::MAD;
 
 /// Heights over a plane at the corners of square cells, bilinear between them, drawn out beyond them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,8 +41,14 @@ const PASSES: usize = 8;
 /// Steps of conjugate gradients in a pass.
 const STEPS: usize = 120;
 
-/// The relief of the ground that `points` show, of noise `sigma`; `None` if they are too few.
-pub(crate) fn relief(points: &[DVec3], ground: &Ground, view: DVec3, sigma: f64) -> Option<Relief> {
+/// The relief of the ground that `points` show, off the plane by `sigma`, and how far they are off the
+/// relief (a standard deviation); `None` if they are too few.
+pub(crate) fn relief(
+    points: &[DVec3],
+    ground: &Ground,
+    view: DVec3,
+    sigma: f64,
+) -> Option<(Relief, f64)> {
     let up = ground.normal;
     let right = view.cross(up).try_normalize()?;
     let ahead = up.cross(right);
@@ -80,7 +87,17 @@ pub(crate) fn relief(points: &[DVec3], ground: &Ground, view: DVec3, sigma: f64)
         .map(|(at, h)| ((*at - low) / cell, *h))
         .collect();
     let heights = grid.surface(&data, 3.0 * sigma);
-    Some(Relief {
+    let off = data.iter().map(|(at, h)| {
+        let on: f64 = grid.taps(*at).iter().map(|(i, w)| w * heights[*i]).sum();
+        (h - on).abs()
+    });
+    let mut off: Vec<f64> = off.filter(|off| *off < 3.0 * sigma).collect();
+    let middle = off.len() / 2;
+    if off.is_empty() {
+        return None;
+    }
+    let noise = MAD * *off.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let relief = Relief {
         origin: eye + low.x * right + low.y * ahead,
         right,
         ahead,
@@ -88,7 +105,8 @@ pub(crate) fn relief(points: &[DVec3], ground: &Ground, view: DVec3, sigma: f64)
         columns: grid.columns as u32,
         rows: grid.rows as u32,
         heights_m: heights.into_iter().map(|h| h as f32).collect(),
-    })
+    };
+    Some((relief, noise))
 }
 
 /// A height of the camera, or what stands for it: the distance of the nearest tenth of the points.

@@ -107,12 +107,17 @@ impl Street {
             }
         }
         if let Some(share) = off_ground {
-            let wanted = (off.len() as f64 * (1.0 - share) / share) as usize;
-            let every = on.len() as f64 / wanted as f64;
-            assert!(every >= 1.0, "too few boxes");
-            on = (0..wanted)
-                .map(|i| on[(i as f64 * every) as usize])
-                .collect();
+            // The larger part is thinned evenly.
+            let all = (on.len() as f64 / (1.0 - share)).min(off.len() as f64 / share);
+            let thinned = |points: Vec<DVec3>, wanted: f64| -> Vec<DVec3> {
+                let every = points.len() as f64 / wanted.floor();
+                let count = wanted as usize;
+                (0..count)
+                    .map(|i| points[(i as f64 * every) as usize])
+                    .collect()
+            };
+            on = thinned(on, all * (1.0 - share));
+            off = thinned(off, all * share);
         }
         on.append(&mut off);
         Cloud {
