@@ -29,7 +29,8 @@ pub struct Ground {
 /// Whether the ground may be other than a plane.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Shape {
-    /// A relief where the points are off the plane by more than their noise.
+    /// A relief where the points are off the plane by more than their noise, and by more than matters:
+    /// 5 cm at 10 m.
     #[default]
     Auto,
     /// A plane.
@@ -113,7 +114,7 @@ pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     if search.shape != Shape::Plane {
         let ahead = -camera.pose.rotation.z_axis;
         if let Some((found, noise)) = relief(&points, &ground, ahead, sigma)
-            && (search.shape == Shape::Relief || !found.is_flat(3.0 * noise))
+            && (search.shape == Shape::Relief || !found.is_flat(threshold.max(3.0 * noise)))
         {
             ground.relief = Some(found);
             ground.count(&points, 3.0 * noise);

@@ -90,7 +90,7 @@ fn sweep(width: usize) -> Vec<u8> {
 fn camera() -> Camera {
     Camera {
         pose: Pose {
-            position: DVec3::new(0.0, 1.5, 0.0),
+            position: DVec3::new(0.0, 0.75, 0.0),
             ..Pose::IDENTITY
         },
         lens: Lens::pinhole([80.0, 60.0], DVec2::splat(70.0)),
@@ -190,11 +190,11 @@ fn scale_axis_and_sensor_move_points() {
 fn a_depth_map_gives_the_points_that_the_camera_sees() {
     let folder = tempfile::tempdir().unwrap();
     let camera = camera();
-    // The ground 1.5 m below a level camera, at half the photograph's size.
+    // The ground 0.75 m below a level camera, at half the photograph's size.
     let depth = |i: usize| {
         let below = (i / 40) as f64 + 0.5 - 15.0;
         if below > 0.0 {
-            (1.5 * 35.0 / below) as f32
+            (0.75 * 35.0 / below) as f32
         } else {
             0.0
         }
