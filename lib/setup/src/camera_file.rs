@@ -6,7 +6,7 @@ use dipir_cameras::{CameraError, Lens, Pose, WorldUp};
 use glam::{DVec2, DVec3};
 
 use crate::error::SetupError;
-use crate::view::{Aim, Asked, EYE_HEIGHT_M, View};
+use crate::view::{Aim, CameraOptions, EYE_HEIGHT_M, View};
 
 /// Most that a lens bends a corner, and that pixels differ from squares at a corner, pixels.
 const MOST_BENT_PX: f64 = 1.0;
@@ -24,7 +24,7 @@ pub fn read(
     photo: &Path,
     size: [u32; 2],
     up: Option<WorldUp>,
-    asked: &Asked,
+    asked: &CameraOptions,
 ) -> Result<View, SetupError> {
     asked.check()?;
     let size = size.map(f64::from);
@@ -85,7 +85,7 @@ fn view(
     ground_at_origin: bool,
     program: &str,
     path: &Path,
-    asked: &Asked,
+    asked: &CameraOptions,
 ) -> View {
     let size = DVec2::from_array(lens.size);
     let shift = lens.principal_px - 0.5 * size;
@@ -164,7 +164,7 @@ mod tests {
             Path::new("photos/b.jpg"),
             size,
             None,
-            &Asked::default(),
+            &CameraOptions::default(),
         );
         found.map_err(|e| e.to_string())
     }

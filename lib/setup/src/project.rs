@@ -18,7 +18,7 @@ use crate::document::{Document, Object, Points, axis};
 use crate::error::SetupError;
 use crate::size::{Size, size};
 use crate::spots::spots;
-use crate::view::{Asked, View};
+use crate::view::{CameraOptions, View};
 
 /// What a first configuration is made from.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -38,7 +38,7 @@ pub struct Request {
     /// Which axis of that camera's world points up.
     pub camera_up: Option<WorldUp>,
     /// Of the camera.
-    pub asked: Asked,
+    pub asked: CameraOptions,
     /// Points of the scene that tell the ground.
     pub points: Option<PathBuf>,
     /// Where their sensor stood.

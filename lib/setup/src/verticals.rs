@@ -1,7 +1,7 @@
 //! Pitch and roll of a camera from edges that are upright in the world.
 //!
-//! Upright lines meet in one point of the image plane, which a pitch and a roll place. The pair that
-//! most edges agree with is looked for on a grid and refined by robust least squares.
+//! Images of upright lines meet in one point of the image plane; pitch and roll determine it. The pair that most edges
+//! agree with is looked for on a grid and refined by robust least squares.
 use glam::{DVec2, DVec3};
 
 use crate::segments::Segment;

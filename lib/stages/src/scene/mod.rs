@@ -35,6 +35,7 @@ use crate::light::method::Method;
 use crate::names::SCENE;
 use crate::presets::{self, Outlook};
 use crate::scene::transport::Frame;
+use crate::written;
 
 /// What the stage did.
 pub struct Done {
@@ -278,7 +279,7 @@ fn plan_with<'a>(
     let table: LightTable = session.config.table("light")?;
     let recovery = transport::settings(session, &table)?;
     let known = known_light::known_params(&composite);
-    // Where nothing is optimised, the record would be made for nobody.
+    // Where nothing is optimised, nothing reads the record.
     let transport = Method::of(session)?.replays().then(|| {
         json!({
             "size": recovery.size, "environment": recovery.environment,
@@ -350,15 +351,10 @@ impl fmt::Display for Done {
             .map(|e| e.name.name())
             .collect();
         let [width, height] = self.resolution;
+        written(f, &self.folder, &self.manifest)?;
         writeln!(
             f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
-        writeln!(
-            f,
-            "  {} triangles, {} materials, {width} x {height} pixels",
+            "\n  {} triangles, {} materials, {width} x {height} pixels",
             self.triangles, self.materials
         )?;
         if let Some(ground) = &self.ground {
