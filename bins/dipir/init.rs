@@ -37,7 +37,7 @@ pub struct InitArgs {
     class: Option<String>,
 
     /// The photograph's camera from another program: fSpy's .fspy or .json, transforms.json, .chan,
-    /// or a folder of COLMAP's
+    /// .glb, .gltf, a folder of COLMAP's, KITTI's .txt, nuScenes' .json
     #[arg(long, value_name = "FILE")]
     camera: Option<PathBuf>,
 
@@ -64,8 +64,34 @@ pub struct InitArgs {
     #[arg(long, value_name = "M")]
     eye_height: Option<f64>,
 
+    /// Points of the scene, which tell the ground: .ply, .pcd, .bin of a scanner, COLMAP's points3D, or
+    /// depths of the photograph as .exr (metres) or .png (16 bits, millimetres)
+    #[arg(long, value_name = "FILE")]
+    points: Option<PathBuf>,
+
+    /// Where the sensor of the points stood: KITTI's calib.txt, or its record of nuScenes as .json
+    #[arg(long, value_name = "FILE", requires = "points")]
+    points_pose: Option<PathBuf>,
+
+    /// Which axis of the points points up [default: as their format has it]
+    #[arg(long, value_name = "AXIS", requires = "points")]
+    points_up: Option<Axis>,
+
+    /// Where the objects stand: side by side in the middle, or wherever the ground is free and seen
+    #[arg(long, value_name = "HOW", default_value = "middle")]
+    place: Place,
+
     #[command(flatten)]
     output: OutputArgs,
+}
+
+/// How places are chosen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Place {
+    /// Side by side
+    Middle,
+    /// Free ground that is seen, looked for on every run
+    Auto,
 }
 
 /// An axis of a camera's world.
@@ -104,6 +130,10 @@ pub fn run(args: &InitArgs) -> anyhow::Result<()> {
             pitch_deg: args.pitch,
             eye_height_m: args.eye_height,
         },
+        points: args.points.clone(),
+        points_pose: args.points_pose.clone(),
+        points_up: args.points_up.map(Into::into),
+        place_auto: args.place == Place::Auto,
     };
     let draft = draft(&request).map_err(classified)?;
     draft.write().map_err(classified)?;
@@ -148,12 +178,16 @@ fn said(draft: &Draft) -> String {
         view.aim_why,
         view.fov_why
     );
+    if let Some(points) = &document.points {
+        text += &format!("  ground: {}\n", points.words);
+    }
     for object in &document.objects {
         let [x, y] = object.at_pixel;
-        text += &format!(
-            "  {}: at pixel {x}, {y}; {}\n",
-            object.path, object.size_why
-        );
+        let place = match object.auto {
+            true => "wherever it is free".into(),
+            false => format!("at pixel {x}, {y}"),
+        };
+        text += &format!("  {}: {place}; {}\n", object.path, object.size_why);
     }
     let [place, look, whole] = commands(&draft.path);
     text + &format!(

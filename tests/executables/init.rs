@@ -1,4 +1,6 @@
 //! `dipir init`: from a photograph and a model to a configuration that runs.
+use dipir_imaging::layers::{Layers, Precision};
+use dipir_imaging::raster::Raster;
 use serde_json::Value;
 
 use crate::project::*;
@@ -89,4 +91,60 @@ fn a_camera_that_sees_no_ground_writes_nothing() {
         init.stderr
     );
     assert!(!project.path("first.toml").exists());
+}
+
+#[test]
+fn a_depth_map_gives_the_ground_and_objects_find_their_place() {
+    let project = Project::new();
+    // Level ground 1.6 m below a camera that looks down by 15 degrees, 60 degrees wide.
+    let focal = 18.0 / 30f64.to_radians().tan();
+    let (sin, cos) = 15f64.to_radians().sin_cos();
+    let depth = |i: usize| {
+        let y = ((i / 36) as f64 + 0.5 - 12.0) / focal;
+        let descent = sin + y * cos;
+        if descent > 0.05 {
+            (1.6 / descent) as f32
+        } else {
+            0.0
+        }
+    };
+    let depth = Raster::from_pixels(36, 24, (0..36 * 24).map(depth).collect());
+    let mut layers = Layers::new(36, 24);
+    layers.insert("Z", Precision::Full, depth).unwrap();
+    layers.write_exr(project.path("depth.exr")).unwrap();
+    let args = [
+        "init",
+        PHOTO,
+        MODEL,
+        "--out",
+        "first.toml",
+        "--pitch",
+        "-15",
+        "--fov",
+        "60",
+        "--height-m",
+        "0.4",
+        "--points",
+        "depth.exr",
+        "--place",
+        "auto",
+    ];
+    let init = project.run(DIPIR, &args);
+    init.expect_success();
+    assert!(
+        init.stdout.contains("ground: a plane, on which"),
+        "{}",
+        init.stdout
+    );
+    let known = ["-p", "first.toml", "-s", "composite.environment=sky.exr"];
+    let scene = project.run(SCENE, &known);
+    scene.expect_success();
+    let scene: Value = serde_json::from_slice(&project.read("out/scene/scene.json")).unwrap();
+    let ground = &scene["proxy"]["ground"];
+    assert!(
+        ground["point"][1].as_f64().unwrap().abs() < 1e-3,
+        "{ground}"
+    );
+    let height = scene["objects"][0]["transform"][1][3].as_f64().unwrap();
+    assert!(height.abs() < 1e-3, "{height}");
 }

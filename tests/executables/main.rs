@@ -10,6 +10,7 @@ mod interruption;
 mod keys;
 mod kills;
 mod large;
+mod lens;
 mod manual;
 mod page;
 mod pipeline;

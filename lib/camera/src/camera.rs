@@ -1,11 +1,12 @@
 //! A lens, where it stands, and the two together.
 use glam::{DMat3, DVec2, DVec3};
+use serde::{Deserialize, Serialize};
 
 use crate::distortion::Distortion;
 use crate::error::CameraError;
 
 /// What turns directions into pixels.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Lens {
     /// Width and height of the image, pixels.
     pub size: [f64; 2],
@@ -116,7 +117,7 @@ impl Pose {
     }
 
     /// From a world of which `up` is up.
-    pub(crate) fn in_our_world(self, up: WorldUp) -> Self {
+    pub fn in_our_world(self, up: WorldUp) -> Self {
         let turn = up.to_ours();
         Self {
             position: turn * self.position,

@@ -2,7 +2,7 @@
 //!
 //! Images map world to camera in image axes. The world has no known up and scale.
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
@@ -27,25 +27,59 @@ pub struct Model {
 /// # Errors
 /// If a file is missing, cut short, or of a camera model that is not known.
 pub fn read(folder: &Path, up: WorldUp) -> Result<Model, CameraError> {
-    let binary = folder.join("cameras.bin").exists();
-    let name = |stem: &str| folder.join(format!("{stem}.{}", if binary { "bin" } else { "txt" }));
-    let bytes = |stem: &str| {
-        let path = name(stem);
-        dipir_files::read(&path).map_err(|source| CameraError::Read { path, source })
-    };
-    let (cameras, images) = (bytes("cameras")?, bytes("images")?);
-    let points = match name("points3D").exists() {
-        true => bytes("points3D")?,
+    let points = match part(folder, "points3D").exists() {
+        true => bytes(folder, "points3D")?,
         false => Vec::new(),
     };
+    of_parts(folder, &points, up)
+}
+
+/// The cameras of the model in `folder` by the names of their images. Errors as [`read`].
+pub fn read_cameras(folder: &Path, up: WorldUp) -> Result<Vec<(String, Camera)>, CameraError> {
+    Ok(of_parts(folder, &[], up)?.images)
+}
+
+/// The points of `points3D.txt` or, if `binary`, `points3D.bin`. Errors as [`read`].
+pub fn read_points(points: &[u8], binary: bool, up: WorldUp) -> Result<Vec<DVec3>, CameraError> {
+    const NONE: [u8; 8] = [0; 8];
     match binary {
-        true => read_binary(&cameras, &images, &points, up),
-        false => {
-            let text = |bytes| {
-                String::from_utf8(bytes).map_err(|_| CameraError::new(FORMAT, "it is not UTF-8"))
-            };
-            read_text(&text(cameras)?, &text(images)?, &text(points)?, up)
-        }
+        true => Ok(read_binary(&NONE, &NONE, points, up)?.points),
+        false => Ok(read_text("", "", text(points)?, up)?.points),
+    }
+}
+
+/// The files of cameras and images in `folder`.
+pub fn parts(folder: &Path) -> Vec<PathBuf> {
+    ["cameras", "images"].map(|stem| part(folder, stem)).into()
+}
+
+/// A file of the model: binary, if its cameras are.
+pub fn part(folder: &Path, stem: &str) -> PathBuf {
+    let extension = match is_binary(folder) {
+        true => "bin",
+        false => "txt",
+    };
+    folder.join(format!("{stem}.{extension}"))
+}
+
+fn is_binary(folder: &Path) -> bool {
+    folder.join("cameras.bin").exists()
+}
+
+fn bytes(folder: &Path, stem: &str) -> Result<Vec<u8>, CameraError> {
+    let path = part(folder, stem);
+    dipir_files::read(&path).map_err(|source| CameraError::Read { path, source })
+}
+
+fn text(bytes: &[u8]) -> Result<&str, CameraError> {
+    std::str::from_utf8(bytes).map_err(|_| CameraError::new(FORMAT, "it is not UTF-8"))
+}
+
+fn of_parts(folder: &Path, points: &[u8], up: WorldUp) -> Result<Model, CameraError> {
+    let (cameras, images) = (bytes(folder, "cameras")?, bytes(folder, "images")?);
+    match is_binary(folder) {
+        true => read_binary(&cameras, &images, points, up),
+        false => read_text(text(&cameras)?, text(&images)?, text(points)?, up),
     }
 }
 

@@ -1,28 +1,57 @@
 //! How a lens bends the straight lines of a pinhole camera.
 use glam::{DMat2, DVec2, DVec3};
+use serde::{Deserialize, Serialize};
 
 /// A model of distortion, between directions and the image plane at distance 1.
 ///
 /// Each model holds up to the angle at which its image would begin to move back towards the centre;
 /// beyond it nothing is seen.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Model", into = "Model")]
 pub struct Distortion {
     model: Model,
     /// Largest undistorted radius (Brown-Conrady) or angle in radians (Kannala-Brandt) that is seen.
     limit: f64,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// The numbers of a model, as files of ours keep them.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 enum Model {
     None,
+    #[serde(rename = "brown_conrady")]
     Brown {
         numerator: [f64; 4],
         denominator: [f64; 3],
         tangential: [f64; 2],
     },
+    #[serde(rename = "kannala_brandt")]
     Fisheye {
         k: [f64; 4],
     },
+}
+
+impl TryFrom<Model> for Distortion {
+    type Error = &'static str;
+
+    fn try_from(model: Model) -> Result<Self, Self::Error> {
+        let lens = match model {
+            Model::None => Some(Self::NONE),
+            Model::Brown {
+                numerator,
+                denominator,
+                tangential,
+            } => Self::brown_conrady(numerator, denominator, tangential),
+            Model::Fisheye { k } => Self::kannala_brandt(k),
+        };
+        lens.ok_or("a coefficient of the lens is not finite")
+    }
+}
+
+impl From<Distortion> for Model {
+    fn from(lens: Distortion) -> Self {
+        lens.model
+    }
 }
 
 /// A point of the image plane, and how it moves with the direction.
@@ -101,6 +130,11 @@ impl Distortion {
     /// Whether this is a pinhole camera.
     pub fn is_none(&self) -> bool {
         self.model == Model::None
+    }
+
+    /// Whether this is Kannala and Brandt's model.
+    pub fn is_fisheye(&self) -> bool {
+        matches!(self.model, Model::Fisheye { .. })
     }
 
     /// Where light from `direction` falls; `None` where the lens does not see.

@@ -16,20 +16,8 @@ const FORMAT: &str = "KITTI calibration";
 /// If the file has no such camera, or its matrix is no projection.
 pub fn read(text: &str, index: u32, size: [f64; 2]) -> Result<Camera, CameraError> {
     let names = [format!("P{index}"), format!("P_rect_{index:02}")];
-    let line = text.lines().find_map(|line| {
-        let (name, values) = line.split_once(':')?;
-        names.iter().any(|n| n == name.trim()).then_some(values)
-    });
-    let Some(line) = line else {
-        let detail = format!("it has neither {} nor {}", names[0], names[1]);
-        return Err(CameraError::new(FORMAT, detail));
-    };
-    let values: Option<Vec<f64>> = line.split_whitespace().map(|v| v.parse().ok()).collect();
-    let values = values.filter(|v| v.len() == 12 && v.iter().all(|v| v.is_finite()));
+    let p: [f64; 12] = numbers(text, [&names[0], &names[1]])?;
     let wrong = |what: &str| CameraError::new(FORMAT, format!("{} {what}", names[0]));
-    let Some(p) = values else {
-        return Err(wrong("is not twelve finite numbers"));
-    };
     // K (I | t) with an upper triangular K that ends in 1.
     let upright = p[4].abs() < 1e-6 && p[8].abs() < 1e-6 && p[9].abs() < 1e-6;
     if !(upright && (p[10] - 1.0).abs() < 1e-6 && p[1].abs() < 1e-3 * p[0].abs()) {
@@ -47,5 +35,42 @@ pub fn read(text: &str, index: u32, size: [f64; 2]) -> Result<Camera, CameraErro
     Ok(Camera {
         pose: pose.in_our_world(WorldUp::MinusY),
         lens,
+    })
+}
+
+/// Rotation and position of the laser scanner in the world of [`read`], by `Tr_velo_to_cam` (or `Tr`) and
+/// `R0_rect` (or `R_rect`, or none for an identity).
+///
+/// # Errors
+/// If the file has no such matrix, or one that does not rotate.
+pub fn read_scanner(text: &str) -> Result<(DMat3, DVec3), CameraError> {
+    let [r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz] =
+        numbers(text, ["Tr_velo_to_cam", "Tr"])?;
+    let rotation = DMat3::from_cols_array(&[r00, r10, r20, r01, r11, r21, r02, r12, r22]);
+    let rectify = match numbers(text, ["R0_rect", "R_rect"]) {
+        Ok(rows) => DMat3::from_cols_array(&rows).transpose(),
+        Err(_) => DMat3::IDENTITY,
+    };
+    let turn = WorldUp::MinusY.to_ours() * rectify;
+    let pose = Pose::from_axes(turn * rotation, turn * DVec3::new(tx, ty, tz));
+    let pose = pose.ok_or_else(|| CameraError::new(FORMAT, "Tr_velo_to_cam does not rotate"))?;
+    Ok((pose.rotation, pose.position))
+}
+
+/// The numbers behind the first of the names that is there.
+fn numbers<const N: usize>(text: &str, names: [&str; 2]) -> Result<[f64; N], CameraError> {
+    let line = text.lines().find_map(|line| {
+        let (name, values) = line.split_once(':')?;
+        names.contains(&name.trim()).then_some((name, values))
+    });
+    let Some((name, line)) = line else {
+        let detail = format!("it has neither {} nor {}", names[0], names[1]);
+        return Err(CameraError::new(FORMAT, detail));
+    };
+    let values: Option<Vec<f64>> = line.split_whitespace().map(|v| v.parse().ok()).collect();
+    let values = values.filter(|v| v.iter().all(|v| v.is_finite()));
+    let values = values.and_then(|v| <[f64; N]>::try_from(v).ok());
+    values.ok_or_else(|| {
+        CameraError::new(FORMAT, format!("{} is not {N} finite numbers", name.trim()))
     })
 }

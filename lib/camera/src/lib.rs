@@ -8,8 +8,11 @@ pub mod chan;
 pub mod colmap;
 pub mod distortion;
 pub mod error;
+pub mod file;
 pub mod fspy;
+pub mod gltf;
 pub mod kitti;
+pub mod nuscenes;
 pub mod opencv;
 pub mod transforms;
 

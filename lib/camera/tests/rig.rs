@@ -1,7 +1,10 @@
 //! One rig of cameras, written in every format, and what is read back.
+use std::path::Path;
+
+use dipir_cameras::file::{self, Which};
 use dipir_cameras::{
-    Camera, CameraError, Distortion, Lens, Pose, WorldUp, chan, colmap, fspy, kitti, opencv,
-    transforms,
+    Camera, CameraError, Distortion, Lens, Pose, WorldUp, chan, colmap, fspy, gltf, kitti,
+    nuscenes, opencv, transforms,
 };
 use glam::{DMat3, DMat4, DQuat, DVec2, DVec3};
 use proptest::prelude::*;
@@ -158,6 +161,171 @@ fn chan_text(rig: &[Camera]) -> String {
         );
     }
     text
+}
+
+/// A document whose cameras hang below a turned and scaled node, as Blender nests them.
+fn gltf_json(rig: &[Camera]) -> String {
+    let above = DMat4::from_scale_rotation_translation(
+        DVec3::splat(2.0),
+        DQuat::from_rotation_y(0.7),
+        DVec3::new(1.0, -2.0, 3.0),
+    );
+    let mut nodes = vec![json!({"matrix": above.to_cols_array(), "children": [1, 2, 3]})];
+    for (i, camera) in rig.iter().enumerate() {
+        let own =
+            DMat4::from_translation(camera.pose.position) * DMat4::from_mat3(camera.pose.rotation);
+        let (scale, rotation, translation) =
+            (above.inverse() * own).to_scale_rotation_translation();
+        nodes.push(json!({
+            "name": format!("view {i}"), "camera": 0, "rotation": rotation.to_array(),
+            "translation": translation.to_array(), "scale": scale.to_array(),
+        }));
+    }
+    let yfov = 2.0 * (240.0f64 / 520.0).atan();
+    let perspective = json!({"yfov": yfov, "aspectRatio": 4.0 / 3.0, "znear": 0.1});
+    json!({
+        "asset": {"version": "2.0"}, "nodes": nodes,
+        "cameras": [{"type": "perspective", "perspective": perspective}],
+    })
+    .to_string()
+}
+
+/// A GLB of the document with a chunk of buffers behind it.
+fn glb(json: &str) -> Vec<u8> {
+    let words = |words: &[u32]| {
+        words
+            .iter()
+            .flat_map(|w| w.to_le_bytes())
+            .collect::<Vec<u8>>()
+    };
+    let length = json.len() as u32;
+    let mut file = [b"glTF", &words(&[2, 12 + 8 + length + 8 + 4, length])[..]].concat();
+    file.extend([b"JSON", json.as_bytes(), &words(&[4]), b"BIN\0\0\0\0\0"].concat());
+    file
+}
+
+fn nuscenes_json(rig: &[Camera]) -> String {
+    let mut records = vec![json!({
+        "token": "lidar", "translation": [0, 0, 1.8], "rotation": [1, 0, 0, 0],
+        "camera_intrinsic": []
+    })];
+    for (i, camera) in rig.iter().enumerate() {
+        let to_z_up = DMat3::from_cols(DVec3::X, DVec3::Z, DVec3::NEG_Y);
+        let flip = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+        let q = DQuat::from_mat3(&(to_z_up * camera.pose.rotation * flip));
+        records.push(json!({
+            "token": "a camera", "channel": format!("CAM_{i}"), "rotation": [q.w, q.x, q.y, q.z],
+            "translation": (to_z_up * camera.pose.position).to_array(),
+            "camera_intrinsic": [[520, 0, 320], [0, 520, 240], [0, 0, 1]],
+        }));
+    }
+    json!(records).to_string()
+}
+
+fn wanted(which: Which<'_>) -> file::Wanted<'_> {
+    file::Wanted {
+        size: SIZE,
+        which,
+        up: None,
+        fov_deg: None,
+    }
+}
+
+#[test]
+fn one_reader_gives_the_same_camera_from_every_format() {
+    let rig = rig();
+    let folder = tempfile::tempdir().unwrap();
+    let put = |name: &str, bytes: &[u8]| {
+        let path = folder.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, bytes).unwrap();
+    };
+    put("sparse/cameras.txt", COLMAP_CAMERAS.as_bytes());
+    put("sparse/images.txt", colmap_images(&rig).as_bytes());
+    put("transforms.json", transforms_json(&rig).as_bytes());
+    put("shot.chan", chan_text(&rig).as_bytes());
+    put("scene.gltf", gltf_json(&rig).as_bytes());
+    put("scene.glb", &glb(&gltf_json(&rig)));
+    put("sensors.json", nuscenes_json(&rig).as_bytes());
+    for (i, camera) in rig.iter().enumerate() {
+        let n = i as u32;
+        for (name, number) in [
+            ("sparse", n),
+            ("transforms.json", n),
+            ("shot.chan", n + 1),
+            ("scene.gltf", n),
+            ("scene.glb", n),
+            ("sensors.json", n),
+        ] {
+            let asked = file::Wanted {
+                up: (name == "sparse").then_some(WorldUp::Z),
+                ..wanted(Which::Number(number))
+            };
+            let found = file::read(&folder.path().join(name), &asked).unwrap();
+            let (pose, lens) = (found.pose.unwrap(), found.lens);
+            agree(&Camera { pose, lens }, camera, name);
+        }
+        for (name, of) in [
+            ("transforms.json", format!("{i}.jpg")),
+            ("scene.glb", format!("view {i}")),
+            ("sensors.json", format!("CAM_{i}")),
+        ] {
+            let path = folder.path().join(name);
+            let found = file::read(&path, &wanted(Which::Name(&of))).unwrap();
+            let position = found.pose.unwrap().position;
+            assert!(position.abs_diff_eq(camera.pose.position, 1e-4), "{name}");
+        }
+        let photo = format!("photos/{i}.png");
+        let path = folder.path().join("transforms.json");
+        let found = file::read(&path, &wanted(Which::Photo(Path::new(&photo)))).unwrap();
+        assert!(
+            found
+                .pose
+                .unwrap()
+                .position
+                .abs_diff_eq(camera.pose.position, 1e-4)
+        );
+    }
+    assert_eq!(file::parts(&folder.path().join("sparse")).len(), 2);
+}
+
+#[test]
+fn the_one_reader_explains_what_it_cannot_choose() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("transforms.json");
+    std::fs::write(&path, transforms_json(&rig())).unwrap();
+    let said = |asked: &file::Wanted| file::read(&path, asked).unwrap_err().to_string();
+    assert_eq!(
+        said(&wanted(Which::Number(3))),
+        "the transforms.json file cannot be used: it has 3 cameras, and no camera 3; say which by \
+         its number from 0 or by the name of its picture"
+    );
+    assert!(said(&wanted(Which::Photo(Path::new("b.jpg")))).contains("none for \"b.jpg\""));
+    let cropped = file::Wanted {
+        size: [640.0, 400.0],
+        ..wanted(Which::Number(0))
+    };
+    assert!(
+        said(&cropped)
+            .contains("of a picture of 640 x 480 pixels, and the photograph has 640 x 400")
+    );
+    let text = transforms_json(&rig())
+        .replace("[1.0,", "[9.0,")
+        .replace("0.0,1.0]", "0.0,9.0]");
+    let turned = text.replacen("\"transform_matrix\":[[", "\"transform_matrix\":[[7", 1);
+    std::fs::write(&path, turned).unwrap();
+    assert!(said(&wanted(Which::Number(0))).contains("does not rotate"));
+}
+
+#[test]
+fn a_glb_without_cameras_or_with_a_cycle_is_refused() {
+    let said = |json: &str| gltf::read(&glb(json), SIZE).unwrap_err().to_string();
+    assert!(said("{\"nodes\": []}").contains("it has no perspective camera"));
+    let cycle = json!({
+        "nodes": [{"camera": 0, "children": [1]}, {"children": [0]}],
+        "cameras": [{"perspective": {"yfov": 1.0}}],
+    });
+    assert!(said(&cycle.to_string()).contains("its nodes form a cycle"));
 }
 
 #[test]
@@ -339,6 +507,13 @@ fn kittis_projection_is_met() {
     let ours = DVec3::new(point.x, -point.y, -point.z);
     let got = camera.project(ours).unwrap().pixel;
     assert!(got.abs_diff_eq(want, 1e-9), "{got} {want}");
+    // 10 m ahead of the scanner, 2 m to its right and 1.7 m below it.
+    let (rotation, position) = kitti::read_scanner(KITTI).unwrap();
+    let seen = rotation * DVec3::new(10.0, -2.0, -1.7) + position;
+    assert!(
+        seen.abs_diff_eq(DVec3::new(2.0, -1.7, -10.0), 1e-9),
+        "{seen}"
+    );
     let error = kitti::read(KITTI, 3, [1242.0, 375.0])
         .unwrap_err()
         .to_string();
@@ -379,8 +554,13 @@ proptest! {
         let _ = colmap::read_binary(&whole(&cameras), &images, &points, WorldUp::Y);
         let _ = colmap::read_binary(&cameras, &whole(&images), &points, WorldUp::Y);
         let _ = colmap::read_binary(&cameras, &images, &whole(&points), WorldUp::Y);
+        let _ = gltf::read(&whole(gltf_json(&rig).as_bytes()), SIZE);
+        let _ = gltf::read(&whole(&glb(&gltf_json(&rig))), SIZE);
+        let _ = nuscenes::read(&whole(nuscenes_json(&rig).as_bytes()), SIZE, WorldUp::Z);
+        let _ = nuscenes::sensor(&whole(nuscenes_json(&rig).as_bytes()), WorldUp::Z);
         let _ = chan::read(&text(chan_text(&rig).as_bytes()), SIZE, None);
         let _ = opencv::read(&text(OPENCV_YAML.as_bytes()), None);
         let _ = kitti::read(&text(KITTI.as_bytes()), 2, SIZE);
+        let _ = kitti::read_scanner(&text(KITTI.as_bytes()));
     }
 }

@@ -19,5 +19,6 @@ mod sensors;
 pub mod spline;
 pub mod tone;
 pub mod transfer;
+pub mod warp;
 
 pub use error::ImagingError;

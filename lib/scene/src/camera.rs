@@ -1,12 +1,16 @@
 //! A pinhole camera that looks down its own -z.
 use std::path::{Path, PathBuf};
 
+use dipir_cameras::file::{self, Wanted};
+use dipir_cameras::{CameraError, Distortion, Lens, Pose};
 use dipir_imaging::facts::Facts;
-use glam::{DMat3, Mat3, Vec2, Vec3};
+use glam::{DMat3, DVec3, Mat3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
-use crate::transforms;
+use crate::undistortion::Undistortion;
+
+pub use dipir_cameras::WorldUp;
 
 /// A ray with a unit direction.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -84,15 +88,6 @@ pub enum FieldOfView {
     Photograph,
 }
 
-/// Which axis of a camera file's world points up.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum WorldUp {
-    /// +y, as here.
-    Y,
-    /// +z, as nerfstudio: (x, y, z) becomes (x, z, -y).
-    Z,
-}
-
 impl Camera {
     /// A camera at `position` with `look_at` in the middle of its image.
     pub fn look_at(
@@ -160,13 +155,13 @@ impl CameraSettings {
         Ok(settings)
     }
 
-    /// The camera of a photo of `resolution`; files are found relative to `base_dir`. Warnings say
-    /// what of a camera file was ignored.
+    /// The camera of a photo of `resolution`, and what undoes its lens's distortion if it has one; then
+    /// the camera is that of the undistorted picture. Files are found relative to `base_dir`.
     pub fn resolve(
         &self,
         resolution: [u32; 2],
         base_dir: &Path,
-    ) -> Result<(Camera, Vec<String>), Error> {
+    ) -> Result<(Camera, Option<Undistortion>), Error> {
         match self {
             Self::LookAt {
                 position,
@@ -174,23 +169,164 @@ impl CameraSettings {
                 up,
                 field_of_view,
                 principal_px,
+                distortion,
             } => {
                 let mut camera =
                     Camera::look_at(*position, *look_at, *up, *field_of_view, resolution);
                 camera.principal_px = principal_px.unwrap_or(camera.principal_px);
-                Ok((camera, Vec::new()))
+                if distortion.is_none() {
+                    return Ok((camera, None));
+                }
+                if let FieldOfView::Vertical(angle_rad) = field_of_view {
+                    camera.focal_px = distorted_focal(distortion, *angle_rad, camera);
+                }
+                let pose = Pose {
+                    position: camera.position.as_dvec3(),
+                    rotation: camera.rotation.as_dmat3(),
+                };
+                let lens = Lens {
+                    principal_px: camera.principal_px.as_dvec2(),
+                    distortion: *distortion,
+                    ..Lens::pinhole(resolution.map(f64::from), camera.focal_px.as_dvec2())
+                };
+                Ok(of_lens(&pose, &lens, resolution))
             }
-            Self::Transforms { path, frame, up } => {
-                let path = base_dir.join(path);
-                let bytes = dipir_files::read(&path).map_err(|source| Error::Read {
-                    role: "the camera file".into(),
-                    path: path.clone(),
-                    source,
-                })?;
-                transforms::camera(&bytes, *frame, *up, resolution).map_err(|e| e.in_file(path))
-            }
+            Self::File(file) => file.resolve(resolution, base_dir),
         }
     }
+}
+
+/// Focal lengths of a fisheye with this vertical field of view; those of `camera` for other lenses,
+/// whose field of view counts without distortion.
+fn distorted_focal(distortion: &Distortion, angle_rad: f32, camera: Camera) -> Vec2 {
+    if !distortion.is_fisheye() {
+        return camera.focal_px;
+    }
+    let (sin, cos) = (0.5 * f64::from(angle_rad)).sin_cos();
+    match distortion.image(DVec3::new(0.0, sin, cos)) {
+        Some(image) if image.point.y > 0.0 => {
+            Vec2::splat((0.5 * f64::from(camera.resolution[1]) / image.point.y) as f32)
+        }
+        _ => camera.focal_px,
+    }
+}
+
+fn of_lens(pose: &Pose, lens: &Lens, resolution: [u32; 2]) -> (Camera, Option<Undistortion>) {
+    if let Some(undistortion) = Undistortion::of(lens) {
+        return (undistortion.camera(pose), Some(undistortion));
+    }
+    let camera = Camera {
+        position: pose.position.as_vec3(),
+        rotation: pose.rotation.as_mat3(),
+        focal_px: lens.focal_px.as_vec2(),
+        principal_px: lens.principal_px.as_vec2(),
+        resolution,
+    };
+    (camera, None)
+}
+
+/// Which of a file's cameras is meant.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Which {
+    /// That of the picture with this file's name, else the only one.
+    Photo(PathBuf),
+    /// By its number.
+    Number(u32),
+    /// By the name of its picture.
+    Name(String),
+}
+
+/// A camera in another program's file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FileSettings {
+    /// Name of the key that names the file.
+    pub key: &'static str,
+    /// The file or, of COLMAP's, the folder.
+    pub path: PathBuf,
+    /// Which camera.
+    pub which: Which,
+    /// Which axis of the file's world points up; `None` as the program that wrote it has it.
+    pub up: Option<WorldUp>,
+    /// Metres of a unit of the file's world.
+    pub scale: f32,
+    /// Position, point looked at and up, for files of a lens alone.
+    pub stand: Option<[Vec3; 3]>,
+    /// Vertical field of view for a file without one, degrees.
+    pub fov_deg: Option<f32>,
+}
+
+impl FileSettings {
+    /// The files that are read, as the configuration would name them.
+    pub fn parts(&self, base_dir: &Path) -> Vec<PathBuf> {
+        parts(&self.path, base_dir)
+    }
+
+    fn resolve(
+        &self,
+        resolution: [u32; 2],
+        base_dir: &Path,
+    ) -> Result<(Camera, Option<Undistortion>), Error> {
+        let path = base_dir.join(&self.path);
+        let wanted = Wanted {
+            size: resolution.map(f64::from),
+            which: match &self.which {
+                Which::Photo(path) => file::Which::Photo(path),
+                Which::Number(n) => file::Which::Number(*n),
+                Which::Name(name) => file::Which::Name(name),
+            },
+            up: self.up,
+            fov_deg: self.fov_deg.map(f64::from),
+        };
+        let found = file::read(&path, &wanted).map_err(|e| match e {
+            CameraError::Read { path, source } => Error::Read {
+                role: "the camera file".into(),
+                path,
+                source,
+            },
+            other => Error::Camera(other).in_file(&path),
+        })?;
+        let pose = match (found.pose, self.stand) {
+            (Some(pose), None) => Pose {
+                position: pose.position * f64::from(self.scale),
+                ..pose
+            },
+            (None, Some([position, look_at, up])) => {
+                let fov = FieldOfView::Photograph;
+                let camera = Camera::look_at(position, look_at, up, fov, resolution);
+                Pose {
+                    position: position.as_dvec3(),
+                    rotation: camera.rotation.as_dmat3(),
+                }
+            }
+            (Some(_), Some(_)) => {
+                return Err(Error::Conflict {
+                    first: format!("scene.camera.{}", self.key),
+                    second: "scene.camera.position".into(),
+                });
+            }
+            (None, None) => {
+                return Err(Error::Missing {
+                    key: "scene.camera.position".into(),
+                    remedy: format!(
+                        "\"{}\" describes a lens alone: write position and look_at, or pitch_deg, too",
+                        self.path.display()
+                    ),
+                });
+            }
+        };
+        Ok(of_lens(&pose, &found.lens, resolution))
+    }
+}
+
+/// The files that a camera's `path` stands for, as the configuration would name them: itself, or those
+/// of COLMAP's folder.
+pub fn parts(path: &Path, base_dir: &Path) -> Vec<PathBuf> {
+    let parts = file::parts(&base_dir.join(path));
+    let beside = |part: PathBuf| match (parts.len(), part.file_name()) {
+        (2.., Some(name)) => path.join(name),
+        _ => path.into(),
+    };
+    parts.iter().cloned().map(beside).collect()
 }
 
 /// The checked `[scene.camera]` table.
@@ -208,16 +344,11 @@ pub enum CameraSettings {
         field_of_view: FieldOfView,
         /// Where the optical axis meets the image, pixels; its middle if absent.
         principal_px: Option<Vec2>,
+        /// How the lens bends lines.
+        distortion: Distortion,
     },
-    /// A frame of a nerfstudio `transforms.json`.
-    Transforms {
-        /// The file.
-        path: PathBuf,
-        /// Index of the frame.
-        frame: u32,
-        /// Which axis of the file's world is up.
-        up: WorldUp,
-    },
+    /// A camera in another program's file.
+    File(FileSettings),
 }
 
 #[cfg(test)]
@@ -232,6 +363,7 @@ mod tests {
             up: Vec3::Y,
             field_of_view: FieldOfView::Focal(50.0),
             principal_px: None,
+            distortion: Distortion::NONE,
         };
         let mut facts = Facts::of_size([600, 400]);
         let error = settings.with_facts(&facts).unwrap_err().to_string();
@@ -253,6 +385,7 @@ mod tests {
             up: Vec3::Y,
             field_of_view: FieldOfView::Photograph,
             principal_px: Some(Vec2::new(310.0, 190.0)),
+            distortion: Distortion::NONE,
         };
         let mut facts = Facts::of_size([600, 400]);
         let error = settings.with_facts(&facts).unwrap_err().to_string();

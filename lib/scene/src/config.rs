@@ -4,8 +4,10 @@
 //! optional that has a default; [`SceneConfig::validate`] turns it into [`SceneSettings`], in which
 //! nothing contradicts anything else. Unknown keys are refused while parsing.
 mod camera;
+mod lens;
+mod proxy;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use dipir_imaging::transfer::Transfer;
 use glam::{DMat3, Vec2, Vec3};
@@ -17,7 +19,9 @@ use crate::error::Error;
 use crate::limits::Limits;
 use crate::pixels::Pixels;
 use crate::placement::{Anchor, Placement, Rest, Size};
-use crate::proxy::Plane;
+
+pub use lens::DistortionConfig;
+pub use proxy::{PlaneConfig, ProxyConfig, ProxySettings};
 
 /// The `[scene]` table as written.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -66,6 +70,15 @@ pub struct ObjectConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("examples" = [[960.0, 810.0]]))]
     pub at_pixel: Option<[f32; 2]>,
+    /// Instead of `position`: `auto` looks for a place on the ground that is free and seen, in the lower
+    /// middle of the picture. With `[scene.proxy] points` nothing of them is in the object.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("enum" = ["auto"]), example = &"auto")]
+    pub place: Option<String>,
+    /// Another place than the best one: any number above 0 draws one of those that are free.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("default" = 0), example = 3)]
+    pub place_draw: Option<u32>,
     /// Instead of `yaw_deg`: the pixel of the same plane, column and row from 0, that the object's front faces.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("examples" = [[1200.0, 900.0]]))]
@@ -100,10 +113,10 @@ pub struct ObjectConfig {
 #[serde(deny_unknown_fields)]
 pub struct CameraConfig {
     /// Centre of projection, metres: x, y and z of the scene.
-    #[schemars(extend("x-default" = "none; required without `transforms`"), extend("examples" = [[0.0, 1.5, 4.0]]))]
+    #[schemars(extend("x-default" = "none; required without `file`"), extend("examples" = [[0.0, 1.5, 4.0]]))]
     pub position: Option<[f32; 3]>,
     /// The point that the centre of the image shows, metres.
-    #[schemars(extend("x-default" = "none; required without `transforms`"), extend("examples" = [[0.0, 0.5, 0.0]]))]
+    #[schemars(extend("x-default" = "none; required without `file`"), extend("examples" = [[0.0, 0.5, 0.0]]))]
     pub look_at: Option<[f32; 3]>,
     /// The direction that is up in the image, of any length.
     #[schemars(extend("default" = [0.0, 1.0, 0.0]), extend("examples" = [[0.0, 0.0, -1.0]]))]
@@ -130,44 +143,39 @@ pub struct CameraConfig {
     /// Width of the sensor, millimetres; 36 is full frame. It belongs to `focal_mm`.
     #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "the photograph's own, from its Exif data"), example = 36.0)]
     pub sensor_mm: Option<f32>,
-    /// A nerfstudio `transforms.json` that holds the camera. It replaces position, direction and field of view.
+    /// How the lens bends lines. The photograph is undistorted for everything that is computed, and the
+    /// result is bent back onto it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub distortion: Option<DistortionConfig>,
+    /// The camera's file of another program: fSpy (`.fspy`, `.json`), nerfstudio (`transforms.json`),
+    /// `.chan`, `.glb`, `.gltf`, a folder of COLMAP's, nuScenes (`.json`), KITTI (`.txt`); OpenCV's
+    /// (`.yaml`, `.json`) has the lens alone, and position and direction are written beside it.
+    /// It replaces position, direction and field of view.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("format" = "path"), example = &"shot.fspy")]
+    pub file: Option<PathBuf>,
+    /// Which camera of `file` is the photograph's, by the name of its picture or its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("x-default" = "the one with the photograph's name, else the only one"), example = &"IMG_0042.jpg")]
+    pub image: Option<String>,
+    /// Which axis of the world of `file` points up.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("enum" = ["z", "y", "-y"]), extend("x-default" = "as the program that wrote it has it: COLMAP `-y`, glTF and `.chan` `y`, others `z`"), example = &"z")]
+    pub file_up: Option<String>,
+    /// Metres of a unit of the world of `file`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("exclusiveMinimum" = 0), extend("default" = 1.0), example = 0.01)]
+    pub file_scale: Option<f32>,
+    /// As `file`, a nerfstudio `transforms.json` whose frame is named by its number.
     #[schemars(extend("format" = "path"), example = &"transforms.json")]
     pub transforms: Option<PathBuf>,
-    /// Which frame of `transforms` is the photograph, from 0.
-    #[schemars(extend("default" = 0), example = 3)]
+    /// Which camera of `transforms` or `file` is the photograph's, from 0; in a `.chan` file the number of
+    /// the frame, in KITTI's that of the camera.
+    #[schemars(extend("x-default" = "`0` of `transforms`; of `file` as `image`"), example = 3)]
     pub frame: Option<u32>,
     /// Which axis of the world of `transforms` is up.
-    #[schemars(extend("enum" = ["z", "y"]), extend("default" = "z"), example = &"y")]
+    #[schemars(extend("enum" = ["z", "y", "-y"]), extend("default" = "z"), example = &"y")]
     pub transforms_up: Option<String>,
-}
-
-/// The `[scene.proxy]` table as written.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ProxyConfig {
-    /// An infinite plane.
-    pub plane: Option<PlaneConfig>,
-    /// A mesh in the coordinates of the scene, metres, in a format of objects. It replaces `plane`.
-    #[schemars(extend("format" = "path"), example = &"room.glb")]
-    pub mesh: Option<PathBuf>,
-}
-
-/// `plane = { point = …, normal = … }`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct PlaneConfig {
-    /// Any point of the plane, metres.
-    #[schemars(extend("examples" = [[0.0, 0.0, 0.0]]))]
-    #[serde(default)]
-    pub point: [f32; 3],
-    /// Direction towards the side that is seen, of any length.
-    #[schemars(extend("examples" = [[0.0, 1.0, 0.0]]))]
-    #[serde(default = "plus_y")]
-    pub normal: [f32; 3],
-}
-
-fn plus_y() -> [f32; 3] {
-    [0.0, 1.0, 0.0]
 }
 
 /// Whether planning decides what is simulated.
@@ -297,17 +305,8 @@ pub struct ObjectSettings {
     pub placement: Placement,
     /// Pixels that say where it goes.
     pub pixels: Pixels,
-}
-
-/// A checked `[scene.proxy]` table.
-#[derive(Clone, Debug, PartialEq)]
-pub enum ProxySettings {
-    /// No proxy.
-    None,
-    /// A plane with a unit normal.
-    Plane(Plane),
-    /// A mesh file.
-    Mesh(PathBuf),
+    /// Number of the draw, where its place is looked for.
+    pub auto: Option<u32>,
 }
 
 impl SceneConfig {
@@ -354,7 +353,7 @@ impl SceneConfig {
         let camera = self.camera.as_ref().ok_or_else(|| {
             missing(
                 "scene.camera",
-                "add a table [scene.camera] with position, look_at and fov_deg, or with transforms",
+                "add a table [scene.camera] with position, look_at and fov_deg, or with file",
             )
         })?;
         if let Some(t) = self.effects.tolerance
@@ -375,17 +374,19 @@ impl SceneConfig {
                 "interactions from 1 to 8, for instance max_depth = 3",
             ));
         }
+        let proxy = match &self.proxy {
+            None => ProxySettings::None,
+            Some(proxy) => proxy.validate(camera)?,
+        };
+        let camera = camera.validate(&background)?;
         Ok(SceneSettings {
             background,
             transfer,
             class: class.into(),
             occluders: self.occluders.clone(),
             objects,
-            camera: camera.validate()?,
-            proxy: match &self.proxy {
-                None => ProxySettings::None,
-                Some(proxy) => proxy.validate()?,
-            },
+            camera,
+            proxy,
             effects: self.effects,
             limits: self.limits,
         })
@@ -423,7 +424,19 @@ impl ObjectConfig {
             }
             (None, Some(h)) => Size::Height(positive("height_m", h, "metres", "1.4")?),
         };
+        let auto = match (self.place.as_deref(), self.place_draw) {
+            (None, None) => None,
+            (Some("auto"), draw) => Some(draw.unwrap_or(0)),
+            (Some(other), _) => return Err(wrong_word(&key("place"), other, &["auto"])),
+            (None, Some(_)) => {
+                return Err(missing(&key("place"), "place_draw needs place = \"auto\""));
+            }
+        };
+        let placed = auto.is_some();
         for (by_pixel, other, both) in [
+            ("place", "position", placed && self.position.is_some()),
+            ("place", "at_pixel", placed && self.at_pixel.is_some()),
+            ("place", "anchor", placed && self.anchor.is_some()),
             (
                 "at_pixel",
                 "position",
@@ -441,6 +454,7 @@ impl ObjectConfig {
         }
         Ok(ObjectSettings {
             path,
+            auto,
             pixels: Pixels {
                 at: finite_pixel(&key("at_pixel"), self.at_pixel)?,
                 to: finite_pixel(&key("to_pixel"), self.to_pixel)?,
@@ -468,35 +482,6 @@ impl ObjectConfig {
                 },
             },
         })
-    }
-}
-
-impl ProxyConfig {
-    fn validate(&self) -> Result<ProxySettings, Error> {
-        match (&self.plane, &self.mesh) {
-            (Some(_), Some(_)) => Err(conflict("scene.proxy.plane", "scene.proxy.mesh")),
-            (None, Some(path)) => Ok(ProxySettings::Mesh(path.clone())),
-            (None, None) => Err(missing(
-                "scene.proxy.plane",
-                "write plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] } or mesh = \"proxy.glb\", or leave the table out",
-            )),
-            (Some(plane), None) => {
-                let point = finite_point("scene.proxy.plane.point", plane.point)?;
-                let normal = finite_point("scene.proxy.plane.normal", plane.normal)?;
-                let unit = normal.as_dvec3().normalize_or_zero().as_vec3();
-                if unit == Vec3::ZERO {
-                    return Err(wrong(
-                        "scene.proxy.plane.normal",
-                        triple(normal),
-                        "a direction that is not zero, for instance normal = [0.0, 1.0, 0.0]",
-                    ));
-                }
-                Ok(ProxySettings::Plane(Plane {
-                    point,
-                    normal: unit,
-                }))
-            }
-        }
     }
 }
 

@@ -1,7 +1,9 @@
 //! `scene.json`: what a scene was made of, so that another executable rebuilds the same.
 use std::path::{Path, PathBuf};
 
+use dipir_cameras::Lens;
 use dipir_imaging::transfer::Transfer;
+use dipir_points::Ground;
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
 
@@ -71,6 +73,8 @@ pub enum ProxyRecord {
     Plane(Plane),
     /// A mesh in world coordinates.
     Mesh(ObjectRecord),
+    /// The ground through points.
+    Ground(Box<Ground>),
 }
 
 /// The content of `scene.json`.
@@ -87,8 +91,11 @@ pub struct SceneDescription {
     pub occluders: Option<FileRecord>,
     /// In the order of the configuration.
     pub objects: Vec<ObjectRecord>,
-    /// The photo's camera.
+    /// The photo's camera; of the undistorted photo, if there is a `lens`.
     pub camera: Camera,
+    /// The photo's lens, if it bends lines.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lens: Option<Lens>,
     /// What receives the shadow.
     pub proxy: ProxyRecord,
     /// What the user says about effects.

@@ -1,7 +1,9 @@
 //! What can go wrong between a `[scene]` table and a scene.
 use std::path::PathBuf;
 
+use dipir_cameras::CameraError;
 use dipir_imaging::ImagingError;
+use dipir_points::PointsError;
 
 use crate::printable::printable;
 
@@ -64,6 +66,12 @@ pub enum Error {
     /// An image cannot be decoded.
     #[error(transparent)]
     Image(#[from] ImagingError),
+    /// A camera's file cannot be used.
+    #[error("{}", printable(_0))]
+    Camera(CameraError),
+    /// Points cannot be used.
+    #[error("{}", printable(_0))]
+    Points(PointsError),
     /// The contents of a file do not make sense.
     #[error("{}; {remedy}", printable(detail))]
     Malformed {

@@ -3,8 +3,10 @@ use glam::{DQuat, DVec2, DVec3, Vec2};
 
 use crate::camera::Camera;
 use crate::error::Error;
+use crate::mesh::TriangleMesh;
 use crate::placement::Placement;
 use crate::proxy::{Plane, Proxy};
+use crate::undistortion::Undistortion;
 
 /// Pixels of the upright photograph that say where an object goes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -31,6 +33,29 @@ pub fn ground_at(camera: &Camera, plane: &Plane, pixel: DVec2) -> Option<DVec3> 
     sees.then(|| camera.position.as_dvec3() + height / descent * direction)
 }
 
+/// The nearest point of `mesh` that `camera` sees at `pixel`.
+pub fn mesh_at(camera: &Camera, mesh: &TriangleMesh, pixel: DVec2) -> Option<DVec3> {
+    let origin = camera.position.as_dvec3();
+    let d = (pixel - camera.principal_px.as_dvec2()) / camera.focal_px.as_dvec2();
+    let direction = camera.rotation.as_dmat3() * DVec3::new(d.x, -d.y, -1.0);
+    let mut nearest: Option<f64> = None;
+    for triangle in &mesh.indices {
+        let [a, b, c] = triangle.map(|i| mesh.positions[i as usize].as_dvec3() - origin);
+        // Signed volumes with the ray: of one sign where it passes inside.
+        let volumes = [(b, c), (c, a), (a, b)].map(|(p, q)| direction.dot(p.cross(q)));
+        let total: f64 = volumes.iter().sum();
+        if total == 0.0 || volumes.iter().any(|v| v * total < 0.0) {
+            continue;
+        }
+        let point = (volumes[0] * a + volumes[1] * b + volumes[2] * c) / total;
+        let away = point.dot(direction) / direction.length_squared();
+        if away > 0.0 && nearest.is_none_or(|n| away < n) {
+            nearest = Some(away);
+        }
+    }
+    nearest.map(|away| origin + away * direction)
+}
+
 /// The row of the plane's horizon in a column of the image, pixels; `None` if the camera looks
 /// along the normal.
 pub fn horizon_row(camera: &Camera, plane: &Plane, column: f64) -> Option<f64> {
@@ -48,6 +73,23 @@ fn height(camera: &Camera, plane: &Plane) -> f64 {
 }
 
 impl Pixels {
+    /// The pixels of the undistorted photograph that show what these show of a photograph whose
+    /// distortion `undistortion` undoes; `key` names the object's table in messages.
+    pub fn undistorted(&self, undistortion: &Undistortion, key: &str) -> Result<Self, Error> {
+        let moved = |pixel: Option<Vec2>, name: &str| {
+            let moved = pixel.map(|p| undistortion.to_working(p.as_dvec2()).ok_or(p));
+            moved.transpose().map_err(|p| Error::Config {
+                key: format!("{key}.{name}"),
+                value: shown(p),
+                accepted: "a pixel that the lens and the undistorted picture show".into(),
+            })
+        };
+        Ok(Self {
+            at: moved(self.at, "at_pixel")?.map(|p| p.as_vec2()),
+            to: moved(self.to, "to_pixel")?.map(|p| p.as_vec2()),
+        })
+    }
+
     /// `placement` with the position and the yaw that the pixels say; `key` names the object's
     /// table in messages.
     pub fn place(
@@ -90,6 +132,13 @@ fn shown(pixel: Vec2) -> String {
 
 /// The point of the proxy that is seen at `pixel`.
 fn seen(camera: &Camera, proxy: &Proxy, pixel: Vec2, key: &str) -> Result<DVec3, Error> {
+    if let Proxy::Mesh(mesh) = proxy {
+        return mesh_at(camera, mesh, pixel.as_dvec2()).ok_or_else(|| Error::Config {
+            key: key.into(),
+            value: format!("{}, where the proxy's mesh is not seen", shown(pixel)),
+            accepted: "a pixel that sees the mesh of scene.proxy".into(),
+        });
+    }
     let Proxy::Plane(plane) = proxy else {
         return Err(Error::Missing {
             key: "scene.proxy.plane".into(),

@@ -3,6 +3,7 @@
 //! Up is the normal of a proxy plane, else +y. The object is turned by roll (about z), pitch (x) and
 //! yaw (y), in this order; scaled; tilted so that its y points up; and moved so that its anchor lies
 //! above the contact point and its lowest point at the same height. This is computed in double precision.
+use dipir_points::place::Body;
 use glam::{DMat3, DMat4, DQuat, DVec3, Vec3, swizzles::Vec3Swizzles};
 use serde::{Deserialize, Serialize};
 
@@ -75,27 +76,8 @@ impl Placement {
             Proxy::Plane(plane) => plane.normal.as_dvec3().normalize(),
             _ => DVec3::Y,
         };
-        let turn = DMat3::from_rotation_y(self.yaw_rad.into())
-            * DMat3::from_rotation_x(self.pitch_rad.into())
-            * DMat3::from_rotation_z(self.roll_rad.into());
-        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-        for corner in mesh.corners() {
-            let p = turn * corner.as_dvec3();
-            low = low.min(p);
-            high = high.max(p);
-        }
-        let scale = match self.size {
-            Size::Scale(s) => f64::from(s),
-            Size::Height(h) if high.y - low.y > 0.0 => f64::from(h) / (high.y - low.y),
-            Size::Height(h) => {
-                return Err(Error::Config {
-                    key: format!("{key}.height_m"),
-                    value: h.to_string(),
-                    accepted: "left out, for the object is flat and has no height; write scale"
-                        .into(),
-                });
-            }
-        };
+        let (turn, low, high) = self.turned(mesh);
+        let scale = self.scale(low, high, key)?;
         let anchor = match self.anchor {
             Anchor::Origin => turn * -origin,
             Anchor::Center => (low + high) * 0.5,
@@ -109,6 +91,43 @@ impl Placement {
             * DMat4::from_translation(-foot)
             * DMat4::from_mat3(turn);
         Ok((map, warning))
+    }
+
+    /// The turn, and the bounds of the turned mesh.
+    fn turned(&self, mesh: &TriangleMesh) -> (DMat3, DVec3, DVec3) {
+        let turn = DMat3::from_rotation_y(self.yaw_rad.into())
+            * DMat3::from_rotation_x(self.pitch_rad.into())
+            * DMat3::from_rotation_z(self.roll_rad.into());
+        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        for corner in mesh.corners() {
+            let p = turn * corner.as_dvec3();
+            low = low.min(p);
+            high = high.max(p);
+        }
+        (turn, low, high)
+    }
+
+    /// The factor on the lengths of a turned mesh with these bounds.
+    fn scale(&self, low: DVec3, high: DVec3, key: &str) -> Result<f64, Error> {
+        match self.size {
+            Size::Scale(s) => Ok(f64::from(s)),
+            Size::Height(h) if high.y - low.y > 0.0 => Ok(f64::from(h) / (high.y - low.y)),
+            Size::Height(h) => Err(Error::Config {
+                key: format!("{key}.height_m"),
+                value: h.to_string(),
+                accepted: "left out, for the object is flat and has no height; write scale".into(),
+            }),
+        }
+    }
+
+    /// The upright cylinder around the mesh as it will stand, about the centre of its bounding box.
+    pub(crate) fn body(&self, mesh: &TriangleMesh, key: &str) -> Result<Body, Error> {
+        let (_, low, high) = self.turned(mesh);
+        let extent = (high - low) * self.scale(low, high, key)?;
+        Ok(Body {
+            radius_m: 0.5 * extent.x.hypot(extent.z),
+            height_m: extent.y,
+        })
     }
 
     /// The point that the object's foot gets.

@@ -2,24 +2,29 @@
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
+use dipir_cameras::Camera as LensCamera;
 use dipir_imaging::file::{self, Photo};
-use dipir_imaging::raster::Raster;
+use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
-use glam::DMat4;
+use dipir_points::Cloud;
+use glam::{DMat4, DVec2};
 
 use crate::camera::{Camera, CameraSettings};
 use crate::config::{EffectsConfig, ProxySettings, SceneConfig};
 use crate::description::{FileRecord, ObjectRecord, PhotoRecord, ProxyRecord, SceneDescription};
 use crate::error::Error;
 use crate::features::SceneFeatures;
+use crate::ground::{self, Places};
 use crate::import::{self, Imported};
 use crate::light::PunctualLight;
 use crate::limits::Limits;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
+use crate::placement::Anchor;
 use crate::printable::printable;
 use crate::proxy::Proxy;
 use crate::texture::Texture;
+use crate::undistortion::Undistortion;
 use crate::visibility;
 
 /// Objects to insert, the camera that took the photo, and the proxy that catches the shadow.
@@ -53,8 +58,10 @@ pub struct Input {
 pub struct LoadedScene {
     /// The scene.
     pub scene: Scene,
-    /// The photo, linear.
+    /// The photo, linear; undistorted, if its lens bends lines.
     pub photo: Photo,
+    /// The photo as it was taken, if its lens bends lines.
+    pub original: Option<Box<Original>>,
     /// The photo's own foreground, 1 in front of the object; of the photo's size.
     pub occluders: Option<Raster<f32>>,
     /// From which the same scene can be rebuilt.
@@ -65,6 +72,66 @@ pub struct LoadedScene {
     pub inputs: Vec<Input>,
     /// One sentence each.
     pub warnings: Vec<String>,
+}
+
+/// A photo whose lens bends lines.
+#[derive(Clone, Debug)]
+pub struct Original {
+    /// As it was taken.
+    pub photo: Photo,
+    /// What leads from it to the undistorted one and back.
+    pub undistortion: Undistortion,
+}
+
+impl LoadedScene {
+    /// The photo as it was taken.
+    pub fn taken(&self) -> &Photo {
+        self.original.as_ref().map_or(&self.photo, |o| &o.photo)
+    }
+
+    /// A picture of the photo's size, undistorted as the photo.
+    pub fn undistorted(&self, image: LinearImage) -> LinearImage {
+        match &self.original {
+            Some(original) => LinearImage(original.undistortion.undistort(&image.0)),
+            None => image,
+        }
+    }
+
+    /// The pixel of the undistorted photo that shows what the photo shows at `pixel`; `pixel` itself
+    /// where there is none.
+    pub fn undistorted_pixel(&self, pixel: DVec2) -> DVec2 {
+        let moved = self.original.as_ref();
+        moved
+            .and_then(|o| o.undistortion.to_working(pixel))
+            .unwrap_or(pixel)
+    }
+}
+
+/// The working photo and mask, and the original if there is something to undo.
+fn undistort(
+    photo: Photo,
+    occluders: Option<Raster<f32>>,
+    undistortion: Option<Undistortion>,
+) -> (Photo, Option<Raster<f32>>, Option<Box<Original>>) {
+    let Some(undistortion) = undistortion else {
+        return (photo, occluders, None);
+    };
+    let working = Photo {
+        image: LinearImage(undistortion.undistort(&photo.image.0)),
+        alpha: photo.alpha.as_ref().map(|a| undistortion.undistort(a)),
+        transfer: photo.transfer,
+        encoding: photo.encoding.clone(),
+        values: None,
+        facts: photo.facts.clone(),
+        exif: photo.exif.clone(),
+        warnings: Vec::new(),
+    };
+    let occluders = occluders.map(|mask| undistortion.undistort(&mask));
+    let original = Original {
+        photo,
+        undistortion,
+    };
+    (working, occluders, Some(Box::new(original)))
 }
 
 impl Scene {
@@ -81,30 +148,47 @@ impl Scene {
                 files.record("occluders", path)?,
             )),
         };
-        if let CameraSettings::Transforms { path, .. } = &settings.camera {
-            files.input("camera", path);
+        if let CameraSettings::File(file) = &settings.camera {
+            for part in file.parts(base_dir) {
+                files.input("camera", &part);
+            }
         }
-        let (camera, warnings) = settings
+        let (camera, undistortion) = settings
             .camera
             .with_facts(&photo.facts)?
             .resolve(resolution, base_dir)?;
-        files.warnings.extend(warnings);
-        let (proxy, proxy_record) = match &settings.proxy {
-            ProxySettings::None => (Proxy::None, ProxyRecord::None),
-            ProxySettings::Plane(plane) => (Proxy::Plane(*plane), ProxyRecord::Plane(*plane)),
-            ProxySettings::Mesh(path) => {
-                let (mesh, record) = files.proxy_mesh(path)?;
-                (Proxy::Mesh(mesh), ProxyRecord::Mesh(record))
-            }
+        let (occluders, occluders_record) = occluders.unzip();
+        let (photo, occluders, original) = undistort(photo, occluders, undistortion);
+        let view = ground::view(&camera, undistortion.as_ref());
+        let (proxy, proxy_record, cloud) = files.proxy(&settings.proxy, &view)?;
+        let mut places = Places {
+            view,
+            ground: match (&proxy_record, &proxy) {
+                (ProxyRecord::Ground(ground), _) => Some(ground.as_ref().clone()),
+                (_, Proxy::Plane(plane)) => Some(ground::of_plane(plane)),
+                _ => None,
+            },
+            cloud,
+            occluders: occluders.as_ref(),
+            undistortion: undistortion.as_ref(),
+            taken: Vec::new(),
         };
         let mut assembly = Assembly::new(camera, settings.objects.iter().map(|o| o.path.clone()));
         let mut objects = Vec::new();
         for (i, object) in settings.objects.iter().enumerate() {
             let key = format!("scene.objects[{i}]");
-            let placement = object
-                .pixels
-                .place(&object.placement, &camera, &proxy, &key)?;
+            let pixels = match &undistortion {
+                Some(way) => object.pixels.undistorted(way, &key)?,
+                None => object.pixels,
+            };
             let (placed, warning) = assembly.add(&mut files, &object.path, |imported| {
+                let mut placement = object.placement;
+                if let Some(draw) = object.auto {
+                    let body = placement.body(&imported.mesh, &key)?;
+                    placement.position = places.find(body, draw, &key)?.as_vec3();
+                    placement.anchor = Anchor::Center;
+                }
+                let placement = pixels.place(&placement, &camera, &proxy, &key)?;
                 let (map, warning) =
                     placement.resolve(&imported.mesh, imported.origin, &proxy, &key)?;
                 // The record's map starts from the file's coordinates.
@@ -121,7 +205,6 @@ impl Scene {
             lights,
             ..
         } = assembly;
-        let (occluders, occluders_record) = occluders.unzip();
         Ok(LoadedScene {
             scene: Scene {
                 mesh,
@@ -131,6 +214,7 @@ impl Scene {
                 proxy,
             },
             photo,
+            original,
             occluders,
             description: SceneDescription {
                 schema: SceneDescription::SCHEMA.into(),
@@ -139,6 +223,7 @@ impl Scene {
                 occluders: occluders_record,
                 objects,
                 camera,
+                lens: undistortion.map(|u| *u.lens()),
                 proxy: proxy_record,
                 effects: settings.effects,
                 limits: settings.limits,
@@ -171,6 +256,8 @@ impl SceneDescription {
                 Some(files.mask(&record.path, resolution)?)
             }
         };
+        let undistortion = self.lens.as_ref().and_then(Undistortion::of);
+        let (photo, occluders, original) = undistort(photo, occluders, undistortion);
         let proxy = match &self.proxy {
             ProxyRecord::None => Proxy::None,
             ProxyRecord::Plane(plane) => Proxy::Plane(*plane),
@@ -178,6 +265,7 @@ impl SceneDescription {
                 files.check_object("the proxy mesh", record)?;
                 Proxy::Mesh(files.proxy_mesh(&record.file.path)?.0)
             }
+            ProxyRecord::Ground(ground) => ground::proxy(ground),
         };
         let mut assembly = Assembly::new(
             self.camera,
@@ -205,6 +293,7 @@ impl SceneDescription {
                 proxy,
             },
             photo,
+            original,
             occluders,
             description: self.clone(),
             lights,
@@ -377,6 +466,36 @@ impl<'a> Files<'a> {
             triangles: imported.mesh.indices.len() as u64,
         };
         Ok((imported, record))
+    }
+
+    /// The proxy, its record, and the points that it was made from.
+    fn proxy(
+        &mut self,
+        settings: &ProxySettings,
+        view: &LensCamera,
+    ) -> Result<(Proxy, ProxyRecord, Option<Cloud>), Error> {
+        let of_plane = |plane| (Proxy::Plane(plane), ProxyRecord::Plane(plane), None);
+        Ok(match settings {
+            ProxySettings::None => (Proxy::None, ProxyRecord::None, None),
+            ProxySettings::Plane(plane) => of_plane(*plane),
+            ProxySettings::Mesh(path) => {
+                let (mesh, record) = self.proxy_mesh(path)?;
+                (Proxy::Mesh(mesh), ProxyRecord::Mesh(record), None)
+            }
+            ProxySettings::Pixels(pixels) => {
+                let (plane, warning) = ground::plane_of(pixels, view)?;
+                self.warnings.extend(warning);
+                of_plane(plane)
+            }
+            ProxySettings::Points(points) => {
+                for part in points.parts(self.base_dir) {
+                    self.input("points", &part);
+                }
+                let (cloud, ground) = points.read(self.base_dir, view)?;
+                let proxy = ground::proxy(&ground);
+                (proxy, ProxyRecord::Ground(Box::new(ground)), Some(cloud))
+            }
+        })
     }
 
     fn proxy_mesh(&mut self, path: &Path) -> Result<(TriangleMesh, ObjectRecord), Error> {

@@ -1,24 +1,13 @@
 //! The camera of a photograph out of another program's file.
 use std::path::Path;
 
-use dipir_cameras::camera::WorldUp;
-use dipir_cameras::{Camera, CameraError, Lens, chan, colmap, fspy, transforms};
+use dipir_cameras::file::{self, Wanted, Which};
+use dipir_cameras::{CameraError, Lens, Pose, WorldUp};
 use glam::{DVec2, DVec3};
 
 use crate::error::SetupError;
 use crate::view::{Aim, CameraOptions, EYE_HEIGHT_M, View};
 
-/// Where the ground is in a file's world.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Ground {
-    /// Through the origin, if the camera is above it.
-    Origin,
-    /// Below the camera.
-    Unknown,
-}
-
-/// By how much the shapes of two pictures may differ, relative.
-const SAME_SHAPE: f64 = 0.01;
 /// Most that a lens bends a corner, and that pixels differ from squares at a corner, pixels.
 const MOST_BENT_PX: f64 = 1.0;
 /// Least shift of the optical axis that is written down, pixels.
@@ -28,8 +17,8 @@ const LEAST_SHIFT_PX: f64 = 0.5;
 /// which axis of its world points up.
 ///
 /// # Errors
-/// On files that cannot be read, without a camera for the photograph, of pictures of another
-/// shape, and with lenses that bend lines.
+/// On files that cannot be read, without a camera for the photograph, and of pictures of another
+/// shape.
 pub fn read(
     path: &Path,
     photo: &Path,
@@ -49,54 +38,59 @@ pub fn read(
             accepted: "left out, for the camera's file says it",
         });
     }
-    let (camera, ground, program) = camera(path, photo, size, up, asked)?;
-    let wrong = |detail: String, remedy: &'static str| SetupError::Camera {
-        path: path.into(),
-        detail,
-        remedy,
+    // A field of view along the longer side is vertical in an upright picture only.
+    let longer = size[0].max(size[1]);
+    let vertical = |deg: f64| {
+        let half = (0.5 * deg.to_radians()).tan() * size[1] / longer;
+        2.0 * half.atan().to_degrees()
     };
-    let [w, h] = camera.lens.size;
-    if (w / h / (size[0] / size[1]) - 1.0).abs() > SAME_SHAPE {
-        return Err(wrong(
-            format!(
-                "it is of a picture of {w} x {h} pixels, and the photograph has {} x {}",
-                size[0], size[1]
-            ),
-            "use the picture that it was made for",
-        ));
-    }
-    let lens = camera.lens.scaled(size);
-    if bent_px(&lens) > MOST_BENT_PX {
-        return Err(wrong(
-            "its lens bends straight lines, which the renderer's does not".into(),
-            "undistort photograph and camera first, for instance with colmap image_undistorter",
-        ));
-    }
+    let wanted = Wanted {
+        size,
+        which: Which::Photo(photo),
+        up,
+        fov_deg: asked.fov_deg.map(vertical),
+    };
+    let found = file::read(path, &wanted).map_err(|source| match source {
+        CameraError::Read { path, source } => SetupError::Read { path, source },
+        source => SetupError::CameraFile {
+            path: path.into(),
+            source,
+        },
+    })?;
+    let pose = found.pose.ok_or_else(|| SetupError::Camera {
+        path: path.into(),
+        detail: "it describes a lens alone".into(),
+        remedy: "leave --camera out, and write file = \"…\" into [scene.camera] beside position and direction",
+    })?;
+    let lens = found.lens;
     let focal = lens.focal_px;
-    if (focal.x / focal.y - 1.0).abs() * 0.5 * size[0] > MOST_BENT_PX {
-        return Err(wrong(
-            format!(
-                "its pixels are not square: focal lengths {} and {}",
-                focal.x, focal.y
-            ),
-            "name it in pipeline.toml: [scene.camera] transforms = \"transforms.json\"",
-        ));
+    let oblong = (focal.x / focal.y - 1.0).abs() * 0.5 * size[0];
+    let mut view = view(
+        &pose,
+        &lens,
+        found.ground_at_origin,
+        found.program,
+        path,
+        asked,
+    );
+    if bent_px(&lens) > MOST_BENT_PX || oblong > MOST_BENT_PX {
+        view.file = Some((path.into(), up));
     }
-    Ok(view(&camera, &lens, ground, program, path, asked))
+    Ok(view)
 }
 
 fn view(
-    camera: &Camera,
+    pose: &Pose,
     lens: &Lens,
-    ground: Ground,
+    ground_at_origin: bool,
     program: &str,
     path: &Path,
     asked: &CameraOptions,
 ) -> View {
-    let (pose, size) = (camera.pose, DVec2::from_array(lens.size));
+    let size = DVec2::from_array(lens.size);
     let shift = lens.principal_px - 0.5 * size;
-    let (ground_y, position_why) = match (asked.eye_height_m, ground) {
-        (None, Ground::Origin) if pose.position.y > 0.01 => {
+    let (ground_y, position_why) = match (asked.eye_height_m, ground_at_origin) {
+        (None, true) if pose.position.y > 0.01 => {
             (0.0, "the ground goes through the file's origin".to_string())
         }
         (height, _) => {
@@ -123,6 +117,7 @@ fn view(
         fov_deg: 2.0 * (0.5 * size.y / lens.focal_px.y).atan().to_degrees(),
         principal_px: (shift.abs().max_element() > LEAST_SHIFT_PX).then_some(lens.principal_px),
         ground_y,
+        file: None,
         position_why: format!("{from}; {position_why}"),
         aim_why: from.clone(),
         fov_why: from,
@@ -143,91 +138,6 @@ fn bent_px(lens: &Lens) -> f64 {
         })
     });
     bent.into_iter().fold(0.0, f64::max)
-}
-
-type Found = (Camera, Ground, &'static str);
-
-fn camera(
-    path: &Path,
-    photo: &Path,
-    size: [f64; 2],
-    up: Option<WorldUp>,
-    asked: &CameraOptions,
-) -> Result<Found, SetupError> {
-    let damaged = |source: CameraError| SetupError::CameraFile {
-        path: path.into(),
-        source,
-    };
-    if path.is_dir() {
-        // COLMAP's world is that of a first camera, unless it was turned.
-        let model = colmap::read(path, up.unwrap_or(WorldUp::MinusY)).map_err(damaged)?;
-        let camera = of_photo(&model.images, path, photo)?;
-        return Ok((camera, Ground::Unknown, "COLMAP"));
-    }
-    let bytes = dipir_files::read(path).map_err(|source| SetupError::Read {
-        path: path.into(),
-        source,
-    })?;
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-    match extension.as_deref() {
-        Some("chan") => {
-            // A field of view along the longer side is vertical in an upright picture only.
-            let longer = size[0].max(size[1]);
-            let vertical = asked.fov_deg.map(|deg| {
-                let half = (0.5 * deg.to_radians()).tan() * size[1] / longer;
-                2.0 * half.atan().to_degrees()
-            });
-            let text = String::from_utf8_lossy(&bytes);
-            let frames = chan::read(&text, size, vertical).map_err(damaged)?;
-            let frames: Vec<(String, Camera)> = frames
-                .into_iter()
-                .map(|(frame, camera)| (format!("frame {frame}"), camera))
-                .collect();
-            Ok((of_photo(&frames, path, photo)?, Ground::Origin, ".chan"))
-        }
-        Some("fspy" | "json") if !names_frames(&bytes) => {
-            let camera = fspy::read(&bytes, up.unwrap_or(WorldUp::Z)).map_err(damaged)?;
-            Ok((camera, Ground::Origin, "fSpy"))
-        }
-        Some("json") => {
-            let up = up.unwrap_or(WorldUp::Z);
-            let frames = transforms::read(&bytes, Some(size), up).map_err(damaged)?;
-            let camera = of_photo(&frames, path, photo)?;
-            Ok((camera, Ground::Unknown, "nerfstudio"))
-        }
-        _ => Err(SetupError::Camera {
-            path: path.into(),
-            detail: "it is not a kind of file that is known".into(),
-            remedy: "use .fspy, fSpy's .json, transforms.json, .chan or a folder of COLMAP's",
-        }),
-    }
-}
-
-/// Whether the JSON is a `transforms.json`; a project of fSpy never is.
-fn names_frames(bytes: &[u8]) -> bool {
-    let key = b"\"frames\"";
-    !bytes.starts_with(b"fspy") && bytes.windows(key.len()).any(|w| w == key)
-}
-
-/// The camera of the image with the photograph's name, else the only one.
-fn of_photo(cameras: &[(String, Camera)], path: &Path, photo: &Path) -> Result<Camera, SetupError> {
-    let same = |part: fn(&Path) -> Option<&std::ffi::OsStr>| {
-        let named = |c: &&(String, Camera)| part(Path::new(&c.0)) == part(photo);
-        cameras.iter().find(named)
-    };
-    let found = same(Path::file_name).or_else(|| same(Path::file_stem));
-    match (found, cameras) {
-        (Some((_, camera)), _) | (None, [(_, camera)]) => Ok(*camera),
-        _ => Err(SetupError::Camera {
-            path: path.into(),
-            detail: format!(
-                "it has {} cameras, and none for {:?}",
-                cameras.len(),
-                photo.file_name().unwrap_or_default()
-            ),
-            remedy: "leave the photograph's camera alone in it, or name the photograph as it does",
-        }),
-    }
 }
 
 #[cfg(test)]
@@ -300,8 +210,9 @@ mod tests {
             error.contains("it has 2 cameras, and none for \"b.jpg\""),
             "{error}"
         );
-        let error = of(file(["a.jpg", "b.jpg"], -0.2)).unwrap_err();
-        assert!(error.contains("bends straight lines"), "{error}");
+        // What a pinhole cannot say stays in the file.
+        let view = of(file(["a.jpg", "b.jpg"], -0.2)).unwrap();
+        assert!(view.file.is_some_and(|f| f.0.ends_with("transforms.json")));
     }
 
     #[test]

@@ -1,4 +1,5 @@
 //! The text of a first `pipeline.toml`.
+use dipir_cameras::WorldUp;
 use dipir_imaging::facts::Facts;
 use glam::DVec3;
 
@@ -11,6 +12,8 @@ pub struct Object {
     pub path: String,
     /// Where it stands, pixels.
     pub at_pixel: [f64; 2],
+    /// Whether a free place is looked for instead.
+    pub auto: bool,
     /// The line of its size, if it needs one.
     pub size_line: Option<String>,
     /// Where the size comes from.
@@ -32,6 +35,23 @@ pub struct Document {
     pub objects: Vec<Object>,
     /// The photograph's camera.
     pub view: View,
+    /// Its file, as the configuration names it, where the view has one.
+    pub camera_file: Option<String>,
+    /// Points that tell the ground.
+    pub points: Option<Points>,
+}
+
+/// Points of the scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Points {
+    /// As the file names them.
+    pub path: String,
+    /// Where their sensor stood, as the file names it.
+    pub pose: Option<String>,
+    /// Which axis of them points up: `z`.
+    pub up: Option<&'static str>,
+    /// The ground in them, and how sure it is.
+    pub words: String,
 }
 
 impl Document {
@@ -51,12 +71,18 @@ impl Document {
         for object in &self.objects {
             text += &object.text();
         }
-        text += &camera(&self.view);
-        text += &format!(
-            "[scene.proxy]                   # the ground that takes the shadow\n\
-             plane = {{ point = [0.0, {}, 0.0], normal = [0.0, 1.0, 0.0] }}\n\n",
-            number(self.view.ground_y, 6)
-        );
+        text += &match (&self.camera_file, &self.view.file) {
+            (Some(name), Some((_, up))) => camera_of_file(name, *up, &self.view),
+            _ => camera(&self.view),
+        };
+        text += "[scene.proxy]                   # the ground that takes the shadow\n";
+        text += &match &self.points {
+            Some(points) => points.text(),
+            None => format!(
+                "plane = {{ point = [0.0, {}, 0.0], normal = [0.0, 1.0, 0.0] }}\n\n",
+                number(self.view.ground_y, 6)
+            ),
+        };
         text += &light(&self.facts);
         text
     }
@@ -79,10 +105,17 @@ impl Document {
 impl Object {
     fn text(&self) -> String {
         let [x, y] = self.at_pixel.map(|v| number(v, 1));
+        let place = match self.auto {
+            true => format!(
+                "place = \"auto\"                  # free ground that is seen; or at_pixel = [{x}, {y}], and place_draw = 1 for another\n"
+            ),
+            false => format!(
+                "at_pixel = [{x}, {y}]    # where it stands on the ground\n\
+                 anchor = \"center\"               # the middle of the object stands there\n"
+            ),
+        };
         let mut text = format!(
-            "[[scene.objects]]\npath = {}\n\
-             at_pixel = [{x}, {y}]    # where it stands on the ground\n\
-             anchor = \"center\"               # the middle of the object stands there\n\
+            "[[scene.objects]]\npath = {}\n{place}\
              yaw_deg = 0.0                   # turn, counter-clockwise from above; or to_pixel = [x, y], which it faces\n\
              # size: {}\n",
             quoted(&self.path),
@@ -95,6 +128,44 @@ impl Object {
         text.push('\n');
         text
     }
+}
+
+impl Points {
+    fn text(&self) -> String {
+        let mut text = format!(
+            "# ground: {}; or plane = {{ … }}\npoints = {}\n",
+            self.words,
+            quoted(&self.path)
+        );
+        if let Some(pose) = &self.pose {
+            text += &format!("points_pose = {}\n", quoted(pose));
+        }
+        if let Some(up) = self.up {
+            text += &format!("points_up = \"{up}\"\n");
+        }
+        text + "\n"
+    }
+}
+
+/// The word of an axis in the file.
+pub(crate) fn axis(up: WorldUp) -> &'static str {
+    match up {
+        WorldUp::Y => "y",
+        WorldUp::Z => "z",
+        WorldUp::MinusY => "-y",
+    }
+}
+
+fn camera_of_file(name: &str, up: Option<WorldUp>, view: &View) -> String {
+    let mut text = format!(
+        "[scene.camera]\n# {}; its lens bends lines or its pixels are not square\nfile = {}\n",
+        view.aim_why,
+        quoted(name)
+    );
+    if let Some(up) = up {
+        text += &format!("file_up = \"{}\"\n", axis(up));
+    }
+    text + "\n"
 }
 
 fn camera(view: &View) -> String {
@@ -252,11 +323,35 @@ mod tests {
             objects: vec![Object {
                 path: "chair.glb".into(),
                 at_pixel: [450.0, 400.3],
+                auto: false,
                 size_line: Some("height_m = 1.0".into()),
                 size_why: "a guess".into(),
             }],
             view,
+            camera_file: None,
+            points: None,
         }
+    }
+
+    #[test]
+    fn points_a_file_and_a_free_place_are_keys_that_are_read() {
+        let mut document = document(View {
+            file: Some(("rig.json".into(), Some(WorldUp::Z))),
+            ..View::default()
+        });
+        document.camera_file = Some("rig.json".into());
+        document.objects[0].auto = true;
+        document.points = Some(Points {
+            path: "scan.bin".into(),
+            pose: Some("calib.txt".into()),
+            up: Some(axis(WorldUp::Z)),
+            words: "a plane".into(),
+        });
+        let config = scene(&document.text());
+        config.validate().unwrap();
+        assert_eq!(config.objects[0].place.as_deref(), Some("auto"));
+        assert_eq!(config.camera.unwrap().file_up.as_deref(), Some("z"));
+        assert_eq!(config.proxy.unwrap().points_up.as_deref(), Some("z"));
     }
 
     /// The `[scene]` table, read as the stages read it.

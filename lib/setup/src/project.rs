@@ -6,10 +6,15 @@ use std::path::{Path, PathBuf};
 use dipir_cameras::WorldUp;
 use dipir_imaging::file::read_photo;
 use dipir_imaging::transfer::Transfer;
+use dipir_points::Ground;
+use dipir_points::ground::Shape;
+use dipir_scene::camera::Camera;
+use dipir_scene::ground::{self, PointsSettings};
 use dipir_scene::import::load_object;
+use dipir_scene::proxy::Plane;
 
 use crate::camera_file;
-use crate::document::{Document, Object};
+use crate::document::{Document, Object, Points, axis};
 use crate::error::SetupError;
 use crate::size::{Size, size};
 use crate::spots::spots;
@@ -34,6 +39,14 @@ pub struct Request {
     pub camera_up: Option<WorldUp>,
     /// Of the camera.
     pub asked: CameraOptions,
+    /// Points of the scene that tell the ground.
+    pub points: Option<PathBuf>,
+    /// Where their sensor stood.
+    pub points_pose: Option<PathBuf>,
+    /// Which axis of them points up.
+    pub points_up: Option<WorldUp>,
+    /// Whether objects look for a free place.
+    pub place_auto: bool,
 }
 
 /// A configuration that is not written yet.
@@ -78,12 +91,32 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
         None => View::of_photo(&photo.image, &photo.facts, &request.asked)?,
     };
     let widths: Vec<f64> = sizes.iter().map(|s| s.width_m).collect();
-    let spots = spots(&view.camera(photo.facts.size), &view.plane(), &widths)?;
+    let camera = view.camera(photo.facts.size);
+    let found = points(request, &camera, folder)?;
+    let plane = match &found {
+        Some((_, ground)) => Plane {
+            point: ground.point.as_vec3(),
+            normal: ground.normal.as_vec3(),
+        },
+        None => view.plane(),
+    };
+    if let Some(path) = request
+        .points
+        .as_ref()
+        .filter(|p| request.camera.is_none() && !is_depth(p))
+    {
+        warnings.push(format!(
+            "\"{}\": points belong to the photograph only with the camera of the same scene: name it with --camera",
+            path.display()
+        ));
+    }
+    let spots = spots(&camera, &plane, &widths)?;
     let objects = request.models.iter().zip(sizes).zip(spots);
     let objects = objects.map(|((path, size), at_pixel)| {
         Ok(Object {
             path: beside(path, folder)?,
             at_pixel,
+            auto: request.place_auto,
             size_line: size.line,
             size_why: size.why,
         })
@@ -96,11 +129,49 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
             class,
             class_why,
             objects: objects.collect::<Result<_, SetupError>>()?,
+            camera_file: match &view.file {
+                Some((path, _)) => Some(beside(path, folder)?),
+                None => None,
+            },
             view,
+            points: found.map(|f| f.0),
         },
         path: request.out.clone(),
         warnings,
     })
+}
+
+/// The points that are asked for, and the ground in them.
+fn points(
+    request: &Request,
+    camera: &Camera,
+    folder: &Path,
+) -> Result<Option<(Points, Ground)>, SetupError> {
+    let Some(path) = &request.points else {
+        return Ok(None);
+    };
+    let settings = PointsSettings {
+        path: path.clone(),
+        up: request.points_up,
+        scale: 1.0,
+        pose: request.points_pose.clone(),
+        shape: Shape::Auto,
+    };
+    let (_, ground) = settings.read(Path::new(""), &ground::view(camera, None))?;
+    let pose = request.points_pose.as_ref();
+    let points = Points {
+        path: beside(path, folder)?,
+        pose: pose.map(|pose| beside(pose, folder)).transpose()?,
+        up: request.points_up.map(axis),
+        words: ground.words(),
+    };
+    Ok(Some((points, ground)))
+}
+
+/// Whether the points are depths of the photograph itself.
+fn is_depth(path: &Path) -> bool {
+    let extension = path.extension();
+    extension.is_some_and(|e| e.eq_ignore_ascii_case("exr") || e.eq_ignore_ascii_case("png"))
 }
 
 impl Draft {

@@ -1,4 +1,7 @@
 //! The camera of a photograph, from its file, its edges and defaults.
+use std::path::PathBuf;
+
+use dipir_cameras::WorldUp;
 use dipir_imaging::facts::{Facts, FocalSource};
 use dipir_imaging::raster::LinearImage;
 use dipir_scene::camera::Camera;
@@ -41,6 +44,8 @@ pub struct View {
     pub principal_px: Option<DVec2>,
     /// Height of the ground, metres.
     pub ground_y: f64,
+    /// The file that says more of the camera than is said here, and which axis of it points up.
+    pub file: Option<(PathBuf, Option<WorldUp>)>,
     /// Where the position comes from.
     pub position_why: String,
     /// Where the turn comes from.
@@ -70,6 +75,7 @@ impl Default for View {
             fov_deg: 40.0,
             principal_px: None,
             ground_y: 0.0,
+            file: None,
             position_why: String::new(),
             aim_why: String::new(),
             fov_why: String::new(),

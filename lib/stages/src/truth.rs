@@ -111,7 +111,7 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
 
     let peak = truth.peak().0;
     let wanted = under_truth(session, &scene, &frame, truth, table.truth_tone)?;
-    let found = picture(session, &frame)?;
+    let found = picture(session, &scene, &frame)?;
     let neutral = under_neutral(&objective, &frame, table.truth_tone)?;
     let mask = touched(&objective);
     let wanted = transfer.encode(&wanted);
@@ -151,11 +151,12 @@ fn recorded(session: &Session, scene: &SceneFolder) -> anyhow::Result<(Transport
 }
 
 /// The composite stage's picture, linear.
-fn picture(session: &Session, frame: &Frame) -> anyhow::Result<LinearImage> {
+fn picture(session: &Session, scene: &SceneFolder, frame: &Frame) -> anyhow::Result<LinearImage> {
     let folder = COMPOSITE.folder(session);
     let manifest = COMPOSITE.manifest(session)?;
     let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
-    Ok(frame.scale(&LinearImage(layers.rgb("")?)))
+    let picture = LinearImage(layers.rgb("")?);
+    Ok(frame.scale(&scene.loaded.undistorted(picture)))
 }
 
 /// The picture under the true light, path traced, linear.

@@ -1,57 +1,49 @@
 //! What `[scene.camera]` says, checked.
+use dipir_cameras::Distortion;
+
 use super::*;
 
 impl CameraConfig {
-    pub(super) fn validate(&self) -> Result<CameraSettings, Error> {
-        match &self.transforms {
-            Some(path) => self.validate_transforms(path.clone()),
-            None => self.validate_look_at(),
+    /// `photo` is the photograph, by whose name a file's camera is found.
+    pub(super) fn validate(&self, photo: &Path) -> Result<CameraSettings, Error> {
+        match (&self.transforms, &self.file) {
+            (Some(path), _) => self.validate_file("transforms", path, photo),
+            (None, Some(path)) => self.validate_file("file", path, photo),
+            (None, None) => self.validate_look_at(),
         }
     }
 
-    pub(super) fn validate_transforms(&self, path: PathBuf) -> Result<CameraSettings, Error> {
-        let others = [
-            ("position", self.position.is_some()),
-            ("look_at", self.look_at.is_some()),
-            ("up", self.up.is_some()),
-            ("pitch_deg", self.pitch_deg.is_some()),
-            ("roll_deg", self.roll_deg.is_some()),
-            ("principal_px", self.principal_px.is_some()),
-            ("fov_deg", self.fov_deg.is_some()),
-            ("focal_mm", self.focal_mm.is_some()),
-            ("sensor_mm", self.sensor_mm.is_some()),
-        ];
-        if let Some((name, _)) = others.iter().find(|(_, given)| *given) {
-            return Err(conflict(
-                "scene.camera.transforms",
-                &format!("scene.camera.{name}"),
-            ));
-        }
-        Ok(CameraSettings::Transforms {
-            path,
-            frame: self.frame.unwrap_or(0),
-            up: match self.transforms_up.as_deref() {
-                None | Some("z") => WorldUp::Z,
-                Some("y") => WorldUp::Y,
-                Some(other) => {
-                    return Err(wrong_word("scene.camera.transforms_up", other, &["z", "y"]));
-                }
-            },
-        })
-    }
-
-    pub(super) fn validate_look_at(&self) -> Result<CameraSettings, Error> {
+    fn validate_look_at(&self) -> Result<CameraSettings, Error> {
         for (name, given) in [
             ("frame", self.frame.is_some()),
+            ("image", self.image.is_some()),
+            ("file_up", self.file_up.is_some()),
+            ("file_scale", self.file_scale.is_some()),
             ("transforms_up", self.transforms_up.is_some()),
         ] {
             if given {
                 return Err(missing(
-                    "scene.camera.transforms",
-                    &format!("name the transforms.json that scene.camera.{name} is about"),
+                    "scene.camera.file",
+                    &format!("name the camera's file that scene.camera.{name} is about"),
                 ));
             }
         }
+        let [position, look_at, up] = self.stand()?;
+        Ok(CameraSettings::LookAt {
+            position,
+            look_at,
+            up,
+            field_of_view: self.field_of_view()?,
+            principal_px: finite_pixel("scene.camera.principal_px", self.principal_px)?,
+            distortion: match &self.distortion {
+                None => Distortion::NONE,
+                Some(table) => table.validate()?,
+            },
+        })
+    }
+
+    /// Position, point looked at and up.
+    pub(super) fn stand(&self) -> Result<[Vec3; 3], Error> {
         let point = |name: &str, value: Option<[f32; 3]>| {
             let key = format!("scene.camera.{name}");
             match value {
@@ -65,7 +57,7 @@ impl CameraConfig {
         let position = point("position", self.position)?;
         if self.pitch_deg.is_some() || self.roll_deg.is_some() {
             let (look_at, up) = self.turned(position)?;
-            return self.looking(position, look_at, up);
+            return Ok([position, look_at, up]);
         }
         let look_at = point("look_at", self.look_at)?;
         let backward = position - look_at;
@@ -85,22 +77,7 @@ impl CameraConfig {
                 "a direction across the line of sight; looking straight down or up, write up = [0.0, 0.0, -1.0]",
             ));
         }
-        self.looking(position, look_at, up)
-    }
-
-    pub(super) fn looking(
-        &self,
-        position: Vec3,
-        look_at: Vec3,
-        up: Vec3,
-    ) -> Result<CameraSettings, Error> {
-        Ok(CameraSettings::LookAt {
-            position,
-            look_at,
-            up,
-            field_of_view: self.field_of_view()?,
-            principal_px: finite_pixel("scene.camera.principal_px", self.principal_px)?,
-        })
+        Ok([position, look_at, up])
     }
 
     /// The point in the centre of the image and what is up in it, of a camera that looks along -z,

@@ -90,7 +90,7 @@ fn missing_tables_say_what_to_write() {
     );
     assert_eq!(
         message(&format!("background = \"photo.jpg\"\n{OBJECT}")),
-        "scene.camera is missing; add a table [scene.camera] with position, look_at and fov_deg, or with transforms"
+        "scene.camera is missing; add a table [scene.camera] with position, look_at and fov_deg, or with file"
     );
 }
 
@@ -205,6 +205,6 @@ fn wrong_cameras_are_explained() {
     );
     assert_eq!(
         message(&camera(&format!("{stands}fov_deg = 40\nframe = 1"))),
-        "scene.camera.transforms is missing; name the transforms.json that scene.camera.frame is about"
+        "scene.camera.file is missing; name the camera's file that scene.camera.frame is about"
     );
 }

@@ -1,5 +1,6 @@
 //! Importers and whole scenes through the public interface.
 mod bad_input;
+mod cameras_and_ground;
 mod compressed;
 mod config_table;
 mod glb;

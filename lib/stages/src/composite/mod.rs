@@ -1,4 +1,5 @@
 //! The composite stage: the object at full quality, its shadow, and the layers of both.
+mod lens;
 pub mod table;
 
 use std::fmt;
@@ -122,12 +123,21 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light));
     let picture = layers.picture()?;
     let png = writer.output("picture", "composite.png")?;
-    write_picture(png, &picture, &inputs.scene.loaded.photo)?;
+    write_picture(png, &picture, inputs.scene.loaded.taken())?;
     let in_picture = Precision::of_colour(&picture.0);
     drop(picture);
-    let gbuffer = Layers::read_exr(&inputs.gbuffer)?;
+    let original = inputs.scene.loaded.original.as_ref();
+    let mut gbuffer = Layers::read_exr(&inputs.gbuffer)?;
+    if let Some(original) = original {
+        gbuffer = lens::gbuffer(&gbuffer, &original.undistortion)?;
+    }
     let exr = writer.output("layers", "composite.exr")?;
     layers.to_rows(in_picture, &gbuffer)?.write_exr(exr)?;
+    if let Some(original) = original {
+        let [distort, undistort] = original.undistortion.st_maps()?;
+        distort.write_exr(writer.output("st_distort", "st_distort.exr")?)?;
+        undistort.write_exr(writer.output("st_undistort", "st_undistort.exr")?)?;
+    }
     writer.set_estimated_error(rendered.error.upper_95);
     let manifest = writer.finish()?;
     let seconds = clock.elapsed().as_secs_f64();
@@ -155,7 +165,7 @@ fn within(stop: Stop, clock: Instant, inputs: &Inputs) -> Stop {
     let Stop::TimeBudget(budget) = stop else {
         return stop;
     };
-    let pixels = inputs.scene.loaded.photo.image.0.pixels().len();
+    let pixels = inputs.scene.loaded.taken().image.0.pixels().len();
     let writing = Duration::from_secs_f64(WRITING_S_PER_PIXEL * pixels as f64);
     Stop::TimeBudget(budget.saturating_sub(clock.elapsed() + writing))
 }
@@ -291,7 +301,12 @@ struct Composite<'a> {
 
 impl<'a> Composite<'a> {
     fn new(inputs: &'a Inputs, film: Film, curve: &Curve) -> Self {
-        let background = &inputs.scene.loaded.photo.image;
+        let loaded = &inputs.scene.loaded;
+        let background = &loaded.taken().image;
+        let film = match &loaded.original {
+            Some(original) => lens::film(film, &original.undistortion),
+            None => film,
+        };
         let Film {
             object,
             mut alpha,

@@ -5,6 +5,7 @@ use dipir_estimator::{Estimator, KnownAngle, KnownSun, LightEstimate};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_optimize::settings::LightTable;
+use dipir_scene::description::ProxyRecord;
 use dipir_scene::proxy::Proxy;
 use dipir_scene::scene::LoadedScene;
 use dipir_sun::shadow::{Angle, Ground, sun_of_shadow};
@@ -125,15 +126,22 @@ fn known_sun(
         let shadow = shadow
             .resolve("light.shadow")
             .map_err(|e| wrong("light.shadow", e.to_string()))?;
-        let Proxy::Plane(plane) = &loaded.scene.proxy else {
-            let message = "needs [scene.proxy] plane: the shadow falls onto it";
-            return Err(wrong("light.shadow", message.into()).into());
-        };
-        let ground = Ground {
-            point: plane.point.as_dvec3(),
-            normal: plane.normal.as_dvec3(),
+        let ground = match (&loaded.scene.proxy, &loaded.description.proxy) {
+            (Proxy::Plane(plane), _) => Ground {
+                point: plane.point.as_dvec3(),
+                normal: plane.normal.as_dvec3(),
+            },
+            (_, ProxyRecord::Ground(ground)) => Ground {
+                point: ground.point,
+                normal: ground.normal,
+            },
+            _ => {
+                let message = "needs [scene.proxy] plane: the shadow falls onto it";
+                return Err(wrong("light.shadow", message.into()).into());
+            }
         };
         let ray = |pixel: glam::DVec2| {
+            let pixel = loaded.undistorted_pixel(pixel);
             let ray = camera.ray(Vec2::new(pixel.x as f32, pixel.y as f32));
             (ray.origin.as_dvec3(), ray.direction.as_dvec3())
         };

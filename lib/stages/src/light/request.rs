@@ -285,7 +285,8 @@ pub(super) fn read_reference(
     let limits = session.config.table::<SceneConfig>("scene")?.limits;
     let image = read_photo_within(file, transfer, limits.photo())?.image;
     let found = [image.0.width() as u32, image.0.height() as u32];
-    let expected = scene.loaded.scene.camera.resolution;
+    let taken = &scene.loaded.taken().image.0;
+    let expected = [taken.width() as u32, taken.height() as u32];
     if found != expected {
         let message = format!(
             "\"{}\" has {} x {} pixels; accepted: a picture of the photograph's size, {} x {}",
@@ -297,5 +298,6 @@ pub(super) fn read_reference(
         );
         return Err(session.config.invalid("light.reference", message).into());
     }
+    let image = scene.loaded.undistorted(image);
     Ok(transfer.encode(&frame.scale(&image)))
 }

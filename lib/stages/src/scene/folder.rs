@@ -13,7 +13,7 @@ use serde::Deserialize;
 use serde_json::json;
 
 use crate::names::SCENE;
-use crate::scene;
+use crate::scene::{self, unnumbered};
 
 /// The scene stage's folder, its files checked by hash, and the scene that they describe.
 pub struct SceneFolder {
@@ -54,8 +54,9 @@ pub fn manifest(session: &Session) -> Result<Manifest, StageError> {
 /// inputs of a plan. Their hashes come from the manifest, and are checked when the files are read.
 pub fn add_inputs(plan: &mut StagePlan, scene: &Manifest, roles: &[&str]) -> anyhow::Result<()> {
     plan.outputs_of(scene, roles)?;
-    // The camera's file is in scene.json, the light's has a role of its own.
-    let made_of = |a: &&Artifact| a.role != "camera" && a.role != "environment";
+    // What camera and points tell is in scene.json, the light's has a role of its own.
+    let told = ["camera", "points", "environment"];
+    let made_of = |a: &&Artifact| !told.contains(&unnumbered(&a.role));
     plan.inputs
         .extend(scene.inputs.iter().filter(made_of).cloned());
     Ok(())

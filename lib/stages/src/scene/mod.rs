@@ -15,11 +15,15 @@ use dipir_optimize::settings::{LightTable, Settings as RecoverySettings};
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
+use dipir_points::Ground;
 use dipir_render::effects::{self, EffectsPlan};
 use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
+use dipir_scene::camera::parts;
 use dipir_scene::config::SceneConfig;
+use dipir_scene::description::ProxyRecord;
+use dipir_scene::ground::points_parts;
 use dipir_scene::plausibility::implausible;
 use dipir_scene::scene::{LoadedScene, Scene};
 use serde_json::{Value, json};
@@ -41,6 +45,8 @@ pub struct Done {
     triangles: usize,
     materials: usize,
     resolution: [u32; 2],
+    /// Of the ground, where it was found in points.
+    ground: Option<Ground>,
     /// Absent where the light is given.
     record: Option<Record>,
     /// Other qualities differ in the record alone.
@@ -151,6 +157,10 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         triangles: loaded.scene.mesh.indices.len(),
         materials: loaded.scene.materials.len(),
         resolution,
+        ground: match loaded.description.proxy {
+            ProxyRecord::Ground(ground) => Some(*ground),
+            _ => None,
+        },
         record,
         outlook: outlook.unwrap_or_default(),
     })
@@ -208,7 +218,7 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
         Err(_) => Vec::new(),
     };
     let parts = recorded.iter().filter(|a| a.role.starts_with("part of "));
-    let named = named_files(&config);
+    let named = named_files(&config, &session.config.base_dir());
     let files = named
         .iter()
         .map(|(role, path)| (*role, path.as_path()))
@@ -235,18 +245,31 @@ pub fn settings(session: &Session) -> anyhow::Result<SceneConfig> {
 }
 
 /// The files that the configuration itself names, every one once.
-fn named_files(config: &SceneConfig) -> Vec<(&'static str, PathBuf)> {
-    let camera = config.camera.as_ref().and_then(|c| c.transforms.clone());
+fn named_files(config: &SceneConfig, base_dir: &Path) -> Vec<(&'static str, PathBuf)> {
+    let camera = config.camera.as_ref();
+    let camera = camera.and_then(|c| c.transforms.as_ref().or(c.file.as_ref()));
+    let camera = camera.map_or(Vec::new(), |path| parts(path, base_dir));
     let proxy = config.proxy.as_ref().and_then(|p| p.mesh.clone());
     let single = [
         ("background", config.background.clone()),
         ("occluders", config.occluders.clone()),
-        ("camera", camera),
         ("proxy", proxy),
     ];
+    let camera = camera.into_iter().map(|path| ("camera", Some(path)));
+    let points = config.proxy.as_ref().and_then(|p| {
+        let path = p.points.as_deref()?;
+        Some(points_parts(path, p.points_pose.as_deref(), base_dir))
+    });
+    let points = points.into_iter().flatten();
+    let points = points.map(|path| ("points", Some(path)));
     let objects = config.objects.iter().map(|o| ("object", o.path.clone()));
     let mut files: Vec<(&str, PathBuf)> = Vec::new();
-    for (role, path) in single.into_iter().chain(objects) {
+    for (role, path) in single
+        .into_iter()
+        .chain(camera)
+        .chain(points)
+        .chain(objects)
+    {
         if let Some(path) = path
             && !files.contains(&(role, path.clone()))
         {
@@ -257,7 +280,7 @@ fn named_files(config: &SceneConfig) -> Vec<(&'static str, PathBuf)> {
 }
 
 /// A role without its number: `part of object` for `part of object 2`.
-fn unnumbered(role: &str) -> &str {
+pub(crate) fn unnumbered(role: &str) -> &str {
     role.trim_end_matches(|c: char| c.is_ascii_digit())
         .trim_end()
 }
@@ -315,6 +338,10 @@ impl Done {
             "triangles": self.triangles,
             "materials": self.materials,
             "resolution": self.resolution,
+            "ground": self.ground.as_ref().map(|g| json!({
+                "point": g.point, "normal": g.normal, "points": g.points, "inliers": g.inliers,
+                "residual_m": g.residual_m, "relief": g.relief.is_some(),
+            })),
             "effects": self.effects.effects,
             "max_depth": self.effects.max_depth,
             "transport": self.record.as_ref().map(|r| json!({
@@ -345,6 +372,9 @@ impl fmt::Display for Done {
             "\n  {} triangles, {} materials, {width} x {height} pixels",
             self.triangles, self.materials
         )?;
+        if let Some(ground) = &self.ground {
+            writeln!(f, "  ground: {}", ground.words())?;
+        }
         write!(
             f,
             "  effects: {} (depth {})",

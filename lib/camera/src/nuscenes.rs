@@ -1,0 +1,124 @@
+//! Records as nuScenes' `calibrated_sensor.json` and `ego_pose.json` have them.
+//!
+//! A sensor has `translation` (metres) and `rotation` (quaternion w x y z) into the vehicle, whose
+//! frame has +x forward, +y to the left, +z up and its origin on the ground; a camera has
+//! `camera_intrinsic`, three rows of three. A record may bring the vehicle's own `ego_pose` along.
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use serde::Deserialize;
+
+use crate::camera::{Camera, Lens, Pose, WorldUp};
+use crate::error::CameraError;
+
+const FORMAT: &str = "nuScenes";
+
+#[derive(Deserialize)]
+struct Record {
+    #[serde(flatten)]
+    sensor: Stand,
+    #[serde(default)]
+    camera_intrinsic: Vec<[f64; 3]>,
+    ego_pose: Option<Stand>,
+    channel: Option<String>,
+    filename: Option<String>,
+    token: Option<String>,
+    width: Option<f64>,
+    height: Option<f64>,
+}
+
+#[derive(Deserialize)]
+struct Stand {
+    translation: [f64; 3],
+    rotation: [f64; 4],
+}
+
+impl Stand {
+    /// Into the frame around it.
+    fn rotation(&self) -> Option<DMat3> {
+        let [w, x, y, z] = self.rotation;
+        let q = DQuat::from_xyzw(x, y, z, w);
+        let length = q.length();
+        (length > 1e-6 && length.is_finite()).then(|| DMat3::from_quat(q / length))
+    }
+}
+
+/// A sensor's rotation and position in the vehicle, or in the world where its record has the
+/// vehicle's pose.
+fn stand(record: &Record) -> Result<(DMat3, DVec3), CameraError> {
+    let wrong = || CameraError::new(FORMAT, "a record has no rotation and translation");
+    let mut rotation = record.sensor.rotation().ok_or_else(wrong)?;
+    let mut position = DVec3::from_array(record.sensor.translation);
+    if let Some(ego) = &record.ego_pose {
+        let turn = ego.rotation().ok_or_else(wrong)?;
+        rotation = turn * rotation;
+        position = turn * position + DVec3::from_array(ego.translation);
+    }
+    match position.is_finite() {
+        true => Ok((rotation, position)),
+        false => Err(wrong()),
+    }
+}
+
+fn records(json: &[u8]) -> Result<Vec<Record>, CameraError> {
+    let wrong = |e: serde_json::Error| CameraError::new(FORMAT, e.to_string());
+    match json.iter().find(|b| !b.is_ascii_whitespace()) {
+        Some(b'[') => serde_json::from_slice(json).map_err(wrong),
+        _ => Ok(vec![serde_json::from_slice(json).map_err(wrong)?]),
+    }
+}
+
+/// Reads all cameras; records of other sensors are passed over. `size` is that of the image, for
+/// records without `width` and `height`.
+///
+/// # Errors
+/// On records without a rotation, and intrinsics that are no pinhole's.
+pub fn read(
+    json: &[u8],
+    size: [f64; 2],
+    up: WorldUp,
+) -> Result<Vec<(String, Camera)>, CameraError> {
+    let mut cameras = Vec::new();
+    for record in records(json)? {
+        if record.camera_intrinsic.is_empty() {
+            continue;
+        }
+        let [[fx, skew, cx], [_, fy, cy], [_, _, one]] = record.camera_intrinsic[..] else {
+            return Err(CameraError::new(FORMAT, "camera_intrinsic is not 3 by 3"));
+        };
+        if !(skew.abs() < 1e-3 * fx.abs() && (one - 1.0).abs() < 1e-6) {
+            return Err(CameraError::new(FORMAT, "camera_intrinsic is no pinhole's"));
+        }
+        let own = record.width.zip(record.height).map(|(w, h)| [w, h]);
+        let lens = Lens {
+            principal_px: DVec2::new(cx, cy),
+            ..Lens::pinhole(own.unwrap_or(size), DVec2::new(fx, fy))
+        };
+        lens.check(FORMAT)?;
+        let (r, position) = stand(&record)?;
+        // From image axes: y down, z forward.
+        let axes = DMat3::from_cols(r.x_axis, -r.y_axis, -r.z_axis);
+        let pose = Pose::from_axes(axes, position)
+            .ok_or_else(|| CameraError::new(FORMAT, "a record does not rotate"))?;
+        let pose = pose.in_our_world(up);
+        let name = record.channel.or(record.filename).or(record.token);
+        cameras.push((name.unwrap_or_default(), Camera { pose, lens }));
+    }
+    Ok(cameras)
+}
+
+/// Where the sensor of the only record stands: rotation and position into our world.
+///
+/// # Errors
+/// On files of more records than one, and as [`read`].
+pub fn sensor(json: &[u8], up: WorldUp) -> Result<(DMat3, DVec3), CameraError> {
+    match &records(json)?[..] {
+        [record] => {
+            let (rotation, position) = stand(record)?;
+            Ok((up.to_ours() * rotation, up.to_ours() * position))
+        }
+        more => Err(CameraError::with_remedy(
+            FORMAT,
+            format!("it has {} records", more.len()),
+            "write the record of the sensor that took the points into a file of its own",
+        )),
+    }
+}

@@ -1,0 +1,59 @@
+//! Points, and from where they were seen.
+use dipir_numerics::sampler::Stream;
+use glam::{DMat3, DVec3};
+
+/// Random numbers of this crate.
+pub(crate) const POINTS: Stream = Stream(11);
+
+/// Points of a scene.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Cloud {
+    /// Finite positions, metres.
+    pub points: Vec<DVec3>,
+    /// Where the sensor stood, if it is known: behind what it saw it did not see.
+    pub viewpoint: Option<DVec3>,
+}
+
+/// Most points that are kept of a file; of more, every second, third, … is.
+pub const MOST_POINTS: usize = 20_000_000;
+
+impl Cloud {
+    /// Scaled, then turned and shifted.
+    pub(crate) fn moved(mut self, scale: f64, rotation: DMat3, position: DVec3) -> Self {
+        let to_world = |p: DVec3| rotation * (scale * p) + position;
+        for p in &mut self.points {
+            *p = to_world(*p);
+        }
+        self.viewpoint = self.viewpoint.map(to_world);
+        self
+    }
+}
+
+/// Collects at most [`MOST_POINTS`] of `count` announced points, evenly.
+pub(crate) struct Collector {
+    points: Vec<DVec3>,
+    every: usize,
+    seen: usize,
+}
+
+impl Collector {
+    pub(crate) fn new(count: usize) -> Self {
+        Self {
+            points: Vec::new(),
+            every: count.div_ceil(MOST_POINTS).max(1),
+            seen: 0,
+        }
+    }
+
+    /// Points that are not finite are those that a sensor did not see.
+    pub(crate) fn add(&mut self, point: DVec3) {
+        if self.seen.is_multiple_of(self.every) && point.is_finite() && point.length() < 1e7 {
+            self.points.push(point);
+        }
+        self.seen += 1;
+    }
+
+    pub(crate) fn points(self) -> Vec<DVec3> {
+        self.points
+    }
+}

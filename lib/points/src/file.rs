@@ -1,0 +1,159 @@
+//! Points in files of every format that is known.
+use std::path::{Path, PathBuf};
+
+use dipir_cameras::{Camera, WorldUp, colmap, kitti, nuscenes};
+use glam::{DMat3, DVec3};
+
+use crate::cloud::{Cloud, Collector};
+use crate::error::PointsError;
+use crate::{depth, pcd, ply};
+
+/// Where points come from, and how their coordinates become the scene's.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Source<'a> {
+    /// `.ply`, `.pcd`, `.bin`, `.exr` or `.png` with depths, COLMAP's folder or its `points3D`.
+    pub path: &'a Path,
+    /// Which axis of the file points up; by default +z, +y for `.ply`, -y for COLMAP.
+    pub up: Option<WorldUp>,
+    /// Metres of a unit of the file.
+    pub scale: f64,
+    /// Where the sensor stood: KITTI's calibration (`.txt`) or a record of nuScenes (`.json`).
+    pub pose: Option<&'a Path>,
+    /// The photograph's camera, for depth maps.
+    pub camera: &'a Camera,
+}
+
+/// The file that [`read`] reads at `path`, which may be COLMAP's folder.
+pub fn part(path: &Path) -> PathBuf {
+    match path.is_dir() {
+        true => colmap::part(path, "points3D"),
+        false => path.into(),
+    }
+}
+
+/// Reads points.
+///
+/// # Errors
+/// On files that cannot be read, are damaged, or of a kind that is not known.
+pub fn read(source: &Source) -> Result<Cloud, PointsError> {
+    let path = part(source.path);
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    let extension = extension.as_deref().unwrap_or_default();
+    if extension == "exr" {
+        return depth::points(&depth::read_exr(&path)?, source.camera);
+    }
+    let bytes = read_bytes(&path)?;
+    if extension == "png" {
+        return depth::points(&depth::read_png(&bytes)?, source.camera);
+    }
+    let is_colmap = path.file_stem().is_some_and(|s| s == "points3D");
+    let (cloud, up) = match extension {
+        "txt" | "bin" if is_colmap => {
+            let points = colmap::read_points(&bytes, extension == "bin", WorldUp::Y)?;
+            (
+                Cloud {
+                    points,
+                    viewpoint: None,
+                },
+                WorldUp::MinusY,
+            )
+        }
+        "ply" => (ply::read(&bytes)?, WorldUp::Y),
+        "pcd" => (pcd::read(&bytes)?, WorldUp::Z),
+        "bin" => (sweep(&bytes)?, WorldUp::Z),
+        _ => {
+            return Err(PointsError::with_remedy(
+                "points'",
+                "it is not a kind of file that is known",
+                "use .ply, .pcd, .bin (4 or 5 floats a point), points3D of COLMAP, or depths as .exr \
+                 or .png",
+            ));
+        }
+    };
+    let (rotation, position) = match source.pose {
+        None => (source.up.unwrap_or(up).to_ours(), DVec3::ZERO),
+        Some(pose) => sensor(pose, source.up)?,
+    };
+    Ok(cloud.moved(source.scale, rotation, position))
+}
+
+fn read_bytes(path: &Path) -> Result<Vec<u8>, PointsError> {
+    dipir_files::read(path).map_err(|source| PointsError::Read {
+        path: path.into(),
+        source,
+    })
+}
+
+/// The sensor's rotation and position in our world.
+fn sensor(path: &Path, up: Option<WorldUp>) -> Result<(DMat3, DVec3), PointsError> {
+    let bytes = read_bytes(path)?;
+    let is_json = path
+        .extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("json"));
+    Ok(match is_json {
+        true => nuscenes::sensor(&bytes, up.unwrap_or(WorldUp::Z))?,
+        false => kitti::read_scanner(&String::from_utf8_lossy(&bytes))?,
+    })
+}
+
+/// A sweep of a laser scanner: x, y, z and intensity as floats of 32 bits, as in KITTI, or the ring,
+/// too, as in nuScenes.
+pub fn sweep(bytes: &[u8]) -> Result<Cloud, PointsError> {
+    let values = bytes.len() / 4;
+    let at = |i: usize| {
+        let value = bytes.get(4 * i..).and_then(|b| b.first_chunk());
+        value.map_or(f32::NAN, |b| f32::from_le_bytes(*b))
+    };
+    // The fifth value is the number of a ring; that of four would be a coordinate by chance.
+    let is_ring = |i: usize| {
+        let ring = at(5 * i + 4);
+        ring.fract() == 0.0 && (0.0..256.0).contains(&ring)
+    };
+    let rings = (0..(values / 5).min(1000)).all(is_ring);
+    let width = match (values % 4, values % 5) {
+        (_, 0) if rings => 5,
+        (0, _) => 4,
+        (_, 0) => 5,
+        _ => 0,
+    };
+    if !bytes.len().is_multiple_of(4) || width == 0 || values == 0 {
+        return Err(PointsError::new(
+            "sweep's",
+            format!("{} bytes are no points of four or five floats", bytes.len()),
+        ));
+    }
+    let count = values / width;
+    let mut found = Collector::new(count);
+    for i in 0..count {
+        let [x, y, z] = [0, 1, 2].map(|k| f64::from(at(width * i + k)));
+        found.add(DVec3::new(x, y, z));
+    }
+    Ok(Cloud {
+        points: found.points(),
+        viewpoint: Some(DVec3::ZERO),
+    })
+}
+
+/// Points out of the bytes of a PLY file.
+///
+/// # Errors
+/// If they are no PLY file with points.
+pub fn ply(bytes: &[u8]) -> Result<Cloud, PointsError> {
+    ply::read(bytes)
+}
+
+/// Points out of the bytes of a PCD file.
+///
+/// # Errors
+/// If they are no PCD file with points.
+pub fn pcd(bytes: &[u8]) -> Result<Cloud, PointsError> {
+    pcd::read(bytes)
+}
+
+/// The depths in the bytes of a PNG, metres.
+///
+/// # Errors
+/// If they are no grey PNG of 16 bits.
+pub fn depth_png(bytes: &[u8]) -> Result<dipir_imaging::raster::Raster<f32>, PointsError> {
+    depth::read_png(bytes)
+}

@@ -1,0 +1,208 @@
+//! The ground through the points that a camera sees.
+use dipir_cameras::Camera;
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+use crate::cloud::Cloud;
+use crate::error::PointsError;
+use crate::plane::{Plane, ransac, refine};
+use crate::relief::{Relief, relief};
+
+/// The ground of a scene, and how sure it is.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Ground {
+    /// A point of the plane below the camera, metres.
+    pub point: DVec3,
+    /// The plane's unit normal, upwards.
+    pub normal: DVec3,
+    /// Points on which the plane was looked for.
+    pub points: u64,
+    /// Those of them that lie on the ground, within three standard deviations.
+    pub inliers: u64,
+    /// Root mean square of their distances from it, metres.
+    pub residual_m: f64,
+    /// Heights over the plane, where the ground is not flat.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub relief: Option<Relief>,
+}
+
+/// Whether the ground may be other than a plane.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Shape {
+    /// A relief where the points are off the plane by more than their noise, and by more than matters:
+    /// 5 cm at 10 m.
+    #[default]
+    Auto,
+    /// A plane.
+    Plane,
+    /// A relief.
+    Relief,
+}
+
+/// How the ground is looked for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Search<'a> {
+    /// The photograph's camera.
+    pub camera: &'a Camera,
+    /// Roughly up in the world: the ground's normal is within [`MOST_TILT_DEG`] of it.
+    pub up: DVec3,
+    /// Whether it may be other than a plane.
+    pub shape: Shape,
+    /// Of the draws.
+    pub seed: u64,
+}
+
+/// Largest angle between the ground's normal and up, degrees: a slope of 36%.
+pub const MOST_TILT_DEG: f64 = 20.0;
+/// Points that are looked at, the nearest ones of what the camera sees.
+const MOST_USED: usize = 200_000;
+/// Fewest points with which a ground is believed.
+const FEWEST: usize = 30;
+/// Distance from a plane within which a draw counts a point, of the points' median distance from the
+/// camera: 5 cm at 10 m.
+const THRESHOLD: f64 = 0.005;
+/// Share of the points that must lie on the ground.
+const LEAST_SHARE: f64 = 0.05;
+
+/// Finds the ground below the camera.
+///
+/// # Errors
+/// If the camera sees too few points below itself, or too few of them lie on a plane.
+pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
+    let camera = search.camera;
+    let up = search.up.normalize();
+    let points = used(cloud, camera, up);
+    if points.len() < FEWEST {
+        return Err(PointsError::NoGround {
+            detail: format!("the camera sees {} of them below itself", points.len()),
+            remedy: "see whether points_up, points_scale and points_pose are right, or write plane",
+        });
+    }
+    let away = |p: &DVec3| p.distance(camera.pose.position);
+    let median = {
+        let mut distances: Vec<f64> = points.iter().map(away).collect();
+        let middle = distances.len() / 2;
+        *distances.select_nth_unstable_by(middle, f64::total_cmp).1
+    };
+    let threshold = THRESHOLD * median;
+    let most = MOST_TILT_DEG.to_radians();
+    let plane = ransac(&points, threshold, up, most, search.seed);
+    let found = plane.map(|plane| refine(&points, plane, threshold));
+    let none = |detail: String| PointsError::NoGround {
+        detail,
+        remedy: "see whether points_up is right, or write plane",
+    };
+    let (plane, sigma) =
+        found.ok_or_else(|| none("no three of them make a plane that lies flat".into()))?;
+    let under = plane.height(camera.pose.position);
+    let mut ground = Ground {
+        point: camera.pose.position - under * plane.normal,
+        normal: plane.normal,
+        points: points.len() as u64,
+        inliers: 0,
+        residual_m: 0.0,
+        relief: None,
+    };
+    ground.count(&points, 3.0 * sigma);
+    let share = ground.inliers as f64 / points.len() as f64;
+    if share < LEAST_SHARE || under <= 0.0 {
+        let percent = 100.0 * share;
+        return Err(none(format!(
+            "only {percent:.1}% lie on a plane below the camera"
+        )));
+    }
+    if search.shape != Shape::Plane {
+        let ahead = -camera.pose.rotation.z_axis;
+        if let Some((found, noise)) = relief(&points, &ground, ahead, sigma)
+            && (search.shape == Shape::Relief || !found.is_flat(threshold.max(3.0 * noise)))
+        {
+            ground.relief = Some(found);
+            ground.count(&points, 3.0 * noise);
+        }
+    }
+    Ok(ground)
+}
+
+/// The points below the camera that it sees, the nearest ones; all those below it, if it sees few.
+fn used(cloud: &Cloud, camera: &Camera, up: DVec3) -> Vec<DVec3> {
+    let [w, h] = camera.lens.size;
+    let below = |p: &&DVec3| (**p - camera.pose.position).dot(up) < 0.0;
+    let seen = |p: &&DVec3| {
+        let pixel = camera.project(**p).map(|seen| seen.pixel);
+        pixel.is_some_and(|p| (0.0..=w).contains(&p.x) && (0.0..=h).contains(&p.y))
+    };
+    let below = cloud.points.iter().filter(below);
+    let mut points: Vec<DVec3> = below.clone().filter(seen).copied().collect();
+    if points.len() < FEWEST {
+        points = below.copied().collect();
+    }
+    if points.len() > MOST_USED {
+        let away = |p: &DVec3| p.distance_squared(camera.pose.position);
+        let order = |a: &DVec3, b: &DVec3| away(a).total_cmp(&away(b));
+        points.select_nth_unstable_by(MOST_USED, order);
+        points.truncate(MOST_USED);
+    }
+    points
+}
+
+impl Ground {
+    /// Counts the points within `reach` of the ground, and their distances from it.
+    fn count(&mut self, points: &[DVec3], reach: f64) {
+        let off = points.iter().map(|p| self.height(*p));
+        let on: Vec<f64> = off.filter(|h| h.abs() <= reach).collect();
+        let squares = on.iter().map(|h| h * h).sum::<f64>();
+        self.inliers = on.len() as u64;
+        self.residual_m = (squares / on.len().max(1) as f64).sqrt();
+    }
+
+    /// Metres over the ground, along the plane's normal.
+    pub fn height(&self, point: DVec3) -> f64 {
+        let over_plane = self.normal.dot(point - self.point);
+        over_plane - self.relief.as_ref().map_or(0.0, |r| r.height(point))
+    }
+
+    /// The point of the ground below or above `point`, along the plane's normal.
+    pub fn below(&self, point: DVec3) -> DVec3 {
+        point - self.height(point) * self.normal
+    }
+
+    /// The first point of the ground on a ray from above it; the direction has any length.
+    pub fn hit(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {
+        let descent = -self.normal.dot(direction);
+        let height = self.normal.dot(origin - self.point);
+        if !(height > 0.0 && descent > 1e-6 * direction.length()) {
+            return None;
+        }
+        let mut point = origin + height / descent * direction;
+        // A relief is low and smooth: each step leaves slope over descent of the error.
+        for _ in 0..if self.relief.is_some() { 40 } else { 0 } {
+            point += self.height(point) / descent * direction;
+        }
+        let above = (point - origin).dot(direction) > 0.0;
+        (above && self.height(point).abs() < 1e-3 * height).then_some(point)
+    }
+
+    /// In one line, for people.
+    pub fn words(&self) -> String {
+        let shape = match &self.relief {
+            Some(relief) => format!(
+                "not flat: a relief of {} by {} cells",
+                relief.columns, relief.rows
+            ),
+            None => "a plane".into(),
+        };
+        format!(
+            "{shape}, on which {} of {} points lie within {:.3} m (rms)",
+            self.inliers, self.points, self.residual_m
+        )
+    }
+}
+
+impl From<&Ground> for Plane {
+    fn from(ground: &Ground) -> Self {
+        Self {
+            normal: ground.normal,
+            offset: ground.normal.dot(ground.point),
+        }
+    }
+}

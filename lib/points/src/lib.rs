@@ -1,0 +1,18 @@
+//! Points of a scene, as scanners, reconstructions and depth maps give them: their files, the ground
+//! through them, and free places on it.
+//!
+//! Coordinates are those of dipir: right-handed, +y up, metres.
+pub mod cloud;
+pub mod depth;
+pub mod error;
+pub mod file;
+pub mod ground;
+mod pcd;
+pub mod place;
+mod plane;
+mod ply;
+pub mod relief;
+
+pub use cloud::Cloud;
+pub use error::PointsError;
+pub use ground::{Ground, ground};

@@ -1,0 +1,156 @@
+//! PCD files of the Point Cloud Library, ASCII and binary.
+use glam::{DQuat, DVec3};
+
+use crate::cloud::{Cloud, Collector};
+use crate::error::PointsError;
+
+const FORMAT: &str = "PCD";
+/// Longer headers are none.
+const MOST_HEADER: usize = 1 << 16;
+/// Most bytes of one point.
+const MOST_STRIDE: usize = 1 << 16;
+
+fn wrong(detail: impl Into<String>) -> PointsError {
+    PointsError::new(FORMAT, detail)
+}
+
+#[derive(Default)]
+struct Header {
+    fields: Vec<String>,
+    sizes: Vec<usize>,
+    kinds: Vec<String>,
+    counts: Vec<usize>,
+    points: usize,
+    viewpoint: Vec<f64>,
+    data: String,
+}
+
+/// Reads `x`, `y` and `z` of all points, moved to where the header's viewpoint says.
+pub(crate) fn read(bytes: &[u8]) -> Result<Cloud, PointsError> {
+    let (header, body) = header(bytes)?;
+    let axes = ["x", "y", "z"].map(|name| header.fields.iter().position(|f| f == name));
+    let [Some(x), Some(y), Some(z)] = axes else {
+        return Err(wrong("its points have no x, y and z"));
+    };
+    let points = match header.data.as_str() {
+        "ascii" => ascii(&header, [x, y, z], &String::from_utf8_lossy(body))?,
+        "binary" => binary(&header, [x, y, z], body)?,
+        other => {
+            return Err(PointsError::with_remedy(
+                FORMAT,
+                format!(
+                    "its data are \"{}\"; accepted: ascii, binary",
+                    other.escape_debug()
+                ),
+                "convert it with pcl_convert_pcd_ascii_binary in.pcd out.pcd 1",
+            ));
+        }
+    };
+    let cloud = Cloud {
+        points,
+        viewpoint: Some(DVec3::ZERO),
+    };
+    let [tx, ty, tz, qw, qx, qy, qz] = header.viewpoint[..] else {
+        return Ok(cloud);
+    };
+    let (q, t) = (DQuat::from_xyzw(qx, qy, qz, qw), DVec3::new(tx, ty, tz));
+    let turns = (q.length() - 1.0).abs() < 1e-3 && t.is_finite();
+    if !turns {
+        return Err(wrong("its viewpoint is no rotation and position"));
+    }
+    Ok(cloud.moved(1.0, glam::DMat3::from_quat(q.normalize()), t))
+}
+
+fn header(bytes: &[u8]) -> Result<(Header, &[u8]), PointsError> {
+    let mut header = Header::default();
+    let mut at = 0;
+    while at < bytes.len().min(MOST_HEADER) {
+        let end = bytes[at..].iter().position(|&b| b == b'\n');
+        let end = end.map_or(bytes.len(), |n| at + n);
+        let line = String::from_utf8_lossy(&bytes[at..end]).into_owned();
+        at = (end + 1).min(bytes.len());
+        let bad = || wrong(format!("its header says \"{}\"", line.escape_debug()));
+        let (key, values) = line.trim().split_once(' ').unwrap_or((line.trim(), ""));
+        let words = || values.split_whitespace();
+        let numbers = || -> Result<Vec<usize>, PointsError> {
+            words().map(|w| w.parse().map_err(|_| bad())).collect()
+        };
+        match key {
+            "FIELDS" => header.fields = words().map(Into::into).collect(),
+            "SIZE" => header.sizes = numbers()?,
+            "TYPE" => header.kinds = words().map(Into::into).collect(),
+            "COUNT" => header.counts = numbers()?,
+            "POINTS" => header.points = values.trim().parse().map_err(|_| bad())?,
+            "VIEWPOINT" => {
+                let values = words().map(|w| w.parse::<f64>().map_err(|_| bad()));
+                header.viewpoint = values.collect::<Result<_, _>>()?;
+            }
+            "DATA" => {
+                header.data = values.trim().into();
+                return header.checked().map(|h| (h, &bytes[at..]));
+            }
+            _ => {}
+        }
+    }
+    Err(wrong("its header has no DATA"))
+}
+
+impl Header {
+    fn checked(mut self) -> Result<Self, PointsError> {
+        let n = self.fields.len();
+        if self.counts.is_empty() {
+            self.counts = vec![1; n];
+        }
+        let whole = [self.sizes.len(), self.kinds.len(), self.counts.len()];
+        let small = |v: &Vec<usize>| v.iter().all(|&v| v <= MOST_STRIDE);
+        if whole != [n; 3] || !small(&self.sizes) || !small(&self.counts) {
+            return Err(wrong("FIELDS, SIZE, TYPE and COUNT do not belong together"));
+        }
+        Ok(self)
+    }
+}
+
+fn ascii(header: &Header, axes: [usize; 3], body: &str) -> Result<Vec<DVec3>, PointsError> {
+    let column = |field: usize| header.counts[..field].iter().sum::<usize>();
+    let columns = axes.map(column);
+    let mut found = Collector::new(header.points);
+    let lines = body.lines().filter(|l| !l.trim().is_empty());
+    for (i, line) in lines.take(header.points).enumerate() {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let at = |k: usize| words.get(columns[k]).and_then(|w| w.parse().ok());
+        let (Some(x), Some(y), Some(z)) = (at(0), at(1), at(2)) else {
+            return Err(wrong(format!("point {i} cannot be read")));
+        };
+        found.add(DVec3::new(x, y, z));
+    }
+    Ok(found.points())
+}
+
+fn binary(header: &Header, axes: [usize; 3], body: &[u8]) -> Result<Vec<DVec3>, PointsError> {
+    let bytes = |field: usize| header.sizes[field] * header.counts[field];
+    let offset = |field: usize| (0..field).map(bytes).sum::<usize>();
+    let stride = offset(header.fields.len());
+    for field in axes {
+        if header.kinds[field] != "F" || ![4, 8].contains(&header.sizes[field]) {
+            return Err(wrong("its coordinates are no numbers of 4 or 8 bytes"));
+        }
+    }
+    if stride > MOST_STRIDE || body.len() / stride.max(1) < header.points {
+        return Err(wrong("it is cut short"));
+    }
+    let places = axes.map(|field| (offset(field), header.sizes[field]));
+    let mut found = Collector::new(header.points);
+    for point in body.chunks_exact(stride).take(header.points) {
+        let at = |(offset, size): (usize, usize)| {
+            let bytes = &point[offset..offset + size];
+            match bytes.first_chunk::<8>() {
+                Some(wide) => f64::from_le_bytes(*wide),
+                None => bytes
+                    .first_chunk()
+                    .map_or(0.0, |b| f64::from(f32::from_le_bytes(*b))),
+            }
+        };
+        found.add(DVec3::from_array(places.map(at)));
+    }
+    Ok(found.points())
+}

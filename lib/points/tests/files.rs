@@ -1,0 +1,274 @@
+//! The same points in every format, and what is read back.
+use std::path::Path;
+
+use dipir_cameras::{Camera, Lens, Pose, WorldUp};
+use dipir_imaging::layers::{Layers, Precision};
+use dipir_imaging::raster::Raster;
+use dipir_points::depth;
+use dipir_points::file::{self, Source};
+use glam::{DVec2, DVec3};
+use proptest::prelude::*;
+
+/// In axes with +z up, with digits that 32 bits hold.
+const POINTS: [[f32; 3]; 6] = [
+    [0.5, 1.0, 0.25],
+    [-2.0, 3.5, 0.0],
+    [10.0, -4.0, 1.5],
+    [0.0, 0.0, 0.0],
+    [7.25, 8.5, -0.75],
+    [1.0, 1.0, 1.0],
+];
+
+fn ours() -> Vec<DVec3> {
+    let turned = |[x, y, z]: [f32; 3]| DVec3::new(x.into(), z.into(), -f64::from(y));
+    POINTS.map(turned).to_vec()
+}
+
+fn bytes(values: &[f32], big: bool) -> Vec<u8> {
+    let of = |v: &f32| {
+        if big {
+            v.to_be_bytes()
+        } else {
+            v.to_le_bytes()
+        }
+    };
+    values.iter().flat_map(of).collect()
+}
+
+fn ply(format: &str) -> Vec<u8> {
+    let mut file = format!(
+        "ply\nformat {format} 1.0\ncomment scan\nelement camera 1\nproperty list uchar int ids\n\
+         element vertex {}\nproperty float x\nproperty uchar red\nproperty float y\nproperty float z\n\
+         element face 0\nproperty list uchar int vertex_indices\nend_header\n",
+        POINTS.len()
+    )
+    .into_bytes();
+    let big = format.ends_with("big_endian");
+    match format {
+        "ascii" => {
+            file.extend(b"2 5 6\n");
+            for [x, y, z] in POINTS {
+                file.extend(format!("{x} 200 {y} {z}\n").bytes());
+            }
+        }
+        _ => {
+            file.push(2);
+            file.extend([0u8; 8]);
+            for [x, y, z] in POINTS {
+                file.extend([bytes(&[x], big), vec![200], bytes(&[y, z], big)].concat());
+            }
+        }
+    }
+    file
+}
+
+fn pcd(data: &str) -> Vec<u8> {
+    let n = POINTS.len() + 1;
+    let mut file = format!(
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS intensity x y z normal\nSIZE 1 4 4 4 4\nTYPE U F F F F\n\
+         COUNT 1 1 1 1 2\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {data}\n"
+    )
+    .into_bytes();
+    let all = POINTS.into_iter().chain([[f32::NAN; 3]]);
+    for [x, y, z] in all {
+        match data {
+            "ascii" => file.extend(format!("9 {x} {y} {z} 0 1\n").bytes()),
+            _ => file.extend([vec![9], bytes(&[x, y, z, 0.0, 1.0], false)].concat()),
+        }
+    }
+    file
+}
+
+fn sweep(width: usize) -> Vec<u8> {
+    let more = [0.37, 31.0];
+    let points = POINTS
+        .iter()
+        .flat_map(|p| [&p[..], &more[..width - 3]].concat());
+    bytes(&points.collect::<Vec<_>>(), false)
+}
+
+fn camera() -> Camera {
+    Camera {
+        pose: Pose {
+            position: DVec3::new(0.0, 0.75, 0.0),
+            ..Pose::IDENTITY
+        },
+        lens: Lens::pinhole([80.0, 60.0], DVec2::splat(70.0)),
+    }
+}
+
+fn source<'a>(path: &'a Path, camera: &'a Camera) -> Source<'a> {
+    Source {
+        path,
+        up: Some(WorldUp::Z),
+        scale: 1.0,
+        pose: None,
+        camera,
+    }
+}
+
+fn near(found: &[DVec3], want: &[DVec3], what: &str) {
+    assert_eq!(found.len(), want.len(), "{what}");
+    for (a, b) in found.iter().zip(want) {
+        assert!(a.distance(*b) < 1e-9, "{what}: {a} {b}");
+    }
+}
+
+#[test]
+fn every_format_gives_the_same_points() {
+    let folder = tempfile::tempdir().unwrap();
+    let camera = camera();
+    let colmap_text: String = POINTS
+        .iter()
+        .map(|[x, y, z]| format!("1 {x} {y} {z} 255 0 0 0.5 1 2\n"))
+        .collect();
+    let mut colmap = (POINTS.len() as u64).to_le_bytes().to_vec();
+    for point in POINTS {
+        colmap.extend(1u64.to_le_bytes());
+        colmap.extend(point.iter().flat_map(|v| f64::from(*v).to_le_bytes()));
+        colmap.extend([0; 11 + 8]);
+    }
+    let files = [
+        ("a.ply", ply("ascii")),
+        ("b.ply", ply("binary_little_endian")),
+        ("c.ply", ply("binary_big_endian")),
+        ("d.pcd", pcd("ascii")),
+        ("e.pcd", pcd("binary")),
+        ("f.bin", sweep(4)),
+        ("g.pcd.bin", sweep(5)),
+        ("points3D.txt", colmap_text.into_bytes()),
+        ("points3D.bin", colmap),
+    ];
+    for (name, bytes) in files {
+        let path = folder.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        let cloud = file::read(&source(&path, &camera)).unwrap();
+        near(&cloud.points, &ours(), name);
+    }
+    // The folder stands for its points.
+    let cloud = file::read(&source(folder.path(), &camera)).unwrap();
+    near(&cloud.points, &ours(), "folder");
+}
+
+#[test]
+fn scale_axis_and_sensor_move_points() {
+    let folder = tempfile::tempdir().unwrap();
+    let camera = camera();
+    let put = |name: &str, bytes: &[u8]| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        path
+    };
+    let scan = put("scan.bin", &sweep(4));
+    let scaled = file::read(&Source {
+        scale: 2.0,
+        ..source(&scan, &camera)
+    });
+    assert_eq!(scaled.unwrap().points[0], 2.0 * ours()[0]);
+    // A lidar 1.8 m over the ground, turned to the left by 90 degrees.
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    let record = format!(
+        "{{\"translation\": [1, 0, 1.8], \"rotation\": [{half}, 0, 0, {half}], \"camera_intrinsic\": []}}"
+    );
+    let record = put("lidar.json", record.as_bytes());
+    let moved = file::read(&Source {
+        pose: Some(&record),
+        ..source(&scan, &camera)
+    });
+    let cloud = moved.unwrap();
+    // (0.5, 1, 0.25) becomes (-1, 0.5, 0.25), shifted (0, 0.5, 2.05) with +z up.
+    assert!(cloud.points[0].abs_diff_eq(DVec3::new(0.0, 2.05, -0.5), 1e-9));
+    assert!(
+        cloud
+            .viewpoint
+            .unwrap()
+            .abs_diff_eq(DVec3::new(1.0, 1.8, 0.0), 1e-9)
+    );
+}
+
+#[test]
+fn a_depth_map_gives_the_points_that_the_camera_sees() {
+    let folder = tempfile::tempdir().unwrap();
+    let camera = camera();
+    // The ground 0.75 m below a level camera, at half the photograph's size.
+    let depth = |i: usize| {
+        let below = (i / 40) as f64 + 0.5 - 15.0;
+        if below > 0.0 {
+            (0.75 * 35.0 / below) as f32
+        } else {
+            0.0
+        }
+    };
+    let depth = Raster::from_pixels(40, 30, (0..1200).map(depth).collect());
+    let exr = folder.path().join("depth.exr");
+    let mut layers = Layers::new(40, 30);
+    layers.insert("Z", Precision::Full, depth.clone()).unwrap();
+    layers.write_exr(&exr).unwrap();
+    let png = folder.path().join("depth.png");
+    let millimetres = depth.pixels().iter().map(|m| (m * 1e3).round() as u16);
+    let grey = image::ImageBuffer::<image::Luma<u16>, _>::from_raw(
+        40,
+        30,
+        millimetres.collect::<Vec<_>>(),
+    );
+    grey.unwrap().save(&png).unwrap();
+    for (path, tolerance) in [(exr, 1e-5), (png, 1e-3)] {
+        let cloud = file::read(&source(&path, &camera)).unwrap();
+        assert_eq!(cloud.points.len(), 600);
+        for point in &cloud.points {
+            // Half a millimetre of the nearest depths is less in height.
+            assert!(point.y.abs() < tolerance, "{point}");
+        }
+        assert_eq!(cloud.viewpoint, Some(camera.pose.position));
+    }
+    let wide = Raster::filled(40, 10, 1.0f32);
+    let error = depth::points(&wide, &camera).unwrap_err().to_string();
+    assert!(
+        error.contains("it has 40 x 10 pixels, and the photograph 80 x 60"),
+        "{error}"
+    );
+}
+
+#[test]
+fn what_is_no_points_is_explained() {
+    let said = |bytes: &[u8]| file::pcd(bytes).unwrap_err().to_string();
+    let packed = String::from_utf8(pcd("ascii"))
+        .unwrap()
+        .replace("DATA ascii", "DATA binary_compressed");
+    assert!(said(packed.as_bytes()).contains("pcl_convert_pcd_ascii_binary"));
+    assert!(file::sweep(&[0; 7]).is_err());
+    assert!(file::sweep(&[]).is_err());
+    let many = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\n\
+                property float y\nproperty float z\nend_header\n";
+    let error = file::ply(many.as_bytes()).unwrap_err().to_string();
+    assert!(error.contains("it is cut short"), "{error}");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(512))]
+
+    /// Points that are finite, or an error, never a panic.
+    #[test]
+    fn damaged_files_never_panic(
+        damage in proptest::collection::vec((0usize..600, any::<u8>()), 0..8),
+        length in 0usize..700,
+    ) {
+        let damaged = |bytes: &[u8]| {
+            let mut bytes = bytes.to_vec();
+            for (at, value) in &damage {
+                let at = at % bytes.len();
+                bytes[at] = *value;
+            }
+            bytes.truncate(length);
+            bytes
+        };
+        let formats = ["ascii", "binary_little_endian", "binary_big_endian"];
+        let plys = formats.map(|f| file::ply(&damaged(&ply(f))));
+        let pcds = ["ascii", "binary"].map(|f| file::pcd(&damaged(&pcd(f))));
+        let sweeps = [4, 5].map(|w| file::sweep(&damaged(&sweep(w))));
+        for cloud in plys.into_iter().chain(pcds).chain(sweeps).flatten() {
+            prop_assert!(cloud.points.iter().all(|p| p.is_finite()));
+        }
+        let _ = file::depth_png(&damaged(&pcd("binary")));
+    }
+}
