@@ -3,13 +3,13 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use dipir_benchmark::command_line::{
-    Cli, Command, MakeArgs, MethodsArgs, ReportArgs, RunArgs, SpheresArgs, StudyCommand,
-    StudyCountArgs, StudyPageArgs,
+    Cli, Command, LeftOutArgs, MakeArgs, MethodsArgs, ReportArgs, RunArgs, SpheresArgs,
+    StudyCommand, StudyCountArgs, StudyPageArgs,
 };
 use dipir_benchmark::folder::EvaluationFolder;
 use dipir_benchmark::methods::{self, Method};
 use dipir_benchmark::run::Step;
-use dipir_benchmark::{make, report, run, spheres, study};
+use dipir_benchmark::{left_out, make, report, run, spheres, study};
 use dipir_cli::exit::{self, describe};
 use dipir_cli::progress::Progress;
 use serde_json::json;
@@ -22,6 +22,7 @@ fn main() -> ExitCode {
         Command::Study(StudyCommand::Page(args)) => write_study(&args),
         Command::Study(StudyCommand::Count(args)) => count_answers(&args),
         Command::Methods(args) => list_methods(&args),
+        Command::LeftOut(args) => compare_left_out(&args),
         Command::Spheres(args) => compare_spheres(&args),
     })
 }
@@ -35,6 +36,30 @@ fn make_scenes(args: &MakeArgs) -> anyhow::Result<()> {
     args.folder.output.result(
         || format!("{} scenes in {}", made.len(), scenes.display()),
         || json!({"scenes": made, "folder": evaluation.root()}),
+    );
+    Ok(())
+}
+
+fn compare_left_out(args: &LeftOutArgs) -> anyhow::Result<()> {
+    let progress = Progress::new("left-out", args.folder.output.quiet);
+    let out = &args.folder.out;
+    let settings = left_out::Settings {
+        panoramas: args.panoramas.clone(),
+        weights: args.weights.clone(),
+        models: args.models.clone(),
+        views: args.views,
+        seed: args.seed,
+        target_error: args.target_error,
+        parts: args.parts,
+        cache: out.join("left-out"),
+        sheet: args.sheet,
+    };
+    let outcome = left_out::run(&settings, &|share| progress.set(share))?;
+    progress.done();
+    outcome.write(out)?;
+    args.folder.output.result(
+        || outcome.tables.trim_end().to_string(),
+        || json!({"scenes": outcome.scenes}),
     );
     Ok(())
 }

@@ -10,8 +10,10 @@ use dipir_cli::exit;
 use dipir_cli::interrupt::{self, Interrupted};
 use dipir_cli::progress::Progress;
 use dipir_cli::session::duration;
+use dipir_places::Progress as Step;
+use dipir_places::figures::table;
 use dipir_pretraining::command_line::{
-    CheckArgs, Cli, Command, DataArgs, EncoderArgs, SheetArgs, TrainArgs,
+    CheckArgs, Cli, Command, DataArgs, EncoderArgs, LightArgs, SheetArgs, TrainArgs,
 };
 use dipir_pretraining::dataset::{Dataset, SceneMix};
 use dipir_pretraining::trainer::TrainerSettings;
@@ -28,6 +30,7 @@ fn main() -> ExitCode {
         match &cli.command {
             Command::Train(args) => train(args, &cli.output),
             Command::Encoder(args) => train_encoder(args, &cli.output),
+            Command::Light(args) => train_light(args, &cli.output),
             Command::Check(args) => check(args, &cli.output),
             Command::Sheet(args) => sheet(args),
         }
@@ -117,6 +120,46 @@ fn train_encoder(args: &EncoderArgs, output: &OutputArgs) -> anyhow::Result<()> 
     output.result(
         || format!("wrote {}, loss {loss:.4}", path.display()),
         || json!({"file": path, "examples": args.samples, "loss": loss}),
+    );
+    Ok(())
+}
+
+fn train_light(args: &LightArgs, output: &OutputArgs) -> anyhow::Result<()> {
+    let settings = args.settings()?;
+    let (progress, clock) = (Progress::new("light", output.quiet), Instant::now());
+    let done = Mutex::new(vec![0.0; settings.folds]);
+    let outcome = dipir_places::run(&settings, &|step| {
+        let (fold, share) = match step {
+            Step::Training(fold, share, _) => (fold, share),
+            Step::Kept(fold) => (fold, 1.0),
+            Step::Places(_) | Step::Photographs(_) => return !interrupt::asked(),
+        };
+        if let Ok(mut done) = done.lock() {
+            done[fold] = share;
+            progress.set(done.iter().sum::<f64>() / done.len() as f64);
+        }
+        !interrupt::asked()
+    });
+    interrupt::check()?;
+    let outcome = outcome?;
+    progress.done();
+    let (file, seconds) = (&args.out, clock.elapsed().as_secs_f64());
+    output.result(
+        || {
+            let tables = [
+                ("as dipir-evaluate takes photographs", &outcome.standard),
+                ("any camera", &outcome.any),
+                ("places that were trained on", &outcome.seen),
+            ];
+            let texts = tables.map(|(name, rows)| format!("{name}\n{}", table(rows)));
+            format!(
+                "{}\nwrote {} in {}",
+                texts.join("\n"),
+                file.display(),
+                duration(seconds)
+            )
+        },
+        || json!({"file": file, "standard": outcome.standard, "any": outcome.any, "elapsed_s": seconds}),
     );
     Ok(())
 }

@@ -33,6 +33,7 @@ fn a_photograph_without_a_light_asks_no_model_and_records_nothing() {
     for name in [
         "estimate.json",
         "candidates.json",
+        "candidates.png",
         "surroundings.exr",
         "environment.exr",
         "tone.json",

@@ -1,6 +1,8 @@
 //! `dipir-pretrain`: runs from a model, and errors.
 use std::time::{Duration, Instant};
 
+use dipir_light::environment::EnvironmentMap;
+use glam::Vec3;
 use serde_json::Value;
 
 use crate::project::{PRETRAIN, Project, Run};
@@ -202,4 +204,52 @@ fn an_encoder_starts_from_that_of_a_model() {
         .map(|tile| tile.into_raw())
         .collect();
     assert!(tiles.len() > 90, "{} of 96 differ", tiles.len());
+}
+
+#[test]
+fn the_light_estimator_is_trained_on_a_folder_of_panoramas() {
+    let project = Project::new();
+    std::fs::create_dir(project.path("maps")).unwrap();
+    for (name, grey) in [("hall", 0.2), ("yard", 0.6)] {
+        let map = EnvironmentMap::constant(64, 32, Vec3::splat(grey));
+        map.write(project.path("maps").join(format!("{name}.exr")))
+            .unwrap();
+    }
+    let small = [
+        "--folds",
+        "2",
+        "--networks",
+        "1",
+        "--views",
+        "2",
+        "--judged",
+        "1",
+        "--hidden",
+        "4",
+        "--epochs",
+        "1",
+    ];
+    let command = [
+        "light",
+        "maps",
+        "out/places.safetensors",
+        "--json",
+        "--quiet",
+        "--keep-folds",
+    ];
+    let run = project.run(PRETRAIN, &[&command[..], &small].concat());
+    run.expect_success();
+    let told: Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!(told["standard"][0]["photographs"], 2);
+    for extension in ["safetensors", "json", "fold0", "fold1"] {
+        let file = project.path("out/places").with_extension(extension);
+        assert!(file.is_file(), "{}", file.display());
+    }
+    let none = project.run(PRETRAIN, &["light", "nowhere", "out/places.safetensors"]);
+    assert_eq!(none.code, Some(1));
+    assert!(
+        none.stderr.contains("cannot read `nowhere`"),
+        "{}",
+        none.stderr
+    );
 }

@@ -18,6 +18,7 @@ Examples:
   dipir-evaluate report --lpips alex.safetensors               with LPIPS
   dipir-evaluate study page --method ours                      a page that asks people
   dipir-evaluate study count answers/*.json                    majorities of the answers
+  dipir-evaluate left-out maps/ places.safetensors             composites on places that were left out of training
   dipir-evaluate spheres true.exr estimate.exr                 two lights, by what three spheres show of them
 
 Everything is in one folder, ./evaluation unless --out says otherwise: scenes/, runs/, report.*.
@@ -44,6 +45,8 @@ pub enum Command {
     Study(StudyCommand),
     /// List the methods
     Methods(MethodsArgs),
+    /// Compare composites under the estimated light on places that its networks were not trained on
+    LeftOut(LeftOutArgs),
     /// Compare two lights by a mirror, a glossy and a diffuse sphere
     Spheres(SpheresArgs),
 }
@@ -199,6 +202,44 @@ pub struct SpheresArgs {
 
     #[command(flatten)]
     pub output: OutputArgs,
+}
+
+#[derive(Args)]
+pub struct LeftOutArgs {
+    #[command(flatten)]
+    pub folder: FolderArgs,
+
+    /// Folder of the panoramas that the estimator was trained on
+    #[arg(value_name = "PANORAMAS")]
+    pub panoramas: PathBuf,
+
+    /// The weights that the training wrote, with the networks of each fold beside them
+    #[arg(value_name = "WEIGHTS")]
+    pub weights: PathBuf,
+
+    /// Folder of models, GLB, glTF or OBJ, beside the generator's solids
+    #[arg(long, value_name = "DIR")]
+    pub models: Option<PathBuf>,
+
+    /// Views of each place
+    #[arg(long, value_name = "N", default_value_t = 2)]
+    pub views: usize,
+
+    /// Seed of views and objects
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+
+    /// Display-referred RMSE of every composite
+    #[arg(long, value_name = "RMSE", default_value_t = 0.015)]
+    pub target_error: f32,
+
+    /// Render the estimate with parts of it replaced by the truth's, too
+    #[arg(long)]
+    pub parts: bool,
+
+    /// Write photograph, truth, neutral light and estimate of this many scenes as left-out.png
+    #[arg(long, value_name = "N", default_value_t = 24)]
+    pub sheet: usize,
 }
 
 #[derive(Subcommand)]

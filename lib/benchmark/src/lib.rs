@@ -7,6 +7,7 @@
 pub mod command_line;
 pub mod folder;
 mod generated;
+pub mod left_out;
 mod lights;
 pub mod make;
 pub mod methods;

@@ -29,4 +29,4 @@ pub use posterior::PeakPosterior;
 pub use visible::{Visible, merged};
 
 /// Raised whenever the same photograph and camera get another estimate.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;

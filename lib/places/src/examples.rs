@@ -47,19 +47,24 @@ pub struct Example {
 impl Example {
     /// The photograph that `view` takes of a place.
     pub fn new(place: &Place, number: usize, view: &View, probes: &Probes, seed: u64) -> Self {
-        let (small, scale) = view.take(place, seed);
+        let (small, gain, curve) = view.take(place, seed);
         let reference = small.reference();
+        let mut truth = Truth::new(place, view.heading, gain * curve / reference, probes);
+        if let Some(albedo) = probes.albedo {
+            truth.develop(|x| view.develop(albedo * x * reference / curve) / albedo / reference);
+        }
         Self {
             place: number,
             features: [small.features(), small.mirrored().features()],
             reference,
-            truth: Truth::new(place, view.heading, scale / reference, probes),
+            truth,
         }
     }
 }
 
 impl Truth {
-    fn new(place: &Place, heading: usize, scale: Vec3, probes: &Probes) -> Self {
+    /// The light of a place for a view turned by `heading` columns, `scale` times the panorama's.
+    pub fn new(place: &Place, heading: usize, scale: Vec3, probes: &Probes) -> Self {
         let smooth: Vec<Vec3> = probes
             .of_smooth(&place.smooth, heading)
             .iter()
@@ -98,6 +103,13 @@ impl Truth {
             sun: place.sun,
             stops: mean.log2(),
             log_base,
+        }
+    }
+
+    /// Makes of each probe the light under which a surface looks as the camera's curve shows it.
+    fn develop(&mut self, shown: impl Fn(f32) -> f32) {
+        for p in self.all.iter_mut().chain(&mut self.smooth) {
+            *p = Vec3::from_array(p.to_array().map(&shown));
         }
     }
 

@@ -121,15 +121,16 @@ impl Case {
     }
 }
 
-fn picture_error(found: &[Vec3], truth: &[Vec3]) -> f64 {
+fn picture_error(found: &[Vec3], truth: &[Vec3], probes: &Probes) -> f64 {
     let shown = |v: f32| f64::from(Transfer::Srgb.encode_scalar(ALBEDO * v));
-    let mut sum = 0.0;
-    for (a, b) in found.iter().zip(truth).take(NORMALS) {
+    let (mut sum, mut total) = (0.0, 0.0);
+    for ((a, b), strength) in found.iter().zip(truth).zip(&probes.strength).take(NORMALS) {
         for c in 0..3 {
-            sum += (shown(a[c]) - shown(b[c])).powi(2);
+            sum += f64::from(*strength) * (shown(a[c]) - shown(b[c])).powi(2);
+            total += f64::from(*strength);
         }
     }
-    (sum / (3 * NORMALS) as f64).sqrt()
+    (sum / total).sqrt()
 }
 
 fn mean_irradiance(probes: &[Vec3]) -> f64 {
@@ -176,10 +177,10 @@ fn errors(case: &Case, constant: f32, probes: &Probes) -> Errors {
     let mean_square = found[..NORMALS].iter().zip(&truth).map(square).sum::<f64>() / NORMALS as f64;
     let e = &case.estimate;
     Errors {
-        neutral: picture_error(&grey(1.0), &truth),
-        scaled: picture_error(&grey(constant), &truth),
-        estimate: picture_error(&found, &truth),
-        exposed: picture_error(&matched, &truth),
+        neutral: picture_error(&grey(1.0), &truth, probes),
+        scaled: picture_error(&grey(constant), &truth, probes),
+        estimate: picture_error(&found, &truth, probes),
+        exposed: picture_error(&matched, &truth, probes),
         stops: (here / there).log2().abs(),
         relative: mean_square.sqrt() / there,
         vector: angle_deg(vector(&found, probes), vector(&truth, probes)),
@@ -189,12 +190,13 @@ fn errors(case: &Case, constant: f32, probes: &Probes) -> Errors {
     }
 }
 
-fn best_constant(cases: &[&Case]) -> f32 {
+fn best_constant(cases: &[&Case], probes: &Probes) -> f32 {
     let error = |scale: f32| -> f64 {
         let one = |c: &&Case| {
             picture_error(
                 &vec![Vec3::splat(c.example.reference * scale); PROBES],
                 &c.truth(),
+                probes,
             )
         };
         cases.iter().map(one).sum()
@@ -215,6 +217,7 @@ pub fn figures(cases: &[Case], probes: &Probes) -> Vec<Figures> {
                     .iter()
                     .filter(|c| c.fold != f || folds == 1)
                     .collect::<Vec<_>>(),
+                probes,
             )
         })
         .collect();
@@ -363,7 +366,7 @@ fn exposure_calibration(cases: &[&Case], probes: &Probes) -> [f64; 2] {
             let scale = (exposure * (weight * told).exp2()) as f32;
             let light: Vec<Vec3> = found.iter().take(NORMALS).map(|p| *p * scale).collect();
             let off = mean_irradiance(&light) / mean_irradiance(truth).max(1e-9);
-            picture_error(&light, truth) + STOP * off.max(1e-9).log2().abs()
+            picture_error(&light, truth, probes) + STOP * off.max(1e-9).log2().abs()
         };
         lights.iter().map(one).sum()
     };

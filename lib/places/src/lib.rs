@@ -8,7 +8,7 @@ pub mod figures;
 mod loss;
 mod network;
 pub mod place;
-mod probes;
+pub mod probes;
 pub mod run;
 #[cfg(test)]
 mod tests;

@@ -108,7 +108,7 @@ fn picture(
             let smooth: f32 = row.iter().zip(&base).map(|(w, b)| w * b).sum();
             let judge = |found: f32, wanted: f32, strength: f32| {
                 let ((a, slope), (b, _)) = (shown(found * reference), shown(wanted * reference));
-                let scale = strength / (3 * PROBES) as f32;
+                let scale = strength * probes.strength[p] / (3 * PROBES) as f32;
                 (
                     scale * (a - b) * (a - b),
                     2.0 * scale * (a - b) * slope * reference,

@@ -27,6 +27,10 @@ pub struct Probes {
     blur_area: f32,
     /// Probe of the mirrored light.
     pub mirrored: Vec<usize>,
+    /// How much each probe counts; 1 in the mean.
+    pub strength: Vec<f32>,
+    /// Reflectance of the surfaces that are to look as the camera's curve shows them; light itself without it.
+    pub albedo: Option<f32>,
 }
 
 impl Default for Probes {
@@ -73,6 +77,8 @@ impl Default for Probes {
                 .chain(half.iter().map(|k| k + NORMALS))
                 .collect(),
             normals: normals.clone(),
+            strength: vec![1.0; PROBES],
+            albedo: None,
         };
         all.base = all.matrix(&base);
         all.smooth = all.matrix(&texels);
@@ -88,6 +94,23 @@ fn blur(cos: f32) -> f32 {
 }
 
 impl Probes {
+    /// Surfaces count by how much of them a camera sees, to the share `facing`; with `albedo` they are to look as the
+    /// camera's curve shows surfaces of that reflectance.
+    pub fn seen(facing: f32, albedo: Option<f32>) -> Self {
+        let mut all = Self {
+            albedo,
+            ..Self::default()
+        };
+        // Cameras look down a little.
+        let camera = Vec3::new(0.0, 0.25, 1.0).normalize();
+        let face = |n: &Vec3| n.dot(camera).max(0.0);
+        let total: f32 = all.normals.iter().map(face).sum();
+        for (s, n) in all.strength.iter_mut().zip(&all.normals) {
+            *s = facing * face(n) / total * NORMALS as f32 + 1.0 - facing;
+        }
+        all
+    }
+
     fn matrix(&self, sources: &[(Vec3, f32)]) -> Vec<f32> {
         let row = |p: usize| {
             sources

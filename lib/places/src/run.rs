@@ -33,8 +33,16 @@ pub struct Settings {
     pub places: Option<usize>,
     /// Seed of photographs and networks.
     pub seed: u64,
+    /// Share to which surfaces count by how much of them a camera sees.
+    pub facing: f32,
+    /// Reflectance of the surfaces that are to look as the camera's curve shows them.
+    pub albedo: Option<f32>,
     /// How networks are trained.
     pub training: Training,
+    /// Whether the networks of each fold stay beside the weights as `.foldN`, calibrated on the other folds: for
+    /// figures on places that nothing of them has seen.
+    #[serde(skip)]
+    pub keep: bool,
 }
 
 impl Settings {
@@ -49,7 +57,10 @@ impl Settings {
             judged: 8,
             places: None,
             seed: 1,
+            facing: 0.8,
+            albedo: Some(0.3),
             training: Training::default(),
+            keep: false,
         }
     }
 }
@@ -98,7 +109,7 @@ pub fn run(
     }
     progress(Progress::Places(places.len()));
     let fold = folds(&places, settings.folds);
-    let probes = Probes::default();
+    let probes = Probes::seen(settings.facing, settings.albedo);
     let photographs = drawn(&places, settings.views, &probes, settings.seed);
     let judged = standard(&places, settings.judged, &probes);
     progress(Progress::Photographs(photographs.len() + judged.len()));
@@ -273,10 +284,13 @@ fn finish(
     let text =
         serde_json::to_string_pretty(&outcome).map_err(|e| PlacesError::Setting(e.to_string()))?;
     write(&settings.out.with_extension("json"), text.as_bytes())?;
-    for f in 0..settings.folds {
-        for extension in [format!("fold{f}"), format!("fold{f}.json")] {
-            // Only what this run made; a fold that is gone already is no loss.
-            std::fs::remove_file(settings.out.with_extension(extension)).ok();
+    for (f, member) in crossed.iter().enumerate() {
+        let file = |extension: String| settings.out.with_extension(extension);
+        // Only what this run made; a fold that is gone already is no loss.
+        std::fs::remove_file(file(format!("fold{f}.json"))).ok();
+        match settings.keep {
+            true => write(&file(format!("fold{f}")), &member.to_bytes()?)?,
+            false => drop(std::fs::remove_file(file(format!("fold{f}")))),
         }
     }
     Ok(outcome)

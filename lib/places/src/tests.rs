@@ -66,7 +66,8 @@ fn the_sun_is_found_relative_to_the_view() {
 fn probes_hold_the_irradiance_of_the_panorama() {
     let (p, probes) = (place("yard", 0.3), Probes::default());
     let e = Example::new(&p, 0, &View::standard(0), &probes, 0);
-    let scale = View::standard(0).take(&p, 0).1 / e.reference;
+    let (_, gain, curve) = View::standard(0).take(&p, 0);
+    let scale = gain * curve / e.reference;
     for (k, normal) in probes.normals.iter().enumerate() {
         let truth: Vec3 = (0..128 * 64)
             .map(|t| {
@@ -206,4 +207,37 @@ fn training_goes_on_from_finished_folds_to_the_same_bytes() {
     assert_eq!(kept.into_inner().unwrap(), [0]);
     let bytes = |s: &Settings| std::fs::read(&s.out).unwrap();
     assert_eq!(bytes(&whole), bytes(&stopped));
+}
+
+#[test]
+fn surfaces_count_by_how_much_of_them_a_camera_sees() {
+    let probes = Probes::seen(0.8, None);
+    let surfaces = &probes.strength[..crate::probes::NORMALS];
+    let mean = surfaces.iter().sum::<f32>() / surfaces.len() as f32;
+    assert!((mean - 1.0).abs() < 1e-5, "{mean}");
+    for (strength, normal) in surfaces.iter().zip(&probes.normals) {
+        // Away from the camera a fifth is left.
+        assert!(
+            *strength >= 0.2 - 1e-6 && (*strength > 0.21) == (normal.z + 0.25 * normal.y > 1e-3)
+        );
+    }
+}
+
+#[test]
+fn with_an_albedo_the_light_to_learn_shows_a_surface_as_the_curve_does() {
+    let p = place("yard", 0.3);
+    let (plain, told) = (Probes::default(), Probes::seen(0.0, Some(0.3)));
+    let view = View::standard(0);
+    let (_, _, curve) = view.take(&p, 0);
+    let a = Example::new(&p, 0, &view, &plain, 0);
+    let b = Example::new(&p, 0, &view, &told, 0);
+    for (light, shown) in a.truth.all.iter().zip(&b.truth.all) {
+        // `x / (1 + x)` of the exposed light.
+        let exposed = 0.3 * light.y * a.reference / curve;
+        let display = 0.3 * shown.y * a.reference;
+        assert!(
+            (display - exposed / (1.0 + exposed)).abs() < 1e-4,
+            "{display} {exposed}"
+        );
+    }
 }

@@ -101,7 +101,7 @@ impl View {
     }
 
     /// From linear light to linear display values.
-    fn develop(&self, x: f32) -> f32 {
+    pub fn develop(&self, x: f32) -> f32 {
         let x = x.max(0.0);
         let y = 0.6 * x;
         let film = (y * (2.51 * y + 0.03) / (y * (2.43 * y + 0.59) + 0.14)).min(1.0);
@@ -109,9 +109,9 @@ impl View {
         curves.iter().zip(self.curve).map(|(c, w)| c * w).sum()
     }
 
-    /// The photograph as the estimator looks at it, and what a place's radiance is multiplied by to be on the
-    /// photograph's scale.
-    pub fn take(&self, place: &Place, seed: u64) -> (SmallPhoto, Vec3) {
+    /// The photograph as the estimator looks at it, the exposure of each channel, and what the curve makes of grey
+    /// under the place's mean light, over its light: a place's radiance times both is on the photograph's scale.
+    pub fn take(&self, place: &Place, seed: u64) -> (SmallPhoto, Vec3, f32) {
         let camera = self.camera();
         let turn = self.heading as f32 / SMOOTH[0] as f32 * TAU;
         let side = SIDE * RAYS;
@@ -151,7 +151,8 @@ impl View {
         let grey = (GREY * luminance(place.mean()) * exposure).max(1e-6);
         (
             SmallPhoto::of_small(small, &camera),
-            gain * (self.develop(grey) / grey),
+            gain,
+            self.develop(grey) / grey,
         )
     }
 }

@@ -5,6 +5,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand};
 use dipir_cli::args::OutputArgs;
 use dipir_cli::exit::Usage;
+use dipir_places::Settings as LightSettings;
+use dipir_places::trainer::Training;
 use dipir_prior::energy::TIMESTEP_SHARES;
 
 use crate::architecture::Architecture;
@@ -19,6 +21,7 @@ Examples:
   dipir-pretrain encoder --out model --cache scenes    train its light encoder
   dipir-pretrain train --out model --cache scenes --from data/prior --relit 0.4 --learning-rate 4e-4
                                                        continue the training of a model
+  dipir-pretrain light panoramas places.safetensors    train the light estimator on panoramas of real places
   dipir-pretrain check model                           how well it recognises light in new scenes
   dipir-pretrain check model --first 1000 --scenes 48  the same on other scenes, to tune on
   dipir-pretrain sheet model sheet.png                 pictures under captions of light
@@ -43,6 +46,8 @@ pub enum Command {
     Train(TrainArgs),
     /// Train the light encoder of a model
     Encoder(EncoderArgs),
+    /// Train the light estimator on panoramas of real places, and measure it on places left out
+    Light(LightArgs),
     /// Measure how well a model recognises light, on held-out scenes
     Check(CheckArgs),
     /// Sample pictures under captions of light
@@ -198,6 +203,77 @@ impl EncoderArgs {
                 seed: self.seed,
                 learning_rate: self.learning_rate,
             },
+        })
+    }
+}
+
+#[derive(Args)]
+pub struct LightArgs {
+    /// Folder of panoramas, HDR or EXR; panoramas.tsv in it (columns name, kind) may name kinds of places
+    #[arg(value_name = "PANORAMAS")]
+    pub panoramas: PathBuf,
+    /// The weights to write; figures are written beside them as .json
+    #[arg(value_name = "OUT")]
+    pub out: PathBuf,
+    /// Folds of places; each is left out once
+    #[arg(long, value_name = "N", default_value_t = 6)]
+    pub folds: usize,
+    /// Networks of each fold, whose answers are averaged
+    #[arg(long, value_name = "N", default_value_t = 2)]
+    pub networks: usize,
+    /// Photographs of each place to train on
+    #[arg(long, value_name = "N", default_value_t = 128)]
+    pub views: usize,
+    /// Photographs of each place that figures are made of
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    pub judged: usize,
+    /// Train on at most this many places of each fold: for the error over the number of places
+    #[arg(long, value_name = "N")]
+    pub places: Option<usize>,
+    /// Key of all random numbers
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub seed: u64,
+    /// Units of each hidden layer
+    #[arg(long, value_name = "N", default_value_t = Training::default().hidden)]
+    pub hidden: usize,
+    /// Passes over all photographs
+    #[arg(long, value_name = "N", default_value_t = Training::default().epochs)]
+    pub epochs: usize,
+    /// Share of hidden units that a step leaves out
+    #[arg(long, value_name = "SHARE", default_value_t = Training::default().dropout)]
+    pub dropout: f32,
+    /// Share of a weight that a unit of learning rate removes
+    #[arg(long, value_name = "SHARE", default_value_t = Training::default().weight_decay)]
+    pub decay: f32,
+    /// Highest learning rate
+    #[arg(long, value_name = "RATE", default_value_t = Training::default().learning_rate)]
+    pub learning_rate: f32,
+    /// Keep the networks that each fold was left out of as OUT.foldN, for dipir-evaluate left-out
+    #[arg(long)]
+    pub keep_folds: bool,
+}
+
+impl LightArgs {
+    /// The training of these arguments. An error names a value that is out of range.
+    pub fn settings(&self) -> Result<LightSettings, Usage> {
+        check_rate(f64::from(self.learning_rate))?;
+        Ok(LightSettings {
+            folds: self.folds,
+            networks: self.networks,
+            views: self.views,
+            judged: self.judged,
+            places: self.places,
+            seed: self.seed,
+            training: Training {
+                hidden: self.hidden,
+                epochs: self.epochs,
+                dropout: self.dropout,
+                weight_decay: self.decay,
+                learning_rate: self.learning_rate,
+                ..Training::default()
+            },
+            keep: self.keep_folds,
+            ..LightSettings::new(self.panoramas.clone(), self.out.clone())
         })
     }
 }

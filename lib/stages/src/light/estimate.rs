@@ -1,7 +1,7 @@
 //! The light that is estimated from the photograph and, where something is known of the sun, from that.
 use anyhow::Context;
 use dipir_cli::session::Session;
-use dipir_estimator::{Estimator, KnownAngle, KnownSun, LightEstimate};
+use dipir_estimator::{Candidate, Estimator, KnownAngle, KnownSun, LightEstimate};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_optimize::settings::LightTable;
@@ -33,6 +33,8 @@ pub(super) struct Estimated {
     pub(super) estimate: LightEstimate,
     /// Lights that it allows, the most probable first.
     pub(super) candidates: Vec<CandidateEntry>,
+    /// The same as lights.
+    pub(super) lights: Vec<Candidate>,
     /// The chosen light as lobes, its sources first.
     pub(super) lobes: Vec<SphericalGaussian>,
     /// How many of the lobes are sources that [`smooth`](Self::smooth) lacks.
@@ -51,7 +53,7 @@ pub(super) fn estimate(
 ) -> anyhow::Result<Estimated> {
     let estimate = distribution(session, table, loaded)?;
     let candidates = estimate.candidates(CANDIDATES);
-    let entry = |(k, c): (usize, &dipir_estimator::Candidate)| CandidateEntry {
+    let entry = |(k, c): (usize, &Candidate)| CandidateEntry {
         candidate: k + 1,
         probability: c.probability,
         words: c.words.clone(),
@@ -81,6 +83,7 @@ pub(super) fn estimate(
     Ok(Estimated {
         estimate,
         candidates: entries,
+        lights: candidates,
         lobes,
         sources,
         smooth,

@@ -1,6 +1,7 @@
 //! The light stage: estimates the light of the photograph, or recovers light and tone curves under
 //! which the object looks as the guidance asks.
 pub mod at_hand;
+mod candidates;
 mod done;
 mod estimate;
 pub mod folder;
@@ -147,6 +148,13 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     };
     let found = found.with_surroundings(&request, &inputs, estimated);
     write_results(&request.settings, &found, resume.as_ref(), &mut writer)?;
+    if let Some(estimated) = &found.estimated {
+        let (loaded, simulation) = (&inputs.scene.loaded, inputs.scene.effects.simulation());
+        let (estimate, lights) = (&estimated.estimate, &estimated.lights);
+        let visible = request.shows_visible();
+        let sheet = candidates::sheet(loaded, &simulation, estimate, lights, visible)?;
+        write_png(writer.output("candidates_sheet", "candidates.png")?, &sheet)?;
+    }
     let manifest = writer.finish()?;
     if let Some(resume) = resume {
         resume.remove();

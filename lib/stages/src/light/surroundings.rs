@@ -10,7 +10,7 @@ use dipir_scene::scene::LoadedScene;
 /// view when it is reflected by a small object.
 pub(super) const MAP: [usize; 2] = [512, 256];
 /// Width of the soft border of the photograph in the map, degrees.
-const BORDER_DEG: f32 = 6.0;
+pub(super) const BORDER_DEG: f32 = 6.0;
 /// A lobe narrower than this, radians, is traced as a lobe: two texels of the map.
 const NARROW: f32 = 2.0 * std::f32::consts::TAU / MAP[0] as f32;
 

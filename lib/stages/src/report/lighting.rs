@@ -29,6 +29,8 @@ use crate::preview::environment;
 const MAP_WIDTH: usize = 512;
 /// Lobes in the table, and drawn: the strongest.
 const MOST_LOBES: usize = 12;
+/// Longest side of the sheet of candidates.
+const SHEET: usize = 768;
 /// Longest side of a preview.
 const PREVIEW: usize = 256;
 
@@ -118,7 +120,13 @@ fn estimate(run: &(PathBuf, Manifest), estimate: &LightEstimate) -> anyhow::Resu
         ]
     });
     let heads = [">candidate", ">probability", "light", "to use it"];
-    Ok(Html::all([sentence, table(&heads, rows.collect())]))
+    let mut parts = vec![sentence, table(&heads, rows.collect())];
+    for (_, path) in outputs(run, "candidates_sheet") {
+        let shown = Transfer::Srgb.encode(&read_photo(path, Transfer::Srgb)?.image);
+        let caption = "the candidates by number, row by row; bars are their probabilities";
+        parts.push(figure(&shown, SHEET, caption)?);
+    }
+    Ok(Html::all(parts))
 }
 
 /// The map of `[composite] environment`.

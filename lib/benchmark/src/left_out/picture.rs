@@ -1,0 +1,161 @@
+//! Rendering a scene under a light, and laying it over the photograph.
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::Arc;
+
+use dipir_evaluation::results::write;
+use dipir_imaging::composite::composite;
+use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
+use dipir_imaging::tone::{ToneCurves, ToneParameters};
+use dipir_imaging::transfer::Transfer;
+use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
+use dipir_render::adaptive::Stop;
+use dipir_render::effects::EffectsPlan;
+use dipir_render::render::{Renderer, Settings};
+use glam::Vec3;
+
+use super::scene::{DrawnScene, SIDE};
+
+/// What is done to the object's light before it is laid over the photograph.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Curve {
+    /// Nothing: light is on the photograph's scale.
+    None,
+    /// `x / (1 + x)`, the photographs' curve.
+    Reinhard,
+    /// Straight in the shadows, rolled off in the lights.
+    RollOff,
+}
+
+/// A rendered object and its shadow.
+#[derive(Clone)]
+pub struct Layers {
+    /// Radiance, premultiplied.
+    pub object: LinearImage,
+    /// Coverage.
+    pub alpha: Raster<f32>,
+    /// Ratio of light with the object to light without it.
+    pub shadow: LinearImage,
+}
+
+impl Layers {
+    /// Renders `scene` under `light`, or reads what an earlier run rendered into `cache`.
+    pub fn render(
+        scene: &DrawnScene,
+        light: &Arc<EnvironmentMap>,
+        target_error: f32,
+        cache: &Path,
+    ) -> anyhow::Result<Self> {
+        let file = cache.join(key(scene, light, target_error));
+        if let Some(layers) = std::fs::read(&file).ok().and_then(|b| Self::from_bytes(&b)) {
+            return Ok(layers);
+        }
+        let settings = Settings {
+            stop: Stop::TargetError(target_error),
+            max_samples: 1024,
+            background: Some(&scene.photo),
+            highlights: false,
+            ..Settings::default()
+        };
+        let renderer = Renderer::new(&scene.scene);
+        let simulation = EffectsPlan::everything(&scene.scene, &settings).simulation();
+        let light = EnvironmentSampler::new(light.clone());
+        let rendered = renderer.render(&light, &simulation, &settings, &mut |_| {
+            ControlFlow::Continue(())
+        })?;
+        let layers = Self {
+            object: LinearImage(rendered.film.object),
+            alpha: rendered.film.alpha,
+            shadow: LinearImage(rendered.film.shadow),
+        };
+        write(&file, layers.to_bytes())?;
+        Ok(layers)
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        let colours = self.object.0.pixels().iter().chain(self.shadow.0.pixels());
+        let all = colours
+            .flat_map(|p| p.to_array())
+            .chain(self.alpha.pixels().iter().copied());
+        all.flat_map(f32::to_le_bytes).collect()
+    }
+
+    fn from_bytes(bytes: &[u8]) -> Option<Self> {
+        let count = SIDE * SIDE;
+        let values: Vec<f32> = bytes
+            .chunks_exact(4)
+            .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+            .collect();
+        if values.len() != 7 * count {
+            return None;
+        }
+        let colours = |from: usize| {
+            let pixels = values[3 * from..3 * (from + count)]
+                .chunks(3)
+                .map(Vec3::from_slice);
+            LinearImage(Raster::from_pixels(SIDE, SIDE, pixels.collect()))
+        };
+        Some(Self {
+            object: colours(0),
+            shadow: colours(count),
+            alpha: Raster::from_pixels(SIDE, SIDE, values[6 * count..].to_vec()),
+        })
+    }
+
+    /// The same under `factor` times the light, where `brighter` is under three times the light: what the
+    /// photograph itself reflects onto the object does not grow.
+    pub fn exposed(&self, brighter: &Self, factor: f32) -> Self {
+        let t = 0.5 * (factor - 1.0);
+        let pairs = self
+            .object
+            .0
+            .pixels()
+            .iter()
+            .zip(brighter.object.0.pixels());
+        let pixels = pairs
+            .map(|(a, b)| (*a + (*b - *a) * t).max(Vec3::ZERO))
+            .collect();
+        Self {
+            object: LinearImage(Raster::from_pixels(SIDE, SIDE, pixels)),
+            ..self.clone()
+        }
+    }
+
+    /// The composite as it is displayed.
+    pub fn over(&self, photo: &LinearImage, curve: Curve) -> anyhow::Result<DisplayImage> {
+        let curves = match curve {
+            Curve::None => None,
+            Curve::Reinhard => Some(ToneCurves::identity()),
+            Curve::RollOff => Some(ToneParameters::camera().curves()),
+        };
+        let object = match curves {
+            Some(curves) => curves.apply_object(&self.object, &self.alpha),
+            None => self.object.clone(),
+        };
+        let linear = composite(photo, &object, &self.alpha, &self.shadow)?;
+        Ok(Transfer::Srgb.encode(&linear))
+    }
+}
+
+fn key(scene: &DrawnScene, light: &EnvironmentMap, target_error: f32) -> String {
+    let mut hash = blake3::Hasher::new();
+    hash.update(scene.name.as_bytes());
+    let floats = |hash: &mut blake3::Hasher, values: &[f32]| {
+        let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        hash.update(&bytes);
+    };
+    let camera = &scene.scene.camera;
+    floats(&mut hash, &camera.position.to_array());
+    floats(&mut hash, &camera.rotation.to_cols_array());
+    floats(&mut hash, &[camera.focal_px.x, target_error]);
+    let flat = |pixels: &[Vec3]| {
+        pixels
+            .iter()
+            .flat_map(|p| p.to_array())
+            .collect::<Vec<f32>>()
+    };
+    floats(&mut hash, &flat(&scene.scene.mesh.positions));
+    floats(&mut hash, &flat(scene.photo.0.pixels()));
+    floats(&mut hash, &flat(light.texels()));
+    hash.finalize().to_hex()[..32].to_string()
+}
