@@ -114,10 +114,10 @@ impl Arrangement {
         loaded_proxy: &Proxy,
     ) -> anyhow::Result<Self> {
         let settings = config.validate()?;
-        let (camera, mut warnings) = settings
-            .camera
-            .with_facts(facts)?
-            .resolve(facts.size, base_dir)?;
+        let lens = settings.camera.with_facts(facts)?;
+        // Of a lens that distorts, the camera of the undistorted picture, which is what is shown.
+        let (camera, _) = lens.resolve(facts.size, base_dir)?;
+        let mut warnings = Vec::new();
         let proxy = match &settings.proxy {
             dipir_scene::config::ProxySettings::Plane(plane) => Proxy::Plane(*plane),
             _ => loaded_proxy.clone(),

@@ -87,7 +87,7 @@ impl SmallScene {
         }
         let props = Arc::new(Props {
             models,
-            facts: loaded.photo.facts.clone(),
+            facts: loaded.taken().facts.clone(),
             proxy: loaded.scene.proxy.clone(),
             base_dir,
         });

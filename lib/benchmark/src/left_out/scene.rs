@@ -15,7 +15,7 @@ use dipir_scene::material::Material;
 use dipir_scene::placement::{Anchor, Placement, Rest, Size};
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
-use dipir_stages::scene::background::{MID_GREY, View, exposure_ev_to};
+use dipir_stages::scene::background::{MID_GREY, PanoramaView, exposure_ev_to};
 use glam::{DVec3, Vec2, Vec3, Vec4};
 
 /// Columns and rows of photographs.
@@ -135,7 +135,7 @@ impl DrawnScene {
         let heading = between([0.0, SMOOTH[0] as f32]) as usize % SMOOTH[0];
         let (fov, down, fills) = (between(FOV_DEG), between(DOWN_DEG), between(FILLS));
         let (turn, which) = (between([0.0, std::f32::consts::TAU]), between([0.0, 1e4]));
-        let view = View {
+        let view = PanoramaView {
             fov_rad: fov.to_radians(),
             yaw_rad: heading as f32 / SMOOTH[0] as f32 * std::f32::consts::TAU,
             pitch_rad: -down.to_radians(),
@@ -163,7 +163,7 @@ impl DrawnScene {
 }
 
 /// The object on the ground in the middle of the picture.
-fn scene(view: &View, fills: f32, turn: f32, object: Imported) -> anyhow::Result<Scene> {
+fn scene(view: &PanoramaView, fills: f32, turn: f32, object: Imported) -> anyhow::Result<Scene> {
     let rotation = view.rotation();
     let (low, high) = object.mesh.bounds().unwrap_or((Vec3::ZERO, Vec3::ONE));
     let scale = OBJECT_M / (high - low).max_element().max(1e-6);
