@@ -50,7 +50,7 @@ fn the_page_shows_every_stage_and_needs_no_other_file() {
         "Guidance",
         "iteration 15",
         " toy ",
-        "Loss of the personalisation",
+        "Loss at fixed crops, timesteps and noise",
         "after 3 updates",
         ">memory</th",
         " MiB",

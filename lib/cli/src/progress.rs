@@ -236,10 +236,13 @@ mod tests {
     fn nothing_is_said_before_there_is_something_to_judge_by() {
         let mut course = Course::new(Instant::now());
         course.set(s(1.0), 0.01);
-        course.set(s(100.0), 0.015);
-        assert_eq!(course.left_s(s(100.0)), None);
-        course.set(s(101.0), 0.02);
-        assert!(course.left_s(s(101.0)).is_some());
+        course.set(s(20.0), 0.015);
+        assert_eq!(course.left_s(s(20.0)), None);
+        // A fiftieth of the work is enough, and so is half a minute of it.
+        course.set(s(21.0), 0.02);
+        assert!(course.left_s(s(21.0)).is_some());
+        course.set(s(40.0), 0.015);
+        assert!(course.left_s(s(40.0)).is_some());
         let mut fast = Course::new(Instant::now());
         fast.set(s(0.1), 0.01);
         fast.set(s(1.9), 0.5);

@@ -194,7 +194,10 @@ impl Document {
     /// If there is no such object.
     pub fn put_at(&mut self, index: usize, point: DVec3) -> anyhow::Result<()> {
         let point = numbers(point.to_array().map(|x| rounded(x, 4)));
-        set(self.object(index)?, "position", point);
+        let table = self.object(index)?;
+        table.remove("place");
+        table.remove("place_draw");
+        set(table, "position", point);
         Ok(())
     }
 

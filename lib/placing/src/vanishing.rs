@@ -55,6 +55,8 @@ pub const CLICK_PX: f64 = 1.5;
 
 /// Fields of view that are believed, degrees.
 const BELIEVED: std::ops::Range<f64> = 2.0..150.0;
+/// The uncertainty of an angle of which nothing is known, degrees.
+const NOTHING_DEG: f64 = 90.0;
 
 /// The camera that sees `lines`; what they do not tell is as in `camera`.
 ///
@@ -71,8 +73,11 @@ pub fn solve(lines: &Lines, camera: &Camera) -> anyhow::Result<Solution> {
             _ => &mut moved.first,
         };
         pair[k % 8 / 4][k % 4 / 2][k % 2] += CLICK_PX;
-        // Lines that stop meeting when they are moved a little say nothing.
-        let (other, _) = turn_of(&moved, camera)?;
+        let Ok((other, _)) = turn_of(&moved, camera) else {
+            // Lines that contradict each other when they are moved a little say nothing.
+            squares = [NOTHING_DEG * NOTHING_DEG; 3];
+            break;
+        };
         for (sum, (a, b)) in squares.iter_mut().zip([
             (turn.pitch_deg, other.pitch_deg),
             (turn.roll_deg, other.roll_deg),

@@ -71,7 +71,10 @@ const LEAST_SHARE: f64 = 0.05;
 pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     let camera = search.camera;
     let up = search.up.normalize();
-    let points = used(cloud, camera, up);
+    let Used {
+        seen: points,
+        below,
+    } = used(cloud, camera, up);
     if points.len() < FEWEST {
         return Err(PointsError::NoGround {
             detail: format!("the camera sees {} of them below itself", points.len()),
@@ -86,8 +89,16 @@ pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     };
     let threshold = THRESHOLD * median;
     let most = MOST_TILT_DEG.to_radians();
-    let plane = ransac(&points, threshold, up, most, search.seed);
-    let found = plane.map(|plane| refine(&points, plane, threshold));
+    // Things may hide most of the ground that the camera looks at: a plane is looked for all around, and
+    // refined on what the camera sees if a third of that is ground.
+    let plane = ransac(&below, threshold, up, most, search.seed);
+    let found = plane.map(|plane| {
+        let on = |p: &&DVec3| plane.height(**p).abs() < threshold;
+        match 3 * points.iter().filter(on).count() < points.len() {
+            true => refine(&below, plane, threshold),
+            false => refine(&points, plane, threshold),
+        }
+    });
     let none = |detail: String| PointsError::NoGround {
         detail,
         remedy: "see whether points_up is right, or write plane",
@@ -104,7 +115,8 @@ pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
         relief: None,
     };
     ground.count(&points, 3.0 * sigma);
-    let share = ground.inliers as f64 / points.len() as f64;
+    let on = |p: &&DVec3| plane.height(**p).abs() <= 3.0 * sigma;
+    let share = below.iter().filter(on).count() as f64 / below.len() as f64;
     if share < LEAST_SHARE || under <= 0.0 {
         let percent = 100.0 * share;
         return Err(none(format!(
@@ -123,26 +135,36 @@ pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     Ok(ground)
 }
 
-/// The points below the camera that it sees, the nearest ones; all those below it, if it sees few.
-fn used(cloud: &Cloud, camera: &Camera, up: DVec3) -> Vec<DVec3> {
+/// Points below the camera.
+struct Used {
+    /// Those that the camera sees, the nearest ones; all of them, if it sees few.
+    seen: Vec<DVec3>,
+    /// All around, the nearest ones.
+    below: Vec<DVec3>,
+}
+
+fn used(cloud: &Cloud, camera: &Camera, up: DVec3) -> Used {
     let [w, h] = camera.lens.size;
-    let below = |p: &&DVec3| (**p - camera.pose.position).dot(up) < 0.0;
-    let seen = |p: &&DVec3| {
+    let from = camera.pose.position;
+    let below = cloud.points.iter().filter(|p| (**p - from).dot(up) < 0.0);
+    let mut below: Vec<DVec3> = below.copied().collect();
+    let is_seen = |p: &&DVec3| {
         let pixel = camera.project(**p).map(|seen| seen.pixel);
         pixel.is_some_and(|p| (0.0..=w).contains(&p.x) && (0.0..=h).contains(&p.y))
     };
-    let below = cloud.points.iter().filter(below);
-    let mut points: Vec<DVec3> = below.clone().filter(seen).copied().collect();
-    if points.len() < FEWEST {
-        points = below.copied().collect();
+    let mut seen: Vec<DVec3> = below.iter().filter(is_seen).copied().collect();
+    for points in [&mut seen, &mut below] {
+        if points.len() > MOST_USED {
+            let away = |p: &DVec3| p.distance_squared(from);
+            let order = |a: &DVec3, b: &DVec3| away(a).total_cmp(&away(b));
+            points.select_nth_unstable_by(MOST_USED, order);
+            points.truncate(MOST_USED);
+        }
     }
-    if points.len() > MOST_USED {
-        let away = |p: &DVec3| p.distance_squared(camera.pose.position);
-        let order = |a: &DVec3, b: &DVec3| away(a).total_cmp(&away(b));
-        points.select_nth_unstable_by(MOST_USED, order);
-        points.truncate(MOST_USED);
+    if seen.len() < FEWEST {
+        seen.clone_from(&below);
     }
-    points
+    Used { seen, below }
 }
 
 impl Ground {

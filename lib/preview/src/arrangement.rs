@@ -105,18 +105,20 @@ fn part(mesh: &TriangleMesh, triangles: std::ops::Range<usize>) -> TriangleMesh 
 
 impl Arrangement {
     /// Places the objects of `config`. Photograph and models are those that were read; a plane
-    /// may be another one.
+    /// may be another one. An object with `place = "auto"` stays where `loaded_maps`, from its file to
+    /// the world, have it.
     pub fn new(
         config: &SceneConfig,
         base_dir: &Path,
         facts: &Facts,
         models: &[Model],
         loaded_proxy: &Proxy,
+        loaded_maps: &[DMat4],
     ) -> anyhow::Result<Self> {
         let settings = config.validate()?;
         let lens = settings.camera.with_facts(facts)?;
         // Of a lens that distorts, the camera of the undistorted picture, which is what is shown.
-        let (camera, _) = lens.resolve(facts.size, base_dir)?;
+        let (camera, undistortion) = lens.resolve(facts.size, base_dir)?;
         let mut warnings = Vec::new();
         let proxy = match &settings.proxy {
             dipir_scene::config::ProxySettings::Plane(plane) => Proxy::Plane(*plane),
@@ -125,16 +127,25 @@ impl Arrangement {
         let mut objects = Vec::new();
         for (i, object) in settings.objects.iter().enumerate() {
             let key = format!("scene.objects[{i}]");
-            let placement = object
-                .pixels
-                .place(&object.placement, &camera, &proxy, &key)?;
+            let pixels = match &undistortion {
+                Some(way) => object.pixels.undistorted(way, &key)?,
+                None => object.pixels,
+            };
+            let placement = pixels.place(&object.placement, &camera, &proxy, &key)?;
             let found = models.iter().position(|m| m.path == object.path);
             let model = found.with_context(|| {
                 format!("{key}.path: \"{}\" was not read", object.path.display())
             })?;
             let mesh = &models[model];
-            let (map, warning) = placement.resolve(&mesh.mesh, mesh.origin, &proxy, &key)?;
-            warnings.extend(warning);
+            let map = match (object.auto, loaded_maps.get(i)) {
+                (Some(_), Some(map)) => *map * DMat4::from_translation(mesh.origin),
+                _ => {
+                    let (map, warning) =
+                        placement.resolve(&mesh.mesh, mesh.origin, &proxy, &key)?;
+                    warnings.extend(warning);
+                    map
+                }
+            };
             objects.push(Placed::new(model, mesh, map, &placement, &proxy));
         }
         Ok(Self {

@@ -13,6 +13,7 @@ use dipir_scene::plausibility::implausible;
 use dipir_scene::proxy::Proxy;
 use dipir_scene::scene::{LoadedScene, Scene};
 use dipir_stages::scene::with_place;
+use glam::DMat4;
 
 use crate::arrangement::{Arrangement, Model};
 
@@ -30,6 +31,8 @@ pub struct Props {
     pub models: Vec<Model>,
     facts: Facts,
     proxy: Proxy,
+    /// From each object's file to the world, as it was read.
+    maps: Vec<DMat4>,
     /// The folder that paths of the configuration start from.
     base_dir: PathBuf,
 }
@@ -55,6 +58,7 @@ impl Props {
             &self.facts,
             &self.models,
             &self.proxy,
+            &self.maps,
         )
     }
 }
@@ -89,6 +93,9 @@ impl SmallScene {
             models,
             facts: loaded.taken().facts.clone(),
             proxy: loaded.scene.proxy.clone(),
+            maps: (loaded.description.objects.iter())
+                .map(|o| o.transform())
+                .collect(),
             base_dir,
         });
         let mut arrangement = props.arranged(&config)?;
