@@ -1,5 +1,5 @@
 //! The server of the page.
-use std::io::Read;
+use std::io::{Read, Write};
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,7 +11,7 @@ use dipir_cli::exit::describe;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::json;
-use tiny_http::{Header, Request, Response, Server};
+use tiny_http::{Request, Server, StatusCode};
 
 use crate::desk::Desk;
 use crate::edit::Edit;
@@ -144,7 +144,8 @@ impl Place {
         // A body that is too long is thrown away while the answer is sent, for as long as it comes:
         // no thread that serves others waits for it.
         let respond = move || {
-            let _ = request.respond(answer.response());
+            // Who broke the connection off does not wait for an answer.
+            let _ = answer.send(request);
         };
         match admitted {
             Ok(_) => respond(),
@@ -269,7 +270,14 @@ impl Answer {
         Self::new(refusal.status, "text/plain; charset=utf-8", text)
     }
 
-    fn response(self) -> Response<std::io::Cursor<Vec<u8>>> {
+    /// Answers `request`, after which the client closes the connection. The pool of threads in `tiny_http`
+    /// 0.12 can leave a new connection waiting for ever while others are kept open, as browsers do.
+    fn send(self, request: Request) -> std::io::Result<()> {
+        let (status, length) = (self.status, self.body.len());
+        let reason = StatusCode(status).default_reason_phrase();
+        let mut head = format!(
+            "HTTP/1.1 {status} {reason}\r\nConnection: close\r\nContent-Length: {length}\r\n"
+        );
         let headers = [
             ("Content-Type", self.kind),
             ("Content-Security-Policy", POLICY),
@@ -280,15 +288,15 @@ impl Answer {
             ("Cross-Origin-Opener-Policy", "same-origin"),
         ];
         let about = self.about.iter().map(|a| ("X-Draft", a.as_str()));
-        let response = Response::from_data(self.body).with_status_code(self.status);
-        // Every length is known.
-        let mut response = response.with_chunked_threshold(usize::MAX);
         for (name, value) in headers.into_iter().chain(about) {
-            // All are ASCII.
-            if let Ok(header) = Header::from_bytes(name, value) {
-                response.add_header(header);
-            }
+            // What a configuration says must not end a header.
+            let value: String = value.chars().filter(|c| !c.is_control()).collect();
+            head += &format!("{name}: {value}\r\n");
         }
-        response
+        head += "\r\n";
+        let mut writer = request.into_writer();
+        writer.write_all(head.as_bytes())?;
+        writer.write_all(&self.body)?;
+        writer.flush()
     }
 }
