@@ -3,7 +3,7 @@ use crate::{
     decode::SizeLimit,
     error::ImagingError,
     format::Format,
-    layer_rows::{LayerRows, RowChannel},
+    layer_rows::{LayerRows, Packing, RowChannel},
     layers::{Layers, Precision},
     raster::Raster,
 };
@@ -44,7 +44,7 @@ use std::{
 const FORMAT: &str = "OpenEXR";
 const EXPECTED: &str = "an OpenEXR image";
 
-/// Writes all channels as one part of scan lines, ZIP1. Rows are asked for when they are due.
+/// Writes all channels as one part of scan lines. Rows are asked for when they are due.
 pub(crate) fn write(layers: &LayerRows, path: &Path) -> Result<(), ImagingError> {
     // Names were checked when they were inserted: they fit the format's one byte a character.
     let channels = layers
@@ -63,7 +63,10 @@ pub(crate) fn write(layers: &LayerRows, path: &Path) -> Result<(), ImagingError>
         );
     }
     let encoding = Encoding {
-        compression: Compression::ZIP1,
+        compression: match layers.packing {
+            Packing::Small => Compression::ZIP1,
+            Packing::Quick => Compression::RLE,
+        },
         ..Encoding::SMALL_LOSSLESS
     };
     let layer = Layer::new(
