@@ -252,7 +252,8 @@ pub(super) fn first_light(
         dipir_files::open(&file)?;
         Ok(Lighting::read(&file)?)
     };
-    let light = read().with_context(|| format!("cannot use light.start = \"{}\"", path.display()))?;
+    let light =
+        read().with_context(|| format!("cannot use light.start = \"{}\"", path.display()))?;
     if light.lobes.len() > MOST_LOBES {
         let message = format!(
             "\"{}\" holds {} lobes; accepted: a lighting.json with at most {MOST_LOBES}",
