@@ -187,6 +187,16 @@ pub(crate) fn read(
     let window = image.attributes.display_window;
     let (width, height) = (window.size.0, window.size.1);
     limit.check(path, width, height)?;
+    let filled = width as u64 * height as u64;
+    if filled > MOST_EMPTY_PIXELS.max(length.saturating_mul(MOST_SAMPLES_A_BYTE)) {
+        return Err(ImagingError::Damaged {
+            path: path.to_owned(),
+            format: FORMAT,
+            detail: format!(
+                "its display window is {width} x {height} pixels, and almost nothing of that is in the file"
+            ),
+        });
+    }
     let mut layers = Layers::from_file(width, height, path);
     for part in image.layer_data {
         if part.attributes.environment_map == Some(EnvironmentMap::LatitudeLongitude) {
@@ -288,6 +298,9 @@ enum Refused {
     /// The file is too short for what it declares.
     Length,
 }
+
+/// Pixels of a display window that a file may leave empty: 8192 x 4096.
+const MOST_EMPTY_PIXELS: u64 = 1 << 25;
 
 /// Samples that a byte of a file can stand for. Deflate makes at most 1032 bytes of one, and two
 /// bytes are the shortest sample; lossy codings of flat blocks reach a few times as much.

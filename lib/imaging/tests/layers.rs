@@ -309,6 +309,20 @@ fn write_windowed(
     image.write().to_file(path).unwrap();
 }
 
+/// 4.7 GB were taken for 427 bytes.
+#[test]
+fn a_display_window_of_nothing_is_refused_before_memory_is_taken() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    let display = IntegerBounds::new((0, 0), (4, 1 << 24));
+    write_windowed(&path, display, &[("beauty", Vec2(0, 0), Vec2(4, 2))]);
+    let error = Layers::read_exr(&path).unwrap_err().to_string();
+    assert!(
+        error.contains("its display window is 4 x 16777216 pixels"),
+        "{error}"
+    );
+}
+
 #[test]
 fn a_data_window_is_placed_on_the_display_window_and_cut_by_it() {
     let folder = tempfile::tempdir().unwrap();
