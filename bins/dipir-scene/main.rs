@@ -6,7 +6,7 @@ use clap::Parser;
 use dipir_cli::args::CommonArgs;
 use dipir_cli::exit::{self, Usage};
 use dipir_cli::session::Session;
-use dipir_imaging::file::write_png;
+use dipir_imaging::marked_png::write_display;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
@@ -55,7 +55,8 @@ fn background(args: &BackgroundArgs) -> anyhow::Result<()> {
         .unwrap_or_else(|| automatic_exposure_ev(&image));
     let gain = exposure_ev.exp2();
     let exposed = LinearImage(image.0.map(|p| *p * gain));
-    write_png(&args.png, &Transfer::Srgb.encode(&exposed))?;
+    write_display(&args.png, &Transfer::Srgb.encode(&exposed))
+        .with_context(|| format!("cannot write {}", args.png.display()))?;
     let rotation = view.rotation();
     args.output.result(
         || {

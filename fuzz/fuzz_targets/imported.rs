@@ -17,6 +17,11 @@ pub fn is_whole(imported: &Imported) {
     let mesh = &imported.mesh;
     assert!(mesh.first_non_finite().is_none());
     let (vertices, materials) = (mesh.positions.len(), imported.materials.len());
-    assert!(mesh.indices.iter().flatten().all(|i| (*i as usize) < vertices));
+    assert!(
+        mesh.indices
+            .iter()
+            .flatten()
+            .all(|i| (*i as usize) < vertices)
+    );
     assert!(mesh.materials.iter().all(|m| (*m as usize) < materials));
 }

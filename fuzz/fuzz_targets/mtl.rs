@@ -3,8 +3,7 @@ use dipir_scene::import::{Limits, Resolver, load_obj_bytes};
 use libfuzzer_sys::fuzz_target;
 
 /// A triangle of the library's material `a`.
-const OBJECT: &[u8] =
-    b"mtllib m.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n";
+const OBJECT: &[u8] = b"mtllib m.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n";
 
 /// Every file that the input names is the input itself.
 struct Itself<'a>(&'a [u8]);

@@ -1,7 +1,7 @@
 #![no_main]
 mod imported;
 
-use dipir_scene::import::{load_ply_bytes};
+use dipir_scene::import::load_ply_bytes;
 use imported::{LIMITS, is_whole};
 use libfuzzer_sys::fuzz_target;
 

@@ -4,7 +4,10 @@ use dipir_points::file;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    for cloud in [file::ply(bytes), file::pcd(bytes), file::sweep(bytes)].into_iter().flatten() {
+    for cloud in [file::ply(bytes), file::pcd(bytes), file::sweep(bytes)]
+        .into_iter()
+        .flatten()
+    {
         assert!(cloud.points.iter().all(|p| p.is_finite()));
     }
     let _ = colmap::read_points(bytes, true, WorldUp::MinusY);

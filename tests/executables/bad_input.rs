@@ -1,4 +1,7 @@
 //! What users get wrong, and the exact words that tell them.
+use dipir_light::environment::EnvironmentMap;
+use glam::Vec3;
+
 use crate::project::*;
 
 #[track_caller]
@@ -224,4 +227,47 @@ fn a_composite_without_any_light_says_where_to_get_one() {
          is missing; name a map, as in --set composite.environment=sky.hdr, or run dipir-light \
          first",
     );
+}
+
+#[test]
+fn light_beyond_all_numbers_is_told_by_its_cause() {
+    let project = Project::new();
+    let bright = EnvironmentMap::constant(16, 8, Vec3::splat(3e38));
+    bright.write(project.path("bright.exr")).unwrap();
+    let args = ["-s", "composite.environment=bright.exr"];
+    project.run(SCENE, &args).expect_success();
+    let run = project.run(COMPOSITE, &args);
+    assert_eq!(run.code, Some(1), "{}", run.stderr);
+    assert!(
+        run.stderr.starts_with("error: the light in column ")
+            && run.stderr.trim_end().ends_with(
+                "of the picture is beyond what 32-bit numbers hold: lower composite.exposure_ev, or the \
+                 radiance of the light or of what the object emits"
+            ),
+        "{}",
+        run.stderr
+    );
+    assert!(!project.path("out/composite").exists());
+}
+
+#[test]
+fn a_camera_beyond_the_earth_is_refused() {
+    let project = Project::new();
+    let run = project.run(SCENE, &["-s", "scene.camera.position=[1e38, 1.2, 4.0]"]);
+    assert_eq!(run.code, Some(2));
+    assert!(
+        run.stderr.contains("at most ten million from the origin"),
+        "{}",
+        run.stderr
+    );
+    project.write("shot.chan", "1 0 1.2 1e200 0 0 0 40\n");
+    let run = project.run(SCENE, &["-s", "scene.camera={file=\"shot.chan\"}"]);
+    assert_eq!(run.code, Some(2));
+    assert!(
+        run.stderr
+            .contains("scene.camera.file is a camera at [0, 1.2, 1000000"),
+        "{}",
+        run.stderr
+    );
+    assert!(!project.path("out/scene").exists());
 }

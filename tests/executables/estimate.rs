@@ -85,6 +85,35 @@ fn a_sun_that_is_known_becomes_a_source_where_it_is() {
 }
 
 #[test]
+fn a_sun_below_the_horizon_is_warned_of() {
+    let project = project();
+    project.run(SCENE, &[]).expect_success();
+    let sun = "light.sun={azimuth_deg = 60.0, elevation_deg = -40.0}";
+    let run = project.run(OPTIMIZE, &["-s", sun]);
+    run.expect_success();
+    let warning = "the sun is 40 degrees below the horizon";
+    assert!(run.stderr.contains(warning), "{}", run.stderr);
+}
+
+#[test]
+fn a_start_that_cannot_be_used_is_refused_at_once() {
+    let project = project();
+    project.run(SCENE, &[]).expect_success();
+    let lobe = r#"{"direction": [0, 1, 0], "radiance": [1, 1, 1], "sigma": 10}"#;
+    let many = vec![lobe; 5000].join(",");
+    project.write("many.json", format!("{{\"lobes\": [{many}]}}"));
+    // A device that ends at once: if it were read, it would be empty.
+    for (start, code, part) in [
+        ("many.json", 2, "holds 5000 lobes"),
+        ("/dev/null", 1, "not a regular file"),
+    ] {
+        let run = project.run(OPTIMIZE, &["-s", &format!("light.start={start}")]);
+        assert_eq!(run.code, Some(code), "{}", run.stderr);
+        assert!(run.stderr.contains(part), "{}", run.stderr);
+    }
+}
+
+#[test]
 fn candidates_are_chosen_by_number_and_one_that_is_not_there_is_refused() {
     let project = project();
     lit(&project, &[]);
@@ -118,6 +147,21 @@ fn what_only_an_estimate_uses_is_refused_where_nothing_is_estimated() {
         }
         assert!(!project.path("out/light").exists(), "{key}");
     }
+}
+
+#[test]
+fn what_only_an_estimate_uses_is_warned_of_where_a_map_gives_the_light() {
+    let project = Project::new();
+    let sun = "light.sun={azimuth_deg = 60.0, elevation_deg = 40.0}";
+    let args = ["-s", sun, "-s", "light.candidate=2"];
+    project.run(SCENE, &args).expect_success();
+    let run = project.run(COMPOSITE, &args);
+    run.expect_success();
+    let warning = "composite.environment gives the light, so that light.sun, light.candidate changes \
+                   nothing; remove one of them";
+    assert!(run.stderr.contains(warning), "{}", run.stderr);
+    let run = project.run(COMPOSITE, &[]);
+    assert!(!run.stderr.contains("warning"), "{}", run.stderr);
 }
 
 #[test]

@@ -2,7 +2,7 @@
 use std::collections::HashMap;
 
 use safetensors::tensor::{Dtype, TensorView, serialize};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::project::*;
 
@@ -56,9 +56,45 @@ fn an_environment_map_names_its_peak_and_gets_a_ring() {
     let value: Value = serde_json::from_str(&run.stdout).unwrap();
     assert_eq!(
         value["environment"]["peak_radiance"],
-        serde_json::json!([20.0, 20.0, 20.0])
+        json!([20.0, 20.0, 20.0])
     );
     assert_eq!(json(&project, "sky.png")["width"], 16);
+}
+
+#[test]
+fn a_texture_that_cannot_be_read_is_told_as_the_scene_stage_tells_it() {
+    let project = Project::new();
+    let document = json!({
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "textures": [{"source": 0}], "images": [{"uri": "t.ktx2"}],
+        "buffers": [{"byteLength": 60, "uri": "buffer.bin"}],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 24},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3",
+             "min": [0, 0, 0], "max": [1, 1, 0]},
+            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
+        ],
+    });
+    let values = [
+        0.0f32, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0,
+    ];
+    project.write("buffer.bin", values.map(f32::to_le_bytes).concat());
+    project.write(
+        "t.ktx2",
+        [&b"\xabKTX 20\xbb\r\n\x1a\n"[..], &[0; 80]].concat(),
+    );
+    project.write("object.gltf", document.to_string());
+    let message =
+        "error: `\"t.ktx2\"` is a KTX texture; expected a PNG or JPEG image: convert the file";
+    let object = "scene.objects=[{path=\"object.gltf\"}]";
+    project.run(SCENE, &["-s", object]).expect_error(1, message);
+    project
+        .run(INSPECT, &["object.gltf"])
+        .expect_error(1, message);
 }
 
 #[test]
@@ -66,7 +102,7 @@ fn objects_show_their_size_and_materials() {
     let project = Project::new();
     let value = json(&project, "object.obj");
     assert_eq!(value["triangles"], 4);
-    assert_eq!(value["max_m"], serde_json::json!([0.6f32, 1.1f32, 0.5]));
+    assert_eq!(value["max_m"], json!([0.6f32, 1.1f32, 0.5]));
 }
 
 #[test]
@@ -98,10 +134,7 @@ fn tensors_show_shapes_types_and_what_is_not_a_number() {
         (&a["min"], &a["max"], &a["mean"]),
         (&(-2.0).into(), &4.0.into(), &1.0.into())
     );
-    assert_eq!(
-        (&a["nan"], &a["shape"]),
-        (&1.into(), &serde_json::json!([2, 2]))
-    );
+    assert_eq!((&a["nan"], &a["shape"]), (&1.into(), &json!([2, 2])));
     assert_eq!(value["tensors"]["b"]["mean"], 2.0);
     assert_eq!(value["metadata"]["rank"], "4");
 }

@@ -88,3 +88,27 @@ fn five_million_triangles_are_set_up_in_bounded_memory() {
     let bytes = result["peak_rss_bytes"].as_f64().unwrap();
     assert!(bytes < 400.0 * triangles, "{bytes}");
 }
+
+/// With work that grows with the square of the objects this would take hours.
+#[test]
+fn one_object_listed_ten_thousand_times_is_drawn_once_and_warned_of() {
+    const COPIES: usize = 10_000;
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let object = "[[scene.objects]]\npath = \"object.obj\"\n";
+    project.write(
+        "pipeline.toml",
+        text.replace(object, &object.repeat(COPIES)),
+    );
+    let run = project.run(SCENE, &["--json"]);
+    run.expect_success();
+    let result: Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!(result["triangles"], 4 * COPIES);
+    let warning = format!(
+        "scene.objects: {} of them stand where the same file stands already, and are drawn once",
+        COPIES - 1
+    );
+    assert_eq!(run.stderr.matches("warning").count(), 1, "{}", run.stderr);
+    assert!(run.stderr.contains(&warning), "{}", run.stderr);
+    project.run(COMPOSITE, &[]).expect_success();
+}

@@ -343,7 +343,7 @@ fn a_folder_with_a_foreign_stage_json_is_neither_run_over_nor_cleaned() {
     std::fs::create_dir_all(project.path("out/scene")).unwrap();
     project.write("out/scene/stage.json", "{\"stage\": \"theatre\"}");
     project.write("out/scene/painting.psd", "years of work");
-    let why = "its stage.json is not one that the stage \"scene\" wrote, so it is left alone";
+    let why = "holds a stage.json that the stage \"scene\" did not write, so it is left alone";
     project.run(SCENE, &[]).expect_error(
         1,
         &format!(

@@ -369,19 +369,19 @@ impl<'a> StageRuns<'a> {
         Ok(())
     }
 
-    /// Moves what is kept of a run to `folder`, and replaces what was there.
+    /// Moves what is kept of a run to `folder`, and replaces the stages of an earlier run.
     fn keep(&self, folder: &Path) -> anyhow::Result<()> {
         let failed = || format!("cannot write {}", folder.display());
-        if folder.is_dir() {
-            fs::remove_dir_all(folder).with_context(failed)?;
-        }
         fs::create_dir_all(folder).with_context(failed)?;
         let described = self.work.join("scene/scene.json");
         fs::copy(described, folder.join("scene.json")).with_context(failed)?;
         for stage in [names::LIGHT.name, names::COMPOSITE.name] {
-            let from = self.work.join(stage);
+            let (from, to) = (self.work.join(stage), folder.join(stage));
+            if to.join("stage.json").is_file() {
+                fs::remove_dir_all(&to).with_context(failed)?;
+            }
             if from.is_dir() {
-                fs::rename(&from, folder.join(stage)).with_context(failed)?;
+                fs::rename(&from, &to).with_context(failed)?;
             }
         }
         Ok(())

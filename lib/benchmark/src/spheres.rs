@@ -10,7 +10,8 @@ use std::f32::consts::PI;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use dipir_imaging::file::write_png;
+use anyhow::Context;
+use dipir_imaging::marked_png::write_display;
 use dipir_imaging::metrics::{rmse, si_rmse};
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
@@ -93,7 +94,8 @@ pub fn compare_files(
         EnvironmentMap::read(estimate)?,
     );
     if let Some(png) = png {
-        write_png(png, &sheet(&truth, &estimate))?;
+        write_display(png, &sheet(&truth, &estimate))
+            .with_context(|| format!("cannot write {}", png.display()))?;
     }
     Ok(compare(&truth, &estimate))
 }

@@ -18,6 +18,14 @@ pub struct Lens {
     pub distortion: Distortion,
 }
 
+/// Pixels along a side of the largest picture.
+const MOST_PIXELS: f64 = 1e7;
+/// Focal lengths in sides of the picture: 179.9 degrees are seen at the shortest, 2 seconds of arc at the longest.
+const SHORTEST: f64 = 5e-4;
+const LONGEST: f64 = 1e5;
+/// Distance of the optical axis, in sides of the picture: the picture is cut out of a larger one.
+const FARTHEST: f64 = 1e4;
+
 impl Lens {
     /// A lens without distortion and with its axis in the middle.
     pub fn pinhole(size: [f64; 2], focal_px: DVec2) -> Self {
@@ -29,16 +37,23 @@ impl Lens {
         }
     }
 
-    /// Errors on sizes and focal lengths that are not above 0.
+    /// Errors on sizes and focal lengths that no picture has.
     pub(crate) fn check(&self, format: &'static str) -> Result<(), CameraError> {
         let [w, h] = self.size;
-        let positive = [w, h, self.focal_px.x, self.focal_px.y];
-        if positive.iter().all(|v| v.is_finite() && *v > 0.0) && self.principal_px.is_finite() {
+        let size = DVec2::new(w, h);
+        let is_size = w >= 1.0 && h >= 1.0 && size.max_element() <= MOST_PIXELS;
+        let focal = self.focal_px / size;
+        // Comparisons of glam's pass over a NaN beside a number.
+        let is_finite = self.focal_px.is_finite() && self.principal_px.is_finite();
+        let is_lens =
+            is_finite && focal.min_element() >= SHORTEST && focal.max_element() <= LONGEST;
+        let off = (self.principal_px / size).abs();
+        if is_size && is_lens && off.max_element() <= FARTHEST {
             return Ok(());
         }
         let detail = format!(
-            "it has a focal length of {} x {} pixels for an image of {w} x {h}",
-            self.focal_px.x, self.focal_px.y
+            "it has a focal length of {} x {} pixels and its axis at {}, {} for an image of {w} x {h}",
+            self.focal_px.x, self.focal_px.y, self.principal_px.x, self.principal_px.y
         );
         Err(CameraError::new(format, detail))
     }

@@ -494,6 +494,26 @@ fn a_fisheye_is_the_same_in_opencv_nerfstudio_and_colmap() {
 const KITTI: &str = "P0: 700 0 600 0 0 700 180 0 0 0 1 0\nP2: 700 0 600 42 0 700 180 0.7 0 0 1 0.002\n\
 Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n";
 
+/// Where numbers are so large or small that directions round to nothing.
+#[test]
+fn lenses_of_no_picture_are_refused() {
+    let text =
+        |f: &str, c: &str| format!("{{\"camera_matrix\": [{f}, 0, {c}, 0, 500, 240, 0, 0, 1]}}");
+    assert!(opencv::read(&text("500", "320"), Some(SIZE)).is_ok());
+    for (focal, axis) in [
+        ("1e-200", "320"),
+        ("1e200", "320"),
+        ("500", "1e300"),
+        ("-500", "320"),
+    ] {
+        let error = opencv::read(&text(focal, axis), Some(SIZE)).unwrap_err();
+        assert!(error.to_string().contains("focal length"), "{error}");
+    }
+    for size in [[0.0, 480.0], [f64::NAN, 480.0], [640.0, 1e12]] {
+        opencv::read(&text("500", "320"), Some(size)).unwrap_err();
+    }
+}
+
 #[test]
 fn kittis_projection_is_met() {
     let camera = kitti::read(KITTI, 2, [1242.0, 375.0]).unwrap();

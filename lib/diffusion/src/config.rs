@@ -18,7 +18,7 @@ pub struct ConfigFile {
 impl ConfigFile {
     /// Reads `path`.
     pub fn read(path: &Path) -> Result<Self> {
-        let bytes = std::fs::read(path).map_err(io("read", path))?;
+        let bytes = dipir_files::read(path).map_err(io("read", path))?;
         let value: Value = serde_json::from_slice(&bytes).map_err(|e| Error::Config {
             path: path.to_owned(),
             message: format!("not JSON: {e}"),

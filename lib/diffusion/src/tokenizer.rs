@@ -245,7 +245,7 @@ fn read_vocab_and_merges(folder: &Path) -> Result<(Vocab, Merges)> {
     let file = ConfigFile::read(&folder.join("vocab.json"))?;
     let vocab: Vocab = file.parse()?;
     let path = folder.join("merges.txt");
-    let text = std::fs::read_to_string(&path).map_err(io("read", &path))?;
+    let text = dipir_files::read_to_string(&path).map_err(io("read", &path))?;
     let merges = read_merges(&path, &text)?;
     Ok((vocab, merges))
 }

@@ -1,7 +1,6 @@
 //! Memory-mapped safetensors: one file or several shards behind one index.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -88,7 +87,7 @@ impl Weights {
     }
 
     fn open_shards(index: &Path) -> Result<Self> {
-        let bytes = std::fs::read(index).map_err(io("read", index))?;
+        let bytes = dipir_files::read(index).map_err(io("read", index))?;
         let parsed: ShardIndex = serde_json::from_slice(&bytes).map_err(|e| Error::Config {
             path: index.to_owned(),
             message: format!("not a shard index: {e}"),
@@ -119,7 +118,7 @@ impl Weights {
     }
 
     fn add(&mut self, path: &Path, expected: Option<&[&str]>) -> Result<()> {
-        let file = File::open(path).map_err(io("read", path))?;
+        let file = dipir_files::open(path).map_err(io("read", path))?;
         // SAFETY: the mapping is read-only. As with every memory-mapped file,
         // another process that truncates it while it is in use breaks the
         // contract; model files are not modified in place.

@@ -59,6 +59,9 @@ impl SizeLimit {
 /// Memory that the decoder of PNG may take beside the picture: rows and unpacked text and profiles.
 const PNG_METADATA_BYTES: u64 = 64 << 20;
 
+/// Bytes at a file's beginning in which it announces a profile.
+const MOST_HEAD: usize = 1 << 16;
+
 impl Decoded {
     /// Decodes a PNG or JPEG file.
     pub fn of(
@@ -77,12 +80,14 @@ impl Decoded {
                 limits.max_alloc = Some(PNG_METADATA_BYTES + 32 * width as u64);
                 let source = Cursor::new(bytes);
                 let decoder = PngDecoder::with_limits(source, limits).map_err(failed)?;
-                Self::with(decoder, path, limit, failed)
+                let decoded = Self::with(decoder, path, limit, failed)?;
+                Ok(decoded.with_profile_of(bytes, b"iCCP"))
             }
             Format::Jpeg => {
                 jpeg_header::check(bytes, path)?;
                 let decoder = JpegDecoder::new(Cursor::new(bytes)).map_err(failed)?;
-                Self::with(decoder, path, limit, failed)
+                let decoded = Self::with(decoder, path, limit, failed)?;
+                Ok(decoded.with_profile_of(bytes, b"ICC_PROFILE\0"))
             }
             other => Err(other.refuse(path, expected)),
         }
@@ -124,6 +129,18 @@ impl Decoded {
             icc,
             exif,
         })
+    }
+
+    /// With an empty profile, which nobody can use, if `bytes` announce one that could not be read.
+    fn with_profile_of(mut self, bytes: &[u8], mark: &[u8]) -> Self {
+        let head = &bytes[..bytes.len().min(MOST_HEAD)];
+        // A PNG's pixels could hold the mark by chance.
+        let pixels = head.windows(4).position(|w| w == b"IDAT");
+        let head = &head[..pixels.unwrap_or(head.len())];
+        if self.icc.is_none() && head.windows(mark.len()).any(|w| w == mark) {
+            self.icc = Some(Vec::new());
+        }
+        self
     }
 
     /// Colours beside opacity: 1 or 3.

@@ -3,7 +3,7 @@ use crate::{
     decode::SizeLimit,
     error::ImagingError,
     format::Format,
-    layer_rows::{LayerRows, RowChannel},
+    layer_rows::{LayerRows, Packing, RowChannel},
     layers::{Layers, Precision},
     raster::Raster,
 };
@@ -44,7 +44,7 @@ use std::{
 const FORMAT: &str = "OpenEXR";
 const EXPECTED: &str = "an OpenEXR image";
 
-/// Writes all channels as one part of scan lines, ZIP1. Rows are asked for when they are due.
+/// Writes all channels as one part of scan lines. Rows are asked for when they are due.
 pub(crate) fn write(layers: &LayerRows, path: &Path) -> Result<(), ImagingError> {
     // Names were checked when they were inserted: they fit the format's one byte a character.
     let channels = layers
@@ -63,7 +63,10 @@ pub(crate) fn write(layers: &LayerRows, path: &Path) -> Result<(), ImagingError>
         );
     }
     let encoding = Encoding {
-        compression: Compression::ZIP1,
+        compression: match layers.packing {
+            Packing::Small => Compression::ZIP1,
+            Packing::Quick => Compression::RLE,
+        },
         ..Encoding::SMALL_LOSSLESS
     };
     let layer = Layer::new(
@@ -184,6 +187,16 @@ pub(crate) fn read(
     let window = image.attributes.display_window;
     let (width, height) = (window.size.0, window.size.1);
     limit.check(path, width, height)?;
+    let filled = width as u64 * height as u64;
+    if filled > MOST_EMPTY_PIXELS.max(length.saturating_mul(MOST_SAMPLES_A_BYTE)) {
+        return Err(ImagingError::Damaged {
+            path: path.to_owned(),
+            format: FORMAT,
+            detail: format!(
+                "its display window is {width} x {height} pixels, and almost nothing of that is in the file"
+            ),
+        });
+    }
     let mut layers = Layers::from_file(width, height, path);
     for part in image.layer_data {
         if part.attributes.environment_map == Some(EnvironmentMap::LatitudeLongitude) {
@@ -285,6 +298,9 @@ enum Refused {
     /// The file is too short for what it declares.
     Length,
 }
+
+/// Pixels of a display window that a file may leave empty: 8192 x 4096.
+const MOST_EMPTY_PIXELS: u64 = 1 << 25;
 
 /// Samples that a byte of a file can stand for. Deflate makes at most 1032 bytes of one, and two
 /// bytes are the shortest sample; lossy codings of flat blocks reach a few times as much.

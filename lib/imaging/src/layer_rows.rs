@@ -18,6 +18,16 @@ pub(crate) struct RowChannel<'a> {
     pub fill: FillRow<'a>,
 }
 
+/// How a file is compressed, without loss in either case.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Packing {
+    /// ZIP1: small files.
+    #[default]
+    Small,
+    /// Run lengths: files up to twice as large, in a fraction of the time.
+    Quick,
+}
+
 /// Named channels of one size, as [`Layers`], whose samples are asked for when the file is written. A file holds the
 /// same bytes as that of [`Layers`] with the same samples.
 pub struct LayerRows<'a> {
@@ -26,6 +36,7 @@ pub struct LayerRows<'a> {
     pub(crate) channels: BTreeMap<String, RowChannel<'a>>,
     pub(crate) latlong: bool,
     pub(crate) attributes: BTreeMap<String, String>,
+    pub(crate) packing: Packing,
 }
 
 impl<'a> LayerRows<'a> {
@@ -37,7 +48,13 @@ impl<'a> LayerRows<'a> {
             channels: BTreeMap::new(),
             latlong: false,
             attributes: BTreeMap::new(),
+            packing: Packing::default(),
         }
+    }
+
+    /// Compressed as `packing` says.
+    pub fn packed(self, packing: Packing) -> Self {
+        Self { packing, ..self }
     }
 
     /// The channels of `layers`.
@@ -115,7 +132,7 @@ impl<'a> LayerRows<'a> {
         Ok(())
     }
 
-    /// Writes an OpenEXR file: one part, scan lines, ZIP1. Replaces an existing file.
+    /// Writes an OpenEXR file: one part, scan lines. Replaces an existing file.
     pub fn write_exr(mut self, path: impl AsRef<Path>) -> Result<(), ImagingError> {
         let path = path.as_ref();
         let (width, height) = (self.width, self.height);

@@ -11,6 +11,7 @@ mod hdr_file;
 mod jpeg_header;
 pub mod layer_rows;
 pub mod layers;
+pub mod marked_png;
 pub mod metrics;
 mod png_file;
 pub mod raster;

@@ -2,7 +2,7 @@
 use dipir_imaging::{
     ImagingError,
     composite::composite,
-    layer_rows::LayerRows,
+    layer_rows::{LayerRows, Packing},
     layers::{Layers, Precision},
     raster::{LinearImage, Raster},
 };
@@ -110,6 +110,26 @@ fn rows_that_are_computed_give_the_bytes_of_layers_in_memory() {
         Layers::read_exr(&other).unwrap().rgb("sun").unwrap(),
         raster(&bright)
     );
+}
+
+#[test]
+fn quick_files_hold_the_same_samples() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("quick.exr");
+    let depth = ramp(37, 11);
+    let colour = |i: usize| Vec3::new(0.1, 1.0 / (1.0 + i as f32), 1e6);
+    let mut rows = LayerRows::new(37, 11).packed(Packing::Quick);
+    rows.insert_pixels(["R", "G", "B"], Precision::Full, colour)
+        .unwrap();
+    rows.insert("depth.Z", Precision::Full, &depth).unwrap();
+    rows.write_exr(&path).unwrap();
+    let meta = exr::meta::MetaData::read_from_file(&path, true).unwrap();
+    let packed = meta.headers[0].compression;
+    assert_eq!(packed, exr::prelude::Compression::RLE);
+    let back = Layers::read_exr(&path).unwrap();
+    assert_eq!(back.channel("depth.Z").unwrap(), &depth);
+    let pixels: Vec<Vec3> = (0..37 * 11).map(colour).collect();
+    assert_eq!(back.rgb("").unwrap().pixels(), pixels);
 }
 
 #[test]
@@ -287,6 +307,20 @@ fn write_windowed(
     let attributes = ImageAttributes::new(display);
     let image = Image::from_layers(attributes, layers.collect::<SmallVec<[_; 2]>>());
     image.write().to_file(path).unwrap();
+}
+
+/// 4.7 GB were taken for 427 bytes.
+#[test]
+fn a_display_window_of_nothing_is_refused_before_memory_is_taken() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    let display = IntegerBounds::new((0, 0), (4, 1 << 24));
+    write_windowed(&path, display, &[("beauty", Vec2(0, 0), Vec2(4, 2))]);
+    let error = Layers::read_exr(&path).unwrap_err().to_string();
+    assert!(
+        error.contains("its display window is 4 x 16777216 pixels"),
+        "{error}"
+    );
 }
 
 #[test]

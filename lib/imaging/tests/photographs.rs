@@ -240,6 +240,27 @@ fn a_profile_that_cannot_be_used_is_said_and_not_a_failure() {
     }
 }
 
+/// The decoder stops unpacking it at a limit and passes on none.
+#[test]
+fn a_profile_too_large_to_be_unpacked_is_said() {
+    let folder = folder();
+    let path = put_png(
+        &folder,
+        (1, 1),
+        &[10, 20, 30],
+        Some(&vec![0; 80 << 20]),
+        None,
+    );
+    let photo = read_photo(&path, Transfer::Srgb).unwrap();
+    assert_eq!(photo.warnings.len(), 1);
+    assert!(photo.warnings[0].contains("it is read as sRGB"));
+    let without = put_png(&folder, (1, 1), &[10, 20, 30], None, None);
+    assert_eq!(
+        read_photo(&without, Transfer::Srgb).unwrap().warnings.len(),
+        0
+    );
+}
+
 #[test]
 fn what_changed_is_encoded_and_clipped() {
     let folder = folder();

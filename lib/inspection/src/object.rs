@@ -3,6 +3,7 @@ use std::path::Path;
 
 use dipir_scene::import::load_object;
 use dipir_scene::material::{AlphaMode, Material};
+use dipir_scene::texture::decode_textures;
 use glam::Vec3;
 use serde_json::json;
 
@@ -10,6 +11,8 @@ use crate::report::{Report, Table, number};
 
 pub(crate) fn inspect(path: &Path) -> anyhow::Result<Report> {
     let object = load_object(path)?;
+    // The scene stage refuses an object with a texture that cannot be read.
+    decode_textures(&object.textures, |_| true)?;
     let mesh = &object.mesh;
     let low = mesh
         .positions

@@ -1,9 +1,10 @@
 //! `--png`: a picture of one layer that any viewer shows.
 use std::path::Path;
 
+use anyhow::Context;
 use dipir_cli::exit::Usage;
-use dipir_imaging::file::write_png;
 use dipir_imaging::layers::Layers;
+use dipir_imaging::marked_png::write_display;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
@@ -48,7 +49,7 @@ pub fn write(
             .unwrap_or_else(|| channel(name, "R"));
         preview::stretched(layers.channel(&single)?)
     };
-    Ok(write_png(png, &picture)?)
+    write_display(png, &picture).with_context(|| format!("cannot write {}", png.display()))
 }
 
 fn channel(layer: &str, suffix: &str) -> String {

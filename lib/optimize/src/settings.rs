@@ -330,6 +330,18 @@ const CHECKPOINT_EVERY: usize = 25;
 const MOST_TEXELS_IN_HALF: usize = 1 << 16;
 
 impl LightTable {
+    /// The given keys that only an estimated light uses.
+    pub fn only_of_estimates(&self) -> impl Iterator<Item = &'static str> {
+        let keys = [
+            ("light.sun", self.sun.is_some()),
+            ("light.shadow", self.shadow.is_some()),
+            ("light.candidate", self.candidate.is_some()),
+        ];
+        keys.into_iter()
+            .filter(|(_, given)| *given)
+            .map(|(key, _)| key)
+    }
+
     /// The settings: what the table says, else what `preset` says. `seed` is the pipeline's.
     pub fn settings(&self, preset: &LightPreset, seed: u64) -> Result<Settings, BadSetting> {
         let environment = self.environment.unwrap_or(preset.environment);

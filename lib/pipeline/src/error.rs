@@ -212,7 +212,7 @@ pub enum Foreign {
     #[error("holds no stage.json, so no stage wrote it and it is left alone")]
     NoManifest,
     /// A `stage.json` that is damaged, or that another stage or program wrote.
-    #[error("its stage.json is not one that the stage \"{stage}\" wrote, so it is left alone")]
+    #[error("holds a stage.json that the stage \"{stage}\" did not write, so it is left alone")]
     OtherManifest {
         /// The stage whose folder it would be.
         stage: String,

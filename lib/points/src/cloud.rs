@@ -56,4 +56,11 @@ impl Collector {
     pub(crate) fn points(self) -> Vec<DVec3> {
         self.points
     }
+
+    /// Those of `all` that are kept.
+    pub(crate) fn of(all: Vec<DVec3>) -> Vec<DVec3> {
+        let mut found = Self::new(all.len());
+        all.into_iter().for_each(|point| found.add(point));
+        found.points()
+    }
 }

@@ -52,7 +52,7 @@ pub fn read(source: &Source) -> Result<Cloud, PointsError> {
             let points = colmap::read_points(&bytes, extension == "bin", WorldUp::Y)?;
             (
                 Cloud {
-                    points,
+                    points: Collector::of(points),
                     viewpoint: None,
                 },
                 WorldUp::MinusY,

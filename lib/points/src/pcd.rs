@@ -131,7 +131,10 @@ fn binary(header: &Header, axes: [usize; 3], body: &[u8]) -> Result<Vec<DVec3>, 
     let offset = |field: usize| (0..field).map(bytes).sum::<usize>();
     let stride = offset(header.fields.len());
     for field in axes {
-        if header.kinds[field] != "F" || ![4, 8].contains(&header.sizes[field]) {
+        if header.counts[field] == 0
+            || header.kinds[field] != "F"
+            || ![4, 8].contains(&header.sizes[field])
+        {
             return Err(wrong("its coordinates are no numbers of 4 or 8 bytes"));
         }
     }

@@ -230,6 +230,38 @@ fn a_depth_map_gives_the_points_that_the_camera_sees() {
 }
 
 #[test]
+fn coordinates_without_values_are_refused_in_pcd() {
+    for counts in ["1 1 0", "0 0 0"] {
+        let header = format!(
+            "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT {counts}\nPOINTS 1\nDATA binary\n"
+        );
+        let error = file::pcd(&[header.as_bytes(), &[0; 64]].concat()).unwrap_err();
+        assert!(
+            error.to_string().contains("no numbers of 4 or 8 bytes"),
+            "{error}"
+        );
+    }
+}
+
+#[test]
+fn points_of_colmap_that_are_nowhere_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("points3D.txt");
+    std::fs::write(
+        &path,
+        "1 nan 0 0 9 9 9 0\n2 1 2 3 9 9 9 0\n3 inf 0 0 9 9 9 0\n",
+    )
+    .unwrap();
+    let camera = camera();
+    let source = Source {
+        up: None,
+        ..source(&path, &camera)
+    };
+    let found = file::read(&source).unwrap().points;
+    near(&found, &[DVec3::new(1.0, -2.0, -3.0)], "points3D.txt");
+}
+
+#[test]
 fn what_is_no_points_is_explained() {
     let said = |bytes: &[u8]| file::pcd(bytes).unwrap_err().to_string();
     let packed = String::from_utf8(pcd("ascii"))

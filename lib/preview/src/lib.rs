@@ -9,5 +9,6 @@ pub mod draft;
 pub mod lines;
 pub mod marks;
 pub mod picture;
-pub mod png;
 pub mod small;
+
+pub use dipir_imaging::marked_png as png;

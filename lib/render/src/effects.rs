@@ -352,8 +352,10 @@ pub fn plan<L: SceneLight>(
     }
     explain_dependents(&mut plan);
     let pilot = Pilot::new(renderer, light, settings);
-    if config.mode() == EffectsMode::Planned {
-        leave_out(&mut plan, &pilot, config, progress)?;
+    match (config.mode(), pilot.is_affordable()) {
+        (EffectsMode::Planned, true) => leave_out(&mut plan, &pilot, config, progress)?,
+        (EffectsMode::Planned, false) => explain_unmeasured(&mut plan, config),
+        (EffectsMode::All, _) => {}
     }
     if let Some(depth) = config.max_depth {
         plan.max_depth = depth;
@@ -375,6 +377,15 @@ fn explain_dependents(plan: &mut EffectsPlan) {
             if was.is_some_and(|e| e.reason.is_empty()) {
                 plan.set(effect, false, format!("nothing without {}", needed.name()));
             }
+        }
+    }
+}
+
+/// Where a ray takes too long for anything to be measured, everything is simulated.
+fn explain_unmeasured(plan: &mut EffectsPlan, config: &EffectsConfig) {
+    for effect in Effect::ALL {
+        if plan.is_enabled(effect) && switch(config, effect) == EffectSwitch::Auto {
+            plan.set(effect, true, "not measured, for rays take too long".into());
         }
     }
 }

@@ -23,7 +23,7 @@ use crate::world::ProxyGeometry;
 /// Pixels of the object that a pilot render aims at: enough that a mean over them is precise to a
 /// few per cent.
 const OBJECT_PIXELS: f32 = 1024.0;
-/// Least pixels of the object, where a ray through it takes so long that fewer are affordable.
+/// Least pixels of the object from which anything is learnt, where a ray takes so long that fewer are affordable.
 const FEW_OBJECT_PIXELS: f32 = 64.0;
 /// Most pixels of a pilot render.
 const MAX_PIXELS: f32 = 16384.0;
@@ -105,6 +105,12 @@ impl<'a, L: SceneLight> Pilot<'a, L> {
                 .map(|image| LinearImage(shrink(&image.0, size))),
             occluders: settings.occluders.map(|mask| shrink(mask, size)),
         }
+    }
+
+    /// Whether rays are fast enough for effects to be measured: all of it then takes a bounded number of visits to
+    /// the hierarchy's nodes, whatever the objects are.
+    pub fn is_affordable(&self) -> bool {
+        OBJECT_PIXELS * self.renderer.geometry().bvh.affordable_share() >= FEW_OBJECT_PIXELS
     }
 
     /// One picture of `simulation`.

@@ -314,9 +314,26 @@ impl FileSettings {
                 });
             }
         };
+        // Comparisons of NaN, of a scale that overflows, fail.
+        if !pose
+            .position
+            .abs()
+            .cmple(DVec3::splat(FARTHEST_M.into()))
+            .all()
+        {
+            return Err(Error::Config {
+                key: format!("scene.camera.{}", self.key),
+                value: format!("a camera at {} metres", pose.position),
+                accepted: "one at most ten million metres from the origin; file_scale is metres of a unit of the file"
+                    .into(),
+            });
+        }
         Ok(of_lens(&pose, &found.lens, resolution))
     }
 }
+
+/// Largest coordinate of a camera, metres: half way around the earth.
+pub(crate) const FARTHEST_M: f32 = 1e7;
 
 /// The files that a camera's `path` stands for, as the configuration would name them: itself, or those
 /// of COLMAP's folder.

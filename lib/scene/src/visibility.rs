@@ -64,8 +64,19 @@ fn without_extent(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
     }
     let pixels = below_a_pixel(mesh, camera)?;
     Some(format!(
-        "it is {size:.1e} m across, {pixels:.1e} of a pixel; raise its scale, or write height_m"
+        "it is {} m across, {} of a pixel; raise its scale, or write height_m",
+        short(size),
+        short(pixels)
     ))
+}
+
+/// Two digits that count, with an exponent only where zeros would have to be counted.
+fn short(value: f64) -> String {
+    match value {
+        1e-3..10.0 => format!("{value:.2}"),
+        10.0..1e5 => format!("{value:.0}"),
+        _ => format!("{value:.1e}"),
+    }
 }
 
 /// How much of a pixel the mesh takes, if that is less than one.

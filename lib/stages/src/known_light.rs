@@ -6,6 +6,7 @@ use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::LinearImage;
 use dipir_light::environment::EnvironmentMap;
+use dipir_optimize::settings::LightTable;
 use dipir_scene::camera::Camera;
 use glam::{Vec2, Vec3};
 use serde_json::{Value, json};
@@ -60,6 +61,22 @@ pub fn known(session: &Session, table: &CompositeTable) -> anyhow::Result<Option
         .scaled(exposure)
         .rotated_y(f64::from(table.rotation_deg).to_radians());
     Ok(Some(Light { map: Arc::new(map) }))
+}
+
+/// Warns of keys that only an estimated light uses, where a map gives the light.
+///
+/// # Errors
+/// On a `[light]` table that cannot be read.
+pub fn warn_of_unused(session: &Session) -> anyhow::Result<()> {
+    let table: LightTable = session.config.table("light")?;
+    let given: Vec<&str> = table.only_of_estimates().collect();
+    if !given.is_empty() {
+        session.warn(&format!(
+            "composite.environment gives the light, so that {} changes nothing; remove one of them",
+            given.join(", ")
+        ));
+    }
+    Ok(())
 }
 
 /// Irradiance of the pilot light's sun on a surface that faces it; with the sky's, a white

@@ -194,7 +194,7 @@ fn said_prediction(path: &Path, weights: &Weights) -> Result<Option<Prediction>>
     if !yaml.is_file() {
         return Ok(None);
     }
-    let text = std::fs::read_to_string(&yaml).map_err(crate::error::io("read", &yaml))?;
+    let text = dipir_files::read_to_string(&yaml).map_err(crate::error::io("read", &yaml))?;
     let parameterization = text.lines().find_map(|line| {
         let value = line.trim().strip_prefix("parameterization:")?;
         of_word(value.trim().trim_matches(['"', '\'']))

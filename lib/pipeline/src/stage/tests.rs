@@ -130,8 +130,8 @@ fn a_folder_with_another_s_stage_json_is_left_alone() {
         assert_eq!(
             error.to_string(),
             format!(
-                "{} is there already and its stage.json is not one that the stage \"scene\" \
-                 wrote, so it is left alone; move it away or choose another folder with --out",
+                "{} is there already and holds a stage.json that the stage \"scene\" did \
+                 not write, so it is left alone; move it away or choose another folder with --out",
                 target.display()
             )
         );

@@ -1,4 +1,5 @@
 use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_scene::mesh::TriangleMesh;
 
 use super::*;
 use crate::counters::RayKind;
@@ -37,6 +38,44 @@ fn every_effect_has_a_switch_and_the_same_name_everywhere() {
         let json = serde_json::to_string(&effect).expect("serialises");
         assert_eq!(json, format!("\"{}\"", effect.name()));
     }
+}
+
+/// Octahedra about one centre: a ray meets thousands of boxes, however the hierarchy is built.
+fn shells(count: u32) -> TriangleMesh {
+    let mut mesh = TriangleMesh::default();
+    for k in 0..count {
+        let r = 0.2 + 0.3 * k as f32 / count as f32;
+        let corners = [Vec3::X, -Vec3::X, Vec3::Y, -Vec3::Y, Vec3::Z, -Vec3::Z];
+        mesh.positions
+            .extend(corners.map(|c| Vec3::Y * 0.5 + c * r));
+        for octant in 0..8 {
+            let pick = |axis: u32| 6 * k + 2 * axis + (octant >> axis & 1);
+            mesh.indices.push([pick(0), pick(1), pick(2)]);
+        }
+    }
+    mesh.materials = vec![0; mesh.indices.len()];
+    mesh
+}
+
+#[test]
+fn where_rays_take_too_long_nothing_is_measured_and_everything_simulated() {
+    let plan_of = |count: u32| {
+        let s = scene(shells(count), matte(Vec3::splat(0.5)), view(), ground());
+        planned(&s, &EffectsConfig::default(), &settings(0, 1))
+    };
+    let p = plan_of(16_000);
+    for effect in [Effect::Shadow, Effect::Specular, Effect::Interreflection] {
+        let e = find(&p, effect);
+        assert_eq!(
+            (e.enabled, e.reason.as_str()),
+            (true, "not measured, for rays take too long")
+        );
+    }
+    assert!(p.effects.iter().all(|e| e.contribution.is_none()));
+    assert_eq!((p.left_out, p.max_depth), (None, MAX_DEPTH));
+    // Fewer shells are worth measuring.
+    let p = plan_of(100);
+    assert!(find(&p, Effect::Specular).contribution.is_some());
 }
 
 #[test]

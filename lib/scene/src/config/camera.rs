@@ -2,6 +2,7 @@
 use dipir_cameras::Distortion;
 
 use super::*;
+use crate::camera::FARTHEST_M;
 
 impl CameraConfig {
     /// `photo` is the photograph, by whose name a file's camera is found.
@@ -55,6 +56,13 @@ impl CameraConfig {
             }
         };
         let position = point("position", self.position)?;
+        if position.abs().max_element() > FARTHEST_M {
+            return Err(wrong(
+                "scene.camera.position",
+                triple(position),
+                "metres, at most ten million from the origin, for instance [0.0, 1.6, 4.0]",
+            ));
+        }
         if self.pitch_deg.is_some() || self.roll_deg.is_some() {
             let (look_at, up) = self.turned(position)?;
             return Ok([position, look_at, up]);

@@ -52,6 +52,14 @@ pub(super) fn estimate(
     lobes: usize,
 ) -> anyhow::Result<Estimated> {
     let estimate = distribution(session, table, loaded)?;
+    let known = known_sun(session, table, loaded, &estimate)?;
+    if let Some(below) = known.and_then(|sun| sun.elevation).filter(|e| e.deg < 0.0) {
+        session.warn(&format!(
+            "the sun is {:.0} degrees below the horizon, as [light] sun or the photograph's time and place say, and \
+             lights nothing",
+            -below.deg
+        ));
+    }
     let candidates = estimate.candidates(CANDIDATES);
     let entry = |(k, c): (usize, &Candidate)| CandidateEntry {
         candidate: k + 1,

@@ -88,14 +88,9 @@ impl First {
             Self::Read => "from what the guiding model reads off the photograph",
             Self::File => "from the light of a file",
         };
-        let keys = [
-            ("light.sun", table.sun.is_some()),
-            ("light.shadow", table.shadow.is_some()),
-            ("light.candidate", table.candidate.is_some()),
-        ];
-        match keys.into_iter().find(|(_, given)| *given) {
+        match table.only_of_estimates().next() {
             None => Ok(()),
-            Some((key, _)) => {
+            Some(key) => {
                 let message = format!(
                     "only an estimated light uses it, and this one starts {how}; remove it, or set \
                      light.start = \"estimated\""
@@ -240,6 +235,9 @@ fn model_guide(session: &Session, table: &LightTable, adapted: bool) -> anyhow::
     })
 }
 
+/// Lobes of a light: every sample of a picture looks at each of them.
+const MOST_LOBES: usize = 4096;
+
 /// The light of `[light] start`, if that is a file.
 pub(super) fn first_light(
     session: &Session,
@@ -248,8 +246,22 @@ pub(super) fn first_light(
     let Start::File(path) = &table.start else {
         return Ok(None);
     };
-    let light = Lighting::read(&session.resolve(path))
-        .with_context(|| format!("cannot use light.start = \"{}\"", path.display()))?;
+    let file = session.resolve(path);
+    let read = || -> anyhow::Result<Lighting> {
+        // A pipe would be waited for, and a device be read without end.
+        dipir_files::open(&file)?;
+        Ok(Lighting::read(&file)?)
+    };
+    let light =
+        read().with_context(|| format!("cannot use light.start = \"{}\"", path.display()))?;
+    if light.lobes.len() > MOST_LOBES {
+        let message = format!(
+            "\"{}\" holds {} lobes; accepted: a lighting.json with at most {MOST_LOBES}",
+            path.display(),
+            light.lobes.len()
+        );
+        return Err(session.config.invalid("light.start", message).into());
+    }
     if light.lobes.is_empty() {
         let message = format!(
             "\"{}\" holds no lobes; accepted: a lighting.json that holds some",

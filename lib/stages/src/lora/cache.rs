@@ -1,7 +1,7 @@
 //! Finished adapters that scenes share: what a run wrote, in a folder named by everything that decides it, under a seal of
 //! hashes that is written last.
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use anyhow::Context;
 use dipir_cli::session::Session;
@@ -44,6 +44,13 @@ struct Sealed {
     blake3: String,
 }
 
+/// Whether a name stays in the folder that it is joined to. A seal can come from anybody who shares the cache.
+fn is_inside(name: &Path) -> bool {
+    name.components()
+        .all(|part| matches!(part, Component::Normal(_)))
+        && name.file_name().is_some()
+}
+
 /// The place of one run among the finished ones.
 pub(super) struct Cache {
     kept: Resume,
@@ -77,9 +84,8 @@ impl Cache {
         let seal = fs::read(self.kept.file(SEAL)).ok()?;
         let files: Vec<Sealed> = serde_json::from_slice(&seal).ok()?;
         let is_whole = |file: &Sealed| {
-            let inside = file.name.is_relative() && !file.name.starts_with("..");
-            let hash = hash_file(&self.kept.file(&file.name)).ok();
-            inside && hash.is_some_and(|(_, hash)| hash == file.blake3)
+            let hash = || hash_file(&self.kept.file(&file.name)).ok();
+            is_inside(&file.name) && hash().is_some_and(|(_, hash)| hash == file.blake3)
         };
         (!files.is_empty() && files.iter().all(is_whole)).then_some(files)
     }
@@ -112,5 +118,28 @@ impl Cache {
         write(&partial)
             .and_then(|()| fs::rename(&partial, &path))
             .with_context(|| format!("cannot write {}", path.display()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_a_seal_do_not_lead_out_of_its_folder() {
+        for name in ["lora.safetensors", "samples/0001.png"] {
+            assert!(is_inside(Path::new(name)), "{name}");
+        }
+        for name in [
+            "",
+            "..",
+            "/etc/passwd",
+            "a/../../x",
+            "../x",
+            "samples/..",
+            "./..",
+        ] {
+            assert!(!is_inside(Path::new(name)), "{name}");
+        }
     }
 }

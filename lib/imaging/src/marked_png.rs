@@ -2,7 +2,7 @@
 use std::io;
 use std::path::Path;
 
-use dipir_imaging::raster::DisplayImage;
+use crate::raster::DisplayImage;
 use png::{BitDepth, ColorType, Compression, Encoder};
 
 /// The text of a PNG that this program made.
@@ -53,6 +53,16 @@ pub fn is_free(path: &Path) -> io::Result<bool> {
     };
     let mark = [MADE_BY.0.as_bytes(), b"\0", MADE_BY.1.as_bytes()].concat();
     Ok(found.starts_with(SIGNATURE) && found.windows(mark.len()).any(|w| w == mark))
+}
+
+/// Writes `picture`, as [`write`].
+///
+/// # Errors
+/// As [`write`].
+pub fn write_display(path: &Path, picture: &DisplayImage) -> io::Result<()> {
+    let (width, height) = (picture.0.width(), picture.0.height());
+    let values = values(picture, [0, 0, width, height]);
+    write(path, &encode(width, height, &values)?)
 }
 
 /// Writes what [`encode`] made. A file that this program did not make is not touched.
