@@ -101,7 +101,7 @@ impl View {
     }
 
     /// From linear light to linear display values.
-    fn develop(&self, x: f32) -> f32 {
+    pub(crate) fn develop(&self, x: f32) -> f32 {
         let x = x.max(0.0);
         let y = 0.6 * x;
         let film = (y * (2.51 * y + 0.03) / (y * (2.43 * y + 0.59) + 0.14)).min(1.0);
@@ -157,7 +157,11 @@ impl View {
 }
 
 /// A map between the middles of its texels at an azimuth, radians, and the sine of an elevation.
-fn bilinear(map: &dipir_light::environment::EnvironmentMap, azimuth: f32, up: f32) -> Vec3 {
+pub(crate) fn bilinear(
+    map: &dipir_light::environment::EnvironmentMap,
+    azimuth: f32,
+    up: f32,
+) -> Vec3 {
     let (width, height) = (map.width(), map.height());
     let x = (azimuth / TAU).rem_euclid(1.0) * width as f32 - 0.5;
     let v = up.clamp(-1.0, 1.0).acos() / std::f32::consts::PI;
