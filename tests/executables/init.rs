@@ -14,7 +14,7 @@ fn what_is_written_runs_as_it_is() {
     for line in [
         "wrote first.toml",
         "dipir run first.toml --set pipeline.quality=draft",
-        "a guess, for the photograph does not say it",
+        "field of view: ",
     ] {
         assert!(init.stdout.contains(line), "{line}: {}", init.stdout);
     }

@@ -196,7 +196,7 @@ impl CameraEstimator {
             .values()
             .map(|log_focal| self.turn_scores(&evidence.thumbnail, &plain, log_focal))
             .collect();
-        let of_focal = self.focal_scores(&plain, known);
+        let of_focal = self.focal_scores(&evidence.thumbnail, &plain, known);
         let of = |k: usize| {
             let c = k % focals.count;
             let pose = Pose {
@@ -224,17 +224,28 @@ impl CameraEstimator {
     fn turn_scores(&self, thumbnail: &Thumbnail, plain: &[f32], log_focal: f64) -> [Vec<f64>; 2] {
         let mut features = plain.to_vec();
         features.extend(thumbnail.angular(log_focal.exp() as f32));
-        let told = mean(&self.turn, Head::Turn, &features);
+        let members = if thumbnail.is_blank() {
+            &[]
+        } else {
+            &self.turn[..]
+        };
+        let told = mean(members, Head::Turn, &features);
         [0, 1].map(|k| told[k].iter().map(|p| (p + LEAST).ln()).collect())
     }
 
     /// The logarithms of the density of the focal length by the look, and as it is known.
     fn focal_scores(
         &self,
+        thumbnail: &Thumbnail,
         plain: &[f32],
         known: Option<KnownFocal>,
     ) -> impl Fn(f64) -> [f64; 2] + Sync {
-        let told = mean(&self.focal, Head::Focal, plain);
+        let members = if thumbnail.is_blank() {
+            &[]
+        } else {
+            &self.focal[..]
+        };
+        let told = mean(members, Head::Focal, plain);
         let scores: Vec<f64> = told[0].iter().map(|p| (p + LEAST).ln()).collect();
         move |log_focal| match known {
             Some(known) => {

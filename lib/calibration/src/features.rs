@@ -9,6 +9,8 @@ use glam::Vec3;
 const LONGEST: usize = 64;
 /// Added to linear values before the logarithm.
 const FLOOR: f32 = 0.02;
+/// Deviation of the logarithm of luminance below which a picture is of one shade.
+const BLANK: f32 = 0.03;
 /// Parts along each side: of brightness and edges, of tints, of edge directions.
 const CELLS: usize = 6;
 const TINTS: usize = 4;
@@ -82,6 +84,12 @@ impl Thumbnail {
             change: change(&log, width),
             log,
         }
+    }
+
+    /// Whether it is of one shade, and tells nothing.
+    pub fn is_blank(&self) -> bool {
+        let squares = self.log.iter().map(|l| l * l).sum::<f32>();
+        squares < BLANK * BLANK * self.log.len() as f32
     }
 
     /// In a mirror.
