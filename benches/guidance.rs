@@ -41,7 +41,7 @@ use dipir_stages::known_light;
 use dipir_stages::presets;
 use glam::{DVec3, Vec3};
 
-/// Key of these scenes; training and gates have others.
+/// Key of these scenes; training and checks have others.
 const SEED: u64 = 0x5ce7e5;
 /// Pixels on a side of the photographs.
 const SIZE: usize = 96;

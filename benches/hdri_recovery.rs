@@ -24,7 +24,7 @@ use dipir_light::fit::fit;
 use dipir_light::rasterize::rasterize;
 use dipir_render::shapes::torus_knot;
 use dipir_scene::export::to_obj;
-use dipir_stages::scene::background::{View, automatic_exposure_ev};
+use dipir_stages::scene::background::{PanoramaView, automatic_exposure_ev};
 use glam::Vec3;
 use serde_json::Value;
 
@@ -136,7 +136,7 @@ fn recover_all(name: &str, map: &EnvironmentMap, objects: &[(&str, &str)], knobs
     let lobes = fit(map, LOBES).lobes;
     let fitted = rasterize(&lobes, map.width().max(512), map.height().max(256));
     fitted.write(folder.join("lobes.exr")).expect("writes");
-    let view = View {
+    let view = PanoramaView {
         fov_rad: FOV_DEG.to_radians(),
         yaw_rad: knobs.yaw_deg.to_radians(),
         pitch_rad: -14f32.to_radians(),
@@ -161,7 +161,13 @@ fn recover_all(name: &str, map: &EnvironmentMap, objects: &[(&str, &str)], knobs
 }
 
 /// One recovery; the numbers of its row.
-fn recover(folder: &Path, truth: &str, view: &View, exposure_ev: f32, knobs: &Knobs) -> String {
+fn recover(
+    folder: &Path,
+    truth: &str,
+    view: &PanoramaView,
+    exposure_ev: f32,
+    knobs: &Knobs,
+) -> String {
     let forward = -view.rotation().z_axis;
     // Four metres in front of the object, wherever the camera looks.
     let across = forward.x.hypot(forward.z);

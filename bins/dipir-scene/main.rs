@@ -11,7 +11,7 @@ use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
 use dipir_stages::command_line::scene::{BackgroundArgs, Cli, Command};
-use dipir_stages::scene::background::{View, automatic_exposure_ev};
+use dipir_stages::scene::background::{PanoramaView, automatic_exposure_ev};
 use serde_json::json;
 
 fn main() -> ExitCode {
@@ -41,7 +41,7 @@ fn background(args: &BackgroundArgs) -> anyhow::Result<()> {
     }
     let map = EnvironmentMap::read(&args.from)
         .with_context(|| format!("cannot cut a photograph out of {}", args.from.display()))?;
-    let view = View {
+    let view = PanoramaView {
         fov_rad: args.fov.to_radians(),
         yaw_rad: args.yaw.to_radians(),
         pitch_rad: args.pitch.to_radians(),

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use dipir_cli::args::OutputArgs;
 use dipir_cli::exit::{Usage, printable};
-use dipir_setup::view::Asked;
+use dipir_setup::view::CameraOptions;
 use dipir_setup::{Draft, Request, SetupError, draft};
 use dipir_stages::report::quoted;
 use serde_json::{Value, json};
@@ -99,7 +99,7 @@ pub fn run(args: &InitArgs) -> anyhow::Result<()> {
         class: args.class.clone(),
         camera: args.camera.clone(),
         camera_up: args.camera_up.map(Into::into),
-        asked: Asked {
+        asked: CameraOptions {
             fov_deg: args.fov,
             pitch_deg: args.pitch,
             eye_height_m: args.eye_height,

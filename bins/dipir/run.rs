@@ -7,7 +7,7 @@ use std::thread::{self, JoinHandle};
 use anyhow::Context;
 use clap::Args;
 use dipir_cli::ending;
-use dipir_cli::exit::{self, Said, Usage, printable};
+use dipir_cli::exit::{self, AlreadyReported, Usage, printable};
 use dipir_cli::interrupt::{self, Interrupted};
 use dipir_cli::session::{Session, check_threads};
 use dipir_cli::style::{bold, color_on_stderr};
@@ -89,7 +89,7 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
             Err(e) if e.is::<Interrupted>() => return Err(e),
             Err(e) => {
                 let code = exit::code_of(&e);
-                if !e.is::<Said>() {
+                if !e.is::<AlreadyReported>() {
                     exit::print(&e.context(name.clone()));
                 }
                 failed.get_or_insert(code);
@@ -101,7 +101,7 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
         output.result(String::new, || json!({"runs": results}));
     }
     match failed {
-        Some(code) => Err(Said(code).into()),
+        Some(code) => Err(AlreadyReported(code).into()),
         None => Ok(()),
     }
 }
@@ -385,7 +385,7 @@ fn stopped(stopped: Stopped<anyhow::Error>) -> anyhow::Error {
         Stopped::Failed { stage, status } => match status.code() {
             Some(code) if code == i32::from(exit::INTERRUPTED) => Interrupted.into(),
             // The stage has printed what was wrong.
-            Some(code) => Said(u8::try_from(code).unwrap_or(exit::FAILED)).into(),
+            Some(code) => AlreadyReported(u8::try_from(code).unwrap_or(exit::FAILED)).into(),
             None => anyhow::anyhow!(
                 "the stage \"{stage}\" ended without a word ({status}): {}; run again to go on \
                  where it was",

@@ -1,6 +1,6 @@
-//! How good the light of a method is, where the true light is known: scenes are made, methods run on
-//! them through the executables, and pictures and lights compared with the true ones. Nothing of the
-//! pipeline imports this.
+//! Measures how good the light of a method is on scenes whose true light is known: makes scenes, runs the methods on
+//! them through the executables, and compares pictures and lights with the true ones. Nothing of the pipeline imports
+//! this.
 //!
 //! Everything is in one folder: `scenes/`, `maps/` and `objects/` that are made, `runs/METHOD/SCENE/`
 //! with pictures and scores, `work/` where stages run, and the report.

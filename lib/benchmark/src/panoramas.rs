@@ -14,7 +14,7 @@ use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_render::shapes::torus_knot;
 use dipir_scene::export::to_obj;
 use dipir_stages::composite::table::Tone;
-use dipir_stages::scene::background::{MID_GREY, View, exposure_ev_to};
+use dipir_stages::scene::background::{MID_GREY, PanoramaView, exposure_ev_to};
 use glam::Vec3;
 
 use crate::command_line::MakeArgs;
@@ -112,7 +112,7 @@ fn make_one(
     let mut draw = Sampler::new(args.seed, Stream::PILOT, n as u32, 0);
     let yaw_deg = (draw.next_1d() * 360.0).round();
     let turn_deg = (draw.next_1d() * 360.0).round();
-    let view = View {
+    let view = PanoramaView {
         fov_rad: FOV_DEG.to_radians(),
         yaw_rad: yaw_deg.to_radians(),
         pitch_rad: PITCH_DEG.to_radians(),
@@ -162,7 +162,7 @@ fn write_map(path: &Path, map: &EnvironmentMap) -> anyhow::Result<()> {
 
 /// The scene's `pipeline.toml`: the camera above the ground, the object in front of it.
 fn pipeline_text(
-    view: &View,
+    view: &PanoramaView,
     turn_deg: f32,
     panorama: &Path,
     model: &Path,

@@ -365,7 +365,7 @@ impl<'a> StageRuns<'a> {
         fs::create_dir_all(folder).with_context(failed)?;
         let described = self.work.join("scene/scene.json");
         fs::copy(described, folder.join("scene.json")).with_context(failed)?;
-        for stage in ["light", "composite"] {
+        for stage in [names::LIGHT.name, names::COMPOSITE.name] {
             let from = self.work.join(stage);
             if from.is_dir() {
                 fs::rename(&from, folder.join(stage)).with_context(failed)?;

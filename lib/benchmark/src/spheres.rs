@@ -38,7 +38,7 @@ const VIEW: Vec3 = Vec3::Z;
 /// What a sphere is made of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Material {
+pub enum SphereMaterial {
     /// A perfect mirror.
     Mirror,
     /// Matte silver.
@@ -48,7 +48,11 @@ pub enum Material {
 }
 
 /// All of them.
-pub const MATERIALS: [Material; 3] = [Material::Mirror, Material::Glossy, Material::Diffuse];
+pub const MATERIALS: [SphereMaterial; 3] = [
+    SphereMaterial::Mirror,
+    SphereMaterial::Glossy,
+    SphereMaterial::Diffuse,
+];
 
 /// Errors of one sphere. Errors of a pixel are lengths of RGB vectors.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -67,7 +71,7 @@ pub struct SphereErrors {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SphereScores {
     /// The sphere.
-    pub material: Material,
+    pub material: SphereMaterial,
     /// Under the compressed maps, as papers report it.
     pub compressed: SphereErrors,
     /// Under the maps as they are.
@@ -167,10 +171,10 @@ fn pixels() -> Vec<(usize, usize, Vec3)> {
 }
 
 /// Radiance of the pixels of a sphere under `map`, in one row.
-fn sphere(map: &EnvironmentMap, material: Material) -> Raster<Vec3> {
+fn sphere(map: &EnvironmentMap, material: SphereMaterial) -> Raster<Vec3> {
     let pixels = pixels();
     let values: Vec<Vec3> = match material {
-        Material::Mirror => pixels
+        SphereMaterial::Mirror => pixels
             .par_iter()
             .map(|&(x, y, _)| mirrored(map, x, y))
             .collect(),
@@ -216,13 +220,13 @@ fn coarse_texels(map: &EnvironmentMap) -> Vec<(Vec3, Vec3, f32)> {
 }
 
 /// Mean of the light over the lobe of a rough material, weights normalised.
-fn reflected(texels: &[(Vec3, Vec3, f32)], normal: Vec3, material: Material) -> Vec3 {
+fn reflected(texels: &[(Vec3, Vec3, f32)], normal: Vec3, material: SphereMaterial) -> Vec3 {
     let (mut sum, mut total) = (Vec3::ZERO, 0.0);
     for &(light, radiance, solid_angle) in texels {
         let cos = normal.dot(light);
         if cos > 0.0 {
             let lobe = match material {
-                Material::Diffuse => cos,
+                SphereMaterial::Diffuse => cos,
                 _ => ggx(normal, light),
             };
             sum += lobe * solid_angle * radiance;
@@ -320,7 +324,7 @@ mod tests {
         texels[20 * 128 + 64] = Vec3::ONE;
         let map = EnvironmentMap::new(128, 64, texels).unwrap();
         let (light, size) = (map.direction_of(20, 64), map.solid_angle(20) as f32);
-        let image = sphere(&map, Material::Diffuse);
+        let image = sphere(&map, SphereMaterial::Diffuse);
         for (&(_, _, normal), value) in pixels().iter().zip(image.pixels()) {
             let expected = REFLECTANCE * normal.dot(light).max(0.0) * size / PI;
             // The sum of cosines over texels is pi to the width of a texel at the horizon, 1%.
@@ -365,8 +369,8 @@ mod tests {
             assert!(score.linear.si_rmse > 0.01, "{score:?}");
             // The lamp colours all of the diffuse sphere, and a few pixels of the mirror.
             let least = match score.material {
-                Material::Diffuse => 1.0,
-                Material::Glossy | Material::Mirror => 0.0,
+                SphereMaterial::Diffuse => 1.0,
+                SphereMaterial::Glossy | SphereMaterial::Mirror => 0.0,
             };
             assert!(score.linear.rgb_angle_deg > least, "{score:?}");
         }

@@ -43,8 +43,7 @@ pub struct CommonArgs {
     #[arg(long, hide = true)]
     pub supervised: bool,
 
-    /// Hashes that the process that started this one knows already; this one adds its own to the
-    /// file
+    /// File of hashes that the parent process knows; this process adds its own
     #[arg(long, value_name = "FILE", hide = true)]
     pub hashes: Option<PathBuf>,
 

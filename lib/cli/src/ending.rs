@@ -1,17 +1,17 @@
-//! Ends that the system brings: why, in words.
+//! Why the system ended a process, in words.
 use std::process::ExitStatus;
 
-/// What is said when the process aborts, as Rust does when an allocation fails.
+/// The message when the process aborts, as Rust does when an allocation fails.
 #[cfg(unix)]
 const ABORTED: &[u8] = b"error: the process cannot go on; where the line above speaks of an \
     allocation, memory ran out: give it more (ulimit -v), or ask for less, as with --set \
     pipeline.quality=draft; earlier results are as they were\n";
 
-/// Lets what would end the process without a word name its cause: a file that grows beyond the
-/// limit on its size becomes an error of the write, and an abort says what it comes from.
+/// Gives a cause to ends that are silent otherwise: a file that grows beyond the size limit becomes
+/// a write error, and an abort prints what it comes from.
 pub(crate) fn prepare() {
-    // SAFETY: called first thing in main. To ignore a signal runs no code of ours, and the handler
-    // only calls `write`, `signal` and `raise`, which handlers may.
+    // SAFETY: called first thing in main. Ignoring a signal runs no code of ours, and the handler
+    // calls only `write`, `signal` and `raise`, which are safe in handlers.
     #[cfg(unix)]
     unsafe {
         libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
@@ -20,7 +20,7 @@ pub(crate) fn prepare() {
     }
 }
 
-/// Says it and ends the process by the signal, whoever sent it.
+/// Prints the message and ends the process by the signal, whoever sent it.
 #[cfg(unix)]
 extern "C" fn say_aborted(_: libc::c_int) {
     // SAFETY: the bytes outlive the call, and handlers may call all three.
@@ -31,7 +31,7 @@ extern "C" fn say_aborted(_: libc::c_int) {
     }
 }
 
-/// What ended a process that gave no exit code, as far as the system tells.
+/// What ended a process that gave no exit code, as far as the system reports it.
 pub fn cause(status: ExitStatus) -> &'static str {
     #[cfg(unix)]
     {

@@ -1,6 +1,6 @@
 //! Executables as child processes: for programs that measure them as users run them.
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
@@ -36,13 +36,6 @@ impl Executables {
         Ok(Self {
             folder: folder.into(),
         })
-    }
-
-    /// Those in `folder`.
-    pub fn in_folder(folder: &Path) -> Self {
-        Self {
-            folder: folder.into(),
-        }
     }
 
     /// Runs the stage `name` with `arguments` and `--json`, and waits for its end.

@@ -30,17 +30,17 @@ impl fmt::Display for Usage {
 
 impl std::error::Error for Usage {}
 
-/// Ends with this exit code and prints nothing: a child process has said it already.
+/// Ends with this exit code and prints nothing, because a child process has printed the error.
 #[derive(Debug)]
-pub struct Said(pub u8);
+pub struct AlreadyReported(pub u8);
 
-impl fmt::Display for Said {
+impl fmt::Display for AlreadyReported {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "exit code {}", self.0)
     }
 }
 
-impl std::error::Error for Said {}
+impl std::error::Error for AlreadyReported {}
 
 /// Runs `main`, prints what went wrong with all its causes, and picks the exit code.
 pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
@@ -50,7 +50,7 @@ pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
         Ok(()) => DONE,
         Err(error) => {
             let code = code_of(&error);
-            if error.is::<Said>() {
+            if error.is::<AlreadyReported>() {
                 return ExitCode::from(code);
             }
             if code == INTERRUPTED {
@@ -71,10 +71,10 @@ pub fn print(error: &anyhow::Error) {
     let _ = writeln!(stderr(), "{label} {}", printable(&describe(error)));
 }
 
-/// Tells the tensor library to do its element-wise work on the thread that asks for it. Its pool
-/// of spinning threads gains little beside kernels that are parallel themselves, and where
-/// processors are shared it costs dearly: on two busy cores training the small model does 1.4
-/// times as much per processor second without it.
+/// Makes the tensor library do its element-wise work on the calling thread. Its pool of spinning
+/// threads gains little beside kernels that are parallel themselves, and where processors are
+/// shared it costs dearly: on two busy cores training the small model does 1.4 times as much per
+/// processor second without it.
 fn one_tensor_thread() {
     const KEY: &str = "CANDLE_NUM_THREADS";
     if std::env::var_os(KEY).is_none() {
@@ -85,7 +85,7 @@ fn one_tensor_thread() {
 
 /// The exit code of an error.
 pub fn code_of(error: &anyhow::Error) -> u8 {
-    if let Some(Said(code)) = error.downcast_ref() {
+    if let Some(AlreadyReported(code)) = error.downcast_ref() {
         return *code;
     }
     let is = |test: fn(&(dyn std::error::Error + 'static)) -> bool| error.chain().any(test);
@@ -98,8 +98,8 @@ pub fn code_of(error: &anyhow::Error) -> u8 {
     }
 }
 
-/// The message, then its causes. A cause that its parent quotes already is not repeated, and the
-/// numbers of operating-system errors, which say nothing that their text does not, are left out.
+/// The message, then its causes. A cause that its parent already quotes is not repeated. Numbers of
+/// operating-system errors are left out, because their text says the same.
 pub fn describe(error: &anyhow::Error) -> String {
     let mut text = String::new();
     let mut parent = String::new();
@@ -198,7 +198,7 @@ mod tests {
         assert_eq!(code_of(&Usage("bad flag".into()).into()), USAGE);
         assert_eq!(code_of(&anyhow::Error::new(Interrupted)), INTERRUPTED);
         assert_eq!(code_of(&anyhow::anyhow!("broken")), FAILED);
-        assert_eq!(code_of(&anyhow::Error::new(Said(7))), 7);
+        assert_eq!(code_of(&anyhow::Error::new(AlreadyReported(7))), 7);
         let wrapped = Err::<(), _>(Interrupted).context("while rendering");
         assert_eq!(code_of(&wrapped.unwrap_err()), INTERRUPTED);
     }

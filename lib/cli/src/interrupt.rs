@@ -30,7 +30,7 @@ impl fmt::Display for Interrupted {
 
 impl std::error::Error for Interrupted {}
 
-/// What the user is told.
+/// The message to the user.
 pub const MESSAGE: &str = "interrupted; earlier results are as they were";
 
 const NO_THREAD: &str = "cannot listen for Ctrl-C, for which a thread is needed: memory or the \
@@ -48,7 +48,7 @@ pub fn listen() -> anyhow::Result<()> {
     ctrlc::set_handler(stop).context(NO_THREAD)
 }
 
-/// Starts to listen without ever ending the process: for work that waits for others to stop. Does
+/// Starts to listen but never ends the process. For work that waits for its children to stop. Does
 /// nothing when called again.
 pub fn listen_patiently() -> anyhow::Result<()> {
     static LISTENS: AtomicBool = AtomicBool::new(false);

@@ -17,7 +17,7 @@ const STEPS: u64 = 1000;
 const DRAW_EVERY: Duration = Duration::from_millis(200);
 /// How often a line is written where there is no bar.
 const LINE_EVERY: Duration = Duration::from_secs(30);
-/// Nothing is said of the time left before this share of the work and this time have passed.
+/// The time left is shown only after this share of the work and this time have passed.
 const SHARE_TO_JUDGE_BY: f64 = 0.02;
 const TIME_TO_JUDGE_BY: Duration = Duration::from_secs(2);
 
@@ -40,7 +40,7 @@ struct Course {
     /// Where the work began: time since `begun`, share done. Work that goes on from a checkpoint
     /// begins there.
     first: Option<(Duration, f64)>,
-    /// The last share that was told.
+    /// The last share that was reported.
     last: (Duration, f64),
 }
 
@@ -93,13 +93,13 @@ fn roughly(seconds: f64) -> String {
     }
 }
 
-fn look(course: &Shared) -> MutexGuard<'_, Course> {
+fn locked(course: &Shared) -> MutexGuard<'_, Course> {
     course.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// What is left behind the bar.
 fn left(course: &Shared) -> String {
-    let course = look(course);
+    let course = locked(course);
     match course.left_s(course.begun.elapsed()) {
         Some(seconds) => format!("about {} left", roughly(seconds)),
         None => String::new(),
@@ -148,7 +148,7 @@ impl Progress {
         let lines = (!visible && !quiet).then(|| {
             let (title, course) = (title.to_string(), course.clone());
             let line = move || {
-                let course = look(&course);
+                let course = locked(&course);
                 format!("{title}: {}", course.in_words(course.begun.elapsed()))
             };
             write_lines(LINE_EVERY, line, |line| {
@@ -169,7 +169,7 @@ impl Progress {
         let fraction = if fraction.is_finite() { fraction } else { 0.0 };
         let fraction = fraction.clamp(0.0, 1.0);
         {
-            let mut course = look(&self.course);
+            let mut course = locked(&self.course);
             let passed = course.begun.elapsed();
             course.set(passed, fraction);
         }

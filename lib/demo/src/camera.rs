@@ -18,7 +18,7 @@ use crate::sky::Sky;
 use crate::square::Square;
 
 /// The sky as a light: every texel the mean over its cell, the sun's energy exact.
-pub fn sky_map(sky: &Sky, width: usize) -> EnvironmentMap {
+fn sky_map(sky: &Sky, width: usize) -> EnvironmentMap {
     let height = width / 2;
     let black = EnvironmentMap::constant(width, height, Vec3::ZERO);
     let mut texels: Vec<Vec3> = (0..width * height)

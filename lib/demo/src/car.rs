@@ -52,8 +52,8 @@ const CABIN: [Vec2; 7] = [
 
 /// Side view of the windows, front and rear.
 const FRONT_WINDOW: [Vec2; 4] = [
-    v(0.86, 0.99),
-    v(0.22, 1.345),
+    v(0.76, 0.99),
+    v(0.10, 1.345),
     v(-0.36, 1.375),
     v(-0.36, 0.985),
 ];

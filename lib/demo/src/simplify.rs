@@ -83,7 +83,7 @@ impl PartialOrd for Candidate {
 }
 
 impl Ord for Candidate {
-    /// The least error is greatest, ties by index, so that the result is always the same.
+    /// For a max-heap: the least error compares greatest, ties by index, so that the result is always the same.
     fn cmp(&self, other: &Self) -> Ordering {
         let key = other.error.total_cmp(&self.error);
         key.then(other.edge.cmp(&self.edge))

@@ -131,8 +131,8 @@ pub struct ScoreDistillation<'a> {
     pub lora: Option<&'a Arc<Lora>>,
     /// States of the prompt, [1 or batch, tokens, width].
     pub conditional: &'a Tensor,
-    /// States of the empty prompt, or, for a batch of 1, of several prompts [prompts, tokens, width],
-    /// over which the prediction is averaged: what the wanted one is to be told from.
+    /// States of the empty prompt, or, for a batch of 1, of several prompts [prompts, tokens, width], over which the
+    /// prediction is averaged: the alternatives that the prompt is contrasted with.
     pub unconditional: &'a Tensor,
     /// For 9-channel networks.
     pub inpaint: Option<&'a InpaintCondition>,

@@ -1,4 +1,4 @@
-//! What can go wrong with a diffusion model, said so that it can be mended.
+//! Errors of diffusion models, each with what to do about it.
 
 use std::path::PathBuf;
 

@@ -35,7 +35,7 @@ pub struct Generated {
 }
 
 /// Pixels that height and width have to be a multiple of.
-pub fn size_multiple(model: &Model) -> usize {
+fn size_multiple(model: &Model) -> usize {
     model.vae.downscale()
 }
 

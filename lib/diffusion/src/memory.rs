@@ -4,8 +4,8 @@
 ///
 /// A network's results are a few megabytes each, are freed soon after and are
 /// asked for again; glibc returns such pieces to the system, which then fills
-/// every page with zeros anew. Holds for the whole process, so executables
-/// call it, once and early; up to 2 GiB beyond what is in use stay with them.
+/// every page with zeros anew. Affects the whole process, so executables call
+/// it, once and early. The process keeps up to 2 GiB beyond what is in use.
 /// Does nothing where there is no glibc.
 pub fn keep_freed() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]

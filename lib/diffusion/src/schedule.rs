@@ -117,9 +117,8 @@ impl NoiseSchedule {
         })
     }
 
-    /// Computes the schedule in f64. Refuses variances outside [0, 1), and a
-    /// noise prediction where the last timestep is noise alone: the sample
-    /// cannot be told from it.
+    /// Computes the schedule in f64. Refuses variances outside [0, 1), and a noise prediction where the last timestep
+    /// is noise alone: it does not determine the sample.
     pub fn new(config: ScheduleConfig) -> Result<Self> {
         let betas = betas(&config)?;
         let mut alpha_bars: Vec<f64> = betas

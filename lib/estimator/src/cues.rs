@@ -10,15 +10,15 @@ use crate::features::{CLIPPED, SIDE};
 const FLOOR: f32 = 0.004;
 /// Rays below or above this elevation are of the ground or of what stands above it, degrees.
 const LEVEL_DEG: f32 = 4.0;
-/// Directions of edges that are told apart.
+/// Bins of edge direction.
 const FACINGS: usize = 8;
 /// Regions: ground and above.
 const REGIONS: usize = 2;
 /// Left, middle, right.
 const THIRDS: usize = 3;
-/// Numbers told of each third of a region.
+/// Features of each third of a region.
 const PER_THIRD: usize = 5;
-/// Numbers told of the brightness of each region against its tint, and of the shape of its histogram.
+/// Features of the brightness of each region against its tint, and of the shape of its histogram.
 const PER_SHAPE: usize = 4;
 /// Numbers in all.
 pub(crate) const CUES: usize = 6 + REGIONS * (THIRDS * PER_THIRD + PER_SHAPE + FACINGS);
@@ -159,7 +159,7 @@ mod tests {
     use super::*;
 
     /// Ground in the lower half whose right side is lit, four times as bright and warmer.
-    fn told(lit: impl Fn(usize) -> bool) -> Vec<f32> {
+    fn cues_of(lit: impl Fn(usize) -> bool) -> Vec<f32> {
         let pixel = |k: usize| match lit(k % SIDE) {
             true => Vec3::new(0.5, 0.4, 0.3),
             false => Vec3::new(0.1, 0.1, 0.1),
@@ -172,8 +172,8 @@ mod tests {
     }
 
     #[test]
-    fn the_lit_side_is_told_and_changes_sides_in_a_mirror() {
-        let (right, left) = (told(|x| x >= SIDE / 2), told(|x| x < SIDE / 2));
+    fn the_lit_side_is_found_and_changes_sides_in_a_mirror() {
+        let (right, left) = (cues_of(|x| x >= SIDE / 2), cues_of(|x| x < SIDE / 2));
         assert_eq!(right.len(), CUES);
         assert!(right[0] > 0.2 && right[2] > 0.4, "{:?}", &right[..6]);
         for k in [0, 2] {
@@ -184,9 +184,9 @@ mod tests {
     }
 
     #[test]
-    fn warm_light_on_bright_ground_is_told() {
+    fn warm_light_on_bright_ground_is_found() {
         let shape = 6 + THIRDS * PER_THIRD;
-        let all = told(|x| x >= SIDE / 2);
+        let all = cues_of(|x| x >= SIDE / 2);
         // Brightness and warmth take the same two values: they go together but for the terms that keep them finite.
         assert!(all[shape] > 0.2 && all[shape + 1] > 0.95);
     }

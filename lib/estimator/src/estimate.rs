@@ -2,7 +2,7 @@
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::fit::fit;
 use dipir_light::gaussian::SphericalGaussian;
-use glam::Vec3;
+use glam::{Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::grid::{BIN_SIGMA, BINS, bin_direction, smooth_map, to_world};
@@ -76,6 +76,14 @@ impl LightEstimate {
         self.elevation_deg = self.posterior.elevation_interval(0.8);
         self.words = words(self.posterior.mode());
         self
+    }
+
+    /// The direction of the strongest source in the world: the one that is known, else the most probable.
+    pub fn mode(&self) -> Vec3 {
+        if let Some(source) = &self.source {
+            return source.direction;
+        }
+        Quat::from_rotation_y(-self.heading_rad as f32) * self.posterior.mode()
     }
 
     /// The mean light in the world: the smooth part, and the strongest source spread over where it may stand.

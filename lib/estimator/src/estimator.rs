@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::EstimatorError;
 use crate::estimate::{Interval, LightEstimate};
-use crate::features::Glance;
+use crate::features::SmallPhoto;
 use crate::grid::{BASE_TEXELS, BINS, base_texel, heading, mirrored_bin, mirrored_texel};
 use crate::histogram::{SHARES, STOPS, Scale};
 use crate::network::{
@@ -127,13 +127,13 @@ impl Estimator {
 
     /// The light of a whole photograph, which is decoded by its transfer function: values in `[0, 1]`.
     pub fn estimate(&self, photo: &LinearImage, camera: &Camera) -> LightEstimate {
-        self.of_glance(&Glance::new(photo, camera), heading(camera))
+        self.of_small_photo(&SmallPhoto::new(photo, camera), heading(camera))
     }
 
     /// The light of a photograph at the size that is looked at, taken towards an azimuth in the world.
-    pub fn of_glance(&self, glance: &Glance, heading_rad: f64) -> LightEstimate {
-        let features = [glance.features(), glance.mirrored().features()];
-        self.of_features(&features, glance.reference(), heading_rad)
+    pub fn of_small_photo(&self, small: &SmallPhoto, heading_rad: f64) -> LightEstimate {
+        let features = [small.features(), small.mirrored().features()];
+        self.of_features(&features, small.reference(), heading_rad)
     }
 
     /// The light of a photograph's features and those of its mirror image, averaged.

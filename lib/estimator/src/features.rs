@@ -1,5 +1,5 @@
-//! What is told of a photograph: means, contrasts and extremes of its parts, by place in the picture and by elevation
-//! in the world. Too little to recognise a place by, which is why light that is learned from few places carries over.
+//! Features of a photograph: means, contrasts and extremes of its parts, by place in the picture and by elevation in
+//! the world. Too little to recognise a place by, which is why light that is learned from few places carries over.
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::resize::{Filter, resize};
 use dipir_light::luminance::luminance;
@@ -22,9 +22,9 @@ pub const CLIPPED: f32 = 0.955;
 const BLACK: f32 = 0.0031;
 /// Borders between bands of elevation, degrees.
 const BANDS_DEG: [f32; 9] = [-91.0, -45.0, -25.0, -12.0, -4.0, 4.0, 12.0, 25.0, 91.0];
-/// Numbers told of each band.
+/// Features of each band.
 const PER_BAND: usize = 7;
-/// Quantiles of log-luminance that are told.
+/// Quantiles of log-luminance that are features.
 const QUANTILES: [f32; 7] = [0.02, 0.1, 0.25, 0.5, 0.75, 0.9, 0.98];
 /// Numbers in all.
 pub const FEATURES: usize = 6
@@ -35,9 +35,9 @@ pub const FEATURES: usize = 6
     + PER_BAND * (BANDS_DEG.len() - 1)
     + CUES;
 
-/// A photograph and its camera at the size that is looked at.
+/// A photograph and its camera, resized to the input of the features.
 #[derive(Clone, Debug)]
-pub struct Glance {
+pub struct SmallPhoto {
     /// Linear light in `[0, 1]`, row by row.
     pixels: Vec<Vec3>,
     /// Elevation of each pixel's ray, degrees.
@@ -46,7 +46,7 @@ pub struct Glance {
     pitch_half: [f32; 3],
 }
 
-impl Glance {
+impl SmallPhoto {
     /// The whole `photo` resized by the area filter. Pixels that are no numbers count as black.
     pub fn new(photo: &LinearImage, camera: &Camera) -> Self {
         let clean = photo.0.map(|p| clean(*p));

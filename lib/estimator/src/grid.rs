@@ -41,11 +41,6 @@ pub fn bin_direction(k: usize) -> Vec3 {
     )
 }
 
-/// The middles of all bins.
-pub fn bin_directions() -> Vec<Vec3> {
-    (0..BINS).map(bin_direction).collect()
-}
-
 /// The middle of texel `k` of the smooth part and its solid angle.
 pub fn base_texel(k: usize) -> (Vec3, f32) {
     let (row, column) = (k / BASE[0], k % BASE[0]);

@@ -52,7 +52,7 @@ pub struct KnownSource {
 }
 
 impl LightEstimate {
-    /// The estimate with what is known of the sun.
+    /// The estimate, conditioned on what is known of the sun.
     pub fn knowing(&self, sun: &KnownSun) -> Self {
         let mut known = self.clone();
         if sun.elevation.is_some_and(|e| e.deg < SET_DEG) {

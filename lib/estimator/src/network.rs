@@ -24,7 +24,7 @@ pub const EXPOSURE: usize = SUN + 1;
 pub const SHARE: usize = EXPOSURE + STOPS.count;
 /// Outputs in all.
 pub const OUTPUTS: usize = SHARE + SHARES.count;
-/// Standardised features are cut off here, deviations: a camera or a picture that was never seen stays finite.
+/// Standardised features are clamped to this many standard deviations, so that no camera or picture leads to infinity.
 pub const FEATURE_LIMIT: f32 = 5.0;
 /// Logarithms of radiance over the photograph's mean are kept between these.
 pub const LOG_RADIANCE: [f32; 2] = [-8.0, 6.0];

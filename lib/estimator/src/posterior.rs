@@ -3,7 +3,7 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use crate::estimate::Interval;
-use crate::grid::{AZIMUTHS, BINS, ELEVATION_EDGES_DEG, ELEVATIONS, bin_direction, direction};
+use crate::grid::{AZIMUTHS, BINS, ELEVATION_EDGES_DEG, ELEVATIONS, bin_direction};
 
 /// Degrees of azimuth of one bin.
 const STEP_DEG: f64 = 360.0 / AZIMUTHS as f64;
@@ -14,7 +14,7 @@ const MODE: f32 = 0.8;
 /// Probabilities of the bins of [`crate::grid`], summing to 1. Azimuth 0 is ahead and grows to the right.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PeakPosterior {
-    /// Elevation after elevation from the lowest, each around the horizon.
+    /// Rows of one elevation from the lowest up, each once around the horizon.
     pub weights: Vec<f32>,
 }
 
@@ -196,9 +196,4 @@ pub fn words(towards: Vec3) -> String {
         _ => "from behind".to_string(),
     };
     format!("{from}, {height}")
-}
-
-/// The direction at degrees of azimuth and elevation relative to the view.
-pub fn direction_deg(azimuth: f64, elevation: f64) -> Vec3 {
-    direction(azimuth.to_radians() as f32, elevation.to_radians() as f32)
 }

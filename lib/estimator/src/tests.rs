@@ -6,11 +6,16 @@ use dipir_light::luminance::luminance;
 use dipir_scene::camera::{Camera, FieldOfView};
 use glam::{DVec3, Vec3};
 
-use crate::features::{FEATURES, Glance};
-use crate::grid::{BINS, bin_direction, heading};
+use crate::features::{FEATURES, SmallPhoto};
+use crate::grid::{BINS, bin_direction, direction, heading};
 use crate::network::{HISTOGRAM, Network, OUTPUTS};
-use crate::posterior::{PeakPosterior, direction_deg, words};
+use crate::posterior::{PeakPosterior, words};
 use crate::{Calibration, Estimator, LightEstimate, Visible, combine, merged};
+
+/// The direction at degrees of azimuth and elevation relative to the view.
+fn direction_deg(azimuth: f64, elevation: f64) -> Vec3 {
+    direction(azimuth.to_radians() as f32, elevation.to_radians() as f32)
+}
 
 fn estimator() -> Estimator {
     let wave = |n: usize, scale: f32| {
@@ -369,8 +374,8 @@ fn a_merged_map_is_continuous_across_the_photographs_border() {
 fn features_are_of_the_whole_photograph_at_any_size() {
     let camera = |n: u32| camera(0.0, n, n);
     let (small, large) = (
-        Glance::new(&photo(64, 64), &camera(64)),
-        Glance::new(&photo(256, 256), &camera(256)),
+        SmallPhoto::new(&photo(64, 64), &camera(64)),
+        SmallPhoto::new(&photo(256, 256), &camera(256)),
     );
     let (a, b) = (small.features(), large.features());
     // The ramps are sampled at pixel corners: they differ by 3/8 of a pixel of the smaller one, under .006.

@@ -53,7 +53,7 @@ impl Visible {
                         (i as f32 + (s / SAMPLES) as f32 / SAMPLES as f32 + 0.5 / SAMPLES as f32)
                             / height as f32;
                     let towards = dipir_light::environment::direction_at(u, v);
-                    if let Some((value, seen)) = view.look(towards) {
+                    if let Some((value, seen)) = view.sample(towards) {
                         light += value * seen;
                         weight += seen;
                         white += if value.max_element() >= CLIPPED {
@@ -110,7 +110,7 @@ impl View {
     }
 
     /// Radiance from a direction and how far inside the picture it lies, 0 at the border to 1.
-    fn look(&self, towards: Vec3) -> Option<(Vec3, f32)> {
+    fn sample(&self, towards: Vec3) -> Option<(Vec3, f32)> {
         let at = self.camera.project(self.camera.position + towards)?;
         let size = Vec2::new(self.pixels.width() as f32, self.pixels.height() as f32);
         if !(at.cmpge(Vec2::ZERO).all() && at.cmplt(size).all()) {

@@ -179,7 +179,8 @@ fn wilson(share: f64, count: usize) -> [f64; 2] {
 /// Two-sided exact binomial test of one half.
 fn sign_test(wins: usize, count: usize) -> f64 {
     let far = wins.max(count - wins);
-    // Chances of `k` of `count`, as logarithms: coefficients overflow beyond a thousand.
+    // Probabilities of `k` of `count`, as logarithms, because binomial coefficients overflow beyond
+    // a thousand.
     let mut ln_choose = 0.0;
     let mut tail = 0.0;
     for k in 0..=count {

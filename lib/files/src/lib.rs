@@ -21,7 +21,7 @@ pub fn open(path: impl AsRef<Path>) -> io::Result<File> {
     check_regular(&fs::metadata(path)?)?;
     let mut options = OpenOptions::new();
     options.read(true);
-    // Something else may have come to the name since: it is not waited for, and refused.
+    // Something else may have taken the name since: it is refused, and nothing waits for it.
     own::do_not_wait(&mut options);
     let file = options.open(path)?;
     check_regular(&file.metadata()?)?;

@@ -1,4 +1,4 @@
-//! Files that this program makes and replaces, told from others' by how they begin.
+//! Files that this program makes and replaces, recognised by how they begin.
 //!
 //! None of these functions follows a symbolic link at the name that it is given.
 use std::fs::{self, File, OpenOptions};
@@ -23,13 +23,13 @@ pub fn open_own(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// Whether `path` is a regular file that begins with `mark`; not there is no.
+/// Whether `path` is a regular file that begins with `mark`; false if nothing is there.
 pub fn begins_with(path: &Path, mark: &[u8]) -> io::Result<bool> {
     Ok(beginning(path, mark.len())?.is_some_and(|found| found == mark))
 }
 
 /// Writes `content`, which begins with `mark`, beside `path`, flushes it and renames it to `path`:
-/// whoever reads `path` finds the earlier content or this one, after a power cut, too.
+/// a reader of `path` finds the earlier content or this one, after a power cut, too.
 ///
 /// # Errors
 /// Those of the system, and [`io::ErrorKind::AlreadyExists`] if `path`, or `.NAME.partial` beside

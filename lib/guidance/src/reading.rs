@@ -8,7 +8,7 @@ use dipir_imaging::resize::{CropResize, Filter, PixelBox};
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_optimize::parameters::Parameters;
 use dipir_prior::caption::ViewDirection;
-use dipir_prior::encoder::{LightEncoder, LightEstimate};
+use dipir_prior::encoder::{LightEncoder, SunSkyEstimate};
 use dipir_prior::inversion::{Crop, InversionSettings, Reading, invert};
 use dipir_prior::picture::SIZE;
 use dipir_scene::camera::Camera;
@@ -36,7 +36,7 @@ const GROUND_ALBEDO: f32 = 0.3;
 
 /// Where an object is inserted.
 #[derive(Clone, Copy)]
-pub struct Place<'a> {
+pub struct Insertion<'a> {
     /// The camera that took the photograph.
     pub camera: &'a Camera,
     /// The ground that catches the shadow.
@@ -104,8 +104,8 @@ fn square(size: (usize, usize), center: Vec2, side: f32) -> PixelBox {
     }
 }
 
-/// How much the middle of a crop stands out from what surrounds it: the distance of their mean
-/// colours, in spreads of the surroundings.
+/// How much the middle of a crop stands out from what surrounds it: the distance of their mean colours, in standard
+/// deviations of the surroundings.
 fn interest(picture: &[f32]) -> f32 {
     let n = SIZE * SIZE;
     let inside = |i: usize, margin: usize| {
@@ -148,8 +148,8 @@ const LEAST_INTEREST: f32 = 0.4;
 
 /// Squares of the photograph: the first three around the place of the insertion, the others where
 /// something seems to stand on the ground.
-fn crops(photo: &Raster<Vec3>, place: &Place<'_>) -> Vec<Crop> {
-    let &Place {
+fn crops(photo: &Raster<Vec3>, place: &Insertion<'_>) -> Vec<Crop> {
+    let &Insertion {
         camera,
         proxy,
         object,
@@ -219,7 +219,7 @@ fn crops(photo: &Raster<Vec3>, place: &Place<'_>) -> Vec<Crop> {
 pub fn read_light(
     model: &Model,
     photo: &DisplayImage,
-    place: &Place<'_>,
+    place: &Insertion<'_>,
     settings: &InversionSettings,
     seed: u64,
     progress: &(dyn Fn(f64) -> ControlFlow<()> + Sync),
@@ -235,7 +235,7 @@ pub fn read_light(
 }
 
 /// The start of the optimisation under an estimate of the light.
-pub fn start(estimate: &LightEstimate, camera: &Camera, lobes: usize) -> Parameters {
+pub fn start(estimate: &SunSkyEstimate, camera: &Camera, lobes: usize) -> Parameters {
     let words = &estimate.description;
     let tint = |warmth: f32| {
         let v = Vec3::new((0.5 * warmth).exp(), 1.0, (-0.5 * warmth).exp());
@@ -293,7 +293,7 @@ mod tests {
             FieldOfView::Vertical(0.7),
             [64, 48],
         );
-        let estimate = LightEstimate {
+        let estimate = SunSkyEstimate {
             description: dipir_prior::caption::LightDescription {
                 azimuth: 0.4,
                 elevation: 0.8,
@@ -305,7 +305,7 @@ mod tests {
             sky_warmth: 0.0,
         };
         let width = |confidence: f32| {
-            let estimate = LightEstimate {
+            let estimate = SunSkyEstimate {
                 confidence,
                 ..estimate
             };
@@ -383,7 +383,7 @@ mod tests {
                 width: side,
                 height: side,
             };
-            let place = Place {
+            let place = Insertion {
                 camera: &camera,
                 proxy: &proxy,
                 object,
@@ -409,7 +409,7 @@ mod tests {
             width: 24,
             height: 24,
         };
-        let place = Place {
+        let place = Insertion {
             camera: &camera,
             proxy: &proxy,
             object,

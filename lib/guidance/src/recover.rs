@@ -20,7 +20,7 @@ use dipir_render::transport::{RecordSettings, Transport};
 
 use crate::distillation::{Adapter, Distillation, DistillationSettings};
 use crate::error::{Error, Result};
-use crate::reading::{self, Place, read_light, view_direction};
+use crate::reading::{self, Insertion, read_light, view_direction};
 
 /// Side of the crops of a reference, pixels, when it is compared on crops.
 const CROP_SIDE: usize = 128;
@@ -209,7 +209,7 @@ fn read(
         return Ok(None);
     };
     let object = bounding_box(coverage).ok_or(Error::NothingToSee)?;
-    let place = Place {
+    let place = Insertion {
         camera: renderer.camera(),
         proxy: &renderer.scene().proxy,
         object,

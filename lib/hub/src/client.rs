@@ -151,7 +151,7 @@ impl Hub {
     }
 
     /// Opens `url` from byte `first` on; returns the reader and whether it
-    /// starts there, or at the beginning because the server cannot do better.
+    /// starts there, or at the beginning, where the server cannot resume.
     pub(crate) fn open(&self, url: &str, first: u64) -> Result<(impl Read + use<>, bool)> {
         let response = self.get(url, first)?;
         let partial = response.status().as_u16() == 206;

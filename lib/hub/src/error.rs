@@ -80,7 +80,7 @@ pub enum Error {
         /// Of the hub.
         wanted: String,
     },
-    /// A file that was whole once is not any more.
+    /// A file that was whole has changed since.
     #[error("{path}: its {kind} is {found}, the hub says {wanted}; remove the folder and fetch it again", path = path.display())]
     Damaged {
         /// Where.

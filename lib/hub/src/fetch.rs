@@ -166,14 +166,14 @@ fn prepare(partial: &Path, source: &Source) -> Result<()> {
         source: e.into(),
     })?;
     text.push(b'\n');
-    // Beside it first: whoever is killed here leaves a note that can be read.
+    // Written beside it first, so that a process killed here leaves a note that can be read.
     let beside = part_of(&note);
     fs::write(&beside, text)
         .and_then(|()| fs::rename(&beside, &note))
         .map_err(io("write", &note))
 }
 
-/// Whether nothing is at `folder`, or an empty folder, or one in which the note was begun.
+/// Whether `folder` is missing, empty, or holds a note that was begun.
 fn is_free(folder: &Path) -> Result<bool> {
     let found = match fs::symlink_metadata(folder) {
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(true),
@@ -233,7 +233,7 @@ impl Run {
             .append(true)
             .open(part)
             .map_err(io("write", part))?;
-        // More than there should be cannot be continued.
+        // A file that is already too long cannot be continued.
         if file.size.is_some_and(|size| there > size) {
             out.set_len(0).map_err(io("write", part))?;
             there = 0;
@@ -288,7 +288,7 @@ impl Run {
     }
 }
 
-/// Compares size and hash with what the hub says, as far as it says anything.
+/// Compares size and hash with those that the hub states, if it states any.
 fn verify_file(file: &RemoteFile, part: &Path) -> Result<()> {
     let size = length(part)?;
     let differs = |kind, found: String, wanted: &str| {

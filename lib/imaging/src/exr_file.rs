@@ -96,7 +96,7 @@ fn half_samples(values: &[f32]) -> FlatSamples {
 }
 
 /// Opens `path` and reads as [`read`], after a look at its first bytes.
-pub(crate) fn open(path: &Path, names: Option<&[&str]>) -> Result<Layers, ImagingError> {
+pub(crate) fn open(path: &Path) -> Result<Layers, ImagingError> {
     let failed = |e| ImagingError::io("read", path, e);
     let file = dipir_files::open(path).map_err(failed)?;
     let length = file.metadata().map_err(failed)?.len();
@@ -109,7 +109,7 @@ pub(crate) fn open(path: &Path, names: Option<&[&str]>) -> Result<Layers, Imagin
         });
     }
     match Format::of(&start[..start.len().min(Format::SNIFF_LENGTH)]) {
-        Format::Exr => read(reader, length, path, names, SizeLimit::Any),
+        Format::Exr => read(reader, length, path, None, SizeLimit::Any),
         other => Err(other.refuse(path, EXPECTED)),
     }
 }

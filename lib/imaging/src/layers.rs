@@ -274,16 +274,7 @@ impl Layers {
     /// already get the part's name in front. Values are not checked for NaN or infinity: depth may
     /// be infinite.
     pub fn read_exr(path: impl AsRef<Path>) -> Result<Self, ImagingError> {
-        exr_file::open(path.as_ref(), None)
-    }
-
-    /// Reads only the channels `names`; the rest is not kept in memory. Errors if one is missing.
-    pub fn read_exr_channels(path: impl AsRef<Path>, names: &[&str]) -> Result<Self, ImagingError> {
-        let layers = exr_file::open(path.as_ref(), Some(names))?;
-        for name in names {
-            layers.channel(name)?;
-        }
-        Ok(layers)
+        exr_file::open(path.as_ref())
     }
 }
 

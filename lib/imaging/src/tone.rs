@@ -260,7 +260,7 @@ impl ToneMapper {
     /// Adjoint of [`ToneMapper::object_pixel`] for a fixed `alpha`: adds to `knots`, returns
     /// the gradient with respect to the premultiplied colour.
     #[inline]
-    pub fn object_pixel_vjp(
+    fn object_pixel_vjp(
         &self,
         object: Vec3,
         alpha: f32,
@@ -295,7 +295,7 @@ impl ToneMapper {
     /// Adjoint of [`ToneMapper::shadow_pixel`]: adds to `knots`, returns the gradient with
     /// respect to the ratio.
     #[inline]
-    pub fn shadow_pixel_vjp(
+    fn shadow_pixel_vjp(
         &self,
         shadow: Vec3,
         gradient: Vec3,

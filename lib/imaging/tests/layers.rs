@@ -75,20 +75,6 @@ fn the_file_declares_latlong_zip1_and_each_channels_type() {
 }
 
 #[test]
-fn a_named_subset_reads_those_channels_alone() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("x.exr");
-    sample().write_exr(&path).unwrap();
-    let some = Layers::read_exr_channels(&path, &["shadow.G", "depth.Z"]).unwrap();
-    assert_eq!(some.names().collect::<Vec<_>>(), ["depth.Z", "shadow.G"]);
-    let whole = sample();
-    assert_eq!(
-        some.channel("shadow.G").unwrap(),
-        whole.channel("shadow.G").unwrap()
-    );
-}
-
-#[test]
 fn a_missing_channel_is_an_error_that_lists_those_in_the_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.exr");
@@ -100,7 +86,10 @@ fn a_missing_channel_is_an_error_that_lists_those_in_the_file() {
         .insert("proxy.A", Precision::Half, ramp(1, 1))
         .unwrap();
     layers.write_exr(&path).unwrap();
-    let error = Layers::read_exr_channels(&path, &["depth.Z", "object.A"]).unwrap_err();
+    let error = Layers::read_exr(&path)
+        .unwrap()
+        .channel("object.A")
+        .unwrap_err();
     assert_eq!(
         error.to_string(),
         format!(

@@ -17,7 +17,7 @@ use anyhow::{Context, bail};
 use command_line::ViewArgs;
 use report::Report;
 
-/// What the first bytes and the name of a file say it is.
+/// The kind of a file, by its first bytes and its name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
     Png,

@@ -17,8 +17,8 @@ pub(crate) fn inspect(path: &Path) -> anyhow::Result<Report> {
         anyhow::anyhow!("cannot read {}: {}", path.display(), crate::reason(&e))
     };
     let file = File::open(path).map_err(unreadable)?;
-    // SAFETY: the map is only read. Another process that cuts the file meanwhile would end this
-    // one with a bus error, which a program that only shows files may risk for files larger than
+    // SAFETY: the map is only read. If another process truncates the file meanwhile, this one ends
+    // with a bus error. A program that only shows files may risk that, to read files larger than
     // memory.
     let bytes = unsafe { Mmap::map(&file) }.map_err(unreadable)?;
     let refused = |e: safetensors::SafeTensorError| {

@@ -85,7 +85,7 @@ impl EnvironmentMap {
 
     /// A map from an image in latitude-longitude layout: twice as wide as high, or it is an
     /// error, because a crop or a cube map would put the light elsewhere.
-    pub fn from_image(image: &LinearImage) -> Result<Self, LightError> {
+    fn from_image(image: &LinearImage) -> Result<Self, LightError> {
         let (width, height) = (image.0.width(), image.0.height());
         if width != 2 * height {
             return Err(LightError::Aspect { width, height });

@@ -1,4 +1,4 @@
-//! Numbers that behave: guarded functions, counter-based random numbers and
+//! Numerical tools: guarded functions, counter-based random numbers and
 //! low-discrepancy samples, warps, deterministic reductions, statistics.
 pub mod gradcheck;
 pub mod guarded;

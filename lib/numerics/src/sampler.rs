@@ -32,8 +32,8 @@ impl Stream {
     pub const BOOTSTRAP: Stream = Stream(8);
     /// Tests.
     pub const TEST: Stream = Stream(9);
-    /// Looking for glints.
-    pub const GLINTS: Stream = Stream(10);
+    /// The search for highlights.
+    pub const HIGHLIGHTS: Stream = Stream(10);
 }
 
 /// Draws the numbers of one sample of one pixel, dimension after dimension.

@@ -1,4 +1,4 @@
-//! Sums that keep their digits and do not depend on the number of threads.
+//! Compensated sums that do not depend on the number of threads.
 use std::ops::Range;
 
 use rayon::prelude::*;

@@ -27,7 +27,7 @@ use dipir_optimize::objective::Objective;
 use dipir_optimize::optimization::{Event, Optimization, Outcome};
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::recorder::SceneRecorder;
-use dipir_optimize::settings::{LightTable, Preset, Settings};
+use dipir_optimize::settings::{LightPreset, LightTable, Settings};
 use dipir_render::adaptive::Stop;
 use dipir_render::features::{SPECULAR, TEXTURES};
 use dipir_render::light::SceneLight;
@@ -55,7 +55,7 @@ struct Knobs {
 }
 
 /// What the light stage does by default.
-fn standard_preset() -> Preset {
+fn standard_preset() -> LightPreset {
     let presets = include_str!("../../stages/src/presets.json");
     let mut presets: serde_json::Value = serde_json::from_str(presets).expect("JSON");
     serde_json::from_value(presets["presets"][1]["light"].take()).expect("a preset")

@@ -42,9 +42,9 @@ impl Adam {
         }
     }
 
-    /// Takes a step against `gradient`, `rate` being the learning rate of each group; a rate of
-    /// 0 leaves a group where it is. Nothing is changed if a gradient is missing or mis-sized.
-    /// The gradient has to be finite: [`Tensors::first_not_finite`] tells.
+    /// Takes a step against `gradient`, `rate` being the learning rate of each group; a rate of 0
+    /// leaves a group where it is. Nothing is changed if a gradient is missing or mis-sized. The
+    /// gradient has to be finite: [`Tensors::first_not_finite`] checks it.
     pub fn step(
         &mut self,
         parameters: &mut Tensors,

@@ -27,7 +27,7 @@ pub struct Step {
 /// Loss and gradient of a picture.
 #[derive(Clone, Debug)]
 pub struct Guided {
-    /// The loss, or for a guidance that has only a gradient a number that tells its size.
+    /// The loss, or for a guidance that has only a gradient a number that measures its size.
     pub loss: f64,
     /// Derivative of the loss with respect to every display value that was shown.
     pub gradient: Raster<Vec3>,

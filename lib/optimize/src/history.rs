@@ -23,7 +23,7 @@ pub struct Row {
     pub fusion: f32,
     /// Factor on every learning rate.
     pub rate: f64,
-    /// What went bad, if the step was skipped.
+    /// What was not finite, if the step was skipped.
     pub skipped: Option<String>,
     /// Whether the transport was recorded anew before this iteration.
     pub recorded: bool,

@@ -30,14 +30,14 @@ use crate::transport::LinearTransport;
 
 /// Weights of the terms beside the guidance.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Weights {
+pub struct TermWeights {
     /// Of the consistency of both maps, lambda of eq. 10.
     pub consistency: f64,
     /// Of the Cauchy regulariser on the shadow's map, lambda of eq. 11.
     pub regularizer: f64,
 }
 
-impl Weights {
+impl TermWeights {
     /// The guidance alone.
     pub const NONE: Self = Self {
         consistency: 0.0,
@@ -50,7 +50,7 @@ pub struct Objective {
     transport: Box<dyn LinearTransport>,
     background: LinearImage,
     transfer: Transfer,
-    weights: Weights,
+    weights: TermWeights,
     rasterizer: Rasterizer,
 }
 
@@ -85,7 +85,7 @@ impl Objective {
         transport: Box<dyn LinearTransport>,
         background: LinearImage,
         transfer: Transfer,
-        weights: Weights,
+        weights: TermWeights,
     ) -> Result<Self, OptimizeError> {
         let (width, height) = transport.environment_size();
         let found = (background.0.width(), background.0.height());
@@ -119,7 +119,7 @@ impl Objective {
     }
 
     /// Changes the weights of the terms beside the guidance.
-    pub fn set_weights(&mut self, weights: Weights) {
+    pub fn set_weights(&mut self, weights: TermWeights) {
         self.weights = weights;
     }
 
@@ -199,7 +199,7 @@ impl Objective {
         };
         let [foreground, shadow] = &forward.maps;
         let mut to_maps = fuse_vjp(foreground, shadow, forward.fusion, &to_fused);
-        let Weights {
+        let TermWeights {
             consistency,
             regularizer,
         } = self.weights;

@@ -15,8 +15,8 @@ use crate::error::OptimizeError;
 use crate::guidance::{Guidance, Guided, Step};
 use crate::history::{Row, stands_still};
 use crate::lighting::Lighting;
-use crate::objective::{Forward, Objective, Weights};
-use crate::parameters::{Bounds, Parameters};
+use crate::objective::{Forward, Objective, TermWeights};
+use crate::parameters::{ParameterBounds, Parameters};
 use crate::settings::Settings;
 use crate::tensors::Tensors;
 use crate::transport::Recorder;
@@ -24,12 +24,11 @@ use crate::transport::Recorder;
 /// Steps in a row that may be skipped because something was not finite. A guidance with noise
 /// may stumble; one that stumbles this often will not recover.
 const MOST_BAD_IN_A_ROW: usize = 5;
-/// Iterations between two looks at how well the record samples the light.
+/// Iterations between two checks of how well the record samples the light.
 const RECORD_EVERY: usize = 50;
-/// The light is recorded anew when a sample is worth less than this many samples drawn for it. 1
-/// is what a record for that very light reaches, so a lobe that narrows is followed closely: it
-/// would soon rest on few samples, and their noise, to which the optimiser then fits, keeps it
-/// from narrowing further.
+/// Transport is recorded anew when its effective sample size falls below this share of its samples. A record made for
+/// the current light reaches 1, so the record follows a lobe that narrows. Otherwise the lobe would soon rest on few
+/// samples, the optimiser would fit their noise, and the lobe would stop narrowing.
 const LEAST_EFFICIENCY: f64 = 1.0;
 /// The largest number of new records, so that recording stays a small part of the run.
 const MOST_RECORDS: usize = 8;
@@ -101,8 +100,8 @@ impl Optimization<'_> {
         let settings = self.settings.clone();
         let (_, rows) = self.objective.transport().environment_size();
         let bounds = match settings.light {
-            true => Bounds::for_map(rows),
-            false => Bounds::for_map(rows).of_tone_alone(),
+            true => ParameterBounds::for_map(rows),
+            false => ParameterBounds::for_map(rows).of_tone_alone(),
         };
         let crops = CropSampler::new(self.objective.transport().coverage());
         let mut state = self.resume()?;
@@ -124,7 +123,7 @@ impl Optimization<'_> {
             // agree, and the shadow's sparsity would dim the object.
             let one_light = settings.light && iteration >= settings.fused_at();
             if one_light {
-                self.objective.set_weights(Weights::NONE);
+                self.objective.set_weights(TermWeights::NONE);
             }
             if one_light && iteration == settings.fused_at() {
                 self.join(&mut state);

@@ -29,7 +29,7 @@ pub struct Parameters {
 
 /// Where parameters are kept between steps.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Bounds {
+pub struct ParameterBounds {
     /// Natural logarithm of a lobe's radiance, exposure included.
     pub log_radiance: (f64, f64),
     /// Natural logarithm of a lobe's sigma.
@@ -38,13 +38,13 @@ pub struct Bounds {
     pub tone: f64,
 }
 
-impl Bounds {
+impl ParameterBounds {
     /// Bounds for maps of `height` rows.
     ///
     /// Radiance from 1e-6, which no display shows, to 1e6, the sun's. Sigma from a quarter of a
-    /// texel, since a texel seen from afar has a spread of .29 of its side and narrower lobes
-    /// cannot be told from it, to 10, a constant to 2%. Tone parameters of 8 give a bin e^8
-    /// of another's share, beyond the least width that the curves allow.
+    /// texel, since a texel seen from afar has a spread of .29 of its side and narrower lobes look
+    /// the same, to 10, a constant to 2%. Tone parameters of 8 give a bin e^8 of another's share,
+    /// beyond the least width that the curves allow.
     pub fn for_map(height: usize) -> Self {
         let narrowest = 0.25 * PI / height as f64;
         Self {
@@ -188,7 +188,7 @@ impl Parameters {
 
     /// Brings parameters back to where they mean something, after a step: directions to unit
     /// length, the rest within `bounds`.
-    pub fn retract(&mut self, bounds: &Bounds) {
+    pub fn retract(&mut self, bounds: &ParameterBounds) {
         let (low, high) = bounds.log_radiance;
         self.log_exposure = self.log_exposure.clamp(low, high);
         let exposure = DVec3::splat(self.log_exposure);
@@ -424,7 +424,7 @@ mod tests {
         ];
         let mut p = Parameters::of_lobes(&light);
         // A light that is not to change is not moved to where the optimiser would keep it.
-        p.retract(&Bounds::for_map(64).of_tone_alone());
+        p.retract(&ParameterBounds::for_map(64).of_tone_alone());
         for lobes in [p.foreground_lobes(), p.shadow_lobes()] {
             assert_eq!(lobes.len(), 2);
             assert!(
@@ -442,7 +442,7 @@ mod tests {
 
     #[test]
     fn a_step_too_far_is_brought_back_and_one_inside_is_left_alone() {
-        let bounds = Bounds::for_map(64);
+        let bounds = ParameterBounds::for_map(64);
         let mut p = Parameters::neutral(3, 1.0);
         p.log_exposure = 0.5;
         p.retract(&bounds);

@@ -15,7 +15,7 @@ pub struct SceneRecorder<'a> {
     pub renderer: &'a Renderer<'a>,
     /// As for the first record; the light is set by each record.
     pub settings: RecordSettings<'a>,
-    /// Told the share that is done; may break off.
+    /// Gets the share that is done; may break off.
     pub progress: &'a mut dyn FnMut(f64) -> ControlFlow<()>,
 }
 

@@ -7,7 +7,7 @@ use dipir_sun::table::{ShadowTable, SunTable};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::objective::Weights;
+use crate::objective::TermWeights;
 use crate::tensors::Group;
 
 /// Where the gradient of the picture comes from.
@@ -246,7 +246,7 @@ impl LearningRates {
 /// How much work is done where the table does not say: one row of the presets of a quality.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Preset {
+pub struct LightPreset {
     /// Steps of the optimiser.
     pub iterations: usize,
     /// Lobes of each light set.
@@ -331,7 +331,7 @@ const MOST_TEXELS_IN_HALF: usize = 1 << 16;
 
 impl LightTable {
     /// The settings: what the table says, else what `preset` says. `seed` is the pipeline's.
-    pub fn settings(&self, preset: &Preset, seed: u64) -> Result<Settings, BadSetting> {
+    pub fn settings(&self, preset: &LightPreset, seed: u64) -> Result<Settings, BadSetting> {
         let environment = self.environment.unwrap_or(preset.environment);
         let fits_half = environment[0].saturating_mul(environment[1]) <= MOST_TEXELS_IN_HALF;
         let settings = Settings {
@@ -470,8 +470,8 @@ impl Settings {
     }
 
     /// Weights of the terms beside the guidance.
-    pub fn weights(&self) -> Weights {
-        Weights {
+    pub fn weights(&self) -> TermWeights {
+        TermWeights {
             consistency: self.consistency,
             regularizer: self.regularizer,
         }

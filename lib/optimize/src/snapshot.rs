@@ -32,7 +32,7 @@ impl Snapshot {
         }
     }
 
-    /// Adds tensors, whose names `set` tells from those of other sets.
+    /// Adds tensors under the names `set.NAME`, so that sets stay apart.
     pub fn add_set(&mut self, set: &str, tensors: &Tensors) {
         for t in &tensors.0 {
             let bytes = t.values.iter().flat_map(|v| v.to_le_bytes()).collect();

@@ -1,7 +1,7 @@
-//! Parameters, gradients and moments as flat lists of numbers with names, so that optimiser,
-//! checkpoints and errors can speak of them without knowing what they mean.
+//! Parameters, gradients and moments as flat lists of numbers with names, so that optimiser, checkpoints and errors
+//! handle them without knowing what they mean.
 
-/// What a parameter stands for: all of a group share a learning rate.
+/// The kind of a parameter. All of a group share a learning rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Group {
     /// Logarithms of lobe radiance.

@@ -17,12 +17,12 @@ use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
 use glam::Vec3;
 
-use crate::objective::{Objective, Weights};
-use crate::settings::Preset;
+use crate::objective::{Objective, TermWeights};
+use crate::settings::LightPreset;
 use crate::transport::LinearTransport;
 
 /// Little work.
-pub const PRESET: Preset = Preset {
+pub const PRESET: LightPreset = LightPreset {
     iterations: 200,
     lobes: 16,
     environment: [64, 32],
@@ -339,13 +339,13 @@ pub fn background(size: (usize, usize)) -> LinearImage {
 }
 
 /// The paper's weights.
-pub const WEIGHTS: Weights = Weights {
+pub const WEIGHTS: TermWeights = TermWeights {
     consistency: 0.03,
     regularizer: 0.01,
 };
 
 /// The ball over [`background`], displayed through sRGB.
-pub fn objective(transport: impl LinearTransport + 'static, weights: Weights) -> Objective {
+pub fn objective(transport: impl LinearTransport + 'static, weights: TermWeights) -> Objective {
     let background = background(transport.size());
     Objective::new(Box::new(transport), background, Transfer::Srgb, weights).unwrap()
 }

@@ -174,11 +174,6 @@ impl Config {
         deserialize::read(node, name)
     }
 
-    /// Whether the table `[name]` is there.
-    pub fn has_table(&self, name: &str) -> bool {
-        self.root.get(name).is_some()
-    }
-
     /// Whether the dotted key is set, in the file or on the command line.
     pub fn has(&self, dotted: &str) -> bool {
         self.place(dotted).is_some()
@@ -250,7 +245,7 @@ pub fn nearest<S: AsRef<str>>(
     // Jaro-Winkler of 0.75 accepts transpositions and one or two lost letters in a word of
     // usual length, and rejects unrelated words of the same length.
     const NEAR: f64 = 0.75;
-    // In a word of three or four letters two that changed places leave it little alike.
+    // In a word of three or four letters, two swapped letters leave little similarity.
     let likeness = |c: &str| match strsim::osa_distance(name, c) {
         1 if name.len() > 2 => strsim::jaro_winkler(name, c).max(NEAR),
         _ => strsim::jaro_winkler(name, c),

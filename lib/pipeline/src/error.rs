@@ -43,7 +43,7 @@ pub enum ConfigError {
         table: String,
         /// Keys that the table knows.
         accepted: Vec<String>,
-        /// The accepted key that looks most like it.
+        /// The accepted key with the most similar spelling.
         nearest: Option<String>,
     },
     /// A key or table by the name that it had before.
@@ -83,7 +83,7 @@ pub enum ConfigError {
         found: String,
         /// What may stand there.
         accepted: Vec<String>,
-        /// The accepted value that looks most like it.
+        /// The accepted value with the most similar spelling.
         nearest: Option<String>,
     },
     /// A key without a default is absent.
@@ -158,7 +158,7 @@ pub enum StageError {
     Foreign {
         /// The folder.
         folder: PathBuf,
-        /// What tells that it is not ours.
+        /// Why it is not ours.
         why: Foreign,
     },
     /// An earlier stage has not run.
@@ -205,7 +205,7 @@ impl StageError {
     }
 }
 
-/// What tells that a folder is not ours.
+/// Why a folder is not ours.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Foreign {
     /// Files, and no `stage.json` among them.

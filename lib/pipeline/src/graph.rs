@@ -12,7 +12,7 @@ pub struct Node {
     pub executable: &'static str,
     /// Stages whose outputs it reads under this configuration.
     pub reads: Vec<&'static str>,
-    /// Why this configuration gets by without it, if it does.
+    /// Why this configuration does not need it; `None` if it does.
     pub unneeded: Option<&'static str>,
 }
 

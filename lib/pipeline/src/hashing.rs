@@ -3,7 +3,8 @@
 //! Within a process, and from a run to the stages that it starts, a file's hash is known by the
 //! file's identity: device, inode, length, and the times of its last change. Any change of its
 //! bytes changes one of them, unless it follows the last within one tick of the file system's
-//! clock: a file that young is hashed anew each time. Nothing is remembered beyond a run.
+//! clock. So a file that changed that recently is hashed each time. Nothing is remembered beyond a
+//! run.
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{File, Metadata};
 use std::io::Read;
@@ -19,7 +20,7 @@ const PIECE: usize = 4 << 20;
 /// How files of hashes begin.
 const HEAD: &[u8] = b"{\"dipir_hashes\":1,";
 
-/// What tells the bytes of a file from others, without reading them.
+/// What identifies the bytes of a file without reading them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 struct Identity {
     device: u64,
@@ -43,7 +44,7 @@ impl Identity {
         })
     }
 
-    /// Elsewhere nothing tells a changed file for certain.
+    /// Elsewhere nothing identifies a changed file for certain.
     #[cfg(not(unix))]
     fn of(_: &Metadata) -> Option<Self> {
         None

@@ -1,9 +1,9 @@
 //! One writer a stage folder.
 //!
-//! The lock is the operating system's own on an open file, so it ends with its process however
-//! that ends: a lock left behind by a killed run holds nobody up. Whoever holds the lock removes
-//! the file when done; whoever comes to hold the lock of a file that is not at its name any more
-//! begins anew, so that two processes never hold locks on two files of the same name.
+//! The lock is the operating system's own on an open file, so it ends with its process, however
+//! that ends: a killed run leaves nothing that blocks the next. The holder removes the file when
+//! done. A process that gets the lock of a file that is no longer at its name starts over, so that
+//! two processes never hold locks on two files of the same name.
 use std::fs::{self, File, TryLockError};
 use std::io::{self, Read, Seek, Write};
 use std::path::{Path, PathBuf};

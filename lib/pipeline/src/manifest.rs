@@ -1,7 +1,7 @@
 //! `stage.json`: what a stage read, with which settings, and what it wrote.
 //!
-//! The file ends with a checksum of all that stands before it, so that a damaged manifest is told
-//! from a whole one as surely as the files that it lists.
+//! The file ends with a checksum of all that stands before it, so that damage of the manifest is
+//! found as surely as damage of the files that it lists.
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Component, Path, PathBuf};
@@ -91,7 +91,7 @@ pub struct Manifest {
     /// from run to run is kept in this file, so that outputs can be compared byte by byte.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub timings_s: BTreeMap<String, f64>,
-    /// Largest resident memory of the process, where the operating system tells.
+    /// Largest resident memory of the process, where the operating system reports it.
     pub peak_rss_bytes: Option<u64>,
     /// The stage's own estimate of its error, in the unit that its documentation names.
     pub estimated_error: Option<f64>,

@@ -199,7 +199,7 @@ impl Owned {
             others,
             folders,
         } = self.contents(folder)?;
-        // What says that the files are ours goes last: a kill on the way leaves the rest known.
+        // The list that marks the files as ours is removed last, so that it still names the rest after a kill.
         let (last, first): (Vec<_>, Vec<_>) = ours
             .into_iter()
             .partition(|name| is_named(name, FILE_NAME) || is_named(name, manifest::FILE_NAME));

@@ -31,7 +31,7 @@ pub enum State {
     Waits {
         /// The stages that it reads and that are not up to date.
         on: Vec<&'static str>,
-        /// Its own reasons, as far as they can be told now.
+        /// Its own reasons, as far as they are known yet.
         reasons: Vec<StaleReason>,
     },
     /// It cannot run as things are.

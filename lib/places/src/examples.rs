@@ -47,11 +47,11 @@ pub struct Example {
 impl Example {
     /// The photograph that `view` takes of a place.
     pub fn new(place: &Place, number: usize, view: &View, probes: &Probes, seed: u64) -> Self {
-        let (glance, scale) = view.take(place, seed);
-        let reference = glance.reference();
+        let (small, scale) = view.take(place, seed);
+        let reference = small.reference();
         Self {
             place: number,
-            features: [glance.features(), glance.mirrored().features()],
+            features: [small.features(), small.mirrored().features()],
             reference,
             truth: Truth::new(place, view.heading, scale / reference, probes),
         }

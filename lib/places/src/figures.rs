@@ -28,7 +28,7 @@ pub struct Case {
     pub kind: String,
     /// Fold that was left out.
     pub fold: usize,
-    /// What the networks say of exposure and share, bin by bin.
+    /// The networks' distributions of exposure and share, bin by bin.
     pub histograms: [Vec<f64>; 2],
 }
 
@@ -304,7 +304,7 @@ pub fn calibration(cases: &[&Case], probes: &Probes) -> Calibration {
     }
 }
 
-/// Where each truth lies in the distribution that was said, 0 to 1.
+/// Where each truth lies in its predicted distribution, 0 to 1.
 fn ranks<'c>(
     cases: &[&'c Case],
     of: impl Fn(&'c Case) -> (&'c Scale, &'c Vec<f64>, f64),
@@ -347,7 +347,8 @@ fn share_tails(cases: &[&Case]) -> [f64; 2] {
     ]
 }
 
-/// The exposure's factor and the weight of its median, by how surfaces look and by how far off they are in stops.
+/// The exposure's factor and the weight of its median that make the error of surfaces, and their exposure error in
+/// stops, least.
 fn exposure_calibration(cases: &[&Case], probes: &Probes) -> [f64; 2] {
     let lights: Vec<(Vec<Vec3>, f64, Vec<Vec3>)> = cases
         .iter()

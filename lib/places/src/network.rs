@@ -3,10 +3,10 @@ use dipir_estimator::network::{Network, silu};
 use dipir_numerics::hashing::mix64;
 use gemm::{Parallelism, gemm};
 
-/// Random numbers in a row.
-pub(crate) struct Dice(u64);
+/// A sequence of random numbers.
+pub(crate) struct SplitMix64(u64);
 
-impl Dice {
+impl SplitMix64 {
     pub fn new(seed: u64) -> Self {
         Self(mix64(seed ^ 0x5eed))
     }
@@ -84,14 +84,19 @@ pub(crate) struct Dropout {
 }
 
 /// The outputs for a batch of standardised features.
-pub(crate) fn forward(w: &Weights, mut x: Vec<f32>, dropout: Dropout, dice: &mut Dice) -> Pass {
+pub(crate) fn forward(
+    w: &Weights,
+    mut x: Vec<f32>,
+    dropout: Dropout,
+    random: &mut SplitMix64,
+) -> Pass {
     let n = w[1].len();
     let inputs = w[0].len() / n;
-    mask(&mut x, dropout.features, dice);
+    mask(&mut x, dropout.features, random);
     let first = affine(&x, inputs, &w[0], &w[1]);
-    let (h, m1) = activated(&first, dropout.hidden, dice);
+    let (h, m1) = activated(&first, dropout.hidden, random);
     let second = affine(&h, n, &w[2], &w[3]);
-    let (s, m2) = activated(&second, dropout.hidden, dice);
+    let (s, m2) = activated(&second, dropout.hidden, random);
     let sum: Vec<f32> = h.iter().zip(&s).map(|(a, b)| a + b).collect();
     let outputs = affine(&sum, n, &w[4], &w[5]);
     Pass {
@@ -164,12 +169,12 @@ fn input_gradient(g: &[f32], n: usize, weight: &[f32], inputs: usize) -> Vec<f32
     out
 }
 
-fn mask(values: &mut [f32], share: f32, dice: &mut Dice) -> Vec<f32> {
+fn mask(values: &mut [f32], share: f32, random: &mut SplitMix64) -> Vec<f32> {
     let kept = 1.0 / (1.0 - share);
     let mask: Vec<f32> = values
         .iter()
         .map(|_| {
-            if share > 0.0 && dice.unit() < share {
+            if share > 0.0 && random.unit() < share {
                 0.0
             } else {
                 kept
@@ -180,9 +185,9 @@ fn mask(values: &mut [f32], share: f32, dice: &mut Dice) -> Vec<f32> {
     mask
 }
 
-fn activated(steps: &[f32], share: f32, dice: &mut Dice) -> (Vec<f32>, Vec<f32>) {
+fn activated(steps: &[f32], share: f32, random: &mut SplitMix64) -> (Vec<f32>, Vec<f32>) {
     let mut h: Vec<f32> = steps.iter().map(|s| silu(*s)).collect();
-    let mask = mask(&mut h, share, dice);
+    let mask = mask(&mut h, share, random);
     (h, mask)
 }
 

@@ -195,7 +195,7 @@ fn one_fold(
 /// The places that the network of fold `f` learns from.
 fn learned(settings: &Settings, f: usize, fold: &[usize]) -> Vec<usize> {
     let mut seen: Vec<usize> = (0..fold.len()).filter(|p| fold[*p] != f).collect();
-    crate::network::Dice::new(settings.seed ^ 0xc0de).shuffle(&mut seen);
+    crate::network::SplitMix64::new(settings.seed ^ 0xc0de).shuffle(&mut seen);
     seen.truncate(settings.places.unwrap_or(usize::MAX));
     seen
 }

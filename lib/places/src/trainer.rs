@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::examples::{Example, Truth};
 use crate::loss::loss;
-use crate::network::{Dice, Dropout, Optimiser, Weights, backward, forward, with_weights};
+use crate::network::{Dropout, Optimiser, SplitMix64, Weights, backward, forward, with_weights};
 use crate::probes::Probes;
 
 /// How a network is trained.
@@ -52,7 +52,7 @@ struct Row<'a> {
     reference: f32,
 }
 
-/// Trains a network from nothing. `progress` is told the share that is done and the mean loss of late; `false` stops.
+/// Trains a network from nothing. `progress` gets the share that is done and the mean of recent losses; `false` stops.
 pub fn train(
     examples: &[&Example],
     settings: &Training,
@@ -76,7 +76,7 @@ pub fn train(
         [a, b, c, d, e, f]
     };
     let mut optimiser = Optimiser::new(&w);
-    let mut dice = Dice::new(seed);
+    let mut random = SplitMix64::new(seed);
     let dropout = Dropout {
         hidden: settings.dropout,
         features: settings.feature_dropout,
@@ -86,13 +86,13 @@ pub fn train(
     let (mut step, mut late) = (0usize, f64::NAN);
     for _ in 0..settings.epochs {
         let mut order: Vec<usize> = (0..rows.len()).collect();
-        dice.shuffle(&mut order);
+        random.shuffle(&mut order);
         for batch in order.chunks_exact(settings.batch) {
             let x: Vec<f32> = batch
                 .iter()
                 .flat_map(|k| inputs[*k].iter().copied())
                 .collect();
-            let pass = forward(&w, x, dropout, &mut dice);
+            let pass = forward(&w, x, dropout, &mut random);
             let mut gradient = vec![0.0; pass.outputs.len()];
             let mut sum = 0.0;
             let share = 1.0 / batch.len() as f32;
@@ -156,11 +156,11 @@ fn start(rows: &[Row<'_>], hidden: usize, seed: u64) -> Network {
     // A feature that hardly varies must not become noise.
     let spread =
         |s: &[f64; 2]| ((s[1] / count - (s[0] / count).powi(2)).max(0.0).sqrt() + 0.02) as f32;
-    let mut dice = Dice::new(seed ^ 0x1a7e);
+    let mut random = SplitMix64::new(seed ^ 0x1a7e);
     let mut drawn = |inputs: usize| -> Vec<f32> {
         let bound = (inputs as f32).sqrt().recip();
         (0..inputs * hidden)
-            .map(|_| bound * (2.0 * dice.unit() - 1.0))
+            .map(|_| bound * (2.0 * random.unit() - 1.0))
             .collect()
     };
     Network {

@@ -1,7 +1,7 @@
 //! One photograph of a place.
 use std::f32::consts::TAU;
 
-use dipir_estimator::features::{Glance, SIDE};
+use dipir_estimator::features::{SIDE, SmallPhoto};
 use dipir_imaging::raster::Raster;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::luminance::luminance;
@@ -111,7 +111,7 @@ impl View {
 
     /// The photograph as the estimator looks at it, and what a place's radiance is multiplied by to be on the
     /// photograph's scale.
-    pub fn take(&self, place: &Place, seed: u64) -> (Glance, Vec3) {
+    pub fn take(&self, place: &Place, seed: u64) -> (SmallPhoto, Vec3) {
         let camera = self.camera();
         let turn = self.heading as f32 / SMOOTH[0] as f32 * TAU;
         let side = SIDE * RAYS;
@@ -150,7 +150,7 @@ impl View {
         let small = Raster::from_pixels(SIDE, SIDE, (0..SIDE * SIDE).map(mean).collect());
         let grey = (GREY * luminance(place.mean()) * exposure).max(1e-6);
         (
-            Glance::of_small(small, &camera),
+            SmallPhoto::of_small(small, &camera),
             gain * (self.develop(grey) / grey),
         )
     }

@@ -35,7 +35,8 @@ pub struct Point {
 pub struct Series {
     /// For the legend; empty for none.
     pub name: String,
-    /// Number of its colour. By default series of the same name have the same one in every panel.
+    /// Number of its colour. By default, series of the same name have the same colour in every
+    /// panel.
     pub color: Option<usize>,
     /// How it is drawn.
     pub mark: Mark,
@@ -110,7 +111,7 @@ const TITLE: f32 = 30.0;
 const NO_TITLE: f32 = 10.0;
 const LEGEND_ROW: f32 = 17.0;
 const LEGEND_COLUMN: f32 = 190.0;
-/// Points that are drawn of a series at most: more than a screen shows.
+/// Most points that are drawn of a series: more than a screen shows.
 const MOST_POINTS: usize = 800;
 
 impl Chart {

@@ -214,7 +214,7 @@ impl Drawing {
         svg + "</svg>\n"
     }
 
-    /// As pixels on white, `scale` of them for each of the drawing's.
+    /// Draws onto white pixels; a unit of the drawing is `scale` pixels.
     pub fn to_pixels(&self, scale: usize) -> Pixels {
         let mut canvas = Canvas::new(self.width * scale, self.height * scale, scale as f32);
         self.shapes.iter().for_each(|shape| canvas.draw(shape));

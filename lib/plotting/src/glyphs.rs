@@ -87,7 +87,7 @@ fn strokes(letter: char) -> &'static str {
         '_' => "02 42",
         '\'' => "08 07",
         '°' => "07 18 27 16 07",
-        // A box, as for every letter that is not here.
+        // A box stands for every letter without a glyph.
         _ => "02 08 48 42 02",
     }
 }

@@ -163,23 +163,14 @@ pub(crate) fn value_noise(p: Vec2, seed: u32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Framing, GeneratedScene, ObjectSet, SceneKind};
-
-    fn ground(index: u64, setting: Setting) -> Ground {
-        let kind = SceneKind {
-            objects: ObjectSet::Training,
-            setting,
-            framing: Framing::Close,
-        };
-        GeneratedScene::draw(7, index, 16, kind).ground
-    }
+    use crate::scene::GeneratedScene;
 
     #[test]
     fn worn_ground_has_a_possible_albedo_and_open_ground_no_wear() {
         let mut mottled = 0;
         for index in 0..20 {
-            let worn = ground(index, Setting::Courtyard);
-            let new = ground(index, Setting::Open);
+            let worn = GeneratedScene::close(index, Setting::Courtyard).ground;
+            let new = GeneratedScene::close(index, Setting::Open).ground;
             let mut factors = vec![];
             for i in 0..400 {
                 let at = Vec2::new((i % 20) as f32, (i / 20) as f32) * 0.37 - 3.0;

@@ -107,6 +107,17 @@ pub struct GeneratedScene {
 }
 
 impl GeneratedScene {
+    /// A close view of scene `index` in `setting`, for tests.
+    #[cfg(test)]
+    pub(crate) fn close(index: u64, setting: Setting) -> Self {
+        let kind = SceneKind {
+            objects: ObjectSet::Training,
+            setting,
+            framing: Framing::Close,
+        };
+        Self::draw(7, index, 16, kind)
+    }
+
     /// The scene number `index` under `seed`, for pictures of `size` pixels.
     pub fn draw(seed: u64, index: u64, size: u32, kind: SceneKind) -> Self {
         let mut stream = NoiseStream::new(seed, index);

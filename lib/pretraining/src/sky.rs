@@ -51,22 +51,13 @@ impl Draw<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Framing, GeneratedScene, ObjectSet, SceneKind, Setting};
-
-    fn sky(index: u64, setting: Setting) -> SkyAppearance {
-        let kind = SceneKind {
-            objects: ObjectSet::Training,
-            setting,
-            framing: Framing::Close,
-        };
-        GeneratedScene::draw(7, index, 16, kind).sky
-    }
+    use crate::scene::{GeneratedScene, Setting};
 
     #[test]
     fn the_sky_is_brightest_around_the_sun_and_clouds_keep_its_mean() {
         let mut clouded = 0;
         for index in 0..20 {
-            let look = sky(index, Setting::Courtyard);
+            let look = GeneratedScene::close(index, Setting::Courtyard).sky;
             let sun = Vec3::new(0.6, 0.8, 0.0);
             let at = |degrees: f32| {
                 let (s, c) = degrees.to_radians().sin_cos();
@@ -84,7 +75,7 @@ mod tests {
             clouded += usize::from(look.clouds > 0.2);
         }
         assert!(clouded > 8);
-        let clear = sky(0, Setting::Open);
+        let clear = GeneratedScene::close(0, Setting::Open).sky;
         assert_eq!(
             (clear.around_sun(Vec3::Y, Vec3::Y), clear.cover(Vec3::Y)),
             (0.0, 1.0)

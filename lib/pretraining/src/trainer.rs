@@ -351,8 +351,8 @@ impl Trainer {
                 "the checkpoint was made with {found}, this run has {expected}; delete it or use its settings"
             )));
         }
-        // In a UNet of another depth blocks of the same name are different ones. Checkpoints without the number have one
-        // block a level.
+        // In a UNet of another depth, the same name is another block. Checkpoints without the number have one block a
+        // level.
         let layers = weights.metadata().get("layers");
         let layers = layers.map_or("1", String::as_str);
         if layers != self.architecture.layers.to_string() {

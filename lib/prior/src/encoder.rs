@@ -26,9 +26,9 @@ pub const MIDDLE_SHARE: f32 = 0.6;
 const CHANNELS: [usize; 4] = [3, 48, 96, 160];
 const HIDDEN: usize = 384;
 
-/// An estimate of the light of a picture.
+/// The light of a picture as one sun and a sky.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct LightEstimate {
+pub struct SunSkyEstimate {
     /// Azimuth and elevation of the sun, and its share.
     pub description: LightDescription,
     /// Confidence in the azimuth, 0 to about 1: the length of the mean of its unit vectors.
@@ -164,7 +164,7 @@ impl LightEncoder {
 
     /// Estimates the light of a picture [3, SIZE, SIZE] in [0, 1]: the mean of the answers for it and its mirror image.
     /// The azimuth is relative to the direction of the picture's middle, which is `pitch` radians below the horizon.
-    pub fn estimate(&self, picture: &[f32], pitch: f32) -> Result<LightEstimate> {
+    pub fn estimate(&self, picture: &[f32], pitch: f32) -> Result<SunSkyEstimate> {
         let pair = [picture.to_vec(), mirrored(picture)].concat();
         let x = Tensor::from_vec(pair, (2, 3, SIZE, SIZE), &Device::Cpu)?;
         let pitch = Tensor::new(&[pitch_features(pitch); 2], &Device::Cpu)?;
@@ -172,7 +172,7 @@ impl LightEncoder {
         let rows = rows.to_vec2::<f32>()?;
         // The mirror swaps left and right.
         let mean = |i: usize| 0.5 * (rows[0][i] + if i == 1 { -rows[1][i] } else { rows[1][i] });
-        Ok(LightEstimate {
+        Ok(SunSkyEstimate {
             description: LightDescription {
                 azimuth: mean(1).atan2(mean(0)),
                 elevation: (mean(2) + MIDDLE_ELEVATION).clamp(0.15, 1.4),
@@ -186,7 +186,7 @@ impl LightEncoder {
     }
 }
 
-impl LightEstimate {
+impl SunSkyEstimate {
     /// Standard deviation of the azimuth, radians: of the wrapped normal distribution whose mean vector has the length
     /// of the confidence [Mardia and Jupp 2000, 3.5.7].
     pub fn spread(&self) -> f32 {
@@ -227,8 +227,8 @@ impl LightEstimate {
 mod tests {
     use super::*;
 
-    fn estimate(azimuth: f32, confidence: f32, irradiance: f32) -> LightEstimate {
-        LightEstimate {
+    fn estimate(azimuth: f32, confidence: f32, irradiance: f32) -> SunSkyEstimate {
+        SunSkyEstimate {
             description: LightDescription {
                 azimuth,
                 elevation: 0.6,
@@ -241,8 +241,8 @@ mod tests {
         }
     }
 
-    fn mean(of: &[LightEstimate]) -> Result<LightEstimate> {
-        LightEstimate::mean(of.iter().map(|e| (*e, 1.0)))
+    fn mean(of: &[SunSkyEstimate]) -> Result<SunSkyEstimate> {
+        SunSkyEstimate::mean(of.iter().map(|e| (*e, 1.0)))
     }
 
     #[test]

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::caption::{Caption, LightDescription, ViewDirection};
-use crate::encoder::{LightEncoder, LightEstimate};
+use crate::encoder::{LightEncoder, SunSkyEstimate};
 use crate::energy::{Observation, energies};
 use crate::error::{Error, Result};
 use crate::picture::{PIXELS, Picture, SIZE, mirrored};
@@ -68,9 +68,9 @@ impl Default for InversionSettings {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Reading {
     /// The light. Its azimuth is relative to the camera.
-    pub light: LightEstimate,
+    pub light: SunSkyEstimate,
     /// The encoder's answer.
-    pub encoder: LightEstimate,
+    pub encoder: SunSkyEstimate,
     /// Energies summed over crops, by elevation and azimuth, minus the least of them; empty without draws of noise.
     pub energies: Vec<Vec<f64>>,
     /// Answers for every crop.
@@ -81,7 +81,7 @@ pub struct Reading {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CropReading {
     /// The encoder's answer. Its azimuth is relative to the camera.
-    pub encoder: LightEstimate,
+    pub encoder: SunSkyEstimate,
     /// Energies of the candidates, elevation by elevation; empty without draws of noise.
     pub energies: Vec<f64>,
 }
@@ -172,7 +172,7 @@ pub fn invert(
     let mut readings = readings.collect::<Result<Vec<_>>>()?;
     check_finite(&readings)?;
     let shares = (0..readings.len()).map(|i| if i < same { 1.0 / same as f32 } else { 1.0 });
-    let prior = LightEstimate::mean(readings.iter().map(|r| r.encoder).zip(shares))?;
+    let prior = SunSkyEstimate::mean(readings.iter().map(|r| r.encoder).zip(shares))?;
     if settings.draws == 0 {
         return Ok(Some(combine(readings, &prior, settings)));
     }
@@ -240,7 +240,7 @@ fn mean_length(nats: &[f64]) -> f32 {
 /// One answer from the energies of all crops and the encoder's answer, `prior`.
 pub fn combine(
     crops: Vec<CropReading>,
-    prior: &LightEstimate,
+    prior: &SunSkyEstimate,
     settings: &InversionSettings,
 ) -> Reading {
     let mut sum = vec![0f64; CANDIDATES];
@@ -254,7 +254,7 @@ pub fn combine(
         .chunks_exact(AZIMUTHS)
         .map(|row| row.iter().map(|e| e - least).collect())
         .collect();
-    // Nats against every candidate, from the model and from the encoder.
+    // The cost of every candidate in nats, from the model and from the encoder.
     let angle = |k: usize| TAU * k as f32 / AZIMUTHS as f32;
     let pull = settings.encoder_weight * prior.confidence as f64;
     let against = |(k, e): (usize, &f64)| {
@@ -275,7 +275,7 @@ pub fn combine(
     let confidence = mean_length(&by_azimuth);
     let has_energies = crops.iter().any(|c| !c.energies.is_empty());
     Reading {
-        light: LightEstimate {
+        light: SunSkyEstimate {
             // Three elevations are too coarse; the encoder estimates the elevation better.
             description: LightDescription {
                 azimuth,
@@ -333,7 +333,7 @@ mod tests {
         }
     }
 
-    const PRIOR: LightEstimate = LightEstimate {
+    const PRIOR: SunSkyEstimate = SunSkyEstimate {
         description: LightDescription {
             azimuth: 1.0,
             elevation: 0.7,
@@ -363,7 +363,7 @@ mod tests {
         }
     }
 
-    fn combined(crops: Vec<CropReading>, encoder_weight: f64) -> LightEstimate {
+    fn combined(crops: Vec<CropReading>, encoder_weight: f64) -> SunSkyEstimate {
         let settings = InversionSettings {
             energy_weight: 1.0,
             encoder_weight,

@@ -1,10 +1,9 @@
 //! Pictures at a lower resolution, for time budgets in which not every pixel can be sampled.
 //!
-//! A first picture of at most [`FIRST_PIXELS`] pixels tells how long a pixel takes. From this
-//! follows the finest resolution, 1/1, 1/2, 1/4 and so on of the frame's, whose first round is
-//! foreseen to take at most half of the time left. The picture is rendered at that resolution and
-//! enlarged. At full resolution, pixels that the budget leaves without a sample all the same are
-//! taken from the first picture.
+//! A first picture of at most [`FIRST_PIXELS`] pixels measures how long a pixel takes. The picture
+//! is then rendered at 1/1, 1/2, 1/4 and so on of the frame's resolution, and enlarged: at the
+//! finest whose first round is expected to take at most half of the time left. At full resolution,
+//! pixels that the budget leaves without a sample all the same are taken from the first picture.
 use std::ops::{AddAssign, ControlFlow, Div};
 use std::time::{Duration, Instant};
 

@@ -25,10 +25,10 @@ pub const BUNDLES: [u32; 7] = [
     EVERYTHING | EXTENSIONS,
 ];
 
-/// The cheapest of [`BUNDLES`] that can do all of `wanted`, without [`SPECULAR`] if that is not
-/// wanted. Any other surplus bit is harmless: the surfaces were stripped of what is not wanted,
-/// so the code behind the bit finds nothing to do.
-pub fn bundle(wanted: u32) -> u32 {
+/// The cheapest of [`BUNDLES`] that has all of `wanted`, without [`SPECULAR`] if that is not
+/// wanted. Any other surplus bit is harmless: the surfaces were stripped of what is not wanted, so
+/// the code behind the bit finds nothing to do.
+pub(crate) fn bundle(wanted: u32) -> u32 {
     BUNDLES
         .into_iter()
         .find(|b| {

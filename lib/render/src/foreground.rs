@@ -24,7 +24,7 @@ use crate::bsdf::{Bsdf, BsdfSample};
 use crate::counters::{RayCounts, RayKind};
 use crate::features::PROXY_RADIANCE;
 use crate::light::PathLight;
-use crate::photo::Photo;
+use crate::photo::ProxyPhoto;
 use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
 use crate::world::World;
 
@@ -47,7 +47,7 @@ pub struct PathContext<'a, L> {
     /// Where light comes from.
     pub light: &'a L,
     /// What the proxy looks like to rays that leave the object.
-    pub photo: Option<&'a Photo<'a>>,
+    pub photo: Option<&'a ProxyPhoto<'a>>,
     /// Most interactions with the object, D; 0 leaves emission alone.
     pub max_depth: u32,
     /// Where paths begin, which decides what emission they see.

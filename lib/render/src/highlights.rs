@@ -54,7 +54,7 @@ const LEAST_SCANS: usize = 32;
 const EVEN: f32 = 0.5;
 /// The largest number below 1.
 const BELOW_1: f32 = 1.0 - f32::EPSILON / 2.0;
-/// The farthest place in a cell that is still told from the next one: eight bits number the cells of a row.
+/// The farthest place in a cell that does not round to the next one: eight bits number the cells of a row.
 const WITHIN_CELL: f32 = 1.0 - f32::EPSILON * 128.0;
 
 /// Density of the samples within a pixel, on the unit square: a mixture of a uniform one and one for each scan, which
@@ -220,7 +220,7 @@ pub fn find<L: PathLight>(
 
 /// The sequence of `pixel`.
 fn sequence(seed: u64, (x, y): (u32, u32)) -> Sampler {
-    Sampler::new(seed, Stream::GLINTS, (y << 16) | (x & 0xffff), 0)
+    Sampler::new(seed, Stream::HIGHLIGHTS, (y << 16) | (x & 0xffff), 0)
 }
 
 /// Pixels in which a surface is smoother than it is curved.
@@ -299,7 +299,7 @@ fn bright_sources(light: &impl PathLight, seed: u64) -> Vec<Vec3> {
     let (mut drawn, mut rest) = (Vec::new(), 0.0);
     let n = 64;
     for sample in 0..n {
-        let mut sampler = Sampler::new(seed, Stream::GLINTS, u32::MAX, sample);
+        let mut sampler = Sampler::new(seed, Stream::HIGHLIGHTS, u32::MAX, sample);
         let source = light.sample(sampler.next_2d());
         if source.pdf > 0.0 {
             drawn.push((source.direction, luminance(source.radiance)));

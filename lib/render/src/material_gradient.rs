@@ -25,7 +25,7 @@ use crate::features::{PROXY_RADIANCE, has, with_features};
 use crate::footprint::Footprint;
 use crate::foreground::{Gather, PathContext, PathStart, Vertex};
 use crate::light::{PathLight, SceneLight};
-use crate::photo::Photo;
+use crate::photo::ProxyPhoto;
 use crate::render::{ROULETTE_DEPTH, Renderer, Simulation, pixels_of, sequence};
 use crate::world::World;
 
@@ -216,7 +216,7 @@ impl Renderer<'_> {
         let photo = settings
             .background
             .filter(|_| has(simulation.features, PROXY_RADIANCE))
-            .map(|image| Photo { image });
+            .map(|image| ProxyPhoto { image });
         let on_object = light.on_object();
         let path = PathContext {
             world: &world,

@@ -12,12 +12,12 @@ use crate::world::World;
 /// the object as without it: its colour in the photograph is its radiance, on the photograph's own
 /// scale. The object's shadow on it is not subtracted.
 #[derive(Clone, Copy)]
-pub struct Photo<'a> {
+pub struct ProxyPhoto<'a> {
     /// Linear radiance, of the camera's size.
     pub image: &'a LinearImage,
 }
 
-impl Photo<'_> {
+impl ProxyPhoto<'_> {
     /// The photograph's colour where `ray` meets the proxy; `None` where it meets none of it or a
     /// part that the photograph does not show.
     #[inline]

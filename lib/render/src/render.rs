@@ -25,7 +25,7 @@ use crate::foreground::{PathContext, PathStart};
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet, REPLICATES};
 use crate::light::{PathLight, SceneLight};
-use crate::photo::Photo;
+use crate::photo::ProxyPhoto;
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowSums};
 use crate::world::{Geometry, ProxyGeometry, World};
 
@@ -208,7 +208,7 @@ impl<'a> Renderer<'a> {
         let photo = settings
             .background
             .filter(|_| has(simulation.features, PROXY_RADIANCE))
-            .map(|image| Photo { image });
+            .map(|image| ProxyPhoto { image });
         let on_object = light.on_object();
         let path = PathContext {
             world,

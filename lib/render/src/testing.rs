@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_scene::camera::Camera;
-use dipir_scene::material::{AlphaMode, Material, MaterialExtensions};
+use dipir_scene::material::Material;
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
@@ -17,22 +17,9 @@ use crate::render::{Rendered, Renderer, Settings, Simulation};
 /// A rough dielectric.
 pub fn matte(colour: Vec3) -> Material {
     Material {
-        name: String::new(),
         base_color: colour.extend(1.0),
-        base_color_texture: None,
         metallic: 0.0,
-        roughness: 1.0,
-        metallic_roughness_texture: None,
-        normal_texture: None,
-        emissive: Vec3::ZERO,
-        emissive_texture: None,
-        alpha_mode: AlphaMode::Opaque,
-        double_sided: false,
-        ior: 1.5,
-        clearcoat: None,
-        transmission: None,
-        extensions: MaterialExtensions::default(),
-        unlit: false,
+        ..Material::default()
     }
 }
 

@@ -231,7 +231,7 @@ impl<'a> World<'a> {
 /// Where `ray` meets the front of `plane`; `None` for rays that run along it, away from it or
 /// come from behind.
 #[inline]
-pub fn plane_point(plane: &Plane, ray: &Ray) -> Option<ProxyPoint> {
+fn plane_point(plane: &Plane, ray: &Ray) -> Option<ProxyPoint> {
     let towards = -ray.direction.dot(plane.normal);
     let height = (ray.origin - plane.point).dot(plane.normal);
     if !(towards > 0.0 && height > 0.0) {

@@ -34,7 +34,7 @@ pub struct Hit {
 
 /// A hit's point and what a ray that leaves it needs to know.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SurfacePoint {
+pub struct HitPoint {
     /// World position, metres.
     pub position: Vec3,
     /// Unit normal of the triangle's plane, on the side of its front face.
@@ -129,7 +129,7 @@ impl Bvh {
             })
             .collect();
         let tree = build::build(&triangles, &ids, |a, b| {
-            look(mesh, ids[a as usize]).cmp(&look(mesh, ids[b as usize]))
+            visible_data(mesh, ids[a as usize]).cmp(&visible_data(mesh, ids[b as usize]))
         });
         let points = |ids: &[u32]| -> Vec<Vec3> {
             ids.iter()
@@ -222,14 +222,14 @@ impl Bvh {
 
     /// The point of `hit`, which must come from this BVH and `mesh` be what it was built from.
     #[inline]
-    pub fn surface_point(&self, mesh: &TriangleMesh, hit: &Hit) -> SurfacePoint {
+    pub fn surface_point(&self, mesh: &TriangleMesh, hit: &Hit) -> HitPoint {
         let vertices = mesh.indices[hit.triangle as usize].map(|i| mesh.positions[i as usize]);
         let position = interpolate(vertices, hit.u, hit.v).as_vec3();
         // Half an ulp a component for the rounding of the position, and as much for vertices
         // and ray origin relative to the BVH's centre, whose coordinates are at most
         // 1 / scale: sqrt(3) (|p| 2^-24 + 2 * 2^-24 / scale), rounded up.
         let error = f32::EPSILON * (position.abs().max_element() + 2.0 * self.unscale as f32);
-        SurfacePoint {
+        HitPoint {
             position,
             geometric_normal: geometric_normal(vertices),
             error,
@@ -239,7 +239,7 @@ impl Bvh {
 
 /// All that a ray can learn of a triangle: its material, and the bits of each corner's position,
 /// colour and texture coordinates, whichever corner comes first.
-fn look(mesh: &TriangleMesh, triangle: u32) -> (u32, [[u32; 11]; 3]) {
+fn visible_data(mesh: &TriangleMesh, triangle: u32) -> (u32, [[u32; 11]; 3]) {
     let corners = mesh.indices[triangle as usize].map(|i| {
         let i = i as usize;
         let [color, uv0, uv1] = [

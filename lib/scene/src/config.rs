@@ -239,7 +239,7 @@ effects_config! {
     normal_mapping: "Shading normals from textures.",
     alpha_mask: "Coverage from base-colour alpha, masked or blended.",
     emission: "Light that the object emits.",
-    emission_on_proxy: "Light that the object sheds on the proxy.",
+    emission_on_proxy: "Light that the object emits onto the proxy.",
     clearcoat: "A coat over the base.",
     transmission: "Light that passes through the surface.",
     bounce_to_proxy: "Light that the object reflects onto the proxy.",

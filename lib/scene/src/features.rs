@@ -1,4 +1,4 @@
-//! Which kinds of surface a scene has, told from its materials without decoding a texture.
+//! Which kinds of surface a scene has, found from its materials without decoding a texture.
 use serde::{Deserialize, Serialize};
 
 use crate::material::{AlphaMode, Material};
@@ -32,7 +32,7 @@ pub struct SceneFeatures {
 }
 
 impl SceneFeatures {
-    /// Looks at the materials that triangles use.
+    /// Of the materials that triangles use.
     pub fn of(scene: &Scene) -> Self {
         let mut used = vec![false; scene.materials.len()];
         for &m in &scene.mesh.materials {

@@ -14,7 +14,7 @@ use glam::{DVec3, Vec3};
 /// plane with unit normal `geometric_normal`, on the side that `direction` points to.
 ///
 /// `error` bounds the distance of `point` from that plane, metres
-/// ([`SurfacePoint::error`](crate::bvh::SurfacePoint::error)).
+/// ([`HitPoint::error`](crate::bvh::HitPoint::error)).
 #[inline]
 pub fn spawn_origin(point: Vec3, geometric_normal: Vec3, direction: Vec3, error: f32) -> Vec3 {
     let side = if direction.dot(geometric_normal) < 0.0 {

@@ -75,7 +75,7 @@ pub enum ImageSource {
     },
 }
 
-/// What tells images apart without looking into them.
+/// What identifies an image without its pixels.
 #[derive(PartialEq, Eq, Hash)]
 enum Identity<'a> {
     File(&'a Path),
@@ -89,11 +89,6 @@ impl ImageSource {
             Self::File(path) => format!("\"{}\"", printable(path.display())),
             Self::Bytes { name, .. } => printable(name),
         }
-    }
-
-    /// Whether both are the same file or share the same bytes.
-    pub fn is_same(&self, other: &Self) -> bool {
-        self.identity() == other.identity()
     }
 
     fn identity(&self) -> Identity<'_> {
@@ -193,7 +188,7 @@ impl Texture {
     }
 
     /// Looks `texels` up the way this texture says.
-    pub fn with_texels(&self, texels: Arc<Raster<[u8; 4]>>) -> DecodedTexture {
+    fn with_texels(&self, texels: Arc<Raster<[u8; 4]>>) -> DecodedTexture {
         let linear =
             |transfer: Transfer| std::array::from_fn(|i| transfer.decode_scalar(i as f32 / 255.0));
         DecodedTexture {

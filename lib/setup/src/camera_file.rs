@@ -6,7 +6,7 @@ use dipir_cameras::{Camera, CameraError, Lens, chan, colmap, fspy, transforms};
 use glam::{DVec2, DVec3};
 
 use crate::error::SetupError;
-use crate::view::{Aim, Asked, EYE_HEIGHT_M, View};
+use crate::view::{Aim, CameraOptions, EYE_HEIGHT_M, View};
 
 /// Where the ground is in a file's world.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -35,7 +35,7 @@ pub fn read(
     photo: &Path,
     size: [u32; 2],
     up: Option<WorldUp>,
-    asked: &Asked,
+    asked: &CameraOptions,
 ) -> Result<View, SetupError> {
     asked.check()?;
     let size = size.map(f64::from);
@@ -91,7 +91,7 @@ fn view(
     ground: Ground,
     program: &str,
     path: &Path,
-    asked: &Asked,
+    asked: &CameraOptions,
 ) -> View {
     let (pose, size) = (camera.pose, DVec2::from_array(lens.size));
     let shift = lens.principal_px - 0.5 * size;
@@ -152,7 +152,7 @@ fn camera(
     photo: &Path,
     size: [f64; 2],
     up: Option<WorldUp>,
-    asked: &Asked,
+    asked: &CameraOptions,
 ) -> Result<Found, SetupError> {
     let damaged = |source: CameraError| SetupError::CameraFile {
         path: path.into(),
@@ -254,7 +254,7 @@ mod tests {
             Path::new("photos/b.jpg"),
             size,
             None,
-            &Asked::default(),
+            &CameraOptions::default(),
         );
         found.map_err(|e| e.to_string())
     }

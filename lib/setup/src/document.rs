@@ -135,7 +135,8 @@ fn camera(view: &View) -> String {
     )
 }
 
-/// The light is estimated from the photograph and, without a word, what its file tells of the sun.
+/// The `[light]` table. The light is estimated from the photograph and from what its file holds of
+/// the sun.
 fn light(facts: &Facts) -> String {
     let mut known = Vec::new();
     let mut example = Vec::new();

@@ -1,8 +1,9 @@
 //! From a photograph and models to a first `pipeline.toml`.
 //!
-//! What the photograph or a camera's file tells is used; the rest is a default that the file says
-//! is one. The world is dipir's: metres, +y up; without a camera's file the camera stands above the
-//! origin of the ground y = 0 and looks along -z, turned by pitch and roll.
+//! Values come from the photograph or a camera's file where these have them. All others are
+//! defaults, which comments in the file mark as such. The world is dipir's: metres, +y up; without
+//! a camera's file the camera stands above the origin of the ground y = 0 and looks along -z,
+//! turned by pitch and roll.
 pub mod camera_file;
 pub mod document;
 pub mod error;

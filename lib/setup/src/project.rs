@@ -13,7 +13,7 @@ use crate::document::{Document, Object};
 use crate::error::SetupError;
 use crate::size::{Size, size};
 use crate::spots::spots;
-use crate::view::{Asked, View};
+use crate::view::{CameraOptions, View};
 
 /// What a first configuration is made from.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -33,7 +33,7 @@ pub struct Request {
     /// Which axis of that camera's world points up.
     pub camera_up: Option<WorldUp>,
     /// Of the camera.
-    pub asked: Asked,
+    pub asked: CameraOptions,
 }
 
 /// A configuration that is not written yet.

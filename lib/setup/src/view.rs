@@ -50,9 +50,9 @@ pub struct View {
 
 /// Height of the eyes of somebody who stands, metres.
 pub const EYE_HEIGHT_M: f64 = 1.6;
-/// Field of view along the longer side of a picture that does not say it, degrees.
+/// Field of view along the longer side where the picture does not state it, degrees.
 pub const DEFAULT_FOV_DEG: f64 = 55.0;
-/// Row of the horizon where nothing tells it, of the height from the top.
+/// Row of the horizon where it is unknown, of the height from the top.
 pub const DEFAULT_HORIZON: f64 = 0.4;
 /// A turn that leaves less ground than this share of the height is not believed.
 const LOWEST_HORIZON: f64 = 0.85;
@@ -82,9 +82,9 @@ impl Default for View {
     }
 }
 
-/// What the command line says of the camera.
+/// Options of the command line for the camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Asked {
+pub struct CameraOptions {
     /// Field of view along the longer side, degrees.
     pub fov_deg: Option<f64>,
     /// Upwards, degrees.
@@ -93,7 +93,7 @@ pub struct Asked {
     pub eye_height_m: Option<f64>,
 }
 
-impl Asked {
+impl CameraOptions {
     /// Errors on values that no camera has.
     ///
     /// # Errors
@@ -138,8 +138,12 @@ impl View {
     /// The camera of a photograph, from what is asked, its data and what it shows.
     ///
     /// # Errors
-    /// As [`Asked::check`], and on weights of another version in the program.
-    pub fn of_photo(image: &LinearImage, facts: &Facts, asked: &Asked) -> Result<Self, SetupError> {
+    /// As [`CameraOptions::check`], and on weights of another version in the program.
+    pub fn of_photo(
+        image: &LinearImage,
+        facts: &Facts,
+        asked: &CameraOptions,
+    ) -> Result<Self, SetupError> {
         asked.check()?;
         let size = [image.0.width() as f64, image.0.height() as f64];
         let (lens, aim, aim_why) = lens_and_aim(image, size, facts, asked)?;
@@ -295,7 +299,7 @@ fn lens_and_aim(
     image: &LinearImage,
     size: [f64; 2],
     facts: &Facts,
-    asked: &Asked,
+    asked: &CameraOptions,
 ) -> Result<(Lens, Aim, String), SetupError> {
     let known = Lens::known(size, facts, asked.fov_deg);
     let estimator = CameraEstimator::embedded()?;
@@ -383,7 +387,7 @@ mod tests {
     fn a_picture_that_tells_nothing_gets_the_defaults_and_is_told_so() {
         for [w, h] in [[900, 600], [600, 900]] {
             let facts = Facts::of_size([w as u32, h as u32]);
-            let view = View::of_photo(&grey(w, h), &facts, &Asked::default()).unwrap();
+            let view = View::of_photo(&grey(w, h), &facts, &CameraOptions::default()).unwrap();
             let camera = view.camera([w as u32, h as u32]);
             // A pitch of a hundredth of a degree: a tenth of 900 pixels' focal length.
             let row = horizon_row(&camera, &view.plane(), 0.5 * w as f64).unwrap();
@@ -403,10 +407,10 @@ mod tests {
             focal_source: Some(FocalSource::Equivalent35mm),
             ..Facts::of_size([900, 600])
         };
-        let mut asked = Asked {
+        let mut asked = CameraOptions {
             pitch_deg: Some(-12.5),
             eye_height_m: Some(3.0),
-            ..Asked::default()
+            ..CameraOptions::default()
         };
         let view = View::of_photo(&grey(900, 600), &facts, &asked).unwrap();
         let focal = view.camera([900, 600]).focal_px.x;
@@ -430,23 +434,24 @@ mod tests {
 
     #[test]
     fn options_that_no_camera_has_are_refused_by_name() {
-        let refused = |asked: Asked| asked.check().unwrap_err().to_string();
+        let refused = |asked: CameraOptions| asked.check().unwrap_err().to_string();
         let fov_deg = Some(180.0);
         let pitch_deg = Some(f64::NAN);
         let eye_height_m = Some(-1.0);
-        let default = Asked::default();
+        let default = CameraOptions::default();
         assert!(
-            refused(Asked { fov_deg, ..default }).starts_with("--fov is 180; accepted: degrees")
+            refused(CameraOptions { fov_deg, ..default })
+                .starts_with("--fov is 180; accepted: degrees")
         );
         assert!(
-            refused(Asked {
+            refused(CameraOptions {
                 pitch_deg,
                 ..default
             })
             .starts_with("--pitch is NaN")
         );
         assert!(
-            refused(Asked {
+            refused(CameraOptions {
                 eye_height_m,
                 ..default
             })

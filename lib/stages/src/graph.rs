@@ -81,8 +81,8 @@ pub fn plan(session: &Session, stage: &str) -> anyhow::Result<StagePlan> {
     plan(session)
 }
 
-/// The states of all stages, as far as `needed` asks for them; an error if the configuration is
-/// wrong for one of them.
+/// The states of all stages that `needed` selects; an error if the configuration is wrong for one
+/// of them.
 pub fn assess(
     session: &Session,
     graph: &Graph,

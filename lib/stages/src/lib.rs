@@ -15,9 +15,13 @@ pub mod report;
 pub mod scene;
 pub mod truth;
 
+use std::fmt;
 use std::ops::ControlFlow;
+use std::path::Path;
 
 use dipir_cli::interrupt::{self, Interrupted};
+use dipir_cli::session::duration;
+use dipir_pipeline::manifest::Manifest;
 use dipir_render::error::RenderError;
 
 /// Whether a long computation goes on.
@@ -26,6 +30,12 @@ fn interruption() -> ControlFlow<()> {
         true => ControlFlow::Break(()),
         false => ControlFlow::Continue(()),
     }
+}
+
+/// The line that every stage ends with: where it wrote, and how long it took.
+fn written(f: &mut fmt::Formatter<'_>, folder: &Path, manifest: &Manifest) -> fmt::Result {
+    let elapsed = duration(manifest.elapsed_s);
+    write!(f, "wrote {} in {elapsed}", folder.display())
 }
 
 /// A renderer's error; its interruption is the user's.

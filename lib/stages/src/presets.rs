@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use dipir_cli::session::duration;
-use dipir_optimize::settings::{LightTable, Preset as LightPreset};
+use dipir_optimize::settings::{LightPreset, LightTable};
 use dipir_pipeline::config::Quality;
 use dipir_scene::config::EffectsMode;
 use serde::Deserialize;
@@ -195,7 +195,7 @@ const REPLAY_POWER: f64 = 0.45;
 
 impl LightRun {
     /// About how long it would have taken with `preset`.
-    pub fn seconds_with(&self, preset: &LightPreset) -> f64 {
+    fn seconds_with(&self, preset: &LightPreset) -> f64 {
         let side = preset.size.min(self.photo_side);
         let pixels = (side as f64 / self.side.max(1) as f64).powi(2);
         let samples = f64::from(preset.samples) / f64::from(self.samples.max(1));

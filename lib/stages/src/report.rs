@@ -2,6 +2,7 @@
 //!
 //! It shows the stages that have run. Where an artifact cannot be read, its section says why.
 mod curves;
+mod direction;
 pub mod html;
 mod learning;
 mod lighting;
@@ -18,6 +19,7 @@ use dipir_pipeline::manifest::{FILE_NAME, Manifest};
 use dipir_pipeline::status::StageStatus;
 use dipir_scene::config::SceneConfig;
 
+use crate::names;
 use crate::truth::Truth;
 use html::Html;
 pub use stages::quoted;
@@ -28,7 +30,7 @@ pub const MARK: &[u8] =
 /// Name of the file in the folder of artifacts.
 pub const FILE: &str = "report.html";
 /// Raised whenever the same artifacts give another page.
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 
 /// What the page shows in addition to the artifacts.
 pub struct Report<'a> {
@@ -170,8 +172,8 @@ pub fn is_current(session: &Session) -> bool {
 fn key(session: &Session) -> anyhow::Result<String> {
     let mut hasher = blake3::Hasher::new();
     hasher.update(format!("report {VERSION}").as_bytes());
-    for stage in ["scene", "concepts", "lora", "light", "composite"] {
-        let manifest = std::fs::read(session.stage_folder(stage).join(FILE_NAME));
+    for stage in names::ALL {
+        let manifest = std::fs::read(stage.folder(session).join(FILE_NAME));
         hasher.update(&manifest.unwrap_or_default());
         hasher.update(b"|");
     }

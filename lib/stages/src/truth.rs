@@ -15,7 +15,7 @@ use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_optimize::guidance::{rmse, touched};
 use dipir_optimize::lighting::Lighting;
-use dipir_optimize::objective::{Objective, Weights};
+use dipir_optimize::objective::{Objective, TermWeights};
 use dipir_optimize::parameters::ambient_of;
 use dipir_pipeline::manifest::{FILE_NAME, hash_file};
 use dipir_render::adaptive::Stop;
@@ -102,7 +102,7 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
     let scene = SceneFolder::read(session)?;
     let (record, frame) = recorded(session, &scene)?;
     let transfer = scene.loaded.photo.transfer;
-    let no_weights = Weights {
+    let no_weights = TermWeights {
         consistency: 0.0,
         regularizer: 0.0,
     };

@@ -1,4 +1,4 @@
-//! What can be wrong with what is said of the sun.
+//! Errors in what the configuration says of the sun.
 
 /// A key with a value that makes no sense, or that cannot be used with what else is known.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

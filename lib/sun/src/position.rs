@@ -38,7 +38,7 @@ pub fn position(unix_s: f64, latitude_deg: f64, longitude_deg: f64) -> Position 
     }
 }
 
-/// Of the earth's radius at the distance of the sun.
+/// Angle of the earth's radius, seen from the sun.
 const PARALLAX_DEG: f64 = 0.002_44;
 
 /// Right ascension and declination of the sun, and the sidereal time of Greenwich, radians.
@@ -60,16 +60,6 @@ fn apparent_place(days: f64, t: f64) -> (f64, f64, f64) {
         + 0.000_387_933 * t * t
         + nutation * obliquity.cos();
     (right_ascension, declination, sidereal.to_radians())
-}
-
-/// By how much the air lifts what stands `elevation_deg` above the horizon, degrees, at sea level
-/// and 10 degrees centigrade [Saemundsson 1986, in Meeus, chapter 16]; 0 below -1 degree.
-pub fn refraction_deg(elevation_deg: f64) -> f64 {
-    if elevation_deg < -1.0 {
-        return 0.0;
-    }
-    let at = elevation_deg + 10.3 / (elevation_deg + 5.11);
-    (1.02 / 60.0 / at.to_radians().tan()).max(0.0)
 }
 
 #[cfg(test)]
@@ -126,14 +116,5 @@ mod tests {
         let time = Time::parse("2024-03-20T03:06:00Z").unwrap().unix_s;
         let best = (0..3600).map(|i| position(time, 0.0, 0.1 * f64::from(i)).elevation_deg);
         assert!((best.fold(f64::MIN, f64::max) - 90.0).abs() < 0.1);
-    }
-
-    #[test]
-    fn refraction_lifts_the_setting_sun_by_half_a_degree() {
-        // 28.6 minutes at 0 and 1.0 at 45 degrees in the tables of the almanacs, to a tenth.
-        assert!((refraction_deg(0.0) - 0.48).abs() < 0.02);
-        assert!((refraction_deg(45.0) - 1.0 / 60.0).abs() < 0.001);
-        assert_eq!(refraction_deg(-5.0), 0.0);
-        assert!(refraction_deg(90.0) < 1e-4);
     }
 }

@@ -1,4 +1,4 @@
-//! The sun from a shadow that somebody drew into the photograph.
+//! The sun from a shadow that the user marked in the photograph.
 use glam::{DVec2, DVec3};
 
 use crate::direction::angles;
@@ -27,9 +27,9 @@ pub struct Shadow {
     pub sigma_height: f64,
 }
 
-/// Standard deviation of a coordinate of a point that somebody clicked on, pixels.
+/// Standard deviation of a coordinate of a point that the user clicked on, pixels.
 pub const CLICK_SIGMA_PX: f64 = 2.0;
-/// Standard deviation of a height that somebody said, as a share of it.
+/// Standard deviation of a stated height, as a share of it.
 pub const HEIGHT_SIGMA: f64 = 0.05;
 
 /// The ground that the shadow falls onto.
@@ -50,7 +50,7 @@ pub struct FromShadow {
     pub elevation: Option<Angle>,
 }
 
-/// Why a shadow says nothing.
+/// Why a shadow gives no direction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NoShadow {
     /// A pixel sees no ground.
@@ -98,7 +98,7 @@ pub fn sun_of_shadow(
     };
     for step in [DVec2::X, DVec2::Y] {
         let step = step * shadow.sigma_px;
-        // A step over the horizon is taken the other way.
+        // If a step leads over the horizon, the opposite one is taken.
         let either = |f: &dyn Fn(f64) -> Result<DVec3, NoShadow>| f(1.0).or_else(|_| f(-1.0));
         add(either(&|s| {
             to_sun(shadow.foot + s * step, shadow.tip, height)

@@ -1,4 +1,4 @@
-//! What somebody says of the sun: `[light] sun = { … }` and `[light] shadow = { … }`.
+//! What the user states of the sun: `[light] sun = { … }` and `[light] shadow = { … }`.
 use glam::{DVec2, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -9,7 +9,7 @@ use crate::position::{self, Position};
 use crate::shadow::{Angle, CLICK_SIGMA_PX, HEIGHT_SIGMA, Shadow};
 use crate::time::Time;
 
-/// `sun = { … }`: each part is optional, and what is not said stays unknown.
+/// `sun = { … }`: each part is optional, and what is left out stays unknown.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SunTable {
@@ -61,7 +61,7 @@ pub enum RelativeTo {
     North,
 }
 
-/// Standard deviation of an angle that somebody says, degrees.
+/// Standard deviation of an angle that the user states, degrees.
 const SAID_SIGMA_DEG: f64 = 3.0;
 /// Standard deviation of a compass in a telephone or a hand, degrees.
 const COMPASS_SIGMA_DEG: f64 = 10.0;
@@ -281,7 +281,7 @@ impl SunTable {
     }
 }
 
-/// `shadow = { … }`: a shadow that somebody drew.
+/// `shadow = { … }`: a shadow that the user marked.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ShadowTable {

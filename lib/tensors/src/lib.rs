@@ -42,12 +42,12 @@ pub fn picture(tensor: &Tensor) -> Result<Raster<Vec3>> {
     Ok(from_planes(&values, width, height))
 }
 
-/// What a diffusion model sees of display values: `2 v - 1`, [3, height, width].
+/// Display values as a diffusion model takes them: `2 v - 1`, [3, height, width].
 pub fn model_input(picture: &DisplayImage) -> Result<Tensor> {
     tensor(&picture.0.map(|p| *p * 2.0 - 1.0))
 }
 
-/// The display values that a diffusion model means: `(v + 1) / 2`, clamped to [0, 1].
+/// The output of a diffusion model as display values: `(v + 1) / 2`, clamped to [0, 1].
 pub fn model_output(tensor: &Tensor) -> Result<DisplayImage> {
     let shown = |p: &Vec3| (*p * 0.5 + 0.5).clamp(Vec3::ZERO, Vec3::ONE);
     Ok(DisplayImage(picture(tensor)?.map(shown)))

@@ -9,11 +9,12 @@ use dipir_evaluation::results::{read_json, write_json};
 use dipir_evaluation::scores::{DisplayedComposite, rmse_over};
 use dipir_imaging::raster::DisplayImage;
 use dipir_render::effects::EffectsPlan;
+use dipir_stages::names::{COMPOSITE, LIGHT, SCENE, StageName};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::knobs::{Part, Variant, beyond_standard};
-use crate::scenes::Scene;
+use crate::scenes::MeasuredScene;
 
 /// What one run of a variant showed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -85,7 +86,7 @@ pub struct SceneMeasurement<'a> {
     /// Where everything goes.
     pub out: &'a Path,
     /// Which scene.
-    pub scene: &'a Scene,
+    pub scene: &'a MeasuredScene,
     /// `--threads`.
     pub threads: usize,
     /// Error at which the reference of the render track stops.
@@ -105,7 +106,7 @@ impl SceneMeasurement<'_> {
 
     fn stage(
         &self,
-        name: &str,
+        stage: &StageName,
         pipeline: &Path,
         out: &Path,
         seed: u64,
@@ -124,7 +125,7 @@ impl SceneMeasurement<'_> {
         for (key, value) in set {
             arguments.extend(["--set".into(), format!("{key}={value}")]);
         }
-        self.executables.run(name, &arguments)
+        self.executables.run(stage.executable, &arguments)
     }
 
     /// The render track's reference: everything simulated, sampled to the reference's error.
@@ -146,8 +147,8 @@ impl SceneMeasurement<'_> {
     /// The scene under its known light, made in `folder` with the reference's seed.
     fn composite(&self, folder: &Path, set: &[(String, String)]) -> anyhow::Result<Ran> {
         let lit = &self.scene.lit;
-        self.stage("dipir-scene", lit, folder, REFERENCE_SEED, set)?;
-        self.stage("dipir-composite", lit, folder, REFERENCE_SEED, set)
+        self.stage(&SCENE, lit, folder, REFERENCE_SEED, set)?;
+        self.stage(&COMPOSITE, lit, folder, REFERENCE_SEED, set)
     }
 
     /// Names of the effects that planning leaves on.
@@ -155,7 +156,7 @@ impl SceneMeasurement<'_> {
         let folder = self.work().join("planned");
         let path = folder.join("scene/effects.json");
         if !path.is_file() {
-            self.stage("dipir-scene", &self.scene.lit, &folder, 0, &[])?;
+            self.stage(&SCENE, &self.scene.lit, &folder, 0, &[])?;
         }
         let plan: EffectsPlan = read_json(&path)?;
         let on = plan.effects.iter().filter(|e| e.enabled);
@@ -251,22 +252,16 @@ impl SceneMeasurement<'_> {
         let folder = self.work().join(format!("{}-{seed}", key(&set_up)));
         let kept = folder.join("cost.json");
         if !kept.is_file() {
-            let ran = self.stage("dipir-scene", &self.scene.lit, &folder, seed, &set_up)?;
+            let ran = self.stage(&SCENE, &self.scene.lit, &folder, seed, &set_up)?;
             write_json(
                 &kept,
                 &[ran.cpu_s.unwrap_or(ran.wall_s), ran.wall_s, rss(&ran.json)],
             )?;
         }
         let [scene_cost, scene_wall, scene_rss]: [f64; 3] = read_json(&kept)?;
-        let ran = self.stage(
-            "dipir-composite",
-            &self.scene.lit,
-            &folder,
-            seed,
-            &variant.set,
-        )?;
+        let ran = self.stage(&COMPOSITE, &self.scene.lit, &folder, seed, &variant.set)?;
         let found = DisplayedComposite::read(&folder.join("composite/composite.exr"))?;
-        let _ = fs::remove_dir_all(folder.join("composite"));
+        let _ = fs::remove_dir_all(folder.join(COMPOSITE.name));
         Ok(Sample {
             seed,
             error: reference.error_of(&found.picture),
@@ -293,11 +288,11 @@ impl SceneMeasurement<'_> {
                 ("light.size", "8"),
                 ("light.environment", "[8, 4]"),
             ]);
-            self.stage("dipir-scene", recover, &folder, seed, &tiny)?;
+            self.stage(&SCENE, recover, &folder, seed, &tiny)?;
         }
-        let ran = self.stage("dipir-light", recover, &folder, seed, &variant.set)?;
+        let ran = self.stage(&LIGHT, recover, &folder, seed, &variant.set)?;
         let picture = settings(&[("composite.target_error", PICTURE_ERROR)]);
-        self.stage("dipir-composite", recover, &folder, seed, &picture)?;
+        self.stage(&COMPOSITE, recover, &folder, seed, &picture)?;
         let found = DisplayedComposite::read(&folder.join("composite/composite.exr"))?;
         Ok(Sample {
             seed,

@@ -10,14 +10,14 @@ use dipir_imaging::transfer::Transfer;
 use dipir_render::shapes::{append, icosphere, torus_knot};
 use dipir_scene::export::to_obj;
 use dipir_scene::mesh::TriangleMesh;
-use dipir_stages::scene::background::{View, automatic_exposure_ev};
+use dipir_stages::scene::background::{PanoramaView, automatic_exposure_ev};
 use glam::{Vec2, Vec3};
 
 use crate::lights::{hazy, indoors, outdoors};
 
 /// A project that is measured.
 #[derive(Clone, Debug)]
-pub struct Scene {
+pub struct MeasuredScene {
     /// In tables and plots.
     pub name: String,
     /// Lit by a known light.
@@ -30,8 +30,8 @@ pub struct Scene {
 pub const NAMES: [&str; 3] = ["matte outdoors", "glossy indoors", "concave"];
 
 /// Writes the built-in scene `name` into `folder`, unless it is there.
-pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<Scene> {
-    let scene = Scene {
+pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<MeasuredScene> {
+    let scene = MeasuredScene {
         name: name.into(),
         lit: folder.join("pipeline.toml"),
         recover: Some(folder.join("recover.toml")),
@@ -65,7 +65,7 @@ pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<S
     fs::write(folder.join("object.obj"), to_obj(&mesh, "object")).with_context(failed)?;
     fs::write(folder.join("object.mtl"), materials).with_context(failed)?;
     map.write(folder.join("map.exr"))?;
-    let view = View {
+    let view = PanoramaView {
         fov_rad: 40f32.to_radians(),
         yaw_rad: 0.4,
         pitch_rad: -16f32.to_radians(),
@@ -101,10 +101,10 @@ pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<S
 }
 
 /// A project of the user's.
-pub fn given(pipeline: &Path) -> Scene {
+pub fn given(pipeline: &Path) -> MeasuredScene {
     let folder = pipeline.parent().and_then(|f| f.canonicalize().ok());
     let name = folder.as_deref().and_then(Path::file_name);
-    Scene {
+    MeasuredScene {
         name: name.map_or("project".into(), |n| n.to_string_lossy().into_owned()),
         lit: pipeline.into(),
         recover: None,

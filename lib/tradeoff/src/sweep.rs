@@ -9,7 +9,7 @@ use serde_json::json;
 use crate::command_line::{Cli, Track};
 use crate::knobs::{self, Part, Variant};
 use crate::measure::{Point, SceneMeasurement};
-use crate::scenes::{self, Scene};
+use crate::scenes::{self, MeasuredScene};
 use crate::tables;
 
 /// The point that is measured next.
@@ -22,7 +22,7 @@ pub struct Step<'a> {
     pub scene: &'a str,
     /// The series.
     pub series: &'a str,
-    /// What tells it from others of the series.
+    /// What distinguishes it from others of the series.
     pub label: &'a str,
 }
 
@@ -62,7 +62,7 @@ pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome>
         threads: cli.threads,
         reference_error: cli.reference_error,
     };
-    let mut work: Vec<(&Scene, Variant)> = Vec::new();
+    let mut work: Vec<(&MeasuredScene, Variant)> = Vec::new();
     for &part in parts {
         for scene in &scenes {
             let effects = match part {
@@ -119,7 +119,7 @@ fn chosen_parts(cli: &Cli) -> anyhow::Result<&'static [Part]> {
     })
 }
 
-fn chosen_scenes(cli: &Cli) -> anyhow::Result<Vec<Scene>> {
+fn chosen_scenes(cli: &Cli) -> anyhow::Result<Vec<MeasuredScene>> {
     if !cli.pipeline.is_empty() {
         return Ok(cli.pipeline.iter().map(|p| scenes::given(p)).collect());
     }

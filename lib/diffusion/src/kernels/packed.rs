@@ -310,6 +310,7 @@ fn pack_rows(
 }
 
 /// Rows of A as a job reads them.
+#[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
 #[derive(Clone, Copy)]
 enum Rows<'a> {
     /// Panels of MR rows, depth by depth.
@@ -323,6 +324,7 @@ enum Rows<'a> {
 }
 
 /// One job: a block of rows and columns over one depth.
+#[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
 struct Block {
     rows: usize,
     columns: usize,

@@ -11,7 +11,7 @@ const RENAMED: [(&str, &str); 5] = [
     ("light.tone", "light.recover_tone"),
 ];
 
-/// What `name`, a table, a dotted key or a stage, is called now, if it was renamed.
+/// The present name of `name` (a table, a dotted key or a stage), if it was renamed.
 pub fn renamed(name: &str) -> Option<&'static str> {
     let found = RENAMED.iter().find(|(old, _)| *old == name);
     found.map(|(_, new)| *new)

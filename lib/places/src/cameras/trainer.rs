@@ -1,7 +1,7 @@
 //! Training one network from features to scores of bins.
 use dipir_calibration::network::{Head, Network};
 
-use crate::network::{Dice, Dropout, Optimiser, Weights, backward, forward};
+use crate::network::{Dropout, Optimiser, SplitMix64, Weights, backward, forward};
 
 /// How networks are trained.
 #[derive(Clone, Debug, PartialEq)]
@@ -58,7 +58,7 @@ pub(crate) fn train(
         .collect();
     let mut w: Weights = network.layers.clone();
     let mut optimiser = Optimiser::new(&w);
-    let mut dice = Dice::new(seed);
+    let mut random = SplitMix64::new(seed);
     let dropout = Dropout {
         hidden: settings.dropout,
         features: settings.feature_dropout,
@@ -67,10 +67,10 @@ pub(crate) fn train(
     let (mut step, mut late) = (0usize, f64::NAN);
     for _ in 0..settings.epochs {
         let mut order: Vec<usize> = (0..samples.len()).collect();
-        dice.shuffle(&mut order);
+        random.shuffle(&mut order);
         for batch in order.chunks_exact(settings.batch) {
             let x = batch.iter().flat_map(|k| inputs[*k].iter().copied());
-            let pass = forward(&w, x.collect(), dropout, &mut dice);
+            let pass = forward(&w, x.collect(), dropout, &mut random);
             let targets: Vec<&[f32]> = batch.iter().map(|k| &samples[*k].target[..]).collect();
             let (loss, gradient) = cross_entropy(head, &pass.outputs, &targets);
             late = if late.is_nan() {
@@ -135,11 +135,11 @@ fn start(head: Head, samples: &[&Sample], hidden: usize, seed: u64) -> Network {
     // A feature that hardly varies must not become noise.
     let spread =
         |s: &[f64; 2]| ((s[1] / count - (s[0] / count).powi(2)).max(0.0).sqrt() + 0.01) as f32;
-    let mut dice = Dice::new(seed ^ 0xca3e);
+    let mut random = SplitMix64::new(seed ^ 0xca3e);
     let mut drawn = |inputs: usize| -> Vec<f32> {
         let bound = (inputs as f32).sqrt().recip();
         (0..inputs * hidden)
-            .map(|_| bound * (2.0 * dice.unit() - 1.0))
+            .map(|_| bound * (2.0 * random.unit() - 1.0))
             .collect()
     };
     Network {

@@ -286,7 +286,7 @@ impl Base {
     }
 
     /// Cosine-weighted mean of [`Self::dielectric_albedo`].
-    pub fn mean_dielectric_albedo(&self) -> f32 {
+    fn mean_dielectric_albedo(&self) -> f32 {
         self.energy.mean_albedo(self.f0_dielectric, self.f90)
             + self.further_dielectric * self.energy.mean_loss
     }

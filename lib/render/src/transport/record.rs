@@ -20,7 +20,7 @@ use crate::error::RenderError;
 use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
 use crate::footprint::Footprint;
 use crate::foreground::{Gather, PathContext, PathStart};
-use crate::photo::Photo;
+use crate::photo::ProxyPhoto;
 use crate::render::{ROULETTE_DEPTH, Renderer, pixels_of};
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowGather};
 use crate::world::{ProxyGeometry, World};
@@ -159,8 +159,8 @@ impl<C, G> Default for Recorded<C, G> {
 
 impl Transport {
     /// Traces the paths of every pixel of `renderer`'s picture and keeps what they found.
-    /// `progress` is told the share that is done and may break off. The result does not depend
-    /// on the number of threads.
+    /// `progress` gets the share that is done and may break off. The result does not depend on the
+    /// number of threads.
     pub fn record(
         renderer: &Renderer,
         settings: &RecordSettings,
@@ -189,7 +189,7 @@ impl Transport {
         let photo = settings
             .background
             .filter(|_| has(simulation.features, PROXY_RADIANCE))
-            .map(|image| Photo { image });
+            .map(|image| ProxyPhoto { image });
         let path = PathContext {
             world: &world,
             light: &light,

@@ -135,7 +135,7 @@ fn partners(nodes: &[Bvh2Node], radius: usize) -> (Vec<u32>, bool) {
         .filter(|&i| partners[i] as usize > i && partners[partners[i] as usize] as usize == i)
         .count();
     if n > FEW && pairs * STALLED < n {
-        // Behind an odd number of boxes the last stays alone.
+        // Of an odd number of boxes the last stays alone.
         let next = (0..n).map(|i| (i ^ 1).min(n - 1) as u32);
         return (next.collect(), true);
     }

@@ -101,7 +101,7 @@ impl Tree {
         unsafe { self.packs.get_unchecked(child.index()) }
     }
 
-    /// Asks for the memory of `child` ahead of its visit.
+    /// Prefetches the memory of `child` before its visit.
     #[inline(always)]
     fn prefetch(&self, child: ChildRef) {
         if child.is_pack() {

@@ -220,8 +220,8 @@ pub(super) fn raw_extension<T: serde::de::DeserializeOwned>(
         })
 }
 
-/// Reads a document that is legal, or nearly so, although the model refuses it: it insists on the
-/// roots of every scene and on the targets of animations, and on what only cameras say.
+/// Reads documents that are legal, or nearly so, but that the `gltf` crate refuses because roots of
+/// a scene, targets of animations or fields of cameras are missing.
 fn read_leniently(
     text: &[u8],
     strict: serde_json::Error,

@@ -137,11 +137,13 @@ fn left_out(document: &Document) -> Vec<String> {
     names.extend(root.chain(nodes).map(String::as_str));
     let mut all = Vec::new();
     for name in names {
-        // Of other materials, images and compressed meshes it is said where they are used.
-        let said_elsewhere = name.starts_with("KHR_materials_") && name != "KHR_materials_variants"
+        // Extensions of other materials, images and compressed meshes are reported where they are
+        // used.
+        let reported_elsewhere = name.starts_with("KHR_materials_")
+            && name != "KHR_materials_variants"
             || IMAGE_EXTENSIONS.contains(&name)
             || name.contains("compression");
-        if said_elsewhere || ACCEPTED.contains(&name) {
+        if reported_elsewhere || ACCEPTED.contains(&name) {
             continue;
         }
         let instead = INSTEAD.iter().find(|(known, _)| *known == name);

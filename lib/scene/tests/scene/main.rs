@@ -4,6 +4,7 @@ mod compressed;
 mod config_table;
 mod glb;
 mod gltf_import;
+mod gltf_materials;
 mod hostile_input;
 mod left_out;
 mod limits;

@@ -30,6 +30,7 @@ use crate::light::materials;
 use crate::names::COMPOSITE;
 use crate::presets::Outlook;
 use crate::scene::folder::{self as scene_folder, SceneFolder};
+use crate::written;
 use table::{CompositeTable, MAX_SAMPLES, Tone};
 
 /// When to stop, from the command line.
@@ -387,15 +388,10 @@ impl Done {
 
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(
-            f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
+        written(f, &self.folder, &self.manifest)?;
         write!(
             f,
-            "  estimated error {:.5} (display-referred RMSE, 95% bound), {:.1} million rays",
+            "\n  estimated error {:.5} (display-referred RMSE, 95% bound), {:.1} million rays",
             self.error,
             self.rays as f64 * 1e-6
         )?;

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use candle_core::{DType, Device, Tensor};
 use dipir_cli::interrupt;
-use dipir_cli::session::{Session, duration};
+use dipir_cli::session::Session;
 use dipir_diffusion::concepts::{Concept, class_prompt, concept};
 use dipir_diffusion::generate::{GenerateSettings, generate};
 use dipir_diffusion::model::Model;
@@ -28,6 +28,7 @@ use serde_json::{Value, json};
 
 use crate::model::{self, ModelTable};
 use crate::names::CONCEPTS;
+use crate::written;
 use folder::{ConceptEntry, ConceptList, read_latents};
 use table::ConceptsTable;
 
@@ -241,15 +242,10 @@ impl Done {
 
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(
-            f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
+        written(f, &self.folder, &self.manifest)?;
         write!(
             f,
-            "  {} images made, {} from the cache",
+            "\n  {} images made, {} from the cache",
             self.made, self.reused
         )
     }

@@ -1,13 +1,13 @@
-//! What the light stage says when it has run.
+//! What the light stage prints when it has run.
 use std::fmt;
 
-use dipir_cli::session::duration;
 use dipir_estimator::LightEstimate;
 use dipir_optimize::history::Row;
 use glam::Vec3;
 use serde_json::{Value, json};
 
 use super::Done;
+use crate::written;
 
 /// An estimate in a sentence.
 pub(crate) fn in_words(estimate: &LightEstimate) -> String {
@@ -68,17 +68,12 @@ impl Done {
 
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(
-            f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
+        written(f, &self.folder, &self.manifest)?;
         match self.found.history.len() {
-            0 => write!(f, "  nothing was optimised: the start is the light")?,
+            0 => write!(f, "\n  nothing was optimised: the start is the light")?,
             n => write!(
                 f,
-                "  {n} iterations on {} x {} pixels",
+                "\n  {n} iterations on {} x {} pixels",
                 self.size[0], self.size[1]
             )?,
         }

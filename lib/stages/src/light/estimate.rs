@@ -12,7 +12,7 @@ use dipir_sun::table::Taken;
 use glam::Vec2;
 use serde::Serialize;
 
-/// Candidates that are told.
+/// Candidates that are written.
 const CANDIDATES: usize = 8;
 
 /// What `candidates.json` says of one light.
@@ -56,12 +56,12 @@ pub(super) fn estimate(
         None => estimate,
     };
     let candidates = estimate.candidates(CANDIDATES);
-    let told = |(k, c): (usize, &dipir_estimator::Candidate)| CandidateEntry {
+    let entry = |(k, c): (usize, &dipir_estimator::Candidate)| CandidateEntry {
         candidate: k + 1,
         probability: c.probability,
         words: c.words.clone(),
     };
-    let entries = candidates.iter().enumerate().map(told).collect();
+    let entries = candidates.iter().enumerate().map(entry).collect();
     let (lobes, sources, smooth) = match table.candidate {
         None => {
             let sources = usize::from(estimate.source_lobe().is_some());

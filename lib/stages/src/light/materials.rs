@@ -3,7 +3,7 @@ use std::fmt;
 use std::path::PathBuf;
 
 use dipir_cli::interrupt::Interrupted;
-use dipir_cli::session::{Session, duration};
+use dipir_cli::session::Session;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentSampler;
@@ -28,6 +28,7 @@ use crate::light::resume::{self, Resume};
 use crate::names::LIGHT;
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::scene::transport::{self, Frame};
+use crate::written;
 
 /// Role of the file among the light stage's outputs.
 const ROLE: &str = "materials";
@@ -264,12 +265,7 @@ impl Done {
 
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
+        written(f, &self.folder, &self.manifest)?;
         for m in &self.outcome.materials {
             let [r, g, b] = m.base_color;
             write!(

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use candle_core::Tensor;
 use dipir_cli::interrupt;
-use dipir_cli::session::{Session, duration};
+use dipir_cli::session::Session;
 use dipir_diffusion::generate::{GenerateSettings, generate};
 use dipir_diffusion::lora::{LoraInfo, LoraStyle};
 use dipir_diffusion::model::Model;
@@ -32,6 +32,7 @@ use crate::concepts::folder::{ConceptsFolder, read_latents};
 use crate::concepts::table::ConceptsTable;
 use crate::model::{self, ModelTable};
 use crate::names::{CONCEPTS, LORA};
+use crate::written;
 
 /// What the stage did.
 pub struct Done {
@@ -299,15 +300,10 @@ impl Done {
 
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(
-            f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
+        written(f, &self.folder, &self.manifest)?;
         write!(
             f,
-            "  {} updates, loss {:.4} at the start, {:.4} at the end (means of a tenth)",
+            "\n  {} updates, loss {:.4} at the start, {:.4} at the end (means of a tenth)",
             self.history.len(),
             self.loss(false),
             self.loss(true)

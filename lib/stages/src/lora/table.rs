@@ -96,7 +96,7 @@ impl LoraTable {
         format!("a scene in the style of {} rendering", self.word)
     }
 
-    /// What decides the course of a run; how long it is does not.
+    /// The settings that determine each step of a run, so not the number of steps.
     pub(super) fn without_steps(&self) -> Self {
         Self {
             steps: 0,

@@ -19,7 +19,7 @@ use serde_json::Value;
 use super::curves::{column, noisy, over};
 use super::html::{Html, table};
 use super::picture::{figure, image};
-use super::{Report, Section, json, outputs};
+use super::{Report, Section, direction, json, outputs};
 use crate::composite::table::CompositeTable;
 use crate::known_light;
 use crate::names::LIGHT;
@@ -54,14 +54,31 @@ pub fn section(report: &Report) -> Section {
         own.truncate(lighting.sources);
     }
     let own = strongest(&own);
+    let truth = report.truth.and_then(|t| t.peak);
+    let estimated: Option<LightEstimate> = match has("estimate") {
+        true => Some(json(&run, "estimate")?),
+        false => None,
+    };
+    let towards = estimated.as_ref().map_or_else(
+        || own.first().map(|(lobe, _)| lobe.direction),
+        |e| Some(e.mode()),
+    );
     let mut parts = vec![];
-    if has("estimate") {
-        parts.push(estimate(&run)?);
+    if let Some(towards) = towards {
+        parts.extend(direction::figure(
+            report,
+            towards,
+            estimated.as_ref(),
+            truth,
+        )?);
+    }
+    if let Some(estimated) = &estimated {
+        parts.push(estimate(&run, estimated)?);
     }
     parts.push(map(
         &environment.resampled(MAP_WIDTH, MAP_WIDTH / 2),
         &own,
-        report.truth.and_then(|t| t.peak),
+        truth,
         "the recovered light: latitude and longitude, +z in the middle, +x to its left",
     )?);
     if !own.is_empty() {
@@ -88,9 +105,8 @@ pub fn section(report: &Report) -> Section {
 }
 
 /// What was estimated from the photograph, with how sure it is, and the lights to choose among.
-fn estimate(run: &(PathBuf, Manifest)) -> anyhow::Result<Html> {
-    let estimate: LightEstimate = json(run, "estimate")?;
-    let sentence = Html::of("p", crate::light::in_words(&estimate));
+fn estimate(run: &(PathBuf, Manifest), estimate: &LightEstimate) -> anyhow::Result<Html> {
+    let sentence = Html::of("p", crate::light::in_words(estimate));
     let candidates: Vec<Value> = json(run, "candidates")?;
     let rows = candidates.iter().map(|c| {
         let chance = c["probability"].as_f64().unwrap_or(0.0);

@@ -57,7 +57,7 @@ pub fn table(report: &Report) -> Section {
     ])))
 }
 
-/// What a stage's error is an error of.
+/// The quantity that a stage's error belongs to.
 fn error_in_words(stage: &str, error: f64) -> String {
     let unit = match stage {
         s if s == SCENE.name => "left out",

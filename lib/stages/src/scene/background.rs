@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 /// A camera in the middle of a panorama.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct View {
+pub struct PanoramaView {
     /// Vertical field of view, radians, in `(0, pi)`.
     pub fov_rad: f32,
     /// Turn to the right, radians; 0 looks along -z.
@@ -24,7 +24,7 @@ pub struct View {
 /// Samples along each side of a pixel.
 const SAMPLES: usize = 4;
 
-impl View {
+impl PanoramaView {
     /// Columns: the camera's right, up and backward axes.
     pub fn rotation(&self) -> Mat3 {
         Mat3::from_euler(EulerRot::YXZ, -self.yaw_rad, self.pitch_rad, -self.roll_rad)
@@ -113,8 +113,8 @@ mod tests {
 
     use super::*;
 
-    fn view(yaw_rad: f32, pitch_rad: f32) -> View {
-        View {
+    fn view(yaw_rad: f32, pitch_rad: f32) -> PanoramaView {
+        PanoramaView {
             fov_rad: FRAC_PI_2,
             yaw_rad,
             pitch_rad,
@@ -151,7 +151,7 @@ mod tests {
         let towards = map.direction_of(i, j);
         let pitch = towards.y.asin();
         let yaw = towards.x.atan2(-towards.z);
-        let image = View {
+        let image = PanoramaView {
             fov_rad: 0.2,
             ..view(yaw, pitch)
         }

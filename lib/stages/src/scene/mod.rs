@@ -31,6 +31,7 @@ use crate::light::method::Method;
 use crate::names::SCENE;
 use crate::presets::{self, Outlook};
 use crate::scene::transport::Frame;
+use crate::written;
 
 /// What the stage did.
 pub struct Done {
@@ -255,7 +256,7 @@ fn plan_with<'a>(
     let table: LightTable = session.config.table("light")?;
     let recovery = transport::settings(session, &table)?;
     let known = known_light::known_params(&composite);
-    // Where nothing is optimised, the record would be made for nobody.
+    // Where nothing is optimised, nothing reads the record.
     let transport = Method::of(session)?.replays().then(|| {
         json!({
             "size": recovery.size, "environment": recovery.environment,
@@ -323,15 +324,10 @@ impl fmt::Display for Done {
             .map(|e| e.name.name())
             .collect();
         let [width, height] = self.resolution;
+        written(f, &self.folder, &self.manifest)?;
         writeln!(
             f,
-            "wrote {} in {}",
-            self.folder.display(),
-            duration(self.manifest.elapsed_s)
-        )?;
-        writeln!(
-            f,
-            "  {} triangles, {} materials, {width} x {height} pixels",
+            "\n  {} triangles, {} materials, {width} x {height} pixels",
             self.triangles, self.materials
         )?;
         write!(

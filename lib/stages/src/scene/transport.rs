@@ -70,7 +70,7 @@ impl Frame {
         LinearImage(resize(&image.0, width, height, Filter::Area))
     }
 
-    /// How transport is recorded for `settings`. `scene_hash` tells one scene from another.
+    /// How transport is recorded for `settings`. `scene_hash` identifies the scene.
     pub fn record_settings(
         &self,
         settings: &Settings,
