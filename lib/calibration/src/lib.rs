@@ -1,8 +1,8 @@
 //! Pitch, roll and field of view of the camera that took a photograph, as a distribution.
 //!
 //! Three things are multiplied: what straight lines tell ([`lines`]), what the picture's look tells (networks over
-//! [`features`], trained on views of real places), and what is known of the focal length. How far each is trusted was
-//! chosen on places that the networks had not seen, so that 90% intervals hold about that.
+//! [`features`], for training on views of real places), and what is known of the focal length. How far each is trusted
+//! is part of the weights. Those in the repository are not trained: lines and the known focal length alone decide.
 pub mod error;
 mod estimate;
 pub mod features;
