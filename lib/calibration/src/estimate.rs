@@ -20,7 +20,7 @@ const COARSE: [usize; 3] = [33, 17, 11];
 const FINE: [usize; 3] = [15, 13, 7];
 /// Points of a focal length that is known, over this many deviations either way.
 const KNOWN: usize = 3;
-const KNOWN_DEVIATIONS: f64 = 1.7;
+const KNOWN_DEVIATIONS: f64 = 1.35;
 /// How often the grid is drawn closer.
 const ROUNDS: usize = 2;
 /// What the outermost points of a closer grid may leave out.

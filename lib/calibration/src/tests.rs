@@ -90,7 +90,7 @@ fn without_networks_everything_is_possible() {
     assert!((roll.half_width() - 0.45 * (16.0 + 16.0 / 12.0)).abs() < 0.1, "{roll:?}");
     // All angles from 24 to 100 degrees are alike.
     let fov = found.fov_deg();
-    assert!((fov.middle - 62.0).abs() < 2.0, "{fov:?}");
+    assert!((fov.middle - 62.0).abs() < 3.0, "{fov:?}");
 }
 
 #[test]
@@ -101,9 +101,9 @@ fn a_known_focal_length_stays_what_it_is() {
     };
     let found = ignorant().grid(&grey(), Some(known)).posterior(1.0);
     let focal = found.interval(2);
-    // 1.645 standard deviations either way, on three points 1.7 apart, each spread as wide.
+    // 1.645 standard deviations either way, on three points 1.35 of them apart, each spread as wide.
     assert!((focal.middle - 0.9f64.ln()).abs() < 1e-3, "{focal:?}");
-    assert!((focal.half_width() - 0.0329).abs() < 0.006, "{focal:?}");
+    assert!((focal.half_width() - 0.0329).abs() < 0.003, "{focal:?}");
 }
 
 #[test]
