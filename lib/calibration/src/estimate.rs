@@ -214,7 +214,10 @@ pub struct Scores {
 impl Scores {
     /// Under a power of the scores' density.
     pub fn posterior(&self, trust: f64) -> Posterior {
-        let logs = self.logs.iter().map(|[score, before]| trust * score + before);
+        let logs = self
+            .logs
+            .iter()
+            .map(|[score, before]| trust * score + before);
         Posterior::new(self.axes, &logs.collect::<Vec<f64>>())
     }
 }

@@ -47,7 +47,7 @@ struct Edge {
     variance: f64,
 }
 
-/// How many segments are explained by what, counted by length.
+/// How many segments are explained by what.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Agreement {
     /// Upright ones.

@@ -47,8 +47,7 @@ const TOLD_DEG: f32 = 3.0;
 const TOLD: usize = 60;
 
 /// How many numbers tell of a picture under a camera.
-pub const FEATURES: usize =
-    5 + CONTEXT + LINES + BANDS * (LEANS + 1) + ROWS + STEPS * PER_STEP + 2;
+pub const FEATURES: usize = 5 + CONTEXT + LINES + BANDS * (LEANS + 1) + ROWS + STEPS * PER_STEP + 2;
 
 /// A place of an edge; positions are relative to the picture's middle, +y up, in units of its longer side.
 #[derive(Clone, Copy, Debug)]

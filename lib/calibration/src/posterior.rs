@@ -33,14 +33,6 @@ impl Axis {
     pub fn values(&self) -> impl Iterator<Item = f64> {
         (0..self.count).map(|k| self.value(k))
     }
-
-    /// The number between those of two neighbours on this axis, the first or last outside.
-    pub fn interpolated(&self, numbers: &[f64], value: f64) -> f64 {
-        let at = ((value - self.low) / self.step).clamp(0.0, (self.count - 1) as f64);
-        let below = (at as usize).min(self.count.saturating_sub(2));
-        let part = at - below as f64;
-        numbers[below] * (1.0 - part) + numbers[(below + 1).min(self.count - 1)] * part
-    }
 }
 
 /// The middle value and the bounds that hold 90% of the probability.
@@ -114,19 +106,6 @@ impl Posterior {
     pub fn interval(&self, axis: usize) -> Interval {
         let [low, middle, high] = [0.05, 0.5, 0.95].map(|q| self.quantile(axis, q));
         Interval { low, middle, high }
-    }
-
-    /// The negative logarithm of the density at a value of an axis, between the grid's points; what lies outside of the
-    /// grid has a thousandth of the mean density.
-    pub fn surprise(&self, axis: usize, value: f64) -> f64 {
-        let (axis, marginal) = (self.axes[axis], self.marginal(axis));
-        let end = axis.value(axis.count - 1);
-        let inside = (axis.low - 0.5 * axis.step..=end + 0.5 * axis.step).contains(&value);
-        let density = match inside {
-            true => axis.interpolated(&marginal, value) / axis.step,
-            false => 0.0,
-        };
-        -density.max(1e-3 / (end - axis.low)).ln()
     }
 
     /// 90% of the angle along the longer side, degrees.

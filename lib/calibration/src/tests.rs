@@ -86,8 +86,14 @@ fn without_networks_everything_is_possible() {
     let found = ignorant().grid(&grey(), None).posterior(1.0);
     let [pitch, roll] = [found.interval(0), found.interval(1)];
     // 90% of what is searched, 80 and 16 degrees, and a step: half of each end's point lies outside.
-    assert!((pitch.half_width() - 0.45 * (80.0 + 80.0 / 14.0)).abs() < 0.1, "{pitch:?}");
-    assert!((roll.half_width() - 0.45 * (16.0 + 16.0 / 12.0)).abs() < 0.1, "{roll:?}");
+    assert!(
+        (pitch.half_width() - 0.45 * (80.0 + 80.0 / 14.0)).abs() < 0.1,
+        "{pitch:?}"
+    );
+    assert!(
+        (roll.half_width() - 0.45 * (16.0 + 16.0 / 12.0)).abs() < 0.1,
+        "{roll:?}"
+    );
     // All angles from 24 to 100 degrees are alike.
     let fov = found.fov_deg();
     assert!((fov.middle - 62.0).abs() < 3.0, "{fov:?}");

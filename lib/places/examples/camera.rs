@@ -36,10 +36,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let outcome = run(&settings, &|p| match p {
         Progress::Training(fold, done, loss) => {
             if shown.fetch_add(1, Ordering::Relaxed).is_multiple_of(4) {
-                eprintln!(
-                    "fold {fold}: {:.0}%, loss {loss:.3}",
-                    100.0 * done
-                );
+                eprintln!("fold {fold}: {:.0}%, loss {loss:.3}", 100.0 * done);
             }
         }
         other => eprintln!("{other:?}"),

@@ -337,7 +337,7 @@ fn aim(size: [f64; 2], focal_px: f64, seen: &CameraEstimate) -> (Aim, String) {
     let agreeing = seen.agreeing.upright + seen.agreeing.level;
     let lines = match agreeing >= LEAST_LINES {
         true => format!(
-            "{agreeing:.0} of {} straight lines and from the look",
+            "{agreeing:.0} of {} straight lines and the look",
             seen.lines
         ),
         false => "the look".into(),
@@ -345,18 +345,18 @@ fn aim(size: [f64; 2], focal_px: f64, seen: &CameraEstimate) -> (Aim, String) {
     let horizon = row(pitch.middle);
     if pitch.half_width() <= MOST_PITCH_HALF_DEG && horizon < LOWEST_HORIZON * size[1] {
         let sure = roll.half_width() <= MOST_ROLL_HALF_DEG;
-        let level = if sure {
-            ""
-        } else {
-            ", which is too wide to be used"
+        // Cameras are held level, unless the picture says otherwise.
+        let (roll_deg, used) = match (sure, roll.holds(0.0)) {
+            (false, _) => (0.0, ", which is too wide: 0 is used"),
+            (true, true) => (0.0, ", which may be level: 0 is used"),
+            (true, false) => (roll.middle, ""),
         };
         let why = format!(
             "from {lines} of the picture: pitch {:.1} to {:.1}, roll {:.1} to {:.1} degrees \
-             (90%){level}; horizon at row {horizon:.0}; or --pitch",
+             (90%){used}; horizon at row {horizon:.0}; or --pitch",
             pitch.low, pitch.high, roll.low, roll.high
         );
-        let roll = if sure { roll.middle } else { 0.0 };
-        return (turned(pitch.middle, roll), why);
+        return (turned(pitch.middle, roll_deg), why);
     }
     let default = (DEFAULT_HORIZON - 0.5) * size[1] / focal_px;
     let why = match horizon < LOWEST_HORIZON * size[1] {

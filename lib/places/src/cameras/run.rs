@@ -20,7 +20,11 @@ use crate::shot::{JUDGED, LEARNED, Range, Shot};
 pub use crate::cameras::trainer::Training;
 
 /// Powers of the scores' density that are tried.
-const TRUSTS: [f64; 11] = [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3, 1.5];
+const TRUSTS: [f64; 16] = [
+    0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0, 2.2,
+];
+/// Share of intervals that should hold the truth.
+const HELD: f64 = 0.9;
 /// Half sides of the boxes around the true camera that other cameras are drawn from: degrees of pitch, twice those of
 /// roll, and 3% of the field of view each. As many more are drawn from everywhere as from a box.
 const BOXES: [f64; 6] = [0.6, 1.2, 2.5, 5.0, 10.0, 20.0];
@@ -60,11 +64,11 @@ impl Settings {
         Self {
             panoramas,
             out,
-            folds: 6,
-            views: 100,
-            learned: 400,
-            judged: 6,
-            built: 40,
+            folds: 3,
+            views: 50,
+            learned: 160,
+            judged: 3,
+            built: 16,
             seed: 1,
             training: Training::default(),
             focal_sigma: 0.02,
@@ -83,8 +87,8 @@ pub enum Progress {
     Training(usize, f64, f64),
     /// Photographs were judged.
     Judged(usize),
-    /// One trust was tried: mean surprise of the truth, natural logarithms, for each fold.
-    Tried(f64, Vec<f64>),
+    /// One trust was tried: the share of intervals that hold the truth.
+    Tried(f64, f64),
 }
 
 /// What it gives.
@@ -163,7 +167,9 @@ fn networks(
     let samples: Vec<(Option<usize>, Sample)> = of_places.chain(generated).collect();
     progress(Progress::Photographs(samples.len()));
     let network = |left_out: usize| {
-        let learned = samples.iter().filter(|s| s.0.is_none_or(|p| fold[p] != left_out));
+        let learned = samples
+            .iter()
+            .filter(|s| s.0.is_none_or(|p| fold[p] != left_out));
         let learned: Vec<&Sample> = learned.map(|s| &s.1).collect();
         let seed = settings.seed + left_out as u64;
         train(&learned, &settings.training, seed, &mut |done, loss| {
@@ -196,17 +202,15 @@ fn built(range: &Range, seed: u64, n: usize, longest: [usize; 2]) -> (Pose, Line
 }
 
 /// A camera in a box around another, or anywhere, and the logarithm of the share of all cameras it stands for.
-fn drawn(
-    pose: &Pose,
-    any_focal: bool,
-    side: Option<f64>,
-    random: &mut SplitMix64,
-) -> (Pose, f32) {
+fn drawn(pose: &Pose, any_focal: bool, side: Option<f64>, random: &mut SplitMix64) -> (Pose, f32) {
     let limits = |side: Option<f64>| limits(pose, side);
-    let [pitch, roll, fov] = limits(side).map(|[low, high]| {
-        low + (high - low) * f64::from(random.unit())
-    });
-    let fov = if any_focal { fov } else { fov_deg(pose.log_focal) };
+    let [pitch, roll, fov] =
+        limits(side).map(|[low, high]| low + (high - low) * f64::from(random.unit()));
+    let fov = if any_focal {
+        fov
+    } else {
+        fov_deg(pose.log_focal)
+    };
     let inside = |side: Option<f64>| {
         let own = limits(side);
         let axes = if any_focal { 3 } else { 2 };
@@ -299,14 +303,15 @@ fn scores(
     let both = |(n, j): (usize, &Judged)| {
         let estimator = CameraEstimator {
             members: vec![trained[fold[j.place]].clone()],
-            trust: 0.8,
+            trust: 1.0,
         };
         [Some(known(&j.pose, settings, n)), None].map(|k| estimator.grid(&j.evidence, k))
     };
     judged.par_iter().enumerate().map(both).collect()
 }
 
-/// The trust with the least surprise on the other folds, for each fold, and on all of them.
+/// The trust under which 90% intervals of pitch, roll (focal length given) and field of view (not given) hold 90% on the
+/// other folds, for each fold, and on all of them.
 fn chosen(
     scores: &[[Scores; 2]],
     judged: &[Judged],
@@ -314,34 +319,35 @@ fn chosen(
     settings: &Settings,
     progress: &(dyn Fn(Progress) + Sync),
 ) -> (Vec<f64>, f64) {
-    let mut surprises = Vec::new();
+    let mut held = Vec::new();
     for trust in TRUSTS {
         let each = judged.iter().zip(scores).map(|(j, scores)| {
             let [given, open] = [0, 1].map(|k| scores[k].posterior(trust));
-            given.surprise(0, j.pose.pitch_deg)
-                + given.surprise(1, j.pose.roll_deg)
-                + open.surprise(2, j.pose.log_focal)
+            let pitch = given.interval(0).holds(j.pose.pitch_deg);
+            let roll = given.interval(1).holds(j.pose.roll_deg);
+            let fov = open.interval(2).holds(j.pose.log_focal);
+            [pitch, roll, fov].iter().filter(|h| **h).count() as f64 / 3.0
         });
         let each: Vec<f64> = each.collect();
-        let mean = |f: usize| {
-            let own = (judged.iter().zip(&each)).filter(|(j, _)| fold[j.place] == f);
-            let own: Vec<f64> = own.map(|(_, e)| *e).collect();
-            own.iter().sum::<f64>() / own.len().max(1) as f64
-        };
-        let by_fold: Vec<f64> = (0..settings.folds).map(mean).collect();
-        progress(Progress::Tried(trust, by_fold.clone()));
-        surprises.push(by_fold);
+        progress(Progress::Tried(trust, mean(each.iter().copied())));
+        held.push(each);
     }
     let best = |without: Option<usize>| {
-        let sum = |k: usize| -> f64 {
-            let folds = (0..settings.folds).filter(|f| Some(*f) != without);
-            folds.map(|f| surprises[k][f]).sum()
+        let off = |k: usize| {
+            let own = judged.iter().zip(&held[k]);
+            let own = own.filter(|(j, _)| Some(fold[j.place]) != without);
+            (mean(own.map(|(_, h)| *h)) - HELD).abs()
         };
-        let order = (0..TRUSTS.len()).min_by(|a, b| sum(*a).total_cmp(&sum(*b)));
+        let order = (0..TRUSTS.len()).min_by(|a, b| off(*a).total_cmp(&off(*b)));
         TRUSTS[order.unwrap_or(0)]
     };
     let by_fold = (0..settings.folds).map(|f| best(Some(f))).collect();
     (by_fold, best(None))
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0), |(s, n), v| (s + v, n + 1));
+    sum / f64::from(count.max(1))
 }
 
 fn rows(
