@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
+use anyhow::anyhow;
 use clap::Args;
 use dipir_cli::interrupt;
 use dipir_placing::desk::Desk;
@@ -41,13 +42,15 @@ pub fn run(args: &PlaceArgs) -> anyhow::Result<()> {
     }
     let stop = AtomicBool::new(false);
     thread::scope(|scope| {
-        scope.spawn(|| place.serve(&stop));
-        while !interrupt::asked() {
+        let server = scope.spawn(|| place.serve(&stop));
+        while !interrupt::asked() && !server.is_finished() {
             thread::sleep(Duration::from_millis(100));
         }
         stop.store(true, Ordering::Relaxed);
-    });
-    Ok(())
+        server
+            .join()
+            .unwrap_or_else(|_| Err(anyhow!("the server failed")))
+    })
 }
 
 /// Opens the system's browser; false if there is none.

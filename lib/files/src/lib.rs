@@ -4,12 +4,14 @@
 //! regular file is refused before it is opened. What is written over an earlier file is written
 //! beside it first; the earlier one is replaced only if it begins with the mark of this program.
 mod own;
+mod rewrite;
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
 
 pub use own::{beginning, begins_with, left_of_replacing, open_own, replace, sync_folder};
+pub use rewrite::rewrite;
 
 /// Opens a regular file for reading. Symbolic links are followed.
 ///

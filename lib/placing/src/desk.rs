@@ -50,13 +50,13 @@ pub struct Desk {
     text: Mutex<String>,
     /// What the page painted, row by row; empty if nothing.
     mask: Mutex<Vec<u8>>,
-    studio: Mutex<Studio>,
+    rendered: Mutex<Rendered>,
     /// Counts drafts that were asked for: an older one is broken off.
     drafts: AtomicU64,
 }
 
-/// What rendering changes.
-struct Studio {
+/// What is rendered: the scene as it is arranged, and its light.
+struct Rendered {
     session: Session,
     small: SmallScene,
     /// The mask of the file.
@@ -94,6 +94,12 @@ impl Desk {
         let text = dipir_files::read_to_string(&path)
             .with_context(|| format!("cannot read \"{}\"", path.display()))?;
         let (small, arrangement) = SmallScene::load(&session, LONGEST)?;
+        if small.loaded.original.is_some() {
+            bail!(
+                "the page cannot show a photograph whose lens distorts it: pixels of [scene.camera.distortion] are \
+                 those of the photograph as it was taken; edit pipeline.toml and look at it with dipir preview"
+            );
+        }
         for warning in &arrangement.warnings {
             session.warn(warning);
         }
@@ -108,7 +114,7 @@ impl Desk {
             size,
             text: Mutex::new(text),
             mask: Mutex::default(),
-            studio: Mutex::new(Studio {
+            rendered: Mutex::new(Rendered {
                 session,
                 own_mask: small.loaded.occluders.clone(),
                 small,
@@ -130,8 +136,8 @@ impl Desk {
 
     /// The mask of the file, as it is shown; nothing if there is none.
     pub fn own_mask(&self) -> Vec<u8> {
-        let studio = held(&self.studio);
-        let mask = studio.own_mask.as_ref();
+        let rendered = held(&self.rendered);
+        let mask = rendered.own_mask.as_ref();
         let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
         mask.map_or_else(Vec::new, |m| m.pixels().iter().map(byte).collect())
     }
@@ -292,23 +298,23 @@ impl Desk {
         let ticket = self.drafts.fetch_add(1, Ordering::SeqCst) + 1;
         let (_, config, arrangement) = self.edited(edit)?;
         let current = || self.drafts.load(Ordering::SeqCst) == ticket;
-        let mut studio = held(&self.studio);
+        let mut rendered = held(&self.rendered);
         if !current() {
             return Ok(Err(Superseded));
         }
-        let studio = &mut *studio;
-        studio.small.arrange(&arrangement);
-        studio.session.config = config;
-        studio.small.loaded.occluders = self.occluders(edit, studio.own_mask.as_ref());
-        studio.light_up()?;
-        let Some((_, light)) = &studio.light else {
+        let rendered = &mut *rendered;
+        rendered.small.arrange(&arrangement);
+        rendered.session.config = config;
+        rendered.small.loaded.occluders = self.occluders(edit, rendered.own_mask.as_ref());
+        rendered.light_up()?;
+        let Some((_, light)) = &rendered.light else {
             bail!("there is no light");
         };
         let mut go_on = || match current() {
             true => ControlFlow::Continue(()),
             false => ControlFlow::Break(()),
         };
-        let draft = match Draft::render(&studio.small.loaded, light, samples, &mut go_on) {
+        let draft = match Draft::render(&rendered.small.loaded, light, samples, &mut go_on) {
             Err(RenderError::Interrupted) => return Ok(Err(Superseded)),
             other => other?,
         };
@@ -320,7 +326,7 @@ impl Desk {
         Ok(Ok(Some(Crop {
             png: png::encode(x1 - x0, y1 - y0, &values)?,
             place,
-            light: told(light, &arrangement.camera),
+            light: description(light, &arrangement.camera),
         })))
     }
 
@@ -356,7 +362,7 @@ impl Desk {
         let text = document.text();
         let config = Config::parse(&self.path, &text, &[])?;
         config.table::<SceneConfig>("scene")?.validate()?;
-        let mut studio = held(&self.studio);
+        let mut rendered = held(&self.rendered);
         let mut base = held(&self.text);
         let found = dipir_files::read_to_string(&self.path)?;
         if found != *base {
@@ -364,9 +370,9 @@ impl Desk {
                 "the file was changed by another program; reload the page after starting dipir place anew"
             );
         }
-        studio.session.config = config;
+        rendered.session.config = config;
         // Every table is read once more, as a run would.
-        graph::graph(&studio.session)?;
+        graph::graph(&rendered.session)?;
         let mut written = Vec::new();
         if let Some(path) = &mask {
             let [w, h] = arrangement.camera.resolution.map(|n| n as usize);
@@ -374,10 +380,10 @@ impl Desk {
             let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
             let values: Vec<u8> = whole.pixels().iter().map(byte).collect();
             png::write(path, &png::encode(w, h, &values)?)?;
-            studio.own_mask = Some(self.raster(&painted));
+            rendered.own_mask = Some(self.raster(&painted));
             written.push(path.display().to_string());
         }
-        dipir_files::replace(&self.path, text.as_bytes(), b"")
+        dipir_files::rewrite(&self.path, base.as_bytes(), text.as_bytes())
             .with_context(|| format!("cannot write \"{}\"", self.path.display()))?;
         written.push(self.path.display().to_string());
         *base = text;
@@ -385,7 +391,7 @@ impl Desk {
     }
 }
 
-impl Studio {
+impl Rendered {
     /// Finds the light, unless it is that of the same camera and keys as before.
     fn light_up(&mut self) -> anyhow::Result<()> {
         let config = &self.session.config;
@@ -504,7 +510,7 @@ fn line(piece: &Piece) -> Value {
 }
 
 /// A light in words and numbers.
-fn told(light: &AtHand, camera: &Camera) -> Value {
+fn description(light: &AtHand, camera: &Camera) -> Value {
     let strongest = light.lobes.lobes().iter().max_by(|a, b| {
         let power = |l: &SphericalGaussian| l.integral().element_sum();
         power(a).total_cmp(&power(b))

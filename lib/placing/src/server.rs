@@ -1,17 +1,26 @@
 //! The server of the page.
-use std::io::{Read, Write};
-use std::net::Ipv4Addr;
+use std::convert::Infallible;
+use std::net::{Ipv4Addr, TcpListener};
+use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use dipir_cli::exit::describe;
+use http_body_util::{BodyExt, Full, Limited};
+use hyper::body::{Bytes, Incoming};
+use hyper::header::{HeaderName, HeaderValue};
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper::{Request, Response, StatusCode, header};
+use hyper_util::rt::{TokioIo, TokioTimer};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::json;
-use tiny_http::{Request, Server, StatusCode};
+use tokio::runtime;
+use tokio::task::spawn_blocking;
+use tokio::time::timeout;
 
 use crate::desk::Desk;
 use crate::edit::Edit;
@@ -48,17 +57,24 @@ const POSTS: [&str; 6] = ["view", "draft", "solve", "measure", "save", MASK];
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; \
                       connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// Threads that answer: one may render, others draw lines meanwhile.
-const THREADS: usize = 4;
-/// How soon a thread sees that it should end.
+/// Most threads that compute an answer: one may render, others draw lines meanwhile.
+const THREADS: usize = 8;
+/// How soon the server sees that it should end.
 const PAUSE: Duration = Duration::from_millis(200);
+/// Longest wait for the head of a request, and for its body.
+const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A server that listens.
 pub struct Place {
-    server: Arc<Server>,
-    gate: Arc<Gate>,
-    desk: Arc<Desk>,
-    routes: Arc<Vec<Route>>,
+    listener: TcpListener,
+    site: Arc<Site>,
+}
+
+/// What is served, and to whom.
+struct Site {
+    gate: Gate,
+    desk: Desk,
+    routes: Vec<Route>,
 }
 
 impl Place {
@@ -67,93 +83,111 @@ impl Place {
     /// # Errors
     /// If the port is taken.
     pub fn listen(desk: Desk, port: u16) -> anyhow::Result<Self> {
-        let server = Server::http((Ipv4Addr::LOCALHOST, port))
-            .map_err(|e| anyhow!("cannot listen on 127.0.0.1:{port}: {e}; try another --port"))?;
-        let address = server.server_addr().to_ip();
-        let address = address.context("the server has no address")?;
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port))
+            .with_context(|| format!("cannot listen on 127.0.0.1:{port}; try another --port"))?;
         let gate = Gate {
-            authority: address.to_string(),
+            authority: listener.local_addr()?.to_string(),
             token: token()?,
             mask_bytes: desk.mask_bytes(),
         };
         let get = |path| Route { path, posts: false };
         let post = |path| Route { path, posts: true };
         let routes = FILES.iter().map(|f| get(f.0));
-        let routes = routes.chain(GETS.map(get)).chain(POSTS.map(post));
-        Ok(Self {
-            server: Arc::new(server),
-            gate: Arc::new(gate),
-            desk: Arc::new(desk),
-            routes: Arc::new(routes.collect()),
-        })
+        let routes = routes.chain(GETS.map(get)).chain(POSTS.map(post)).collect();
+        let site = Arc::new(Site { gate, desk, routes });
+        Ok(Self { listener, site })
     }
 
     /// The address to open, with its token.
     pub fn address(&self) -> String {
-        format!("http://{}/{}/", self.gate.authority, self.gate.token)
+        let gate = &self.site.gate;
+        format!("http://{}/{}/", gate.authority, gate.token)
     }
 
-    /// Answers until `stop`.
-    pub fn serve(&self, stop: &AtomicBool) {
-        thread::scope(|scope| {
-            for _ in 0..THREADS {
-                scope.spawn(|| {
-                    while !stop.load(Ordering::Relaxed) {
-                        match self.server.recv_timeout(PAUSE) {
-                            Ok(Some(request)) => self.answer(request),
-                            Ok(None) => {}
-                            // A connection that broke off; the pause keeps a lasting error cheap.
-                            Err(_) => thread::sleep(PAUSE),
-                        }
-                    }
-                });
-            }
-        });
+    /// Answers until `stop`. A picture that is being rendered then is not waited for.
+    ///
+    /// # Errors
+    /// If the system gives no threads or no events.
+    pub fn serve(&self, stop: &AtomicBool) -> anyhow::Result<()> {
+        let runtime = runtime::Builder::new_current_thread()
+            .enable_all()
+            .max_blocking_threads(THREADS)
+            .build()
+            .context("the server cannot start")?;
+        let done = runtime.block_on(self.accept(stop));
+        runtime.shutdown_background();
+        done.context("the server ended")
     }
 
-    fn answer(&self, mut request: Request) {
-        let header = |name: &'static str| {
-            let found = request.headers().iter().find(|h| h.field.equiv(name));
-            found.map(|h| h.value.as_str().to_owned())
+    async fn accept(&self, stop: &AtomicBool) -> std::io::Result<()> {
+        let listener = self.listener.try_clone()?;
+        listener.set_nonblocking(true)?;
+        let listener = tokio::net::TcpListener::from_std(listener)?;
+        while !stop.load(Ordering::Relaxed) {
+            let stream = match timeout(PAUSE, listener.accept()).await {
+                Err(_) => continue,
+                Ok(Ok((stream, _))) => stream,
+                // A connection that broke off; the pause keeps a lasting error cheap.
+                Ok(Err(_)) => {
+                    tokio::time::sleep(PAUSE).await;
+                    continue;
+                }
+            };
+            let site = self.site.clone();
+            let service = service_fn(move |request| site.clone().answer(request));
+            let mut http = http1::Builder::new();
+            http.timer(TokioTimer::new()).header_read_timeout(PATIENCE);
+            let connection = http.serve_connection(TokioIo::new(stream), service);
+            // Who breaks a connection off does not wait for an answer.
+            tokio::spawn(async { drop(connection.await) });
+        }
+        Ok(())
+    }
+}
+
+impl Site {
+    async fn answer(
+        self: Arc<Self>,
+        request: Request<Incoming>,
+    ) -> Result<Response<Full<Bytes>>, Infallible> {
+        let answer = match self.admit(&request) {
+            Err(refusal) => Answer::refusal(&refusal),
+            Ok(route) => match self.body(route, request.into_body()).await {
+                Err(e) => Answer::error(&e),
+                Ok(body) => spawn_blocking(move || self.route(route, &body))
+                    .await
+                    .unwrap_or_else(|e| Answer::error(&e.into())),
+            },
         };
-        let (host, origin) = (header("Host"), header("Origin"));
+        Ok(answer.response())
+    }
+
+    fn admit(&self, request: &Request<Incoming>) -> Result<Route, Refusal> {
+        let header = |name: HeaderName| request.headers().get(name)?.to_str().ok();
+        let url = request.uri().to_string();
         let head = Head {
             method: request.method().as_str(),
-            url: request.url(),
-            host: host.as_deref(),
-            origin: origin.as_deref(),
-            length: request.body_length(),
-            is_chunked: header("Transfer-Encoding").is_some(),
+            url: &url,
+            host: header(header::HOST),
+            origin: header(header::ORIGIN),
+            length: header(header::CONTENT_LENGTH).and_then(|l| l.parse().ok()),
+            is_chunked: request.headers().contains_key(header::TRANSFER_ENCODING),
         };
-        let admitted = self.gate.admit(&head, &self.routes);
-        let answer = match admitted {
-            Err(refusal) => Answer::refusal(&refusal),
-            Ok(route) => {
-                let most = match route.path {
-                    MASK => self.gate.mask_bytes,
-                    _ => MOST_JSON,
-                };
-                let mut body = Vec::new();
-                let mut reader = request.as_reader().take(most as u64);
-                match reader.read_to_end(&mut body) {
-                    Ok(_) => self.route(route, body),
-                    Err(e) => Answer::error(&e.into()),
-                }
-            }
-        };
-        // A body that is too long is thrown away while the answer is sent, for as long as it comes:
-        // no thread that serves others waits for it.
-        let respond = move || {
-            // Who broke the connection off does not wait for an answer.
-            let _ = answer.send(request);
-        };
-        match admitted {
-            Ok(_) => respond(),
-            Err(_) => drop(thread::spawn(respond)),
-        }
+        self.gate.admit(&head, &self.routes)
     }
 
-    fn route(&self, route: Route, body: Vec<u8>) -> Answer {
+    async fn body(&self, route: Route, body: Incoming) -> anyhow::Result<Bytes> {
+        let most = match route.path {
+            MASK => self.gate.mask_bytes,
+            _ => MOST_JSON,
+        };
+        let whole = pin!(Limited::new(body, most).collect());
+        let read = timeout(PATIENCE, whole).await;
+        let read = read.context("the rest of the request did not come")?;
+        Ok(read.map_err(|e| anyhow!(e))?.to_bytes())
+    }
+
+    fn route(&self, route: Route, body: &[u8]) -> Answer {
         if let Some((_, kind, text)) = FILES.iter().find(|f| f.0 == route.path && !route.posts) {
             return Answer::new(200, kind, text.as_bytes().to_vec());
         }
@@ -166,21 +200,21 @@ impl Place {
                 "application/octet-stream",
                 desk.own_mask(),
             )),
-            MASK => desk.paint(body).map(|()| Answer::json(json!({}))),
-            "view" => parsed::<ViewAsked>(&body)
+            MASK => desk.paint(body.to_vec()).map(|()| Answer::json(json!({}))),
+            "view" => parsed::<ViewAsked>(body)
                 .and_then(|a| desk.view(&a.edit, a.grid))
                 .map(Answer::json),
-            "solve" => parsed::<SolveAsked>(&body)
+            "solve" => parsed::<SolveAsked>(body)
                 .and_then(|a| desk.solve(&a.edit, &a.lines))
                 .map(|found| Answer::json(json!(found))),
-            "measure" => parsed::<MeasureAsked>(&body)
+            "measure" => parsed::<MeasureAsked>(body)
                 .and_then(|a| desk.measure(&a.edit, a.ends, a.length_m))
                 .map(|height| Answer::json(json!({"height_m": height}))),
-            "save" => parsed::<Edit>(&body)
+            "save" => parsed::<Edit>(body)
                 .and_then(|edit| desk.save(&edit))
                 .and_then(|written| Ok((written, desk.state()?)))
                 .map(|(written, state)| Answer::json(json!({"written": written, "state": state}))),
-            "draft" => parsed::<DraftAsked>(&body).and_then(|a| self.draft(&a)),
+            "draft" => parsed::<DraftAsked>(body).and_then(|a| self.draft(&a)),
             other => Err(anyhow!("{other} is not answered")),
         };
         answer.unwrap_or_else(|e| Answer::error(&e))
@@ -270,33 +304,33 @@ impl Answer {
         Self::new(refusal.status, "text/plain; charset=utf-8", text)
     }
 
-    /// Answers `request`, after which the client closes the connection. The pool of threads in `tiny_http`
-    /// 0.12 can leave a new connection waiting for ever while others are kept open, as browsers do.
-    fn send(self, request: Request) -> std::io::Result<()> {
-        let (status, length) = (self.status, self.body.len());
-        let reason = StatusCode(status).default_reason_phrase();
-        let mut head = format!(
-            "HTTP/1.1 {status} {reason}\r\nConnection: close\r\nContent-Length: {length}\r\n"
-        );
-        let headers = [
-            ("Content-Type", self.kind),
-            ("Content-Security-Policy", POLICY),
-            ("X-Content-Type-Options", "nosniff"),
-            ("Referrer-Policy", "no-referrer"),
-            ("Cache-Control", "no-store"),
-            ("Cross-Origin-Resource-Policy", "same-origin"),
-            ("Cross-Origin-Opener-Policy", "same-origin"),
-        ];
-        let about = self.about.iter().map(|a| ("X-Draft", a.as_str()));
-        for (name, value) in headers.into_iter().chain(about) {
-            // What a configuration says must not end a header.
-            let value: String = value.chars().filter(|c| !c.is_control()).collect();
-            head += &format!("{name}: {value}\r\n");
+    fn response(self) -> Response<Full<Bytes>> {
+        let mut response = Response::new(Full::new(Bytes::from(self.body)));
+        *response.status_mut() =
+            StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+        let headers = response.headers_mut();
+        for (name, value) in [
+            (header::CONTENT_TYPE, self.kind),
+            (header::CONTENT_SECURITY_POLICY, POLICY),
+            (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+            (header::REFERRER_POLICY, "no-referrer"),
+            (header::CACHE_CONTROL, "no-store"),
+            (
+                HeaderName::from_static("cross-origin-resource-policy"),
+                "same-origin",
+            ),
+            (
+                HeaderName::from_static("cross-origin-opener-policy"),
+                "same-origin",
+            ),
+        ] {
+            headers.insert(name, HeaderValue::from_static(value));
         }
-        head += "\r\n";
-        let mut writer = request.into_writer();
-        writer.write_all(head.as_bytes())?;
-        writer.write_all(&self.body)?;
-        writer.flush()
+        // A value with control characters is left out: it must not end the header.
+        let about = self.about.and_then(|a| HeaderValue::try_from(a).ok());
+        if let Some(about) = about {
+            headers.insert("x-draft", about);
+        }
+        response
     }
 }

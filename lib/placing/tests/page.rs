@@ -2,10 +2,11 @@
 use std::fs;
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
+use std::time::Duration;
 
 use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::session::Session;
@@ -26,6 +27,9 @@ const TEXT: &str = "# The street.\n[scene]\nbackground = \"photo.png\" # mine\n\
 
 const BOX: &str = "v -.5 0 -.5\nv .5 0 -.5\nv .5 1 -.5\nv -.5 1 -.5\nv -.5 0 .5\nv .5 0 .5\nv .5 1 .5\nv -.5 1 .5\n\
     f 1 4 3 2\nf 5 6 7 8\nf 1 5 8 4\nf 2 3 7 6\nf 4 8 7 3\nf 1 2 6 5\n";
+
+/// More than any answer takes on a slow machine.
+const PATIENCE: Duration = Duration::from_secs(120);
 
 struct Running {
     folder: TempDir,
@@ -58,33 +62,41 @@ impl Answer {
 
     fn header(&self, name: &str) -> Option<&str> {
         let mut lines = self.head.lines();
-        lines.find_map(|l| l.strip_prefix(name)?.strip_prefix(": "))
+        lines.find_map(|l| {
+            let (field, value) = l.split_once(": ")?;
+            field.eq_ignore_ascii_case(name).then_some(value)
+        })
     }
+}
+
+/// The project of [`TEXT`] with some keys changed, as `KEY=VALUE`.
+fn project(folder: &Path, set: &[&str]) -> Session {
+    let grey = Raster::filled(300, 200, Vec3::splat(0.5));
+    write_png(folder.join("photo.png"), &DisplayImage(grey)).unwrap();
+    fs::write(folder.join("box.obj"), BOX).unwrap();
+    fs::write(folder.join("pipeline.toml"), TEXT).unwrap();
+    Session::open(&CommonArgs {
+        pipeline: folder.join("pipeline.toml"),
+        set: set.iter().map(|s| (*s).to_owned()).collect(),
+        out: None,
+        threads: None,
+        seed: None,
+        wait: false,
+        supervised: false,
+        hashes: None,
+        output: OutputArgs {
+            json: false,
+            quiet: true,
+            verbose: false,
+        },
+    })
+    .unwrap()
 }
 
 impl Running {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let grey = Raster::filled(300, 200, Vec3::splat(0.5));
-        write_png(folder.path().join("photo.png"), &DisplayImage(grey)).unwrap();
-        fs::write(folder.path().join("box.obj"), BOX).unwrap();
-        fs::write(folder.path().join("pipeline.toml"), TEXT).unwrap();
-        let session = Session::open(&CommonArgs {
-            pipeline: folder.path().join("pipeline.toml"),
-            set: Vec::new(),
-            out: None,
-            threads: None,
-            seed: None,
-            wait: false,
-            supervised: false,
-            hashes: None,
-            output: OutputArgs {
-                json: false,
-                quiet: true,
-                verbose: false,
-            },
-        });
-        let desk = Desk::open(session.unwrap()).unwrap();
+        let desk = Desk::open(project(folder.path(), &[])).unwrap();
         let place = Place::listen(desk, 0).unwrap();
         let address = place.address();
         let parts: Vec<&str> = address.split('/').collect();
@@ -94,7 +106,7 @@ impl Running {
             token: parts[3].into(),
             thread: Some({
                 let stop = stop.clone();
-                thread::spawn(move || place.serve(&stop))
+                thread::spawn(move || place.serve(&stop).unwrap())
             }),
             stop,
             folder,
@@ -105,9 +117,17 @@ impl Running {
         self.folder.path().join(name)
     }
 
+    /// A connection that fails instead of waiting for ever.
+    fn connect(&self) -> TcpStream {
+        let stream = TcpStream::connect(&self.authority).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream.set_write_timeout(Some(PATIENCE)).unwrap();
+        stream
+    }
+
     /// Sends a request whose head is given, and reads the answer.
     fn send(&self, head: &str, body: &[u8]) -> Answer {
-        let mut stream = TcpStream::connect(&self.authority).unwrap();
+        let mut stream = self.connect();
         let head = format!("{head}\r\nConnection: close\r\n\r\n");
         stream.write_all(head.as_bytes()).unwrap();
         stream.write_all(body).unwrap();
@@ -223,7 +243,7 @@ fn a_body_of_100_megabytes_is_refused_before_it_is_sent() {
     let place = Running::new();
     let (token, host) = (&place.token, &place.authority);
     for route in ["save", "mask", "draft"] {
-        let mut stream = TcpStream::connect(host).unwrap();
+        let mut stream = place.connect();
         let head = format!(
             "POST /{token}/{route} HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n\
              Content-Length: 104857600\r\n\r\n"
@@ -239,6 +259,32 @@ fn a_body_of_100_megabytes_is_refused_before_it_is_sent() {
     assert_eq!(place.post_bytes("mask", &[0; 60_000]).status, 200);
     assert_eq!(place.post_bytes("mask", &[0; 60_001]).status, 413);
     assert_eq!(place.post_bytes("mask", &[0; 59_999]).status, 422);
+}
+
+#[test]
+fn connections_that_stay_open_keep_nobody_waiting() {
+    let place = Running::new();
+    let silent: Vec<TcpStream> = (0..20).map(|_| place.connect()).collect();
+    let (token, host) = (&place.token, &place.authority);
+    // As browsers do: further requests on a connection that is kept.
+    let mut kept: Vec<TcpStream> = (0..6).map(|_| place.connect()).collect();
+    for _ in 0..3 {
+        for stream in &mut kept {
+            let head = format!("GET /{token}/mask.bin HTTP/1.1\r\nHost: {host}\r\n\r\n");
+            stream.write_all(head.as_bytes()).unwrap();
+        }
+        for stream in &mut kept {
+            let mut head = Vec::new();
+            while !head.ends_with(b"\r\n\r\n") {
+                let mut byte = [0];
+                stream.read_exact(&mut byte).unwrap();
+                head.extend(byte);
+            }
+            assert!(head.starts_with(b"HTTP/1.1 200"));
+        }
+    }
+    assert_eq!(place.get("state").status, 200);
+    drop(silent);
 }
 
 #[test]
@@ -258,6 +304,14 @@ fn saving_keeps_comments_and_order() {
     assert_eq!(text, expected);
     // Nothing but the file is left in the folder.
     assert_eq!(fs::read_dir(place.folder.path()).unwrap().count(), 3);
+}
+
+#[test]
+fn a_photograph_that_its_lens_distorts_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let session = project(folder.path(), &["scene.camera.distortion={k1=-0.2}"]);
+    let error = Desk::open(session).err().expect("refused").to_string();
+    assert!(error.contains("[scene.camera.distortion]"), "{error}");
 }
 
 #[test]

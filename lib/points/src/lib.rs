@@ -10,7 +10,7 @@ pub mod ground;
 mod pcd;
 pub mod place;
 mod plane;
-mod ply;
+pub mod ply;
 pub mod relief;
 
 pub use cloud::Cloud;

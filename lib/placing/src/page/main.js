@@ -3,7 +3,7 @@ import * as api from "./api.js";
 import { Picture } from "./canvas.js";
 import { Dial } from "./dial.js";
 import { History } from "./history.js";
-import { HELP, number, objects, put, say, told } from "./panel.js";
+import { HELP, number, objects, put, say, showNumbers } from "./panel.js";
 import { Tools } from "./tools.js";
 
 const $ = (id) => document.getElementById(id);
@@ -101,7 +101,7 @@ const look = api.latest(async (edit) => {
   } catch (error) {
     return say(error.message, true);
   }
-  told(page.view, page.chosen);
+  showNumbers(page.view, page.chosen);
   page.redraw();
 });
 
@@ -309,5 +309,5 @@ $("file").textContent = first.file;
 $("help").textContent = HELP.move;
 document.documentElement.dataset.ready = "yes";
 refresh();
-told(page.view, page.chosen);
+showNumbers(page.view, page.chosen);
 page.redraw();

@@ -40,7 +40,7 @@ export function objects(names, edit, chosen, choose) {
   $("objects").replaceChildren(...list);
 }
 
-export function told(view, chosen) {
+export function showNumbers(view, chosen) {
   const object = view.objects[chosen];
   const { pitch_deg, roll_deg, fov_deg, height_m } = view.camera;
   const way = pitch_deg < 0 ? "down" : "up";
