@@ -359,7 +359,7 @@ fn aim(size: [f64; 2], focal_px: f64, seen: &CameraEstimate) -> (Aim, String) {
         return (turned(pitch.middle, roll_deg), why);
     }
     let default = (DEFAULT_HORIZON - 0.5) * size[1] / focal_px;
-    let why = match horizon < LOWEST_HORIZON * size[1] {
+    let why = match pitch.half_width() > MOST_PITCH_HALF_DEG {
         true => format!(
             "neither straight lines nor the look of the picture tell it: a pitch of {:.0} to {:.0} \
              degrees is possible (90%)",
