@@ -241,7 +241,7 @@ fn what_is_no_points_is_explained() {
     let many = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\n\
                 property float y\nproperty float z\nend_header\n";
     let error = file::ply(many.as_bytes()).unwrap_err().to_string();
-    assert!(error.contains("it is cut short"), "{error}");
+    assert!(error.contains("the file ends here"), "{error}");
 }
 
 proptest! {
