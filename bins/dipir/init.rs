@@ -46,12 +46,12 @@ pub struct InitArgs {
     camera_up: Option<Axis>,
 
     /// Field of view along the photograph's longer side, degrees [default: what the photograph
-    /// says, else 55]
+    /// says, else what it shows, else 55]
     #[arg(long, value_name = "DEG")]
     fov: Option<f64>,
 
-    /// How far the camera looks up (or, below 0, down), degrees [default: from upright edges, else
-    /// with the horizon 40% from the top]
+    /// How far the camera looks up (or, below 0, down), degrees [default: what the photograph
+    /// shows, else with the horizon 40% from the top]
     #[arg(
         long,
         value_name = "DEG",

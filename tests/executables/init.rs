@@ -17,7 +17,7 @@ fn what_is_written_runs_as_it_is() {
         "wrote first.toml",
         "dipir place first.toml",
         "dipir run first.toml --draft",
-        "a guess, for the photograph does not say it",
+        "field of view: ",
     ] {
         assert!(init.stdout.contains(line), "{line}: {}", init.stdout);
     }

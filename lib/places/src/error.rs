@@ -31,6 +31,9 @@ pub enum PlacesError {
     /// Weights could not be made or read.
     #[error(transparent)]
     Estimator(#[from] dipir_estimator::EstimatorError),
+    /// Weights of the camera could not be made or read.
+    #[error(transparent)]
+    Camera(#[from] dipir_calibration::CalibrationError),
     /// A setting that cannot be worked with.
     #[error("{0}")]
     Setting(String),

@@ -2,6 +2,7 @@
 //!
 //! Photographs are drawn from the panoramas as cameras would take them, each with the light that falls on its camera.
 //! Places are left out in folds, never photographs: figures are of places that nothing was trained on.
+pub mod cameras;
 pub mod error;
 pub mod examples;
 pub mod figures;
@@ -10,6 +11,7 @@ mod network;
 pub mod place;
 pub mod probes;
 pub mod run;
+pub mod shot;
 #[cfg(test)]
 mod tests;
 pub mod trainer;

@@ -1,6 +1,5 @@
 //! The estimator's network in training: batches, dropout, gradients, and the optimiser.
-use dipir_estimator::features::FEATURES;
-use dipir_estimator::network::{Network, OUTPUTS, silu};
+use dipir_estimator::network::{Network, silu};
 use dipir_numerics::hashing::mix64;
 use gemm::{Parallelism, gemm};
 
@@ -73,7 +72,7 @@ pub(crate) struct Pass {
     steps: [Vec<f32>; 2],
     masks: [Vec<f32>; 2],
     hidden: [Vec<f32>; 2],
-    /// `batch x OUTPUTS`.
+    /// `batch x outputs`.
     pub outputs: Vec<f32>,
 }
 
@@ -91,15 +90,15 @@ pub(crate) fn forward(
     dropout: Dropout,
     random: &mut SplitMix64,
 ) -> Pass {
-    let (rows, n) = (x.len() / FEATURES, w[1].len());
+    let n = w[1].len();
+    let inputs = w[0].len() / n;
     mask(&mut x, dropout.features, random);
-    let first = affine(&x, FEATURES, &w[0], &w[1]);
+    let first = affine(&x, inputs, &w[0], &w[1]);
     let (h, m1) = activated(&first, dropout.hidden, random);
     let second = affine(&h, n, &w[2], &w[3]);
     let (s, m2) = activated(&second, dropout.hidden, random);
     let sum: Vec<f32> = h.iter().zip(&s).map(|(a, b)| a + b).collect();
     let outputs = affine(&sum, n, &w[4], &w[5]);
-    debug_assert_eq!(outputs.len(), rows * OUTPUTS);
     Pass {
         x,
         steps: [first, second],
@@ -113,8 +112,9 @@ pub(crate) fn forward(
 pub(crate) fn backward(w: &Weights, pass: &Pass, outputs: &[f32]) -> Weights {
     let n = w[1].len();
     let [h, sum] = &pass.hidden;
-    let (output, output_bias) = weight_gradient(sum, n, outputs, OUTPUTS);
-    let mut sum_gradient = input_gradient(outputs, OUTPUTS, &w[4], n);
+    let (inputs, scores) = (w[0].len() / n, w[5].len());
+    let (output, output_bias) = weight_gradient(sum, n, outputs, scores);
+    let mut sum_gradient = input_gradient(outputs, scores, &w[4], n);
     let second_gradient = through(&sum_gradient, &pass.steps[1], &pass.masks[1]);
     let (second, second_bias) = weight_gradient(h, n, &second_gradient, n);
     let back = input_gradient(&second_gradient, n, &w[2], n);
@@ -123,7 +123,7 @@ pub(crate) fn backward(w: &Weights, pass: &Pass, outputs: &[f32]) -> Weights {
         .zip(&back)
         .for_each(|(a, b)| *a += b);
     let first_gradient = through(&sum_gradient, &pass.steps[0], &pass.masks[0]);
-    let (first, first_bias) = weight_gradient(&pass.x, FEATURES, &first_gradient, n);
+    let (first, first_bias) = weight_gradient(&pass.x, inputs, &first_gradient, n);
     [first, first_bias, second, second_bias, output, output_bias]
 }
 

@@ -158,7 +158,11 @@ impl View {
 }
 
 /// A map between the middles of its texels at an azimuth, radians, and the sine of an elevation.
-fn bilinear(map: &dipir_light::environment::EnvironmentMap, azimuth: f32, up: f32) -> Vec3 {
+pub(crate) fn bilinear(
+    map: &dipir_light::environment::EnvironmentMap,
+    azimuth: f32,
+    up: f32,
+) -> Vec3 {
     let (width, height) = (map.width(), map.height());
     let x = (azimuth / TAU).rem_euclid(1.0) * width as f32 - 0.5;
     let v = up.clamp(-1.0, 1.0).acos() / std::f32::consts::PI;

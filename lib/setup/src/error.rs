@@ -47,6 +47,9 @@ pub enum SetupError {
         /// The accepted form, with an example.
         accepted: &'static str,
     },
+    /// The weights that tell a photograph's camera are of another version.
+    #[error(transparent)]
+    Calibration(#[from] dipir_calibration::CalibrationError),
     /// The camera sees no ground to put anything on.
     #[error(
         "the camera sees no ground: {detail}; look further down with --pitch -10, or see whether --camera is right"

@@ -8,10 +8,8 @@ pub mod camera_file;
 pub mod document;
 pub mod error;
 pub mod project;
-pub mod segments;
 pub mod size;
 pub mod spots;
-pub mod verticals;
 pub mod view;
 
 pub use error::SetupError;

@@ -253,6 +253,69 @@ fn beside(path: &Path, folder: &Path) -> Result<String, SetupError> {
 mod tests {
     use super::*;
 
+    /// Exif data that say nothing but an orientation: a TIFF header and one tag [TIFF 6.0].
+    fn exif_of(turn: u8) -> Vec<u8> {
+        let mut bytes = b"II*\0\x08\0\0\0\x01\0".to_vec();
+        bytes.extend([0x12, 0x01, 3, 0, 1, 0, 0, 0, turn, 0, 0, 0, 0, 0, 0, 0]);
+        bytes
+    }
+
+    /// A PNG that this turn makes upright.
+    fn put_turned(path: &Path, [w, h]: [usize; 2], at: &dyn Fn(usize, usize) -> u8, turn: u8) {
+        let (right, bottom) = (w - 1, h - 1);
+        let stored = if turn < 5 { [w, h] } else { [h, w] };
+        let place = |row: usize, column: usize| match turn {
+            1 => at(column, row),
+            2 => at(right - column, row),
+            3 => at(right - column, bottom - row),
+            4 => at(column, bottom - row),
+            5 => at(row, column),
+            6 => at(right - row, column),
+            7 => at(right - row, bottom - column),
+            _ => at(row, bottom - column),
+        };
+        let mut info = png::Info::with_size(stored[0] as u32, stored[1] as u32);
+        info.exif_metadata = Some(exif_of(turn).into());
+        let file = std::fs::File::create(path).unwrap();
+        let encoder = png::Encoder::with_info(file, info).unwrap();
+        let mut writer = encoder.write_header().unwrap();
+        let pixels = (0..w * h).map(|k| place(k / stored[0], k % stored[0]));
+        writer
+            .write_image_data(&pixels.collect::<Vec<u8>>())
+            .unwrap();
+        writer.finish().unwrap();
+    }
+
+    #[test]
+    fn each_of_the_eight_orientations_gives_the_same_scene() {
+        let folder = tempfile::tempdir().unwrap();
+        let (photo, model) = (folder.path().join("photo.png"), folder.path().join("a.obj"));
+        let corners = "v 0 0 0\nv 1 0 0\nv 0 0 1\nv 0 1 0\n";
+        std::fs::write(
+            &model,
+            format!("{corners}f 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"),
+        )
+        .unwrap();
+        let pose = dipir_calibration::Pose::new(-8.0, 2.0, 60.0);
+        let size = [192, 128];
+        let room = dipir_calibration::generated::Built::Room;
+        let room = dipir_calibration::generated::picture(room, 1, &pose, size);
+        let at = |x: usize, y: usize| (room.0.get(x, y).x.sqrt() * 255.0) as u8;
+        let texts = (1..=8).map(|turn| {
+            put_turned(&photo, size, &at, turn);
+            let request = Request {
+                photo: photo.clone(),
+                models: vec![model.clone()],
+                out: folder.path().join("pipeline.toml"),
+                ..Request::default()
+            };
+            draft(&request).unwrap().document.text()
+        });
+        let texts: Vec<String> = texts.collect();
+        assert!(texts[0].contains("192 x 128 pixels"), "{}", texts[0]);
+        assert!(texts.iter().all(|text| *text == texts[0]), "{texts:?}");
+    }
+
     #[test]
     fn the_class_is_the_words_of_the_model_s_name() {
         let of = |name: &str| {

@@ -1,6 +1,7 @@
-//! The camera of a photograph, from its file, its edges and defaults.
+//! The camera of a photograph: what its file says, what the picture shows, and defaults.
 use std::path::PathBuf;
 
+use dipir_calibration::{CameraEstimate, CameraEstimator, Evidence, KnownFocal};
 use dipir_cameras::WorldUp;
 use dipir_imaging::facts::{Facts, FocalSource};
 use dipir_imaging::raster::LinearImage;
@@ -9,8 +10,6 @@ use dipir_scene::proxy::Plane;
 use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 
 use crate::error::SetupError;
-use crate::segments;
-use crate::verticals;
 
 /// How a camera is turned.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -62,6 +61,12 @@ pub const DEFAULT_FOV_DEG: f64 = 55.0;
 pub const DEFAULT_HORIZON: f64 = 0.4;
 /// A turn that leaves less ground than this share of the height is not believed.
 const LOWEST_HORIZON: f64 = 0.85;
+/// Half widths of 90% intervals up to which what the picture shows is used, degrees, and relative.
+const MOST_PITCH_HALF_DEG: f64 = 12.0;
+const MOST_ROLL_HALF_DEG: f64 = 3.5;
+const MOST_FOV_HALF: f64 = 0.35;
+/// Straight lines are named as a reason if as many agree.
+const LEAST_LINES: f64 = 6.0;
 
 impl Default for View {
     /// Level, at the height of the eyes, 40 degrees.
@@ -136,10 +141,10 @@ impl CameraOptions {
 }
 
 impl View {
-    /// The camera of a photograph, from what is asked, its data and its edges.
+    /// The camera of a photograph, from what is asked, its data and what it shows.
     ///
     /// # Errors
-    /// As [`CameraOptions::check`].
+    /// As [`CameraOptions::check`], and on weights of another version in the program.
     pub fn of_photo(
         image: &LinearImage,
         facts: &Facts,
@@ -147,8 +152,7 @@ impl View {
     ) -> Result<Self, SetupError> {
         asked.check()?;
         let size = [image.0.width() as f64, image.0.height() as f64];
-        let lens = Lens::of(size, facts, asked.fov_deg);
-        let (aim, aim_why) = aim(image, size, &lens, asked.pitch_deg);
+        let (lens, aim, aim_why) = lens_and_aim(image, size, facts, asked)?;
         let (eye, position_why) = match asked.eye_height_m {
             Some(height) => (height, "as --eye-height says"),
             None => (
@@ -219,27 +223,17 @@ struct Lens {
 }
 
 impl Lens {
-    fn of(size: [f64; 2], facts: &Facts, asked_deg: Option<f64>) -> Self {
-        let longer = size[0].max(size[1]);
-        let of_angle = |deg: f64| 0.5 * longer / (0.5 * deg.to_radians()).tan();
+    /// As it is asked for, or as the photograph's data say.
+    fn known(size: [f64; 2], facts: &Facts, asked_deg: Option<f64>) -> Option<Self> {
         if let Some(deg) = asked_deg {
-            return Self {
-                focal_px: of_angle(deg),
+            return Some(Self {
+                focal_px: focal_px(size, deg),
                 sigma: 0.02,
                 why: format!("--fov says {deg} degrees along the longer side"),
-            };
+            });
         }
-        let known = facts.focal_px.filter(|f| f.is_finite());
-        let Some((focal_px, source)) = known.zip(facts.focal_source) else {
-            return Self {
-                focal_px: of_angle(DEFAULT_FOV_DEG),
-                sigma: 0.2,
-                why: format!(
-                    "a guess, for the photograph does not say it: {DEFAULT_FOV_DEG} degrees along \
-                     the longer side; telephones have 60 to 75, a zoom less; or --fov"
-                ),
-            };
-        };
+        let known = facts.focal_px.filter(|f| f.is_finite() && *f > 0.0);
+        let (focal_px, source) = known.zip(facts.focal_source)?;
         let (sigma, from) = match source {
             FocalSource::Equivalent35mm => (0.02, "the focal length for 35 mm"),
             FocalSource::FocalPlaneResolution => {
@@ -251,48 +245,137 @@ impl Lens {
             Some(mm) => format!(" (the lens has {mm} mm)"),
             None => String::new(),
         };
-        Self {
+        Some(Self {
             focal_px,
             sigma,
             why: format!(
                 "from {from} in the photograph's Exif data{millimetres}, sure to about {:.0}%",
                 100.0 * sigma
             ),
+        })
+    }
+
+    /// As the picture shows it, or a guess.
+    fn shown(size: [f64; 2], seen: &CameraEstimate) -> Self {
+        let fov = seen.fov_deg;
+        let range = format!(
+            "{:.0} to {:.0} degrees along the longer side (90%)",
+            fov.low, fov.high
+        );
+        let told = fov.half_width() <= MOST_FOV_HALF * fov.middle;
+        let (deg, why) = match told {
+            true => (
+                fov.middle,
+                format!(
+                    "from the picture itself, for the photograph's data do not say it: {range}; \
+                     or --fov"
+                ),
+            ),
+            false => (
+                DEFAULT_FOV_DEG,
+                format!(
+                    "a guess, for the photograph does not say it: {DEFAULT_FOV_DEG} degrees along \
+                     the longer side, where the picture itself tells {range}; telephones have 60 \
+                     to 75, a zoom less; or --fov"
+                ),
+            ),
+        };
+        Self {
+            focal_px: focal_px(size, deg),
+            sigma: 0.1,
+            why,
+        }
+    }
+
+    fn relative(&self, size: [f64; 2]) -> KnownFocal {
+        KnownFocal {
+            relative: self.focal_px / size[0].max(size[1]),
+            sigma: self.sigma,
         }
     }
 }
 
-/// How the camera is turned, and why.
-fn aim(image: &LinearImage, size: [f64; 2], lens: &Lens, asked: Option<f64>) -> (Aim, String) {
-    let turned = |pitch: f64, roll: f64| Aim::Turned {
+/// The focal length that sees this angle along the longer side.
+fn focal_px(size: [f64; 2], fov_deg: f64) -> f64 {
+    0.5 * size[0].max(size[1]) / (0.5 * fov_deg.to_radians()).tan()
+}
+
+/// Lens and turn, and why the turn.
+fn lens_and_aim(
+    image: &LinearImage,
+    size: [f64; 2],
+    facts: &Facts,
+    asked: &CameraOptions,
+) -> Result<(Lens, Aim, String), SetupError> {
+    let known = Lens::known(size, facts, asked.fov_deg);
+    let estimator = CameraEstimator::embedded()?;
+    let evidence = Evidence::new(image);
+    let lens = known.unwrap_or_else(|| Lens::shown(size, &estimator.weighed(&evidence, None)));
+    let (aim, why) = match asked.pitch_deg {
+        Some(pitch) => (turned(pitch, 0.0), "as --pitch says".into()),
+        // The turn belongs to the focal length that the file will say.
+        None => aim(
+            size,
+            lens.focal_px,
+            &estimator.weighed(&evidence, Some(lens.relative(size))),
+        ),
+    };
+    Ok((lens, aim, why))
+}
+
+fn turned(pitch: f64, roll: f64) -> Aim {
+    Aim::Turned {
         pitch_deg: rounded(pitch),
         roll_deg: rounded(roll),
+    }
+}
+
+/// How the camera is turned, and why.
+fn aim(size: [f64; 2], focal_px: f64, seen: &CameraEstimate) -> (Aim, String) {
+    let row = |pitch_deg: f64| 0.5 * size[1] + focal_px * pitch_deg.to_radians().tan();
+    let (pitch, roll) = (seen.pitch_deg, seen.roll_deg);
+    let agreeing = seen.agreeing.upright + seen.agreeing.level;
+    let lines = match agreeing >= LEAST_LINES {
+        true => format!(
+            "{agreeing:.0} of {} straight lines and the look",
+            seen.lines
+        ),
+        false => "the look".into(),
     };
-    if let Some(pitch) = asked {
-        return (turned(pitch, 0.0), "as --pitch says".into());
-    }
-    let found = verticals::turn(&segments::upright(image), size, lens.focal_px, lens.sigma);
-    let horizon = |pitch_deg: f64| 0.5 * size[1] + lens.focal_px * pitch_deg.to_radians().tan();
-    if let Some(turn) = found
-        && horizon(turn.pitch_deg) < LOWEST_HORIZON * size[1]
-    {
+    let horizon = row(pitch.middle);
+    if pitch.half_width() <= MOST_PITCH_HALF_DEG && horizon < LOWEST_HORIZON * size[1] {
+        let sure = roll.half_width() <= MOST_ROLL_HALF_DEG;
+        // Cameras are held level, unless the picture says otherwise.
+        let (roll_deg, used) = match (sure, roll.holds(0.0)) {
+            (false, _) => (0.0, ", which is too wide: 0 is used"),
+            (true, true) => (0.0, ", which may be level: 0 is used"),
+            (true, false) => (roll.middle, ""),
+        };
         let why = format!(
-            "from {} upright edges: pitch +- {:.1}, roll +- {:.1} degrees, if these edges are \
-             vertical in the world; horizon at row {:.0}; or --pitch",
-            turn.edges,
-            turn.pitch_sigma_deg,
-            turn.roll_sigma_deg,
-            horizon(turn.pitch_deg)
+            "from {lines} of the picture: pitch {:.1} to {:.1}, roll {:.1} to {:.1} degrees \
+             (90%){used}; horizon at row {horizon:.0}; or --pitch",
+            pitch.low, pitch.high, roll.low, roll.high
         );
-        return (turned(turn.pitch_deg, turn.roll_deg), why);
+        return (turned(pitch.middle, roll_deg), why);
     }
-    let pitch = (DEFAULT_HORIZON - 0.5) * size[1] / lens.focal_px;
+    let default = (DEFAULT_HORIZON - 0.5) * size[1] / focal_px;
+    let why = match pitch.half_width() > MOST_PITCH_HALF_DEG {
+        true => format!(
+            "neither straight lines nor the look of the picture tell it: a pitch of {:.0} to {:.0} \
+             degrees is possible (90%)",
+            pitch.low, pitch.high
+        ),
+        false => format!(
+            "the picture seems to show no ground: a pitch of {:.0} to {:.0} degrees (90%)",
+            pitch.low, pitch.high
+        ),
+    };
     let why = format!(
-        "a guess, for too few edges agree on what is upright: it puts the horizon at row {:.0}, \
-         40% from the top; a larger pitch moves it down; or --pitch",
+        "a guess, for {why}. It puts the horizon at row {:.0}, 40% from the top; a larger \
+         pitch_deg moves it down. dipir place shows horizon and ground to set them by eye; or --pitch",
         DEFAULT_HORIZON * size[1]
     );
-    (turned(pitch.atan().to_degrees(), 0.0), why)
+    (turned(default.atan().to_degrees(), 0.0), why)
 }
 
 #[cfg(test)]

@@ -35,7 +35,7 @@ export async function sendMask(bytes) {
 // asked for.
 export async function draft(edit, samples) {
   const response = await fetch("draft", { method: "POST", body: JSON.stringify({ edit, samples }) });
-  if (response.status === 409) return undefined;
+  if (response.status === 409 || response.headers.has("X-Superseded")) return undefined;
   if (response.status === 204) return null;
   if (!response.ok) throw await failed(response);
   const about = JSON.parse(response.headers.get("X-Draft"));

@@ -1,4 +1,4 @@
-//! Straight edges of a picture that stand roughly upright.
+//! Straight edges of a picture.
 //!
 //! Neighbouring pixels whose brightness changes in nearly the same direction are joined; a region
 //! that is long and thin is a segment [Grompone von Gioi et al. 2010, without its test of chance].
@@ -11,7 +11,7 @@ use glam::DVec2;
 pub struct Segment {
     /// Its middle.
     pub middle: DVec2,
-    /// Unit vector along it, downwards.
+    /// Unit vector along it, either way.
     pub direction: DVec2,
     /// From end to end.
     pub length: f64,
@@ -21,8 +21,6 @@ pub struct Segment {
 const LONGEST: usize = 1024;
 /// Least change of brightness a pixel, of a display's range: five steps of 255.
 const LEAST_CHANGE: f32 = 0.02;
-/// Pixels whose edge is further than this from upright are left out.
-const STEEPEST_RAD: f32 = 0.6;
 /// Most that a pixel's direction differs from its region's.
 const ALIKE_RAD: f32 = 0.26;
 /// Shortest segment, of the picture's diagonal, and in pixels.
@@ -31,10 +29,10 @@ const SHORTEST_PX: f64 = 12.0;
 /// Widest segment: standard deviation across it, pixels.
 const WIDEST: f64 = 1.5;
 /// Most segments that are kept, the longest.
-const MOST: usize = 400;
+const MOST: usize = 250;
 
-/// Finds the segments of `image` within 34 degrees of upright, the longest first.
-pub fn upright(image: &LinearImage) -> Vec<Segment> {
+/// Finds the segments of `image`, the longest first.
+pub fn segments(image: &LinearImage) -> Vec<Segment> {
     let (grey, factor) = small(image);
     let edges = Edges::of(&grey);
     let diagonal = (grey.width() as f64).hypot(grey.height() as f64);
@@ -69,10 +67,15 @@ pub fn upright(image: &LinearImage) -> Vec<Segment> {
     found
 }
 
+/// Pixels along each side of the blocks whose means edges are looked for in.
+pub(crate) fn block_side([w, h]: [usize; 2]) -> usize {
+    w.max(h).div_ceil(LONGEST).max(1)
+}
+
 /// Brightness as displays encode it, in blocks of pixels, and the blocks' side.
 fn small(image: &LinearImage) -> (Raster<f32>, f64) {
     let (w, h) = (image.0.width(), image.0.height());
-    let side = w.max(h).div_ceil(LONGEST);
+    let side = block_side([w, h]);
     let (sw, sh) = ((w / side).max(1), (h / side).max(1));
     let mut pixels = Vec::with_capacity(sw * sh);
     for y in 0..sh {
@@ -96,7 +99,7 @@ fn small(image: &LinearImage) -> (Raster<f32>, f64) {
 /// Change of brightness at every pixel.
 struct Edges {
     width: usize,
-    /// Per pixel; 0 where there is no upright edge.
+    /// Per pixel; 0 where there is no edge.
     strength: Vec<f32>,
     /// Direction of the change, radians.
     angle: Vec<f32>,
@@ -116,7 +119,7 @@ impl Edges {
                 let gx = (column(x + 1) - column(x - 1)) / 8.0;
                 let gy = (row(y + 1) - row(y - 1)) / 8.0;
                 let change = gx.hypot(gy);
-                if change > LEAST_CHANGE && gy.abs() < STEEPEST_RAD.tan() * gx.abs() {
+                if change > LEAST_CHANGE {
                     strength[y * w + x] = change;
                     angle[y * w + x] = gy.atan2(gx);
                 }
@@ -220,7 +223,7 @@ pub(crate) mod tests {
     fn both_sides_of_a_leaning_bar_are_found() {
         // x = 60 + 0.1 y, 20 pixels wide.
         let bar = |p: DVec2| (0.0..20.0).contains(&(p.x - 60.0 - 0.1 * p.y));
-        let found = upright(&picture(200, 160, bar));
+        let found = segments(&picture(200, 160, bar));
         assert_eq!(found.len(), 2, "{found:?}");
         for segment in found {
             // A quarter of a pixel over 150.
@@ -235,9 +238,13 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn level_edges_and_empty_pictures_give_nothing() {
-        assert!(upright(&picture(120, 90, |p| p.y > 40.0)).is_empty());
-        assert!(upright(&picture(120, 90, |_| false)).is_empty());
-        assert!(upright(&picture(1, 1, |_| false)).is_empty());
+    fn level_edges_are_found_and_empty_pictures_give_nothing() {
+        let level = segments(&picture(120, 90, |p| p.y > 40.0));
+        assert!(
+            level.len() == 1 && level[0].direction.y.abs() < 1e-6,
+            "{level:?}"
+        );
+        assert!(segments(&picture(120, 90, |_| false)).is_empty());
+        assert!(segments(&picture(1, 1, |_| false)).is_empty());
     }
 }

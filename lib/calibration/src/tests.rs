@@ -1,0 +1,195 @@
+use glam::{DVec2, DVec3};
+use proptest::prelude::*;
+
+use crate::generated::{Built, picture};
+use crate::lines::Lines;
+use crate::look::FEATURES;
+use crate::network::Network;
+use crate::pose::{Pose, fov_deg, log_focal};
+use crate::posterior::{Axis, Posterior};
+use crate::segments::Segment;
+use crate::{CameraEstimator, Evidence, KnownFocal};
+
+/// An estimator that knows nothing of pictures.
+fn ignorant() -> CameraEstimator {
+    CameraEstimator {
+        members: Vec::new(),
+        trust: 1.0,
+    }
+}
+
+/// The segments of bars along the axes of a world that is turned by 30 degrees about the vertical.
+fn bars(pose: &Pose, size: [usize; 2]) -> Vec<Segment> {
+    let (w, h) = (size[0] as f64, size[1] as f64);
+    let own = pose.rotation().transpose();
+    let turn = glam::DMat3::from_rotation_y(30f64.to_radians());
+    let focal = pose.focal() * w.max(h);
+    let seen = |p: DVec3| {
+        let p = own * p;
+        (p.z < -0.1).then(|| 0.5 * DVec2::new(w, h) + focal * DVec2::new(p.x, -p.y) / -p.z)
+    };
+    let mut all = Vec::new();
+    for k in 0..27 {
+        let at = DVec3::new(
+            f64::from(k % 3) - 1.0,
+            f64::from(k / 3 % 3) - 1.2,
+            f64::from(k / 9),
+        );
+        let at = DVec3::new(3.0 * at.x, 1.5 * at.y, -6.0 - 3.0 * at.z);
+        for axis in [turn.x_axis, turn.y_axis, turn.z_axis] {
+            if let (Some(a), Some(b)) = (seen(at), seen(at + axis)) {
+                let length = a.distance(b);
+                all.push(Segment {
+                    middle: 0.5 * (a + b),
+                    direction: (b - a) / length,
+                    length,
+                });
+            }
+        }
+    }
+    all
+}
+
+fn grey() -> Evidence {
+    let pose = Pose::new(0.0, 0.0, 60.0);
+    Evidence::new(&picture(Built::Room, 0, &pose, [32, 24]))
+}
+
+proptest! {
+    #[test]
+    fn angles_of_view_and_focal_lengths_belong_together(fov in 5.0f64..150.0) {
+        prop_assert!((fov_deg(log_focal(fov)) - fov).abs() < 1e-9);
+    }
+
+    #[test]
+    fn lines_agree_with_their_own_camera_more_than_with_others(
+        pitch in -30.0f64..20.0, roll in -5.0f64..5.0, fov in 40.0f64..80.0, upright in any::<bool>(),
+    ) {
+        let size = if upright { [480, 640] } else { [640, 480] };
+        let own = Pose::new(pitch, roll, fov);
+        let lines = Lines::new(&bars(&own, size), size);
+        // The mean of the logarithms under the narrower spread.
+        let mean = |pose: &Pose| lines.features(pose)[5];
+        for off in [-3.0, 3.0] {
+            let pitched = Pose { pitch_deg: pitch + off, ..own };
+            let rolled = Pose { roll_deg: roll + off, ..own };
+            prop_assert!(mean(&pitched) < mean(&own) - 0.1);
+            prop_assert!(mean(&rolled) < mean(&own) - 0.1);
+        }
+        let agree = lines.agreement(&own);
+        prop_assert!(agree.upright + agree.level > 0.9 * lines.count() as f64, "{agree:?}");
+    }
+}
+
+#[test]
+fn without_networks_everything_is_possible() {
+    let found = ignorant().grid(&grey(), None).posterior(1.0);
+    let [pitch, roll] = [found.interval(0), found.interval(1)];
+    // 90% of what is searched, 80 and 16 degrees, and a step: half of each end's point lies outside.
+    assert!(
+        (pitch.half_width() - 0.45 * (80.0 + 80.0 / 14.0)).abs() < 0.1,
+        "{pitch:?}"
+    );
+    assert!(
+        (roll.half_width() - 0.45 * (16.0 + 16.0 / 12.0)).abs() < 0.1,
+        "{roll:?}"
+    );
+    // All angles from 24 to 100 degrees are alike.
+    let fov = found.fov_deg();
+    assert!((fov.middle - 62.0).abs() < 3.0, "{fov:?}");
+}
+
+#[test]
+fn a_known_focal_length_stays_what_it_is() {
+    let known = KnownFocal {
+        relative: 0.9,
+        sigma: 0.02,
+    };
+    let found = ignorant().grid(&grey(), Some(known)).posterior(1.0);
+    let focal = found.interval(2);
+    // 1.645 standard deviations either way, on three points 1.35 of them apart, each spread as wide.
+    assert!((focal.middle - 0.9f64.ln()).abs() < 1e-3, "{focal:?}");
+    assert!((focal.half_width() - 0.0329).abs() < 0.003, "{focal:?}");
+}
+
+#[test]
+fn streets_and_rooms_with_straight_lines_are_found_to_a_degree() {
+    let estimator = CameraEstimator::embedded().unwrap();
+    let mut off = Vec::new();
+    for n in 0..6 {
+        let built = [Built::Street, Built::Room][n % 2];
+        let pose = Pose::new(
+            -15.0 + 4.0 * n as f64,
+            1.5 * n as f64 - 3.0,
+            50.0 + 5.0 * n as f64,
+        );
+        let image = picture(built, n as u64, &pose, [640, 480]);
+        let known = KnownFocal {
+            relative: pose.focal(),
+            sigma: 0.02,
+        };
+        let found = estimator.estimate(&image, Some(known));
+        off.push((found.pitch_deg.middle - pose.pitch_deg).abs());
+        off.push((found.roll_deg.middle - pose.roll_deg).abs());
+    }
+    assert!(off.iter().all(|e| *e < 1.0), "{off:?}");
+}
+
+#[test]
+fn the_same_photograph_gives_the_same_estimate() {
+    let image = picture(Built::Street, 3, &Pose::new(-5.0, 1.0, 60.0), [320, 240]);
+    let estimator = CameraEstimator::embedded().unwrap();
+    assert_eq!(
+        estimator.estimate(&image, None),
+        estimator.estimate(&image, None)
+    );
+}
+
+#[test]
+fn quantiles_are_those_of_an_even_and_of_a_pointed_distribution() {
+    let axis = Axis::between(-2.0, 2.0, 5);
+    let one = Axis::between(0.0, 1.0, 2);
+    let even = Posterior::new([axis, one, one], &[0.0; 20]);
+    // Five points stand for -2.5 to 2.5.
+    assert!((even.quantile(0, 0.05) + 2.25).abs() < 1e-9);
+    assert!((even.quantile(0, 0.5)).abs() < 1e-9);
+    let mut logs = [-1e3; 20];
+    logs[4..8].fill(0.0);
+    let pointed = Posterior::new([axis, one, one], &logs);
+    assert!((pointed.quantile(0, 0.5) + 1.0).abs() < 1e-9);
+    assert!((pointed.marginal(0)[1] - 1.0).abs() < 1e-9);
+}
+
+#[test]
+fn weights_survive_their_file_and_others_are_refused_by_name() {
+    let zero = |hidden: usize| Network {
+        mean: vec![0.0; FEATURES],
+        deviation: vec![1.0; FEATURES],
+        layers: [
+            vec![0.01; FEATURES * hidden],
+            vec![0.0; hidden],
+            vec![0.02; hidden * hidden],
+            vec![0.0; hidden],
+            vec![0.03; hidden],
+            vec![0.5; 1],
+        ],
+    };
+    let estimator = CameraEstimator {
+        members: vec![zero(3), zero(2)],
+        trust: 0.7,
+    };
+    let bytes = estimator.to_bytes().unwrap();
+    assert_eq!(CameraEstimator::from_bytes(&bytes).unwrap(), estimator);
+    let error = CameraEstimator::from_bytes(&ignorant().to_bytes().unwrap()).unwrap_err();
+    assert!(
+        error.to_string().contains("`member.0.mean` is missing"),
+        "{error}"
+    );
+    let error = CameraEstimator::from_bytes(&bytes[..100]).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .starts_with("the camera's weights are refused"),
+        "{error}"
+    );
+}

@@ -1,0 +1,409 @@
+//! From a folder of panoramas to weights and figures.
+use std::path::PathBuf;
+
+use dipir_calibration::generated::{Built, picture};
+use dipir_calibration::look::FEATURES;
+use dipir_calibration::network::Network;
+use dipir_calibration::pose::{Pose, fov_deg, log_focal};
+use dipir_calibration::{CameraEstimator, Evidence, KnownFocal, SEARCHED, Scores};
+use dipir_imaging::raster::LinearImage;
+use dipir_numerics::hashing::hash_u64s;
+use rayon::prelude::*;
+
+use crate::cameras::figures::{Case, Row};
+use crate::cameras::trainer::{Sample, train};
+use crate::error::PlacesError;
+use crate::network::SplitMix64;
+use crate::place::{Place, folds, read_places};
+use crate::shot::{JUDGED, LEARNED, Range, Shot};
+
+pub use crate::cameras::trainer::Training;
+
+/// Powers of the scores' density that are tried.
+const TRUSTS: [f64; 16] = [
+    0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0, 2.2,
+];
+/// Share of intervals that should hold the truth.
+const HELD: f64 = 0.9;
+/// Half sides of the boxes around the true camera that other cameras are drawn from: degrees of pitch, twice those of
+/// roll, and 3% of the field of view each. As many more are drawn from everywhere as from a box.
+const BOXES: [f64; 6] = [0.6, 1.2, 2.5, 5.0, 10.0, 20.0];
+/// Cameras drawn from each, with the true focal length and with any.
+const DRAWN: usize = 4;
+/// The true camera stands for a box of this half side.
+const OWN_BOX: f64 = 0.3;
+
+/// What is asked for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
+    /// Folder of panoramas.
+    pub panoramas: PathBuf,
+    /// The file of weights.
+    pub out: PathBuf,
+    /// Folds of places; each is left out by one network.
+    pub folds: usize,
+    /// Photographs drawn of each place.
+    pub views: usize,
+    /// Generated streets and rooms that are learned from.
+    pub learned: usize,
+    /// Photographs of each place that figures are made of.
+    pub judged: usize,
+    /// Generated streets and rooms that figures are made of.
+    pub built: usize,
+    /// Seed of photographs and networks.
+    pub seed: u64,
+    /// Of the networks.
+    pub training: Training,
+    /// One deviation of a known focal length, relative.
+    pub focal_sigma: f64,
+}
+
+impl Settings {
+    /// Those of the weights that are part of the program.
+    pub fn new(panoramas: PathBuf, out: PathBuf) -> Self {
+        Self {
+            panoramas,
+            out,
+            folds: 6,
+            views: 100,
+            learned: 320,
+            judged: 5,
+            built: 32,
+            seed: 1,
+            training: Training::default(),
+            focal_sigma: 0.02,
+        }
+    }
+}
+
+/// How far it is.
+#[derive(Clone, Debug)]
+pub enum Progress {
+    /// Panoramas were read.
+    Places(usize),
+    /// Photographs were drawn.
+    Photographs(usize),
+    /// A network is being trained: its fold, the share that is done, the mean loss of late.
+    Training(usize, f64, f64),
+    /// Photographs were judged.
+    Judged(usize),
+    /// One trust was tried: the share of intervals that hold the truth.
+    Tried(f64, f64),
+}
+
+/// What it gives.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    /// How far the scores are trusted, chosen on all places left out.
+    pub trust: f64,
+    /// Figures of places left out, each under the trust that was chosen on the other folds.
+    pub rows: Vec<Row>,
+    /// Figures of generated streets and rooms.
+    pub built: Vec<Row>,
+}
+
+/// A photograph that is judged.
+struct Judged {
+    place: usize,
+    pose: Pose,
+    evidence: Evidence,
+}
+
+/// Trains a network for each fold, chooses how far they are trusted, writes the weights, and tells how well cameras of
+/// places left out are found.
+///
+/// # Errors
+/// If panoramas cannot be read or weights not be written.
+pub fn run(
+    settings: &Settings,
+    progress: &(dyn Fn(Progress) + Sync),
+) -> Result<Outcome, PlacesError> {
+    let places = read_places(&settings.panoramas)?;
+    progress(Progress::Places(places.len()));
+    let fold = folds(&places, settings.folds);
+    let trained = networks(&places, &fold, settings, progress);
+    let judged = judged(&places, settings);
+    let scores = scores(&trained, &judged, &fold, settings);
+    progress(Progress::Judged(judged.len()));
+    let (by_fold, trust) = chosen(&scores, &judged, &fold, settings, progress);
+    let rows = rows(&scores, &by_fold, &judged, &places, &fold);
+    let whole = CameraEstimator {
+        members: trained,
+        trust,
+    };
+    let bytes = whole.to_bytes()?;
+    std::fs::write(&settings.out, bytes).map_err(|source| PlacesError::File {
+        what: "write",
+        path: settings.out.clone(),
+        source,
+    })?;
+    Ok(Outcome {
+        trust,
+        rows,
+        built: built_rows(&whole, settings),
+    })
+}
+
+/// One network for each fold, which it leaves out.
+fn networks(
+    places: &[Place],
+    fold: &[usize],
+    settings: &Settings,
+    progress: &(dyn Fn(Progress) + Sync),
+) -> Vec<Network> {
+    let count = settings.views;
+    let of_place = |k: usize| {
+        let (place, pose, image) = taken(places, &LEARNED, settings.seed, k, count);
+        let seed = hash_u64s(&[settings.seed, 1, k as u64]);
+        (Some(place), sample(&pose, &image, seed))
+    };
+    let generated = |n: usize| {
+        let (pose, image) = built(&LEARNED, settings.seed, n, [320, 256]);
+        let seed = hash_u64s(&[settings.seed, 2, n as u64]);
+        (None, sample(&pose, &image, seed))
+    };
+    let of_places = (0..places.len() * count).into_par_iter().map(of_place);
+    let generated = (0..settings.learned).into_par_iter().map(generated);
+    let samples: Vec<(Option<usize>, Sample)> = of_places.chain(generated).collect();
+    progress(Progress::Photographs(samples.len()));
+    let network = |left_out: usize| {
+        let learned = samples
+            .iter()
+            .filter(|s| s.0.is_none_or(|p| fold[p] != left_out));
+        let learned: Vec<&Sample> = learned.map(|s| &s.1).collect();
+        let seed = settings.seed + left_out as u64;
+        train(&learned, &settings.training, seed, &mut |done, loss| {
+            progress(Progress::Training(left_out, done, loss));
+        })
+    };
+    (0..settings.folds).into_par_iter().map(network).collect()
+}
+
+fn taken(
+    places: &[Place],
+    range: &Range,
+    seed: u64,
+    k: usize,
+    count: usize,
+) -> (usize, Pose, LinearImage) {
+    let (place, n) = (k / count, k % count);
+    let shot = Shot::drawn(range, seed, place, n);
+    let image = shot.take(&places[place], seed ^ (k as u64) << 20);
+    (place, shot.pose, image)
+}
+
+/// A generated street or room.
+fn built(range: &Range, seed: u64, n: usize, longest: [usize; 2]) -> (Pose, LinearImage) {
+    let kind = [Built::Street, Built::Room][n % 2];
+    let shot = Shot::drawn(range, seed + 104_729, 0, n);
+    let size = shot.size.map(|side| side * longest[0] / longest[1]);
+    let look = hash_u64s(&[seed, n as u64]);
+    (shot.pose, picture(kind, look, &shot.pose, size))
+}
+
+/// A camera in a box around another, or anywhere, and the logarithm of the share of all cameras it stands for.
+fn drawn(pose: &Pose, any_focal: bool, side: Option<f64>, random: &mut SplitMix64) -> (Pose, f32) {
+    let limits = |side: Option<f64>| limits(pose, side);
+    let [pitch, roll, fov] =
+        limits(side).map(|[low, high]| low + (high - low) * f64::from(random.unit()));
+    let fov = if any_focal {
+        fov
+    } else {
+        fov_deg(pose.log_focal)
+    };
+    let inside = |side: Option<f64>| {
+        let own = limits(side);
+        let axes = if any_focal { 3 } else { 2 };
+        let at = [pitch, roll, fov];
+        let all = (0..axes).all(|k| (own[k][0]..=own[k][1]).contains(&at[k]));
+        let volume: f64 = (0..axes).map(|k| own[k][1] - own[k][0]).product();
+        if all { volume.recip() } else { 0.0 }
+    };
+    // Over the density of the mixture that all are drawn from.
+    let boxes: f64 = BOXES.iter().map(|side| inside(Some(*side))).sum();
+    let share = inside(None) / (boxes + inside(None)) / DRAWN as f64;
+    let pose = Pose {
+        pitch_deg: pitch,
+        roll_deg: roll,
+        log_focal: log_focal(fov),
+    };
+    (pose, share.ln() as f32)
+}
+
+/// A box around a camera within what is searched; all of it without a side.
+fn limits(pose: &Pose, side: Option<f64>) -> [[f64; 2]; 3] {
+    let Some(side) = side else { return SEARCHED };
+    let fov = fov_deg(pose.log_focal);
+    let at = [pose.pitch_deg, pose.roll_deg, fov];
+    let half = [side, 0.5 * side, 0.03 * side * fov];
+    std::array::from_fn(|k| {
+        let [low, high] = SEARCHED[k];
+        [(at[k] - half[k]).max(low), (at[k] + half[k]).min(high)]
+    })
+}
+
+/// A photograph under its own and other cameras.
+fn sample(pose: &Pose, image: &LinearImage, seed: u64) -> Sample {
+    let evidence = Evidence::new(image);
+    let mut random = SplitMix64::new(seed);
+    let mut features = evidence.features(pose);
+    let sides: Vec<Option<f64>> = BOXES.iter().map(|b| Some(*b)).chain([None]).collect();
+    let sets = [false, true].map(|any_focal| {
+        let own = limits(pose, Some(OWN_BOX));
+        let axes = if any_focal { 3 } else { 2 };
+        let part = |k: usize| (own[k][1] - own[k][0]) / (SEARCHED[k][1] - SEARCHED[k][0]);
+        let own = (0..axes).map(part).product::<f64>().ln() as f32;
+        let mut shares = Vec::new();
+        for side in sides.iter().flat_map(|s| [*s; DRAWN]) {
+            let (other, share) = drawn(pose, any_focal, side, &mut random);
+            features.extend(evidence.features(&other));
+            shares.push(share);
+        }
+        (shares, own)
+    });
+    debug_assert!(features.len().is_multiple_of(FEATURES));
+    Sample {
+        features,
+        own: [sets[0].1, sets[1].1],
+        shares: sets.map(|s| s.0),
+    }
+}
+
+fn judged(places: &[Place], settings: &Settings) -> Vec<Judged> {
+    let one = |k: usize| {
+        let (place, pose, image) = taken(places, &JUDGED, settings.seed + 7919, k, settings.judged);
+        Judged {
+            place,
+            pose,
+            evidence: Evidence::new(&image),
+        }
+    };
+    let count = places.len() * settings.judged;
+    (0..count).into_par_iter().map(one).collect()
+}
+
+/// A focal length that is known but for its error, which is drawn.
+fn known(pose: &Pose, settings: &Settings, n: usize) -> KnownFocal {
+    let mut random = SplitMix64::new(hash_u64s(&[settings.seed, 3, n as u64]));
+    // Nearly normal, of deviation 1.
+    let error: f64 = (0..12).map(|_| f64::from(random.unit())).sum::<f64>() - 6.0;
+    KnownFocal {
+        relative: pose.focal() * (settings.focal_sigma * error).exp(),
+        sigma: settings.focal_sigma,
+    }
+}
+
+/// By the network that left the place out, with the focal length and without.
+fn scores(
+    trained: &[Network],
+    judged: &[Judged],
+    fold: &[usize],
+    settings: &Settings,
+) -> Vec<[Scores; 2]> {
+    let both = |(n, j): (usize, &Judged)| {
+        let estimator = CameraEstimator {
+            members: vec![trained[fold[j.place]].clone()],
+            trust: 1.0,
+        };
+        [Some(known(&j.pose, settings, n)), None].map(|k| estimator.grid(&j.evidence, k))
+    };
+    judged.par_iter().enumerate().map(both).collect()
+}
+
+/// The trust under which 90% intervals of pitch, roll (focal length given) and field of view (not given) hold 90% on the
+/// other folds, for each fold, and on all of them.
+fn chosen(
+    scores: &[[Scores; 2]],
+    judged: &[Judged],
+    fold: &[usize],
+    settings: &Settings,
+    progress: &(dyn Fn(Progress) + Sync),
+) -> (Vec<f64>, f64) {
+    let mut held = Vec::new();
+    for trust in TRUSTS {
+        let each = judged.iter().zip(scores).map(|(j, scores)| {
+            let [given, open] = [0, 1].map(|k| scores[k].posterior(trust));
+            let pitch = given.interval(0).holds(j.pose.pitch_deg);
+            let roll = given.interval(1).holds(j.pose.roll_deg);
+            let fov = open.interval(2).holds(j.pose.log_focal);
+            [pitch, roll, fov].iter().filter(|h| **h).count() as f64 / 3.0
+        });
+        let each: Vec<f64> = each.collect();
+        progress(Progress::Tried(trust, mean(each.iter().copied())));
+        held.push(each);
+    }
+    let best = |without: Option<usize>| {
+        let off = |k: usize| {
+            let own = judged.iter().zip(&held[k]);
+            let own = own.filter(|(j, _)| Some(fold[j.place]) != without);
+            (mean(own.map(|(_, h)| *h)) - HELD).abs()
+        };
+        let order = (0..TRUSTS.len()).min_by(|a, b| off(*a).total_cmp(&off(*b)));
+        TRUSTS[order.unwrap_or(0)]
+    };
+    let by_fold = (0..settings.folds).map(|f| best(Some(f))).collect();
+    (by_fold, best(None))
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0), |(s, n), v| (s + v, n + 1));
+    sum / f64::from(count.max(1))
+}
+
+fn rows(
+    scores: &[[Scores; 2]],
+    by_fold: &[f64],
+    judged: &[Judged],
+    places: &[Place],
+    fold: &[usize],
+) -> Vec<Row> {
+    let both = |(j, scores): (&Judged, &[Scores; 2])| {
+        let trust = by_fold[fold[j.place]];
+        let group = &places[j.place].kind;
+        [(0, true), (1, false)]
+            .map(|(k, known)| Case::new(group, &j.pose, &scores[k].posterior(trust), known))
+    };
+    let cases: Vec<Case> = judged.iter().zip(scores).flat_map(both).collect();
+    let mut groups: Vec<&str> = places.iter().map(|p| p.kind.as_str()).collect();
+    groups.sort_unstable();
+    groups.dedup();
+    let mut rows = Vec::new();
+    for (known, word) in [(true, "given"), (false, "not given")] {
+        let name = format!("focal length {word}");
+        rows.push(Row::of(&name, &cases, |c| c.focal_known == known));
+        for group in &groups {
+            let belongs = |c: &Case| c.focal_known == known && c.group == *group;
+            rows.push(Row::of(&format!("… {group}"), &cases, belongs));
+        }
+    }
+    rows
+}
+
+/// Generated streets and rooms of 640 pixels along the longer side.
+fn built_rows(estimator: &CameraEstimator, settings: &Settings) -> Vec<Row> {
+    let both = |n: usize| {
+        let (pose, image) = built(&JUDGED, settings.seed + 7919, n, [640, 256]);
+        let evidence = Evidence::new(&image);
+        let group = ["street", "room"][n % 2];
+        [Some(known(&pose, settings, n)), None].map(|known| {
+            let posterior = estimator.grid(&evidence, known).posterior(estimator.trust);
+            Case::new(group, &pose, &posterior, known.is_some())
+        })
+    };
+    let cases: Vec<Case> = (0..settings.built)
+        .into_par_iter()
+        .flat_map_iter(both)
+        .collect();
+    let mut rows = Vec::new();
+    for (known, word) in [(true, "given"), (false, "not given")] {
+        for group in ["street", "room"] {
+            let belongs = |c: &Case| c.focal_known == known && c.group == group;
+            rows.push(Row::of(
+                &format!("{group}s, focal length {word}"),
+                &cases,
+                belongs,
+            ));
+        }
+    }
+    rows
+}
