@@ -1,0 +1,183 @@
+//! Configurations that cannot be what the weights are.
+use candle_core::{DType, Device};
+use dipir_diffusion::Error;
+use dipir_diffusion::model::{Model, load_unet};
+
+use super::{Outcome, family, model_folder, unet_folder, unet_tensors};
+
+#[test]
+fn unsupported_configurations_are_refused_by_key() -> Outcome {
+    let tensors = unet_tensors()?;
+    let folder = unet_folder(&tensors)?;
+    let path = folder.path().join("config.json");
+    let text = std::fs::read_to_string(&path)?;
+    for (key, value, part) in [
+        (
+            "class_embed_type",
+            serde_json::json!("timestep"),
+            "class_embed_type = \"timestep\" is not supported",
+        ),
+        ("act_fn", serde_json::json!("mish"), "accepted: \"silu\""),
+        (
+            "down_block_types",
+            serde_json::json!(["ResnetDownsampleBlock2D", "DownBlock2D", "DownBlock2D"]),
+            "ResnetDownsampleBlock2D",
+        ),
+        (
+            "attention_head_dim",
+            serde_json::json!([4, 4]),
+            "need 1 or 3 entries",
+        ),
+        (
+            "attention_head_dim",
+            serde_json::json!(5),
+            "no multiple of 5 heads",
+        ),
+    ] {
+        let mut config: serde_json::Value = serde_json::from_str(&text)?;
+        config[key] = value;
+        std::fs::write(&path, config.to_string())?;
+        let message = load_unet(folder.path(), DType::F32, &Device::Cpu)
+            .expect_err(key)
+            .to_string();
+        assert!(
+            message.contains(part) && message.contains("config.json"),
+            "{message}"
+        );
+    }
+    let mut config: serde_json::Value = serde_json::from_str(&text)?;
+    config["a_key_of_tomorrow"] = serde_json::json!(1);
+    std::fs::write(&path, config.to_string())?;
+    assert!(
+        load_unet(folder.path(), DType::F32, &Device::Cpu).is_ok(),
+        "unknown keys are tolerated"
+    );
+    Ok(())
+}
+
+/// Were one of these read as it stands, the test would not end, or end for want of memory.
+#[test]
+fn sizes_that_the_weights_do_not_hold_are_refused_by_key() -> Outcome {
+    use serde_json::json;
+    let folder = model_folder()?;
+    let load = || Model::load(folder.path(), DType::F32, &Device::Cpu);
+    load()?;
+    let many = json!(1_000_000_000u64);
+    let levels = || json!(vec![16; 64]);
+    for (file, key, value) in [
+        ("unet/config.json", "layers_per_block", many.clone()),
+        ("unet/config.json", "layers_per_block", json!(0)),
+        ("unet/config.json", "layers_per_block", json!(-1)),
+        ("unet/config.json", "layers_per_block", json!(1e9)),
+        (
+            "unet/config.json",
+            "transformer_layers_per_block",
+            many.clone(),
+        ),
+        ("unet/config.json", "transformer_layers_per_block", json!(0)),
+        ("unet/config.json", "num_attention_heads", many.clone()),
+        ("unet/config.json", "attention_head_dim", json!(0)),
+        ("unet/config.json", "sample_size", many.clone()),
+        ("unet/config.json", "sample_size", json!(0)),
+        ("unet/config.json", "in_channels", json!(u64::MAX)),
+        ("unet/config.json", "cross_attention_dim", json!(u64::MAX)),
+        (
+            "unet/config.json",
+            "block_out_channels",
+            json!([1u64 << 62, 32, 32]),
+        ),
+        ("unet/config.json", "block_out_channels", levels()),
+        ("unet/config.json", "downsample_padding", many.clone()),
+        ("unet/config.json", "norm_eps", json!(0)),
+        ("vae/config.json", "layers_per_block", many.clone()),
+        ("vae/config.json", "layers_per_block", json!(-1)),
+        ("vae/config.json", "latent_channels", json!(u64::MAX)),
+        ("vae/config.json", "block_out_channels", levels()),
+        (
+            "text_encoder/config.json",
+            "num_hidden_layers",
+            many.clone(),
+        ),
+        ("text_encoder/config.json", "num_hidden_layers", json!(0)),
+        ("text_encoder/config.json", "num_hidden_layers", json!(-1)),
+        (
+            "text_encoder/config.json",
+            "num_attention_heads",
+            many.clone(),
+        ),
+        ("text_encoder/config.json", "num_attention_heads", json!(0)),
+        (
+            "text_encoder/config.json",
+            "intermediate_size",
+            many.clone(),
+        ),
+        ("text_encoder/config.json", "vocab_size", json!(u64::MAX)),
+        (
+            "scheduler/scheduler_config.json",
+            "num_train_timesteps",
+            json!(1_000_000_000_000u64),
+        ),
+        (
+            "scheduler/scheduler_config.json",
+            "num_train_timesteps",
+            json!(0),
+        ),
+        (
+            "scheduler/scheduler_config.json",
+            "num_train_timesteps",
+            json!(-5),
+        ),
+        (
+            "scheduler/scheduler_config.json",
+            "steps_offset",
+            json!(u64::MAX),
+        ),
+    ] {
+        let path = folder.path().join(file);
+        let text = std::fs::read_to_string(&path)?;
+        let mut config: serde_json::Value = serde_json::from_str(&text)?;
+        config[key] = value.clone();
+        std::fs::write(&path, config.to_string())?;
+        let message = match load() {
+            Ok(_) => return Err(format!("{file}: {key} = {value} is taken").into()),
+            Err(e) => e.to_string(),
+        };
+        // The heads' error is about the channels that they have to divide.
+        let names_it = message.contains(key) || message.contains("heads");
+        assert!(names_it && message.contains(file), "{key}: {message}");
+        std::fs::write(&path, text)?;
+    }
+    Ok(())
+}
+
+#[test]
+fn a_model_whose_parts_do_not_fit_is_refused() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    for part in ["unet", "vae", "text_encoder", "tokenizer", "scheduler"] {
+        let from = if part == "text_encoder" {
+            family().with_file_name("sd21")
+        } else {
+            family()
+        };
+        std::fs::create_dir(folder.path().join(part))?;
+        for entry in std::fs::read_dir(from.join(part))? {
+            let entry = entry?;
+            std::fs::copy(
+                entry.path(),
+                folder.path().join(part).join(entry.file_name()),
+            )?;
+        }
+    }
+    let load = || Model::load(folder.path(), DType::F32, &Device::Cpu);
+    assert!(
+        matches!(load(), Err(Error::Io { .. })),
+        "no model_index.json"
+    );
+    std::fs::write(folder.path().join("model_index.json"), "{}")?;
+    let message = load().expect_err("widths 24 and 32").to_string();
+    assert!(
+        message.contains("cross_attention_dim 24") && message.contains("hidden_size 32"),
+        "{message}"
+    );
+    Ok(())
+}

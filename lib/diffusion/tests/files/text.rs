@@ -1,0 +1,75 @@
+//! Text encoders and tokenizers.
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use candle_core::{DType, Device};
+use dipir_diffusion::text_encoder::TextEncoder;
+use dipir_diffusion::tokenizer::Tokenizer;
+use dipir_diffusion::weights::write_safetensors;
+
+use super::{Outcome, family, tensors};
+
+#[test]
+fn text_encoder_loads_with_and_without_the_prefix() -> Outcome {
+    let with = family().join("text_encoder");
+    let folder = tempfile::tempdir()?;
+    std::fs::copy(with.join("config.json"), folder.path().join("config.json"))?;
+    let without = tensors(&with.join("model.safetensors"))?
+        .into_iter()
+        .map(|(k, v)| (k.strip_prefix("text_model.").unwrap_or(&k).to_owned(), v))
+        .collect();
+    write_safetensors(
+        &folder.path().join("model.safetensors"),
+        &without,
+        &BTreeMap::new(),
+    )?;
+    let tokens = vec![vec![1, 2, 3, 4]];
+    let run = |folder: &Path| -> Result<Vec<f32>, Box<dyn std::error::Error>> {
+        let encoder = TextEncoder::load(folder, DType::F32, &Device::Cpu)?;
+        Ok(encoder.forward(&tokens, None)?.flatten_all()?.to_vec1()?)
+    };
+    assert_eq!(run(&with)?, run(folder.path())?);
+    Ok(())
+}
+
+#[test]
+fn tokenizer_takes_nothing_a_thousand_words_and_a_placeholder() -> Outcome {
+    let mut tokenizer = Tokenizer::load(&family().join("tokenizer"))?;
+    let empty = tokenizer.encode("")?;
+    assert_eq!(empty.len(), 77);
+    assert!(
+        empty[1..].iter().all(|&t| t == empty[1]),
+        "start marker, then end markers"
+    );
+    let long = tokenizer.encode(&"word ".repeat(1000))?;
+    assert_eq!(long.len(), 77);
+    assert_eq!(long[76], empty[1], "cut, but ended");
+    tokenizer.add_placeholder("SKS", 5000);
+    assert_eq!(
+        tokenizer
+            .words("a sks car")?
+            .iter()
+            .filter(|&&t| t == 5000)
+            .count(),
+        1
+    );
+    assert_eq!(tokenizer.words("sks")?, [5000]);
+    assert!(!tokenizer.words("sksx")?.contains(&5000));
+    Ok(())
+}
+
+#[test]
+fn tokenizer_json_alone_gives_the_same_tokens() -> Outcome {
+    let source = family().join("tokenizer");
+    let vocab: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(source.join("vocab.json"))?)?;
+    let merges = std::fs::read_to_string(source.join("merges.txt"))?;
+    let merges: Vec<&str> = merges.lines().skip(1).filter(|l| !l.is_empty()).collect();
+    let folder = tempfile::tempdir()?;
+    let json = serde_json::json!({"model": {"type": "BPE", "vocab": vocab, "merges": merges}});
+    std::fs::write(folder.path().join("tokenizer.json"), json.to_string())?;
+    let (a, b) = (Tokenizer::load(&source)?, Tokenizer::load(folder.path())?);
+    let prompt = "a photo of the strangest 12 cars, isn't it? ☺";
+    assert_eq!(a.encode(prompt)?, b.encode(prompt)?);
+    Ok(())
+}
