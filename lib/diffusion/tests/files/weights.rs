@@ -7,7 +7,7 @@ use dipir_diffusion::model::load_unet;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::weights::{Weights, write_safetensors};
 
-use super::{Outcome, tensors, unet_folder, unet_tensors};
+use super::{Outcome, unet_folder, unet_tensors};
 
 #[test]
 fn missing_extra_and_mis_shaped_tensors_are_all_named() -> Outcome {
