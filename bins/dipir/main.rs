@@ -34,8 +34,17 @@ Examples:
   dipir keys shadow                         keys of pipeline.toml that are about shadows
   dipir clean                               remove what the stages wrote
 
-Stages: scene concepts lora light composite. Each is an executable of its own and can be run by
-itself; dipir runs them in order, leaves out what is up to date, and goes on where it was stopped.
+  dipir run --set composite.environment=sky.hdr     light by a map of yours instead of an estimate
+  dipir run --set model.path=models/sd15    guidance by a Stable Diffusion of yours (dipir-model)
+
+Results, in [pipeline] out: composite/composite.png the picture, composite/composite.exr its layers,
+light/environment.exr the light, report.html all of it on one page.
+Stages: scene concepts lora light composite. Each is an executable of its own, such as dipir-scene,
+and can be run by itself; dipir runs them in order, leaves out what is up to date, and goes on where
+it was stopped.
+Beside them: dipir-inspect shows what any artifact holds; dipir-model fetches, checks and times
+diffusion models; dipir-evaluate and dipir-tradeoff compare methods and settings; dipir-pretrain
+trains the small model and the light estimator. Each has --help, and a page in dipir man.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 
 /// Put a 3D object into a photograph: all stages, each only if it has to run

@@ -71,6 +71,14 @@ impl Executable {
     }
 }
 
+/// Names of all executables.
+pub fn executables() -> impl Iterator<Item = String> {
+    let values = Executable::value_variants().iter();
+    values
+        .filter_map(|e| e.to_possible_value())
+        .map(|v| v.get_name().into())
+}
+
 pub fn completions(args: &CompletionsArgs) -> anyhow::Result<()> {
     let mut command = args.executable.command();
     let name = command.get_name().to_string();

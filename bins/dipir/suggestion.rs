@@ -7,7 +7,7 @@ use clap::{CommandFactory, Parser};
 use dipir_cli::exit::Usage;
 use dipir_pipeline::config::{nearest, renamed};
 
-use crate::Cli;
+use crate::{Cli, manual};
 
 /// Reads the command line. What clap has no better word for than that it is wrong is answered with
 /// what was meant.
@@ -30,7 +30,9 @@ fn meant(error: &clap::Error) -> Option<String> {
     match error.kind() {
         ErrorKind::InvalidSubcommand => {
             let name = said(ContextKind::InvalidSubcommand)?;
-            file(name).or_else(|| command(name))
+            file(name)
+                .or_else(|| executable(name))
+                .or_else(|| command(name))
         }
         ErrorKind::InvalidValue => {
             let value = said(ContextKind::InvalidValue)?;
@@ -40,6 +42,17 @@ fn meant(error: &clap::Error) -> Option<String> {
         }
         _ => None,
     }
+}
+
+/// For what is an executable of its own: a stage, or one of those that stand beside them.
+fn executable(name: &str) -> Option<String> {
+    let own = format!("dipir-{name}");
+    if manual::executables().any(|known| known == own) {
+        return Some(format!(
+            "{name} is no command of dipir but an executable of its own: {own} --help"
+        ));
+    }
+    None
 }
 
 /// For a slip of the pen.

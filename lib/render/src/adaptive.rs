@@ -9,6 +9,8 @@
 //! after which round to stop.
 use std::collections::HashSet;
 use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
@@ -17,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use crate::counters::RayCounts;
 use crate::error::RenderError;
 use crate::film::{Film, SquaredError, Viewing};
+use crate::foresight::{Foresight, first_share};
 use crate::highlights::Found;
 use crate::job::{Job, Layer, REPLICATES};
 
@@ -64,10 +67,10 @@ pub struct EstimatedError {
     pub touched_pixels: u64,
 }
 
-/// State after a round.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// State after a round, and every [`REPORT_EVERY`] of the next one.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Progress {
-    /// Rounds done, from 1.
+    /// Rounds done; 0 while the first is under way, when nothing is known of the error.
     pub round: u32,
     /// Error so far.
     pub error: EstimatedError,
@@ -80,6 +83,9 @@ pub struct Progress {
     /// Share of the work that is done, in `[0, 1]`, as far as it can be foreseen.
     pub fraction: f64,
 }
+
+/// How often a round says how far it is. Only where the caller's thread is none of rayon's, which would wait in vain.
+const REPORT_EVERY: Duration = Duration::from_millis(200);
 
 /// What the rounds led to.
 #[derive(Clone, Debug)]
@@ -94,6 +100,8 @@ pub struct Refined {
     pub samples: u64,
     /// Rounds.
     pub rounds: u32,
+    /// What other errors cost.
+    pub foresight: Foresight,
 }
 
 /// Samples per replicate of a pixel with a highlight in its first round: the highlight may fill a hundredth of the area
@@ -102,7 +110,7 @@ const FIRST_ROUND_WITH_HIGHLIGHT: u32 = 1024;
 
 /// Draws samples until `stop`. `advance(job, n)` brings a job to `n` samples per pixel and
 /// replicate; `find_highlights(film, jobs)` says once, after the first round, which pixels of the object start
-/// again with another density of samples; `progress` may break off after any round. A time budget counts
+/// again with another density of samples; `progress` may break off whenever it is called. A time budget counts
 /// from `start`; where it ends within the first round, the pixels that have no samples yet are taken from `coarse`,
 /// the same picture at a lower resolution. Without one, the first round is always finished.
 pub fn refine(
@@ -126,17 +134,31 @@ pub fn refine(
         _ => false,
     };
     let mut search = RayCounts::default();
+    let mut foresight = Foresight::new(limit);
+    let mut report = Progress::default();
     loop {
         let round_start = Instant::now();
         let cost_before: f64 = jobs.iter().map(Job::cost).sum();
-        jobs.par_iter_mut()
-            .zip(&goals)
-            .with_max_len(1)
-            .for_each(|(job, &goal)| {
-                if goal > job.samples && (job.samples > 0 || !is_late()) {
-                    advance(job, goal);
-                }
-            });
+        let end_of_round = match stop {
+            Stop::TargetError(target) if round == 0 => first_share(f64::from(target)),
+            _ => share_after(report.fraction, &jobs, &goals),
+        };
+        let within_round = |share: f64| {
+            let fraction = match stop {
+                Stop::TimeBudget(budget) => share_of_time(start.elapsed(), budget),
+                _ => report.fraction + share * (end_of_round - report.fraction),
+            };
+            let elapsed = start.elapsed();
+            progress(&Progress {
+                elapsed,
+                fraction,
+                ..report
+            })
+        };
+        let is_wanted = |job: &Job, goal| goal > job.samples && (job.samples > 0 || !is_late());
+        if draw(&mut jobs, &goals, &is_wanted, advance, within_round).is_break() {
+            return Err(RenderError::Interrupted);
+        }
         let cost_of_round = jobs.iter().map(Job::cost).sum::<f64>() - cost_before;
         let seconds_of_round = round_start.elapsed().as_secs_f64();
         round += 1;
@@ -159,6 +181,7 @@ pub fn refine(
             .collect();
         let error = total_error(&errors, &film, viewing);
         let cost: f64 = jobs.iter().map(Job::cost).sum();
+        foresight.learn(&jobs, &errors, &error);
         let growth = match stop {
             Stop::TimeBudget(budget) => {
                 let rate = seconds_of_round / cost_of_round.max(1.0);
@@ -174,7 +197,7 @@ pub fn refine(
                 .iter()
                 .zip(jobs.iter())
                 .all(|(&n, job)| n <= job.samples);
-        let report = Progress {
+        report = Progress {
             round,
             error,
             samples: jobs.iter().map(Job::samples_drawn).sum(),
@@ -183,7 +206,7 @@ pub fn refine(
             fraction: if done {
                 1.0
             } else {
-                fraction(stop, &error, cost, &jobs, &next, start.elapsed())
+                fraction(stop, &foresight, cost, &jobs, &next, start.elapsed())
             },
         };
         if progress(&report).is_break() {
@@ -198,10 +221,82 @@ pub fn refine(
                 counts,
                 samples: report.samples,
                 rounds: round,
+                foresight,
             });
         }
         goals = next;
     }
+}
+
+/// Brings every job for which `is_wanted` holds to its goal, and tells `report` the share that is done from time to
+/// time; breaks off when it says so.
+fn draw(
+    jobs: &mut [Job],
+    goals: &[u32],
+    is_wanted: &(impl Fn(&Job, u32) -> bool + Sync),
+    advance: &(impl Fn(&mut Job, u32) + Sync),
+    mut report: impl FnMut(f64) -> ControlFlow<()>,
+) -> ControlFlow<()> {
+    let work = |job: &Job, goal: u32| work(job, goal) as u64;
+    let all: u64 = jobs.iter().zip(goals).map(|(j, &g)| work(j, g)).sum();
+    let (done, is_broken) = (AtomicU64::new(0), AtomicBool::new(false));
+    let mut draw = || {
+        let jobs = jobs.par_iter_mut().zip(goals).with_max_len(1);
+        jobs.for_each(|(job, &goal)| {
+            if is_broken.load(Ordering::Relaxed) {
+                return;
+            }
+            let work = work(job, goal);
+            if is_wanted(job, goal) {
+                advance(job, goal);
+            }
+            done.fetch_add(work, Ordering::Relaxed);
+        });
+    };
+    if rayon::current_thread_index().is_some() {
+        draw();
+        return ControlFlow::Continue(());
+    }
+    let (end, ended) = channel::<()>();
+    rayon::in_place_scope(|scope| {
+        scope.spawn(move |_| {
+            draw();
+            drop(end);
+        });
+        while ended.recv_timeout(REPORT_EVERY) == Err(RecvTimeoutError::Timeout) {
+            let share = done.load(Ordering::Relaxed) as f64 / all.max(1) as f64;
+            if report(share).is_break() {
+                is_broken.store(true, Ordering::Relaxed);
+            }
+        }
+    });
+    match is_broken.into_inner() {
+        true => ControlFlow::Break(()),
+        false => ControlFlow::Continue(()),
+    }
+}
+
+/// What bringing `job` to `goal` costs, by what its samples cost so far: of a job without any, its number of samples.
+fn work(job: &Job, goal: u32) -> f64 {
+    let more = f64::from(goal.saturating_sub(job.samples));
+    match job.samples {
+        0 => more * job.pixels.len() as f64,
+        n => more * job.cost() / f64::from(n),
+    }
+}
+
+/// The share of all work that is done when `goals` are reached, where `fraction` of it is now.
+fn share_after(fraction: f64, jobs: &[Job], goals: &[u32]) -> f64 {
+    let done: f64 = jobs.iter().map(Job::cost).sum();
+    let more: f64 = jobs.iter().zip(goals).map(|(j, &g)| work(j, g)).sum();
+    match done > 0.0 {
+        true => (fraction * (done + more) / done).min(1.0),
+        false => 0.25,
+    }
+}
+
+fn share_of_time(elapsed: Duration, budget: Duration) -> f64 {
+    (elapsed.as_secs_f64() / budget.as_secs_f64().max(1e-9)).min(1.0)
 }
 
 /// Gives every pixel that `found` names a job of its own, behind the others, and brings it to `goal` samples.
@@ -345,34 +440,31 @@ fn spread<'a>(
 fn goals(jobs: &[Job], errors: &[SquaredError], scale: f64, limit: u32) -> Vec<u32> {
     spread(jobs, errors)
         .zip(jobs)
-        .map(|((root, _), job)| {
-            let n = f64::from(job.samples);
-            let wanted = (root * scale).min(n * MAX_GROWTH).ceil() as u32;
-            // Multiples of four keep the sequences stratified.
-            wanted.next_multiple_of(4).min(limit).max(job.samples)
-        })
+        .map(|((root, _), job)| goal(root * scale, job.samples, limit))
         .collect()
+}
+
+/// Samples per pixel and replicate of a job in the next round, of which it has `samples` and would best have `best`.
+pub(crate) fn goal(best: f64, samples: u32, limit: u32) -> u32 {
+    let wanted = best.min(f64::from(samples) * MAX_GROWTH).ceil() as u32;
+    // Multiples of four keep the sequences stratified.
+    wanted.next_multiple_of(4).min(limit).max(samples)
 }
 
 fn fraction(
     stop: Stop,
-    error: &EstimatedError,
+    foresight: &Foresight,
     cost: f64,
     jobs: &[Job],
     next: &[u32],
     elapsed: Duration,
 ) -> f64 {
     let f = match stop {
-        // Cost falls with the square of the error.
-        Stop::TargetError(target) => (f64::from(target) / error.upper_95).powi(2),
-        Stop::TimeBudget(budget) => elapsed.as_secs_f64() / budget.as_secs_f64().max(1e-9),
+        Stop::TargetError(target) => 1.0 / foresight.cost_of(f64::from(target)),
+        Stop::TimeBudget(budget) => share_of_time(elapsed, budget),
         Stop::Samples(_) => {
-            let all: f64 = jobs
-                .iter()
-                .zip(next)
-                .map(|(job, &n)| job.cost() * f64::from(n) / f64::from(job.samples.max(1)))
-                .sum();
-            cost / all.max(1.0)
+            let more: f64 = jobs.iter().zip(next).map(|(j, &n)| work(j, n)).sum();
+            cost / (cost + more).max(1.0)
         }
     };
     if f.is_finite() {

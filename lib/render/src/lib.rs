@@ -11,6 +11,7 @@ pub mod features;
 pub mod film;
 pub mod footprint;
 pub mod foreground;
+pub mod foresight;
 pub mod gbuffer;
 pub mod highlights;
 pub mod job;

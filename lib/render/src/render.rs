@@ -22,6 +22,7 @@ use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
 use crate::film::{Film, Viewing};
 use crate::footprint::Footprint;
 use crate::foreground::{PathContext, PathStart};
+use crate::foresight::Foresight;
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet, REPLICATES};
 use crate::light::{PathLight, SceneLight};
@@ -99,6 +100,8 @@ pub struct Rendered {
     pub samples: u64,
     /// Rounds of adaptive sampling.
     pub rounds: u32,
+    /// What other errors of the rendered picture cost.
+    pub foresight: Foresight,
 }
 
 /// Side of the blocks of pixels that are scheduled and refined as one.
@@ -304,6 +307,7 @@ impl<'a> Renderer<'a> {
             counts: refined.counts,
             samples: refined.samples,
             rounds: refined.rounds,
+            foresight: refined.foresight,
         })
     }
 

@@ -239,8 +239,8 @@ macro_rules! effects_config {
 }
 
 effects_config! {
-    shadow: "Light that the object takes from the proxy.",
-    proxy_occlusion: "Light that the proxy takes from itself.",
+    shadow: "The object's shadow: light that it keeps from the proxy.",
+    proxy_occlusion: "The proxy's own shadow: light that its parts keep from each other.",
     interreflection: "Light that bounces between parts of the object.",
     specular: "Mirror-like reflection at the surface.",
     textures: "Base colour, metalness and roughness that vary over the surface.",

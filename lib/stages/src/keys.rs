@@ -222,7 +222,10 @@ pub fn about(word: &str) -> Vec<Table> {
         keys: keys(table),
         ..table.clone()
     });
-    tables.filter(|table| !table.keys.is_empty()).collect()
+    let mut found: Vec<Table> = tables.filter(|table| !table.keys.is_empty()).collect();
+    // Whoever names a table means its keys first.
+    found.sort_by_key(|table| !table.name.starts_with(&word));
+    found
 }
 
 /// The key whose name is most like `word`, if one is.

@@ -128,7 +128,7 @@ impl Outlook {
         Self(next.filter_map(estimated).collect())
     }
 
-    /// For composites: the presets next to a display-referred error, and seconds for each target.
+    /// For composites that no preset stopped: those next to a display-referred error, and seconds for each target.
     pub fn around_error(error: f64, seconds: impl Fn(f64) -> f64) -> Self {
         // Nearer targets are no other choice.
         const APART: f64 = 1.2;
@@ -180,10 +180,12 @@ pub struct LightRun {
     pub side: usize,
     /// Longest side of the photograph, beyond which no preset goes.
     pub photo_side: usize,
-    /// Seconds of the first record.
+    /// Seconds in which the stage recorded, or read what the scene stage had recorded.
     pub record_s: f64,
     /// Seconds of the optimisation.
     pub optimization_s: f64,
+    /// Other seconds, which no preset changes: reading the photograph, writing.
+    pub rest_s: f64,
     /// Whether a model guided: then the time grows with the steps alone, whatever the record.
     pub by_model: bool,
 }
@@ -206,7 +208,7 @@ impl LightRun {
             true => 1.0,
             false => pixels * samples.powf(REPLAY_POWER),
         };
-        self.record_s * pixels * samples + self.optimization_s * iterations * replay
+        self.rest_s + self.record_s * pixels * samples + self.optimization_s * iterations * replay
     }
 
     /// The presets next to `quality`, for the keys that `table` does not set.
@@ -258,6 +260,7 @@ mod tests {
             photo_side: 4096,
             record_s: 2.0,
             optimization_s: 10.0,
+            rest_s: 0.0,
             by_model,
         }
     }

@@ -98,7 +98,9 @@ fn a_target_error_is_met_and_costs_more_the_lower_it_is() {
         let mut errors = Vec::new();
         let r = Renderer::new(&s)
             .render(&sunny(), &lambertian(2), &settings, &mut |p| {
-                errors.push(p.error.upper_95);
+                if p.round as usize > errors.len() {
+                    errors.push(p.error.upper_95);
+                }
                 ControlFlow::Continue(())
             })
             .expect("renders");
@@ -112,6 +114,47 @@ fn a_target_error_is_met_and_costs_more_the_lower_it_is() {
         samples.push(r.samples);
     }
     assert!(samples[1] > 2 * samples[0], "{samples:?}");
+}
+
+#[test]
+fn the_work_and_the_cost_of_other_errors_are_foreseen_within_three_tenths() {
+    let s = knot_scene(64);
+    let targets = [0.02f32, 0.004, 0.001];
+    let runs = targets.map(|target| {
+        let settings = Settings {
+            stop: Stop::TargetError(target),
+            transfer: Transfer::Srgb,
+            ..settings(0, 1)
+        };
+        let mut course = Vec::new();
+        let r = Renderer::new(&s)
+            .render(&sunny(), &lambertian(2), &settings, &mut |p| {
+                if p.round as usize > course.len() {
+                    course.push(((p.samples + p.rays) as f64, p.fraction));
+                }
+                ControlFlow::Continue(())
+            })
+            .expect("renders");
+        (r, course)
+    });
+    let cost = runs.each_ref().map(|(_, course)| course.last().unwrap().0);
+    for ((_, course), all) in runs.iter().zip(cost) {
+        for &(done, fraction) in course.iter().filter(|c| c.0 >= 0.1 * all) {
+            let ratio = fraction * all / done;
+            assert!(
+                (1.0 / 1.3..1.3).contains(&ratio),
+                "{ratio} at {}",
+                done / all
+            );
+        }
+    }
+    let neighbours = [(0, 1), (1, 0), (1, 2), (2, 1)];
+    let ratios = neighbours.map(|(from, to)| {
+        let foreseen = runs[from].0.foresight.cost_of(targets[to].into());
+        foreseen * cost[from] / cost[to]
+    });
+    let close = |r: &f64| (1.0 / 1.3..1.3).contains(r);
+    assert!(ratios.iter().all(close), "{ratios:?}");
 }
 
 #[test]

@@ -12,9 +12,10 @@ Examples:
                                                  a material, under [composite] environment
   dipir-light --set pipeline.quality=high     finer environment, more lobes
 
-Reads OUT/scene/, which dipir-scene writes. Writes OUT/light/: lighting.json environment.exr tone.json
-stage.json; of an estimate, estimate.json candidates.json candidates.png surroundings.exr; under guidance, history.json
-previews/, and reading.json of a model that knows light; for materials, materials.json history.json.
+Reads OUT/scene/, which dipir-scene writes. Writes OUT/light/: lighting.json environment.exr
+tone.json stage.json; of an estimate, estimate.json candidates.json candidates.png
+surroundings.exr; under guidance, history.json previews/, and reading.json of a model that knows
+light; for materials, materials.json history.json.
 An interrupted run goes on where it stopped and ends with the same bytes.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 

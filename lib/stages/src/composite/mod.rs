@@ -62,9 +62,7 @@ pub struct Done {
 /// How a render went.
 struct Course {
     rendered: Rendered,
-    /// Seconds to the end of its first round, the least that makes a picture.
-    first_round_s: f64,
-    /// Seconds in all.
+    /// Seconds that it took.
     seconds: f64,
 }
 
@@ -148,10 +146,16 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let manifest = writer.finish()?;
     let seconds = clock.elapsed().as_secs_f64();
     let error = rendered.error.upper_95;
-    // Squared error falls with the time spent on samples; the rest stays.
-    let at_target = |target: f64| {
-        let sampling = course.seconds * (error / target).powi(2);
-        seconds - course.seconds + sampling.max(course.first_round_s)
+    // What is not spent on samples stays.
+    let foresight = &rendered.foresight;
+    let at_target = |target: f64| seconds + course.seconds * (foresight.cost_of(target) - 1.0);
+    let quality = session.pipeline.quality;
+    let outlook = match stop == CompositeTable::default().stop(quality) {
+        true => Outlook::beside(quality, |preset| {
+            let target = f64::from(preset.composite.target_error);
+            Some((at_target(target), Some(target)))
+        }),
+        false => Outlook::around_error(error, at_target),
     };
     Ok(Done {
         folder,
@@ -161,7 +165,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         error,
         target: stop,
         seconds,
-        outlook: Outlook::around_error(error, at_target),
+        outlook,
     })
 }
 
@@ -266,7 +270,7 @@ fn render_under<L: SceneLight>(
     light: &L,
 ) -> anyhow::Result<Course> {
     let clock = Instant::now();
-    let mut first_round_s = None;
+    let mut round = 0;
     let loaded = &inputs.scene.loaded;
     let photo = &loaded.photo;
     let settings = Settings {
@@ -286,8 +290,11 @@ fn render_under<L: SceneLight>(
             &inputs.scene.effects.simulation(),
             &settings,
             &mut |state| {
-                first_round_s.get_or_insert_with(|| clock.elapsed().as_secs_f64());
                 progress.set(state.fraction);
+                if state.round == round {
+                    return interruption();
+                }
+                round = state.round;
                 let goal = match stop {
                     Stop::TargetError(target) => format!(" -> {target}"),
                     _ => String::new(),
@@ -310,11 +317,7 @@ fn render_under<L: SceneLight>(
         .map_err(crate::render_error)?;
     progress.done();
     let seconds = clock.elapsed().as_secs_f64();
-    Ok(Course {
-        rendered,
-        first_round_s: first_round_s.unwrap_or(seconds),
-        seconds,
-    })
+    Ok(Course { rendered, seconds })
 }
 
 /// The layers of the picture, linear.

@@ -147,6 +147,7 @@ fn a_word_finds_keys_by_name_and_by_sentence_and_a_slip_the_nearest() {
     };
     assert!(found("OCCLUDERS").contains(&"scene.occluders".into()));
     assert!(found("nerfstudio").contains(&"scene.camera.transforms".into()));
+    assert!(found("light")[0].starts_with("light."));
     assert!(found("no such thing").is_empty());
     assert_eq!(like("ocluders"), Some("scene.occluders"));
 }

@@ -330,22 +330,23 @@ fn recover(
 /// What took how long.
 fn light_run(scene: &SceneFolder, request: &Request, manifest: &Manifest) -> LightRun {
     let settings = &request.settings;
-    let seconds = |manifest: &Manifest, name: &str| manifest.timings_s.get(name).copied();
+    let seconds = |name: &str| manifest.timings_s.get(name).copied().unwrap_or(0.0);
     let resolution = scene.loaded.scene.camera.resolution;
     let photo_side = resolution[0].max(resolution[1]) as usize;
     let (by_model, refines) = match &request.guide {
         Guide::Reference { .. } | Guide::None => (false, false),
         Guide::Model { reading, .. } => (true, reading.is_some()),
     };
+    let record_s = seconds("transport");
+    let optimization_s = seconds("optimization");
     LightRun {
         iterations: (!refines).then_some(settings.iterations),
         samples: settings.samples,
         side: settings.size.min(photo_side),
         photo_side,
-        record_s: seconds(&scene.manifest, "transport")
-            .or(seconds(manifest, "transport"))
-            .unwrap_or(0.0),
-        optimization_s: seconds(manifest, "optimization").unwrap_or(0.0),
+        record_s,
+        optimization_s,
+        rest_s: (manifest.elapsed_s - record_s - optimization_s).max(0.0),
         by_model,
     }
 }

@@ -16,6 +16,10 @@ use crate::names::SCENE;
 const SHOWN: usize = 640;
 /// Degrees between the corners of the sector of azimuths.
 const STEP_DEG: f64 = 5.0;
+/// Sizes of the arrow that are tried, each this share of the one before, until it lies in the picture.
+const SMALLER: f32 = 0.85;
+/// And how many.
+const SIZES: i32 = 16;
 /// Half the angle of the disc in the sky, degrees. The sun's own would be hard to see.
 const DISC_DEG: f32 = 1.2;
 
@@ -51,7 +55,7 @@ pub fn figure(
         drawn.extend(ground.disc(truth, "truth"));
     }
     let relative = Quat::from_rotation_y(heading(&ground.camera)) * towards;
-    let mut caption = format!("most light comes {}", words(relative));
+    let mut caption = format!("Most light comes {}", words(relative));
     if estimate.is_some() {
         caption += "; shaded: where it comes from in four photographs of five";
     }
@@ -113,8 +117,8 @@ impl Ground {
         ))
     }
 
-    /// An arrow along the ground that ends at the foot and comes from the light. None if the light stands so high
-    /// that its azimuth means nothing, or a part of the arrow is not in front of the camera.
+    /// An arrow along the ground that points at the foot and comes from the light: as large as fits into the picture.
+    /// None if the light stands so high that its azimuth means nothing, or the foot is not in the picture.
     fn arrow(&self, towards: Vec3, class: &str) -> Option<Html> {
         let level = Vec3::new(towards.x, 0.0, towards.z);
         if level.length() < 0.2 * towards.length() {
@@ -122,19 +126,24 @@ impl Ground {
         }
         let level = level.normalize();
         let side = level.cross(Vec3::Y);
-        let at = |along: f32, aside: f32| {
-            let point = self.foot + self.radius * (along * level + aside * side);
-            self.camera.project(point)
-        };
-        let outline = [
-            at(1.0, 0.0)?,
-            at(1.35, 0.22)?,
-            at(1.35, 0.07)?,
-            at(2.2, 0.07)?,
-            at(2.2, -0.07)?,
-            at(1.35, -0.07)?,
-            at(1.35, -0.22)?,
+        // Along and aside, in units of the radius.
+        const OUTLINE: [[f32; 2]; 7] = [
+            [1.0, 0.0],
+            [1.35, 0.22],
+            [1.35, 0.07],
+            [2.2, 0.07],
+            [2.2, -0.07],
+            [1.35, -0.07],
+            [1.35, -0.22],
         ];
+        let outline = (0..SIZES).find_map(|k| {
+            let radius = self.radius * SMALLER.powi(k);
+            let corners = OUTLINE.iter().map(|[along, aside]| {
+                let at = self.foot + radius * (along * level + aside * side);
+                self.camera.project(at).filter(|p| self.is_seen(*p))
+            });
+            corners.collect::<Option<Vec<Vec2>>>()
+        })?;
         let list = points(&outline);
         Some(Html::element(
             "polygon",
@@ -143,12 +152,17 @@ impl Ground {
         ))
     }
 
+    /// Whether a pixel lies in the picture.
+    fn is_seen(&self, pixel: Vec2) -> bool {
+        let [width, height] = self.camera.resolution.map(|n| n as f32);
+        (0.0..width).contains(&pixel.x) && (0.0..height).contains(&pixel.y)
+    }
+
     /// A disc where the light itself is seen. None if it is not in the picture.
     fn disc(&self, towards: Vec3, class: &str) -> Option<Html> {
         let camera = &self.camera;
         let at = camera.project(camera.position + towards)?;
-        let [width, height] = camera.resolution.map(|n| n as f32);
-        if !(0.0..width).contains(&at.x) || !(0.0..height).contains(&at.y) {
+        if !self.is_seen(at) {
             return None;
         }
         let radius = DISC_DEG.to_radians().tan() * camera.focal_px.max_element();
@@ -198,6 +212,23 @@ mod tests {
         assert_eq!(list(Vec3::new(1.0, 1.0, 0.0)), 92.5);
         assert_eq!(list(Vec3::new(-1.0, 0.3, 0.0)), 67.5);
         assert!(ground().arrow(Vec3::Y, "towards").is_none());
+    }
+
+    #[test]
+    fn an_arrow_that_would_leave_the_picture_is_smaller() {
+        let mut ground = ground();
+        // 5 m to the right of a foot 4 m away is 125 pixels, of which there are 80.
+        ground.radius = 2.3;
+        let html = ground.arrow(Vec3::X, "towards").unwrap().into_string();
+        let list = html.split('"').find(|part| part.contains(',')).unwrap();
+        let corners: Vec<Vec<f32>> = list
+            .split(' ')
+            .map(|c| c.split(',').map(|n| n.parse().unwrap()).collect())
+            .collect();
+        let right = corners.iter().map(|c| c[0]).fold(0.0, f32::max);
+        assert!((135.0..160.0).contains(&right), "{right}");
+        ground.foot = Vec3::new(9.0, 0.0, -4.0);
+        assert!(ground.arrow(Vec3::X, "towards").is_none());
     }
 
     #[test]

@@ -110,6 +110,6 @@ fn losses(training: &Value) -> Vec<(&'static str, Chart)> {
             over("update", true, validated),
         ),
         ("Loss of single updates", over("update", true, losses)),
-        ("Norm of its gradient", over("update", true, norm)),
+        ("Norm of the gradient", over("update", true, norm)),
     ]
 }

@@ -81,7 +81,7 @@ pub fn section(report: &Report) -> Section {
         &environment.resampled(MAP_WIDTH, MAP_WIDTH / 2),
         &own,
         truth,
-        "the recovered light: latitude and longitude, +z in the middle, +x to its left",
+        "The recovered light: latitude and longitude, +z in the middle, +x to its left",
     )?);
     if !own.is_empty() {
         parts.push(lobes(&own));
@@ -123,7 +123,7 @@ fn estimate(run: &(PathBuf, Manifest), estimate: &LightEstimate) -> anyhow::Resu
     let mut parts = vec![sentence, table(&heads, rows.collect())];
     for (_, path) in outputs(run, "candidates_sheet") {
         let shown = Transfer::Srgb.encode(&read_photo(path, Transfer::Srgb)?.image);
-        let caption = "the candidates by number, row by row; bars are their probabilities";
+        let caption = "The candidates by number, row by row; bars are their probabilities";
         parts.push(figure(&shown, SHEET, caption)?);
     }
     Ok(Html::all(parts))
@@ -137,7 +137,7 @@ fn given(report: &Report) -> Section {
         return Ok(None);
     };
     let shown = known.map.resampled(MAP_WIDTH, MAP_WIDTH / 2);
-    Ok(Some(map(&shown, &[], None, "the light that was given")?))
+    Ok(Some(map(&shown, &[], None, "The light that was given")?))
 }
 
 /// What was recovered of materials.

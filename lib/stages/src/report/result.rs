@@ -46,7 +46,7 @@ pub fn before_and_after(report: &Report) -> Section {
         ("type", "range"),
         ("min", "0"),
         ("max", "100"),
-        ("value", "50"),
+        ("value", "15"),
         ("aria-label", "share of the photograph without the object"),
     ];
     let parts = [
@@ -143,7 +143,7 @@ pub fn truth(truth: &Truth) -> Html {
             ],
             rows,
         ),
-        Html::element("p", &[], [Html::text(truth.in_words())]),
+        Html::of("p", capitalised(&truth.in_words())),
         Html::element(
             "p",
             &[("class", "soft")],
@@ -153,4 +153,11 @@ pub fn truth(truth: &Truth) -> Html {
             )],
         ),
     ])
+}
+
+/// A sentence with a capital.
+fn capitalised(sentence: &str) -> String {
+    let mut rest = sentence.chars();
+    let first = rest.next().map(|c| c.to_ascii_uppercase());
+    first.into_iter().chain(rest).collect()
 }

@@ -60,12 +60,12 @@ pub fn table(report: &Report) -> Section {
 /// The quantity that a stage's error belongs to.
 fn error_in_words(stage: &str, error: f64) -> String {
     let unit = match stage {
-        s if s == SCENE.name => "left out",
-        s if s == LIGHT.name => "from the guidance's reference",
-        s if s == COMPOSITE.name => "95% bound",
+        s if s == SCENE.name => ", of the effects that are left out",
+        s if s == LIGHT.name => ", from the guidance's reference",
+        s if s == COMPOSITE.name => ", 95% bound",
         _ => "",
     };
-    format!("{} RMSE {unit}", number(error)).trim_end().into()
+    format!("RMSE {}{unit}", number(error))
 }
 
 /// What is simulated, and why.

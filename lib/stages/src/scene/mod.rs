@@ -21,7 +21,7 @@ use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
 use dipir_scene::camera::parts;
-use dipir_scene::config::SceneConfig;
+use dipir_scene::config::{EffectsMode, SceneConfig};
 use dipir_scene::description::ProxyRecord;
 use dipir_scene::ground::points_parts;
 use dipir_scene::plausibility::implausible;
@@ -149,7 +149,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let resolution = loaded.scene.camera.resolution;
     let outlook = record
         .as_ref()
-        .map(|r| outlook(session, r, resolution, manifest.elapsed_s));
+        .map(|r| outlook(session, r, resolution, &manifest))
+        .transpose()?;
     Ok(Done {
         folder,
         manifest,
@@ -179,18 +180,33 @@ fn warn_of_slow_rays(session: &Session, renderer: &Renderer) {
     }
 }
 
-/// What the presets beside this one would have cost: recording takes time in proportion to paths.
-fn outlook(session: &Session, record: &Record, resolution: [u32; 2], elapsed_s: f64) -> Outlook {
+/// What the presets beside this one would have cost: recording takes time in proportion to paths, and effects are
+/// planned by some of them only.
+fn outlook(
+    session: &Session,
+    record: &Record,
+    resolution: [u32; 2],
+    manifest: &Manifest,
+) -> anyhow::Result<Outlook> {
+    let effects = settings(session)?.effects.mode;
+    let is_free = session
+        .config
+        .table::<SceneConfig>("scene")?
+        .effects
+        .mode
+        .is_none();
+    let planning_s = manifest.timings_s.get("effects").copied().unwrap_or(0.0);
     let longest = resolution[0].max(resolution[1]) as usize;
     let paths = |samples: u32, side: usize| f64::from(samples) * (side.min(longest) as f64).powi(2);
     let here = paths(record.samples, record.size[0].max(record.size[1]));
-    Outlook::beside(session.pipeline.quality, |p| {
+    Ok(Outlook::beside(session.pipeline.quality, |p| {
         let there = paths(p.light.samples, p.light.size);
-        Some((
-            elapsed_s - record.seconds + record.seconds * there / here,
-            None,
-        ))
-    })
+        let plans_no_more =
+            is_free && effects != Some(p.scene.effects) && p.scene.effects == EffectsMode::All;
+        let spared_s = if plans_no_more { planning_s } else { 0.0 };
+        let rest_s = manifest.elapsed_s - record.seconds - spared_s;
+        Some((rest_s + record.seconds * there / here, None))
+    }))
 }
 
 /// Traces how light reaches the picture, for the light stage.

@@ -1,0 +1,221 @@
+//! What a lower error costs, foreseen from the samples drawn so far.
+//!
+//! The rounds of [`crate::adaptive`] are played through on the jobs' squared errors and costs instead of their samples,
+//! with the same goals. A job's squared error is taken to fall with a power of its samples, the one that the jobs that
+//! grew have shown: 1 for independent samples, more where stratification helps.
+use crate::adaptive::{EstimatedError, goal};
+use crate::film::SquaredError;
+use crate::job::Job;
+
+/// The power before any job has grown: that of independent samples.
+const POWER: f64 = 1.0;
+/// Powers that are believed: 3 is that of scrambled nets on a smooth integrand, the best there is
+/// [Owen 1997, "Scrambled net variance for integrals of smooth functions"].
+const POWERS: [f64; 2] = [0.5, 3.0];
+/// Jobs that grew tell the power if they held this share of the squared error.
+const SHARE_TO_LEARN_FROM: f64 = 0.25;
+/// Rounds that are played through at most; each multiplies the samples by up to 4.
+const ROUNDS: usize = 32;
+/// Error of most pictures after the first round, from which the share of the first round is guessed while it is under way.
+const FIRST_ERROR: f64 = 0.027;
+
+/// A job after a round.
+#[derive(Clone, Copy, Debug)]
+struct Point {
+    /// Summed over its pixels, display-referred.
+    squared_error: f64,
+    /// Per pixel and replicate.
+    samples: f64,
+    /// Of one such sample.
+    cost: f64,
+}
+
+/// What is known of the jobs.
+#[derive(Clone, Debug)]
+pub struct Foresight {
+    /// After the first round, which every target pays for.
+    first: Vec<Point>,
+    /// After the last round.
+    last: Vec<Point>,
+    power: f64,
+    /// Squared error allowed for a target of 1, summed over the pixels: less than their number, because it is the bound
+    /// that has to reach the target.
+    allowed: f64,
+    /// Samples per pixel and replicate at most.
+    limit: u32,
+}
+
+impl Foresight {
+    /// Nothing is known yet.
+    pub(crate) fn new(limit: u32) -> Self {
+        Self {
+            first: vec![],
+            last: vec![],
+            power: POWER,
+            allowed: 0.0,
+            limit,
+        }
+    }
+
+    /// Adds what a round has led to.
+    pub(crate) fn learn(&mut self, jobs: &[Job], errors: &[SquaredError], error: &EstimatedError) {
+        let points = jobs.iter().zip(errors).map(|(job, e)| {
+            let samples = f64::from(job.samples.max(1));
+            Point {
+                squared_error: e.sum,
+                samples,
+                cost: (job.cost() / samples).max(1e-9),
+            }
+        });
+        let points: Vec<Point> = points.collect();
+        if self.first.is_empty() {
+            self.first.clone_from(&points);
+        } else if let Some(power) = power(&self.last, &points) {
+            self.power = power;
+        }
+        self.last = points;
+        let slack = match error.upper_95 > 0.0 {
+            true => error.rmse / error.upper_95,
+            false => 1.0,
+        };
+        self.allowed = slack.powi(2) * error.touched_pixels as f64;
+    }
+
+    /// What reaching the 95% bound `target` costs in all, over what was spent so far. Below 1 for targets that earlier
+    /// rounds had reached, down to the first round's share.
+    pub fn cost_of(&self, target: f64) -> f64 {
+        let allowed = self.allowed * target * target;
+        let sum = |points: &[Point]| points.iter().map(|p| p.squared_error).sum::<f64>();
+        let mut points = match sum(&self.last) > allowed {
+            true => self.last.clone(),
+            false => self.first.clone(),
+        };
+        for _ in 0..ROUNDS {
+            if sum(&points) <= allowed || !self.play(&mut points, allowed) {
+                break;
+            }
+        }
+        let ratio = spent(&points) / spent(&self.last);
+        if ratio.is_finite() { ratio } else { 1.0 }
+    }
+
+    /// One round more; whether any job has grown.
+    fn play(&self, points: &mut [Point], allowed: f64) -> bool {
+        let root = |p: &Point| (p.squared_error * p.samples / p.cost).sqrt();
+        let scale = points.iter().map(|p| root(p) * p.cost).sum::<f64>() / allowed;
+        let mut grown = false;
+        for point in points {
+            let goal = f64::from(goal(root(point) * scale, point.samples as u32, self.limit));
+            if goal > point.samples {
+                point.squared_error *= (goal / point.samples).powf(-self.power);
+                point.samples = goal;
+                grown = true;
+            }
+        }
+        grown
+    }
+}
+
+/// The share of all work that the first round is guessed to be, before anything is known of the picture. Behind it, most
+/// pictures cost as the inverse of the error: the jobs that hold most of the error are few at first.
+pub(crate) fn first_share(target: f64) -> f64 {
+    (target / FIRST_ERROR).clamp(0.0, 1.0)
+}
+
+fn spent(points: &[Point]) -> f64 {
+    points.iter().map(|p| p.cost * p.samples).sum()
+}
+
+/// The power of the samples with which the squared error of the jobs that grew has fallen, found by bisection. None if
+/// they held little of it.
+fn power(before: &[Point], after: &[Point]) -> Option<f64> {
+    let grew = before.iter().zip(after);
+    let grew = grew.filter(|(b, a)| a.samples > b.samples);
+    let grew: Vec<_> = grew
+        .map(|(b, a)| (a.samples / b.samples, b.squared_error, a.squared_error))
+        .collect();
+    let held: f64 = grew.iter().map(|g| g.1).sum();
+    let all: f64 = before.iter().map(|p| p.squared_error).sum();
+    if held <= SHARE_TO_LEARN_FROM * all {
+        return None;
+    }
+    let left: f64 = grew.iter().map(|g| g.2).sum();
+    let [mut low, mut high] = POWERS;
+    for _ in 0..32 {
+        let middle = 0.5 * (low + high);
+        let expected: f64 = grew.iter().map(|g| g.1 * g.0.powf(-middle)).sum();
+        match expected > left {
+            true => low = middle,
+            false => high = middle,
+        }
+    }
+    Some(0.5 * (low + high))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn points(errors: &[f64], samples: f64) -> Vec<Point> {
+        let point = |&squared_error: &f64| Point {
+            squared_error,
+            samples,
+            cost: 1.0,
+        };
+        errors.iter().map(point).collect()
+    }
+
+    fn known(errors: &[f64], power: f64) -> Foresight {
+        Foresight {
+            first: points(errors, 8.0),
+            last: points(errors, 8.0),
+            power,
+            allowed: errors.len() as f64,
+            limit: 1 << 20,
+        }
+    }
+
+    #[test]
+    fn jobs_of_equal_error_cost_the_inverse_square_of_the_target() {
+        // Mean square 4: a target of 0.2 is a tenth of the error. 100 times 8 samples.
+        let even = known(&[4.0; 10], 1.0);
+        assert_eq!(even.cost_of(2.0), 1.0);
+        assert!(
+            (even.cost_of(0.2) - 100.0).abs() < 1.0,
+            "{}",
+            even.cost_of(0.2)
+        );
+        // As the error falls with the samples instead of their root, 10 times; the last round, which does not know,
+        // draws up to 4 times what is needed.
+        let smooth = known(&[4.0; 10], 2.0).cost_of(0.2);
+        assert!((10.0..=40.0).contains(&smooth), "{smooth}");
+    }
+
+    #[test]
+    fn error_in_few_jobs_is_cheap_to_lower() {
+        // One job in a hundred holds all: it alone grows, to 100 times its samples.
+        let mut errors = [0.0; 100];
+        errors[0] = 400.0;
+        let cost = known(&errors, 1.0).cost_of(0.2);
+        assert!((cost - 1.99).abs() < 0.05, "{cost}");
+        // A target that was passed already costs the first round at least.
+        let mut done = known(&errors, 1.0);
+        done.last = points(&[0.01; 100], 80.0);
+        assert!((done.cost_of(10.0) - 0.1).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_power_is_that_of_the_jobs_that_grew() {
+        let before = points(&[1.0, 3.0, 2.0], 8.0);
+        let mut after = before.clone();
+        for (point, growth) in after.iter_mut().zip([4.0f64, 2.0, 1.0]) {
+            point.samples *= growth;
+            point.squared_error *= growth.powf(-1.5);
+        }
+        assert!((power(&before, &after).unwrap() - 1.5).abs() < 1e-6);
+        after = before.clone();
+        after[0].samples = 16.0;
+        assert!(power(&before, &after).is_none(), "a sixth of the error");
+        assert_eq!(first_share(1.0), 1.0);
+    }
+}
