@@ -448,7 +448,8 @@ fn goals(jobs: &[Job], errors: &[SquaredError], scale: f64, limit: u32) -> Vec<u
 pub(crate) fn goal(best: f64, samples: u32, limit: u32) -> u32 {
     let wanted = best.min(f64::from(samples) * MAX_GROWTH).ceil() as u32;
     // Multiples of four keep the sequences stratified.
-    wanted.next_multiple_of(4).min(limit).max(samples)
+    let stratified = wanted.checked_next_multiple_of(4).unwrap_or(limit);
+    stratified.min(limit).max(samples)
 }
 
 fn fraction(

@@ -205,6 +205,14 @@ mod tests {
     }
 
     #[test]
+    fn a_target_out_of_reach_costs_as_many_samples_as_there_are() {
+        let mut even = known(&[4.0; 10], 1.0);
+        even.limit = u32::MAX;
+        let most = f64::from(u32::MAX) / 8.0;
+        assert!((even.cost_of(1e-9) / most - 1.0).abs() < 1e-9);
+    }
+
+    #[test]
     fn the_power_is_that_of_the_jobs_that_grew() {
         let before = points(&[1.0, 3.0, 2.0], 8.0);
         let mut after = before.clone();
