@@ -8,7 +8,7 @@ use std::sync::Arc;
 use candle_core::{DType, Tensor};
 use serde::{Deserialize, Serialize};
 
-use crate::error::Result;
+use crate::error::{Result, argument};
 use crate::lora::Lora;
 use crate::noise::NoiseStream;
 use crate::pass::Pass;
@@ -51,11 +51,19 @@ pub struct ValidationRow {
 
 impl Validation {
     /// Draws `count` examples of each kind, their timesteps spread evenly over those of the training. Call it before the
-    /// trainer's first update or the resumption of an earlier run.
-    pub fn new(trainer: &LoraTrainer, data: &dyn TrainingData, count: usize) -> Result<Self> {
-        let sets = (0..count)
-            .map(|i| Fixed::draw(trainer, data, i, count))
-            .collect::<Result<Vec<_>>>()?;
+    /// trainer's first update or the resumption of an earlier run. `watch` gets the share that is done, and ends the work
+    /// if it returns false.
+    pub fn new(
+        trainer: &LoraTrainer,
+        data: &dyn TrainingData,
+        count: usize,
+        mut watch: impl FnMut(f64) -> bool,
+    ) -> Result<Self> {
+        let mut sets = vec![];
+        for i in 0..count {
+            proceed(&mut watch, i, count)?;
+            sets.push(Fixed::draw(trainer, data, i, count)?);
+        }
         let mut validation = Self {
             start: ValidationRow {
                 step: 0,
@@ -65,7 +73,7 @@ impl Validation {
             },
             sets,
         };
-        validation.start = validation.row(0, |fixed| Ok(fixed.unadapted.clone()))?;
+        validation.start = validation.row(0, |_| true, |fixed| Ok(fixed.unadapted.clone()))?;
         Ok(validation)
     }
 
@@ -74,11 +82,15 @@ impl Validation {
         self.start
     }
 
-    /// The losses of the adapter as it is now.
-    pub fn evaluate(&self, trainer: &LoraTrainer) -> Result<ValidationRow> {
+    /// The losses of the adapter as it is now; `watch` as in [`Self::new`].
+    pub fn evaluate(
+        &self,
+        trainer: &LoraTrainer,
+        watch: impl FnMut(f64) -> bool,
+    ) -> Result<ValidationRow> {
         let lora = Arc::new(trainer.lora().detached());
         let learned = learned(trainer);
-        self.row(trainer.steps(), |fixed| {
+        self.row(trainer.steps(), watch, |fixed| {
             let (examples, t) = (&fixed.examples, fixed.timestep);
             predict(
                 trainer,
@@ -94,6 +106,7 @@ impl Validation {
     fn row(
         &self,
         step: usize,
+        mut watch: impl FnMut(f64) -> bool,
         predict: impl Fn(&Fixed) -> Result<Tensor>,
     ) -> Result<ValidationRow> {
         let mean_square = |t: Tensor| -> Result<f64> {
@@ -102,7 +115,8 @@ impl Validation {
         let share = 1.0 / self.sets.len().max(1) as f64;
         let mut losses = [0.0; 2];
         let (mut moved, mut size) = (0.0, 0.0);
-        for fixed in &self.sets {
+        for (index, fixed) in self.sets.iter().enumerate() {
+            proceed(&mut watch, index, self.sets.len())?;
             let output = predict(fixed)?;
             for i in 0..fixed.examples.len().min(2) {
                 losses[i] += mean_square((output.get(i)? - fixed.target.get(i)?)?)? * share;
@@ -116,6 +130,14 @@ impl Validation {
             prior_loss: losses[1],
             change: (moved / size.max(f64::MIN_POSITIVE)).sqrt(),
         })
+    }
+}
+
+/// Tells `watch` that `done` of `count` are done; an error if it ends the work.
+fn proceed(watch: &mut impl FnMut(f64) -> bool, done: usize, count: usize) -> Result<()> {
+    match watch(done as f64 / count as f64) {
+        true => Ok(()),
+        false => argument("validation was stopped"),
     }
 }
 

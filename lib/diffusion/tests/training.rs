@@ -282,27 +282,27 @@ fn the_loss_at_fixed_noise_falls_and_is_the_same_after_a_resumption() -> Outcome
     };
     let config = config();
     let mut trainer = LoraTrainer::new(&model, config.clone(), None)?;
-    let validation = Validation::new(&trainer, &data, 6)?;
+    let validation = Validation::new(&trainer, &data, 6, |_| true)?;
     let start = validation.start();
     assert_eq!((start.step, start.change), (0, 0.0));
     // A fresh adapter is the un-adapted model.
     assert_eq!(
-        validation.evaluate(&trainer)?.instance_loss,
+        validation.evaluate(&trainer, |_| true)?.instance_loss,
         start.instance_loss
     );
     for _ in 0..40 {
         trainer.step(&data)?;
     }
-    let end = validation.evaluate(&trainer)?;
+    let end = validation.evaluate(&trainer, |_| true)?;
     assert!(end.instance_loss < start.instance_loss, "{start:?} {end:?}");
     assert!(end.change > 0.0 && end.step == 40, "{end:?}");
     let folder = tempfile::tempdir()?;
     let path = folder.path().join("checkpoint.safetensors");
     trainer.save_checkpoint(&path)?;
     let mut resumed = LoraTrainer::new(&model, config, None)?;
-    let validation = Validation::new(&resumed, &data, 6)?;
+    let validation = Validation::new(&resumed, &data, 6, |_| true)?;
     resumed.resume(&path)?;
-    assert_eq!(validation.evaluate(&resumed)?, end);
+    assert_eq!(validation.evaluate(&resumed, |_| true)?, end);
     Ok(())
 }
 

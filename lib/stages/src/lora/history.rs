@@ -33,6 +33,13 @@ impl History {
         }
     }
 
+    /// Whether the fixed examples were looked at after so many updates.
+    pub(super) fn is_validated(&self, steps: usize) -> bool {
+        self.validation
+            .last()
+            .is_some_and(|last| last.step == steps)
+    }
+
     /// Before the first update and after the last.
     pub(super) fn ends(&self) -> Option<(ValidationRow, ValidationRow)> {
         Some((*self.validation.first()?, *self.validation.last()?))

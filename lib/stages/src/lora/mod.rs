@@ -223,7 +223,14 @@ fn train(
     let mut trainer = LoraTrainer::new(&model, training, start.as_ref())?;
     let resume = Resume::open(session, fingerprint)?;
     // Before anything is restored: it shows the un-adapted model.
-    let validation = Validation::new(&trainer, &data, VALIDATED)?;
+    let progress = session.progress("the model before its training");
+    let validation = Validation::new(&trainer, &data, VALIDATED, |share| {
+        progress.set(share);
+        !interrupt::asked()
+    });
+    progress.done();
+    interrupt::check()?;
+    let validation = validation?;
     let mut history = resume.restore(session, &mut trainer, table.steps);
     history.add(validation.start());
     let resumed_at = trainer.steps();
@@ -316,14 +323,38 @@ impl Course<'_> {
                 show(self.data.model, trainer, self.data, &path)?;
             }
             if every(table.validate_every) {
-                history.add(self.validation.evaluate(trainer)?);
+                self.validate(trainer, history, |_| ())?;
             }
             if every(table.checkpoint_every) {
                 self.resume.save(trainer, history)?;
             }
         }
-        history.add(self.validation.evaluate(trainer)?);
         progress.done();
+        let progress = self.session.progress("validation");
+        let seen = self.validate(trainer, history, |share| progress.set(share));
+        progress.done();
+        seen
+    }
+
+    /// Adds the losses of the fixed examples, unless they are known. Ctrl-C keeps the updates so far.
+    fn validate(
+        &self,
+        trainer: &LoraTrainer,
+        history: &mut History,
+        mut progress: impl FnMut(f64),
+    ) -> anyhow::Result<()> {
+        if history.is_validated(trainer.steps()) {
+            return Ok(());
+        }
+        let row = self.validation.evaluate(trainer, |share| {
+            progress(share);
+            !interrupt::asked()
+        });
+        if interrupt::asked() {
+            self.resume.save(trainer, history)?;
+            interrupt::check()?;
+        }
+        history.add(row?);
         Ok(())
     }
 }
