@@ -46,22 +46,41 @@ fn multiply_add(a: f32, b: f32, c: f32) -> f32 {
     }
 }
 
-/// Estrin's scheme: neighbouring terms in pairs, a chain of `log2 N` steps and not `N`.
+/// Estrin's scheme: neighbouring terms in pairs, a chain of `log2 N` steps and not `N`. Each size is
+/// written out: a loop over the terms, whose indices are checked where overflow is, keeps the compiler
+/// from evaluating eight polynomials at once.
 #[inline(always)]
-fn polynomial<const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
-    let mut terms = *coefficients;
-    let (mut count, mut power) = (N, x);
-    while count > 1 {
-        for k in 0..count / 2 {
-            terms[k] = multiply_add(terms[2 * k + 1], power, terms[2 * k]);
-        }
-        if count % 2 == 1 {
-            terms[count / 2] = terms[count - 1];
-        }
-        count = count.div_ceil(2);
-        power *= power;
-    }
-    terms[0]
+fn polynomial4(&[a, b, c, d]: &[f32; 4], x: f32) -> f32 {
+    let square = x * x;
+    multiply_add(multiply_add(d, x, c), square, multiply_add(b, x, a))
+}
+
+/// As [`polynomial4`].
+#[inline(always)]
+fn polynomial5(&[a, b, c, d, e]: &[f32; 5], x: f32) -> f32 {
+    let square = x * x;
+    let low = polynomial4(&[a, b, c, d], x);
+    multiply_add(e, square * square, low)
+}
+
+/// As [`polynomial4`].
+#[inline(always)]
+fn polynomial7(&[a, b, c, d, e, f, g]: &[f32; 7], x: f32) -> f32 {
+    let square = x * x;
+    let low = polynomial4(&[a, b, c, d], x);
+    let high = multiply_add(g, square, multiply_add(f, x, e));
+    multiply_add(high, square * square, low)
+}
+
+/// As [`polynomial4`].
+#[inline(always)]
+fn polynomial10(&[a, b, c, d, e, f, g, h, i, j]: &[f32; 10], x: f32) -> f32 {
+    let square = x * x;
+    let fourth = square * square;
+    let low = polynomial4(&[a, b, c, d], x);
+    let middle = polynomial4(&[e, f, g, h], x);
+    let high = multiply_add(j, x, i);
+    multiply_add(high, fourth * fourth, multiply_add(middle, fourth, low))
 }
 
 /// Angle of `(x, y)` in turns, in `[0, 1)`, counted from +x towards +y; 0 at the origin.
@@ -72,7 +91,7 @@ pub(crate) fn atan2_turns(y: f32, x: f32) -> f32 {
     let (long, short) = (ax.max(ay), ax.min(ay));
     // At the origin 0 / tiny is 0.
     let slope = short / long.max(f32::MIN_POSITIVE);
-    let turns = slope * polynomial(&ATAN_TURNS, slope * slope);
+    let turns = slope * polynomial10(&ATAN_TURNS, slope * slope);
     // Reflections, as a sign and an offset each: no jumps that random directions would miss.
     let (offset, sign) = if ay > ax { (0.25, -1.0) } else { (0.0, 1.0) };
     let turns = offset + sign * turns;
@@ -90,8 +109,8 @@ pub(crate) fn sin_cos_turns(turns: f32) -> (f32, f32) {
     let quarters = 4.0 * turns;
     let nearest = (quarters + 0.5).floor();
     let x = quarters - nearest;
-    let sin = x * polynomial(&SIN_QUARTER_TURNS, x * x);
-    let cos = polynomial(&COS_QUARTER_TURNS, x * x);
+    let sin = x * polynomial4(&SIN_QUARTER_TURNS, x * x);
+    let cos = polynomial5(&COS_QUARTER_TURNS, x * x);
     let quadrant = nearest as i32 as u32;
     let (s, c) = if quadrant & 1 == 0 {
         (sin, cos)
@@ -120,7 +139,7 @@ pub(crate) fn exp_nonpositive(x: f32) -> f32 {
     let shifted = scaled + ROUND;
     let whole = shifted - ROUND;
     let power = f32::from_bits(shifted.to_bits().wrapping_sub(BIAS) << 23);
-    let value = polynomial(&EXP2, scaled - whole) * power;
+    let value = polynomial7(&EXP2, scaled - whole) * power;
     if x < -87.0 { 0.0 } else { value }
 }
 
