@@ -94,7 +94,7 @@ impl InpaintCondition {
         let mask = hard.index_select(&rows, 2)?.index_select(&columns, 3)?;
         Ok(Self {
             mask,
-            masked_latents: vae.encode(&masked, None)?.detach(),
+            masked_latents: vae.encode(&masked)?.detach(),
         })
     }
 

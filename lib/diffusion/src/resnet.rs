@@ -78,16 +78,40 @@ impl ResnetBlock {
 
     /// x [batch, inputs, h, w], time [batch, size] after its SiLU.
     pub(crate) fn forward(&self, x: &Tensor, time: Option<&Tensor>) -> Result<Tensor> {
+        let h = self.first_half(x, time)?;
+        let h = self.conv2.forward(&self.norm2.forward(&h)?)?;
+        Ok(match &self.shortcut {
+            Some(shortcut) => (shortcut.forward(x)? + h)?,
+            None => (x + h)?,
+        })
+    }
+
+    /// The gradient at x, where that at the value is `g`; without a timestep. Of what [`ResnetBlock::forward`]
+    /// computes, only the input of the second norm is needed again.
+    pub(crate) fn gradient(&self, x: &Tensor, g: &Tensor) -> Result<Tensor> {
+        let h = self.first_half(x, None)?;
+        let at_h = {
+            let normed = self.conv2.input_gradient(h.shape(), g)?;
+            self.norm2.input_gradient(&h, &normed)?
+        };
+        drop(h);
+        let through = {
+            let normed = self.conv1.input_gradient(x.shape(), &at_h)?;
+            self.norm1.input_gradient(x, &normed)?
+        };
+        Ok(match &self.shortcut {
+            Some(shortcut) => (shortcut.input_gradient(x.shape(), g)? + through)?,
+            None => (g + through)?,
+        })
+    }
+
+    fn first_half(&self, x: &Tensor, time: Option<&Tensor>) -> Result<Tensor> {
         let mut h = self.conv1.forward(&self.norm1.forward(x)?)?;
         if let (Some(layer), Some(time)) = (&self.time, time) {
             let shift = layer.forward(time)?;
             let (batch, channels) = shift.dims2()?;
             h = h.broadcast_add(&shift.reshape((batch, channels, 1, 1))?)?;
         }
-        let h = self.conv2.forward(&self.norm2.forward(&h)?)?;
-        Ok(match &self.shortcut {
-            Some(shortcut) => (shortcut.forward(x)? + h)?,
-            None => (x + h)?,
-        })
+        Ok(h)
     }
 }

@@ -1,7 +1,7 @@
 //! Guidance by a diffusion model: what it would change about the composite, as a gradient.
 use std::sync::Arc;
 
-use candle_core::{DType, Tensor, Var};
+use candle_core::{DType, Tensor};
 use dipir_diffusion::distillation::{InpaintCondition, ScoreDistillation, ScoreRule, Weighting};
 use dipir_diffusion::lora::Lora;
 use dipir_diffusion::model::Model;
@@ -234,11 +234,12 @@ impl<'a> Distillation<'a> {
         // (docs/prior.md).
         let swapped = self.mirrored.as_ref().filter(|_| step.iteration % 2 == 1);
         let contrast = swapped.unwrap_or(&self.contrast);
-        let image = Var::from_tensor(&match swapped {
+        let image = match swapped {
             Some(_) => self.tensor(&mirror(picture))?,
             None => self.tensor(picture)?,
-        })?;
-        let latents = self.model.vae.encode(&image, None)?;
+        };
+        let encoding = self.model.vae.trace(&image)?;
+        let latents = encoding.latents();
         let condition = self.condition(view, swapped.is_some())?;
         let rule = match self.settings.guidance {
             GuidanceKind::Sds => ScoreRule::Sds {
@@ -277,7 +278,7 @@ impl<'a> Distillation<'a> {
             let noise = stream
                 .normal_tensor(latents.dims(), DType::F32, self.model.device())?
                 .to_dtype(self.model.dtype())?;
-            let found = distillation.gradient(&latents, t, &noise)?;
+            let found = distillation.gradient(latents, t, &noise)?;
             size += found.difference / draws as f64;
             mean_t += at / draws as f64;
             sum = Some(match sum {
@@ -287,12 +288,7 @@ impl<'a> Distillation<'a> {
         }
         let sum = sum.ok_or(Error::Cut("no noise was drawn"))?.detach();
         let scale = STRENGTH / (draws * latents.elem_count()) as f64;
-        // The gradient is injected at the latents and carried back to the picture.
-        let injected = (&latents * &sum)?.sum_all()?;
-        let gradients = injected.backward()?;
-        let at_image = gradients
-            .get(&image)
-            .ok_or(Error::Cut("the autoencoder has no gradient at its input"))?;
+        let at_image = encoding.gradient(&sum)?;
         let at_image = (at_image.to_dtype(DType::F32)? * (2.0 * scale))?;
         let gradient = dipir_tensors::picture(&at_image)?;
         Ok(Guided {

@@ -2,7 +2,7 @@
 
 mod times;
 
-use candle_core::{DType, Device, Tensor, Var};
+use candle_core::{DType, Device, Tensor};
 
 pub use times::{Times, TimesSettings, times};
 
@@ -163,19 +163,13 @@ fn unet(model: &Model, side: usize) -> Result<Tensor> {
 }
 
 fn encoder(model: &Model, side: usize) -> Result<Tensor> {
-    Ok(model.vae.encode(&image(model, side)?, None)?.detach())
+    Ok(model.vae.encode(&image(model, side)?)?.detach())
 }
 
 fn encoder_gradient(model: &Model, side: usize) -> Result<Tensor> {
-    let image = Var::from_tensor(&image(model, side)?)?;
-    let latents = model.vae.encode(&image, None)?;
-    let store = (&latents * normal(model, 5, latents.dims())?)?
-        .sum_all()?
-        .backward()?;
-    store
-        .get(&image)
-        .cloned()
-        .ok_or_else(|| Error::Argument("the autoencoder has no gradient at its input".into()))
+    let encoding = model.vae.trace(&image(model, side)?)?;
+    let at_latents = normal(model, 5, encoding.latents().dims())?;
+    encoding.gradient(&at_latents)
 }
 
 fn decoder(model: &Model, side: usize) -> Result<Tensor> {

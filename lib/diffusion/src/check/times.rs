@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use candle_core::{DType, Tensor, Var};
+use candle_core::{DType, Tensor};
 use serde::{Deserialize, Serialize};
 
 use super::{image, latents, normal, text};
@@ -75,7 +75,7 @@ pub fn times(
         size: side * model.vae.downscale(),
         text_s: time(&mut || wait(&text(model, side)?))?,
         unet_s: time(&mut || wait(&bench.predict(1)?))?,
-        encode_s: time(&mut || wait(&model.vae.encode(&bench.image, None)?))?,
+        encode_s: time(&mut || wait(&model.vae.encode(&bench.image)?))?,
         encode_with_gradient_s: time(&mut || bench.encode_with(|z| Ok(z.clone())))?,
         decode_s: time(&mut || wait(&model.vae.decode(&bench.latents)?))?,
         sampling_step_s: time(&mut || wait(&bench.predict(2)?))?,
@@ -158,16 +158,9 @@ impl<'a> Bench<'a> {
 
     /// Encodes the image and carries `at_latents` of its latents back to it.
     fn encode_with(&self, at_latents: impl FnOnce(&Tensor) -> Result<Tensor>) -> Result<()> {
-        let image = Var::from_tensor(&self.image)?;
-        let latents = self.model.vae.encode(&image, None)?;
-        let gradient = at_latents(&latents)?.detach();
-        let store = (&latents * gradient)?.sum_all()?.backward()?;
-        match store.get(&image) {
-            Some(gradient) => wait(gradient),
-            None => Err(Error::Argument(
-                "the autoencoder has no gradient at its input".into(),
-            )),
-        }
+        let encoding = self.model.vae.trace(&self.image)?;
+        let at_latents = at_latents(encoding.latents())?;
+        wait(&encoding.gradient(&at_latents)?)
     }
 
     fn guide(&self) -> Result<()> {
@@ -218,7 +211,7 @@ impl Crops<'_> {
 
 impl TrainingData for Crops<'_> {
     fn instance(&self, _: &mut NoiseStream) -> Result<Example> {
-        let latents = self.bench.model.vae.encode(&self.bench.image, None)?;
+        let latents = self.bench.model.vae.encode(&self.bench.image)?;
         Ok(self.example(latents.detach()))
     }
 

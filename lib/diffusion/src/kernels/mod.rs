@@ -19,9 +19,10 @@ use std::sync::{Mutex, PoisonError};
 /// Buffers that kernels left behind: fresh pages cost as much time as the
 /// arithmetic on them.
 static POOL: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
-/// Buffers that are kept, and the floats of the largest one (256 MiB).
+/// Buffers that are kept, their floats in all (512 MiB) and those of the largest.
 const POOL_BUFFERS: usize = 6;
-const POOL_FLOATS: usize = 64 << 20;
+const POOL_FLOATS: usize = 128 << 20;
+const BUFFER_FLOATS: usize = 64 << 20;
 
 /// Runs `f` on a buffer of `len` floats of unspecified content.
 pub(crate) fn with_scratch<R>(len: usize, f: impl FnOnce(&mut [f32]) -> R) -> R {
@@ -38,10 +39,10 @@ pub(crate) fn with_scratch<R>(len: usize, f: impl FnOnce(&mut [f32]) -> R) -> R 
         buffer = vec![0.0; len];
     }
     let result = f(&mut buffer[..len]);
-    if buffer.len() <= POOL_FLOATS {
+    if buffer.len() <= BUFFER_FLOATS {
         let mut pool = pool();
         pool.push(buffer);
-        if pool.len() > POOL_BUFFERS {
+        while pool.len() > POOL_BUFFERS || pool.iter().map(Vec::len).sum::<usize>() > POOL_FLOATS {
             let smallest = (0..pool.len()).min_by_key(|&i| pool[i].len()).unwrap_or(0);
             pool.swap_remove(smallest);
         }

@@ -8,6 +8,7 @@ use crate::error::{Result, argument};
 use crate::kernels::conv::{self, ConvShape};
 use crate::kernels::tensor::{floats, from_floats, read, store};
 use crate::parameters::{Init, Parameters};
+use crate::recompute::gradient_through;
 
 /// Zeros around the input of a convolution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,22 +79,34 @@ impl Conv2d {
     /// Applies the layer.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
+        let op = self.op();
+        if has_kernels(&x) {
+            return Ok(x.apply_op3(&self.weight, &self.bias, op)?);
+        }
+        self.forward_composed(&x, op.before, op.after)
+    }
+
+    /// The gradient at an input of shape `x`, where that at the value is `g`. It does not depend on the input's values.
+    pub(crate) fn input_gradient(&self, x: &Shape, g: &Tensor) -> Result<Tensor> {
+        if has_kernels(g) {
+            let (shape, g) = (self.op().shape(x, self.weight.shape())?, g.contiguous()?);
+            let dx = conv::conv2d_vjp_input(shape, &read(&g)?, &read(&self.weight)?);
+            return Ok(from_floats(dx, x, g.dtype())?);
+        }
+        let nothing = Tensor::zeros(x, g.dtype(), g.device())?;
+        gradient_through(|x| self.forward(x), nothing, g)
+    }
+
+    fn op(&self) -> ConvOp {
         let (before, after) = match self.padding {
             Padding::Same(n) => (n, n),
             Padding::After(n) => (0, n),
         };
-        if has_kernels(&x) {
-            return Ok(x.apply_op3(
-                &self.weight,
-                &self.bias,
-                ConvOp {
-                    stride: self.stride,
-                    before,
-                    after,
-                },
-            )?);
+        ConvOp {
+            stride: self.stride,
+            before,
+            after,
         }
-        self.forward_composed(&x, before, after)
     }
 
     /// [`Conv2d::forward`] of candle's operations, for other devices.

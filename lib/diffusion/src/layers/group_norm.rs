@@ -8,6 +8,7 @@ use crate::error::{Result, argument};
 use crate::kernels::norm::{self, GroupShape};
 use crate::kernels::tensor::{floats, from_floats, read, store};
 use crate::parameters::{Init, Parameters};
+use crate::recompute::gradient_through;
 
 /// What follows the normalisation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,15 +60,29 @@ impl GroupNorm {
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
         if has_kernels(&x) {
-            let silu = self.activation == NormActivation::Silu;
-            let op = GroupNormOp {
-                groups: self.groups,
-                eps: self.eps as f32,
-                silu,
-            };
-            return Ok(x.apply_op3(&self.gamma, &self.beta, op)?);
+            return Ok(x.apply_op3(&self.gamma, &self.beta, self.op())?);
         }
         self.forward_composed(&x)
+    }
+
+    /// The gradient at `x`, where that at the value is `g`.
+    pub(crate) fn input_gradient(&self, x: &Tensor, g: &Tensor) -> Result<Tensor> {
+        if !has_kernels(x) {
+            return gradient_through(|x| self.forward(x), x.clone(), g);
+        }
+        let (x, g) = (x.contiguous()?, g.contiguous()?);
+        let shape = self.op().shape(x.shape(), self.gamma.shape())?;
+        let (gamma, beta) = (read(&self.gamma)?, read(&self.beta)?);
+        let (dx, _, _) = norm::group_norm_vjp(shape, &read(&x)?, &gamma, &beta, &read(&g)?);
+        Ok(from_floats(dx, x.shape(), x.dtype())?)
+    }
+
+    fn op(&self) -> GroupNormOp {
+        GroupNormOp {
+            groups: self.groups,
+            eps: self.eps as f32,
+            silu: self.activation == NormActivation::Silu,
+        }
     }
 
     /// [`GroupNorm::forward`] of candle's operations, for other devices.

@@ -1,7 +1,5 @@
 //! Encoder and decoder of the autoencoder.
 
-use std::sync::Arc;
-
 use candle_core::Tensor;
 
 use super::config::AutoencoderConfig;
@@ -10,7 +8,7 @@ use crate::layers::{
     Attention, Causality, Conv2d, GroupNorm, Linear, NormActivation, Padding, upsample_nearest,
 };
 use crate::parameters::Parameters;
-use crate::recompute::Recompute;
+use crate::recompute::gradient_through;
 use crate::resnet::{ResnetBlock, ResnetShape};
 
 /// Added to variances.
@@ -114,20 +112,21 @@ impl Unit {
             Self::Out(norm, conv) => conv.forward(&norm.forward(x)?),
         }
     }
+
+    /// The gradient at x, where that at the value is `g`.
+    fn gradient(&self, x: Tensor, g: &Tensor) -> Result<Tensor> {
+        match self {
+            Self::Resnet(block) => block.gradient(&x, g),
+            Self::Conv(conv) => conv.input_gradient(x.shape(), g),
+            unit => gradient_through(|x| unit.forward(x), x, g),
+        }
+    }
 }
 
-fn run(units: &[Arc<Unit>], x: &Tensor, recompute: Option<&Recompute>) -> Result<Tensor> {
+fn run(units: &[Unit], x: &Tensor) -> Result<Tensor> {
     let mut x = x.clone();
     for unit in units {
-        x = match recompute {
-            Some(recompute) => {
-                let unit = unit.clone();
-                // The second input is for text; there is none here.
-                let nothing = Tensor::zeros(1, x.dtype(), x.device())?;
-                recompute.run(&x, &nothing, move |x, _| unit.forward(x))?
-            }
-            None => unit.forward(&x)?,
-        };
+        x = unit.forward(&x)?;
     }
     Ok(x)
 }
@@ -136,12 +135,12 @@ fn run(units: &[Arc<Unit>], x: &Tensor, recompute: Option<&Recompute>) -> Result
 struct Builder<'a> {
     parameters: &'a Parameters,
     config: &'a AutoencoderConfig,
-    units: Vec<Arc<Unit>>,
+    units: Vec<Unit>,
 }
 
 impl Builder<'_> {
     fn push(&mut self, unit: Unit) {
-        self.units.push(Arc::new(unit));
+        self.units.push(unit);
     }
 
     fn conv(
@@ -199,7 +198,7 @@ impl Builder<'_> {
 
 #[derive(Debug)]
 pub(super) struct Encoder {
-    units: Vec<Arc<Unit>>,
+    units: Vec<Unit>,
 }
 
 impl Encoder {
@@ -234,14 +233,34 @@ impl Encoder {
         Ok(Self { units: b.units })
     }
 
-    pub(super) fn forward(&self, x: &Tensor, recompute: Option<&Recompute>) -> Result<Tensor> {
-        run(&self.units, x, recompute)
+    pub(super) fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        run(&self.units, x)
+    }
+
+    /// The input of every unit, and the value.
+    pub(super) fn trace(&self, x: &Tensor) -> Result<(Vec<Tensor>, Tensor)> {
+        let mut x = x.detach();
+        let mut inputs = vec![];
+        for unit in &self.units {
+            let value = unit.forward(&x)?;
+            inputs.push(std::mem::replace(&mut x, value));
+        }
+        Ok((inputs, x))
+    }
+
+    /// The gradient at the first of `inputs`, where that at the value is `g`.
+    pub(super) fn gradient(&self, mut inputs: Vec<Tensor>, mut g: Tensor) -> Result<Tensor> {
+        for unit in self.units.iter().rev() {
+            let Some(x) = inputs.pop() else { break };
+            g = unit.gradient(x, &g)?;
+        }
+        Ok(g)
     }
 }
 
 #[derive(Debug)]
 pub(super) struct Decoder {
-    units: Vec<Arc<Unit>>,
+    units: Vec<Unit>,
 }
 
 impl Decoder {
@@ -277,6 +296,6 @@ impl Decoder {
     }
 
     pub(super) fn forward(&self, z: &Tensor) -> Result<Tensor> {
-        run(&self.units, z, None)
+        run(&self.units, z)
     }
 }

@@ -18,7 +18,7 @@ use crate::config::ConfigFile;
 use crate::error::Result;
 use crate::layers::{Conv2d, Padding};
 use crate::parameters::Parameters;
-use crate::recompute::Recompute;
+use crate::recompute::gradient_through;
 use crate::weights::Weights;
 
 /// Bounds of the encoder's log variance, as in training.
@@ -86,11 +86,15 @@ impl AutoencoderKl {
     }
 
     /// Encodes images [batch, 3, h, w] in [-1, 1].
-    pub fn encode(&self, image: &Tensor, recompute: Option<&Recompute>) -> Result<Moments> {
-        let mut h = self.encoder.forward(image, recompute)?;
-        if let Some(quantize) = &self.quantize {
-            h = quantize.forward(&h)?;
-        }
+    pub fn encode(&self, image: &Tensor) -> Result<Moments> {
+        self.moments(&self.encoder.forward(image)?)
+    }
+
+    fn moments(&self, h: &Tensor) -> Result<Moments> {
+        let h = match &self.quantize {
+            Some(quantize) => &quantize.forward(h)?,
+            None => h,
+        };
         let parts = h.chunk(2, 1)?;
         let log_variance = parts[1].clamp(LOG_VARIANCE.0, LOG_VARIANCE.1)?;
         Ok(Moments {
@@ -190,16 +194,39 @@ impl Vae {
         }
     }
 
+    /// [`Vae::encode`] that can carry a gradient back to the image.
+    pub fn trace(&self, image: &Tensor) -> Result<Encoding<'_>> {
+        let (inputs, last) = match self {
+            Self::Kl(vae) => vae.encoder.trace(image)?,
+            Self::PixelUnshuffle { .. } => (vec![], image.detach()),
+        };
+        let latents = self.latents_of(&last)?;
+        Ok(Encoding {
+            vae: self,
+            inputs,
+            last,
+            latents,
+        })
+    }
+
     /// Scaled latents of images [batch, 3, h, w] in [-1, 1]: the mean of the
     /// encoder's distribution. Differentiable in the image.
-    pub fn encode(&self, image: &Tensor, recompute: Option<&Recompute>) -> Result<Tensor> {
+    pub fn encode(&self, image: &Tensor) -> Result<Tensor> {
         match self {
-            Self::Kl(vae) => Ok((vae.encode(image, recompute)?.mean * vae.config.scaling_factor)?),
+            Self::Kl(vae) => self.latents_of(&vae.encoder.forward(image)?),
+            Self::PixelUnshuffle { .. } => self.latents_of(image),
+        }
+    }
+
+    /// Of the encoder's last values, or of the image where there is no encoder.
+    fn latents_of(&self, last: &Tensor) -> Result<Tensor> {
+        match self {
+            Self::Kl(vae) => Ok((vae.moments(last)?.mean * vae.config.scaling_factor)?),
             Self::PixelUnshuffle {
                 factor,
                 scaling_factor,
                 ..
-            } => Ok((pixel_unshuffle(image, *factor)? * *scaling_factor)?),
+            } => Ok((pixel_unshuffle(last, *factor)? * *scaling_factor)?),
         }
     }
 
@@ -212,6 +239,33 @@ impl Vae {
                 scaling_factor,
                 ..
             } => pixel_shuffle(&(latents / *scaling_factor)?, *factor),
+        }
+    }
+}
+
+/// Latents of an image, with what their gradient at the image takes: the input of every unit of the encoder. All
+/// inner values would take 5 GiB at 768 pixels; they are computed again.
+#[derive(Debug)]
+pub struct Encoding<'a> {
+    vae: &'a Vae,
+    inputs: Vec<Tensor>,
+    last: Tensor,
+    latents: Tensor,
+}
+
+impl Encoding<'_> {
+    /// As [`Vae::encode`] gives them.
+    pub fn latents(&self) -> &Tensor {
+        &self.latents
+    }
+
+    /// The gradient at the image, where that at the latents is `at_latents`, of their shape.
+    pub fn gradient(self, at_latents: &Tensor) -> Result<Tensor> {
+        let vae = self.vae;
+        let g = gradient_through(|last| vae.latents_of(last), self.last, at_latents)?;
+        match vae {
+            Vae::Kl(vae) => vae.encoder.gradient(self.inputs, g),
+            Vae::PixelUnshuffle { .. } => Ok(g),
         }
     }
 }

@@ -30,7 +30,7 @@ fn pixel_unshuffle_is_exact_both_ways() -> Outcome {
     let vae = Vae::load(folder.path(), DType::F32, &Device::Cpu)?;
     assert_eq!((vae.downscale(), vae.latent_channels()), (2, 12));
     let image = Tensor::arange(0f32, 96.0, &Device::Cpu)?.reshape((2, 3, 4, 4))?;
-    let latents = vae.encode(&image, None)?;
+    let latents = vae.encode(&image)?;
     assert_eq!(latents.dims(), [2, 12, 2, 2]);
     // Channel 0 is the top left pixel of each block, channel 1 the one right of it.
     assert_eq!(
@@ -42,7 +42,7 @@ fn pixel_unshuffle_is_exact_both_ways() -> Outcome {
         image.flatten_all()?.to_vec1::<f32>()?
     );
     let message = vae
-        .encode(&image.narrow(3, 0, 3)?, None)
+        .encode(&image.narrow(3, 0, 3)?)
         .expect_err("odd width")
         .to_string();
     assert!(message.contains("3x4"), "{message}");

@@ -65,7 +65,7 @@ impl TrainingData for Data<'_> {
         let image = self.place(&resample(&self.photo, region, self.size)?)?;
         let inpaint = self.mask(&image, stream)?;
         Ok(Example {
-            latents: self.model.vae.encode(&image, None)?.detach(),
+            latents: self.model.vae.encode(&image)?.detach(),
             prompt: self.prompt.clone(),
             inpaint,
         })
