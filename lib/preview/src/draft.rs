@@ -94,6 +94,7 @@ fn render<L: SceneLight>(
         transfer: loaded.photo.transfer,
         occluders: loaded.occluders.as_ref(),
         highlights: false,
+        denoise: true,
         ..Settings::default()
     };
     let everything = EffectsPlan::everything(&loaded.scene, &settings).simulation();

@@ -38,7 +38,7 @@ fn main() {
     let size = value("size", if whole { 48.0 } else { 12.0 }) as u32;
     let target = value("target", if whole { 0.008 } else { 0.03 }) as f32;
     let samples = value("samples", 0.0) as u32;
-    let highlights = value("highlights", 1.0) > 0.0;
+    let [highlights, denoise] = ["highlights", "denoise"].map(|key| value(key, 1.0) > 0.0);
     let stop = match samples {
         0 => Stop::TargetError(target),
         n => Stop::Samples(n),
@@ -65,12 +65,18 @@ fn main() {
             &renderer,
             &light,
             &simulation,
-            (Stop::TargetError(target / 10.0), true),
+            (Stop::TargetError(target / 10.0), true, false),
             1 << 40,
         );
         let (mut stated, mut bounds, mut squares, mut within) = (vec![], vec![], 0.0, 0);
         for seed in 0..SEEDS {
-            let found = render(&renderer, &light, &simulation, (stop, highlights), seed);
+            let found = render(
+                &renderer,
+                &light,
+                &simulation,
+                (stop, highlights, denoise),
+                seed,
+            );
             let square = squared_difference(&found.film, &reference.film)
                 - reference.error.rmse * reference.error.rmse;
             squares += square.max(0.0) / SEEDS as f64;
@@ -114,7 +120,7 @@ fn render(
     renderer: &Renderer,
     light: &dipir_light::environment::EnvironmentSampler,
     simulation: &Simulation,
-    (stop, highlights): (Stop, bool),
+    (stop, highlights, denoise): (Stop, bool, bool),
     seed: u64,
 ) -> Rendered {
     let settings = Settings {
@@ -122,6 +128,7 @@ fn render(
         stop,
         max_samples: 1 << 20,
         highlights,
+        denoise,
         ..Settings::default()
     };
     let go_on = &mut |_: &_| ControlFlow::Continue(());
@@ -139,7 +146,7 @@ fn spent(
 ) -> f64 {
     let clock = Instant::now();
     let stop = Stop::TimeBudget(Duration::from_secs_f64(seconds));
-    render(renderer, light, simulation, (stop, true), 0);
+    render(renderer, light, simulation, (stop, true, true), 0);
     clock.elapsed().as_secs_f64() / seconds
 }
 

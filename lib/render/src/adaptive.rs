@@ -17,6 +17,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::counters::RayCounts;
+use crate::denoise;
 use crate::error::RenderError;
 use crate::film::{Film, SquaredError, Viewing};
 use crate::foresight::{Foresight, first_share};
@@ -110,9 +111,10 @@ const FIRST_ROUND_WITH_HIGHLIGHT: u32 = 1024;
 
 /// Draws samples until `stop`. `advance(job, n)` brings a job to `n` samples per pixel and
 /// replicate; `find_highlights(film, jobs)` says once, after the first round, which pixels of the object start
-/// again with another density of samples; `progress` may break off whenever it is called. A time budget counts
-/// from `start`; where it ends within the first round, the pixels that have no samples yet are taken from `coarse`,
-/// the same picture at a lower resolution. Without one, the first round is always finished.
+/// again with another density of samples; with `denoise` shadows are filtered after every round; `progress` may break
+/// off whenever it is called. A time budget counts from `start`; where it ends within the first round, the pixels that
+/// have no samples yet are taken from `coarse`, the same picture at a lower resolution. Without one, the first round is
+/// always finished.
 pub fn refine(
     size: (usize, usize),
     mut jobs: Vec<Job>,
@@ -122,6 +124,7 @@ pub fn refine(
     viewing: &Viewing,
     advance: &(impl Fn(&mut Job, u32) + Sync),
     find_highlights: &dyn Fn(&Film, &[Job]) -> Found,
+    denoise: bool,
     coarse: Option<&Film>,
     progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
 ) -> Result<Refined, RenderError> {
@@ -175,9 +178,14 @@ pub fn refine(
             let begun = start_again(&mut jobs, found, goal, advance);
             film.develop(&jobs[begun..]);
         }
+        let denoised = match denoise {
+            true => denoise::shadows(&mut film, &jobs, viewing),
+            false => vec![None; jobs.len()],
+        };
         let errors: Vec<SquaredError> = jobs
             .par_iter()
-            .map(|job| viewing.squared_error(&film, job))
+            .zip(denoised)
+            .map(|(job, error)| error.unwrap_or_else(|| viewing.squared_error(&film, job)))
             .collect();
         let error = total_error(&errors, &film, viewing);
         let cost: f64 = jobs.iter().map(Job::cost).sum();

@@ -148,6 +148,28 @@ impl Film {
         }
     }
 
+    /// Replaces shadow ratios and their variances.
+    pub(crate) fn set_shadow(&mut self, pixels: impl Iterator<Item = ((u32, u32), (Vec3, Vec3))>) {
+        for ((x, y), (shadow, variance)) in pixels {
+            let (x, y) = (x as usize, y as usize);
+            *self.shadow.get_mut(x, y) = shadow;
+            self.shadow_variance.set(x, y, variance);
+        }
+    }
+
+    /// Raises the variances of shadow ratios to `least`.
+    pub(crate) fn raise_shadow_variance(
+        &mut self,
+        pixels: impl Iterator<Item = (u32, u32)>,
+        least: f32,
+    ) {
+        for (x, y) in pixels {
+            let (x, y) = (x as usize, y as usize);
+            let variance = self.shadow_variance(x, y).max(Vec3::splat(least));
+            self.shadow_variance.set(x, y, variance);
+        }
+    }
+
     /// Takes the pixels of the jobs that have no samples from `coarse`, the same picture at a lower
     /// resolution.
     pub fn fill_in(&mut self, jobs: &[Job], coarse: &Film) {
@@ -302,6 +324,22 @@ impl Viewing<'_> {
             }
         }
         total
+    }
+
+    /// Squared display-referred error for a squared error of the shadow ratio, of which `variance` is the size.
+    pub(crate) fn weight_of_shadow(&self, film: &Film, x: usize, y: usize, variance: Vec3) -> Vec3 {
+        let (object, alpha) = (*film.object.get(x, y), *film.alpha.get(x, y));
+        let background = self.background(x, y);
+        let mean = composite_pixel(background, object, alpha, *film.shadow.get(x, y));
+        let slope = |c: usize| {
+            let per_ratio = background[c] * (1.0 - alpha);
+            let weight = per_ratio * self.slope(mean[c], per_ratio * variance[c].sqrt()) as f32;
+            match weight.is_finite() {
+                true => weight * weight,
+                false => 0.0,
+            }
+        };
+        Vec3::new(slope(0), slope(1), slope(2))
     }
 
     /// Mean slope of the transfer curve within one standard error: clipped values cannot be wrong.

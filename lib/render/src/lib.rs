@@ -5,6 +5,7 @@ pub mod bsdf;
 mod coarse;
 pub mod convexity;
 pub mod counters;
+mod denoise;
 pub mod effects;
 pub mod error;
 pub mod features;

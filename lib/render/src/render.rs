@@ -66,6 +66,8 @@ pub struct Settings<'a> {
     pub shadow_tolerance: f32,
     /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
     pub highlights: bool,
+    /// Whether shadows are [denoised](crate::denoise).
+    pub denoise: bool,
 }
 
 impl Default for Settings<'_> {
@@ -80,6 +82,7 @@ impl Default for Settings<'_> {
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
             highlights: true,
+            denoise: false,
         }
     }
 }
@@ -297,6 +300,7 @@ impl<'a> Renderer<'a> {
             &viewing,
             advance,
             &find_highlights,
+            settings.denoise,
             coarse,
             progress,
         )?;

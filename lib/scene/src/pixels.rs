@@ -76,7 +76,11 @@ impl Pixels {
     /// The pixels of the undistorted photograph that show what these show of a photograph whose
     /// distortion `undistortion` undoes; `key` names the object's table in messages.
     pub fn undistorted(&self, undistortion: &Undistortion, key: &str) -> Result<Self, Error> {
+        let size = DVec2::from_array(undistortion.lens().size);
         let moved = |pixel: Option<Vec2>, name: &str| {
+            if let Some(pixel) = pixel {
+                within(pixel, size.as_vec2(), &format!("{key}.{name}"))?;
+            }
             let moved = pixel.map(|p| undistortion.to_working(p.as_dvec2()).ok_or(p));
             moved.transpose().map_err(|p| Error::Config {
                 key: format!("{key}.{name}"),
@@ -100,11 +104,15 @@ impl Pixels {
         key: &str,
     ) -> Result<Placement, Error> {
         let mut placed = *placement;
+        let size = Vec2::from(camera.resolution.map(|n| n as f32));
         if let Some(at) = self.at {
-            placed.position = seen(camera, proxy, at, &format!("{key}.at_pixel"))?.as_vec3();
+            let key = format!("{key}.at_pixel");
+            within(at, size, &key)?;
+            placed.position = seen(camera, proxy, at, &key)?.as_vec3();
         }
         if let Some(to) = self.to {
             let key = format!("{key}.to_pixel");
+            within(to, size, &key)?;
             let target = seen(camera, proxy, to, &key)?;
             let up = match proxy {
                 Proxy::Plane(plane) => plane.normal.as_dvec3(),
@@ -123,6 +131,21 @@ impl Pixels {
             placed.yaw_rad = ahead.x.atan2(ahead.z) as f32;
         }
         Ok(placed)
+    }
+}
+
+/// Refuses pixels outside of a picture of `size` pixels.
+fn within(pixel: Vec2, size: Vec2, key: &str) -> Result<(), Error> {
+    match pixel.cmpge(Vec2::ZERO).all() && pixel.cmple(size).all() {
+        true => Ok(()),
+        false => Err(Error::Config {
+            key: key.into(),
+            value: shown(pixel),
+            accepted: format!(
+                "a pixel of the photograph, [0, 0] to {}; `position` also places what is outside of it",
+                shown(size)
+            ),
+        }),
     }
 }
 
@@ -241,6 +264,21 @@ mod tests {
                 format!(
                     "scene.objects[0].at_pixel is [2000.0, {y:?}], where no ground is seen; accepted: \
                      a pixel below the horizon, which is at row 1500.0 in this column"
+                )
+            );
+        }
+    }
+
+    #[test]
+    fn a_pixel_outside_of_the_photograph_is_refused() {
+        let camera = camera(Vec3::new(0.3, 1.6, -3.0));
+        for (x, y) in [(2000.0, 3001.0), (-1.0, 2000.0), (4000.5, 2000.0)] {
+            let error = place(&camera, &Proxy::Plane(GROUND), at(x, y)).unwrap_err();
+            assert_eq!(
+                error,
+                format!(
+                    "scene.objects[0].at_pixel is [{x:?}, {y:?}]; accepted: a pixel of the photograph, \
+                     [0, 0] to [4000.0, 3000.0]; `position` also places what is outside of it"
                 )
             );
         }

@@ -361,3 +361,79 @@ fn a_white_sheet_a_thousand_kilometres_out_stays_white() {
         assert!(colour.abs_diff_eq(Vec3::ONE, 1e-5), "{colour}");
     }
 }
+
+/// Mean square error of the shadow ratio, and what is stated of it. Ground that `reference` leaves alone stays as it is.
+fn shadow_errors(rendered: &Rendered, reference: &Rendered) -> [f64; 2] {
+    let film = &rendered.film;
+    let [width, height] = [film.shadow.width(), film.shadow.height()];
+    let mut sums = [0.0; 2];
+    for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
+        let (ratio, truth) = (*film.shadow.get(x, y), *reference.film.shadow.get(x, y));
+        assert!(truth != Vec3::ONE || (ratio - truth).length() < 0.02);
+        sums[0] += f64::from((ratio - truth).length_squared());
+        sums[1] += f64::from(film.shadow_variance(x, y).element_sum());
+    }
+    sums.map(|sum| sum / (3 * width * height) as f64)
+}
+
+#[test]
+fn denoised_shadows_have_a_smaller_error_and_it_is_measured() {
+    let scene = knot_scene(48);
+    // Of the lobe that casts the shadow, samples, and most of the squared error that may be left.
+    for (sigma, samples, most) in [
+        (0.3, 4, 0.15),
+        (0.13, 4, 0.2),
+        (0.13, 16, 0.6),
+        (0.05, 16, 0.8),
+        (0.05, 64, 1.0),
+    ] {
+        let lobe = SphericalGaussian {
+            direction: Vec3::new(0.5, 0.8, 0.4).normalize(),
+            radiance: Vec3::splat(0.1 / (sigma * sigma)),
+            sigma,
+        };
+        let light = EnvironmentSampler::new(rasterize(&[lobe], 128, 64));
+        let with = |samples, seed, denoise| {
+            let settings = Settings {
+                denoise,
+                ..settings(samples, seed)
+            };
+            render(&scene, &light, &lambertian(2), &settings)
+        };
+        let reference = with(1024, 1, false);
+        let [drawn, _] = shadow_errors(&with(samples, 2, false), &reference);
+        let [left, stated] = shadow_errors(&with(samples, 2, true), &reference);
+        eprintln!(
+            "{sigma} {samples} {} stated {}",
+            left / drawn,
+            stated / left
+        );
+        assert!(left < most * drawn, "{left} of {drawn}");
+        // A pixel's own spread counts where it is larger than what its neighbours measure.
+        assert!((0.8..2.6).contains(&(stated / left)), "{stated} for {left}");
+    }
+}
+
+#[test]
+fn denoised_shadows_have_the_same_bytes_for_any_number_of_threads() {
+    let scene = knot_scene(48);
+    let lobe = SphericalGaussian {
+        direction: Vec3::Y,
+        radiance: Vec3::ONE,
+        sigma: 0.3,
+    };
+    let light = EnvironmentSampler::new(rasterize(&[lobe], 64, 32));
+    let settings = Settings {
+        denoise: true,
+        ..settings(4, 1)
+    };
+    let [one, three] = [1, 3].map(|threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        pool.expect("threads").install(|| {
+            render(&scene, &light, &lambertian(2), &settings)
+                .film
+                .shadow
+        })
+    });
+    assert_eq!(one.pixels(), three.pixels());
+}

@@ -223,6 +223,7 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
         "light": known.as_ref().map_or_else(|| light_folder::recovered_params(table), |k| k.0.clone()),
         "tone": table.tone,
         "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
+        "denoise": table.denoise(session.pipeline.quality),
         "stop": match table.stop(session.pipeline.quality) {
             Stop::Samples(n) => json!({"samples": n}),
             Stop::TargetError(e) => json!({"target_error": e}),
@@ -280,6 +281,7 @@ fn render_under<L: SceneLight>(
         background: Some(&photo.image),
         transfer: photo.transfer,
         occluders: loaded.occluders.as_ref(),
+        denoise: table.denoise(session.pipeline.quality),
         ..Settings::default()
     };
     let renderer = Renderer::new(&loaded.scene);

@@ -31,6 +31,9 @@ pub struct CompositeTable {
     /// Most samples in any pixel.
     #[schemars(range(min = 1), extend("default" = MAX_SAMPLES), example = 1024)]
     pub max_samples: Option<u32>,
+    /// Whether noise is removed from shadows. What that does to the error is measured and stated.
+    #[schemars(extend("x-default" = "true; false for the preset `high`"), example = false)]
+    pub denoise: Option<bool>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
     /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
     #[schemars(extend("x-default" = "the recovered curves with the recovered light, `none` with a map"), example = &"reinhard")]
@@ -100,6 +103,10 @@ impl CompositeTable {
             return wrong("rotation_deg", "must be a finite angle in degrees".into());
         }
         Ok(())
+    }
+
+    pub(super) fn denoise(&self, quality: Quality) -> bool {
+        self.denoise.unwrap_or(quality != Quality::High)
     }
 
     pub(super) fn stop(&self, quality: Quality) -> Stop {
