@@ -229,3 +229,17 @@ fn a_reader_that_goes_away_is_no_error() {
         String::from_utf8_lossy(&output.stderr)
     );
 }
+
+#[cfg(unix)]
+#[test]
+fn a_pipe_or_a_device_is_refused_and_not_waited_for() {
+    for path in ["pipe", "/dev/null"] {
+        let project = Project::new();
+        let made = project.command("mkfifo", &["pipe"]).status().unwrap();
+        assert!(made.success());
+        project.run(INSPECT, &[path]).expect_error(
+            1,
+            &format!("error: {path} is a pipe or a device; name a file or a folder"),
+        );
+    }
+}

@@ -41,6 +41,12 @@ pub fn inspect(path: &Path, view: &ViewArgs) -> anyhow::Result<Report> {
         view.refuse("a folder")?;
         return folder::inspect(path);
     }
+    if !metadata.is_file() {
+        bail!(
+            "{} is a pipe or a device; name a file or a folder",
+            path.display()
+        );
+    }
     let kind = kind_of(path, metadata.len())?;
     match kind {
         Kind::Png | Kind::Jpeg | Kind::Hdr | Kind::Exr => picture::inspect(path, kind, view),
