@@ -1,6 +1,7 @@
-//! Pictures at a lower resolution, for time budgets in which not every pixel can be sampled.
+//! Pictures at a lower resolution, for drafts of large frames and for time budgets in which not every pixel can be
+//! sampled.
 //!
-//! A first picture of at most [`FIRST_PIXELS`] pixels measures how long a pixel takes. The picture
+//! Under a time budget, a first picture of at most [`FIRST_PIXELS`] pixels measures how long a pixel takes. The picture
 //! is then rendered at 1/1, 1/2, 1/4 and so on of the frame's resolution, and enlarged: at the
 //! finest whose first round is expected to take at most half of the time left. At full resolution,
 //! pixels that the budget leaves without a sample all the same are taken from the first picture.
@@ -13,6 +14,7 @@ use glam::Vec2;
 
 use crate::adaptive::{Progress, Stop};
 use crate::error::RenderError;
+use crate::film::Film;
 use crate::light::{PreparedLight, SceneLight};
 use crate::render::{Rendered, Renderer, Settings, Simulation};
 use crate::world::{ProxyGeometry, World};
@@ -22,6 +24,9 @@ const FIRST_PIXELS: u64 = 1 << 16;
 
 /// Share of the time left that the first round of the picture may be foreseen to take.
 const FIRST_ROUND: f64 = 0.5;
+
+/// Is told of the progress, and may break off.
+type Watch<'a> = dyn FnMut(&Progress) -> ControlFlow<()> + 'a;
 
 /// A frame of fewer pixels than this is rendered without a first picture: its first round takes no
 /// longer than a first picture may.
@@ -49,34 +54,16 @@ impl Renderer<'_> {
             _ => None,
         };
         let light = PreparedLight::new(light, normal);
-        let mut at = |divisor: u32,
-                      stop: Stop,
-                      coarse: Option<&Rendered>,
-                      progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>| {
-            let resolution = camera.resolution.map(|n| n.div_ceil(divisor));
-            let size = resolution.map(|n| n as usize);
-            let background = match (settings.background, divisor) {
-                (Some(image), 2..) => Some(LinearImage(shrink(&image.0, size))),
-                _ => None,
-            };
-            let settings = Settings {
-                stop,
-                background: background.as_ref().or(settings.background),
-                // A mask has edges, which are applied at full resolution.
-                occluders: settings.occluders.filter(|_| divisor == 1),
-                ..*settings
-            };
-            let smaller = self.with_camera(at_resolution(camera, resolution));
-            world.camera = *smaller.camera();
+        let mut at = |divisor: u32, stop, coarse: Option<&Rendered>, progress: &mut Watch| {
+            let settings = Settings { stop, ..*settings };
             let film = coarse.map(|coarse| &coarse.film);
-            smaller.render_world(&light, world, simulation, &settings, start, film, progress)
+            self.render_at(
+                divisor, &light, world, simulation, &settings, start, film, progress,
+            )
         };
 
         // ---- How long a pixel takes ---------------------------------------------------------
-        let mut divisor = 1u32;
-        while width.div_ceil(divisor.into()) * height.div_ceil(divisor.into()) > FIRST_PIXELS {
-            divisor *= 2;
-        }
+        let divisor = divisor_for(camera.resolution, Some(FIRST_PIXELS));
         let clock = Instant::now();
         let one_round = Stop::TimeBudget(Duration::ZERO);
         let first = at(divisor, one_round, None, &mut |_| ControlFlow::Continue(()))?;
@@ -89,15 +76,92 @@ impl Renderer<'_> {
         if chosen == 1 {
             return at(1, stop, Some(&first), progress);
         }
-        let mut rendered = match chosen < divisor {
+        let rendered = match chosen < divisor {
             true => at(chosen, stop, None, progress)?,
             false => first,
         };
-        rendered.film = rendered.film.enlarged(width as usize, height as usize);
-        rendered.error.touched_pixels *= u64::from(chosen).pow(2);
-        rendered.divisor = chosen;
-        Ok(rendered)
+        Ok(rendered.enlarged(chosen, [width as usize, height as usize]))
     }
+
+    /// Renders the layers at the finest of 1/1, 1/2, 1/4 and so on of the frame's resolution that has at most
+    /// `most_pixels`, and enlarges them; occluders left aside.
+    pub(crate) fn render_at_most<L: SceneLight>(
+        &self,
+        most_pixels: Option<u64>,
+        light: &L,
+        world: &mut World,
+        simulation: &Simulation,
+        settings: &Settings,
+        start: Instant,
+        progress: &mut Watch,
+    ) -> Result<Rendered, RenderError> {
+        let [width, height] = self.camera().resolution;
+        let divisor = divisor_for([width, height], most_pixels);
+        let rendered = self.render_at(
+            divisor, light, world, simulation, settings, start, None, progress,
+        )?;
+        Ok(rendered.enlarged(divisor, [width as usize, height as usize]))
+    }
+
+    /// Renders the layers at `1 / divisor` of the frame's resolution, occluders left aside; `coarse` is the same
+    /// picture at a lower one.
+    fn render_at<L: SceneLight>(
+        &self,
+        divisor: u32,
+        light: &L,
+        world: &mut World,
+        simulation: &Simulation,
+        settings: &Settings,
+        start: Instant,
+        coarse: Option<&Film>,
+        progress: &mut Watch,
+    ) -> Result<Rendered, RenderError> {
+        let camera = *self.camera();
+        let resolution = camera.resolution.map(|n| n.div_ceil(divisor));
+        let size = resolution.map(|n| n as usize);
+        let background = match (settings.background, divisor) {
+            (Some(image), 2..) => Some(LinearImage(shrink(&image.0, size))),
+            _ => None,
+        };
+        let settings = Settings {
+            background: background.as_ref().or(settings.background),
+            // A mask has edges, which are applied at full resolution.
+            occluders: settings.occluders.filter(|_| divisor == 1),
+            ..*settings
+        };
+        let smaller = self.with_camera(at_resolution(camera, resolution));
+        world.camera = *smaller.camera();
+        smaller.render_world(light, world, simulation, &settings, start, coarse, progress)
+    }
+}
+
+impl Rendered {
+    /// What was rendered at `1 / divisor` of the resolution, with as many pixels as the frame has.
+    fn enlarged(mut self, divisor: u32, [width, height]: [usize; 2]) -> Self {
+        if divisor > 1 {
+            self.film = self.film.enlarged(width, height);
+            self.error.touched_pixels *= u64::from(divisor).pow(2);
+            self.divisor = divisor;
+        }
+        self
+    }
+}
+
+/// The smallest power of two by which `resolution` is divided so that at most `most_pixels` are left; 1 where there is no
+/// such limit.
+pub fn divisor_for(resolution: [u32; 2], most_pixels: Option<u64>) -> u32 {
+    let Some(most_pixels) = most_pixels else {
+        return 1;
+    };
+    let mut divisor = 1;
+    let pixels = |divisor: u32| -> u64 {
+        let sides = resolution.map(|n| u64::from(n.div_ceil(divisor)));
+        sides[0] * sides[1]
+    };
+    while pixels(divisor) > most_pixels.max(1) {
+        divisor *= 2;
+    }
+    divisor
 }
 
 /// The smallest power of two, `first` at most, such that the first round of a picture at one over
@@ -147,7 +211,6 @@ where
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::film::Film;
     use crate::job::{Job, Layer, PixelSet};
     use crate::shadow::Block;
     use crate::shapes::icosphere;
@@ -169,6 +232,49 @@ mod tests {
         for (left, divisor) in cases {
             assert_eq!(resolution_for(left, 1.0, 8), divisor, "{left} s");
         }
+    }
+
+    #[test]
+    fn a_divisor_leaves_no_more_pixels_than_are_wanted() {
+        assert_eq!(divisor_for([960, 640], Some(1 << 20)), 1);
+        assert_eq!(divisor_for([1920, 1080], Some(1 << 20)), 2);
+        assert_eq!(divisor_for([6000, 4000], Some(1 << 20)), 8);
+        assert_eq!(divisor_for([3, 3], Some(0)), 4);
+    }
+
+    #[test]
+    fn a_picture_of_fewer_pixels_is_enlarged_and_close_to_the_whole_one() {
+        let scene = ball(256);
+        let whole = rendered(&scene, None);
+        assert_eq!(whole.divisor, 1);
+        assert_eq!(rendered(&scene, Some(1 << 16)).divisor, 1);
+        let small = rendered(&scene, Some(1 << 14));
+        assert_eq!(small.divisor, 2);
+        assert_eq!(small.film.alpha.width(), 256);
+        // A quarter, but for blocks of 8 x 8 pixels that shadow or object touch in part.
+        assert!(small.samples < whole.samples / 2);
+        // They differ by noise and at the ball's edge, which is smooth over two pixels.
+        let pairs = small
+            .film
+            .alpha
+            .pixels()
+            .iter()
+            .zip(whole.film.alpha.pixels());
+        let difference = pairs.map(|(a, b)| (a - b).abs()).sum::<f32>() / 65536.0;
+        // The edge is a circle of about 120 pixels across: 377 pixels, each off by at most a half.
+        assert!(difference < 377.0 * 0.5 / 65536.0, "{difference}");
+    }
+
+    /// Rendered with 8 samples a pixel, of a frame's pixels at most `most_pixels`.
+    fn rendered(scene: &Scene, most_pixels: Option<u64>) -> Rendered {
+        let settings = Settings {
+            most_pixels,
+            ..settings(8, 1)
+        };
+        let mut progress = |_: &Progress| ControlFlow::Continue(());
+        Renderer::new(scene)
+            .render(&sky(1.0), &everything(2), &settings, &mut progress)
+            .unwrap()
     }
 
     /// A ball on the ground in a frame of `n` x `n`.

@@ -2,7 +2,7 @@
 pub mod adaptive;
 pub mod blocker;
 pub mod bsdf;
-mod coarse;
+pub mod coarse;
 pub mod convexity;
 pub mod counters;
 mod denoise;

@@ -68,6 +68,9 @@ pub struct Settings<'a> {
     pub highlights: bool,
     /// Whether shadows are [denoised](crate::denoise).
     pub denoise: bool,
+    /// A frame of more pixels is rendered at 1/2, 1/4 and so on of its resolution, the finest that has at most
+    /// this many, and enlarged. A time budget chooses the resolution itself.
+    pub most_pixels: Option<u64>,
 }
 
 impl Default for Settings<'_> {
@@ -83,6 +86,7 @@ impl Default for Settings<'_> {
             shadow_tolerance: 2e-4,
             highlights: true,
             denoise: false,
+            most_pixels: None,
         }
     }
 }
@@ -93,7 +97,8 @@ pub struct Rendered {
     /// Colour, coverage, shadow ratio and their variances.
     pub film: Film,
     /// The picture was rendered at one over this of the frame's resolution and enlarged: above 1
-    /// where a time budget is too short for the frame.
+    /// where a time budget is too short for the frame, or where it has more than
+    /// [`most_pixels`](Settings::most_pixels).
     pub divisor: u32,
     /// Estimated error of the composite: what samples leave, not what a lower resolution does.
     pub error: EstimatedError,
@@ -191,7 +196,15 @@ impl<'a> Renderer<'a> {
             Stop::TimeBudget(budget) => self.render_within(
                 light, &mut world, simulation, settings, budget, start, progress,
             ),
-            _ => self.render_world(light, &world, simulation, settings, start, None, progress),
+            _ => self.render_at_most(
+                settings.most_pixels,
+                light,
+                &mut world,
+                simulation,
+                settings,
+                start,
+                progress,
+            ),
         }?;
         if let Some(mask) = settings.occluders {
             rendered.film.hide_behind(mask);

@@ -51,6 +51,8 @@ pub struct ScenePreset {
 pub struct CompositePreset {
     /// Display-referred RMSE at which sampling stops.
     pub target_error: f32,
+    /// Most pixels at which object and shadow are rendered.
+    pub most_pixels: Option<u64>,
 }
 
 /// Means over the measured scenes.

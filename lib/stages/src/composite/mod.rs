@@ -20,6 +20,7 @@ use dipir_light::map_with_lobes::MapWithLobes;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_render::adaptive::Stop;
+use dipir_render::coarse::divisor_for;
 use dipir_render::film::Film;
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings};
@@ -54,6 +55,8 @@ pub struct Done {
     rays: u64,
     error: f64,
     target: Stop,
+    /// Object and shadow were rendered at one over this of the photograph's resolution.
+    divisor: u32,
     /// From the start of the run to its end.
     seconds: f64,
     outlook: Outlook,
@@ -148,14 +151,24 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let error = rendered.error.upper_95;
     // What is not spent on samples stays.
     let foresight = &rendered.foresight;
-    let at_target = |target: f64| seconds + course.seconds * (foresight.cost_of(target) - 1.0);
+    let resolution = inputs.scene.loaded.scene.camera.resolution;
+    let pixels_of = |most: Option<u64>| f64::from(divisor_for(resolution, most)).powi(-2);
+    let here = f64::from(rendered.divisor).powi(-2);
+    // The same error takes as many samples a pixel at any resolution.
+    let at_target = |target: f64, most: Option<u64>| {
+        let pixels = pixels_of(table.most_pixels.or(most)) / here;
+        seconds + course.seconds * (pixels * foresight.cost_of(target) - 1.0)
+    };
     let quality = session.pipeline.quality;
     let outlook = match stop == CompositeTable::default().stop(quality) {
         true => Outlook::beside(quality, |preset| {
             let target = f64::from(preset.composite.target_error);
-            Some((at_target(target), Some(target)))
+            Some((
+                at_target(target, preset.composite.most_pixels),
+                Some(target),
+            ))
         }),
-        false => Outlook::around_error(error, at_target),
+        false => Outlook::around_error(error, |target| at_target(target, None)),
     };
     Ok(Done {
         folder,
@@ -164,6 +177,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         rays: rendered.counts.total(),
         error,
         target: stop,
+        divisor: rendered.divisor,
         seconds,
         outlook,
     })
@@ -224,6 +238,7 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
         "tone": table.tone,
         "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
         "denoise": table.denoise(session.pipeline.quality),
+        "most_pixels": table.most_pixels(session.pipeline.quality),
         "stop": match table.stop(session.pipeline.quality) {
             Stop::Samples(n) => json!({"samples": n}),
             Stop::TargetError(e) => json!({"target_error": e}),
@@ -282,6 +297,7 @@ fn render_under<L: SceneLight>(
         transfer: photo.transfer,
         occluders: loaded.occluders.as_ref(),
         denoise: table.denoise(session.pipeline.quality),
+        most_pixels: table.most_pixels(session.pipeline.quality),
         ..Settings::default()
     };
     let renderer = Renderer::new(&loaded.scene);
@@ -479,6 +495,13 @@ impl fmt::Display for Done {
             self.error,
             self.rays as f64 * 1e-6
         )?;
+        if self.divisor > 1 {
+            write!(
+                f,
+                "\n  object and shadow at 1/{} of the photograph's resolution, enlarged",
+                self.divisor
+            )?;
+        }
         if let Stop::TimeBudget(budget) = self.target {
             let (budget, share) = (budget.as_secs_f64(), self.seconds / budget.as_secs_f64());
             write!(

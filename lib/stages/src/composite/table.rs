@@ -31,6 +31,10 @@ pub struct CompositeTable {
     /// Most samples in any pixel.
     #[schemars(range(min = 1), extend("default" = MAX_SAMPLES), example = 1024)]
     pub max_samples: Option<u32>,
+    /// Most pixels at which object and shadow are rendered: in a larger photograph they are rendered at a half, a quarter
+    /// and so on of its resolution, and enlarged. A time budget chooses the resolution itself.
+    #[schemars(range(min = 1), extend("x-default" = "none; 1048576 for the preset `draft`"), example = 4000000)]
+    pub most_pixels: Option<u64>,
     /// Whether noise is removed from shadows. What that does to the error is measured and stated.
     #[schemars(extend("x-default" = "true; false for the preset `high`"), example = false)]
     pub denoise: Option<bool>,
@@ -90,6 +94,12 @@ impl CompositeTable {
                 "0 is out of range; accepted: 1 or more".into(),
             );
         }
+        if self.most_pixels == Some(0) {
+            return wrong(
+                "most_pixels",
+                "0 is out of range; accepted: 1 or more".into(),
+            );
+        }
         if !(self.exposure_ev.abs() <= 64.0) {
             return wrong(
                 "exposure_ev",
@@ -107,6 +117,16 @@ impl CompositeTable {
 
     pub(super) fn denoise(&self, quality: Quality) -> bool {
         self.denoise.unwrap_or(quality != Quality::High)
+    }
+
+    /// Most pixels at which object and shadow are rendered; a time budget chooses the resolution itself.
+    pub(super) fn most_pixels(&self, quality: Quality) -> Option<u64> {
+        match self.time_budget_s {
+            Some(_) => None,
+            None => self
+                .most_pixels
+                .or(presets::of(quality).composite.most_pixels),
+        }
     }
 
     pub(super) fn stop(&self, quality: Quality) -> Stop {

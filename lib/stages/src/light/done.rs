@@ -12,12 +12,18 @@ use crate::written;
 /// An estimate in a sentence.
 pub(crate) fn in_words(estimate: &LightEstimate) -> String {
     let (azimuth, elevation) = (estimate.azimuth_deg, estimate.elevation_deg);
+    let arc = azimuth.high - azimuth.low;
+    let side = match arc > 180.0 {
+        true => format!("the side is open (azimuth within an arc of {arc:.0} degrees)"),
+        false => format!(
+            "azimuth {:.0} to {:.0} degrees to the right of the view",
+            azimuth.low, azimuth.high
+        ),
+    };
     format!(
-        "estimated: most light {}; in four photographs of five its azimuth is {:.0} to {:.0} degrees to the \
-         right of the view and its elevation {:.0} to {:.0}; a sun with a probability of {:.0}%",
+        "estimated: most light {}; 80% intervals: {side}, elevation {:.0} to {:.0} degrees; a sun with a probability \
+         of {:.0}%",
         estimate.words,
-        azimuth.low,
-        azimuth.high,
         elevation.low,
         elevation.high,
         100.0 * estimate.sun_probability
