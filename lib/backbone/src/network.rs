@@ -53,12 +53,14 @@ pub struct Backbone {
 impl Backbone {
     /// The network that is part of the program, read once.
     ///
-    /// # Errors
-    /// If its weights are not what the program expects.
-    pub fn embedded() -> Result<&'static Self, BackboneError> {
-        static ONCE: OnceLock<Result<Backbone, BackboneError>> = OnceLock::new();
-        let read = || Self::from_bytes(include_bytes!("../weights/lite0.safetensors"));
-        ONCE.get_or_init(read).as_ref().map_err(Clone::clone)
+    /// # Panics
+    /// Never: the tests read the same bytes.
+    pub fn embedded() -> &'static Self {
+        static ONCE: OnceLock<Backbone> = OnceLock::new();
+        ONCE.get_or_init(|| {
+            Self::from_bytes(include_bytes!("../weights/lite0.safetensors"))
+                .expect("the embedded weights are those of the tests")
+        })
     }
 
     /// The network of a safetensors file's bytes; `weights/make.py` says what is in it.

@@ -6,9 +6,9 @@ use dipir_light::luminance::luminance;
 use dipir_scene::camera::{Camera, FieldOfView};
 use glam::{DVec3, Vec3};
 
-use crate::features::{FEATURES, SmallPhoto};
+use crate::features::{FEATURES, OF_PARTS, SmallPhoto};
 use crate::grid::{BINS, bin_direction, direction, heading};
-use crate::network::{HISTOGRAM, Network, OUTPUTS};
+use crate::network::{HISTOGRAM, Network, OUTPUTS, Sight};
 use crate::posterior::{PeakPosterior, words};
 use crate::{Calibration, Estimator, LightEstimate, Visible, combine, merged};
 
@@ -26,15 +26,16 @@ fn estimator() -> Estimator {
     let hidden = 8;
     let mut bias = wave(OUTPUTS, 0.5);
     bias[HISTOGRAM + 40] += 3.0;
-    let network = Network {
+    let network = |sight: Sight| Network {
+        sight,
         hidden,
-        mean: vec![0.0; FEATURES],
-        deviation: vec![1.0; FEATURES],
-        first: [wave(FEATURES * hidden, 0.1), vec![0.1; hidden]],
+        mean: vec![0.0; sight.count()],
+        deviation: vec![1.0; sight.count()],
+        first: [wave(sight.count() * hidden, 0.1), vec![0.1; hidden]],
         second: [wave(hidden * hidden, 0.3), vec![0.0; hidden]],
-        output: [wave(hidden * OUTPUTS, 0.3), bias],
+        output: [wave(hidden * OUTPUTS, 0.3), bias.clone()],
     };
-    Estimator::new(vec![network], Calibration::default()).unwrap()
+    Estimator::new(vec![Sight::ALL.map(network)], Calibration::default()).unwrap()
 }
 
 /// A picture that is not its own mirror image.
@@ -378,13 +379,19 @@ fn features_are_of_the_whole_photograph_at_any_size() {
         SmallPhoto::new(&photo(256, 256), &camera(256)),
     );
     let (a, b) = (small.features(), large.features());
+    assert!(a.len() == FEATURES && b.len() == FEATURES);
     // The ramps are sampled at pixel corners: they differ by 3/8 of a pixel of the smaller one, under .006.
-    let most = a
+    let most = a[..OF_PARTS]
         .iter()
         .zip(&b)
         .map(|(a, b)| (a - b).abs())
         .fold(0.0, f32::max);
-    assert!(a.len() == FEATURES && most < 0.1, "{most}");
+    assert!(most < 0.1, "{most}");
+    // The backbone's features are of the order of 1.
+    let pairs = a[OF_PARTS..].iter().zip(&b[OF_PARTS..]);
+    let squares = pairs.clone().map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+    let size = pairs.map(|(a, _)| a * a).sum::<f32>();
+    assert!(squares < 0.02 * size, "{squares} of {size}");
 }
 
 #[test]
