@@ -18,6 +18,11 @@ fn direction_deg(azimuth: f64, elevation: f64) -> Vec3 {
 }
 
 fn estimator() -> Estimator {
+    brighter([0.0; 2])
+}
+
+/// The estimator of the tests whose two networks see a light that is brighter by these logarithms.
+fn brighter(by: [f32; 2]) -> Estimator {
     let wave = |n: usize, scale: f32| {
         (0..n)
             .map(|k| scale * (0.37 * (k * k % 1013) as f32).sin())
@@ -26,16 +31,23 @@ fn estimator() -> Estimator {
     let hidden = 8;
     let mut bias = wave(OUTPUTS, 0.5);
     bias[HISTOGRAM + 40] += 3.0;
-    let network = |sight: Sight| Network {
+    let brighter = |by: f32| {
+        let mut bias = bias.clone();
+        bias[..HISTOGRAM].iter_mut().for_each(|b| *b += by);
+        bias
+    };
+    let network = |sight: Sight, by: f32| Network {
         sight,
         hidden,
         mean: vec![0.0; sight.count()],
         deviation: vec![1.0; sight.count()],
         first: [wave(sight.count() * hidden, 0.1), vec![0.1; hidden]],
         second: [wave(hidden * hidden, 0.3), vec![0.0; hidden]],
-        output: [wave(hidden * OUTPUTS, 0.3), bias.clone()],
+        output: [wave(hidden * OUTPUTS, 0.3), brighter(by)],
     };
-    Estimator::new(vec![Sight::ALL.map(network)], Calibration::default()).unwrap()
+    let [parts, kind] = Sight::ALL;
+    let pair = [network(parts, by[0]), network(kind, by[1])];
+    Estimator::new(vec![pair], Calibration::default()).unwrap()
 }
 
 /// A picture that is not its own mirror image.
@@ -117,6 +129,17 @@ fn a_mirrored_photograph_has_mirrored_light() {
             a.distance(b) < 1e-3 * (1.0 + a.length()),
             "texel {k}: {a} {b}"
         );
+    }
+}
+
+#[test]
+fn brightness_is_told_by_the_network_that_sees_the_kind_of_place() {
+    let (photo, camera) = (photo(60, 40), camera(0.0, 60, 40));
+    let map = |by: [f32; 2]| brighter(by).estimate(&photo, &camera).map();
+    let (plain, parts, kind) = (map([0.0; 2]), map([0.7, 0.0]), map([0.0, 0.7]));
+    for (k, p) in plain.texels().iter().enumerate() {
+        assert!(parts.texels()[k].distance(*p) < 1e-4 * p.length());
+        assert!((kind.texels()[k] / 0.7f32.exp()).distance(*p) < 1e-4 * p.length());
     }
 }
 
