@@ -14,7 +14,7 @@ use crate::features::SmallPhoto;
 use crate::grid::{BASE_TEXELS, BINS, base_texel, heading, mirrored_bin, mirrored_texel};
 use crate::histogram::{SHARES, STOPS, Scale};
 use crate::network::{
-    ENERGY, EXPOSURE, HISTOGRAM, LOG_ENERGY, LOG_RADIANCE, MAP, Network, SHARE, SUN, from_bytes,
+    ENERGY, EXPOSURE, HISTOGRAM, LOG_ENERGY, LOG_RADIANCE, MAP, Member, SHARE, SUN, from_bytes,
     to_bytes,
 };
 use crate::posterior::PeakPosterior;
@@ -50,16 +50,17 @@ impl Default for Calibration {
     }
 }
 
-/// Networks whose answers are averaged, and their calibration.
+/// Pairs of networks whose answers are averaged, and their calibration. Where the light is, is told by both networks of
+/// a pair; how bright it is, by the one that sees what kind of place it is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Estimator {
-    members: Vec<Network>,
+    members: Vec<Member>,
     calibration: Calibration,
 }
 
 impl Estimator {
-    /// Networks, of which there has to be one.
-    pub fn new(members: Vec<Network>, calibration: Calibration) -> Result<Self, EstimatorError> {
+    /// Pairs of networks, of which there has to be one.
+    pub fn new(members: Vec<Member>, calibration: Calibration) -> Result<Self, EstimatorError> {
         if members.is_empty() {
             return Err(EstimatorError::Weights("there is no network".into()));
         }
@@ -149,13 +150,16 @@ impl Estimator {
     }
 
     fn sum(&self, features: &[Vec<f32>; 2]) -> Sum {
-        let mut sum = Sum::default();
+        let mut sums = [Sum::default(), Sum::default()];
         for member in &self.members {
-            let plain = self.read(&member.forward(&features[0]), false);
-            let mirrored = self.read(&member.forward(&features[1]), true);
-            sum.add(&plain.plus(&mirrored));
+            for (sum, network) in sums.iter_mut().zip(member) {
+                let plain = self.read(&network.forward(&features[0]), false);
+                let mirrored = self.read(&network.forward(&features[1]), true);
+                sum.add(&plain.plus(&mirrored));
+            }
         }
-        sum
+        let [parts, kind] = sums;
+        parts.as_bright_as(kind)
     }
 
     fn read(&self, o: &[f32], mirrored: bool) -> Sum {
@@ -218,6 +222,26 @@ impl Sum {
         pairs(&mut self.exposure, &other.exposure);
         pairs(&mut self.share, &other.share);
         self.sun += other.sun;
+    }
+
+    /// The mean of both, each as bright as `kind`, with its exposure.
+    fn as_bright_as(mut self, kind: Self) -> Self {
+        let level = |s: &Self| luminance_f64(DVec3::from(s.mean()));
+        let scale = level(&kind) / level(&self).max(1e-12);
+        for v in self.base.iter_mut().flatten().chain(&mut self.peak) {
+            *v *= scale;
+        }
+        self.add(&kind);
+        let half = |v: &mut f64| *v *= 0.5;
+        self.base.iter_mut().flatten().for_each(half);
+        self.peak.iter_mut().for_each(half);
+        self.weights.iter_mut().for_each(half);
+        self.share.iter_mut().for_each(half);
+        Self {
+            sun: 0.5 * self.sun,
+            exposure: kind.exposure,
+            ..self
+        }
     }
 
     fn estimate(

@@ -1,7 +1,11 @@
-//! Features of a photograph: means, contrasts and extremes of its parts, by place in the picture and by elevation in
-//! the world. Too little to recognise a place by, which is why light that is learned from few places carries over.
+//! Features of a photograph. The first are means, contrasts and extremes of its parts, by place in the picture and by
+//! elevation in the world: too little to recognise a place by, which is why light that is learned from few places
+//! carries over. The others say what kind of place it is: what a network sees in it that was trained on a million
+//! photographs of all kinds.
+use dipir_backbone::{Backbone, CHANNELS, Map};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::resize::{Filter, resize};
+use dipir_imaging::transfer::Transfer;
 use dipir_light::luminance::luminance;
 use dipir_scene::camera::Camera;
 use glam::{Vec2, Vec3};
@@ -10,6 +14,8 @@ use crate::cues::{CUES, cues};
 
 /// Pixels along each side of the picture that is looked at, whatever the photograph's size.
 pub const SIDE: usize = 64;
+/// Pixels along each side of the picture that the backbone looks at.
+pub const LOOKED: usize = 192;
 /// Parts of the picture along each side.
 const CELLS: usize = 8;
 /// Coarser parts, for edges.
@@ -26,20 +32,28 @@ const BANDS_DEG: [f32; 9] = [-91.0, -45.0, -25.0, -12.0, -4.0, 4.0, 12.0, 25.0, 
 const PER_BAND: usize = 7;
 /// Quantiles of log-luminance that are features.
 const QUANTILES: [f32; 7] = [0.02, 0.1, 0.25, 0.5, 0.75, 0.9, 0.98];
-/// Numbers in all.
-pub const FEATURES: usize = 6
+/// Features that say what the camera is and how bright the photograph is; they come first.
+pub const OF_CAMERA: usize = 6;
+/// Features of parts of the picture, with those of the camera.
+pub const OF_PARTS: usize = OF_CAMERA
     + 6 * CELLS * CELLS
     + 2 * COARSE * COARSE
     + QUANTILES.len()
     + 2
     + PER_BAND * (BANDS_DEG.len() - 1)
     + CUES;
+/// Features of the backbone: means of its channels; they come last.
+pub const OF_KIND: usize = CHANNELS[0] + CHANNELS[1];
+/// Numbers in all.
+pub const FEATURES: usize = OF_PARTS + OF_KIND;
 
 /// A photograph and its camera, resized to the input of the features.
 #[derive(Clone, Debug)]
 pub struct SmallPhoto {
     /// Linear light in `[0, 1]`, row by row.
     pixels: Vec<Vec3>,
+    /// Display values, [`LOOKED`] x [`LOOKED`].
+    looked: Raster<Vec3>,
     /// Elevation of each pixel's ray, degrees.
     elevation_deg: Vec<f32>,
     /// Pitch of the view and half the angles that it spans to the side and upwards, radians.
@@ -47,40 +61,28 @@ pub struct SmallPhoto {
 }
 
 impl SmallPhoto {
-    /// The whole `photo` resized by the area filter. Pixels that are no numbers count as black.
+    /// The whole `photo`, resized. Pixels that are no numbers count as black.
     pub fn new(photo: &LinearImage, camera: &Camera) -> Self {
-        let clean = photo.0.map(|p| clean(*p));
-        let small = resize(&clean, SIDE, SIDE, Filter::Area);
-        let size = [photo.0.width() as u32, photo.0.height() as u32];
+        let photo = photo.0.map(|p| clean(*p));
+        let small = resize(&photo, SIDE, SIDE, Filter::Area);
+        let shown =
+            |p: &Vec3| Vec3::from_array(p.to_array().map(|v| Transfer::Srgb.encode_scalar(v)));
+        let looked = resize(&photo, LOOKED, LOOKED, Filter::Tent).map(shown);
         let camera = Camera {
             resolution: camera.resolution.map(|n| n.max(1)),
             ..*camera
         };
-        debug_assert!(size[0] > 0 && size[1] > 0);
-        Self::of_small(small, &camera.scaled([SIDE as u32; 2]))
-    }
-
-    /// A picture that has the size already, with its camera at that size.
-    pub fn of_small(small: Raster<Vec3>, camera: &Camera) -> Self {
-        assert_eq!(
-            (small.width(), small.height()),
-            (SIDE, SIDE),
-            "the size that is looked at"
-        );
+        let camera = camera.scaled([SIDE as u32; 2]);
         let elevation = |k: usize| {
             let pixel = Vec2::new((k % SIDE) as f32 + 0.5, (k / SIDE) as f32 + 0.5);
-            camera
-                .ray(pixel)
-                .direction
-                .y
-                .clamp(-1.0, 1.0)
-                .asin()
-                .to_degrees()
+            let up = camera.ray(pixel).direction.y;
+            up.clamp(-1.0, 1.0).asin().to_degrees()
         };
         let half = 0.5 * SIDE as f32;
         let forward = -camera.rotation.z_axis;
         Self {
             pixels: small.pixels().iter().map(|p| clean(*p)).collect(),
+            looked,
             elevation_deg: (0..SIDE * SIDE).map(elevation).collect(),
             pitch_half: [
                 forward.y.clamp(-1.0, 1.0).asin(),
@@ -93,8 +95,9 @@ impl SmallPhoto {
     /// The picture in a mirror.
     pub fn mirrored(&self) -> Self {
         Self {
-            pixels: flipped(&self.pixels),
-            elevation_deg: flipped(&self.elevation_deg),
+            pixels: flipped(&self.pixels, SIDE),
+            looked: Raster::from_pixels(LOOKED, LOOKED, flipped(self.looked.pixels(), LOOKED)),
+            elevation_deg: flipped(&self.elevation_deg, SIDE),
             ..*self
         }
     }
@@ -107,6 +110,14 @@ impl SmallPhoto {
 
     /// The [`FEATURES`] numbers.
     pub fn features(&self) -> Vec<f32> {
+        let mut all = self.of_parts();
+        let maps = Backbone::embedded().maps(&self.looked);
+        all.extend(maps.iter().flat_map(Map::mean));
+        debug_assert_eq!(all.len(), FEATURES);
+        all
+    }
+
+    fn of_parts(&self) -> Vec<f32> {
         let light: Vec<f32> = self.pixels.iter().map(|p| luminance(*p)).collect();
         let log: Vec<f32> = light.iter().map(|l| (l + FLOOR).ln()).collect();
         let reference = self.reference().ln();
@@ -137,7 +148,7 @@ impl SmallPhoto {
         }
         let relative: Vec<f32> = log.iter().map(|l| l - reference).collect();
         all.extend(cues(&self.pixels, &light, &relative, &self.elevation_deg));
-        debug_assert_eq!(all.len(), FEATURES);
+        debug_assert_eq!(all.len(), OF_PARTS);
         all
     }
 
@@ -222,9 +233,9 @@ fn clean(pixel: Vec3) -> Vec3 {
     Vec3::from_array(pixel.to_array().map(channel))
 }
 
-fn flipped<T: Copy>(values: &[T]) -> Vec<T> {
+fn flipped<T: Copy>(values: &[T], side: usize) -> Vec<T> {
     let turned = |row: &[T]| row.iter().rev().copied().collect::<Vec<T>>();
-    values.chunks(SIDE).flat_map(turned).collect()
+    values.chunks(side).flat_map(turned).collect()
 }
 
 /// The pixels of one of `per_side` x `per_side` parts.

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use safetensors::tensor::{SafeTensors, TensorView};
 
 use crate::error::EstimatorError;
-use crate::features::FEATURES;
+use crate::features::{FEATURES, OF_CAMERA, OF_KIND, OF_PARTS};
 use crate::grid::{BASE_TEXELS, BINS};
 use crate::histogram::{SHARES, STOPS};
 
@@ -26,6 +26,8 @@ pub const SHARE: usize = EXPOSURE + STOPS.count;
 pub const OUTPUTS: usize = SHARE + SHARES.count;
 /// Standardised features are clamped to this many standard deviations, so that no camera or picture leads to infinity.
 pub const FEATURE_LIMIT: f32 = 5.0;
+/// The backbone's features are multiplied by this after that: many numbers say the same.
+const OF_KIND_SCALE: f32 = 0.3;
 /// Logarithms of radiance over the photograph's mean are kept between these.
 pub const LOG_RADIANCE: [f32; 2] = [-8.0, 6.0];
 /// Logarithms of energy over the photograph's mean are kept between these.
@@ -37,16 +39,57 @@ pub fn silu(x: f32) -> f32 {
     x / (1.0 + (-x).exp())
 }
 
+/// Which features a network sees.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sight {
+    /// Those of the camera and of parts of the picture: where light comes from.
+    Parts,
+    /// Those of the camera and of the backbone: what kind of place it is, which says how bright it is.
+    Kind,
+}
+
+impl Sight {
+    /// Both, in the order in which a file holds them.
+    pub const ALL: [Self; 2] = [Self::Parts, Self::Kind];
+
+    /// How many features.
+    pub fn count(self) -> usize {
+        match self {
+            Self::Parts => OF_PARTS,
+            Self::Kind => OF_CAMERA + OF_KIND,
+        }
+    }
+
+    /// Those of all features that are seen.
+    pub fn of(self, features: &[f32]) -> impl Iterator<Item = &f32> {
+        assert_eq!(features.len(), FEATURES, "features");
+        let (first, last) = match self {
+            Self::Parts => (OF_PARTS, FEATURES),
+            Self::Kind => (OF_CAMERA, OF_PARTS),
+        };
+        features[..first].iter().chain(&features[last..])
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Parts => "parts",
+            Self::Kind => "kind",
+        }
+    }
+}
+
 /// Weights. Matrices are row-major with a row for each input.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Network {
+    /// What it sees.
+    pub sight: Sight,
     /// Units of each hidden layer.
     pub hidden: usize,
     /// Mean of each feature over the training photographs.
     pub mean: Vec<f32>,
     /// Deviation of each feature over the training photographs.
     pub deviation: Vec<f32>,
-    /// First layer, `FEATURES x hidden`, then its bias.
+    /// First layer, inputs x hidden, then its bias.
     pub first: [Vec<f32>; 2],
     /// Second layer, `hidden x hidden`, then its bias.
     pub second: [Vec<f32>; 2],
@@ -57,18 +100,21 @@ pub struct Network {
 impl Network {
     /// Features as the first layer takes them.
     pub fn standardised(&self, features: &[f32]) -> Vec<f32> {
-        let one =
-            |(x, (m, d)): (&f32, (&f32, &f32))| ((x - m) / d).clamp(-FEATURE_LIMIT, FEATURE_LIMIT);
-        features
-            .iter()
-            .zip(self.mean.iter().zip(&self.deviation))
+        let seen = self.sight.of(features).enumerate();
+        let one = |((n, x), (m, d)): ((usize, &f32), (&f32, &f32))| {
+            let value = ((x - m) / d).clamp(-FEATURE_LIMIT, FEATURE_LIMIT);
+            match self.sight == Sight::Kind && n >= OF_CAMERA {
+                true => OF_KIND_SCALE * value,
+                false => value,
+            }
+        };
+        seen.zip(self.mean.iter().zip(&self.deviation))
             .map(one)
             .collect()
     }
 
     /// The [`OUTPUTS`] numbers for [`FEATURES`] features.
     pub fn forward(&self, features: &[f32]) -> Vec<f32> {
-        assert_eq!(features.len(), FEATURES, "features");
         let x = self.standardised(features);
         let h: Vec<f32> = layer(&self.first, &x).into_iter().map(silu).collect();
         let step = layer(&self.second, &h);
@@ -77,11 +123,11 @@ impl Network {
     }
 
     fn tensors(&self) -> [(&'static str, Vec<usize>, &Vec<f32>); 8] {
-        let n = self.hidden;
+        let (inputs, n) = (self.sight.count(), self.hidden);
         [
-            ("mean", vec![FEATURES], &self.mean),
-            ("deviation", vec![FEATURES], &self.deviation),
-            ("first.weight", vec![FEATURES, n], &self.first[0]),
+            ("mean", vec![inputs], &self.mean),
+            ("deviation", vec![inputs], &self.deviation),
+            ("first.weight", vec![inputs, n], &self.first[0]),
             ("first.bias", vec![n], &self.first[1]),
             ("second.weight", vec![n, n], &self.second[0]),
             ("second.bias", vec![n], &self.second[1]),
@@ -99,17 +145,25 @@ fn layer([weight, bias]: &[Vec<f32>; 2], x: &[f32]) -> Vec<f32> {
     y
 }
 
-/// The bytes of a safetensors file with networks as `member.N.*` and `metadata`.
+/// A network of each [`Sight`].
+pub type Member = [Network; 2];
+
+/// The bytes of a safetensors file with networks as `member.N.parts.*` and `member.N.kind.*`, and `metadata`.
 pub fn to_bytes(
-    members: &[Network],
+    members: &[Member],
     metadata: HashMap<String, String>,
 ) -> Result<Vec<u8>, EstimatorError> {
     let refused = |e: safetensors::SafeTensorError| EstimatorError::Weights(e.to_string());
     let mut stored: Vec<(String, Vec<usize>, Vec<u8>)> = Vec::new();
-    for (n, member) in members.iter().enumerate() {
-        for (name, shape, values) in member.tensors() {
+    for (n, network) in members
+        .iter()
+        .enumerate()
+        .flat_map(|(n, m)| m.iter().map(move |network| (n, network)))
+    {
+        let sight = network.sight.name();
+        for (name, shape, values) in network.tensors() {
             let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();
-            stored.push((format!("member.{n}.{name}"), shape, bytes));
+            stored.push((format!("member.{n}.{sight}.{name}"), shape, bytes));
         }
     }
     let views = stored
@@ -124,28 +178,30 @@ pub fn to_bytes(
 }
 
 /// The networks and the metadata of such bytes.
-pub fn from_bytes(bytes: &[u8]) -> Result<(Vec<Network>, HashMap<String, String>), EstimatorError> {
+pub fn from_bytes(bytes: &[u8]) -> Result<(Vec<Member>, HashMap<String, String>), EstimatorError> {
     let refused = |e: safetensors::SafeTensorError| EstimatorError::Weights(e.to_string());
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(refused)?;
     let file = SafeTensors::deserialize(bytes).map_err(refused)?;
     let mut members = Vec::new();
-    while file
-        .tensor(&format!("member.{}.mean", members.len()))
-        .is_ok()
-    {
-        members.push(member(&file, members.len())?);
+    let first = |n: usize| format!("member.{n}.{}.mean", Sight::ALL[0].name());
+    while file.tensor(&first(members.len())).is_ok() {
+        let n = members.len();
+        let [parts, kind] = Sight::ALL.map(|sight| network(&file, n, sight));
+        members.push([parts?, kind?]);
     }
     if members.is_empty() {
-        return Err(EstimatorError::Weights(
-            "there is no `member.0.mean`".into(),
-        ));
+        return Err(EstimatorError::Weights(format!(
+            "there is no `{}`",
+            first(0)
+        )));
     }
     Ok((members, header.metadata().clone().unwrap_or_default()))
 }
 
-fn member(file: &SafeTensors<'_>, n: usize) -> Result<Network, EstimatorError> {
+fn network(file: &SafeTensors<'_>, n: usize, sight: Sight) -> Result<Network, EstimatorError> {
+    let prefix = format!("member.{n}.{}", sight.name());
     let read = |name: &str, shape: &[usize]| -> Result<Vec<f32>, EstimatorError> {
-        let name = format!("member.{n}.{name}");
+        let name = format!("{prefix}.{name}");
         let refused = |why: String| EstimatorError::Weights(format!("`{name}` {why}"));
         let tensor = file
             .tensor(&name)
@@ -168,15 +224,17 @@ fn member(file: &SafeTensors<'_>, n: usize) -> Result<Network, EstimatorError> {
         }
     };
     let bias = file
-        .tensor(&format!("member.{n}.first.bias"))
-        .map_err(|_| EstimatorError::Weights(format!("`member.{n}.first.bias` is missing")))?;
+        .tensor(&format!("{prefix}.first.bias"))
+        .map_err(|_| EstimatorError::Weights(format!("`{prefix}.first.bias` is missing")))?;
     let hidden = bias.shape().first().copied().unwrap_or(0);
+    let inputs = sight.count();
     Ok(Network {
+        sight,
         hidden,
-        mean: read("mean", &[FEATURES])?,
-        deviation: read("deviation", &[FEATURES])?,
+        mean: read("mean", &[inputs])?,
+        deviation: read("deviation", &[inputs])?,
         first: [
-            read("first.weight", &[FEATURES, hidden])?,
+            read("first.weight", &[inputs, hidden])?,
             read("first.bias", &[hidden])?,
         ],
         second: [

@@ -6,9 +6,9 @@ use dipir_light::luminance::luminance;
 use dipir_scene::camera::{Camera, FieldOfView};
 use glam::{DVec3, Vec3};
 
-use crate::features::{FEATURES, SmallPhoto};
+use crate::features::{FEATURES, OF_PARTS, SmallPhoto};
 use crate::grid::{BINS, bin_direction, direction, heading};
-use crate::network::{HISTOGRAM, Network, OUTPUTS};
+use crate::network::{HISTOGRAM, Network, OUTPUTS, Sight};
 use crate::posterior::{PeakPosterior, words};
 use crate::{Calibration, Estimator, LightEstimate, Visible, combine, merged};
 
@@ -18,6 +18,11 @@ fn direction_deg(azimuth: f64, elevation: f64) -> Vec3 {
 }
 
 fn estimator() -> Estimator {
+    brighter([0.0; 2])
+}
+
+/// The estimator of the tests whose two networks see a light that is brighter by these logarithms.
+fn brighter(by: [f32; 2]) -> Estimator {
     let wave = |n: usize, scale: f32| {
         (0..n)
             .map(|k| scale * (0.37 * (k * k % 1013) as f32).sin())
@@ -26,15 +31,23 @@ fn estimator() -> Estimator {
     let hidden = 8;
     let mut bias = wave(OUTPUTS, 0.5);
     bias[HISTOGRAM + 40] += 3.0;
-    let network = Network {
-        hidden,
-        mean: vec![0.0; FEATURES],
-        deviation: vec![1.0; FEATURES],
-        first: [wave(FEATURES * hidden, 0.1), vec![0.1; hidden]],
-        second: [wave(hidden * hidden, 0.3), vec![0.0; hidden]],
-        output: [wave(hidden * OUTPUTS, 0.3), bias],
+    let brighter = |by: f32| {
+        let mut bias = bias.clone();
+        bias[..HISTOGRAM].iter_mut().for_each(|b| *b += by);
+        bias
     };
-    Estimator::new(vec![network], Calibration::default()).unwrap()
+    let network = |sight: Sight, by: f32| Network {
+        sight,
+        hidden,
+        mean: vec![0.0; sight.count()],
+        deviation: vec![1.0; sight.count()],
+        first: [wave(sight.count() * hidden, 0.1), vec![0.1; hidden]],
+        second: [wave(hidden * hidden, 0.3), vec![0.0; hidden]],
+        output: [wave(hidden * OUTPUTS, 0.3), brighter(by)],
+    };
+    let [parts, kind] = Sight::ALL;
+    let pair = [network(parts, by[0]), network(kind, by[1])];
+    Estimator::new(vec![pair], Calibration::default()).unwrap()
 }
 
 /// A picture that is not its own mirror image.
@@ -116,6 +129,17 @@ fn a_mirrored_photograph_has_mirrored_light() {
             a.distance(b) < 1e-3 * (1.0 + a.length()),
             "texel {k}: {a} {b}"
         );
+    }
+}
+
+#[test]
+fn brightness_is_told_by_the_network_that_sees_the_kind_of_place() {
+    let (photo, camera) = (photo(60, 40), camera(0.0, 60, 40));
+    let map = |by: [f32; 2]| brighter(by).estimate(&photo, &camera).map();
+    let (plain, parts, kind) = (map([0.0; 2]), map([0.7, 0.0]), map([0.0, 0.7]));
+    for (k, p) in plain.texels().iter().enumerate() {
+        assert!(parts.texels()[k].distance(*p) < 1e-4 * p.length());
+        assert!((kind.texels()[k] / 0.7f32.exp()).distance(*p) < 1e-4 * p.length());
     }
 }
 
@@ -378,13 +402,19 @@ fn features_are_of_the_whole_photograph_at_any_size() {
         SmallPhoto::new(&photo(256, 256), &camera(256)),
     );
     let (a, b) = (small.features(), large.features());
+    assert!(a.len() == FEATURES && b.len() == FEATURES);
     // The ramps are sampled at pixel corners: they differ by 3/8 of a pixel of the smaller one, under .006.
-    let most = a
+    let most = a[..OF_PARTS]
         .iter()
         .zip(&b)
         .map(|(a, b)| (a - b).abs())
         .fold(0.0, f32::max);
-    assert!(a.len() == FEATURES && most < 0.1, "{most}");
+    assert!(most < 0.1, "{most}");
+    // The backbone's features are of the order of 1.
+    let pairs = a[OF_PARTS..].iter().zip(&b[OF_PARTS..]);
+    let squares = pairs.clone().map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+    let size = pairs.map(|(a, _)| a * a).sum::<f32>();
+    assert!(squares < 0.02 * size, "{squares} of {size}");
 }
 
 #[test]

@@ -76,23 +76,25 @@ pub(crate) struct Pass {
     pub outputs: Vec<f32>,
 }
 
-/// Share of units that are left out of each hidden layer, and of features.
-#[derive(Clone, Copy)]
+/// Share of units that are left out of each hidden layer, and of each feature.
 pub(crate) struct Dropout {
     pub hidden: f32,
-    pub features: f32,
+    pub features: Vec<f32>,
 }
 
 /// The outputs for a batch of standardised features.
 pub(crate) fn forward(
     w: &Weights,
     mut x: Vec<f32>,
-    dropout: Dropout,
+    dropout: &Dropout,
     random: &mut SplitMix64,
 ) -> Pass {
     let n = w[1].len();
     let inputs = w[0].len() / n;
-    mask(&mut x, dropout.features, random);
+    let shares = dropout.features.iter().cycle();
+    x.iter_mut()
+        .zip(shares)
+        .for_each(|(x, s)| *x *= kept(*s, random));
     let first = affine(&x, inputs, &w[0], &w[1]);
     let (h, m1) = activated(&first, dropout.hidden, random);
     let second = affine(&h, n, &w[2], &w[3]);
@@ -169,25 +171,18 @@ fn input_gradient(g: &[f32], n: usize, weight: &[f32], inputs: usize) -> Vec<f32
     out
 }
 
-fn mask(values: &mut [f32], share: f32, random: &mut SplitMix64) -> Vec<f32> {
-    let kept = 1.0 / (1.0 - share);
-    let mask: Vec<f32> = values
-        .iter()
-        .map(|_| {
-            if share > 0.0 && random.unit() < share {
-                0.0
-            } else {
-                kept
-            }
-        })
-        .collect();
-    values.iter_mut().zip(&mask).for_each(|(v, m)| *v *= m);
-    mask
+/// The factor of a number that is left out with a probability.
+fn kept(share: f32, random: &mut SplitMix64) -> f32 {
+    match share > 0.0 && random.unit() < share {
+        true => 0.0,
+        false => 1.0 / (1.0 - share),
+    }
 }
 
 fn activated(steps: &[f32], share: f32, random: &mut SplitMix64) -> (Vec<f32>, Vec<f32>) {
     let mut h: Vec<f32> = steps.iter().map(|s| silu(*s)).collect();
-    let mask = mask(&mut h, share, random);
+    let mask: Vec<f32> = h.iter().map(|_| kept(share, random)).collect();
+    h.iter_mut().zip(&mask).for_each(|(h, m)| *h *= m);
     (h, mask)
 }
 

@@ -3,6 +3,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use dipir_estimator::network::Sight;
 use dipir_estimator::{Calibration, Estimator};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -154,7 +155,7 @@ fn checked(s: &Settings) -> Result<(), PlacesError> {
         && s.judged > 0
         && t.hidden > 0
         && t.batch > 0;
-    let shares = [t.dropout, t.feature_dropout]
+    let shares = [t.dropout, t.feature_dropout, t.kind_dropout]
         .iter()
         .all(|d| (0.0..1.0).contains(d));
     match sound && shares {
@@ -191,11 +192,17 @@ fn one_fold(
     let mut networks = Vec::new();
     for n in 0..settings.networks {
         let count = settings.networks as f64;
-        let mut told =
+        let told =
             |done: f64, loss: f64| progress(Progress::Training(f, (n as f64 + done) / count, loss));
         let seed = settings.seed ^ (f as u64 + 1) << 32 ^ (n as u64) << 48;
-        let network = train(&examples, &settings.training, probes, seed, &mut told);
-        networks.push(network.ok_or(PlacesError::Stopped)?);
+        let network = |sight: Sight, told: &mut dyn FnMut(f64, f64) -> bool| {
+            let seed = seed ^ (sight as u64) << 56;
+            train(&examples, &settings.training, probes, sight, seed, told)
+                .ok_or(PlacesError::Stopped)
+        };
+        let parts = network(Sight::Parts, &mut |done, loss| told(0.5 * done, loss))?;
+        let kind = network(Sight::Kind, &mut |done, loss| told(0.5 + 0.5 * done, loss))?;
+        networks.push([parts, kind]);
     }
     let member = Estimator::new(networks, Calibration::default())?;
     write(&file, &member.to_bytes()?)?;

@@ -1,8 +1,10 @@
 //! Training one network on the photographs of some places.
-use dipir_estimator::features::FEATURES;
+use dipir_estimator::features::OF_CAMERA;
 use dipir_estimator::grid::{BASE_TEXELS, BINS};
 use dipir_estimator::histogram::{SHARES, STOPS};
-use dipir_estimator::network::{ENERGY, EXPOSURE, HISTOGRAM, MAP, Network, OUTPUTS, SHARE, SUN};
+use dipir_estimator::network::{
+    ENERGY, EXPOSURE, HISTOGRAM, MAP, Network, OUTPUTS, SHARE, SUN, Sight,
+};
 use dipir_estimator::posterior::soft_bins;
 use serde::{Deserialize, Serialize};
 
@@ -29,6 +31,8 @@ pub struct Training {
     pub dropout: f32,
     /// Share of features that are left out in a step.
     pub feature_dropout: f32,
+    /// The same of the backbone's features.
+    pub kind_dropout: f32,
 }
 
 impl Default for Training {
@@ -41,6 +45,7 @@ impl Default for Training {
             weight_decay: 0.1,
             dropout: 0.4,
             feature_dropout: 0.1,
+            kind_dropout: 0.5,
         }
     }
 }
@@ -57,11 +62,12 @@ pub fn train(
     examples: &[&Example],
     settings: &Training,
     probes: &Probes,
+    sight: Sight,
     seed: u64,
     progress: &mut dyn FnMut(f64, f64) -> bool,
 ) -> Option<Network> {
     let rows = rows(examples, probes);
-    let network = start(&rows, settings.hidden, seed);
+    let network = start(&rows, sight, settings.hidden, seed);
     let inputs: Vec<Vec<f32>> = rows
         .iter()
         .map(|r| network.standardised(r.features))
@@ -79,7 +85,12 @@ pub fn train(
     let mut random = SplitMix64::new(seed);
     let dropout = Dropout {
         hidden: settings.dropout,
-        features: settings.feature_dropout,
+        features: (0..sight.count())
+            .map(|n| match sight == Sight::Kind && n >= OF_CAMERA {
+                true => settings.kind_dropout,
+                false => settings.feature_dropout,
+            })
+            .collect(),
     };
     let per_epoch = rows.len() / settings.batch;
     let total = (settings.epochs * per_epoch).max(1);
@@ -92,7 +103,7 @@ pub fn train(
                 .iter()
                 .flat_map(|k| inputs[*k].iter().copied())
                 .collect();
-            let pass = forward(&w, x, dropout, &mut random);
+            let pass = forward(&w, x, &dropout, &mut random);
             let mut gradient = vec![0.0; pass.outputs.len()];
             let mut sum = 0.0;
             let share = 1.0 / batch.len() as f32;
@@ -143,11 +154,11 @@ fn rows<'a>(examples: &[&'a Example], probes: &Probes) -> Vec<Row<'a>> {
 }
 
 /// A network that knows the means of features and of answers, and nothing else.
-fn start(rows: &[Row<'_>], hidden: usize, seed: u64) -> Network {
+fn start(rows: &[Row<'_>], sight: Sight, hidden: usize, seed: u64) -> Network {
     let count = rows.len().max(1) as f64;
-    let mut sums = vec![[0f64; 2]; FEATURES];
+    let mut sums = vec![[0f64; 2]; sight.count()];
     for row in rows {
-        for (s, x) in sums.iter_mut().zip(row.features) {
+        for (s, x) in sums.iter_mut().zip(sight.of(row.features)) {
             s[0] += f64::from(*x);
             s[1] += f64::from(*x) * f64::from(*x);
         }
@@ -164,10 +175,11 @@ fn start(rows: &[Row<'_>], hidden: usize, seed: u64) -> Network {
             .collect()
     };
     Network {
+        sight,
         hidden,
         deviation: sums.iter().map(spread).collect(),
         mean,
-        first: [drawn(FEATURES), vec![0.0; hidden]],
+        first: [drawn(sight.count()), vec![0.0; hidden]],
         second: [drawn(hidden), vec![0.0; hidden]],
         output: [vec![0.0; hidden * OUTPUTS], mean_answer(rows)],
     }

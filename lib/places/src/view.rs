@@ -1,8 +1,8 @@
 //! One photograph of a place.
 use std::f32::consts::TAU;
 
-use dipir_estimator::features::{SIDE, SmallPhoto};
-use dipir_imaging::raster::Raster;
+use dipir_estimator::features::{LOOKED, SmallPhoto};
+use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::luminance::luminance;
 use dipir_numerics::sampler::{Sampler, Stream};
@@ -11,8 +11,6 @@ use glam::{EulerRot, Mat3, Vec2, Vec3};
 
 use crate::place::{Place, SMOOTH};
 
-/// Rays along each side of a pixel.
-const RAYS: usize = 2;
 /// Curves that are mixed: from linear light to linear display values.
 const CURVES: usize = 4;
 /// The log-average of a photograph before its curve: `x / (1 + x)` shows it as .18.
@@ -39,6 +37,8 @@ pub struct View {
     pub curve: [f32; CURVES],
     /// Standard deviation of noise over the signal.
     pub noise: f32,
+    /// Rays along each side of a pixel: a photograph has `LOOKED / rays` pixels along each side.
+    pub rays: usize,
 }
 
 impl View {
@@ -62,6 +62,7 @@ impl View {
         let shares: [f32; CURVES] = std::array::from_fn(|_| between(0.0, 1.0).powi(3) + 1e-3);
         let total: f32 = shares.iter().sum();
         let noise = between(0.0, 0.05);
+        let rays = if between(0.0, 1.0) < 0.5 { 1 } else { 2 };
         Self {
             heading,
             pitch,
@@ -71,6 +72,7 @@ impl View {
             white,
             curve: shares.map(|v| v / total),
             noise,
+            rays,
         }
     }
 
@@ -85,18 +87,23 @@ impl View {
             white: Vec3::ONE,
             curve: [1.0, 0.0, 0.0, 0.0],
             noise: 0.0,
+            rays: 2,
         }
     }
 
-    /// The camera with azimuth 0, at the size that the estimator looks at.
+    fn side(&self) -> usize {
+        LOOKED / self.rays
+    }
+
+    /// The camera with azimuth 0.
     pub fn camera(&self) -> Camera {
-        let side = SIDE as f32;
+        let side = self.side() as f32;
         Camera {
             position: Vec3::ZERO,
             rotation: Mat3::from_euler(EulerRot::YXZ, 0.0, self.pitch, self.roll),
             focal_px: Vec2::splat(0.5 * side) / self.half,
             principal_px: Vec2::splat(0.5 * side),
-            resolution: [SIDE as u32; 2],
+            resolution: [self.side() as u32; 2],
         }
     }
 
@@ -114,10 +121,11 @@ impl View {
     pub fn take(&self, place: &Place, seed: u64) -> (SmallPhoto, Vec3, f32) {
         let camera = self.camera();
         let turn = self.heading as f32 / SMOOTH[0] as f32 * TAU;
-        let side = SIDE * RAYS;
-        let seen: Vec<Vec3> = (0..side * side)
+        let (side, rays) = (self.side(), self.rays);
+        let seen: Vec<Vec3> = (0..LOOKED * LOOKED)
             .map(|k| {
-                let at = Vec2::new((k % side) as f32 + 0.5, (k / side) as f32 + 0.5) / RAYS as f32;
+                let at = Vec2::new((k % LOOKED) as f32 + 0.5, (k / LOOKED) as f32 + 0.5);
+                let at = at / rays as f32;
                 let d = camera.ray(at).direction;
                 bilinear(&place.panorama, d.x.atan2(-d.z) + turn, d.y)
             })
@@ -141,16 +149,16 @@ impl View {
         };
         let fine: Vec<Vec3> = seen.iter().map(&mut shown).collect();
         let mean = |k: usize| {
-            let (x, y) = (k % SIDE * RAYS, k / SIDE * RAYS);
-            (0..RAYS * RAYS)
-                .map(|r| fine[(y + r / RAYS) * side + x + r % RAYS])
+            let (x, y) = (k % side * rays, k / side * rays);
+            (0..rays * rays)
+                .map(|r| fine[(y + r / rays) * LOOKED + x + r % rays])
                 .sum::<Vec3>()
-                / (RAYS * RAYS) as f32
+                / (rays * rays) as f32
         };
-        let small = Raster::from_pixels(SIDE, SIDE, (0..SIDE * SIDE).map(mean).collect());
+        let photo = Raster::from_pixels(side, side, (0..side * side).map(mean).collect());
         let grey = (GREY * luminance(place.mean()) * exposure).max(1e-6);
         (
-            SmallPhoto::of_small(small, &camera),
+            SmallPhoto::new(&LinearImage(photo), &camera),
             gain,
             self.develop(grey) / grey,
         )

@@ -40,7 +40,7 @@ pub const LORA: StageName = StageName {
 pub const LIGHT: StageName = StageName {
     name: "light",
     executable: "dipir-light",
-    version: 5,
+    version: 6,
 };
 /// Renders the picture and its layers.
 pub const COMPOSITE: StageName = StageName {

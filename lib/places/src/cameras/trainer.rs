@@ -62,7 +62,7 @@ pub(crate) fn train(
     let mut random = SplitMix64::new(seed);
     let dropout = Dropout {
         hidden: settings.dropout,
-        features: 0.0,
+        features: vec![0.0],
     };
     let batch_size = settings.batch.min(samples.len()).max(1);
     let total = (settings.epochs * (samples.len() / batch_size)).max(1);
@@ -73,7 +73,7 @@ pub(crate) fn train(
         for batch in order.chunks_exact(batch_size) {
             let batch: Vec<&Sample> = batch.iter().map(|k| samples[*k]).collect();
             let x = inputs(&network, &batch, settings.feature_dropout, &mut random);
-            let pass = forward(&w, x, dropout, &mut random);
+            let pass = forward(&w, x, &dropout, &mut random);
             let (loss, gradient) = surprise(&pass.outputs, &batch);
             late = match late.is_nan() {
                 true => loss,

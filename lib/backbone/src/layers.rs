@@ -1,0 +1,150 @@
+//! Convolutions of feature maps, with batch normalisation folded into weights and biases.
+use gemm::{Parallelism, gemm};
+
+/// Numbers by row, column and channel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Map {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Numbers of each cell.
+    pub channels: usize,
+    /// All numbers, cell after cell.
+    pub values: Vec<f32>,
+}
+
+impl Map {
+    /// The mean of each channel over the map.
+    pub fn mean(&self) -> Vec<f32> {
+        let mut sums = vec![0f64; self.channels];
+        for cell in self.values.chunks_exact(self.channels) {
+            sums.iter_mut()
+                .zip(cell)
+                .for_each(|(s, v)| *s += f64::from(*v));
+        }
+        let count = (self.width * self.height) as f64;
+        sums.iter().map(|s| (s / count) as f32).collect()
+    }
+}
+
+/// Weights of a layer and the bias of each of its outputs.
+pub(crate) struct Layer {
+    /// Dense: `inputs x outputs`; by channel: `taps x channels`.
+    pub weight: Vec<f32>,
+    pub bias: Vec<f32>,
+}
+
+/// The side of a square kernel and its step.
+#[derive(Clone, Copy)]
+pub(crate) struct Window {
+    pub side: usize,
+    pub step: usize,
+}
+
+impl Window {
+    /// Outputs along a line of `n`, and how many taps of the first lie outside: half of all that must, rounded down.
+    fn line(self, n: usize) -> (usize, usize) {
+        let outputs = n.div_ceil(self.step);
+        let outside = ((outputs - 1) * self.step + self.side).saturating_sub(n);
+        (outputs, outside / 2)
+    }
+
+    /// Calls `tap(output cell, kernel tap, input cell)` for all taps that lie inside of the map.
+    fn taps(self, map: &Map, mut tap: impl FnMut(usize, usize, usize)) -> [usize; 2] {
+        let (columns, left) = self.line(map.width);
+        let (rows, above) = self.line(map.height);
+        for (y, x) in (0..rows).flat_map(|y| (0..columns).map(move |x| (y, x))) {
+            for k in 0..self.side * self.side {
+                let row = (y * self.step + k / self.side).wrapping_sub(above);
+                let column = (x * self.step + k % self.side).wrapping_sub(left);
+                if row < map.height && column < map.width {
+                    tap(y * columns + x, k, row * map.width + column);
+                }
+            }
+        }
+        [columns, rows]
+    }
+}
+
+/// A map times a matrix, cell by cell.
+pub(crate) fn pointwise(map: &Map, layer: &Layer) -> Map {
+    let (cells, inputs, outputs) = (map.width * map.height, map.channels, layer.bias.len());
+    let mut values = layer.bias.repeat(cells);
+    assert!(map.values.len() == cells * inputs && layer.weight.len() == inputs * outputs);
+    // SAFETY: dense row-major matrices whose sizes are checked above; `values` is borrowed alone.
+    unsafe {
+        gemm(
+            cells,
+            outputs,
+            inputs,
+            values.as_mut_ptr(),
+            1,
+            outputs as isize,
+            true,
+            map.values.as_ptr(),
+            1,
+            inputs as isize,
+            layer.weight.as_ptr(),
+            1,
+            outputs as isize,
+            1.0,
+            1.0,
+            false,
+            false,
+            false,
+            Parallelism::None,
+        );
+    }
+    Map {
+        channels: outputs,
+        values,
+        ..*map
+    }
+}
+
+/// A convolution of all channels with all.
+pub(crate) fn dense(map: &Map, layer: &Layer, window: Window) -> Map {
+    let taps = window.side * window.side;
+    let (columns, rows) = (window.line(map.width).0, window.line(map.height).0);
+    let n = map.channels;
+    let mut patches = vec![0.0; columns * rows * taps * n];
+    window.taps(map, |to, k, from| {
+        let at = (to * taps + k) * n;
+        patches[at..at + n].copy_from_slice(&map.values[from * n..(from + 1) * n]);
+    });
+    let patches = Map {
+        width: columns,
+        height: rows,
+        channels: taps * n,
+        values: patches,
+    };
+    pointwise(&patches, layer)
+}
+
+/// A convolution of each channel with itself.
+pub(crate) fn by_channel(map: &Map, layer: &Layer, window: Window) -> Map {
+    let n = map.channels;
+    let (columns, rows) = (window.line(map.width).0, window.line(map.height).0);
+    let mut values = layer.bias.repeat(columns * rows);
+    window.taps(map, |to, k, from| {
+        let input = &map.values[from * n..(from + 1) * n];
+        let weight = &layer.weight[k * n..(k + 1) * n];
+        let output = &mut values[to * n..(to + 1) * n];
+        for ((o, x), w) in output.iter_mut().zip(input).zip(weight) {
+            *o += x * w;
+        }
+    });
+    Map {
+        width: columns,
+        height: rows,
+        channels: n,
+        values,
+    }
+}
+
+/// Between 0 and 6.
+pub(crate) fn clamped(mut map: Map) -> Map {
+    map.values.iter_mut().for_each(|v| *v = v.clamp(0.0, 6.0));
+    map
+}
