@@ -69,14 +69,7 @@ fn five_million_triangles_are_set_up_in_bounded_memory() {
     project.write("object.glb", sheet());
     let run = project.run(
         SCENE,
-        &[
-            "--json",
-            "--set",
-            r#"scene.objects=[{path="object.glb"}]"#,
-            // Without a pilot render.
-            "--set",
-            r#"scene.effects.mode="all""#,
-        ],
+        &["--json", "--set", r#"scene.objects=[{path="object.glb"}]"#],
     );
     run.expect_success();
     let result: Value = serde_json::from_str(&run.stdout).unwrap();

@@ -68,7 +68,8 @@ fn the_scene_stage_writes_what_the_others_read() {
         roles.contains(&"background") && roles.contains(&"object"),
         "{roles:?}"
     );
-    assert!(roles.contains(&"environment"), "{roles:?}");
+    // Which effects show is found by the composite, under the light that it has.
+    assert!(!roles.contains(&"environment"), "{roles:?}");
     assert!(manifest.elapsed_s > 0.0);
     assert_eq!(manifest.damages(&project.path("out/scene")).unwrap(), []);
 }
@@ -79,9 +80,10 @@ fn an_effect_that_is_switched_off_costs_no_ray() {
     project
         .run(SCENE, &["--set", "scene.effects.shadow=off"])
         .expect_success();
-    let effects = json(&project, "out/scene/effects.json");
-    assert_eq!(effects["rays"]["shadow"], 0);
     project.run(COMPOSITE, &[]).expect_success();
+    let effects = json(&project, "out/composite/effects.json");
+    assert_eq!(effects["rays"]["shadow"], 0);
+    assert!(effects["rays"]["camera"].as_u64() > Some(0));
     let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
     assert!(
         layers
@@ -94,17 +96,24 @@ fn an_effect_that_is_switched_off_costs_no_ray() {
 }
 
 #[test]
-fn a_draft_is_not_planned_unless_it_is_asked_for() {
+fn the_composite_says_what_effects_contribute_unless_everything_is_simulated() {
     let project = Project::new();
-    let draft = ["--set", "pipeline.quality=draft"];
-    let left_out = |more: &[&str]| {
-        project
-            .run(SCENE, &[&draft[..], more].concat())
-            .expect_success();
-        json(&project, "out/scene/effects.json")["left_out"].as_f64()
+    let effects = |more: &[&str]| {
+        project.run(SCENE, more).expect_success();
+        project.run(COMPOSITE, more).expect_success();
+        json(&project, "out/composite/effects.json")
     };
-    assert_eq!(left_out(&[]), None);
-    assert!(left_out(&["--set", "scene.effects.mode=planned"]).is_some());
+    let contribution = |effects: &serde_json::Value, name: &str| {
+        let mut all = effects["effects"].as_array().unwrap().iter();
+        all.find(|e| e["name"] == name).unwrap()["contribution"].as_f64()
+    };
+    let planned = effects(&[]);
+    assert!(contribution(&planned, "shadow") > Some(0.01), "{planned}");
+    let bound = planned["left_out_upper_95"].as_f64().unwrap();
+    assert!(bound <= planned["tolerance"].as_f64().unwrap(), "{planned}");
+    let all = effects(&["--set", "scene.effects.mode=all"]);
+    assert_eq!(contribution(&all, "shadow"), None);
+    assert_eq!(all["left_out"].as_f64(), None);
 }
 
 #[test]

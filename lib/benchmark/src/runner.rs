@@ -171,7 +171,7 @@ impl Runner<'_> {
     fn shared_work(&self, scene: &SceneInfo, method: &Method) -> anyhow::Result<PathBuf> {
         let before_light = |s: &&String| !s.starts_with("light.") && !s.starts_with("composite.");
         let params = json!({
-            // Under a given light effects are planned for it, so no two such methods share a scene.
+            // Where the light is given, no transport is recorded.
             "light": match method.light {
                 Source::Recovered => "recovered",
                 _ => &method.name,

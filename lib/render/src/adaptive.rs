@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::contribution::{LeaveOut, LeftOut, SHARE_OF_TARGET};
 use crate::counters::RayCounts;
 use crate::denoise;
 use crate::error::RenderError;
@@ -23,6 +24,7 @@ use crate::film::{Film, SquaredError, Viewing};
 use crate::foresight::{Foresight, first_share};
 use crate::highlights::Found;
 use crate::job::{Job, Layer, REPLICATES};
+use crate::render::Simulation;
 
 /// When to stop.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -103,14 +105,26 @@ pub struct Refined {
     pub rounds: u32,
     /// What other errors cost.
     pub foresight: Foresight,
+    /// What effects contribute, where that was asked for.
+    pub left_out: Option<LeftOut>,
+}
+
+/// What a round draws.
+#[derive(Clone, Copy)]
+pub struct Round<'a> {
+    /// What is simulated.
+    pub simulation: Simulation,
+    /// The layers so far, where the round measures what effects contribute: the object's are done before shadows begin.
+    pub measures: Option<(&'a Film, &'a Viewing<'a>)>,
 }
 
 /// Samples per replicate of a pixel with a highlight in its first round: the highlight may fill a hundredth of the area
 /// that they concentrate on.
 const FIRST_ROUND_WITH_HIGHLIGHT: u32 = 1024;
 
-/// Draws samples until `stop`. `advance(job, n)` brings a job to `n` samples per pixel and
-/// replicate; `find_highlights(film, jobs)` says once, after the first round, which pixels of the object start
+/// Draws samples until `stop`. `advance(job, n, round)` brings a job to `n` samples per pixel and
+/// replicate; the first round simulates `simulation`, and measures what may be left out from the next one on, if
+/// `leave_out` says what; `find_highlights(film, jobs)` says once, after the first round, which pixels of the object start
 /// again with another density of samples; with `denoise` shadows are filtered after every round; `progress` may break
 /// off whenever it is called. A time budget counts from `start`; where it ends within the first round, the pixels that
 /// have no samples yet are taken from `coarse`, the same picture at a lower resolution. Without one, the first round is
@@ -122,7 +136,9 @@ pub fn refine(
     start: Instant,
     max_samples: u32,
     viewing: &Viewing,
-    advance: &(impl Fn(&mut Job, u32) + Sync),
+    simulation: Simulation,
+    leave_out: Option<&LeaveOut>,
+    advance: &(impl Fn(&mut Job, u32, &Round) + Sync),
     find_highlights: &dyn Fn(&Film, &[Job]) -> Found,
     denoise: bool,
     coarse: Option<&Film>,
@@ -139,6 +155,7 @@ pub fn refine(
     let mut search = RayCounts::default();
     let mut foresight = Foresight::new(limit);
     let mut report = Progress::default();
+    let (mut simulation, mut stop, mut left_out) = (simulation, stop, None::<LeftOut>);
     loop {
         let round_start = Instant::now();
         let cost_before: f64 = jobs.iter().map(Job::cost).sum();
@@ -146,7 +163,7 @@ pub fn refine(
             Stop::TargetError(target) if round == 0 => first_share(f64::from(target)),
             _ => share_after(report.fraction, &jobs, &goals),
         };
-        let within_round = |share: f64| {
+        let mut within_round = |share: f64| {
             let fraction = match stop {
                 Stop::TimeBudget(budget) => share_of_time(start.elapsed(), budget),
                 _ => report.fraction + share * (end_of_round - report.fraction),
@@ -159,23 +176,50 @@ pub fn refine(
             })
         };
         let is_wanted = |job: &Job, goal| goal > job.samples && (job.samples > 0 || !is_late());
-        if draw(&mut jobs, &goals, &is_wanted, advance, within_round).is_break() {
-            return Err(RenderError::Interrupted);
+        let measures = leave_out.is_some() && round == 0;
+        let phases: &[Phase] = match measures {
+            true => &[Phase::Object, Phase::Shadow],
+            false => &[Phase::All],
+        };
+        for (number, &phase) in phases.iter().enumerate() {
+            let drawn = Round {
+                simulation,
+                measures: measures.then_some((&film, viewing)),
+            };
+            let share = |share| (number as f64 + share) / phases.len() as f64;
+            let is_wanted = |job: &Job, goal| phase.holds(job) && is_wanted(job, goal);
+            let advance = |job: &mut Job, goal: u32| advance(job, goal, &drawn);
+            let report = |done| within_round(share(done));
+            if draw(&mut jobs, &goals, phase, &is_wanted, &advance, report).is_break() {
+                return Err(RenderError::Interrupted);
+            }
+            film.develop(&jobs);
         }
         let cost_of_round = jobs.iter().map(Job::cost).sum::<f64>() - cost_before;
         let seconds_of_round = round_start.elapsed().as_secs_f64();
         round += 1;
-        film.develop(&jobs);
         if round == 1
             && let Some(coarse) = coarse
         {
             film.fill_in(&jobs, coarse);
         }
+        if let (1, Some(allowed)) = (round, leave_out) {
+            let decided = leave_out_of(&jobs, simulation, allowed, stop, &film, viewing);
+            jobs.iter_mut().for_each(|job| job.measured = None);
+            simulation = decided.simulation;
+            stop = without_bias(stop, &decided);
+            left_out = Some(decided);
+        }
         if round == 1 && !is_late() {
             let found = find_highlights(&film, &jobs);
             search = found.counts;
             let goal = FIRST_ROUND_WITH_HIGHLIGHT.min(limit);
-            let begun = start_again(&mut jobs, found, goal, advance);
+            let drawn = Round {
+                simulation,
+                measures: None,
+            };
+            let advance = |job: &mut Job, goal: u32| advance(job, goal, &drawn);
+            let begun = start_again(&mut jobs, found, goal, &advance);
             film.develop(&jobs[begun..]);
         }
         let denoised = match denoise {
@@ -205,6 +249,7 @@ pub fn refine(
                 .iter()
                 .zip(jobs.iter())
                 .all(|(&n, job)| n <= job.samples);
+        let error = with_bias(error, left_out.as_ref());
         report = Progress {
             round,
             error,
@@ -230,6 +275,7 @@ pub fn refine(
                 samples: report.samples,
                 rounds: round,
                 foresight,
+                left_out,
             });
         }
         goals = next;
@@ -241,11 +287,15 @@ pub fn refine(
 fn draw(
     jobs: &mut [Job],
     goals: &[u32],
+    phase: Phase,
     is_wanted: &(impl Fn(&Job, u32) -> bool + Sync),
     advance: &(impl Fn(&mut Job, u32) + Sync),
     mut report: impl FnMut(f64) -> ControlFlow<()>,
 ) -> ControlFlow<()> {
-    let work = |job: &Job, goal: u32| work(job, goal) as u64;
+    let work = |job: &Job, goal: u32| match phase.holds(job) {
+        true => work(job, goal) as u64,
+        false => 0,
+    };
     let all: u64 = jobs.iter().zip(goals).map(|(j, &g)| work(j, g)).sum();
     let (done, is_broken) = (AtomicU64::new(0), AtomicBool::new(false));
     let mut draw = || {
@@ -281,6 +331,63 @@ fn draw(
     match is_broken.into_inner() {
         true => ControlFlow::Break(()),
         false => ControlFlow::Continue(()),
+    }
+}
+
+/// Which jobs are drawn at a time.
+#[derive(Clone, Copy)]
+enum Phase {
+    All,
+    Object,
+    Shadow,
+}
+
+impl Phase {
+    fn holds(self, job: &Job) -> bool {
+        match self {
+            Phase::All => true,
+            Phase::Object => job.layer == Layer::Object,
+            Phase::Shadow => job.layer != Layer::Object,
+        }
+    }
+}
+
+/// What is left out after the first round.
+fn leave_out_of(
+    jobs: &[Job],
+    simulation: Simulation,
+    allowed: &LeaveOut,
+    stop: Stop,
+    film: &Film,
+    viewing: &Viewing,
+) -> LeftOut {
+    let most = match stop {
+        Stop::TargetError(target) => SHARE_OF_TARGET * f64::from(target),
+        _ => f64::INFINITY,
+    };
+    let tolerance = allowed.tolerance.min(most);
+    let touched = touched_pixels(film, viewing);
+    LeftOut::decide(jobs, simulation, allowed, tolerance, touched)
+}
+
+/// Where samples stop, so that with what is left out the error is as `stop` says.
+fn without_bias(stop: Stop, left_out: &LeftOut) -> Stop {
+    match stop {
+        Stop::TargetError(target) => {
+            let square = f64::from(target).powi(2) - left_out.lost.upper_95.powi(2);
+            Stop::TargetError(square.max(0.0).sqrt() as f32)
+        }
+        _ => stop,
+    }
+}
+
+/// The error of samples and of what is left out together: they are independent.
+fn with_bias(error: EstimatedError, left_out: Option<&LeftOut>) -> EstimatedError {
+    let lost = left_out.map(|l| l.lost).unwrap_or_default();
+    EstimatedError {
+        rmse: error.rmse.hypot(lost.rmse),
+        upper_95: error.upper_95.hypot(lost.upper_95),
+        ..error
     }
 }
 
@@ -353,19 +460,21 @@ fn timed_growth(left: f64, again: f64) -> f64 {
     }
 }
 
+/// Pixels that the object or its shadow touches.
+fn touched_pixels(film: &Film, viewing: &Viewing) -> u64 {
+    let (width, height) = (film.alpha.width(), film.alpha.height());
+    let rows = (0..height).into_par_iter().map(|y| {
+        let touched = (0..width).filter(|&x| viewing.is_touched(film, x, y));
+        touched.count() as u64
+    });
+    rows.sum()
+}
+
 fn total_error(errors: &[SquaredError], film: &Film, viewing: &Viewing) -> EstimatedError {
     let total = errors
         .iter()
         .fold(SquaredError::default(), |sum, e| sum.merge(*e));
-    let (width, height) = (film.alpha.width(), film.alpha.height());
-    let touched: u64 = (0..height)
-        .into_par_iter()
-        .map(|y| {
-            (0..width)
-                .filter(|&x| viewing.is_touched(film, x, y))
-                .count() as u64
-        })
-        .sum();
+    let touched = touched_pixels(film, viewing);
     let pixels = touched.max(1) as f64;
     // 1.645 standard errors bound a normal variable from above in 95% of cases. Of a sum of squares it
     // is the logarithm that is nearly normal: few pixels hold most of the error, and where the sum

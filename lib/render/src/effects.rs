@@ -1,17 +1,12 @@
 //! Which effects a scene calls for.
 //!
-//! An effect is absent by structure (no coat on any material, a plane that cannot shadow itself),
-//! or a pilot render at low resolution measures what leaving it out would change: the
-//! display-referred RMSE between the composite with everything and the composite without it, over
-//! the pixels that the object or its shadow touches. Effects are left out, the least important
-//! first, while what is lost together stays below the tolerance: RMSE is a norm, so the sum of the
-//! parts bounds the whole.
-//!
-//! Both pictures share their random numbers, so an effect that changes nothing measures exactly
-//! zero; and the squared difference is the product of two independently seeded differences, so that
-//! noise does not count as contribution.
+//! What a scene cannot show is known from its description: no coat on any material, a plane that cannot shadow itself,
+//! a convex object whose parts light cannot bounce between. Of what it can show, the first round of a render measures
+//! what it contributes ([`crate::contribution`]): the display-referred RMSE that leaving it out would cost, over the
+//! pixels that the object or its shadow touches. From then on effects are left out, the least important first, while
+//! what is lost together stays below the tolerance: RMSE is a norm, so the sum of the parts bounds the whole. Effects
+//! that change a surface, but neither the number of rays nor their ways, are simulated wherever the scene has them.
 use std::collections::BTreeMap;
-use std::ops::ControlFlow;
 
 use dipir_scene::config::{EffectSwitch, EffectsConfig, EffectsMode};
 use dipir_scene::material::{AlphaMode, Material};
@@ -20,11 +15,10 @@ use dipir_scene::scene::Scene;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use crate::error::RenderError;
-use crate::features::{self, PROXY_RADIANCE};
-use crate::light::SceneLight;
-use crate::pilot::{Difference, Pilot};
-use crate::render::{Renderer, Settings, Simulation};
+use crate::contribution::LeaveOut;
+use crate::counters::{RayCounts, RayKind};
+use crate::features::{self, PROXY_RADIANCE, has};
+use crate::render::{Rendered, Renderer, Settings, Simulation};
 use crate::shadow::LightOnProxy;
 
 /// A phenomenon that can be simulated, by its name in files.
@@ -115,6 +109,18 @@ impl Effect {
         }
     }
 
+    /// Whether the first round of a render measures what it contributes.
+    fn is_measured(self) -> bool {
+        matches!(
+            self,
+            Effect::Shadow
+                | Effect::Interreflection
+                | Effect::EmissionOnProxy
+                | Effect::BounceToProxy
+                | Effect::BounceFromProxy
+        )
+    }
+
     /// What must be simulated too for this effect to mean anything.
     fn needs(self) -> Option<Effect> {
         match self {
@@ -140,8 +146,7 @@ pub struct PlannedEffect {
     pub contribution: Option<f64>,
     /// Standard error of `contribution`.
     pub contribution_se: Option<f64>,
-    /// Share of the pilot's effort with everything on that leaving it out saves, counted in rays
-    /// and weighted shading, so that it is the same on every machine.
+    /// Share of the first round's rays that are traced for it alone.
     pub time_share: Option<f64>,
 }
 
@@ -153,12 +158,14 @@ pub struct EffectsPlan {
     pub max_depth: u32,
     /// Display-referred RMSE that was allowed to be left out.
     pub tolerance: f64,
-    /// Measured display-referred RMSE of everything that was left out; absent if nothing was
+    /// Display-referred RMSE of everything that was left out, as measured, if the parts add up; absent if nothing was
     /// measured.
     pub left_out: Option<f64>,
+    /// One-sided 95% bound of it.
+    pub left_out_upper_95: Option<f64>,
     /// All effects.
     pub effects: Vec<PlannedEffect>,
-    /// Rays of the pilot render as planned, by kind.
+    /// Rays traced so far, by kind: those of the composite, once it is rendered.
     pub rays: BTreeMap<String, u64>,
 }
 
@@ -193,8 +200,9 @@ impl EffectsPlan {
             max_depth: MAX_DEPTH,
             tolerance: 0.0,
             left_out: None,
+            left_out_upper_95: None,
             effects,
-            rays: BTreeMap::new(),
+            rays: named(&RayCounts::default()),
         }
     }
 
@@ -326,47 +334,151 @@ fn switch(config: &EffectsConfig, effect: Effect) -> EffectSwitch {
         .map_or(EffectSwitch::Auto, |(_, s)| s)
 }
 
-/// Decides what to simulate of the renderer's scene under `light`. Of `settings` the pilot takes
-/// seed, photograph, transfer and mask. `progress` is told the share done and may break off.
-pub fn plan<L: SceneLight>(
-    renderer: &Renderer,
-    light: &L,
-    config: &EffectsConfig,
-    settings: &Settings,
-    progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
-) -> Result<EffectsPlan, RenderError> {
-    let scene = renderer.scene();
-    let mut plan = EffectsPlan::everything(scene, settings);
-    plan.tolerance = config.tolerance();
-    for effect in Effect::ALL {
-        if absence(scene, settings, effect).is_none() {
+impl EffectsPlan {
+    /// What the renderer's scene can show and the user does not switch off.
+    pub fn new(renderer: &Renderer, config: &EffectsConfig, settings: &Settings) -> Self {
+        let scene = renderer.scene();
+        let mut plan = Self::everything(scene, settings);
+        plan.tolerance = match config.mode() {
+            EffectsMode::Planned => config.tolerance(),
+            EffectsMode::All => 0.0,
+        };
+        let is_planned = config.mode() == EffectsMode::Planned;
+        for effect in Effect::ALL {
+            if absence(scene, settings, effect).is_some() {
+                continue;
+            }
             match switch(config, effect) {
                 EffectSwitch::On => plan.set(effect, true, "switched on by the user".into()),
                 EffectSwitch::Off => {
                     plan = plan.without(effect);
                     plan.set(effect, false, "switched off by the user".into());
                 }
+                EffectSwitch::Auto if is_planned && plan.is_enabled(effect) => {
+                    let reason = match effect.is_measured() {
+                        true => "the scene can show it",
+                        false => "the scene has it",
+                    };
+                    plan.set(effect, true, reason.into());
+                }
                 EffectSwitch::Auto => {}
             }
         }
+        explain_dependents(&mut plan);
+        if is_planned
+            && switch(config, Effect::Interreflection) == EffectSwitch::Auto
+            && renderer.geometry().convex
+            && !lets_light_pass(scene)
+        {
+            let why = "the object is convex, so that no part of it lights another";
+            plan.set(Effect::Interreflection, false, why.into());
+        }
+        plan.max_depth = config.max_depth.unwrap_or(MAX_DEPTH);
+        if !plan.is_enabled(Effect::Interreflection) {
+            plan.max_depth = plan.max_depth.min(1);
+        }
+        plan.rays = named(&RayCounts::default());
+        plan
     }
-    explain_dependents(&mut plan);
-    let pilot = Pilot::new(renderer, light, settings);
-    match (config.mode(), pilot.is_affordable()) {
-        (EffectsMode::Planned, true) => leave_out(&mut plan, &pilot, config, progress)?,
-        (EffectsMode::Planned, false) => explain_unmeasured(&mut plan, config),
-        (EffectsMode::All, _) => {}
+
+    /// What a render may leave out after its first round; `None` where everything is to be simulated.
+    pub fn leave_out(&self, config: &EffectsConfig) -> Option<LeaveOut> {
+        let is_open = |e| self.is_enabled(e) && switch(config, e) == EffectSwitch::Auto;
+        (self.tolerance > 0.0).then(|| LeaveOut {
+            tolerance: self.tolerance,
+            depth: is_open(Effect::Interreflection) && config.max_depth.is_none(),
+            emission_on_proxy: is_open(Effect::EmissionOnProxy),
+            bounce_to_proxy: is_open(Effect::BounceToProxy),
+            bounce_from_proxy: is_open(Effect::BounceFromProxy),
+        })
     }
-    if let Some(depth) = config.max_depth {
-        plan.max_depth = depth;
+
+    /// The plan with what a render of it did: rays, and what effects contribute where it was measured.
+    pub fn rendered(&self, rendered: &Rendered) -> Self {
+        let mut plan = self.clone();
+        plan.rays = named(&rendered.counts);
+        let Some(left_out) = &rendered.left_out else {
+            return plan;
+        };
+        let simulation = &left_out.simulation;
+        let sent = simulation.light_on_proxy;
+        let first = &left_out.first_round;
+        let share = |kind| first.get(kind) as f64 / first.total().max(1) as f64;
+        use RayKind::{LightOnProxy, ProxyOcclusion, ProxyRadiance, Shadow};
+        // What was measured, its rays, and whether it was kept.
+        let measured = [
+            (
+                Effect::Shadow,
+                left_out.shadow(),
+                Some(Shadow),
+                simulation.shadow,
+            ),
+            (
+                Effect::Interreflection,
+                left_out.interreflection(),
+                None,
+                simulation.max_depth > 1,
+            ),
+            (
+                Effect::EmissionOnProxy,
+                left_out.emission_on_proxy(),
+                None,
+                sent.is_some_and(|s| s.emission),
+            ),
+            (
+                Effect::BounceToProxy,
+                left_out.bounce_to_proxy(),
+                Some(LightOnProxy),
+                sent.is_some_and(|s| s.bounce),
+            ),
+            (
+                Effect::BounceFromProxy,
+                left_out.bounce_from_proxy(),
+                Some(ProxyRadiance),
+                has(simulation.features, PROXY_RADIANCE),
+            ),
+        ];
+        for effect in &mut plan.effects {
+            if effect.enabled && effect.name == Effect::ProxyOcclusion {
+                effect.time_share = Some(share(ProxyOcclusion));
+            }
+            let found = measured.iter().find(|m| m.0 == effect.name);
+            let Some((_, contribution, rays, is_kept)) = found.filter(|_| effect.enabled) else {
+                continue;
+            };
+            effect.contribution = Some(contribution.rmse);
+            effect.contribution_se = Some(contribution.std_error);
+            effect.time_share = rays.map(share);
+            let text = format!(
+                "contributes {:.5} +- {:.5}",
+                contribution.rmse, contribution.std_error
+            );
+            effect.enabled = *is_kept;
+            if !is_kept {
+                let tolerance = left_out.tolerance;
+                effect.reason = format!(
+                    "{text}, left out after the first round within the tolerance of {tolerance:.5}"
+                );
+            } else if effect.reason != "switched on by the user" {
+                effect.reason = text;
+            }
+        }
+        plan.max_depth = simulation.max_depth;
+        plan.left_out = Some(left_out.lost.rmse);
+        plan.left_out_upper_95 = Some(left_out.lost.upper_95);
+        plan
     }
-    plan.rays = pilot
-        .render(&plan.simulation())?
-        .counts
-        .named()
-        .map(|(name, n)| (name.to_owned(), n))
-        .collect();
-    Ok(plan)
+}
+
+fn named(counts: &RayCounts) -> BTreeMap<String, u64> {
+    let named = counts.named().map(|(name, n)| (name.to_owned(), n));
+    named.collect()
+}
+
+/// Whether a ray that leaves a convex object may meet it again, from within.
+fn lets_light_pass(scene: &Scene) -> bool {
+    let opens = |m: &Material| m.alpha_mode != AlphaMode::Opaque || m.transmission.is_some();
+    scene.materials.iter().any(opens)
 }
 
 /// Switched-off effects take those along that mean nothing without them.
@@ -379,107 +491,6 @@ fn explain_dependents(plan: &mut EffectsPlan) {
             }
         }
     }
-}
-
-/// Where a ray takes too long for anything to be measured, everything is simulated.
-fn explain_unmeasured(plan: &mut EffectsPlan, config: &EffectsConfig) {
-    for effect in Effect::ALL {
-        if plan.is_enabled(effect) && switch(config, effect) == EffectSwitch::Auto {
-            plan.set(effect, true, "not measured, for rays take too long".into());
-        }
-    }
-}
-
-/// Measures every effect that the user leaves open and drops what the tolerance allows.
-fn leave_out<L: SceneLight>(
-    plan: &mut EffectsPlan,
-    pilot: &Pilot<L>,
-    config: &EffectsConfig,
-    progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
-) -> Result<(), RenderError> {
-    let open: Vec<Effect> = Effect::ALL
-        .into_iter()
-        // A mask is data, not an effect that costs time.
-        .filter(|&e| e != Effect::Occluders && plan.is_enabled(e))
-        .filter(|&e| switch(config, e) == EffectSwitch::Auto)
-        .collect();
-    let everything = plan.clone();
-    let reference = pilot.reference(&everything.simulation())?;
-    let steps = open.len() as f64 + f64::from(MAX_DEPTH.ilog2());
-    let mut done = 0.0;
-    let mut step = || {
-        done += 1.0;
-        match progress((done / steps).min(1.0)) {
-            ControlFlow::Break(()) => Err(RenderError::Interrupted),
-            ControlFlow::Continue(()) => Ok(()),
-        }
-    };
-
-    // ---- What each effect contributes, alone ------------------------------------------------
-    let mut measured: Vec<(Effect, Difference)> = Vec::new();
-    for &effect in &open {
-        let difference = pilot.difference(&reference, &everything.without(effect).simulation())?;
-        if let Some(e) = plan.effects.iter_mut().find(|e| e.name == effect) {
-            e.contribution = Some(difference.rmse);
-            e.contribution_se = Some(difference.std_error);
-            e.time_share = Some(difference.cost_share);
-        }
-        measured.push((effect, difference));
-        step()?;
-    }
-
-    // ---- Whole effects, the least important first; half of the tolerance is kept for D ------
-    measured.sort_by(|a, b| a.1.upper_95().total_cmp(&b.1.upper_95()));
-    let tolerance = plan.tolerance;
-    let mut spent = 0.0;
-    for (effect, difference) in &measured {
-        let budget = match effect {
-            Effect::Interreflection => tolerance,
-            _ => 0.5 * tolerance,
-        };
-        let text = format!("{:.5} +- {:.5}", difference.rmse, difference.std_error);
-        if !plan.is_enabled(*effect) {
-            continue; // Gone with what it needs.
-        }
-        if spent + difference.upper_95() <= budget {
-            spent += difference.upper_95();
-            *plan = plan.without(*effect);
-            let reason =
-                format!("contributes {text}, left out within the tolerance of {tolerance}");
-            plan.set(*effect, false, reason);
-            explain_dependents(plan);
-        } else {
-            plan.set(*effect, true, format!("contributes {text}"));
-        }
-    }
-
-    // ---- The smallest depth that suffices ---------------------------------------------------
-    if !plan.is_enabled(Effect::Interreflection) {
-        plan.max_depth = 1;
-    } else if config.max_depth.is_none()
-        && switch(config, Effect::Interreflection) == EffectSwitch::Auto
-    {
-        // What is lost falls with depth, so the least sufficient one is found by halving.
-        let (mut least, mut most) = (2, MAX_DEPTH);
-        while least < most {
-            let depth = (least + most) / 2;
-            let mut shallow = everything.clone();
-            shallow.max_depth = depth;
-            let difference = pilot.difference(&reference, &shallow.simulation())?;
-            step()?;
-            if spent + difference.upper_95() <= tolerance {
-                most = depth;
-            } else {
-                least = depth + 1;
-            }
-        }
-        plan.max_depth = most;
-    }
-    if let Some(depth) = config.max_depth {
-        plan.max_depth = depth;
-    }
-    plan.left_out = Some(pilot.difference(&reference, &plan.simulation())?.rmse);
-    Ok(())
 }
 
 #[cfg(test)]

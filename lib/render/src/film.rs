@@ -283,6 +283,12 @@ impl Viewing<'_> {
             .map_or(Vec3::splat(0.18), |image| *image.0.get(x, y))
     }
 
+    /// Linear values as they are shown.
+    pub(crate) fn shown(&self, linear: Vec3) -> Vec3 {
+        let encode = |v: f32| self.transfer.encode_scalar(v.max(0.0)).clamp(0.0, 1.0);
+        Vec3::from(linear.to_array().map(encode))
+    }
+
     /// The composite's display-referred squared error that comes from the noise of `job`,
     /// to first order: the replicates' spread of the linear composite times the squared slope of
     /// the transfer curve.

@@ -21,6 +21,7 @@ use glam::{Vec2, Vec3};
 
 use crate::bsdf::features::{EMISSION, EXTENSIONS, has};
 use crate::bsdf::{Bsdf, BsdfSample};
+use crate::contribution::Carried;
 use crate::counters::{RayCounts, RayKind};
 use crate::features::PROXY_RADIANCE;
 use crate::light::PathLight;
@@ -90,9 +91,14 @@ pub trait Gather {
     /// Whether a vertex that returns no light is of interest, for its derivative may not be 0.
     const DERIVATIVES: bool = false;
 
-    /// What the photograph shows, `seen`, that arrives with `throughput * weight`.
+    /// The light that is reported next has met the object so often.
     #[inline(always)]
-    fn photographed(&mut self, throughput: Vec3, seen: Vec3, weight: f32) {
+    fn after(&mut self, _interactions: u32) {}
+
+    /// What the photograph shows, `seen`, that arrives with `throughput * weight`; `light` is the radiance of the light
+    /// behind it.
+    #[inline(always)]
+    fn photographed(&mut self, throughput: Vec3, seen: Vec3, _light: Vec3, weight: f32) {
         self.local(throughput * seen * weight);
     }
 
@@ -209,13 +215,16 @@ impl<L: PathLight> PathContext<'_, L> {
         sampler: &mut Sampler,
         counts: &mut RayCounts,
     ) -> PathSample {
-        let mut radiance = Vec3::ZERO;
-        let coverage = self.trace_from_image::<F, _>(point, sampler, counts, &mut radiance);
-        PathSample { radiance, coverage }
+        let mut found = Carried::default();
+        let coverage = self.trace_from_image::<F, _>(point, sampler, counts, &mut found);
+        PathSample {
+            radiance: found.sum,
+            coverage,
+        }
     }
 
     #[inline]
-    fn trace_from_image<const F: u32, G: Gather>(
+    pub(crate) fn trace_from_image<const F: u32, G: Gather>(
         &self,
         point: Vec2,
         sampler: &mut Sampler,
@@ -292,8 +301,9 @@ impl<L: PathLight> PathContext<'_, L> {
                 }
                 let (light, light_pdf) = self.light.eval_with_pdf(ray.direction);
                 let weight = balance_heuristic(sampled_pdf, light_pdf);
+                gather.after(depth);
                 match self.photo_beyond::<F>(&ray, counts) {
-                    Some(seen) => gather.photographed(throughput, seen, weight),
+                    Some(seen) => gather.photographed(throughput, seen, light, weight),
                     None => gather.distant(ray.direction, throughput, light, weight),
                 }
                 break;
@@ -313,6 +323,7 @@ impl<L: PathLight> PathContext<'_, L> {
                 surface: &surface,
             };
             if has(F, EMISSION) {
+                gather.after(depth);
                 if surface.unlit {
                     if depth > 0 || self.start == PathStart::Camera {
                         gather.emitted::<F>(&vertex, throughput);
@@ -363,8 +374,11 @@ impl<L: PathLight> PathContext<'_, L> {
                         let weight = balance_heuristic(light.pdf, bsdf_pdf) / light.pdf;
                         let arriving = throughput * value;
                         gather.lit(lit, &vertex, throughput, light.direction, value);
+                        gather.after(depth + 1);
                         match self.photo_beyond::<F>(&shadow, counts) {
-                            Some(seen) => gather.photographed(arriving, seen, weight),
+                            Some(seen) => {
+                                gather.photographed(arriving, seen, light.radiance, weight);
+                            }
                             None => {
                                 gather.distant(light.direction, arriving, light.radiance, weight);
                             }

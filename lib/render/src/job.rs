@@ -1,6 +1,7 @@
 //! Sums over the image samples of one layer of a block of pixels.
 use glam::Vec3;
 
+use crate::contribution::Measured;
 use crate::counters::RayCounts;
 use crate::highlights::PixelDensity;
 use crate::shadow::{Block, ShadowSums, ratio};
@@ -103,8 +104,10 @@ pub struct Job {
     pub counts: RayCounts,
     /// Density of the samples within its pixels, if not uniform.
     pub density: Option<PixelDensity>,
+    /// What effects contribute, where the first round measures it.
+    pub(crate) measured: Option<Box<Measured>>,
     /// Light per sample where the denominator of the ratio is known.
-    arriving: Option<Vec3>,
+    pub(crate) arriving: Option<Vec3>,
     sums: Vec<f32>,
     /// With a density of samples, the sum of their squares for every pixel.
     squares: Vec<Vec3>,
@@ -119,6 +122,7 @@ impl Job {
             samples: 0,
             counts: RayCounts::default(),
             density: None,
+            measured: None,
             arriving,
             sums: vec![0.0; pixels.len() * REPLICATES * layer.channels()],
             squares: Vec::new(),
@@ -219,6 +223,7 @@ impl Job {
                     blocked,
                     arriving: Vec3::new(d, e, f),
                     hits: g,
+                    ..ShadowSums::default()
                 };
                 (ratio(&sums, samples, self.arriving), 1.0)
             }

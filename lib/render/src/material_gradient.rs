@@ -131,7 +131,7 @@ impl Gather for Tape<'_> {
         unreachable!("light of the scene is reported as photographed or emitted");
     }
 
-    fn photographed(&mut self, _: Vec3, seen: Vec3, weight: f32) {
+    fn photographed(&mut self, _: Vec3, seen: Vec3, _: Vec3, weight: f32) {
         self.arrive(seen * weight);
     }
 

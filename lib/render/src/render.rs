@@ -14,8 +14,9 @@ use dipir_scene::scene::Scene;
 use glam::{DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::adaptive::{EstimatedError, Progress, Stop, refine};
+use crate::adaptive::{EstimatedError, Progress, Round, Stop, refine};
 use crate::blocker::Blocker;
+use crate::contribution::{Carried, LeaveOut, LeftOut, Measured};
 use crate::counters::RayCounts;
 use crate::error::RenderError;
 use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
@@ -71,6 +72,8 @@ pub struct Settings<'a> {
     /// A frame of more pixels is rendered at 1/2, 1/4 and so on of its resolution, the finest that has at most
     /// this many, and enlarged. A time budget chooses the resolution itself.
     pub most_pixels: Option<u64>,
+    /// What may be left out after the first round, which then measures it.
+    pub leave_out: Option<LeaveOut>,
 }
 
 impl Default for Settings<'_> {
@@ -87,6 +90,7 @@ impl Default for Settings<'_> {
             highlights: true,
             denoise: false,
             most_pixels: None,
+            leave_out: None,
         }
     }
 }
@@ -110,6 +114,8 @@ pub struct Rendered {
     pub rounds: u32,
     /// What other errors of the rendered picture cost.
     pub foresight: Foresight,
+    /// What effects contribute and what was left out, where the settings ask for it.
+    pub left_out: Option<LeftOut>,
 }
 
 /// Side of the blocks of pixels that are scheduled and refined as one.
@@ -265,15 +271,20 @@ impl<'a> Renderer<'a> {
                 tolerance: settings.shadow_tolerance,
             };
             jobs.extend(self.shadow_jobs(&shadow, arriving, settings));
-            let advance = |job: &mut Job, goal: u32| match job.layer {
-                Layer::Object => advance_object(&path, settings.seed, job, goal),
-                _ => advance_shadow(&shadow, settings.seed, job, goal),
+            let advance = |job: &mut Job, goal: u32, round: &Round| match job.layer {
+                Layer::Object => advance_object(path, settings.seed, job, goal, round),
+                _ => advance_shadow(shadow, settings.seed, job, goal, round),
             };
-            self.run(jobs, settings, start, &path, &advance, coarse, progress)
+            self.run(
+                jobs, settings, start, simulation, &path, &advance, coarse, progress,
+            )
         } else {
-            let advance =
-                |job: &mut Job, goal: u32| advance_object(&path, settings.seed, job, goal);
-            self.run(jobs, settings, start, &path, &advance, coarse, progress)
+            let advance = |job: &mut Job, goal: u32, round: &Round| {
+                advance_object(path, settings.seed, job, goal, round);
+            };
+            self.run(
+                jobs, settings, start, simulation, &path, &advance, coarse, progress,
+            )
         }
     }
 
@@ -282,8 +293,9 @@ impl<'a> Renderer<'a> {
         jobs: Vec<Job>,
         settings: &Settings,
         start: Instant,
+        simulation: &Simulation,
         path: &PathContext<L>,
-        advance: &(impl Fn(&mut Job, u32) + Sync),
+        advance: &(impl Fn(&mut Job, u32, &Round) + Sync),
         coarse: Option<&Film>,
         progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
     ) -> Result<Rendered, RenderError> {
@@ -311,6 +323,8 @@ impl<'a> Renderer<'a> {
             start,
             settings.max_samples,
             &viewing,
+            *simulation,
+            settings.leave_out.as_ref(),
             advance,
             &find_highlights,
             settings.denoise,
@@ -325,6 +339,7 @@ impl<'a> Renderer<'a> {
             samples: refined.samples,
             rounds: refined.rounds,
             foresight: refined.foresight,
+            left_out: refined.left_out,
         })
     }
 
@@ -441,8 +456,23 @@ pub(crate) fn sequence(seed: u64, stream: Stream, replicate: usize, (x, y): (u32
 }
 
 /// Brings `job` to `goal` samples per pixel and replicate.
-fn advance_object<L: PathLight>(path: &PathContext<L>, seed: u64, job: &mut Job, goal: u32) {
-    with_features!(path.world.mask, F => advance_object_with::<_, F>(path, seed, job, goal))
+fn advance_object<L: PathLight>(
+    mut path: PathContext<L>,
+    seed: u64,
+    job: &mut Job,
+    goal: u32,
+    round: &Round,
+) {
+    path.max_depth = round.simulation.max_depth;
+    path.photo = path
+        .photo
+        .filter(|_| has(round.simulation.features, PROXY_RADIANCE));
+    // The photograph is none of the surfaces' parts, which hold what the first round needs.
+    let wanted = match path.photo {
+        Some(_) => path.world.mask,
+        None => path.world.mask & !PROXY_RADIANCE,
+    };
+    with_features!(wanted, F => advance_object_with::<_, F>(&path, seed, job, goal, round));
 }
 
 fn advance_object_with<L: PathLight, const F: u32>(
@@ -450,10 +480,14 @@ fn advance_object_with<L: PathLight, const F: u32>(
     seed: u64,
     job: &mut Job,
     goal: u32,
+    round: &Round,
 ) {
     let mut counts = job.counts;
+    let mut measured = round.measures.map(|_| Box::<Measured>::default());
     for (index, (x, y)) in job.pixels.iter().enumerate() {
         let corner = Vec2::new(x as f32, y as f32);
+        let mut found = [Carried::default(); REPLICATES];
+        let (mut covered, mut drawn) = (0.0, 0.0);
         for replicate in 0..REPLICATES {
             let base = sequence(seed, Stream::FOREGROUND, replicate, (x, y));
             let (mut radiance, mut coverage, mut weights) = (Vec3::ZERO, 0.0, 0.0);
@@ -465,39 +499,64 @@ fn advance_object_with<L: PathLight, const F: u32>(
                     Some(density) => density.place(place),
                     None => (place, 1.0),
                 };
-                let s = path.image_sample::<F>(corner + place, &mut sampler, &mut counts);
-                radiance += s.radiance * weight;
-                squares += s.radiance * s.radiance * (weight * weight);
-                coverage += s.coverage * weight;
+                let mut light = Carried::default();
+                let point = corner + place;
+                let seen =
+                    path.trace_from_image::<F, _>(point, &mut sampler, &mut counts, &mut light);
+                radiance += light.sum * weight;
+                squares += light.sum * light.sum * (weight * weight);
+                coverage += seen * weight;
                 weights += weight;
+                if measured.is_some() {
+                    found[replicate].add(&light, weight);
+                }
             }
             job.add(
                 index,
                 replicate,
                 &[radiance.x, radiance.y, radiance.z, coverage, weights],
             );
+            covered += coverage;
+            drawn += weights;
             if job.density.is_some() {
                 job.add_squares(index, squares);
             }
         }
+        if let (Some(measured), Some((_, viewing)), true) =
+            (&mut measured, round.measures, covered > 0.0)
+        {
+            let samples = drawn / REPLICATES as f32;
+            measured.object(
+                (x, y),
+                &found,
+                covered / drawn,
+                samples,
+                path.max_depth,
+                viewing,
+            );
+        }
     }
+    job.measured = measured;
     job.counts = counts;
     job.samples = goal;
 }
 
 fn advance_shadow<L: PathLight, P: PlaneLight>(
-    shadow: &ShadowContext<L, P>,
+    mut shadow: ShadowContext<L, P>,
     seed: u64,
     job: &mut Job,
     goal: u32,
+    round: &Round,
 ) {
+    shadow.path.max_depth = round.simulation.max_depth;
+    shadow.light_on_proxy = round.simulation.light_on_proxy;
     // Blocking alone asks nothing of a surface but its coverage.
     let wanted = match shadow.light_on_proxy {
         Some(_) => shadow.path.world.mask,
         None if has(shadow.path.world.mask, ALPHA) => ALPHA,
         None => 0,
     };
-    with_features!(wanted, F => advance_shadow_with::<_, _, F>(shadow, seed, job, goal))
+    with_features!(wanted, F => advance_shadow_with::<_, _, F>(&shadow, seed, job, goal, round));
 }
 
 fn advance_shadow_with<L: PathLight, P: PlaneLight, const F: u32>(
@@ -505,6 +564,7 @@ fn advance_shadow_with<L: PathLight, P: PlaneLight, const F: u32>(
     seed: u64,
     job: &mut Job,
     goal: u32,
+    round: &Round,
 ) {
     let mut counts = job.counts;
     let range = SampleRange {
@@ -512,6 +572,10 @@ fn advance_shadow_with<L: PathLight, P: PlaneLight, const F: u32>(
         count: goal - job.samples,
     };
     let block = job.block;
+    let mut found = match round.measures {
+        Some(_) => vec![[ShadowSums::default(); REPLICATES]; job.pixels.len()],
+        None => vec![],
+    };
     for replicate in 0..REPLICATES {
         let sampler = |x, y| sequence(seed, Stream::SHADOW, replicate, (x, y));
         if job.layer == Layer::PlaneShadow {
@@ -525,6 +589,9 @@ fn advance_shadow_with<L: PathLight, P: PlaneLight, const F: u32>(
                 &mut |x, y, sums| {
                     let index = ((y - block.y) * block.width + (x - block.x)) as usize;
                     job.add(index, replicate, &sums.blocked.to_array());
+                    if let Some(found) = found.get_mut(index) {
+                        found[replicate] = sums;
+                    }
                 },
             );
         } else {
@@ -533,9 +600,22 @@ fn advance_shadow_with<L: PathLight, P: PlaneLight, const F: u32>(
                     shadow.mesh_pixel::<F, _>((x, y), range, &sampler(x, y), &mut counts);
                 let (b, a) = (s.blocked, s.arriving);
                 job.add(index, replicate, &[b.x, b.y, b.z, a.x, a.y, a.z, s.hits]);
+                if let Some(found) = found.get_mut(index) {
+                    found[replicate] = s;
+                }
             }
         }
     }
+    job.measured = round.measures.map(|seen| {
+        let mut measured = Box::<Measured>::default();
+        let (samples, depth) = (range.count as f32, shadow.path.max_depth);
+        for (pixel, found) in job.pixels.iter().zip(&found) {
+            if *found != [ShadowSums::default(); REPLICATES] {
+                measured.shadow(pixel, found, job.arriving, samples, depth, seen);
+            }
+        }
+        measured
+    });
     job.counts = counts;
     job.samples = goal;
 }

@@ -21,6 +21,7 @@ use glam::{Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::blocker::{Blocker, Cone};
+use crate::contribution::Carried;
 use crate::counters::{RayCounts, RayKind};
 use crate::foreground::{Gather, MIN_CAUSTIC_ROUGHNESS, PathContext, PathStart};
 use crate::light::PathLight;
@@ -54,6 +55,14 @@ pub struct ShadowContext<'a, L, P> {
     pub tolerance: f32,
 }
 
+impl<L, P> Clone for ShadowContext<'_, L, P> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<L, P> Copy for ShadowContext<'_, L, P> {}
+
 /// Sums over the samples of one pixel, from which the ratio follows.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ShadowSums {
@@ -63,6 +72,8 @@ pub struct ShadowSums {
     pub arriving: Vec3,
     /// Samples that meet the proxy.
     pub hits: f32,
+    /// What the object adds, which `blocked` holds with it.
+    pub sent: Carried,
 }
 
 /// What becomes of the samples of a pixel on the proxy: sums, or a record of where the light came
@@ -82,7 +93,7 @@ pub trait ShadowGather: Default {
 }
 
 impl ShadowGather for ShadowSums {
-    type Path = Vec3;
+    type Path = Carried;
 
     #[inline(always)]
     fn hit(&mut self) {
@@ -100,8 +111,9 @@ impl ShadowGather for ShadowSums {
     }
 
     #[inline(always)]
-    fn sent(&mut self, path: Vec3, weight: f32) {
-        self.blocked -= path * weight;
+    fn sent(&mut self, path: Carried, weight: f32) {
+        self.blocked -= path.sum * weight;
+        self.sent.add(&path, weight);
     }
 }
 

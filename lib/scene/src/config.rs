@@ -209,10 +209,10 @@ macro_rules! effects_config {
         pub struct EffectsConfig {
             /// Whether planning decides what is simulated: `planned` simulates what the picture
             /// shows, `all` everything.
-            #[schemars(example = &"all")]
+            #[schemars(extend("default" = "planned"), example = &"all")]
             #[serde(skip_serializing_if = "Option::is_none")]
             pub mode: Option<EffectsMode>,
-            /// Error that planning may leave, display-referred RMSE with white at 1.
+            /// Error that planning may leave, display-referred RMSE with white at 1; never more than a quarter of `composite.target_error`.
             #[schemars(range(min = 0.0, max = 1.0), extend("default" = EffectsConfig::DEFAULT_TOLERANCE), example = 0.002)]
             #[serde(skip_serializing_if = "Option::is_none")]
             pub tolerance: Option<f64>,

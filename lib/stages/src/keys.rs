@@ -193,7 +193,6 @@ fn of_qualities(key: &str) -> Option<String> {
         let preset = presets::of(quality);
         let light = &preset.light;
         Some(match key {
-            "scene.effects.mode" => value::toml(&serde_json::to_value(preset.scene.effects).ok()?),
             "composite.target_error" => preset.composite.target_error.to_string(),
             "light.iterations" => light.iterations.to_string(),
             "light.lobes" => light.lobes.to_string(),

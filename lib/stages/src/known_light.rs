@@ -79,42 +79,6 @@ pub fn warn_of_unused(session: &Session) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Irradiance of the pilot light's sun on a surface that faces it; with the sky's, a white
-/// horizontal surface has a radiance of about 1.
-const PILOT_SUN_IRRADIANCE: f32 = 2.8;
-/// Radiance of the pilot light's sky.
-const PILOT_SKY: f32 = 0.35;
-/// Radiance of the ground below the pilot light's horizon.
-const PILOT_GROUND: f32 = 0.2;
-
-/// The light under which effects are planned if no other is known: a grey sky with a sun
-/// at 45 degrees, to the left of and behind a camera that looks down -z. Grey and sharp at once,
-/// it shows every effect of materials and shadows without favouring a colour.
-pub fn pilot() -> Light {
-    const WIDTH: usize = 128;
-    const HEIGHT: usize = WIDTH / 2;
-    let sun = Vec3::new(-0.5, std::f32::consts::FRAC_1_SQRT_2, 0.5);
-    let mut texels: Vec<Vec3> = (0..WIDTH * HEIGHT)
-        .map(|n| {
-            Vec3::splat(if n / WIDTH < HEIGHT / 2 {
-                PILOT_SKY
-            } else {
-                PILOT_GROUND
-            })
-        })
-        .collect();
-    let map = EnvironmentMap::constant(WIDTH, HEIGHT, Vec3::ZERO);
-    let (row, column) = map.texel_of(sun);
-    texels[row * WIDTH + column] += PILOT_SUN_IRRADIANCE / map.solid_angle(row) as f32;
-    let map = EnvironmentMap::new(WIDTH, HEIGHT, texels).unwrap_or(map);
-    Light { map: Arc::new(map) }
-}
-
-/// What stands for the pilot light among a stage's parameters.
-pub fn pilot_params() -> Value {
-    json!("pilot: sun and sky")
-}
-
 /// The photograph in the directions that it shows, mirrored behind the camera, its borders drawn out: a
 /// light of `width` x `height` texels without any model.
 pub fn projected(
@@ -141,20 +105,4 @@ pub fn projected(
         height,
         (0..width * height).map(texel).collect(),
     )?)
-}
-
-#[cfg(test)]
-mod tests {
-    use dipir_light::cosine::CosineWeightedMap;
-
-    use super::*;
-
-    #[test]
-    fn the_pilot_light_shows_a_white_floor_at_a_radiance_of_about_one() {
-        let light = pilot();
-        let irradiance = CosineWeightedMap::new(light.map, Vec3::Y).irradiance();
-        // Sun: 2.8 cos 45 = 1.98 (to the texel's extent); sky: 0.35 pi = 1.10; over pi: 0.98.
-        assert!((irradiance.x / std::f64::consts::PI - 0.98).abs() < 0.03);
-        assert_eq!(irradiance.x, irradiance.y);
-    }
 }

@@ -18,11 +18,11 @@ pub struct StageName {
     pub version: u32,
 }
 
-/// Reads photograph, objects, camera and proxy; decides what is simulated.
+/// Reads photograph, objects, camera and proxy; says what can be simulated.
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 7,
+    version: 8,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
@@ -46,7 +46,7 @@ pub const LIGHT: StageName = StageName {
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 6,
+    version: 7,
 };
 
 /// All stages, each after those that it reads.

@@ -5,7 +5,6 @@ use std::sync::OnceLock;
 use dipir_cli::session::duration;
 use dipir_optimize::settings::{LightPreset, LightTable};
 use dipir_pipeline::config::Quality;
-use dipir_scene::config::EffectsMode;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
@@ -27,22 +26,12 @@ pub struct Presets {
 pub struct Preset {
     /// Which.
     pub quality: Quality,
-    /// Of `[scene]`.
-    pub scene: ScenePreset,
     /// Of `[composite]`.
     pub composite: CompositePreset,
     /// Of `[light]`.
     pub light: LightPreset,
     /// What recovering light was measured to cost.
     pub recovery: Option<Measured>,
-}
-
-/// Of `[scene]`.
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ScenePreset {
-    /// Of `[scene.effects]`: whether planning is worth its time.
-    pub effects: EffectsMode,
 }
 
 /// Of `[composite]`.
@@ -243,7 +232,6 @@ mod tests {
         assert!(draft.composite.target_error > standard.composite.target_error);
         assert!(standard.composite.target_error > high.composite.target_error);
         assert!(draft.light.samples <= standard.light.samples);
-        assert_eq!(draft.scene.effects, EffectsMode::All);
         for preset in &all().presets {
             assert!(LightTable::default().settings(&preset.light, 0).is_ok());
         }

@@ -1,24 +1,32 @@
 use dipir_imaging::raster::{LinearImage, Raster};
-use dipir_scene::mesh::TriangleMesh;
 
 use super::*;
-use crate::counters::RayKind;
+use crate::adaptive::Stop;
 use crate::shapes::{icosphere, quad, torus_knot};
-use crate::testing::{camera, ground, matte, scene, settings, sky};
+use crate::testing::{camera, ground, matte, render, scene, settings, sky};
 
 fn view() -> dipir_scene::camera::Camera {
     camera(Vec3::new(0.0, 2.0, 4.0), Vec3::Y * 0.5, 40.0, 24)
 }
 
+/// What the scene can show.
+fn possible(scene: &Scene, config: &EffectsConfig, settings: &Settings) -> EffectsPlan {
+    EffectsPlan::new(&Renderer::new(scene), config, settings)
+}
+
+/// What it shows, as the first round of a render finds it, and the render.
+fn rendered(scene: &Scene, config: &EffectsConfig, settings: &Settings) -> (EffectsPlan, Rendered) {
+    let p = possible(scene, config, settings);
+    let settings = Settings {
+        leave_out: p.leave_out(config),
+        ..*settings
+    };
+    let rendered = render(scene, &sky(1.0), &p.simulation(), &settings);
+    (p.rendered(&rendered), rendered)
+}
+
 fn planned(scene: &Scene, config: &EffectsConfig, settings: &Settings) -> EffectsPlan {
-    plan(
-        &Renderer::new(scene),
-        &sky(1.0),
-        config,
-        settings,
-        &mut |_| ControlFlow::Continue(()),
-    )
-    .expect("plans")
+    rendered(scene, config, settings).0
 }
 
 fn find(plan: &EffectsPlan, effect: Effect) -> &PlannedEffect {
@@ -40,51 +48,14 @@ fn every_effect_has_a_switch_and_the_same_name_everywhere() {
     }
 }
 
-/// Octahedra about one centre: a ray meets thousands of boxes, however the hierarchy is built.
-fn shells(count: u32) -> TriangleMesh {
-    let mut mesh = TriangleMesh::default();
-    for k in 0..count {
-        let r = 0.2 + 0.3 * k as f32 / count as f32;
-        let corners = [Vec3::X, -Vec3::X, Vec3::Y, -Vec3::Y, Vec3::Z, -Vec3::Z];
-        mesh.positions
-            .extend(corners.map(|c| Vec3::Y * 0.5 + c * r));
-        for octant in 0..8 {
-            let pick = |axis: u32| 6 * k + 2 * axis + (octant >> axis & 1);
-            mesh.indices.push([pick(0), pick(1), pick(2)]);
-        }
-    }
-    mesh.materials = vec![0; mesh.indices.len()];
-    mesh
-}
-
-#[test]
-fn where_rays_take_too_long_nothing_is_measured_and_everything_simulated() {
-    let plan_of = |count: u32| {
-        let s = scene(shells(count), matte(Vec3::splat(0.5)), view(), ground());
-        planned(&s, &EffectsConfig::default(), &settings(0, 1))
-    };
-    let p = plan_of(16_000);
-    for effect in [Effect::Shadow, Effect::Specular, Effect::Interreflection] {
-        let e = find(&p, effect);
-        assert_eq!(
-            (e.enabled, e.reason.as_str()),
-            (true, "not measured, for rays take too long")
-        );
-    }
-    assert!(p.effects.iter().all(|e| e.contribution.is_none()));
-    assert_eq!((p.left_out, p.max_depth), (None, MAX_DEPTH));
-    // Fewer shells are worth measuring.
-    let p = plan_of(100);
-    assert!(find(&p, Effect::Specular).contribution.is_some());
-}
-
 #[test]
 fn a_matte_convex_object_needs_no_interreflection_and_only_what_it_has() {
     let ball = icosphere(Vec3::Y * 0.5, 0.5, 3);
     let s = scene(ball, matte(Vec3::splat(0.5)), view(), ground());
-    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    let p = planned(&s, &EffectsConfig::default(), &settings(64, 1));
     let e = find(&p, Effect::Interreflection);
-    assert_eq!((e.enabled, e.contribution), (false, Some(0.0)), "{e:?}");
+    assert_eq!((e.enabled, e.contribution), (false, None), "{e:?}");
+    assert!(e.reason.contains("convex"), "{e:?}");
     assert_eq!(p.max_depth, 1);
     assert!(p.is_enabled(Effect::Shadow));
     for (effect, reason) in [
@@ -121,7 +92,7 @@ fn a_matte_convex_object_needs_no_interreflection_and_only_what_it_has() {
 fn without_a_proxy_nothing_is_planned_for_it() {
     let ball = icosphere(Vec3::ZERO, 0.5, 3);
     let s = scene(ball, matte(Vec3::splat(0.5)), view(), Proxy::None);
-    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    let p = planned(&s, &EffectsConfig::default(), &settings(64, 1));
     for effect in [
         Effect::Shadow,
         Effect::ProxyOcclusion,
@@ -139,23 +110,22 @@ fn without_a_proxy_nothing_is_planned_for_it() {
 fn a_folded_bright_object_gets_the_depth_that_it_needs() {
     let knot = torus_knot(Vec3::Y * 0.7, 0.4, 0.17, 96, 12);
     let s = scene(knot, matte(Vec3::splat(0.9)), view(), ground());
-    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    let p = planned(&s, &EffectsConfig::default(), &settings(64, 1));
     assert!(p.is_enabled(Effect::Interreflection));
     assert!((2..=MAX_DEPTH).contains(&p.max_depth), "{}", p.max_depth);
     let coarse = EffectsConfig {
         tolerance: Some(0.02),
         ..EffectsConfig::default()
     };
-    let coarse = planned(&s, &coarse, &settings(0, 1));
+    let coarse = planned(&s, &coarse, &settings(64, 1));
     assert!(coarse.max_depth < p.max_depth, "{coarse:?} {p:?}");
-    // A depth that the user gives stands, and what it costs is said.
+    // A depth that the user gives stands.
     let shallow = EffectsConfig {
         max_depth: Some(1),
         ..EffectsConfig::default()
     };
-    let shallow = planned(&s, &shallow, &settings(0, 1));
+    let shallow = planned(&s, &shallow, &settings(64, 1));
     assert_eq!((shallow.max_depth, shallow.simulation().max_depth), (1, 1));
-    assert!(shallow.left_out > p.left_out);
 }
 
 #[test]
@@ -169,7 +139,7 @@ fn what_the_user_switches_wins() {
         clearcoat: Some(EffectSwitch::On),
         ..EffectsConfig::default()
     };
-    let p = planned(&s, &config, &settings(0, 1));
+    let p = planned(&s, &config, &settings(64, 1));
     let emission = find(&p, Effect::Emission);
     assert_eq!(
         (emission.enabled, emission.reason.as_str()),
@@ -187,7 +157,7 @@ fn what_the_user_switches_wins() {
         shadow: Some(EffectSwitch::Off),
         ..EffectsConfig::default()
     };
-    let p = planned(&s, &no_shadow, &settings(0, 1));
+    let p = planned(&s, &no_shadow, &settings(64, 1));
     assert_eq!(
         find(&p, Effect::BounceToProxy).reason,
         "nothing without shadow"
@@ -200,7 +170,7 @@ fn light_that_reaches_the_proxy_is_found_and_simulated() {
     let mut glowing = matte(Vec3::splat(0.5));
     glowing.emissive = Vec3::splat(4.0);
     let s = scene(icosphere(Vec3::Y * 0.6, 0.5, 2), glowing, view(), ground());
-    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    let p = planned(&s, &EffectsConfig::default(), &settings(64, 1));
     assert!(p.is_enabled(Effect::Emission) && p.is_enabled(Effect::EmissionOnProxy));
     assert!(p.rays["light_on_proxy"] > 0);
 }
@@ -210,7 +180,7 @@ fn a_coloured_floor_in_the_photograph_lights_the_object() {
     let photo = LinearImage(Raster::filled(24, 24, Vec3::new(0.9, 0.1, 0.1)));
     let settings = Settings {
         background: Some(&photo),
-        ..settings(0, 1)
+        ..settings(64, 1)
     };
     let s = scene(
         icosphere(Vec3::Y * 0.6, 0.5, 3),
@@ -223,40 +193,68 @@ fn a_coloured_floor_in_the_photograph_lights_the_object() {
     assert!(p.rays["proxy_radiance"] > 0);
 }
 
-/// Plans `scene` and compares what was planned with everything, under fresh seeds; then the rays
-/// of every kind that belongs to what was left out must not exist. Returns the plan.
+/// Samples a pixel of the references.
+const MANY: u32 = 4096;
+
+/// Display-referred RMSE between two films over the pixels that the object or its shadow touches in the second, in the
+/// linear values of these tests.
+fn difference(a: &Rendered, b: &Rendered) -> f64 {
+    let (a, b) = (&a.film, &b.film);
+    let (mut sum, mut count) = (0.0, 0);
+    for k in 0..b.alpha.pixels().len() {
+        let shown = |film: &crate::film::Film| {
+            let (object, alpha) = (film.object.pixels()[k], film.alpha.pixels()[k]);
+            let under = Vec3::splat(0.18) * film.shadow.pixels()[k] * (1.0 - alpha);
+            (under + object).clamp(Vec3::ZERO, Vec3::ONE)
+        };
+        let is_shadowed = (b.shadow.pixels()[k] - Vec3::ONE).abs().max_element() > 0.02;
+        if b.alpha.pixels()[k] > 0.0 || is_shadowed {
+            sum += f64::from((shown(a) - shown(b)).length_squared()) / 3.0;
+            count += 1;
+        }
+    }
+    (sum / f64::from(count.max(1))).sqrt()
+}
+
+/// Plans `scene` by a render and compares what was left out with everything, converged with the same numbers. From the
+/// second round on no ray may be traced for what was left out. Returns the plan.
 fn assert_plan_keeps_the_picture(scene: &Scene, settings: &Settings) -> EffectsPlan {
-    let light = sky(1.0);
-    let p = planned(scene, &EffectsConfig::default(), settings);
-    let renderer = Renderer::new(scene);
-    let fresh = Settings {
-        seed: 77,
-        ..*settings
-    };
-    let pilot = Pilot::new(&renderer, &light, &fresh);
+    let (p, first) = rendered(scene, &EffectsConfig::default(), settings);
+    let left_out = first.left_out.as_ref().expect("was asked for");
     let all = EffectsPlan::everything(scene, settings).simulation();
-    let reference = pilot.reference(&all).expect("renders");
-    let planned = p.simulation();
-    let difference = pilot.difference(&reference, &planned).expect("renders");
-    // The measurement itself is uncertain by its standard error.
-    let allowed = p.tolerance + 2.0 * difference.std_error;
-    assert!(difference.rmse <= allowed, "{difference:?} {p:?}");
-    let counts = pilot.render(&planned).expect("renders").counts;
+    let converged = |simulation: &Simulation| {
+        let settings = Settings {
+            stop: Stop::Samples(MANY),
+            ..*settings
+        };
+        render(scene, &sky(1.0), simulation, &settings)
+    };
+    let everything = converged(&all);
+    let kept = converged(&left_out.simulation);
+    // Different bounces draw different numbers after the first: some noise of both is left.
+    let noise = everything.error.rmse + kept.error.rmse;
+    let lost = difference(&kept, &everything);
+    assert!(lost <= p.tolerance + noise, "{lost} {noise} {p:?}");
+    assert!(
+        p.left_out_upper_95.is_some_and(|l| l <= p.tolerance),
+        "{p:?}"
+    );
+    let sent = left_out.simulation.light_on_proxy;
     let kinds = [
         (RayKind::Shadow, p.is_enabled(Effect::Shadow)),
-        (RayKind::Bounce, planned.max_depth > 0),
         (
             RayKind::ProxyOcclusion,
             p.is_enabled(Effect::ProxyOcclusion),
         ),
-        (RayKind::LightOnProxy, planned.light_on_proxy.is_some()),
+        (RayKind::LightOnProxy, sent.is_some()),
         (
             RayKind::ProxyRadiance,
             p.is_enabled(Effect::BounceFromProxy),
         ),
     ];
     for (kind, enabled) in kinds {
-        assert!(enabled || counts.get(kind) == 0, "{kind:?}: {counts:?}");
+        let later = first.counts.get(kind) - left_out.first_round.get(kind);
+        assert!(enabled || later == 0, "{kind:?}: {later}");
     }
     p
 }
@@ -272,14 +270,14 @@ fn ball() -> dipir_scene::mesh::TriangleMesh {
 #[test]
 fn the_plan_of_a_matte_convex_object_keeps_the_picture() {
     let s = scene(ball(), matte(Vec3::splat(0.6)), view(), ground());
-    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    let p = assert_plan_keeps_the_picture(&s, &settings(64, 1));
     assert_eq!(p.max_depth, 1);
 }
 
 #[test]
 fn the_plan_of_a_concave_object_keeps_the_picture() {
     let s = scene(knot(), matte(Vec3::splat(0.8)), view(), ground());
-    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    let p = assert_plan_keeps_the_picture(&s, &settings(64, 1));
     assert!(p.is_enabled(Effect::Interreflection));
 }
 
@@ -288,7 +286,7 @@ fn the_plan_of_a_metal_keeps_the_picture() {
     let mut metal = matte(Vec3::new(0.9, 0.6, 0.2));
     (metal.metallic, metal.roughness) = (1.0, 0.3);
     let s = scene(knot(), metal, view(), ground());
-    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    let p = assert_plan_keeps_the_picture(&s, &settings(64, 1));
     assert!(p.is_enabled(Effect::Specular));
 }
 
@@ -297,7 +295,7 @@ fn the_plan_of_a_coloured_surface_keeps_the_picture() {
     let mut mesh = ball();
     mesh.colors = mesh.normals.iter().map(|n| n.abs().extend(1.0)).collect();
     let s = scene(mesh, matte(Vec3::splat(0.9)), view(), ground());
-    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    let p = assert_plan_keeps_the_picture(&s, &settings(64, 1));
     assert!(p.is_enabled(Effect::Textures));
 }
 
@@ -306,7 +304,7 @@ fn the_plan_of_an_emitter_keeps_the_picture() {
     let mut glowing = matte(Vec3::splat(0.5));
     glowing.emissive = Vec3::new(0.5, 0.3, 0.1);
     let s = scene(ball(), glowing, view(), ground());
-    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    let p = assert_plan_keeps_the_picture(&s, &settings(64, 1));
     assert!(p.is_enabled(Effect::Emission));
 }
 
@@ -318,7 +316,7 @@ fn the_plan_of_a_half_transparent_sheet_keeps_the_picture() {
     holes.double_sided = true;
     let sheet = quad(Vec3::new(-0.5, 0.2, 0.0), Vec3::X, Vec3::Y);
     let s = scene(sheet, holes, view(), ground());
-    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    let p = assert_plan_keeps_the_picture(&s, &settings(64, 1));
     assert!(p.is_enabled(Effect::AlphaMask));
 }
 
@@ -331,14 +329,14 @@ fn the_plan_of_glass_keeps_the_picture() {
         texture: None,
     });
     let s = scene(ball(), glass, view(), ground());
-    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    let p = assert_plan_keeps_the_picture(&s, &settings(64, 1));
     assert!(p.is_enabled(Effect::Transmission));
 }
 
 #[test]
 fn the_plan_without_a_proxy_keeps_the_picture() {
     let s = scene(knot(), matte(Vec3::splat(0.5)), view(), Proxy::None);
-    assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    assert_plan_keeps_the_picture(&s, &settings(64, 1));
 }
 
 #[test]
@@ -351,7 +349,7 @@ fn the_plan_of_a_folded_proxy_mesh_keeps_the_picture() {
     let wall = quad(Vec3::new(-9.0, 0.0, -1.5), Vec3::X * 18.0, Vec3::Y * 4.0);
     crate::shapes::append(&mut floor, wall, 0);
     let s = scene(ball(), matte(Vec3::splat(0.5)), view(), Proxy::Mesh(floor));
-    let p = assert_plan_keeps_the_picture(&s, &settings(0, 1));
+    let p = assert_plan_keeps_the_picture(&s, &settings(64, 1));
     assert!(p.simulation().shadow);
 }
 
@@ -363,7 +361,7 @@ fn the_file_round_trips_and_refuses_unknown_keys() {
         view(),
         ground(),
     );
-    let p = planned(&s, &EffectsConfig::default(), &settings(0, 1));
+    let p = planned(&s, &EffectsConfig::default(), &settings(64, 1));
     let json = serde_json::to_string_pretty(&p).expect("serialises");
     let back: EffectsPlan = serde_json::from_str(&json).expect("parses");
     assert_eq!(back, p);
@@ -380,25 +378,124 @@ fn the_same_seed_gives_the_same_plan() {
             .num_threads(threads)
             .build()
             .expect("a pool")
-            .install(|| planned(&s, &EffectsConfig::default(), &settings(0, 1)))
+            .install(|| planned(&s, &EffectsConfig::default(), &settings(64, 1)))
     });
     assert_eq!(a, b);
 }
 
 #[test]
-fn planning_can_be_interrupted() {
-    let s = scene(
-        icosphere(Vec3::Y, 0.5, 2),
-        matte(Vec3::splat(0.5)),
-        view(),
-        ground(),
+fn what_does_not_show_takes_no_ray_after_the_first_round_and_the_bound_holds() {
+    let mut dark = matte(Vec3::splat(0.002));
+    (dark.metallic, dark.roughness) = (1.0, 1.0);
+    let s = scene(knot(), dark, view(), ground());
+    let many = Settings {
+        stop: Stop::TargetError(0.003),
+        ..settings(64, 1)
+    };
+    let (p, r) = rendered(&s, &EffectsConfig::default(), &many);
+    let left_out = r.left_out.as_ref().expect("measured");
+    assert!(r.rounds > 1);
+    // A black object sends nothing anywhere.
+    for effect in [Effect::Interreflection, Effect::BounceToProxy] {
+        let e = find(&p, effect);
+        assert!(!e.enabled && e.contribution.is_some(), "{e:?}");
+    }
+    assert_eq!((p.max_depth, left_out.simulation.light_on_proxy), (1, None));
+    assert!(left_out.first_round.get(RayKind::LightOnProxy) > 0);
+    let later = r.counts.get(RayKind::LightOnProxy);
+    assert_eq!(later, left_out.first_round.get(RayKind::LightOnProxy));
+    // What is lost counts as error.
+    assert!(
+        r.error.rmse >= left_out.lost.rmse && r.error.upper_95 <= 0.003,
+        "{r:?}"
     );
-    let result = plan(
-        &Renderer::new(&s),
-        &sky(1.0),
-        &EffectsConfig::default(),
-        &settings(0, 1),
-        &mut |_| ControlFlow::Break(()),
+    assert!(left_out.lost.upper_95 <= 0.25 * 0.003);
+    // The user's word stands.
+    let config = EffectsConfig {
+        bounce_to_proxy: Some(EffectSwitch::On),
+        max_depth: Some(3),
+        ..EffectsConfig::default()
+    };
+    let (p, r) = rendered(&s, &config, &many);
+    assert!(
+        p.is_enabled(Effect::BounceToProxy) && p.max_depth == 3,
+        "{p:?}"
     );
-    assert!(matches!(result, Err(RenderError::Interrupted)));
+    let first = &r.left_out.as_ref().expect("measured").first_round;
+    assert!(r.counts.get(RayKind::LightOnProxy) > first.get(RayKind::LightOnProxy));
+    let all = EffectsConfig {
+        mode: Some(EffectsMode::All),
+        ..EffectsConfig::default()
+    };
+    let (p, r) = rendered(&s, &all, &many);
+    assert!(r.left_out.is_none() && p.max_depth == MAX_DEPTH && p.left_out.is_none());
+}
+
+#[test]
+fn a_contribution_is_what_leaving_the_effect_out_changes() {
+    let mut glowing = matte(Vec3::new(0.9, 0.7, 0.5));
+    glowing.emissive = Vec3::splat(0.3);
+    let s = scene(knot(), glowing, view(), ground());
+    let (_, r) = rendered(&s, &EffectsConfig::default(), &settings(256, 1));
+    let left_out = r.left_out.expect("measured");
+    let everything = EffectsPlan::everything(&s, &settings(64, 1)).simulation();
+    let converged = |simulation: &Simulation| render(&s, &sky(1.0), simulation, &settings(MANY, 3));
+    let all = converged(&everything);
+    let both = LightOnProxy {
+        emission: true,
+        bounce: true,
+    };
+    let with = |max_depth: u32, sent: LightOnProxy| Simulation {
+        max_depth,
+        light_on_proxy: Some(sent),
+        ..everything
+    };
+    let emission = LightOnProxy {
+        emission: false,
+        ..both
+    };
+    let bounce = LightOnProxy {
+        bounce: false,
+        ..both
+    };
+    let cases = [
+        ("interreflection", left_out.interreflection(), with(1, both)),
+        ("depth 2", left_out.deeper(2), with(2, both)),
+        (
+            "emission",
+            left_out.emission_on_proxy(),
+            with(MAX_DEPTH, emission),
+        ),
+        (
+            "bounce",
+            left_out.bounce_to_proxy(),
+            with(MAX_DEPTH, bounce),
+        ),
+    ];
+    for (name, measured, without) in cases {
+        let truth = difference(&converged(&without), &all);
+        assert!(truth > 0.002, "{name}: {truth}");
+        let error = (measured.rmse - truth).abs();
+        assert!(
+            error < 0.1 * truth + 3.0 * measured.std_error,
+            "{name}: {measured:?}, true {truth}"
+        );
+    }
+}
+
+#[test]
+fn the_same_bytes_come_from_any_number_of_threads_when_effects_are_left_out() {
+    let s = scene(knot(), matte(Vec3::splat(0.3)), view(), ground());
+    let many = Settings {
+        stop: Stop::TargetError(0.01),
+        ..settings(64, 1)
+    };
+    let [a, b] = [1, 2].map(|threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        let pool = pool.expect("a pool");
+        pool.install(|| rendered(&s, &EffectsConfig::default(), &many).1)
+    });
+    assert_eq!(a.film.object, b.film.object);
+    assert_eq!(a.film.shadow, b.film.shadow);
+    assert_eq!((a.left_out, a.counts), (b.left_out, b.counts));
 }

@@ -17,11 +17,10 @@ Writes OUT/scene/: scene.json effects.json gbuffer.exr stage.json, and transport
 where a guidance recovers the light.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 
-/// Set up the scene: read photo, objects, camera and proxy, and plan which effects to simulate
+/// Set up the scene: read photo, objects, camera and proxy, and say which effects they can show
 ///
-/// Reads the [scene] table. Which effects are worth their time is measured in small pilot
-/// renders, under the light of [composite] environment if that is given, else under a sun and
-/// sky.
+/// Reads the [scene] table. Which of these effects are worth their time is measured by the first
+/// samples of dipir-composite.
 #[derive(Parser)]
 #[command(name = "dipir-scene", version, after_help = EXAMPLES, args_conflicts_with_subcommands = true)]
 pub struct Cli {

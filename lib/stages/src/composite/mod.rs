@@ -125,6 +125,8 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         &light,
     )?;
     let Course { rendered, .. } = course;
+    let effects = inputs.scene.effects.rendered(&rendered);
+    writer.write_json("effects", "effects.json", &effects)?;
     let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light));
     let picture = layers.picture()?;
     check_finite(&picture)?;
@@ -289,6 +291,7 @@ fn render_under<L: SceneLight>(
     let mut round = 0;
     let loaded = &inputs.scene.loaded;
     let photo = &loaded.photo;
+    let effects = &inputs.scene.effects;
     let settings = Settings {
         seed: session.pipeline.seed,
         stop,
@@ -298,40 +301,36 @@ fn render_under<L: SceneLight>(
         occluders: loaded.occluders.as_ref(),
         denoise: table.denoise(session.pipeline.quality),
         most_pixels: table.most_pixels(session.pipeline.quality),
+        leave_out: effects.leave_out(loaded.description.effects()),
         ..Settings::default()
     };
     let renderer = Renderer::new(&loaded.scene);
     let progress = session.progress("composite");
     let rendered = renderer
-        .render(
-            light,
-            &inputs.scene.effects.simulation(),
-            &settings,
-            &mut |state| {
-                progress.set(state.fraction);
-                if state.round == round {
-                    return interruption();
-                }
-                round = state.round;
-                let goal = match stop {
-                    Stop::TargetError(target) => format!(" -> {target}"),
-                    _ => String::new(),
-                };
-                progress.say(format!("error {:.5}{goal}", state.error.upper_95));
-                session.remark(|| {
-                    format!(
-                        "round {}: error {:.5} (95% bound {:.5}), {} samples, {} rays, {}",
-                        state.round,
-                        state.error.rmse,
-                        state.error.upper_95,
-                        state.samples,
-                        state.rays,
-                        duration(state.elapsed.as_secs_f64())
-                    )
-                });
-                interruption()
-            },
-        )
+        .render(light, &effects.simulation(), &settings, &mut |state| {
+            progress.set(state.fraction);
+            if state.round == round {
+                return interruption();
+            }
+            round = state.round;
+            let goal = match stop {
+                Stop::TargetError(target) => format!(" -> {target}"),
+                _ => String::new(),
+            };
+            progress.say(format!("error {:.5}{goal}", state.error.upper_95));
+            session.remark(|| {
+                format!(
+                    "round {}: error {:.5} (95% bound {:.5}), {} samples, {} rays, {}",
+                    state.round,
+                    state.error.rmse,
+                    state.error.upper_95,
+                    state.samples,
+                    state.rays,
+                    duration(state.elapsed.as_secs_f64())
+                )
+            });
+            interruption()
+        })
         .map_err(crate::render_error)?;
     progress.done();
     let seconds = clock.elapsed().as_secs_f64();

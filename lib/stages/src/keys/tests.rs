@@ -130,7 +130,7 @@ fn defaults_are_values_words_or_the_qualities() {
         default("light.environment"),
         "the quality's: draft `[64, 32]`, standard `[256, 128]`, high `[256, 128]`"
     );
-    assert!(default("scene.effects.mode").contains("draft `\"all\"`"));
+    assert_eq!(default("scene.effects.mode"), "`\"planned\"`");
     assert!(default("composite.target_error").contains("standard `0.004`"));
     for name in ["iterations", "lobes", "samples", "size"] {
         let default = default(&format!("light.{name}"));

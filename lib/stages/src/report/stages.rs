@@ -60,7 +60,6 @@ pub fn table(report: &Report) -> Section {
 /// The quantity that a stage's error belongs to.
 fn error_in_words(stage: &str, error: f64) -> String {
     let unit = match stage {
-        s if s == SCENE.name => ", of the effects that are left out",
         s if s == LIGHT.name => ", from the guidance's reference",
         s if s == COMPOSITE.name => ", 95% bound",
         _ => "",
@@ -70,7 +69,12 @@ fn error_in_words(stage: &str, error: f64) -> String {
 
 /// What is simulated, and why.
 pub fn effects(report: &Report) -> Section {
-    let Some(run) = report.stage(SCENE.name)? else {
+    // What was done, or what could be.
+    let done = match report.stage(COMPOSITE.name)? {
+        Some(run) if run.1.output(&run.0, "effects").is_ok() => Some(run),
+        _ => report.stage(SCENE.name)?,
+    };
+    let Some(run) = done else {
         return Ok(None);
     };
     let plan: EffectsPlan = json(&run, "effects")?;
@@ -96,13 +100,15 @@ pub fn effects(report: &Report) -> Section {
         "effect",
         "",
         ">contribution (RMSE)",
-        ">share of the work",
+        ">share of the rays",
         "why",
     ];
     let rays: Vec<String> = plan.rays.iter().map(|(k, n)| format!("{k} {n}")).collect();
     let note = format!(
-        "Paths of at most {} interactions. Rays of the pilot render: {}.",
+        "Paths of at most {} interactions. Left out: {} of display-referred RMSE, 95% bound {}. Rays: {}.",
         plan.max_depth,
+        optional(plan.left_out),
+        optional(plan.left_out_upper_95),
         rays.join(", ")
     );
     Ok(Some(Html::all([

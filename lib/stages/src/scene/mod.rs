@@ -1,4 +1,4 @@
-//! The scene stage: reads everything once, decides what to simulate, and writes down both.
+//! The scene stage: reads everything once, says what of it can be simulated, and writes down both.
 pub mod background;
 pub mod folder;
 pub mod transport;
@@ -10,18 +10,17 @@ use std::time::Instant;
 use dipir_cli::exit::Usage;
 use dipir_cli::interrupt;
 use dipir_cli::session::{Session, duration, size};
-use dipir_light::environment::EnvironmentSampler;
 use dipir_optimize::settings::{LightTable, Settings as RecoverySettings};
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::StagePlan;
 use dipir_points::Ground;
-use dipir_render::effects::{self, EffectsPlan};
+use dipir_render::effects::EffectsPlan;
 use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
 use dipir_scene::camera::parts;
-use dipir_scene::config::{EffectsMode, SceneConfig};
+use dipir_scene::config::SceneConfig;
 use dipir_scene::description::ProxyRecord;
 use dipir_scene::ground::points_parts;
 use dipir_scene::plausibility::implausible;
@@ -29,11 +28,9 @@ use dipir_scene::scene::{LoadedScene, Scene};
 use serde_json::{Value, json};
 
 use crate::composite::table::CompositeTable;
-use crate::interruption;
-use crate::known_light;
 use crate::light::method::Method;
 use crate::names::SCENE;
-use crate::presets::{self, Outlook};
+use crate::presets::Outlook;
 use crate::scene::transport::Frame;
 use crate::written;
 
@@ -78,7 +75,6 @@ impl Record {
 /// Runs the stage.
 pub fn run(session: &Session) -> anyhow::Result<Done> {
     let config: SceneConfig = session.config.table("scene")?;
-    let wanted = settings(session)?.effects;
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
     let mut loaded = Scene::load(&config, &session.config.base_dir())
@@ -88,9 +84,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     }
     let table: LightTable = session.config.table("light")?;
     let recovery = transport::settings(session, &table)?;
-    let known = known_light::known(session, &composite)?;
     let recorded = Method::of(session)?.replays().then_some(&recovery);
-    let light = known.unwrap_or_else(known_light::pilot);
     let read = loaded.inputs.iter();
     let plan_of_this = plan_with(
         session,
@@ -108,21 +102,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     };
     let renderer = Renderer::new(&loaded.scene);
     warn_of_slow_rays(session, &renderer);
-    let progress = session.progress("effects");
-    let clock = Instant::now();
-    let effects = effects::plan(
-        &renderer,
-        &EnvironmentSampler::new(light.map.clone()),
-        &wanted,
-        &settings,
-        &mut |fraction| {
-            progress.set(fraction);
-            interruption()
-        },
-    )
-    .map_err(crate::render_error)?;
-    progress.done();
-    writer.set_timing("effects", clock.elapsed().as_secs_f64());
+    let effects = EffectsPlan::new(&renderer, &config.effects, &settings);
     writer.write_json("effects", "effects.json", &effects)?;
     loaded.description.seed = session.pipeline.seed;
     writer.write_json("scene", "scene.json", &loaded.description)?;
@@ -142,15 +122,11 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         }
         None => None,
     };
-    if let Some(left_out) = effects.left_out {
-        writer.set_estimated_error(left_out);
-    }
     let manifest = writer.finish()?;
     let resolution = loaded.scene.camera.resolution;
     let outlook = record
         .as_ref()
-        .map(|r| outlook(session, r, resolution, &manifest))
-        .transpose()?;
+        .map(|r| outlook(session, r, resolution, &manifest));
     Ok(Done {
         folder,
         manifest,
@@ -167,7 +143,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     })
 }
 
-/// Where planning does with fewer rays than usual, the render will want patience.
+/// Where a ray takes long, the render will want patience.
 fn warn_of_slow_rays(session: &Session, renderer: &Renderer) {
     let bvh = &renderer.geometry().bvh;
     if bvh.affordable_share() < 1.0 {
@@ -180,33 +156,21 @@ fn warn_of_slow_rays(session: &Session, renderer: &Renderer) {
     }
 }
 
-/// What the presets beside this one would have cost: recording takes time in proportion to paths, and effects are
-/// planned by some of them only.
+/// What the presets beside this one would have cost: recording takes time in proportion to paths.
 fn outlook(
     session: &Session,
     record: &Record,
     resolution: [u32; 2],
     manifest: &Manifest,
-) -> anyhow::Result<Outlook> {
-    let effects = settings(session)?.effects.mode;
-    let is_free = session
-        .config
-        .table::<SceneConfig>("scene")?
-        .effects
-        .mode
-        .is_none();
-    let planning_s = manifest.timings_s.get("effects").copied().unwrap_or(0.0);
+) -> Outlook {
     let longest = resolution[0].max(resolution[1]) as usize;
     let paths = |samples: u32, side: usize| f64::from(samples) * (side.min(longest) as f64).powi(2);
     let here = paths(record.samples, record.size[0].max(record.size[1]));
-    Ok(Outlook::beside(session.pipeline.quality, |p| {
+    Outlook::beside(session.pipeline.quality, |p| {
         let there = paths(p.light.samples, p.light.size);
-        let plans_no_more =
-            is_free && effects != Some(p.scene.effects) && p.scene.effects == EffectsMode::All;
-        let spared_s = if plans_no_more { planning_s } else { 0.0 };
-        let rest_s = manifest.elapsed_s - record.seconds - spared_s;
+        let rest_s = manifest.elapsed_s - record.seconds;
         Some((rest_s + record.seconds * there / here, None))
-    }))
+    })
 }
 
 /// Traces how light reaches the picture, for the light stage.
@@ -250,12 +214,9 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     )
 }
 
-/// The keys of `[scene]` that decide what the stage writes, with the quality's values where they are not
-/// set. `class` is left out: only stages that ask a model use it.
+/// The keys of `[scene]` that decide what the stage writes. `class` is left out: only stages that ask a model use it.
 pub fn settings(session: &Session) -> anyhow::Result<SceneConfig> {
     let mut config: SceneConfig = session.config.table("scene")?;
-    let quality = presets::of(session.pipeline.quality).scene;
-    config.effects.mode = config.effects.mode.or(Some(quality.effects));
     config.class = None;
     Ok(config)
 }
@@ -306,10 +267,8 @@ fn plan_with<'a>(
     files: impl Iterator<Item = (&'a str, &'a Path, &'a Path)>,
 ) -> anyhow::Result<StagePlan> {
     let config = settings(session)?;
-    let composite: CompositeTable = session.config.table("composite")?;
     let table: LightTable = session.config.table("light")?;
     let recovery = transport::settings(session, &table)?;
-    let known = known_light::known_params(&composite);
     // Where nothing is optimised, nothing reads the record.
     let transport = Method::of(session)?.replays().then(|| {
         json!({
@@ -318,18 +277,10 @@ fn plan_with<'a>(
             "seed": recovery.seed,
         })
     });
-    let light = known
-        .as_ref()
-        .map_or_else(known_light::pilot_params, |k| k.0.clone());
-    let params = json!({
-        "scene": serde_json::to_value(&config)?, "light": light, "transport": transport,
-    });
+    let params = json!({"scene": serde_json::to_value(&config)?, "transport": transport});
     let mut plan = SCENE.plan(session, params);
     for (role, path, location) in files {
         plan.input(role, path, location)?;
-    }
-    if let Some((_, path)) = known {
-        plan.input("environment", path, &session.resolve(path))?;
     }
     Ok(plan)
 }
@@ -400,9 +351,6 @@ impl fmt::Display for Done {
             },
             self.effects.max_depth
         )?;
-        if let Some(error) = self.manifest.estimated_error {
-            write!(f, "\n  left out: {error:.5} of display-referred RMSE")?;
-        }
         if !self.outlook.0.is_empty() {
             write!(f, "\n  {}", self.outlook.text())?;
         }
