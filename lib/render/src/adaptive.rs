@@ -26,6 +26,9 @@ use crate::highlights::Found;
 use crate::job::{Job, Layer, REPLICATES};
 use crate::render::Simulation;
 
+/// Is told of the progress after every round and from time to time, and may break off.
+pub type Watch<'a> = dyn FnMut(&Progress) -> ControlFlow<()> + 'a;
+
 /// When to stop.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Stop {

@@ -12,21 +12,18 @@ use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_scene::camera::Camera;
 use glam::Vec2;
 
-use crate::adaptive::{Progress, Stop};
+use crate::adaptive::{Stop, Watch};
 use crate::error::RenderError;
 use crate::film::Film;
 use crate::light::{PreparedLight, SceneLight};
 use crate::render::{Rendered, Renderer, Settings, Simulation};
-use crate::world::{ProxyGeometry, World};
+use crate::world::World;
 
 /// Pixels of the first picture at most.
 const FIRST_PIXELS: u64 = 1 << 16;
 
 /// Share of the time left that the first round of the picture may be foreseen to take.
 const FIRST_ROUND: f64 = 0.5;
-
-/// Is told of the progress, and may break off.
-type Watch<'a> = dyn FnMut(&Progress) -> ControlFlow<()> + 'a;
 
 /// A frame of fewer pixels than this is rendered without a first picture: its first round takes no
 /// longer than a first picture may.
@@ -36,29 +33,24 @@ impl Renderer<'_> {
     /// Renders the layers within `budget`, counted from `start`, occluders left aside.
     pub(crate) fn render_within<L: SceneLight>(
         &self,
-        light: &L,
+        light: &PreparedLight<L>,
         world: &mut World,
         simulation: &Simulation,
         settings: &Settings,
         budget: Duration,
         start: Instant,
-        progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
+        progress: &mut Watch,
     ) -> Result<Rendered, RenderError> {
         let camera = *self.camera();
         let [width, height] = camera.resolution.map(u64::from);
         if width * height < LEAST_PIXELS {
             return self.render_world(light, world, simulation, settings, start, None, progress);
         }
-        let normal = match &self.geometry().proxy {
-            ProxyGeometry::Plane(plane) => Some(plane.normal),
-            _ => None,
-        };
-        let light = PreparedLight::new(light, normal);
         let mut at = |divisor: u32, stop, coarse: Option<&Rendered>, progress: &mut Watch| {
             let settings = Settings { stop, ..*settings };
             let film = coarse.map(|coarse| &coarse.film);
             self.render_at(
-                divisor, &light, world, simulation, &settings, start, film, progress,
+                divisor, light, world, simulation, &settings, start, film, progress,
             )
         };
 
@@ -88,7 +80,7 @@ impl Renderer<'_> {
     pub(crate) fn render_at_most<L: SceneLight>(
         &self,
         most_pixels: Option<u64>,
-        light: &L,
+        light: &PreparedLight<L>,
         world: &mut World,
         simulation: &Simulation,
         settings: &Settings,
@@ -108,7 +100,7 @@ impl Renderer<'_> {
     fn render_at<L: SceneLight>(
         &self,
         divisor: u32,
-        light: &L,
+        light: &PreparedLight<L>,
         world: &mut World,
         simulation: &Simulation,
         settings: &Settings,
@@ -211,6 +203,7 @@ where
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::adaptive::Progress;
     use crate::job::{Job, Layer, PixelSet};
     use crate::shadow::Block;
     use crate::shapes::icosphere;

@@ -17,6 +17,10 @@ use dipir_light::luminance::{luminance, luminance_f64};
 use dipir_light::plane::{CosineWeightedMixture, PlaneLight};
 use glam::{DVec3, Vec2, Vec3};
 
+use crate::adaptive::Watch;
+use crate::error::RenderError;
+use crate::render::{Rendered, Renderer, Settings, Simulation};
+
 /// A light as paths over the object meet it.
 pub trait PathLight: Sync {
     /// Radiance from the unit vector `direction`, and the density of [`Self::sample`] there: 0
@@ -26,10 +30,7 @@ pub trait PathLight: Sync {
     fn sample(&self, u: Vec2) -> LightSample;
 }
 
-/// A light that can light an object and a plane.
-///
-/// Preparing takes about as long as a picture of a few thousand pixels: [`PreparedLight`] does it
-/// once for many pictures.
+/// A light that can light an object and a plane. Preparing it takes about as long as a picture of a few thousand pixels.
 pub trait SceneLight: Sync {
     /// The light as paths meet it; cheap to clone.
     type OnObject: PathLight + Clone;
@@ -39,7 +40,32 @@ pub trait SceneLight: Sync {
     fn on_object(&self) -> Self::OnObject;
     /// Prepares the light for a plane with the unit normal `normal`: its parts add up.
     fn on_plane(&self, normal: Vec3) -> Vec<Self::OnPlane>;
+    /// [`Renderer::render`], which calls this. Every light implements it by [`Renderer::render_under`], so that the
+    /// kernels are compiled here, once for each light, and not in each crate that renders.
+    fn render(
+        &self,
+        renderer: &Renderer,
+        simulation: &Simulation,
+        settings: &Settings,
+        progress: &mut Watch,
+    ) -> Result<Rendered, RenderError>;
 }
+
+/// [`SceneLight::render`] of a light.
+macro_rules! compiled_here {
+    () => {
+        fn render(
+            &self,
+            renderer: &crate::render::Renderer,
+            simulation: &crate::render::Simulation,
+            settings: &crate::render::Settings,
+            progress: &mut crate::adaptive::Watch,
+        ) -> Result<crate::render::Rendered, crate::error::RenderError> {
+            renderer.render_under(self, simulation, settings, progress)
+        }
+    };
+}
+use compiled_here;
 
 /// A part of a light on a plane, behind a counted reference.
 #[derive(Debug)]
@@ -70,37 +96,12 @@ impl<P: PlaneLight + Send> PlaneLight for SharedPlane<P> {
     }
 }
 
-/// A light that was prepared once for many pictures of the same scene.
-#[derive(Clone, Debug)]
-pub struct PreparedLight<L: SceneLight> {
-    on_object: L::OnObject,
-    normal: Vec3,
-    on_plane: Vec<L::OnPlane>,
-}
-
-impl<L: SceneLight> PreparedLight<L> {
-    /// Prepares `light` for paths and, if there is one, a plane with the unit normal `normal`.
-    pub fn new(light: &L, normal: Option<Vec3>) -> Self {
-        Self {
-            on_object: light.on_object(),
-            normal: normal.unwrap_or(Vec3::Y),
-            on_plane: normal.map_or_else(Vec::new, |n| light.on_plane(n)),
-        }
-    }
-}
-
-impl<L: SceneLight> SceneLight for PreparedLight<L> {
-    type OnObject = L::OnObject;
-    type OnPlane = L::OnPlane;
-
-    fn on_object(&self) -> L::OnObject {
-        self.on_object.clone()
-    }
-
-    fn on_plane(&self, normal: Vec3) -> Vec<L::OnPlane> {
-        debug_assert_eq!(normal, self.normal, "prepared for another plane");
-        self.on_plane.clone()
-    }
+/// A light that was prepared once for pictures of several resolutions.
+pub(crate) struct PreparedLight<L: SceneLight> {
+    /// As paths meet it.
+    pub on_object: L::OnObject,
+    /// Its parts as the proxy's plane receives them; none without a plane or a shadow.
+    pub on_plane: Vec<L::OnPlane>,
 }
 
 /// Luminance above the mean by less than this share counts as the mean itself: rounding.
@@ -230,6 +231,8 @@ impl SceneLight for EnvironmentSampler {
             .map(|part| SharedPlane(Arc::new(part)))
             .collect()
     }
+
+    compiled_here!();
 }
 
 impl PathLight for SgMixture {
@@ -256,6 +259,8 @@ impl SceneLight for SgMixture {
         let light = CosineWeightedMixture::new(self.clone(), normal);
         vec![SharedPlane(Arc::new(light))]
     }
+
+    compiled_here!();
 }
 
 #[cfg(test)]

@@ -1,5 +1,4 @@
 //! From a scene, a light and a plan to the layers of a composite.
-use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -14,7 +13,7 @@ use dipir_scene::scene::Scene;
 use glam::{DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::adaptive::{EstimatedError, Progress, Round, Stop, refine};
+use crate::adaptive::{EstimatedError, Round, Stop, Watch, refine};
 use crate::blocker::Blocker;
 use crate::contribution::{Carried, LeaveOut, LeftOut, Measured};
 use crate::counters::RayCounts;
@@ -26,7 +25,7 @@ use crate::foreground::{PathContext, PathStart};
 use crate::foresight::Foresight;
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet, REPLICATES};
-use crate::light::{PathLight, SceneLight};
+use crate::light::{PathLight, PreparedLight, SceneLight};
 use crate::photo::ProxyPhoto;
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowSums};
 use crate::world::{Geometry, ProxyGeometry, World};
@@ -193,11 +192,30 @@ impl<'a> Renderer<'a> {
         light: &L,
         simulation: &Simulation,
         settings: &Settings,
-        progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
+        progress: &mut Watch,
+    ) -> Result<Rendered, RenderError> {
+        light.render(self, simulation, settings, progress)
+    }
+
+    /// What [`render`](Self::render) does. For implementations of [`SceneLight::render`]: everybody else would compile
+    /// the kernels once more.
+    pub fn render_under<L: SceneLight>(
+        &self,
+        light: &L,
+        simulation: &Simulation,
+        settings: &Settings,
+        progress: &mut Watch,
     ) -> Result<Rendered, RenderError> {
         let start = Instant::now();
         self.check_images(settings.background, settings.occluders)?;
         let mut world = self.world(simulation.features)?;
+        let light: &PreparedLight<L> = &PreparedLight {
+            on_object: light.on_object(),
+            on_plane: match &self.geometry.proxy {
+                ProxyGeometry::Plane(plane) if simulation.shadow => light.on_plane(plane.normal),
+                _ => Vec::new(),
+            },
+        };
         let mut rendered = match settings.stop {
             Stop::TimeBudget(budget) => self.render_within(
                 light, &mut world, simulation, settings, budget, start, progress,
@@ -222,22 +240,21 @@ impl<'a> Renderer<'a> {
     /// resolution.
     pub(crate) fn render_world<L: SceneLight>(
         &self,
-        light: &L,
+        light: &PreparedLight<L>,
         world: &World,
         simulation: &Simulation,
         settings: &Settings,
         start: Instant,
         coarse: Option<&Film>,
-        progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
+        progress: &mut Watch,
     ) -> Result<Rendered, RenderError> {
         let photo = settings
             .background
             .filter(|_| has(simulation.features, PROXY_RADIANCE))
             .map(|image| ProxyPhoto { image });
-        let on_object = light.on_object();
         let path = PathContext {
             world,
-            light: &on_object,
+            light: &light.on_object,
             photo: photo.as_ref(),
             max_depth: simulation.max_depth,
             start: PathStart::Camera,
@@ -245,10 +262,7 @@ impl<'a> Renderer<'a> {
             min_roughness: 0.0,
             min_lit_roughness: 0.0,
         };
-        let plane = match &self.geometry.proxy {
-            ProxyGeometry::Plane(plane) if simulation.shadow => light.on_plane(plane.normal),
-            _ => Vec::new(),
-        };
+        let plane = &light.on_plane;
         let blocker = self
             .geometry
             .bvh
@@ -264,7 +278,7 @@ impl<'a> Renderer<'a> {
             let shadow = ShadowContext {
                 path,
                 blocker,
-                plane: &plane,
+                plane,
                 irradiance: luminance_f64(irradiance),
                 proxy_occlusion: simulation.proxy_occlusion,
                 light_on_proxy: simulation.light_on_proxy,
@@ -297,7 +311,7 @@ impl<'a> Renderer<'a> {
         path: &PathContext<L>,
         advance: &(impl Fn(&mut Job, u32, &Round) + Sync),
         coarse: Option<&Film>,
-        progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
+        progress: &mut Watch,
     ) -> Result<Rendered, RenderError> {
         let [width, height] = self.camera.resolution.map(|n| n as usize);
         let viewing = Viewing {

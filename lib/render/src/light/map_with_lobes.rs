@@ -11,7 +11,7 @@ use dipir_light::map_with_lobes::{Choice, MapWithLobes};
 use dipir_light::plane::{LightInCone, PlaneLight};
 use glam::{DVec3, Vec2, Vec3};
 
-use super::{CompensatedMap, PathLight, SceneLight, SharedPlane};
+use super::{CompensatedMap, PathLight, SceneLight, SharedPlane, compiled_here};
 use dipir_light::environment::EnvironmentSampler;
 
 /// A map whose bright part is drawn, and lobes.
@@ -147,6 +147,8 @@ impl SceneLight for MapWithLobes {
             .map(PlanePart::Lobes);
         map.chain(lobes).collect()
     }
+
+    compiled_here!();
 }
 
 #[cfg(test)]
