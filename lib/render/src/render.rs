@@ -184,14 +184,27 @@ impl<'a> Renderer<'a> {
         settings: &Settings,
         progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
     ) -> Result<Rendered, RenderError> {
+        let mut world = self.world(simulation.features)?;
+        self.render_in(&mut world, light, simulation, settings, progress)
+    }
+
+    /// As [`render`](Self::render), in a world that [`world`](Self::world) made ready for the features
+    /// of `simulation`: for many pictures under changing lights.
+    pub fn render_in<L: SceneLight>(
+        &self,
+        world: &mut World,
+        light: &L,
+        simulation: &Simulation,
+        settings: &Settings,
+        progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
+    ) -> Result<Rendered, RenderError> {
         let start = Instant::now();
         self.check_images(settings.background, settings.occluders)?;
-        let mut world = self.world(simulation.features)?;
         let mut rendered = match settings.stop {
-            Stop::TimeBudget(budget) => self.render_within(
-                light, &mut world, simulation, settings, budget, start, progress,
-            ),
-            _ => self.render_world(light, &world, simulation, settings, start, None, progress),
+            Stop::TimeBudget(budget) => {
+                self.render_within(light, world, simulation, settings, budget, start, progress)
+            }
+            _ => self.render_world(light, world, simulation, settings, start, None, progress),
         }?;
         if let Some(mask) = settings.occluders {
             rendered.film.hide_behind(mask);
