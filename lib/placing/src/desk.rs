@@ -16,6 +16,7 @@ use dipir_preview::draft::Draft;
 use dipir_preview::lines::{Kind, Piece};
 use dipir_preview::marks::{Grid, horizon, outline, stick};
 use dipir_preview::png;
+use dipir_preview::relit::Relit;
 use dipir_preview::small::{Props, SmallScene};
 use dipir_render::error::RenderError;
 use dipir_scene::camera::Camera;
@@ -30,6 +31,7 @@ use serde_json::{Value, json};
 
 use crate::document::Document;
 use crate::edit::Edit;
+use crate::relighting::Relighting;
 use crate::vanishing::{Lines, Solution, solve, turn_of_camera};
 
 /// Longest side of the photograph on the page, pixels.
@@ -51,8 +53,11 @@ pub struct Desk {
     /// What the page painted, row by row; empty if nothing.
     mask: Mutex<Vec<u8>>,
     rendered: Mutex<Rendered>,
-    /// Counts drafts that were asked for: an older one is broken off.
-    drafts: AtomicU64,
+    /// Counts pictures that were asked for: an older one is broken off.
+    drafts: Arc<AtomicU64>,
+    /// Counts masks that were painted.
+    masks: AtomicU64,
+    relighting: Mutex<Relighting>,
 }
 
 /// What is rendered: the scene as it is arranged, and its light.
@@ -120,7 +125,9 @@ impl Desk {
                 small,
                 light: None,
             }),
-            drafts: AtomicU64::new(0),
+            drafts: Arc::default(),
+            masks: AtomicU64::new(0),
+            relighting: Mutex::default(),
         })
     }
 
@@ -151,6 +158,7 @@ impl Desk {
             bail!("a mask has a byte for each of {} pixels", self.mask_bytes());
         }
         *held(&self.mask) = mask;
+        self.masks.fetch_add(1, Ordering::SeqCst);
         Ok(())
     }
 
@@ -303,9 +311,7 @@ impl Desk {
             return Ok(Err(Superseded));
         }
         let rendered = &mut *rendered;
-        rendered.small.arrange(&arrangement);
-        rendered.session.config = config;
-        rendered.small.loaded.occluders = self.occluders(edit, rendered.own_mask.as_ref());
+        self.arrange(rendered, edit, &arrangement, config);
         rendered.light_up()?;
         let Some((_, light)) = &rendered.light else {
             bail!("there is no light");
@@ -327,6 +333,66 @@ impl Desk {
             png: png::encode(x1 - x0, y1 - y0, &values)?,
             place,
             light: description(light, &arrangement.camera),
+        })))
+    }
+
+    fn arrange(&self, to: &mut Rendered, edit: &Edit, arrangement: &Arrangement, config: Config) {
+        to.small.arrange(arrangement);
+        to.session.config = config;
+        to.small.loaded.occluders = self.occluders(edit, to.own_mask.as_ref());
+    }
+
+    /// The objects under another sun or exposure, at a low resolution and many times a second: they are
+    /// recorded first, unless they stand as they did the last time. `None` if they change nothing.
+    /// A newer draft breaks it off, and it breaks off older ones.
+    ///
+    /// # Errors
+    /// If it cannot be, and [`Superseded`].
+    pub fn relight(&self, edit: &Edit) -> anyhow::Result<Result<Option<Crop>, Superseded>> {
+        let ticket = self.drafts.fetch_add(1, Ordering::SeqCst) + 1;
+        let mut relighting = held(&self.relighting);
+        let masks = self.masks.load(Ordering::SeqCst);
+        let key = format!("{masks} {} {}", still(edit), held(&self.text));
+        if !relighting.is_recorded(&key) || !relighting.is_lit(&key, edit) {
+            let (_, config, arrangement) = self.edited(edit)?;
+            let drafts = self.drafts.clone();
+            let go_on = move || match drafts.load(Ordering::SeqCst) == ticket {
+                true => ControlFlow::Continue(()),
+                false => ControlFlow::Break(()),
+            };
+            let mut rendered = held(&self.rendered);
+            if go_on().is_break() {
+                return Ok(Err(Superseded));
+            }
+            let rendered = &mut *rendered;
+            self.arrange(rendered, edit, &arrangement, config);
+            rendered.light_up()?;
+            let Some((_, light)) = &rendered.light else {
+                bail!("there is no light");
+            };
+            if !relighting.is_recorded(&key) {
+                // Two records are never held at once.
+                relighting.keep(None);
+                let normal = arrangement.ground().normal;
+                match Relit::record(&rendered.small.loaded, normal, light, go_on) {
+                    Err(RenderError::Interrupted) => return Ok(Err(Superseded)),
+                    other => relighting.keep(Some((key.clone(), other?, arrangement.camera))),
+                }
+            }
+            let text = held(&self.text).clone();
+            let said: CompositeTable = Config::parse(&self.path, &text, &[])?.table("composite")?;
+            relighting.light_up(&key, edit, f64::from(said.exposure_ev), light);
+        }
+        let Some((piece, light, camera)) = relighting.picture(edit)? else {
+            return Ok(Ok(None));
+        };
+        let place = piece.place;
+        let [w, h] = [place[2] - place[0], place[3] - place[1]];
+        let values = png::values(&piece.picture, [0, 0, w, h]);
+        Ok(Ok(Some(Crop {
+            png: png::encode(w, h, &values)?,
+            place,
+            light: description(&light, &camera),
         })))
     }
 
@@ -405,6 +471,16 @@ impl Rendered {
         }
         Ok(())
     }
+}
+
+/// All of an edit that a record depends on.
+fn still(edit: &Edit) -> String {
+    let still = Edit {
+        sun: None,
+        exposure_ev: None,
+        ..edit.clone()
+    };
+    format!("{still:?}")
 }
 
 /// Refuses numbers that make no sense before anything is computed from them.

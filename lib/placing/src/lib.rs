@@ -6,5 +6,6 @@ pub mod desk;
 pub mod document;
 pub mod edit;
 pub mod gate;
+pub mod relighting;
 pub mod server;
 pub mod vanishing;

@@ -22,7 +22,7 @@ use tokio::runtime;
 use tokio::task::spawn_blocking;
 use tokio::time::timeout;
 
-use crate::desk::Desk;
+use crate::desk::{Crop, Desk, Superseded};
 use crate::edit::Edit;
 use crate::gate::{Gate, Head, MASK, MOST_JSON, Refusal, Route, token};
 use crate::vanishing::Lines;
@@ -51,7 +51,7 @@ const JAVASCRIPT: &str = "text/javascript; charset=utf-8";
 
 /// What is asked for beside the files.
 const GETS: [&str; 3] = ["state", "photo.png", "mask.bin"];
-const POSTS: [&str; 6] = ["view", "draft", "solve", "measure", "save", MASK];
+const POSTS: [&str; 7] = ["view", "draft", "relight", "solve", "measure", "save", MASK];
 
 /// Nothing is loaded from elsewhere, and no other page may show this one.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; \
@@ -214,24 +214,16 @@ impl Site {
                 .and_then(|edit| desk.save(&edit))
                 .and_then(|written| Ok((written, desk.state()?)))
                 .map(|(written, state)| Answer::json(json!({"written": written, "state": state}))),
-            "draft" => parsed::<DraftAsked>(body).and_then(|a| self.draft(&a)),
+            "draft" => parsed::<DraftAsked>(body).and_then(|a| {
+                let samples = a.samples.clamp(1, MOST_SAMPLES);
+                self.desk.draft(&a.edit, samples).map(Answer::picture)
+            }),
+            "relight" => {
+                parsed::<Edit>(body).and_then(|edit| desk.relight(&edit).map(Answer::picture))
+            }
             other => Err(anyhow!("{other} is not answered")),
         };
         answer.unwrap_or_else(|e| Answer::error(&e))
-    }
-
-    fn draft(&self, asked: &DraftAsked) -> anyhow::Result<Answer> {
-        let samples = asked.samples.clamp(1, MOST_SAMPLES);
-        Ok(match self.desk.draft(&asked.edit, samples)? {
-            Err(_) => Answer::new(409, "text/plain", b"a newer draft was asked for".to_vec()),
-            Ok(None) => Answer::new(204, "text/plain", Vec::new()),
-            Ok(Some(crop)) => {
-                let mut answer = Answer::new(200, "image/png", crop.png);
-                let about = json!({"place": crop.place, "light": crop.light});
-                answer.about = Some(about.to_string());
-                answer
-            }
-        })
     }
 }
 
@@ -292,6 +284,22 @@ impl Answer {
 
     fn json(value: serde_json::Value) -> Self {
         Self::new(200, "application/json", value.to_string().into_bytes())
+    }
+
+    fn picture(picture: Result<Option<Crop>, Superseded>) -> Self {
+        match picture {
+            Err(Superseded) => {
+                Self::new(409, "text/plain", b"a newer picture was asked for".to_vec())
+            }
+            Ok(None) => Self::new(204, "text/plain", Vec::new()),
+            Ok(Some(crop)) => {
+                let about = json!({"place": crop.place, "light": crop.light});
+                Self {
+                    about: Some(about.to_string()),
+                    ..Self::new(200, "image/png", crop.png)
+                }
+            }
+        }
     }
 
     fn error(error: &anyhow::Error) -> Self {

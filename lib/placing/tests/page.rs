@@ -75,6 +75,10 @@ fn project(folder: &Path, set: &[&str]) -> Session {
     write_png(folder.join("photo.png"), &DisplayImage(grey)).unwrap();
     fs::write(folder.join("box.obj"), BOX).unwrap();
     fs::write(folder.join("pipeline.toml"), TEXT).unwrap();
+    open(folder, set)
+}
+
+fn open(folder: &Path, set: &[&str]) -> Session {
     Session::open(&CommonArgs {
         pipeline: folder.join("pipeline.toml"),
         set: set.iter().map(|s| (*s).to_owned()).collect(),
@@ -96,7 +100,12 @@ fn project(folder: &Path, set: &[&str]) -> Session {
 impl Running {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let desk = Desk::open(project(folder.path(), &[])).unwrap();
+        let session = project(folder.path(), &[]);
+        Self::of(folder, session)
+    }
+
+    fn of(folder: TempDir, session: Session) -> Self {
+        let desk = Desk::open(session).unwrap();
         let place = Place::listen(desk, 0).unwrap();
         let address = place.address();
         let parts: Vec<&str> = address.split('/').collect();
@@ -416,6 +425,69 @@ fn the_draft_shows_the_object_where_the_projection_says() {
         "{shown:?}"
     );
     assert!(shown[3] >= most(2) - 2.0, "{shown:?}");
+}
+
+/// Mean difference of two pictures where both are, in steps of 8 bits.
+fn apart(a: &Answer, b: &Answer) -> f64 {
+    let read = |answer: &Answer| {
+        assert_eq!(answer.status, 200);
+        let about: Value = serde_json::from_str(answer.header("X-Draft").unwrap()).unwrap();
+        let place: [u32; 4] = serde_json::from_value(about["place"].clone()).unwrap();
+        let picture = image::load_from_memory(&answer.body).unwrap().to_rgb8();
+        (place, picture)
+    };
+    let ((p, a), (q, b)) = (read(a), read(b));
+    let span = |k: usize| p[k].max(q[k])..p[k + 2].min(q[k + 2]);
+    let (mut sum, mut count) = (0.0, 0.0);
+    for y in span(1) {
+        for x in span(0) {
+            let (c, d) = (
+                a.get_pixel(x - p[0], y - p[1]),
+                b.get_pixel(x - q[0], y - q[1]),
+            );
+            sum +=
+                c.0.iter()
+                    .zip(d.0)
+                    .map(|(m, n)| f64::from(m.abs_diff(n)))
+                    .sum::<f64>();
+            count += 3.0;
+        }
+    }
+    assert!(count > 3000.0, "{p:?} {q:?}");
+    sum / count
+}
+
+#[test]
+fn turning_the_sun_and_the_exposure_shows_what_a_draft_shows() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = TEXT.replace("start = \"neutral\"", "sun = { share = 0.6 }");
+    project(folder.path(), &[]);
+    fs::write(folder.path().join("pipeline.toml"), text).unwrap();
+    let session = open(folder.path(), &[]);
+    let place = Running::of(folder, session);
+    let lit = |azimuth: f64, elevation: f64, stops: f64| {
+        json!({"objects": [{"of": 0, "at": [150.0, 140.0]}], "exposure_ev": stops,
+            "sun": {"azimuth_deg": azimuth, "elevation_deg": elevation}})
+    };
+    let mut last: Option<Answer> = None;
+    for (azimuth, elevation, stops) in [(60.0, 40.0, 0.0), (-50.0, 30.0, 0.0), (100.0, 55.0, 1.0)] {
+        let edit = lit(azimuth, elevation, stops);
+        let relit = place.post("relight", &edit);
+        let draft = place.post("draft", &json!({"edit": edit, "samples": 32}));
+        for answer in [&relit, &draft] {
+            let about: Value = serde_json::from_str(answer.header("X-Draft").unwrap()).unwrap();
+            let sun = |key: &str| about["light"]["sun"][key].as_f64().unwrap();
+            assert!((sun("azimuth_deg") - azimuth).abs() < 0.1, "{about}");
+            assert!((sun("elevation_deg") - elevation).abs() < 0.1, "{about}");
+        }
+        let same = apart(&relit, &draft);
+        assert!(same < 4.0, "{azimuth}: {same}");
+        if let Some(last) = &last {
+            let other = apart(last, &draft);
+            assert!(other > 2.0 * same, "{azimuth}: {same} {other}");
+        }
+        last = Some(relit);
+    }
 }
 
 #[test]

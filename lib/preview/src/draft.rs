@@ -97,15 +97,20 @@ fn render<L: SceneLight>(
         denoise: true,
         ..Settings::default()
     };
-    let everything = EffectsPlan::everything(&loaded.scene, &settings).simulation();
+    let simulation = simulation(loaded, &settings);
+    Renderer::new(&loaded.scene).render(light, &simulation, &settings, &mut |_| go_on())
+}
+
+/// What a draft simulates.
+pub(crate) fn simulation(loaded: &LoadedScene, settings: &Settings) -> Simulation {
+    let everything = EffectsPlan::everything(&loaded.scene, settings).simulation();
     let wanted = loaded.description.effects();
-    let simulation = Simulation {
+    Simulation {
         max_depth: everything.max_depth.min(DEPTH),
         shadow: everything.shadow && wanted.shadow != Some(EffectSwitch::Off),
         light_on_proxy: None,
         ..everything
-    };
-    Renderer::new(&loaded.scene).render(light, &simulation, &settings, &mut |_| go_on())
+    }
 }
 
 /// The box of pixels that differ by more than an 8-bit step.

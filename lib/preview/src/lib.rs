@@ -9,6 +9,7 @@ pub mod draft;
 pub mod lines;
 pub mod marks;
 pub mod picture;
+pub mod relit;
 pub mod small;
 
 pub use dipir_imaging::marked_png as png;

@@ -1,14 +1,22 @@
 //! Previews of a small project.
 use std::fs;
+use std::ops::ControlFlow;
+use std::sync::Arc;
 
 use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::session::Session;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_light::environment::EnvironmentMap;
+use dipir_light::gaussian::{SgMixture, SphericalGaussian};
+use dipir_preview::draft::Draft;
 use dipir_preview::lines::Kind;
 use dipir_preview::marks::Marks;
 use dipir_preview::picture::Preview;
+use dipir_preview::relit::Relit;
 use dipir_preview::small::SmallScene;
+use dipir_render::error::RenderError;
+use dipir_stages::light::at_hand::{AtHand, Origin};
 use glam::{DVec3, Vec3};
 use tempfile::TempDir;
 
@@ -133,4 +141,84 @@ fn a_preview_is_written_again_but_not_over_another_s_picture() {
     let error = Preview::new(&session, false).unwrap().write(&photo);
     assert!(format!("{:#}", error.unwrap_err()).contains("dipir did not make it"));
     assert_eq!(fs::read(&photo).unwrap(), before);
+}
+
+/// A sky that is brighter on one side, and a sun of half a degree's width.
+fn sunny(direction: Vec3) -> AtHand {
+    let texels = (0..32 * 16).map(|k| Vec3::splat(if k % 32 < 16 { 0.2 } else { 0.5 }));
+    let sun = SphericalGaussian {
+        direction: direction.normalize(),
+        radiance: Vec3::new(4000.0, 3600.0, 3000.0),
+        sigma: 0.008,
+    };
+    AtHand {
+        lobes: SgMixture::new(vec![sun]).unwrap(),
+        map: Some(Arc::new(
+            EnvironmentMap::new(32, 16, texels.collect()).unwrap(),
+        )),
+        tone: None,
+        origin: Origin::Estimate,
+    }
+}
+
+#[test]
+fn a_record_shows_another_sun_and_exposure_as_a_draft_does() {
+    let (_folder, session) = project();
+    let (small, arrangement) = SmallScene::load(&session, 300).unwrap();
+    let normal = arrangement.ground().normal;
+    let start = sunny(Vec3::new(1.0, 1.0, 0.3));
+    let relit = Relit::record(&small.loaded, normal, &start, || ControlFlow::Continue(())).unwrap();
+    let mut shown = Vec::new();
+    for (direction, exposure) in [
+        (Vec3::new(1.0, 1.0, 0.3), 1.0),
+        (Vec3::new(-1.0, 0.7, 0.2), 1.0),
+        (Vec3::new(0.2, 0.5, 1.0), 0.5),
+    ] {
+        let light = sunny(direction);
+        let piece = relit.under(&light, exposure).unwrap().expect("an object");
+        let exposed = AtHand {
+            lobes: SgMixture::new(
+                light
+                    .lobes
+                    .lobes()
+                    .iter()
+                    .map(|l| SphericalGaussian {
+                        radiance: l.radiance * exposure,
+                        ..*l
+                    })
+                    .collect(),
+            )
+            .unwrap(),
+            map: light.map.map(|m| Arc::new(m.scaled(exposure))),
+            ..light
+        };
+        let mut go_on = || ControlFlow::Continue(());
+        let draft = Draft::render(&small.loaded, &exposed, 64, &mut go_on).unwrap();
+        // All that the draft changes is in the piece, to a pixel.
+        let [x0, y0, x1, y1] = piece.place;
+        let [a0, b0, a1, b1] = draft.touched.unwrap();
+        assert!(x0 <= a0 + 1 && y0 <= b0 + 1 && x1 + 1 >= a1 && y1 + 1 >= b1);
+        let mut sum = 0.0;
+        for y in y0..y1 {
+            for x in x0..x1 {
+                let apart = *piece.picture.0.get(x - x0, y - y0) - *draft.picture.0.get(x, y);
+                sum += f64::from(apart.abs().element_sum()) / 3.0;
+            }
+        }
+        let mean = sum / ((x1 - x0) * (y1 - y0)) as f64;
+        // Two rays to the sun a pixel: edges of shadows and of the boxes are rough.
+        assert!(mean < 0.012, "{direction}: {mean}");
+        shown.push(piece);
+    }
+    assert_ne!(shown[0].picture, shown[1].picture);
+}
+
+#[test]
+fn a_record_that_is_broken_off_says_so() {
+    let (_folder, session) = project();
+    let (small, arrangement) = SmallScene::load(&session, 300).unwrap();
+    let light = sunny(Vec3::Y);
+    let normal = arrangement.ground().normal;
+    let broken = Relit::record(&small.loaded, normal, &light, || ControlFlow::Break(()));
+    assert!(matches!(broken.err(), Some(RenderError::Interrupted)));
 }

@@ -20,6 +20,7 @@ use glam::{DVec3, Vec2, Vec3};
 use crate::adaptive::Watch;
 use crate::error::RenderError;
 use crate::render::{Rendered, Renderer, Settings, Simulation};
+use crate::world::World;
 
 /// A light as paths over the object meet it.
 pub trait PathLight: Sync {
@@ -40,11 +41,12 @@ pub trait SceneLight: Sync {
     fn on_object(&self) -> Self::OnObject;
     /// Prepares the light for a plane with the unit normal `normal`: its parts add up.
     fn on_plane(&self, normal: Vec3) -> Vec<Self::OnPlane>;
-    /// [`Renderer::render`], which calls this. Every light implements it by [`Renderer::render_under`], so that the
+    /// [`Renderer::render_in`], which calls this. Every light implements it by [`Renderer::render_under`], so that the
     /// kernels are compiled here, once for each light, and not in each crate that renders.
     fn render(
         &self,
         renderer: &Renderer,
+        world: &mut World,
         simulation: &Simulation,
         settings: &Settings,
         progress: &mut Watch,
@@ -57,11 +59,12 @@ macro_rules! compiled_here {
         fn render(
             &self,
             renderer: &crate::render::Renderer,
+            world: &mut crate::world::World,
             simulation: &crate::render::Simulation,
             settings: &crate::render::Settings,
             progress: &mut crate::adaptive::Watch,
         ) -> Result<crate::render::Rendered, crate::error::RenderError> {
-            renderer.render_under(self, simulation, settings, progress)
+            renderer.render_under(world, self, simulation, settings, progress)
         }
     };
 }

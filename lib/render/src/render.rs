@@ -194,13 +194,28 @@ impl<'a> Renderer<'a> {
         settings: &Settings,
         progress: &mut Watch,
     ) -> Result<Rendered, RenderError> {
-        light.render(self, simulation, settings, progress)
+        let mut world = self.world(simulation.features)?;
+        self.render_in(&mut world, light, simulation, settings, progress)
     }
 
-    /// What [`render`](Self::render) does. For implementations of [`SceneLight::render`]: everybody else would compile
-    /// the kernels once more.
+    /// As [`render`](Self::render), in a world that [`world`](Self::world) made ready for the features
+    /// of `simulation`: for many pictures under changing lights.
+    pub fn render_in<L: SceneLight>(
+        &self,
+        world: &mut World,
+        light: &L,
+        simulation: &Simulation,
+        settings: &Settings,
+        progress: &mut Watch,
+    ) -> Result<Rendered, RenderError> {
+        light.render(self, world, simulation, settings, progress)
+    }
+
+    /// What [`render_in`](Self::render_in) does. For implementations of [`SceneLight::render`]: everybody else would
+    /// compile the kernels once more.
     pub fn render_under<L: SceneLight>(
         &self,
+        world: &mut World,
         light: &L,
         simulation: &Simulation,
         settings: &Settings,
@@ -208,7 +223,6 @@ impl<'a> Renderer<'a> {
     ) -> Result<Rendered, RenderError> {
         let start = Instant::now();
         self.check_images(settings.background, settings.occluders)?;
-        let mut world = self.world(simulation.features)?;
         let light: &PreparedLight<L> = &PreparedLight {
             on_object: light.on_object(),
             on_plane: match &self.geometry.proxy {
@@ -217,18 +231,13 @@ impl<'a> Renderer<'a> {
             },
         };
         let mut rendered = match settings.stop {
-            Stop::TimeBudget(budget) => self.render_within(
-                light, &mut world, simulation, settings, budget, start, progress,
-            ),
-            _ => self.render_at_most(
-                settings.most_pixels,
-                light,
-                &mut world,
-                simulation,
-                settings,
-                start,
-                progress,
-            ),
+            Stop::TimeBudget(budget) => {
+                self.render_within(light, world, simulation, settings, budget, start, progress)
+            }
+            _ => {
+                let most = settings.most_pixels;
+                self.render_at_most(most, light, world, simulation, settings, start, progress)
+            }
         }?;
         if let Some(mask) = settings.occluders {
             rendered.film.hide_behind(mask);

@@ -31,16 +31,21 @@ export async function sendMask(bytes) {
   if (!response.ok) throw await failed(response);
 }
 
-// A draft as {image, place, light}; null if the objects change nothing, undefined if a newer one was
+// A picture as {image, place, light}; null if the objects change nothing, undefined if a newer one was
 // asked for.
-export async function draft(edit, samples) {
-  const response = await fetch("draft", { method: "POST", body: JSON.stringify({ edit, samples }) });
-  if (response.status === 409 || response.headers.has("X-Superseded")) return undefined;
+async function picture(route, body) {
+  const response = await fetch(route, { method: "POST", body: JSON.stringify(body) });
+  if (response.status === 409) return undefined;
   if (response.status === 204) return null;
   if (!response.ok) throw await failed(response);
   const about = JSON.parse(response.headers.get("X-Draft"));
   return { image: await createImageBitmap(await response.blob()), ...about };
 }
+
+export const draft = (edit, samples) => picture("draft", { edit, samples });
+
+// The same objects under another sun or exposure: coarse, and at once where they are recorded.
+export const relight = (edit) => picture("relight", edit);
 
 // Calls `work` with the latest argument only: while one call runs, all but the last that come are
 // dropped.

@@ -116,14 +116,36 @@ async function shoot(samples) {
   try {
     const found = await api.draft(edit, samples);
     if (found === undefined) return;
-    draft = found;
-    light = found?.light ?? light;
-    showLight();
-    page.redraw();
+    showPicture(found);
     if (samples < 32) soon = setTimeout(() => shoot(32), 700);
+    else await api.relight(edit); // records, so that the sun turns at once
   } catch (error) {
     say(error.message, true);
   }
+}
+
+function showPicture(found) {
+  draft = found;
+  light = found?.light ?? light;
+  showLight();
+  page.redraw();
+}
+
+const relight = api.latest(async (edit) => {
+  try {
+    const found = await api.relight(edit);
+    if (found !== undefined) showPicture(found);
+  } catch (error) {
+    say(error.message, true);
+  }
+});
+
+// Shows another sun or exposure while it is dragged.
+function showLit(keys) {
+  history.show({ ...history.now, edit: { ...history.now.edit, ...keys } });
+  clearTimeout(soon);
+  showLight();
+  relight(history.now.edit);
 }
 
 function showLight() {
@@ -221,7 +243,7 @@ if (own.length) {
 let beforeSun = null;
 const dial = new Dial($("dial"), (sun, done) => {
   beforeSun ??= history.now;
-  edit({ sun, shadow: null }, false);
+  showLit({ sun, shadow: null });
   if (done) {
     history.commit(history.now, beforeSun);
     beforeSun = null;
@@ -240,7 +262,7 @@ number("height", (v) => {
 let beforeExposure = null;
 $("exposure").addEventListener("input", (event) => {
   beforeExposure ??= history.now;
-  edit({ exposure_ev: event.target.valueAsNumber }, false);
+  showLit({ exposure_ev: event.target.valueAsNumber });
 });
 $("exposure").addEventListener("change", () => {
   history.commit(history.now, beforeExposure ?? history.now);
