@@ -65,7 +65,9 @@ fn effects_table(value: &Value, effects: &[Value]) -> String {
             .filter(|(_, n)| n.as_u64() != Some(0))
             .map(|(kind, n)| format!("{kind} {n}"))
             .collect();
-        text.push_str(&format!("  rays: {}\n", counts.join(", ")));
+        if !counts.is_empty() {
+            text.push_str(&format!("  rays: {}\n", counts.join(", ")));
+        }
     }
     text
 }

@@ -20,7 +20,7 @@ impl Stream {
     pub const FOREGROUND: Stream = Stream(1);
     /// Light blocked from the proxy.
     pub const SHADOW: Stream = Stream(2);
-    /// The pilot render of effects planning.
+    /// Scenes that the evaluation draws.
     pub const PILOT: Stream = Stream(3);
     /// Recording of light transport.
     pub const RECORD: Stream = Stream(4);

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::contribution::{LeaveOut, LeftOut, SHARE_OF_TARGET};
+use crate::contribution::{LeaveOut, LeftOut};
 use crate::counters::RayCounts;
 use crate::denoise;
 use crate::error::RenderError;
@@ -364,13 +364,12 @@ fn leave_out_of(
     film: &Film,
     viewing: &Viewing,
 ) -> LeftOut {
-    let most = match stop {
-        Stop::TargetError(target) => SHARE_OF_TARGET * f64::from(target),
-        _ => f64::INFINITY,
+    let target = match stop {
+        Stop::TargetError(target) => Some(f64::from(target)),
+        _ => None,
     };
-    let tolerance = allowed.tolerance.min(most);
     let touched = touched_pixels(film, viewing);
-    LeftOut::decide(jobs, simulation, allowed, tolerance, touched)
+    LeftOut::decide(jobs, simulation, allowed, target, touched)
 }
 
 /// Where samples stop, so that with what is left out the error is as `stop` says.

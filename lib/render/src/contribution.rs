@@ -8,7 +8,7 @@ use glam::Vec3;
 
 use dipir_imaging::composite::composite_pixel;
 
-use crate::counters::RayCounts;
+use crate::counters::{RayCounts, RayKind};
 use crate::features::{PROXY_RADIANCE, has};
 use crate::film::{Film, Viewing};
 use crate::foreground::Gather;
@@ -228,6 +228,8 @@ pub struct LeaveOut {
 
 /// Share of a target error that may be lost by what is left out: a sixteenth of its square, which samples make up for.
 pub const SHARE_OF_TARGET: f64 = 0.25;
+/// The same of interactions alone, of which few paths have many: leaving them out saves little.
+const SHARE_OF_DEPTH: f64 = 0.1;
 
 /// What effects contribute, and what was left out from the second round on.
 #[derive(Clone, Debug, PartialEq)]
@@ -244,14 +246,16 @@ pub struct LeftOut {
 }
 
 impl LeftOut {
-    /// Decides from the first round of `jobs`, which simulated `simulation`.
+    /// Decides from the first round of `jobs`, which simulated `simulation`, where the error is to be `target`.
     pub(crate) fn decide(
         jobs: &[Job],
         simulation: Simulation,
         allowed: &LeaveOut,
-        tolerance: f64,
+        target: Option<f64>,
         touched_pixels: u64,
     ) -> Self {
+        let most = target.map_or(f64::INFINITY, |target| SHARE_OF_TARGET * target);
+        let tolerance = allowed.tolerance.min(most);
         let mut sums = [Sums::default(); PARTS];
         for measured in jobs.iter().filter_map(|job| job.measured.as_ref()) {
             for (sum, job) in sums.iter_mut().zip(&measured.0) {
@@ -272,31 +276,36 @@ impl LeftOut {
             parts,
         };
 
-        // ---- Whole effects, the least important first; half of the tolerance is kept for depth ----
+        // ---- Whole effects, the least important first ------------------------------------------
+        let share = |kind| first_round.get(kind) as f64 / first_round.total().max(1) as f64;
         let mut open = vec![];
         if let Some(sent) = simulation.light_on_proxy {
-            let both = [
-                (
-                    EMISSION_ON_PROXY,
-                    sent.emission && allowed.emission_on_proxy,
-                ),
-                (BOUNCE_TO_PROXY, sent.bounce && allowed.bounce_to_proxy),
-            ];
-            open.extend(both.iter().filter(|e| e.1).map(|e| e.0));
+            let saved = share(RayKind::LightOnProxy);
+            if sent.emission && allowed.emission_on_proxy {
+                open.push((EMISSION_ON_PROXY, saved));
+            }
+            if sent.bounce && allowed.bounce_to_proxy {
+                open.push((BOUNCE_TO_PROXY, saved));
+            }
         }
         if has(simulation.features, PROXY_RADIANCE) && allowed.bounce_from_proxy {
-            open.push(BOUNCE_FROM_PROXY);
+            open.push((BOUNCE_FROM_PROXY, share(RayKind::ProxyRadiance)));
         }
-        open.sort_by(|&a, &b| parts[a].upper_95.total_cmp(&parts[b].upper_95));
-        for part in open {
-            if decided.lost.upper_95 + parts[part].upper_95 <= 0.5 * tolerance {
+        open.sort_by(|a, b| parts[a.0].upper_95.total_cmp(&parts[b.0].upper_95));
+        for (part, saved) in open {
+            let lost = decided.lost.upper_95 + parts[part].upper_95;
+            // As much as the squared error grows, samples have to make up for.
+            let share_of_target = |lost: f64| target.map_or(0.0, |target| (lost / target).powi(2));
+            let more = share_of_target(lost) - share_of_target(decided.lost.upper_95);
+            if lost <= tolerance && saved > more {
                 decided.leave_out(part);
             }
         }
         // ---- The smallest depth that suffices ---------------------------------------------------
         if allowed.depth {
             let most = (simulation.max_depth as usize).min(DEPTHS);
-            let left = tolerance - decided.lost.upper_95;
+            let left = (tolerance - decided.lost.upper_95)
+                .min(target.map_or(f64::INFINITY, |target| SHARE_OF_DEPTH * target));
             if let Some(depth) = (1..most).find(|&d| parts[d].upper_95 <= left) {
                 decided.leave_out(depth);
             }

@@ -185,7 +185,7 @@ pub const PRESETS: &str = "preset";
 /// Series of the joint search.
 pub const JOINT: &str = "joint search";
 
-/// Series of effects that planning leaves on, switched off one at a time.
+/// Series of effects that the scene can show, switched off one at a time.
 const EFFECT_OFF: &str = "effect off";
 
 /// Names of all series.

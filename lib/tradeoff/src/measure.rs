@@ -151,7 +151,7 @@ impl SceneMeasurement<'_> {
         self.stage(&COMPOSITE, lit, folder, REFERENCE_SEED, set)
     }
 
-    /// Names of the effects that planning leaves on.
+    /// Names of the effects that the scene can show.
     pub fn effects_on(&self) -> anyhow::Result<Vec<String>> {
         let folder = self.work().join("planned");
         let path = folder.join("scene/effects.json");
