@@ -50,7 +50,7 @@ impl Model {
     /// each other.
     pub fn load(folder: &Path, dtype: DType, device: &Device) -> Result<Self> {
         check_precision(dtype, device)?;
-        ConfigFile::read(&folder.join("model_index.json"))?;
+        refuse_foreign(&ConfigFile::read(&folder.join("model_index.json"))?)?;
         // What is small comes first: its errors cost nothing.
         let schedule = NoiseSchedule::load(&folder.join("scheduler"))?;
         let tokenizer = Tokenizer::load(&folder.join("tokenizer"))?;
@@ -170,6 +170,22 @@ impl Model {
             .map(|p| self.tokenizer.encode(p))
             .collect::<Result<Vec<_>>>()?;
         self.text_encoder.forward(&tokens, learned)
+    }
+}
+
+/// Refuses the families of models that this code does not compute, by their name.
+fn refuse_foreign(index: &ConfigFile) -> Result<()> {
+    let class = index.get("_class_name").and_then(|name| name.as_str());
+    let families = [
+        ("StableDiffusionXL", "Stable Diffusion XL"),
+        ("StableDiffusion3", "Stable Diffusion 3"),
+        ("Flux", "Flux"),
+    ];
+    match families.iter().find(|(start, _)| class.is_some_and(|c| c.starts_with(start))) {
+        None => Ok(()),
+        Some((_, family)) => Err(index.error(format!(
+            "_class_name says that this is {family}; accepted: Stable Diffusion 1 and 2, plain and inpainting"
+        ))),
     }
 }
 

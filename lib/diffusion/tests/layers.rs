@@ -404,7 +404,7 @@ fn impossible_shapes_are_refused_with_both_numbers() {
 }
 
 /// <conv(x), g> = <x, conv^T(g)>, in f64, at sizes that take every path: the
-/// transformed, the blocked, the strided and the pointwise one.
+/// transformed, the blocked, the strided, the pointwise one, and that of few pixels.
 #[test]
 fn adjoints_of_large_convolutions_are_adjoint() -> Outcome {
     for (channels, outputs, kernel, stride, padding, side) in [
@@ -415,6 +415,9 @@ fn adjoints_of_large_convolutions_are_adjoint() -> Outcome {
         (24, 16, 3, 2, Padding::Same(1), 33),
         (24, 16, 3, 2, Padding::After(1), 32),
         (24, 40, 1, 1, Padding::Same(0), 27),
+        (24, 70, 3, 1, Padding::Same(1), 6),
+        (8, 30, 3, 1, Padding::Same(0), 5),
+        (5, 40, 5, 1, Padding::After(2), 6),
     ] {
         let name = format!("{channels}->{outputs} kernel {kernel} stride {stride} {padding:?}");
         let x = Var::from_tensor(&normal(40, &[2, channels, side, side]))?;

@@ -39,6 +39,9 @@ pub struct DistillationSettings {
     pub timesteps: [[f64; 2]; 2],
     /// Noise samples in each iteration.
     pub draws: usize,
+    /// Side of the crops that the model sees, pixels; without it, [`default_crop`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub crop: Option<usize>,
     /// Classifier-free guidance of SDS and of edited pictures.
     pub guidance_scale: f64,
     /// What the picture should show. If absent, the prompt is made of class, word and light.
@@ -83,15 +86,34 @@ impl DistillationSettings {
                 format!("{draws} is out of range; accepted: 1 to 64"),
             );
         }
+        if let Some(side) = table.crop
+            && !((64..=1024).contains(&side) && side % 8 == 0)
+        {
+            let message = format!("{side} is refused; accepted: multiples of 8 from 64 to 1024");
+            return wrong("crop", message);
+        }
         Ok(Self {
             guidance: table.guidance,
             timesteps,
             draws,
+            crop: table.crop,
             guidance_scale: table.guidance_scale.unwrap_or(7.5),
             prompt: table.prompt.clone(),
             adapt: table.adapt.unwrap_or(true),
             turned: true,
         })
+    }
+}
+
+/// Side of the crops on a CPU at most: a model of 512 pixels takes a quarter of its time there.
+const CPU_CROP: usize = 256;
+
+/// Side of the crops that a model sees where nothing says it, pixels: that of its training, on the
+/// CPU at most [`CPU_CROP`].
+pub fn default_crop(native: usize, on_cpu: bool) -> usize {
+    match on_cpu {
+        true => native.min(CPU_CROP),
+        false => native,
     }
 }
 
@@ -201,7 +223,9 @@ impl<'a> Distillation<'a> {
             mirrored,
             background: background.0.clone(),
             paint: paint.map(|&a| Vec3::splat(a)),
-            side: model.native_size(),
+            side: settings
+                .crop
+                .unwrap_or_else(|| default_crop(model.native_size(), model.device().is_cpu())),
             knows_light: light.is_some(),
             settings,
         })
@@ -337,6 +361,29 @@ mod tests {
     use super::*;
 
     #[test]
+    fn crops_are_those_of_the_training_and_smaller_on_a_cpu_unless_set() {
+        assert_eq!(default_crop(512, false), 512);
+        assert_eq!(default_crop(768, true), 256);
+        assert_eq!(default_crop(64, true), 64);
+        let with = |crop| {
+            DistillationSettings::new(
+                &LightTable {
+                    crop,
+                    ..Default::default()
+                },
+                false,
+            )
+        };
+        assert_eq!(with(Some(512)).unwrap().crop, Some(512));
+        for bad in [0, 56, 260, 1032] {
+            let refusal = with(Some(bad)).unwrap_err();
+            assert_eq!(refusal.key, "crop");
+            let message = format!("{bad} is refused; accepted: multiples of 8 from 64 to 1024");
+            assert_eq!(refusal.message, message);
+        }
+    }
+
+    #[test]
     fn an_odd_iteration_is_that_of_the_mirror_image_turned_back() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../data/prior");
         let mut model = Model::load(&folder, DType::F32, &Device::Cpu).unwrap();
@@ -357,6 +404,7 @@ mod tests {
             guidance: GuidanceKind::Lds,
             timesteps: [[0.5, 0.8]; 2],
             draws: 2,
+            crop: None,
             guidance_scale: 7.5,
             prompt: None,
             adapt: false,

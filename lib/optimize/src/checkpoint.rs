@@ -18,6 +18,8 @@ use crate::snapshot::{Snapshot, SnapshotFile};
 pub struct State {
     /// The next iteration.
     pub iteration: usize,
+    /// Iterations of the run, where a time budget decided them.
+    pub planned: Option<usize>,
     /// What is optimised.
     pub parameters: Parameters,
     /// Moments of the optimiser.
@@ -53,6 +55,7 @@ impl State {
     pub fn new(parameters: Parameters) -> Self {
         Self {
             iteration: 0,
+            planned: None,
             adam: Adam::new(&parameters.to_tensors()),
             parameters,
             bad_in_a_row: 0,
@@ -63,7 +66,7 @@ impl State {
     }
 
     /// Writes the state beside `path`, flushes it and renames it into place: a crash leaves the
-    /// earlier checkpoint or this one.
+    /// earlier checkpoint or this one. The iterations of `settings` are those of the schedule.
     pub fn write(&self, path: &Path, settings: &Settings) -> Result<(), OptimizeError> {
         let header = Header {
             schema: SCHEMA,
@@ -96,7 +99,16 @@ impl State {
         };
         let header: Header = file.header()?;
         file.check_schema(header.schema, SCHEMA)?;
-        if header.settings != *settings {
+        let scheduled = header.settings.iterations;
+        let planned = settings
+            .time_budget_s
+            .is_some_and(|_| (1..=settings.iterations).contains(&scheduled))
+            .then_some(scheduled);
+        let expected = Settings {
+            iterations: planned.unwrap_or(settings.iterations),
+            ..settings.clone()
+        };
+        if header.settings != expected {
             return Err(file.refused("belongs to a run with other settings".into()));
         }
         let shape = start.to_tensors();
@@ -107,6 +119,7 @@ impl State {
         };
         Ok(Some(Self {
             iteration: header.iteration,
+            planned,
             parameters: Parameters::from_tensors(&file.set("parameters", &shape)?),
             adam,
             bad_in_a_row: header.bad_in_a_row,

@@ -52,6 +52,8 @@ pub struct Optimization<'a> {
 /// What happens during a run.
 #[derive(Debug)]
 pub enum Event<'a> {
+    /// So many iterations are run, where a time budget decides.
+    Planned(usize),
     /// An iteration is done.
     Step(&'a Row),
     /// The picture at the start of an iteration.
@@ -97,14 +99,29 @@ impl Optimization<'_> {
         mut self,
         watch: &mut dyn FnMut(Event) -> ControlFlow<()>,
     ) -> Result<Outcome, OptimizeError> {
-        let settings = self.settings.clone();
         let (_, rows) = self.objective.transport().environment_size();
-        let bounds = match settings.light {
+        let bounds = match self.settings.light {
             true => ParameterBounds::for_map(rows),
             false => ParameterBounds::for_map(rows).of_tone_alone(),
         };
         let crops = CropSampler::new(self.objective.transport().coverage());
         let mut state = self.resume()?;
+        if let Some(budget) = self.settings.time_budget_s
+            && self.settings.iterations > 0
+        {
+            let planned = match state.planned {
+                Some(planned) => planned,
+                None => self.plan(&mut state, &crops, budget)?,
+            };
+            self.settings.iterations = planned;
+            if watch(Event::Planned(planned)).is_break() {
+                return self.interrupt(&state);
+            }
+            if state.iteration == 0 && self.settings.checkpoint_every > 0 {
+                self.keep(&state)?;
+            }
+        }
+        let settings = self.settings.clone();
         let mut stopped_early = false;
         while state.iteration < settings.iterations && !stopped_early {
             let clock = Instant::now();
@@ -134,16 +151,7 @@ impl Optimization<'_> {
 
             // Forwards, the loss, and backwards.
             let parameters = state.parameters.to_tensors();
-            let forward = self.objective.forward(&state.parameters, fusion);
-            let view = self.view(&crops, step);
-            let evaluation = match bad_before_guidance(&parameters, &forward) {
-                Some(bad) => Err(bad.to_string()),
-                None => {
-                    let shown = view.apply(&forward.picture.0);
-                    let guided = self.guidance.gradient(&shown, &view, step)?;
-                    self.gradient(&state.parameters, &forward, &view, guided)
-                }
-            };
+            let (forward, evaluation) = self.evaluate(&state.parameters, &crops, step, fusion)?;
             let evaluation = evaluation.map(|evaluation| match one_light {
                 true => Evaluation {
                     gradient: evaluation.gradient.shared(&Parameters::TWINS),
@@ -216,6 +224,57 @@ impl Optimization<'_> {
             stopped_early = stands_still(&state.history, settings.patience, settings.fused_at());
         }
         self.outcome(state, stopped_early, watch)
+    }
+
+    /// The number of iterations that fit into `budget` seconds, from 1 to that of the settings: as
+    /// many as the first one, evaluated twice, says. The schedule has not begun to depend on the
+    /// number there, so the run is that of `iterations` set to it, byte for byte.
+    fn plan(
+        &mut self,
+        state: &mut State,
+        crops: &CropSampler,
+        budget: f64,
+    ) -> Result<usize, OptimizeError> {
+        let first = Step {
+            iteration: 0,
+            iterations: self.settings.iterations,
+            seed: self.settings.seed,
+        };
+        let clock = Instant::now();
+        // The first evaluation pays for pages and caches that later ones find.
+        let _ = self.evaluate(&state.parameters, crops, first, 0.0)?;
+        let warm_up = clock.elapsed().as_secs_f64();
+        let mut one = warm_up;
+        if 2.0 * warm_up < budget {
+            let _ = self.evaluate(&state.parameters, crops, first, 0.0)?;
+            one = clock.elapsed().as_secs_f64() - warm_up;
+        }
+        let left = budget - clock.elapsed().as_secs_f64();
+        let planned = ((left / one.max(1e-9)) as usize).clamp(1, self.settings.iterations);
+        state.planned = Some(planned);
+        Ok(planned)
+    }
+
+    /// The picture, and what the guidance says of it as a gradient of the parameters, or what was
+    /// not finite.
+    fn evaluate(
+        &mut self,
+        parameters: &Parameters,
+        crops: &CropSampler,
+        step: Step,
+        fusion: f32,
+    ) -> Result<(Forward, Result<Evaluation, String>), OptimizeError> {
+        let forward = self.objective.forward(parameters, fusion);
+        let view = self.view(crops, step);
+        let evaluation = match bad_before_guidance(&parameters.to_tensors(), &forward) {
+            Some(bad) => Err(bad.to_string()),
+            None => {
+                let shown = view.apply(&forward.picture.0);
+                let guided = self.guidance.gradient(&shown, &view, step)?;
+                self.gradient(parameters, &forward, &view, guided)
+            }
+        };
+        Ok((forward, evaluation))
     }
 
     /// The state of the checkpoint, or that of the start; with the transport that it had.

@@ -549,3 +549,6 @@ fn previews_come_when_they_are_due_and_last_of_all_the_final_picture() {
     assert_eq!(at, [0, 10, 20, 25]);
     assert_eq!(seen[3].1, outcome.picture);
 }
+
+#[path = "time_budget_tests.rs"]
+mod time_budget;

@@ -95,6 +95,10 @@ pub struct LightTable {
     /// Steps of the optimiser; 0 keeps the light that it would start from.
     #[schemars(range(min = 0, max = 1000000), example = 300)]
     pub iterations: Option<usize>,
+    /// Seconds that the optimisation may take: its first step is timed, and as many of `iterations`
+    /// are run as fit. Loading, recording and reading are not counted.
+    #[schemars(extend("exclusiveMinimum" = 0, "x-default" = "no limit"), example = 600.0)]
+    pub time_budget_s: Option<f64>,
     /// What guides the light. `auto`: `lds` with a model of `[model] path`, `none` with the
     /// embedded one. `none`: the start is kept. `lds`, `sds`, `csd`: score distillation. `sdedit`:
     /// what the model makes of the picture. `reference`: the picture `reference`.
@@ -130,6 +134,9 @@ pub struct LightTable {
     /// With a diffusion model: draws of noise in each iteration.
     #[schemars(range(min = 1, max = 64), extend("default" = 1), example = 4)]
     pub draws: Option<usize>,
+    /// With a diffusion model: side of the crops that it is shown, pixels, a multiple of 8.
+    #[schemars(range(min = 64, max = 1024), extend("x-default" = "the model's own size, at most 256 on the CPU"), example = 512)]
+    pub crop: Option<usize>,
     /// With `guidance = "sds"` or `"sdedit"`: scale of classifier-free guidance.
     #[schemars(extend("default" = 7.5), example = 7.5)]
     pub guidance_scale: Option<f64>,
@@ -276,6 +283,9 @@ pub struct BadSetting {
 pub struct Settings {
     /// Steps of the optimiser.
     pub iterations: usize,
+    /// Seconds into which the steps have to fit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub time_budget_s: Option<f64>,
     /// Lobes of each light set.
     pub lobes: usize,
     /// Longest side of the picture that is optimised, pixels.
@@ -348,6 +358,7 @@ impl LightTable {
         let fits_half = environment[0].saturating_mul(environment[1]) <= MOST_TEXELS_IN_HALF;
         let settings = Settings {
             iterations: self.iterations.unwrap_or(preset.iterations),
+            time_budget_s: self.time_budget_s,
             lobes: self.lobes.unwrap_or(preset.lobes),
             size: self.size.unwrap_or(preset.size),
             environment,
@@ -381,6 +392,14 @@ impl Settings {
             let found = self.iterations;
             let message = format!("{found} is out of range; accepted: 0 to 1000000");
             return wrong("iterations", message);
+        }
+        if let Some(s) = self.time_budget_s
+            && !(s > 0.0 && s.is_finite())
+        {
+            return wrong(
+                "time_budget_s",
+                format!("{s} is out of range; accepted: above 0"),
+            );
         }
         let counts = [
             ("lobes", self.lobes, 1024),

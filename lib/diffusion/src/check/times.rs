@@ -31,6 +31,8 @@ pub struct TimesSettings {
 pub struct Times {
     /// Side of the image, pixels.
     pub size: usize,
+    /// Whether the model lies on the CPU.
+    pub on_cpu: bool,
     /// States of two prompts.
     pub text_s: f64,
     /// One prediction.
@@ -73,6 +75,7 @@ pub fn times(
     let data = bench.data(settings);
     Ok(Times {
         size: side * model.vae.downscale(),
+        on_cpu: model.device().is_cpu(),
         text_s: time(&mut || wait(&text(model, side)?))?,
         unet_s: time(&mut || wait(&bench.predict(1)?))?,
         encode_s: time(&mut || wait(&model.vae.encode(&bench.image)?))?,

@@ -25,6 +25,10 @@ pub(crate) struct AttentionShape {
 
 /// Scores of one block: 1 MiB, half of a usual L2.
 const BLOCK_SCORES: usize = 256 * 1024;
+/// Queries of a block are a multiple of it: rows of the register tile of a product.
+const TILE_ROWS: usize = 14;
+/// Floats of a cache line.
+const LINE: usize = 16;
 
 impl AttentionShape {
     fn width(&self) -> usize {
@@ -33,9 +37,16 @@ impl AttentionShape {
 
     /// Queries of one block, from the shape alone.
     fn block(&self) -> usize {
-        (BLOCK_SCORES / self.keys.max(1))
-            .clamp(16, 128)
+        let rows = (BLOCK_SCORES / self.keys.max(1)).min(9 * TILE_ROWS);
+        (rows / TILE_ROWS * TILE_ROWS)
+            .max(TILE_ROWS)
             .min(self.queries.max(1))
+    }
+
+    /// Floats from one row of scores to the next: an odd number of cache lines, so that rows do not
+    /// fall onto the same few sets of the caches.
+    fn stride(&self) -> usize {
+        (self.keys.div_ceil(LINE) | 1) * LINE
     }
 
     /// Head `head` of batch item `item` in a tensor of `length` tokens.
@@ -59,9 +70,10 @@ impl AttentionShape {
 vectorized! {
     /// exp(score - largest of the row) in place, and 1 / the row's sum into
     /// `inverse`; entries past `visible(row)` become 0.
-    fn exponentials(scores: &mut [f32], keys: usize, first_visible: usize, inverse: &mut [f32]) {
+    fn exponentials(scores: &mut [f32], keys: usize, stride: usize, first_visible: usize, inverse: &mut [f32]) {
         const LANES: usize = 32;
-        for (row, scores) in scores.chunks_exact_mut(keys).enumerate() {
+        for (row, scores) in scores.chunks_exact_mut(stride).enumerate() {
+            let scores = &mut scores[..keys];
             let visible = if first_visible == usize::MAX { keys } else { (first_visible + row).min(keys) };
             let (seen, hidden) = scores.split_at_mut(visible);
             let mut lanes = [f32::NEG_INFINITY; LANES];
@@ -102,16 +114,6 @@ vectorized! {
     }
 }
 
-vectorized! {
-    fn scale_rows(rows: &mut [f32], width: usize, factors: &[f32]) {
-        for (row, &factor) in rows.chunks_exact_mut(width).zip(factors) {
-            for v in row {
-                *v *= factor;
-            }
-        }
-    }
-}
-
 impl AttentionShape {
     /// Probabilities of `rows` queries from `first` into `scores`, up to the
     /// factor of each row that goes into `inverse`; `keys` are the head's
@@ -126,13 +128,14 @@ impl AttentionShape {
         threads: Threads,
     ) {
         let q = self.head(q, self.queries, item, head, first);
-        // SAFETY: `scores` holds rows * keys elements and is borrowed exclusively.
+        let stride = self.stride();
+        // SAFETY: `scores` holds rows * stride elements and is borrowed exclusively.
         unsafe {
             let (shape, out) = ((rows, self.keys, self.head_dim), scores.as_mut_ptr());
-            product_columns(shape, out, self.keys, 0.0, self.scale, q, keys, threads);
+            product_columns(shape, out, stride, 0.0, self.scale, q, keys, threads);
         }
         let visible = if self.causal { first + 1 } else { usize::MAX };
-        exponentials(scores, self.keys, visible, inverse);
+        exponentials(scores, self.keys, stride, visible, inverse);
     }
 
     /// One head's matrix of `data`, keys or values: as it is, [keys, head_dim].
@@ -172,12 +175,12 @@ pub(crate) fn attention(shape: AttentionShape, q: &[f32], k: &[f32], v: &[f32]) 
             let (keys, values) = &heads[pair];
             let rows = block.min(shape.queries - first);
             let mut inverse = vec![0f32; rows];
-            with_scratch(rows * shape.keys, |scores| {
+            with_scratch(rows * shape.stride(), |scores| {
                 let place = (item, head, first, rows);
                 shape.probabilities(scores, place, q, keys, &mut inverse, Threads::One);
                 let offset = (item * shape.queries + first) * width + head * shape.head_dim;
                 let size = (rows, shape.head_dim, shape.keys);
-                let p = Matrix::rows(scores, shape.keys);
+                let p = Matrix::rows(scores, shape.stride());
                 // SAFETY: each job writes its own rows and head columns of `out`.
                 unsafe {
                     let out = target.at(offset);
@@ -196,27 +199,44 @@ pub(crate) fn attention(shape: AttentionShape, q: &[f32], k: &[f32], v: &[f32]) 
 }
 
 vectorized! {
-    /// ds = p (dp - sum(p dp)) by rows, into `dp`.
-    fn softmax_rows_vjp(p: &[f32], dp: &mut [f32], keys: usize) {
-        for (p, dp) in p.chunks_exact(keys).zip(dp.chunks_exact_mut(keys)) {
-            let mean = sum_of_2(p, dp, |p, d| p * d) as f32;
+    /// ds = p (dp - mean) by rows, into `dp`, where p is up to the factor of each row.
+    fn softmax_rows_vjp(p: &[f32], dp: &mut [f32], keys: usize, stride: usize, means: &[f32], factors: &[f32]) {
+        let rows = p.chunks_exact(stride).zip(dp.chunks_exact_mut(stride));
+        for ((p, dp), (&mean, &factor)) in rows.zip(means.iter().zip(factors)) {
+            let (p, dp) = (&p[..keys], &mut dp[..keys]);
             for i in 0..keys {
-                dp[i] = p[i] * (dp[i] - mean);
+                dp[i] = p[i] * factor * (dp[i] - mean);
             }
         }
     }
 }
 
-/// Gradients of [`attention`]: (dq, dk, dv).
+vectorized! {
+    /// Of each row of `g`: its product with the same row of `y`, which is the mean of dp under p, into `means`, and
+    /// the row times its factor into `scaled`.
+    fn rows_of_gradient(g: Matrix, y: Matrix, factors: &[f32], means: &mut [f32], scaled: &mut [f32]) {
+        let width = scaled.len() / means.len().max(1);
+        for (row, scaled) in scaled.chunks_exact_mut(width).enumerate() {
+            let (g, y) = (&g.data[row * g.row..][..width], &y.data[row * y.row..][..width]);
+            means[row] = sum_of_2(g, y, |g, y| g * y) as f32;
+            for i in 0..width {
+                scaled[i] = g[i] * factors[row];
+            }
+        }
+    }
+}
+
+/// Gradients of [`attention`], whose value is `y`: (dq, dk, dv).
 pub(crate) fn attention_vjp(
     shape: AttentionShape,
     q: &[f32],
     k: &[f32],
     v: &[f32],
+    y: &[f32],
     g: &[f32],
 ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let (mut dq, mut dk, mut dv) = (vec![0.0; q.len()], vec![0.0; k.len()], vec![0.0; v.len()]);
-    let (block, width) = (shape.block(), shape.width());
+    let (block, width, stride) = (shape.block(), shape.width(), shape.stride());
     let targets = (
         SharedMut::new(&mut dq),
         SharedMut::new(&mut dk),
@@ -235,12 +255,15 @@ pub(crate) fn attention_vjp(
     let step = |place: (usize, usize, usize), shared: &Shared, p: &mut [f32], dp: &mut [f32]| {
         let (item, head, first) = place;
         let (keys_t, values_t, keys) = shared;
-        let rows = p.len() / shape.keys;
-        let mut inverse = vec![0f32; rows];
+        let rows = p.len() / stride;
+        let (mut inverse, mut means) = (vec![0f32; rows], vec![0f32; rows]);
+        let mut scaled = vec![0f32; rows * shape.head_dim];
         let place = (item, head, first, rows);
         shape.probabilities(p, place, q, keys_t, &mut inverse, threads);
-        scale_rows(p, shape.keys, &inverse);
         let g = shape.head(g, shape.queries, item, head, first);
+        let y = shape.head(y, shape.queries, item, head, first);
+        rows_of_gradient(g, y, &inverse, &mut means, &mut scaled);
+        let scaled = Matrix::rows(&scaled, shape.head_dim);
         let q = shape.head(q, shape.queries, item, head, first);
         let keep = if first == 0 { 0.0 } else { 1.0 };
         let key_offset = item * shape.keys * width + head * shape.head_dim;
@@ -249,15 +272,15 @@ pub(crate) fn attention_vjp(
         let by_key = (shape.keys, shape.head_dim, rows);
         let by_query = (rows, shape.head_dim, shape.keys);
         // SAFETY: each job writes the columns of its own head and item, and
-        // `dp` holds rows * keys elements.
+        // `dp` holds rows * stride elements.
         unsafe {
             let out = dp.as_mut_ptr();
-            product_columns(scores, out, shape.keys, 0.0, 1.0, g, values_t, threads);
-            let weights = Matrix::rows(p, shape.keys).transposed();
+            product_columns(scores, out, stride, 0.0, 1.0, g, values_t, threads);
+            let weights = Matrix::rows(p, stride).transposed();
             let out = targets.2.at(key_offset);
-            product_at(by_key, out, width, keep, 1.0, weights, g, threads);
-            softmax_rows_vjp(p, dp, shape.keys);
-            let ds = Matrix::rows(dp, shape.keys);
+            product_at(by_key, out, width, keep, 1.0, weights, scaled, threads);
+            softmax_rows_vjp(p, dp, shape.keys, stride, &means, &inverse);
+            let ds = Matrix::rows(dp, stride);
             let out = targets.0.at(query_offset);
             product_columns(by_query, out, width, 0.0, shape.scale, ds, keys, threads);
             let out = targets.1.at(key_offset);
@@ -273,7 +296,7 @@ pub(crate) fn attention_vjp(
             shape.columns(k, item, head),
         );
         for first in (0..shape.queries).step_by(block) {
-            let len = block.min(shape.queries - first) * shape.keys;
+            let len = block.min(shape.queries - first) * stride;
             with_scratch(len, |p| {
                 with_scratch(len, |dp| step((item, head, first), &shared, p, dp))
             });

@@ -243,7 +243,10 @@ pub(crate) fn conv2d_vjp_input(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f3
             winograd::conv2d(adjoint, g, w, winograd::Weights::Adjoint, &mut dx);
             return dx;
         }
-        return conv2d(adjoint, g, &turned(shape, w), None);
+        // Turning the weights costs as much as there are outputs, folding as much as there are pixels.
+        if pixels >= shape.outputs {
+            return conv2d(adjoint, g, &turned(shape, w), None);
+        }
     }
     fold_product(shape, g, w)
 }
@@ -267,7 +270,7 @@ fn turned(shape: ConvShape, w: &[f32]) -> Vec<f32> {
     turned
 }
 
-/// Strided convolutions: unfolded gradients, summed back into the image.
+/// Strided convolutions and those of few pixels: unfolded gradients, summed back into the image.
 fn fold_product(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f32> {
     let (pixels, taps, out_width) = (
         shape.out_pixels(),
@@ -309,17 +312,30 @@ fn fold_product(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f32> {
             for (row, column) in columns.chunks_exact(pixels).enumerate() {
                 let (ky, kx) = (row / shape.kernel % shape.kernel, row % shape.kernel);
                 let dx = &mut dx[row / taps * plane..][..plane];
-                for (pixel, &value) in column.iter().enumerate() {
-                    let y = (pixel / out_width * shape.stride + ky).wrapping_sub(shape.pad_before);
-                    let x = (pixel % out_width * shape.stride + kx).wrapping_sub(shape.pad_before);
-                    if y < shape.height && x < shape.width {
-                        dx[y * shape.width + x] += value;
+                for (i, column) in column.chunks_exact(out_width).enumerate() {
+                    let y = (i * shape.stride + ky).wrapping_sub(shape.pad_before);
+                    if y < shape.height {
+                        let dx = &mut dx[y * shape.width..][..shape.width];
+                        fold_row(column, dx, shape.stride, kx, shape.pad_before);
                     }
                 }
             }
         },
     );
     dx
+}
+
+/// Adds what tap `kx` of each output of a row meets to the input's row.
+fn fold_row(column: &[f32], dx: &mut [f32], stride: usize, kx: usize, pad: usize) {
+    // The first output whose input lies inside.
+    let skipped = pad.saturating_sub(kx).div_ceil(stride);
+    let start = (skipped * stride + kx).saturating_sub(pad);
+    let column = column.get(skipped..).unwrap_or_default();
+    let dx = dx.get_mut(start..).unwrap_or_default();
+    match stride {
+        1 => dx.iter_mut().zip(column).for_each(|(d, c)| *d += c),
+        _ => (dx.iter_mut().step_by(stride).zip(column)).for_each(|(d, c)| *d += c),
+    }
 }
 
 /// Gradient of [`conv2d`] with respect to w.

@@ -19,6 +19,8 @@ const POINTS: usize = PATCH * PATCH;
 const LANES: usize = 16;
 /// Floats of the transformed tiles of one block: 32 MiB.
 const BLOCK: usize = 8 << 20;
+/// Outputs of one job of the products at most.
+const PART_OUTPUTS: usize = 640;
 /// Fewer pixels do not pay for transforming the weights.
 const MIN_PIXELS: usize = 512;
 /// Fewer channels do not pay for transforming the tiles.
@@ -101,15 +103,13 @@ pub(super) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], order: Weights, out
 
 /// m[p] = u[p] v[p] for each of the points.
 fn multiply((outputs, count, inputs): (usize, usize, usize), u: &[f32], v: &[f32], m: &mut [f32]) {
-    // Halves of the outputs, so that many threads find work.
-    let half = outputs.div_ceil(2).next_multiple_of(LANES).min(outputs);
+    // Each part packs the tiles again, so few outputs stay together.
+    let parts = outputs.div_ceil(PART_OUTPUTS);
+    let part = outputs.div_ceil(parts);
     let target = SharedMut::new(m);
-    (0..2 * POINTS).into_par_iter().for_each(|job| {
-        let (point, first) = (job / 2, job % 2 * half);
-        let rows = half.min(outputs - first.min(outputs));
-        if rows == 0 {
-            return;
-        }
+    (0..parts * POINTS).into_par_iter().for_each(|job| {
+        let (point, first) = (job / parts, job % parts * part);
+        let rows = part.min(outputs - first);
         let u = Matrix::rows(&u[(point * outputs + first) * inputs..], inputs);
         let v = Matrix::rows(&v[point * inputs * count..], count);
         // SAFETY: each job owns its rows of its point.

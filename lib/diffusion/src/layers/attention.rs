@@ -152,13 +152,13 @@ impl CustomOp3 for AttentionOp {
         q: &Tensor,
         k: &Tensor,
         v: &Tensor,
-        _: &Tensor,
+        y: &Tensor,
         g: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let shape = self.shape(q.shape(), k.shape())?;
         let g = g.contiguous()?;
-        let (dq, dk, dv) =
-            attention::attention_vjp(shape, &read(q)?, &read(k)?, &read(v)?, &read(&g)?);
+        let (q_, k_, v_) = (read(q)?, read(k)?, read(v)?);
+        let (dq, dk, dv) = attention::attention_vjp(shape, &q_, &k_, &v_, &read(y)?, &read(&g)?);
         let wanted = |like: &Tensor, values: Vec<f32>| {
             like.track_op()
                 .then(|| from_floats(values, like.shape(), like.dtype()))

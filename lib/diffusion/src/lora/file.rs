@@ -199,7 +199,9 @@ fn sort_keys<'a>(
             }
         };
         let Some(layer) = layer else {
-            let hint = if module.starts_with("lora_te") || module.starts_with("text_encoder") {
+            let own = module.strip_prefix("base_model.model.").unwrap_or(module);
+            let of_text = ["lora_te", "text_encoder", "text_model"];
+            let hint = if of_text.iter().any(|start| own.starts_with(start)) {
                 "adapts the text encoder, accepted are adapters of the UNet; train or export with the UNet only"
             } else {
                 "belongs to no layer of this UNet"

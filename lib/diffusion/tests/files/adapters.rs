@@ -19,7 +19,15 @@ fn foreign_lora_keys_are_named() -> Outcome {
     let cases = [
         (
             vec![("lora_te_text_model_x.lora_down.weight", matrix(4, 8)?)],
-            "adapts the text encoder",
+            "key \"lora_te_text_model_x.lora_down.weight\" adapts the text encoder",
+        ),
+        (
+            vec![("text_encoder.text_model.x.lora_A.weight", matrix(4, 8)?)],
+            "key \"text_encoder.text_model.x.lora_A.weight\" adapts the text encoder",
+        ),
+        (
+            vec![("base_model.model.text_model.x.lora_A.weight", matrix(4, 8)?)],
+            "key \"base_model.model.text_model.x.lora_A.weight\" adapts the text encoder",
         ),
         (
             vec![("unet.nowhere.lora_A.weight", matrix(4, 8)?)],

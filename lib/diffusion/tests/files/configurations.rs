@@ -179,5 +179,21 @@ fn a_model_whose_parts_do_not_fit_is_refused() -> Outcome {
         message.contains("cross_attention_dim 24") && message.contains("hidden_size 32"),
         "{message}"
     );
+    for (class, family) in [
+        ("StableDiffusionXLPipeline", "Stable Diffusion XL"),
+        ("StableDiffusionXLInpaintPipeline", "Stable Diffusion XL"),
+        ("StableDiffusion3Pipeline", "Stable Diffusion 3"),
+        ("FluxPipeline", "Flux"),
+    ] {
+        let index = format!("{{\"_class_name\": \"{class}\"}}");
+        std::fs::write(folder.path().join("model_index.json"), index)?;
+        let message = load().expect_err(class).to_string();
+        assert!(
+            message.contains(&format!(
+                "this is {family}; accepted: Stable Diffusion 1 and 2"
+            )),
+            "{message}"
+        );
+    }
     Ok(())
 }

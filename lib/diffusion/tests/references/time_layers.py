@@ -16,7 +16,6 @@ import time
 
 import torch
 import torch.nn.functional as F
-from diffusers import UNet2DConditionModel
 
 CASES = ["linear", "conv320", "conv64", "conv128", "conv1280", "groupnorm", "attention", "unet"]
 TURNS = int(os.environ.get("TURNS", "2"))
@@ -39,6 +38,8 @@ def case(name, train):
             h = x.view(1, 4096, 8, 40).transpose(1, 2)
             return F.scaled_dot_product_attention(h, h, h).transpose(1, 2).reshape(x.shape)
         return (1, 4096, 320), attention
+    from diffusers import UNet2DConditionModel  # The layers need torch alone.
+
     unet = UNet2DConditionModel(
         in_channels=4, block_out_channels=(64, 128, 128), cross_attention_dim=64, attention_head_dim=8,
         down_block_types=("CrossAttnDownBlock2D", "CrossAttnDownBlock2D", "DownBlock2D"),

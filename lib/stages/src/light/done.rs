@@ -53,6 +53,7 @@ impl Done {
             "folder": self.folder,
             "size": self.size,
             "iterations": history.len(),
+            "wanted": self.wanted,
             "resumed_at": self.resumed_at,
             "skipped": self.found.skipped(),
             "stopped_early": self.found.stopped_early,
@@ -77,11 +78,13 @@ impl fmt::Display for Done {
         written(f, &self.folder, &self.manifest)?;
         match self.found.history.len() {
             0 => write!(f, "\n  nothing was optimised: the start is the light")?,
-            n => write!(
-                f,
-                "\n  {n} iterations on {} x {} pixels",
-                self.size[0], self.size[1]
-            )?,
+            n => {
+                write!(f, "\n  {n} iterations")?;
+                if let Some(wanted) = self.wanted {
+                    write!(f, " of {wanted} within light.time_budget_s,")?;
+                }
+                write!(f, " on {} x {} pixels", self.size[0], self.size[1])?
+            }
         }
         if let Some(rmse) = self.found.rmse {
             write!(f, ", {rmse:.5} of display-referred RMSE from the reference")?;

@@ -120,6 +120,14 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
     let settings = transport::settings(session, &table)?;
+    if settings.time_budget_s.is_some() {
+        let message =
+            "does not limit the recovery of materials; remove it, or set light.iterations";
+        return Err(session
+            .config
+            .invalid("light.time_budget_s", message)
+            .into());
+    }
     let (reference_path, reference_file) = reference_of(session, &table)?;
     let (light, environment) =
         known_light::known_params(&composite).ok_or_else(|| needs_light(session))?;

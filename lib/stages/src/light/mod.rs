@@ -57,6 +57,8 @@ pub struct Done {
     folder: PathBuf,
     manifest: Manifest,
     found: Found,
+    /// The iterations that were asked for, where a time budget decided how many were run.
+    wanted: Option<usize>,
     size: [u32; 2],
     resumed_at: usize,
     /// What other presets would have taken; empty for a run that went on from a checkpoint.
@@ -159,8 +161,9 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     if let Some(resume) = resume {
         resume.remove();
     }
+    let budget = request.settings.time_budget_s;
     let outlook = match (resumed_at, &request.guide) {
-        (0, Guide::Reference { .. } | Guide::Model { .. }) => {
+        (0, Guide::Reference { .. } | Guide::Model { .. }) if budget.is_none() => {
             light_run(&inputs.scene, &request, &manifest)
                 .outlook(session.pipeline.quality, &request.table)
         }
@@ -170,6 +173,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         folder: LIGHT.folder(session),
         manifest,
         found,
+        wanted: budget.map(|_| request.settings.iterations),
         size: inputs.frame.camera.resolution,
         resumed_at,
         outlook,
@@ -434,6 +438,8 @@ struct Watch<'a> {
 struct WatchState {
     bar: Option<Progress>,
     resumed_at: usize,
+    /// Iterations of the run, where a time budget decides them.
+    planned: Option<usize>,
     /// Why the recovery was broken off.
     failed: Option<anyhow::Error>,
 }
@@ -463,9 +469,17 @@ impl Watch<'_> {
                 state.bar = Some(self.session.progress("light"));
             }
             Event::Recording => {}
+            Event::Optimization(optimization::Event::Planned(planned)) => {
+                let wanted = self.settings.iterations;
+                state.planned = Some(planned);
+                self.session.remark(|| {
+                    format!("{planned} iterations of {wanted} fit into light.time_budget_s")
+                });
+            }
             Event::Optimization(optimization::Event::Step(row)) => {
                 if let Some(bar) = &state.bar {
-                    bar.set((row.iteration + 1) as f64 / self.settings.iterations as f64);
+                    let iterations = state.planned.unwrap_or(self.settings.iterations);
+                    bar.set((row.iteration + 1) as f64 / iterations as f64);
                     match (row.loss, &row.skipped) {
                         (Some(loss), _) => bar.say(format!("loss {loss:.4}")),
                         (None, bad) => bar.say(format!("skipped: {bad:?}")),

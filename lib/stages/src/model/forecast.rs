@@ -2,6 +2,7 @@
 use dipir_cli::session::Session;
 use dipir_diffusion::check::{Times, TimesSettings, times};
 use dipir_diffusion::model::Model;
+use dipir_guidance::distillation::default_crop;
 use dipir_optimize::settings::GuidanceKind;
 use serde::Serialize;
 
@@ -67,14 +68,20 @@ pub fn works(session: &Session, times: &Times) -> anyhow::Result<Vec<Work>> {
         GuidanceKind::SdEdit => times.guidance_s + 4.0 * times.sampling_step_s,
         _ => times.guidance_s,
     };
+    let native = default_crop(times.size, times.on_cpu);
+    let crop = settings.crop.unwrap_or(native);
+    // As for the images of concepts.
+    let scale = (crop as f64 / times.size as f64).powi(2);
+    let seconds = (iterations * settings.draws) as f64 * one * scale;
+    let budget = request.settings.time_budget_s.unwrap_or(f64::INFINITY);
     works.push(Work {
         stage: LIGHT.name,
         what: format!(
-            "{iterations} iterations of {} {}",
+            "{iterations} iterations of {} {}, {crop} pixels",
             settings.draws,
             draws(settings.draws)
         ),
-        seconds: (iterations * settings.draws) as f64 * one,
+        seconds: seconds.min(budget),
         halved_by: vec![format!("light.iterations = {}", iterations.div_ceil(2))],
     });
     Ok(works)
