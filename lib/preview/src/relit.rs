@@ -36,7 +36,7 @@ const MAP: [usize; 2] = [128, 64];
 /// Paths a pixel of the record.
 const SAMPLES: u32 = 64;
 /// Paths a pixel of the sun.
-const SUN_SAMPLES: u32 = 2;
+const SUN_SAMPLES: u32 = 4;
 /// Lobes narrower than this, radians, are traced: two texels of the record.
 const NARROW: f32 = 2.0 * std::f32::consts::TAU / MAP[0] as f32;
 /// A change of the photograph's light by less than this is not shown.
@@ -60,9 +60,12 @@ pub struct Relit {
 }
 
 /// What a picture is lit by.
+#[derive(Clone)]
 struct Lit {
     map: Option<Arc<EnvironmentMap>>,
     lobes: SgMixture,
+    /// Factor on both.
+    exposure: f32,
 }
 
 /// Layers of the small picture.
@@ -94,7 +97,7 @@ impl Relit {
         small.photo.image = LinearImage(resize(&small.photo.image.0, w, h, Filter::Area));
         let mask = small.occluders.take();
         small.occluders = mask.map(|m| resize(&m, w, h, Filter::Area));
-        let first = Lit::of(light);
+        let first = Lit::of(light, 1.0);
         thread::spawn(move || {
             let done = work(&small, normal, &first, &go_on, &asked, &answer);
             if let Err(e) = done {
@@ -121,15 +124,10 @@ impl Relit {
     /// # Errors
     /// As [`record`](Self::record).
     pub fn under(&self, light: &AtHand, exposure: f32) -> Result<Option<Piece>, RenderError> {
-        if self.lights.send(Lit::of(light)).is_err() {
+        if self.lights.send(Lit::of(light, exposure)).is_err() {
             return Err(RenderError::Interrupted);
         }
         let mut small = self.answer()?;
-        small
-            .object
-            .pixels_mut()
-            .iter_mut()
-            .for_each(|p| *p *= exposure);
         if let Some(tone) = &light.tone {
             small = small.toned(tone);
         }
@@ -138,10 +136,11 @@ impl Relit {
 }
 
 impl Lit {
-    fn of(light: &AtHand) -> Self {
+    fn of(light: &AtHand, exposure: f32) -> Self {
         Self {
             map: light.map.clone(),
             lobes: light.lobes.clone(),
+            exposure,
         }
     }
 
@@ -186,6 +185,7 @@ fn work(
         transfer: loaded.photo.transfer,
         occluders: loaded.occluders.as_ref(),
         highlights: false,
+        denoise: true,
         ..Settings::default()
     };
     let simulation = simulation(loaded, &settings);
@@ -202,10 +202,7 @@ fn work(
     };
     let transport = Transport::record(&renderer, &record, &mut |_| go_on())?;
     let mut world = renderer.world(simulation.features)?;
-    let mut next = Lit {
-        map: first.map.clone(),
-        lobes: first.lobes.clone(),
-    };
+    let mut next = first.clone();
     loop {
         let (map, sun) = next.parts();
         let mut small = Small {
@@ -213,6 +210,7 @@ fn work(
             alpha: transport.coverage().clone(),
             shadow: transport.shadow(map.texels()),
         };
+        let has_sun = sun.is_some();
         if let Some(sun) = sun {
             let film = renderer
                 .render_in(&mut world, &sun, &simulation, &settings, &mut |_| {
@@ -222,6 +220,12 @@ fn work(
             let wide = irradiance(&EnvironmentSampler::new(map), normal);
             let narrow = irradiance(&sun, normal);
             small.add(&film.object, &film.shadow, wide, narrow);
+        }
+        // What the object emits, and how it shows the photograph, is part of both pictures, and stays.
+        let own = transport.base().pixels().iter();
+        let twice = if has_sun { 2.0 } else { 1.0 };
+        for (lit, own) in small.object.pixels_mut().iter_mut().zip(own) {
+            *lit = (*own + (*lit - *own * twice) * next.exposure).max(Vec3::ZERO);
         }
         if answers.send(Ok(small)).is_err() {
             return Ok(());
