@@ -352,7 +352,7 @@ impl Desk {
         let ticket = self.drafts.fetch_add(1, Ordering::SeqCst) + 1;
         let mut relighting = held(&self.relighting);
         let masks = self.masks.load(Ordering::SeqCst);
-        let key = format!("{masks} {} {}", still(edit), held(&self.text));
+        let key = format!("{masks} {:?} {}", edit.without_light(), held(&self.text));
         if !relighting.is_recorded(&key) || !relighting.is_lit(&key, edit) {
             let (_, config, arrangement) = self.edited(edit)?;
             let drafts = self.drafts.clone();
@@ -471,16 +471,6 @@ impl Rendered {
         }
         Ok(())
     }
-}
-
-/// All of an edit that a record depends on.
-fn still(edit: &Edit) -> String {
-    let still = Edit {
-        sun: None,
-        exposure_ev: None,
-        ..edit.clone()
-    };
-    format!("{still:?}")
 }
 
 /// Refuses numbers that make no sense before anything is computed from them.

@@ -27,6 +27,17 @@ pub struct Edit {
     pub mask: bool,
 }
 
+impl Edit {
+    /// All of it that a record of light transport depends on.
+    pub fn without_light(&self) -> Self {
+        Self {
+            sun: None,
+            exposure_ev: None,
+            ..self.clone()
+        }
+    }
+}
+
 /// An object.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

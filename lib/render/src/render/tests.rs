@@ -5,6 +5,8 @@ use dipir_light::gaussian::{SgMixture, SphericalGaussian};
 use dipir_light::rasterize::rasterize;
 use dipir_scene::proxy::Proxy;
 
+use std::ops::ControlFlow;
+
 use super::*;
 use crate::features::ALL;
 use crate::shapes::{icosphere, torus_knot};
