@@ -194,9 +194,10 @@ fn a_required_extension_that_cannot_be_ignored_is_named() {
 
 #[test]
 fn a_photo_is_no_environment_map() {
-    scene_fails(
-        &Project::new(),
-        "composite.environment=background.png",
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    let set = ["-s", "composite.environment=background.png"];
+    project.run(COMPOSITE, &set).expect_error(
         1,
         "error: cannot use composite.environment = \"background.png\"\n  caused by: \
          `background.png` is a PNG image (display-referred); expected an OpenEXR or Radiance HDR \

@@ -16,7 +16,8 @@ fn a_rerun_writes_the_same_bytes() {
     );
     assert!(first == second);
     assert_eq!(first.0.len(), 3);
-    assert_eq!(first.1.len(), 2);
+    // The picture, its layers, and what was simulated.
+    assert_eq!(first.1.len(), 3);
 }
 
 #[test]

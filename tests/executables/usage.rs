@@ -227,9 +227,7 @@ fn a_pipe_as_configuration_or_input_is_refused_at_once() {
         2,
         "error: cannot read pipe: not a regular file; name another file with --pipeline",
     );
-    project
-        .run(DIPIR, &["status", "--set", "composite.environment=pipe"])
-        .expect_success();
+    project.run(SCENE, &[]).expect_success();
     let run = project.run(DIPIR, &["status", "--set", "composite.environment=pipe"]);
     assert!(
         run.stdout.contains("pipe: not a regular file"),
