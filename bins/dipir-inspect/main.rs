@@ -3,7 +3,7 @@ use std::process::ExitCode;
 
 use anyhow::bail;
 use clap::Parser;
-use dipir_cli::exit::{self, Usage};
+use dipir_cli::exit::{self, Usage, printable};
 use dipir_cli::style::{bold, color_on_stdout};
 use dipir_inspection::command_line::Cli;
 use dipir_inspection::inspect;
@@ -35,7 +35,10 @@ fn print(args: &Cli, reports: &[Report]) {
         let color = color_on_stdout();
         let shown: Vec<String> = reports
             .iter()
-            .map(|r| format!("{}\n{}", bold(&r.title, color), r.text.trim_end()))
+            .map(|r| {
+                let title = bold(&printable(&r.title), color);
+                format!("{title}\n{}", printable(r.text.trim_end()))
+            })
             .collect();
         shown.join("\n\n")
     };

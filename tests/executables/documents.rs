@@ -201,3 +201,38 @@ fn every_key_of_the_documents_exists() {
     }
     assert!(count >= 60, "{count} keys");
 }
+
+/// The text of every Rust file below `folder`, appended to `text`.
+fn sources(folder: &Path, text: &mut String) {
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            sources(&path, text);
+        } else if path.extension().is_some_and(|e| e == "rs") {
+            text.push_str(&fs::read_to_string(&path).unwrap());
+        }
+    }
+}
+
+#[test]
+fn every_test_and_seed_of_the_page_on_hostile_input_exists() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut text = String::new();
+    for folder in ["bins", "lib", "tests"] {
+        sources(&root.join(folder), &mut text);
+    }
+    let page = fs::read_to_string(root.join("docs/hostile-input.md")).unwrap();
+    let mut count = 0;
+    for row in page.lines().filter(|l| l.starts_with("| ")) {
+        let held_by = row.trim_end_matches(" |").rsplit(" | ").next().unwrap();
+        for name in held_by.split('`').skip(1).step_by(2) {
+            let exists = match name.contains('/') {
+                true => root.join("fuzz/seeds").join(name).is_file(),
+                false => text.contains(&format!("fn {name}(")),
+            };
+            assert!(exists, "{name}");
+            count += 1;
+        }
+    }
+    assert!(count > 70, "{count} names");
+}

@@ -106,6 +106,26 @@ fn objects_show_their_size_and_materials() {
 }
 
 #[test]
+fn names_in_a_file_cannot_command_the_terminal() {
+    let project = Project::new();
+    let name = "m\u{1b}[2J\u{9b}31m";
+    project.write(
+        "object.obj",
+        format!("mtllib a.mtl\nusemtl {name}\n{OBJECT}"),
+    );
+    project.write("a.mtl", format!("newmtl {name}\nKd 0.5 0.5 0.5\n"));
+    let run = project.run(INSPECT, &["object.obj"]);
+    run.expect_success();
+    let obeyed = |c: char| c.is_control() && c != '\n';
+    assert!(!run.stdout.contains(obeyed), "{:?}", run.stdout);
+    assert!(
+        run.stdout.contains("m\\u{1b}[2J\\u{9b}31m"),
+        "{}",
+        run.stdout
+    );
+}
+
+#[test]
 fn tensors_show_shapes_types_and_what_is_not_a_number() {
     let project = Project::new();
     let floats: Vec<u8> = [1.0f32, -2.0, f32::NAN, 4.0]

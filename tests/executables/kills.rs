@@ -1,6 +1,7 @@
 //! Runs that are killed at any moment, in any stage, and run again.
 //!
-//! A few kills here; `DIPIR_KILLS=50 cargo test --test executables kills -- --nocapture` for more.
+//! A few kills here; `DIPIR_KILLS=50 cargo test --test executables kills -- --nocapture` for more. Runs
+//! take one thread and two in turn; all must end with the bytes of the first one.
 use std::fs;
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command};
@@ -46,12 +47,12 @@ fn forget(project: &Project, stage: usize) {
 }
 
 /// Starts a run and returns when it has started `stage`.
-fn start(project: &Project, stage: &str) -> Child {
+fn start(project: &Project, stage: &str, threads: &str) -> Child {
     let until = match stage {
         "concepts" | "lora" => "lora",
         _ => "composite",
     };
-    let mut command = project.command(DIPIR, &["run", "--until", until]);
+    let mut command = project.command(DIPIR, &["run", "-j", threads, "--until", until]);
     let mut child = command.stdout(std::process::Stdio::null()).spawn().unwrap();
     let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
     let begin = format!("{stage}: runs");
@@ -91,8 +92,9 @@ fn killed_at_any_moment_and_run_again_everything_is_the_same_bytes() {
     for n in 0..how_many() {
         let k = n % STAGES.len();
         let victim = [Victim::Runner, Victim::Stage, Victim::Both][(mix64(n as u64) % 3) as usize];
+        let threads = ["1", "2"][n % 2];
         forget(&project, k);
-        let mut child = start(&project, STAGES[k]);
+        let mut child = start(&project, STAGES[k], threads);
         // The start of a process counts, too.
         let span = 0.02 + 1.1 * seconds[k];
         std::thread::sleep(Duration::from_secs_f64(span * share(1000 + n as u64)));
@@ -111,10 +113,11 @@ fn killed_at_any_moment_and_run_again_everything_is_the_same_bytes() {
                 .join("stage.json")
                 .exists(),
         );
-        run_all(&project, &[]);
+        // What one thread left, the other number of threads ends.
+        run_all(&project, &["-j", ["2", "1"][n % 2]]);
         assert!(
             all_artifacts(&project, "out") == whole,
-            "kill {n}: {victim:?} in {}",
+            "kill {n}: {victim:?} in {}, {threads} threads",
             STAGES[k]
         );
         assert!(run_all(&project, &[]).is_empty(), "kill {n}");
@@ -149,7 +152,7 @@ fn control_c_stops_the_stage_and_the_next_run_goes_on() {
     run_all(&project, &[]);
     let whole = all_artifacts(&project, "out");
     forget(&project, 3);
-    let mut child = start(&project, "light");
+    let mut child = start(&project, "light", "2");
     let pid = child.id().to_string();
     let sent = Command::new("kill").args(["-INT", &pid]).status().unwrap();
     assert!(sent.success());

@@ -185,7 +185,7 @@ impl Sheen {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
     #[test]
@@ -226,7 +226,7 @@ mod tests {
     }
 
     /// White sheen without the cosine of `wi`, in f64 [Estevez and Kulla 2017, eq. 2 to 4].
-    fn textbook(roughness: f64, wo: glam::DVec3, wi: glam::DVec3) -> f64 {
+    pub fn textbook(roughness: f64, wo: glam::DVec3, wi: glam::DVec3) -> f64 {
         let alpha = roughness * roughness;
         let t = (1.0 - alpha).powi(2);
         let mix = |smooth: f64, rough: f64| t * smooth + (1.0 - t) * rough;

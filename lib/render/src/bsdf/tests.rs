@@ -4,6 +4,7 @@ use dipir_numerics::stats::sidak;
 use glam::{Vec2, Vec3};
 
 mod extensions;
+mod pictures;
 
 use super::features::{ALL, CLEARCOAT, PLAIN_GGX, SPECULAR, TRANSMISSION};
 use super::harness::{Case, Measured, Scatter};

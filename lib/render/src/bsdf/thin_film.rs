@@ -122,7 +122,7 @@ impl Film {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
     fn film(ior: f32, thickness_nm: f32, f0: f32) -> Film {
@@ -168,7 +168,7 @@ mod tests {
     }
 
     /// The reflectance as the specification of `KHR_materials_iridescence` spells it out, one channel of the base.
-    fn specified(film_ior: f64, nm: f64, f0: f64, cosine: f64) -> [f64; 3] {
+    pub fn specified(film_ior: f64, nm: f64, f0: f64, cosine: f64) -> [f64; 3] {
         let to_f0 = |above: f64, below: f64| ((above - below) / (above + below)).powi(2);
         let schlick = |f0: f64, c: f64| f0 + (1.0 - f0) * (1.0 - c).powi(5);
         let inner = (1.0 - (1.0 - cosine * cosine) / film_ior.powi(2)).sqrt();
