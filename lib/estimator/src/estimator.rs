@@ -159,7 +159,7 @@ impl Estimator {
             }
         }
         let [parts, kind] = sums;
-        parts.as_bright_as(kind)
+        parts.joined_with(kind)
     }
 
     fn read(&self, o: &[f32], mirrored: bool) -> Sum {
@@ -225,7 +225,7 @@ impl Sum {
     }
 
     /// The mean of both, each as bright as `kind`, with its exposure.
-    fn as_bright_as(mut self, kind: Self) -> Self {
+    fn joined_with(mut self, kind: Self) -> Self {
         let level = |s: &Self| luminance_f64(DVec3::from(s.mean()));
         let scale = level(&kind) / level(&self).max(1e-12);
         for v in self.base.iter_mut().flatten().chain(&mut self.peak) {

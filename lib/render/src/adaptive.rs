@@ -7,6 +7,8 @@
 //! one sample (Lagrange's rule). Cost is counted in rays and samples, never in seconds, so that the
 //! same samples are drawn by any number of threads on any machine; a time budget only decides
 //! after which round to stop.
+mod goals;
+
 use std::collections::HashSet;
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -16,6 +18,8 @@ use std::time::{Duration, Instant};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+pub(crate) use self::goals::goal;
+use self::goals::{first_goal, next_goals};
 use crate::contribution::{LeaveOut, LeftOut};
 use crate::counters::RayCounts;
 use crate::denoise;
@@ -40,17 +44,6 @@ pub enum Stop {
     /// is expected to fit.
     TimeBudget(Duration),
 }
-
-/// Samples per pixel and replicate of the first adaptive round: the fewest whose spread says
-/// anything about the error.
-const FIRST_ROUND: u32 = 8;
-
-/// No job grows faster than this from one round to the next, because early variances are
-/// uncertain.
-const MAX_GROWTH: f64 = 4.0;
-
-/// The first round under a time budget, small, because the time of a sample is not known yet.
-const FIRST_TIMED_ROUND: u32 = 4;
 
 /// Under a time budget the total cost grows at most by this factor a round, so that how long the
 /// last one takes is foreseen from rounds much like it.
@@ -437,18 +430,6 @@ fn start_again(
     first
 }
 
-fn first_goal(stop: Stop, limit: u32) -> u32 {
-    match stop {
-        // A quarter first, so that long renders show something early.
-        Stop::Samples(n) => {
-            let n = n.div_ceil(REPLICATES as u32).max(1);
-            if n >= 4 * FIRST_ROUND { n / 4 } else { n }
-        }
-        Stop::TargetError(_) => FIRST_ROUND.min(limit),
-        Stop::TimeBudget(_) => FIRST_TIMED_ROUND.min(limit),
-    }
-}
-
 /// By which share of the cost so far the next round adds to it, `left` seconds before the end, when
 /// all of it again would take `again` seconds; 0 to stop. A last but one round leaves enough for
 /// the last.
@@ -488,87 +469,6 @@ fn total_error(errors: &[SquaredError], film: &Film, viewing: &Viewing) -> Estim
         upper_95: (upper / pixels).sqrt(),
         touched_pixels: touched,
     }
-}
-
-/// Samples per pixel and replicate that every job should reach in the next round, which under a time
-/// budget may cost `allowance`.
-fn next_goals(
-    stop: Stop,
-    limit: u32,
-    jobs: &[Job],
-    errors: &[SquaredError],
-    error: &EstimatedError,
-    allowance: f64,
-) -> Vec<u32> {
-    let unchanged = || jobs.iter().map(|job| job.samples).collect();
-    match stop {
-        Stop::Samples(n) => vec![n.div_ceil(REPLICATES as u32).max(1); jobs.len()],
-        Stop::TargetError(target) => {
-            if error.upper_95 <= f64::from(target) {
-                return unchanged();
-            }
-            // The estimate itself has to come as far below the target as its bound lies above it.
-            let slack = error.rmse / error.upper_95;
-            let allowed = (f64::from(target) * slack).powi(2) * error.touched_pixels as f64;
-            let scale = spread(jobs, errors).map(|(root, c)| root * c).sum::<f64>() / allowed;
-            goals(jobs, errors, scale, limit)
-        }
-        Stop::TimeBudget(_) => {
-            let spent_already: f64 = jobs.iter().map(Job::cost).sum();
-            let per_scale = spread(jobs, errors).map(|(root, c)| root * c).sum::<f64>();
-            if per_scale == 0.0 {
-                return unchanged();
-            }
-            // Jobs that are ahead of their share stay, so look for the scale that spends what
-            // the round may spend.
-            let spent = |scale: f64| -> f64 {
-                goals(jobs, errors, scale, limit)
-                    .iter()
-                    .zip(jobs)
-                    .map(|(&n, job)| job.cost() * f64::from(n) / f64::from(job.samples.max(1)))
-                    .sum()
-            };
-            let whole = spent_already + allowance;
-            let (mut low, mut high) = (0.0, whole / per_scale * 8.0);
-            for _ in 0..32 {
-                let middle = 0.5 * (low + high);
-                if spent(middle) <= whole {
-                    low = middle;
-                } else {
-                    high = middle;
-                }
-            }
-            goals(jobs, errors, low, limit)
-        }
-    }
-}
-
-/// `(sqrt(V / c), c)` of every job: V the variance times samples, c the cost of a sample per pixel
-/// and replicate.
-fn spread<'a>(
-    jobs: &'a [Job],
-    errors: &'a [SquaredError],
-) -> impl Iterator<Item = (f64, f64)> + 'a {
-    jobs.iter().zip(errors).map(|(job, e)| {
-        let n = f64::from(job.samples.max(1));
-        let cost = (job.cost() / n).max(1e-9);
-        ((e.sum * n / cost).sqrt(), cost)
-    })
-}
-
-fn goals(jobs: &[Job], errors: &[SquaredError], scale: f64, limit: u32) -> Vec<u32> {
-    spread(jobs, errors)
-        .zip(jobs)
-        .map(|((root, _), job)| goal(root * scale, job.samples, limit))
-        .collect()
-}
-
-/// Samples per pixel and replicate of a job in the next round, of which it has `samples` and would best have `best`.
-pub(crate) fn goal(best: f64, samples: u32, limit: u32) -> u32 {
-    let wanted = best.min(f64::from(samples) * MAX_GROWTH).ceil() as u32;
-    // Multiples of four keep the sequences stratified.
-    let stratified = wanted.checked_next_multiple_of(4).unwrap_or(limit);
-    stratified.min(limit).max(samples)
 }
 
 fn fraction(
