@@ -7,7 +7,7 @@ use libfuzzer_sys::fuzz_target;
 
 const SIZE: [f64; 2] = [640.0, 480.0];
 
-/// Panics on a camera that sees in no direction, or at no place.
+/// Panics if the camera's position or direction is not finite.
 fn is_whole(camera: &Camera) {
     assert!(camera.pose.position.is_finite() && camera.pose.rotation.is_finite());
     let size = DVec2::from_array(camera.lens.size);

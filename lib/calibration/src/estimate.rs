@@ -85,7 +85,7 @@ pub struct CameraEstimator {
 }
 
 impl CameraEstimator {
-    /// The one that is part of the program.
+    /// The estimator with the weights that are built into the program.
     ///
     /// # Errors
     /// Never, unless the program was built with weights of another version.

@@ -13,7 +13,7 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// Of a camera that sees `fov_deg` along the longer side.
+    /// The pose of a camera whose field of view along the longer side is `fov_deg`.
     pub fn new(pitch_deg: f64, roll_deg: f64, fov_deg: f64) -> Self {
         Self {
             pitch_deg,

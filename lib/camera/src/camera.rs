@@ -106,7 +106,7 @@ impl Pose {
         Ok(pose.in_our_world(up))
     }
 
-    /// Axes that are orthogonal and equally long but for the file's few digits.
+    /// The camera with these axes. They must be orthogonal and equally long, up to the rounding of the file.
     pub(crate) fn from_axes(matrix: DMat3, position: DVec3) -> Option<Self> {
         let scale = matrix.determinant().cbrt();
         let rotation = matrix * scale.recip();

@@ -10,7 +10,7 @@ use crate::{chan, colmap, fspy, gltf, kitti, nuscenes, opencv, transforms};
 /// Which of a file's cameras is meant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Which<'a> {
-    /// The one of the picture with this file's name, else the only one.
+    /// The camera of the picture that has this file's name; if no picture has it, the only camera.
     Photo(&'a Path),
     /// By number: counted from 0; the frame in a `.chan` file, n of `Pn` in KITTI's.
     Number(u32),

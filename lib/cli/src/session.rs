@@ -30,8 +30,8 @@ pub struct Session {
     _hashes: HandBack,
 }
 
-/// Adds the hashes that this process took to the file that it got its first ones from, for the
-/// process that started this one.
+/// On drop, writes the hashes that this process computed into the file of hashes that the process which started it
+/// reads.
 #[derive(Debug)]
 struct HandBack(Option<PathBuf>);
 

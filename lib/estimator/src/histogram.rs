@@ -31,7 +31,7 @@ impl Scale {
         at.clamp(0.0, self.count as f64)
     }
 
-    /// How much of each bin a value is, summing to 1: shared by the two bins whose middles it lies between.
+    /// The share of `value` in each bin; shares sum to 1. The two bins whose middles enclose the value share it.
     pub fn soft(&self, value: f64) -> Vec<f32> {
         let at = (self.position(value) - 0.5).clamp(0.0, (self.count - 1) as f64);
         let near = |k: usize| (1.0 - (at - k as f64).abs()).max(0.0) as f32;

@@ -53,7 +53,7 @@ pub fn elbow(points: &[(f64, f64)], front: &[usize]) -> Option<usize> {
 /// quarter of its cost (else the cheapest), and the best for at most four times its cost. `None` for an
 /// empty front.
 pub fn three_presets(points: &[(f64, f64)], front: &[usize]) -> Option<[usize; 3]> {
-    /// What a user notices as another class of waiting.
+    /// Two presets differ in cost by at least this factor: less is not noticed while waiting.
     const APART: f64 = 4.0;
     let first = *front.first()?;
     let middle = elbow(points, front).unwrap_or(front[front.len() / 2]);

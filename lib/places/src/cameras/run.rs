@@ -201,7 +201,8 @@ fn built(range: &Range, seed: u64, n: usize, longest: [usize; 2]) -> (Pose, Line
     (shot.pose, picture(kind, look, &shot.pose, size))
 }
 
-/// A camera in a box around another, or anywhere, and the logarithm of the share of all cameras it stands for.
+/// Draws a camera, from a box around `pose` or from all cameras. Also returns the logarithm of the share of all cameras
+/// that the draw represents.
 fn drawn(pose: &Pose, any_focal: bool, side: Option<f64>, random: &mut SplitMix64) -> (Pose, f32) {
     let limits = |side: Option<f64>| limits(pose, side);
     let [pitch, roll, fov] =
