@@ -86,8 +86,14 @@ fn render<L: SceneLight>(
     samples: u32,
     go_on: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Result<Rendered, RenderError> {
-    let settings = Settings {
-        seed: 0,
+    let settings = settings(loaded, samples);
+    let simulation = simulation(loaded, &settings);
+    Renderer::new(&loaded.scene).render(light, &simulation, &settings, &mut |_| go_on())
+}
+
+/// How a draft is rendered, with this many samples a pixel.
+pub(crate) fn settings(loaded: &LoadedScene, samples: u32) -> Settings<'_> {
+    Settings {
         stop: Stop::Samples(samples),
         max_samples: samples,
         background: Some(&loaded.photo.image),
@@ -96,9 +102,7 @@ fn render<L: SceneLight>(
         highlights: false,
         denoise: true,
         ..Settings::default()
-    };
-    let simulation = simulation(loaded, &settings);
-    Renderer::new(&loaded.scene).render(light, &simulation, &settings, &mut |_| go_on())
+    }
 }
 
 /// What a draft simulates.

@@ -17,17 +17,16 @@ use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_light::gaussian::{SgMixture, SphericalGaussian};
 use dipir_light::plane::PlaneLight;
 use dipir_light::rasterize::rasterize;
-use dipir_render::adaptive::Stop;
 use dipir_render::error::RenderError;
 use dipir_render::light::SceneLight;
-use dipir_render::render::{Renderer, Settings};
+use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
 use dipir_scene::scene::LoadedScene;
 use dipir_stages::light::at_hand::AtHand;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use crate::draft::simulation;
+use crate::draft::{settings, simulation};
 
 /// Longest side of the replayed picture, pixels.
 const LONGEST: f32 = 400.0;
@@ -178,16 +177,7 @@ fn work(
     asked: &Receiver<Lit>,
     answers: &Sender<Result<Small, RenderError>>,
 ) -> Result<(), RenderError> {
-    let settings = Settings {
-        stop: Stop::Samples(SUN_SAMPLES),
-        max_samples: SUN_SAMPLES,
-        background: Some(&loaded.photo.image),
-        transfer: loaded.photo.transfer,
-        occluders: loaded.occluders.as_ref(),
-        highlights: false,
-        denoise: true,
-        ..Settings::default()
-    };
+    let settings = settings(loaded, SUN_SAMPLES);
     let simulation = simulation(loaded, &settings);
     let renderer = Renderer::new(&loaded.scene);
     let (map, _) = first.parts();
