@@ -1,5 +1,6 @@
 //! The executables as a user runs them: on files, by exit code and by what they print.
 mod bad_input;
+mod browser;
 mod disk;
 mod documents;
 mod estimate;

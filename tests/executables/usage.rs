@@ -195,6 +195,12 @@ fn more_threads_than_any_machine_has_are_refused() {
     }
     let run = project.run(DIPIR, &["run", "-j", "1025"]);
     run.expect_error(2, &message);
+    let message = format!("error: RAYON_NUM_THREADS=1000000 in the environment: {accepted}");
+    for executable in [SCENE, DIPIR] {
+        let mut command = project.command(executable, &["--version"]);
+        let run = command.env("RAYON_NUM_THREADS", "1000000").output();
+        Run::from(run.unwrap()).expect_error(2, &message);
+    }
     assert!(!project.path("out").exists());
 }
 

@@ -7,6 +7,7 @@ use dipir_pipeline::error::ConfigError;
 
 use crate::ending;
 use crate::interrupt::{self, Interrupted};
+use crate::session::check_threads;
 use crate::style::{bold_red, color_on_stderr};
 
 /// Done.
@@ -46,7 +47,7 @@ impl std::error::Error for AlreadyReported {}
 pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
     one_tensor_thread();
     ending::prepare();
-    let code = match main() {
+    let code = match few_threads().and_then(|()| main()) {
         Ok(()) => DONE,
         Err(error) => {
             let code = code_of(&error);
@@ -81,6 +82,19 @@ fn one_tensor_thread() {
         // SAFETY: called first thing in main, before any other thread exists.
         unsafe { std::env::set_var(KEY, "1") };
     }
+}
+
+/// Refuses a number of threads that no machine has. Libraries with a pool of threads of their own start as many as the
+/// environment says, whatever `[pipeline] threads` is.
+fn few_threads() -> anyhow::Result<()> {
+    const KEY: &str = "RAYON_NUM_THREADS";
+    let Some(value) = std::env::var_os(KEY) else {
+        return Ok(());
+    };
+    // What is no number is not heeded.
+    let threads = value.to_str().and_then(|v| v.parse().ok()).unwrap_or(0);
+    check_threads(threads)
+        .map_err(|why| Usage(format!("{KEY}={threads} in the environment: {why}")).into())
 }
 
 /// The exit code of an error.
