@@ -589,5 +589,5 @@ fn description(light: &AtHand, camera: &Camera) -> Value {
         let azimuth_deg = (from_view + 180.0).rem_euclid(360.0) - 180.0;
         json!({"azimuth_deg": azimuth_deg, "elevation_deg": d.y.clamp(-1.0, 1.0).asin().to_degrees()})
     });
-    json!({"origin": light.origin.words(), "sun": sun})
+    json!({"origin": light.origin.words(), "fixed": light.origin.is_fixed(), "sun": sun})
 }

@@ -46,14 +46,11 @@ impl Relighting {
     /// Whether the light of `edit` follows from the one that is known.
     pub fn is_lit(&self, key: &str, edit: &Edit) -> bool {
         self.known.as_ref().is_some_and(|k| {
-            let follows = match k.light.origin {
-                Origin::Map | Origin::File | Origin::Neutral => true,
-                Origin::Estimate => {
-                    k.sun.is_some() && edit.sun.is_some() && k.light.lobes.lobes().len() == 1
-                }
-                Origin::Stage => false,
-            };
-            k.key == key && (k.sun == edit.sun || follows)
+            let turns = k.light.origin == Origin::Estimate
+                && k.sun.is_some()
+                && edit.sun.is_some()
+                && k.light.lobes.lobes().len() == 1;
+            k.key == key && (k.sun == edit.sun || turns || k.light.origin.is_fixed())
         })
     }
 

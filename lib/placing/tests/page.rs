@@ -491,6 +491,22 @@ fn turning_the_sun_and_the_exposure_shows_what_a_draft_shows() {
 }
 
 #[test]
+fn a_light_that_is_given_is_said_not_to_follow_the_sun() {
+    for (start, fixed) in [("neutral", true), ("estimated", false)] {
+        let folder = tempfile::tempdir().unwrap();
+        project(folder.path(), &[]);
+        let text = TEXT.replace("neutral", start);
+        fs::write(folder.path().join("pipeline.toml"), text).unwrap();
+        let session = open(folder.path(), &[]);
+        let place = Running::of(folder, session);
+        let edit = moved_to(150.0, 140.0);
+        let draft = place.post("draft", &json!({"edit": edit, "samples": 4}));
+        let about: Value = serde_json::from_str(draft.header("X-Draft").unwrap()).unwrap();
+        assert_eq!(about["light"]["fixed"], fixed, "{about}");
+    }
+}
+
+#[test]
 fn a_known_length_lifts_the_camera_and_lines_turn_it() {
     let place = Running::new();
     let edit = json!({"objects": [{"of": 0}]});

@@ -154,7 +154,8 @@ function showLight() {
   dial.draw(sun, Boolean(said));
   put("azimuth", sun?.azimuth_deg, 0);
   put("elevation", sun?.elevation_deg, 0);
-  $("origin").textContent = light ? `Light: ${light.origin}${sun ? "" : ", no sun"}` : "";
+  const effect = light?.fixed ? "; a sun that is set here does not change it" : sun ? "" : ", no sun";
+  $("origin").textContent = light ? `Light: ${light.origin}${effect}` : "";
   const stops = history.now.edit.exposure_ev ?? state.exposure_ev;
   $("exposure").value = stops;
   $("stops").textContent = `${stops >= 0 ? "+" : ""}${stops.toFixed(1)}`;

@@ -46,6 +46,11 @@ impl Origin {
             Self::Neutral => "neutral",
         }
     }
+
+    /// Whether what is said of the sun does not change it.
+    pub fn is_fixed(self) -> bool {
+        matches!(self, Self::Map | Self::File | Self::Neutral)
+    }
 }
 
 /// A light, exposed and turned as `[composite]` says.
