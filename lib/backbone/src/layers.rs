@@ -43,7 +43,8 @@ pub(crate) struct Window {
 }
 
 impl Window {
-    /// Outputs along a line of `n`, and how many taps of the first lie outside: half of all that must, rounded down.
+    /// For a line of `n` inputs: the number of outputs, and how many taps of the first output lie before the line. The
+    /// padding that all outputs need is split in half; the odd tap comes after the line.
     fn line(self, n: usize) -> (usize, usize) {
         let outputs = n.div_ceil(self.step);
         let outside = ((outputs - 1) * self.step + self.side).saturating_sub(n);

@@ -141,7 +141,7 @@ impl Look {
             let along = edge.along.extend(0.0);
             let squared = ray.length_squared();
             let (rise, length) = (ray.dot(up), squared.sqrt());
-            // Between the planes through the camera of the edge and of the vertical.
+            // The angle between two planes through the camera: one holds the edge, the other the vertical.
             let across = length * ray.dot(along.cross(up)).abs();
             let beside = (squared * along.dot(up) - rise * ray.dot(along)).abs();
             let lean = across.atan2(beside).to_degrees();

@@ -67,7 +67,7 @@ pub fn segments(image: &LinearImage) -> Vec<Segment> {
     found
 }
 
-/// Pixels along each side of the blocks whose means edges are looked for in.
+/// Side of the blocks, pixels. Edges are found in a picture that holds the mean of each block.
 pub(crate) fn block_side([w, h]: [usize; 2]) -> usize {
     w.max(h).div_ceil(LONGEST).max(1)
 }

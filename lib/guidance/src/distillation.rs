@@ -48,8 +48,8 @@ pub struct DistillationSettings {
     pub prompt: Option<String>,
     /// Whether a LoRA is used.
     pub adapt: bool,
-    /// The prediction for the estimated light is compared with that for the same light from other
-    /// sides; if false, with that for the empty caption.
+    /// Whether the model's prediction under the caption of the estimated light is compared with its predictions
+    /// under captions of the same light from other sides. If not, the other caption is empty.
     pub turned: bool,
 }
 

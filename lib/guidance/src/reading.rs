@@ -17,8 +17,8 @@ use glam::{DVec3, Vec2, Vec3};
 
 use crate::error::{Error, Result};
 
-/// Side of a crop in longer sides of the object's box: as the model was trained, where the object
-/// takes about two fifths.
+/// Side of a crop, in units of the longer side of the object's box. In the pictures that the model was trained on, the
+/// object's box is about two fifths as long as the picture.
 const CROP: f32 = 2.6;
 /// Most crops from which light is estimated.
 const CROPS: usize = 12;
@@ -165,7 +165,7 @@ fn crops(photo: &Raster<Vec3>, place: &Insertion<'_>) -> Vec<Crop> {
     let near = ground_depth(camera, proxy, corner + extent * Vec2::new(0.5, 1.0));
     let mut found: Vec<(f32, Vec2, f32, Crop)> = vec![];
     for own in OWN_SIZES {
-        // Of what stands at a row of pixels, as wide as the crop there.
+        // The side of a crop whose foot is at a row of pixels: as many metres there as the first crop has at the object.
         let side_at = |row: f32| {
             let depth = |row| ground_depth(camera, proxy, Vec2::new(0.5 * size.0 as f32, row));
             match (near, depth(row)) {

@@ -134,7 +134,7 @@ struct Window {
     weights: Vec<f64>,
 }
 
-/// The window at every position along a dimension that counts.
+/// One window for every position along a dimension at which similarity is measured.
 fn window_positions(length: usize) -> Vec<Window> {
     let fits = length > 2 * SSIM_RADIUS;
     let centres = if fits {

@@ -28,7 +28,7 @@ pub struct Settings {
     pub networks: usize,
     /// Photographs drawn of each place.
     pub views: usize,
-    /// Photographs of each place that figures are made of.
+    /// Photographs of each place on which the networks are judged.
     pub judged: usize,
     /// Networks learn from at most this many places each; all without it.
     pub places: Option<usize>,

@@ -224,7 +224,7 @@ pub struct LightArgs {
     /// Photographs of each place to train on
     #[arg(long, value_name = "N", default_value_t = 128)]
     pub views: usize,
-    /// Photographs of each place that figures are made of
+    /// Photographs of each place on which the networks are judged
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub judged: usize,
     /// Train on at most this many places of each fold: for the error over the number of places

@@ -1,5 +1,5 @@
-//! Photographs of generated scenes whose light is known. The main object, of a shape that training never shows, is to be
-//! inserted.
+//! Photographs of generated scenes whose light is known, for tests of insertion. The object that is inserted has a shape
+//! that training does not contain.
 use std::f32::consts::{PI, TAU};
 
 use dipir_diffusion::noise::NoiseStream;

@@ -23,7 +23,7 @@ struct Wear {
     grain: f32,
     /// Share of the albedo that dark patches with clear edges lack.
     stains: f32,
-    /// Contrast of the two sides of a line: the darker side lacks .6 of the albedo at 1.
+    /// Contrast between the two sides of a line, from 0 to 1. At 1 the darker side has .4 of the other's albedo.
     kerb: f32,
     /// Distance of that line from the origin, metres.
     offset: f32,

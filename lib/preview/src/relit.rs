@@ -50,7 +50,7 @@ pub struct Piece {
     pub place: [usize; 4],
 }
 
-/// Recorded objects. Whatever is asked is answered by one thread, which ends with this.
+/// Recorded objects. One thread answers all questions; it ends when this is dropped.
 pub struct Relit {
     lights: Sender<Lit>,
     answers: Receiver<Result<Small, RenderError>>,

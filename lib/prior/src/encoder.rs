@@ -261,7 +261,7 @@ mod tests {
         let overcast = mean(&[estimate(0.0, 0.0, 1.0), estimate(2.0, 0.0, 4.0)]).unwrap();
         assert!((overcast.irradiance - 2.0).abs() < 1e-5 && overcast.confidence == 0.0);
         let opposed = mean(&[estimate(0.0, 0.9, 1.0), estimate(3.0, 0.9, 1.0)]).unwrap();
-        // .9 cos(1.5) is left, of a spread of sqrt(-2 ln .0637).
+        // The mean vector has length .9 cos(1.5) = .0637, and the spread is sqrt(-2 ln .0637).
         assert!(
             (opposed.confidence - 0.0637).abs() < 1e-3 && (opposed.spread() - 2.347).abs() < 0.01,
             "{opposed:?}"

@@ -11,11 +11,11 @@ pub enum RayKind {
     Light,
     /// From a point on the object in a direction that its BSDF chose.
     Bounce,
-    /// From the proxy towards the light, against the object.
+    /// From the proxy towards the light, to find whether the object is in the way.
     Shadow,
     /// From the camera to a proxy mesh.
     Proxy,
-    /// From a proxy mesh towards the light, against the mesh itself.
+    /// From a proxy mesh towards the light, to find whether the mesh itself is in the way.
     ProxyOcclusion,
     /// From the proxy to the object, for light that the object sends there.
     LightOnProxy,

@@ -381,8 +381,8 @@ impl<L: PathLight> PathContext<'_, L> {
         (radiance, coverage)
     }
 
-    /// Density of samples in `pixel`, whose normals differ by `spread`: scans of all cells, of the parts of the
-    /// brightest of them, and of the brightest parts in turn.
+    /// Density of samples in `pixel`, whose normals differ by `spread`. All cells are scanned, then the brightest
+    /// ones in smaller cells, and so on.
     fn scan<const F: u32>(
         &self,
         (x, y): (u32, u32),

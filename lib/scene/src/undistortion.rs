@@ -276,7 +276,7 @@ mod tests {
                 let got = way.to_photo(working).unwrap();
                 // Single precision of the renderer's camera.
                 assert!(got.distance(want) < 1e-3, "{got} {want}");
-                // A dot of the rendered picture comes to lie there, too.
+                // A dot of the rendered picture lands on the same pixel of the photograph.
                 let dot = Raster::from_pixels(
                     pinhole.resolution[0] as usize,
                     pinhole.resolution[1] as usize,

@@ -42,7 +42,7 @@ pub(super) fn suits(shape: ConvShape) -> bool {
 pub(super) enum Weights {
     /// [outputs, inputs, 3, 3].
     AsStored,
-    /// [inputs, outputs, 3, 3], turned round: those of the adjoint.
+    /// Weights of the adjoint: [inputs, outputs, 3, 3], each kernel rotated by 180 degrees.
     Adjoint,
 }
 

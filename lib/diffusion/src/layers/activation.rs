@@ -48,7 +48,7 @@ pub fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
     activate_composed(f, &x)
 }
 
-/// [`activate`] of candle's operations, for other devices.
+/// [`activate`] composed of candle's operations, for devices other than the CPU.
 pub(super) fn activate_composed(f: Activation, x: &Tensor) -> Result<Tensor> {
     Ok(match f {
         Activation::Silu => x.silu()?,
@@ -75,7 +75,7 @@ pub fn geglu(x: &Tensor) -> Result<Tensor> {
     geglu_composed(&x)
 }
 
-/// [`geglu`] of candle's operations, for other devices.
+/// [`geglu`] composed of candle's operations, for devices other than the CPU.
 pub(super) fn geglu_composed(x: &Tensor) -> Result<Tensor> {
     let halves = x.chunk(2, D::Minus1)?;
     Ok((&halves[0] * halves[1].gelu_erf()?)?)

@@ -41,7 +41,7 @@ impl Attention {
         self.forward_composed(&q, &k, &v, shape)
     }
 
-    /// [`Attention::forward`] of candle's operations, for other devices.
+    /// [`Attention::forward`] composed of candle's operations, for devices other than the CPU.
     pub(super) fn forward_composed(
         &self,
         q: &Tensor,

@@ -109,7 +109,7 @@ impl Conv2d {
         }
     }
 
-    /// [`Conv2d::forward`] of candle's operations, for other devices.
+    /// [`Conv2d::forward`] composed of candle's operations, for devices other than the CPU.
     pub(super) fn forward_composed(
         &self,
         x: &Tensor,

@@ -85,7 +85,7 @@ impl GroupNorm {
         }
     }
 
-    /// [`GroupNorm::forward`] of candle's operations, for other devices.
+    /// [`GroupNorm::forward`] composed of candle's operations, for devices other than the CPU.
     pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let (batch, channels) = (x.dims()[0], x.dims()[1]);
         let grouped = x.to_dtype(DType::F32)?.reshape((batch, self.groups, ()))?;

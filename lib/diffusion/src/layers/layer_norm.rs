@@ -40,7 +40,7 @@ impl LayerNorm {
         self.forward_composed(&x)
     }
 
-    /// [`LayerNorm::forward`] of candle's operations, for other devices.
+    /// [`LayerNorm::forward`] composed of candle's operations, for devices other than the CPU.
     pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let last = x.rank() - 1;
         let values = x.to_dtype(DType::F32)?;

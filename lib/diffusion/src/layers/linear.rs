@@ -83,7 +83,7 @@ impl Linear {
         })
     }
 
-    /// [`Linear::forward`] of candle's operations, for other devices.
+    /// [`Linear::forward`] composed of candle's operations, for devices other than the CPU.
     pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let mut shape = x.dims().to_vec();
         let inputs = shape.pop().unwrap_or(1);

@@ -44,11 +44,11 @@ pub struct Settings {
     pub folds: usize,
     /// Photographs drawn of each place.
     pub views: usize,
-    /// Generated streets and rooms that are learned from.
+    /// Generated streets and rooms on which the networks are trained.
     pub learned: usize,
-    /// Photographs of each place that figures are made of.
+    /// Photographs of each place on which the networks are judged.
     pub judged: usize,
-    /// Generated streets and rooms that figures are made of.
+    /// Generated streets and rooms on which the networks are judged.
     pub built: usize,
     /// Seed of photographs and networks.
     pub seed: u64,

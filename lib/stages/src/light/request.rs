@@ -185,7 +185,7 @@ const REFINEMENT: usize = 50;
 /// does not say, and full rates would follow it (docs/prior.md).
 const REFINEMENT_RATE: f64 = 0.05;
 
-/// Fills what `table` leaves open, for a start that is near the result.
+/// Sets what `table` leaves open, where the optimisation starts near its result: few iterations at low rates.
 fn refine(table: &LightTable, settings: &mut Settings) {
     settings.iterations = table.iterations.unwrap_or(REFINEMENT);
     if table.learning_rates == LearningRates::default() {
