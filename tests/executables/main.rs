@@ -24,4 +24,5 @@ mod stages;
 mod staleness;
 mod tradeoff;
 mod usage;
+mod views;
 mod whole;

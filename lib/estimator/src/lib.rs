@@ -20,13 +20,13 @@ mod tests;
 mod visible;
 
 pub use candidates::Candidate;
-pub use combine::combine;
+pub use combine::{ViewEstimate, combine};
 pub use error::EstimatorError;
 pub use estimate::{Interval, LightEstimate};
 pub use estimator::{Calibration, Estimator};
 pub use known::{KnownAngle, KnownSource, KnownSun};
 pub use posterior::PeakPosterior;
-pub use visible::{Visible, merged};
+pub use visible::{Visible, merged, overlaid};
 
 /// Raised whenever the same photograph and camera get another estimate.
 pub const VERSION: u32 = 3;

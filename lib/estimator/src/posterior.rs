@@ -180,7 +180,6 @@ pub fn soft_bins(towards: Vec3) -> [f32; BINS] {
 pub fn words(towards: Vec3) -> String {
     let azimuth = towards.x.atan2(-towards.z).to_degrees();
     let elevation = towards.y.clamp(-1.0, 1.0).asin().to_degrees();
-    let side = if azimuth < 0.0 { "left" } else { "right" };
     let height = match elevation.round() as i32 {
         h if h < 0 => format!("{} degrees below the horizon", -h),
         h => format!("{h} degrees high"),
@@ -188,12 +187,18 @@ pub fn words(towards: Vec3) -> String {
     if elevation > 75.0 {
         return format!("from above, {height}");
     }
-    let from = match azimuth.abs() {
-        a if a < 22.5 => "from ahead".to_string(),
-        a if a < 67.5 => format!("from ahead on the {side}"),
-        a if a < 112.5 => format!("from the {side}"),
-        a if a < 157.5 => format!("from behind on the {side}"),
-        _ => "from behind".to_string(),
-    };
-    format!("{from}, {height}")
+    format!("from {}, {height}", side(f64::from(azimuth)))
+}
+
+/// A side in words, from degrees to the right of the view: "behind on the left".
+pub fn side(azimuth_deg: f64) -> String {
+    let azimuth = (azimuth_deg + 180.0).rem_euclid(360.0) - 180.0;
+    let side = if azimuth < 0.0 { "left" } else { "right" };
+    match azimuth.abs() {
+        a if a < 22.5 => "ahead".to_string(),
+        a if a < 67.5 => format!("ahead on the {side}"),
+        a if a < 112.5 => format!("the {side}"),
+        a if a < 157.5 => format!("behind on the {side}"),
+        _ => "behind".to_string(),
+    }
 }

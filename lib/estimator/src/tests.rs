@@ -10,7 +10,7 @@ use crate::features::{FEATURES, OF_PARTS, SmallPhoto};
 use crate::grid::{BINS, bin_direction, direction, heading};
 use crate::network::{HISTOGRAM, Network, OUTPUTS, Sight};
 use crate::posterior::{PeakPosterior, words};
-use crate::{Calibration, Estimator, LightEstimate, Visible, combine, merged};
+use crate::{Calibration, Estimator, LightEstimate, ViewEstimate, Visible, combine, merged};
 
 /// The direction at degrees of azimuth and elevation relative to the view.
 fn direction_deg(azimuth: f64, elevation: f64) -> Vec3 {
@@ -297,6 +297,14 @@ fn candidates_are_far_apart_and_their_probabilities_sum_to_one() {
     assert!(estimate.candidates(0).is_empty());
 }
 
+/// A photograph's estimate among those of others.
+fn of(estimate: &LightEstimate, stops: Option<f64>) -> ViewEstimate {
+    ViewEstimate {
+        estimate: estimate.clone(),
+        stops,
+    }
+}
+
 #[test]
 fn two_views_of_one_sun_are_surer_than_each() {
     let mut one = estimator().estimate(&photo(60, 40), &camera(0.0, 60, 40));
@@ -309,11 +317,109 @@ fn two_views_of_one_sun_are_surer_than_each() {
     // The second camera is turned by 90 degrees to the right: the same sun stands 30 degrees to its left.
     two.heading_rad = std::f64::consts::FRAC_PI_2;
     two.posterior = one.posterior.turned(90.0);
-    let both = combine(&[one.clone(), two]).unwrap();
+    let both = combine(&[of(&one, Some(0.0)), of(&two, Some(0.0))]).unwrap();
     let towards = direction_deg(60.0, 30.0);
-    assert!(both.posterior.density(towards) > 1.3 * one.posterior.density(towards));
+    assert!(both.posterior.density(towards) > 1.1 * one.posterior.density(towards));
     assert!(both.posterior.mode().dot(towards) > 0.98);
     assert!(combine(&[]).is_err());
+    assert_eq!(combine(&[of(&one, None)]).unwrap(), one);
+}
+
+/// Relative difference of two maps' texels, over the brightest.
+fn apart(a: &EnvironmentMap, b: &EnvironmentMap) -> f32 {
+    let brightest = a
+        .texels()
+        .iter()
+        .map(|t| t.max_element())
+        .fold(0.0, f32::max);
+    let differences = a
+        .texels()
+        .iter()
+        .zip(b.texels())
+        .map(|(a, b)| a.distance(*b));
+    differences.fold(0.0, f32::max) / brightest
+}
+
+#[test]
+fn all_cameras_turned_alike_turn_the_light_and_nothing_else() {
+    let (width, height) = (60, 40);
+    let pictures = [photo(width, height), photo(height, width)];
+    let light = |turn_deg: f64| {
+        let view = |k: usize| {
+            let (w, h) = (pictures[k].0.width() as u32, pictures[k].0.height() as u32);
+            let heading = [0.0, 80.0][k] + turn_deg;
+            let estimate = estimator().estimate(&pictures[k], &camera(heading as f32, w, h));
+            of(&estimate, [Some(0.0), Some(-0.7)][k])
+        };
+        combine(&[view(0), view(1)]).unwrap()
+    };
+    let here = light(0.0);
+    for turn in [22.5, 45.0, 180.0, -90.0] {
+        let there = light(turn);
+        let off = there.heading_rad - here.heading_rad - turn.to_radians();
+        assert!(off.sin().abs() < 1e-5 && off.cos() > 0.0, "{off}");
+        // Cameras are f32 matrices: everything relative to the view is equal to some units of their rounding.
+        for (a, b) in here.posterior.weights.iter().zip(&there.posterior.weights) {
+            assert!((a - b).abs() < 1e-5, "{turn}: {a} {b}");
+        }
+        assert_eq!(here.words, there.words);
+        let stops = here.exposure_stops.middle - there.exposure_stops.middle;
+        assert!(stops.abs() < 1e-4 && here.share.high - there.share.high < 1e-4);
+        // A heading to the right is a turn clockwise seen from above; 22.5 degrees are 4 texels.
+        let turned = here.map().rotated_y(-turn.to_radians());
+        assert!(apart(&turned, &there.map()) < 1e-3, "{turn}");
+    }
+}
+
+#[test]
+fn views_of_one_light_at_known_exposures_give_that_light() {
+    // One light, seen by cameras that look 0, 90 and 180 degrees to the right: columns of 22.5 degrees move by 4.
+    let first = estimator().estimate(&photo(60, 40), &camera(0.0, 60, 40));
+    let seen = |quarters: usize, stops: f64| {
+        let mut e = first.clone();
+        e.heading_rad += quarters as f64 * std::f64::consts::FRAC_PI_2;
+        e.posterior = first.posterior.turned(90.0 * quarters as f64);
+        let column = |k: usize| k / 16 * 16 + (k + 4 * quarters) % 16;
+        let scale = stops.exp2() as f32;
+        e.base = (0..128)
+            .map(|k| first.base[column(k)].map(|v| v * scale))
+            .collect();
+        e.peak = first.peak.map(|v| v * scale);
+        e.reference *= stops.exp2();
+        e
+    };
+    let views = |known: bool| {
+        [(0, 0.0), (1, 1.5), (2, -0.5)]
+            .map(|(quarters, stops)| of(&seen(quarters, stops), known.then_some(stops)))
+    };
+    for known in [true, false] {
+        let all = combine(&views(known)).unwrap();
+        for (a, b) in all.base.iter().flatten().zip(first.base.iter().flatten()) {
+            assert!((a / b - 1.0).abs() < 1e-3, "{a} {b}");
+        }
+        for (a, b) in all.peak.iter().zip(first.peak) {
+            assert!((a / b - 1.0).abs() < 1e-3, "{a} {b}");
+        }
+        assert!((all.exposure_stops.middle - first.exposure_stops.middle).abs() < 1e-9);
+        let width = |e: &LightEstimate| e.exposure_stops.high - e.exposure_stops.low;
+        assert!((width(&all) - width(&first)).abs() < 1e-9, "{known}");
+    }
+}
+
+#[test]
+fn a_view_of_an_unknown_exposure_does_not_tell_how_bright_the_light_is() {
+    let first = estimator().estimate(&photo(60, 40), &camera(0.0, 60, 40));
+    let mut bright = first.clone();
+    bright.base.iter_mut().flatten().for_each(|v| *v *= 4.0);
+    bright.peak = bright.peak.map(|v| 4.0 * v);
+    let mean = |e: &LightEstimate| e.map().integral().element_sum();
+    let brighter = |stops| {
+        mean(&combine(&[of(&first, Some(0.0)), of(&bright, stops)]).unwrap()) / mean(&first)
+    };
+    assert!((brighter(None) - 1.0).abs() < 1e-3);
+    // Both are equally sure: the mean of 0 and 2 stops.
+    assert!((brighter(Some(0.0)) - 2.0).abs() < 5e-3);
+    assert!((brighter(Some(2.0)) - 1.0).abs() < 1e-3);
 }
 
 #[test]

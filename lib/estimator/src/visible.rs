@@ -76,6 +76,14 @@ impl Visible {
             clipped,
         }
     }
+
+    /// The same part with all radiance times a factor.
+    pub fn scaled(self, factor: f32) -> Self {
+        Self {
+            map: self.map.scaled(factor),
+            ..self
+        }
+    }
 }
 
 /// A photograph with pixels about as large as the samples of a texel.
@@ -133,22 +141,37 @@ impl View {
 /// scaled to the exposure of what is seen. Where the photograph is clipped the brighter of the two stays, so that a
 /// source in view keeps the energy that is estimated for it.
 pub fn merged(visible: &Visible, estimate: &EnvironmentMap) -> EnvironmentMap {
-    let (width, height) = (visible.map.width(), visible.map.height());
-    let unseen = estimate.resampled(width, height);
+    let unseen = estimate.resampled(visible.map.width(), visible.map.height());
     let ratios = border_ratios(visible, &unseen);
+    joined(visible, &unseen, |k| ratios[k])
+}
+
+/// As [`merged`], the estimate as it is: for photographs whose exposure is that of the estimate.
+pub fn overlaid(visible: &Visible, estimate: &EnvironmentMap) -> EnvironmentMap {
+    let unseen = estimate.resampled(visible.map.width(), visible.map.height());
+    joined(visible, &unseen, |_| 1.0)
+}
+
+/// Both parts, where each texel that is not seen is multiplied by `ratio`.
+fn joined(
+    visible: &Visible,
+    unseen: &EnvironmentMap,
+    ratio: impl Fn(usize) -> f32,
+) -> EnvironmentMap {
+    let (width, height) = (unseen.width(), unseen.height());
     let texels = (0..width * height)
         .map(|k| {
             let other = unseen.texels()[k];
             let (alpha, white) = (visible.alpha[k], visible.clipped[k]);
             if alpha == 0.0 {
-                return other * ratios[k];
+                return other * ratio(k);
             }
             let seen = visible.map.texels()[k];
             let bounded = seen + (other - seen).max(Vec3::ZERO) * white;
-            other * ratios[k] * (1.0 - alpha) + bounded * alpha
+            other * ratio(k) * (1.0 - alpha) + bounded * alpha
         })
         .collect();
-    EnvironmentMap::new(width, height, texels).unwrap_or(unseen)
+    EnvironmentMap::new(width, height, texels).unwrap_or_else(|_| unseen.clone())
 }
 
 /// What each texel of the estimate is multiplied by: the mean ratio of what is seen nearby to what is estimated there,

@@ -35,6 +35,10 @@ pub struct Facts {
     pub altitude_m: Option<f64>,
     /// Where the camera looked, degrees clockwise from north.
     pub heading: Option<Heading>,
+    /// How much the camera exposed, stops: of the same light, a photograph with one more is twice as bright. It is
+    /// the logarithm of seconds times ISO over the square of the f-number.
+    #[serde(default)]
+    pub exposure_stops: Option<f64>,
 }
 
 /// A compass bearing.
@@ -88,6 +92,7 @@ impl Facts {
             facts.model = fields.text(Tag::Model);
             facts.read_lens(&fields);
             facts.time = fields.time();
+            facts.exposure_stops = fields.exposure_stops();
             facts.read_place(&fields);
         }
         facts
@@ -256,6 +261,13 @@ impl Fields<'_> {
     /// A number above 0: an unknown one is written as 0.
     fn positive(&self, tag: Tag) -> Option<f64> {
         self.number(tag).filter(|&v| v > 0.0)
+    }
+
+    fn exposure_stops(&self) -> Option<f64> {
+        let seconds = self.positive(Tag::ExposureTime)?;
+        let f_number = self.positive(Tag::FNumber)?;
+        let iso = self.positive(Tag::PhotographicSensitivity)?;
+        Some((seconds * iso / (f_number * f_number)).log2())
     }
 
     /// Local time with its offset, else the satellites' universal time, else local time.

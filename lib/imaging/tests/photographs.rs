@@ -411,6 +411,9 @@ fn time_place_heading_and_camera_are_read_and_kept() {
             text(0x9011, "+02:00"),
             rationals(0x920a, &[(43, 10)]),
             short(0xa405, 26),
+            rationals(0x829a, &[(1, 50)]),
+            rationals(0x829d, &[(2, 1)]),
+            short(0x8827, 800),
         ],
         vec![
             text(1, "S"),
@@ -437,6 +440,8 @@ fn time_place_heading_and_camera_are_read_and_kept() {
         magnetic: false,
     };
     assert_eq!(facts.heading, Some(want));
+    // 1/50 s at ISO 800 and f/2: 4, two stops.
+    assert!((facts.exposure_stops.unwrap() - 2.0).abs() < 1e-9);
     // 26 mm on a diagonal of 43.27 mm, on one of 50 pixels.
     let focal_px = 26.0 / 43.266_615_305 * 50.0;
     assert!((facts.focal_px.unwrap() - focal_px).abs() < 1e-6);

@@ -97,7 +97,8 @@ impl Case {
         (base + Vec3::from(self.estimate.peak)) / (4.0 * std::f32::consts::PI)
     }
 
-    fn truth(&self) -> Vec<Vec3> {
+    /// Probes of the true light, on the photograph's scale.
+    pub fn truth(&self) -> Vec<Vec3> {
         self.example
             .truth
             .all
@@ -121,7 +122,8 @@ impl Case {
     }
 }
 
-fn picture_error(found: &[Vec3], truth: &[Vec3], probes: &Probes) -> f64 {
+/// RMSE of grey surfaces between two lights, given by their probes, in display values.
+pub fn picture_error(found: &[Vec3], truth: &[Vec3], probes: &Probes) -> f64 {
     let shown = |v: f32| f64::from(Transfer::Srgb.encode_scalar(ALBEDO * v));
     let (mut sum, mut total) = (0.0, 0.0);
     for ((a, b), strength) in found.iter().zip(truth).zip(&probes.strength).take(NORMALS) {

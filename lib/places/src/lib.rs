@@ -11,6 +11,7 @@ mod network;
 pub mod place;
 pub mod probes;
 pub mod run;
+pub mod several;
 pub mod shot;
 #[cfg(test)]
 mod tests;

@@ -119,6 +119,12 @@ impl View {
     /// The photograph as the estimator looks at it, the exposure of each channel, and what the curve makes of grey
     /// under the place's mean light, over its light: a place's radiance times both is on the photograph's scale.
     pub fn take(&self, place: &Place, seed: u64) -> (SmallPhoto, Vec3, f32) {
+        let (photo, gain, curve) = self.photograph(place, seed);
+        (SmallPhoto::new(&photo, &self.camera()), gain, curve)
+    }
+
+    /// As [`take`](Self::take), the photograph itself.
+    pub fn photograph(&self, place: &Place, seed: u64) -> (LinearImage, Vec3, f32) {
         let camera = self.camera();
         let turn = self.heading as f32 / SMOOTH[0] as f32 * TAU;
         let (side, rays) = (self.side(), self.rays);
@@ -157,11 +163,7 @@ impl View {
         };
         let photo = Raster::from_pixels(side, side, (0..side * side).map(mean).collect());
         let grey = (GREY * luminance(place.mean()) * exposure).max(1e-6);
-        (
-            SmallPhoto::new(&LinearImage(photo), &camera),
-            gain,
-            self.develop(grey) / grey,
-        )
+        (LinearImage(photo), gain, self.develop(grey) / grey)
     }
 }
 

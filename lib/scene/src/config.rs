@@ -6,6 +6,7 @@
 mod camera;
 mod lens;
 mod proxy;
+mod view;
 
 use std::path::{Path, PathBuf};
 
@@ -22,6 +23,7 @@ use crate::placement::{Anchor, Placement, Rest, Size};
 
 pub use lens::DistortionConfig;
 pub use proxy::{PlaneConfig, ProxyConfig, ProxySettings};
+pub use view::ViewConfig;
 
 /// The `[scene]` table as written.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -47,6 +49,9 @@ pub struct SceneConfig {
     pub camera: Option<CameraConfig>,
     /// What receives the shadow: a plane or a mesh. Without this table nothing does.
     pub proxy: Option<ProxyConfig>,
+    /// Other photographs of the place, under the same light, from known directions: the light is estimated from all.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub views: Vec<ViewConfig>,
     /// Which effects are simulated: `on`, `off`, or `auto`, for planning to decide.
     #[serde(default)]
     pub effects: EffectsConfig,
@@ -121,7 +126,7 @@ pub struct CameraConfig {
     /// The direction that is up in the image, of any length.
     #[schemars(extend("default" = [0.0, 1.0, 0.0]), extend("examples" = [[0.0, 0.0, -1.0]]))]
     pub up: Option<[f32; 3]>,
-    /// Instead of `look_at` and `up`: turn upwards from looking along -z, degrees.
+    /// Instead of `look_at` and `up`: turn upwards from looking along -z, degrees; `heading_deg` turns to the side.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = -90, max = 90), example = -8.0)]
     pub pitch_deg: Option<f32>,
@@ -129,6 +134,10 @@ pub struct CameraConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = -180, max = 180), example = 1.5)]
     pub roll_deg: Option<f32>,
+    /// With `pitch_deg`: turn to the right from -z, degrees; a compass bearing, where -z is north.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = -360, max = 360), extend("default" = 0.0), example = 90.0)]
+    pub heading_deg: Option<f32>,
     /// Where the optical axis meets the photograph, pixels from its top left corner; its middle by
     /// default.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -310,6 +319,19 @@ pub struct ObjectSettings {
 }
 
 impl SceneConfig {
+    /// How photographs are encoded.
+    fn transfer(&self) -> Result<Transfer, Error> {
+        match self.transfer.as_deref() {
+            None | Some("srgb") => Ok(Transfer::Srgb),
+            Some("gamma22") => Ok(Transfer::Gamma22),
+            Some("linear") => Ok(Transfer::Linear),
+            Some(other) => {
+                let accepted = ["srgb", "gamma22", "linear"];
+                Err(wrong_word("scene.transfer", other, &accepted))
+            }
+        }
+    }
+
     /// Checks every key; the first that is wrong is reported with its value and the accepted form.
     pub fn validate(&self) -> Result<SceneSettings, Error> {
         let background = self.background.clone().ok_or_else(|| {
@@ -318,18 +340,7 @@ impl SceneConfig {
                 "name the photograph: background = \"photo.jpg\"",
             )
         })?;
-        let transfer = match self.transfer.as_deref() {
-            None | Some("srgb") => Transfer::Srgb,
-            Some("gamma22") => Transfer::Gamma22,
-            Some("linear") => Transfer::Linear,
-            Some(other) => {
-                return Err(wrong_word(
-                    "scene.transfer",
-                    other,
-                    &["srgb", "gamma22", "linear"],
-                ));
-            }
-        };
+        let transfer = self.transfer()?;
         let class = self.class.as_deref().unwrap_or("object").trim();
         if class.is_empty() {
             return Err(wrong(
@@ -374,6 +385,7 @@ impl SceneConfig {
                 "interactions from 1 to 8, for instance max_depth = 3",
             ));
         }
+        self.views()?;
         let proxy = match &self.proxy {
             None => ProxySettings::None,
             Some(proxy) => proxy.validate(camera)?,

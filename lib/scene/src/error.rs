@@ -164,6 +164,31 @@ impl Error {
         }
     }
 
+    /// The same error about a table that has another's keys: `scene.views[0].camera` for `scene.camera`.
+    pub(crate) fn moved(self, from: &str, to: &str) -> Self {
+        let moved = |text: String| text.replace(from, to);
+        match self {
+            Self::Config {
+                key,
+                value,
+                accepted,
+            } => Self::Config {
+                key: moved(key),
+                value,
+                accepted: moved(accepted),
+            },
+            Self::Missing { key, remedy } => Self::Missing {
+                key: moved(key),
+                remedy: moved(remedy),
+            },
+            Self::Conflict { first, second } => Self::Conflict {
+                first: moved(first),
+                second: moved(second),
+            },
+            other => other,
+        }
+    }
+
     pub(crate) fn malformed(detail: impl Into<String>, remedy: &'static str) -> Self {
         Self::Malformed {
             detail: detail.into(),

@@ -24,6 +24,7 @@ pub mod scene;
 pub mod texture;
 pub mod triangle;
 pub mod undistortion;
+pub mod views;
 pub mod visibility;
 
 pub use error::Error;

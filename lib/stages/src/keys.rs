@@ -60,12 +60,21 @@ pub struct Table {
 }
 
 impl Table {
-    /// As it stands in the file: `[scene.camera]`, `[[scene.objects]]`.
+    /// As it stands in the file: `[scene.camera]`, `[[scene.objects]]`, `[scene.views.camera]` for the last view.
     pub fn header(&self) -> String {
         match self.name.strip_suffix(".N") {
             Some(list) => format!("[[{list}]]"),
-            None => format!("[{}]", self.name),
+            None => format!("[{}]", self.name.replace(".N.", ".")),
         }
+    }
+
+    /// Whether it has the same keys.
+    fn is_like(&self, other: &Self) -> bool {
+        let keys = |table: &Self| -> Vec<(String, String)> {
+            let all = table.keys.iter();
+            all.map(|k| (k.name().into(), k.sentence.clone())).collect()
+        };
+        !self.keys.is_empty() && keys(self) == keys(other)
     }
 }
 

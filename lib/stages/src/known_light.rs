@@ -8,6 +8,7 @@ use dipir_imaging::raster::LinearImage;
 use dipir_light::environment::EnvironmentMap;
 use dipir_optimize::settings::LightTable;
 use dipir_scene::camera::Camera;
+use dipir_scene::config::SceneConfig;
 use glam::{Vec2, Vec3};
 use serde_json::{Value, json};
 
@@ -69,7 +70,9 @@ pub fn known(session: &Session, table: &CompositeTable) -> anyhow::Result<Option
 /// On a `[light]` table that cannot be read.
 pub fn warn_of_unused(session: &Session) -> anyhow::Result<()> {
     let table: LightTable = session.config.table("light")?;
-    let given: Vec<&str> = table.only_of_estimates().collect();
+    let scene: SceneConfig = session.config.table("scene")?;
+    let views = (!scene.views.is_empty()).then_some("scene.views");
+    let given: Vec<&str> = table.only_of_estimates().chain(views).collect();
     if !given.is_empty() {
         session.warn(&format!(
             "composite.environment gives the light, so that {} changes nothing; remove one of them",

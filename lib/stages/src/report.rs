@@ -30,7 +30,7 @@ pub const MARK: &[u8] =
 /// Name of the file in the folder of artifacts.
 pub const FILE: &str = "report.html";
 /// Raised whenever the same artifacts give another page.
-const VERSION: u32 = 6;
+const VERSION: u32 = 7;
 
 /// What the page shows in addition to the artifacts.
 pub struct Report<'a> {

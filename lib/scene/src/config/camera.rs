@@ -63,7 +63,7 @@ impl CameraConfig {
                 "metres, at most ten million from the origin, for instance [0.0, 1.6, 4.0]",
             ));
         }
-        if self.pitch_deg.is_some() || self.roll_deg.is_some() {
+        if self.is_turned() {
             let (look_at, up) = self.turned(position)?;
             return Ok([position, look_at, up]);
         }
@@ -88,12 +88,19 @@ impl CameraConfig {
         Ok([position, look_at, up])
     }
 
+    /// Whether angles say where it looks.
+    pub(super) fn is_turned(&self) -> bool {
+        let angles = [self.pitch_deg, self.roll_deg, self.heading_deg];
+        angles.iter().any(Option::is_some)
+    }
+
     /// The point in the centre of the image and what is up in it, of a camera that looks along -z,
-    /// turned by `pitch_deg` and `roll_deg`.
+    /// turned by `pitch_deg`, `roll_deg` and `heading_deg`.
     pub(super) fn turned(&self, position: Vec3) -> Result<(Vec3, Vec3), Error> {
-        let given = match self.pitch_deg {
-            Some(_) => "scene.camera.pitch_deg",
-            None => "scene.camera.roll_deg",
+        let given = match (self.pitch_deg, self.roll_deg) {
+            (Some(_), _) => "scene.camera.pitch_deg",
+            (None, Some(_)) => "scene.camera.roll_deg",
+            (None, None) => "scene.camera.heading_deg",
         };
         for (name, other) in [("look_at", self.look_at), ("up", self.up)] {
             if other.is_some() {
@@ -113,7 +120,10 @@ impl CameraConfig {
         };
         let pitch = angle_rad("pitch_deg", self.pitch_deg, 90.0)?;
         let roll = angle_rad("roll_deg", self.roll_deg, 180.0)?;
-        let rotation = DMat3::from_rotation_x(pitch) * DMat3::from_rotation_z(-roll);
+        let heading = angle_rad("heading_deg", self.heading_deg, 360.0)?;
+        let rotation = DMat3::from_rotation_y(-heading)
+            * DMat3::from_rotation_x(pitch)
+            * DMat3::from_rotation_z(-roll);
         // Far enough that rounding the point does not turn the line of sight.
         let distance = 1.0 + position.as_dvec3().length();
         let look_at = position.as_dvec3() - distance * rotation.z_axis;

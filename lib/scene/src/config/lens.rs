@@ -71,6 +71,7 @@ impl CameraConfig {
             ("up", self.up.is_some()),
             ("pitch_deg", self.pitch_deg.is_some()),
             ("roll_deg", self.roll_deg.is_some()),
+            ("heading_deg", self.heading_deg.is_some()),
         ];
         let lens = [
             ("principal_px", self.principal_px.is_some()),

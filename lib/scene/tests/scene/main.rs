@@ -13,4 +13,5 @@ mod obj_import;
 mod obj_reference;
 mod ply_and_stl;
 mod scene_load;
+mod views;
 mod visibility;

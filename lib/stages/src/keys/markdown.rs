@@ -19,16 +19,21 @@ An editor that knows Taplo completes and checks the file with the schema that
 /// All keys as a page of Markdown.
 pub fn markdown() -> String {
     let mut page = HEAD.to_string();
-    for table in tables() {
-        page += &section(table);
+    for (k, table) in tables().iter().enumerate() {
+        page += &section(table, &tables()[..k]);
     }
     page
 }
 
-fn section(table: &Table) -> String {
+/// A table; that it has the keys of an earlier one is said.
+fn section(table: &Table, earlier: &[Table]) -> String {
     let mut text = format!("\n## `{}`\n{}\n", table.header(), table.sentence);
     if table.keys.is_empty() {
         return text;
+    }
+    if let Some(same) = earlier.iter().find(|t| t.is_like(table)) {
+        let (name, header) = (&table.name, same.header());
+        return text + &format!("\nThe keys of `{header}`, as `{name}.` and their names.\n");
     }
     text += "\n| key | accepted | default | example | what it is |\n|---|---|---|---|---|\n";
     for key in &table.keys {

@@ -2,6 +2,7 @@
 use std::sync::Arc;
 
 use dipir_cli::session::Session;
+use dipir_estimator::Visible;
 use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::{SgMixture, SphericalGaussian};
@@ -140,9 +141,9 @@ fn start(
             (neutral.foreground_lobes(), None, Origin::Neutral)
         }
         _ => {
-            let (lobes, smooth) = estimated(session, &table, loaded)?;
+            let (lobes, smooth, seen) = estimated(session, &table, loaded)?;
             let visible = table.visible.unwrap_or(true);
-            let map = surroundings(loaded, &smooth, visible);
+            let map = surroundings(loaded, &seen, &smooth, visible);
             (lobes, Some(map), Origin::Estimate)
         }
     };
@@ -151,21 +152,21 @@ fn start(
     Ok((light, origin))
 }
 
-/// The sources of the estimated light, and the rest of it. Unlike the stage's, without fitting lobes
+/// The sources of the estimated light, the rest of it, and what other photographs show of it. Unlike the stage's, without fitting lobes
 /// to the rest, which takes most of its time.
 fn estimated(
     session: &Session,
     table: &LightTable,
     loaded: &LoadedScene,
-) -> anyhow::Result<(Vec<SphericalGaussian>, EnvironmentMap)> {
+) -> anyhow::Result<(Vec<SphericalGaussian>, EnvironmentMap, Vec<Visible>)> {
     if table.candidate.is_some() {
         let mut found = estimate(session, table, loaded, 1)?;
         found.lobes.truncate(found.sources);
-        return Ok((found.lobes, found.smooth));
+        return Ok((found.lobes, found.smooth, found.seen));
     }
-    let estimate = distribution(session, table, loaded)?;
+    let (estimate, seen) = distribution(session, table, loaded)?;
     Ok(match estimate.source_lobe() {
-        Some(source) => (vec![source], estimate.base_map()),
-        None => (Vec::new(), estimate.map()),
+        Some(source) => (vec![source], estimate.base_map(), seen),
+        None => (Vec::new(), estimate.map(), seen),
     })
 }

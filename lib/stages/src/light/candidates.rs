@@ -1,7 +1,7 @@
 //! The contact sheet of the lights that the photograph allows: the object under each, to choose by eye.
 use std::sync::Arc;
 
-use dipir_estimator::{Candidate, LightEstimate, Visible, merged};
+use dipir_estimator::{Candidate, Visible, merged};
 use dipir_imaging::composite::composite;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
@@ -13,7 +13,8 @@ use dipir_render::render::{Renderer, Settings, Simulation};
 use dipir_scene::scene::LoadedScene;
 use glam::Vec3;
 
-use super::surroundings::BORDER_DEG;
+use super::estimate::Estimated;
+use super::surroundings::{BORDER_DEG, with_others};
 use crate::interruption;
 use crate::scene::transport::Frame;
 
@@ -33,8 +34,7 @@ const GAP: usize = 6;
 pub(super) fn sheet(
     loaded: &LoadedScene,
     simulation: &Simulation,
-    estimate: &LightEstimate,
-    candidates: &[Candidate],
+    estimated: &Estimated,
     visible: bool,
 ) -> anyhow::Result<DisplayImage> {
     let frame = Frame::new(loaded, SIDE);
@@ -51,11 +51,11 @@ pub(super) fn sheet(
     let tone = ToneCurves::identity();
     let picture = |c: &Candidate| -> anyhow::Result<Raster<Vec3>> {
         let (smooth, sources) = match c.direction {
-            Some(_) => (estimate.base_map(), &c.lobes[..1]),
+            Some(_) => (estimated.estimate.base_map(), &c.lobes[..1]),
             None => (c.map.clone(), &c.lobes[..0]),
         };
         let map = match visible {
-            true => merged(&seen, &smooth),
+            true => merged(&seen, &with_others(&estimated.seen, &smooth)),
             false => smooth,
         };
         let sampler = EnvironmentSampler::new(Arc::new(map));
@@ -69,6 +69,7 @@ pub(super) fn sheet(
         let linear = composite(&frame.background, &object, &film.alpha, &shadow)?;
         Ok(loaded.photo.transfer.encode(&linear).0)
     };
+    let candidates = &estimated.lights;
     let pictures = candidates
         .iter()
         .map(picture)

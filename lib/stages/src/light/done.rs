@@ -1,34 +1,13 @@
 //! What the light stage prints when it has run.
 use std::fmt;
 
-use dipir_estimator::LightEstimate;
 use dipir_optimize::history::Row;
 use glam::Vec3;
 use serde_json::{Value, json};
 
 use super::Done;
+use super::words::in_words;
 use crate::written;
-
-/// An estimate in a sentence.
-pub(crate) fn in_words(estimate: &LightEstimate) -> String {
-    let (azimuth, elevation) = (estimate.azimuth_deg, estimate.elevation_deg);
-    let arc = azimuth.high - azimuth.low;
-    let side = match arc > 180.0 {
-        true => format!("the side is open (azimuth within an arc of {arc:.0} degrees)"),
-        false => format!(
-            "azimuth {:.0} to {:.0} degrees to the right of the view",
-            azimuth.low, azimuth.high
-        ),
-    };
-    format!(
-        "estimated: most light {}; 80% intervals: {side}, elevation {:.0} to {:.0} degrees; a sun with a probability \
-         of {:.0}%",
-        estimate.words,
-        elevation.low,
-        elevation.high,
-        100.0 * estimate.sun_probability
-    )
-}
 
 /// Degrees above the horizon, and counter-clockwise from +z seen from above.
 fn angles_deg(direction: Vec3) -> [f32; 2] {
@@ -99,6 +78,9 @@ impl fmt::Display for Done {
         }
         if let Some(estimated) = &self.found.estimated {
             write!(f, "\n  {}", in_words(&estimated.estimate))?;
+            if estimated.photographs > 1 {
+                write!(f, "\n  from {} photographs", estimated.photographs)?;
+            }
         }
         let skipped = self.found.skipped();
         if skipped > 0 {

@@ -1,7 +1,6 @@
 //! The light that is estimated from the photograph and, where something is known of the sun, from that.
-use anyhow::Context;
 use dipir_cli::session::Session;
-use dipir_estimator::{Candidate, Estimator, KnownAngle, KnownSun, LightEstimate};
+use dipir_estimator::{Candidate, KnownAngle, KnownSun, LightEstimate, Visible};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_optimize::settings::LightTable;
@@ -12,6 +11,8 @@ use dipir_sun::shadow::{Angle, Ground, sun_of_shadow};
 use dipir_sun::table::Taken;
 use glam::Vec2;
 use serde::Serialize;
+
+use super::views;
 
 /// Candidates that are written.
 const CANDIDATES: usize = 8;
@@ -41,17 +42,21 @@ pub(super) struct Estimated {
     pub(super) sources: usize,
     /// The light without these sources.
     pub(super) smooth: EnvironmentMap,
+    /// What the other photographs of the place show of it.
+    pub(super) seen: Vec<Visible>,
+    /// How many photographs tell it.
+    pub(super) photographs: usize,
 }
 
-/// The light of the whole photograph: a function of photograph, camera and what is known of the
-/// sun, not of objects, presets or seeds.
+/// The light of the whole photograph: a function of photograph, camera, other photographs of the place
+/// and what is known of the sun, not of objects, presets or seeds.
 pub(super) fn estimate(
     session: &Session,
     table: &LightTable,
     loaded: &LoadedScene,
     lobes: usize,
 ) -> anyhow::Result<Estimated> {
-    let estimate = distribution(session, table, loaded)?;
+    let (estimate, seen) = distribution(session, table, loaded)?;
     let known = known_sun(session, table, loaded, &estimate)?;
     if let Some(below) = known.and_then(|sun| sun.elevation).filter(|e| e.deg < 0.0) {
         session.warn(&format!(
@@ -79,7 +84,8 @@ pub(super) fn estimate(
         Some(number) => {
             let chosen = number.checked_sub(1).and_then(|k| candidates.get(k));
             let chosen = chosen.ok_or_else(|| {
-                let message = format!("{number} is no candidate; accepted: 1 to {CANDIDATES}");
+                let most = candidates.len();
+                let message = format!("{number} is no candidate; accepted: 1 to {most}");
                 session.config.invalid("light.candidate", message)
             })?;
             match chosen.direction {
@@ -95,20 +101,21 @@ pub(super) fn estimate(
         lobes,
         sources,
         smooth,
+        seen,
+        photographs: 1 + views::settings(session)?.len(),
     })
 }
 
-/// The light as a distribution, with what is known of the sun.
+/// The light as a distribution, with what is known of the sun, and what the other photographs of the place show of it.
 pub(super) fn distribution(
     session: &Session,
     table: &LightTable,
     loaded: &LoadedScene,
-) -> anyhow::Result<LightEstimate> {
-    let estimator = Estimator::embedded().context("cannot read the embedded light estimator")?;
-    let estimate = estimator.estimate(&loaded.photo.image, &loaded.scene.camera);
+) -> anyhow::Result<(LightEstimate, Vec<Visible>)> {
+    let (estimate, seen) = views::estimate(session, loaded)?;
     Ok(match known_sun(session, table, loaded, &estimate)? {
-        Some(sun) => estimate.knowing(&sun),
-        None => estimate,
+        Some(sun) => (estimate.knowing(&sun), seen),
+        None => (estimate, seen),
     })
 }
 

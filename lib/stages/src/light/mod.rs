@@ -10,6 +10,8 @@ pub(crate) mod method;
 pub(crate) mod request;
 mod resume;
 mod surroundings;
+mod views;
+mod words;
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -50,7 +52,7 @@ use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::scene::transport::{self, Frame};
 use crate::{interruption, lora};
 
-pub(crate) use done::in_words;
+pub(crate) use words::{in_words, quantities};
 
 /// What the stage did.
 pub struct Done {
@@ -152,9 +154,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     write_results(&request.settings, &found, resume.as_ref(), &mut writer)?;
     if let Some(estimated) = &found.estimated {
         let (loaded, simulation) = (&inputs.scene.loaded, inputs.scene.effects.simulation());
-        let (estimate, lights) = (&estimated.estimate, &estimated.lights);
         let visible = request.shows_visible();
-        let sheet = candidates::sheet(loaded, &simulation, estimate, lights, visible)?;
+        let sheet = candidates::sheet(loaded, &simulation, estimated, visible)?;
         write_png(writer.output("candidates_sheet", "candidates.png")?, &sheet)?;
     }
     let manifest = writer.finish()?;
@@ -242,7 +243,8 @@ impl Found {
                 smooth
             }),
         };
-        self.surroundings = smooth.map(|light| surroundings(loaded, &light, visible));
+        let others = estimated.as_ref().map_or(&[][..], |e| &e.seen);
+        self.surroundings = smooth.map(|light| surroundings(loaded, others, &light, visible));
         self.estimated = estimated;
         self
     }
@@ -374,6 +376,7 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
             }
         }
     }
+    views::add_inputs(session, &request.views, &mut plan)?;
     if let Start::File(path) = &request.table.start {
         plan.input("start", path, &session.resolve(path))?;
     }

@@ -10,9 +10,11 @@ use dipir_optimize::lighting::Lighting;
 use dipir_optimize::settings::{GuidanceKind, LearningRates, LightTable, Settings, Start};
 use dipir_prior::inversion::InversionSettings;
 use dipir_scene::config::SceneConfig;
+use dipir_scene::views::ViewSettings;
 use serde_json::{Value, json};
 
 use crate::light::method::Method;
+use crate::light::views;
 use crate::model::ModelTable;
 use crate::scene::folder::SceneFolder;
 use crate::scene::transport::{self, Frame};
@@ -44,6 +46,8 @@ pub(crate) struct Request {
     pub(crate) settings: Settings,
     pub(crate) guide: Guide,
     pub(crate) start: First,
+    /// Other photographs of the place, which the estimate uses.
+    pub(crate) views: Vec<ViewSettings>,
 }
 
 /// Where the light starts.
@@ -81,14 +85,20 @@ impl First {
     }
 
     /// What an estimate alone makes use of is refused where nothing is estimated.
-    fn refuse_unused(self, session: &Session, table: &LightTable) -> anyhow::Result<()> {
+    fn refuse_unused(
+        self,
+        session: &Session,
+        table: &LightTable,
+        views: &[ViewSettings],
+    ) -> anyhow::Result<()> {
         let how = match self {
             Self::Estimated => return Ok(()),
             Self::Neutral => "from neutral light",
             Self::Read => "from what the guiding model reads off the photograph",
             Self::File => "from the light of a file",
         };
-        match table.only_of_estimates().next() {
+        let views = (!views.is_empty()).then_some(views::KEY);
+        match table.only_of_estimates().chain(views).next() {
             None => Ok(()),
             Some(key) => {
                 let message = format!(
@@ -114,7 +124,8 @@ impl Request {
             Method::Start | Method::Materials | Method::Given => Guide::None,
         };
         let start = First::of(session, &table, &guide)?;
-        start.refuse_unused(session, &table)?;
+        let views = views::settings(session)?;
+        start.refuse_unused(session, &table, &views)?;
         if let Guide::Model {
             reading: Some(_), ..
         } = &guide
@@ -126,6 +137,7 @@ impl Request {
             settings,
             guide,
             start,
+            views,
         })
     }
 
@@ -137,10 +149,14 @@ impl Request {
         };
         let table = &self.table;
         let start = (self.start == First::Estimated).then(|| {
-            json!({
+            let mut start = json!({
                 "estimator": dipir_estimator::VERSION, "candidate": table.candidate,
                 "sun": table.sun, "shadow": table.shadow,
-            })
+            });
+            if !self.views.is_empty() {
+                start["views"] = self.views.iter().map(|v| json!(v.config)).collect();
+            }
+            start
         });
         let mut params = match &self.guide {
             Guide::None => json!({"lobes": settings.lobes, "start": table.start}),

@@ -1,6 +1,6 @@
 //! The light around the place as a map. Where the photograph shows the surroundings, the map shows
 //! them as the photograph does.
-use dipir_estimator::{Visible, merged};
+use dipir_estimator::{Visible, merged, overlaid};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::rasterize::rasterize;
@@ -26,9 +26,10 @@ pub(super) fn map_of(lobes: &[SphericalGaussian]) -> EnvironmentMap {
     rasterize(lobes, MAP[0], MAP[1])
 }
 
-/// `light` with what the photograph shows, if that is wanted.
+/// `light` with what the photograph and the `others` of its place show, if that is wanted.
 pub(super) fn surroundings(
     loaded: &LoadedScene,
+    others: &[Visible],
     light: &EnvironmentMap,
     visible: bool,
 ) -> EnvironmentMap {
@@ -37,8 +38,14 @@ pub(super) fn surroundings(
         true => {
             let camera = &loaded.scene.camera;
             let seen = Visible::new(&loaded.photo.image, camera, width, height, BORDER_DEG);
-            merged(&seen, light)
+            merged(&seen, &with_others(others, light))
         }
         false => light.resampled(width, height),
     }
+}
+
+/// `light` with what the other photographs of the place show.
+pub(super) fn with_others(others: &[Visible], light: &EnvironmentMap) -> EnvironmentMap {
+    let add = |light: EnvironmentMap, seen: &Visible| overlaid(seen, &light);
+    others.iter().fold(light.clone(), add)
 }

@@ -10,7 +10,7 @@ use dipir_light::environment::{EnvironmentMap, texel_of};
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::luminance::luminance_f64;
 use dipir_optimize::lighting::Lighting;
-use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::manifest::{Artifact, Manifest};
 use dipir_plotting::chart::{Chart, Mark, Series};
 use dipir_plotting::number;
 use glam::Vec3;
@@ -22,8 +22,10 @@ use super::picture::{figure, image};
 use super::{Report, Section, direction, json, outputs};
 use crate::composite::table::CompositeTable;
 use crate::known_light;
+use crate::light::{in_words, quantities};
 use crate::names::LIGHT;
 use crate::preview::environment;
+use crate::scene::unnumbered;
 
 /// Columns of the map as it is shown.
 const MAP_WIDTH: usize = 512;
@@ -108,19 +110,44 @@ pub fn section(report: &Report) -> Section {
 
 /// What was estimated from the photograph, with how sure it is, and the lights to choose among.
 fn estimate(run: &(PathBuf, Manifest), estimate: &LightEstimate) -> anyhow::Result<Html> {
-    let sentence = Html::of("p", crate::light::in_words(estimate));
+    let mut parts = vec![Html::of("p", in_words(estimate))];
+    let is_view = |input: &&Artifact| unnumbered(&input.role) == "view";
+    let views = run.1.inputs.iter().filter(is_view).count();
+    if views > 0 {
+        let count = views + 1;
+        parts.push(Html::of(
+            "p",
+            format!("Estimated from {count} photographs of the place."),
+        ));
+    }
+    let rows = quantities(estimate).map(|q| {
+        let cells = [q.middle, q.interval, q.words].map(Html::text);
+        std::iter::once(Html::text(q.name)).chain(cells).collect()
+    });
+    let heads = [
+        "80% intervals",
+        ">median",
+        ">interval",
+        "the interval in words",
+    ];
+    parts.push(table(&heads, rows.into()));
     let candidates: Vec<Value> = json(run, "candidates")?;
+    let used = run.1.params["estimate"]["candidate"].as_u64();
     let rows = candidates.iter().map(|c| {
         let chance = c["probability"].as_f64().unwrap_or(0.0);
+        let used = c["candidate"].as_u64() == used;
         vec![
             Html::text(c["candidate"].to_string()),
             Html::text(format!("{:.0}%", 100.0 * chance)),
             Html::text(c["words"].as_str().unwrap_or_default()),
-            Html::of("code", format!("--set light.candidate={}", c["candidate"])),
+            match used {
+                true => Html::text("used"),
+                false => Html::of("code", format!("--set light.candidate={}", c["candidate"])),
+            },
         ]
     });
     let heads = [">candidate", ">probability", "light", "to use it"];
-    let mut parts = vec![sentence, table(&heads, rows.collect())];
+    parts.push(table(&heads, rows.collect()));
     for (_, path) in outputs(run, "candidates_sheet") {
         let shown = Transfer::Srgb.encode(&read_photo(path, Transfer::Srgb)?.image);
         let caption = "The candidates by number, row by row; bars are their probabilities";

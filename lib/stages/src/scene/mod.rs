@@ -214,10 +214,12 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     )
 }
 
-/// The keys of `[scene]` that decide what the stage writes. `class` is left out: only stages that ask a model use it.
+/// The keys of `[scene]` that decide what the stage writes. Left out are `class`, which only stages that ask a model use,
+/// and `views`, which only the light's estimate uses.
 pub fn settings(session: &Session) -> anyhow::Result<SceneConfig> {
     let mut config: SceneConfig = session.config.table("scene")?;
     config.class = None;
+    config.views.clear();
     Ok(config)
 }
 

@@ -1,0 +1,86 @@
+//! Other photographs of the scene's place.
+use std::path::{Path, PathBuf};
+
+use dipir_imaging::file::{Photo, read_photo_within};
+use dipir_imaging::raster::LinearImage;
+use dipir_imaging::transfer::Transfer;
+
+use crate::camera::{Camera, CameraSettings, FieldOfView};
+use crate::config::ViewConfig;
+use crate::error::Error;
+use crate::limits::Limits;
+
+/// A checked `[[scene.views]]` table.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewSettings {
+    /// The key of its photograph: `scene.views[0].background`.
+    pub key: String,
+    /// As written, with what it takes from `[scene.camera]`.
+    pub config: ViewConfig,
+    /// The photograph, as written.
+    pub background: PathBuf,
+    /// Its exposure over that of the scene's photograph, stops, if that is written.
+    pub exposure_stops: Option<f64>,
+    pub(crate) camera: CameraSettings,
+    /// Of the scene's camera, for a photograph that does not tell its own.
+    pub(crate) lens: Option<FieldOfView>,
+    pub(crate) transfer: Transfer,
+    pub(crate) limits: Limits,
+}
+
+/// A photograph with its camera.
+#[derive(Clone, Debug)]
+pub struct View {
+    /// As it was taken.
+    pub taken: Photo,
+    /// In linear light; undistorted, if its lens bends lines.
+    pub image: LinearImage,
+    /// The camera of `image`.
+    pub camera: Camera,
+}
+
+impl ViewSettings {
+    /// The files of its camera, as the configuration would name them.
+    pub fn camera_files(&self, base_dir: &Path) -> Vec<PathBuf> {
+        match &self.camera {
+            CameraSettings::File(file) => file.parts(base_dir),
+            CameraSettings::LookAt { .. } => Vec::new(),
+        }
+    }
+
+    /// Reads the photograph and its camera, relative to `base_dir`.
+    ///
+    /// # Errors
+    /// On files that cannot be used, and a field of view that nothing tells.
+    pub fn load(&self, base_dir: &Path) -> Result<View, Error> {
+        let path = base_dir.join(&self.background);
+        let taken = read_photo_within(path, self.transfer, self.limits.photo())?;
+        let resolution = [taken.image.0.width() as u32, taken.image.0.height() as u32];
+        let (camera, undistortion) = self
+            .with_lens(&taken)
+            .with_facts(&taken.facts)
+            .and_then(|c| c.resolve(resolution, base_dir))
+            .map_err(|e| e.moved("scene.camera", &self.key.replace("background", "camera")))?;
+        let image = match undistortion {
+            Some(undistortion) => LinearImage(undistortion.undistort(&taken.image.0)),
+            None => taken.image.clone(),
+        };
+        Ok(View {
+            taken,
+            image,
+            camera,
+        })
+    }
+
+    /// The camera with the scene's field of view, if neither the table nor the photograph tells one.
+    fn with_lens(&self, photo: &Photo) -> CameraSettings {
+        let mut camera = self.camera.clone();
+        if let (CameraSettings::LookAt { field_of_view, .. }, Some(lens)) = (&mut camera, self.lens)
+            && *field_of_view == FieldOfView::Photograph
+            && photo.facts.field_of_view_rad().is_none()
+        {
+            *field_of_view = lens;
+        }
+        camera
+    }
+}

@@ -1,0 +1,109 @@
+//! The other photographs of the place, `[[scene.views]]`.
+use anyhow::Context;
+use dipir_cli::session::Session;
+use dipir_estimator::{Estimator, LightEstimate, ViewEstimate, Visible, combine};
+use dipir_imaging::file::Photo;
+use dipir_pipeline::stage::StagePlan;
+use dipir_scene::config::SceneConfig;
+use dipir_scene::scene::LoadedScene;
+use dipir_scene::views::{View, ViewSettings};
+
+use super::surroundings::{BORDER_DEG, MAP};
+use crate::scene::with_place;
+
+/// The key of the list.
+pub(super) const KEY: &str = "scene.views";
+
+/// What the configuration says of them.
+pub(super) fn settings(session: &Session) -> anyhow::Result<Vec<ViewSettings>> {
+    let scene: SceneConfig = session.config.table("scene")?;
+    scene.views().map_err(|e| with_place(e, &session.config))
+}
+
+/// Adds their photographs and cameras to the inputs of a plan.
+pub(super) fn add_inputs(
+    session: &Session,
+    views: &[ViewSettings],
+    plan: &mut StagePlan,
+) -> anyhow::Result<()> {
+    for view in views {
+        let location = session.resolve(&view.background);
+        plan.input("view", &view.background, &location)
+            .with_context(|| cannot_use(view))?;
+        for path in view.camera_files(&session.config.base_dir()) {
+            if !plan.inputs.iter().any(|i| i.path == path) {
+                plan.input("view's camera", &path, &session.resolve(&path))
+                    .with_context(|| cannot_use(view))?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn cannot_use(view: &ViewSettings) -> String {
+    format!(
+        "cannot use {} = \"{}\"",
+        view.key,
+        view.background.display()
+    )
+}
+
+/// The light of the scene's photograph and of the others together, and what of it those show that have a known exposure.
+pub(super) fn estimate(
+    session: &Session,
+    loaded: &LoadedScene,
+) -> anyhow::Result<(LightEstimate, Vec<Visible>)> {
+    let estimator = Estimator::embedded().context("cannot read the embedded light estimator")?;
+    let own = estimator.estimate(&loaded.photo.image, &loaded.scene.camera);
+    let mut all = vec![ViewEstimate {
+        estimate: own,
+        stops: Some(0.0),
+    }];
+    let mut seen = Vec::new();
+    for settings in settings(session)? {
+        let view = read(session, &settings)?;
+        let stops = settings
+            .exposure_stops
+            .or_else(|| between(loaded.taken(), &view.taken));
+        if stops.is_none() {
+            session.remark(|| {
+                format!(
+                    "{}: nothing tells how it is exposed, so that it tells where light comes from and not how bright it is; \
+                     write exposure_stops = 0.0 beside it if it is exposed as scene.background is",
+                    settings.key
+                )
+            });
+        }
+        all.push(ViewEstimate {
+            estimate: estimator.estimate(&view.image, &view.camera),
+            stops,
+        });
+        if let Some(stops) = stops {
+            let visible = Visible::new(&view.image, &view.camera, MAP[0], MAP[1], BORDER_DEG);
+            seen.push(visible.scaled((-stops).exp2() as f32));
+        }
+    }
+    Ok((combine(&all)?, seen))
+}
+
+fn read(session: &Session, settings: &ViewSettings) -> anyhow::Result<View> {
+    use dipir_scene::Error::{Config, Conflict, Missing};
+    let view = settings
+        .load(&session.config.base_dir())
+        .map_err(|e| match e {
+            Config { .. } | Missing { .. } | Conflict { .. } => with_place(e, &session.config),
+            other => anyhow::Error::new(other).context(cannot_use(settings)),
+        })?;
+    for warning in &view.taken.warnings {
+        session.warn(warning);
+    }
+    Ok(view)
+}
+
+/// How much more `other` is exposed than `photo`, stops, if their files tell: those of linear light have one scale.
+fn between(photo: &Photo, other: &Photo) -> Option<f64> {
+    if photo.values.is_none() && other.values.is_none() {
+        return Some(0.0);
+    }
+    Some(other.facts.exposure_stops? - photo.facts.exposure_stops?)
+}

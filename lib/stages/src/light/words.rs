@@ -1,0 +1,117 @@
+//! An estimated light in words, with how sure it is.
+use dipir_estimator::posterior::side;
+use dipir_estimator::{Interval, LightEstimate};
+
+/// A quantity of the light, its middle and its 80% interval in numbers, and the interval in words.
+pub(crate) struct Quantity {
+    /// What it is.
+    pub(crate) name: &'static str,
+    /// Its median, with the unit.
+    pub(crate) middle: String,
+    /// What holds the truth in four of five photographs.
+    pub(crate) interval: String,
+    /// The same in words.
+    pub(crate) words: String,
+}
+
+/// An estimate in a sentence.
+pub(crate) fn in_words(estimate: &LightEstimate) -> String {
+    let [azimuth, elevation, exposure, share] = quantities(estimate).map(|q| q.words);
+    format!(
+        "estimated: most light {}; in four of five such photographs it comes from {azimuth}, {elevation}; the mean light \
+         is {exposure}, its strongest source {share}; a sun with a probability of {:.0}%",
+        estimate.words,
+        100.0 * estimate.sun_probability
+    )
+}
+
+/// Azimuth, elevation, exposure and share.
+pub(crate) fn quantities(estimate: &LightEstimate) -> [Quantity; 4] {
+    let (azimuth, elevation) = (&estimate.azimuth_deg, &estimate.elevation_deg);
+    let (exposure, share) = (&estimate.exposure_stops, &estimate.share);
+    let quantity = |name, i: &Interval, show: &dyn Fn(f64) -> String, words| Quantity {
+        name,
+        middle: show(i.middle),
+        interval: format!("{} to {}", show(i.low), show(i.high)),
+        words,
+    };
+    let degrees = |deg: f64| format!("{deg:.0}°");
+    let times = |stops: f64| format!("{:.2}", stops.exp2());
+    let percent = |share: f64| format!("{:.0}%", 100.0 * share);
+    [
+        quantity(
+            "azimuth, to the right of the view",
+            azimuth,
+            &degrees,
+            sides(azimuth),
+        ),
+        quantity(
+            "elevation",
+            elevation,
+            &degrees,
+            format!("{:.0} to {:.0} degrees high", elevation.low, elevation.high),
+        ),
+        quantity(
+            "exposure: mean light over the photograph's mean",
+            exposure,
+            &|stops| format!("{stops:+.1} stops"),
+            format!(
+                "{} to {} times as bright as the photograph's mean",
+                times(exposure.low),
+                times(exposure.high)
+            ),
+        ),
+        quantity(
+            "share of the strongest source",
+            share,
+            &percent,
+            format!(
+                "{} to {} of all light",
+                percent(share.low),
+                percent(share.high)
+            ),
+        ),
+    ]
+}
+
+/// The sides of an arc.
+fn sides(arc: &Interval) -> String {
+    let (low, middle, high) = (side(arc.low), side(arc.middle), side(arc.high));
+    if arc.high - arc.low >= 359.5 {
+        return "any side".into();
+    }
+    if arc.high - arc.low > 180.0 {
+        return format!("any side but {}", side(arc.middle + 180.0));
+    }
+    match (low == middle, high == middle) {
+        (true, true) => middle,
+        (true, false) | (false, true) => format!("{low} to {high}"),
+        (false, false) => format!("{low} over {middle} to {high}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arcs_are_said_by_their_sides() {
+        for (low, high, wanted) in [
+            (-20.0, 15.0, "ahead"),
+            (10.0, 60.0, "ahead to ahead on the right"),
+            (
+                -60.0,
+                60.0,
+                "ahead on the left over ahead to ahead on the right",
+            ),
+            // Across the back: 190 degrees are 170 to the left.
+            (100.0, 235.0, "the right over behind to behind on the left"),
+            (-135.0, 135.0, "any side but behind"),
+            (-45.0, 225.0, "any side but the left"),
+            (-180.0, 180.0, "any side"),
+        ] {
+            let arc = Interval::new(low, 0.5 * (low + high), high);
+            assert_eq!(sides(&arc), wanted, "{low} to {high}");
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! Several photographs of one place.
+use dipir_imaging::file::write_png;
+use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_light::environment::EnvironmentMap;
+use glam::Vec3;
+use serde_json::Value;
+
+use crate::project::*;
+
+/// A photograph of what is behind the camera: a yellow wall.
+const WALL: Vec3 = Vec3::new(0.7, 0.6, 0.2);
+const VIEW: &str = "\n[[scene.views]]\nbackground = \"behind.png\"\n";
+
+/// A project that names no light, and another photograph.
+fn project(view: &str) -> Project {
+    let project = Project::new();
+    wall(&project, WALL);
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let text = text.replace("environment = \"sky.exr\"\n", "");
+    project.write("pipeline.toml", text + view);
+    project
+}
+
+fn wall(project: &Project, colour: Vec3) {
+    let grey = Raster::filled(24, 36, colour);
+    write_png(project.path("behind.png"), &DisplayImage(grey)).unwrap();
+}
+
+fn ran(project: &Project, args: &[&str]) -> Vec<String> {
+    let run = project.run(DIPIR, &[&["run", "--json"], args].concat());
+    run.expect_success();
+    let value: Value = serde_json::from_str(&run.stdout).unwrap();
+    let names = value["ran"].as_array().unwrap();
+    names.iter().map(|n| n.as_str().unwrap().into()).collect()
+}
+
+fn json(project: &Project, name: &str) -> Value {
+    serde_json::from_slice(&project.read(name)).unwrap()
+}
+
+/// What the light is from behind.
+fn behind(project: &Project) -> Vec3 {
+    let map = EnvironmentMap::read(project.path("out/light/surroundings.exr")).unwrap();
+    map.eval(Vec3::Z)
+}
+
+#[test]
+fn another_photograph_belongs_to_the_light_and_to_no_other_stage() {
+    let project = project("");
+    assert_eq!(ran(&project, &[]), ["scene", "light", "composite"]);
+    let alone = json(&project, "out/light/estimate.json");
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let view = format!("{VIEW}exposure_stops = 0.0\ncamera = {{ heading_deg = 180.0 }}\n");
+    project.write("pipeline.toml", text + &view);
+    assert_eq!(ran(&project, &[]), ["light", "composite"]);
+    assert!(ran(&project, &[]).is_empty());
+    let both = json(&project, "out/light/estimate.json");
+    assert!(both["base"] != alone["base"] && both["posterior"] != alone["posterior"]);
+    assert_eq!(both["heading_rad"], alone["heading_rad"]);
+    // Display values decoded.
+    let shown = WALL.powf(2.2);
+    let seen = behind(&project);
+    assert!(seen.distance(shown) < 0.02, "{seen}");
+    let inputs = json(&project, "out/light/stage.json")["inputs"].clone();
+    let named = |i: &&Value| i["role"] == "view" && i["path"] == "behind.png";
+    assert_eq!(inputs.as_array().unwrap().iter().filter(named).count(), 1);
+    let page = String::from_utf8(project.read("out/report.html")).unwrap();
+    assert!(page.contains("Estimated from 2 photographs"));
+    // Other bytes of it run the light again, and nothing that does not read the light.
+    wall(&project, Vec3::splat(0.3));
+    assert_eq!(ran(&project, &[]), ["light", "composite"]);
+}
+
+#[test]
+fn a_photograph_of_unknown_exposure_tells_directions_alone() {
+    let view = format!("{VIEW}camera = {{ heading_deg = 180.0 }}\n");
+    let project = project(&view);
+    let run = project.run(DIPIR, &["run", "-v"]);
+    run.expect_success();
+    let hint = "scene.views[0].background: nothing tells how it is exposed";
+    assert!(run.stderr.contains(hint), "{}", run.stderr);
+    let unknown = json(&project, "out/light/estimate.json");
+    let seen = behind(&project);
+    assert!(seen.distance(WALL.powf(2.2)) > 0.02, "{seen}");
+    ran(&project, &["-s", "scene.views.0.exposure_stops=3"]);
+    let exposed = json(&project, "out/light/estimate.json");
+    assert_eq!(unknown["posterior"], exposed["posterior"]);
+    assert!(unknown["exposure_stops"] != exposed["exposure_stops"]);
+    // Three stops more than the scene's photograph: an eighth of what it shows.
+    let seen = behind(&project);
+    assert!(seen.distance(WALL.powf(2.2) / 8.0) < 0.01, "{seen}");
+}
+
+#[test]
+fn cameras_that_turn_together_turn_the_light_and_keep_the_estimate() {
+    let light = |turn: i32| {
+        let view = format!("{VIEW}camera = {{ heading_deg = {}.0 }}\n", 120 + turn);
+        let project = project(&view);
+        let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+        let looks = format!("pitch_deg = -11.0\nheading_deg = {turn}.0");
+        let text = text.replace("look_at = [0.0, 0.4, 0.0]", &looks);
+        project.write("pipeline.toml", text);
+        project.run(SCENE, &[]).expect_success();
+        project.run(OPTIMIZE, &[]).expect_success();
+        json(&project, "out/light/estimate.json")
+    };
+    let (here, there) = (light(0), light(90));
+    assert_eq!(here["words"], there["words"]);
+    for key in ["azimuth_deg", "elevation_deg", "exposure_stops", "share"] {
+        for end in ["low", "middle", "high"] {
+            let [a, b] = [&here, &there].map(|e| e[key][end].as_f64().unwrap());
+            assert!((a - b).abs() < 1e-2, "{key}.{end}: {a} {b}");
+        }
+    }
+    let [a, b] = [&here, &there].map(|e| e["heading_rad"].as_f64().unwrap());
+    assert!((b - a - std::f64::consts::FRAC_PI_2).abs() < 1e-5);
+}
+
+#[test]
+fn views_that_cannot_be_used_are_refused_by_their_key() {
+    let view = format!("{VIEW}camera = {{ heading_deg = 180.0 }}\n");
+    let project = project(&view);
+    project.run(SCENE, &[]).expect_success();
+    for (set, code, parts) in [
+        (
+            "scene.views.0.background=gone.png",
+            1,
+            [
+                "cannot use scene.views[0].background = \"gone.png\"",
+                "gone.png",
+            ],
+        ),
+        (
+            "scene.views.0.background=object.obj",
+            1,
+            [
+                "cannot use scene.views[0].background = \"object.obj\"",
+                "PNG",
+            ],
+        ),
+        (
+            "scene.views.0.camera.pitch_deg=100",
+            2,
+            [
+                "scene.views[0].camera.pitch_deg is 100",
+                "degrees from -90 to 90",
+            ],
+        ),
+        (
+            "light.start=neutral",
+            2,
+            [
+                "scene.views",
+                "remove it, or set light.start = \"estimated\"",
+            ],
+        ),
+    ] {
+        let run = project.run(OPTIMIZE, &["-s", set]);
+        assert_eq!(run.code, Some(code), "{set}: {}", run.stderr);
+        for part in parts {
+            assert!(run.stderr.contains(part), "{set}: {}", run.stderr);
+        }
+        assert!(!project.path("out/light").exists(), "{set}");
+    }
+}
