@@ -153,7 +153,11 @@ fn names(value: &toml::Value, name: &str, is_key: &dyn Fn(&str) -> bool, found: 
 #[test]
 fn every_key_of_the_documents_exists() {
     let (table_of_keys, mut count) = (include_str!("../../docs/keys.md"), 0);
-    let is_key = |name: &str| table_of_keys.contains(&format!("\n| `{name}` |"));
+    let is_key = |name: &str| {
+        // A view's camera has the keys of the scene's.
+        let name = name.replace("scene.views.N.camera", "scene.camera");
+        table_of_keys.contains(&format!("\n| `{name}` |"))
+    };
     let check = |text: &str, path: &Path| {
         let value: toml::Value =
             toml::from_str(text).unwrap_or_else(|e| panic!("{}: {e}", path.display()));

@@ -41,7 +41,43 @@ fn a_photograph_without_a_light_asks_no_model_and_records_nothing() {
         assert!(project.path("out/light").join(name).is_file(), "{name}");
     }
     let page = String::from_utf8(project.read("out/report.html")).unwrap();
-    assert!(page.contains("estimated: most light") && !page.contains("Not shown"));
+    assert!(!page.contains("Not shown"));
+    for part in [
+        "Estimated from the photograph: most light from",
+        "degrees high",
+        "to the right of the view",
+        "as bright as the photograph&#39;s mean",
+        "of all light",
+        "--set light.candidate=8",
+    ] {
+        assert!(page.contains(part), "{part}");
+    }
+    // The numbers are those of the file.
+    let estimate: Value = serde_json::from_slice(&project.read("out/light/estimate.json")).unwrap();
+    let end = |key: &str, end: &str| estimate[key][end].as_f64().unwrap();
+    let interval = |key: &str, show: &dyn Fn(f64) -> String| {
+        format!("{} to {}", show(end(key, "low")), show(end(key, "high")))
+    };
+    let degrees = |deg: f64| format!("{deg:.0}°");
+    for text in [
+        interval("azimuth_deg", &degrees),
+        interval("elevation_deg", &degrees),
+        interval("exposure_stops", &|stops| format!("{stops:+.1} stops")),
+        interval("share", &|share| format!("{:.0}%", 100.0 * share)),
+    ] {
+        assert!(page.contains(&text), "{text}");
+    }
+}
+
+#[test]
+fn the_report_says_which_candidate_is_used() {
+    let project = project();
+    let run = project.run(DIPIR, &["run", "-s", "light.candidate=2"]);
+    run.expect_success();
+    let page = String::from_utf8(project.read("out/report.html")).unwrap();
+    assert!(page.contains(">used</td>"));
+    let offers = |n: usize| page.contains(&format!("<code>--set light.candidate={n}</code>"));
+    assert!(offers(1) && !offers(2) && offers(3));
 }
 
 #[test]

@@ -447,6 +447,11 @@ fn what_is_seen_is_where_the_camera_looks() {
         }
     }
     assert!(seen.alpha.iter().any(|a| *a > 0.99));
+    let darker = seen.clone().scaled(0.25);
+    assert!((darker.map.peak().1.max_element() - 0.125).abs() < 1e-5);
+    assert_eq!(darker.alpha, seen.alpha);
+    let brightest = seen.scaled(f32::MAX).scaled(1e9).map.integral();
+    assert!(brightest.is_finite() && brightest.x > 1e38);
 }
 
 #[test]

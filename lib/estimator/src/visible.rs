@@ -77,10 +77,13 @@ impl Visible {
         }
     }
 
-    /// The same part with all radiance times a factor.
+    /// The same part with all radiance times a factor; a smaller one, if it took radiance beyond all numbers.
     pub fn scaled(self, factor: f32) -> Self {
+        let texels = self.map.texels().iter();
+        let brightest = texels.map(|t| t.max_element()).fold(0.0, f32::max);
+        let most = 0.99 * f32::MAX / brightest.max(1.0);
         Self {
-            map: self.map.scaled(factor),
+            map: self.map.scaled(factor.min(most)),
             ..self
         }
     }

@@ -105,5 +105,6 @@ fn between(photo: &Photo, other: &Photo) -> Option<f64> {
     if photo.values.is_none() && other.values.is_none() {
         return Some(0.0);
     }
-    Some(other.facts.exposure_stops? - photo.facts.exposure_stops?)
+    let stops = other.facts.exposure_stops? - photo.facts.exposure_stops?;
+    Some(stops.clamp(-30.0, 30.0))
 }

@@ -15,7 +15,7 @@ pub(crate) struct Quantity {
 }
 
 /// An estimate in a sentence.
-pub(crate) fn in_words(estimate: &LightEstimate) -> String {
+pub(super) fn in_words(estimate: &LightEstimate) -> String {
     let [azimuth, elevation, exposure, share] = quantities(estimate).map(|q| q.words);
     format!(
         "estimated: most light {}; in four of five such photographs it comes from {azimuth}, {elevation}; the mean light \
@@ -45,12 +45,7 @@ pub(crate) fn quantities(estimate: &LightEstimate) -> [Quantity; 4] {
             &degrees,
             sides(azimuth),
         ),
-        quantity(
-            "elevation",
-            elevation,
-            &degrees,
-            format!("{:.0} to {:.0} degrees high", elevation.low, elevation.high),
-        ),
+        quantity("elevation", elevation, &degrees, heights(elevation)),
         quantity(
             "exposure: mean light over the photograph's mean",
             exposure,
@@ -74,6 +69,18 @@ pub(crate) fn quantities(estimate: &LightEstimate) -> [Quantity; 4] {
     ]
 }
 
+/// The elevations of an interval.
+fn heights(i: &Interval) -> String {
+    // Without the sign of a zero.
+    let (low, high) = (i.low.round() + 0.0, i.high.round() + 0.0);
+    let below = |deg: f64| format!("{} degrees below the horizon", -deg);
+    match (low < 0.0, high < 0.0) {
+        (true, true) => format!("{} to {}", -low, below(high)),
+        (true, false) => format!("{} to {high} degrees high", below(low)),
+        (false, _) => format!("{low} to {high} degrees high"),
+    }
+}
+
 /// The sides of an arc.
 fn sides(arc: &Interval) -> String {
     let (low, middle, high) = (side(arc.low), side(arc.middle), side(arc.high));
@@ -93,6 +100,17 @@ fn sides(arc: &Interval) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn heights_below_the_horizon_are_said_to_be() {
+        for (low, high, wanted) in [
+            (11.2, 70.6, "11 to 71 degrees high"),
+            (-7.8, 34.0, "8 degrees below the horizon to 34 degrees high"),
+            (-20.0, -5.0, "20 to 5 degrees below the horizon"),
+        ] {
+            assert_eq!(heights(&Interval::new(low, low, high)), wanted);
+        }
+    }
 
     #[test]
     fn arcs_are_said_by_their_sides() {

@@ -22,7 +22,7 @@ use super::picture::{figure, image};
 use super::{Report, Section, direction, json, outputs};
 use crate::composite::table::CompositeTable;
 use crate::known_light;
-use crate::light::{in_words, quantities};
+use crate::light::quantities;
 use crate::names::LIGHT;
 use crate::preview::environment;
 use crate::scene::unnumbered;
@@ -63,10 +63,13 @@ pub fn section(report: &Report) -> Section {
         true => Some(json(&run, "estimate")?),
         false => None,
     };
-    let towards = estimated.as_ref().map_or_else(
-        || own.first().map(|(lobe, _)| lobe.direction),
-        |e| Some(e.mode()),
-    );
+    // The source of a candidate, or one that is known, else the estimate's most probable direction.
+    let source = own.first().map(|(lobe, _)| lobe.direction);
+    let towards = match &estimated {
+        Some(e) if !has("surroundings") => Some(e.mode()),
+        Some(e) => source.or(Some(e.mode())),
+        None => source,
+    };
     let mut parts = vec![];
     if let Some(towards) = towards {
         parts.extend(direction::figure(
@@ -110,16 +113,18 @@ pub fn section(report: &Report) -> Section {
 
 /// What was estimated from the photograph, with how sure it is, and the lights to choose among.
 fn estimate(run: &(PathBuf, Manifest), estimate: &LightEstimate) -> anyhow::Result<Html> {
-    let mut parts = vec![Html::of("p", in_words(estimate))];
     let is_view = |input: &&Artifact| unnumbered(&input.role) == "view";
-    let views = run.1.inputs.iter().filter(is_view).count();
-    if views > 0 {
-        let count = views + 1;
-        parts.push(Html::of(
-            "p",
-            format!("Estimated from {count} photographs of the place."),
-        ));
-    }
+    let photographs = match run.1.inputs.iter().filter(is_view).count() {
+        0 => "the photograph".to_string(),
+        others => format!("{} photographs of the place", others + 1),
+    };
+    let sentence = format!(
+        "Estimated from {photographs}: most light {}; a sun with a probability of {:.0}%. In four of five photographs the \
+         truth lies in these intervals:",
+        estimate.words,
+        100.0 * estimate.sun_probability
+    );
+    let mut parts = vec![Html::of("p", sentence)];
     let rows = quantities(estimate).map(|q| {
         let cells = [q.middle, q.interval, q.words].map(Html::text);
         std::iter::once(Html::text(q.name)).chain(cells).collect()
@@ -131,6 +136,12 @@ fn estimate(run: &(PathBuf, Manifest), estimate: &LightEstimate) -> anyhow::Resu
         "the interval in words",
     ];
     parts.push(table(&heads, rows.into()));
+    let how = [
+        Html::text("Lights that are possible; "),
+        Html::of("code", "dipir run"),
+        Html::text(" with an option of these uses one:"),
+    ];
+    parts.push(Html::element("p", &[], how));
     let candidates: Vec<Value> = json(run, "candidates")?;
     let used = run.1.params["estimate"]["candidate"].as_u64();
     let rows = candidates.iter().map(|c| {
@@ -151,7 +162,8 @@ fn estimate(run: &(PathBuf, Manifest), estimate: &LightEstimate) -> anyhow::Resu
     for (_, path) in outputs(run, "candidates_sheet") {
         let shown = Transfer::Srgb.encode(&read_photo(path, Transfer::Srgb)?.image);
         let caption = "The candidates by number, row by row; bars are their probabilities";
-        parts.push(figure(&shown, SHEET, caption)?);
+        let sheet = [figure(&shown, SHEET, caption)?];
+        parts.push(Html::element("div", &[("class", "sheet")], sheet));
     }
     Ok(Html::all(parts))
 }
