@@ -8,10 +8,11 @@ use safetensors::tensor::SafeTensors;
 use crate::error::CalibrationError;
 use crate::lines::{Agreement, Lines};
 use crate::look::Look;
-use crate::network::{self, Network};
+use crate::network::{self, Member};
 use crate::pose::{Pose, fov_deg, log_focal};
 use crate::posterior::{Axis, Interval, Posterior};
 use crate::segments::segments;
+use crate::whole::{BLUR, Table, Whole};
 
 /// What is searched, and what networks learn from: pitch, roll and the angle along the longer side, degrees.
 pub const SEARCHED: [[f64; 2]; 3] = [[-50.0, 30.0], [-8.0, 8.0], [24.0, 100.0]];
@@ -42,19 +43,27 @@ pub struct Evidence {
     pub lines: Lines,
     /// Edges, brightness and tint.
     pub look: Look,
+    /// The picture as a whole.
+    pub whole: Whole,
 }
 
 impl Evidence {
     /// Of a photograph of any size.
     pub fn new(image: &LinearImage) -> Self {
+        Self::blurred(image, BLUR)
+    }
+
+    /// With another blur of the whole than photographs get.
+    pub fn blurred(image: &LinearImage, blur: usize) -> Self {
         let size = [image.0.width(), image.0.height()];
         Self {
             lines: Lines::new(&segments(image), size),
             look: Look::new(image),
+            whole: Whole::new(image, blur),
         }
     }
 
-    /// What networks are told of a camera.
+    /// What lines and look tell of a camera.
     pub fn features(&self, pose: &Pose) -> Vec<f32> {
         self.look.features(&self.lines, pose)
     }
@@ -75,11 +84,11 @@ pub struct CameraEstimate {
     pub agreeing: Agreement,
 }
 
-/// Networks and how far they are trusted.
+/// Networks, and how far they are trusted.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraEstimator {
     /// Their scores are averaged.
-    pub members: Vec<Network>,
+    pub members: Vec<Member>,
     /// Power of their density.
     pub trust: f64,
 }
@@ -138,7 +147,15 @@ impl CameraEstimator {
 
     /// Scores on a grid around where the camera is.
     pub fn grid(&self, evidence: &Evidence, known: Option<KnownFocal>) -> Scores {
-        let mut scores = self.on_grid(evidence, known, coarse(known));
+        // One shade looks alike under all cameras.
+        let members: Vec<(&Member, Table)> = match evidence.look.is_blank() {
+            true => Vec::new(),
+            false => {
+                let with_table = |m| (m, Member::table(m, &evidence.whole));
+                self.members.iter().map(with_table).collect()
+            }
+        };
+        let mut scores = on_grid(&members, evidence, known, coarse(known));
         for _ in 0..ROUNDS {
             let mut fine = FINE;
             fine[2] = if known.is_some() { KNOWN } else { FINE[2] };
@@ -148,43 +165,45 @@ impl CameraEstimator {
                 let [low, high] = [scores.axes[k].low, scores.axes[k].last()];
                 Axis::between(closer[k].low.max(low), closer[k].last().min(high), fine[k])
             });
-            scores = self.on_grid(evidence, known, axes);
+            scores = on_grid(&members, evidence, known, axes);
         }
         scores
     }
+}
 
-    fn on_grid(&self, evidence: &Evidence, known: Option<KnownFocal>, axes: [Axis; 3]) -> Scores {
-        let [pitches, rolls, focals] = axes;
-        // One shade looks alike under all cameras.
-        let members = match evidence.look.is_blank() {
-            true => &[],
-            false => &self.members[..],
+fn on_grid(
+    members: &[(&Member, Table)],
+    evidence: &Evidence,
+    known: Option<KnownFocal>,
+    axes: [Axis; 3],
+) -> Scores {
+    let [pitches, rolls, focals] = axes;
+    let of = |k: usize| {
+        let pose = Pose {
+            pitch_deg: pitches.value(k / focals.count / rolls.count),
+            roll_deg: rolls.value(k / focals.count % rolls.count),
+            log_focal: focals.value(k % focals.count),
         };
-        let of = |k: usize| {
-            let pose = Pose {
-                pitch_deg: pitches.value(k / focals.count / rolls.count),
-                roll_deg: rolls.value(k / focals.count % rolls.count),
-                log_focal: focals.value(k % focals.count),
-            };
-            let before = match known {
-                Some(known) => {
-                    let off = (pose.log_focal - known.relative.ln()) / known.sigma;
-                    -0.5 * off * off
-                }
-                // All angles of view are alike: the density of the focal length's logarithm.
-                None => fov_deg(pose.log_focal).to_radians().sin().ln(),
-            };
-            if members.is_empty() {
-                return [0.0, before];
+        let before = match known {
+            Some(known) => {
+                let off = (pose.log_focal - known.relative.ln()) / known.sigma;
+                -0.5 * off * off
             }
-            let features = evidence.features(&pose);
-            let scores = members.iter().map(|m| m.score(&features));
-            [scores.sum::<f64>() / members.len() as f64, before]
+            // All angles of view are alike: the density of the focal length's logarithm.
+            None => fov_deg(pose.log_focal).to_radians().sin().ln(),
         };
-        let count = pitches.count * rolls.count * focals.count;
-        let logs = (0..count).into_par_iter().map(of).collect();
-        Scores { axes, logs }
-    }
+        if members.is_empty() {
+            return [0.0, before];
+        }
+        let features = evidence.features(&pose);
+        let scores = members
+            .iter()
+            .map(|(m, table)| m.score(&features, table.told(&pose)));
+        [scores.sum::<f64>() / members.len() as f64, before]
+    };
+    let count = pitches.count * rolls.count * focals.count;
+    let logs = (0..count).into_par_iter().map(of).collect();
+    Scores { axes, logs }
 }
 
 /// The first grid.

@@ -1,13 +1,14 @@
-use glam::{DVec2, DVec3};
+use dipir_imaging::raster::{LinearImage, Raster};
+use glam::{DVec2, DVec3, Vec3};
 use proptest::prelude::*;
 
 use crate::generated::{Built, picture};
 use crate::lines::Lines;
-use crate::look::FEATURES;
-use crate::network::Network;
+use crate::network::{Member, Network, SCORED};
 use crate::pose::{Pose, fov_deg, log_focal};
 use crate::posterior::{Axis, Posterior};
 use crate::segments::Segment;
+use crate::whole::{FOCALS, PITCHES, WHOLE};
 use crate::{CameraEstimator, Evidence, KnownFocal};
 
 /// An estimator that knows nothing of pictures.
@@ -160,29 +161,118 @@ fn quantiles_are_those_of_an_even_and_of_a_pointed_distribution() {
     assert!((pointed.marginal(0)[1] - 1.0).abs() < 1e-9);
 }
 
+/// A network of so many inputs, hidden units and outputs.
+fn network(inputs: usize, hidden: usize, outputs: usize) -> Network {
+    let wave = |n: usize, scale: f32| (0..n).map(|k| scale * (k as f32).sin()).collect();
+    Network {
+        mean: wave(inputs, 0.3),
+        deviation: vec![2.0; inputs],
+        layers: [
+            wave(inputs * hidden, 0.7),
+            wave(hidden, 0.2),
+            wave(hidden * hidden, 0.9),
+            wave(hidden, 0.4),
+            wave(hidden * outputs, 0.8),
+            wave(outputs, 0.5),
+        ],
+    }
+}
+
+#[test]
+fn networks_say_what_their_layers_say_one_by_one() {
+    let (inputs, hidden, outputs) = (3, 4, 2);
+    let network = network(inputs, hidden, outputs);
+    let x = [0.5, -1.5, 40.0];
+    let [a, b, c, d, e, f] = network.layers.each_ref().map(|l| {
+        let all = l.iter().map(|v| f64::from(*v));
+        all.collect::<Vec<f64>>()
+    });
+    let silu = |v: f64| v / (1.0 + (-v).exp());
+    let dot = |x: &[f64], w: &[f64], n: usize, k: usize, bias: f64| -> f64 {
+        bias + x
+            .iter()
+            .enumerate()
+            .map(|(i, x)| x * w[i * n + k])
+            .sum::<f64>()
+    };
+    // The third is cut off at 5 deviations.
+    let mean = |k: usize| f64::from(network.mean[k]);
+    let x64: Vec<f64> = vec![(0.5 - mean(0)) / 2.0, (-1.5 - mean(1)) / 2.0, 5.0];
+    let h: Vec<f64> = (0..hidden)
+        .map(|k| silu(dot(&x64, &a, hidden, k, b[k])))
+        .collect();
+    let h: Vec<f64> = (0..hidden)
+        .map(|k| h[k] + silu(dot(&h, &c, hidden, k, d[k])))
+        .collect();
+    for (k, found) in network.outputs(&x).into_iter().enumerate() {
+        let wanted = dot(&h, &e, outputs, k, f[k]);
+        assert!((f64::from(found) - wanted).abs() < 1e-5, "{found} {wanted}");
+    }
+}
+
+#[test]
+fn a_picture_of_one_shade_tells_nothing() {
+    let image = LinearImage(Raster::filled(90, 60, Vec3::splat(0.3)));
+    let estimator = CameraEstimator::embedded().unwrap();
+    let known = KnownFocal {
+        relative: 1.0,
+        sigma: 0.02,
+    };
+    for known in [None, Some(known)] {
+        assert_eq!(
+            estimator.estimate(&image, known),
+            CameraEstimator {
+                trust: estimator.trust,
+                ..ignorant()
+            }
+            .estimate(&image, known)
+        );
+    }
+}
+
+#[test]
+fn a_mirrored_photograph_is_rolled_the_other_way() {
+    let pose = Pose::new(-9.0, 3.0, 65.0);
+    let image = picture(Built::Room, 4, &pose, [320, 240]);
+    let turned = |k: usize| *image.0.get(319 - k % 320, k / 320);
+    let turned = LinearImage(Raster::from_pixels(
+        320,
+        240,
+        (0..320 * 240).map(turned).collect(),
+    ));
+    let estimator = CameraEstimator::embedded().unwrap();
+    let [a, b] = [&image, &turned].map(|i| estimator.estimate(i, None));
+    assert!((a.roll_deg.middle + b.roll_deg.middle).abs() < 0.3);
+    assert!((a.roll_deg.middle - 3.0).abs() < 1.0, "{:?}", a.roll_deg);
+    assert!((a.pitch_deg.middle - b.pitch_deg.middle).abs() < 0.5);
+}
+
 #[test]
 fn weights_survive_their_file_and_others_are_refused_by_name() {
-    let zero = |hidden: usize| Network {
-        mean: vec![0.0; FEATURES],
-        deviation: vec![1.0; FEATURES],
-        layers: [
-            vec![0.01; FEATURES * hidden],
-            vec![0.0; hidden],
-            vec![0.02; hidden * hidden],
-            vec![0.0; hidden],
-            vec![0.03; hidden],
-            vec![0.5; 1],
-        ],
+    let member = |hidden: usize| Member {
+        whole: network(WHOLE, hidden, PITCHES * FOCALS),
+        scorer: network(SCORED, hidden + 1, 1),
     };
     let estimator = CameraEstimator {
-        members: vec![zero(3), zero(2)],
+        members: vec![member(3), member(2)],
         trust: 0.7,
     };
     let bytes = estimator.to_bytes().unwrap();
     assert_eq!(CameraEstimator::from_bytes(&bytes).unwrap(), estimator);
     let error = CameraEstimator::from_bytes(&ignorant().to_bytes().unwrap()).unwrap_err();
     assert!(
-        error.to_string().contains("`member.0.mean` is missing"),
+        error
+            .to_string()
+            .contains("`member.0.whole.mean` is missing"),
+        "{error}"
+    );
+    let mut other = estimator;
+    other.members[1].whole = network(WHOLE, 3, 7);
+    let error = CameraEstimator::from_bytes(&other.to_bytes().unwrap()).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .contains("`member.1.whole.output.weight` has another size"),
         "{error}"
     );
     let error = CameraEstimator::from_bytes(&bytes[..100]).unwrap_err();

@@ -1,6 +1,7 @@
 //! Trains the networks that score a photograph's camera, and prints how well it is told of places left out:
 //! `cargo run -p dipir-places --example camera -- PANORAMAS OUT [key=value]...` with the keys folds, views, learned,
-//! judged, built, seed, hidden, epochs, batch, dropout, features, decay, rate.
+//! judged, built, seed; and hidden, epochs, batch, dropout, features, decay, rate of the networks that score, with
+//! `whole.` before them of those that see pictures as a whole.
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -14,7 +15,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut settings = Settings::new(PathBuf::from(panoramas), PathBuf::from(out));
     for argument in arguments {
         let (key, value) = argument.split_once('=').ok_or("arguments are key=value")?;
-        let training = &mut settings.training;
+        let (training, key) = match key.strip_prefix("whole.") {
+            Some(key) => (&mut settings.wholes, key),
+            None => (&mut settings.scorers, key),
+        };
         match key {
             "folds" => settings.folds = value.parse()?,
             "views" => settings.views = value.parse()?,
@@ -47,5 +51,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         table(&outcome.rows)
     );
     println!("generated\n{}", table(&outcome.built));
+    println!(
+        "panoramas of half the resolution: field of view times {:.3}",
+        outcome.blurred
+    );
     Ok(())
 }

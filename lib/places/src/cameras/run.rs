@@ -3,15 +3,16 @@ use std::path::PathBuf;
 
 use dipir_calibration::generated::{Built, picture};
 use dipir_calibration::look::FEATURES;
-use dipir_calibration::network::Network;
+use dipir_calibration::network::{Member, Network};
 use dipir_calibration::pose::{Pose, fov_deg, log_focal};
+use dipir_calibration::whole::MOST_BLUR;
 use dipir_calibration::{CameraEstimator, Evidence, KnownFocal, SEARCHED, Scores};
 use dipir_imaging::raster::LinearImage;
 use dipir_numerics::hashing::hash_u64s;
 use rayon::prelude::*;
 
 use crate::cameras::figures::{Case, Row};
-use crate::cameras::trainer::{Sample, train};
+use crate::cameras::trainer::{Sample, train, train_whole};
 use crate::error::PlacesError;
 use crate::network::SplitMix64;
 use crate::place::{Place, folds, read_places};
@@ -52,8 +53,10 @@ pub struct Settings {
     pub built: usize,
     /// Seed of photographs and networks.
     pub seed: u64,
-    /// Of the networks.
-    pub training: Training,
+    /// Of the networks that score cameras.
+    pub scorers: Training,
+    /// Of the networks that see pictures as a whole.
+    pub wholes: Training,
     /// One deviation of a known focal length, relative.
     pub focal_sigma: f64,
 }
@@ -70,7 +73,8 @@ impl Settings {
             judged: 5,
             built: 32,
             seed: 1,
-            training: Training::default(),
+            scorers: Training::of_scorers(),
+            wholes: Training::of_wholes(),
             focal_sigma: 0.02,
         }
     }
@@ -83,7 +87,9 @@ pub enum Progress {
     Places(usize),
     /// Photographs were drawn.
     Photographs(usize),
-    /// A network is being trained: its fold, the share that is done, the mean loss of late.
+    /// Networks see pictures as a whole.
+    Wholes(usize),
+    /// A network that scores is being trained: its fold, the share that is done, the mean loss of late.
     Training(usize, f64, f64),
     /// Photographs were judged.
     Judged(usize),
@@ -100,6 +106,8 @@ pub struct Outcome {
     pub rows: Vec<Row>,
     /// Figures of generated streets and rooms.
     pub built: Vec<Row>,
+    /// By which factor half of the panoramas' resolution changes the field of view, in the median.
+    pub blurred: f64,
 }
 
 /// A photograph that is judged.
@@ -122,11 +130,12 @@ pub fn run(
     progress(Progress::Places(places.len()));
     let fold = folds(&places, settings.folds);
     let trained = networks(&places, &fold, settings, progress);
-    let judged = judged(&places, settings);
-    let scores = scores(&trained, &judged, &fold, settings);
-    progress(Progress::Judged(judged.len()));
-    let (by_fold, trust) = chosen(&scores, &judged, &fold, settings, progress);
-    let rows = rows(&scores, &by_fold, &judged, &places, &fold);
+    let photographs = judged(&places, settings);
+    let scores = scores(&trained, &photographs, &fold, settings);
+    progress(Progress::Judged(photographs.len()));
+    let (by_fold, trust) = chosen(&scores, &photographs, &fold, settings, progress);
+    let rows = rows(&scores, &by_fold, &photographs, &places, &fold);
+    let blurred = blurred(&trained, &scores, &by_fold, &places, &fold, settings);
     let whole = CameraEstimator {
         members: trained,
         trust,
@@ -141,42 +150,63 @@ pub fn run(
         trust,
         rows,
         built: built_rows(&whole, settings),
+        blurred,
     })
 }
 
-/// One network for each fold, which it leaves out.
+/// Two networks for each fold, which they leave out.
 fn networks(
     places: &[Place],
     fold: &[usize],
     settings: &Settings,
     progress: &(dyn Fn(Progress) + Sync),
-) -> Vec<Network> {
-    let count = settings.views;
+) -> Vec<Member> {
+    let (count, folds) = (settings.views, settings.folds);
     let of_place = |k: usize| {
         let (place, pose, image) = taken(places, &LEARNED, settings.seed, k, count);
         let seed = hash_u64s(&[settings.seed, 1, k as u64]);
-        (Some(place), sample(&pose, &image, seed))
+        (fold[place], sample(&pose, &image, seed))
     };
     let generated = |n: usize| {
         let (pose, image) = built(&LEARNED, settings.seed, n, [320, 256]);
         let seed = hash_u64s(&[settings.seed, 2, n as u64]);
-        (None, sample(&pose, &image, seed))
+        (n / 2 % folds, sample(&pose, &image, seed))
     };
     let of_places = (0..places.len() * count).into_par_iter().map(of_place);
     let generated = (0..settings.learned).into_par_iter().map(generated);
-    let samples: Vec<(Option<usize>, Sample)> = of_places.chain(generated).collect();
+    let samples: Vec<(usize, Sample)> = of_places.chain(generated).collect();
     progress(Progress::Photographs(samples.len()));
-    let network = |left_out: usize| {
-        let learned = samples
-            .iter()
-            .filter(|s| s.0.is_none_or(|p| fold[p] != left_out));
+    // The networks that score learn from what networks say that did not see the photographs either.
+    let pairs: Vec<[usize; 2]> = (0..folds)
+        .flat_map(|a| (a..folds).map(move |b| [a, b]))
+        .collect();
+    let whole = |without: &[usize; 2]| {
+        let learned = samples.iter().filter(|s| !without.contains(&s.0));
         let learned: Vec<&Sample> = learned.map(|s| &s.1).collect();
-        let seed = settings.seed + left_out as u64;
-        train(&learned, &settings.training, seed, &mut |done, loss| {
-            progress(Progress::Training(left_out, done, loss));
-        })
+        let seed = settings.seed + 1000 + (without[0] * folds + without[1]) as u64;
+        train_whole(&learned, &settings.wholes, seed)
     };
-    (0..settings.folds).into_par_iter().map(network).collect()
+    let wholes: Vec<Network> = pairs.par_iter().map(whole).collect();
+    progress(Progress::Wholes(wholes.len()));
+    let without = |a: usize, b: usize| {
+        let pair = [a.min(b), a.max(b)];
+        let at = pairs.iter().position(|p| *p == pair);
+        &wholes[at.expect("all pairs are there")]
+    };
+    let member = |left_out: usize| {
+        let learned = samples.iter().filter(|s| s.0 != left_out);
+        let learned = learned.map(|s| (&s.1, s.1.told(without(left_out, s.0))));
+        let learned: Vec<(&Sample, Vec<f32>)> = learned.collect();
+        let seed = settings.seed + left_out as u64;
+        let scorer = train(&learned, &settings.scorers, seed, &mut |done, loss| {
+            progress(Progress::Training(left_out, done, loss));
+        });
+        Member {
+            whole: without(left_out, left_out).clone(),
+            scorer,
+        }
+    };
+    (0..folds).into_par_iter().map(member).collect()
 }
 
 fn taken(
@@ -245,9 +275,11 @@ fn limits(pose: &Pose, side: Option<f64>) -> [[f64; 2]; 3] {
 
 /// A photograph under its own and other cameras.
 fn sample(pose: &Pose, image: &LinearImage, seed: u64) -> Sample {
-    let evidence = Evidence::new(image);
     let mut random = SplitMix64::new(seed);
+    let blur = (random.unit() * (MOST_BLUR + 1) as f32) as usize;
+    let evidence = Evidence::blurred(image, blur.min(MOST_BLUR));
     let mut features = evidence.features(pose);
+    let mut poses = vec![*pose];
     let sides: Vec<Option<f64>> = BOXES.iter().map(|b| Some(*b)).chain([None]).collect();
     let sets = [false, true].map(|any_focal| {
         let own = limits(pose, Some(OWN_BOX));
@@ -258,12 +290,15 @@ fn sample(pose: &Pose, image: &LinearImage, seed: u64) -> Sample {
         for side in sides.iter().flat_map(|s| [*s; DRAWN]) {
             let (other, share) = drawn(pose, any_focal, side, &mut random);
             features.extend(evidence.features(&other));
+            poses.push(other);
             shares.push(share);
         }
         (shares, own)
     });
     debug_assert!(features.len().is_multiple_of(FEATURES));
     Sample {
+        whole: evidence.whole,
+        poses,
         features,
         own: [sets[0].1, sets[1].1],
         shares: sets.map(|s| s.0),
@@ -294,18 +329,23 @@ fn known(pose: &Pose, settings: &Settings, n: usize) -> KnownFocal {
     }
 }
 
-/// By the network that left the place out, with the focal length and without.
+/// The networks that left a fold out.
+fn without(trained: &[Member], fold: usize) -> CameraEstimator {
+    CameraEstimator {
+        members: vec![trained[fold].clone()],
+        trust: 1.0,
+    }
+}
+
+/// By the networks that left the place out, with the focal length and without.
 fn scores(
-    trained: &[Network],
+    trained: &[Member],
     judged: &[Judged],
     fold: &[usize],
     settings: &Settings,
 ) -> Vec<[Scores; 2]> {
     let both = |(n, j): (usize, &Judged)| {
-        let estimator = CameraEstimator {
-            members: vec![trained[fold[j.place]].clone()],
-            trust: 1.0,
-        };
+        let estimator = without(trained, fold[j.place]);
         [Some(known(&j.pose, settings, n)), None].map(|k| estimator.grid(&j.evidence, k))
     };
     judged.par_iter().enumerate().map(both).collect()
@@ -407,4 +447,34 @@ fn built_rows(estimator: &CameraEstimator, settings: &Settings) -> Vec<Row> {
         }
     }
     rows
+}
+
+/// By which factor the field of view of places left out changes, in the median, if their panoramas have half of the
+/// resolution: 1 if sharpness tells nothing.
+fn blurred(
+    trained: &[Member],
+    scores: &[[Scores; 2]],
+    by_fold: &[f64],
+    places: &[Place],
+    fold: &[usize],
+    settings: &Settings,
+) -> f64 {
+    let halved = |p: &Place| {
+        let [width, height] = [p.panorama.width(), p.panorama.height()].map(|n| n / 2);
+        Place {
+            panorama: p.panorama.resampled(width, height),
+            ..p.clone()
+        }
+    };
+    let halved: Vec<Place> = places.iter().map(halved).collect();
+    let factor = |(j, scores): (&Judged, &[Scores; 2])| {
+        let fold = fold[j.place];
+        let again = without(trained, fold).grid(&j.evidence, None);
+        let middle = |s: &Scores| s.posterior(by_fold[fold]).fov_deg().middle;
+        middle(&again) / middle(&scores[1])
+    };
+    let judged = judged(&halved, settings);
+    let mut all: Vec<f64> = judged.par_iter().zip(scores).map(factor).collect();
+    all.sort_by(f64::total_cmp);
+    all.get(all.len() / 2).copied().unwrap_or(f64::NAN)
 }

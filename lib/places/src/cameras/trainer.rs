@@ -1,6 +1,8 @@
-//! Training one network that scores cameras.
+//! Training the networks that tell cameras.
 use dipir_calibration::look::FEATURES;
-use dipir_calibration::network::Network;
+use dipir_calibration::network::{Network, SCORED};
+use dipir_calibration::pose::Pose;
+use dipir_calibration::whole::{FOCALS, PITCHES, TOLD, Table, WHOLE, Whole, shares};
 
 use crate::network::{Dropout, Optimiser, SplitMix64, Weights, backward, forward};
 
@@ -23,8 +25,9 @@ pub struct Training {
     pub feature_dropout: f32,
 }
 
-impl Default for Training {
-    fn default() -> Self {
+impl Training {
+    /// Of the networks that score cameras.
+    pub fn of_scorers() -> Self {
         Self {
             hidden: 64,
             epochs: 12,
@@ -35,11 +38,28 @@ impl Default for Training {
             feature_dropout: 0.15,
         }
     }
+
+    /// Of the networks that see pictures as a whole.
+    pub fn of_wholes() -> Self {
+        Self {
+            hidden: 64,
+            epochs: 12,
+            batch: 64,
+            learning_rate: 2e-3,
+            weight_decay: 1.0,
+            dropout: 0.2,
+            feature_dropout: 0.5,
+        }
+    }
 }
 
 /// A photograph under its own camera and under others.
 pub(crate) struct Sample {
-    /// [`FEATURES`] of each camera, the true one first.
+    /// As a whole.
+    pub whole: Whole,
+    /// The true camera and the others.
+    pub poses: Vec<Pose>,
+    /// [`FEATURES`] of each camera.
     pub features: Vec<f32>,
     /// Logarithms of the share of all cameras that each other one stands for, in two sets: with the true focal length,
     /// and with any.
@@ -48,72 +68,152 @@ pub(crate) struct Sample {
     pub own: [f32; 2],
 }
 
-/// Trains a network from nothing by the probability of the true camera. `progress` is told the share that is done and
-/// the mean loss of late.
+impl Sample {
+    /// [`TOLD`] of each camera, by a network that did not learn from the photograph.
+    pub fn told(&self, whole: &Network) -> Vec<f32> {
+        let sides = self.whole.sides.each_ref();
+        let table = Table::mean(&sides.map(|side| whole.outputs(side)));
+        self.poses.iter().flat_map(|p| table.told(p)).collect()
+    }
+}
+
+/// Trains a network from nothing to tell how probable the true camera is from pictures as a whole, as they are and
+/// mirrored.
+pub(crate) fn train_whole(samples: &[&Sample], settings: &Training, seed: u64) -> Network {
+    let sides: Vec<(&[f32], &Pose)> = samples
+        .iter()
+        .flat_map(|s| s.whole.sides.iter().map(|side| (&side[..], &s.poses[0])))
+        .collect();
+    let rows = sides.iter().map(|s| s.0.to_vec());
+    let mut network = start(rows, [WHOLE, settings.hidden, PITCHES * FOCALS], seed);
+    let mut features = vec![settings.feature_dropout; WHOLE];
+    // The shape is always known.
+    features[WHOLE - 1] = 0.0;
+    let dropout = Dropout {
+        hidden: settings.dropout,
+        features,
+    };
+    let step = |w: &Weights, batch: &[usize], random: &mut SplitMix64| {
+        let rows = batch.iter().map(|k| network.standardised(sides[*k].0));
+        let pass = forward(w, rows.collect::<Vec<_>>().concat(), &dropout, random);
+        let truths: Vec<&Pose> = batch.iter().map(|k| sides[*k].1).collect();
+        let (loss, gradient) = unlikelihood(&pass.outputs, &truths);
+        (loss, backward(w, &pass, &gradient))
+    };
+    let start = network.layers.clone();
+    network.layers = descend(start, sides.len(), settings, seed, step, &mut |_, _| ());
+    network
+}
+
+/// Trains a network from nothing by the probability of the true camera, from photographs and what is told of them as a
+/// whole. `progress` is told the share that is done and the mean loss of late.
 pub(crate) fn train(
-    samples: &[&Sample],
+    samples: &[(&Sample, Vec<f32>)],
     settings: &Training,
     seed: u64,
     progress: &mut dyn FnMut(f64, f64),
 ) -> Network {
-    let mut network = start(samples, settings.hidden, seed);
-    let mut w: Weights = network.layers.clone();
-    let mut optimiser = Optimiser::new(&w);
-    let mut random = SplitMix64::new(seed);
+    let rows = samples.iter().flat_map(rows);
+    let mut network = start(rows, [SCORED, settings.hidden, 1], seed);
     let dropout = Dropout {
         hidden: settings.dropout,
         features: vec![0.0],
     };
-    let batch_size = settings.batch.min(samples.len()).max(1);
-    let total = (settings.epochs * (samples.len() / batch_size)).max(1);
-    let (mut step, mut late) = (0usize, f64::NAN);
+    let step = |w: &Weights, batch: &[usize], random: &mut SplitMix64| {
+        let batch: Vec<&(&Sample, Vec<f32>)> = batch.iter().map(|k| &samples[*k]).collect();
+        let x = inputs(&network, &batch, settings.feature_dropout, random);
+        let pass = forward(w, x, &dropout, random);
+        let told = batch.iter().flat_map(|s| s.1.iter().step_by(TOLD));
+        let scores: Vec<f32> = pass.outputs.iter().zip(told).map(|(s, t)| s + t).collect();
+        let photographs: Vec<&Sample> = batch.iter().map(|s| s.0).collect();
+        let (loss, gradient) = surprise(&scores, &photographs);
+        (loss, backward(w, &pass, &gradient))
+    };
+    let start = network.layers.clone();
+    network.layers = descend(start, samples.len(), settings, seed, step, progress);
+    network
+}
+
+/// Lowers a loss of `count` samples, of which `step` gives loss and gradient for some; returns the mean weights of late.
+fn descend(
+    mut w: Weights,
+    count: usize,
+    settings: &Training,
+    seed: u64,
+    step: impl Fn(&Weights, &[usize], &mut SplitMix64) -> (f64, Weights),
+    progress: &mut dyn FnMut(f64, f64),
+) -> Weights {
+    let mut optimiser = Optimiser::new(&w);
+    let mut random = SplitMix64::new(seed);
+    let batch_size = settings.batch.min(count).max(1);
+    let total = (settings.epochs * (count / batch_size)).max(1);
+    let (mut steps, mut late) = (0usize, f64::NAN);
     for _ in 0..settings.epochs {
-        let mut order: Vec<usize> = (0..samples.len()).collect();
+        let mut order: Vec<usize> = (0..count).collect();
         random.shuffle(&mut order);
         for batch in order.chunks_exact(batch_size) {
-            let batch: Vec<&Sample> = batch.iter().map(|k| samples[*k]).collect();
-            let x = inputs(&network, &batch, settings.feature_dropout, &mut random);
-            let pass = forward(&w, x, &dropout, &mut random);
-            let (loss, gradient) = surprise(&pass.outputs, &batch);
+            let (loss, gradient) = step(&w, batch, &mut random);
             late = match late.is_nan() {
                 true => loss,
                 false => late + 0.02 * (loss - late),
             };
-            let done = step as f32 / total as f32;
-            let warm = ((step + 1) as f32 / 100.0).min(1.0);
+            let done = steps as f32 / total as f32;
+            let warm = ((steps + 1) as f32 / 100.0).min(1.0);
             let rate =
                 settings.learning_rate * warm * (0.5 + 0.5 * (std::f32::consts::PI * done).cos());
-            let gradients = backward(&w, &pass, &gradient);
-            optimiser.step(&mut w, &gradients, rate, settings.weight_decay);
-            step += 1;
-            if step.is_multiple_of(100) {
-                progress(step as f64 / total as f64, late);
+            optimiser.step(&mut w, &gradient, rate, settings.weight_decay);
+            steps += 1;
+            if steps.is_multiple_of(100) {
+                progress(steps as f64 / total as f64, late);
             }
         }
     }
-    network.layers = optimiser.mean;
-    network
+    optimiser.mean
+}
+
+/// What a photograph is scored by under each camera.
+fn rows<'a>((sample, told): &'a (&Sample, Vec<f32>)) -> impl Iterator<Item = Vec<f32>> + 'a {
+    let pairs = sample.features.chunks(FEATURES).zip(told.chunks(TOLD));
+    pairs.map(|(f, t)| [f, t].concat())
 }
 
 /// Standardised features; those that a photograph goes without are at their mean.
 fn inputs(
     network: &Network,
-    batch: &[&Sample],
+    batch: &[&(&Sample, Vec<f32>)],
     left_out: f32,
     random: &mut SplitMix64,
 ) -> Vec<f32> {
     let mut all = Vec::new();
     for sample in batch {
         let kept = (1.0 - left_out).recip();
-        let mask: Vec<f32> = (0..FEATURES)
+        let mask: Vec<f32> = (0..SCORED)
             .map(|_| if random.unit() < left_out { 0.0 } else { kept })
             .collect();
-        for features in sample.features.chunks(FEATURES) {
-            let row = network.standardised(features);
+        for features in rows(sample) {
+            let row = network.standardised(&features);
             all.extend(row.iter().zip(&mask).map(|(x, m)| x * m));
         }
     }
     all
+}
+
+/// The mean of the negative logarithms of the true camera's probability, and its gradient.
+fn unlikelihood(logs: &[f32], truths: &[&Pose]) -> (f64, Vec<f32>) {
+    let share = 1.0 / truths.len() as f32;
+    let mut gradient = Vec::with_capacity(logs.len());
+    let mut loss = 0.0;
+    for (own, truth) in logs.chunks_exact(PITCHES * FOCALS).zip(truths) {
+        let best = own.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let total: f32 = own.iter().map(|l| (l - best).exp()).sum();
+        let from = gradient.len();
+        gradient.extend(own.iter().map(|l| share * (l - best).exp() / total));
+        for (point, part) in shares(truth) {
+            loss += f64::from(share * part * (best + total.ln() - own[point]));
+            gradient[from + point] -= share * part;
+        }
+    }
+    (loss, gradient)
 }
 
 /// The mean of the negative logarithms of the true camera's density over that of all in both sets, and its gradient.
@@ -142,15 +242,19 @@ fn surprise(scores: &[f32], batch: &[&Sample]) -> (f64, Vec<f32>) {
     (loss, gradient)
 }
 
-/// A network that knows the means of features and nothing else.
-fn start(samples: &[&Sample], hidden: usize, seed: u64) -> Network {
-    let mut sums = vec![[0f64; 2]; FEATURES];
+/// A network of so many inputs, hidden units and outputs that knows the means of features and nothing else.
+fn start(
+    rows: impl Iterator<Item = Vec<f32>>,
+    [inputs, hidden, outputs]: [usize; 3],
+    seed: u64,
+) -> Network {
+    let mut sums = vec![[0f64; 2]; inputs];
     let mut count = 0.0;
-    for row in samples.iter().flat_map(|s| s.features.chunks(FEATURES)) {
+    for row in rows {
         count += 1.0;
         for (s, x) in sums.iter_mut().zip(row) {
-            s[0] += f64::from(*x);
-            s[1] += f64::from(*x) * f64::from(*x);
+            s[0] += f64::from(x);
+            s[1] += f64::from(x) * f64::from(x);
         }
     }
     let count = f64::max(count, 1.0);
@@ -168,12 +272,12 @@ fn start(samples: &[&Sample], hidden: usize, seed: u64) -> Network {
         mean: sums.iter().map(|s| (s[0] / count) as f32).collect(),
         deviation: sums.iter().map(spread).collect(),
         layers: [
-            drawn(FEATURES),
+            drawn(inputs),
             vec![0.0; hidden],
             drawn(hidden),
             vec![0.0; hidden],
-            vec![0.0; hidden],
-            vec![0.0; 1],
+            vec![0.0; hidden * outputs],
+            vec![0.0; outputs],
         ],
     }
 }
@@ -191,7 +295,15 @@ mod tests {
             features[k * FEATURES + 3] = 0.3 + wave(k).abs();
         }
         let even = |count: usize| vec![-(count as f32).ln(); count];
+        let pose = Pose::new(f64::from(n as u32 % 7) * 8.0 - 40.0, 0.0, 60.0);
+        // As a whole, one of seven numbers says what the pitch is.
+        let mut side = vec![0.0; WHOLE];
+        side[5 + n % 7] = 1.0;
         Sample {
+            whole: Whole {
+                sides: [side.clone(), side],
+            },
+            poses: vec![pose; count],
             features,
             shares: cameras.map(even),
             own: [-5.0; 2],
@@ -226,14 +338,69 @@ mod tests {
             epochs: 40,
             dropout: 0.0,
             feature_dropout: 0.0,
-            ..Training::default()
+            ..Training::of_scorers()
+        };
+        let nothing = |s: &Sample| vec![0.0; s.poses.len() * TOLD];
+        let all: Vec<(&Sample, Vec<f32>)> = samples.iter().map(|s| (s, nothing(s))).collect();
+        let network = train(&all, &settings, 1, &mut |_, _| ());
+        for s in &all {
+            let scores: Vec<f32> = rows(s).map(|row| network.outputs(&row)[0]).collect();
+            assert!(scores[1..].iter().all(|o| *o < scores[0]), "{scores:?}");
+        }
+    }
+
+    #[test]
+    fn the_gradient_of_the_unlikelihood_is_that_of_finite_differences() {
+        let poses = [Pose::new(-12.3, 1.0, 41.0), Pose::new(20.0, -3.0, 99.0)];
+        let logs: Vec<f32> = (0..2 * PITCHES * FOCALS)
+            .map(|k| (1.3 * k as f32).sin())
+            .collect();
+        let truths = [&poses[0], &poses[1]];
+        let (_, gradient) = unlikelihood(&logs, &truths);
+        let points = poses.iter().enumerate().flat_map(|(n, p)| {
+            let own = shares(p).map(|(k, _)| n * PITCHES * FOCALS + k);
+            own.into_iter().chain([n * 200 + 7])
+        });
+        for k in points {
+            let at = |step: f32| {
+                let mut moved = logs.clone();
+                moved[k] += step;
+                unlikelihood(&moved, &truths).0
+            };
+            // Sums of about 6 in f32: differences over .1 are good to 3e-5.
+            let numeric = (at(0.05) - at(-0.05)) / 0.1;
+            assert!(
+                (numeric - f64::from(gradient[k])).abs() < 1e-4,
+                "{k}: {numeric} {}",
+                gradient[k]
+            );
+        }
+    }
+
+    #[test]
+    fn a_network_learns_the_pitch_of_pictures_as_a_whole() {
+        let samples: Vec<Sample> = (0..70).map(|n| sample(n, [1, 1])).collect();
+        let settings = Training {
+            hidden: 16,
+            epochs: 250,
+            batch: 16,
+            weight_decay: 0.1,
+            dropout: 0.0,
+            feature_dropout: 0.0,
+            ..Training::of_wholes()
         };
         let all: Vec<&Sample> = samples.iter().collect();
-        let network = train(&all, &settings, 1, &mut |_, _| ());
+        let network = train_whole(&all, &settings, 1);
         for s in &samples {
-            let scores = s.features.chunks(FEATURES).map(|f| network.score(f));
-            let scores: Vec<f64> = scores.collect();
-            assert!(scores[1..].iter().all(|o| *o < scores[0]), "{scores:?}");
+            let table = Table::mean(&[network.outputs(&s.whole.sides[0])]);
+            let own = table.told(&s.poses[0])[0];
+            for off in [-8.0, 8.0] {
+                let other = Pose {
+                    pitch_deg: s.poses[0].pitch_deg + off,
+                    ..s.poses[0]
+                };
+                assert!(table.told(&other)[0] < own - 1.0, "{own}");
+            }
         }
     }
 }
