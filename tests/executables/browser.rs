@@ -279,8 +279,8 @@ fn what_is_placed_on_the_page_is_what_the_run_makes() {
         "no picture while the sun turned"
     );
 
-    // A coarse and a fine picture follow; the grid and the frame of the object are hidden.
-    browser.wait(&format!("{} > {}", answered("draft"), drafts + 1));
+    // A fine picture follows; the grid and the frame of the object are hidden.
+    browser.wait("document.getElementById('canvas').dataset.samples === '32'");
     browser.click("#show");
     browser.screenshot("turned.png");
     browser.post("window/rect", &json!({"width": 500, "height": 900}));

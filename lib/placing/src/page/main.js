@@ -106,8 +106,10 @@ const look = api.latest(async (edit) => {
 });
 
 let soon = 0;
+// A coarse picture soon and a fine one after it; `data-samples` of the canvas says which one is shown.
 function render() {
   clearTimeout(soon);
+  delete $("canvas").dataset.samples;
   soon = setTimeout(() => shoot(4), 90);
 }
 
@@ -117,6 +119,7 @@ async function shoot(samples) {
     const found = await api.draft(edit, samples);
     if (found === undefined) return;
     showPicture(found);
+    $("canvas").dataset.samples = samples;
     if (samples < 32) soon = setTimeout(() => shoot(32), 700);
     else await api.relight(edit); // records, so that the sun turns at once
   } catch (error) {
@@ -138,12 +141,18 @@ const relight = api.latest(async (edit) => {
   } catch (error) {
     say(error.message, true);
   }
+  // The last one that was dragged may have broken off the draft that followed.
+  if (!beforeSun && !beforeExposure) render();
 });
+
+let beforeSun = null; // while the sun is dragged: what undo leads to
+let beforeExposure = null;
 
 // Shows another sun or exposure while it is dragged.
 function showLit(keys) {
   history.show({ ...history.now, edit: { ...history.now.edit, ...keys } });
   clearTimeout(soon);
+  delete $("canvas").dataset.samples;
   showLight();
   relight(history.now.edit);
 }
@@ -241,7 +250,6 @@ if (own.length) {
 }
 
 // The sun, by hand: until the pointer is let go it is only shown.
-let beforeSun = null;
 const dial = new Dial($("dial"), (sun, done) => {
   beforeSun ??= history.now;
   showLit({ sun, shadow: null });
@@ -260,7 +268,6 @@ number("height", (v) => {
   const size = history.now.edit.objects[page.chosen].size ?? 1;
   if (v > 0 && now > 0) page.change({ size: (size * v) / now }, true);
 });
-let beforeExposure = null;
 $("exposure").addEventListener("input", (event) => {
   beforeExposure ??= history.now;
   showLit({ exposure_ev: event.target.valueAsNumber });
