@@ -10,6 +10,10 @@ use glam::Vec3;
 use image::{ImageDecoder, codecs::hdr::HdrDecoder};
 use std::{io::Cursor, path::Path};
 
+/// Pixels that a byte of a file can stand for. A run of the usual coding makes 16 of one, the older coding of rows of one
+/// colour some hundred.
+const MOST_PIXELS_A_BYTE: usize = 512;
+
 /// Decodes a file in RGBE. Its `EXPOSURE` and `COLORCORR` say by what the stored values were
 /// multiplied, over all of its lines; they are divided by it [Radiance file formats, "pictures"].
 pub(crate) fn decode(
@@ -28,15 +32,25 @@ pub(crate) fn decode(
     let (width, height) = decoder.dimensions();
     let (width, height) = (width as usize, height as usize);
     limit.check(path, width, height)?;
+    let damaged = |detail| ImagingError::Damaged {
+        path: path.to_owned(),
+        format: Format::Hdr.name(),
+        detail,
+    };
+    if width * height > bytes.len().saturating_mul(MOST_PIXELS_A_BYTE) {
+        let detail = format!(
+            "it declares {width} x {height} pixels and has {} bytes",
+            bytes.len()
+        );
+        return Err(damaged(detail));
+    }
     let header = decoder.metadata();
     let (r, g, b) = header.color_correction.unwrap_or((1.0, 1.0, 1.0));
     let stored_over_light = Vec3::new(r, g, b) * header.exposure.unwrap_or(1.0);
     if !(stored_over_light.min_element() > 0.0 && stored_over_light.is_finite()) {
-        return Err(ImagingError::Damaged {
-            path: path.to_owned(),
-            format: Format::Hdr.name(),
-            detail: format!("its EXPOSURE and COLORCORR are {stored_over_light}, not above 0"),
-        });
+        return Err(damaged(format!(
+            "its EXPOSURE and COLORCORR are {stored_over_light}, not above 0"
+        )));
     }
     let mut samples = vec![[0.0f32; 3]; width * height];
     let bytes = bytemuck::cast_slice_mut(&mut samples);

@@ -131,3 +131,12 @@ proptest! {
         let _ = Layers::read_exr(&path);
     }
 }
+
+#[test]
+fn a_small_hdr_file_of_many_pixels_is_refused_before_memory_is_taken() {
+    let folder = folder();
+    let file = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 91000595\n\x01\x02\x03\x80";
+    let error = words(read_linear(put(&folder, "x.hdr", file)).unwrap_err());
+    let wanted = format!("91000595 x 2 pixels and has {} bytes", file.len());
+    assert!(error.contains(&wanted), "{error}");
+}
