@@ -10,9 +10,9 @@ use glam::Vec3;
 use image::{ImageDecoder, codecs::hdr::HdrDecoder};
 use std::{io::Cursor, path::Path};
 
-/// Pixels that a byte of a file can stand for. A run of the usual coding makes 16 of one, the older coding of rows of one
-/// colour some hundred.
-const MOST_PIXELS_A_BYTE: usize = 512;
+/// Pixels that a byte of a file can stand for. In the older run-length coding a row of one colour takes 12 bytes up to a
+/// length of 65,536: a square of the 16,384 pixels a side that are accepted has 1,366 a byte.
+const MOST_PIXELS_A_BYTE: usize = 2048;
 
 /// Decodes a file in RGBE. Its `EXPOSURE` and `COLORCORR` say by what the stored values were
 /// multiplied, over all of its lines; they are divided by it [Radiance file formats, "pictures"].
