@@ -313,7 +313,8 @@ fn what_is_placed_on_the_page_is_what_the_run_makes() {
         .to_rgb8();
     let [changed, off] = [rmse(&shown, &bare), rmse(&shown, &run)];
     assert!(changed > 6.0, "the page shows hardly an object: {changed}");
-    assert!(off < 0.3 * changed, "{off} of {changed} levels");
+    // .12 was measured: the grain of two drafts, and edges that the page scales. An object elsewhere makes 1 or more.
+    assert!(off < 0.2 * changed, "{off} of {changed} levels");
 }
 
 /// Levels of 255, over the picture at the size of the page's.

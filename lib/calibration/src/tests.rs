@@ -242,9 +242,10 @@ fn a_mirrored_photograph_is_rolled_the_other_way() {
     ));
     let estimator = CameraEstimator::embedded().unwrap();
     let [a, b] = [&image, &turned].map(|i| estimator.estimate(i, None));
-    assert!((a.roll_deg.middle + b.roll_deg.middle).abs() < 0.3);
-    assert!((a.roll_deg.middle - 3.0).abs() < 1.0, "{:?}", a.roll_deg);
-    assert!((a.pitch_deg.middle - b.pitch_deg.middle).abs() < 0.5);
+    // Segments of a mirrored picture differ by rounding: a tenth of the half widths, which are .5 and .9 degrees.
+    assert!((a.roll_deg.middle + b.roll_deg.middle).abs() < 0.05);
+    assert!((a.pitch_deg.middle - b.pitch_deg.middle).abs() < 0.09);
+    assert!(a.roll_deg.holds(3.0), "{:?}", a.roll_deg);
 }
 
 #[test]

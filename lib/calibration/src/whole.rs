@@ -254,7 +254,8 @@ mod tests {
         let close = |a: &[f32], b: &[f32]| {
             assert_eq!(a.len(), WHOLE);
             let off = a.iter().zip(b).map(|(a, b)| (a - b).abs());
-            assert!(off.fold(0.0, f32::max) < 0.02);
+            // Sums in single precision, of numbers up to 17, in another order.
+            assert!(off.fold(0.0, f32::max) < 1e-4);
         };
         let whole = Whole::new(&image, BLUR);
         let mirrored = again(128, 96, &|x, y| [127 - x, y]);
