@@ -26,7 +26,7 @@ pub use estimate::{Interval, LightEstimate};
 pub use estimator::{Calibration, Estimator};
 pub use known::{KnownAngle, KnownSource, KnownSun};
 pub use posterior::PeakPosterior;
-pub use visible::{Visible, merged, overlaid};
+pub use visible::{BORDER_DEG, Visible, merged, overlaid};
 
 /// Raised whenever the same photograph and camera get another estimate.
 pub const VERSION: u32 = 3;

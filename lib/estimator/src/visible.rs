@@ -8,6 +8,8 @@ use glam::{Vec2, Vec3};
 
 use crate::features::CLIPPED;
 
+/// Width of the soft border of a photograph in a map, degrees.
+pub const BORDER_DEG: f32 = 6.0;
 /// Directions along each side of a texel at which the photograph is looked up.
 const SAMPLES: usize = 4;
 /// Columns and rows on which the two parts are compared at their border.

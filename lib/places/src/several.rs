@@ -2,7 +2,10 @@
 use std::f32::consts::TAU;
 use std::path::Path;
 
-use dipir_estimator::{Estimator, ViewEstimate, Visible, combine, overlaid};
+use dipir_estimator::{
+    BORDER_DEG, Estimator, LightEstimate, ViewEstimate, Visible, combine, overlaid,
+};
+use dipir_imaging::raster::LinearImage;
 use dipir_light::luminance::luminance;
 use dipir_numerics::stats::median;
 use dipir_scene::camera::Camera;
@@ -18,8 +21,6 @@ use crate::view::View;
 
 /// Photographs of each place, around the horizon.
 const AROUND: usize = 8;
-/// Width of a photograph's soft border in a map, degrees.
-const BORDER_DEG: f32 = 6.0;
 
 /// Figures over sets of photographs.
 #[derive(Clone, Debug)]
@@ -39,8 +40,8 @@ pub struct Row {
 /// One photograph of a place.
 struct Shot {
     example: Example,
-    estimate: dipir_estimator::LightEstimate,
-    photo: dipir_imaging::raster::LinearImage,
+    estimate: LightEstimate,
+    photo: LinearImage,
     camera: Camera,
     heading: usize,
     gain: f32,

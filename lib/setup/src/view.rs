@@ -395,7 +395,7 @@ mod tests {
             let facts = Facts::of_size([w as u32, h as u32]);
             let view = View::of_photo(&grey(w, h), &facts, &CameraOptions::default()).unwrap();
             let camera = view.camera([w as u32, h as u32]);
-            // The pitch is written to a hundredth of a degree: at a focal length of 900 pixels that is a sixth of a pixel.
+            // The pitch is rounded to a hundredth of a degree: .08 pixels at a focal length of 900 pixels.
             let row = horizon_row(&camera, &view.plane(), 0.5 * w as f64).unwrap();
             assert!((row - 0.4 * h as f64).abs() < 0.2, "{row}");
             let longer = f64::from(camera.focal_px.x) / w.max(h) as f64;

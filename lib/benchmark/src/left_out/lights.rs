@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use dipir_estimator::grid::BASE_TEXELS;
 use dipir_estimator::posterior::soft_bins;
-use dipir_estimator::{LightEstimate, PeakPosterior, Visible, merged};
+use dipir_estimator::{BORDER_DEG, LightEstimate, PeakPosterior, Visible, merged};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::luminance::luminance_f64;
 use dipir_places::examples::Truth;
@@ -19,8 +19,6 @@ use super::scene::DrawnScene;
 const MAP: [usize; 2] = [512, 256];
 /// Columns and rows of maps with a sun: a texel has .35 degrees.
 const SHARP: [usize; 2] = [1024, 512];
-/// Width of the soft border of the photograph in the map, degrees.
-const BORDER_DEG: f32 = 6.0;
 
 /// A light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -75,10 +75,7 @@ impl ViewConfig {
     /// Its camera with what it takes from the scene's.
     fn camera(&self, scene: &SceneConfig, at: &str) -> Result<CameraConfig, Error> {
         let own = self.camera.clone().unwrap_or_default();
-        if own.file.is_some() || own.transforms.is_some() {
-            return Ok(own);
-        }
-        if own.look_at.is_some() {
+        if own.file.is_some() || own.transforms.is_some() || own.look_at.is_some() {
             return Ok(own);
         }
         if own.is_turned() {

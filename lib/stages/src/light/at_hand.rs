@@ -152,8 +152,8 @@ fn start(
     Ok((light, origin))
 }
 
-/// The sources of the estimated light, the rest of it, and what other photographs show of it. Unlike the stage's, without fitting lobes
-/// to the rest, which takes most of its time.
+/// The sources of the estimated light, the rest of it, and what other photographs show of it. No lobes are fitted to
+/// the rest, which takes most of the stage's time.
 fn estimated(
     session: &Session,
     table: &LightTable,

@@ -1,7 +1,7 @@
 //! The contact sheet of the lights that the photograph allows: the object under each, to choose by eye.
 use std::sync::Arc;
 
-use dipir_estimator::{Candidate, Visible, merged};
+use dipir_estimator::{BORDER_DEG, Candidate, Visible, merged};
 use dipir_imaging::composite::composite;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
@@ -14,7 +14,7 @@ use dipir_scene::scene::LoadedScene;
 use glam::Vec3;
 
 use super::estimate::Estimated;
-use super::surroundings::{BORDER_DEG, with_others};
+use super::surroundings::with_others;
 use crate::interruption;
 use crate::scene::transport::Frame;
 

@@ -1,6 +1,6 @@
 //! The light around the place as a map. Where the photograph shows the surroundings, the map shows
 //! them as the photograph does.
-use dipir_estimator::{Visible, merged, overlaid};
+use dipir_estimator::{BORDER_DEG, Visible, merged, overlaid};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::rasterize::rasterize;
@@ -9,8 +9,6 @@ use dipir_scene::scene::LoadedScene;
 /// Columns and rows of the map: texels of .7 degrees, about what a photograph resolves of its own
 /// view when it is reflected by a small object.
 pub(super) const MAP: [usize; 2] = [512, 256];
-/// Width of the soft border of the photograph in the map, degrees.
-pub(super) const BORDER_DEG: f32 = 6.0;
 /// A lobe narrower than this, radians, is traced as a lobe: two texels of the map.
 const NARROW: f32 = 2.0 * std::f32::consts::TAU / MAP[0] as f32;
 

@@ -1,14 +1,14 @@
 //! The other photographs of the place, `[[scene.views]]`.
 use anyhow::Context;
 use dipir_cli::session::Session;
-use dipir_estimator::{Estimator, LightEstimate, ViewEstimate, Visible, combine};
+use dipir_estimator::{BORDER_DEG, Estimator, LightEstimate, ViewEstimate, Visible, combine};
 use dipir_imaging::file::Photo;
 use dipir_pipeline::stage::StagePlan;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::scene::LoadedScene;
 use dipir_scene::views::{View, ViewSettings};
 
-use super::surroundings::{BORDER_DEG, MAP};
+use super::surroundings::MAP;
 use crate::scene::with_place;
 
 /// The key of the list.

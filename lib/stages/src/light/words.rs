@@ -93,7 +93,7 @@ fn sides(arc: &Interval) -> String {
     match (low == middle, high == middle) {
         (true, true) => middle,
         (true, false) | (false, true) => format!("{low} to {high}"),
-        (false, false) => format!("{low} over {middle} to {high}"),
+        (false, false) => format!("{low} to {high}, through {middle}"),
     }
 }
 
@@ -120,10 +120,14 @@ mod tests {
             (
                 -60.0,
                 60.0,
-                "ahead on the left over ahead to ahead on the right",
+                "ahead on the left to ahead on the right, through ahead",
             ),
             // Across the back: 190 degrees are 170 to the left.
-            (100.0, 235.0, "the right over behind to behind on the left"),
+            (
+                100.0,
+                235.0,
+                "the right to behind on the left, through behind",
+            ),
             (-135.0, 135.0, "any side but behind"),
             (-45.0, 225.0, "any side but the left"),
             (-180.0, 180.0, "any side"),
