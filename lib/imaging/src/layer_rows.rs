@@ -5,7 +5,6 @@ use crate::{
     layers::{Layers, Precision, check_name},
     raster::Raster,
 };
-use glam::Vec3;
 use rayon::prelude::*;
 use std::{collections::BTreeMap, path::Path};
 
@@ -98,18 +97,18 @@ impl<'a> LayerRows<'a> {
 
     /// Adds the channels `names`, the components of what `pixel` gives for a pixel's index, row by row from the top
     /// left. Errors as [`insert`](Self::insert).
-    pub fn insert_pixels(
+    pub fn insert_pixels<P: Into<[f32; N]>, const N: usize>(
         &mut self,
-        names: [&str; 3],
+        names: [&str; N],
         precision: Precision,
-        pixel: impl Fn(usize) -> Vec3 + Copy + Sync + 'a,
+        pixel: impl Fn(usize) -> P + Copy + Sync + 'a,
     ) -> Result<(), ImagingError> {
         let width = self.width;
         for (k, name) in names.into_iter().enumerate() {
             check_name(name)?;
             let fill: FillRow<'a> = Box::new(move |y, row| {
                 for (x, sample) in row.iter_mut().enumerate() {
-                    *sample = pixel(y * width + x)[k];
+                    *sample = pixel(y * width + x).into()[k];
                 }
             });
             let channel = RowChannel { precision, fill };

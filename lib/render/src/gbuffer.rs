@@ -4,6 +4,7 @@ use dipir_imaging::layer_rows::LayerRows;
 use dipir_imaging::layers::Precision;
 use dipir_imaging::raster::Raster;
 use dipir_numerics::sampler::{Sampler, Stream};
+use dipir_scene::camera::Ray;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
@@ -15,139 +16,296 @@ use crate::world::World;
 
 /// Geometry and albedo as the camera sees them: 36 bytes a pixel.
 #[derive(Clone, Debug, PartialEq)]
-pub struct GBuffer {
+pub struct GBuffer(pub Raster<Pixel>);
+
+/// What one pixel shows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pixel {
     /// Distance along the optical axis to the nearest surface, object before proxy, metres;
     /// infinite where there is none. Not averaged: edges keep the nearest of their samples.
-    pub depth: Raster<f32>,
+    pub depth: f32,
     /// Unit shading normal of the object, else normal of the proxy, world space; 0 where neither.
-    pub normal: Raster<Vec3>,
+    pub normal: Vec3,
     /// Base colour of the object, linear, not premultiplied; 0 where there is none.
-    pub albedo: Raster<Vec3>,
+    pub albedo: Vec3,
     /// Antialiased coverage of the object.
-    pub object_alpha: Raster<f32>,
+    pub object_alpha: f32,
     /// Antialiased coverage of the proxy, whether the object hides it or not.
-    pub proxy_alpha: Raster<f32>,
+    pub proxy_alpha: f32,
 }
 
-/// Samples per pixel: coverage in steps of a sixteenth. Fewer where rays are slow ([`affordable_share`]).
+/// Samples of a pixel that shows an edge: coverage in steps of a sixteenth. Fewer where rays are slow
+/// ([`affordable_share`]).
 ///
 /// [`affordable_share`]: dipir_scene::bvh::Bvh::affordable_share
 const SAMPLES: u32 = 16;
-/// Samples after which a pixel of the proxy alone is done, if they all hit it or all miss it.
+/// Samples of a pixel that may show the object. It takes the others if these differ among themselves, or from those of
+/// the pixels around it.
 const FIRST_SAMPLES: u32 = 4;
+/// Cosine between normals, and difference of base colours, from which samples differ.
+const SAME_NORMAL: f32 = 0.99;
+const SAME_COLOUR: f32 = 0.02;
+/// Rows that are computed together, and share the corners of their pixels.
+const BAND: usize = 16;
 
-#[derive(Clone, Copy)]
-struct Pixel {
-    depth: f32,
-    normal: Vec3,
-    albedo: Vec3,
-    object: f32,
-    proxy: f32,
+/// What the first samples of a pixel say of the object.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum First {
+    /// None of them meets it.
+    Missed,
+    /// All meet it and are alike.
+    Even,
+    /// All meet it, and normals or colours differ.
+    Uneven,
+    /// Some meet it.
+    Edge,
 }
 
 impl GBuffer {
     /// Of the scene of `renderer`, textures included.
     pub fn new(renderer: &Renderer, seed: u64) -> Result<Self, RenderError> {
         let world = renderer.world(EVERYTHING)?;
-        let [width, height] = world.camera().resolution;
-        let bvh = &world.geometry.bvh;
-        let footprint = Footprint::new(world.camera(), bvh.bounds(), bvh.clusters());
-        let size = (width as usize, height as usize);
-        let samples = (SAMPLES as f32 * bvh.affordable_share()).ceil() as u32;
-        let mut all = Self {
-            depth: Raster::filled(size.0, size.1, f32::INFINITY),
-            normal: Raster::filled(size.0, size.1, Vec3::ZERO),
-            albedo: Raster::filled(size.0, size.1, Vec3::ZERO),
-            object_alpha: Raster::filled(size.0, size.1, 0.0),
-            proxy_alpha: Raster::filled(size.0, size.1, 0.0),
-        };
-        let rows = all.depth.pixels_mut().par_chunks_mut(size.0);
-        let rows = rows.zip(all.normal.pixels_mut().par_chunks_mut(size.0));
-        let rows = rows.zip(all.albedo.pixels_mut().par_chunks_mut(size.0));
-        let rows = rows.zip(all.object_alpha.pixels_mut().par_chunks_mut(size.0));
-        let rows = rows.zip(all.proxy_alpha.pixels_mut().par_chunks_mut(size.0));
-        rows.enumerate()
-            .for_each(|(y, ((((depth, normal), albedo), object), proxy))| {
-                for x in 0..size.0 {
-                    let at = (x as u32, y as u32);
-                    let held = footprint.holds(at.0, at.1);
-                    let seen = with_features!(world.mask, F => pixel::<F>(&world, at, held, (seed, samples)));
-                    depth[x] = seen.depth;
-                    normal[x] = seen.normal;
-                    albedo[x] = seen.albedo;
-                    object[x] = seen.object;
-                    proxy[x] = seen.proxy;
+        let share = world.geometry.bvh.affordable_share();
+        let samples = (SAMPLES as f32 * share).ceil() as u32;
+        let view = View::new(&world, seed);
+        let (mut pixels, first) = view.first(samples);
+        if samples > FIRST_SAMPLES {
+            let width = pixels.width();
+            let rows = pixels.pixels_mut().par_chunks_mut(width);
+            rows.enumerate().for_each(|(y, row)| {
+                for (x, pixel) in row.iter_mut().enumerate() {
+                    if needs_more(&first, x, y) {
+                        view.object(pixel, (x, y), samples);
+                    }
                 }
             });
-        Ok(all)
+        }
+        Ok(Self(pixels))
     }
 
     /// As the channels `depth.Z normal.X/Y/Z albedo.R/G/B object.A proxy.A`; depth in full
     /// precision, the rest in half.
     pub fn to_rows(&self) -> Result<LayerRows<'_>, ImagingError> {
-        let (normal, albedo) = (self.normal.pixels(), self.albedo.pixels());
-        let mut rows = LayerRows::new(self.depth.width(), self.depth.height());
+        let pixels = self.0.pixels();
+        let mut rows = LayerRows::new(self.0.width(), self.0.height());
         let half = Precision::Half;
-        rows.insert("depth.Z", Precision::Full, &self.depth)?;
-        rows.insert_pixels(["normal.X", "normal.Y", "normal.Z"], half, |i| normal[i])?;
-        rows.insert_pixels(["albedo.R", "albedo.G", "albedo.B"], half, |i| albedo[i])?;
-        rows.insert("object.A", half, &self.object_alpha)?;
-        rows.insert("proxy.A", half, &self.proxy_alpha)?;
+        rows.insert_pixels(["depth.Z"], Precision::Full, |i| [pixels[i].depth])?;
+        let normals = ["normal.X", "normal.Y", "normal.Z"];
+        rows.insert_pixels(normals, half, |i| pixels[i].normal)?;
+        let colours = ["albedo.R", "albedo.G", "albedo.B"];
+        rows.insert_pixels(colours, half, |i| pixels[i].albedo)?;
+        rows.insert_pixels(["object.A"], half, |i| [pixels[i].object_alpha])?;
+        rows.insert_pixels(["proxy.A"], half, |i| [pixels[i].proxy_alpha])?;
         Ok(rows)
     }
 }
 
-fn pixel<const F: u32>(
-    world: &World,
-    (x, y): (u32, u32),
-    object: bool,
-    (seed, samples): (u64, u32),
-) -> Pixel {
-    let camera = world.camera();
-    let axis = -camera.rotation.z_axis;
-    let corner = Vec2::new(x as f32, y as f32);
-    let (mut object_depth, mut proxy_depth) = (f32::INFINITY, f32::INFINITY);
-    let (mut object_normal, mut proxy_normal) = (Vec3::ZERO, Vec3::ZERO);
-    let (mut albedo, mut object_hits, mut proxy_hits) = (Vec3::ZERO, 0.0, 0.0);
-    let mut taken = 0;
-    for sample in 0..samples {
-        let agree = proxy_hits == 0.0 || proxy_hits == taken as f32;
-        if !object && taken == FIRST_SAMPLES && agree {
-            break;
-        }
-        taken += 1;
-        let mut sampler = Sampler::new(seed, Stream::FOREGROUND, (y << 16) | (x & 0xffff), sample);
-        let ray = camera.ray(corner + sampler.next_2d());
-        if let Some(point) = world.proxy_point(&ray) {
-            proxy_hits += 1.0;
-            proxy_normal += point.normal;
-            proxy_depth = proxy_depth.min((point.position - ray.origin).dot(axis));
-        }
-        let hit = match object {
-            true => world.closest::<F>(&ray, sampler.next_u64()),
-            false => None,
-        };
-        if let Some(hit) = hit {
-            let surface = world
-                .surfaces
-                .interact::<F>(ray.direction, hit.triangle, hit.u, hit.v);
-            object_hits += 1.0;
-            object_normal += surface.normal;
-            albedo += surface.base_color;
-            object_depth = object_depth.min((surface.position - ray.origin).dot(axis));
+impl Pixel {
+    const EMPTY: Self = Self {
+        depth: f32::INFINITY,
+        normal: Vec3::ZERO,
+        albedo: Vec3::ZERO,
+        object_alpha: 0.0,
+        proxy_alpha: 0.0,
+    };
+}
+
+/// Whether the first samples of the pixel at `(x, y)` are too few.
+fn needs_more(first: &Raster<First>, x: usize, y: usize) -> bool {
+    let mine = *first.get(x, y);
+    let hit = |f: First| f != First::Missed;
+    let around = |n: usize, end: usize| n.saturating_sub(1)..(n + 2).min(end);
+    matches!(mine, First::Uneven | First::Edge)
+        || around(y, first.height()).any(|v| {
+            let row = first.row(v);
+            around(x, first.width()).any(|u| row[u] == First::Edge || hit(row[u]) != hit(mine))
+        })
+}
+
+/// A scene as it is sampled.
+struct View<'a> {
+    world: &'a World<'a>,
+    footprint: Footprint,
+    seed: u64,
+}
+
+impl<'a> View<'a> {
+    fn new(world: &'a World, seed: u64) -> Self {
+        let bvh = &world.geometry.bvh;
+        Self {
+            world,
+            footprint: Footprint::new(world.camera(), bvh.bounds(), bvh.clusters()),
+            seed,
         }
     }
-    let seen = object_hits > 0.0;
-    Pixel {
-        depth: if seen { object_depth } else { proxy_depth },
-        normal: if seen { object_normal } else { proxy_normal }.normalize_or_zero(),
-        albedo: if seen {
-            albedo / object_hits
-        } else {
-            Vec3::ZERO
-        },
-        object: object_hits / taken as f32,
-        proxy: proxy_hits / taken as f32,
+
+    /// All pixels with the proxy and the first samples of the object.
+    fn first(&self, samples: u32) -> (Raster<Pixel>, Raster<First>) {
+        let [width, height] = self.world.camera().resolution.map(|n| n as usize);
+        let mut pixels = Raster::filled(width, height, Pixel::EMPTY);
+        let mut first = Raster::filled(width, height, First::Missed);
+        let bands = pixels.pixels_mut().par_chunks_mut(BAND * width);
+        bands
+            .zip(first.pixels_mut().par_chunks_mut(BAND * width))
+            .enumerate()
+            .for_each(|(i, (pixels, first))| self.band(i * BAND, pixels, first, samples));
+        (pixels, first)
+    }
+
+    /// The rows from `top` on.
+    fn band(&self, top: usize, pixels: &mut [Pixel], first: &mut [First], samples: u32) {
+        let width = self.world.camera().resolution[0] as usize;
+        let mut above = self.corners(top, width);
+        let rows = pixels.chunks_mut(width).zip(first.chunks_mut(width));
+        for (y, (pixels, first)) in (top..).zip(rows) {
+            let below = self.corners(y + 1, width);
+            for (x, pixel) in pixels.iter_mut().enumerate() {
+                self.proxy(
+                    pixel,
+                    (x, y),
+                    [above[x], above[x + 1], below[x], below[x + 1]],
+                );
+                if self.footprint.holds(x as u32, y as u32) {
+                    first[x] = self.object(pixel, (x, y), samples.min(FIRST_SAMPLES));
+                }
+            }
+            above = below;
+        }
+    }
+
+    /// The proxy at the upper corners of the pixels of row `y`, and at the last one's right.
+    fn corners(&self, y: usize, width: usize) -> Vec<Option<Seen>> {
+        let corner = |x: usize| self.proxy_at(&self.ray(Vec2::new(x as f32, y as f32)));
+        (0..=width).map(corner).collect()
+    }
+
+    /// Sets the pixel to what it shows of the proxy: its corners, and more samples where some of them miss it.
+    fn proxy(&self, pixel: &mut Pixel, at: (usize, usize), corners: [Option<Seen>; 4]) {
+        let hits = corners.iter().flatten().count();
+        let mut sum = Sum::default();
+        match hits {
+            0 => return,
+            4 => corners.iter().for_each(|seen| sum.add(*seen)),
+            _ => (0..SAMPLES).for_each(|i| sum.add(self.proxy_at(&self.sample(at, i).0))),
+        }
+        pixel.depth = sum.depth;
+        pixel.normal = sum.normal.normalize_or_zero();
+        pixel.proxy_alpha = sum.alpha();
+    }
+
+    /// Lays over the pixel what `samples` samples show of the object.
+    fn object(&self, pixel: &mut Pixel, at: (usize, usize), samples: u32) -> First {
+        let mut sum = Sum::default();
+        let mut one: Option<Seen> = None;
+        let mut alike = true;
+        for i in 0..samples {
+            let (ray, mut sampler) = self.sample(at, i);
+            let seen =
+                with_features!(self.world.mask, F => self.object_at::<F>(&ray, &mut sampler));
+            sum.add(seen);
+            if let Some(seen) = seen {
+                alike &= one.get_or_insert(seen).is_like(&seen);
+            }
+        }
+        if sum.hits > 0 {
+            pixel.depth = sum.depth;
+            pixel.normal = sum.normal.normalize_or_zero();
+            pixel.albedo = sum.albedo / sum.hits as f32;
+        }
+        pixel.object_alpha = sum.alpha();
+        match sum.hits {
+            0 => First::Missed,
+            n if n < samples => First::Edge,
+            _ if alike => First::Even,
+            _ => First::Uneven,
+        }
+    }
+
+    /// The ray of a pixel's sample, and the numbers that follow.
+    fn sample(&self, (x, y): (usize, usize), i: u32) -> (Ray, Sampler) {
+        let pixel = (y as u32) << 16 | (x as u32 & 0xffff);
+        let mut sampler = Sampler::new(self.seed, Stream::FOREGROUND, pixel, i);
+        let ray = self.ray(Vec2::new(x as f32, y as f32) + sampler.next_2d());
+        (ray, sampler)
+    }
+
+    fn ray(&self, at: Vec2) -> Ray {
+        self.world.camera().ray(at)
+    }
+
+    fn depth(&self, position: Vec3) -> f32 {
+        let camera = self.world.camera();
+        (position - camera.position).dot(-camera.rotation.z_axis)
+    }
+
+    fn proxy_at(&self, ray: &Ray) -> Option<Seen> {
+        self.world.proxy_point(ray).map(|point| Seen {
+            depth: self.depth(point.position),
+            normal: point.normal,
+            albedo: Vec3::ZERO,
+        })
+    }
+
+    fn object_at<const F: u32>(&self, ray: &Ray, sampler: &mut Sampler) -> Option<Seen> {
+        let hit = self.world.closest::<F>(ray, sampler.next_u64())?;
+        let surfaces = &self.world.surfaces;
+        let surface = surfaces.interact::<F>(ray.direction, hit.triangle, hit.u, hit.v);
+        Some(Seen {
+            depth: self.depth(surface.position),
+            normal: surface.normal,
+            albedo: surface.base_color,
+        })
+    }
+}
+
+/// A surface where a ray meets it.
+#[derive(Clone, Copy)]
+struct Seen {
+    depth: f32,
+    normal: Vec3,
+    albedo: Vec3,
+}
+
+impl Seen {
+    fn is_like(&self, other: &Self) -> bool {
+        self.normal.dot(other.normal) > SAME_NORMAL
+            && (self.albedo - other.albedo).abs().max_element() < SAME_COLOUR
+    }
+}
+
+/// Samples of a pixel.
+struct Sum {
+    taken: u32,
+    hits: u32,
+    depth: f32,
+    normal: Vec3,
+    albedo: Vec3,
+}
+
+impl Default for Sum {
+    fn default() -> Self {
+        Self {
+            taken: 0,
+            hits: 0,
+            depth: f32::INFINITY,
+            normal: Vec3::ZERO,
+            albedo: Vec3::ZERO,
+        }
+    }
+}
+
+impl Sum {
+    fn add(&mut self, seen: Option<Seen>) {
+        self.taken += 1;
+        let Some(seen) = seen else { return };
+        self.hits += 1;
+        self.depth = self.depth.min(seen.depth);
+        self.normal += seen.normal;
+        self.albedo += seen.albedo;
+    }
+
+    fn alpha(&self) -> f32 {
+        self.hits as f32 / self.taken as f32
     }
 }
 
@@ -170,24 +328,90 @@ mod tests {
         let horizon = view.project(far).expect("is ahead").y;
         let s = scene(ball, matte(Vec3::splat(0.5)), view, ground());
         let buffer = GBuffer::new(&Renderer::new(&s), 0).expect("sizes fit");
-        let rows = (0..buffer.proxy_alpha.height()).map(|y| buffer.proxy_alpha.row(y));
-        for (y, row) in rows.enumerate() {
+        for y in 0..buffer.0.height() {
+            let row = buffer.0.row(y);
             let wanted = (y as f32 + 1.0 - horizon).clamp(0.0, 1.0);
-            let mean = row.iter().sum::<f32>() / row.len() as f32;
-            // On the horizon the first samples alone shift the mean by up to .06, and the deviation of 24 means of 16
-            // is .025.
+            let mean = row.iter().map(|p| p.proxy_alpha).sum::<f32>() / row.len() as f32;
+            // The deviation of 24 means of 16 is .025.
             let tolerance = if wanted.fract() == 0.0 {
                 0.0
             } else {
-                0.06 + 4.0 * 0.025
+                4.0 * 0.025
             };
             assert!(
                 (mean - wanted).abs() <= tolerance,
                 "row {y}: {mean}, {wanted}"
             );
         }
-        let ground = buffer.depth.row(23)[0];
-        let other = buffer.depth.row(23)[23];
+        let ground = buffer.0.get(0, 23).depth;
+        let other = buffer.0.get(23, 23).depth;
         assert!(ground.is_finite() && (ground / other - 1.0).abs() < 0.1);
+    }
+
+    /// What every pixel shows with `samples` samples of each.
+    fn reference(renderer: &Renderer, samples: u32) -> Raster<Pixel> {
+        let world = renderer.world(EVERYTHING).expect("valid");
+        let view = View::new(&world, 1);
+        let [width, height] = world.camera().resolution.map(|n| n as usize);
+        let mut pixels = Raster::filled(width, height, Pixel::EMPTY);
+        for (i, pixel) in pixels.pixels_mut().iter_mut().enumerate() {
+            view.object(pixel, (i % width, i / width), samples);
+        }
+        pixels
+    }
+
+    #[test]
+    fn edges_are_covered_as_by_many_samples_and_alone_take_more_than_the_first() {
+        let ball = icosphere(Vec3::new(0.0, 0.5, 0.0), 0.5, 3);
+        let view = camera(Vec3::new(0.0, 1.0, 4.0), Vec3::Y * 0.5, 20.0, 96);
+        let s = scene(ball, matte(Vec3::splat(0.5)), view, ground());
+        let renderer = Renderer::new(&s);
+        let truth = reference(&renderer, 1024);
+        let buffer = GBuffer::new(&renderer, 0).expect("sizes fit");
+        let (mut edges, mut sum, mut squares) = (0.0f32, 0.0, 0.0);
+        for (found, truth) in buffer.0.pixels().iter().zip(truth.pixels()) {
+            if truth.object_alpha == 0.0 || truth.object_alpha == 1.0 {
+                assert_eq!(found.object_alpha, truth.object_alpha);
+            } else {
+                let error = found.object_alpha - truth.object_alpha;
+                edges += 1.0;
+                sum += error;
+                squares += error * error;
+            }
+            // Normals that differ by up to 8 degrees are the mean of four, one of each quarter: 2 degrees.
+            if truth.object_alpha == 1.0 {
+                assert!(found.normal.dot(truth.normal) > 0.999);
+                assert!((found.albedo - 0.5).abs().max_element() < 1e-6);
+            }
+        }
+        // A straight edge crosses at most 7 of the 4 x 4 cells that hold a sample each, with a variance of at most 1/4.
+        let deviation = (squares / edges).sqrt();
+        assert!(deviation < (7.0f32 / 4.0).sqrt() / 16.0, "{deviation}");
+        let bias = sum / edges;
+        assert!(bias.abs() < 4.0 * deviation / edges.sqrt(), "{bias}");
+
+        let world = renderer.world(EVERYTHING).expect("valid");
+        let (_, first) = View::new(&world, 0).first(SAMPLES);
+        let places = (0..96).flat_map(|y| (0..96).map(move |x| (x, y)));
+        let more = places.filter(|(x, y)| needs_more(&first, *x, *y)).count();
+        // Pixels of the edge and on either side of it.
+        assert!(more as f32 <= 3.0 * edges, "{more} of {edges}");
+    }
+
+    #[test]
+    fn a_texture_takes_more_samples_where_its_colours_differ() {
+        let tiles = |colour: f32| Seen {
+            depth: 1.0,
+            normal: Vec3::Y,
+            albedo: Vec3::splat(colour),
+        };
+        assert!(tiles(0.5).is_like(&tiles(0.51)));
+        assert!(!tiles(0.5).is_like(&tiles(0.53)));
+        let mut first = Raster::filled(3, 3, First::Even);
+        assert!(!needs_more(&first, 0, 0));
+        *first.get_mut(2, 2) = First::Uneven;
+        assert!(needs_more(&first, 2, 2) && !needs_more(&first, 1, 1));
+        *first.get_mut(2, 2) = First::Missed;
+        assert!(needs_more(&first, 1, 1) && !needs_more(&first, 0, 1));
     }
 }

@@ -22,7 +22,7 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 8,
+    version: 9,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
