@@ -34,6 +34,18 @@ pub struct Preset {
     pub recovery: Option<Measured>,
 }
 
+impl Preset {
+    /// What it means for light where `table` sets some keys itself.
+    pub fn light_with(&self, table: &LightTable) -> LightPreset {
+        LightPreset {
+            iterations: table.iterations.unwrap_or(self.light.iterations),
+            samples: table.samples.unwrap_or(self.light.samples),
+            size: table.size.unwrap_or(self.light.size),
+            ..self.light
+        }
+    }
+}
+
 /// Of `[composite]`.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -202,18 +214,21 @@ impl LightRun {
         self.rest_s + self.record_s * pixels * samples + self.optimization_s * iterations * replay
     }
 
-    /// The presets next to `quality`, for the keys that `table` does not set.
+    /// Whether `preset` would have done the same.
+    fn is_that_of(&self, preset: &LightPreset) -> bool {
+        let same_steps = self.iterations.is_none_or(|n| n == preset.iterations);
+        same_steps
+            && self.samples == preset.samples
+            && self.side == preset.size.min(self.photo_side)
+    }
+
+    /// The presets next to `quality` that differ in keys that `table` does not set.
     pub fn outlook(&self, quality: Quality, table: &LightTable) -> Outlook {
         // Measured with a reference; what a model guides to is another matter.
         let error = |p: &Preset| p.recovery.filter(|_| !self.by_model).map(|l| l.error);
         Outlook::beside(quality, |p| {
-            let there = LightPreset {
-                iterations: table.iterations.unwrap_or(p.light.iterations),
-                samples: table.samples.unwrap_or(p.light.samples),
-                size: table.size.unwrap_or(p.light.size),
-                ..p.light
-            };
-            Some((self.seconds_with(&there), error(p)))
+            let there = p.light_with(table);
+            (!self.is_that_of(&there)).then(|| (self.seconds_with(&there), error(p)))
         })
     }
 }
@@ -326,8 +341,21 @@ mod tests {
             ..LightTable::default()
         };
         // Nothing is left to a preset.
-        for estimate in run.outlook(Quality::Standard, &table).0 {
-            assert!((estimate.seconds - 12.0).abs() < 1e-9);
-        }
+        assert_eq!(run.outlook(Quality::Standard, &table).0, []);
+        let table = LightTable {
+            size: None,
+            ..table
+        };
+        let [draft, high] = run.outlook(Quality::Standard, &table).0[..] else {
+            panic!("presets differ in size");
+        };
+        assert!(draft.seconds < 12.0 && high.seconds > 12.0);
+        // No preset goes beyond the photograph.
+        let small = LightRun {
+            side: 64,
+            photo_side: 64,
+            ..run
+        };
+        assert_eq!(small.outlook(Quality::Standard, &table).0, []);
     }
 }

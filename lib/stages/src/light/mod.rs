@@ -52,7 +52,7 @@ use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::scene::transport::{self, Frame};
 use crate::{interruption, lora};
 
-pub(crate) use words::quantities;
+pub(crate) use words::{percent, quantities};
 
 /// What the stage did.
 pub struct Done {

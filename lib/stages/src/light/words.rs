@@ -19,9 +19,9 @@ pub(super) fn in_words(estimate: &LightEstimate) -> String {
     let [azimuth, elevation, exposure, share] = quantities(estimate).map(|q| q.words);
     format!(
         "estimated: most light {}; in four of five such photographs it comes from {azimuth}, {elevation}; the mean light \
-         is {exposure}, its strongest source {share}; a sun with a probability of {:.0}%",
+         is {exposure}, its strongest source {share}; a sun with a probability of {}",
         estimate.words,
-        100.0 * estimate.sun_probability
+        percent(estimate.sun_probability)
     )
 }
 
@@ -37,7 +37,6 @@ pub(crate) fn quantities(estimate: &LightEstimate) -> [Quantity; 4] {
     };
     let degrees = |deg: f64| format!("{deg:.0}°");
     let times = |stops: f64| format!("{:.2}", stops.exp2());
-    let percent = |share: f64| format!("{:.0}%", 100.0 * share);
     [
         quantity(
             "azimuth, to the right of the view",
@@ -67,6 +66,15 @@ pub(crate) fn quantities(estimate: &LightEstimate) -> [Quantity; 4] {
             ),
         ),
     ]
+}
+
+/// A share or a probability in percent. What is possible is not called 0%, nor what is not certain 100%.
+pub(crate) fn percent(share: f64) -> String {
+    match (100.0 * share).round() {
+        0.0 if share > 0.0 => "under 1%".into(),
+        100.0 if share < 1.0 => "over 99%".into(),
+        percent => format!("{percent:.0}%"),
+    }
 }
 
 /// The elevations of an interval.
@@ -110,6 +118,13 @@ mod tests {
         ] {
             assert_eq!(heights(&Interval::new(low, low, high)), wanted);
         }
+    }
+
+    #[test]
+    fn what_is_possible_is_not_called_impossible() {
+        let shown = [0.0, 0.004, 0.006, 0.5, 0.994, 0.996, 1.0].map(percent);
+        let wanted = ["0%", "under 1%", "1%", "50%", "99%", "over 99%", "100%"];
+        assert_eq!(shown, wanted);
     }
 
     #[test]

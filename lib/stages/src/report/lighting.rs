@@ -22,7 +22,7 @@ use super::picture::{figure, image};
 use super::{Report, Section, direction, json, outputs};
 use crate::composite::table::CompositeTable;
 use crate::known_light;
-use crate::light::quantities;
+use crate::light::{percent, quantities};
 use crate::names::LIGHT;
 use crate::preview::environment;
 use crate::scene::unnumbered;
@@ -119,10 +119,10 @@ fn estimate(run: &(PathBuf, Manifest), estimate: &LightEstimate) -> anyhow::Resu
         others => format!("{} photographs of the place", others + 1),
     };
     let sentence = format!(
-        "Estimated from {photographs}: most light {}; a sun with a probability of {:.0}%. In four of five photographs the \
+        "Estimated from {photographs}: most light {}; a sun with a probability of {}. In four of five photographs the \
          truth lies in these intervals:",
         estimate.words,
-        100.0 * estimate.sun_probability
+        percent(estimate.sun_probability)
     );
     let mut parts = vec![Html::of("p", sentence)];
     let rows = quantities(estimate).map(|q| {
@@ -149,7 +149,7 @@ fn estimate(run: &(PathBuf, Manifest), estimate: &LightEstimate) -> anyhow::Resu
         let used = c["candidate"].as_u64() == used;
         vec![
             Html::text(c["candidate"].to_string()),
-            Html::text(format!("{:.0}%", 100.0 * chance)),
+            Html::text(percent(chance)),
             Html::text(c["words"].as_str().unwrap_or_default()),
             match used {
                 true => Html::text("used"),

@@ -126,7 +126,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let resolution = loaded.scene.camera.resolution;
     let outlook = record
         .as_ref()
-        .map(|r| outlook(session, r, resolution, &manifest));
+        .map(|r| outlook(session, &table, r, resolution, &manifest));
     Ok(Done {
         folder,
         manifest,
@@ -159,6 +159,7 @@ fn warn_of_slow_rays(session: &Session, renderer: &Renderer) {
 /// What the presets beside this one would have cost: recording takes time in proportion to paths.
 fn outlook(
     session: &Session,
+    table: &LightTable,
     record: &Record,
     resolution: [u32; 2],
     manifest: &Manifest,
@@ -167,9 +168,10 @@ fn outlook(
     let paths = |samples: u32, side: usize| f64::from(samples) * (side.min(longest) as f64).powi(2);
     let here = paths(record.samples, record.size[0].max(record.size[1]));
     Outlook::beside(session.pipeline.quality, |p| {
-        let there = paths(p.light.samples, p.light.size);
+        let light = p.light_with(table);
+        let there = paths(light.samples, light.size);
         let rest_s = manifest.elapsed_s - record.seconds;
-        Some((rest_s + record.seconds * there / here, None))
+        (there != here).then(|| (rest_s + record.seconds * there / here, None))
     })
 }
 
