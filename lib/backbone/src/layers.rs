@@ -1,5 +1,5 @@
 //! Convolutions of feature maps, with batch normalisation folded into weights and biases.
-use gemm::{Parallelism, gemm};
+use crate::product::product;
 
 /// Numbers by row, column and channel.
 #[derive(Clone, Debug, PartialEq)]
@@ -72,31 +72,14 @@ impl Window {
 pub(crate) fn pointwise(map: &Map, layer: &Layer) -> Map {
     let (cells, inputs, outputs) = (map.width * map.height, map.channels, layer.bias.len());
     let mut values = layer.bias.repeat(cells);
-    assert!(map.values.len() == cells * inputs && layer.weight.len() == inputs * outputs);
-    // SAFETY: dense row-major matrices whose sizes are checked above; `values` is borrowed alone.
-    unsafe {
-        gemm(
-            cells,
-            outputs,
-            inputs,
-            values.as_mut_ptr(),
-            1,
-            outputs as isize,
-            true,
-            map.values.as_ptr(),
-            1,
-            inputs as isize,
-            layer.weight.as_ptr(),
-            1,
-            outputs as isize,
-            1.0,
-            1.0,
-            false,
-            false,
-            false,
-            Parallelism::None,
-        );
-    }
+    let size = (cells, outputs, inputs);
+    product(
+        size,
+        (&map.values, inputs, 1),
+        (&layer.weight, outputs, 1),
+        &mut values,
+        true,
+    );
     Map {
         channels: outputs,
         values,

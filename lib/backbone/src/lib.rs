@@ -4,6 +4,8 @@
 //! channels at a thirty-second. One thread computes them, so that the bytes never depend on threads.
 mod layers;
 mod network;
+mod product;
 
 pub use layers::Map;
 pub use network::{Backbone, BackboneError, CHANNELS};
+pub use product::product;

@@ -202,7 +202,7 @@ fn six_thousand_iterations_stay_finite() {
     assert!(last.guidance.unwrap() < 0.2 * first.guidance.unwrap());
 }
 
-/// Asks another guidance and spoils its answer.
+/// Asks another guidance, then spoils or delays its answer.
 struct Spoiled<'a> {
     inner: Reference,
     spoil: &'a dyn Fn(usize, &mut Guided),

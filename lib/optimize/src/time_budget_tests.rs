@@ -2,28 +2,6 @@ use std::time::Duration;
 
 use super::*;
 
-/// A reference that takes a time of its own.
-struct Slow {
-    inner: Reference,
-    each: Duration,
-}
-
-impl Guidance for Slow {
-    fn framing(&self) -> Framing {
-        self.inner.framing()
-    }
-
-    fn gradient(
-        &mut self,
-        picture: &Raster<Vec3>,
-        view: &CropView,
-        step: Step,
-    ) -> Result<Guided, OptimizeError> {
-        std::thread::sleep(self.each);
-        self.inner.gradient(picture, view, step)
-    }
-}
-
 #[test]
 fn a_time_budget_decides_the_iterations_once_and_the_run_is_that_of_their_number() {
     let mut case = Case::new(500);
@@ -31,27 +9,43 @@ fn a_time_budget_decides_the_iterations_once_and_the_run_is_that_of_their_number
     case.settings.time_budget_s = Some(0.3);
     let folder = tempfile::tempdir().unwrap();
     let checkpoint = folder.path().join("checkpoint");
-    let slow = |each| Slow {
-        inner: case.reference(),
-        each: Duration::from_millis(each),
-    };
+    // A reference that takes a time of its own.
+    let sleep = |_: usize, _: &mut Guided| std::thread::sleep(Duration::from_millis(20));
+    let at_once = |_: usize, _: &mut Guided| ();
+    let inner = || case.reference();
     let mut planned = vec![];
-    let broken_off = case.run_with(&mut slow(20), None, Some(&checkpoint), &mut |event| {
-        match event {
-            Event::Planned(n) => planned.push(n),
-            other => panic!("{other:?} after the plan was broken off"),
-        }
-        ControlFlow::Break(())
-    });
+    let broken_off = case.run_with(
+        &mut Spoiled {
+            inner: inner(),
+            spoil: &sleep,
+        },
+        None,
+        Some(&checkpoint),
+        &mut |event| {
+            match event {
+                Event::Planned(n) => planned.push(n),
+                other => panic!("{other:?} after the plan was broken off"),
+            }
+            ControlFlow::Break(())
+        },
+    );
     assert!(matches!(broken_off, Err(OptimizeError::Interrupted)));
     assert!((1..=15).contains(&planned[0]), "{planned:?}");
     // A faster machine goes on with the schedule that was begun.
-    let resumed = case.run_with(&mut slow(0), None, Some(&checkpoint), &mut |event| {
-        if let Event::Planned(n) = event {
-            planned.push(n);
-        }
-        ControlFlow::Continue(())
-    });
+    let resumed = case.run_with(
+        &mut Spoiled {
+            inner: inner(),
+            spoil: &at_once,
+        },
+        None,
+        Some(&checkpoint),
+        &mut |event| {
+            if let Event::Planned(n) = event {
+                planned.push(n);
+            }
+            ControlFlow::Continue(())
+        },
+    );
     let resumed = resumed.unwrap();
     assert_eq!(planned, [planned[0]; 2]);
     assert_eq!(resumed.history.len(), planned[0]);

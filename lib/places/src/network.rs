@@ -1,7 +1,7 @@
 //! The estimator's network in training: batches, dropout, gradients, and the optimiser.
+use dipir_backbone::product;
 use dipir_estimator::network::{Network, silu};
 use dipir_numerics::hashing::mix64;
-use gemm::{Parallelism, gemm};
 
 /// A sequence of random numbers.
 pub(crate) struct SplitMix64(u64);
@@ -25,41 +25,6 @@ impl SplitMix64 {
         for k in (1..items.len()).rev() {
             items.swap(k, (self.bits() % (k as u64 + 1)) as usize);
         }
-    }
-}
-
-/// `out = keep * out + a b`, `a` of `m x k`, `b` of `k x n`; a matrix is its values, row stride and column stride.
-fn product(
-    (m, n, k): (usize, usize, usize),
-    a: (&[f32], usize, usize),
-    b: (&[f32], usize, usize),
-    out: &mut [f32],
-    keep: bool,
-) {
-    assert!(out.len() >= m * n && a.0.len() >= m * k && b.0.len() >= k * n);
-    // SAFETY: the strides describe dense matrices whose sizes are checked above; `out` is borrowed alone.
-    unsafe {
-        gemm(
-            m,
-            n,
-            k,
-            out.as_mut_ptr(),
-            1,
-            n as isize,
-            keep,
-            a.0.as_ptr(),
-            a.2 as isize,
-            a.1 as isize,
-            b.0.as_ptr(),
-            b.2 as isize,
-            b.1 as isize,
-            1.0,
-            1.0,
-            false,
-            false,
-            false,
-            Parallelism::None,
-        );
     }
 }
 

@@ -23,6 +23,7 @@ use dipir_scene::camera::Camera;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::pixels::ground_at;
 use dipir_scene::proxy::{Plane, Proxy};
+use dipir_scene::scene::LoadedScene;
 use dipir_stages::composite::table::CompositeTable;
 use dipir_stages::graph;
 use dipir_stages::light::at_hand::{AtHand, at_hand};
@@ -303,24 +304,14 @@ impl Desk {
         edit: &Edit,
         samples: u32,
     ) -> anyhow::Result<Result<Option<Crop>, Superseded>> {
-        let ticket = self.drafts.fetch_add(1, Ordering::SeqCst) + 1;
+        let go_on = self.newest();
         let (_, config, arrangement) = self.edited(edit)?;
-        let current = || self.drafts.load(Ordering::SeqCst) == ticket;
         let mut rendered = held(&self.rendered);
-        if !current() {
+        if go_on().is_break() {
             return Ok(Err(Superseded));
         }
-        let rendered = &mut *rendered;
-        self.arrange(rendered, edit, &arrangement, config);
-        rendered.light_up()?;
-        let Some((_, light)) = &rendered.light else {
-            bail!("there is no light");
-        };
-        let mut go_on = || match current() {
-            true => ControlFlow::Continue(()),
-            false => ControlFlow::Break(()),
-        };
-        let draft = match Draft::render(&rendered.small.loaded, light, samples, &mut go_on) {
+        let (loaded, light) = self.arrange(&mut rendered, edit, &arrangement, config)?;
+        let draft = match Draft::render(loaded, light, samples, &mut || go_on()) {
             Err(RenderError::Interrupted) => return Ok(Err(Superseded)),
             other => other?,
         };
@@ -336,10 +327,28 @@ impl Desk {
         })))
     }
 
-    fn arrange(&self, to: &mut Rendered, edit: &Edit, arrangement: &Arrangement, config: Config) {
+    /// Breaks off older drafts; whether there is none newer than this.
+    fn newest(&self) -> impl Fn() -> ControlFlow<()> + Send + 'static {
+        let ticket = self.drafts.fetch_add(1, Ordering::SeqCst) + 1;
+        let drafts = self.drafts.clone();
+        move || match drafts.load(Ordering::SeqCst) == ticket {
+            true => ControlFlow::Continue(()),
+            false => ControlFlow::Break(()),
+        }
+    }
+
+    /// The objects as `edit` places them, and their light.
+    fn arrange<'a>(
+        &self,
+        to: &'a mut Rendered,
+        edit: &Edit,
+        arrangement: &Arrangement,
+        config: Config,
+    ) -> anyhow::Result<(&'a LoadedScene, &'a AtHand)> {
         to.small.arrange(arrangement);
         to.session.config = config;
         to.small.loaded.occluders = self.occluders(edit, to.own_mask.as_ref());
+        to.light_up()
     }
 
     /// The objects under another sun or exposure, at a low resolution and many times a second: they are
@@ -349,32 +358,22 @@ impl Desk {
     /// # Errors
     /// If it cannot be, and [`Superseded`].
     pub fn relight(&self, edit: &Edit) -> anyhow::Result<Result<Option<Crop>, Superseded>> {
-        let ticket = self.drafts.fetch_add(1, Ordering::SeqCst) + 1;
+        let go_on = self.newest();
         let mut relighting = held(&self.relighting);
         let masks = self.masks.load(Ordering::SeqCst);
         let key = format!("{masks} {:?} {}", edit.without_light(), held(&self.text));
         if !relighting.is_recorded(&key) || !relighting.is_lit(&key, edit) {
             let (_, config, arrangement) = self.edited(edit)?;
-            let drafts = self.drafts.clone();
-            let go_on = move || match drafts.load(Ordering::SeqCst) == ticket {
-                true => ControlFlow::Continue(()),
-                false => ControlFlow::Break(()),
-            };
             let mut rendered = held(&self.rendered);
             if go_on().is_break() {
                 return Ok(Err(Superseded));
             }
-            let rendered = &mut *rendered;
-            self.arrange(rendered, edit, &arrangement, config);
-            rendered.light_up()?;
-            let Some((_, light)) = &rendered.light else {
-                bail!("there is no light");
-            };
+            let (loaded, light) = self.arrange(&mut rendered, edit, &arrangement, config)?;
             if !relighting.is_recorded(&key) {
                 // Two records are never held at once.
                 relighting.keep(None);
                 let normal = arrangement.ground().normal;
-                match Relit::record(&rendered.small.loaded, normal, light, go_on) {
+                match Relit::record(loaded, normal, light, go_on) {
                     Err(RenderError::Interrupted) => return Ok(Err(Superseded)),
                     other => relighting.keep(Some((key.clone(), other?, arrangement.camera))),
                 }
@@ -458,18 +457,20 @@ impl Desk {
 }
 
 impl Rendered {
-    /// Finds the light, unless it is that of the same camera and keys as before.
-    fn light_up(&mut self) -> anyhow::Result<()> {
+    /// The objects and their light, which is found unless it is that of the same camera and keys as before.
+    fn light_up(&mut self) -> anyhow::Result<(&LoadedScene, &AtHand)> {
         let config = &self.session.config;
         let light: LightTable = config.table("light")?;
         let composite: CompositeTable = config.table("composite")?;
         let camera = self.small.loaded.scene.camera;
         let key = format!("{light:?} {composite:?} {camera:?}");
-        if self.light.as_ref().is_none_or(|(known, _)| *known != key) {
-            let found = at_hand(&self.session, &self.small.loaded)?;
-            self.light = Some((key, found));
-        }
-        Ok(())
+        let known = self.light.take().filter(|(known, _)| *known == key);
+        let light = match known {
+            Some((_, light)) => light,
+            None => at_hand(&self.session, &self.small.loaded)?,
+        };
+        let (_, light) = self.light.insert((key, light));
+        Ok((&self.small.loaded, light))
     }
 }
 

@@ -8,3 +8,4 @@ mod pixels;
 
 pub use axis::number;
 pub use drawing::STYLE;
+pub use pixels::distance_to_segment;

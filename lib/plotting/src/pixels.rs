@@ -142,7 +142,8 @@ impl Canvas {
     }
 }
 
-fn distance_to_segment(p: Vec2, a: Vec2, b: Vec2) -> f32 {
+/// From `p` to the nearest point between `a` and `b`.
+pub fn distance_to_segment(p: Vec2, a: Vec2, b: Vec2) -> f32 {
     let along = b - a;
     let length = along.length_squared();
     let t = match length > 0.0 {

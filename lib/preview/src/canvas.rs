@@ -1,5 +1,6 @@
 //! Hairlines with a dark halo, drawn over a picture.
 use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_plotting::distance_to_segment;
 use dipir_plotting::glyphs::{CAPITAL, lay_out};
 use glam::{Vec2, Vec3};
 
@@ -48,7 +49,7 @@ impl Layer {
         for y in range(low.y, high.y, self.height) {
             for x in range(low.x, high.x, self.width) {
                 let p = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
-                let d = distance(p, a, b);
+                let d = distance_to_segment(p, a, b);
                 let edge = |half: f32| opacity * (half + 0.5 - d).clamp(0.0, 1.0);
                 let found = Vec2::new(edge(0.5 * width), edge(0.5 * width + HALO_PX));
                 let at = &mut self.coverage[y * self.width + x];
@@ -82,16 +83,6 @@ impl Layer {
             }
         }
     }
-}
-
-fn distance(p: Vec2, a: Vec2, b: Vec2) -> f32 {
-    let along = b - a;
-    let length = along.length_squared();
-    let t = match length > 0.0 {
-        true => ((p - a).dot(along) / length).clamp(0.0, 1.0),
-        false => 0.0,
-    };
-    p.distance(a + t * along)
 }
 
 #[cfg(test)]

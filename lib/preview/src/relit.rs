@@ -202,10 +202,9 @@ fn work(
         };
         let has_sun = sun.is_some();
         if let Some(sun) = sun {
-            let film = renderer
-                .render_in(&mut world, &sun, &simulation, &settings, &mut |_| {
-                    ControlFlow::Continue(())
-                })?
+            let mut go_on = |_: &_| ControlFlow::Continue(());
+            let film = sun
+                .render(&renderer, &mut world, &simulation, &settings, &mut go_on)?
                 .film;
             let wide = irradiance(&EnvironmentSampler::new(map), normal);
             let narrow = irradiance(&sun, normal);

@@ -12,6 +12,7 @@
 //!
 //! What it cannot do: caustics from light through rough glass onto the object converge slowly, as
 //! in every unidirectional path tracer; refracted rays see the distant light, not the photograph.
+use dipir_imaging::raster::LinearImage;
 use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::Sampler;
 use dipir_numerics::warp::balance_heuristic;
@@ -26,6 +27,7 @@ use crate::counters::{RayCounts, RayKind};
 use crate::features::PROXY_RADIANCE;
 use crate::light::PathLight;
 use crate::photo::ProxyPhoto;
+use crate::render::Simulation;
 use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
 use crate::world::World;
 
@@ -48,7 +50,7 @@ pub struct PathContext<'a, L> {
     /// Where light comes from.
     pub light: &'a L,
     /// What the proxy looks like to rays that leave the object.
-    pub photo: Option<&'a ProxyPhoto<'a>>,
+    pub photo: Option<ProxyPhoto<'a>>,
     /// Most interactions with the object, D; 0 leaves emission alone.
     pub max_depth: u32,
     /// Where paths begin, which decides what emission they see.
@@ -60,6 +62,33 @@ pub struct PathContext<'a, L> {
     /// The same, but only for light that reaches them from where the light is sampled: a small source is then met by
     /// many paths, and shown blurred.
     pub min_lit_roughness: f32,
+}
+
+/// Interactions after which Russian roulette may end a path. Earlier, the rays that it saves
+/// are outweighed by its variance: most paths of opaque objects have left by then.
+const ROULETTE_DEPTH: u32 = 4;
+
+impl<'a, L> PathContext<'a, L> {
+    /// Paths from the camera; `background` is the photograph, which the proxy looks like where that is simulated.
+    pub fn from_camera(
+        world: &'a World<'a>,
+        light: &'a L,
+        simulation: &Simulation,
+        background: Option<&'a LinearImage>,
+    ) -> Self {
+        Self {
+            world,
+            light,
+            photo: background
+                .filter(|_| has(simulation.features, PROXY_RADIANCE))
+                .map(|image| ProxyPhoto { image }),
+            max_depth: simulation.max_depth,
+            start: PathStart::Camera,
+            roulette_depth: ROULETTE_DEPTH,
+            min_roughness: 0.0,
+            min_lit_roughness: 0.0,
+        }
+    }
 }
 
 impl<L> Clone for PathContext<'_, L> {

@@ -41,8 +41,9 @@ pub trait SceneLight: Sync {
     fn on_object(&self) -> Self::OnObject;
     /// Prepares the light for a plane with the unit normal `normal`: its parts add up.
     fn on_plane(&self, normal: Vec3) -> Vec<Self::OnPlane>;
-    /// [`Renderer::render_in`], which calls this. Every light implements it by [`Renderer::render_under`], so that the
-    /// kernels are compiled here, once for each light, and not in each crate that renders.
+    /// As [`Renderer::render`], which calls this, in a world that [`Renderer::world`] made ready for the features of
+    /// `simulation`: for many pictures under changing lights. Every light implements it by [`Renderer::render_under`], so
+    /// that the kernels are compiled here, once for each light, and not in each crate that renders.
     fn render(
         &self,
         renderer: &Renderer,
@@ -269,9 +270,7 @@ impl SceneLight for SgMixture {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::sun;
-    use dipir_numerics::sampler::{Sampler, Stream};
-    use dipir_numerics::warp::square_to_sphere;
+    use crate::testing::{integral_of_density, sun};
 
     #[test]
     fn the_parts_on_a_plane_add_up_to_the_light() {
@@ -298,17 +297,7 @@ mod tests {
     fn densities_and_samples_agree_and_integrate_to_one() {
         let map = sun(Vec3::new(0.3, 0.8, 0.2).normalize(), 50.0, 0.7, 8);
         let light = EnvironmentSampler::new(map).on_object();
-        let (n, mut sum) = (1 << 16, 0.0f64);
-        for s in 0..n {
-            let mut r = Sampler::new(0, Stream::TEST, 0, s);
-            let drawn = light.sample(r.next_2d());
-            let (radiance, pdf) = light.eval_with_pdf(drawn.direction);
-            // Splitting and joining round by an ulp of the luminance, 1/1000 of the excess.
-            assert!((pdf / drawn.pdf - 1.0).abs() < 1e-3);
-            assert!(radiance.abs_diff_eq(drawn.radiance, 1e-3 * radiance.max_element()));
-            sum += f64::from(light.eval_with_pdf(square_to_sphere(r.next_2d())).1);
-        }
-        let integral = sum / f64::from(n) * 4.0 * std::f64::consts::PI;
+        let integral = integral_of_density(&light, 1 << 16);
         // Stratified over a texel of 1/40 of the sphere's area.
         assert!((integral - 1.0).abs() < 0.02, "{integral}");
     }

@@ -21,12 +21,11 @@ use crate::bsdf::slopes::{BsdfSlopes, MaterialSlopes};
 use crate::bsdf::{Bsdf, BsdfSample};
 use crate::counters::RayCounts;
 use crate::error::RenderError;
-use crate::features::{PROXY_RADIANCE, has, with_features};
+use crate::features::with_features;
 use crate::footprint::Footprint;
-use crate::foreground::{Gather, PathContext, PathStart, Vertex};
+use crate::foreground::{Gather, PathContext, Vertex};
 use crate::light::{PathLight, SceneLight};
-use crate::photo::ProxyPhoto;
-use crate::render::{ROULETTE_DEPTH, Renderer, Simulation, pixels_of, sequence};
+use crate::render::{Renderer, Simulation, pixels_of, sequence};
 use crate::world::World;
 
 /// The derivatives of a scalar with respect to one material's factors.
@@ -213,21 +212,8 @@ impl Renderer<'_> {
             self.geometry().clone(),
             simulation.features,
         )?;
-        let photo = settings
-            .background
-            .filter(|_| has(simulation.features, PROXY_RADIANCE))
-            .map(|image| ProxyPhoto { image });
         let on_object = light.on_object();
-        let path = PathContext {
-            world: &world,
-            light: &on_object,
-            photo: photo.as_ref(),
-            max_depth: simulation.max_depth,
-            start: PathStart::Camera,
-            roulette_depth: ROULETTE_DEPTH,
-            min_roughness: 0.0,
-            min_lit_roughness: 0.0,
-        };
+        let path = PathContext::from_camera(&world, &on_object, simulation, settings.background);
         let bvh = &self.geometry().bvh;
         let footprint = Footprint::new(self.camera(), bvh.bounds(), bvh.clusters());
         let pixels: Vec<(u32, u32)> = self

@@ -211,14 +211,8 @@ fn the_gradient_of_a_whole_render_equals_differences_in_f64_along_the_same_paths
         let sampler = light();
         let on_object = sampler.on_object();
         let path = PathContext {
-            world: &world,
-            light: &on_object,
-            photo: None,
-            max_depth: 4,
-            start: PathStart::Camera,
             roulette_depth: 2,
-            min_roughness: 0.0,
-            min_lit_roughness: 0.0,
+            ..PathContext::from_camera(&world, &on_object, &everything(4), None)
         };
         let settings = GradientSettings {
             seed: 3,

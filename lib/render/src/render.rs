@@ -20,15 +20,13 @@ use crate::blocker::Blocker;
 use crate::contribution::{LeaveOut, LeftOut};
 use crate::counters::RayCounts;
 use crate::error::RenderError;
-use crate::features::{PROXY_RADIANCE, has};
 use crate::film::{Film, Viewing};
 use crate::footprint::Footprint;
-use crate::foreground::{PathContext, PathStart};
+use crate::foreground::PathContext;
 use crate::foresight::Foresight;
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet};
 use crate::light::{PathLight, PreparedLight, SceneLight};
-use crate::photo::ProxyPhoto;
 use crate::shadow::{Block, LightOnProxy, ShadowContext};
 use crate::world::{Geometry, ProxyGeometry, World};
 
@@ -122,10 +120,6 @@ pub struct Rendered {
 /// Side of the blocks of pixels that are scheduled and refined as one.
 const BLOCK: u32 = 8;
 
-/// Interactions after which Russian roulette may end a path. Earlier, the rays that it saves
-/// are outweighed by its variance: most paths of opaque objects have left by then.
-pub(crate) const ROULETTE_DEPTH: u32 = 4;
-
 /// A scene with its hierarchies built, to be rendered under lights and plans.
 #[derive(Clone)]
 pub struct Renderer<'a> {
@@ -197,24 +191,11 @@ impl<'a> Renderer<'a> {
         progress: &mut Watch,
     ) -> Result<Rendered, RenderError> {
         let mut world = self.world(simulation.features)?;
-        self.render_in(&mut world, light, simulation, settings, progress)
+        light.render(self, &mut world, simulation, settings, progress)
     }
 
-    /// As [`render`](Self::render), in a world that [`world`](Self::world) made ready for the features
-    /// of `simulation`: for many pictures under changing lights.
-    pub fn render_in<L: SceneLight>(
-        &self,
-        world: &mut World,
-        light: &L,
-        simulation: &Simulation,
-        settings: &Settings,
-        progress: &mut Watch,
-    ) -> Result<Rendered, RenderError> {
-        light.render(self, world, simulation, settings, progress)
-    }
-
-    /// What [`render_in`](Self::render_in) does. For implementations of [`SceneLight::render`]: everybody else would
-    /// compile the kernels once more.
+    /// What [`SceneLight::render`] does. For its implementations alone: everybody else would compile the kernels once
+    /// more.
     pub fn render_under<L: SceneLight>(
         &self,
         world: &mut World,
@@ -259,20 +240,8 @@ impl<'a> Renderer<'a> {
         coarse: Option<&Film>,
         progress: &mut Watch,
     ) -> Result<Rendered, RenderError> {
-        let photo = settings
-            .background
-            .filter(|_| has(simulation.features, PROXY_RADIANCE))
-            .map(|image| ProxyPhoto { image });
-        let path = PathContext {
-            world,
-            light: &light.on_object,
-            photo: photo.as_ref(),
-            max_depth: simulation.max_depth,
-            start: PathStart::Camera,
-            roulette_depth: ROULETTE_DEPTH,
-            min_roughness: 0.0,
-            min_lit_roughness: 0.0,
-        };
+        let path =
+            PathContext::from_camera(world, &light.on_object, simulation, settings.background);
         let plane = &light.on_plane;
         let blocker = self
             .geometry

@@ -3,6 +3,8 @@ use std::ops::ControlFlow;
 
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
+use dipir_numerics::sampler::{Sampler, Stream};
+use dipir_numerics::warp::square_to_sphere;
 use dipir_scene::camera::Camera;
 use dipir_scene::material::Material;
 use dipir_scene::mesh::TriangleMesh;
@@ -12,6 +14,7 @@ use glam::{Mat3, Vec2, Vec3};
 
 use crate::adaptive::{Progress, Stop};
 use crate::features::ALL;
+use crate::light::PathLight;
 use crate::render::{Rendered, Renderer, Settings, Simulation};
 
 /// A rough dielectric.
@@ -121,4 +124,19 @@ pub fn render(
 /// Progress that never breaks off.
 pub fn carry_on(_: &Progress) -> ControlFlow<()> {
     ControlFlow::Continue(())
+}
+
+/// The integral of a light's density over the sphere by `n` samples, which must agree with it in radiance and density.
+pub fn integral_of_density(light: &impl PathLight, n: u32) -> f64 {
+    let mut sum = 0.0f64;
+    for s in 0..n {
+        let mut r = Sampler::new(0, Stream::TEST, 0, s);
+        let drawn = light.sample(r.next_2d());
+        let (radiance, pdf) = light.eval_with_pdf(drawn.direction);
+        // Splitting a map and joining it again round by an ulp of the luminance, 1/1000 of the excess.
+        assert!((pdf / drawn.pdf - 1.0).abs() < 1e-3);
+        assert!(radiance.abs_diff_eq(drawn.radiance, 1e-3 * radiance.max_element()));
+        sum += f64::from(light.eval_with_pdf(square_to_sphere(r.next_2d())).1);
+    }
+    sum / f64::from(n) * 4.0 * std::f64::consts::PI
 }

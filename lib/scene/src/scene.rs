@@ -198,21 +198,9 @@ impl Scene {
             objects.push(placed);
         }
         files.warnings.extend(repeated(&objects));
-        let Assembly {
-            mesh,
-            materials,
-            textures,
-            lights,
-            ..
-        } = assembly;
+        let (scene, lights) = assembly.into_scene(proxy);
         Ok(LoadedScene {
-            scene: Scene {
-                mesh,
-                materials,
-                textures,
-                camera,
-                proxy,
-            },
+            scene,
             photo,
             original,
             occluders,
@@ -277,21 +265,9 @@ impl SceneDescription {
                 Ok((object.transform(), ()))
             })?;
         }
-        let Assembly {
-            mesh,
-            materials,
-            textures,
-            lights,
-            ..
-        } = assembly;
+        let (scene, lights) = assembly.into_scene(proxy);
         Ok(LoadedScene {
-            scene: Scene {
-                mesh,
-                materials,
-                textures,
-                camera: self.camera,
-                proxy,
-            },
+            scene,
             photo,
             original,
             occluders,
@@ -535,6 +511,17 @@ impl Assembly {
             pending,
             kept: HashMap::new(),
         }
+    }
+
+    fn into_scene(self, proxy: Proxy) -> (Scene, Vec<PunctualLight>) {
+        let scene = Scene {
+            mesh: self.mesh,
+            materials: self.materials,
+            textures: self.textures,
+            camera: self.camera,
+            proxy,
+        };
+        (scene, self.lights)
     }
 
     /// Adds the object in `path`; `place` gives the map from its file's coordinates to the world.

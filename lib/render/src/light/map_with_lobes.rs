@@ -156,11 +156,11 @@ mod tests {
     use super::*;
     use crate::render::{Rendered, Renderer};
     use crate::shapes::icosphere;
-    use crate::testing::{camera, carry_on, everything, ground, matte, scene, settings, sun};
+    use crate::testing::{
+        camera, carry_on, everything, ground, integral_of_density, matte, scene, settings, sun,
+    };
     use dipir_light::environment::EnvironmentMap;
     use dipir_light::gaussian::SphericalGaussian;
-    use dipir_numerics::sampler::{Sampler, Stream};
-    use dipir_numerics::warp::square_to_sphere;
     use dipir_scene::scene::Scene;
 
     fn map() -> EnvironmentSampler {
@@ -263,17 +263,7 @@ mod tests {
     #[test]
     fn densities_and_samples_agree_and_integrate_to_one() {
         let light = MapWithLobes::new(map(), lobes()).on_object();
-        let (n, mut sum) = (1 << 17, 0.0f64);
-        for s in 0..n {
-            let mut r = Sampler::new(0, Stream::TEST, 0, s);
-            let drawn = light.sample(r.next_2d());
-            let (radiance, pdf) = light.eval_with_pdf(drawn.direction);
-            // Splitting the map and joining it again rounds by 1/1000 of the excess.
-            assert!((pdf / drawn.pdf - 1.0).abs() < 1e-3);
-            assert!(radiance.abs_diff_eq(drawn.radiance, 1e-3 * radiance.max_element()));
-            sum += f64::from(light.eval_with_pdf(square_to_sphere(r.next_2d())).1);
-        }
-        let integral = sum / f64::from(n) * 4.0 * std::f64::consts::PI;
+        let integral = integral_of_density(&light, 1 << 17);
         // The texel of the sun is 1/163 of the sphere, the narrow lobe as small: stratified points
         // find either to a few per cent.
         assert!((integral - 1.0).abs() < 0.03, "{integral}");

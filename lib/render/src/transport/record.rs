@@ -17,11 +17,10 @@ use super::{Header, Precision, RowSet, Sent, Shadow, ShadowKind, Transport, Weig
 use crate::blocker::Blocker;
 use crate::counters::RayCounts;
 use crate::error::RenderError;
-use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
+use crate::features::{ALPHA, has, with_features};
 use crate::footprint::Footprint;
-use crate::foreground::{Gather, PathContext, PathStart};
-use crate::photo::ProxyPhoto;
-use crate::render::{ROULETTE_DEPTH, Renderer, pixels_of};
+use crate::foreground::{Gather, PathContext};
+use crate::render::{Renderer, pixels_of};
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowGather};
 use crate::world::{ProxyGeometry, World};
 
@@ -186,20 +185,7 @@ impl Transport {
         };
         let simulation = settings.simulation;
         let world = renderer.world(simulation.features)?;
-        let photo = settings
-            .background
-            .filter(|_| has(simulation.features, PROXY_RADIANCE))
-            .map(|image| ProxyPhoto { image });
-        let path = PathContext {
-            world: &world,
-            light: &light,
-            photo: photo.as_ref(),
-            max_depth: simulation.max_depth,
-            start: PathStart::Camera,
-            roulette_depth: ROULETTE_DEPTH,
-            min_roughness: 0.0,
-            min_lit_roughness: 0.0,
-        };
+        let path = PathContext::from_camera(&world, &light, &simulation, settings.background);
         let geometry = &world.geometry;
         let plane: Vec<UnitOnPlane> = match &geometry.proxy {
             ProxyGeometry::Plane(plane) => {

@@ -17,9 +17,10 @@ use super::super::features::{EXTENSIONS, PLAIN_GGX, SPECULAR, TRANSMISSION};
 use super::super::sheen::tests::textbook;
 use super::super::thin_film::tests::specified;
 use crate::counters::RayCounts;
-use crate::foreground::{PathContext, PathStart};
+use crate::foreground::PathContext;
 use crate::light::SceneLight;
 use crate::render::Renderer;
+use crate::testing::everything;
 
 /// Pixels along a side.
 const SIZE: u32 = 24;
@@ -105,14 +106,8 @@ fn difference<const F: u32>(
     let sampler = EnvironmentSampler::new(Arc::new(map));
     let light = sampler.on_object();
     let path = PathContext {
-        world: &world,
-        light: &light,
-        photo: None,
-        max_depth: 4,
-        start: PathStart::Camera,
         roulette_depth: u32::MAX,
-        min_roughness: 0.0,
-        min_lit_roughness: 0.0,
+        ..PathContext::from_camera(&world, &light, &everything(4), None)
     };
     let (mut largest, mut worst) = (0.0f64, 0.0f64);
     for p in 0..SIZE * SIZE {
