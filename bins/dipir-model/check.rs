@@ -65,7 +65,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     let open = |dtype, device: &Device| open(path.as_deref(), dtype, prediction, device);
     let model = open(dtype, &device)?;
     let progress = Progress::new("comparing", output.quiet);
-    // What the model is compared with is gone before anything is timed.
+    // The second copy is dropped before anything is timed.
     let on_cpu = match device.is_cpu() {
         true => None,
         false => Some(open(DType::F32, &Device::Cpu)?),
@@ -124,7 +124,7 @@ fn session(args: &CheckArgs) -> anyhow::Result<Option<Session>> {
     Session::start(&common).map(Some)
 }
 
-/// Where the model is: named, or the configuration's; nothing is the embedded one.
+/// The model's path: that of the command line, else that of the configuration. `None` is the embedded model.
 fn chosen(args: &CheckArgs, session: Option<&Session>) -> anyhow::Result<Option<PathBuf>> {
     let Some(session) = session.filter(|_| args.model.is_none()) else {
         return Ok(args.model.clone());
@@ -193,7 +193,7 @@ fn measure(
     }
 }
 
-/// An error after Ctrl-C is that Ctrl-C.
+/// After Ctrl-C, the error that says so; else `error`.
 fn interrupted(error: anyhow::Error) -> anyhow::Error {
     interrupt::check().map_or_else(Into::into, |()| error)
 }

@@ -55,14 +55,14 @@ pub fn run(args: &FetchArgs) -> anyhow::Result<()> {
     Model::load(&partial, DType::F32, &Device::Cpu)
         .with_context(|| format!("{} was fetched whole, but it does not load", args.repo))?;
     if target.is_dir() {
-        // Empty, or there would have been an error above.
+        // It is empty: a folder that holds anything was refused above.
         fs::remove_dir(&target).with_context(|| format!("cannot write {}", target.display()))?;
     }
     fs::rename(&partial, &target).with_context(|| format!("cannot write {}", target.display()))?;
     finish(args, &target, &revision, outcome)
 }
 
-/// What only the command line can mend counts as wrong usage.
+/// A wrong name is an error of usage: only another command line mends it.
 fn usage(error: Error) -> anyhow::Error {
     match error {
         Error::Name { .. } => Usage(error.to_string()).into(),

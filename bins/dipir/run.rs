@@ -278,7 +278,7 @@ impl<'a> Pipeline<'a> {
     fn take_hashes(&self, stage: &str) {
         let path = hashes_file(&self.session.out, stage);
         let hashes = Hashes::read(&path);
-        // Another's file of that name stays; it holds no hashes, either.
+        // A file of that name that is not ours stays, and nothing is taken from it.
         if Hashes::remove(&path).unwrap_or(false) {
             hashes.adopt();
         }

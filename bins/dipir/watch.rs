@@ -68,7 +68,7 @@ fn stamp(path: &PathBuf) -> Option<(SystemTime, u64)> {
     Some((found.modified().ok()?, found.len()))
 }
 
-/// The project's file and what its stages read, but what they wrote themselves.
+/// The project's file and the files that its stages read, except those that they wrote themselves.
 fn stamps(project: &ProjectArgs) -> Stamps {
     let mut files: Vec<PathBuf> = project.each().iter().map(|p| p.file().to_owned()).collect();
     for project in project.each() {

@@ -72,7 +72,7 @@ fn another_photograph_belongs_to_the_light_and_to_no_other_stage() {
     assert_eq!(inputs.as_array().unwrap().iter().filter(named).count(), 1);
     let page = String::from_utf8(project.read("out/report.html")).unwrap();
     assert!(page.contains("Estimated from 2 photographs"));
-    // Other bytes of it run the light again, and nothing that does not read the light.
+    // If the view's file changes, the light runs again, and only the stages that read the light.
     wall(&project, Vec3::splat(0.3));
     assert_eq!(ran(&project, &[]), ["light", "composite"]);
 }

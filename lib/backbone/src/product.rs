@@ -5,7 +5,7 @@ use gemm::{Parallelism, gemm};
 /// stride.
 ///
 /// # Panics
-/// If there are fewer values than that.
+/// If a matrix has fewer values than its size and its strides need.
 pub fn product(
     (m, n, k): (usize, usize, usize),
     a: (&[f32], usize, usize),

@@ -1,8 +1,8 @@
 //! What a picture would show under a camera: how its edges lean from the vertical, and how brightness, tint and texture
 //! change with elevation. Under the true camera edges are upright or level, and the sky is above.
 //!
-//! A mirrored picture under a mirrored camera gives the same numbers. Nothing finer than a 128th of the longer side is
-//! looked at, so that how sharp a picture is tells nothing.
+//! A mirrored picture under a mirrored camera gives the same numbers. Details finer than a
+//! 128th of the longer side are removed first, so that sharpness tells nothing.
 use dipir_imaging::metrics::LUMA;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::resize::{Filter, resize};

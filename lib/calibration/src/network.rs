@@ -51,7 +51,7 @@ impl Network {
 pub struct Member {
     /// From [`WHOLE`] numbers to the logarithms of a [`Table`].
     pub whole: Network,
-    /// From [`SCORED`] numbers to what is added to the table's logarithm.
+    /// From [`SCORED`] numbers to a correction, which is added to the table's logarithm.
     pub scorer: Network,
 }
 
@@ -61,8 +61,8 @@ impl Member {
         Table::mean(&whole.sides.each_ref().map(|side| self.whole.outputs(side)))
     }
 
-    /// The logarithm of how much more probable a camera is than before the picture was seen, but for a summand of the
-    /// picture, from the [`FEATURES`] of lines and look and what the table tells.
+    /// The logarithm of a camera's likelihood, plus a constant that is the same for all cameras of a picture. `features`
+    /// are the [`FEATURES`] of lines and look, `told` is what the table says of the camera.
     pub fn score(&self, features: &[f32], told: [f32; TOLD]) -> f64 {
         let added = self.scorer.outputs(&[features, &told].concat())[0];
         f64::from(told[0] + added)

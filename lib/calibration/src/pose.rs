@@ -27,7 +27,7 @@ impl Pose {
         self.log_focal.exp()
     }
 
-    /// Columns: the camera's right, up and backward axes in a world that it looks along -z of.
+    /// Columns: the camera's right, up and backward axes. Seen from above, the camera looks along the world's -z.
     pub fn rotation(&self) -> DMat3 {
         DMat3::from_rotation_x(self.pitch_deg.to_radians())
             * DMat3::from_rotation_z(-self.roll_deg.to_radians())

@@ -45,8 +45,8 @@ struct Perspective {
     aspect_ratio: Option<f64>,
 }
 
-/// Reads all perspective cameras, in the order of their nodes, for images of the height of `size`, and
-/// of its width where a camera has no aspect ratio. Their names are those of the cameras, else of
+/// Reads all perspective cameras, in the order of their nodes. Their images have the height of `size`. Their width
+/// follows from the camera's aspect ratio; without one it is that of `size`. Their names are those of the cameras, else of
 /// their nodes.
 ///
 /// # Errors

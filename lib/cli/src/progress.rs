@@ -184,7 +184,7 @@ impl Progress {
         self.bar.set_message(printable(&message.into()));
     }
 
-    /// Writes `line` to stay: above the bar, or as it is into the log of hours of work without a terminal.
+    /// Writes `line`, which stays: above the bar, or without a terminal as a line of the log.
     pub fn note(&self, line: &str) {
         match self.bar.is_hidden() {
             false => self.bar.println(line),

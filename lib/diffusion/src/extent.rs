@@ -1,4 +1,5 @@
-//! How large a network its weights allow. A configuration that names more is refused before a layer is built.
+//! The largest sizes of a network that its weights can fill. A configuration with larger ones is refused before a layer
+//! is built.
 
 /// How many tensors there are, and how long the longest of their axes is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

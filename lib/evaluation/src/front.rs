@@ -1,7 +1,7 @@
 //! The Pareto front of cost and error, and its elbow.
 
-/// Indices of the points that no other beats: none has at most the cost and at most the error,
-/// one of them less. By rising cost. Points that are not finite and above 0 are left out; of equal
+/// Indices of the points that no other point beats, by rising cost. A point beats another if its cost and its error are
+/// not higher, and one of them is lower. Points that are not finite and above 0 are left out; of equal
 /// points the first counts.
 pub fn pareto(points: &[(f64, f64)]) -> Vec<usize> {
     let usable = |v: f64| v.is_finite() && v > 0.0;

@@ -189,7 +189,7 @@ mod tests {
         let same = compare_pictures(&truth, &truth, &touched);
         assert_eq!((same.rmse, same.rmse_touched, same.ssim), (0.0, 0.0, 1.0));
         let scores = compare_pictures(&found, &truth, &touched);
-        // One pixel of 192, one of the two touched; and the best scale explains a single pixel.
+        // One pixel differs, of 192, and of the two that are touched. A scale makes up for a single pixel.
         assert!((scores.rmse - 0.2 / 192f64.sqrt()).abs() < 1e-7);
         assert!((scores.rmse_touched - 0.2 / 2f64.sqrt()).abs() < 1e-7);
         assert!(scores.si_rmse_object < 1e-7);

@@ -81,7 +81,7 @@ pub fn sync_folder(folder: &Path) -> io::Result<()> {
         return Ok(());
     }
     match File::open(folder)?.sync_all() {
-        // The files in it have been flushed all the same.
+        // The file system flushes no folders. The files in it have been flushed.
         Err(e) if e.kind() == io::ErrorKind::InvalidInput => Ok(()),
         other => other,
     }

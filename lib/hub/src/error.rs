@@ -8,7 +8,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 /// Every message says what failed and what to do about it.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The name of a repository or revision is none.
+    /// What was given cannot be the name of a repository or a revision.
     #[error("{what} {value:?} is not one; accepted: {accepted}")]
     Name {
         /// `repository`, `revision` or `endpoint`.
@@ -28,7 +28,7 @@ pub enum Error {
         /// What to do.
         remedy: String,
     },
-    /// No answer, or one that broke off.
+    /// The hub did not answer, or its answer broke off.
     #[error(
         "{url}: {source}; check the network and the endpoint, then run again: it goes on where it stopped"
     )]

@@ -27,8 +27,8 @@ const MOST_BAD_IN_A_ROW: usize = 5;
 /// Iterations between two checks of how well the record samples the light.
 const RECORD_EVERY: usize = 50;
 /// Transport is recorded anew when its effective sample size falls below this share of its samples. A record made for
-/// the current light reaches 1, so the record follows a lobe that narrows. Otherwise the lobe would soon rest on few
-/// samples, the optimiser would fit their noise, and the lobe would stop narrowing.
+/// the current light has 1. So a lobe that narrows gets new records. Otherwise it would soon rest on few samples, the
+/// optimiser would fit their noise, and the lobe would stop narrowing.
 const LEAST_EFFICIENCY: f64 = 1.0;
 /// The largest number of new records, so that recording stays a small part of the run.
 const MOST_RECORDS: usize = 8;

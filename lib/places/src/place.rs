@@ -17,7 +17,7 @@ pub const SMOOTH: [usize; 2] = [64, 32];
 const PEAK_GRID: [usize; 2] = [128, 64];
 /// The strongest source lies within this angle of the brightest direction, degrees.
 const SOURCE_DEG: f32 = 10.0;
-/// Between the source and this angle lie its surroundings, which do not count as source, degrees.
+/// Directions between the source and this angle are its surroundings, degrees. They do not count as source.
 const RING_DEG: f32 = 20.0;
 /// A source is like a sun if this share of it lies within 3 degrees.
 const SUN_SHARPNESS: f64 = 0.8;

@@ -216,7 +216,7 @@ fn surfaces_count_by_how_much_of_them_a_camera_sees() {
     let mean = surfaces.iter().sum::<f32>() / surfaces.len() as f32;
     assert!((mean - 1.0).abs() < 1e-5, "{mean}");
     for (strength, normal) in surfaces.iter().zip(&probes.normals) {
-        // Away from the camera a fifth is left.
+        // A surface that faces away from the camera keeps a fifth.
         assert!(
             *strength >= 0.2 - 1e-6 && (*strength > 0.21) == (normal.z + 0.25 * normal.y > 1e-3)
         );

@@ -116,8 +116,8 @@ impl View {
         curves.iter().zip(self.curve).map(|(c, w)| c * w).sum()
     }
 
-    /// The photograph as the estimator looks at it, the exposure of each channel, and what the curve makes of grey
-    /// under the place's mean light, over its light: a place's radiance times both is on the photograph's scale.
+    /// The photograph at the estimator's size, the exposure of each channel, and the curve's gain: its output for grey
+    /// under the place's mean light, divided by that light. A place's radiance times both is on the photograph's scale.
     pub fn take(&self, place: &Place, seed: u64) -> (SmallPhoto, Vec3, f32) {
         let (photo, gain, curve) = self.photograph(place, seed);
         (SmallPhoto::new(&photo, &self.camera()), gain, curve)

@@ -276,7 +276,7 @@ impl Desk {
     /// The height of the camera at which two pixels of the ground are `length_m` apart.
     ///
     /// # Errors
-    /// If one of them sees no ground, or both the same.
+    /// If no ground is seen at one of the pixels, or both show the same point.
     pub fn measure(&self, edit: &Edit, ends: [[f64; 2]; 2], length_m: f64) -> anyhow::Result<f64> {
         if !(length_m > 0.0 && length_m.is_finite()) {
             bail!("a length is above 0 m");

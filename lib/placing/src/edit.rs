@@ -91,7 +91,7 @@ pub struct ShadowEdit {
 }
 
 impl Edit {
-    /// No change of a file with so many objects.
+    /// An edit that changes nothing, for a file with this many objects.
     pub fn none(objects: usize) -> Self {
         let object = |of| ObjectEdit {
             of,

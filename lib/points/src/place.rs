@@ -27,7 +27,7 @@ pub struct Search<'a> {
     pub taken: &'a [(DVec3, Body)],
     /// Whether something of the photograph stands in front of a pixel.
     pub hidden: &'a dyn Fn(DVec2) -> bool,
-    /// 0 for the best place, near the lower middle; any other number for another one.
+    /// 0 takes the best place, near the lower middle. Every other number takes another place.
     pub draw: u32,
 }
 
@@ -182,7 +182,7 @@ impl Surroundings {
                 }
                 let share = along / distance;
                 let off = (to - along * ahead).length();
-                // Between the lines of sight to the foot and to the top.
+                // It blocks the view if it reaches between the lines of sight to the body's foot and to its top.
                 let lower = height * (1.0 - along / (distance + wide));
                 let upper = height + (body.height_m - height) * share;
                 off < wide * share.max(0.2) && *h > lower - CLEARANCE_M && *h < upper + CLEARANCE_M

@@ -1,4 +1,4 @@
-//! A plane through points of which many lie on none.
+//! A plane through points, most of which may lie on no plane.
 use dipir_numerics::sampler::Sampler;
 use glam::{DMat3, DVec3};
 

@@ -515,9 +515,9 @@ mod tests {
 
     #[test]
     fn a_budget_is_kept_within_a_tenth_while_rounds_differ_by_a_fifth() {
-        // In units of the first round. A round is foreseen by the rate of the one before, at most
-        // 1.21 times off: the last adds at most (0.97 * 1.21 - 1) of what was left, a third of the
-        // budget at most: 6%. It stops with less than 0.03 / 0.97 * 1.21 of it left: 4%.
+        // Times are in units of the first round. The time of a round is predicted from the rate of the round before, at
+        // most 1.21 times wrong. The last round exceeds the rest of the budget by at most 0.97 * 1.21 - 1 of it, and that
+        // rest is at most a third of the budget: 6%. At most 0.03 / 0.97 * 1.21 of the budget stays unused: 4%.
         for budget in [1.5, 3.0, 10.0, 100.0, 1e4] {
             for first in [1.1, 1.0 / 1.1] {
                 let (mut elapsed, mut cost, mut rate) = (1.0, 1.0, 1.0);

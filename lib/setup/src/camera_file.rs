@@ -210,7 +210,7 @@ mod tests {
             error.contains("it has 2 cameras, and none for \"b.jpg\""),
             "{error}"
         );
-        // What a pinhole cannot say stays in the file.
+        // A lens with distortion is no pinhole: the configuration then names the file.
         let view = of(file(["a.jpg", "b.jpg"], -0.2)).unwrap();
         assert!(view.file.is_some_and(|f| f.0.ends_with("transforms.json")));
     }

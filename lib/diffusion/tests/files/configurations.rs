@@ -1,4 +1,4 @@
-//! Configurations that cannot be what the weights are.
+//! Configurations that contradict the weights.
 use candle_core::{DType, Device};
 use dipir_diffusion::Error;
 use dipir_diffusion::model::{Model, load_unet};

@@ -114,7 +114,7 @@ impl Library {
             "Ns" => draft.shininess = Some(number(rest)?.max(0.0)),
             "Ni" => {
                 let ior = number(rest)?;
-                // 1 is what exporters write that know no better, and would leave no reflection.
+                // Many exporters write 1 for "unknown". It would mean a surface without reflection, so it is ignored.
                 if ior > 1.0 && material.ior > 1.0 {
                     material.ior = ior.min(10.0);
                 }

@@ -133,8 +133,8 @@ const SURFACES: [(f32, f32); 6] = [
 
 #[test]
 fn a_ray_that_leaves_a_convex_surface_does_not_meet_it_again() {
-    // Of a polyhedron whose corners the grid of f32 moves, hence perhaps not quite convex, only
-    // the triangle itself is asked for.
+    // Rounding of its corners to f32 may make a polyhedron slightly concave. Then the ray may meet its neighbours, and the
+    // test only asks that it does not meet the triangle it left.
     for (size, offset) in SURFACES {
         let m = moved(sphere(10, 0.0), size, Vec3::splat(offset));
         let bvh = Bvh::build(&m);
