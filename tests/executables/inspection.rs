@@ -103,6 +103,13 @@ fn objects_show_their_size_and_materials() {
     let value = json(&project, "object.obj");
     assert_eq!(value["triangles"], 4);
     assert_eq!(value["max_m"], json!([0.6f32, 1.1f32, 0.5]));
+    project.write(
+        "object.stl",
+        "solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 2 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid\n",
+    );
+    let value = json(&project, "object.stl");
+    assert_eq!(value["triangles"], 1);
+    assert_eq!(value["max_m"], json!([2.0, 1.0, 0.0]));
 }
 
 #[test]
@@ -228,7 +235,7 @@ fn what_is_no_artifact_is_told() {
     project.run(INSPECT, &["pipeline.toml"]).expect_error(
         1,
         "error: pipeline.toml is of no kind known here; accepted: PNG, JPEG, HDR, EXR, GLB, glTF, \
-         OBJ, JSON, safetensors, or a stage's folder",
+         OBJ, PLY, STL, JSON, safetensors, or a stage's folder",
     );
     project.run(INSPECT, &["."]).expect_error(
         1,

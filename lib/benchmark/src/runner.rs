@@ -14,7 +14,6 @@ use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::{Artifact, FILE_NAME};
 use dipir_pipeline::stage::StagePlan;
 use dipir_scene::description::SceneDescription;
-use dipir_stages::composite::table::Tone;
 use dipir_stages::names::{self, StageName};
 use serde_json::{Value, json};
 
@@ -78,7 +77,7 @@ impl Runner<'_> {
             let mut run = StageRuns::new(self, scene, &work, TRUTH_SEED);
             run.set("composite.environment", &toml_string(&map_file)?);
             run.set("composite.exposure_ev", &scene.exposure_ev.to_string());
-            run.set("composite.tone", tone_key(scene.tone));
+            run.set("composite.tone", scene.tone.key());
             run.set(
                 "composite.target_error",
                 &(0.5 * self.args.target_error).to_string(),
@@ -135,7 +134,7 @@ impl Runner<'_> {
                 .with_context(|| format!("cannot create {}", work.display()))?;
             map.write(&file)?;
             run.set("composite.environment", &toml_string(&file)?);
-            run.set("composite.tone", tone_key(scene.tone));
+            run.set("composite.tone", scene.tone.key());
         }
         for stage in BEFORE_COMPOSITE {
             let runs = method.stages.iter().any(|s| s == stage.name);
@@ -269,14 +268,6 @@ fn shared_cache(set: &str, folder: &Path) -> anyhow::Result<String> {
     }
     let cache = folder.join(value.trim().trim_matches(['"', '\'']));
     Ok(format!("{key}={}", toml_string(&cache)?))
-}
-
-/// The value of `composite.tone`.
-fn tone_key(tone: Tone) -> &'static str {
-    match tone {
-        Tone::None => "none",
-        Tone::Reinhard => "reinhard",
-    }
 }
 
 /// The map of `scene` in a folder of imported ones.

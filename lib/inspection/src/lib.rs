@@ -15,6 +15,7 @@ use std::path::Path;
 
 use anyhow::{Context, bail};
 use command_line::ViewArgs;
+use dipir_scene::import::EXTENSIONS;
 use report::Report;
 
 /// The kind of a file, by its first bytes and its name.
@@ -81,7 +82,8 @@ fn kind_of(path: &Path, length: u64) -> anyhow::Result<Kind> {
         ([0xff, 0xd8, 0xff, ..], _) => Kind::Jpeg,
         ([b'#', b'?', ..], _) => Kind::Hdr,
         ([0x76, 0x2f, 0x31, 0x01, ..], _) => Kind::Exr,
-        ([b'g', b'l', b'T', b'F', ..], _) | (_, "glb" | "gltf" | "obj") => Kind::Object,
+        ([b'g', b'l', b'T', b'F', ..], _) => Kind::Object,
+        (_, extension) if EXTENSIONS.contains(&extension) => Kind::Object,
         (_, "png") => Kind::Png,
         (_, "jpg" | "jpeg") => Kind::Jpeg,
         (_, "hdr") => Kind::Hdr,
@@ -89,7 +91,7 @@ fn kind_of(path: &Path, length: u64) -> anyhow::Result<Kind> {
         (_, "safetensors") => Kind::Safetensors,
         (_, "json") => Kind::Json,
         _ => bail!(
-            "{} is of no kind known here; accepted: PNG, JPEG, HDR, EXR, GLB, glTF, OBJ, JSON, \
+            "{} is of no kind known here; accepted: PNG, JPEG, HDR, EXR, GLB, glTF, OBJ, PLY, STL, JSON, \
              safetensors, or a stage's folder",
             path.display()
         ),

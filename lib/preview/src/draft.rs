@@ -96,12 +96,9 @@ pub(crate) fn settings(loaded: &LoadedScene, samples: u32) -> Settings<'_> {
     Settings {
         stop: Stop::Samples(samples),
         max_samples: samples,
-        background: Some(&loaded.photo.image),
-        transfer: loaded.photo.transfer,
-        occluders: loaded.occluders.as_ref(),
         highlights: false,
         denoise: true,
-        ..Settings::default()
+        ..Settings::of_scene(loaded)
     }
 }
 

@@ -9,7 +9,7 @@ use dipir_imaging::transfer::Transfer;
 use dipir_light::luminance::luminance_f64;
 use dipir_light::plane::PlaneLight;
 use dipir_scene::camera::Camera;
-use dipir_scene::scene::Scene;
+use dipir_scene::scene::{LoadedScene, Scene};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
@@ -73,6 +73,28 @@ pub struct Settings<'a> {
     pub most_pixels: Option<u64>,
     /// What may be left out after the first round, which then measures it.
     pub leave_out: Option<LeaveOut>,
+}
+
+impl<'a> Settings<'a> {
+    /// For a photograph, its encoding and the mask of its foreground.
+    pub fn of(
+        background: &'a LinearImage,
+        transfer: Transfer,
+        occluders: Option<&'a Raster<f32>>,
+    ) -> Self {
+        Self {
+            background: Some(background),
+            transfer,
+            occluders,
+            ..Self::default()
+        }
+    }
+
+    /// For the photograph of `loaded`, at its full size.
+    pub fn of_scene(loaded: &'a LoadedScene) -> Self {
+        let photo = &loaded.photo;
+        Self::of(&photo.image, photo.transfer, loaded.occluders.as_ref())
+    }
 }
 
 impl Default for Settings<'_> {

@@ -11,7 +11,6 @@ use dipir_cli::session::Session;
 use dipir_imaging::composite::composite as over;
 use dipir_imaging::layers::Layers;
 use dipir_imaging::raster::{LinearImage, Raster};
-use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_optimize::guidance::{rmse, touched};
 use dipir_optimize::lighting::Lighting;
@@ -170,10 +169,7 @@ fn under_truth(
     let settings = Settings {
         seed: session.pipeline.seed,
         stop: Stop::TargetError(ERROR),
-        background: Some(&frame.background),
-        transfer: scene.loaded.photo.transfer,
-        occluders: frame.occluders.as_ref(),
-        ..Settings::default()
+        ..frame.render_settings()
     };
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
     let light = EnvironmentSampler::new(Arc::new(truth));
@@ -214,9 +210,9 @@ fn under_neutral(
 }
 
 fn toned(object: LinearImage, alpha: &Raster<f32>, tone: Option<Tone>) -> LinearImage {
-    match tone {
-        None | Some(Tone::None) => object,
-        Some(Tone::Reinhard) => ToneCurves::identity().apply_object(&object, alpha),
+    match tone.and_then(Tone::curves) {
+        None => object,
+        Some(curves) => curves.apply_object(&object, alpha),
     }
 }
 

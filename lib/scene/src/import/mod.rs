@@ -54,6 +54,9 @@ pub struct Imported {
     pub dependencies: Vec<PathBuf>,
 }
 
+/// Extensions of the kinds of file that are read.
+pub const EXTENSIONS: [&str; 5] = ["glb", "gltf", "obj", "ply", "stl"];
+
 /// Kinds of file that are not read, and how to convert them.
 const CONVERTED: [(&[&str], &str); 5] = [
     (
@@ -84,7 +87,7 @@ pub fn load_object(path: &Path) -> Result<Imported, Error> {
 pub fn load_object_within(path: &Path, limits: &Limits) -> Result<Imported, Error> {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     let extension = extension.as_deref().unwrap_or("");
-    if !["glb", "gltf", "obj", "ply", "stl"].contains(&extension) {
+    if !EXTENSIONS.contains(&extension) {
         let known = CONVERTED.iter().find(|(all, _)| all.contains(&extension));
         return Err(Error::malformed(
             format!(

@@ -290,19 +290,15 @@ fn render_under<L: SceneLight>(
     let clock = Instant::now();
     let mut round = 0;
     let loaded = &inputs.scene.loaded;
-    let photo = &loaded.photo;
     let effects = &inputs.scene.effects;
     let settings = Settings {
         seed: session.pipeline.seed,
         stop,
         max_samples: table.max_samples.unwrap_or(MAX_SAMPLES),
-        background: Some(&photo.image),
-        transfer: photo.transfer,
-        occluders: loaded.occluders.as_ref(),
         denoise: table.denoise(session.pipeline.quality),
         most_pixels: table.most_pixels(session.pipeline.quality),
         leave_out: effects.leave_out(loaded.description.effects()),
-        ..Settings::default()
+        ..Settings::of_scene(loaded)
     };
     let renderer = Renderer::new(&loaded.scene);
     let progress = session.progress("composite");
@@ -424,7 +420,7 @@ impl<'a> Composite<'a> {
 enum Curve {
     None,
     /// On the object's own colour, which is `rgb / alpha`.
-    Reinhard,
+    Object(Box<ToneCurves>),
     /// Reinhard and a spline on the object, a spline per channel on the shadow.
     Recovered(Box<ToneCurves>),
 }
@@ -433,8 +429,11 @@ impl Curve {
     /// The table's, else the one that was recovered with the light, else none.
     fn of(tone: Option<Tone>, light: &Source) -> Self {
         match (tone, light) {
-            (Some(Tone::None), _) | (None, Source::Map(_)) => Self::None,
-            (Some(Tone::Reinhard), _) => Self::Reinhard,
+            (Some(tone), _) => match tone.curves() {
+                Some(curves) => Self::Object(Box::new(curves)),
+                None => Self::None,
+            },
+            (None, Source::Map(_)) => Self::None,
             (None, Source::Recovered(light)) => Self::Recovered(Box::new(light.tone)),
         }
     }
@@ -448,10 +447,7 @@ impl Curve {
         let object = LinearImage(object);
         match self {
             Self::None => (object.0, shadow),
-            Self::Reinhard => {
-                let curves = ToneCurves::identity();
-                (curves.apply_object(&object, alpha).0, shadow)
-            }
+            Self::Object(curves) => (curves.apply_object(&object, alpha).0, shadow),
             Self::Recovered(curves) => (
                 curves.apply_object(&object, alpha).0,
                 curves.apply_shadow(&LinearImage(shadow)).0,

@@ -2,6 +2,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use dipir_imaging::tone::ToneCurves;
 use dipir_pipeline::config::{Config, Quality};
 use dipir_render::adaptive::Stop;
 use schemars::JsonSchema;
@@ -52,6 +53,24 @@ pub enum Tone {
     None,
     /// `x / (1 + x)` on every channel, for photographs whose highlights are compressed.
     Reinhard,
+}
+
+impl Tone {
+    /// As the configuration has it.
+    pub fn key(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Reinhard => "reinhard",
+        }
+    }
+
+    /// What it does to the object's own colour; `None` for nothing.
+    pub fn curves(self) -> Option<ToneCurves> {
+        match self {
+            Self::None => None,
+            Self::Reinhard => Some(ToneCurves::identity()),
+        }
+    }
 }
 
 /// Most samples in any pixel, unless the table says otherwise.
@@ -116,7 +135,8 @@ impl CompositeTable {
     }
 
     pub(super) fn denoise(&self, quality: Quality) -> bool {
-        self.denoise.unwrap_or(quality != Quality::High)
+        let by_preset = presets::of(quality).composite.denoise;
+        self.denoise.unwrap_or(by_preset)
     }
 
     /// Most pixels at which object and shadow are rendered; a time budget chooses the resolution itself.

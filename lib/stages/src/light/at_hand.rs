@@ -80,10 +80,7 @@ pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand
         return Ok(AtHand {
             lobes: SgMixture::new(Vec::new())?,
             map: Some(light.map),
-            tone: match composite.tone {
-                Some(Tone::Reinhard) => Some(ToneCurves::identity()),
-                Some(Tone::None) | None => None,
-            },
+            tone: composite.tone.and_then(Tone::curves),
             origin: Origin::Map,
         });
     }
@@ -101,8 +98,7 @@ pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand
         lobes: light.lobes,
         map: light.surroundings.map(Arc::new),
         tone: match composite.tone {
-            Some(Tone::None) => None,
-            Some(Tone::Reinhard) => Some(ToneCurves::identity()),
+            Some(tone) => tone.curves(),
             None => Some(light.tone),
         },
         origin,

@@ -41,10 +41,7 @@ pub(super) fn sheet(
     let renderer = Renderer::new(&loaded.scene).with_camera(frame.camera);
     let settings = Settings {
         stop: Stop::Samples(SAMPLES),
-        background: Some(&frame.background),
-        transfer: loaded.photo.transfer,
-        occluders: frame.occluders.as_ref(),
-        ..Settings::default()
+        ..frame.render_settings()
     };
     let photo = &loaded.photo.image;
     let seen = Visible::new(photo, &loaded.scene.camera, MAP[0], MAP[1], BORDER_DEG);

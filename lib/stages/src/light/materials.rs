@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use dipir_cli::interrupt::Interrupted;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::{LinearImage, Raster};
-use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentSampler;
 use dipir_optimize::OptimizeError;
 use dipir_optimize::materials::{
@@ -75,14 +74,14 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
     let sampler = EnvironmentSampler::new(light.map.clone());
     let simulation = scene.effects.simulation();
-    let background = shadowed(&renderer, &sampler, &simulation, &scene, &frame)?;
+    let background = shadowed(&renderer, &sampler, &simulation, &frame)?;
     let resume = Resume::open(session, &fingerprint)?;
     let checkpoint = resume.checkpoint();
     let optimization = MaterialOptimization {
         renderer: &renderer,
         light: &sampler,
         simulation,
-        tone: (composite.tone == Some(Tone::Reinhard)).then(ToneCurves::identity),
+        tone: composite.tone.and_then(Tone::curves),
         background: &background,
         transfer: scene.loaded.photo.transfer,
         reference: &reference,
@@ -167,15 +166,11 @@ fn shadowed(
     renderer: &Renderer,
     light: &EnvironmentSampler,
     simulation: &Simulation,
-    scene: &SceneFolder,
     frame: &Frame,
 ) -> anyhow::Result<LinearImage> {
     let settings = Settings {
         stop: Stop::TargetError(SHADOW_ERROR),
-        background: Some(&frame.background),
-        transfer: scene.loaded.photo.transfer,
-        occluders: frame.occluders.as_ref(),
-        ..Settings::default()
+        ..frame.render_settings()
     };
     let rendered = renderer
         .render(light, simulation, &settings, &mut |_: &Progress| {

@@ -95,10 +95,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
 
     let settings = Settings {
         seed: session.pipeline.seed,
-        background: Some(&loaded.photo.image),
-        transfer: loaded.photo.transfer,
-        occluders: loaded.occluders.as_ref(),
-        ..Settings::default()
+        ..Settings::of_scene(&loaded)
     };
     let renderer = Renderer::new(&loaded.scene);
     warn_of_slow_rays(session, &renderer);

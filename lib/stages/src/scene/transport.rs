@@ -8,9 +8,10 @@ use std::ops::ControlFlow;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::resize::{Filter, resize};
+use dipir_imaging::transfer::Transfer;
 use dipir_optimize::settings::{LightTable, Settings};
 use dipir_render::error::RenderError;
-use dipir_render::render::{Renderer, Simulation};
+use dipir_render::render::{Renderer, Settings as RenderSettings, Simulation};
 use dipir_render::transport::{RecordSettings, Transport};
 use dipir_scene::camera::Camera;
 use dipir_scene::scene::LoadedScene;
@@ -38,6 +39,8 @@ pub struct Frame {
     pub camera: Camera,
     /// The scaled photograph, linear.
     pub background: LinearImage,
+    /// How the photograph is encoded.
+    pub transfer: Transfer,
     /// Scaled, too.
     pub occluders: Option<Raster<f32>>,
 }
@@ -50,6 +53,7 @@ impl Frame {
         Self {
             camera: camera.scaled([width, height]),
             background: Self::image(&loaded.photo.image, [width, height]),
+            transfer: loaded.photo.transfer,
             occluders: loaded
                 .occluders
                 .as_ref()
@@ -68,6 +72,11 @@ impl Frame {
             return image.clone();
         }
         LinearImage(resize(&image.0, width, height, Filter::Area))
+    }
+
+    /// How a picture of this size is rendered.
+    pub fn render_settings(&self) -> RenderSettings<'_> {
+        RenderSettings::of(&self.background, self.transfer, self.occluders.as_ref())
     }
 
     /// How transport is recorded for `settings`. `scene_hash` identifies the scene.
