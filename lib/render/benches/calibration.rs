@@ -5,8 +5,8 @@
 //! reference with a tenth of the target's error, less the reference's own.
 //!
 //! Run with `cargo test -p dipir-render --bench calibration -- --bench [target=RMSE] [size=PIXELS]
-//! [samples=N] [highlights=0] [NAME]`: `samples` draws so many in every pixel instead of stopping at the target, `highlights=0`
-//! leaves highlights to chance, and only scenes whose name holds NAME are rendered.
+//! [samples=N] [highlights=0] [denoise=0] [NAME]`: `samples` draws so many in every pixel instead of stopping at the target,
+//! `highlights=0` leaves highlights to chance, `denoise=0` leaves noise, and only scenes whose name holds NAME are rendered.
 //! Without `--bench`, as tests run it, one small scene proves that it works.
 mod gallery;
 
@@ -53,9 +53,9 @@ fn main() {
         .take(if whole { usize::MAX } else { 1 });
     let light = gallery::sky();
     println!(
-        "| scene | stated, median | 95% bound, median | true, root mean square | true / target | within the bound |"
+        "| scene | stated, median | 95% bound, median | true, root mean square | true / target | within the bound | rays, millions |"
     );
-    println!("|---|--:|--:|--:|--:|--:|");
+    println!("|---|--:|--:|--:|--:|--:|--:|");
     let (mut all_within, mut count, mut ratios) = (0, 0, Vec::new());
     let mut budgets = Vec::new();
     for (name, scene) in scenes {
@@ -69,6 +69,7 @@ fn main() {
             1 << 40,
         );
         let (mut stated, mut bounds, mut squares, mut within) = (vec![], vec![], 0.0, 0);
+        let mut rays = 0;
         for seed in 0..SEEDS {
             let found = render(
                 &renderer,
@@ -81,6 +82,7 @@ fn main() {
                 - reference.error.rmse * reference.error.rmse;
             squares += square.max(0.0) / SEEDS as f64;
             within += u32::from(square.max(0.0).sqrt() <= found.error.upper_95);
+            rays += found.counts.total();
             stated.push(found.error.rmse);
             bounds.push(found.error.upper_95);
         }
@@ -89,10 +91,11 @@ fn main() {
         all_within += within;
         count += SEEDS;
         println!(
-            "| {name} | {:.5} | {:.5} | {error:.5} | {:.2} | {within} of {SEEDS} |",
+            "| {name} | {:.5} | {:.5} | {error:.5} | {:.2} | {within} of {SEEDS} | {:.2} |",
             median(&stated).expect("some"),
             median(&bounds).expect("some"),
             ratios.last().expect("one"),
+            rays as f64 / (1e6 * SEEDS as f64),
         );
         if whole && samples == 0 {
             budgets.push((

@@ -22,7 +22,7 @@ pub(crate) use self::goals::goal;
 use self::goals::{first_goal, next_goals};
 use crate::contribution::{LeaveOut, LeftOut};
 use crate::counters::RayCounts;
-use crate::denoise;
+use crate::denoise::{auxiliary::Auxiliary, denoise};
 use crate::error::RenderError;
 use crate::film::{Film, SquaredError, Viewing};
 use crate::foresight::{Foresight, first_share};
@@ -121,11 +121,11 @@ const FIRST_ROUND_WITH_HIGHLIGHT: u32 = 1024;
 /// Draws samples until `stop`. `advance(job, n, round)` brings a job to `n` samples per pixel and
 /// replicate; the first round simulates `simulation`, and measures what may be left out from the next one on, if
 /// `leave_out` says what; `find_highlights(film, jobs)` says once, after the first round, which pixels of the object start
-/// again with another density of samples; with `denoise` shadows are filtered after every round; `progress` may break
-/// off whenever it is called. A time budget counts from `start`; where it ends within the first round, the pixels that
+/// again with another density of samples; with `auxiliary` pictures the layers are filtered after every round; `progress` may
+/// break off whenever it is called. A time budget counts from `start`; where it ends within the first round, the pixels that
 /// have no samples yet are taken from `coarse`, the same picture at a lower resolution. Without one, the first round is
 /// always finished.
-pub fn refine(
+pub(crate) fn refine(
     size: (usize, usize),
     mut jobs: Vec<Job>,
     stop: Stop,
@@ -136,7 +136,7 @@ pub fn refine(
     leave_out: Option<&LeaveOut>,
     advance: &(impl Fn(&mut Job, u32, &Round) + Sync),
     find_highlights: &dyn Fn(&Film, &[Job]) -> Found,
-    denoise: bool,
+    auxiliary: Option<&Auxiliary>,
     coarse: Option<&Film>,
     progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
 ) -> Result<Refined, RenderError> {
@@ -218,9 +218,9 @@ pub fn refine(
             let begun = start_again(&mut jobs, found, goal, &advance);
             film.develop(&jobs[begun..]);
         }
-        let denoised = match denoise {
-            true => denoise::shadows(&mut film, &jobs, viewing),
-            false => vec![None; jobs.len()],
+        let denoised = match auxiliary {
+            Some(auxiliary) => denoise(&mut film, &jobs, auxiliary, viewing),
+            None => vec![None; jobs.len()],
         };
         let errors: Vec<SquaredError> = jobs
             .par_iter()

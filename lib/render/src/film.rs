@@ -6,6 +6,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::job::{Developed, Job, Layer, REPLICATES};
+use crate::tiles::Tiles;
 
 /// The layers as estimated so far.
 ///
@@ -19,59 +20,8 @@ pub struct Film {
     pub alpha: Raster<f32>,
     /// Shadow ratio; 1 where nothing is shadowed.
     pub shadow: Raster<Vec3>,
-    object_variance: Tiles,
-    shadow_variance: Tiles,
-}
-
-/// A value for every pixel of a frame, stored for the 8 x 8 tiles in which any is not 0.
-#[derive(Clone, Debug)]
-struct Tiles {
-    columns: usize,
-    /// Per tile of the frame, 0 or one more than its place in `values`.
-    places: Vec<u32>,
-    values: Vec<[Vec3; TILE * TILE]>,
-}
-
-/// Side of a tile: the one of blocks of pixels, so that none shares a tile with another.
-const TILE: usize = 8;
-
-impl Tiles {
-    fn new(width: usize, height: usize) -> Self {
-        let columns = width.div_ceil(TILE);
-        Self {
-            columns,
-            places: vec![0; columns * height.div_ceil(TILE)],
-            values: Vec::new(),
-        }
-    }
-
-    fn get(&self, x: usize, y: usize) -> Vec3 {
-        match self.places[y / TILE * self.columns + x / TILE] {
-            0 => Vec3::ZERO,
-            place => self.values[place as usize - 1][y % TILE * TILE + x % TILE],
-        }
-    }
-
-    fn bytes(&self) -> usize {
-        self.places.capacity() * size_of::<u32>()
-            + self.values.capacity() * size_of::<[Vec3; TILE * TILE]>()
-    }
-
-    fn scale(&mut self, x: usize, y: usize, factor: f32) {
-        let place = self.places[y / TILE * self.columns + x / TILE];
-        if place > 0 {
-            self.values[place as usize - 1][y % TILE * TILE + x % TILE] *= factor;
-        }
-    }
-
-    fn set(&mut self, x: usize, y: usize, value: Vec3) {
-        let place = &mut self.places[y / TILE * self.columns + x / TILE];
-        if *place == 0 {
-            self.values.push([Vec3::ZERO; TILE * TILE]);
-            *place = self.values.len() as u32;
-        }
-        self.values[*place as usize - 1][y % TILE * TILE + x % TILE] = value;
-    }
+    object_variance: Tiles<Vec3>,
+    shadow_variance: Tiles<Vec3>,
 }
 
 /// Jobs that are developed at a time, side by side: bounds the memory that holds what they found.
@@ -109,8 +59,12 @@ impl Film {
             let shadow = &mut self.shadow.pixels_mut()[i];
             *shadow = Vec3::ONE + (*shadow - Vec3::ONE) * seen;
             let (x, y) = (i % mask.width(), i / mask.width());
-            self.object_variance.scale(x, y, seen * seen);
-            self.shadow_variance.scale(x, y, seen * seen);
+            for variance in [&mut self.object_variance, &mut self.shadow_variance] {
+                let before = variance.get(x, y);
+                if before != Vec3::ZERO {
+                    variance.set(x, y, before * (seen * seen));
+                }
+            }
         }
     }
 
@@ -148,25 +102,39 @@ impl Film {
         }
     }
 
-    /// Replaces shadow ratios and their variances.
-    pub(crate) fn set_shadow(&mut self, pixels: impl Iterator<Item = ((u32, u32), (Vec3, Vec3))>) {
-        for ((x, y), (shadow, variance)) in pixels {
+    /// Replaces radiance of the object or shadow ratios, and their variances. Coverage stays.
+    pub(crate) fn replace(
+        &mut self,
+        layer: Layer,
+        pixels: impl Iterator<Item = ((u32, u32), (Vec3, Vec3))>,
+    ) {
+        let (values, variances) = self.layer_mut(layer);
+        for ((x, y), (value, variance)) in pixels {
             let (x, y) = (x as usize, y as usize);
-            *self.shadow.get_mut(x, y) = shadow;
-            self.shadow_variance.set(x, y, variance);
+            *values.get_mut(x, y) = value;
+            variances.set(x, y, variance);
         }
     }
 
-    /// Raises the variances of shadow ratios to `least`.
-    pub(crate) fn raise_shadow_variance(
+    /// Raises the variances of radiance or of shadow ratios to `least`.
+    pub(crate) fn raise_variance(
         &mut self,
+        layer: Layer,
         pixels: impl Iterator<Item = (u32, u32)>,
         least: f32,
     ) {
+        let (_, variances) = self.layer_mut(layer);
         for (x, y) in pixels {
             let (x, y) = (x as usize, y as usize);
-            let variance = self.shadow_variance(x, y).max(Vec3::splat(least));
-            self.shadow_variance.set(x, y, variance);
+            let variance = variances.get(x, y).max(Vec3::splat(least));
+            variances.set(x, y, variance);
+        }
+    }
+
+    fn layer_mut(&mut self, layer: Layer) -> (&mut Raster<Vec3>, &mut Tiles<Vec3>) {
+        match layer {
+            Layer::Object => (&mut self.object, &mut self.object_variance),
+            _ => (&mut self.shadow, &mut self.shadow_variance),
         }
     }
 
@@ -293,11 +261,22 @@ impl Viewing<'_> {
     /// to first order: the replicates' spread of the linear composite times the squared slope of
     /// the transfer curve.
     pub fn squared_error(&self, film: &Film, job: &Job) -> SquaredError {
+        self.squared_error_where(film, job, |_| true)
+    }
+
+    /// As [`squared_error`](Self::squared_error), of the pixels for which `holds` is true.
+    pub(crate) fn squared_error_where(
+        &self,
+        film: &Film,
+        job: &Job,
+        holds: impl Fn((u32, u32)) -> bool,
+    ) -> SquaredError {
         let mut total = SquaredError::default();
         if job.samples == 0 {
             return total;
         }
-        for (index, (x, y)) in job.pixels.iter().enumerate() {
+        let pixels = job.pixels.iter().enumerate();
+        for (index, (x, y)) in pixels.filter(|(_, pixel)| holds(*pixel)) {
             let (x, y) = (x as usize, y as usize);
             let background = self.background(x, y);
             let composite = |(value, coverage): (Vec3, f32)| match job.layer {
@@ -332,20 +311,31 @@ impl Viewing<'_> {
         total
     }
 
-    /// Squared display-referred error for a squared error of the shadow ratio, of which `variance` is the size.
-    pub(crate) fn weight_of_shadow(&self, film: &Film, x: usize, y: usize, variance: Vec3) -> Vec3 {
+    /// Squared display-referred error for a squared error of the shadow ratio, or of the object's radiance, of which
+    /// `variance` is the size.
+    pub(crate) fn weight(
+        &self,
+        film: &Film,
+        layer: Layer,
+        (x, y): (u32, u32),
+        variance: Vec3,
+    ) -> Vec3 {
+        let (x, y) = (x as usize, y as usize);
         let (object, alpha) = (*film.object.get(x, y), *film.alpha.get(x, y));
         let background = self.background(x, y);
         let mean = composite_pixel(background, object, alpha, *film.shadow.get(x, y));
-        let slope = |c: usize| {
-            let per_ratio = background[c] * (1.0 - alpha);
-            let weight = per_ratio * self.slope(mean[c], per_ratio * variance[c].sqrt()) as f32;
+        let weight = |c: usize| {
+            let linear = match layer {
+                Layer::Object => 1.0,
+                _ => background[c] * (1.0 - alpha),
+            };
+            let weight = linear * self.slope(mean[c], linear * variance[c].sqrt()) as f32;
             match weight.is_finite() {
                 true => weight * weight,
                 false => 0.0,
             }
         };
-        Vec3::new(slope(0), slope(1), slope(2))
+        Vec3::new(weight(0), weight(1), weight(2))
     }
 
     /// Mean slope of the transfer curve within one standard error: clipped values cannot be wrong.

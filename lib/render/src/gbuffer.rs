@@ -8,9 +8,11 @@ use dipir_scene::camera::Ray;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
+use crate::denoise::auxiliary::{self, Auxiliary};
 use crate::error::RenderError;
 use crate::features::{EVERYTHING, with_features};
 use crate::footprint::Footprint;
+use crate::job::{Job, Layer};
 use crate::render::Renderer;
 use crate::world::World;
 
@@ -98,6 +100,28 @@ impl GBuffer {
         rows.insert_pixels(["proxy.A"], half, |i| [pixels[i].proxy_alpha])?;
         Ok(rows)
     }
+}
+
+/// The surfaces in the pixels of the object that `jobs` sample.
+pub(crate) fn auxiliary(world: &World, jobs: &[Job], seed: u64) -> Auxiliary {
+    let view = View::new(world, seed);
+    let objects = jobs.iter().filter(|job| job.layer == Layer::Object);
+    let pixels: Vec<_> = objects.flat_map(|job| job.pixels.iter()).collect();
+    let seen = pixels.par_iter().map(|&(x, y)| {
+        let mut pixel = Pixel::EMPTY;
+        let at = (x as usize, y as usize);
+        if view.object(&mut pixel, at, FIRST_SAMPLES) == First::Uneven {
+            view.object(&mut pixel, at, SAMPLES);
+        }
+        auxiliary::Seen::new(pixel.normal, pixel.albedo)
+    });
+    let seen: Vec<_> = seen.collect();
+    let [width, height] = world.camera().resolution.map(|n| n as usize);
+    let mut auxiliary = Auxiliary::new(width, height);
+    for ((x, y), seen) in pixels.into_iter().zip(seen) {
+        auxiliary.set(x as usize, y as usize, seen);
+    }
+    auxiliary
 }
 
 impl Pixel {

@@ -75,6 +75,16 @@ impl PixelSet {
         self.bits == 0
     }
 
+    /// Its number among them, row by row; `None` if it is none of them.
+    pub fn index_of(self, x: u32, y: u32) -> Option<usize> {
+        let (column, row) = (x.checked_sub(self.x)?, y.checked_sub(self.y)?);
+        if column >= 8 || row >= 8 {
+            return None;
+        }
+        let bit = 1u64 << (8 * row + column);
+        (self.bits & bit != 0).then(|| (self.bits & (bit - 1)).count_ones() as usize)
+    }
+
     /// Column and row of each, row by row.
     pub fn iter(self) -> impl Iterator<Item = (u32, u32)> {
         let mut bits = self.bits;
@@ -268,6 +278,23 @@ pub(crate) type Developed = (Vec3, f32, Vec3);
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn every_pixel_has_its_number() {
+        let block = Block {
+            x: 8,
+            y: 16,
+            width: 8,
+            height: 5,
+        };
+        let pixels = PixelSet::new(block, |(x, y)| (x + y) % 3 != 0);
+        for (index, (x, y)) in pixels.iter().enumerate() {
+            assert_eq!(pixels.index_of(x, y), Some(index));
+        }
+        for missing in [(9, 18), (7, 16), (16, 16), (8, 15), (10, 21)] {
+            assert_eq!(pixels.index_of(missing.0, missing.1), None);
+        }
+    }
 
     #[test]
     fn pixels_that_are_not_given_up_keep_their_samples() {

@@ -26,5 +26,6 @@ pub mod shapes;
 pub mod surface;
 #[cfg(test)]
 mod testing;
+mod tiles;
 pub mod transport;
 pub mod world;

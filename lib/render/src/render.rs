@@ -24,6 +24,7 @@ use crate::film::{Film, Viewing};
 use crate::footprint::Footprint;
 use crate::foreground::PathContext;
 use crate::foresight::Foresight;
+use crate::gbuffer;
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet};
 use crate::light::{PathLight, PreparedLight, SceneLight};
@@ -66,7 +67,7 @@ pub struct Settings<'a> {
     pub shadow_tolerance: f32,
     /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
     pub highlights: bool,
-    /// Whether shadows are [denoised](crate::denoise).
+    /// Whether noise is [removed](crate::denoise) from object and shadow.
     pub denoise: bool,
     /// A frame of more pixels is rendered at 1/2, 1/4 and so on of its resolution, the finest that has at most
     /// this many, and enlarged. A time budget chooses the resolution itself.
@@ -332,6 +333,10 @@ impl<'a> Renderer<'a> {
             };
             highlights::find(path, film, &viewing, &pixels, limit, settings.seed)
         };
+        let auxiliary = (settings.denoise).then(|| {
+            // Other samples than those that are filtered.
+            gbuffer::auxiliary(path.world, &jobs, !settings.seed)
+        });
         let refined = refine(
             (width, height),
             jobs,
@@ -343,7 +348,7 @@ impl<'a> Renderer<'a> {
             settings.leave_out.as_ref(),
             advance,
             &find_highlights,
-            settings.denoise,
+            auxiliary.as_ref(),
             coarse,
             progress,
         )?;

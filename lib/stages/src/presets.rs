@@ -52,7 +52,7 @@ impl Preset {
 pub struct CompositePreset {
     /// Display-referred RMSE at which sampling stops.
     pub target_error: f32,
-    /// Whether shadows are denoised.
+    /// Whether object and shadow are denoised.
     pub denoise: bool,
     /// Most pixels at which object and shadow are rendered.
     pub most_pixels: Option<u64>,

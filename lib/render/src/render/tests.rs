@@ -417,7 +417,43 @@ fn denoised_shadows_have_a_smaller_error_and_it_is_measured() {
 }
 
 #[test]
-fn denoised_shadows_have_the_same_bytes_for_any_number_of_threads() {
+fn a_denoised_object_has_a_smaller_error_and_it_is_stated() {
+    let scene = knot_scene(64);
+    let simulation = Simulation {
+        shadow: false,
+        ..lambertian(4)
+    };
+    // Samples, and most of the squared error that may be left.
+    for (samples, most) in [(4, 0.85), (32, 0.95)] {
+        let with = |samples, seed, denoise| {
+            let settings = Settings {
+                denoise,
+                ..settings(samples, seed)
+            };
+            render(&scene, &sunny(), &simulation, &settings)
+        };
+        let reference = with(2048, 100, false);
+        let n = reference.film.alpha.pixels().len();
+        let touched = reference.error.touched_pixels as f64;
+        let error = |r: &Rendered| {
+            let sum: f64 = (0..n).map(|i| squared_difference(r, &reference, i)).sum();
+            sum / touched
+        };
+        let (mut drawn, mut left, mut stated) = (0.0, 0.0, 0.0);
+        for seed in 0..6 {
+            drawn += error(&with(samples, seed, false));
+            let denoised = with(samples, seed, true);
+            left += error(&denoised);
+            stated += denoised.error.rmse.powi(2);
+        }
+        eprintln!("{samples} {} stated {}", left / drawn, stated / left);
+        assert!(left < most * drawn, "{left} of {drawn}");
+        assert!((0.7..1.4).contains(&(stated / left)), "{stated} for {left}");
+    }
+}
+
+#[test]
+fn denoised_layers_have_the_same_bytes_for_any_number_of_threads() {
     let scene = knot_scene(48);
     let lobe = SphericalGaussian {
         direction: Vec3::Y,
@@ -431,11 +467,9 @@ fn denoised_shadows_have_the_same_bytes_for_any_number_of_threads() {
     };
     let [one, three] = [1, 3].map(|threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-        pool.expect("threads").install(|| {
-            render(&scene, &light, &lambertian(2), &settings)
-                .film
-                .shadow
-        })
+        pool.expect("threads")
+            .install(|| render(&scene, &light, &lambertian(2), &settings).film)
     });
-    assert_eq!(one.pixels(), three.pixels());
+    assert_eq!(one.shadow.pixels(), three.shadow.pixels());
+    assert_eq!(one.object.pixels(), three.object.pixels());
 }

@@ -36,7 +36,7 @@ pub struct CompositeTable {
     /// and so on of its resolution, and enlarged. A time budget chooses the resolution itself.
     #[schemars(range(min = 1), extend("x-default" = "none; 1048576 for the preset `draft`"), example = 4000000)]
     pub most_pixels: Option<u64>,
-    /// Whether noise is removed from shadows. What that does to the error is measured and stated.
+    /// Whether noise is removed from object and shadow. What that does to the error is measured and stated.
     #[schemars(extend("x-default" = "true; false for the preset `high`"), example = false)]
     pub denoise: Option<bool>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x

@@ -1,0 +1,294 @@
+//! Layers without most of their noise: non-local means between the two halves of the samples.
+//!
+//! A shadow ratio has no texture: pixels whose surroundings look alike have nearly the same value. On the object, normals
+//! and base colours ([`auxiliary`]) also tell which pixels may differ; its edges, and pixels with highlights of their own,
+//! are left as they are. Each half of the samples is filtered with weights that the other half gives, so that weights do not
+//! follow the noise that they average [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering"]. What is
+//! left of the error is measured, bias included: a filtered half differs from the other half as drawn by the error of the
+//! one and the noise of the other, and the noise is known. Where the filter does not help, the samples stay as they are.
+pub(crate) mod auxiliary;
+mod window;
+
+use dipir_light::luminance::luminance;
+use glam::Vec3;
+use rayon::prelude::*;
+
+use self::auxiliary::Auxiliary;
+use self::window::{BLOCK, Comparison, Halves, Window};
+use crate::film::{Film, SquaredError, Viewing};
+use crate::job::{Job, Layer, REPLICATES};
+
+/// Tiles to each side whose noise is averaged for that of a tile, and whose errors for its bias and for whether its pixels
+/// are filtered.
+const NOISE_POOL: usize = 1;
+const BIAS_POOL: usize = 2;
+/// Jobs that are filtered at a time: bounds the memory that holds their pixels.
+const AT_ONCE: usize = 4096;
+
+/// Sums over pixels.
+#[derive(Clone, Copy, Debug, Default)]
+struct Sums {
+    pixels: f64,
+    /// Squared error of the filtered pixels, as measured: may come out negative. Display-referred.
+    error: f64,
+    /// The same of radiance or shadow ratio, linear.
+    linear: f64,
+    /// Variance of `error`.
+    variance: f64,
+    /// Squared error that the halves, filtered, differ by.
+    residual: f64,
+    /// Squared error of the samples.
+    noise: f64,
+}
+
+impl Sums {
+    fn add(&mut self, other: &Self) {
+        self.pixels += other.pixels;
+        self.error += other.error;
+        self.linear += other.linear;
+        self.variance += other.variance;
+        self.residual += other.residual;
+        self.noise += other.noise;
+    }
+}
+
+/// What is filtered as one.
+#[derive(Clone, Copy, PartialEq)]
+enum Kind {
+    Object,
+    Shadow,
+}
+
+impl Kind {
+    /// Pixels with a density of samples hold a highlight, and what their neighbours do not.
+    fn holds(self, job: &Job) -> bool {
+        match self {
+            Kind::Object => job.layer == Layer::Object && job.density.is_none(),
+            Kind::Shadow => job.layer != Layer::Object,
+        }
+    }
+}
+
+/// Shadow ratios are compared by luminance.
+const SHADOW: Comparison<1, 2> = Comparison {
+    with_own: true,
+    channels: |ratio| [luminance(ratio)],
+};
+/// Radiance by all channels: what differs in colour alone stays apart.
+const OBJECT: Comparison<3, 1> = Comparison {
+    with_own: false,
+    channels: |radiance| radiance.to_array(),
+};
+
+/// The jobs of a kind by the tile of the frame that they cover.
+struct Tiles<'a> {
+    kind: Kind,
+    jobs: &'a [Job],
+    auxiliary: &'a Auxiliary,
+    size: [usize; 2],
+    columns: usize,
+    /// Per tile 0, or one more than its job.
+    places: Vec<u32>,
+}
+
+impl<'a> Tiles<'a> {
+    fn new(kind: Kind, jobs: &'a [Job], auxiliary: &'a Auxiliary, film: &Film) -> Self {
+        let size = [film.alpha.width(), film.alpha.height()];
+        let columns = size[0].div_ceil(BLOCK);
+        let mut places = vec![0; columns * size[1].div_ceil(BLOCK)];
+        for (index, job) in jobs.iter().enumerate() {
+            if kind.holds(job) {
+                let tile = [job.block.x, job.block.y].map(|n| n as usize / BLOCK);
+                places[tile[1] * columns + tile[0]] = index as u32 + 1;
+            }
+        }
+        Self {
+            kind,
+            jobs,
+            auxiliary,
+            size,
+            columns,
+            places,
+        }
+    }
+
+    fn job(&self, column: usize, row: usize) -> Option<usize> {
+        let place = self.places[row * self.columns + column];
+        (place > 0).then(|| place as usize - 1)
+    }
+
+    /// What is filtered at a pixel: radiance of the object where it covers all of the pixel, or the part of the light that
+    /// is missing on the ground.
+    fn halves(&self, x: usize, y: usize) -> Halves {
+        let mut halves = Halves {
+            values: [Vec3::ZERO; REPLICATES],
+            is_inside: self.kind == Kind::Shadow,
+            seen: self.auxiliary.get(x, y),
+        };
+        let Some(job) = self.job(x / BLOCK, y / BLOCK) else {
+            return halves;
+        };
+        let job = &self.jobs[job];
+        let Some(index) = job.pixels.index_of(x as u32, y as u32) else {
+            return halves;
+        };
+        let estimates: [_; REPLICATES] = std::array::from_fn(|k| job.estimate(index, Some(k)));
+        match self.kind {
+            Kind::Object => {
+                halves.values = estimates.map(|e| e.0);
+                halves.is_inside = estimates.iter().all(|e| e.1 >= 1.0);
+            }
+            Kind::Shadow => halves.values = estimates.map(|e| Vec3::ONE - e.0),
+        }
+        halves
+    }
+
+    /// The sums of the tiles up to `reach` away from that of `job`.
+    fn around(&self, job: &Job, reach: usize, sums: &[Sums]) -> Sums {
+        let rows = self.places.len() / self.columns;
+        let [column, row] = [job.block.x, job.block.y].map(|n| n as usize / BLOCK);
+        let mut all = Sums::default();
+        for row in row.saturating_sub(reach)..(row + reach + 1).min(rows) {
+            for column in column.saturating_sub(reach)..(column + reach + 1).min(self.columns) {
+                if let Some(job) = self.job(column, row) {
+                    all.add(&sums[job]);
+                }
+            }
+        }
+        all
+    }
+}
+
+/// A job's pixels, filtered, with the variance of each, and what its halves differ by.
+struct Filtered {
+    pixels: Vec<((u32, u32), (Vec3, Vec3))>,
+    sums: Sums,
+}
+
+fn filter<const CHANNELS: usize, const PATCH: usize>(
+    comparison: Comparison<CHANNELS, PATCH>,
+    tiles: &Tiles,
+    job: &Job,
+    film: &Film,
+    viewing: &Viewing,
+) -> Option<Filtered> {
+    let first = [job.block.x, job.block.y].map(|n| n as usize);
+    let window = Window::new(comparison, first, tiles.size, |x, y| tiles.halves(x, y))?;
+    let place = |(x, y): (u32, u32)| (x as usize - first[0], y as usize - first[1]);
+    let is_inside = |pixel: &(u32, u32)| {
+        let (i, j) = place(*pixel);
+        window.is_inside(i, j)
+    };
+    if !job.pixels.iter().any(|pixel| is_inside(&pixel)) {
+        return None;
+    }
+    let filtered = window.filtered();
+    let mut sums = Sums::default();
+    let pixels = job.pixels.iter().filter(is_inside).map(|pixel| {
+        let (i, j) = place(pixel);
+        let [a, b] = window.drawn(i, j);
+        let [fa, fb] = [0, 1].map(|k| filtered[k][j * BLOCK + i]);
+        let square = |v: Vec3| v * v;
+        let half_noise = square(a - b) * 0.5;
+        let residual = square(fa - fb) * 0.25;
+        // The mean of two filtered halves is better than one by what they differ.
+        let error = (square(fa - b) + square(fb - a)) * 0.5 - half_noise - residual;
+        let seen = viewing.weight(film, job.layer, pixel, residual);
+        let mean = |v: Vec3| f64::from((v * seen).element_sum()) / 3.0;
+        let measured = mean(error);
+        sums.add(&match measured.is_finite() && error.is_finite() {
+            true => Sums {
+                pixels: 1.0,
+                error: measured,
+                linear: f64::from(error.element_sum()) / 3.0,
+                variance: measured * measured,
+                residual: mean(residual),
+                noise: mean(half_noise) * 0.5,
+            },
+            // So bright that its square is no number: nothing near is filtered.
+            false => Sums {
+                pixels: 1.0,
+                error: f64::INFINITY,
+                ..Sums::default()
+            },
+        });
+        let value = match tiles.kind {
+            Kind::Object => (fa + fb) * 0.5,
+            Kind::Shadow => Vec3::ONE - (fa + fb) * 0.5,
+        };
+        (pixel, (value, residual))
+    });
+    Some(Filtered {
+        pixels: pixels.collect(),
+        sums,
+    })
+}
+
+/// Filters the layers of `film`, which holds what `jobs` have found, and returns the error of every job that is
+/// filtered. Pixels where nothing near is shadowed stay as they are. Does nothing to a layer while any job of it has no
+/// samples.
+pub(crate) fn denoise(
+    film: &mut Film,
+    jobs: &[Job],
+    auxiliary: &Auxiliary,
+    viewing: &Viewing,
+) -> Vec<Option<SquaredError>> {
+    let mut errors = vec![None; jobs.len()];
+    for kind in [Kind::Object, Kind::Shadow] {
+        let of_kind = || jobs.iter().filter(|job| kind.holds(job));
+        if of_kind().all(|job| job.samples > 0) {
+            let tiles = Tiles::new(kind, jobs, auxiliary, film);
+            denoise_kind(film, &tiles, viewing, &mut errors);
+        }
+    }
+    errors
+}
+
+fn denoise_kind(
+    film: &mut Film,
+    tiles: &Tiles,
+    viewing: &Viewing,
+    errors: &mut [Option<SquaredError>],
+) {
+    let jobs = tiles.jobs;
+    let mut sums = vec![Sums::default(); jobs.len()];
+    for (jobs, sums) in jobs.chunks(AT_ONCE).zip(sums.chunks_mut(AT_ONCE)) {
+        let filter = |job: &Job| match tiles.kind {
+            kind if !kind.holds(job) => None,
+            Kind::Object => filter(OBJECT, tiles, job, film, viewing),
+            Kind::Shadow => filter(SHADOW, tiles, job, film, viewing),
+        };
+        let filtered: Vec<_> = jobs.par_iter().map(filter).collect();
+        for ((job, sums), filtered) in jobs.iter().zip(sums).zip(filtered) {
+            if let Some(filtered) = filtered {
+                *sums = filtered.sums;
+                film.replace(job.layer, filtered.pixels.into_iter());
+            }
+        }
+    }
+    for (index, job) in jobs.iter().enumerate() {
+        if sums[index].pixels == 0.0 {
+            continue;
+        }
+        let wide = tiles.around(job, BIAS_POOL, &sums);
+        if wide.error > wide.noise {
+            film.develop(std::slice::from_ref(job));
+            continue;
+        }
+        let is_filtered = |(x, y): (u32, u32)| tiles.halves(x as usize, y as usize).is_inside;
+        let near = tiles.around(job, NOISE_POOL, &sums);
+        let filtered = job.pixels.iter().filter(|&pixel| is_filtered(pixel));
+        film.raise_variance(job.layer, filtered, (near.linear / near.pixels) as f32);
+        let noise = near.residual / near.pixels;
+        let bias = ((wide.error - wide.residual) / wide.pixels).max(0.0);
+        let left = SquaredError {
+            sum: (noise + bias) * sums[index].pixels,
+            variance: sums[index].variance,
+        };
+        let drawn = viewing.squared_error_where(film, job, |pixel| !is_filtered(pixel));
+        errors[index] = Some(left.merge(drawn));
+    }
+}
+
+#[cfg(test)]
+mod tests;
