@@ -15,7 +15,7 @@ use kernels::matmul::{Engine, Matrix, Threads, product_by};
 /// Name, rows, columns, depth, and whether the right-hand matrix is stored transposed.
 type Shape = (&'static str, [usize; 3], bool);
 
-const SHAPES: [Shape; 17] = [
+const SHAPES: [Shape; 15] = [
     ("linear 320 to 1280", [4096, 1280, 320], true),
     ("linear 1280 to 320", [4096, 320, 1280], true),
     ("linear 320 to 320", [4096, 320, 320], true),
@@ -26,8 +26,6 @@ const SHAPES: [Shape; 17] = [
     ("scores, 40 channels", [128, 4096, 40], true),
     ("values, 40 channels", [128, 40, 4096], false),
     ("scores, 160 channels", [64, 64, 160], true),
-    ("Winograd, 320 channels", [320, 256, 320], false),
-    ("Winograd, 64 channels", [64, 64, 64], false),
     ("unfolded, 1280 channels", [1280, 256, 11520], false),
     ("small linear, 64 to 64", [64, 64, 64], true),
     ("small linear, 128 to 1024", [16, 1024, 128], true),

@@ -126,15 +126,15 @@ fn unfold_tap(
 pub(crate) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
     let pixels = shape.out_pixels();
     let mut out = vec![0.0; shape.batch * shape.outputs * pixels];
+    if winograd::suits(shape) {
+        winograd::conv2d(shape, x, w, winograd::Weights::AsStored, bias, &mut out);
+        return out;
+    }
     if let Some(bias) = bias {
         out.par_chunks_exact_mut(pixels)
             .with_min_len(FILL.div_ceil(pixels))
             .enumerate()
             .for_each(|(row, out)| out.fill(bias[row % shape.outputs]));
-    }
-    if winograd::suits(shape) {
-        winograd::conv2d(shape, x, w, winograd::Weights::AsStored, &mut out);
-        return out;
     }
     let keep = if bias.is_some() { 1.0 } else { 0.0 };
     let depth = shape.depth();
@@ -240,7 +240,7 @@ pub(crate) fn conv2d_vjp_input(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f3
         };
         if winograd::suits(adjoint) {
             let mut dx = vec![0.0; shape.batch * image_len];
-            winograd::conv2d(adjoint, g, w, winograd::Weights::Adjoint, &mut dx);
+            winograd::conv2d(adjoint, g, w, winograd::Weights::Adjoint, None, &mut dx);
             return dx;
         }
         // Turning the weights costs as much as there are outputs, folding as much as there are pixels.
@@ -344,6 +344,9 @@ fn fold_row(column: &[f32], dx: &mut [f32], stride: usize, kx: usize, pad: usize
 /// made transposed, [depth, outputs]: the unfolded pixels are then read as they lie, and only the smaller `g` is
 /// turned.
 pub(crate) fn conv2d_vjp_weight(shape: ConvShape, g: &[f32], x: &[f32]) -> Vec<f32> {
+    if winograd::suits(shape) {
+        return winograd::gradient_of_weights(shape, g, x);
+    }
     let (pixels, depth, outputs) = (shape.out_pixels(), shape.depth(), shape.outputs);
     let image_len = shape.inputs * shape.height * shape.width;
     let (block_rows, out_width) = (shape.block_rows(), shape.out_width());

@@ -6,6 +6,7 @@
 
 pub(crate) mod attention;
 pub(crate) mod conv;
+mod lanes;
 pub(crate) mod matmul;
 pub(crate) mod norm;
 mod packed;
@@ -24,21 +25,26 @@ const POOL_BUFFERS: usize = 6;
 const POOL_FLOATS: usize = 128 << 20;
 const BUFFER_FLOATS: usize = 64 << 20;
 
-/// Runs `f` on a buffer of `len` floats of unspecified content.
+/// Floats of a cache line: loads of a vector register that cross one take twice as long.
+const LINE: usize = 16;
+
+/// Runs `f` on a buffer of `len` floats of unspecified content, which starts with a cache line.
 pub(crate) fn with_scratch<R>(len: usize, f: impl FnOnce(&mut [f32]) -> R) -> R {
+    let needed = len + LINE - 1;
     let pool = || POOL.lock().unwrap_or_else(PoisonError::into_inner);
     let mut buffer = {
         let mut pool = pool();
         // The smallest that is large enough, else a new one.
         let fitting = (0..pool.len())
-            .filter(|&i| pool[i].len() >= len)
+            .filter(|&i| pool[i].len() >= needed)
             .min_by_key(|&i| pool[i].len());
         fitting.map(|i| pool.swap_remove(i)).unwrap_or_default()
     };
-    if buffer.len() < len {
-        buffer = vec![0.0; len];
+    if buffer.len() < needed {
+        buffer = vec![0.0; needed];
     }
-    let result = f(&mut buffer[..len]);
+    let start = buffer.as_ptr().align_offset(size_of::<f32>() * LINE);
+    let result = f(&mut buffer[start..start + len]);
     if buffer.len() <= BUFFER_FLOATS {
         let mut pool = pool();
         pool.push(buffer);
