@@ -9,7 +9,7 @@ use dipir_stages::command_line::concepts::Cli;
 fn main() -> ExitCode {
     exit::run(|| {
         let session = Session::start(&Cli::parse().common)?;
-        let done = dipir_stages::concepts::run(&session)?;
+        let done = session.on_worker(|| dipir_stages::concepts::run(&session))?;
         session.result(|| done.to_string(), || done.to_json());
         Ok(())
     })

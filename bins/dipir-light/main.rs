@@ -10,11 +10,11 @@ fn main() -> ExitCode {
     exit::run(|| {
         let session = Session::start(&Cli::parse().common)?;
         if dipir_stages::light::materials::are_asked_for(&session)? {
-            let done = dipir_stages::light::materials::run(&session)?;
+            let done = session.on_worker(|| dipir_stages::light::materials::run(&session))?;
             session.result(|| done.to_string(), || done.to_json());
             return Ok(());
         }
-        let done = dipir_stages::light::run(&session)?;
+        let done = session.on_worker(|| dipir_stages::light::run(&session))?;
         session.result(|| done.to_string(), || done.to_json());
         Ok(())
     })

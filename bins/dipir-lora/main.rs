@@ -9,7 +9,7 @@ use dipir_stages::command_line::lora::Cli;
 fn main() -> ExitCode {
     exit::run(|| {
         let session = Session::start(&Cli::parse().common)?;
-        let done = dipir_stages::lora::run(&session)?;
+        let done = session.on_worker(|| dipir_stages::lora::run(&session))?;
         session.result(|| done.to_string(), || done.to_json());
         Ok(())
     })

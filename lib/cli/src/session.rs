@@ -98,6 +98,12 @@ impl Session {
         start_threads(self.pipeline.threads)
     }
 
+    /// Does `work` on one of the worker threads. From any other thread each loop in parallel hands its work to a worker,
+    /// and sleeps until it is done: two switches of threads, longer than a small network's layers take.
+    pub fn on_worker<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
+        rayon::scope(|_| work())
+    }
+
     /// The folder of a stage.
     pub fn stage_folder(&self, stage: &str) -> PathBuf {
         self.out.join(stage)
@@ -180,9 +186,13 @@ pub fn check_threads(threads: usize) -> Result<(), String> {
     }
 }
 
+/// Bytes of a worker's stack, as many as the main thread has on Linux: gradients of deep networks are found by recursion.
+const STACK: usize = 8 << 20;
+
 fn start_threads(threads: usize) -> anyhow::Result<()> {
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
+        .stack_size(STACK)
         .build_global()
         .context("cannot start the worker threads; ask for fewer with --threads, or give the process more memory (ulimit -v)")
 }
