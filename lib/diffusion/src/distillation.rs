@@ -240,10 +240,7 @@ impl ScoreDistillation<'_> {
             lora_rows,
             recompute: None,
         };
-        let output = self
-            .unet
-            .forward(&inputs, &[t as f64], &context, &pass)?
-            .detach();
+        let output = self.unet.predict(&inputs, &[t as f64], &context, &pass)?;
         let unconditional = output.narrow(0, batch, rows - batch)?;
         Ok((
             output.narrow(0, 0, batch)?,

@@ -79,10 +79,7 @@ pub fn generate(
             None => x.clone(),
         };
         let both = Tensor::cat(&[&input, &input], 0)?;
-        let output = model
-            .unet
-            .forward(&both, &[t as f64], &context, pass)?
-            .detach();
+        let output = model.unet.predict(&both, &[t as f64], &context, pass)?;
         done += 1;
         if !progress(done as f64 / settings.steps as f64) {
             return argument("sampling was stopped");

@@ -35,6 +35,14 @@ impl Recompute {
         }
     }
 
+    /// For the same parameters, without gradients yet: what another backward pass collects apart.
+    pub fn another(&self) -> Self {
+        Self {
+            variables: self.variables.clone(),
+            gradients: Default::default(),
+        }
+    }
+
     /// Runs `segment` on (x, context) without keeping its inner values. One
     /// of the two inputs has to be part of a graph, or the gradients of the
     /// segment's own parameters are never asked for.
@@ -64,11 +72,7 @@ impl Recompute {
             .unwrap_or_else(PoisonError::into_inner);
         for variable in self.variables.iter() {
             if let Some(found) = collected.remove(&variable.id()) {
-                let sum = match gradients.remove(variable) {
-                    Some(other) => (other + found)?,
-                    None => found,
-                };
-                gradients.insert(variable, sum);
+                add_gradient(gradients, variable, found)?;
             }
         }
         Ok(())
@@ -90,6 +94,16 @@ impl Recompute {
         }
         Ok(())
     }
+}
+
+/// Adds `found` to the gradient of `variable`.
+pub(crate) fn add_gradient(gradients: &mut GradStore, variable: &Var, found: Tensor) -> Result<()> {
+    let sum = match gradients.remove(variable) {
+        Some(other) => (other + found)?,
+        None => found,
+    };
+    gradients.insert(variable, sum);
+    Ok(())
 }
 
 /// Passes the third argument, the segment's value, through; replays the

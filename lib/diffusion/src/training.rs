@@ -5,7 +5,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
+use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Tensor, Var};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::distillation::InpaintCondition;
@@ -15,7 +17,7 @@ use crate::model::Model;
 use crate::noise::NoiseStream;
 use crate::optimizer::{AdamW, AdamWConfig};
 use crate::pass::Pass;
-use crate::recompute::Recompute;
+use crate::recompute::{Recompute, add_gradient};
 use crate::text_encoder::LearnedTokens;
 use crate::weights::{Weights, write_safetensors};
 
@@ -270,25 +272,63 @@ impl<'a> LoraTrainer<'a> {
         if self.config.prior_weight > 0.0 {
             examples.extend(data.prior(stream)?);
         }
-        let losses = self.losses(&examples, stream)?;
-        let total = match losses.get(1) {
-            Some(prior) => (&losses[0] + (prior * self.config.prior_weight)?)?,
-            None => losses[0].clone(),
+        let draws = self.draws(&examples, stream)?;
+        // On the CPU each example takes a thread of its own, as in `UNet::predict`.
+        let together = match self.model.device().is_cpu() {
+            true => 1,
+            false => examples.len(),
         };
-        let gradients = self.gradients_of(&total)?;
-        let value = |t: &Tensor| -> Result<f64> { Ok(t.to_scalar::<f32>()? as f64) };
-        let prior = losses.get(1).map(value).transpose()?.unwrap_or(0.0);
-        Ok((gradients, (value(&losses[0])?, prior)))
+        let parts = (0..examples.len()).into_par_iter().step_by(together);
+        let parts = parts.map(|first| self.part(&examples[first..][..together], &draws, first));
+        let mut parts = parts.collect::<Result<Vec<_>>>()?.into_iter();
+        let Some((mut gradients, mut losses)) = parts.next() else {
+            return argument("training: no example");
+        };
+        for (mut more, values) in parts {
+            losses.extend(values);
+            for variable in self.variables().values() {
+                if let Some(found) = more.remove(variable) {
+                    add_gradient(&mut gradients, variable, found)?;
+                }
+            }
+        }
+        let gradients = self.optimizer.collect(&gradients)?;
+        Ok((
+            gradients,
+            (losses[0], losses.get(1).copied().unwrap_or(0.0)),
+        ))
+    }
+
+    /// Gradients of the weighted sum of some examples' losses, and the losses; `first` counts among all.
+    fn part(
+        &self,
+        examples: &[Example],
+        draws: &Draws,
+        first: usize,
+    ) -> Result<(GradStore, Vec<f64>)> {
+        let recompute = self.recompute.as_ref().map(Recompute::another);
+        let losses = self.losses_of(examples, draws, first, recompute.as_ref())?;
+        let weight = |index: usize| match first + index {
+            0 => 1.0,
+            _ => self.config.prior_weight,
+        };
+        let weighted = losses.iter().enumerate();
+        let weighted = weighted.map(|(index, loss)| Ok((loss * weight(index))?));
+        let total = Tensor::stack(&weighted.collect::<Result<Vec<_>>>()?, 0)?.sum_all()?;
+        let values = losses
+            .iter()
+            .map(|loss| Ok(loss.to_scalar::<f32>()? as f64));
+        Ok((
+            backward(&total, recompute.as_ref())?,
+            values.collect::<Result<_>>()?,
+        ))
     }
 
     /// Gradients of a scalar with respect to every trained parameter, by
     /// name; a parameter that gets none is an error.
     pub fn gradients_of(&self, loss: &Tensor) -> Result<BTreeMap<String, Tensor>> {
-        let mut store = loss.backward()?;
-        if let Some(recompute) = &self.recompute {
-            recompute.drain_into(&mut store)?;
-        }
-        self.optimizer.collect(&store)
+        self.optimizer
+            .collect(&backward(loss, self.recompute.as_ref())?)
     }
 
     /// Every trained parameter by name.
@@ -305,10 +345,16 @@ impl<'a> LoraTrainer<'a> {
     /// The denoising loss (eq. 1 with w = 1) of each example, as scalars in
     /// f32 that are part of the graph. All examples share one batch.
     pub fn losses(&self, examples: &[Example], stream: &mut NoiseStream) -> Result<Vec<Tensor>> {
+        let draws = self.draws(examples, stream)?;
+        self.losses_of(examples, &draws, 0, self.recompute.as_ref())
+    }
+
+    fn draws(&self, examples: &[Example], stream: &mut NoiseStream) -> Result<Draws> {
         let model = self.model;
-        let latents: Vec<&Tensor> = examples.iter().map(|e| &e.latents).collect();
-        let latents = Tensor::cat(&latents, 0)?;
-        if latents.dim(0)? != examples.len() {
+        if examples
+            .iter()
+            .any(|e| e.latents.dims().first() != Some(&1))
+        {
             return argument("training: every example has one image");
         }
         let (low, high) = self.config.timesteps;
@@ -320,17 +366,33 @@ impl<'a> LoraTrainer<'a> {
             .iter()
             .map(|_| first + stream.below(last - first + 1))
             .collect();
+        let latents: Vec<&Tensor> = examples.iter().map(|e| &e.latents).collect();
+        let latents = Tensor::cat(&latents, 0)?;
         let noise = stream
             .normal_tensor(latents.dims(), DType::F32, model.device())?
             .to_dtype(model.dtype())?;
-        let noisy = model
-            .schedule
-            .add_noise_each(&latents, &noise, &timesteps)?;
+        Ok(Draws { timesteps, noise })
+    }
+
+    /// The losses of `examples`, which are those from `first` on of the draws.
+    fn losses_of(
+        &self,
+        examples: &[Example],
+        draws: &Draws,
+        first: usize,
+        recompute: Option<&Recompute>,
+    ) -> Result<Vec<Tensor>> {
+        let model = self.model;
+        let timesteps = &draws.timesteps[first..][..examples.len()];
+        let noise = draws.noise.narrow(0, first, examples.len())?;
+        let latents: Vec<&Tensor> = examples.iter().map(|e| &e.latents).collect();
+        let latents = Tensor::cat(&latents, 0)?;
+        let noisy = model.schedule.add_noise_each(&latents, &noise, timesteps)?;
         let input = self.join_conditions(examples, &noisy)?;
         let prompts: Vec<&str> = examples.iter().map(|e| e.prompt.as_str()).collect();
         let context = model.encode_prompts(&prompts, self.learned().as_ref())?;
         let pass = Pass {
-            recompute: self.recompute.clone(),
+            recompute: recompute.cloned(),
             ..Pass::with_lora(&self.lora)
         };
         let t: Vec<f64> = timesteps.iter().map(|&t| t as f64).collect();
@@ -340,7 +402,7 @@ impl<'a> LoraTrainer<'a> {
             .to_dtype(DType::F32)?;
         let target = model
             .schedule
-            .target(&latents, &noise, &timesteps)?
+            .target(&latents, &noise, timesteps)?
             .to_dtype(DType::F32)?;
         let squares = (output - target)?.sqr()?;
         (0..examples.len())
@@ -433,6 +495,20 @@ impl<'a> LoraTrainer<'a> {
             &BTreeMap::new(),
         )
     }
+}
+
+/// What is drawn at random for examples: their timesteps, and noise [examples, c, h, w].
+struct Draws {
+    timesteps: Vec<usize>,
+    noise: Tensor,
+}
+
+fn backward(loss: &Tensor, recompute: Option<&Recompute>) -> Result<GradStore> {
+    let mut gradients = loss.backward()?;
+    if let Some(recompute) = recompute {
+        recompute.drain_into(&mut gradients)?;
+    }
+    Ok(gradients)
 }
 
 fn add(

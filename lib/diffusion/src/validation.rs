@@ -199,6 +199,6 @@ fn predict(
     let output = trainer
         .model
         .unet
-        .forward(&input, &[timestep], &context, &pass)?;
-    Ok(output.detach().to_dtype(DType::F32)?)
+        .predict(&input, &[timestep], &context, &pass)?;
+    Ok(output.to_dtype(DType::F32)?)
 }

@@ -359,6 +359,56 @@ fn a_fresh_adapter_changes_nothing_and_rows_choose_who_sees_it() -> Outcome {
     };
     assert!(!close(&all[0], &base[0]));
     assert!(close(&first[0], &all[0]) && close(&first[1], &base[1]));
+    // Row by row.
+    let pass = Pass {
+        lora_rows: Some(1),
+        ..Pass::with_lora(&lora)
+    };
+    let apart = model.unet.predict(&x, &[300.0], &context, &pass)?;
+    let apart: Vec<Vec<f32>> = apart.flatten_from(1)?.to_vec2()?;
+    assert!(close(&apart[0], &first[0]) && close(&apart[1], &first[1]));
+    Ok(())
+}
+
+/// The first update beside the gradient of one batch with the same draws.
+#[test]
+fn an_update_is_that_of_the_weighted_sum_of_both_losses() -> Outcome {
+    let model = model("sd15")?;
+    let data = Data {
+        inpaint: false,
+        prior: true,
+    };
+    let config = TrainingConfig {
+        prior_weight: 0.3,
+        ..config()
+    };
+    let mut trainer = LoraTrainer::new(&model, config.clone(), None)?;
+    let mut stream = NoiseStream::new(config.seed, 1);
+    let prior = |stream: &mut NoiseStream| {
+        data.prior(stream)?
+            .ok_or(Error::Argument("no prior".into()))
+    };
+    let examples = [data.instance(&mut stream)?, prior(&mut stream)?];
+    let losses = trainer.losses(&examples, &mut stream)?;
+    let gradients = trainer.gradients_of(&(&losses[0] + (&losses[1] * 0.3)?)?)?;
+    let mut squares = 0f64;
+    for gradient in gradients.values() {
+        squares += gradient.sqr()?.sum_all()?.to_scalar::<f32>()? as f64;
+    }
+    let report = trainer.step(&data)?;
+    let wanted = [losses[0].to_scalar::<f32>()?, losses[1].to_scalar::<f32>()?];
+    let pairs = [
+        (report.instance_loss, wanted[0] as f64),
+        (report.prior_loss, wanted[1] as f64),
+        (report.gradient_norm, squares.sqrt()),
+    ];
+    // Rounding of a network of f32.
+    for (found, wanted) in pairs {
+        assert!(
+            (found - wanted).abs() < 1e-4 * wanted,
+            "{found} instead of {wanted}"
+        );
+    }
     Ok(())
 }
 

@@ -156,7 +156,7 @@ impl<'a> Bench<'a> {
         let context = self.context.narrow(0, 0, batch)?.contiguous()?;
         self.model
             .unet
-            .forward(&inputs, &[400.0], &context, &Pass::default())
+            .predict(&inputs, &[400.0], &context, &Pass::default())
     }
 
     /// Encodes the image and carries `at_latents` of its latents back to it.

@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use candle_core::{Tensor, Var};
+use rayon::prelude::*;
 
 pub(crate) use config::MAX_LEVELS;
 pub use config::UNetConfig;
@@ -190,6 +191,34 @@ impl UNet {
     ) -> Result<Tensor> {
         let (output, _) = self.forward_and_middle(sample, timesteps, context, pass)?;
         Ok(output)
+    }
+
+    /// As [`UNet::forward`], without a graph. On the CPU each row of the batch takes a thread of its own: the layers of a
+    /// small network are too short to be shared among threads.
+    pub fn predict(
+        &self,
+        sample: &Tensor,
+        timesteps: &[f64],
+        context: &Tensor,
+        pass: &Pass,
+    ) -> Result<Tensor> {
+        let rows = sample.dim(0)?;
+        if rows == 1 || !sample.device().is_cpu() {
+            return Ok(self.forward(sample, timesteps, context, pass)?.detach());
+        }
+        let timesteps = self.check(sample, timesteps, context)?;
+        let outputs = (0..rows).into_par_iter().map(|row| {
+            let adapted = pass.lora_rows.is_none_or(|rows| row < rows);
+            let pass = Pass {
+                lora: pass.lora.clone().filter(|_| adapted),
+                ..Pass::default()
+            };
+            let (sample, context) = (sample.narrow(0, row, 1)?, context.narrow(0, row, 1)?);
+            let output = self.forward(&sample, &timesteps[row..=row], &context, &pass)?;
+            Ok(output.detach())
+        });
+        let outputs = outputs.collect::<Result<Vec<Tensor>>>()?;
+        Ok(Tensor::cat(&outputs, 0)?)
     }
 
     /// As [`UNet::forward`], with what the middle block makes of it: [batch, channels, h, w] of the coarsest level.
