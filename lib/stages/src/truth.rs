@@ -169,6 +169,7 @@ fn under_truth(
     let settings = Settings {
         seed: session.pipeline.seed,
         stop: Stop::TargetError(ERROR),
+        denoise: true,
         ..frame.render_settings()
     };
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
