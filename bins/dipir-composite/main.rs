@@ -14,7 +14,7 @@ fn main() -> ExitCode {
             target_error: cli.target_error,
             time_budget_s: cli.time_budget,
         };
-        let done = session.on_worker(|| dipir_stages::composite::run(&session, &stop))?;
+        let done = dipir_stages::composite::run(&session, &stop)?;
         session.result(|| done.to_string(), || done.to_json());
         Ok(())
     })

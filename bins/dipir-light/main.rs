@@ -10,7 +10,7 @@ fn main() -> ExitCode {
     exit::run(|| {
         let session = Session::start(&Cli::parse().common)?;
         if dipir_stages::light::materials::are_asked_for(&session)? {
-            let done = session.on_worker(|| dipir_stages::light::materials::run(&session))?;
+            let done = dipir_stages::light::materials::run(&session)?;
             session.result(|| done.to_string(), || done.to_json());
             return Ok(());
         }

@@ -26,7 +26,7 @@ fn main() -> ExitCode {
 
 fn set_up(args: &CommonArgs) -> anyhow::Result<()> {
     let session = Session::start(args)?;
-    let done = session.on_worker(|| dipir_stages::scene::run(&session))?;
+    let done = dipir_stages::scene::run(&session)?;
     session.result(|| done.to_string(), || done.to_json());
     Ok(())
 }

@@ -99,7 +99,8 @@ impl Session {
     }
 
     /// Does `work` on one of the worker threads. From any other thread each loop in parallel hands its work to a worker,
-    /// and sleeps until it is done: two switches of threads, longer than a small network's layers take.
+    /// and sleeps until it is done: two switches of threads, longer than a small network's layers take. A renderer says
+    /// how far a round is from the thread that sleeps: one that shows progress is called from there.
     pub fn on_worker<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
         rayon::scope(|_| work())
     }
