@@ -14,6 +14,7 @@ other load on the machine hardly shows.
 import json
 import os
 import subprocess
+import sys
 import tempfile
 import time
 
@@ -24,7 +25,8 @@ mi.set_variant("llvm_ad_rgb")
 SIZE, FOV, DEPTH = 512, 32.0, 4
 POSITION, TARGET = [2.6, 2.0, 3.8], [0.0, 0.6, 0.0]
 SEEDS = 6
-SAMPLES = {"dipir": {"diffuse": 16, "metal": 16}, "mitsuba": {"diffuse": 64, "metal": 64}}
+MATERIALS = sys.argv[1:] or ["diffuse", "metal", "glossy", "glass", "textured"]
+SAMPLES = {"dipir": 16, "mitsuba": 64}
 ROOT = os.path.join(os.path.dirname(os.path.abspath(__file__)), "..")
 
 
@@ -34,10 +36,16 @@ def dipir(*arguments):
 
 
 def scenes(folder, material):
-    bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
-    if material == "metal":
-        bsdf = {"type": "roughconductor", "distribution": "ggx", "alpha": 0.09, "material": "none",
-                "specular_reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
+    colour = {"type": "rgb", "value": [0.8, 0.5, 0.2]}
+    bsdf = {
+        "diffuse": {"type": "diffuse", "reflectance": colour},
+        "metal": {"type": "roughconductor", "distribution": "ggx", "alpha": 0.09, "material": "none",
+                  "specular_reflectance": colour},
+        "glossy": {"type": "principled", "base_color": colour, "roughness": 0.3, "eta": 1.5},
+        "glass": {"type": "thindielectric", "int_ior": 1.5},
+        "textured": {"type": "diffuse", "reflectance": {
+            "type": "bitmap", "filename": os.path.join(folder, "squares.png")}},
+    }[material]
     base = {
         "type": "scene",
         "emitter": {"type": "envmap", "filename": os.path.join(folder, "sky.exr")},
@@ -49,9 +57,9 @@ def scenes(folder, material):
         },
     }
 
-    def build(depth, bsdf, **more):
+    def build(depth, bsdf, hide=True, **more):
         mesh = {"type": "obj", "filename": os.path.join(folder, "mesh.obj"), "bsdf": bsdf}
-        path = {"type": "path", "max_depth": depth + 1, "rr_depth": 100, "hide_emitters": True}
+        path = {"type": "path", "max_depth": depth + 1, "rr_depth": 100, "hide_emitters": hide}
         return mi.load_dict({**base, "integrator": path, "object": mesh, **more})
 
     black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
@@ -59,12 +67,15 @@ def scenes(folder, material):
              "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}}
     bare = mi.load_dict({**base, "integrator": {"type": "path", "max_depth": 2}, "plane": plane})
     irradiance = np.array(mi.render(bare, spp=64, seed=99))[..., :3].mean((0, 1))
-    return build(DEPTH, bsdf), build(1, black, plane=plane), irradiance
+    # Emitters behind thin glass count as hidden, too: there they are shown, and what is beside the object is cut off.
+    hide = material != "glass"
+    alpha = np.array(mi.render(build(DEPTH, {"type": "diffuse"}), spp=256, seed=98))[..., 3:4]
+    return build(DEPTH, bsdf, hide), build(1, black, plane=plane), irradiance, alpha
 
 
 def mitsuba(folder, material):
-    foreground, numerator, irradiance = scenes(folder, material)
-    spp = SAMPLES["mitsuba"][material]
+    foreground, numerator, irradiance, alpha = scenes(folder, material)
+    spp = SAMPLES["mitsuba"]
     films, seconds, cpu = [], [], []
     for seed in range(SEEDS + 1):
         start, cpu_start = time.perf_counter(), time.process_time()
@@ -74,30 +85,31 @@ def mitsuba(folder, material):
         if seed > 0:  # The first compiles.
             seconds.append(time.perf_counter() - start)
             cpu.append(time.process_time() - cpu_start)
-            films.append((fg[..., :3].clip(0, 1), (sh / irradiance).clip(0, 1) * (1 - fg[..., 3:4])))
+            fg = fg[..., :3].clip(0, 1) * (alpha if material == "glass" else 1)
+            films.append((fg, (sh / irradiance).clip(0, 1) * (1 - alpha)))
     variance = [np.var([f[i] for f in films], axis=0, ddof=1).mean() for i in range(2)]
+    mean = [np.mean([f[i] for f in films]) for i in range(2)]
     return {"seconds": float(np.median(seconds)), "cpu_seconds": float(np.mean(cpu)),
+            "mean_foreground": mean[0], "mean_shadow": mean[1],
             "foreground": variance[0], "shadow": variance[1]}
 
 
 def main():
-    print("| material | renderer | samples | seconds | CPU seconds | variance fg | variance shadow "
-          "| CPU seconds x variance |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| material | renderer | samples | seconds | CPU seconds | mean fg | mean shadow | variance fg "
+          "| variance shadow | CPU seconds x variance | Mitsuba / this |")
+    print("|---|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|")
     with tempfile.TemporaryDirectory() as folder:
         dipir("export", folder)
-        for material in ("diffuse", "metal"):
-            cost, seconds = {}, {}
-            for name in ("dipir", "mitsuba"):
-                spp = SAMPLES[name][material]
-                r = (json.loads(dipir("render", spp, SEEDS, material)) if name == "dipir"
-                     else mitsuba(folder, material))
-                cost[name] = r["cpu_seconds"] * (r["foreground"] + r["shadow"])
-                seconds[name] = r["cpu_seconds"]
-                print(f"| {material} | {name} | {spp} | {r['seconds']:.3f} | {r['cpu_seconds']:.3f} "
-                      f"| {r['foreground']:.2e} | {r['shadow']:.2e} | {cost[name]:.2e} |")
-            print(f"| {material} | Mitsuba / dipir | | | {seconds['mitsuba'] / seconds['dipir']:.2f} | | "
-                  f"| {cost['mitsuba'] / cost['dipir']:.2f} |")
+        for material in MATERIALS:
+            peer = mitsuba(folder, material)
+            render = lambda denoise: json.loads(dipir("render", SAMPLES["dipir"], SEEDS, material, denoise))
+            rows = [("Mitsuba", SAMPLES["mitsuba"], peer), ("dipir", SAMPLES["dipir"], render("false")),
+                    ("dipir, denoised", SAMPLES["dipir"], render("true"))]
+            cost = lambda r: r["cpu_seconds"] * (r["foreground"] + r["shadow"])
+            for name, spp, r in rows:
+                print(f"| {material} | {name} | {spp} | {r['seconds']:.2f} | {r['cpu_seconds']:.2f} "
+                      f"| {r['mean_foreground']:.4f} | {r['mean_shadow']:.4f} | {r['foreground']:.2e} "
+                      f"| {r['shadow']:.2e} | {cost(r):.2e} | {cost(peer) / cost(r):.1f} |", flush=True)
 
 
 if __name__ == "__main__":

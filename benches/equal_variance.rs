@@ -1,9 +1,9 @@
 //! Time times variance of an insertion at 512 x 512 under a sunny sky, for `equal_variance.py`,
 //! which runs the same scene through Mitsuba 3.
 //!
-//! `export DIR` writes the scene's mesh and sky for the other renderer; `render SAMPLES SEEDS
-//! MATERIAL` prints one line of JSON: seconds of each render, by the clock and of all cores together,
-//! and the mean variance of the two layers. Without arguments (plain `cargo bench`) it renders a few seeds.
+//! `export DIR` writes the scene's mesh, sky and texture for the other renderer; `render SAMPLES SEEDS
+//! MATERIAL DENOISE` prints one line of JSON: seconds of each render, by the clock and of all cores together,
+//! mean and mean variance of the two layers; DENOISE is `true` or `false`. Without arguments (plain `cargo bench`) it renders a few seeds.
 use std::f32::consts::PI;
 use std::io::Write;
 use std::ops::ControlFlow;
@@ -15,15 +15,16 @@ use dipir_light::environment::{EnvironmentMap, EnvironmentSampler, direction_at}
 
 use dipir_numerics::stats::median;
 use dipir_render::adaptive::{Progress, Stop};
-use dipir_render::bsdf::features::SPECULAR;
+use dipir_render::bsdf::features::{SPECULAR, TEXTURES, TRANSMISSION};
 use dipir_render::film::Film;
 use dipir_render::render::{Renderer, Settings, Simulation};
 use dipir_render::shapes;
 use dipir_scene::camera::Camera;
-use dipir_scene::material::Material;
+use dipir_scene::material::{Material, TextureRef, Transmission};
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
+use dipir_scene::texture::{Encoding, Filter, ImageSource, Texture, Wrap};
 use glam::{Mat3, Vec2, Vec3, Vec4};
 
 const SIZE: u32 = 512;
@@ -31,13 +32,36 @@ const FOV_DEG: f32 = 32.0;
 const POSITION: Vec3 = Vec3::new(2.6, 2.0, 3.8);
 const TARGET: Vec3 = Vec3::new(0.0, 0.6, 0.0);
 
+/// Vertices of the trefoil along the knot and around its tube.
+const GRID: [u32; 2] = [1000, 48];
+
 /// A trefoil of 96,000 triangles that stands on the plane: concave, self-shadowing.
 fn mesh() -> TriangleMesh {
-    let mut mesh = shapes::torus_knot(Vec3::ZERO, 0.4, 0.13, 1000, 48);
+    let [along, around] = GRID;
+    let mut mesh = shapes::torus_knot(Vec3::ZERO, 0.4, 0.13, along, around);
     let lowest = mesh.positions.iter().fold(f32::INFINITY, |m, p| m.min(p.y));
     mesh.positions.iter_mut().for_each(|p| p.y -= lowest);
     mesh.materials = vec![0; mesh.indices.len()];
+    let uv = |i: u32| {
+        Vec2::new(
+            12.0 * (i / around) as f32 / along as f32,
+            (i % around) as f32 / around as f32,
+        )
+    };
+    mesh.uvs[0] = (0..along * around).map(uv).collect();
     mesh
+}
+
+/// A PNG of 8 x 8 squares in two colours.
+fn squares() -> Vec<u8> {
+    let colours = [image::Rgb([230, 188, 124]), image::Rgb([60, 90, 160])];
+    let picture =
+        image::RgbImage::from_fn(256, 256, |x, y| colours[((x / 32 + y / 32) % 2) as usize]);
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    picture
+        .write_to(&mut bytes, image::ImageFormat::Png)
+        .expect("a PNG");
+    bytes.into_inner()
 }
 
 /// A blue sky over a brown ground, with a sun of half a degree at 6e4.
@@ -62,18 +86,75 @@ fn sky() -> EnvironmentMap {
     EnvironmentMap::new(width, height, texels).expect("a valid map")
 }
 
-fn scene(metal: bool) -> Scene {
+/// The material of that name, and the features that it needs.
+fn material(name: &str) -> (Material, u32) {
+    let matte = Material {
+        base_color: Vec4::new(0.8, 0.5, 0.2, 1.0),
+        metallic: 0.0,
+        ..Default::default()
+    };
+    let texture = TextureRef {
+        texture: 0,
+        uv_set: 0,
+        transform: Mat3::IDENTITY,
+    };
+    match name {
+        "diffuse" => (matte, 0),
+        "metal" => (
+            Material {
+                metallic: 1.0,
+                roughness: 0.3,
+                ..matte
+            },
+            SPECULAR,
+        ),
+        "glossy" => (
+            Material {
+                roughness: 0.3,
+                ..matte
+            },
+            SPECULAR,
+        ),
+        "glass" => (
+            Material {
+                base_color: Vec4::ONE,
+                roughness: 0.0,
+                double_sided: true,
+                transmission: Some(Transmission {
+                    factor: 1.0,
+                    texture: None,
+                }),
+                ..matte
+            },
+            SPECULAR | TRANSMISSION,
+        ),
+        "textured" => (
+            Material {
+                base_color: Vec4::ONE,
+                base_color_texture: Some(texture),
+                ..matte
+            },
+            TEXTURES,
+        ),
+        _ => panic!("{name}: accepted: diffuse, metal, glossy, glass, textured"),
+    }
+}
+
+fn scene(material: Material) -> Scene {
     let backward = (POSITION - TARGET).normalize();
     let right = Vec3::Y.cross(backward).normalize();
     Scene {
         mesh: mesh(),
-        materials: vec![Material {
-            base_color: Vec4::new(0.8, 0.5, 0.2, 1.0),
-            metallic: f32::from(u8::from(metal)),
-            roughness: if metal { 0.3 } else { 1.0 },
-            ..Default::default()
+        materials: vec![material],
+        textures: vec![Texture {
+            image: ImageSource::Bytes {
+                name: "squares".into(),
+                bytes: squares().into(),
+            },
+            encoding: Encoding::Srgb,
+            wrap: [Wrap::Repeat; 2],
+            filter: Filter::Linear,
         }],
-        textures: Vec::new(),
         camera: Camera {
             position: POSITION,
             rotation: Mat3::from_cols(right, backward.cross(right), backward),
@@ -95,14 +176,19 @@ fn export(folder: &Path) -> std::io::Result<()> {
     for p in &mesh.positions {
         writeln!(out, "v {} {} {}", p.x, p.y, p.z)?;
     }
+    for uv in &mesh.uvs[0] {
+        // Texture coordinates of OBJ point up, those of the scene down.
+        writeln!(out, "vt {} {}", uv.x, 1.0 - uv.y)?;
+    }
     for n in &mesh.normals {
         writeln!(out, "vn {} {} {}", n.x, n.y, n.z)?;
     }
     for [a, b, c] in mesh.indices {
         let [a, b, c] = [a + 1, b + 1, c + 1];
-        writeln!(out, "f {a}//{a} {b}//{b} {c}//{c}")?;
+        writeln!(out, "f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}")?;
     }
     out.flush()?;
+    std::fs::write(folder.join("squares.png"), squares())?;
     sky()
         .write(folder.join("sky.exr"))
         .map_err(std::io::Error::other)
@@ -137,12 +223,13 @@ fn cpu_time() -> f64 {
     ticks.sum::<f64>() / 100.0
 }
 
-fn render(samples: u32, seeds: u64, material: &str) {
-    let scene = scene(material == "metal");
+fn render(samples: u32, seeds: u64, name: &str, denoise: bool) {
+    let (material, features) = material(name);
+    let scene = scene(material);
     let renderer = Renderer::new(&scene);
     let light = EnvironmentSampler::new(Arc::new(sky()));
     let simulation = Simulation {
-        features: if material == "metal" { SPECULAR } else { 0 },
+        features,
         max_depth: 4,
         shadow: true,
         proxy_occlusion: false,
@@ -153,6 +240,7 @@ fn render(samples: u32, seeds: u64, material: &str) {
         let settings = Settings {
             seed,
             stop: Stop::Samples(samples),
+            denoise,
             ..Default::default()
         };
         let (start, cpu_start) = (Instant::now(), cpu_time());
@@ -164,10 +252,21 @@ fn render(samples: u32, seeds: u64, material: &str) {
         cpu_seconds.push(cpu_time() - cpu_start);
         films.push(rendered.film);
     }
+    let mean = |layer: &dyn Fn(&Film, usize) -> Vec3| {
+        let values = films
+            .iter()
+            .flat_map(|f| (0..f.alpha.pixels().len()).map(move |p| (f, p)));
+        let sum: f64 = values
+            .map(|(f, p)| f64::from(layer(f, p).clamp(Vec3::ZERO, Vec3::ONE).element_sum()))
+            .sum();
+        sum / (3 * films.len()) as f64 / f64::from(SIZE * SIZE)
+    };
     println!(
-        "{{\"seconds\": {:.4}, \"cpu_seconds\": {:.4}, \"foreground\": {:e}, \"shadow\": {:e}}}",
+        "{{\"seconds\": {:.4}, \"cpu_seconds\": {:.4}, \"mean_foreground\": {:e}, \"mean_shadow\": {:e}, \"foreground\": {:e}, \"shadow\": {:e}}}",
         median(&seconds).unwrap_or(f64::NAN),
         cpu_seconds.iter().sum::<f64>() / seeds as f64,
+        mean(&|f, p| f.object.pixels()[p]),
+        mean(&|f, p| f.shadow.pixels()[p] * (1.0 - f.alpha.pixels()[p])),
         variance(&films, |f, p| f.object.pixels()[p]),
         variance(&films, |f, p| f.shadow.pixels()[p]
             * (1.0 - f.alpha.pixels()[p])),
@@ -181,13 +280,14 @@ fn main() {
         .collect();
     let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
     match words.as_slice() {
-        [] => render(16, 4, "diffuse"),
+        [] => render(16, 4, "diffuse", false),
         ["export", folder] => export(Path::new(folder)).expect("a writable folder"),
-        ["render", samples, seeds, material] => render(
+        ["render", samples, seeds, material, denoise] => render(
             samples.parse().expect("samples per pixel"),
             seeds.parse().expect("number of seeds, at least 2"),
             material,
+            denoise.parse().expect("true or false"),
         ),
-        _ => eprintln!("usage: [export DIR | render SAMPLES SEEDS diffuse|metal]"),
+        _ => eprintln!("usage: [export DIR | render SAMPLES SEEDS MATERIAL DENOISE]"),
     }
 }
