@@ -55,6 +55,8 @@ clock = time.process_time if PROCESSOR else time.perf_counter
 
 def best_of(layer, x, mode, repetitions):
     best = float("inf")
+    with torch.no_grad():
+        gradient = torch.randn_like(layer(x))
     for _ in range(repetitions + 1):
         start = clock()
         if mode == "forward":
@@ -62,7 +64,7 @@ def best_of(layer, x, mode, repetitions):
                 layer(x)
         else:
             x.grad = None
-            layer(x.requires_grad_()).square().sum().backward()
+            layer(x.requires_grad_()).backward(gradient)
         best = min(best, 1e3 * (clock() - start))
     return best
 
