@@ -149,7 +149,7 @@ pub(crate) fn refine(
         _ => false,
     };
     let mut search = RayCounts::default();
-    let mut foresight = Foresight::new(limit);
+    let mut foresight = Foresight::new(limit, auxiliary.is_some());
     let mut report = Progress::default();
     let (mut simulation, mut stop, mut left_out) = (simulation, stop, None::<LeftOut>);
     loop {
@@ -224,12 +224,19 @@ pub(crate) fn refine(
         };
         let errors: Vec<SquaredError> = jobs
             .par_iter()
-            .zip(denoised)
-            .map(|(job, error)| error.unwrap_or_else(|| viewing.squared_error(&film, job)))
+            .zip(&denoised)
+            .map(|(job, error)| match error {
+                Some(error) => error.left,
+                None => viewing.squared_error(&film, job),
+            })
+            .collect();
+        let drawn = denoised.iter().zip(&errors);
+        let drawn: Vec<f64> = drawn
+            .map(|(denoised, error)| denoised.map_or(error.sum, |e| e.drawn))
             .collect();
         let error = total_error(&errors, &film, viewing);
         let cost: f64 = jobs.iter().map(Job::cost).sum();
-        foresight.learn(&jobs, &errors, &error);
+        foresight.learn(&jobs, &errors, &drawn, &error);
         let growth = match stop {
             Stop::TimeBudget(budget) => {
                 let rate = seconds_of_round / cost_of_round.max(1.0);

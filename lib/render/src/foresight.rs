@@ -16,6 +16,9 @@ const POWERS: [f64; 2] = [0.5, 3.0];
 const SHARE_TO_LEARN_FROM: f64 = 0.25;
 /// Rounds that are played through at most; each multiplies the samples by up to 4.
 const ROUNDS: usize = 32;
+/// Share of the squared error of samples that the denoiser leaves, where it was not there: of most pictures after the first
+/// round (`benches/forecasts.rs`).
+const DENOISED: f64 = 0.4;
 /// Error of most pictures after the first round, from which the share of the first round is guessed while it is under way.
 const FIRST_ERROR: f64 = 0.027;
 
@@ -24,6 +27,8 @@ const FIRST_ERROR: f64 = 0.027;
 struct Point {
     /// Summed over its pixels, display-referred.
     squared_error: f64,
+    /// The same before noise is removed.
+    drawn: f64,
     /// Per pixel and replicate.
     samples: f64,
     /// Of one such sample.
@@ -37,7 +42,11 @@ pub struct Foresight {
     first: Vec<Point>,
     /// After the last round.
     last: Vec<Point>,
+    /// Squared error in units of what a target of 1 allows, and cost: after every round.
+    rounds: Vec<(f64, f64)>,
     power: f64,
+    /// Whether noise is removed.
+    denoises: bool,
     /// Squared error allowed for a target of 1, summed over the pixels: less than their number, because it is the bound
     /// that has to reach the target.
     allowed: f64,
@@ -47,26 +56,39 @@ pub struct Foresight {
 
 impl Foresight {
     /// Nothing is known yet.
-    pub(crate) fn new(limit: u32) -> Self {
+    pub(crate) fn new(limit: u32, denoises: bool) -> Self {
         Self {
             first: vec![],
             last: vec![],
+            rounds: vec![],
+            denoises,
             power: POWER,
             allowed: 0.0,
             limit,
         }
     }
 
-    /// Adds what a round has led to.
-    pub(crate) fn learn(&mut self, jobs: &[Job], errors: &[SquaredError], error: &EstimatedError) {
-        let points = jobs.iter().zip(errors).map(|(job, e)| {
-            let samples = f64::from(job.samples.max(1));
-            Point {
-                squared_error: e.sum,
-                samples,
-                cost: (job.cost() / samples).max(1e-9),
-            }
-        });
+    /// Adds what a round has led to: of each job the error that is left, and that before noise was removed.
+    pub(crate) fn learn(
+        &mut self,
+        jobs: &[Job],
+        errors: &[SquaredError],
+        drawn: &[f64],
+        error: &EstimatedError,
+    ) {
+        let points = jobs
+            .iter()
+            .zip(errors)
+            .zip(drawn)
+            .map(|((job, e), &drawn)| {
+                let samples = f64::from(job.samples.max(1));
+                Point {
+                    squared_error: e.sum,
+                    drawn,
+                    samples,
+                    cost: (job.cost() / samples).max(1e-9),
+                }
+            });
         let points: Vec<Point> = points.collect();
         if self.first.is_empty() {
             self.first.clone_from(&points);
@@ -79,19 +101,47 @@ impl Foresight {
             false => 1.0,
         };
         self.allowed = slack.powi(2) * error.touched_pixels as f64;
+        self.rounds
+            .push((sum(&self.last) / self.allowed, spent(&self.last)));
     }
 
     /// What reaching the 95% bound `target` costs in all, over what was spent so far. Below 1 for targets that earlier
     /// rounds had reached, down to the first round's share.
     pub fn cost_of(&self, target: f64) -> f64 {
+        self.cost_with(target, self.denoises)
+    }
+
+    /// As [`cost_of`](Self::cost_of), where noise is removed or not, whatever was done.
+    pub fn cost_with(&self, target: f64, denoises: bool) -> f64 {
+        let (first, power) = match (self.denoises, denoises) {
+            (true, false) => {
+                let [first, last] = [&self.first, &self.last].map(|p| as_drawn(p));
+                let power = power(&first, &last).unwrap_or(POWER);
+                return self.played(&first, &last, power, target);
+            }
+            (false, true) => (scaled(&self.first, DENOISED), POWER),
+            _ => (self.first.clone(), self.power),
+        };
+        let share = match self.denoises == denoises {
+            true => 1.0,
+            false => DENOISED,
+        };
+        // A round that reached the target has shown what is enough.
+        let reached = self.rounds.iter().find(|r| r.0 * share <= target * target);
+        let most = reached.map_or(f64::INFINITY, |r| r.1 / spent(&self.last));
+        let last = scaled(&self.last, share);
+        self.played(&first, &last, power, target).min(most)
+    }
+
+    /// The rounds after `last` are played through, or those after `first` for a target that `last` has reached.
+    fn played(&self, first: &[Point], last: &[Point], power: f64, target: f64) -> f64 {
         let allowed = self.allowed * target * target;
-        let sum = |points: &[Point]| points.iter().map(|p| p.squared_error).sum::<f64>();
-        let mut points = match sum(&self.last) > allowed {
-            true => self.last.clone(),
-            false => self.first.clone(),
+        let mut points = match sum(last) > allowed {
+            true => last.to_vec(),
+            false => first.to_vec(),
         };
         for _ in 0..ROUNDS {
-            if sum(&points) <= allowed || !self.play(&mut points, allowed) {
+            if sum(&points) <= allowed || !self.play(&mut points, power, allowed) {
                 break;
             }
         }
@@ -100,14 +150,14 @@ impl Foresight {
     }
 
     /// One round more; whether any job has grown.
-    fn play(&self, points: &mut [Point], allowed: f64) -> bool {
+    fn play(&self, points: &mut [Point], power: f64, allowed: f64) -> bool {
         let root = |p: &Point| (p.squared_error * p.samples / p.cost).sqrt();
         let scale = points.iter().map(|p| root(p) * p.cost).sum::<f64>() / allowed;
         let mut grown = false;
         for point in points {
             let goal = f64::from(goal(root(point) * scale, point.samples as u32, self.limit));
             if goal > point.samples {
-                point.squared_error *= (goal / point.samples).powf(-self.power);
+                point.squared_error *= (goal / point.samples).powf(-power);
                 point.samples = goal;
                 grown = true;
             }
@@ -120,6 +170,28 @@ impl Foresight {
 /// pictures cost as the inverse of the error: the jobs that hold most of the error are few at first.
 pub(crate) fn first_share(target: f64) -> f64 {
     (target / FIRST_ERROR).clamp(0.0, 1.0)
+}
+
+fn sum(points: &[Point]) -> f64 {
+    points.iter().map(|p| p.squared_error).sum()
+}
+
+/// The same jobs with `share` of their errors.
+fn scaled(points: &[Point], share: f64) -> Vec<Point> {
+    let scaled = points.iter().map(|&p| Point {
+        squared_error: share * p.squared_error,
+        ..p
+    });
+    scaled.collect()
+}
+
+/// The same jobs with the errors of their samples.
+fn as_drawn(points: &[Point]) -> Vec<Point> {
+    let drawn = points.iter().map(|&p| Point {
+        squared_error: p.drawn,
+        ..p
+    });
+    drawn.collect()
 }
 
 fn spent(points: &[Point]) -> f64 {
@@ -159,6 +231,7 @@ mod tests {
     fn points(errors: &[f64], samples: f64) -> Vec<Point> {
         let point = |&squared_error: &f64| Point {
             squared_error,
+            drawn: 2.0 * squared_error,
             samples,
             cost: 1.0,
         };
@@ -169,6 +242,8 @@ mod tests {
         Foresight {
             first: points(errors, 8.0),
             last: points(errors, 8.0),
+            rounds: vec![],
+            denoises: true,
             power,
             allowed: errors.len() as f64,
             limit: 1 << 20,
@@ -210,6 +285,27 @@ mod tests {
         even.limit = u32::MAX;
         let most = f64::from(u32::MAX) / 8.0;
         assert!((even.cost_of(1e-9) / most - 1.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn without_the_denoiser_the_errors_of_the_samples_count_and_with_it_a_share_of_them() {
+        // Twice the squared error takes twice the samples.
+        let even = known(&[4.0; 10], 1.0);
+        let cost = even.cost_with(0.2, false);
+        assert!((cost - 200.0).abs() < 1.0, "{cost}");
+        let without = Foresight {
+            denoises: false,
+            ..even.clone()
+        };
+        let cost = without.cost_with(0.2, true);
+        assert!((cost - 100.0 * DENOISED).abs() < 1.0, "{cost}");
+        assert_eq!(without.cost_with(0.2, false), without.cost_of(0.2));
+        // A round that reached the target bounds what it costs.
+        let reached = Foresight {
+            rounds: vec![(0.04 / DENOISED, 80.0)],
+            ..without
+        };
+        assert!((reached.cost_with(0.2, true) - 1.0).abs() < 1e-12);
     }
 
     #[test]

@@ -133,8 +133,8 @@ impl Outlook {
         Self(next.filter_map(estimated).collect())
     }
 
-    /// For composites that no preset stopped: those next to a display-referred error, and seconds for each target.
-    pub fn around_error(error: f64, seconds: impl Fn(f64) -> f64) -> Self {
+    /// For composites that no preset stopped: those next to a display-referred error, and the seconds of each.
+    pub fn around_error(error: f64, seconds: impl Fn(&Preset) -> f64) -> Self {
         // Nearer targets are no other choice.
         const APART: f64 = 1.2;
         let target = |p: &&Preset| f64::from(p.composite.target_error);
@@ -144,7 +144,7 @@ impl Outlook {
         let chosen = cheaper.into_iter().chain(better);
         let estimate = |p: &Preset| Estimate {
             quality: p.quality,
-            seconds: seconds(target(&p)),
+            seconds: seconds(p),
             error: Some(target(&p)),
         };
         Self(chosen.map(estimate).collect())
@@ -298,7 +298,9 @@ mod tests {
             .presets
             .each_ref()
             .map(|p| f64::from(p.composite.target_error));
-        let around = |e: f64| Outlook::around_error(e, |target| (e / target).powi(2));
+        let around = |e: f64| {
+            Outlook::around_error(e, |p| (e / f64::from(p.composite.target_error)).powi(2))
+        };
         assert_eq!(names(&around(targets[1])), ["draft", "high"]);
         assert_eq!(names(&around(2.0 * targets[0])), ["draft"]);
         assert_eq!(names(&around(0.5 * targets[2])), ["high"]);

@@ -52,6 +52,15 @@ impl Sums {
     }
 }
 
+/// Squared error of a job that is filtered, display-referred.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Error {
+    /// What is left.
+    pub left: SquaredError,
+    /// That of its samples.
+    pub drawn: f64,
+}
+
 /// What is filtered as one.
 #[derive(Clone, Copy, PartialEq)]
 enum Kind {
@@ -232,7 +241,7 @@ pub(crate) fn denoise(
     jobs: &[Job],
     auxiliary: &Auxiliary,
     viewing: &Viewing,
-) -> Vec<Option<SquaredError>> {
+) -> Vec<Option<Error>> {
     let mut errors = vec![None; jobs.len()];
     for kind in [Kind::Object, Kind::Shadow] {
         let of_kind = || jobs.iter().filter(|job| kind.holds(job));
@@ -244,12 +253,7 @@ pub(crate) fn denoise(
     errors
 }
 
-fn denoise_kind(
-    film: &mut Film,
-    tiles: &Tiles,
-    viewing: &Viewing,
-    errors: &mut [Option<SquaredError>],
-) {
+fn denoise_kind(film: &mut Film, tiles: &Tiles, viewing: &Viewing, errors: &mut [Option<Error>]) {
     let jobs = tiles.jobs;
     let mut sums = vec![Sums::default(); jobs.len()];
     for (jobs, sums) in jobs.chunks(AT_ONCE).zip(sums.chunks_mut(AT_ONCE)) {
@@ -286,7 +290,10 @@ fn denoise_kind(
             variance: sums[index].variance,
         };
         let drawn = viewing.squared_error_where(film, job, |pixel| !is_filtered(pixel));
-        errors[index] = Some(left.merge(drawn));
+        errors[index] = Some(Error {
+            left: left.merge(drawn),
+            drawn: sums[index].noise + drawn.sum,
+        });
     }
 }
 

@@ -89,7 +89,7 @@ fn noise_falls_and_what_is_left_of_it_is_measured() {
             drawn += squared_error(&film, surface, |_, _| true);
             let errors = denoise(&mut film, &jobs, &auxiliary, &VIEWING);
             left += squared_error(&film, surface, |_, _| true);
-            stated += errors.iter().flatten().map(|e| e.sum).sum::<f64>();
+            stated += errors.iter().flatten().map(|e| e.left.sum).sum::<f64>();
             assert!(errors.iter().all(Option::is_some));
         }
         assert!(left < most * drawn, "{left} of {drawn}");
@@ -167,5 +167,5 @@ fn a_radiance_whose_square_overflows_stays() {
     let errors = denoise(&mut film, &jobs, &auxiliary, &VIEWING);
     assert_eq!(film.object.get(13, 17), drawn.object.get(13, 17));
     assert!(film.object.pixels().iter().all(|v| v.is_finite()));
-    assert!(errors.iter().flatten().all(|e| e.sum.is_finite()));
+    assert!(errors.iter().flatten().all(|e| e.left.sum.is_finite()));
 }

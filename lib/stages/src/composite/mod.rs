@@ -33,7 +33,7 @@ use crate::known_light::{self, Light};
 use crate::light::folder::{self as light_folder, Recovered};
 use crate::light::materials;
 use crate::names::COMPOSITE;
-use crate::presets::Outlook;
+use crate::presets::{Outlook, Preset};
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::written;
 use table::{CompositeTable, MAX_SAMPLES, Tone};
@@ -157,20 +157,20 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let pixels_of = |most: Option<u64>| f64::from(divisor_for(resolution, most)).powi(-2);
     let here = f64::from(rendered.divisor).powi(-2);
     // The same error takes as many samples a pixel at any resolution.
-    let at_target = |target: f64, most: Option<u64>| {
-        let pixels = pixels_of(table.most_pixels.or(most)) / here;
-        seconds + course.seconds * (pixels * foresight.cost_of(target) - 1.0)
+    let with_preset = |preset: &Preset| {
+        let preset = &preset.composite;
+        let pixels = pixels_of(table.most_pixels.or(preset.most_pixels)) / here;
+        let denoises = table.denoise.unwrap_or(preset.denoise);
+        let cost = foresight.cost_with(preset.target_error.into(), denoises);
+        seconds + course.seconds * (pixels * cost - 1.0)
     };
     let quality = session.pipeline.quality;
     let outlook = match stop == CompositeTable::default().stop(quality) {
         true => Outlook::beside(quality, |preset| {
             let target = f64::from(preset.composite.target_error);
-            Some((
-                at_target(target, preset.composite.most_pixels),
-                Some(target),
-            ))
+            Some((with_preset(preset), Some(target)))
         }),
-        false => Outlook::around_error(error, |target| at_target(target, None)),
+        false => Outlook::around_error(error, with_preset),
     };
     Ok(Done {
         folder,
