@@ -87,9 +87,9 @@ impl DistillationSettings {
             );
         }
         if let Some(side) = table.crop
-            && !((64..=1024).contains(&side) && side % 8 == 0)
+            && !((32..=1024).contains(&side) && side % 8 == 0)
         {
-            let message = format!("{side} is refused; accepted: multiples of 8 from 64 to 1024");
+            let message = format!("{side} is refused; accepted: multiples of 8 from 32 to 1024");
             return wrong("crop", message);
         }
         Ok(Self {
@@ -375,10 +375,10 @@ mod tests {
             )
         };
         assert_eq!(with(Some(512)).unwrap().crop, Some(512));
-        for bad in [0, 56, 260, 1032] {
+        for bad in [0, 24, 260, 1032] {
             let refusal = with(Some(bad)).unwrap_err();
             assert_eq!(refusal.key, "crop");
-            let message = format!("{bad} is refused; accepted: multiples of 8 from 64 to 1024");
+            let message = format!("{bad} is refused; accepted: multiples of 8 from 32 to 1024");
             assert_eq!(refusal.message, message);
         }
     }

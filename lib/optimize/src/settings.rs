@@ -135,7 +135,7 @@ pub struct LightTable {
     #[schemars(range(min = 1, max = 64), extend("default" = 1), example = 4)]
     pub draws: Option<usize>,
     /// With a diffusion model: side of the crops that it is shown, pixels, a multiple of 8.
-    #[schemars(range(min = 64, max = 1024), extend("x-default" = "the model's own size, at most 256 on the CPU"), example = 512)]
+    #[schemars(range(min = 32, max = 1024), extend("x-default" = "the model's own size, at most 256 on the CPU"), example = 512)]
     pub crop: Option<usize>,
     /// With `guidance = "sds"` or `"sdedit"`: scale of classifier-free guidance.
     #[schemars(extend("default" = 7.5), example = 7.5)]
