@@ -85,6 +85,28 @@ pub(super) fn gather(source: &[f32], stride: usize, rows: usize, target: &mut [L
     plain::gather(source, stride, rows, target);
 }
 
+/// As [`gather`], of `len` elements a row, into `len` groups of `width` numbers, one after the other; width is at most 16.
+/// False, and nothing is done, where the processor has no AVX-512.
+#[cfg_attr(not(target_arch = "x86_64"), allow(unused_variables))]
+pub(super) fn gather_narrow(
+    source: &[f32],
+    stride: usize,
+    rows: usize,
+    len: usize,
+    target: &mut [f32],
+    width: usize,
+) -> bool {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        assert!(width <= LANES && rows <= width && target.len() >= len * width);
+        assert!(rows == 0 || len == 0 || (rows - 1) * stride + len <= source.len());
+        // SAFETY: the processor was asked, and the sizes were checked.
+        unsafe { avx512::columns(source, stride, rows, len, target.as_mut_ptr(), width) };
+        return true;
+    }
+    false
+}
+
 /// The reverse of [`gather`]: element c of row r of `target` is number r of `source[c]`.
 ///
 /// # Safety
@@ -179,16 +201,67 @@ mod avx512 {
     #[target_feature(enable = "avx512f")]
     pub(super) unsafe fn gather(source: &[f32], stride: usize, rows: usize, target: &mut [Lane]) {
         for (block, target) in target.chunks_mut(LANES).enumerate() {
-            let mask = first(target.len());
             let start = source.as_ptr().wrapping_add(block * LANES);
-            let r = std::array::from_fn(|row| {
-                let mask = if row < rows { mask } else { 0 };
-                // SAFETY: reads the elements under the mask alone, which lie in `source`.
-                unsafe { _mm512_maskz_loadu_ps(mask, start.wrapping_add(row * stride)) }
-            });
-            for (lane, column) in target.iter_mut().zip(transposed(r)) {
+            // SAFETY: the rows hold as many elements more as `target` has lanes.
+            let columns = unsafe { block_of(start, stride, rows, target.len()) };
+            for (lane, column) in target.iter_mut().zip(columns) {
                 // SAFETY: a lane is sixteen floats.
                 unsafe { _mm512_store_ps(lane.0.as_mut_ptr(), column) };
+            }
+        }
+    }
+
+    /// The columns of a block of `rows` rows of `len` elements, at most 16 of either.
+    ///
+    /// # Safety
+    /// The elements can be read.
+    #[target_feature(enable = "avx512f")]
+    #[inline]
+    unsafe fn block_of(
+        start: *const f32,
+        stride: usize,
+        rows: usize,
+        len: usize,
+    ) -> [__m512; LANES] {
+        let mask = first(len);
+        transposed(std::array::from_fn(|row| {
+            let mask = if row < rows { mask } else { 0 };
+            // SAFETY: reads the elements under the mask alone.
+            unsafe { _mm512_maskz_loadu_ps(mask, start.wrapping_add(row * stride)) }
+        }))
+    }
+
+    /// Element c of row r goes to `r + c width` of `target`; 0 where r is at least `rows`.
+    ///
+    /// # Safety
+    /// `source` holds `rows` rows of `len` elements, `stride` apart; `target` is valid for writes of `len` times `width`
+    /// elements, and `width` is at most 16.
+    #[target_feature(enable = "avx512f")]
+    pub(super) unsafe fn columns(
+        source: &[f32],
+        stride: usize,
+        rows: usize,
+        len: usize,
+        target: *mut f32,
+        width: usize,
+    ) {
+        let end = len * width;
+        for left in (0..len).step_by(LANES) {
+            let start = source.as_ptr().wrapping_add(left);
+            // SAFETY: the rows hold `len - left` elements more.
+            let columns = unsafe { block_of(start, stride, rows, len - left) };
+            let to = target.wrapping_add(left * width);
+            if (left + LANES - 1) * width + LANES <= end {
+                for (number, column) in columns.into_iter().enumerate() {
+                    // SAFETY: inside of the target; what lies past a column's width is written again by the next one.
+                    unsafe { _mm512_storeu_ps(to.wrapping_add(number * width), column) };
+                }
+                continue;
+            }
+            for (number, column) in columns.into_iter().enumerate().take(len - left) {
+                let mask = first(end - (left + number) * width);
+                // SAFETY: as above; nothing is written past the last column.
+                unsafe { _mm512_mask_storeu_ps(to.wrapping_add(number * width), mask, column) };
             }
         }
     }
@@ -224,6 +297,32 @@ mod tests {
     fn rows_come_side_by_side_and_go_back() {
         assert_rows(gather, scatter);
         assert_rows(plain::gather, plain::scatter);
+    }
+
+    #[test]
+    fn narrow_groups_hold_what_lanes_do() {
+        let source: Vec<f32> = (0..16 * 50).map(|i| i as f32 + 1.0).collect();
+        for (rows, columns, width) in [
+            (14, 50, 14),
+            (14, 16, 14),
+            (3, 1, 5),
+            (16, 33, 16),
+            (1, 17, 1),
+        ] {
+            let mut lanes = vec![Lane::ZERO; columns];
+            gather(&source, 50, rows, &mut lanes);
+            // One number more, which stays.
+            let mut target = vec![-1.0; columns * width + 1];
+            if !gather_narrow(&source, 50, rows, columns, &mut target, width) {
+                return;
+            }
+            let wanted = lanes.iter().flat_map(|lane| &lane.0[..width]);
+            assert!(
+                target[..columns * width].iter().eq(wanted),
+                "{rows} x {columns} in {width}"
+            );
+            assert_eq!(target[columns * width], -1.0);
+        }
     }
 
     fn assert_rows(gather: Gather, scatter: Scatter) {

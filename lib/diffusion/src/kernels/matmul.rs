@@ -211,13 +211,10 @@ pub(crate) fn linear(
     w: &[f32],
     bias: Option<&[f32]>,
 ) -> Vec<f32> {
-    let mut y = vec![0.0; rows * outputs];
-    if let Some(bias) = bias {
-        y.par_chunks_exact_mut(outputs)
-            .with_min_len(64)
-            .for_each(|y| y.copy_from_slice(bias));
-    }
-    let keep = if bias.is_some() { 1.0 } else { 0.0 };
+    let (mut y, keep) = match bias {
+        Some(bias) => (bias.repeat(rows), 1.0),
+        None => (vec![0.0; rows * outputs], 0.0),
+    };
     let (a, b) = (
         Matrix::rows(x, inputs),
         Matrix::rows(w, inputs).transposed(),

@@ -5,7 +5,7 @@
 use rayon::prelude::*;
 
 use super::pointwise::{silu, silu_derivative};
-use super::simd::{sum_of, sum_of_2, vectorized};
+use super::simd::{CHUNK, sum_of, sum_of_2, vectorized};
 
 /// Shape of a group normalisation over [batch, channels, pixels].
 #[derive(Debug, Clone, Copy)]
@@ -25,12 +25,22 @@ impl GroupShape {
 }
 
 vectorized! {
-    /// Mean and reciprocal standard deviation.
+    /// Mean and reciprocal standard deviation: those of pieces that stay in the cache, merged [Chan, Golub & LeVeque 1983].
     fn statistics(x: &[f32], eps: f32) -> (f32, f32) {
-        let n = x.len() as f64;
-        let mean = (sum_of(x, |v| v) / n) as f32;
-        let variance = sum_of(x, |v| (v - mean) * (v - mean)) / n;
-        (mean, (1.0 / (variance + eps as f64).sqrt()) as f32)
+        let (mut n, mut mean, mut squares) = (0f64, 0f64, 0f64);
+        for piece in x.chunks(CHUNK) {
+            let count = piece.len() as f64;
+            let own = sum_of(piece, |v| v) / count;
+            let pivot = own as f32;
+            let off = own - pivot as f64;
+            let apart = own - mean;
+            squares += sum_of(piece, |v| (v - pivot) * (v - pivot)) - count * off * off;
+            squares += apart * apart * (n * count / (n + count));
+            n += count;
+            mean += apart * count / n;
+        }
+        let variance = squares.max(0.0) / n;
+        (mean as f32, (1.0 / (variance + eps as f64).sqrt()) as f32)
     }
 }
 
@@ -75,14 +85,19 @@ vectorized! {
     ) -> (f64, f64) {
         let scale = gamma * rstd;
         let shift = beta - mean * scale;
-        if with_silu {
-            for i in 0..x.len() {
-                dz[i] = g[i] * silu_derivative(x[i] * scale + shift);
+        let (mut sum, mut sum_xhat) = (0f64, 0f64);
+        for ((x, g), dz) in x.chunks(CHUNK).zip(g.chunks(CHUNK)).zip(dz.chunks_mut(CHUNK)) {
+            if with_silu {
+                for ((d, &x), &g) in dz.iter_mut().zip(x).zip(g) {
+                    *d = g * silu_derivative(x * scale + shift);
+                }
+            } else {
+                dz.copy_from_slice(g);
             }
-        } else {
-            dz.copy_from_slice(g);
+            sum += sum_of(dz, |d| d);
+            sum_xhat += sum_of_2(dz, x, |d, x| d * ((x - mean) * rstd));
         }
-        (sum_of(dz, |v| v), sum_of_2(dz, x, |d, x| d * ((x - mean) * rstd)))
+        (sum, sum_xhat)
     }
 }
 

@@ -6,6 +6,7 @@
 
 use rayon::prelude::*;
 
+use super::lanes::gather_narrow;
 use super::matmul::{Matrix, Threads};
 use super::{SharedMut, with_scratch};
 
@@ -300,8 +301,12 @@ fn pack_rows(
             }
             continue;
         }
+        let start = (first + top) * a.row + first_depth * a.column;
+        if a.column == 1 && gather_narrow(&a.data[start..], a.row, count, depth, target, MR) {
+            continue;
+        }
         for i in 0..count {
-            let start = (first + top + i) * a.row + first_depth * a.column;
+            let start = start + i * a.row;
             for p in 0..depth {
                 target[p * MR + i] = a.data[start + p * a.column];
             }

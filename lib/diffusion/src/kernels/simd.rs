@@ -86,7 +86,7 @@ pub(crate) fn sigmoid(x: f32) -> f32 {
 const LANES: usize = 16;
 
 /// Elements summed in f32 before they go into an f64.
-const CHUNK: usize = 1024;
+pub(crate) const CHUNK: usize = 1024;
 
 /// Sum in f64 of f32 partial sums over chunks: relative error below 1e-5 of
 /// the sum of magnitudes for any length.
