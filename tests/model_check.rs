@@ -41,6 +41,19 @@ fn every_part_agrees_and_is_timed_on_the_cpu() {
 }
 
 #[test]
+fn a_wrong_key_is_named_before_the_model_is_read() {
+    let pipeline = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("pipeline.toml");
+    let pipeline = pipeline.display().to_string();
+    let wrong = "--device cpu --set light.start=neutral --set light.draws=0 -p";
+    let wrong: Vec<_> = wrong.split(' ').chain([pipeline.as_str()]).collect();
+    // Reading the model would end with an error of its own.
+    let output = check(&[&["missing.safetensors"], &wrong[..]].concat());
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(text.contains("light.draws"), "{text}");
+}
+
+#[test]
 fn a_gpu_that_is_not_there_is_an_error_if_it_was_named_and_a_line_if_not() {
     let output = check(&[&reference("sd15"), "--small", "--device", "cuda:7"]);
     let text = String::from_utf8_lossy(&output.stderr).into_owned();

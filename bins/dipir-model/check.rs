@@ -40,6 +40,10 @@ struct Report {
 pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     let output = args.common.output;
     let session = session(args)?;
+    if let Some(session) = &session {
+        // What the configuration has wrong is said before minutes are spent.
+        forecast::works(session, &Times::default())?;
+    }
     let path = chosen(args, session.as_ref())?;
     if session.is_none() {
         interrupt::listen()?;

@@ -63,7 +63,7 @@ impl Course {
         });
     }
 
-    /// Seconds until the end, if the rest is done at the pace so far.
+    /// Seconds until the end, if the rest is done at the pace so far; if nothing has been done for long, at that pace.
     fn left_s(&self, passed: Duration) -> Option<f64> {
         let (start, first) = self.first?;
         let (then, share) = self.last;
@@ -73,8 +73,9 @@ impl Course {
         if !enough || passed.saturating_sub(start) < TIME_TO_JUDGE_BY {
             return None;
         }
-        let at_the_time = worked.as_secs_f64() * (1.0 - share) / done;
-        Some((at_the_time - passed.saturating_sub(then).as_secs_f64()).max(0.0))
+        let rest = (1.0 - share) / done;
+        let since = passed.saturating_sub(then).as_secs_f64();
+        Some((worked.as_secs_f64() * rest - since).max(since * rest))
     }
 
     /// `43%, about 12 s left`.
@@ -226,8 +227,8 @@ mod tests {
         // A tenth in 10 s: nine more of them.
         assert_eq!(course.left_s(s(10.0)), Some(90.0));
         assert_eq!(course.left_s(s(14.0)), Some(86.0));
-        assert_eq!(course.in_words(s(14.0)), "10%, about 1 min 26 s left");
-        assert_eq!(course.left_s(s(500.0)), Some(0.0));
+        // Nothing has been done for 490 s: nine times that, as nine times as much is left as was done.
+        assert_eq!(course.left_s(s(500.0)), Some(4410.0));
         course.set(s(20.0), 0.5);
         assert_eq!(course.left_s(s(20.0)), Some(20.0));
     }

@@ -27,7 +27,7 @@ pub struct TimesSettings {
 }
 
 /// Wall seconds, the least of a few turns; of one turn where it takes more than a second.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Times {
     /// Side of the image, pixels.
     pub size: usize,
