@@ -198,12 +198,17 @@ fn start_threads(threads: usize) -> anyhow::Result<()> {
         .context("cannot start the worker threads; ask for fewer with --threads, or give the process more memory (ulimit -v)")
 }
 
-/// `1.2 s`, `3 min 20 s`.
+/// `1.2 s`, `3 min 20 s`, `4 h 18 min`.
 pub fn duration(seconds: f64) -> String {
     match seconds {
         s if s < 10.0 => format!("{s:.2} s"),
         s if s < 60.0 => format!("{s:.1} s"),
-        s => format!("{} min {:02} s", (s / 60.0) as u64, (s % 60.0) as u64),
+        s if s < 3600.0 => format!("{} min {:02} s", (s / 60.0) as u64, (s % 60.0) as u64),
+        s => format!(
+            "{} h {:02} min",
+            (s / 3600.0) as u64,
+            (s % 3600.0 / 60.0) as u64
+        ),
     }
 }
 
@@ -230,6 +235,7 @@ mod tests {
     fn durations_and_sizes_read_well() {
         assert_eq!(duration(1.234), "1.23 s");
         assert_eq!(duration(59.0), "59.0 s");
+        assert_eq!(duration(15491.0), "4 h 18 min");
         assert_eq!(duration(200.4), "3 min 20 s");
         assert_eq!(size(512), "512 B");
         assert_eq!(size(1536), "1.5 KiB");

@@ -218,22 +218,7 @@ pub(crate) fn refine(
             let begun = start_again(&mut jobs, found, goal, &advance);
             film.develop(&jobs[begun..]);
         }
-        let denoised = match auxiliary {
-            Some(auxiliary) => denoise(&mut film, &jobs, auxiliary, viewing),
-            None => vec![None; jobs.len()],
-        };
-        let errors: Vec<SquaredError> = jobs
-            .par_iter()
-            .zip(&denoised)
-            .map(|(job, error)| match error {
-                Some(error) => error.left,
-                None => viewing.squared_error(&film, job),
-            })
-            .collect();
-        let drawn = denoised.iter().zip(&errors);
-        let drawn: Vec<f64> = drawn
-            .map(|(denoised, error)| denoised.map_or(error.sum, |e| e.drawn))
-            .collect();
+        let (errors, drawn) = errors_of(&mut film, &jobs, auxiliary, viewing);
         let error = total_error(&errors, &film, viewing);
         let cost: f64 = jobs.iter().map(Job::cost).sum();
         foresight.learn(&jobs, &errors, &drawn, &error);
@@ -283,6 +268,32 @@ pub(crate) fn refine(
         }
         goals = next;
     }
+}
+
+/// The error that is left of each job, after its noise is removed from `film` if there are `auxiliary` pictures, and that of
+/// its samples before.
+fn errors_of(
+    film: &mut Film,
+    jobs: &[Job],
+    auxiliary: Option<&Auxiliary>,
+    viewing: &Viewing,
+) -> (Vec<SquaredError>, Vec<f64>) {
+    let denoised = match auxiliary {
+        Some(auxiliary) => denoise(film, jobs, auxiliary, viewing),
+        None => vec![None; jobs.len()],
+    };
+    let film = &*film;
+    let errors = jobs
+        .par_iter()
+        .zip(denoised)
+        .map(|(job, denoised)| match denoised {
+            Some(error) => (error.left, error.drawn),
+            None => {
+                let error = viewing.squared_error(film, job);
+                (error, error.sum)
+            }
+        });
+    errors.unzip()
 }
 
 /// Brings every job for which `is_wanted` holds to its goal, and tells `report` the share that is done from time to

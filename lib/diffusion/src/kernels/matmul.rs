@@ -2,7 +2,6 @@
 //! processor has AVX-512, the `gemm` crate elsewhere.
 
 use gemm::{Parallelism, gemm};
-use rayon::prelude::*;
 
 use super::packed::{self, PackedColumns};
 
