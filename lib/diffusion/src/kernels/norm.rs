@@ -39,7 +39,8 @@ vectorized! {
             n += count;
             mean += apart * count / n;
         }
-        let variance = squares.max(0.0) / n;
+        // Not `max`, which would turn NaN into 0.
+        let variance = if squares < 0.0 { 0.0 } else { squares / n };
         (mean as f32, (1.0 / (variance + eps as f64).sqrt()) as f32)
     }
 }

@@ -83,15 +83,18 @@ fn noise_falls_and_what_is_left_of_it_is_measured() {
     // tile and those around it within s^2 / sqrt(25 * 64), s^2 the variance of a half: 5% of the samples' squared error,
     // two thirds of which count where the filter has no bias.
     for (surface, most, most_stated) in [(even, 0.06, 2.0), (ramp, 0.4, 1.2), (stripes, 0.8, 1.2)] {
-        let (mut drawn, mut left, mut stated) = (0.0, 0.0, 0.0);
+        let (mut drawn, mut left, mut stated, mut stated_drawn) = (0.0, 0.0, 0.0, 0.0);
         for seed in 0..16 {
             let (jobs, auxiliary, mut film) = object(surface, 0.02, seed);
             drawn += squared_error(&film, surface, |_, _| true);
             let errors = denoise(&mut film, &jobs, &auxiliary, &VIEWING);
             left += squared_error(&film, surface, |_, _| true);
             stated += errors.iter().flatten().map(|e| e.left.sum).sum::<f64>();
+            stated_drawn += errors.iter().flatten().map(|e| e.drawn).sum::<f64>();
             assert!(errors.iter().all(Option::is_some));
         }
+        // Either has a standard deviation of sqrt(2 / 16384), 1.1%: four of both.
+        assert!((stated_drawn / drawn - 1.0).abs() < 0.063);
         assert!(left < most * drawn, "{left} of {drawn}");
         eprintln!("{} stated {}", left / drawn, stated / left);
         // The noise of 16 frames of 1,024 pixels, of which some 10 are averaged: 4% of the sum.
