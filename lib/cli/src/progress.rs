@@ -63,7 +63,8 @@ impl Course {
         });
     }
 
-    /// Seconds until the end, if the rest is done at the pace so far; if nothing has been done for long, at that pace.
+    /// Seconds until the end at the pace so far, less those since the last report; at least what is left would take if all
+    /// that is done had taken the time since then, so that a late report does not end in 0 s.
     fn left_s(&self, passed: Duration) -> Option<f64> {
         let (start, first) = self.first?;
         let (then, share) = self.last;

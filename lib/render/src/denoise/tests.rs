@@ -93,7 +93,7 @@ fn noise_falls_and_what_is_left_of_it_is_measured() {
             stated_drawn += errors.iter().flatten().map(|e| e.drawn).sum::<f64>();
             assert!(errors.iter().all(Option::is_some));
         }
-        // Either has a standard deviation of sqrt(2 / 16384), 1.1%: four of both.
+        // Each is a sum of 16,384 squares, with a standard deviation of sqrt(2 / 16384), 1.1%: four times that of their ratio.
         assert!((stated_drawn / drawn - 1.0).abs() < 0.063);
         assert!(left < most * drawn, "{left} of {drawn}");
         eprintln!("{} stated {}", left / drawn, stated / left);
