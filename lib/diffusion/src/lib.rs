@@ -5,6 +5,8 @@ pub mod check;
 pub mod concepts;
 pub mod config;
 pub mod crop;
+#[cfg(feature = "cuda")]
+mod cuda;
 pub mod distillation;
 pub mod error;
 pub mod extent;

@@ -2,11 +2,15 @@
 
 use std::collections::BTreeMap;
 
+#[cfg(feature = "cuda")]
+use candle_core::Device;
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Tensor, Var};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+#[cfg(feature = "cuda")]
+use crate::cuda;
 use crate::error::{Error, Result, argument};
 
 /// Settings of [`AdamW`].
@@ -132,6 +136,28 @@ impl AdamW {
         let correction2 = 1.0 - beta2.powf(self.steps as f64);
         self.slots.par_iter_mut().try_for_each(|(name, slot)| {
             let rate = learning_rate(name);
+            #[cfg(feature = "cuda")]
+            if slot.variable.device().is_cuda() {
+                let step = cuda::optimizer::AdamWStep {
+                    scale,
+                    beta1,
+                    beta2,
+                    correction1,
+                    correction2,
+                    eps,
+                    keep: 1.0 - rate * weight_decay,
+                    rate,
+                };
+                let gradient = gradients[name].detach().contiguous()?;
+                let (first, second) = (&slot.first, &slot.second);
+                return Ok(cuda::optimizer::adamw(
+                    step,
+                    &slot.variable,
+                    first,
+                    second,
+                    &gradient,
+                )?);
+            }
             let gradient = (gradients[name].detach() * scale)?;
             slot.first = ((&slot.first * beta1)? + (&gradient * (1.0 - beta1))?)?;
             slot.second = ((&slot.second * beta2)? + (gradient.sqr()? * (1.0 - beta2))?)?;
@@ -189,6 +215,15 @@ impl AdamW {
 /// Euclidean norm of all gradients together, summed in f64; an error names
 /// the first that is not finite.
 pub fn gradient_norm(gradients: &BTreeMap<String, Tensor>) -> Result<f64> {
+    #[cfg(feature = "cuda")]
+    if let Some(Device::Cuda(device)) = gradients.values().next().map(|g| g.device()) {
+        let tensors = gradients
+            .values()
+            .map(|g| g.to_dtype(DType::F32)?.contiguous());
+        let tensors = tensors.collect::<Result<Vec<Tensor>, _>>()?;
+        let squares = cuda::optimizer::squares(device, &tensors)?;
+        return norm_of(gradients.keys().zip(squares.into_iter().map(Ok)));
+    }
     let squares = |gradient: &Tensor| -> Result<f64> {
         let gradient = gradient.to_dtype(DType::F64)?;
         Ok(gradient.sqr()?.sum_all()?.to_scalar::<f64>()?)
@@ -197,6 +232,10 @@ pub fn gradient_norm(gradients: &BTreeMap<String, Tensor>) -> Result<f64> {
         .par_iter()
         .map(|(name, gradient)| (name, squares(gradient)))
         .collect();
+    norm_of(squares)
+}
+
+fn norm_of<'a>(squares: impl IntoIterator<Item = (&'a String, Result<f64>)>) -> Result<f64> {
     let mut total = 0f64;
     for (name, squares) in squares {
         let squares = squares?;

@@ -1,9 +1,9 @@
 //! Fine-tuning a LoRA, and optionally the embedding of a new word, with the
 //! denoising objective and prior preservation [Ruiz et al. 2023].
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Tensor, Var};
@@ -154,6 +154,8 @@ pub struct LoraTrainer<'a> {
     initial_token: Option<Tensor>,
     optimizer: AdamW,
     recompute: Option<Recompute>,
+    /// States of prompts, where no embedding is learned: they stay the same.
+    text: Mutex<HashMap<String, Tensor>>,
 }
 
 impl<'a> LoraTrainer<'a> {
@@ -199,12 +201,32 @@ impl<'a> LoraTrainer<'a> {
             initial_token: initial_token.cloned(),
             optimizer,
             recompute,
+            text: Mutex::default(),
         })
     }
 
     /// The adapter as it is now.
     pub fn lora(&self) -> &Arc<Lora> {
         &self.lora
+    }
+
+    fn text_states(&self, prompts: &[&str]) -> Result<Tensor> {
+        if let Some(learned) = self.learned() {
+            return self.model.encode_prompts(prompts, Some(&learned));
+        }
+        let known = |prompt: &str| {
+            let known = self.text.lock().unwrap_or_else(PoisonError::into_inner);
+            known.get(prompt).cloned()
+        };
+        let states = prompts.iter().map(|&prompt| {
+            if let Some(states) = known(prompt) {
+                return Ok(states);
+            }
+            let states = self.model.encode_prompts(&[prompt], None)?.detach();
+            let mut known = self.text.lock().unwrap_or_else(PoisonError::into_inner);
+            Ok(known.entry(prompt.to_owned()).or_insert(states).clone())
+        });
+        Ok(Tensor::cat(&states.collect::<Result<Vec<_>>>()?, 0)?)
     }
 
     /// The learned embedding as it is now, [1, hidden size].
@@ -390,7 +412,7 @@ impl<'a> LoraTrainer<'a> {
         let noisy = model.schedule.add_noise_each(&latents, &noise, timesteps)?;
         let input = self.join_conditions(examples, &noisy)?;
         let prompts: Vec<&str> = examples.iter().map(|e| e.prompt.as_str()).collect();
-        let context = model.encode_prompts(&prompts, self.learned().as_ref())?;
+        let context = self.text_states(&prompts)?;
         let pass = Pass {
             recompute: recompute.cloned(),
             ..Pass::with_lora(&self.lora)

@@ -88,7 +88,7 @@ impl Validation {
         trainer: &LoraTrainer,
         watch: impl FnMut(f64) -> bool,
     ) -> Result<ValidationRow> {
-        let lora = Arc::new(trainer.lora().detached());
+        let lora = Arc::new(trainer.lora().constant(trainer.model.dtype())?);
         let learned = learned(trainer);
         self.row(trainer.steps(), watch, |fixed| {
             let (examples, t) = (&fixed.examples, fixed.timestep);

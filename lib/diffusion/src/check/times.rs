@@ -136,7 +136,9 @@ impl<'a> Bench<'a> {
         Ok(Self {
             latents: latents(model, settings.side)?,
             context: text(model, settings.side)?,
-            lora: Arc::new(Lora::new(&targets, rank, alpha, 0, model.device())?),
+            lora: Arc::new(
+                Lora::new(&targets, rank, alpha, 0, model.device())?.constant(model.dtype())?,
+            ),
             model,
             image,
             condition,

@@ -1,6 +1,7 @@
 //! 2-D convolution over blocks of unfolded pixels and a matrix product, and
 //! its adjoints.
 
+use candle_core::Shape;
 use rayon::prelude::*;
 
 use super::matmul::{Matrix, Threads, product, product_at};
@@ -33,6 +34,12 @@ const FILL: usize = 64 * 1024;
 const BLOCK_PIXELS: usize = 256;
 
 impl ConvShape {
+    /// Of the result.
+    pub(crate) fn result(&self) -> Shape {
+        let (height, width) = (self.out_height(), self.out_width());
+        Shape::from((self.batch, self.outputs, height, width))
+    }
+
     pub(crate) fn out_height(&self) -> usize {
         (self.height + self.pad_before + self.pad_after - self.kernel) / self.stride + 1
     }

@@ -201,11 +201,21 @@ pub(crate) fn product(
     unsafe { product_at((m, n, k), out.as_mut_ptr(), n, keep, 1.0, a, b, threads) }
 }
 
+/// Sizes of x [rows, inputs] and y [rows, outputs] of a fully connected layer.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct LinearShape {
+    pub rows: usize,
+    pub inputs: usize,
+    pub outputs: usize,
+}
+
 /// `y = x w^T + bias` for x [rows, inputs], w [outputs, inputs].
 pub(crate) fn linear(
-    rows: usize,
-    inputs: usize,
-    outputs: usize,
+    LinearShape {
+        rows,
+        inputs,
+        outputs,
+    }: LinearShape,
     x: &[f32],
     w: &[f32],
     bias: Option<&[f32]>,
@@ -224,9 +234,11 @@ pub(crate) fn linear(
 
 /// Gradient of [`linear`] with respect to x, for the gradient `g` of y.
 pub(crate) fn linear_vjp_input(
-    rows: usize,
-    inputs: usize,
-    outputs: usize,
+    LinearShape {
+        rows,
+        inputs,
+        outputs,
+    }: LinearShape,
     g: &[f32],
     w: &[f32],
 ) -> Vec<f32> {
@@ -244,9 +256,11 @@ pub(crate) fn linear_vjp_input(
 
 /// Gradient of [`linear`] with respect to w.
 pub(crate) fn linear_vjp_weight(
-    rows: usize,
-    inputs: usize,
-    outputs: usize,
+    LinearShape {
+        rows,
+        inputs,
+        outputs,
+    }: LinearShape,
     g: &[f32],
     x: &[f32],
 ) -> Vec<f32> {

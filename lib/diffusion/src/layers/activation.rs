@@ -1,9 +1,13 @@
 //! Activation functions.
 
+#[cfg(feature = "cuda")]
+use candle_core::CudaStorage;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp1, D, Layout, Shape, Tensor};
 
-use super::backend::has_kernels;
+use super::backend::{has_kernels, has_kernels_anywhere};
+#[cfg(feature = "cuda")]
+use crate::cuda::{self, View};
 use crate::error::{Result, argument};
 use crate::kernels::pointwise;
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -69,7 +73,7 @@ pub fn geglu(x: &Tensor) -> Result<Tensor> {
             x.dims()
         ));
     }
-    if has_kernels(&x) {
+    if has_kernels_anywhere(&x, &[]) {
         return Ok(x.apply_op1(GegluOp)?);
     }
     geglu_composed(&x)
@@ -102,23 +106,44 @@ impl CustomOp1 for ActivationOp {
 
 struct GegluOp;
 
+impl GegluOp {
+    /// Values of a row of the result, and its shape.
+    fn half(x: &Layout) -> (usize, Shape) {
+        let mut shape = x.dims().to_vec();
+        let width = shape.pop().unwrap_or(0) / 2;
+        shape.push(width);
+        (width, Shape::from(shape))
+    }
+}
+
 impl CustomOp1 for GegluOp {
     fn name(&self) -> &'static str {
         "geglu"
     }
 
     fn cpu_fwd(&self, x: &CpuStorage, lx: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
-        let mut shape = lx.dims().to_vec();
-        let width = shape.pop().unwrap_or(0) / 2;
-        shape.push(width);
-        Ok((
-            store(pointwise::geglu(&floats(x, lx)?, width), x.dtype()),
-            Shape::from(shape),
-        ))
+        let (width, shape) = Self::half(lx);
+        let y = pointwise::geglu(&floats(x, lx)?, width);
+        Ok((store(y, x.dtype()), shape))
+    }
+
+    #[cfg(feature = "cuda")]
+    fn cuda_fwd(&self, x: &CudaStorage, lx: &Layout) -> candle_core::Result<(CudaStorage, Shape)> {
+        let (width, shape) = Self::half(lx);
+        let rows = shape.elem_count() / width.max(1);
+        let y = cuda::pointwise::geglu((rows, width), View::new(x, lx)?)?;
+        Ok((y, shape))
     }
 
     fn bwd(&self, x: &Tensor, _: &Tensor, g: &Tensor) -> candle_core::Result<Option<Tensor>> {
         let g = g.contiguous()?;
+        #[cfg(feature = "cuda")]
+        if g.device().is_cuda() {
+            let width = g.dim(D::Minus1)?;
+            let size = (g.elem_count() / width.max(1), width);
+            let dx = cuda::pointwise::geglu_vjp(size, View::of(x)?, View::of(&g)?)?;
+            return Ok(Some(cuda::tensor(dx, x.shape())));
+        }
         let dx = pointwise::geglu_vjp(&read(x)?, g.dim(D::Minus1)?, &read(&g)?);
         Ok(Some(from_floats(dx, x.shape(), x.dtype())?))
     }

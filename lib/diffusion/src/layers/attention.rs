@@ -1,9 +1,13 @@
 //! Scaled dot-product attention over heads [Vaswani et al. 2017].
 
+#[cfg(feature = "cuda")]
+use candle_core::CudaStorage;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, D, DType, Device, Layout, Shape, Tensor};
 
-use super::backend::has_kernels;
+use super::backend::has_kernels_anywhere;
+#[cfg(feature = "cuda")]
+use crate::cuda::{self, View};
 use crate::error::{Result, argument};
 use crate::kernels::attention::{self, AttentionShape};
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -35,7 +39,7 @@ impl Attention {
     pub fn forward(&self, q: &Tensor, k: &Tensor, v: &Tensor) -> Result<Tensor> {
         let (q, k, v) = (q.contiguous()?, k.contiguous()?, v.contiguous()?);
         let shape = self.shape(q.shape(), k.shape(), v.shape())?;
-        if has_kernels(&q) {
+        if has_kernels_anywhere(&q, &[]) {
             return Ok(q.apply_op3(&k, &v, AttentionOp(*self))?);
         }
         self.forward_composed(&q, &k, &v, shape)
@@ -147,6 +151,22 @@ impl CustomOp3 for AttentionOp {
         Ok((store(out, q.dtype()), lq.shape().clone()))
     }
 
+    #[cfg(feature = "cuda")]
+    fn cuda_fwd(
+        &self,
+        q: &CudaStorage,
+        lq: &Layout,
+        k: &CudaStorage,
+        lk: &Layout,
+        v: &CudaStorage,
+        lv: &Layout,
+    ) -> candle_core::Result<(CudaStorage, Shape)> {
+        let shape = self.shape(lq.shape(), lk.shape())?;
+        let (q, k, v) = (View::new(q, lq)?, View::new(k, lk)?, View::new(v, lv)?);
+        let out = cuda::attention::attention(shape, q, k, v)?;
+        Ok((out, lq.shape().clone()))
+    }
+
     fn bwd(
         &self,
         q: &Tensor,
@@ -157,6 +177,13 @@ impl CustomOp3 for AttentionOp {
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let shape = self.shape(q.shape(), k.shape())?;
         let g = g.contiguous()?;
+        #[cfg(feature = "cuda")]
+        if g.device().is_cuda() {
+            let (q_, k_, v_) = (View::of(q)?, View::of(k)?, View::of(v)?);
+            let [dq, dk, dv] = cuda::attention::vjp(shape, q_, k_, v_, View::of(&g)?)?;
+            let wanted = |like: &Tensor, d| like.track_op().then(|| cuda::tensor(d, like.shape()));
+            return Ok((wanted(q, dq), wanted(k, dk), wanted(v, dv)));
+        }
         let (q_, k_, v_) = (read(q)?, read(k)?, read(v)?);
         let (dq, dk, dv) = attention::attention_vjp(shape, &q_, &k_, &v_, &read(y)?, &read(&g)?);
         let wanted = |like: &Tensor, values: Vec<f32>| {

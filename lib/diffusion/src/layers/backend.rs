@@ -21,7 +21,13 @@ pub fn composed<T>(work: impl FnOnce() -> T) -> T {
     work()
 }
 
-/// Whether the kernels compute what is asked of `x`.
+/// Whether the CPU's kernels compute what is asked of `x`.
 pub(super) fn has_kernels(x: &Tensor) -> bool {
     x.device().is_cpu() && !COMPOSED.get()
+}
+
+/// As [`has_kernels`], or a GPU's do: those of layers whose `parameters` are constants.
+pub(super) fn has_kernels_anywhere(x: &Tensor, parameters: &[&Tensor]) -> bool {
+    let on_gpu = cfg!(feature = "cuda") && x.device().is_cuda() && !COMPOSED.get();
+    has_kernels(x) || (on_gpu && !parameters.iter().any(|p| p.track_op()))
 }

@@ -1,9 +1,13 @@
 //! 2-D convolution.
 
+#[cfg(feature = "cuda")]
+use candle_core::CudaStorage;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
 
-use super::backend::has_kernels;
+use super::backend::has_kernels_anywhere;
+#[cfg(feature = "cuda")]
+use crate::cuda::{self, View};
 use crate::error::{Result, argument};
 use crate::kernels::conv::{self, ConvShape};
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -80,7 +84,7 @@ impl Conv2d {
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
         let op = self.op();
-        if has_kernels(&x) {
+        if has_kernels_anywhere(&x, &[&self.weight, &self.bias]) {
             return Ok(x.apply_op3(&self.weight, &self.bias, op)?);
         }
         self.forward_composed(&x, op.before, op.after)
@@ -88,8 +92,13 @@ impl Conv2d {
 
     /// The gradient at an input of shape `x`, where that at the value is `g`. It does not depend on the input's values.
     pub(crate) fn input_gradient(&self, x: &Shape, g: &Tensor) -> Result<Tensor> {
-        if has_kernels(g) {
+        if has_kernels_anywhere(g, &[&self.weight]) {
             let (shape, g) = (self.op().shape(x, self.weight.shape())?, g.contiguous()?);
+            #[cfg(feature = "cuda")]
+            if g.device().is_cuda() {
+                let dx = cuda::conv::vjp_input(shape, View::of(&g)?, View::of(&self.weight)?)?;
+                return Ok(cuda::tensor(dx, x));
+            }
             let dx = conv::conv2d_vjp_input(shape, &read(&g)?, &read(&self.weight)?);
             return Ok(from_floats(dx, x, g.dtype())?);
         }
@@ -183,13 +192,23 @@ impl CustomOp3 for ConvOp {
             &floats(w, lw)?,
             Some(&floats(b, lb)?),
         );
-        let dims = (
-            shape.batch,
-            shape.outputs,
-            shape.out_height(),
-            shape.out_width(),
-        );
-        Ok((store(y, x.dtype()), Shape::from(dims)))
+        Ok((store(y, x.dtype()), shape.result()))
+    }
+
+    #[cfg(feature = "cuda")]
+    fn cuda_fwd(
+        &self,
+        x: &CudaStorage,
+        lx: &Layout,
+        w: &CudaStorage,
+        lw: &Layout,
+        b: &CudaStorage,
+        lb: &Layout,
+    ) -> candle_core::Result<(CudaStorage, Shape)> {
+        let shape = self.shape(lx.shape(), lw.shape())?;
+        let (x, w, b) = (View::new(x, lx)?, View::new(w, lw)?, View::new(b, lb)?);
+        let y = cuda::conv::conv2d(shape, x, w, b)?;
+        Ok((y, shape.result()))
     }
 
     fn bwd(
@@ -202,6 +221,11 @@ impl CustomOp3 for ConvOp {
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let shape = self.shape(x.shape(), w.shape())?;
         let g = g.contiguous()?;
+        #[cfg(feature = "cuda")]
+        if g.device().is_cuda() {
+            let dx = cuda::conv::vjp_input(shape, View::of(&g)?, View::of(w)?)?;
+            return Ok((Some(cuda::tensor(dx, x.shape())), None, None));
+        }
         let g_values = read(&g)?;
         let mut result = (None, None, None);
         if x.track_op() {

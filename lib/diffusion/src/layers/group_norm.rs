@@ -1,9 +1,13 @@
 //! Group normalisation, optionally followed by SiLU.
 
+#[cfg(feature = "cuda")]
+use candle_core::CudaStorage;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
 
-use super::backend::has_kernels;
+use super::backend::has_kernels_anywhere;
+#[cfg(feature = "cuda")]
+use crate::cuda::{self, View, norm::NormShape};
 use crate::error::{Result, argument};
 use crate::kernels::norm::{self, GroupShape};
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -59,7 +63,7 @@ impl GroupNorm {
     /// Applies the layer.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
-        if has_kernels(&x) {
+        if has_kernels_anywhere(&x, &[&self.gamma, &self.beta]) {
             return Ok(x.apply_op3(&self.gamma, &self.beta, self.op())?);
         }
         self.forward_composed(&x)
@@ -67,11 +71,15 @@ impl GroupNorm {
 
     /// The gradient at `x`, where that at the value is `g`.
     pub(crate) fn input_gradient(&self, x: &Tensor, g: &Tensor) -> Result<Tensor> {
-        if !has_kernels(x) {
+        if !has_kernels_anywhere(x, &[&self.gamma, &self.beta]) {
             return gradient_through(|x| self.forward(x), x.clone(), g);
         }
         let (x, g) = (x.contiguous()?, g.contiguous()?);
         let shape = self.op().shape(x.shape(), self.gamma.shape())?;
+        #[cfg(feature = "cuda")]
+        if x.device().is_cuda() {
+            return Ok(on_gpu_vjp(shape, &x, &self.gamma, &self.beta, &g)?);
+        }
         let (gamma, beta) = (read(&self.gamma)?, read(&self.beta)?);
         let (dx, _, _) = norm::group_norm_vjp(shape, &read(&x)?, &gamma, &beta, &read(&g)?);
         Ok(from_floats(dx, x.shape(), x.dtype())?)
@@ -106,6 +114,35 @@ impl GroupNorm {
         };
         Ok(y.to_dtype(x.dtype())?)
     }
+}
+
+/// Each group of a sample is a row.
+#[cfg(feature = "cuda")]
+fn rows(s: &GroupShape, elements: usize) -> NormShape {
+    let n = s.channels / s.groups * s.pixels;
+    NormShape {
+        rows: elements / n.max(1),
+        n,
+        groups: s.groups,
+        pixels: s.pixels,
+        eps: s.eps,
+        silu: s.silu,
+    }
+}
+
+/// The gradient at x.
+#[cfg(feature = "cuda")]
+fn on_gpu_vjp(
+    s: GroupShape,
+    x: &Tensor,
+    gamma: &Tensor,
+    beta: &Tensor,
+    g: &Tensor,
+) -> candle_core::Result<Tensor> {
+    let rows = rows(&s, x.elem_count());
+    let (gamma, beta) = (View::of(gamma)?, View::of(beta)?);
+    let dx = cuda::norm::vjp_input(rows, View::of(x)?, gamma, beta, View::of(g)?)?;
+    Ok(cuda::tensor(dx, x.shape()))
 }
 
 struct GroupNormOp {
@@ -155,6 +192,25 @@ impl CustomOp3 for GroupNormOp {
         Ok((store(y, x.dtype()), lx.shape().clone()))
     }
 
+    #[cfg(feature = "cuda")]
+    fn cuda_fwd(
+        &self,
+        x: &CudaStorage,
+        lx: &Layout,
+        gamma: &CudaStorage,
+        lg: &Layout,
+        beta: &CudaStorage,
+        lb: &Layout,
+    ) -> candle_core::Result<(CudaStorage, Shape)> {
+        let rows = rows(
+            &self.shape(lx.shape(), lg.shape())?,
+            lx.shape().elem_count(),
+        );
+        let (gamma, beta) = (View::new(gamma, lg)?, View::new(beta, lb)?);
+        let y = cuda::norm::norm(rows, View::new(x, lx)?, gamma, beta)?;
+        Ok((y, lx.shape().clone()))
+    }
+
     fn bwd(
         &self,
         x: &Tensor,
@@ -165,6 +221,10 @@ impl CustomOp3 for GroupNormOp {
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let shape = self.shape(x.shape(), gamma.shape())?;
         let g = g.contiguous()?;
+        #[cfg(feature = "cuda")]
+        if g.device().is_cuda() {
+            return Ok((Some(on_gpu_vjp(shape, x, gamma, beta, &g)?), None, None));
+        }
         let (dx, dgamma, dbeta) =
             norm::group_norm_vjp(shape, &read(x)?, &read(gamma)?, &read(beta)?, &read(&g)?);
         let wanted = |like: &Tensor, values: Vec<f32>| {

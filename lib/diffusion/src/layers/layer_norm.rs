@@ -1,9 +1,13 @@
 //! Layer normalisation.
 
+#[cfg(feature = "cuda")]
+use candle_core::CudaStorage;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
 
-use super::backend::has_kernels;
+use super::backend::has_kernels_anywhere;
+#[cfg(feature = "cuda")]
+use crate::cuda::{self, View, norm::NormShape};
 use crate::error::Result;
 use crate::kernels::norm;
 use crate::kernels::tensor::{floats, from_floats, read, store};
@@ -28,7 +32,7 @@ impl LayerNorm {
     /// Applies the layer to x [..., size].
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
-        if has_kernels(&x) {
+        if has_kernels_anywhere(&x, &[&self.gamma, &self.beta]) {
             return Ok(x.apply_op3(
                 &self.gamma,
                 &self.beta,
@@ -54,8 +58,30 @@ impl LayerNorm {
     }
 }
 
+fn check(x: &Shape, gamma: &Shape) -> candle_core::Result<()> {
+    if x.dims().last() != Some(&gamma.elem_count()) {
+        candle_core::bail!("layer norm of {gamma:?} got {x:?}");
+    }
+    Ok(())
+}
+
 struct LayerNormOp {
     eps: f32,
+}
+
+#[cfg(feature = "cuda")]
+impl LayerNormOp {
+    fn rows(&self, x: &Shape) -> NormShape {
+        let n = x.dims().last().copied().unwrap_or(1);
+        NormShape {
+            rows: x.elem_count() / n.max(1),
+            n,
+            groups: 1,
+            pixels: 1,
+            eps: self.eps,
+            silu: false,
+        }
+    }
 }
 
 impl CustomOp3 for LayerNormOp {
@@ -72,9 +98,7 @@ impl CustomOp3 for LayerNormOp {
         beta: &CpuStorage,
         lb: &Layout,
     ) -> candle_core::Result<(CpuStorage, Shape)> {
-        if lx.dims().last() != Some(&lg.shape().elem_count()) {
-            candle_core::bail!("layer norm of {:?} got {:?}", lg.shape(), lx.shape());
-        }
+        check(lx.shape(), lg.shape())?;
         let y = norm::layer_norm(
             &floats(x, lx)?,
             &floats(gamma, lg)?,
@@ -82,6 +106,22 @@ impl CustomOp3 for LayerNormOp {
             self.eps,
         );
         Ok((store(y, x.dtype()), lx.shape().clone()))
+    }
+
+    #[cfg(feature = "cuda")]
+    fn cuda_fwd(
+        &self,
+        x: &CudaStorage,
+        lx: &Layout,
+        gamma: &CudaStorage,
+        lg: &Layout,
+        beta: &CudaStorage,
+        lb: &Layout,
+    ) -> candle_core::Result<(CudaStorage, Shape)> {
+        check(lx.shape(), lg.shape())?;
+        let (gamma, beta) = (View::new(gamma, lg)?, View::new(beta, lb)?);
+        let y = cuda::norm::norm(self.rows(lx.shape()), View::new(x, lx)?, gamma, beta)?;
+        Ok((y, lx.shape().clone()))
     }
 
     fn bwd(
@@ -93,6 +133,13 @@ impl CustomOp3 for LayerNormOp {
         g: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let g = g.contiguous()?;
+        #[cfg(feature = "cuda")]
+        if g.device().is_cuda() {
+            let (gamma, beta) = (View::of(gamma)?, View::of(beta)?);
+            let rows = self.rows(x.shape());
+            let dx = cuda::norm::vjp_input(rows, View::of(x)?, gamma, beta, View::of(&g)?)?;
+            return Ok((Some(cuda::tensor(dx, x.shape())), None, None));
+        }
         let (dx, dgamma, dbeta) =
             norm::layer_norm_vjp(&read(x)?, &read(gamma)?, &read(&g)?, self.eps);
         let wanted = |like: &Tensor, values: Vec<f32>| {

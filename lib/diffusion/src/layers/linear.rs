@@ -1,10 +1,14 @@
 //! Fully connected layer.
 
+#[cfg(feature = "cuda")]
+use candle_core::CudaStorage;
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
 
-use super::backend::has_kernels;
+use super::backend::has_kernels_anywhere;
+#[cfg(feature = "cuda")]
+use crate::cuda::{self, View};
 use crate::error::{Result, argument};
-use crate::kernels::matmul;
+use crate::kernels::matmul::{self, LinearShape};
 use crate::kernels::tensor::{floats, from_floats, read, store};
 use crate::parameters::{Init, Parameters};
 
@@ -48,14 +52,6 @@ impl Linear {
         Ok(Self { weight, bias })
     }
 
-    /// The same layer of constants.
-    pub fn detached(&self) -> Self {
-        Self {
-            weight: self.weight.detach(),
-            bias: self.bias.as_ref().map(Tensor::detach),
-        }
-    }
-
     /// Number of inputs.
     pub fn inputs(&self) -> usize {
         self.weight.dims()[1]
@@ -74,7 +70,7 @@ impl Linear {
     /// Applies the layer to x [..., inputs].
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
-        if !has_kernels(&x) {
+        if !has_kernels_anywhere(&x, &[]) {
             return self.forward_composed(&x);
         }
         Ok(match &self.bias {
@@ -100,28 +96,44 @@ impl Linear {
 struct LinearOp;
 
 impl LinearOp {
+    /// Of the product, and of its result.
+    fn sizes(x: &Shape, w: &Shape) -> candle_core::Result<(LinearShape, Shape)> {
+        let (outputs, inputs) = w.dims2()?;
+        let mut shape = x.dims().to_vec();
+        if shape.pop() != Some(inputs) {
+            candle_core::bail!("linear layer of {inputs} inputs got {x:?}");
+        }
+        let rows = shape.iter().product();
+        shape.push(outputs);
+        let sizes = LinearShape {
+            rows,
+            inputs,
+            outputs,
+        };
+        Ok((sizes, Shape::from(shape)))
+    }
+
     fn run(
         (x, lx): (&CpuStorage, &Layout),
         (w, lw): (&CpuStorage, &Layout),
         bias: Option<(&CpuStorage, &Layout)>,
     ) -> candle_core::Result<(CpuStorage, Shape)> {
-        let (outputs, inputs) = lw.shape().dims2()?;
-        let mut shape = lx.dims().to_vec();
-        if shape.pop() != Some(inputs) {
-            candle_core::bail!("linear layer of {inputs} inputs got {:?}", lx.shape());
-        }
-        let rows = shape.iter().product();
-        shape.push(outputs);
+        let (sizes, shape) = Self::sizes(lx.shape(), lw.shape())?;
         let bias = bias.map(|(b, lb)| floats(b, lb)).transpose()?;
-        let y = matmul::linear(
-            rows,
-            inputs,
-            outputs,
-            &floats(x, lx)?,
-            &floats(w, lw)?,
-            bias.as_deref(),
-        );
-        Ok((store(y, x.dtype()), Shape::from(shape)))
+        let y = matmul::linear(sizes, &floats(x, lx)?, &floats(w, lw)?, bias.as_deref());
+        Ok((store(y, x.dtype()), shape))
+    }
+
+    #[cfg(feature = "cuda")]
+    fn run_on_gpu(
+        (x, lx): (&CudaStorage, &Layout),
+        (w, lw): (&CudaStorage, &Layout),
+        bias: Option<(&CudaStorage, &Layout)>,
+    ) -> candle_core::Result<(CudaStorage, Shape)> {
+        let (sizes, shape) = Self::sizes(lx.shape(), lw.shape())?;
+        let bias = bias.map(|(b, lb)| View::new(b, lb)).transpose()?;
+        let y = cuda::linear::linear(sizes, View::new(x, lx)?, View::new(w, lw)?, bias)?;
+        Ok((y, shape))
     }
 
     fn vjp(
@@ -132,14 +144,35 @@ impl LinearOp {
         let (outputs, inputs) = w.dims2()?;
         let g = g.contiguous()?;
         let rows = g.elem_count() / outputs;
+        let sizes = LinearShape {
+            rows,
+            inputs,
+            outputs,
+        };
+        #[cfg(feature = "cuda")]
+        if g.device().is_cuda() {
+            let (x_, w_, g) = (View::of(x)?, View::of(w)?, View::of(&g)?);
+            let dx = x
+                .track_op()
+                .then(|| cuda::linear::vjp_input(sizes, g, w_))
+                .transpose()?;
+            let dw = w
+                .track_op()
+                .then(|| cuda::linear::vjp_weight(sizes, g, x_))
+                .transpose()?;
+            return Ok((
+                dx.map(|d| cuda::tensor(d, x.shape())),
+                dw.map(|d| cuda::tensor(d, w.shape())),
+            ));
+        }
         let g_values = read(&g)?;
         let mut result = (None, None);
         if x.track_op() {
-            let dx = matmul::linear_vjp_input(rows, inputs, outputs, &g_values, &read(w)?);
+            let dx = matmul::linear_vjp_input(sizes, &g_values, &read(w)?);
             result.0 = Some(from_floats(dx, x.shape(), x.dtype())?);
         }
         if w.track_op() {
-            let dw = matmul::linear_vjp_weight(rows, inputs, outputs, &g_values, &read(x)?);
+            let dw = matmul::linear_vjp_weight(sizes, &g_values, &read(x)?);
             result.1 = Some(from_floats(dw, w.shape(), w.dtype())?);
         }
         Ok(result)
@@ -161,6 +194,17 @@ impl CustomOp2 for LinearOp {
         lw: &Layout,
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         Self::run((x, lx), (w, lw), None)
+    }
+
+    #[cfg(feature = "cuda")]
+    fn cuda_fwd(
+        &self,
+        x: &CudaStorage,
+        lx: &Layout,
+        w: &CudaStorage,
+        lw: &Layout,
+    ) -> candle_core::Result<(CudaStorage, Shape)> {
+        Self::run_on_gpu((x, lx), (w, lw), None)
     }
 
     fn bwd(
@@ -191,6 +235,19 @@ impl CustomOp3 for LinearOp {
         Self::run((x, lx), (w, lw), Some((b, lb)))
     }
 
+    #[cfg(feature = "cuda")]
+    fn cuda_fwd(
+        &self,
+        x: &CudaStorage,
+        lx: &Layout,
+        w: &CudaStorage,
+        lw: &Layout,
+        b: &CudaStorage,
+        lb: &Layout,
+    ) -> candle_core::Result<(CudaStorage, Shape)> {
+        Self::run_on_gpu((x, lx), (w, lw), Some((b, lb)))
+    }
+
     fn bwd(
         &self,
         x: &Tensor,
@@ -200,7 +257,9 @@ impl CustomOp3 for LinearOp {
         g: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let (dx, dw) = Self::vjp(x, w, g)?;
-        let db = if b.track_op() {
+        let db = if b.track_op() && g.device().is_cuda() {
+            Some(g.reshape(((), b.elem_count()))?.sum(0)?)
+        } else if b.track_op() {
             let sums = matmul::column_sums(&read(&g.contiguous()?)?, b.elem_count());
             Some(from_floats(sums, b.shape(), b.dtype())?)
         } else {

@@ -16,6 +16,8 @@ mod embedding;
 mod group_norm;
 mod layer_norm;
 mod linear;
+#[cfg(all(test, feature = "cuda"))]
+mod on_gpu;
 mod resample;
 
 pub use activation::{Activation, activate, geglu};

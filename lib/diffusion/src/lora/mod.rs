@@ -151,19 +151,20 @@ impl Lora {
         self.adapters.insert(name.to_owned(), adapter);
     }
 
-    /// The same adapters as constants: predictions with them keep nothing for
-    /// a backward pass.
-    pub fn detached(&self) -> Self {
-        let detached = |adapter: &Adapter| Adapter {
-            down: adapter.down.detached(),
-            up: adapter.up.detached(),
-            scale: adapter.scale,
+    /// The same adapters as constants in the precision `dtype` of a model: predictions with them keep nothing for a backward
+    /// pass.
+    pub fn constant(&self, dtype: DType) -> Result<Self> {
+        let constant = |layer: &Linear| {
+            let weight = layer.weight().detach().to_dtype(dtype)?;
+            Linear::from_tensors(weight, None)
         };
-        let adapters = self.adapters.iter();
-        Self {
-            adapters: adapters.map(|(n, a)| (n.clone(), detached(a))).collect(),
-            variables: BTreeMap::new(),
+        let mut lora = Self::default();
+        for (name, adapter) in &self.adapters {
+            let (down, up) = (constant(&adapter.down)?, constant(&adapter.up)?);
+            let scale = adapter.scale;
+            lora.insert_frozen(name, Adapter { down, up, scale });
         }
+        Ok(lora)
     }
 
     /// The adapter of the layer `name`.

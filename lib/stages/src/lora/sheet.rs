@@ -45,7 +45,7 @@ impl Sheet {
         mut progress: impl FnMut(f64),
     ) -> anyhow::Result<f64> {
         let adapted = Pass {
-            lora: Some(trainer.lora().detached().into()),
+            lora: Some(trainer.lora().constant(model.dtype())?.into()),
             ..Pass::default()
         };
         let (mut rows, mut squares) = (vec![], 0.0);
