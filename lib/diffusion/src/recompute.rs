@@ -8,7 +8,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use candle_core::backend::BackendStorage;
 use candle_core::backprop::GradStore;
 use candle_core::{
-    CpuStorage, CudaStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor, TensorId, Var,
+    CpuStorage, CudaStorage, CustomOp2, CustomOp3, Layout, MetalStorage, Shape, Tensor, TensorId,
+    Var,
 };
 
 use crate::error::{Result, argument};
@@ -142,6 +143,18 @@ impl CustomOp3 for RecomputeOp {
         Ok((y.try_clone(layout)?, layout.shape().clone()))
     }
 
+    fn metal_fwd(
+        &self,
+        _: &MetalStorage,
+        _: &Layout,
+        _: &MetalStorage,
+        _: &Layout,
+        y: &MetalStorage,
+        layout: &Layout,
+    ) -> candle_core::Result<(MetalStorage, Shape)> {
+        Ok((y.try_clone(layout)?, layout.shape().clone()))
+    }
+
     fn bwd(
         &self,
         x: &Tensor,
@@ -217,6 +230,16 @@ impl CustomOp2 for GradientOp {
         nothing: &CudaStorage,
         layout: &Layout,
     ) -> candle_core::Result<(CudaStorage, Shape)> {
+        Ok((nothing.try_clone(layout)?, layout.shape().clone()))
+    }
+
+    fn metal_fwd(
+        &self,
+        _: &MetalStorage,
+        _: &Layout,
+        nothing: &MetalStorage,
+        layout: &Layout,
+    ) -> candle_core::Result<(MetalStorage, Shape)> {
         Ok((nothing.try_clone(layout)?, layout.shape().clone()))
     }
 

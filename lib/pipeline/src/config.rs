@@ -92,8 +92,8 @@ pub struct PipelineTable {
     /// Worker threads; 0 is one for every core. They never change a result.
     #[schemars(range(min = 0, max = MAX_THREADS), example = 8)]
     pub threads: usize,
-    /// What computes diffusion models: `cpu`, `cuda:N` (the N-th GPU, from 0) or `auto` (a GPU if
-    /// there is one).
+    /// What computes diffusion models: `cpu`, `cuda:N` (the N-th NVIDIA GPU, from 0), `metal:N` (Apple's; never tried) or
+    /// `auto` (an NVIDIA GPU if there is one).
     #[schemars(example = &"auto")]
     pub device: String,
     /// How much work is done where a key does not say it.

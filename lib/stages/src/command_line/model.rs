@@ -58,7 +58,7 @@ pub struct CheckArgs {
     #[arg(value_name = "MODEL")]
     pub model: Option<PathBuf>,
 
-    /// What computes: cpu, cuda:N, or auto for a GPU if there is one
+    /// What computes: cpu, cuda:N, metal:N (never tried), or auto for an NVIDIA GPU if there is one
     #[arg(long, default_value = "auto")]
     pub device: String,
 

@@ -155,8 +155,8 @@ pub struct Placed {
     pub fallback: Option<String>,
 }
 
-/// The device that `name` stands for: `cpu`, `cuda:N`, or `auto`, which is the first GPU if there is one. `asked` is what
-/// stands before the name in messages.
+/// The device that `name` stands for: `cpu`, `cuda:N`, `metal:N`, or `auto`, which is the first GPU of NVIDIA if there is one.
+/// `asked` is what stands before the name in messages.
 pub fn device(name: &str, asked: &str) -> anyhow::Result<Placed> {
     let placed = |device| Placed {
         device,
@@ -179,8 +179,13 @@ pub fn device(name: &str, asked: &str) -> anyhow::Result<Placed> {
             })?;
             Ok(placed(device))
         }
+        Some(("metal", number)) if number.parse::<usize>().is_ok() => {
+            let device = apple_gpu(number.parse()?)
+                .map_err(|why| Usage(format!("{asked}\"{name}\": {why}; use \"cpu\"")))?;
+            Ok(placed(device))
+        }
         _ => {
-            let message = format!("{asked}\"{name}\"; accepted: cpu, cuda:N, auto");
+            let message = format!("{asked}\"{name}\"; accepted: cpu, cuda:N, metal:N, auto");
             Err(Usage(message).into())
         }
     }
@@ -201,6 +206,14 @@ fn gpu(number: usize) -> Result<Device, String> {
         Ok(Err(e)) => Err(format!("GPU {number} cannot be used ({e})")),
         Err(_) => Err("no NVIDIA driver was found (libcuda.so)".into()),
     }
+}
+
+/// The N-th GPU of Apple, or why it cannot be used.
+fn apple_gpu(number: usize) -> Result<Device, String> {
+    if !candle_core::utils::metal_is_available() {
+        return Err("this build has no Metal (it was built without --features metal)".into());
+    }
+    Device::new_metal(number).map_err(|e| format!("GPU {number} cannot be used ({e})"))
 }
 
 /// Adds every file of the model to the plan of a stage.
