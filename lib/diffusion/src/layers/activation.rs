@@ -52,7 +52,7 @@ pub fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
     activate_composed(f, &x)
 }
 
-/// [`activate`] composed of candle's operations, for devices other than the CPU.
+/// [`activate`] composed of candle's operations, for devices without kernels.
 pub(super) fn activate_composed(f: Activation, x: &Tensor) -> Result<Tensor> {
     Ok(match f {
         Activation::Silu => x.silu()?,
@@ -79,7 +79,7 @@ pub fn geglu(x: &Tensor) -> Result<Tensor> {
     geglu_composed(&x)
 }
 
-/// [`geglu`] composed of candle's operations, for devices other than the CPU.
+/// [`geglu`] composed of candle's operations, for devices without kernels.
 pub(super) fn geglu_composed(x: &Tensor) -> Result<Tensor> {
     let halves = x.chunk(2, D::Minus1)?;
     Ok((&halves[0] * halves[1].gelu_erf()?)?)

@@ -45,7 +45,7 @@ impl Attention {
         self.forward_composed(&q, &k, &v, shape)
     }
 
-    /// [`Attention::forward`] composed of candle's operations, for devices other than the CPU.
+    /// [`Attention::forward`] composed of candle's operations, for devices without kernels.
     pub(super) fn forward_composed(
         &self,
         q: &Tensor,

@@ -1,7 +1,6 @@
-//! Every layer exists twice: as kernels of our own on the CPU, and composed of
-//! candle's operations for other devices. Here both run on the CPU and have to
-//! agree, results and gradients, so that the second is known to be right
-//! before a GPU sees it.
+//! Every layer exists twice: as kernels of our own, and composed of candle's
+//! operations for devices that have none. Here both run on the CPU and have to
+//! agree, results and gradients.
 
 use std::collections::BTreeMap;
 

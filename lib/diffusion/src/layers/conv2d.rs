@@ -118,7 +118,7 @@ impl Conv2d {
         }
     }
 
-    /// [`Conv2d::forward`] composed of candle's operations, for devices other than the CPU.
+    /// [`Conv2d::forward`] composed of candle's operations, for devices without kernels.
     pub(super) fn forward_composed(
         &self,
         x: &Tensor,

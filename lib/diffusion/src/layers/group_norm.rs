@@ -93,7 +93,7 @@ impl GroupNorm {
         }
     }
 
-    /// [`GroupNorm::forward`] composed of candle's operations, for devices other than the CPU.
+    /// [`GroupNorm::forward`] composed of candle's operations, for devices without kernels.
     pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let (batch, channels) = (x.dims()[0], x.dims()[1]);
         let grouped = x.to_dtype(DType::F32)?.reshape((batch, self.groups, ()))?;

@@ -44,7 +44,7 @@ impl LayerNorm {
         self.forward_composed(&x)
     }
 
-    /// [`LayerNorm::forward`] composed of candle's operations, for devices other than the CPU.
+    /// [`LayerNorm::forward`] composed of candle's operations, for devices without kernels.
     pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let last = x.rank() - 1;
         let values = x.to_dtype(DType::F32)?;

@@ -79,7 +79,7 @@ impl Linear {
         })
     }
 
-    /// [`Linear::forward`] composed of candle's operations, for devices other than the CPU.
+    /// [`Linear::forward`] composed of candle's operations, for devices without kernels.
     pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let mut shape = x.dims().to_vec();
         let inputs = shape.pop().unwrap_or(1);

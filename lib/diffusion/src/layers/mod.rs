@@ -1,10 +1,11 @@
-//! Layers through which gradients pass, on the CPU through the crate's own
-//! kernels and elsewhere composed of candle's differentiable operations.
+//! Layers through which gradients pass, on the CPU and on NVIDIA GPUs through
+//! the crate's own kernels and elsewhere composed of candle's differentiable
+//! operations.
 //!
 //! candle's fused `layer_norm`, `softmax_last_dim`, `rms_norm` and rotary
 //! operations have no backward pass and cut the graph without an error: none
 //! of them is used here. Gradients of parameters that are not variables are
-//! never computed by the CPU kernels.
+//! never computed by the kernels.
 
 mod activation;
 mod attention;

@@ -21,7 +21,7 @@ pub fn upsample_nearest(x: &Tensor, height: usize, width: usize) -> Result<Tenso
     upsample_composed(&x, height, width)
 }
 
-/// [`upsample_nearest`] composed of candle's operations, for devices other than the CPU.
+/// [`upsample_nearest`] composed of candle's operations, for devices without kernels.
 pub(super) fn upsample_composed(x: &Tensor, height: usize, width: usize) -> Result<Tensor> {
     let (_, _, h, w) = x.dims4()?;
     let rows = Tensor::from_vec(sources(h, height), height, x.device())?;
