@@ -277,7 +277,13 @@ fn what_is_missing_or_impossible_is_said_with_a_remedy() {
         CONCEPTS,
         &["--set", "pipeline.device=tpu"],
         2,
-        "cpu, cuda:N, auto",
+        "cpu, cuda:N, metal:N, auto",
+    );
+    fails(
+        CONCEPTS,
+        &["--set", "pipeline.device=metal:0"],
+        2,
+        "--features metal",
     );
     fails(LORA, &["--set", "lora.min_crop=0"], 2, "above 0, up to 1");
     // Without concept preservation no concepts are needed.
