@@ -8,6 +8,7 @@
 //!   unknown and the minimum is used there too.
 //!
 //! The specification's one-sided factor `1 - C(wo)` is not reciprocal.
+use std::cell::Cell;
 use std::f32::consts::FRAC_1_PI;
 
 use dipir_numerics::warp::Frame;
@@ -53,6 +54,16 @@ pub(super) struct Coat {
     diffuse: f32,
     /// Directional albedo of the lobe of visible normals and of that of further bounces.
     pub albedo: [f32; 2],
+}
+
+/// All that [`Coat::diffuse_coupling`] depends on.
+#[derive(Clone, Copy, PartialEq)]
+struct Layers {
+    base: LobeEnergy,
+    /// Of the base: at normal and at grazing incidence, and of further bounces.
+    fresnel: [f32; 3],
+    coat: LobeEnergy,
+    factor: f32,
 }
 
 /// Values (cosine included) and densities of the coat's lobes.
@@ -115,8 +126,29 @@ impl Coat {
     }
 
     /// What keeps a white diffuse base white below the coat: the base's mean passing light
-    /// over the mean of what passes both.
+    /// over the mean of what passes both. It depends on the material alone, and neighbouring
+    /// paths meet the same one: the last is kept.
     fn diffuse_coupling(&self, base: &Base) -> f32 {
+        thread_local! {
+            static LAST: Cell<Option<(Layers, f32)>> = const { Cell::new(None) };
+        }
+        let layers = Layers {
+            base: base.energy,
+            fresnel: [base.f0_dielectric, base.f90, base.further_dielectric],
+            coat: self.energy,
+            factor: self.factor,
+        };
+        match LAST.get() {
+            Some((last, coupling)) if last == layers => coupling,
+            _ => {
+                let coupling = self.integrate_coupling(base);
+                LAST.set(Some((layers, coupling)));
+                coupling
+            }
+        }
+    }
+
+    fn integrate_coupling(&self, base: &Base) -> f32 {
         let (mut one, mut both) = (0.0, 0.0);
         for (mu, weight) in GAUSS {
             let (loss, share) = (base.energy.loss(mu), base.energy.share(mu));

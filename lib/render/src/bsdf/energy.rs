@@ -31,7 +31,7 @@ pub(super) const SHARE_SCALE: f32 = 1.0 / 65535.0;
 pub(super) const MEAN_SCHLICK: f32 = 1.0 / 21.0;
 
 /// What the table says at one roughness.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LobeEnergy {
     alpha: f32,
     loss_row: (usize, f32),
