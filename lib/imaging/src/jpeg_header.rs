@@ -1,9 +1,10 @@
 //! What a JPEG file's markers say before it is decoded: the decoder fills in missing data without
-//! an error, and converts ink to light by a rule of its own.
+//! an error, converts ink to light by a rule of its own, and panics on some layouts.
 use crate::error::ImagingError;
 use std::path::Path;
 
-/// Errors on files that end before their end-of-image marker, on CMYK, and on other than 8 bits.
+/// Errors on files that end before their end-of-image marker, on CMYK, on other than 8 bits, and on layouts
+/// that cannot be decoded.
 pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
     let damaged = |detail: &str| ImagingError::Damaged {
         path: path.to_owned(),
@@ -40,9 +41,30 @@ pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
                 (8, _) => {}
                 _ => return Err(unsupported(format!("is a {bits}-bit JPEG"))),
             }
+            let Some(layout) = bytes.get(at + 10..at + 10 + 3 * usize::from(components)) else {
+                return Err(damaged("the frame header is cut off"));
+            };
+            if !has_finest_first(layout) {
+                let what = "is a JPEG whose colour is sampled more finely than its brightness";
+                return Err(unsupported(what.to_string()));
+            }
         }
         at += 2 + usize::from(u16::from_be_bytes([high, low])).max(2);
     }
+}
+
+/// Whether every component of a frame (identifier, factors of sampling, table) has a whole fraction of the samples of the
+/// first: the decoder panics on others.
+fn has_finest_first(layout: &[u8]) -> bool {
+    let factors = |component: &[u8]| (component[1] >> 4, component[1] & 15);
+    let mut all = layout.chunks_exact(3).map(factors);
+    let Some((across, down)) = all.next() else {
+        return true;
+    };
+    let divides = |part: u8, whole: u8| part > 0 && whole.is_multiple_of(part);
+    divides(across, across)
+        && divides(down, down)
+        && all.all(|(x, y)| divides(x, across) && divides(y, down))
 }
 
 /// Whether two bytes start a segment. 0xff00 is a stuffed data byte, 0xffff fill, and 0xffd0 to

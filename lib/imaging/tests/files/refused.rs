@@ -218,6 +218,21 @@ fn a_cmyk_jpeg_is_refused() {
     );
 }
 
+/// Brightness is sampled once where colour is sampled four times. The decoder panics on such a file.
+#[test]
+fn a_jpeg_whose_colour_is_finer_than_its_brightness_is_refused() {
+    let folder = folder();
+    let path = put(&folder, "x.jpg", include_bytes!("fine_colour.jpg"));
+    assert_eq!(
+        words(read_photo(&path, Transfer::Srgb).unwrap_err()),
+        format!(
+            "`{}` is a JPEG whose colour is sampled more finely than its brightness, which is not supported; \
+             save it as 8-bit RGB",
+            path.display()
+        )
+    );
+}
+
 #[test]
 fn a_header_that_asks_for_all_memory_is_refused() {
     let folder = folder();
