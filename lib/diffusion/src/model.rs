@@ -190,10 +190,10 @@ fn refuse_foreign(index: &ConfigFile) -> Result<()> {
 }
 
 fn check_precision(dtype: DType, device: &Device) -> Result<()> {
-    if device.is_cpu() && dtype != DType::F32 {
-        return crate::error::argument(format!(
-            "precision {dtype:?} on the CPU: accepted is f32; half-precision files are converted while reading"
-        ));
+    if device.is_cpu() && dtype == DType::F16 {
+        return crate::error::argument(
+            "precision f16 on the CPU: accepted are f32 and bf16; half-precision files are converted while reading",
+        );
     }
     Ok(())
 }

@@ -4,7 +4,7 @@
 
 use rayon::prelude::*;
 
-use super::matmul::{Columns, Matrix, Threads, product_at, product_columns};
+use super::matmul::{Columns, Engine, Matrix, Threads, product_by, product_columns};
 use super::simd::{exp, sum_of_2, vectorized};
 use super::{SharedMut, with_scratch};
 
@@ -139,20 +139,38 @@ impl AttentionShape {
     }
 
     /// One head's matrix of `data`, keys or values: as it is, [keys, head_dim].
-    fn columns<'a>(&self, data: &'a [f32], item: usize, head: usize) -> Columns<'a> {
+    fn columns<'a>(
+        &self,
+        engine: Engine,
+        data: &'a [f32],
+        item: usize,
+        head: usize,
+    ) -> Columns<'a> {
         let view = self.head(data, self.keys, item, head, 0);
-        Columns::new(view, (self.keys, self.head_dim))
+        Columns::new(engine, view, (self.keys, self.head_dim))
     }
 
     /// The same matrix transposed, [head_dim, keys].
-    fn columns_transposed<'a>(&self, data: &'a [f32], item: usize, head: usize) -> Columns<'a> {
+    fn columns_transposed<'a>(
+        &self,
+        engine: Engine,
+        data: &'a [f32],
+        item: usize,
+        head: usize,
+    ) -> Columns<'a> {
         let view = self.head(data, self.keys, item, head, 0).transposed();
-        Columns::new(view, (self.head_dim, self.keys))
+        Columns::new(engine, view, (self.head_dim, self.keys))
     }
 }
 
-/// softmax(scale q k^T) v, heads side by side in the last dimension.
-pub(crate) fn attention(shape: AttentionShape, q: &[f32], k: &[f32], v: &[f32]) -> Vec<f32> {
+/// softmax(scale q k^T) v, heads side by side in the last dimension, with products by `engine`.
+pub(crate) fn attention(
+    engine: Engine,
+    shape: AttentionShape,
+    q: &[f32],
+    k: &[f32],
+    v: &[f32],
+) -> Vec<f32> {
     let mut out = vec![0.0; q.len()];
     let (block, width) = (shape.block(), shape.width());
     let blocks = shape.queries.div_ceil(block);
@@ -161,8 +179,8 @@ pub(crate) fn attention(shape: AttentionShape, q: &[f32], k: &[f32], v: &[f32]) 
         .map(|pair| {
             let (item, head) = (pair / shape.heads, pair % shape.heads);
             (
-                shape.columns_transposed(k, item, head),
-                shape.columns(v, item, head),
+                shape.columns_transposed(engine, k, item, head),
+                shape.columns(engine, v, item, head),
             )
         })
         .collect();
@@ -228,6 +246,7 @@ vectorized! {
 
 /// Gradients of [`attention`], whose value is `y`: (dq, dk, dv).
 pub(crate) fn attention_vjp(
+    engine: Engine,
     shape: AttentionShape,
     q: &[f32],
     k: &[f32],
@@ -278,22 +297,34 @@ pub(crate) fn attention_vjp(
             product_columns(scores, out, stride, 0.0, 1.0, g, values_t, threads);
             let weights = Matrix::rows(p, stride).transposed();
             let out = targets.2.at(key_offset);
-            product_at(by_key, out, width, keep, 1.0, weights, scaled, threads);
+            product_by(
+                engine, by_key, out, width, keep, 1.0, weights, scaled, threads,
+            );
             softmax_rows_vjp(p, dp, shape.keys, stride, &means, &inverse);
             let ds = Matrix::rows(dp, stride);
             let out = targets.0.at(query_offset);
             product_columns(by_query, out, width, 0.0, shape.scale, ds, keys, threads);
             let out = targets.1.at(key_offset);
             let ds = ds.transposed();
-            product_at(by_key, out, width, keep, shape.scale, ds, q, threads);
+            product_by(
+                engine,
+                by_key,
+                out,
+                width,
+                keep,
+                shape.scale,
+                ds,
+                q,
+                threads,
+            );
         }
     };
     let run = |pair: usize| {
         let (item, head) = (pair / shape.heads, pair % shape.heads);
         let shared = (
-            shape.columns_transposed(k, item, head),
-            shape.columns_transposed(v, item, head),
-            shape.columns(k, item, head),
+            shape.columns_transposed(engine, k, item, head),
+            shape.columns_transposed(engine, v, item, head),
+            shape.columns(engine, k, item, head),
         );
         for first in (0..shape.queries).step_by(block) {
             let len = block.min(shape.queries - first) * stride;

@@ -131,12 +131,23 @@ fn unfold_tap(
 
 /// The convolution, [batch, outputs, out_height, out_width].
 pub(crate) fn conv2d(shape: ConvShape, x: &[f32], w: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
-    let pixels = shape.out_pixels();
-    let mut out = vec![0.0; shape.batch * shape.outputs * pixels];
     if winograd::suits(shape) {
+        let mut out = vec![0.0; shape.batch * shape.outputs * shape.out_pixels()];
         winograd::conv2d(shape, x, w, winograd::Weights::AsStored, bias, &mut out);
         return out;
     }
+    conv2d_unfolded(shape, x, w, bias)
+}
+
+/// [`conv2d`] of unfolded pixels.
+pub(super) fn conv2d_unfolded(
+    shape: ConvShape,
+    x: &[f32],
+    w: &[f32],
+    bias: Option<&[f32]>,
+) -> Vec<f32> {
+    let pixels = shape.out_pixels();
+    let mut out = vec![0.0; shape.batch * shape.outputs * pixels];
     if let Some(bias) = bias {
         out.par_chunks_exact_mut(pixels)
             .with_min_len(FILL.div_ceil(pixels))
@@ -278,7 +289,7 @@ fn turned(shape: ConvShape, w: &[f32]) -> Vec<f32> {
 }
 
 /// Strided convolutions and those of few pixels: unfolded gradients, summed back into the image.
-fn fold_product(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f32> {
+pub(super) fn fold_product(shape: ConvShape, g: &[f32], w: &[f32]) -> Vec<f32> {
     let (pixels, taps, out_width) = (
         shape.out_pixels(),
         shape.kernel * shape.kernel,

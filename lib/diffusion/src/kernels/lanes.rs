@@ -150,6 +150,9 @@ mod plain {
 }
 
 #[cfg(target_arch = "x86_64")]
+pub(super) use avx512::turn;
+
+#[cfg(target_arch = "x86_64")]
 mod avx512 {
     use std::arch::x86_64::*;
 
@@ -194,6 +197,26 @@ mod avx512 {
             out[12 + q] = _mm512_shuffle_f32x4::<0xdd>(odd_low, odd_high);
         }
         out
+    }
+
+    /// Sixteen rows of sixteen words become columns. No arithmetic is done: any bits will do.
+    ///
+    /// # Safety
+    /// The processor has AVX-512; both are valid for 16 rows of 16 words, `stride` and `target_stride` apart.
+    #[target_feature(enable = "avx512f")]
+    pub(in crate::kernels) unsafe fn turn(
+        source: *const f32,
+        stride: usize,
+        target: *mut f32,
+        target_stride: usize,
+    ) {
+        // SAFETY: by the caller's contract.
+        unsafe {
+            let rows = std::array::from_fn(|row| _mm512_loadu_ps(source.add(row * stride)));
+            for (row, column) in transposed(rows).into_iter().enumerate() {
+                _mm512_storeu_ps(target.add(row * target_stride), column);
+            }
+        }
     }
 
     /// # Safety

@@ -4,18 +4,19 @@
 use gemm::{Parallelism, gemm};
 
 use super::packed::{self, PackedColumns};
+use super::tiles;
 
 /// A row-major view: element (i, j) at `i * row + j * column`.
 #[derive(Clone, Copy)]
-pub(crate) struct Matrix<'a> {
-    pub data: &'a [f32],
+pub(crate) struct Matrix<'a, T = f32> {
+    pub data: &'a [T],
     pub row: usize,
     pub column: usize,
 }
 
-impl<'a> Matrix<'a> {
+impl<'a, T> Matrix<'a, T> {
     /// Rows of `width` contiguous elements.
-    pub(crate) fn rows(data: &'a [f32], width: usize) -> Self {
+    pub(crate) fn rows(data: &'a [T], width: usize) -> Self {
         Self {
             data,
             row: width,
@@ -32,7 +33,7 @@ impl<'a> Matrix<'a> {
         }
     }
 
-    fn check(&self, rows: usize, columns: usize) {
+    pub(super) fn check(&self, rows: usize, columns: usize) {
         if rows > 0 && columns > 0 {
             assert!(
                 (rows - 1) * self.row + (columns - 1) * self.column < self.data.len(),
@@ -56,10 +57,12 @@ pub(crate) enum Engine {
     Panels,
     /// The `gemm` crate; runs everywhere.
     Gemm,
+    /// `tiles`: elements are rounded to bf16 first.
+    Tiles,
 }
 
 impl Engine {
-    /// The faster one of those that this processor can run.
+    /// Of numbers in f32: the faster one of those that this processor can run.
     pub(crate) fn best() -> Self {
         match packed::available() {
             true => Self::Panels,
@@ -111,6 +114,10 @@ pub(crate) unsafe fn product_by(
         // SAFETY: both views were checked, `out` is the caller's contract.
         return unsafe { packed::product((m, n, k), out, out_row, keep, scale, a, b, threads) };
     }
+    if engine == Engine::Tiles {
+        // SAFETY: as above.
+        return unsafe { tiles::product((m, n, k), out, out_row, keep, scale, a, b, threads) };
+    }
     let parallelism = match threads {
         Threads::One => Parallelism::None,
         Threads::All => Parallelism::Rayon(rayon::current_num_threads()),
@@ -145,17 +152,18 @@ pub(crate) unsafe fn product_by(
 /// pays.
 pub(crate) enum Columns<'a> {
     Packed(PackedColumns),
+    Tiles(tiles::PackedColumns),
     Matrix(Matrix<'a>),
 }
 
 impl<'a> Columns<'a> {
-    /// The k x n elements of `b`.
-    pub(crate) fn new(b: Matrix<'a>, (k, n): (usize, usize)) -> Self {
+    /// The k x n elements of `b`, for products by `engine`.
+    pub(crate) fn new(engine: Engine, b: Matrix<'a>, (k, n): (usize, usize)) -> Self {
         b.check(k, n);
-        if packed::available() {
-            Self::Packed(PackedColumns::new(b, (k, n)))
-        } else {
-            Self::Matrix(b)
+        match engine {
+            Engine::Panels => Self::Packed(PackedColumns::new(b, (k, n))),
+            Engine::Tiles => Self::Tiles(tiles::PackedColumns::new(b, (k, n))),
+            Engine::Gemm => Self::Matrix(b),
         }
     }
 }
@@ -181,8 +189,22 @@ pub(crate) unsafe fn product_columns(
             unsafe { packed::product_packed(m, out, out_row, keep, scale, a, b, threads) }
         }
         // SAFETY: by the caller's contract.
+        Columns::Tiles(b) => unsafe {
+            tiles::product_packed(m, out, out_row, keep, scale, a, b, threads)
+        },
+        // SAFETY: by the caller's contract.
         Columns::Matrix(b) => unsafe {
-            product_at((m, n, k), out, out_row, keep, scale, a, *b, threads)
+            product_by(
+                Engine::Gemm,
+                (m, n, k),
+                out,
+                out_row,
+                keep,
+                scale,
+                a,
+                *b,
+                threads,
+            )
         },
     }
 }

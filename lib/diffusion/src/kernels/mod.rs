@@ -13,6 +13,7 @@ mod packed;
 pub(crate) mod pointwise;
 pub(crate) mod simd;
 pub(crate) mod tensor;
+pub(crate) mod tiles;
 mod winograd;
 
 use std::sync::{Mutex, PoisonError};

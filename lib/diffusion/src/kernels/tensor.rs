@@ -4,6 +4,10 @@ use std::borrow::Cow;
 use std::ops::Deref;
 
 use candle_core::{CpuStorage, DType, Device, Layout, Shape, Storage, Tensor};
+use half::bf16;
+
+use super::simd::vectorized;
+use super::tiles::Element;
 
 /// The elements of a contiguous storage as f32, converted if stored in half
 /// precision.
@@ -19,18 +23,63 @@ pub(crate) fn floats<'a>(
         CpuStorage::F16(values) => {
             Cow::Owned(values[start..end].iter().map(|v| v.to_f32()).collect())
         }
-        CpuStorage::BF16(values) => {
-            Cow::Owned(values[start..end].iter().map(|v| v.to_f32()).collect())
-        }
+        CpuStorage::BF16(values) => Cow::Owned(widened(&values[start..end])),
         _ => candle_core::bail!("kernel input is neither f32, f16 nor bf16"),
     })
+}
+
+/// The elements of a contiguous storage of bf16.
+pub(crate) fn halves<'a>(
+    storage: &'a CpuStorage,
+    layout: &Layout,
+) -> candle_core::Result<&'a [bf16]> {
+    match (storage, layout.contiguous_offsets()) {
+        (CpuStorage::BF16(values), Some((start, end))) => Ok(&values[start..end]),
+        _ => candle_core::bail!("kernel input is not contiguous bf16: {:?}", layout.shape()),
+    }
+}
+
+/// Runs `f` on the elements of contiguous CPU tensors of bf16.
+pub(crate) fn with_halves<const N: usize, R>(
+    tensors: [&Tensor; N],
+    f: impl FnOnce([&[bf16]; N]) -> R,
+) -> candle_core::Result<R> {
+    let guards = tensors.map(Tensor::storage_and_layout);
+    let mut elements: [&[bf16]; N] = [&[]; N];
+    for (elements, (guard, layout)) in elements.iter_mut().zip(&guards) {
+        let Storage::Cpu(storage) = &**guard else {
+            candle_core::bail!("kernel input is not on the CPU")
+        };
+        *elements = halves(storage, layout)?;
+    }
+    Ok(f(elements))
+}
+
+fn widened(values: &[bf16]) -> Vec<f32> {
+    let mut wide = vec![0.0; values.len()];
+    widen(values, &mut wide);
+    wide
+}
+
+vectorized! {
+    fn widen(values: &[bf16], wide: &mut [f32]) {
+        for (wide, value) in wide.iter_mut().zip(values) {
+            *wide = f32::from_bits((value.to_bits() as u32) << 16);
+        }
+    }
+}
+
+fn narrowed(values: &[f32]) -> Vec<bf16> {
+    let mut bits = vec![0; values.len()];
+    f32::round_to(values, &mut bits);
+    bits.into_iter().map(bf16::from_bits).collect()
 }
 
 /// Stores f32 results in the precision `dtype`.
 pub(crate) fn store(values: Vec<f32>, dtype: DType) -> CpuStorage {
     match dtype {
         DType::F16 => CpuStorage::F16(values.into_iter().map(half::f16::from_f32).collect()),
-        DType::BF16 => CpuStorage::BF16(values.into_iter().map(half::bf16::from_f32).collect()),
+        DType::BF16 => CpuStorage::BF16(narrowed(&values)),
         _ => CpuStorage::F32(values),
     }
 }
@@ -41,7 +90,10 @@ pub(crate) fn from_floats(
     shape: impl Into<Shape>,
     dtype: DType,
 ) -> candle_core::Result<Tensor> {
-    Tensor::from_vec(values, shape, &Device::Cpu)?.to_dtype(dtype)
+    match dtype {
+        DType::BF16 => Tensor::from_vec(narrowed(&values), shape, &Device::Cpu),
+        _ => Tensor::from_vec(values, shape, &Device::Cpu)?.to_dtype(dtype),
+    }
 }
 
 /// A tensor's elements, kept alive by its read lock.

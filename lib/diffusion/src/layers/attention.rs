@@ -10,6 +10,7 @@ use super::backend::has_kernels_anywhere;
 use crate::cuda::{self, View};
 use crate::error::{Result, argument};
 use crate::kernels::attention::{self, AttentionShape};
+use crate::kernels::matmul::Engine;
 use crate::kernels::tensor::{floats, from_floats, read, store};
 
 /// Which keys a query sees.
@@ -124,6 +125,14 @@ fn causal_mask(queries: usize, keys: usize, device: &Device) -> Result<Tensor> {
     Ok(Tensor::from_vec(values, (queries, keys), device)?)
 }
 
+/// What multiplies numbers of `dtype` on the CPU.
+fn engine(dtype: DType) -> Engine {
+    match dtype {
+        DType::BF16 => Engine::Tiles,
+        _ => Engine::best(),
+    }
+}
+
 struct AttentionOp(Attention);
 
 impl AttentionOp {
@@ -147,7 +156,8 @@ impl CustomOp3 for AttentionOp {
         lv: &Layout,
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let shape = self.shape(lq.shape(), lk.shape())?;
-        let out = attention::attention(shape, &floats(q, lq)?, &floats(k, lk)?, &floats(v, lv)?);
+        let (engine, q_, k_) = (engine(q.dtype()), floats(q, lq)?, floats(k, lk)?);
+        let out = attention::attention(engine, shape, &q_, &k_, &floats(v, lv)?);
         Ok((store(out, q.dtype()), lq.shape().clone()))
     }
 
@@ -185,7 +195,8 @@ impl CustomOp3 for AttentionOp {
             return Ok((wanted(q, dq), wanted(k, dk), wanted(v, dv)));
         }
         let (q_, k_, v_) = (read(q)?, read(k)?, read(v)?);
-        let (dq, dk, dv) = attention::attention_vjp(shape, &q_, &k_, &v_, &read(y)?, &read(&g)?);
+        let (engine, y, g) = (engine(q.dtype()), read(y)?, read(&g)?);
+        let (dq, dk, dv) = attention::attention_vjp(engine, shape, &q_, &k_, &v_, &y, &g);
         let wanted = |like: &Tensor, values: Vec<f32>| {
             like.track_op()
                 .then(|| from_floats(values, like.shape(), like.dtype()))

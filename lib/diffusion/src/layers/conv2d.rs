@@ -3,14 +3,15 @@
 #[cfg(feature = "cuda")]
 use candle_core::CudaStorage;
 use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
 
 use super::backend::has_kernels_anywhere;
 #[cfg(feature = "cuda")]
 use crate::cuda::{self, View};
 use crate::error::{Result, argument};
 use crate::kernels::conv::{self, ConvShape};
-use crate::kernels::tensor::{floats, from_floats, read, store};
+use crate::kernels::tensor::{floats, from_floats, halves, read, store, with_halves};
+use crate::kernels::tiles;
 use crate::parameters::{Init, Parameters};
 use crate::recompute::gradient_through;
 
@@ -99,7 +100,7 @@ impl Conv2d {
                 let dx = cuda::conv::vjp_input(shape, View::of(&g)?, View::of(&self.weight)?)?;
                 return Ok(cuda::tensor(dx, x));
             }
-            let dx = conv::conv2d_vjp_input(shape, &read(&g)?, &read(&self.weight)?);
+            let dx = vjp_input(shape, &g, &self.weight)?;
             return Ok(from_floats(dx, x, g.dtype())?);
         }
         let nothing = Tensor::zeros(x, g.dtype(), g.device())?;
@@ -135,6 +136,14 @@ impl Conv2d {
         };
         Ok(y.broadcast_add(&self.bias.reshape((1, (), 1, 1))?)?)
     }
+}
+
+/// Gradient at the input of a convolution, on the CPU.
+fn vjp_input(shape: ConvShape, g: &Tensor, w: &Tensor) -> candle_core::Result<Vec<f32>> {
+    if g.dtype() == DType::BF16 && w.dtype() == DType::BF16 {
+        return with_halves([g, w], |[g, w]| tiles::conv2d_vjp_input(shape, g, w));
+    }
+    Ok(conv::conv2d_vjp_input(shape, &read(g)?, &read(w)?))
 }
 
 struct ConvOp {
@@ -186,12 +195,13 @@ impl CustomOp3 for ConvOp {
         lb: &Layout,
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let shape = self.shape(lx.shape(), lw.shape())?;
-        let y = conv::conv2d(
-            shape,
-            &floats(x, lx)?,
-            &floats(w, lw)?,
-            Some(&floats(b, lb)?),
-        );
+        let bias = floats(b, lb)?;
+        let y = match (x, w) {
+            (CpuStorage::BF16(_), CpuStorage::BF16(_)) => {
+                tiles::conv2d(shape, halves(x, lx)?, halves(w, lw)?, Some(&bias))
+            }
+            _ => conv::conv2d(shape, &floats(x, lx)?, &floats(w, lw)?, Some(&bias)),
+        };
         Ok((store(y, x.dtype()), shape.result()))
     }
 
@@ -226,12 +236,15 @@ impl CustomOp3 for ConvOp {
             let dx = cuda::conv::vjp_input(shape, View::of(&g)?, View::of(w)?)?;
             return Ok((Some(cuda::tensor(dx, x.shape())), None, None));
         }
-        let g_values = read(&g)?;
         let mut result = (None, None, None);
         if x.track_op() {
-            let dx = conv::conv2d_vjp_input(shape, &g_values, &read(w)?);
+            let dx = vjp_input(shape, &g, w)?;
             result.0 = Some(from_floats(dx, x.shape(), x.dtype())?);
         }
+        if !w.track_op() && !b.track_op() {
+            return Ok(result);
+        }
+        let g_values = read(&g)?;
         if w.track_op() {
             let dw = conv::conv2d_vjp_weight(shape, &g_values, &read(x)?);
             result.1 = Some(from_floats(dw, w.shape(), w.dtype())?);

@@ -2,14 +2,15 @@
 
 #[cfg(feature = "cuda")]
 use candle_core::CudaStorage;
-use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, DType, Layout, Shape, Tensor};
 
 use super::backend::has_kernels_anywhere;
 #[cfg(feature = "cuda")]
 use crate::cuda::{self, View};
 use crate::error::{Result, argument};
 use crate::kernels::matmul::{self, LinearShape};
-use crate::kernels::tensor::{floats, from_floats, read, store};
+use crate::kernels::tensor::{floats, from_floats, halves, read, store, with_halves};
+use crate::kernels::tiles;
 use crate::parameters::{Init, Parameters};
 
 /// y = x W^T + b over the last dimension.
@@ -120,7 +121,12 @@ impl LinearOp {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (sizes, shape) = Self::sizes(lx.shape(), lw.shape())?;
         let bias = bias.map(|(b, lb)| floats(b, lb)).transpose()?;
-        let y = matmul::linear(sizes, &floats(x, lx)?, &floats(w, lw)?, bias.as_deref());
+        let y = match (x, w) {
+            (CpuStorage::BF16(_), CpuStorage::BF16(_)) => {
+                tiles::linear(sizes, halves(x, lx)?, halves(w, lw)?, bias.as_deref())
+            }
+            _ => matmul::linear(sizes, &floats(x, lx)?, &floats(w, lw)?, bias.as_deref()),
+        };
         Ok((store(y, x.dtype()), shape))
     }
 
@@ -165,14 +171,17 @@ impl LinearOp {
                 dw.map(|d| cuda::tensor(d, w.shape())),
             ));
         }
-        let g_values = read(&g)?;
         let mut result = (None, None);
         if x.track_op() {
-            let dx = matmul::linear_vjp_input(sizes, &g_values, &read(w)?);
+            let dx = if g.dtype() == DType::BF16 && w.dtype() == DType::BF16 {
+                with_halves([&g, w], |[g, w]| tiles::linear_vjp_input(sizes, g, w))?
+            } else {
+                matmul::linear_vjp_input(sizes, &read(&g)?, &read(w)?)
+            };
             result.0 = Some(from_floats(dx, x.shape(), x.dtype())?);
         }
         if w.track_op() {
-            let dw = matmul::linear_vjp_weight(sizes, &g_values, &read(x)?);
+            let dw = matmul::linear_vjp_weight(sizes, &read(&g)?, &read(x)?);
             result.1 = Some(from_floats(dw, w.shape(), w.dtype())?);
         }
         Ok(result)

@@ -1,0 +1,336 @@
+//! 32 x 32 sums over a depth of packed bf16, by the instructions that the processor has.
+
+use crate::kernels::simd::vectorized;
+
+/// Rows of a tile.
+pub(super) const ROWS: usize = 16;
+/// Elements of depth of a tile.
+pub(super) const DEPTH: usize = 32;
+/// Rows and columns of a block of sums: two by two tiles.
+pub(super) const SIDE: usize = 32;
+
+/// Whether this processor multiplies bf16 itself, and the system lets it.
+pub(crate) fn native() -> bool {
+    kind() != Kind::Plain
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// AMX: a tile of 16 rows times a tile of 16 columns, 32 deep, an instruction.
+    Tiles,
+    /// AVX-512: sixteen dot products of two pairs an instruction.
+    Dots,
+    /// Products in f32: runs everywhere.
+    Plain,
+}
+
+fn kind() -> Kind {
+    static KIND: std::sync::OnceLock<Kind> = std::sync::OnceLock::new();
+    *KIND.get_or_init(|| kinds()[0])
+}
+
+/// Those that can run here, the fastest first.
+pub(super) fn kinds() -> Vec<Kind> {
+    let mut kinds = Vec::new();
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        if amx::available() {
+            kinds.push(Kind::Tiles);
+        }
+        if is_x86_feature_detected!("avx512bf16") {
+            kinds.push(Kind::Dots);
+        }
+    }
+    kinds.push(Kind::Plain);
+    kinds
+}
+
+/// This thread's right to multiply, until it is dropped.
+pub(super) struct Instructions(Kind);
+
+impl Instructions {
+    pub(super) fn start() -> Self {
+        Self::of(kind())
+    }
+
+    pub(super) fn of(kind: Kind) -> Self {
+        #[cfg(target_arch = "x86_64")]
+        if kind == Kind::Tiles {
+            amx::configure();
+        }
+        Self(kind)
+    }
+
+    /// Adds the products of two tiles of rows and 32 columns over `steps` to `sums`, or starts them anew.
+    ///
+    /// # Safety
+    /// `a` are the first tiles of two blocks of rows, whose tiles follow one another; `b` is valid for reads of 16 rows of
+    /// 32 words, `stride` apart, at each of `steps`.
+    pub(super) unsafe fn multiply(
+        &self,
+        a: [*const u16; 2],
+        b: *const u32,
+        steps: &[usize],
+        stride: usize,
+        sums: &mut [f32; SIDE * SIDE],
+        anew: bool,
+    ) {
+        // SAFETY: by the caller's contract; `of` was given what the processor has.
+        unsafe {
+            match self.0 {
+                #[cfg(target_arch = "x86_64")]
+                Kind::Tiles => amx::multiply(a, b, steps, stride, sums, anew),
+                #[cfg(target_arch = "x86_64")]
+                Kind::Dots => dots::multiply(a, b, steps, stride, sums, anew),
+                _ => plain_tiles(a, b, steps, stride, sums, anew),
+            }
+        }
+    }
+}
+
+/// # Safety
+/// As [`Instructions::multiply`].
+unsafe fn plain_tiles(
+    a: [*const u16; 2],
+    b: *const u32,
+    steps: &[usize],
+    stride: usize,
+    sums: &mut [f32; SIDE * SIDE],
+    anew: bool,
+) {
+    if anew {
+        sums.fill(0.0);
+    }
+    for (step, &at) in steps.iter().enumerate() {
+        // SAFETY: by the caller's contract.
+        let (words, tiles) = unsafe {
+            let words = std::slice::from_raw_parts(b.add(at), (DEPTH / 2 - 1) * stride + SIDE);
+            let tile = |a: *const u16| {
+                std::slice::from_raw_parts(a.add(step * ROWS * DEPTH), ROWS * DEPTH)
+            };
+            (words, a.map(tile))
+        };
+        for (tile, sums) in tiles.into_iter().zip(sums.chunks_exact_mut(ROWS * SIDE)) {
+            plain(tile, words, stride, sums);
+        }
+    }
+}
+
+/// Rows whose sums stay in registers.
+const GROUP: usize = 4;
+
+vectorized! {
+    /// Adds the product of a tile of rows and 32 columns.
+    fn plain(tile: &[u16], words: &[u32], stride: usize, sums: &mut [f32]) {
+        let groups = tile.chunks_exact(GROUP * DEPTH).zip(sums.chunks_exact_mut(GROUP * SIDE));
+        for (rows, sums) in groups {
+            let mut kept = [[0f32; SIDE]; GROUP];
+            for (kept, sums) in kept.iter_mut().zip(sums.chunks_exact(SIDE)) {
+                kept.copy_from_slice(sums);
+            }
+            for pair in 0..DEPTH / 2 {
+                let words = &words[pair * stride..][..SIDE];
+                for (row, kept) in kept.iter_mut().enumerate() {
+                    let at = row * DEPTH + 2 * pair;
+                    let low = f32::from_bits((rows[at] as u32) << 16);
+                    let high = f32::from_bits((rows[at + 1] as u32) << 16);
+                    for j in 0..SIDE {
+                        let sum = low.mul_add(f32::from_bits(words[j] << 16), kept[j]);
+                        kept[j] = high.mul_add(f32::from_bits(words[j] & 0xffff_0000), sum);
+                    }
+                }
+            }
+            for (kept, sums) in kept.iter().zip(sums.chunks_exact_mut(SIDE)) {
+                sums.copy_from_slice(kept);
+            }
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Drop for Instructions {
+    fn drop(&mut self) {
+        if self.0 == Kind::Tiles {
+            amx::release();
+        }
+    }
+}
+
+/// The instructions are written out: the compiler's own functions for them are not stable.
+#[cfg(target_arch = "x86_64")]
+mod amx {
+    use std::arch::asm;
+    use std::arch::x86_64::{__cpuid, __cpuid_count};
+
+    use super::{DEPTH, ROWS, SIDE};
+
+    /// Whether the processor has tiles of bf16 and the system saves them for this process.
+    pub(super) fn available() -> bool {
+        const TILES_AND_BF16: u32 = 1 << 24 | 1 << 22;
+        let known =
+            __cpuid(0).eax >= 7 && __cpuid_count(7, 0).edx & TILES_AND_BF16 == TILES_AND_BF16;
+        known && permitted()
+    }
+
+    /// Linux wants to be asked before the first use.
+    #[cfg(target_os = "linux")]
+    fn permitted() -> bool {
+        const ARCH_REQ_XCOMP_PERM: libc::c_long = 0x1023;
+        const TILE_DATA: libc::c_long = 18;
+        // SAFETY: the call changes nothing but what the process may use.
+        unsafe { libc::syscall(libc::SYS_arch_prctl, ARCH_REQ_XCOMP_PERM, TILE_DATA) == 0 }
+    }
+
+    #[cfg(not(target_os = "linux"))]
+    fn permitted() -> bool {
+        false
+    }
+
+    /// Eight tiles of 16 rows of 64 bytes.
+    pub(super) fn configure() {
+        #[repr(C, align(64))]
+        struct Configuration([u8; 64]);
+        let mut tiles = Configuration([0; 64]);
+        tiles.0[0] = 1;
+        for tile in 0..8 {
+            tiles.0[16 + 2 * tile] = 64;
+            tiles.0[48 + tile] = ROWS as u8;
+        }
+        // SAFETY: `Instructions` has asked for the feature; compiled code uses no tiles of its own.
+        unsafe { asm!("ldtilecfg [{}]", in(reg) tiles.0.as_ptr(), options(nostack, readonly)) };
+    }
+
+    pub(super) fn release() {
+        // SAFETY: as above.
+        unsafe { asm!("tilerelease", options(nostack, nomem)) };
+    }
+
+    /// # Safety
+    /// As [`super::Instructions::multiply`]; the tiles are configured.
+    pub(super) unsafe fn multiply(
+        a: [*const u16; 2],
+        b: *const u32,
+        steps: &[usize],
+        stride: usize,
+        sums: &mut [f32; SIDE * SIDE],
+        anew: bool,
+    ) {
+        const LINE: usize = 64;
+        let sums = sums.as_mut_ptr();
+        let corners =
+            [0, SIDE / 2, ROWS * SIDE, ROWS * SIDE + SIDE / 2].map(|at| sums.wrapping_add(at));
+        // SAFETY: reads and writes the sums, the tiles of A and the words of B that the caller vouches for.
+        unsafe {
+            if anew {
+                asm!(
+                    "tilezero tmm0",
+                    "tilezero tmm1",
+                    "tilezero tmm2",
+                    "tilezero tmm3",
+                    options(nostack, nomem)
+                );
+            } else {
+                asm!(
+                    "tileloadd tmm0, [{0} + {4}*1]",
+                    "tileloadd tmm1, [{1} + {4}*1]",
+                    "tileloadd tmm2, [{2} + {4}*1]",
+                    "tileloadd tmm3, [{3} + {4}*1]",
+                    in(reg) corners[0],
+                    in(reg) corners[1],
+                    in(reg) corners[2],
+                    in(reg) corners[3],
+                    in(reg) SIDE * 4,
+                    options(nostack, readonly)
+                );
+            }
+            for (step, &at) in steps.iter().enumerate() {
+                let words = b.add(at);
+                asm!(
+                    "tileloadd tmm4, [{a0} + {line}*1]",
+                    "tileloadd tmm6, [{b} + {stride}*1]",
+                    "tdpbf16ps tmm0, tmm4, tmm6",
+                    "tileloadd tmm7, [{b} + {stride}*1 + 64]",
+                    "tdpbf16ps tmm1, tmm4, tmm7",
+                    "tileloadd tmm5, [{a1} + {line}*1]",
+                    "tdpbf16ps tmm2, tmm5, tmm6",
+                    "tdpbf16ps tmm3, tmm5, tmm7",
+                    a0 = in(reg) a[0].add(step * ROWS * DEPTH),
+                    a1 = in(reg) a[1].add(step * ROWS * DEPTH),
+                    b = in(reg) words,
+                    line = in(reg) LINE,
+                    stride = in(reg) stride * 4,
+                    options(nostack, readonly)
+                );
+            }
+            asm!(
+                "tilestored [{0} + {4}*1], tmm0",
+                "tilestored [{1} + {4}*1], tmm1",
+                "tilestored [{2} + {4}*1], tmm2",
+                "tilestored [{3} + {4}*1], tmm3",
+                in(reg) corners[0],
+                in(reg) corners[1],
+                in(reg) corners[2],
+                in(reg) corners[3],
+                in(reg) SIDE * 4,
+                options(nostack)
+            );
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod dots {
+    use std::arch::x86_64::*;
+
+    use super::{DEPTH, ROWS, SIDE};
+
+    /// Rows of a register tile: 8 x 2 registers of sums.
+    const GROUP: usize = 8;
+
+    /// # Safety
+    /// As [`super::Instructions::multiply`].
+    #[target_feature(enable = "avx512f,avx512bf16")]
+    pub(super) unsafe fn multiply(
+        a: [*const u16; 2],
+        b: *const u32,
+        steps: &[usize],
+        stride: usize,
+        sums: &mut [f32; SIDE * SIDE],
+        anew: bool,
+    ) {
+        for group in 0..SIDE / GROUP {
+            let top = group * GROUP;
+            let rows = a[top / ROWS].wrapping_add(top % ROWS * DEPTH).cast::<i32>();
+            // SAFETY: the group's rows lie in `sums`; the rest is the caller's contract.
+            unsafe {
+                let sums = sums.as_mut_ptr().add(top * SIDE);
+                let mut kept = [[_mm512_setzero_ps(); 2]; GROUP];
+                if !anew {
+                    for (i, kept) in kept.iter_mut().enumerate() {
+                        *kept = [0, 16].map(|at| _mm512_loadu_ps(sums.add(i * SIDE + at)));
+                    }
+                }
+                for (step, &at) in steps.iter().enumerate() {
+                    let rows = rows.add(step * ROWS * DEPTH / 2);
+                    for pair in 0..DEPTH / 2 {
+                        let words = b.add(at + pair * stride).cast::<i32>();
+                        let columns: [__m512bh; 2] = [0, 16]
+                            .map(|at| std::mem::transmute(_mm512_loadu_epi32(words.add(at))));
+                        for (i, kept) in kept.iter_mut().enumerate() {
+                            let row = _mm512_set1_epi32(*rows.add(i * DEPTH / 2 + pair));
+                            let row: __m512bh = std::mem::transmute(row);
+                            for half in 0..2 {
+                                kept[half] = _mm512_dpbf16_ps(kept[half], row, columns[half]);
+                            }
+                        }
+                    }
+                }
+                for (i, kept) in kept.iter().enumerate() {
+                    for half in 0..2 {
+                        _mm512_storeu_ps(sums.add(i * SIDE + 16 * half), kept[half]);
+                    }
+                }
+            }
+        }
+    }
+}

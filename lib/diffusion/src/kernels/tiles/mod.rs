@@ -1,0 +1,410 @@
+//! Matrix products of numbers rounded to bf16, summed in f32: by the processor's own instructions, tiles of AMX or the
+//! dot products of AVX-512, where it has them.
+//!
+//! A is packed in tiles of 16 rows and 32 elements of depth, B in pairs of depth: word (p, j) holds the elements
+//! (2 p, j) and (2 p + 1, j). All instructions read these layouts. Jobs are fixed by the shape; each element of a result
+//! is summed in one order whatever the number of threads.
+
+mod conv;
+mod element;
+mod micro;
+
+use rayon::prelude::*;
+
+pub(crate) use conv::{conv2d, conv2d_vjp_input};
+pub(crate) use element::Element;
+pub(crate) use micro::native;
+
+use super::matmul::{LinearShape, Matrix, Threads};
+use super::{SharedMut, with_scratch};
+use element::transpose;
+use micro::{DEPTH, Instructions, ROWS, SIDE};
+
+/// Rows of a job.
+const JOB_ROWS: usize = 4 * SIDE;
+/// Columns of a job.
+const JOB_COLUMNS: usize = 16 * SIDE;
+/// Steps of depth of one pass: two rows of tiles of A, 36 KiB, stay in L1.
+const PASS: usize = 18;
+/// Elements of a tile of A.
+const TILE: usize = ROWS * DEPTH;
+/// Products below this many multiplications run on one thread.
+const SMALL: usize = 1 << 20;
+
+/// Runs `f` on `len` words of unspecified content.
+fn with_words<R>(len: usize, f: impl FnOnce(&mut [u32]) -> R) -> R {
+    with_scratch(len, |floats| {
+        // SAFETY: a word is as large and aligned as a float, and any bits are either.
+        f(unsafe { std::slice::from_raw_parts_mut(floats.as_mut_ptr().cast(), len) })
+    })
+}
+
+/// Runs `f` on `len` bf16 of unspecified content.
+fn with_halves<R>(len: usize, f: impl FnOnce(&mut [u16]) -> R) -> R {
+    with_words(len.div_ceil(2), |words| {
+        // SAFETY: a word is two halves, and any bits are halves.
+        f(unsafe { std::slice::from_raw_parts_mut(words.as_mut_ptr().cast(), len) })
+    })
+}
+
+/// A right-hand matrix of k x n elements in panels of [`SIDE`] columns, each of all pairs of depth.
+pub(crate) struct PackedColumns {
+    words: Vec<u32>,
+    pub(super) n: usize,
+    pub(super) k: usize,
+}
+
+impl PackedColumns {
+    pub(super) fn new<T: Element>(b: Matrix<T>, (k, n): (usize, usize)) -> Self {
+        let mut words = vec![0; n.div_ceil(SIDE) * panel_words(k)];
+        for (panel, words) in words.chunks_exact_mut(panel_words(k).max(1)).enumerate() {
+            pack_panel(b, (k, n), panel * SIDE, words);
+        }
+        Self { words, n, k }
+    }
+}
+
+/// Words of a panel.
+fn panel_words(k: usize) -> usize {
+    k.div_ceil(DEPTH) * DEPTH / 2 * SIDE
+}
+
+/// Packs the panel whose first column is `left`; what lies past the matrix is 0.
+fn pack_panel<T: Element>(b: Matrix<T>, (k, n): (usize, usize), left: usize, words: &mut [u32]) {
+    let count = SIDE.min(n - left);
+    if b.row == 1 {
+        // Columns lie along the depth: sixteen of them, 32 deep, are turned at once.
+        for (step, words) in words.chunks_exact_mut(DEPTH / 2 * SIDE).enumerate() {
+            let (first, depth) = (step * DEPTH, DEPTH.min(k - step * DEPTH));
+            for half in 0..SIDE / ROWS {
+                let mut tile = [0u16; TILE];
+                let columns = count.saturating_sub(half * ROWS).min(ROWS);
+                for (j, tile) in tile.chunks_exact_mut(DEPTH).enumerate().take(columns) {
+                    let start = (left + half * ROWS + j) * b.column + first;
+                    T::round_to(&b.data[start..start + depth], &mut tile[..depth]);
+                }
+                transpose(&tile, &mut words[half * ROWS..], SIDE);
+            }
+        }
+        return;
+    }
+    let mut rows = [[0u16; SIDE]; 2];
+    for (pair, words) in words.chunks_exact_mut(SIDE).enumerate() {
+        for (i, row) in rows.iter_mut().enumerate() {
+            let p = 2 * pair + i;
+            if p >= k {
+                *row = [0; SIDE];
+                continue;
+            }
+            let start = p * b.row + left * b.column;
+            if b.column == 1 {
+                T::round_to(&b.data[start..start + count], &mut row[..count]);
+            } else {
+                for (j, value) in row.iter_mut().enumerate().take(count) {
+                    *value = b.data[start + j * b.column].bits();
+                }
+            }
+        }
+        for (word, (&low, &high)) in words.iter_mut().zip(rows[0].iter().zip(&rows[1])) {
+            *word = low as u32 | (high as u32) << 16;
+        }
+    }
+}
+
+/// Packs `rows` rows of A from `first`: blocks of 16 rows, each of all steps; what lies past the matrix is 0.
+fn pack_rows<T: Element>(a: Matrix<T>, first: usize, rows: usize, k: usize, target: &mut [u16]) {
+    let steps = k.div_ceil(DEPTH);
+    for (block, target) in target.chunks_exact_mut((steps * TILE).max(1)).enumerate() {
+        let top = first + block * ROWS;
+        let count = (first + rows).saturating_sub(top).min(ROWS);
+        if count < ROWS || k % DEPTH != 0 {
+            target.fill(0);
+        }
+        for (step, tile) in target.chunks_exact_mut(TILE).enumerate() {
+            let start = step * DEPTH;
+            let depth = DEPTH.min(k - start);
+            if a.column == 1 {
+                for (i, row) in tile.chunks_exact_mut(DEPTH).enumerate().take(count) {
+                    let start = (top + i) * a.row + start;
+                    T::round_to(&a.data[start..start + depth], &mut row[..depth]);
+                }
+            } else if a.row == 1 && count > 0 {
+                let mut words = [0u32; TILE / 2];
+                for (pair, words) in words.chunks_exact_mut(ROWS).enumerate() {
+                    let mut sides = [[0u16; ROWS]; 2];
+                    for (i, side) in sides.iter_mut().enumerate() {
+                        let p = start + 2 * pair + i;
+                        if p < k {
+                            let start = p * a.column + top;
+                            T::round_to(&a.data[start..start + count], &mut side[..count]);
+                        }
+                    }
+                    for (word, (&low, &high)) in
+                        words.iter_mut().zip(sides[0].iter().zip(&sides[1]))
+                    {
+                        *word = low as u32 | (high as u32) << 16;
+                    }
+                }
+                element::transpose_words(&words, tile);
+            } else {
+                for (i, row) in tile.chunks_exact_mut(DEPTH).enumerate().take(count) {
+                    for (p, value) in row.iter_mut().enumerate().take(depth) {
+                        *value = a.data[(top + i) * a.row + (start + p) * a.column].bits();
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// `out = keep * out + scale * a b`, with the elements of a and b rounded to bf16.
+///
+/// # Safety
+/// `out` is valid for writes of m rows of n elements at stride `out_row` (and reads, if `keep` is
+/// not 0), used by nobody else meanwhile.
+pub(super) unsafe fn product<A: Element, B: Element>(
+    (m, n, k): (usize, usize, usize),
+    out: *mut f32,
+    out_row: usize,
+    keep: f32,
+    scale: f32,
+    a: Matrix<A>,
+    b: Matrix<B>,
+    threads: Threads,
+) {
+    a.check(m, k);
+    b.check(k, n);
+    with_words(n.div_ceil(SIDE) * panel_words(k), |words| {
+        let panel = panel_words(k).max(1);
+        if threads == Threads::All && n * k >= SMALL / 64 {
+            words
+                .par_chunks_exact_mut(panel)
+                .enumerate()
+                .for_each(|(index, words)| pack_panel(b, (k, n), index * SIDE, words));
+        } else {
+            for (index, words) in words.chunks_exact_mut(panel).enumerate() {
+                pack_panel(b, (k, n), index * SIDE, words);
+            }
+        }
+        // SAFETY: by the caller's contract.
+        unsafe { product_panels((m, n, k), out, out_row, keep, scale, a, words, threads) };
+    });
+}
+
+/// [`product`] with a right-hand matrix that is packed already.
+///
+/// # Safety
+/// As [`product`], for the n and k of `b`.
+pub(super) unsafe fn product_packed<A: Element>(
+    m: usize,
+    out: *mut f32,
+    out_row: usize,
+    keep: f32,
+    scale: f32,
+    a: Matrix<A>,
+    b: &PackedColumns,
+    threads: Threads,
+) {
+    a.check(m, b.k);
+    // SAFETY: by the caller's contract.
+    unsafe {
+        product_panels(
+            (m, b.n, b.k),
+            out,
+            out_row,
+            keep,
+            scale,
+            a,
+            &b.words,
+            threads,
+        )
+    };
+}
+
+/// # Safety
+/// As [`product`]; `words` are the panels of B, and the view of A covers m x k elements.
+unsafe fn product_panels<A: Element>(
+    (m, n, k): (usize, usize, usize),
+    out: *mut f32,
+    out_row: usize,
+    keep: f32,
+    scale: f32,
+    a: Matrix<A>,
+    words: &[u32],
+    threads: Threads,
+) {
+    if m == 0 || n == 0 {
+        return;
+    }
+    let target = SharedMut(out);
+    let steps: Vec<usize> = (0..k.div_ceil(DEPTH))
+        .map(|s| s * DEPTH / 2 * SIDE)
+        .collect();
+    let columns_of_job = if n <= JOB_COLUMNS * 3 / 2 {
+        n
+    } else {
+        JOB_COLUMNS
+    };
+    let (row_jobs, column_jobs) = (m.div_ceil(JOB_ROWS), n.div_ceil(columns_of_job));
+    let job = |job: usize| {
+        let (top, left) = (
+            job / column_jobs * JOB_ROWS,
+            job % column_jobs * columns_of_job,
+        );
+        let (rows, columns) = (JOB_ROWS.min(m - top), columns_of_job.min(n - left));
+        with_halves(rows.div_ceil(SIDE) * 2 * steps.len() * TILE, |packed| {
+            pack_rows(a, top, rows, k, packed);
+            let b = Columns {
+                words: &words[left / SIDE * panel_words(k)..],
+                steps: &steps,
+                stride: SIDE,
+                block: panel_words(k),
+            };
+            blocks((rows, columns), packed, b, |(i, j), sums| {
+                let (rows, columns) = (SIDE.min(rows - i), SIDE.min(columns - j));
+                // SAFETY: the rows and columns of this job are its own.
+                unsafe {
+                    let out = target.at((top + i) * out_row + left + j);
+                    element::deposit(sums, (rows, columns), out, out_row, keep, scale);
+                }
+            });
+        });
+    };
+    if threads == Threads::All && m * n * k.max(1) >= SMALL {
+        (0..row_jobs * column_jobs).into_par_iter().for_each(job);
+    } else {
+        (0..row_jobs * column_jobs).for_each(job);
+    }
+}
+
+/// Packed columns as a job reads them: the words of pair p of step s of block j start at
+/// `steps[s] + p * stride + j * block`.
+#[derive(Clone, Copy)]
+struct Columns<'a> {
+    words: &'a [u32],
+    steps: &'a [usize],
+    stride: usize,
+    block: usize,
+}
+
+/// All blocks of 32 x 32 sums of `rows` x `columns`: `done` gets row, column and sums of each.
+fn blocks(
+    (rows, columns): (usize, usize),
+    a: &[u16],
+    b: Columns,
+    mut done: impl FnMut((usize, usize), &[f32; SIDE * SIDE]),
+) {
+    let (row_blocks, column_blocks) = (rows.div_ceil(SIDE), columns.div_ceil(SIDE));
+    let (steps, passes) = (b.steps.len(), b.steps.len().div_ceil(PASS).max(1));
+    assert!(a.len() >= row_blocks * 2 * steps * TILE);
+    if let Some(last) = b.steps.iter().max() {
+        let end = last + (DEPTH / 2 - 1) * b.stride + (column_blocks - 1) * b.block + SIDE;
+        assert!(end <= b.words.len(), "columns out of range");
+    }
+    let instructions = Instructions::start();
+    let kept = if passes == 1 {
+        1
+    } else {
+        row_blocks * column_blocks
+    };
+    with_scratch(kept * SIDE * SIDE, |sums| {
+        for pass in 0..passes {
+            let part = pass * PASS..steps.min((pass + 1) * PASS);
+            for i in 0..row_blocks {
+                let rows =
+                    |block: usize| a[((2 * i + block) * steps + part.start) * TILE..].as_ptr();
+                for j in 0..column_blocks {
+                    let at = if passes == 1 {
+                        0
+                    } else {
+                        i * column_blocks + j
+                    };
+                    let sums = &mut sums[at * SIDE * SIDE..][..SIDE * SIDE];
+                    let sums: &mut [f32; SIDE * SIDE] = sums.try_into().expect("32 x 32 sums");
+                    // SAFETY: the ranges were checked above.
+                    unsafe {
+                        let words = b.words.as_ptr().add(j * b.block);
+                        let tiles = if steps == 0 {
+                            [a.as_ptr(); 2]
+                        } else {
+                            [rows(0), rows(1)]
+                        };
+                        let part = &b.steps[part.clone()];
+                        instructions.multiply(tiles, words, part, b.stride, sums, pass == 0);
+                    }
+                    if pass + 1 == passes {
+                        done((i * SIDE, j * SIDE), sums);
+                    }
+                }
+            }
+        }
+    });
+}
+
+/// `y = x w^T + bias` for x [rows, inputs], w [outputs, inputs].
+pub(crate) fn linear<X: Element, W: Element>(
+    LinearShape {
+        rows,
+        inputs,
+        outputs,
+    }: LinearShape,
+    x: &[X],
+    w: &[W],
+    bias: Option<&[f32]>,
+) -> Vec<f32> {
+    let (mut y, keep) = match bias {
+        Some(bias) => (bias.repeat(rows), 1.0),
+        None => (vec![0.0; rows * outputs], 0.0),
+    };
+    let (a, b) = (
+        Matrix::rows(x, inputs),
+        Matrix::rows(w, inputs).transposed(),
+    );
+    // SAFETY: `y` holds rows x outputs elements.
+    unsafe {
+        let out = y.as_mut_ptr();
+        product(
+            (rows, outputs, inputs),
+            out,
+            outputs,
+            keep,
+            1.0,
+            a,
+            b,
+            Threads::All,
+        );
+    }
+    y
+}
+
+/// Gradient of [`linear`] with respect to x, for the gradient `g` of y.
+pub(crate) fn linear_vjp_input<G: Element, W: Element>(
+    LinearShape {
+        rows,
+        inputs,
+        outputs,
+    }: LinearShape,
+    g: &[G],
+    w: &[W],
+) -> Vec<f32> {
+    let mut dx = vec![0.0; rows * inputs];
+    let (a, b) = (Matrix::rows(g, outputs), Matrix::rows(w, inputs));
+    // SAFETY: `dx` holds rows x inputs elements.
+    unsafe {
+        let out = dx.as_mut_ptr();
+        product(
+            (rows, inputs, outputs),
+            out,
+            inputs,
+            0.0,
+            1.0,
+            a,
+            b,
+            Threads::All,
+        );
+    }
+    dx
+}
+
+#[cfg(test)]
+mod tests;
