@@ -1,6 +1,6 @@
 //! Times a whole model at its real size for tests/references/time_model.py:
 //!
-//!     model_times FOLDER
+//!     model_times FOLDER [bf16]
 //!
 //! Prints wall and processor seconds of "forward", "text" (the text encoder)
 //! and "step" (a LoRA step with recomputation, one example, its text encoded),
@@ -44,10 +44,16 @@ fn processor_seconds() -> Outcome<f64> {
 
 fn main() -> Outcome<()> {
     dipir_diffusion::memory::keep_freed();
-    let folder = PathBuf::from(std::env::args().nth(1).ok_or("usage: model_times FOLDER")?);
-    let model = Model::load(&folder, DType::F32, &Device::Cpu)?;
-    let latents =
-        NoiseStream::new(1, 1).normal_tensor(&[1, 4, 64, 64], DType::F32, &Device::Cpu)?;
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let (folder, dtype) = match arguments.as_slice() {
+        [folder] => (PathBuf::from(folder), DType::F32),
+        [folder, word] if word == "bf16" => (PathBuf::from(folder), DType::BF16),
+        _ => return Err("usage: model_times FOLDER [bf16]".into()),
+    };
+    let model = Model::load(&folder, dtype, &Device::Cpu)?;
+    let latents = NoiseStream::new(1, 1)
+        .normal_tensor(&[1, 4, 64, 64], DType::F32, &Device::Cpu)?
+        .to_dtype(dtype)?;
     let context = model.encode_prompts(&["a photo of a car"], None)?;
     let report = |name: &str, run: &mut dyn FnMut() -> Outcome<()>| -> Outcome<()> {
         run()?;

@@ -7,7 +7,7 @@ use candle_core::{CpuStorage, DType, Device, Layout, Shape, Storage, Tensor};
 use half::bf16;
 
 use super::simd::vectorized;
-use super::tiles::Element;
+use super::tiles::round;
 
 /// The elements of a contiguous storage as f32, converted if stored in half
 /// precision.
@@ -70,9 +70,17 @@ vectorized! {
 }
 
 fn narrowed(values: &[f32]) -> Vec<bf16> {
-    let mut bits = vec![0; values.len()];
-    f32::round_to(values, &mut bits);
-    bits.into_iter().map(bf16::from_bits).collect()
+    let mut narrow = vec![bf16::ZERO; values.len()];
+    narrow_all(values, &mut narrow);
+    narrow
+}
+
+vectorized! {
+    fn narrow_all(values: &[f32], narrow: &mut [bf16]) {
+        for (narrow, value) in narrow.iter_mut().zip(values) {
+            *narrow = bf16::from_bits(round(*value));
+        }
+    }
 }
 
 /// Stores f32 results in the precision `dtype`.

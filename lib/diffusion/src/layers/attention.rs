@@ -4,6 +4,7 @@
 use candle_core::CudaStorage;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, D, DType, Device, Layout, Shape, Tensor};
+use half::bf16;
 
 use super::backend::has_kernels_anywhere;
 #[cfg(feature = "cuda")]
@@ -11,7 +12,8 @@ use crate::cuda::{self, View};
 use crate::error::{Result, argument};
 use crate::kernels::attention::{self, AttentionShape};
 use crate::kernels::matmul::Engine;
-use crate::kernels::tensor::{floats, from_floats, read, store};
+use crate::kernels::tensor::{floats, from_floats, halves, read, store, with_halves};
+use crate::kernels::tiles;
 
 /// Which keys a query sees.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -156,6 +158,10 @@ impl CustomOp3 for AttentionOp {
         lv: &Layout,
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let shape = self.shape(lq.shape(), lk.shape())?;
+        if q.dtype() == DType::BF16 && !shape.causal {
+            let out = tiles::attention(shape, halves(q, lq)?, halves(k, lk)?, halves(v, lv)?);
+            return Ok((CpuStorage::BF16(out), lq.shape().clone()));
+        }
         let (engine, q_, k_) = (engine(q.dtype()), floats(q, lq)?, floats(k, lk)?);
         let out = attention::attention(engine, shape, &q_, &k_, &floats(v, lv)?);
         Ok((store(out, q.dtype()), lq.shape().clone()))
@@ -193,6 +199,18 @@ impl CustomOp3 for AttentionOp {
             let [dq, dk, dv] = cuda::attention::vjp(shape, q_, k_, v_, View::of(&g)?)?;
             let wanted = |like: &Tensor, d| like.track_op().then(|| cuda::tensor(d, like.shape()));
             return Ok((wanted(q, dq), wanted(k, dk), wanted(v, dv)));
+        }
+        // One head has one job: products that share its rows among threads are faster there.
+        if q.dtype() == DType::BF16 && !shape.causal && shape.batch * shape.heads > 1 {
+            let (dq, dk, dv) = with_halves([q, k, v, y, &g], |[q, k, v, y, g]| {
+                tiles::attention_vjp(shape, [q, k, v], y, g)
+            })?;
+            let wanted = |like: &Tensor, values: Vec<bf16>| {
+                like.track_op()
+                    .then(|| Tensor::from_vec(values, like.shape(), like.device()))
+                    .transpose()
+            };
+            return Ok((wanted(q, dq)?, wanted(k, dk)?, wanted(v, dv)?));
         }
         let (q_, k_, v_) = (read(q)?, read(k)?, read(v)?);
         let (engine, y, g) = (engine(q.dtype()), read(y)?, read(&g)?);

@@ -100,8 +100,7 @@ impl Conv2d {
                 let dx = cuda::conv::vjp_input(shape, View::of(&g)?, View::of(&self.weight)?)?;
                 return Ok(cuda::tensor(dx, x));
             }
-            let dx = vjp_input(shape, &g, &self.weight)?;
-            return Ok(from_floats(dx, x, g.dtype())?);
+            return Ok(vjp_input(shape, x, &g, &self.weight)?);
         }
         let nothing = Tensor::zeros(x, g.dtype(), g.device())?;
         gradient_through(|x| self.forward(x), nothing, g)
@@ -139,11 +138,13 @@ impl Conv2d {
 }
 
 /// Gradient at the input of a convolution, on the CPU.
-fn vjp_input(shape: ConvShape, g: &Tensor, w: &Tensor) -> candle_core::Result<Vec<f32>> {
+fn vjp_input(shape: ConvShape, x: &Shape, g: &Tensor, w: &Tensor) -> candle_core::Result<Tensor> {
     if g.dtype() == DType::BF16 && w.dtype() == DType::BF16 {
-        return with_halves([g, w], |[g, w]| tiles::conv2d_vjp_input(shape, g, w));
+        let dx = with_halves([g, w], |[g, w]| tiles::conv2d_vjp_input(shape, g, w))?;
+        return Tensor::from_vec(dx, x, g.device());
     }
-    Ok(conv::conv2d_vjp_input(shape, &read(g)?, &read(w)?))
+    let dx = conv::conv2d_vjp_input(shape, &read(g)?, &read(w)?);
+    from_floats(dx, x, g.dtype())
 }
 
 struct ConvOp {
@@ -196,12 +197,11 @@ impl CustomOp3 for ConvOp {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let shape = self.shape(lx.shape(), lw.shape())?;
         let bias = floats(b, lb)?;
-        let y = match (x, w) {
-            (CpuStorage::BF16(_), CpuStorage::BF16(_)) => {
-                tiles::conv2d(shape, halves(x, lx)?, halves(w, lw)?, Some(&bias))
-            }
-            _ => conv::conv2d(shape, &floats(x, lx)?, &floats(w, lw)?, Some(&bias)),
-        };
+        if let (CpuStorage::BF16(_), CpuStorage::BF16(_)) = (x, w) {
+            let y = tiles::conv2d(shape, halves(x, lx)?, halves(w, lw)?, Some(&bias));
+            return Ok((CpuStorage::BF16(y), shape.result()));
+        }
+        let y = conv::conv2d(shape, &floats(x, lx)?, &floats(w, lw)?, Some(&bias));
         Ok((store(y, x.dtype()), shape.result()))
     }
 
@@ -238,8 +238,7 @@ impl CustomOp3 for ConvOp {
         }
         let mut result = (None, None, None);
         if x.track_op() {
-            let dx = vjp_input(shape, &g, w)?;
-            result.0 = Some(from_floats(dx, x.shape(), x.dtype())?);
+            result.0 = Some(vjp_input(shape, x.shape(), &g, w)?);
         }
         if !w.track_op() && !b.track_op() {
             return Ok(result);

@@ -121,12 +121,11 @@ impl LinearOp {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (sizes, shape) = Self::sizes(lx.shape(), lw.shape())?;
         let bias = bias.map(|(b, lb)| floats(b, lb)).transpose()?;
-        let y = match (x, w) {
-            (CpuStorage::BF16(_), CpuStorage::BF16(_)) => {
-                tiles::linear(sizes, halves(x, lx)?, halves(w, lw)?, bias.as_deref())
-            }
-            _ => matmul::linear(sizes, &floats(x, lx)?, &floats(w, lw)?, bias.as_deref()),
-        };
+        if let (CpuStorage::BF16(_), CpuStorage::BF16(_)) = (x, w) {
+            let y = tiles::linear(sizes, halves(x, lx)?, halves(w, lw)?, bias.as_deref());
+            return Ok((CpuStorage::BF16(y), shape));
+        }
+        let y = matmul::linear(sizes, &floats(x, lx)?, &floats(w, lw)?, bias.as_deref());
         Ok((store(y, x.dtype()), shape))
     }
 
@@ -173,12 +172,13 @@ impl LinearOp {
         }
         let mut result = (None, None);
         if x.track_op() {
-            let dx = if g.dtype() == DType::BF16 && w.dtype() == DType::BF16 {
-                with_halves([&g, w], |[g, w]| tiles::linear_vjp_input(sizes, g, w))?
+            result.0 = Some(if g.dtype() == DType::BF16 && w.dtype() == DType::BF16 {
+                let dx = with_halves([&g, w], |[g, w]| tiles::linear_vjp_input(sizes, g, w))?;
+                Tensor::from_vec(dx, x.shape(), x.device())?
             } else {
-                matmul::linear_vjp_input(sizes, &read(&g)?, &read(w)?)
-            };
-            result.0 = Some(from_floats(dx, x.shape(), x.dtype())?);
+                let dx = matmul::linear_vjp_input(sizes, &read(&g)?, &read(w)?);
+                from_floats(dx, x.shape(), x.dtype())?
+            });
         }
         if w.track_op() {
             let dw = matmul::linear_vjp_weight(sizes, &read(&g)?, &read(x)?);

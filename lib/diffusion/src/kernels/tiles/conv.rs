@@ -4,12 +4,13 @@
 //! Columns are the positions of the bordered picture, row by row, so that sixteen neighbours are contiguous words for every
 //! size; the sums of positions that belong to no output are dropped.
 
+use half::bf16;
 use rayon::prelude::*;
 
-use super::element::Element;
+use super::element::{Element, SharedHalves, bits_of, round_row, transpose_words};
 use super::micro::{DEPTH, ROWS, SIDE};
+use super::taps::Taps;
 use super::{Columns, JOB_COLUMNS, JOB_ROWS, TILE, blocks, with_halves, with_words};
-use crate::kernels::SharedMut;
 use crate::kernels::conv::ConvShape;
 
 /// Words of a cache line.
@@ -17,20 +18,15 @@ const LINE: usize = 16;
 
 /// The kernel [outputs, inputs, taps] as one convolution reads it: element (output, input, tap) is at
 /// `output * by_output + input * by_input + tap`, or at the opposite tap.
-struct Kernel<'a, W> {
-    data: &'a [W],
+struct Kernel<'a> {
+    data: &'a [bf16],
     by_output: usize,
     by_input: usize,
     turned: bool,
 }
 
 /// The convolution of x [batch, inputs, height, width] with w [outputs, inputs, kernel, kernel].
-pub(crate) fn conv2d<X: Element, W: Element>(
-    shape: ConvShape,
-    x: &[X],
-    w: &[W],
-    bias: Option<&[f32]>,
-) -> Vec<f32> {
+pub(crate) fn conv2d(shape: ConvShape, x: &[bf16], w: &[bf16], bias: Option<&[f32]>) -> Vec<bf16> {
     let taps = shape.kernel * shape.kernel;
     let kernel = Kernel {
         data: w,
@@ -38,26 +34,12 @@ pub(crate) fn conv2d<X: Element, W: Element>(
         by_input: taps,
         turned: false,
     };
-    let mut out = vec![0.0; shape.batch * shape.outputs * shape.out_height() * shape.out_width()];
-    run(
-        shape,
-        1,
-        (shape.height, shape.width),
-        x,
-        kernel,
-        bias,
-        &mut out,
-    );
-    out
+    run(shape, 1, (shape.height, shape.width), x, kernel, bias)
 }
 
 /// Gradient of [`conv2d`] with respect to x for the gradient `g` of its result: the convolution of `g`, its pixels as far
 /// apart as the stride, with the kernel turned round and the channels exchanged.
-pub(crate) fn conv2d_vjp_input<G: Element, W: Element>(
-    shape: ConvShape,
-    g: &[G],
-    w: &[W],
-) -> Vec<f32> {
+pub(crate) fn conv2d_vjp_input(shape: ConvShape, g: &[bf16], w: &[bf16]) -> Vec<bf16> {
     let taps = shape.kernel * shape.kernel;
     let (height, width) = (shape.out_height(), shape.out_width());
     let before = shape.kernel - 1 - shape.pad_before;
@@ -79,17 +61,7 @@ pub(crate) fn conv2d_vjp_input<G: Element, W: Element>(
         by_input: shape.inputs * taps,
         turned: true,
     };
-    let mut dx = vec![0.0; shape.batch * shape.inputs * shape.height * shape.width];
-    run(
-        adjoint,
-        shape.stride,
-        (height, width),
-        g,
-        kernel,
-        None,
-        &mut dx,
-    );
-    dx
+    run(adjoint, shape.stride, (height, width), g, kernel, None)
 }
 
 /// How the packed picture lies: [pairs of channels][phases][batch][height][width] words, where a phase holds the pixels
@@ -153,17 +125,18 @@ impl Layout {
 }
 
 /// The convolution of the pixels of x, `size`, that stand `spread` apart between zeros.
-fn run<X: Element, W: Element>(
+fn run(
     shape: ConvShape,
     spread: usize,
     size: (usize, usize),
-    x: &[X],
-    kernel: Kernel<W>,
+    x: &[bf16],
+    kernel: Kernel,
     bias: Option<&[f32]>,
-    out: &mut [f32],
-) {
-    if out.is_empty() {
-        return;
+) -> Vec<bf16> {
+    let len = shape.batch * shape.outputs * shape.out_height() * shape.out_width();
+    let mut out = Vec::with_capacity(len);
+    if len == 0 {
+        return out;
     }
     let layout = Layout::new(shape);
     let steps = layout.steps(shape);
@@ -178,93 +151,118 @@ fn run<X: Element, W: Element>(
                 .par_chunks_exact_mut(steps.len() * TILE)
                 .enumerate()
                 .for_each(|(block, target)| pack_kernel(shape, &kernel, block * ROWS, target));
-            multiply(shape, &layout, &steps, packed, words, bias, out);
+            let target = SharedHalves(out.as_mut_ptr());
+            multiply(shape, &layout, &steps, packed, words, bias, target);
         });
     });
+    // SAFETY: there is room for all outputs, and every one has been written.
+    unsafe { out.set_len(len) };
+    out
 }
 
 /// Packs two channels of all pictures.
-fn pack_pair<X: Element>(
+fn pack_pair(
     shape: ConvShape,
     layout: &Layout,
     spread: usize,
     (height, width): (usize, usize),
-    x: &[X],
+    x: &[bf16],
     pair: usize,
     words: &mut [u32],
 ) {
-    words.fill(0);
     let (s, plane) = (shape.stride, height * width);
-    let mut rows = [vec![0u16; width], vec![0u16; width]];
+    let nothing = vec![bf16::ZERO; width];
     // The pixel that meets column `column` of a phase, if there is one.
     let pixel = |at: usize, phase: usize, size: usize| {
         let at = (at * s + phase).wrapping_sub(shape.pad_before);
         (at % spread == 0 && at / spread < size).then_some(at / spread)
     };
-    for phase in 0..layout.phases_per_side * layout.phases_per_side {
+    let pictures = shape.batch * layout.height * layout.width;
+    for (phase, words) in words.chunks_mut(layout.phase).enumerate() {
+        if phase >= layout.phases_per_side * layout.phases_per_side {
+            words.fill(0);
+            continue;
+        }
         let (py, px) = (
             phase / layout.phases_per_side,
             phase % layout.phases_per_side,
         );
-        for item in 0..shape.batch {
-            for line in 0..layout.height {
-                let Some(y) = pixel(line, py, height) else {
-                    continue;
-                };
-                for (side, row) in rows.iter_mut().enumerate() {
-                    let channel = 2 * pair + side;
-                    if channel < shape.inputs {
-                        let start = (item * shape.inputs + channel) * plane + y * width;
-                        X::round_to(&x[start..start + width], row);
-                    } else {
-                        row.fill(0);
-                    }
-                }
-                let start = phase * layout.phase + (item * layout.height + line) * layout.width;
-                let target = &mut words[start..start + layout.width];
-                if s == 1 && spread == 1 {
-                    // Pixel 0 is at column `pad_before`.
-                    let first = shape.pad_before.min(layout.width);
-                    for (word, (&low, &high)) in
-                        target[first..].iter_mut().zip(rows[0].iter().zip(&rows[1]))
-                    {
-                        *word = low as u32 | (high as u32) << 16;
-                    }
-                    continue;
-                }
-                for (column, word) in target.iter_mut().enumerate() {
-                    if let Some(x) = pixel(column, px, width) {
-                        *word = rows[0][x] as u32 | (rows[1][x] as u32) << 16;
-                    }
-                }
+        let (lines, past) = words.split_at_mut(pictures);
+        past.fill(0);
+        for (line, target) in lines.chunks_exact_mut(layout.width).enumerate() {
+            let (item, line) = (line / layout.height, line % layout.height);
+            let Some(y) = pixel(line, py, height) else {
+                target.fill(0);
+                continue;
+            };
+            let [low, high] =
+                [2 * pair, 2 * pair + 1].map(|channel| match channel < shape.inputs {
+                    true => &x[(item * shape.inputs + channel) * plane + y * width..][..width],
+                    false => &nothing,
+                });
+            if s == 1 && spread == 1 {
+                // Pixel 0 is at column `pad_before`.
+                let first = shape.pad_before.min(layout.width);
+                let end = (first + width).min(layout.width);
+                target[..first].fill(0);
+                target[end..].fill(0);
+                bf16::pair(low, high, &mut target[first..end]);
+                continue;
+            }
+            for (column, word) in target.iter_mut().enumerate() {
+                *word = pixel(column, px, width)
+                    .map_or(0, |x| low[x].bits() as u32 | (high[x].bits() as u32) << 16);
             }
         }
     }
 }
 
 /// Packs the kernels of 16 outputs from `first`: groups of 32 inputs, and all taps of each.
-fn pack_kernel<W: Element>(shape: ConvShape, kernel: &Kernel<W>, first: usize, target: &mut [u16]) {
+fn pack_kernel(shape: ConvShape, kernel: &Kernel, first: usize, target: &mut [u16]) {
     let taps = shape.kernel * shape.kernel;
-    if first + ROWS > shape.outputs || shape.inputs % DEPTH != 0 {
+    let outputs = ROWS.min(shape.outputs.saturating_sub(first));
+    if outputs < ROWS || shape.inputs % DEPTH != 0 {
         target.fill(0);
     }
+    if outputs == 0 {
+        return;
+    }
+    let split = Taps::new(taps);
+    let mut rows = vec![[0u16; DEPTH]; taps];
+    // Pairs of inputs of one tap: 16 words of 16 outputs.
+    let mut words = vec![[0u32; ROWS * ROWS]; if kernel.turned { taps } else { 0 }];
     for (group, target) in target.chunks_exact_mut(taps * TILE).enumerate() {
         let inputs = DEPTH.min(shape.inputs - group * DEPTH);
-        for i in 0..ROWS.min(shape.outputs.saturating_sub(first)) {
-            let start = (first + i) * kernel.by_output + group * DEPTH * kernel.by_input;
-            for input in 0..inputs {
-                let source = &kernel.data[start + input * kernel.by_input..][..taps];
-                let target = &mut target[i * DEPTH + input..];
-                for (tap, value) in source.iter().enumerate() {
-                    let tap = if kernel.turned { taps - 1 - tap } else { tap };
-                    target[tap * TILE] = value.bits();
+        let start = first * kernel.by_output + group * DEPTH * kernel.by_input;
+        if !kernel.turned {
+            for i in 0..outputs {
+                let source = &kernel.data[start + i * kernel.by_output..][..inputs * taps];
+                split.split(bits_of(source), &mut rows);
+                for (tap, tile) in target.chunks_exact_mut(TILE).enumerate() {
+                    tile[i * DEPTH..][..inputs].copy_from_slice(&rows[tap][..inputs]);
                 }
             }
+            continue;
+        }
+        words.iter_mut().for_each(|words| words.fill(0));
+        for input in 0..inputs {
+            let source = &kernel.data[start + input * kernel.by_input..][..outputs * taps];
+            split.split(bits_of(source), &mut rows);
+            let shift = 16 * (input % 2);
+            for (words, row) in words.iter_mut().zip(&rows) {
+                let words = &mut words[input / 2 * ROWS..][..outputs];
+                for (word, &value) in words.iter_mut().zip(row) {
+                    *word |= (value as u32) << shift;
+                }
+            }
+        }
+        for (tap, words) in words.iter().enumerate() {
+            transpose_words(words, &mut target[(taps - 1 - tap) * TILE..][..TILE]);
         }
     }
 }
 
-/// The product, and its sums where they belong.
+/// The product, and its sums where they belong: `target` has room for all outputs.
 fn multiply(
     shape: ConvShape,
     layout: &Layout,
@@ -272,10 +270,9 @@ fn multiply(
     packed: &[u16],
     words: &[u32],
     bias: Option<&[f32]>,
-    out: &mut [f32],
+    target: SharedHalves,
 ) {
     let (out_height, out_width) = (shape.out_height(), shape.out_width());
-    let target = SharedMut::new(out);
     let column_jobs = layout.positions.div_ceil(JOB_COLUMNS);
     let row_jobs = shape.outputs.div_ceil(JOB_ROWS);
     (0..row_jobs * column_jobs).into_par_iter().for_each(|job| {
@@ -290,7 +287,7 @@ fn multiply(
             block: SIDE,
         };
         let a = &packed[top * steps.len() * DEPTH..];
-        blocks((rows, columns), a, b, |(i, j), sums| {
+        blocks((rows, columns), a, b, &mut |(i, j), sums| {
             let end = SIDE.min(columns - j);
             let mut at = 0;
             while at < end {
@@ -306,11 +303,8 @@ fn multiply(
                             ((item * shape.outputs + output) * out_height + y) * out_width + x;
                         let bias = bias.map_or(0.0, |bias| bias[output]);
                         // SAFETY: outputs and positions of this job are its own, and lie in `out`.
-                        let out =
-                            unsafe { std::slice::from_raw_parts_mut(target.at(start), count) };
-                        for (out, &sum) in out.iter_mut().zip(&sums[at..]) {
-                            *out = sum + bias;
-                        }
+                        let out = unsafe { target.row(start, count) };
+                        round_row(&sums[at..], bias, out);
                     }
                 }
                 at += run;

@@ -3,30 +3,50 @@
 use half::bf16;
 
 use super::micro::{DEPTH, ROWS, SIDE};
+use super::with_halves;
+use crate::kernels::SharedMut;
 use crate::kernels::simd::vectorized;
 
 /// A number that is multiplied in bf16.
 pub(crate) trait Element: Copy + Send + Sync {
+    const ZERO: Self;
+
     /// The bits of the nearest bf16, ties to even.
     fn bits(self) -> u16;
 
     /// [`Element::bits`] of all of `source`; both are equally long.
     fn round_to(source: &[Self], target: &mut [u16]);
+
+    /// Fills `steps` tiles, one behind the other, with `count` rows of `source`, `stride` apart, as deep as they are.
+    fn fill_tiles(source: &[Self], stride: usize, count: usize, steps: usize, target: &mut [u16]);
+
+    /// Pairs of two rows, as long as `target`.
+    fn pair(low: &[Self], high: &[Self], target: &mut [u32]);
 }
 
 impl Element for bf16 {
+    const ZERO: Self = Self::ZERO;
+
     fn bits(self) -> u16 {
         self.to_bits()
     }
 
     fn round_to(source: &[Self], target: &mut [u16]) {
-        // SAFETY: a bf16 is its bits.
-        let bits = unsafe { std::slice::from_raw_parts(source.as_ptr().cast(), source.len()) };
-        target.copy_from_slice(bits);
+        target.copy_from_slice(bits_of(source));
+    }
+
+    fn fill_tiles(source: &[Self], stride: usize, count: usize, steps: usize, target: &mut [u16]) {
+        fill_tiles_of_halves(bits_of(source), stride, count, steps, target);
+    }
+
+    fn pair(low: &[Self], high: &[Self], target: &mut [u32]) {
+        pair_of_halves(bits_of(low), bits_of(high), target);
     }
 }
 
 impl Element for f32 {
+    const ZERO: Self = 0.0;
+
     fn bits(self) -> u16 {
         round(self)
     }
@@ -34,11 +54,65 @@ impl Element for f32 {
     fn round_to(source: &[Self], target: &mut [u16]) {
         round_all(source, target);
     }
+
+    fn fill_tiles(source: &[Self], stride: usize, count: usize, steps: usize, target: &mut [u16]) {
+        fill_tiles_of_floats(source, stride, count, steps, target);
+    }
+
+    fn pair(low: &[Self], high: &[Self], target: &mut [u32]) {
+        pair_of_floats(low, high, target);
+    }
+}
+
+pub(super) fn bits_of(values: &[bf16]) -> &[u16] {
+    // SAFETY: a bf16 is its bits.
+    unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), values.len()) }
+}
+
+vectorized! {
+    fn fill_tiles_of_halves(source: &[u16], stride: usize, count: usize, steps: usize, target: &mut [u16]) {
+        for row in 0..count {
+            let source = source[row * stride..][..steps * DEPTH].chunks_exact(DEPTH);
+            for (source, tile) in source.zip(target.chunks_exact_mut(ROWS * DEPTH)) {
+                tile[row * DEPTH..][..DEPTH].copy_from_slice(&source[..DEPTH]);
+            }
+        }
+    }
+}
+
+vectorized! {
+    fn fill_tiles_of_floats(source: &[f32], stride: usize, count: usize, steps: usize, target: &mut [u16]) {
+        for row in 0..count {
+            let source = source[row * stride..][..steps * DEPTH].chunks_exact(DEPTH);
+            for (source, tile) in source.zip(target.chunks_exact_mut(ROWS * DEPTH)) {
+                let tile = &mut tile[row * DEPTH..][..DEPTH];
+                for i in 0..DEPTH {
+                    tile[i] = round(source[i]);
+                }
+            }
+        }
+    }
+}
+
+vectorized! {
+    fn pair_of_halves(low: &[u16], high: &[u16], target: &mut [u32]) {
+        for (word, (&low, &high)) in target.iter_mut().zip(low.iter().zip(high)) {
+            *word = low as u32 | (high as u32) << 16;
+        }
+    }
+}
+
+vectorized! {
+    fn pair_of_floats(low: &[f32], high: &[f32], target: &mut [u32]) {
+        for (word, (&low, &high)) in target.iter_mut().zip(low.iter().zip(high)) {
+            *word = round(low) as u32 | (round(high) as u32) << 16;
+        }
+    }
 }
 
 /// The nearest bf16; NaN stays NaN.
 #[inline(always)]
-fn round(value: f32) -> u16 {
+pub(crate) fn round(value: f32) -> u16 {
     let bits = value.to_bits();
     let nearest = bits.wrapping_add(0x7fff + ((bits >> 16) & 1)) >> 16;
     let quiet = bits >> 16 | 0x40;
@@ -93,35 +167,171 @@ pub(super) fn transpose_words(words: &[u32; ROWS * ROWS], tile: &mut [u16]) {
     }
 }
 
-/// `out = keep * out + scale * sums` of the first rows and columns.
-///
-/// # Safety
-/// `out` is valid for writes of `rows` rows of `columns` elements at stride `out_row`, and for reads if `keep` is not 0.
-pub(super) unsafe fn deposit(
-    sums: &[f32; SIDE * SIDE],
-    (rows, columns): (usize, usize),
-    out: *mut f32,
-    out_row: usize,
-    keep: f32,
-    scale: f32,
-) {
-    for (i, sums) in sums.chunks_exact(SIDE).enumerate().take(rows) {
-        // SAFETY: by the caller's contract; what is not kept is only written.
-        let out = unsafe {
-            let out = out.add(i * out_row);
-            if keep == 0.0 {
-                out.write_bytes(0, columns);
+/// Rows of a block as columns.
+pub(super) fn turn_floats(sums: &[f32; SIDE * SIDE]) -> [f32; SIDE * SIDE] {
+    let mut turned = [0.0; SIDE * SIDE];
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        for (i, j) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+            let source = sums[i * ROWS * SIDE + j * ROWS..].as_ptr();
+            let target = turned[j * ROWS * SIDE + i * ROWS..].as_mut_ptr();
+            // SAFETY: the feature is there; both are quarters, 16 rows of 16 numbers, of a block.
+            unsafe { crate::kernels::lanes::turn(source, SIDE, target, SIDE) };
+        }
+        return turned;
+    }
+    for (i, row) in sums.chunks_exact(SIDE).enumerate() {
+        for (j, &value) in row.iter().enumerate() {
+            turned[j * SIDE + i] = value;
+        }
+    }
+    turned
+}
+
+/// Gets row and column of a block, and its sums.
+pub(super) type Take<'a> = &'a mut dyn FnMut((usize, usize), &[f32; SIDE * SIDE]);
+
+/// Where sums go.
+pub(super) trait Sink: Copy + Send + Sync {
+    /// Takes all blocks of a job, `size` from `first`, that `run` makes.
+    ///
+    /// # Safety
+    /// The job lies in the result, and nobody else uses that part meanwhile.
+    unsafe fn job(self, first: (usize, usize), size: (usize, usize), run: impl FnOnce(Take));
+}
+
+/// What a block has of `size`.
+fn part((rows, columns): (usize, usize), (i, j): (usize, usize)) -> (usize, usize) {
+    (SIDE.min(rows - i), SIDE.min(columns - j))
+}
+
+/// `out = keep * out + scale * sums`, rows `row` apart.
+#[derive(Clone, Copy)]
+pub(super) struct Floats {
+    pub out: SharedMut,
+    pub row: usize,
+    pub keep: f32,
+    pub scale: f32,
+}
+
+impl Sink for Floats {
+    unsafe fn job(self, (top, left): (usize, usize), size: (usize, usize), run: impl FnOnce(Take)) {
+        run(&mut |(i, j), sums| {
+            // SAFETY: by the caller's contract.
+            let out = unsafe { self.out.at((top + i) * self.row + left + j) };
+            place(
+                sums,
+                out,
+                self.row,
+                part(size, (i, j)),
+                self.keep,
+                self.scale,
+            );
+        });
+    }
+}
+
+/// `out = sums + bias` of each column, rounded to bf16; rows follow one another.
+#[derive(Clone, Copy)]
+pub(super) struct Halves<'a> {
+    pub out: SharedHalves,
+    pub row: usize,
+    pub bias: Option<&'a [f32]>,
+}
+
+/// A pointer that may cross threads: every user writes disjoint elements.
+#[derive(Clone, Copy)]
+pub(super) struct SharedHalves(pub *mut bf16);
+
+// SAFETY: jobs write disjoint ranges.
+unsafe impl Send for SharedHalves {}
+// SAFETY: as above.
+unsafe impl Sync for SharedHalves {}
+
+impl SharedHalves {
+    /// The pointer to element `offset`.
+    ///
+    /// # Safety
+    /// `offset` lies inside of what the pointer was made from.
+    pub(super) unsafe fn at(self, offset: usize) -> *mut u16 {
+        // SAFETY: by the caller's contract.
+        unsafe { self.0.add(offset).cast() }
+    }
+
+    /// `count` elements from `start`.
+    ///
+    /// # Safety
+    /// They lie in what the pointer was made from, hold numbers, and nobody else uses them meanwhile.
+    pub(super) unsafe fn row<'a>(self, start: usize, count: usize) -> &'a mut [u16] {
+        // SAFETY: by the caller's contract; a bf16 is its bits.
+        unsafe { std::slice::from_raw_parts_mut(self.0.add(start).cast(), count) }
+    }
+}
+
+impl Sink for Halves<'_> {
+    unsafe fn job(
+        self,
+        (top, left): (usize, usize),
+        (rows, columns): (usize, usize),
+        run: impl FnOnce(Take),
+    ) {
+        // Blocks meet in the cache: whole rows of the job are then written at once, not 64 bytes in every page.
+        with_halves(rows * columns, |all| {
+            let first = all.as_mut_ptr();
+            run(&mut |(i, j), sums| {
+                let (_, count) = part((rows, columns), (i, j));
+                let mut bias = [0.0; SIDE];
+                if let Some(all) = self.bias {
+                    bias[..count].copy_from_slice(&all[left + j..left + j + count]);
+                }
+                let out = first.wrapping_add(i * columns + j);
+                place_halves(sums, &bias, out, columns, part((rows, columns), (i, j)));
+            });
+            for (i, row) in all.chunks_exact(columns).enumerate() {
+                // SAFETY: by the caller's contract.
+                unsafe { self.out.row((top + i) * self.row + left, columns) }.copy_from_slice(row);
             }
-            std::slice::from_raw_parts_mut(out, columns)
-        };
-        place(sums, out, keep, scale);
+        });
     }
 }
 
 vectorized! {
-    fn place(sums: &[f32], out: &mut [f32], keep: f32, scale: f32) {
+    /// `out = keep * out + scale * sums`, of the first rows and columns. `out` can be written, and read unless `keep` is 0.
+    fn place(sums: &[f32; SIDE * SIDE], out: *mut f32, stride: usize, size: (usize, usize), keep: f32, scale: f32) {
+        for (i, sums) in sums.chunks_exact(SIDE).enumerate().take(size.0) {
+            let out = out.wrapping_add(i * stride);
+            for (j, &sum) in sums.iter().enumerate().take(size.1) {
+                let out = out.wrapping_add(j);
+                // SAFETY: the element is one of those that can be written; what is not kept is not read.
+                unsafe {
+                    let kept = if keep == 0.0 { 0.0 } else { keep * *out };
+                    *out = kept + scale * sum;
+                }
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// The sums and a bias for each column, rounded, of the first rows and columns. `out` can be written.
+    fn place_halves(sums: &[f32; SIDE * SIDE], bias: &[f32; SIDE], out: *mut u16, stride: usize, size: (usize, usize)) {
+        for (i, sums) in sums.chunks_exact(SIDE).enumerate().take(size.0) {
+            let out = out.wrapping_add(i * stride);
+            let mut row = [0u16; SIDE];
+            for j in 0..SIDE {
+                row[j] = round(sums[j] + bias[j]);
+            }
+            // SAFETY: these elements can be written.
+            unsafe { out.copy_from_nonoverlapping(row.as_ptr(), size.1) };
+        }
+    }
+}
+
+vectorized! {
+    /// The sums of a row of outputs plus one number, rounded.
+    pub(super) fn round_row(sums: &[f32], bias: f32, out: &mut [u16]) {
         for (out, &sum) in out.iter_mut().zip(sums) {
-            *out = keep * *out + scale * sum;
+            *out = round(sum + bias);
         }
     }
 }

@@ -245,13 +245,14 @@ mod amx {
             }
             for (step, &at) in steps.iter().enumerate() {
                 let words = b.add(at);
+                // Rows are read once and columns again: T1 leaves L1 to the columns.
                 asm!(
-                    "tileloadd tmm4, [{a0} + {line}*1]",
+                    "tileloaddt1 tmm4, [{a0} + {line}*1]",
                     "tileloadd tmm6, [{b} + {stride}*1]",
                     "tdpbf16ps tmm0, tmm4, tmm6",
                     "tileloadd tmm7, [{b} + {stride}*1 + 64]",
                     "tdpbf16ps tmm1, tmm4, tmm7",
-                    "tileloadd tmm5, [{a1} + {line}*1]",
+                    "tileloaddt1 tmm5, [{a1} + {line}*1]",
                     "tdpbf16ps tmm2, tmm5, tmm6",
                     "tdpbf16ps tmm3, tmm5, tmm7",
                     a0 = in(reg) a[0].add(step * ROWS * DEPTH),

@@ -5,19 +5,23 @@
 //! (2 p, j) and (2 p + 1, j). All instructions read these layouts. Jobs are fixed by the shape; each element of a result
 //! is summed in one order whatever the number of threads.
 
+mod attention;
 mod conv;
 mod element;
 mod micro;
+mod taps;
 
 use rayon::prelude::*;
 
+pub(crate) use attention::{attention, attention_vjp};
 pub(crate) use conv::{conv2d, conv2d_vjp_input};
-pub(crate) use element::Element;
+pub(crate) use element::{Element, round};
 pub(crate) use micro::native;
 
 use super::matmul::{LinearShape, Matrix, Threads};
 use super::{SharedMut, with_scratch};
-use element::transpose;
+use element::{Floats, Halves, SharedHalves, Sink, Take, transpose};
+use half::bf16;
 use micro::{DEPTH, Instructions, ROWS, SIDE};
 
 /// Rows of a job.
@@ -74,39 +78,50 @@ fn pack_panel<T: Element>(b: Matrix<T>, (k, n): (usize, usize), left: usize, wor
     let count = SIDE.min(n - left);
     if b.row == 1 {
         // Columns lie along the depth: sixteen of them, 32 deep, are turned at once.
-        for (step, words) in words.chunks_exact_mut(DEPTH / 2 * SIDE).enumerate() {
-            let (first, depth) = (step * DEPTH, DEPTH.min(k - step * DEPTH));
+        let (whole, rest) = (k / DEPTH, k % DEPTH);
+        let steps = k.div_ceil(DEPTH);
+        with_halves(steps * TILE, |tiles| {
             for half in 0..SIDE / ROWS {
-                let mut tile = [0u16; TILE];
                 let columns = count.saturating_sub(half * ROWS).min(ROWS);
-                for (j, tile) in tile.chunks_exact_mut(DEPTH).enumerate().take(columns) {
-                    let start = (left + half * ROWS + j) * b.column + first;
-                    T::round_to(&b.data[start..start + depth], &mut tile[..depth]);
+                if columns < ROWS {
+                    tiles.fill(0);
                 }
-                transpose(&tile, &mut words[half * ROWS..], SIDE);
+                if columns > 0 {
+                    let data = &b.data[(left + half * ROWS) * b.column..];
+                    T::fill_tiles(data, b.column, columns, whole, tiles);
+                    fill_last(data, b.column, (columns, rest), whole * DEPTH, tiles);
+                }
+                for (step, tile) in tiles.chunks_exact(TILE).enumerate() {
+                    let words = &mut words[step * DEPTH / 2 * SIDE + half * ROWS..];
+                    transpose(tile.try_into().expect("a tile"), words, SIDE);
+                }
             }
-        }
+        });
         return;
     }
-    let mut rows = [[0u16; SIDE]; 2];
     for (pair, words) in words.chunks_exact_mut(SIDE).enumerate() {
-        for (i, row) in rows.iter_mut().enumerate() {
-            let p = 2 * pair + i;
-            if p >= k {
-                *row = [0; SIDE];
-                continue;
-            }
-            let start = p * b.row + left * b.column;
-            if b.column == 1 {
-                T::round_to(&b.data[start..start + count], &mut row[..count]);
-            } else {
-                for (j, value) in row.iter_mut().enumerate().take(count) {
-                    *value = b.data[start + j * b.column].bits();
+        let row = |p: usize| {
+            let start = p * b.row + left;
+            &b.data[start..start + count]
+        };
+        words[count..].fill(0);
+        let words = &mut words[..count];
+        match k.saturating_sub(2 * pair) {
+            0 => words.fill(0),
+            _ if b.column != 1 => {
+                for (j, word) in words.iter_mut().enumerate() {
+                    let bits = |p: usize| match p < k {
+                        true => b.data[p * b.row + (left + j) * b.column].bits() as u32,
+                        false => 0,
+                    };
+                    *word = bits(2 * pair) | bits(2 * pair + 1) << 16;
                 }
             }
-        }
-        for (word, (&low, &high)) in words.iter_mut().zip(rows[0].iter().zip(&rows[1])) {
-            *word = low as u32 | (high as u32) << 16;
+            1 => {
+                let row = row(2 * pair).iter();
+                (words.iter_mut().zip(row)).for_each(|(word, value)| *word = value.bits() as u32);
+            }
+            _ => T::pair(row(2 * pair), row(2 * pair + 1), words),
         }
     }
 }
@@ -120,15 +135,18 @@ fn pack_rows<T: Element>(a: Matrix<T>, first: usize, rows: usize, k: usize, targ
         if count < ROWS || k % DEPTH != 0 {
             target.fill(0);
         }
+        if a.column == 1 {
+            if count > 0 {
+                let data = &a.data[top * a.row..];
+                T::fill_tiles(data, a.row, count, k / DEPTH, target);
+                fill_last(data, a.row, (count, k % DEPTH), k / DEPTH * DEPTH, target);
+            }
+            continue;
+        }
         for (step, tile) in target.chunks_exact_mut(TILE).enumerate() {
             let start = step * DEPTH;
             let depth = DEPTH.min(k - start);
-            if a.column == 1 {
-                for (i, row) in tile.chunks_exact_mut(DEPTH).enumerate().take(count) {
-                    let start = (top + i) * a.row + start;
-                    T::round_to(&a.data[start..start + depth], &mut row[..depth]);
-                }
-            } else if a.row == 1 && count > 0 {
+            if a.row == 1 && count > 0 {
                 let mut words = [0u32; TILE / 2];
                 for (pair, words) in words.chunks_exact_mut(ROWS).enumerate() {
                     let mut sides = [[0u16; ROWS]; 2];
@@ -157,13 +175,31 @@ fn pack_rows<T: Element>(a: Matrix<T>, first: usize, rows: usize, k: usize, targ
     }
 }
 
+/// The last tile of a block, which is not filled to its depth: `rest` elements from `first` of each row, then 0.
+fn fill_last<T: Element>(
+    data: &[T],
+    stride: usize,
+    (rows, rest): (usize, usize),
+    first: usize,
+    tiles: &mut [u16],
+) {
+    if rest == 0 {
+        return;
+    }
+    let tile = &mut tiles[first / DEPTH * TILE..][..TILE];
+    for (row, tile) in tile.chunks_exact_mut(DEPTH).enumerate().take(rows) {
+        T::round_to(&data[row * stride + first..][..rest], &mut tile[..rest]);
+        tile[rest..].fill(0);
+    }
+}
+
 /// `out = keep * out + scale * a b`, with the elements of a and b rounded to bf16.
 ///
 /// # Safety
-/// `out` is valid for writes of m rows of n elements at stride `out_row` (and reads, if `keep` is
-/// not 0), used by nobody else meanwhile.
+/// `out` is valid for writes of m rows of n elements at stride `out_row` (and reads, if `keep` is not 0), used by nobody
+/// else meanwhile.
 pub(super) unsafe fn product<A: Element, B: Element>(
-    (m, n, k): (usize, usize, usize),
+    size: (usize, usize, usize),
     out: *mut f32,
     out_row: usize,
     keep: f32,
@@ -172,22 +208,39 @@ pub(super) unsafe fn product<A: Element, B: Element>(
     b: Matrix<B>,
     threads: Threads,
 ) {
+    let sink = Floats {
+        out: SharedMut(out),
+        row: out_row,
+        keep,
+        scale,
+    };
+    // SAFETY: by the caller's contract.
+    unsafe { product_into(size, sink, a, b, threads) };
+}
+
+/// The product's sums, into `sink`.
+///
+/// # Safety
+/// The sink takes m x n elements.
+unsafe fn product_into<A: Element, B: Element>(
+    (m, n, k): (usize, usize, usize),
+    sink: impl Sink,
+    a: Matrix<A>,
+    b: Matrix<B>,
+    threads: Threads,
+) {
     a.check(m, k);
     b.check(k, n);
     with_words(n.div_ceil(SIDE) * panel_words(k), |words| {
         let panel = panel_words(k).max(1);
-        if threads == Threads::All && n * k >= SMALL / 64 {
-            words
-                .par_chunks_exact_mut(panel)
-                .enumerate()
-                .for_each(|(index, words)| pack_panel(b, (k, n), index * SIDE, words));
+        let pack = |(index, words): (usize, &mut [u32])| pack_panel(b, (k, n), index * SIDE, words);
+        if threads == Threads::All && m * n * k >= SMALL {
+            words.par_chunks_exact_mut(panel).enumerate().for_each(pack);
         } else {
-            for (index, words) in words.chunks_exact_mut(panel).enumerate() {
-                pack_panel(b, (k, n), index * SIDE, words);
-            }
+            words.chunks_exact_mut(panel).enumerate().for_each(pack);
         }
         // SAFETY: by the caller's contract.
-        unsafe { product_panels((m, n, k), out, out_row, keep, scale, a, words, threads) };
+        unsafe { product_panels((m, n, k), sink, a, words, threads) };
     });
 }
 
@@ -206,29 +259,21 @@ pub(super) unsafe fn product_packed<A: Element>(
     threads: Threads,
 ) {
     a.check(m, b.k);
-    // SAFETY: by the caller's contract.
-    unsafe {
-        product_panels(
-            (m, b.n, b.k),
-            out,
-            out_row,
-            keep,
-            scale,
-            a,
-            &b.words,
-            threads,
-        )
+    let sink = Floats {
+        out: SharedMut(out),
+        row: out_row,
+        keep,
+        scale,
     };
+    // SAFETY: by the caller's contract.
+    unsafe { product_panels((m, b.n, b.k), sink, a, &b.words, threads) };
 }
 
 /// # Safety
-/// As [`product`]; `words` are the panels of B, and the view of A covers m x k elements.
+/// As [`product_into`]; `words` are the panels of B, and the view of A covers m x k elements.
 unsafe fn product_panels<A: Element>(
     (m, n, k): (usize, usize, usize),
-    out: *mut f32,
-    out_row: usize,
-    keep: f32,
-    scale: f32,
+    sink: impl Sink,
     a: Matrix<A>,
     words: &[u32],
     threads: Threads,
@@ -236,9 +281,8 @@ unsafe fn product_panels<A: Element>(
     if m == 0 || n == 0 {
         return;
     }
-    let target = SharedMut(out);
     let steps: Vec<usize> = (0..k.div_ceil(DEPTH))
-        .map(|s| s * DEPTH / 2 * SIDE)
+        .map(|step| step * DEPTH / 2 * SIDE)
         .collect();
     let columns_of_job = if n <= JOB_COLUMNS * 3 / 2 {
         n
@@ -260,14 +304,12 @@ unsafe fn product_panels<A: Element>(
                 stride: SIDE,
                 block: panel_words(k),
             };
-            blocks((rows, columns), packed, b, |(i, j), sums| {
-                let (rows, columns) = (SIDE.min(rows - i), SIDE.min(columns - j));
-                // SAFETY: the rows and columns of this job are its own.
-                unsafe {
-                    let out = target.at((top + i) * out_row + left + j);
-                    element::deposit(sums, (rows, columns), out, out_row, keep, scale);
-                }
-            });
+            // SAFETY: the rows and columns of this job are its own.
+            unsafe {
+                sink.job((top, left), (rows, columns), |take| {
+                    blocks((rows, columns), packed, b, take)
+                });
+            }
         });
     };
     if threads == Threads::All && m * n * k.max(1) >= SMALL {
@@ -287,13 +329,8 @@ struct Columns<'a> {
     block: usize,
 }
 
-/// All blocks of 32 x 32 sums of `rows` x `columns`: `done` gets row, column and sums of each.
-fn blocks(
-    (rows, columns): (usize, usize),
-    a: &[u16],
-    b: Columns,
-    mut done: impl FnMut((usize, usize), &[f32; SIDE * SIDE]),
-) {
+/// All blocks of 32 x 32 sums of `rows` x `columns`, into `done`.
+fn blocks((rows, columns): (usize, usize), a: &[u16], b: Columns, done: Take) {
     let (row_blocks, column_blocks) = (rows.div_ceil(SIDE), columns.div_ceil(SIDE));
     let (steps, passes) = (b.steps.len(), b.steps.len().div_ceil(PASS).max(1));
     assert!(a.len() >= row_blocks * 2 * steps * TILE);
@@ -310,10 +347,11 @@ fn blocks(
     with_scratch(kept * SIDE * SIDE, |sums| {
         for pass in 0..passes {
             let part = pass * PASS..steps.min((pass + 1) * PASS);
-            for i in 0..row_blocks {
-                let rows =
-                    |block: usize| a[((2 * i + block) * steps + part.start) * TILE..].as_ptr();
-                for j in 0..column_blocks {
+            // Rows are the faster index: 32 columns of this pass stay in L1, and rows stream by.
+            for j in 0..column_blocks {
+                for i in 0..row_blocks {
+                    let rows =
+                        |block: usize| a[((2 * i + block) * steps + part.start) * TILE..].as_ptr();
                     let at = if passes == 1 {
                         0
                     } else {
@@ -342,68 +380,56 @@ fn blocks(
 }
 
 /// `y = x w^T + bias` for x [rows, inputs], w [outputs, inputs].
-pub(crate) fn linear<X: Element, W: Element>(
+pub(crate) fn linear(
     LinearShape {
         rows,
         inputs,
         outputs,
     }: LinearShape,
-    x: &[X],
-    w: &[W],
+    x: &[bf16],
+    w: &[bf16],
     bias: Option<&[f32]>,
-) -> Vec<f32> {
-    let (mut y, keep) = match bias {
-        Some(bias) => (bias.repeat(rows), 1.0),
-        None => (vec![0.0; rows * outputs], 0.0),
-    };
+) -> Vec<bf16> {
     let (a, b) = (
         Matrix::rows(x, inputs),
         Matrix::rows(w, inputs).transposed(),
     );
-    // SAFETY: `y` holds rows x outputs elements.
-    unsafe {
-        let out = y.as_mut_ptr();
-        product(
-            (rows, outputs, inputs),
-            out,
-            outputs,
-            keep,
-            1.0,
-            a,
-            b,
-            Threads::All,
-        );
-    }
-    y
+    product_of_halves((rows, outputs, inputs), bias, a, b)
 }
 
 /// Gradient of [`linear`] with respect to x, for the gradient `g` of y.
-pub(crate) fn linear_vjp_input<G: Element, W: Element>(
+pub(crate) fn linear_vjp_input(
     LinearShape {
         rows,
         inputs,
         outputs,
     }: LinearShape,
-    g: &[G],
-    w: &[W],
-) -> Vec<f32> {
-    let mut dx = vec![0.0; rows * inputs];
+    g: &[bf16],
+    w: &[bf16],
+) -> Vec<bf16> {
     let (a, b) = (Matrix::rows(g, outputs), Matrix::rows(w, inputs));
-    // SAFETY: `dx` holds rows x inputs elements.
+    product_of_halves((rows, inputs, outputs), None, a, b)
+}
+
+/// `a b`, and a bias to every row.
+fn product_of_halves(
+    size: (usize, usize, usize),
+    bias: Option<&[f32]>,
+    a: Matrix<bf16>,
+    b: Matrix<bf16>,
+) -> Vec<bf16> {
+    let mut out = Vec::with_capacity(size.0 * size.1);
+    let sink = Halves {
+        out: SharedHalves(out.as_mut_ptr()),
+        row: size.1,
+        bias,
+    };
+    // SAFETY: `out` has room for the rows and columns of the product, all of which are written.
     unsafe {
-        let out = dx.as_mut_ptr();
-        product(
-            (rows, inputs, outputs),
-            out,
-            inputs,
-            0.0,
-            1.0,
-            a,
-            b,
-            Threads::All,
-        );
+        product_into(size, sink, a, b, Threads::All);
+        out.set_len(size.0 * size.1);
     }
-    dx
+    out
 }
 
 #[cfg(test)]

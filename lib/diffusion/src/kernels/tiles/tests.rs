@@ -2,7 +2,9 @@ use half::bf16;
 
 use super::micro::{Instructions, Kind, kinds};
 use super::*;
+use crate::kernels::attention::{self, AttentionShape};
 use crate::kernels::conv::{self, ConvShape};
+use crate::kernels::matmul::Engine;
 
 /// Numbers of both signs that bf16 holds as they are.
 fn values(len: usize, seed: usize) -> Vec<f32> {
@@ -186,26 +188,28 @@ fn convolutions_and_their_adjoints_match_those_in_f32() {
         let x = values(batch * inputs * height * width, 1);
         let w = values(outputs * inputs * kernel * kernel, 4);
         let bias = values(outputs, 9);
-        let near = |found: &[f32], wanted: &[f32], terms: usize| {
+        let near = |found: &[bf16], wanted: &[f32], terms: usize| {
             assert_eq!(found.len(), wanted.len());
-            for (i, (found, wanted)) in found.iter().zip(wanted).enumerate() {
-                // Twice, for both round; magnitudes are at most 1.
-                let error = (found - wanted).abs() as f64;
-                let bound = 2.0 * rounding(terms) * (terms + 1) as f64;
+            for (i, (found, &wanted)) in found.iter().zip(wanted).enumerate() {
+                // Both sums round, their magnitudes are at most 1; then the result is rounded.
+                let error = (found.to_f32() - wanted).abs() as f64;
+                let sums = 2.0 * rounding(terms) * (terms + 1) as f64;
+                let bound = sums + (wanted.abs() as f64 + sums) * (-8f64).exp2();
                 assert!(error <= bound, "{shape:?} at {i}: {found} not {wanted}");
             }
         };
         let wanted = conv::conv2d_unfolded(shape, &x, &w, Some(&bias));
         let terms = inputs * kernel * kernel;
-        near(&conv2d(shape, &x, &w, Some(&bias)), &wanted, terms);
-        assert_eq!(
-            conv2d(shape, &x, &halves(&w), Some(&bias)),
-            conv2d(shape, &halves(&x), &w, Some(&bias))
+        let w_halves = halves(&w);
+        near(
+            &conv2d(shape, &halves(&x), &w_halves, Some(&bias)),
+            &wanted,
+            terms,
         );
         let g = values(wanted.len(), 6);
         let wanted = conv::fold_product(shape, &g, &w);
         near(
-            &conv2d_vjp_input(shape, &g, &w),
+            &conv2d_vjp_input(shape, &halves(&g), &w_halves),
             &wanted,
             outputs * kernel * kernel,
         );
@@ -234,4 +238,62 @@ fn rounding_is_to_nearest_even_and_keeps_what_is_no_number() {
     }
     assert!(bf16::from_bits(f32::NAN.bits()).is_nan());
     assert!(bf16::from_bits(f32::from_bits(0x7f80_0001).bits()).is_nan());
+}
+
+#[test]
+fn attention_matches_that_in_f32() {
+    for (batch, heads, queries, keys, head_dim) in [
+        (1, 1, 1, 1, 1),
+        (2, 3, 33, 77, 40),
+        (1, 2, 64, 700, 64),
+        (1, 1, 40, 513, 160),
+    ] {
+        let shape = AttentionShape {
+            batch,
+            heads,
+            queries,
+            keys,
+            head_dim,
+            // Sharp: one key takes nearly all of most queries.
+            scale: 2.0,
+            causal: false,
+        };
+        let q = values(batch * queries * heads * head_dim, 1);
+        let k = values(batch * keys * heads * head_dim, 2);
+        let v = values(k.len(), 3);
+        let wanted = attention::attention(Engine::best(), shape, &q, &k, &v);
+        let y = wanted.clone();
+        let g = values(q.len(), 8);
+        let by = |values: &Vec<f32>| halves(values);
+        let (q_, k_, v_, y_, g_) = (by(&q), by(&k), by(&v), by(&y), by(&g));
+        let found = super::attention(shape, &q_, &k_, &v_);
+        for (i, (found, wanted)) in found.iter().zip(&wanted).enumerate() {
+            // Weights and the result are rounded by 2^-8 at most; values are at most 1. Exponentials are off by 4e-5.
+            let error = (found.to_f32() - wanted).abs();
+            assert!(
+                error <= 2.0 / 256.0 + 2e-4,
+                "{shape:?} at {i}: {found} not {wanted}"
+            );
+        }
+        // Both take the mean gradient of a query from the rounded value.
+        let y: Vec<f32> = y_.iter().map(|y| y.to_f32()).collect();
+        let wanted = attention::attention_vjp(Engine::best(), shape, &q, &k, &v, &y, &g);
+        let found = super::attention_vjp(shape, [&q_, &k_, &v_], &y_, &g_);
+        let pairs = [
+            ("q", &found.0, &wanted.0),
+            ("k", &found.1, &wanted.1),
+            ("v", &found.2, &wanted.2),
+        ];
+        for (name, found, wanted) in pairs {
+            // Weights and gradients at scores are rounded by 2^-8 each, then the result: of the size of the largest gradient.
+            let size = wanted.iter().fold(0f32, |size, v| size.max(v.abs()));
+            for (i, (found, wanted)) in found.iter().zip(wanted).enumerate() {
+                let error = (found.to_f32() - wanted).abs();
+                assert!(
+                    error <= 4.0 / 256.0 * size,
+                    "{shape:?}, d{name} at {i}: {found} not {wanted}"
+                );
+            }
+        }
+    }
 }
