@@ -29,6 +29,8 @@ struct Report {
     device: String,
     precision: String,
     threads: usize,
+    /// What multiplies bf16 on the CPU: null where it has no instructions for that.
+    bf16_products: Option<&'static str>,
     reference: &'static str,
     agreement: Vec<Agreement>,
     times: Times,
@@ -70,7 +72,8 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     let model = open(dtype, &device)?;
     let progress = Progress::new("comparing", output.quiet);
     // The second copy is dropped before anything is timed.
-    let on_cpu = match device.is_cpu() {
+    let composed = device.is_cpu() && dtype == DType::F32;
+    let on_cpu = match composed {
         true => None,
         false => Some(open(DType::F32, &Device::Cpu)?),
     };
@@ -92,7 +95,8 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
         device: placed_name(&device),
         precision: dtype.as_str().into(),
         threads: rayon_threads(),
-        reference: match device.is_cpu() {
+        bf16_products: dipir_diffusion::bf16_products(),
+        reference: match composed {
             true => "the same layers of candle's operations",
             false => "the same model on the CPU in f32",
         },
@@ -216,8 +220,15 @@ fn rayon_threads() -> usize {
 
 impl Report {
     fn in_words(&self) -> String {
+        let multiplied = match (self.device.as_str(), self.precision.as_str()) {
+            ("cpu", "bf16") => match self.bf16_products {
+                Some(products) => format!(" ({products})"),
+                None => " (products in f32: this processor has none in bf16)".into(),
+            },
+            _ => String::new(),
+        };
         let mut text = format!(
-            "{} on {} in {}, against {}\n\n  part                     size        error\n",
+            "{} on {} in {}{multiplied}, against {}\n\n  part                     size        error\n",
             self.model, self.device, self.precision, self.reference
         );
         for part in &self.agreement {

@@ -6,7 +6,7 @@
 
 use std::time::Instant;
 
-#[allow(dead_code)]
+#[allow(dead_code, unused_imports)]
 #[path = "../src/kernels/mod.rs"]
 mod kernels;
 

@@ -34,3 +34,4 @@ pub mod validation;
 pub mod weights;
 
 pub use error::{Error, Result};
+pub use kernels::tiles::bf16_products;

@@ -30,6 +30,25 @@ fn our_kernels_agree_with_the_composed_operations_in_every_part() -> Outcome {
     Ok(())
 }
 
+/// Against f32, whose numbers bf16 rounds: the tolerance is that of a GPU.
+#[test]
+fn every_part_of_every_family_computes_in_bf16_on_the_cpu() -> Outcome {
+    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/references");
+    for family in ["sd15", "sd21", "inpaint"] {
+        let exact = model(family)?;
+        let rounded = Model::load(&folder.join(family), DType::BF16, &Device::Cpu)?;
+        for side in sizes(&exact) {
+            for part in compare(&rounded, Reference::Cpu(&exact), side, |_| true)? {
+                // Less than a third of one rounding would mean that nothing was rounded.
+                assert!(part.holds() && part.error > 1e-3, "{family}: {part:?}");
+            }
+        }
+    }
+    let refused = Model::load(&folder.join("sd15"), DType::F16, &Device::Cpu).expect_err("f16");
+    assert!(refused.to_string().contains("accepted are f32 and bf16"));
+    Ok(())
+}
+
 #[test]
 fn a_part_that_computes_something_else_is_found() -> Outcome {
     // Another family of the same sizes has other weights.

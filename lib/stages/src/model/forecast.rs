@@ -1,5 +1,6 @@
 //! How long the stages that ask a diffusion model will take, from measured parts of it.
 use dipir_cli::session::Session;
+use dipir_diffusion::bf16_products;
 use dipir_diffusion::check::{Times, TimesSettings, times};
 use dipir_diffusion::model::Model;
 use dipir_guidance::distillation::default_crop;
@@ -10,6 +11,7 @@ use crate::concepts::table::ConceptsTable;
 use crate::light::request::{Guide, Request};
 use crate::lora::preserves_concepts;
 use crate::lora::table::LoraTable;
+use crate::model::ModelTable;
 use crate::names::{CONCEPTS, LIGHT, LORA};
 
 /// What a stage has to do with the model.
@@ -84,6 +86,17 @@ pub fn works(session: &Session, times: &Times) -> anyhow::Result<Vec<Work>> {
         seconds: seconds.min(budget),
         halved_by: vec![format!("light.iterations = {}", iterations.div_ceil(2))],
     });
+    let table: ModelTable = session.config.table("model")?;
+    if let (Some(products), true, "f32") = (
+        bf16_products(),
+        times.on_cpu && table.path.is_some(),
+        table.precision.as_str(),
+    ) {
+        for work in &mut works {
+            work.halved_by
+                .push(format!("model.precision = \"bf16\" ({products})"));
+        }
+    }
     Ok(works)
 }
 

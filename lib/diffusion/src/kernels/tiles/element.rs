@@ -9,8 +9,6 @@ use crate::kernels::simd::vectorized;
 
 /// A number that is multiplied in bf16.
 pub(crate) trait Element: Copy + Send + Sync {
-    const ZERO: Self;
-
     /// The bits of the nearest bf16, ties to even.
     fn bits(self) -> u16;
 
@@ -25,8 +23,6 @@ pub(crate) trait Element: Copy + Send + Sync {
 }
 
 impl Element for bf16 {
-    const ZERO: Self = Self::ZERO;
-
     fn bits(self) -> u16 {
         self.to_bits()
     }
@@ -45,8 +41,6 @@ impl Element for bf16 {
 }
 
 impl Element for f32 {
-    const ZERO: Self = 0.0;
-
     fn bits(self) -> u16 {
         round(self)
     }

@@ -9,9 +9,14 @@ pub(super) const DEPTH: usize = 32;
 /// Rows and columns of a block of sums: two by two tiles.
 pub(super) const SIDE: usize = 32;
 
-/// Whether this processor multiplies bf16 itself, and the system lets it.
-pub(crate) fn native() -> bool {
-    kind() != Kind::Plain
+/// What multiplies bf16 on this processor, in words; `None` where it has no instructions for that, or the system does not let
+/// them be used.
+pub fn bf16_products() -> Option<&'static str> {
+    match kind() {
+        Kind::Tiles => Some("tiles of AMX"),
+        Kind::Dots => Some("dot products of AVX-512"),
+        Kind::Plain => None,
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 pub(crate) use attention::{attention, attention_vjp};
 pub(crate) use conv::{conv2d, conv2d_vjp_input};
 pub(crate) use element::{Element, round};
-pub(crate) use micro::native;
+pub use micro::bf16_products;
 
 use super::matmul::{LinearShape, Matrix, Threads};
 use super::{SharedMut, with_scratch};
