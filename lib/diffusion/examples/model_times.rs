@@ -4,7 +4,8 @@
 //!
 //! Prints wall and processor seconds of "forward", "text" (the text encoder)
 //! and "step" (a LoRA step with recomputation, one example, its text encoded),
-//! and "peak_mib", the mebibytes of the whole process.
+//! "peak_mib", the mebibytes of the whole process so far, then "encode" and
+//! "gradient" (the autoencoder's encoder, and that with the gradient at the image).
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -93,5 +94,16 @@ fn main() -> Outcome<()> {
         .ok_or("VmHWM")?;
     let kib: f64 = peak.trim().trim_end_matches(" kB").parse()?;
     println!("peak_mib {:.0}", kib / 1024.0);
+    let image = NoiseStream::new(1, 2)
+        .normal_tensor(&[1, 3, 512, 512], DType::F32, &Device::Cpu)?
+        .to_dtype(dtype)?;
+    report("encode", &mut || {
+        model.vae.encode(&image)?;
+        Ok(())
+    })?;
+    report("gradient", &mut || {
+        model.vae.trace(&image)?.gradient(&latents)?;
+        Ok(())
+    })?;
     Ok(())
 }

@@ -1,10 +1,12 @@
 //! Tensors of the CPU as f32 slices and back.
 
 use std::borrow::Cow;
+use std::mem::MaybeUninit;
 use std::ops::Deref;
 
 use candle_core::{CpuStorage, DType, Device, Layout, Shape, Storage, Tensor};
 use half::bf16;
+use rayon::prelude::*;
 
 use super::simd::vectorized;
 use super::tiles::round;
@@ -23,7 +25,7 @@ pub(crate) fn floats<'a>(
         CpuStorage::F16(values) => {
             Cow::Owned(values[start..end].iter().map(|v| v.to_f32()).collect())
         }
-        CpuStorage::BF16(values) => Cow::Owned(widened(&values[start..end])),
+        CpuStorage::BF16(values) => Cow::Owned(converted(&values[start..end], widen)),
         _ => candle_core::bail!("kernel input is neither f32, f16 nor bf16"),
     })
 }
@@ -55,30 +57,36 @@ pub(crate) fn with_halves<const N: usize, R>(
     Ok(f(elements))
 }
 
-fn widened(values: &[bf16]) -> Vec<f32> {
-    let mut wide = vec![0.0; values.len()];
-    widen(values, &mut wide);
-    wide
+/// Numbers that one thread converts at a time.
+const CONVERT: usize = 64 * 1024;
+
+/// All of `values`, converted by `convert` piece by piece, which fills the piece that it is given.
+fn converted<A: Sync, B: Send>(
+    values: &[A],
+    convert: impl Fn(&[A], &mut [MaybeUninit<B>]) + Sync,
+) -> Vec<B> {
+    let mut all = Vec::with_capacity(values.len());
+    all.spare_capacity_mut()[..values.len()]
+        .par_chunks_mut(CONVERT)
+        .zip(values.par_chunks(CONVERT))
+        .for_each(|(target, values)| convert(values, target));
+    // SAFETY: every piece has been filled.
+    unsafe { all.set_len(values.len()) };
+    all
 }
 
 vectorized! {
-    fn widen(values: &[bf16], wide: &mut [f32]) {
+    fn widen(values: &[bf16], wide: &mut [MaybeUninit<f32>]) {
         for (wide, value) in wide.iter_mut().zip(values) {
-            *wide = f32::from_bits((value.to_bits() as u32) << 16);
+            wide.write(f32::from_bits((value.to_bits() as u32) << 16));
         }
     }
 }
 
-fn narrowed(values: &[f32]) -> Vec<bf16> {
-    let mut narrow = vec![bf16::ZERO; values.len()];
-    narrow_all(values, &mut narrow);
-    narrow
-}
-
 vectorized! {
-    fn narrow_all(values: &[f32], narrow: &mut [bf16]) {
+    fn narrow(values: &[f32], narrow: &mut [MaybeUninit<bf16>]) {
         for (narrow, value) in narrow.iter_mut().zip(values) {
-            *narrow = bf16::from_bits(round(*value));
+            narrow.write(bf16::from_bits(round(*value)));
         }
     }
 }
@@ -87,7 +95,7 @@ vectorized! {
 pub(crate) fn store(values: Vec<f32>, dtype: DType) -> CpuStorage {
     match dtype {
         DType::F16 => CpuStorage::F16(values.into_iter().map(half::f16::from_f32).collect()),
-        DType::BF16 => CpuStorage::BF16(narrowed(&values)),
+        DType::BF16 => CpuStorage::BF16(converted(&values, narrow)),
         _ => CpuStorage::F32(values),
     }
 }
@@ -99,7 +107,7 @@ pub(crate) fn from_floats(
     dtype: DType,
 ) -> candle_core::Result<Tensor> {
     match dtype {
-        DType::BF16 => Tensor::from_vec(narrowed(&values), shape, &Device::Cpu),
+        DType::BF16 => Tensor::from_vec(converted(&values, narrow), shape, &Device::Cpu),
         _ => Tensor::from_vec(values, shape, &Device::Cpu)?.to_dtype(dtype),
     }
 }
