@@ -3,8 +3,11 @@
 use crate::error::ImagingError;
 use std::path::Path;
 
-/// Errors on files that end before their end-of-image marker, on CMYK, on other than 8 bits, and on layouts
-/// that cannot be decoded.
+/// The brightness of 8 x 8 pixels takes a bit at least: a file that declares more is cut off or made to waste time.
+const MOST_PIXELS_A_BYTE: usize = 8 * 64;
+
+/// Errors on files that end before their end-of-image marker, on CMYK, on other than 8 bits, on more pixels
+/// than their bytes can hold, and on layouts that cannot be decoded.
 pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
     let damaged = |detail: &str| ImagingError::Damaged {
         path: path.to_owned(),
@@ -44,6 +47,15 @@ pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
             let Some(layout) = bytes.get(at + 10..at + 10 + 3 * usize::from(components)) else {
                 return Err(damaged("the frame header is cut off"));
             };
+            let size =
+                |from: usize| usize::from(u16::from_be_bytes([bytes[from], bytes[from + 1]]));
+            let (height, width) = (size(at + 5), size(at + 7));
+            if width * height > bytes.len().saturating_mul(MOST_PIXELS_A_BYTE) {
+                return Err(damaged(&format!(
+                    "it declares {width} x {height} pixels and has {} bytes",
+                    bytes.len()
+                )));
+            }
             if !has_finest_first(layout) {
                 let what = "is a JPEG whose colour is sampled more finely than its brightness";
                 return Err(unsupported(what.to_string()));

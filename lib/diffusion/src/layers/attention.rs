@@ -129,9 +129,9 @@ fn causal_mask(queries: usize, keys: usize, device: &Device) -> Result<Tensor> {
 
 /// What multiplies numbers of `dtype` on the CPU.
 fn engine(dtype: DType) -> Engine {
-    match dtype {
-        DType::BF16 => Engine::Tiles,
-        _ => Engine::best(),
+    match tiles::suit([dtype]) {
+        true => Engine::Tiles,
+        false => Engine::best(),
     }
 }
 
@@ -158,7 +158,7 @@ impl CustomOp3 for AttentionOp {
         lv: &Layout,
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let shape = self.shape(lq.shape(), lk.shape())?;
-        if q.dtype() == DType::BF16 && !shape.causal {
+        if tiles::suit([q.dtype()]) && !shape.causal {
             let out = tiles::attention(shape, halves(q, lq)?, halves(k, lk)?, halves(v, lv)?);
             return Ok((CpuStorage::BF16(out), lq.shape().clone()));
         }
@@ -201,7 +201,7 @@ impl CustomOp3 for AttentionOp {
             return Ok((wanted(q, dq), wanted(k, dk), wanted(v, dv)));
         }
         // One head has one job: products that share its rows among threads are faster there.
-        if q.dtype() == DType::BF16 && !shape.causal && shape.batch * shape.heads > 1 {
+        if tiles::suit([q.dtype()]) && !shape.causal && shape.batch * shape.heads > 1 {
             let (dq, dk, dv) = with_halves([q, k, v, y, &g], |[q, k, v, y, g]| {
                 tiles::attention_vjp(shape, [q, k, v], y, g)
             })?;

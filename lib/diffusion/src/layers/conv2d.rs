@@ -3,7 +3,7 @@
 #[cfg(feature = "cuda")]
 use candle_core::CudaStorage;
 use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
 
 use super::backend::has_kernels_anywhere;
 #[cfg(feature = "cuda")]
@@ -139,7 +139,7 @@ impl Conv2d {
 
 /// Gradient at the input of a convolution, on the CPU.
 fn vjp_input(shape: ConvShape, x: &Shape, g: &Tensor, w: &Tensor) -> candle_core::Result<Tensor> {
-    if g.dtype() == DType::BF16 && w.dtype() == DType::BF16 {
+    if tiles::suit([g.dtype(), w.dtype()]) {
         let dx = with_halves([g, w], |[g, w]| tiles::conv2d_vjp_input(shape, g, w))?;
         return Tensor::from_vec(dx, x, g.device());
     }
@@ -197,7 +197,7 @@ impl CustomOp3 for ConvOp {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let shape = self.shape(lx.shape(), lw.shape())?;
         let bias = floats(b, lb)?;
-        if let (CpuStorage::BF16(_), CpuStorage::BF16(_)) = (x, w) {
+        if tiles::suit([x.dtype(), w.dtype()]) {
             let y = tiles::conv2d(shape, halves(x, lx)?, halves(w, lw)?, Some(&bias));
             return Ok((CpuStorage::BF16(y), shape.result()));
         }

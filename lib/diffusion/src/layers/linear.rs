@@ -2,7 +2,7 @@
 
 #[cfg(feature = "cuda")]
 use candle_core::CudaStorage;
-use candle_core::{CpuStorage, CustomOp2, CustomOp3, DType, Layout, Shape, Tensor};
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
 
 use super::backend::has_kernels_anywhere;
 #[cfg(feature = "cuda")]
@@ -121,7 +121,7 @@ impl LinearOp {
     ) -> candle_core::Result<(CpuStorage, Shape)> {
         let (sizes, shape) = Self::sizes(lx.shape(), lw.shape())?;
         let bias = bias.map(|(b, lb)| floats(b, lb)).transpose()?;
-        if let (CpuStorage::BF16(_), CpuStorage::BF16(_)) = (x, w) {
+        if tiles::suit([x.dtype(), w.dtype()]) {
             let y = tiles::linear(sizes, halves(x, lx)?, halves(w, lw)?, bias.as_deref());
             return Ok((CpuStorage::BF16(y), shape));
         }
@@ -172,7 +172,7 @@ impl LinearOp {
         }
         let mut result = (None, None);
         if x.track_op() {
-            result.0 = Some(if g.dtype() == DType::BF16 && w.dtype() == DType::BF16 {
+            result.0 = Some(if tiles::suit([g.dtype(), w.dtype()]) {
                 let dx = with_halves([&g, w], |[g, w]| tiles::linear_vjp_input(sizes, g, w))?;
                 Tensor::from_vec(dx, x.shape(), x.device())?
             } else {

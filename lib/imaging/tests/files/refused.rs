@@ -234,6 +234,35 @@ fn a_jpeg_whose_colour_is_finer_than_its_brightness_is_refused() {
 }
 
 #[test]
+fn a_small_jpeg_of_many_pixels_is_refused_before_it_is_decoded() {
+    let folder = folder();
+    let mut file = Vec::new();
+    let grey = image::GrayImage::from_pixel(64, 64, image::Luma([90]));
+    image::codecs::jpeg::JpegEncoder::new(&mut file)
+        .encode_image(&grey)
+        .unwrap();
+    let size = file.windows(2).position(|w| w == [0xff, 0xc0]).unwrap() + 5;
+    let read = |height: u16, width: u16| {
+        let mut file = file.clone();
+        file[size..size + 2].copy_from_slice(&height.to_be_bytes());
+        file[size + 2..size + 4].copy_from_slice(&width.to_be_bytes());
+        let path = put(&folder, "x.jpg", &file);
+        read_photo(&path, Transfer::Srgb).map_err(words)
+    };
+    let path = folder.path().join("x.jpg");
+    assert!(read(64, 64).is_ok());
+    assert_eq!(
+        read(65024, 2056).unwrap_err(),
+        format!(
+            "`{}` is damaged or cut short: it declares 2056 x 65024 pixels and has {} bytes; \
+             expected a complete JPEG file: export or copy it again",
+            path.display(),
+            file.len()
+        )
+    );
+}
+
+#[test]
 fn a_header_that_asks_for_all_memory_is_refused() {
     let folder = folder();
     let file = flat_hdr("#?RADIANCE", 1, 1, [1, 2, 3, 128]);

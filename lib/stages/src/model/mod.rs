@@ -27,8 +27,8 @@ pub struct ModelTable {
     /// original layout.
     #[schemars(extend("format" = "path"), extend("x-default" = "the embedded model"), example = &"models/sd15")]
     pub path: Option<PathBuf>,
-    /// Numbers that the model computes with. `bf16` halves the memory of its weights; it is faster on GPUs and on processors that
-    /// multiply it (AMX, AVX-512). `f16` needs a GPU.
+    /// Numbers that the model computes with. `bf16` halves the memory of its weights; it is faster on GPUs and on processors with tiles
+    /// (AMX). `f16` needs a GPU.
     #[schemars(extend("enum" = ["f32", "bf16", "f16"]), example = &"bf16")]
     pub precision: String,
     /// With a model in one file: what its UNet predicts.

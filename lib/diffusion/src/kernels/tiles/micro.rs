@@ -9,12 +9,11 @@ pub(super) const DEPTH: usize = 32;
 /// Rows and columns of a block of sums: two by two tiles.
 pub(super) const SIDE: usize = 32;
 
-/// What multiplies bf16 on this processor, in words; `None` where it has no instructions for that, or the system does not let
-/// them be used.
+/// What multiplies bf16 faster than f32 on this processor, in words; `None` where nothing does, or the system does not let it
+/// be used. AVX-512's dot products of bf16 do not: they save half of the products, Winograd's convolutions in f32 more.
 pub fn bf16_products() -> Option<&'static str> {
     match kind() {
         Kind::Tiles => Some("tiles of AMX"),
-        Kind::Dots => Some("dot products of AVX-512"),
         Kind::Plain => None,
     }
 }
@@ -23,9 +22,7 @@ pub fn bf16_products() -> Option<&'static str> {
 pub(super) enum Kind {
     /// AMX: a tile of 16 rows times a tile of 16 columns, 32 deep, an instruction.
     Tiles,
-    /// AVX-512: sixteen dot products of two pairs an instruction.
-    Dots,
-    /// Products in f32: runs everywhere.
+    /// Products in f32: runs everywhere, slower than the kernels for f32.
     Plain,
 }
 
@@ -36,17 +33,11 @@ fn kind() -> Kind {
 
 /// Those that can run here, the fastest first.
 pub(super) fn kinds() -> Vec<Kind> {
-    let mut kinds = Vec::new();
+    let mut kinds = vec![Kind::Plain];
     #[cfg(target_arch = "x86_64")]
-    if is_x86_feature_detected!("avx512f") {
-        if amx::available() {
-            kinds.push(Kind::Tiles);
-        }
-        if is_x86_feature_detected!("avx512bf16") {
-            kinds.push(Kind::Dots);
-        }
+    if is_x86_feature_detected!("avx512f") && amx::available() {
+        kinds.insert(0, Kind::Tiles);
     }
-    kinds.push(Kind::Plain);
     kinds
 }
 
@@ -85,8 +76,6 @@ impl Instructions {
             match self.0 {
                 #[cfg(target_arch = "x86_64")]
                 Kind::Tiles => amx::multiply(a, b, steps, stride, sums, anew),
-                #[cfg(target_arch = "x86_64")]
-                Kind::Dots => dots::multiply(a, b, steps, stride, sums, anew),
                 _ => plain_tiles(a, b, steps, stride, sums, anew),
             }
         }
@@ -280,63 +269,6 @@ mod amx {
                 in(reg) SIDE * 4,
                 options(nostack)
             );
-        }
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-mod dots {
-    use std::arch::x86_64::*;
-
-    use super::{DEPTH, ROWS, SIDE};
-
-    /// Rows of a register tile: 8 x 2 registers of sums.
-    const GROUP: usize = 8;
-
-    /// # Safety
-    /// As [`super::Instructions::multiply`].
-    #[target_feature(enable = "avx512f,avx512bf16")]
-    pub(super) unsafe fn multiply(
-        a: [*const u16; 2],
-        b: *const u32,
-        steps: &[usize],
-        stride: usize,
-        sums: &mut [f32; SIDE * SIDE],
-        anew: bool,
-    ) {
-        for group in 0..SIDE / GROUP {
-            let top = group * GROUP;
-            let rows = a[top / ROWS].wrapping_add(top % ROWS * DEPTH).cast::<i32>();
-            // SAFETY: the group's rows lie in `sums`; the rest is the caller's contract.
-            unsafe {
-                let sums = sums.as_mut_ptr().add(top * SIDE);
-                let mut kept = [[_mm512_setzero_ps(); 2]; GROUP];
-                if !anew {
-                    for (i, kept) in kept.iter_mut().enumerate() {
-                        *kept = [0, 16].map(|at| _mm512_loadu_ps(sums.add(i * SIDE + at)));
-                    }
-                }
-                for (step, &at) in steps.iter().enumerate() {
-                    let rows = rows.add(step * ROWS * DEPTH / 2);
-                    for pair in 0..DEPTH / 2 {
-                        let words = b.add(at + pair * stride).cast::<i32>();
-                        let columns: [__m512bh; 2] = [0, 16]
-                            .map(|at| std::mem::transmute(_mm512_loadu_epi32(words.add(at))));
-                        for (i, kept) in kept.iter_mut().enumerate() {
-                            let row = _mm512_set1_epi32(*rows.add(i * DEPTH / 2 + pair));
-                            let row: __m512bh = std::mem::transmute(row);
-                            for half in 0..2 {
-                                kept[half] = _mm512_dpbf16_ps(kept[half], row, columns[half]);
-                            }
-                        }
-                    }
-                }
-                for (i, kept) in kept.iter().enumerate() {
-                    for half in 0..2 {
-                        _mm512_storeu_ps(sums.add(i * SIDE + 16 * half), kept[half]);
-                    }
-                }
-            }
         }
     }
 }

@@ -1,8 +1,8 @@
-//! Matrix products of numbers rounded to bf16, summed in f32: by the processor's own instructions, tiles of AMX or the
-//! dot products of AVX-512, where it has them.
+//! Matrix products of numbers rounded to bf16, summed in f32, by the processor's tiles (AMX), or in plain Rust where it has
+//! none. Layers use them where there are tiles.
 //!
 //! A is packed in tiles of 16 rows and 32 elements of depth, B in pairs of depth: word (p, j) holds the elements
-//! (2 p, j) and (2 p + 1, j). All instructions read these layouts. Jobs are fixed by the shape; each element of a result
+//! (2 p, j) and (2 p + 1, j). Both read these layouts. Jobs are fixed by the shape; each element of a result
 //! is summed in one order whatever the number of threads.
 
 mod attention;
@@ -20,6 +20,7 @@ pub use micro::bf16_products;
 
 use super::matmul::{LinearShape, Matrix, Threads};
 use super::{SharedMut, with_scratch};
+use candle_core::DType;
 use element::{Floats, Halves, SharedHalves, Sink, Take, transpose};
 use half::bf16;
 use micro::{DEPTH, Instructions, ROWS, SIDE};
@@ -34,6 +35,11 @@ const PASS: usize = 18;
 const TILE: usize = ROWS * DEPTH;
 /// Products below this many multiplications run on one thread.
 const SMALL: usize = 1 << 20;
+
+/// Whether tensors of these types are multiplied here: in f32, other kernels are faster without tiles.
+pub(crate) fn suit<const N: usize>(types: [DType; N]) -> bool {
+    types == [DType::BF16; N] && bf16_products().is_some()
+}
 
 /// Runs `f` on `len` words of unspecified content.
 fn with_words<R>(len: usize, f: impl FnOnce(&mut [u32]) -> R) -> R {
