@@ -175,7 +175,7 @@ fn pack_pair(
     // The pixel that meets column `column` of a phase, if there is one.
     let pixel = |at: usize, phase: usize, size: usize| {
         let at = (at * s + phase).wrapping_sub(shape.pad_before);
-        (at % spread == 0 && at / spread < size).then_some(at / spread)
+        (at.is_multiple_of(spread) && at / spread < size).then_some(at / spread)
     };
     let pictures = shape.batch * layout.height * layout.width;
     for (phase, words) in words.chunks_mut(layout.phase).enumerate() {
@@ -221,7 +221,7 @@ fn pack_pair(
 fn pack_kernel(shape: ConvShape, kernel: &Kernel, first: usize, target: &mut [u16]) {
     let taps = shape.kernel * shape.kernel;
     let outputs = ROWS.min(shape.outputs.saturating_sub(first));
-    if outputs < ROWS || shape.inputs % DEPTH != 0 {
+    if outputs < ROWS || !shape.inputs.is_multiple_of(DEPTH) {
         target.fill(0);
     }
     if outputs == 0 {

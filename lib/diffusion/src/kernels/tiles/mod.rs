@@ -138,7 +138,7 @@ fn pack_rows<T: Element>(a: Matrix<T>, first: usize, rows: usize, k: usize, targ
     for (block, target) in target.chunks_exact_mut((steps * TILE).max(1)).enumerate() {
         let top = first + block * ROWS;
         let count = (first + rows).saturating_sub(top).min(ROWS);
-        if count < ROWS || k % DEPTH != 0 {
+        if count < ROWS || !k.is_multiple_of(DEPTH) {
             target.fill(0);
         }
         if a.column == 1 {

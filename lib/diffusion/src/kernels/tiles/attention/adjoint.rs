@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::super::element::{SharedHalves, round, turn_floats};
 use super::super::micro::{DEPTH, Instructions, ROWS, SIDE};
-use super::super::{PackedColumns, TILE, pack_rows, panel_words, with_halves, with_words};
+use super::super::{PackedColumns, TILE, pack_rows, panel_words, with_halves};
 use super::{BLOCK, CHUNK, Running, STEP, Sums, block_of, exp2, store_rows, take_chunk, tokens};
 use crate::kernels::attention::AttentionShape;
 use crate::kernels::simd::vectorized;
@@ -171,140 +171,182 @@ fn levels(shape: AttentionShape, packed: &Packed, factor: f32) -> Vec<[f32; SIDE
     })
 }
 
+/// Two blocks of 16 rows, `depth` steps each, from step `first`.
+fn rows(packed: &[u16], block: usize, depth: usize, first: usize) -> [&[u16]; 2] {
+    [0, 1].map(|half| &packed[((2 * block + half) * depth + first) * TILE..])
+}
+
+/// Blocks of up to [`GROUP`], the first one and how many.
+type Blocks = (usize, usize);
+
+/// The sums of one head, and what they are made of.
+struct Adjoint<'a> {
+    shape: AttentionShape,
+    packed: &'a Packed,
+    means: &'a [f32],
+    levels: Vec<[f32; SIDE]>,
+    /// Blocks of 32 elements of a token.
+    panels: usize,
+    query_blocks: usize,
+    steps: Vec<usize>,
+    instructions: Instructions,
+    /// Weights, and gradients at scores, in pairs of queries: [keys of the group, queries of the group].
+    weight_pairs: Vec<u32>,
+    gradient_pairs: Vec<u32>,
+    /// Gradients at scores in tiles: [queries of the group, halves, keys of the group].
+    tiles: Vec<u16>,
+    /// Sums of all queries, [block, panel], and of the keys of a group, [block, panel] turned.
+    at_queries: Vec<f32>,
+    at_values: Vec<f32>,
+    at_keys: Vec<f32>,
+}
+
 /// The gradients of one head, into rows of tokens from each of `targets`.
 fn one_head(shape: AttentionShape, packed: &Packed, means: &[f32], [dq, dk, dv]: [*mut u16; 3]) {
-    let (d, width) = (shape.head_dim, shape.heads * shape.head_dim);
-    let (depth, panels) = (d.div_ceil(DEPTH), d.div_ceil(SIDE));
+    let panels = shape.head_dim.div_ceil(SIDE);
     let (query_blocks, key_blocks) = (shape.queries.div_ceil(SIDE), shape.keys.div_ceil(SIDE));
-    let factor = shape.scale * std::f32::consts::LOG2_E;
-    let levels = levels(shape, packed, factor);
-    let steps: Vec<usize> = (0..depth.max(GROUP)).map(|step| step * STEP).collect();
-    let instructions = Instructions::start();
-    let multiply = |a: [&[u16]; 2], b: &[u32], steps: &[usize], sums: &mut Sums, anew: bool| {
-        let tiles = a.map(|a| a[..steps.len() * TILE].as_ptr());
-        let words = b[..steps.len() * STEP].as_ptr();
-        // SAFETY: both were just measured.
-        unsafe { instructions.multiply(tiles, words, steps, SIDE, sums, anew) };
+    let steps = 0..shape.head_dim.div_ceil(DEPTH).max(GROUP);
+    let mut adjoint = Adjoint {
+        shape,
+        packed,
+        means,
+        levels: levels(shape, packed, shape.scale * std::f32::consts::LOG2_E),
+        panels,
+        query_blocks,
+        steps: steps.map(|step| step * STEP).collect(),
+        instructions: Instructions::start(),
+        weight_pairs: vec![0; GROUP * GROUP * STEP],
+        gradient_pairs: vec![0; GROUP * GROUP * STEP],
+        tiles: vec![0; GROUP * 2 * GROUP * TILE],
+        at_queries: vec![0.0; query_blocks * panels * BLOCK],
+        at_values: vec![0.0; GROUP * panels * BLOCK],
+        at_keys: vec![0.0; GROUP * panels * BLOCK],
     };
-    // Two blocks of 16 rows, `depth` steps each, from step `first`.
-    fn rows(packed: &[u16], block: usize, depth: usize, first: usize) -> [&[u16]; 2] {
-        [0, 1].map(|half| &packed[((2 * block + half) * depth + first) * TILE..])
+    let groups = |blocks: usize| {
+        let firsts = (0..blocks).step_by(GROUP);
+        firsts.map(move |first| (first, GROUP.min(blocks - first)))
+    };
+    for keys in groups(key_blocks) {
+        for queries in groups(query_blocks) {
+            adjoint.weigh(queries, keys);
+            adjoint.add(queries, keys);
+        }
+        adjoint.store_keys(keys, dk, dv);
     }
-    let ones = [1.0; SIDE];
-    let scaled = [shape.scale; SIDE];
-    let group_words = GROUP * GROUP * STEP;
-    with_scratch(query_blocks * panels * BLOCK, |at_queries| {
-        with_scratch((2 * GROUP * panels + 2) * BLOCK, |scratch| {
-            with_words(2 * group_words, |words| {
-                with_halves(GROUP * 2 * GROUP * TILE, |tiles| {
-                    let (pair, sums) = scratch.split_at_mut(2 * BLOCK);
-                    let (scores, gradients) = pair.split_at_mut(BLOCK);
-                    let (at_values, at_keys) = sums.split_at_mut(GROUP * panels * BLOCK);
-                    let (weight_pairs, gradient_pairs) = words.split_at_mut(group_words);
-                    for first_key in (0..key_blocks).step_by(GROUP) {
-                        let keys = GROUP.min(key_blocks - first_key);
-                        for first in (0..query_blocks).step_by(GROUP) {
-                            let queries = GROUP.min(query_blocks - first);
-                            for i in 0..queries {
-                                let block = first + i;
-                                let mut mean = [0.0; SIDE];
-                                let of_block = &means[block * SIDE..];
-                                let count = SIDE.min(of_block.len());
-                                mean[..count].copy_from_slice(&of_block[..count]);
-                                for j in 0..keys {
-                                    let at = (first_key + j) * panel_words(d);
-                                    let (scores, gradients) =
-                                        (block_of(scores, 0), block_of(gradients, 0));
-                                    let steps = &steps[..depth];
-                                    let b = &packed.keys_turned.words[at..];
-                                    multiply(
-                                        rows(&packed.queries, block, depth, 0),
-                                        b,
-                                        steps,
-                                        scores,
-                                        true,
-                                    );
-                                    let b = &packed.values_turned.words[at..];
-                                    multiply(
-                                        rows(&packed.gradients, block, depth, 0),
-                                        b,
-                                        steps,
-                                        gradients,
-                                        true,
-                                    );
-                                    let (low, high) = tiles[i * 2 * GROUP * TILE..]
-                                        [..2 * GROUP * TILE]
-                                        .split_at_mut(GROUP * TILE);
-                                    let tiles =
-                                        [low, high].map(|half| &mut half[j * TILE..][..TILE]);
-                                    let pairs = (j * GROUP + i) * STEP..(j * GROUP + i + 1) * STEP;
-                                    let left = (shape.keys - (first_key + j) * SIDE).min(SIDE);
-                                    weigh(
-                                        scores,
-                                        gradients,
-                                        factor,
-                                        &levels[block],
-                                        &mean,
-                                        left,
-                                        &mut weight_pairs[pairs.clone()],
-                                        &mut gradient_pairs[pairs],
-                                        tiles,
-                                    );
-                                }
-                            }
-                            for panel in 0..panels {
-                                for j in 0..keys {
-                                    let (at, steps) = (j * GROUP * STEP, &steps[..queries]);
-                                    let a =
-                                        rows(&packed.gradients_turned, panel, query_blocks, first);
-                                    let sums = block_of(at_values, j * panels + panel);
-                                    multiply(a, &weight_pairs[at..], steps, sums, first == 0);
-                                    let a =
-                                        rows(&packed.queries_turned, panel, query_blocks, first);
-                                    let sums = block_of(at_keys, j * panels + panel);
-                                    multiply(a, &gradient_pairs[at..], steps, sums, first == 0);
-                                }
-                                for i in 0..queries {
-                                    let start = panel * panel_words(shape.keys) + first_key * STEP;
-                                    let b = &packed.keys.words[start..];
-                                    let sums = block_of(at_queries, (first + i) * panels + panel);
-                                    multiply(
-                                        rows(tiles, i, GROUP, 0),
-                                        b,
-                                        &steps[..keys],
-                                        sums,
-                                        first_key == 0,
-                                    );
-                                }
-                            }
-                        }
-                        for j in 0..keys {
-                            let first = (first_key + j) * SIDE;
-                            let count = SIDE.min(shape.keys - first);
-                            for panel in 0..panels {
-                                let columns = SIDE.min(d - panel * SIDE);
-                                let at = first * width + panel * SIDE;
-                                for (sums, factors, target) in
-                                    [(&mut *at_values, &ones, dv), (&mut *at_keys, &scaled, dk)]
-                                {
-                                    let turned = turn_floats(block_of(sums, j * panels + panel));
-                                    let target = target.wrapping_add(at);
-                                    store_rows(&turned, factors, count, columns, target, width);
-                                }
-                            }
-                        }
-                    }
-                });
-            });
-        });
-        for block in 0..query_blocks {
-            let count = SIDE.min(shape.queries - block * SIDE);
-            for panel in 0..panels {
-                let columns = SIDE.min(d - panel * SIDE);
-                let target = dq.wrapping_add(block * SIDE * width + panel * SIDE);
-                let sums = block_of(at_queries, block * panels + panel);
-                store_rows(sums, &scaled, count, columns, target, width);
+    adjoint.store_queries(dq);
+}
+
+impl Adjoint<'_> {
+    /// Adds products over `steps` of the first steps to `sums`, or starts them anew.
+    fn multiply(&self, a: [&[u16]; 2], b: &[u32], steps: usize, sums: &mut Sums, anew: bool) {
+        let tiles = a.map(|a| a[..steps * TILE].as_ptr());
+        let words = b[..steps * STEP].as_ptr();
+        let steps = &self.steps[..steps];
+        // SAFETY: both were just measured.
+        unsafe { (self.instructions).multiply(tiles, words, steps, SIDE, sums, anew) };
+    }
+
+    /// Weights and gradients at the scores of a group of queries and one of keys.
+    fn weigh(&mut self, (first_query, queries): Blocks, (first_key, keys): Blocks) {
+        let (shape, packed) = (self.shape, self.packed);
+        let (depth, words) = (shape.head_dim.div_ceil(DEPTH), panel_words(shape.head_dim));
+        let factor = shape.scale * std::f32::consts::LOG2_E;
+        let (mut scores, mut gradients) = ([0.0; BLOCK], [0.0; BLOCK]);
+        for i in 0..queries {
+            let block = first_query + i;
+            let mut mean = [0.0; SIDE];
+            let means = &self.means[block * SIDE..];
+            let count = SIDE.min(means.len());
+            mean[..count].copy_from_slice(&means[..count]);
+            for j in 0..keys {
+                let at = (first_key + j) * words;
+                let a = rows(&packed.queries, block, depth, 0);
+                self.multiply(a, &packed.keys_turned.words[at..], depth, &mut scores, true);
+                let (a, b) = (
+                    rows(&packed.gradients, block, depth, 0),
+                    &packed.values_turned,
+                );
+                self.multiply(a, &b.words[at..], depth, &mut gradients, true);
+                let tiles = &mut self.tiles[i * 2 * GROUP * TILE..][..2 * GROUP * TILE];
+                let (low, high) = tiles.split_at_mut(GROUP * TILE);
+                let pairs = (j * GROUP + i) * STEP..(j * GROUP + i + 1) * STEP;
+                weigh(
+                    &scores,
+                    &gradients,
+                    factor,
+                    &self.levels[block],
+                    &mean,
+                    (shape.keys - (first_key + j) * SIDE).min(SIDE),
+                    &mut self.weight_pairs[pairs.clone()],
+                    &mut self.gradient_pairs[pairs],
+                    [low, high].map(|half| &mut half[j * TILE..][..TILE]),
+                );
             }
         }
-    });
+    }
+
+    /// Adds what a group of queries and one of keys give to each other's sums.
+    fn add(&mut self, (first_query, queries): Blocks, (first_key, keys): Blocks) {
+        let (packed, panels, blocks) = (self.packed, self.panels, self.query_blocks);
+        let take = |sums: &mut Vec<f32>| std::mem::take(sums);
+        let (mut at_values, mut at_keys) = (take(&mut self.at_values), take(&mut self.at_keys));
+        let mut at_queries = take(&mut self.at_queries);
+        for panel in 0..panels {
+            for j in 0..keys {
+                let (at, anew) = (j * GROUP * STEP, first_query == 0);
+                let a = rows(&packed.gradients_turned, panel, blocks, first_query);
+                let sums = block_of(&mut at_values, j * panels + panel);
+                self.multiply(a, &self.weight_pairs[at..], queries, sums, anew);
+                let a = rows(&packed.queries_turned, panel, blocks, first_query);
+                let sums = block_of(&mut at_keys, j * panels + panel);
+                self.multiply(a, &self.gradient_pairs[at..], queries, sums, anew);
+            }
+            for i in 0..queries {
+                let start = panel * panel_words(self.shape.keys) + first_key * STEP;
+                let (a, b) = (rows(&self.tiles, i, GROUP, 0), &packed.keys.words[start..]);
+                let sums = block_of(&mut at_queries, (first_query + i) * panels + panel);
+                self.multiply(a, b, keys, sums, first_key == 0);
+            }
+        }
+        (self.at_values, self.at_keys, self.at_queries) = (at_values, at_keys, at_queries);
+    }
+
+    /// Rows and columns of a token's block of 32 x 32 elements, and where it starts.
+    fn place(&self, block: usize, panel: usize, length: usize) -> (usize, usize, usize) {
+        let (d, width) = (self.shape.head_dim, self.shape.heads * self.shape.head_dim);
+        let count = SIDE.min(length - block * SIDE);
+        let columns = SIDE.min(d - panel * SIDE);
+        (count, columns, block * SIDE * width + panel * SIDE)
+    }
+
+    fn store_keys(&mut self, (first, count): Blocks, dk: *mut u16, dv: *mut u16) {
+        let (shape, panels) = (self.shape, self.panels);
+        let width = shape.heads * shape.head_dim;
+        for j in 0..count {
+            for panel in 0..panels {
+                let (rows, columns, at) = self.place(first + j, panel, shape.keys);
+                for (sums, factor, target) in [
+                    (&mut self.at_values, 1.0, dv),
+                    (&mut self.at_keys, shape.scale, dk),
+                ] {
+                    let turned = turn_floats(block_of(sums, j * panels + panel));
+                    let (factors, target) = ([factor; SIDE], target.wrapping_add(at));
+                    store_rows(&turned, &factors, rows, columns, target, width);
+                }
+            }
+        }
+    }
+
+    fn store_queries(&mut self, dq: *mut u16) {
+        let (shape, panels) = (self.shape, self.panels);
+        let factors = [shape.scale; SIDE];
+        for block in 0..self.query_blocks {
+            for panel in 0..panels {
+                let (rows, columns, at) = self.place(block, panel, shape.queries);
+                let sums = block_of(&mut self.at_queries, block * panels + panel);
+                let (target, width) = (dq.wrapping_add(at), shape.heads * shape.head_dim);
+                store_rows(sums, &factors, rows, columns, target, width);
+            }
+        }
+    }
 }
