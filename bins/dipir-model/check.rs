@@ -29,7 +29,7 @@ struct Report {
     device: String,
     precision: String,
     threads: usize,
-    /// What multiplies bf16 on the CPU: null where it has no instructions for that.
+    /// What multiplies bf16 faster than f32 on the CPU, if anything does.
     bf16_products: Option<&'static str>,
     reference: &'static str,
     agreement: Vec<Agreement>,
@@ -223,7 +223,7 @@ impl Report {
         let multiplied = match (self.device.as_str(), self.precision.as_str()) {
             ("cpu", "bf16") => match self.bf16_products {
                 Some(products) => format!(" ({products})"),
-                None => " (products in f32: this processor has none in bf16)".into(),
+                None => " (products in f32: this processor has no tiles of bf16)".into(),
             },
             _ => String::new(),
         };

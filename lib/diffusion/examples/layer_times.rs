@@ -5,8 +5,7 @@
 //!     layer_times CASE MODE REPETITIONS
 //!
 //! MODE is `forward`, `frozen` (forward and the gradient of the input) or
-//! `train` (the gradients of the parameters too). CASE may end in `:bf16`,
-//! but not that of a norm or a network.
+//! `train` (the gradients of the parameters too).
 
 use std::time::Instant;
 
@@ -32,8 +31,8 @@ fn normal(shape: &[usize]) -> Outcome<Tensor> {
 }
 
 /// A parameter: a variable when training.
-fn parameter(shape: &[usize], train: bool, dtype: DType) -> Outcome<Tensor> {
-    let tensor = (normal(shape)? * 0.05)?.to_dtype(dtype)?;
+fn parameter(shape: &[usize], train: bool) -> Outcome<Tensor> {
+    let tensor = (normal(shape)? * 0.05)?;
     Ok(if train {
         Var::from_tensor(&tensor)?.as_tensor().clone()
     } else {
@@ -44,15 +43,10 @@ fn parameter(shape: &[usize], train: bool, dtype: DType) -> Outcome<Tensor> {
 type Run = Box<dyn Fn(&Tensor) -> dipir_diffusion::Result<Tensor>>;
 
 /// The input's shape and the layer.
-fn case(name: &str, train: bool, dtype: DType) -> Outcome<(Vec<usize>, Run)> {
+fn case(name: &str, train: bool) -> Outcome<(Vec<usize>, Run)> {
     let conv = |batch, channels, side| -> Outcome<(Vec<usize>, Run)> {
-        let w = parameter(&[channels, channels, 3, 3], train, dtype)?;
-        let conv = Conv2d::from_tensors(
-            w,
-            parameter(&[channels], train, dtype)?,
-            1,
-            Padding::Same(1),
-        )?;
+        let w = parameter(&[channels, channels, 3, 3], train)?;
+        let conv = Conv2d::from_tensors(w, parameter(&[channels], train)?, 1, Padding::Same(1))?;
         Ok((
             vec![batch, channels, side, side],
             Box::new(move |x| conv.forward(x)),
@@ -61,8 +55,8 @@ fn case(name: &str, train: bool, dtype: DType) -> Outcome<(Vec<usize>, Run)> {
     Ok(match name {
         "linear" => {
             let layer = Linear::from_tensors(
-                parameter(&[1280, 320], train, dtype)?,
-                Some(parameter(&[1280], train, dtype)?),
+                parameter(&[1280, 320], train)?,
+                Some(parameter(&[1280], train)?),
             )?;
             (vec![4096, 320], Box::new(move |x| layer.forward(x)))
         }
@@ -137,12 +131,8 @@ impl CustomOp1 for GivenGradient {
         "given gradient"
     }
 
-    fn cpu_fwd(&self, x: &CpuStorage, _: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
-        let zero = match x {
-            CpuStorage::BF16(_) => CpuStorage::BF16(vec![half::bf16::ZERO]),
-            _ => CpuStorage::F32(vec![0.0]),
-        };
-        Ok((zero, Shape::from(())))
+    fn cpu_fwd(&self, _: &CpuStorage, _: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
+        Ok((CpuStorage::F32(vec![0.0]), Shape::from(())))
     }
 
     fn bwd(&self, _: &Tensor, _: &Tensor, _: &Tensor) -> candle_core::Result<Option<Tensor>> {
@@ -167,14 +157,10 @@ fn main() -> Outcome<()> {
     let [name, mode, repetitions] = arguments.as_slice() else {
         return Err("usage: layer_times CASE forward|frozen|train REPETITIONS".into());
     };
-    let (kind, dtype) = match name.strip_suffix(":bf16") {
-        Some(kind) => (kind, DType::BF16),
-        None => (name.as_str(), DType::F32),
-    };
-    let (shape, layer) = case(kind, mode == "train", dtype)?;
-    let x = normal(&shape)?.to_dtype(dtype)?;
+    let (shape, layer) = case(name, mode == "train")?;
+    let x = normal(&shape)?;
     let variable = Var::from_tensor(&x)?;
-    let gradient = normal(layer(&x)?.dims())?.to_dtype(dtype)?;
+    let gradient = normal(layer(&x)?.dims())?;
     let (mut best, mut best_processor) = (f64::INFINITY, f64::INFINITY);
     for _ in 0..=repetitions.parse::<usize>()? {
         let (start, processor) = (Instant::now(), processor_ms());

@@ -1,6 +1,6 @@
-//! Times the engines of the matrix product on the shapes that the networks have. Prints for each
+//! Times both engines of the matrix product on the shapes that the networks have. Prints for each
 //! shape the processor's milliseconds on one thread, the least of several runs in turns, and
-//! their ratios.
+//! their ratio.
 //!
 //!     product_times REPETITIONS
 
@@ -75,29 +75,23 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     if Engine::best() == Engine::Gemm {
         return Err("this processor has no AVX-512: there is nothing to compare".into());
     }
-    println!(
-        "| product | rows x columns x depth | panels, ms | gemm, ms | bf16, ms | gemm / panels | bf16 / panels |"
-    );
-    println!("|---|---|--:|--:|--:|--:|--:|");
+    println!("| product | rows x columns x depth | panels, ms | gemm, ms | gemm / panels |");
+    println!("|---|---|--:|--:|--:|");
     for (name, shape, transposed) in SHAPES {
         let [m, n, k] = shape;
         let values: Vec<f32> = (0..m.max(n) * k)
             .map(|i| (i % 251) as f32 / 251.0 - 0.5)
             .collect();
-        let mut best = [f64::INFINITY; 3];
+        let mut best = [f64::INFINITY; 2];
         for _ in 0..repetitions {
-            for (best, engine) in best
-                .iter_mut()
-                .zip([Engine::Panels, Engine::Gemm, Engine::Tiles])
-            {
+            for (best, engine) in best.iter_mut().zip([Engine::Panels, Engine::Gemm]) {
                 *best = best.min(time(engine, shape, transposed, &values));
             }
         }
-        let [panels, gemm, tiles] = best;
+        let [panels, gemm] = best;
         println!(
-            "| {name} | {m} x {n} x {k} | {panels:.4} | {gemm:.4} | {tiles:.4} | {:.2} | {:.2} |",
-            gemm / panels,
-            tiles / panels
+            "| {name} | {m} x {n} x {k} | {panels:.4} | {gemm:.4} | {:.2} |",
+            gemm / panels
         );
     }
     Ok(())

@@ -9,15 +9,15 @@ use dipir_diffusion::training::TrainingConfig;
 
 type Outcome = Result<(), Box<dyn std::error::Error>>;
 
-fn model(family: &str) -> Result<Model, dipir_diffusion::Error> {
+fn model(family: &str, dtype: DType) -> Result<Model, dipir_diffusion::Error> {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/references");
-    Model::load(&folder.join(family), DType::F32, &Device::Cpu)
+    Model::load(&folder.join(family), dtype, &Device::Cpu)
 }
 
 #[test]
 fn our_kernels_agree_with_the_composed_operations_in_every_part() -> Outcome {
     for family in ["sd15", "sd21", "inpaint"] {
-        let model = model(family)?;
+        let model = model(family, DType::F32)?;
         for side in sizes(&model) {
             let parts = compare(&model, Reference::Composed, side, |_| true)?;
             assert_eq!(parts.len(), 5);
@@ -33,10 +33,9 @@ fn our_kernels_agree_with_the_composed_operations_in_every_part() -> Outcome {
 /// Against f32, whose numbers bf16 rounds: the tolerance is that of a GPU.
 #[test]
 fn every_part_of_every_family_computes_in_bf16_on_the_cpu() -> Outcome {
-    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/references");
     for family in ["sd15", "sd21", "inpaint"] {
-        let exact = model(family)?;
-        let rounded = Model::load(&folder.join(family), DType::BF16, &Device::Cpu)?;
+        let exact = model(family, DType::F32)?;
+        let rounded = model(family, DType::BF16)?;
         for side in sizes(&exact) {
             for part in compare(&rounded, Reference::Cpu(&exact), side, |_| true)? {
                 // Less than a third of one rounding would mean that nothing was rounded.
@@ -44,7 +43,7 @@ fn every_part_of_every_family_computes_in_bf16_on_the_cpu() -> Outcome {
             }
         }
     }
-    let refused = Model::load(&folder.join("sd15"), DType::F16, &Device::Cpu).expect_err("f16");
+    let refused = model("sd15", DType::F16).expect_err("f16");
     assert!(refused.to_string().contains("accepted are f32 and bf16"));
     Ok(())
 }
@@ -52,7 +51,7 @@ fn every_part_of_every_family_computes_in_bf16_on_the_cpu() -> Outcome {
 #[test]
 fn a_part_that_computes_something_else_is_found() -> Outcome {
     // Another family of the same sizes has other weights.
-    let (model, other) = (model("sd15")?, model("pooled")?);
+    let (model, other) = (model("sd15", DType::F32)?, model("pooled", DType::F32)?);
     let parts = compare(&model, Reference::Cpu(&other), 8, |_| true)?;
     assert!(parts.iter().any(|p| p.part == "UNet" && !p.holds()));
     Ok(())
@@ -60,8 +59,13 @@ fn a_part_that_computes_something_else_is_found() -> Outcome {
 
 #[test]
 fn every_part_of_every_family_can_be_timed_and_a_measurement_can_be_stopped() -> Outcome {
-    for (family, with_prior) in [("sd21", true), ("inpaint", false)] {
-        let model = model(family)?;
+    for (family, dtype, with_prior) in [
+        ("sd21", DType::F32, true),
+        ("inpaint", DType::F32, false),
+        ("sd21", DType::BF16, true),
+        ("inpaint", DType::BF16, false),
+    ] {
+        let model = model(family, dtype)?;
         let settings = TimesSettings {
             side: 8,
             training: TrainingConfig::default(),

@@ -393,10 +393,19 @@ fn half_precision_layers_reduce_in_f32() -> Outcome {
 
 #[test]
 fn any_number_of_threads_gives_the_same_bytes() -> Outcome {
-    let x = normal(27, &[2, 24, 19, 23]);
-    let (w, b) = (normal(28, &[32, 24, 3, 3]), normal(29, &[32]));
-    let tokens = normal(30, &[2, 300, 64]);
-    let matrix = normal(31, &[64, 64]);
+    for dtype in [DType::F32, DType::BF16] {
+        assert_same_bytes(dtype)?;
+    }
+    Ok(())
+}
+
+fn assert_same_bytes(dtype: DType) -> Outcome {
+    let number = |stream, shape: &[usize]| normal(stream, shape).to_dtype(dtype);
+    let x = number(27, &[2, 24, 19, 23])?;
+    let (w, b) = (number(28, &[32, 24, 3, 3])?, number(29, &[32])?);
+    let tokens = number(30, &[2, 300, 64])?;
+    let matrix = number(31, &[64, 64])?;
+    let plain = |t: &Tensor| t.to_dtype(DType::F32)?.flatten_all()?.to_vec1();
     let run = || -> dipir_diffusion::Result<Vec<Vec<f32>>> {
         let (x, w) = (Var::from_tensor(&x)?, Var::from_tensor(&w)?);
         let tokens = Var::from_tensor(&tokens)?;
@@ -410,10 +419,10 @@ fn any_number_of_threads_gives_the_same_bytes() -> Outcome {
         .forward(&q, &tokens, &tokens)?;
         let loss = (y.sqr()?.sum_all()? + a.sqr()?.sum_all()?)?;
         let gradients = loss.backward()?;
-        let mut all = vec![y.flatten_all()?.to_vec1()?, a.flatten_all()?.to_vec1()?];
+        let mut all = vec![plain(&y)?, plain(&a)?];
         for variable in [&x, &w, &tokens] {
             if let Some(gradient) = gradients.get(variable) {
-                all.push(gradient.flatten_all()?.to_vec1()?);
+                all.push(plain(gradient)?);
             }
         }
         Ok(all)
@@ -435,7 +444,7 @@ fn any_number_of_threads_gives_the_same_bytes() -> Outcome {
         };
         assert!(
             bits(&with_threads(threads)?) == bits(&one),
-            "{threads} threads gave other bytes than one"
+            "{dtype:?}: {threads} threads gave other bytes than one"
         );
     }
     Ok(())

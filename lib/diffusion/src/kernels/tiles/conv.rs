@@ -7,7 +7,7 @@
 use half::bf16;
 use rayon::prelude::*;
 
-use super::element::{Element, SharedHalves, bits_of, round_row, transpose_words};
+use super::element::{Element, SharedHalves, bits_of, place_row, transpose_words};
 use super::micro::{DEPTH, ROWS, SIDE};
 use super::taps::Taps;
 use super::{Columns, JOB_COLUMNS, JOB_ROWS, TILE, blocks, with_halves, with_words};
@@ -303,8 +303,8 @@ fn multiply(
                             ((item * shape.outputs + output) * out_height + y) * out_width + x;
                         let bias = bias.map_or(0.0, |bias| bias[output]);
                         // SAFETY: outputs and positions of this job are its own, and lie in `out`.
-                        let out = unsafe { target.row(start, count) };
-                        round_row(&sums[at..], bias, out);
+                        let out = unsafe { target.at(start) };
+                        place_row(&sums[at..at + count], bias, out);
                     }
                 }
                 at += run;

@@ -251,15 +251,6 @@ impl SharedHalves {
         // SAFETY: by the caller's contract.
         unsafe { self.0.add(offset).cast() }
     }
-
-    /// `count` elements from `start`.
-    ///
-    /// # Safety
-    /// They lie in what the pointer was made from, hold numbers, and nobody else uses them meanwhile.
-    pub(super) unsafe fn row<'a>(self, start: usize, count: usize) -> &'a mut [u16] {
-        // SAFETY: by the caller's contract; a bf16 is its bits.
-        unsafe { std::slice::from_raw_parts_mut(self.0.add(start).cast(), count) }
-    }
 }
 
 impl Sink for Halves<'_> {
@@ -283,7 +274,10 @@ impl Sink for Halves<'_> {
             });
             for (i, row) in all.chunks_exact(columns).enumerate() {
                 // SAFETY: by the caller's contract.
-                unsafe { self.out.row((top + i) * self.row + left, columns) }.copy_from_slice(row);
+                unsafe {
+                    let out = self.out.at((top + i) * self.row + left);
+                    out.copy_from_nonoverlapping(row.as_ptr(), columns);
+                }
             }
         });
     }
@@ -322,10 +316,13 @@ vectorized! {
 }
 
 vectorized! {
-    /// The sums of a row of outputs plus one number, rounded.
-    pub(super) fn round_row(sums: &[f32], bias: f32, out: &mut [u16]) {
-        for (out, &sum) in out.iter_mut().zip(sums) {
-            *out = round(sum + bias);
+    /// The sums of a row of outputs, up to 32, plus one number, rounded. As many elements of `out` can be written.
+    pub(super) fn place_row(sums: &[f32], bias: f32, out: *mut u16) {
+        let mut row = [0u16; SIDE];
+        for (row, &sum) in row.iter_mut().zip(sums) {
+            *row = round(sum + bias);
         }
+        // SAFETY: these elements can be written.
+        unsafe { out.copy_from_nonoverlapping(row.as_ptr(), sums.len()) };
     }
 }

@@ -29,14 +29,14 @@ use micro::{DEPTH, Instructions, ROWS, SIDE};
 const JOB_ROWS: usize = 4 * SIDE;
 /// Columns of a job.
 const JOB_COLUMNS: usize = 16 * SIDE;
-/// Steps of depth of one pass: two rows of tiles of A, 36 KiB, stay in L1.
+/// Steps of depth of one pass: 32 columns of B, 36 KiB, stay in L1 while rows of A stream by.
 const PASS: usize = 18;
 /// Elements of a tile of A.
 const TILE: usize = ROWS * DEPTH;
 /// Products below this many multiplications run on one thread.
 const SMALL: usize = 1 << 20;
 
-/// Whether tensors of these types are multiplied here: in f32, other kernels are faster without tiles.
+/// Whether tensors of these types are multiplied here. Without tiles the kernels for f32 are faster.
 pub(crate) fn suit<const N: usize>(types: [DType; N]) -> bool {
     types == [DType::BF16; N] && bf16_products().is_some()
 }
@@ -353,7 +353,6 @@ fn blocks((rows, columns): (usize, usize), a: &[u16], b: Columns, done: Take) {
     with_scratch(kept * SIDE * SIDE, |sums| {
         for pass in 0..passes {
             let part = pass * PASS..steps.min((pass + 1) * PASS);
-            // Rows are the faster index: 32 columns of this pass stay in L1, and rows stream by.
             for j in 0..column_blocks {
                 for i in 0..row_blocks {
                     let rows =

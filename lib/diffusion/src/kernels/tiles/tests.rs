@@ -297,3 +297,39 @@ fn attention_matches_that_in_f32() {
         }
     }
 }
+
+/// Scores of 3e5: times log2 e, f32 holds them to .03 alone, which is 2% of a weight. Three equal keys share each query.
+#[test]
+fn weights_at_huge_scores_are_not_scaled_by_the_rounding_of_scores() {
+    let (tokens, head_dim) = (39, 32);
+    let shape = AttentionShape {
+        batch: 1,
+        heads: 1,
+        queries: tokens,
+        keys: tokens,
+        head_dim,
+        scale: 1.0,
+        causal: false,
+    };
+    let mut q = vec![0.0; tokens * head_dim];
+    for i in 0..tokens {
+        // bf16 holds multiples of 4 here.
+        q[i * head_dim + i / 3] = (544 + 4 * (i / 3)) as f32;
+    }
+    let (v, g) = (values(q.len(), 3), values(q.len(), 8));
+    let [q, v, g] = [&q, &v, &g].map(|values| halves(values));
+    let y = super::attention(shape, &q, &q, &v);
+    let (_, _, dv) = super::attention_vjp(shape, [&q, &q, &v], &y, &g);
+    let third = bf16::from_f32(1.0 / 3.0).to_f32();
+    for (i, found) in dv.iter().enumerate() {
+        let first = i / head_dim / 3 * 3;
+        let shared = (first..first + 3).map(|query| g[query * head_dim + i % head_dim].to_f32());
+        let wanted = third * shared.sum::<f32>();
+        // The result is rounded, and sums of f32 are.
+        let error = (found.to_f32() - wanted).abs();
+        assert!(
+            error <= wanted.abs() / 256.0 + 1e-6,
+            "dv at {i}: {found} not {wanted}"
+        );
+    }
+}

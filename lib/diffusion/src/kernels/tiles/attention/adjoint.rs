@@ -6,7 +6,9 @@ use rayon::prelude::*;
 use super::super::element::{SharedHalves, round, turn_floats};
 use super::super::micro::{DEPTH, Instructions, ROWS, SIDE};
 use super::super::{PackedColumns, TILE, pack_rows, panel_words, with_halves};
-use super::{BLOCK, CHUNK, Running, STEP, Sums, block_of, exp2, store_rows, take_chunk, tokens};
+use super::{
+    BLOCK, CHUNK, Running, STEP, Sums, block_of, exp2, score, store_rows, take_chunk, tokens,
+};
 use crate::kernels::attention::AttentionShape;
 use crate::kernels::simd::vectorized;
 use crate::kernels::with_scratch;
@@ -16,13 +18,14 @@ const GROUP: usize = 4;
 
 vectorized! {
     /// From 32 x 32 scores and gradients at the weights: weights and gradients at the scores, in pairs of queries and, of
-    /// the latter, in tiles. `level` is what to take off the scaled scores of a query, `mean` its mean gradient; weights of
-    /// keys from `keys` on are 0.
+    /// the latter, in tiles. `level` has the largest score and the sum of each query, `mean` its mean gradient; weights of
+    /// keys from `keys` on are 0. The largest score is taken off as when the sum was made: where scores are so large that their
+    /// rounding shows, it cancels.
     fn weigh(
         scores: &Sums,
         gradients: &Sums,
         factor: f32,
-        level: &[f32; SIDE],
+        level: &Running,
         mean: &[f32; SIDE],
         keys: usize,
         weight_pairs: &mut [u32],
@@ -34,9 +37,10 @@ vectorized! {
             for side in 0..2 {
                 let row = 2 * pair + side;
                 let (scores, gradients) = (&scores[row * SIDE..][..SIDE], &gradients[row * SIDE..][..SIDE]);
+                let (largest, inverse) = (level.largest[row], 1.0 / level.sum[row]);
                 let mut weights = [0f32; SIDE];
                 for j in 0..SIDE {
-                    weights[j] = exp2(scores[j].mul_add(factor, -level[row]));
+                    weights[j] = exp2(scores[j].mul_add(factor, -largest)) * inverse;
                 }
                 if keys < SIDE {
                     weights[keys..].fill(0.0);
@@ -134,34 +138,23 @@ pub(crate) fn attention_vjp(
     (dq, dk, dv)
 }
 
-/// log2 of the sum of the exponentials of each query's scaled scores; far above every score where there is no query.
-fn levels(shape: AttentionShape, packed: &Packed, factor: f32) -> Vec<[f32; SIDE]> {
+/// Largest score and sum of every block of queries.
+fn levels(shape: AttentionShape, packed: &Packed, factor: f32) -> Vec<Running> {
     let depth = shape.head_dim.div_ceil(DEPTH);
     let key_blocks = shape.keys.div_ceil(SIDE);
-    let steps: Vec<usize> = (0..depth).map(|step| step * STEP).collect();
     let instructions = Instructions::start();
     let one = |block: usize, scores: &mut [f32], tiles: &mut [u16]| {
-        let rows = [0, 1].map(|half| packed.queries[(2 * block + half) * depth * TILE..].as_ptr());
+        let queries = rows(&packed.queries, block, depth, 0);
         let mut running = Running::NONE;
         for first in (0..key_blocks).step_by(CHUNK) {
             let count = CHUNK.min(key_blocks - first);
-            for key in 0..count {
-                let words = panel_words(shape.head_dim);
-                let keys = &packed.keys_turned.words[(first + key) * words..][..words];
-                // SAFETY: queries and keys are packed as deep as the steps go.
-                unsafe {
-                    let scores = block_of(scores, key);
-                    instructions.multiply(rows, keys.as_ptr(), &steps, SIDE, scores, true);
-                }
-            }
+            let blocks = (first, count);
+            score(&instructions, queries, &packed.keys_turned, blocks, scores);
             let left = (shape.keys - first * SIDE).min(count * SIDE);
             let scores = &mut scores[..count * BLOCK];
             take_chunk(scores, left, factor, &mut running, &mut [0.0; SIDE], tiles);
         }
-        std::array::from_fn(|row| match block * SIDE + row < shape.queries {
-            true => running.largest[row] + running.sum[row].log2(),
-            false => 1e30,
-        })
+        running
     };
     with_scratch(CHUNK * BLOCK, |scores| {
         with_halves(2 * CHUNK * TILE, |tiles| {
@@ -184,7 +177,7 @@ struct Adjoint<'a> {
     shape: AttentionShape,
     packed: &'a Packed,
     means: &'a [f32],
-    levels: Vec<[f32; SIDE]>,
+    levels: Vec<Running>,
     /// Blocks of 32 elements of a token.
     panels: usize,
     query_blocks: usize,

@@ -27,8 +27,8 @@ const STEP: usize = DEPTH / 2 * SIDE;
 
 type Sums = [f32; BLOCK];
 
-/// 2^x to 4e-5, of x below 128. Below -60 it is 2^-60, which is nothing beside the largest weight, while products with it are
-/// still far from the slow, denormal numbers.
+/// 2^x to 4e-5, for x below 128. Everything below -60 counts as -60: that is nothing beside the largest weight, and no product
+/// with it is a denormal number, which would be slow.
 #[inline(always)]
 fn exp2(x: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0; // 1.5 * 2^23: adding it rounds to an integer
@@ -186,6 +186,25 @@ pub(crate) fn attention(shape: AttentionShape, q: &[bf16], k: &[bf16], v: &[bf16
     out
 }
 
+/// Scores of 32 queries, in two blocks of packed rows, and `count` blocks of keys from `first`.
+fn score(
+    instructions: &Instructions,
+    queries: [&[u16]; 2],
+    keys: &PackedColumns,
+    (first, count): (usize, usize),
+    scores: &mut [f32],
+) {
+    let (depth, words) = (keys.k.div_ceil(DEPTH), panel_words(keys.k));
+    let steps: Vec<usize> = (0..depth).map(|step| step * STEP).collect();
+    let queries = queries.map(|queries| queries[..depth * TILE].as_ptr());
+    for block in 0..count {
+        let keys = &keys.words[(first + block) * words..][..words];
+        let scores = block_of(scores, block);
+        // SAFETY: queries and keys were measured, and are as deep as the steps go.
+        unsafe { instructions.multiply(queries, keys.as_ptr(), &steps, SIDE, scores, true) };
+    }
+}
+
 /// The value of 32 queries of a head, of which `rows` are stored from `out`.
 fn one_block(
     shape: AttentionShape,
@@ -199,28 +218,14 @@ fn one_block(
     let (depth, key_blocks) = (d.div_ceil(DEPTH), shape.keys.div_ceil(SIDE));
     let (scores, sums) = scratch.split_at_mut(CHUNK * BLOCK);
     let factor = shape.scale * std::f32::consts::LOG2_E;
-    let steps: Vec<usize> = (0..depth.max(CHUNK)).map(|step| step * STEP).collect();
+    let steps: Vec<usize> = (0..CHUNK).map(|step| step * STEP).collect();
     let instructions = Instructions::start();
     let mut running = Running::NONE;
     with_halves(2 * CHUNK * TILE, |tiles| {
         for first in (0..key_blocks).step_by(CHUNK) {
             let count = CHUNK.min(key_blocks - first);
-            let rows_of = [queries.as_ptr(), queries[depth * TILE..].as_ptr()];
-            for block in 0..count {
-                let keys = &head.keys.words[(first + block) * panel_words(d)..][..panel_words(d)];
-                // SAFETY: queries and keys are packed as deep as the steps go.
-                unsafe {
-                    let scores = block_of(scores, block);
-                    instructions.multiply(
-                        rows_of,
-                        keys.as_ptr(),
-                        &steps[..depth],
-                        SIDE,
-                        scores,
-                        true,
-                    );
-                }
-            }
+            let halves = [queries, &queries[depth * TILE..]];
+            score(&instructions, halves, &head.keys, (first, count), scores);
             let scores = &mut scores[..count * BLOCK];
             let mut factors = [0.0; SIDE];
             let left = (shape.keys - first * SIDE).min(count * SIDE);
