@@ -86,6 +86,19 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 /// How many problems an error message spells out before it only counts.
 const SPELLED_OUT: usize = 8;
 
+impl Error {
+    /// Whether a GPU's memory did not suffice. candle hands the driver's error on as text.
+    pub(crate) fn is_out_of_memory(&self) -> bool {
+        let told = |e: &candle_core::Error| {
+            let text = e.to_string();
+            ["CUDA_ERROR_OUT_OF_MEMORY", "CUBLAS_STATUS_ALLOC_FAILED"]
+                .iter()
+                .any(|name| text.contains(name))
+        };
+        matches!(self, Self::Tensor(e) if told(e))
+    }
+}
+
 fn list(problems: &[String]) -> String {
     let mut text = problems
         .iter()

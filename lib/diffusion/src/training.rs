@@ -46,8 +46,9 @@ pub struct TrainingConfig {
     /// Lowest and highest timestep as shares of the schedule.
     pub timesteps: (f64, f64),
     /// Recompute activations in the backward pass: a third more time for a
-    /// fraction of the memory.
-    pub recompute: bool,
+    /// fraction of the memory. None: on an NVIDIA GPU once its memory has run
+    /// out, elsewhere always.
+    pub recompute: Option<bool>,
     /// Key of all random numbers.
     pub seed: u64,
     /// Moments and decay.
@@ -70,7 +71,7 @@ impl Default for TrainingConfig {
             max_gradient_norm: 1.0,
             prior_weight: 1.0,
             timesteps: (0.0, 1.0),
-            recompute: true,
+            recompute: None,
             seed: 0,
             optimizer: AdamWConfig::default(),
         }
@@ -192,6 +193,7 @@ impl<'a> LoraTrainer<'a> {
         let optimizer = AdamW::new(&variables, config.optimizer)?;
         let recompute = config
             .recompute
+            .unwrap_or(!model.device().is_cuda())
             .then(|| Recompute::new(variables.into_values().collect()));
         Ok(Self {
             model,
@@ -250,9 +252,13 @@ impl<'a> LoraTrainer<'a> {
         let share = 1.0 / self.config.accumulation as f64;
         for micro in 0..self.config.accumulation {
             let index = (step * self.config.accumulation + micro) as u64;
-            let mut stream =
-                NoiseStream::new(self.config.seed, index.wrapping_mul(2).wrapping_add(1));
-            let (gradients, losses) = self.gradients(data, &mut stream)?;
+            let (gradients, losses) = match self.gradients(data, index) {
+                Err(e) if self.may_recompute() && e.is_out_of_memory() => {
+                    self.recompute = Some(Recompute::new(self.variables().into_values().collect()));
+                    self.gradients(data, index)?
+                }
+                found => found?,
+            };
             instance_loss += losses.0 * share;
             prior_loss += losses.1 * share;
             sum = Some(match sum {
@@ -284,12 +290,23 @@ impl<'a> LoraTrainer<'a> {
         })
     }
 
-    /// Gradients of one example of each kind, and both losses.
+    /// Whether activations are recomputed: as configured, or because memory ran out.
+    pub fn recomputes(&self) -> bool {
+        self.recompute.is_some()
+    }
+
+    fn may_recompute(&self) -> bool {
+        self.config.recompute.is_none() && self.recompute.is_none()
+    }
+
+    /// Gradients of one example of each kind, the `index`th of all, and both losses.
     fn gradients(
         &self,
         data: &dyn TrainingData,
-        stream: &mut NoiseStream,
+        index: u64,
     ) -> Result<(BTreeMap<String, Tensor>, (f64, f64))> {
+        let key = index.wrapping_mul(2).wrapping_add(1);
+        let stream = &mut NoiseStream::new(self.config.seed, key);
         let mut examples = vec![data.instance(stream)?];
         if self.config.prior_weight > 0.0 {
             examples.extend(data.prior(stream)?);
@@ -337,13 +354,12 @@ impl<'a> LoraTrainer<'a> {
         let weighted = losses.iter().enumerate();
         let weighted = weighted.map(|(index, loss)| Ok((loss * weight(index))?));
         let total = Tensor::stack(&weighted.collect::<Result<Vec<_>>>()?, 0)?.sum_all()?;
+        let gradients = backward(&total, recompute.as_ref())?;
+        // Reading a loss waits for a GPU, so it comes after all that the GPU is to do.
         let values = losses
             .iter()
             .map(|loss| Ok(loss.to_scalar::<f32>()? as f64));
-        Ok((
-            backward(&total, recompute.as_ref())?,
-            values.collect::<Result<_>>()?,
-        ))
+        Ok((gradients, values.collect::<Result<_>>()?))
     }
 
     /// Gradients of a scalar with respect to every trained parameter, by

@@ -84,7 +84,7 @@ fn assert_gradients(family: &str) -> Outcome {
         let trainer = LoraTrainer::new(
             &model,
             TrainingConfig {
-                recompute,
+                recompute: Some(recompute),
                 ..config()
             },
             Some(&start),
@@ -164,7 +164,7 @@ fn recomputation_changes_nothing() -> Outcome {
         let mut trainer = LoraTrainer::new(
             &model,
             TrainingConfig {
-                recompute,
+                recompute: Some(recompute),
                 ..config()
             },
             None,

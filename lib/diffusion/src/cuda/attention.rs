@@ -5,7 +5,7 @@ use candle_core::cuda_backend::cudarc::driver::sys::CUdevice_attribute;
 use candle_core::{CudaStorage, DType, Result};
 
 use super::gemm::{Matrices, products};
-use super::{FLASH, SCRATCH, View, alike, empty, launch, launch_of, whole};
+use super::{Argument, FLASH, SCRATCH, View, alike, empty, launch, launch_of, whole};
 use crate::kernels::attention::AttentionShape;
 
 /// A sample and some of its heads.
@@ -79,7 +79,7 @@ impl Work<'_> {
     }
 
     /// A block for every row of the scores.
-    fn launch(&self, name: &str, part: Heads, arguments: &[super::Argument]) -> Result<()> {
+    fn launch(&self, name: &str, part: Heads, arguments: &[Argument]) -> Result<()> {
         let pack = if self.s.keys.is_multiple_of(4) { 4 } else { 1 };
         let threads = (self.s.keys / pack).next_multiple_of(32).clamp(32, 256) as u32;
         let (name, rows) = (format!("{name}_{pack}"), part.count * self.s.queries);
@@ -106,32 +106,54 @@ fn has_flash(s: &AttentionShape, views: &[View]) -> bool {
         && context.attribute(capability).is_ok_and(|major| major >= 8)
 }
 
-fn flash(s: &AttentionShape, q: View, k: View, v: View) -> Result<CudaStorage> {
-    /// Queries of a block, and its threads.
-    const QUERIES: usize = 128;
+/// Starts a kernel of `flash.cu` with a block for 128 of `rows`, a head and a sample; its last arguments are the sizes.
+fn launch_flash(s: &AttentionShape, name: &str, rows: usize, views: &[View]) -> Result<()> {
+    /// Rows of a block, and its threads.
+    const ROWS: usize = 128;
     const THREADS: u32 = 256;
+    let mut arguments: Vec<Argument> = views.iter().map(|&v| v.into()).collect();
+    for size in [s.queries, s.keys, s.heads] {
+        arguments.push(size.try_into()?);
+    }
+    arguments.push((s.scale * std::f32::consts::LOG2_E).into());
+    let grid = (rows.div_ceil(ROWS), s.heads, s.batch);
+    let (device, kernel) = (views[0].device, (name, views[0].dtype));
+    launch_of(FLASH, device, kernel, grid, THREADS, &arguments)
+}
+
+fn flash(s: &AttentionShape, q: View, k: View, v: View) -> Result<CudaStorage> {
     let elements = s.batch * s.queries * s.heads * s.head_dim;
     let y = empty(q.device, q.dtype, elements)?;
-    let arguments = [
-        q.into(),
-        k.into(),
-        v.into(),
-        whole(&y, elements)?.into(),
-        s.queries.try_into()?,
-        s.keys.try_into()?,
-        s.heads.try_into()?,
-        (s.scale * std::f32::consts::LOG2_E).into(),
-    ];
-    let grid = (s.queries.div_ceil(QUERIES), s.heads, s.batch);
-    launch_of(
-        FLASH,
-        q.device,
-        ("flash", q.dtype),
-        grid,
-        THREADS,
-        &arguments,
-    )?;
+    launch_flash(s, "flash", s.queries, &[q, k, v, whole(&y, elements)?])?;
     Ok(y)
+}
+
+fn flash_vjp(s: &AttentionShape, [q, k, v, y, g]: [View; 5]) -> Result<[CudaStorage; 3]> {
+    let (device, width) = (q.device, s.heads * s.head_dim);
+    let (of_queries, of_keys) = (s.batch * s.queries * width, s.batch * s.keys * width);
+    let rows = s.batch * s.heads * s.queries;
+    let (sums, dots) = (
+        empty(device, DType::F32, rows)?,
+        empty(device, DType::F32, rows)?,
+    );
+    let (sums, dots) = (whole(&sums, rows)?, whole(&dots, rows)?);
+    let [dq, dk, dv] = [of_queries, of_keys, of_keys].map(|n| empty(device, q.dtype, n));
+    let (dq, dk, dv) = (dq?, dk?, dv?);
+    let to_q = whole(&dq, of_queries)?;
+    launch_flash(
+        s,
+        "flash_vjp_queries",
+        s.queries,
+        &[q, k, v, y, g, to_q, sums, dots],
+    )?;
+    let (to_k, to_v) = (whole(&dk, of_keys)?, whole(&dv, of_keys)?);
+    launch_flash(
+        s,
+        "flash_vjp_keys",
+        s.keys,
+        &[q, k, v, g, sums, dots, to_k, to_v],
+    )?;
+    Ok([dq, dk, dv])
 }
 
 pub(crate) fn attention(s: AttentionShape, q: View, k: View, v: View) -> Result<CudaStorage> {
@@ -167,15 +189,16 @@ pub(crate) fn attention(s: AttentionShape, q: View, k: View, v: View) -> Result<
     Ok(y)
 }
 
-/// The gradients at q, k and v, where that at the result is `g`. The weights are computed again.
-pub(crate) fn vjp(
-    s: AttentionShape,
-    q: View,
-    k: View,
-    v: View,
-    g: View,
-) -> Result<[CudaStorage; 3]> {
-    let (dtype, device) = (alike(&[q, k, v, g])?, q.device);
+/// Fewest keys for which the adjoint's kernel by keys has enough blocks.
+const FLASH_KEYS: usize = 512;
+
+/// The gradients at q, k and v, where that at the result y is `g`. The weights are computed again.
+pub(crate) fn vjp(s: AttentionShape, views: [View; 5]) -> Result<[CudaStorage; 3]> {
+    let [q, k, v, _, g] = views;
+    let (dtype, device) = (alike(&views)?, q.device);
+    if s.keys >= FLASH_KEYS && has_flash(&s, &views) {
+        return flash_vjp(&s, views);
+    }
     let heads_at_once = heads_at_once(&s);
     let square = heads_at_once * s.queries * s.keys;
     let (scores, weights) = (

@@ -1,5 +1,7 @@
-// Attention of heads of 64 values on tensor cores, without ever storing the scores: each block takes 128 queries of a head
-// over all keys, 64 at a time, and keeps the largest score and the sum so far [Dao 2023]. For compute capability 8.0 on.
+// Attention of heads of 64 values on tensor cores, and its adjoint, without ever storing the scores: each block takes 128
+// queries of a head over all keys, 64 at a time, and keeps the largest score and the sum so far [Dao 2023]. The adjoint
+// computes the scores again, once by queries and once by keys, so that no sum is shared by blocks. For compute capability
+// 8.0 on. `scale` is that of the scores times log2(e).
 #include <cuda_bf16.h>
 #include <cuda_fp16.h>
 
@@ -7,6 +9,7 @@ typedef long long i64;
 typedef unsigned int u32;
 
 constexpr int HEAD = 64, KEYS = 64, WARPS = 8, QUERIES = 16 * WARPS;
+constexpr float LN_2 = 0.693147180559945f;
 constexpr int PITCH = HEAD + 8; // Values from a stored row to the next: eight rows lie in different banks.
 
 __device__ inline u32 pack(float a, float b, __nv_bfloat16) {
@@ -17,6 +20,11 @@ __device__ inline u32 pack(float a, float b, __half) {
     __half2 v = __floats2half2_rn(a, b);
     return *reinterpret_cast<u32 *>(&v);
 }
+
+__device__ inline float2 unpack(u32 bits, __nv_bfloat16) {
+    return __bfloat1622float2(*reinterpret_cast<__nv_bfloat162 *>(&bits));
+}
+__device__ inline float2 unpack(u32 bits, __half) { return __half22float2(*reinterpret_cast<__half2 *>(&bits)); }
 
 // C += A B for A 16 x 16 and B 16 x 8.
 __device__ inline void multiply(float *c, const u32 *a, u32 b0, u32 b1, __nv_bfloat16) {
@@ -61,12 +69,99 @@ template <typename T> __device__ void fetch(T *to, const T *from, int first, int
     }
 }
 
-// blockIdx: queries, head, sample. `scale` is that of the scores times log2(e).
+// This thread's part of 16 rows as a left factor: rows row[0] and row[1] from `from`, zeros beyond `rows`.
+template <typename T> __device__ void left(u32 (*to)[4], const T *from, const int *row, int rows, i64 width, int pair) {
+    for (int s = 0; s < HEAD / 16; s++)
+        for (int i = 0; i < 4; i++) {
+            int r = row[i % 2], column = 16 * s + pair + i / 2 * 8;
+            to[s][i] = r < rows ? *reinterpret_cast<const u32 *>(from + r * width + column) : 0;
+        }
+}
+
+// 16 rows times the transpose of 64 stored rows.
+template <typename T> __device__ void scores(float (*to)[4], const u32 (*rows)[4], const T *stored, int lane) {
+    for (int n = 0; n < KEYS / 8; n++) {
+        for (int i = 0; i < 4; i++) to[n][i] = 0.0f;
+        for (int half = 0; half < HEAD / 32; half++) {
+            u32 b[4];
+            load(b, stored + (n * 8 + lane % 8) * PITCH + half * 32 + lane / 8 * 8);
+            multiply(to[n], rows[2 * half], b[0], b[1], T());
+            multiply(to[n], rows[2 * half + 1], b[2], b[3], T());
+        }
+    }
+}
+
+// Adds 16 rows of 64 weights times 64 stored rows.
+template <typename T> __device__ void accumulate(float (*to)[4], const float (*weights)[4], const T *stored, int lane) {
+    for (int s = 0; s < KEYS / 16; s++) {
+        u32 weight[4];
+        for (int i = 0; i < 4; i++) {
+            const float *c = weights[2 * s + i / 2] + 2 * (i % 2);
+            weight[i] = pack(c[0], c[1], T());
+        }
+        for (int n = 0; n < HEAD / 8; n += 2) {
+            u32 b[4];
+            load_transposed(b, stored + (s * 16 + lane % 16) * PITCH + (n + lane / 16) * 8);
+            multiply(to[n], weight, b[0], b[1], T());
+            multiply(to[n + 1], weight, b[2], b[3], T());
+        }
+    }
+}
+
+// Scores of keys that are not there.
+__device__ inline void mask(float (*score)[4], int tile, int keys, int pair) {
+    if ((tile + 1) * KEYS <= keys) return;
+    for (int n = 0; n < KEYS / 8; n++)
+        for (int i = 0; i < 4; i++)
+            if (tile * KEYS + n * 8 + pair + i % 2 >= keys) score[n][i] = -INFINITY;
+}
+
+// Over the four threads that share a row.
+__device__ inline float of_row(float sum) {
+    sum += __shfl_xor_sync(0xffffffffu, sum, 1);
+    return sum + __shfl_xor_sync(0xffffffffu, sum, 2);
+}
+
+// Rows row[0] and row[1] of a result.
+template <typename T>
+__device__ void write(T *to, const float (*values)[4], const float *factor, const int *row, int rows, i64 width, int pair) {
+    for (int r = 0; r < 2; r++) {
+        if (row[r] >= rows) continue;
+        for (int n = 0; n < HEAD / 8; n++)
+            *reinterpret_cast<u32 *>(to + row[r] * width + n * 8 + pair) =
+                pack(values[n][2 * r] * factor[r], values[n][2 * r + 1] * factor[r], T());
+    }
+}
+
+// Takes scores of row r in: they become weights of the largest so far, and what was summed before has to shrink by the result.
+__device__ inline float renew(float (*score)[4], float *largest, float *sum, int r, float scale) {
+    float top = *largest;
+    for (int n = 0; n < KEYS / 8; n++) top = fmaxf(top, fmaxf(score[n][2 * r], score[n][2 * r + 1]));
+    top = fmaxf(top, __shfl_xor_sync(0xffffffffu, top, 1));
+    top = fmaxf(top, __shfl_xor_sync(0xffffffffu, top, 2));
+    float shrink = exp2f((*largest - top) * scale);
+    *largest = top;
+    *sum *= shrink;
+    for (int n = 0; n < KEYS / 8; n++)
+        for (int i = 2 * r; i < 2 * r + 2; i++) {
+            score[n][i] = exp2f((score[n][i] - top) * scale);
+            *sum += score[n][i];
+        }
+    return shrink;
+}
+
+__device__ inline void end_of_copies() { asm volatile("cp.async.commit_group;" ::: "memory"); }
+// All but the last group of copies.
+__device__ inline void await_copies() {
+    asm volatile("cp.async.wait_group 1;" ::: "memory");
+    __syncthreads();
+}
+
+// blockIdx: queries, head, sample.
 template <typename T>
 __device__ void flash(const T *q, const T *k, const T *v, T *y, int queries, int keys, int heads, float scale) {
     __shared__ __align__(16) T shared_keys[2][KEYS * PITCH];
     __shared__ __align__(16) T shared_values[2][KEYS * PITCH];
-    const T type = T();
     i64 width = (i64)heads * HEAD;
     i64 head = blockIdx.y * HEAD;
     q += blockIdx.z * queries * width + head;
@@ -78,92 +173,202 @@ __device__ void flash(const T *q, const T *k, const T *v, T *y, int queries, int
     int row[2];
     row[0] = blockIdx.x * QUERIES + threadIdx.x / 32 * 16 + group;
     row[1] = row[0] + 8;
-
     u32 query[HEAD / 16][4];
-    for (int s = 0; s < HEAD / 16; s++)
-        for (int i = 0; i < 4; i++) {
-            int r = row[i % 2], column = 16 * s + pair + i / 2 * 8;
-            query[s][i] = r < queries ? *reinterpret_cast<const u32 *>(q + r * width + column) : 0;
-        }
+    left(query, q, row, queries, width, pair);
 
     float out[HEAD / 8][4] = {}, largest[2] = {-INFINITY, -INFINITY}, sum[2] = {0.0f, 0.0f};
     int tiles = (keys + KEYS - 1) / KEYS;
     fetch(shared_keys[0], k, 0, keys, width);
     fetch(shared_values[0], v, 0, keys, width);
-    asm volatile("cp.async.commit_group;" ::: "memory");
+    end_of_copies();
     for (int tile = 0; tile < tiles; tile++) {
         int now = tile % 2;
         if (tile + 1 < tiles) {
             fetch(shared_keys[1 - now], k, (tile + 1) * KEYS, keys, width);
             fetch(shared_values[1 - now], v, (tile + 1) * KEYS, keys, width);
         }
-        asm volatile("cp.async.commit_group;" ::: "memory");
-        asm volatile("cp.async.wait_group 1;" ::: "memory");
-        __syncthreads();
-
-        float score[KEYS / 8][4] = {};
-        for (int n = 0; n < KEYS / 8; n++)
-            for (int half = 0; half < HEAD / 32; half++) {
-                u32 b[4];
-                load(b, shared_keys[now] + (n * 8 + lane % 8) * PITCH + half * 32 + lane / 8 * 8);
-                multiply(score[n], query[2 * half], b[0], b[1], type);
-                multiply(score[n], query[2 * half + 1], b[2], b[3], type);
-            }
-        if ((tile + 1) * KEYS > keys)
-            for (int n = 0; n < KEYS / 8; n++)
-                for (int i = 0; i < 4; i++)
-                    if (tile * KEYS + n * 8 + pair + i % 2 >= keys) score[n][i] = -INFINITY;
-
+        end_of_copies();
+        await_copies();
+        float score[KEYS / 8][4];
+        scores(score, query, shared_keys[now], lane);
+        mask(score, tile, keys, pair);
         for (int r = 0; r < 2; r++) {
-            float top = largest[r];
-            for (int n = 0; n < KEYS / 8; n++) top = fmaxf(top, fmaxf(score[n][2 * r], score[n][2 * r + 1]));
-            top = fmaxf(top, __shfl_xor_sync(0xffffffffu, top, 1));
-            top = fmaxf(top, __shfl_xor_sync(0xffffffffu, top, 2));
-            float shrink = exp2f((largest[r] - top) * scale);
-            largest[r] = top;
-            sum[r] *= shrink;
+            float shrink = renew(score, largest + r, sum + r, r, scale);
             for (int n = 0; n < HEAD / 8; n++) {
                 out[n][2 * r] *= shrink;
                 out[n][2 * r + 1] *= shrink;
             }
-            for (int n = 0; n < KEYS / 8; n++)
-                for (int i = 2 * r; i < 2 * r + 2; i++) {
-                    score[n][i] = exp2f((score[n][i] - top) * scale);
-                    sum[r] += score[n][i];
-                }
         }
-
-        for (int s = 0; s < KEYS / 16; s++) {
-            u32 weight[4];
-            for (int i = 0; i < 4; i++) {
-                const float *c = score[2 * s + i / 2] + 2 * (i % 2);
-                weight[i] = pack(c[0], c[1], type);
-            }
-            for (int n = 0; n < HEAD / 8; n += 2) {
-                u32 b[4];
-                load_transposed(b, shared_values[now] + (s * 16 + lane % 16) * PITCH + (n + lane / 16) * 8);
-                multiply(out[n], weight, b[0], b[1], type);
-                multiply(out[n + 1], weight, b[2], b[3], type);
-            }
-        }
+        accumulate(out, score, shared_values[now], lane);
         __syncthreads(); // Before the next tile but one overwrites this one.
     }
-
-    for (int r = 0; r < 2; r++) {
-        sum[r] += __shfl_xor_sync(0xffffffffu, sum[r], 1);
-        sum[r] += __shfl_xor_sync(0xffffffffu, sum[r], 2);
-        if (row[r] >= queries) continue;
-        for (int n = 0; n < HEAD / 8; n++)
-            *reinterpret_cast<u32 *>(y + row[r] * width + n * 8 + pair) =
-                pack(out[n][2 * r] / sum[r], out[n][2 * r + 1] / sum[r], type);
-    }
+    float factor[2];
+    for (int r = 0; r < 2; r++) factor[r] = 1.0f / of_row(sum[r]);
+    write(y, out, factor, row, queries, width, pair);
 }
 
-#define ENTRY(T, S)                                                                                                   \
+// The gradient at the queries, and what the kernel by keys needs of each: the logarithm of its weights' sum and <g, y>.
+// blockIdx: queries, head, sample; `sums` and `dots` are [samples, heads, queries].
+template <typename T>
+__device__ void flash_vjp_queries(const T *q, const T *k, const T *v, const T *y, const T *g, T *dq, float *sums,
+                                  float *dots, int queries, int keys, int heads, float scale) {
+    __shared__ __align__(16) T shared_keys[2][KEYS * PITCH];
+    __shared__ __align__(16) T shared_values[2][KEYS * PITCH];
+    i64 width = (i64)heads * HEAD;
+    i64 head = blockIdx.y * HEAD, of_queries = blockIdx.z * queries * width + head;
+    q += of_queries;
+    y += of_queries;
+    g += of_queries;
+    dq += of_queries;
+    k += blockIdx.z * keys * width + head;
+    v += blockIdx.z * keys * width + head;
+    sums += ((i64)blockIdx.z * heads + blockIdx.y) * queries;
+    dots += ((i64)blockIdx.z * heads + blockIdx.y) * queries;
+    int lane = threadIdx.x % 32, group = lane / 4, pair = lane % 4 * 2;
+    int row[2];
+    row[0] = blockIdx.x * QUERIES + threadIdx.x / 32 * 16 + group;
+    row[1] = row[0] + 8;
+    u32 query[HEAD / 16][4], gradient[HEAD / 16][4];
+    left(query, q, row, queries, width, pair);
+    left(gradient, g, row, queries, width, pair);
+
+    float dot[2] = {0.0f, 0.0f};
+    {
+        u32 result[HEAD / 16][4];
+        left(result, y, row, queries, width, pair);
+        for (int s = 0; s < HEAD / 16; s++)
+            for (int i = 0; i < 4; i++) {
+                float2 a = unpack(gradient[s][i], T()), b = unpack(result[s][i], T());
+                dot[i % 2] += a.x * b.x + a.y * b.y;
+            }
+    }
+    float score[KEYS / 8][4], largest[2] = {-INFINITY, -INFINITY}, sum[2] = {0.0f, 0.0f};
+    int tiles = (keys + KEYS - 1) / KEYS;
+    fetch(shared_keys[0], k, 0, keys, width);
+    end_of_copies();
+    for (int tile = 0; tile < tiles; tile++) {
+        int now = tile % 2;
+        if (tile + 1 < tiles) fetch(shared_keys[1 - now], k, (tile + 1) * KEYS, keys, width);
+        end_of_copies();
+        await_copies();
+        scores(score, query, shared_keys[now], lane);
+        mask(score, tile, keys, pair);
+        for (int r = 0; r < 2; r++) renew(score, largest + r, sum + r, r, scale);
+        __syncthreads();
+    }
+    for (int r = 0; r < 2; r++) {
+        dot[r] = of_row(dot[r]);
+        sum[r] = largest[r] * scale + log2f(of_row(sum[r]));
+        if (pair == 0 && row[r] < queries) {
+            sums[row[r]] = sum[r];
+            dots[row[r]] = dot[r];
+        }
+    }
+
+    float out[HEAD / 8][4] = {};
+    fetch(shared_keys[0], k, 0, keys, width);
+    fetch(shared_values[0], v, 0, keys, width);
+    end_of_copies();
+    for (int tile = 0; tile < tiles; tile++) {
+        int now = tile % 2;
+        if (tile + 1 < tiles) {
+            fetch(shared_keys[1 - now], k, (tile + 1) * KEYS, keys, width);
+            fetch(shared_values[1 - now], v, (tile + 1) * KEYS, keys, width);
+        }
+        end_of_copies();
+        await_copies();
+        float at_weights[KEYS / 8][4];
+        scores(score, query, shared_keys[now], lane);
+        mask(score, tile, keys, pair);
+        scores(at_weights, gradient, shared_values[now], lane);
+        for (int n = 0; n < KEYS / 8; n++)
+            for (int i = 0; i < 4; i++)
+                score[n][i] = exp2f(score[n][i] * scale - sum[i / 2]) * (at_weights[n][i] - dot[i / 2]);
+        accumulate(out, score, shared_keys[now], lane);
+        __syncthreads();
+    }
+    float factor[2] = {scale * LN_2, scale * LN_2};
+    write(dq, out, factor, row, queries, width, pair);
+}
+
+// The gradients at keys and values, from what the kernel by queries left. blockIdx: keys, head, sample.
+template <typename T>
+__device__ void flash_vjp_keys(const T *q, const T *k, const T *v, const T *g, const float *sums, const float *dots, T *dk,
+                               T *dv, int queries, int keys, int heads, float scale) {
+    __shared__ __align__(16) T shared_queries[2][KEYS * PITCH];
+    __shared__ __align__(16) T shared_gradients[2][KEYS * PITCH];
+    __shared__ float shared_sums[2][KEYS], shared_dots[2][KEYS];
+    i64 width = (i64)heads * HEAD;
+    i64 head = blockIdx.y * HEAD, of_keys = blockIdx.z * keys * width + head;
+    q += blockIdx.z * queries * width + head;
+    g += blockIdx.z * queries * width + head;
+    k += of_keys;
+    v += of_keys;
+    dk += of_keys;
+    dv += of_keys;
+    sums += ((i64)blockIdx.z * heads + blockIdx.y) * queries;
+    dots += ((i64)blockIdx.z * heads + blockIdx.y) * queries;
+    int lane = threadIdx.x % 32, group = lane / 4, pair = lane % 4 * 2;
+    int row[2];
+    row[0] = blockIdx.x * QUERIES + threadIdx.x / 32 * 16 + group;
+    row[1] = row[0] + 8;
+    u32 key[HEAD / 16][4], value[HEAD / 16][4];
+    left(key, k, row, keys, width, pair);
+    left(value, v, row, keys, width, pair);
+
+    auto fetch_queries = [&](int to, int tile) {
+        fetch(shared_queries[to], q, tile * KEYS, queries, width);
+        fetch(shared_gradients[to], g, tile * KEYS, queries, width);
+        if (threadIdx.x < KEYS) {
+            int query = tile * KEYS + threadIdx.x;
+            // A query that is not there has no weights.
+            shared_sums[to][threadIdx.x] = query < queries ? sums[query] : INFINITY;
+            shared_dots[to][threadIdx.x] = query < queries ? dots[query] : 0.0f;
+        }
+        end_of_copies();
+    };
+    float at_key[HEAD / 8][4] = {}, at_value[HEAD / 8][4] = {};
+    int tiles = (queries + KEYS - 1) / KEYS;
+    fetch_queries(0, 0);
+    for (int tile = 0; tile < tiles; tile++) {
+        int now = tile % 2;
+        if (tile + 1 < tiles)
+            fetch_queries(1 - now, tile + 1);
+        else
+            end_of_copies();
+        await_copies();
+        float weight[KEYS / 8][4], at_weight[KEYS / 8][4];
+        scores(weight, key, shared_queries[now], lane);
+        for (int n = 0; n < KEYS / 8; n++)
+            for (int i = 0; i < 4; i++)
+                weight[n][i] = exp2f(weight[n][i] * scale - shared_sums[now][n * 8 + pair + i % 2]);
+        accumulate(at_value, weight, shared_gradients[now], lane);
+        scores(at_weight, value, shared_gradients[now], lane);
+        for (int n = 0; n < KEYS / 8; n++)
+            for (int i = 0; i < 4; i++) weight[n][i] *= at_weight[n][i] - shared_dots[now][n * 8 + pair + i % 2];
+        accumulate(at_key, weight, shared_queries[now], lane);
+        __syncthreads();
+    }
+    float one[2] = {1.0f, 1.0f}, factor[2] = {scale * LN_2, scale * LN_2};
+    write(dv, at_value, one, row, keys, width, pair);
+    write(dk, at_key, factor, row, keys, width, pair);
+}
+
+#define ENTRIES(T, S)                                                                                                 \
     extern "C" __global__ void __launch_bounds__(32 * WARPS)                                                          \
         flash_##S(const T *q, const T *k, const T *v, T *y, int queries, int keys, int heads, float scale) {          \
         flash(q, k, v, y, queries, keys, heads, scale);                                                               \
+    }                                                                                                                 \
+    extern "C" __global__ void __launch_bounds__(32 * WARPS)                                                          \
+        flash_vjp_queries_##S(const T *q, const T *k, const T *v, const T *y, const T *g, T *dq, float *sums,         \
+                              float *dots, int queries, int keys, int heads, float scale) {                           \
+        flash_vjp_queries(q, k, v, y, g, dq, sums, dots, queries, keys, heads, scale);                                \
+    }                                                                                                                 \
+    extern "C" __global__ void __launch_bounds__(32 * WARPS)                                                          \
+        flash_vjp_keys_##S(const T *q, const T *k, const T *v, const T *g, const float *sums, const float *dots,      \
+                           T *dk, T *dv, int queries, int keys, int heads, float scale) {                             \
+        flash_vjp_keys(q, k, v, g, sums, dots, dk, dv, queries, keys, heads, scale);                                  \
     }
 
-ENTRY(__half, f16)
-ENTRY(__nv_bfloat16, bf16)
+ENTRIES(__half, f16)
+ENTRIES(__nv_bfloat16, bf16)

@@ -195,8 +195,8 @@ impl CustomOp3 for AttentionOp {
         let g = g.contiguous()?;
         #[cfg(feature = "cuda")]
         if g.device().is_cuda() {
-            let (q_, k_, v_) = (View::of(q)?, View::of(k)?, View::of(v)?);
-            let [dq, dk, dv] = cuda::attention::vjp(shape, q_, k_, v_, View::of(&g)?)?;
+            let [q_, k_, v_, y_, g_] = [q, k, v, y, &g].map(View::of);
+            let [dq, dk, dv] = cuda::attention::vjp(shape, [q_?, k_?, v_?, y_?, g_?])?;
             let wanted = |like: &Tensor, d| like.track_op().then(|| cuda::tensor(d, like.shape()));
             return Ok((wanted(q, dq), wanted(k, dk), wanted(v, dv)));
         }

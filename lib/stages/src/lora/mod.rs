@@ -309,8 +309,14 @@ impl Course<'_> {
                 self.resume.save(trainer, history)?;
                 interrupt::check()?;
             }
-            let clock = Instant::now();
+            let (clock, recomputed) = (Instant::now(), trainer.recomputes());
             let report = trainer.step(self.data).context("fine-tuning stopped")?;
+            if trainer.recomputes() && !recomputed {
+                self.session.warn(
+                    "the GPU's memory ran out: activations are recomputed from here on, with a third more time \
+                     (lora.recompute = true does so from the start)",
+                );
+            }
             last_s = clock.elapsed().as_secs_f64();
             spent_s += last_s;
             let of_steps = report.step as f64 / table.steps as f64;

@@ -44,8 +44,9 @@ pub struct LoraTable {
     #[schemars(range(min = 0.0), example = 0.001)]
     pub word_learning_rate: f64,
     /// Whether activations are computed again in the backward pass: less memory, a third more time.
-    #[schemars(example = false)]
-    pub recompute: bool,
+    #[schemars(extend("x-default" = "on a GPU once its memory has run out, on a CPU always"), example = false)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub recompute: Option<bool>,
     /// Updates between checkpoints; 0 for none.
     #[schemars(example = 100)]
     pub checkpoint_every: usize,

@@ -132,7 +132,7 @@ fn lora(session: &Session, times: &Times) -> anyhow::Result<Work> {
     if table.prior_weight != 0.0 {
         halved_by.push("lora.prior_weight = 0 (without the class's images)".into());
     }
-    if table.recompute {
+    if table.recompute.unwrap_or(times.on_cpu) {
         halved_by.push("lora.recompute = false saves a quarter for more memory".into());
     }
     halved_by.push("lora.cache shares adapters among scenes of one photograph".into());
