@@ -1,12 +1,13 @@
 """Foreground and shadow ratio at equal variance: dipir beside Mitsuba 3, in one run.
 
     python3 -m venv venv && venv/bin/pip install mitsuba==3.9.1 numpy
-    DRJIT_LIBLLVM_PATH=<libLLVM 16 or later> venv/bin/python benches/equal_variance.py
+    DRJIT_LIBLLVM_PATH=<libLLVM 19> venv/bin/python benches/equal_variance.py
 
 Both render the scene of `benches/equal_variance.rs` (a trefoil of 96,000 triangles on a plane,
 512 x 512, a sky with a half-degree sun at 6e4) with several seeds, in turn. Monte Carlo variance
 falls as one over time, so time x variance is what a renderer costs at any variance; low-discrepancy
-samples do better than that, so the sample counts are chosen for similar variance. Values are
+samples do better than that, so the sample counts are chosen for similar variance. A further row
+has samples where they are needed for an error, as composites do. Values are
 clamped to [0, 1] before the variance is taken. Scene loading, BVH building and (for Mitsuba)
 kernel compilation are left out of the times. CPU seconds are those of all threads together, in which
 other load on the machine hardly shows.
@@ -27,6 +28,7 @@ POSITION, TARGET = [2.6, 2.0, 3.8], [0.0, 0.6, 0.0]
 SEEDS = 6
 MATERIALS = sys.argv[1:] or ["diffuse", "metal", "glossy", "glass", "textured"]
 SAMPLES = {"dipir": 16, "mitsuba": 64}
+ERROR = 0.004 # Of the standard preset.
 ROOT = os.path.join(os.path.dirname(os.path.abspath(__file__)), "..")
 
 
@@ -102,9 +104,10 @@ def main():
         dipir("export", folder)
         for material in MATERIALS:
             peer = mitsuba(folder, material)
-            render = lambda denoise: json.loads(dipir("render", SAMPLES["dipir"], SEEDS, material, denoise))
-            rows = [("Mitsuba", SAMPLES["mitsuba"], peer), ("dipir", SAMPLES["dipir"], render("false")),
-                    ("dipir, denoised", SAMPLES["dipir"], render("true"))]
+            render = lambda stop, denoise: json.loads(dipir("render", stop, SEEDS, material, denoise))
+            spp, error = SAMPLES["dipir"], f"error={ERROR}"
+            rows = [("Mitsuba", SAMPLES["mitsuba"], peer), ("dipir", spp, render(spp, "false")),
+                    ("dipir", error, render(error, "false")), ("dipir, denoised", spp, render(spp, "true"))]
             cost = lambda r: r["cpu_seconds"] * (r["foreground"] + r["shadow"])
             for name, spp, r in rows:
                 print(f"| {material} | {name} | {spp} | {r['seconds']:.2f} | {r['cpu_seconds']:.2f} "

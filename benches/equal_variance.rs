@@ -1,9 +1,10 @@
 //! Time times variance of an insertion at 512 x 512 under a sunny sky, for `equal_variance.py`,
 //! which runs the same scene through Mitsuba 3.
 //!
-//! `export DIR` writes the scene's mesh, sky and texture for the other renderer; `render SAMPLES SEEDS
+//! `export DIR` writes the scene's mesh, sky and texture for the other renderer; `render STOP SEEDS
 //! MATERIAL DENOISE` prints one line of JSON: seconds of each render, by the clock and of all cores together,
-//! mean and mean variance of the two layers; DENOISE is `true` or `false`. Without arguments (plain `cargo bench`) it renders a few seeds.
+//! mean and mean variance of the two layers; STOP is a number of samples per pixel or, as `error=.004`, an error; DENOISE is
+//! `true` or `false`. Without arguments (plain `cargo bench`) it renders a few seeds.
 use std::f32::consts::PI;
 use std::io::Write;
 use std::ops::ControlFlow;
@@ -223,7 +224,7 @@ fn cpu_time() -> f64 {
     ticks.sum::<f64>() / 100.0
 }
 
-fn render(samples: u32, seeds: u64, name: &str, denoise: bool) {
+fn render(stop: Stop, seeds: u64, name: &str, denoise: bool) {
     let (material, features) = material(name);
     let scene = scene(material);
     let renderer = Renderer::new(&scene);
@@ -239,7 +240,7 @@ fn render(samples: u32, seeds: u64, name: &str, denoise: bool) {
     for seed in 0..seeds {
         let settings = Settings {
             seed,
-            stop: Stop::Samples(samples),
+            stop,
             denoise,
             ..Default::default()
         };
@@ -273,6 +274,14 @@ fn render(samples: u32, seeds: u64, name: &str, denoise: bool) {
     );
 }
 
+/// "16": samples per pixel; "error=.01": as many as that error takes, where they are needed.
+fn stop(word: &str) -> Stop {
+    match word.strip_prefix("error=") {
+        Some(error) => Stop::TargetError(error.parse().expect("an error")),
+        None => Stop::Samples(word.parse().expect("samples per pixel")),
+    }
+}
+
 fn main() {
     let arguments: Vec<String> = std::env::args()
         .skip(1)
@@ -280,14 +289,14 @@ fn main() {
         .collect();
     let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
     match words.as_slice() {
-        [] => render(16, 4, "diffuse", false),
+        [] => render(Stop::Samples(16), 4, "diffuse", false),
         ["export", folder] => export(Path::new(folder)).expect("a writable folder"),
-        ["render", samples, seeds, material, denoise] => render(
-            samples.parse().expect("samples per pixel"),
+        ["render", until, seeds, material, denoise] => render(
+            stop(until),
             seeds.parse().expect("number of seeds, at least 2"),
             material,
             denoise.parse().expect("true or false"),
         ),
-        _ => eprintln!("usage: [export DIR | render SAMPLES SEEDS MATERIAL DENOISE]"),
+        _ => eprintln!("usage: [export DIR | render STOP SEEDS MATERIAL DENOISE]"),
     }
 }
