@@ -39,6 +39,7 @@ fn main() {
     );
     println!("|---|--:|--:|--:|--:|--:|--:|--:|");
     let (mut within, mut count) = ([0; 2], 0);
+    let mut guesses = vec![];
     for (name, scene) in gallery::scenes(size)
         .into_iter()
         .chain(gallery::with_highlights(size))
@@ -61,16 +62,27 @@ fn main() {
         });
         let millions = runs.each_ref().map(|r| r.counts.total() as f64 * 1e-6);
         let ratios = PAIRS.map(|(from, to)| {
-            let foreseen = runs[from]
-                .foresight
-                .cost_with(PRESETS[to].0.into(), PRESETS[to].1);
-            foreseen * cost(&runs[from]) / cost(&runs[to])
+            let (foresight, target) = (&runs[from].foresight, PRESETS[to].0.into());
+            let foreseen = foresight.cost_with(target, PRESETS[to].1);
+            let ratio = foreseen * cost(&runs[from]) / cost(&runs[to]);
+            (ratio, foresight.is_guess(target))
+        });
+        let told = ratios.map(|(ratio, guess)| match guess {
+            true => format!("{ratio:.2} (guess)"),
+            false => format!("{ratio:.2}"),
         });
         println!(
-            "| {name} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} |",
-            millions[0], millions[1], millions[2], ratios[0], ratios[1], ratios[2], ratios[3]
+            "| {name} | {:.2} | {:.2} | {:.2} | {} |",
+            millions[0],
+            millions[1],
+            millions[2],
+            told.join(" | ")
         );
-        for ratio in ratios {
+        for (ratio, guess) in ratios {
+            if guess {
+                guesses.push(ratio);
+                continue;
+            }
             count += 1;
             for (k, most) in [1.25, 1.3].into_iter().enumerate() {
                 within[k] += usize::from((1.0 / most..most).contains(&ratio));
@@ -78,7 +90,11 @@ fn main() {
         }
     }
     println!(
-        "\nWithin 25%: {} of {count}, within 30%: {}.",
-        within[0], within[1]
+        "\nWithin 25%: {} of {count}, within 30%: {}. Guesses: {}, of {:.2} to {:.2}.",
+        within[0],
+        within[1],
+        guesses.len(),
+        guesses.iter().copied().fold(f64::INFINITY, f64::min),
+        guesses.iter().copied().fold(0.0, f64::max),
     );
 }

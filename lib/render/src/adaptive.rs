@@ -209,6 +209,9 @@ pub(crate) fn refine(
         if round == 1 && !is_late() {
             let found = find_highlights(&film, &jobs);
             search = found.counts;
+            if !found.pixels.is_empty() {
+                foresight.learn_of_highlights();
+            }
             let goal = FIRST_ROUND_WITH_HIGHLIGHT.min(limit);
             let drawn = Round {
                 simulation,

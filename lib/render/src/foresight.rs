@@ -47,6 +47,8 @@ pub struct Foresight {
     power: f64,
     /// Whether noise is removed.
     denoises: bool,
+    /// Whether highlights smaller than a pixel were found.
+    highlights: bool,
     /// Squared error allowed for a target of 1, summed over the pixels: less than their number, because it is the bound
     /// that has to reach the target.
     allowed: f64,
@@ -62,6 +64,7 @@ impl Foresight {
             last: vec![],
             rounds: vec![],
             denoises,
+            highlights: false,
             power: POWER,
             allowed: 0.0,
             limit,
@@ -103,6 +106,18 @@ impl Foresight {
         self.allowed = slack.powi(2) * error.touched_pixels as f64;
         self.rounds
             .push((sum(&self.last) / self.allowed, spent(&self.last)));
+    }
+
+    /// Highlights smaller than a pixel were found.
+    pub(crate) fn learn_of_highlights(&mut self) {
+        self.highlights = true;
+    }
+
+    /// Whether the cost of `target` is a guess: how many highlights smaller than a pixel the samples have missed is not known.
+    /// It has been between an eighth and twice of what was foreseen (docs/performance.md).
+    pub fn is_guess(&self, target: f64) -> bool {
+        let reached = self.rounds.last().is_some_and(|r| r.0 <= target * target);
+        self.highlights && !reached
     }
 
     /// What reaching the 95% bound `target` costs in all, over what was spent so far. Below 1 for targets that earlier
@@ -244,6 +259,7 @@ mod tests {
             last: points(errors, 8.0),
             rounds: vec![],
             denoises: true,
+            highlights: false,
             power,
             allowed: errors.len() as f64,
             limit: 1 << 20,
@@ -306,6 +322,18 @@ mod tests {
             ..without
         };
         assert!((reached.cost_with(0.2, true) - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn with_highlights_only_what_was_reached_is_more_than_a_guess() {
+        let mut one = Foresight {
+            rounds: vec![(0.04, 80.0)],
+            ..known(&[4.0; 10], 1.0)
+        };
+        assert!(!one.is_guess(0.1));
+        one.learn_of_highlights();
+        assert!(one.is_guess(0.1));
+        assert!(!one.is_guess(0.2));
     }
 
     #[test]

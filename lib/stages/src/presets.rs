@@ -102,6 +102,8 @@ pub struct Estimate {
     pub quality: Quality,
     /// About so many seconds.
     pub seconds: f64,
+    /// Whether it is a guess, because some pixels have highlights smaller than they are.
+    pub guess: bool,
     /// The error that it is made for, display-referred RMSE.
     pub error: Option<f64>,
 }
@@ -127,6 +129,7 @@ impl Outlook {
             estimate(p).map(|(seconds, error)| Estimate {
                 quality: p.quality,
                 seconds,
+                guess: false,
                 error,
             })
         };
@@ -145,9 +148,18 @@ impl Outlook {
         let estimate = |p: &Preset| Estimate {
             quality: p.quality,
             seconds: seconds(p),
+            guess: false,
             error: Some(target(&p)),
         };
         Self(chosen.map(estimate).collect())
+    }
+
+    /// The same, where `is_guess` tells of an error whether its estimate is a guess.
+    pub fn with_guesses(mut self, is_guess: impl Fn(f64) -> bool) -> Self {
+        for estimate in &mut self.0 {
+            estimate.guess = estimate.error.is_some_and(&is_guess);
+        }
+        self
     }
 
     /// A sentence; empty without an estimate.
@@ -158,18 +170,30 @@ impl Outlook {
                 .map_or(String::new(), |e| format!(" (error {e:.3})"));
             format!("{} about {}{error}", name(e.quality), duration(e.seconds))
         };
+        let guessed = self.0.iter().filter(|e| e.guess).map(|e| name(e.quality));
+        let guessed: Vec<&str> = guessed.collect();
+        let because = match guessed.is_empty() {
+            true => String::new(),
+            false => format!(
+                "; for {} a guess, as there are highlights smaller than a pixel",
+                guessed.join(" and ")
+            ),
+        };
         match self.0.is_empty() {
             true => String::new(),
             false => {
                 let all: Vec<String> = self.0.iter().map(one).collect();
-                format!("other presets would have taken: {}", all.join(", "))
+                format!(
+                    "other presets would have taken: {}{because}",
+                    all.join(", ")
+                )
             }
         }
     }
 
     /// For programs.
     pub fn to_json(&self) -> Value {
-        let one = |e: &Estimate| json!({"quality": name(e.quality), "seconds": e.seconds, "error": e.error});
+        let one = |e: &Estimate| json!({"quality": name(e.quality), "seconds": e.seconds, "guess": e.guess, "error": e.error});
         self.0.iter().map(one).collect()
     }
 }
@@ -311,6 +335,10 @@ mod tests {
                 .text()
                 .starts_with("other presets would have taken: draft about")
         );
+        assert!(!around(targets[1]).text().contains("guess"));
+        let guessed = around(targets[1]).with_guesses(|e| e < targets[1]).text();
+        let end = "; for high a guess, as there are highlights smaller than a pixel";
+        assert!(guessed.ends_with(end), "{guessed}");
     }
 
     #[test]

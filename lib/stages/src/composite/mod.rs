@@ -172,6 +172,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         }),
         false => Outlook::around_error(error, with_preset),
     };
+    let outlook = outlook.with_guesses(|target| foresight.is_guess(target));
     Ok(Done {
         folder,
         manifest,
