@@ -128,8 +128,9 @@ impl SamplesWriter for Rows<'_> {
     }
 }
 
-/// Opens `path` and reads as [`read`], after a look at its first bytes.
-pub(crate) fn open(path: &Path) -> Result<Layers, ImagingError> {
+/// Opens `path` and reads as [`read`], after a look at its first bytes. With `longest`, blocks of pixels are averaged while
+/// they are read: the longer side gets `longest` pixels at least, and less than twice as many.
+pub(crate) fn open(path: &Path, longest: Option<usize>) -> Result<Layers, ImagingError> {
     let failed = |e| ImagingError::io("read", path, e);
     let file = dipir_files::open(path).map_err(failed)?;
     let length = file.metadata().map_err(failed)?.len();
@@ -142,7 +143,7 @@ pub(crate) fn open(path: &Path) -> Result<Layers, ImagingError> {
         });
     }
     match Format::of(&start[..start.len().min(Format::SNIFF_LENGTH)]) {
-        Format::Exr => read(reader, length, path, None, SizeLimit::Any),
+        Format::Exr => read_small(reader, length, path, None, SizeLimit::Any, longest),
         other => Err(other.refuse(path, EXPECTED)),
     }
 }
@@ -157,12 +158,24 @@ pub(crate) fn read(
     names: Option<&[&str]>,
     limit: SizeLimit,
 ) -> Result<Layers, ImagingError> {
+    read_small(source, length, path, names, limit, None)
+}
+
+fn read_small(
+    source: impl Read + Seek + Send,
+    length: u64,
+    path: &Path,
+    names: Option<&[&str]>,
+    limit: SizeLimit,
+    longest: Option<usize>,
+) -> Result<Layers, ImagingError> {
     let refused = Rc::new(Cell::new(None));
     let reader = ReadAnyChannels {
         read_samples: WantedSamples {
             names: names.map(|names| names.iter().map(|name| name.to_string()).collect()),
             samples_left: Cell::new(length.saturating_mul(MOST_SAMPLES_A_BYTE)),
             limit,
+            longest,
             path: path.to_owned(),
             refused: refused.clone(),
         },
@@ -197,6 +210,8 @@ pub(crate) fn read(
             ),
         });
     }
+    let block = block_side(longest, window.size);
+    let (width, height) = (width.div_ceil(block), height.div_ceil(block));
     let mut layers = Layers::from_file(width, height, path);
     for part in image.layer_data {
         if part.attributes.environment_map == Some(EnvironmentMap::LatitudeLongitude) {
@@ -222,7 +237,10 @@ pub(crate) fn read(
             if let (true, Some(part)) = (layers.contains(&name), &part_name) {
                 name = format!("{part}.{name}");
             }
-            let samples = place(values, part.size, offset, (width, height));
+            let samples = match block {
+                1 => place(values, part.size, offset, (width, height)),
+                _ => Raster::from_pixels(width, height, values),
+            };
             layers.insert(name, precision, samples)?;
         }
     }
@@ -286,6 +304,8 @@ struct WantedSamples {
     /// How many more the file can hold.
     samples_left: Cell<u64>,
     limit: SizeLimit,
+    /// As in [`open`].
+    longest: Option<usize>,
     path: PathBuf,
     /// Why the file is not read.
     refused: Rc<Cell<Option<Refused>>>,
@@ -311,6 +331,47 @@ struct WantedSamplesReader {
     size: Vec2<usize>,
     /// One line before conversion.
     halves: Vec<f16>,
+    means: Option<Means>,
+}
+
+/// Means of blocks of pixels, without values that are not finite: depth is infinite where there is nothing.
+struct Means {
+    /// Side of a block, and blocks of a row.
+    block: usize,
+    columns: usize,
+    /// Finite values of each block.
+    counts: Vec<u32>,
+    line: Vec<f32>,
+}
+
+impl Means {
+    /// Adds the line, which begins at `(x, y)`, to the sums; the last infinite value stands until there is a finite one.
+    fn add(&mut self, sums: &mut [f32], (x, y): (usize, usize)) {
+        let first = y / self.block * self.columns + x / self.block;
+        // A tile may begin within a block.
+        let lead = (self.block - x % self.block).min(self.line.len());
+        let (lead, rest) = self.line.split_at(lead);
+        let parts = std::iter::once(lead).chain(rest.chunks(self.block));
+        for (at, values) in (first..).zip(parts) {
+            let (mut sum, mut count) = (0.0, 0);
+            for &value in values {
+                let finite = value.is_finite();
+                sum += if finite { value } else { 0.0 };
+                count += u32::from(finite);
+            }
+            match (self.counts[at], count) {
+                (0, 0) => sums[at] = values.last().copied().unwrap_or(0.0),
+                (0, _) => sums[at] = sum,
+                _ => sums[at] += sum,
+            }
+            self.counts[at] += count;
+        }
+    }
+}
+
+/// Side of the blocks whose mean is kept.
+fn block_side(longest: Option<usize>, size: Vec2<usize>) -> usize {
+    longest.map_or(1, |n| (size.0.max(size.1) / n.max(1)).max(1))
 }
 
 impl ReadSamples for WantedSamples {
@@ -338,17 +399,33 @@ impl ReadSamples for WantedSamples {
         if self.limit.check(&self.path, size.0, size.1).is_err() {
             return refuse(Refused::Size(size.0, size.1));
         }
-        let area = size.0 * size.1;
+        let window = header.shared_attributes.display_window;
+        let block = block_side(self.longest, window.size);
+        if block > 1
+            && (size != window.size || header.own_attributes.layer_position != window.position)
+        {
+            return Err(exr::error::Error::NotSupported(
+                "a data window of its own in a picture that is read smaller".into(),
+            ));
+        }
         if wanted {
-            match self.samples_left.get().checked_sub(area as u64) {
+            let area = size.0 as u64 * size.1 as u64;
+            match self.samples_left.get().checked_sub(area) {
                 Some(left) => self.samples_left.set(left),
                 None => return refuse(Refused::Length),
             }
         }
+        let (columns, rows) = (size.0.div_ceil(block), size.1.div_ceil(block));
         Ok(WantedSamplesReader {
-            kept: wanted.then(|| (channel.sample_type, vec![0.0; area])),
+            kept: wanted.then(|| (channel.sample_type, vec![0.0; columns * rows])),
             size,
             halves: Vec::new(),
+            means: (wanted && block > 1).then(|| Means {
+                block,
+                columns,
+                counts: vec![0; columns * rows],
+                line: Vec::new(),
+            }),
         })
     }
 }
@@ -365,8 +442,16 @@ impl SamplesReader for WantedSamplesReader {
             return Ok(());
         };
         let at = line.location;
-        let start = at.position.1 * self.size.0 + at.position.0;
-        let target = &mut samples[start..start + at.sample_count];
+        let target = match &mut self.means {
+            Some(means) => {
+                means.line.resize(at.sample_count, 0.0);
+                &mut means.line[..]
+            }
+            None => {
+                let start = at.position.1 * self.size.0 + at.position.0;
+                &mut samples[start..start + at.sample_count]
+            }
+        };
         match kind {
             SampleType::F32 => line.read_samples_into_slice(target)?,
             SampleType::F16 => {
@@ -380,11 +465,20 @@ impl SamplesReader for WantedSamplesReader {
                 }
             }
         }
+        if let Some(means) = &mut self.means {
+            means.add(samples, (at.position.0, at.position.1));
+        }
         Ok(())
     }
 
     fn into_samples(self) -> Self::Samples {
-        let (kind, samples) = self.kept?;
+        let (kind, mut samples) = self.kept?;
+        for (sum, &count) in samples
+            .iter_mut()
+            .zip(self.means.iter().flat_map(|m| &m.counts))
+        {
+            *sum /= count.max(1) as f32;
+        }
         let precision = match kind {
             SampleType::F16 => Precision::Half,
             SampleType::F32 | SampleType::U32 => Precision::Full,

@@ -262,7 +262,14 @@ impl Layers {
     /// already get the part's name in front. Values are not checked for NaN or infinity: depth may
     /// be infinite.
     pub fn read_exr(path: impl AsRef<Path>) -> Result<Self, ImagingError> {
-        exr_file::open(path.as_ref())
+        exr_file::open(path.as_ref(), None)
+    }
+
+    /// As [`read_exr`](Self::read_exr), to look at: square blocks of pixels become one with the mean of their finite
+    /// values, so that the longer side has `longest` pixels at least and less than twice as many. Nothing of the file's size
+    /// is kept. A large file whose data window is not its display window is refused.
+    pub fn read_exr_small(path: impl AsRef<Path>, longest: usize) -> Result<Self, ImagingError> {
+        exr_file::open(path.as_ref(), Some(longest))
     }
 }
 

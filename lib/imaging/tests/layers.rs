@@ -274,6 +274,40 @@ fn channels_of_another_size_are_refused() {
     ));
 }
 
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    #[test]
+    fn a_small_reading_holds_the_means_of_the_finite_values_of_its_blocks(
+        width in 1usize..40,
+        height in 1usize..40,
+        longest in 1usize..50,
+        values in proptest::collection::vec(prop_oneof![4 => -9.0f32..9.0, 1 => Just(f32::INFINITY)], 40 * 40),
+    ) {
+        let full = Raster::from_pixels(width, height, values[..width * height].to_vec());
+        let mut layers = Layers::new(width, height);
+        layers.insert("depth.Z", Precision::Full, full.clone()).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.exr");
+        layers.write_exr(&path).unwrap();
+        let small = Layers::read_exr_small(&path, longest).unwrap();
+        let block = (width.max(height) / longest).max(1);
+        prop_assert_eq!((small.width(), small.height()), (width.div_ceil(block), height.div_ceil(block)));
+        let found = small.channel("depth.Z").unwrap();
+        for (y, x) in (0..small.height()).flat_map(|y| (0..small.width()).map(move |x| (y, x))) {
+            let inside = (y * block..height.min((y + 1) * block))
+                .flat_map(|v| (x * block..width.min((x + 1) * block)).map(move |u| (u, v)));
+            let finite: Vec<f64> = inside.map(|(u, v)| f64::from(*full.get(u, v))).filter(|v| v.is_finite()).collect();
+            let found = f64::from(*found.get(x, y));
+            match finite.is_empty() {
+                true => prop_assert_eq!(found, f64::INFINITY),
+                // A sum of at most 1600 values below 9 is rounded by 1600 * 9 * 2^-24 of each.
+                false => prop_assert!((found - finite.iter().sum::<f64>() / finite.len() as f64).abs() < 1e-3),
+            }
+        }
+    }
+}
+
 #[test]
 fn one_pixel_and_odd_sizes_round_trip() {
     let folder = tempfile::tempdir().unwrap();
@@ -334,6 +368,10 @@ fn a_data_window_is_placed_on_the_display_window_and_cut_by_it() {
     assert_eq!((layers.width(), layers.height()), (4, 3));
     let want = vec![0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 4.0, 5.0];
     assert_eq!(layers.channel("R").unwrap().pixels(), want);
+    // Read as it is, it may be small; blocks of it have no place.
+    assert_eq!(Layers::read_exr_small(&path, 4).unwrap(), layers);
+    let error = Layers::read_exr_small(&path, 2).unwrap_err().to_string();
+    assert!(error.contains("data window"), "{error}");
 }
 
 #[test]

@@ -30,7 +30,7 @@ pub const MARK: &[u8] =
 /// Name of the file in the folder of artifacts.
 pub const FILE: &str = "report.html";
 /// Raised whenever the same artifacts give another page.
-const VERSION: u32 = 7;
+const VERSION: u32 = 8;
 
 /// What the page shows in addition to the artifacts.
 pub struct Report<'a> {
@@ -69,11 +69,17 @@ impl Report<'_> {
         let class = scene.class.as_deref().unwrap_or("object");
         let photo = scene.background.unwrap_or_default();
         let title = format!("{class} in {}", photo.display());
+        let small = result::small(self);
+        let of_composite = |section: fn(&Self, &result::Small) -> Section| match &small {
+            Ok(Some(small)) => section(self, small),
+            Ok(None) => Ok(None),
+            Err(e) => Err(anyhow::anyhow!("{}", describe(e))),
+        };
         let sections: [(&str, Section); 8] = [
-            ("", result::before_and_after(self)),
+            ("", of_composite(result::before_and_after)),
             ("Against the true light", Ok(self.truth.map(result::truth))),
             ("Stages", stages::table(self)),
-            ("Layers", result::layers(self)),
+            ("Layers", of_composite(result::layers)),
             ("Light and tone", lighting::section(self)),
             ("Personalisation", learning::section(self)),
             ("Effects", stages::effects(self)),

@@ -1,6 +1,7 @@
 //! The picture, its layers, and how it compares with the true light.
+use std::path::PathBuf;
+
 use anyhow::Context;
-use dipir_imaging::file::read_photo;
 use dipir_imaging::layers::Layers;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
@@ -28,15 +29,27 @@ fn transfer(report: &Report) -> anyhow::Result<Transfer> {
     Ok(scene.background.transfer)
 }
 
-/// The photograph and the picture, one over the other.
-pub fn before_and_after(report: &Report) -> Section {
+/// The layers of the composite, small, and the folder that they lie in.
+pub struct Small {
+    folder: PathBuf,
+    layers: Layers,
+}
+
+/// Reads what this page shows of the composite; nothing where there is none.
+pub fn small(report: &Report) -> anyhow::Result<Option<Small>> {
     let Some((folder, manifest)) = report.stage(COMPOSITE.name)? else {
         return Ok(None);
     };
-    let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
-    let picture = manifest.output(&folder, "picture")?;
-    let after = Transfer::Srgb.encode(&read_photo(picture, Transfer::Srgb)?.image);
-    let before = transfer(report)?.encode(&LinearImage(layers.rgb("background")?));
+    let layers = Layers::read_exr_small(manifest.output(&folder, "layers")?, LARGE)?;
+    Ok(Some(Small { folder, layers }))
+}
+
+/// The photograph and the picture, one over the other.
+pub fn before_and_after(report: &Report, small: &Small) -> Section {
+    let layers = &small.layers;
+    let transfer = transfer(report)?;
+    let after = transfer.encode(&LinearImage(layers.rgb("")?));
+    let before = transfer.encode(&LinearImage(layers.rgb("background")?));
     let before = Html::element(
         "div",
         &[("class", "before")],
@@ -68,11 +81,8 @@ pub fn before_and_after(report: &Report) -> Section {
 }
 
 /// The layers that a compositor gets.
-pub fn layers(report: &Report) -> Section {
-    let Some((folder, manifest)) = report.stage(COMPOSITE.name)? else {
-        return Ok(None);
-    };
-    let layers = Layers::read_exr(manifest.output(&folder, "layers")?)?;
+pub fn layers(report: &Report, small: &Small) -> Section {
+    let Small { folder, layers } = small;
     let transfer = transfer(report)?;
     let shown = |raster: Raster<Vec3>| transfer.encode(&LinearImage(raster));
     let grey = |name: &str| -> anyhow::Result<DisplayImage> {
