@@ -131,12 +131,11 @@ fn flash(s: &AttentionShape, q: View, k: View, v: View) -> Result<CudaStorage> {
 fn flash_vjp(s: &AttentionShape, [q, k, v, y, g]: [View; 5]) -> Result<[CudaStorage; 3]> {
     let (device, width) = (q.device, s.heads * s.head_dim);
     let (of_queries, of_keys) = (s.batch * s.queries * width, s.batch * s.keys * width);
+    // Of every query its largest score, the factor of its weights, and <g, y>.
     let rows = s.batch * s.heads * s.queries;
-    let (sums, dots) = (
-        empty(device, DType::F32, rows)?,
-        empty(device, DType::F32, rows)?,
-    );
-    let (sums, dots) = (whole(&sums, rows)?, whole(&dots, rows)?);
+    let facts = empty(device, DType::F32, 3 * rows)?;
+    let facts = whole(&facts, 3 * rows)?;
+    let [tops, shares, dots] = [0, rows, 2 * rows].map(|first| facts.at(first));
     let [dq, dk, dv] = [of_queries, of_keys, of_keys].map(|n| empty(device, q.dtype, n));
     let (dq, dk, dv) = (dq?, dk?, dv?);
     let to_q = whole(&dq, of_queries)?;
@@ -144,14 +143,14 @@ fn flash_vjp(s: &AttentionShape, [q, k, v, y, g]: [View; 5]) -> Result<[CudaStor
         s,
         "flash_vjp_queries",
         s.queries,
-        &[q, k, v, y, g, to_q, sums, dots],
+        &[q, k, v, y, g, to_q, tops, shares, dots],
     )?;
     let (to_k, to_v) = (whole(&dk, of_keys)?, whole(&dv, of_keys)?);
     launch_flash(
         s,
         "flash_vjp_keys",
         s.keys,
-        &[q, k, v, g, sums, dots, to_k, to_v],
+        &[q, k, v, g, tops, shares, dots, to_k, to_v],
     )?;
     Ok([dq, dk, dv])
 }

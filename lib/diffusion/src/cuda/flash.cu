@@ -207,11 +207,12 @@ __device__ void flash(const T *q, const T *k, const T *v, T *y, int queries, int
     write(y, out, factor, row, queries, width, pair);
 }
 
-// The gradient at the queries, and what the kernel by keys needs of each: the logarithm of its weights' sum and <g, y>.
-// blockIdx: queries, head, sample; `sums` and `dots` are [samples, heads, queries].
+// The gradient at the queries, and what the kernel by keys needs of each: its largest score, what its weights are divided by,
+// as a factor, and <g, y>. A logarithm of both would be rounded by more than a weight's precision where scores are large.
+// blockIdx: queries, head, sample; `tops`, `shares` and `dots` are [samples, heads, queries].
 template <typename T>
-__device__ void flash_vjp_queries(const T *q, const T *k, const T *v, const T *y, const T *g, T *dq, float *sums,
-                                  float *dots, int queries, int keys, int heads, float scale) {
+__device__ void flash_vjp_queries(const T *q, const T *k, const T *v, const T *y, const T *g, T *dq, float *tops,
+                                  float *shares, float *dots, int queries, int keys, int heads, float scale) {
     __shared__ __align__(16) T shared_keys[2][KEYS * PITCH];
     __shared__ __align__(16) T shared_values[2][KEYS * PITCH];
     i64 width = (i64)heads * HEAD;
@@ -222,8 +223,10 @@ __device__ void flash_vjp_queries(const T *q, const T *k, const T *v, const T *y
     dq += of_queries;
     k += blockIdx.z * keys * width + head;
     v += blockIdx.z * keys * width + head;
-    sums += ((i64)blockIdx.z * heads + blockIdx.y) * queries;
-    dots += ((i64)blockIdx.z * heads + blockIdx.y) * queries;
+    i64 of_rows = ((i64)blockIdx.z * heads + blockIdx.y) * queries;
+    tops += of_rows;
+    shares += of_rows;
+    dots += of_rows;
     int lane = threadIdx.x % 32, group = lane / 4, pair = lane % 4 * 2;
     int row[2];
     row[0] = blockIdx.x * QUERIES + threadIdx.x / 32 * 16 + group;
@@ -256,11 +259,13 @@ __device__ void flash_vjp_queries(const T *q, const T *k, const T *v, const T *y
         for (int r = 0; r < 2; r++) renew(score, largest + r, sum + r, r, scale);
         __syncthreads();
     }
+    float share[2];
     for (int r = 0; r < 2; r++) {
         dot[r] = of_row(dot[r]);
-        sum[r] = largest[r] * scale + log2f(of_row(sum[r]));
+        share[r] = 1.0f / of_row(sum[r]);
         if (pair == 0 && row[r] < queries) {
-            sums[row[r]] = sum[r];
+            tops[row[r]] = largest[r];
+            shares[row[r]] = share[r];
             dots[row[r]] = dot[r];
         }
     }
@@ -283,7 +288,7 @@ __device__ void flash_vjp_queries(const T *q, const T *k, const T *v, const T *y
         scores(at_weights, gradient, shared_values[now], lane);
         for (int n = 0; n < KEYS / 8; n++)
             for (int i = 0; i < 4; i++)
-                score[n][i] = exp2f(score[n][i] * scale - sum[i / 2]) * (at_weights[n][i] - dot[i / 2]);
+                score[n][i] = exp2f((score[n][i] - largest[i / 2]) * scale) * share[i / 2] * (at_weights[n][i] - dot[i / 2]);
         accumulate(out, score, shared_keys[now], lane);
         __syncthreads();
     }
@@ -293,11 +298,11 @@ __device__ void flash_vjp_queries(const T *q, const T *k, const T *v, const T *y
 
 // The gradients at keys and values, from what the kernel by queries left. blockIdx: keys, head, sample.
 template <typename T>
-__device__ void flash_vjp_keys(const T *q, const T *k, const T *v, const T *g, const float *sums, const float *dots, T *dk,
-                               T *dv, int queries, int keys, int heads, float scale) {
+__device__ void flash_vjp_keys(const T *q, const T *k, const T *v, const T *g, const float *tops, const float *shares,
+                               const float *dots, T *dk, T *dv, int queries, int keys, int heads, float scale) {
     __shared__ __align__(16) T shared_queries[2][KEYS * PITCH];
     __shared__ __align__(16) T shared_gradients[2][KEYS * PITCH];
-    __shared__ float shared_sums[2][KEYS], shared_dots[2][KEYS];
+    __shared__ float shared_tops[2][KEYS], shared_shares[2][KEYS], shared_dots[2][KEYS];
     i64 width = (i64)heads * HEAD;
     i64 head = blockIdx.y * HEAD, of_keys = blockIdx.z * keys * width + head;
     q += blockIdx.z * queries * width + head;
@@ -306,8 +311,10 @@ __device__ void flash_vjp_keys(const T *q, const T *k, const T *v, const T *g, c
     v += of_keys;
     dk += of_keys;
     dv += of_keys;
-    sums += ((i64)blockIdx.z * heads + blockIdx.y) * queries;
-    dots += ((i64)blockIdx.z * heads + blockIdx.y) * queries;
+    i64 of_rows = ((i64)blockIdx.z * heads + blockIdx.y) * queries;
+    tops += of_rows;
+    shares += of_rows;
+    dots += of_rows;
     int lane = threadIdx.x % 32, group = lane / 4, pair = lane % 4 * 2;
     int row[2];
     row[0] = blockIdx.x * QUERIES + threadIdx.x / 32 * 16 + group;
@@ -322,7 +329,8 @@ __device__ void flash_vjp_keys(const T *q, const T *k, const T *v, const T *g, c
         if (threadIdx.x < KEYS) {
             int query = tile * KEYS + threadIdx.x;
             // A query that is not there has no weights.
-            shared_sums[to][threadIdx.x] = query < queries ? sums[query] : INFINITY;
+            shared_tops[to][threadIdx.x] = query < queries ? tops[query] : INFINITY;
+            shared_shares[to][threadIdx.x] = query < queries ? shares[query] : 0.0f;
             shared_dots[to][threadIdx.x] = query < queries ? dots[query] : 0.0f;
         }
         end_of_copies();
@@ -340,8 +348,10 @@ __device__ void flash_vjp_keys(const T *q, const T *k, const T *v, const T *g, c
         float weight[KEYS / 8][4], at_weight[KEYS / 8][4];
         scores(weight, key, shared_queries[now], lane);
         for (int n = 0; n < KEYS / 8; n++)
-            for (int i = 0; i < 4; i++)
-                weight[n][i] = exp2f(weight[n][i] * scale - shared_sums[now][n * 8 + pair + i % 2]);
+            for (int i = 0; i < 4; i++) {
+                int query = n * 8 + pair + i % 2;
+                weight[n][i] = exp2f((weight[n][i] - shared_tops[now][query]) * scale) * shared_shares[now][query];
+            }
         accumulate(at_value, weight, shared_gradients[now], lane);
         scores(at_weight, value, shared_gradients[now], lane);
         for (int n = 0; n < KEYS / 8; n++)
@@ -360,14 +370,14 @@ __device__ void flash_vjp_keys(const T *q, const T *k, const T *v, const T *g, c
         flash(q, k, v, y, queries, keys, heads, scale);                                                               \
     }                                                                                                                 \
     extern "C" __global__ void __launch_bounds__(32 * WARPS)                                                          \
-        flash_vjp_queries_##S(const T *q, const T *k, const T *v, const T *y, const T *g, T *dq, float *sums,         \
-                              float *dots, int queries, int keys, int heads, float scale) {                           \
-        flash_vjp_queries(q, k, v, y, g, dq, sums, dots, queries, keys, heads, scale);                                \
+        flash_vjp_queries_##S(const T *q, const T *k, const T *v, const T *y, const T *g, T *dq, float *tops,         \
+                              float *shares, float *dots, int queries, int keys, int heads, float scale) {            \
+        flash_vjp_queries(q, k, v, y, g, dq, tops, shares, dots, queries, keys, heads, scale);                        \
     }                                                                                                                 \
     extern "C" __global__ void __launch_bounds__(32 * WARPS)                                                          \
-        flash_vjp_keys_##S(const T *q, const T *k, const T *v, const T *g, const float *sums, const float *dots,      \
-                           T *dk, T *dv, int queries, int keys, int heads, float scale) {                             \
-        flash_vjp_keys(q, k, v, g, sums, dots, dk, dv, queries, keys, heads, scale);                                  \
+        flash_vjp_keys_##S(const T *q, const T *k, const T *v, const T *g, const float *tops, const float *shares,    \
+                           const float *dots, T *dk, T *dv, int queries, int keys, int heads, float scale) {          \
+        flash_vjp_keys(q, k, v, g, tops, shares, dots, dk, dv, queries, keys, heads, scale);                          \
     }
 
 ENTRIES(__half, f16)

@@ -109,6 +109,37 @@ fn layers_agree_with_the_cpu() {
     assert_agree(gpu, "geglu", &[x], &[], &|t, _| geglu(&t[0]));
 }
 
+/// Scores up to a million, of which one weight takes all: the weights of each query sum to 1, so the gradient at the values
+/// sums to that at the result, up to bf16's rounding of each.
+#[test]
+fn attention_of_huge_scores_has_weights_that_sum_to_one() -> Result<()> {
+    let Some(gpu) = gpu() else { return Ok(()) };
+    let there = |stream, size: f64| -> Result<Var> {
+        let tensor = (normal(stream, &[1, 640, 64]) * size)?;
+        Ok(Var::from_tensor(
+            &tensor.to_device(&gpu)?.to_dtype(DType::BF16)?,
+        )?)
+    };
+    let (q, k, v) = (there(31, 600.0)?, there(32, 600.0)?, there(33, 1.0)?);
+    let attention = Attention {
+        heads: 1,
+        causality: Causality::Full,
+    };
+    let y = attention.forward(&q, &k, &v)?;
+    let gradients = y.sum_all()?.backward()?;
+    let read = |t: &Tensor| t.to_dtype(DType::F32)?.to_device(&Device::Cpu);
+    for variable in [&q, &k] {
+        let gradient = gradients.get(variable).expect("a gradient");
+        let sum = read(gradient)?.sum_all()?.to_scalar::<f32>()?;
+        assert!(sum.is_finite(), "{sum}");
+    }
+    let at_values = read(gradients.get(&v).expect("a gradient"))?.sum(1)?;
+    for column in at_values.flatten_all()?.to_vec1::<f32>()? {
+        assert!((column / 640.0 - 1.0).abs() < 2f32.powi(-8), "{column}");
+    }
+    Ok(())
+}
+
 #[test]
 fn an_optimizer_agrees_with_the_cpu() -> Result<()> {
     let Some(gpu) = gpu() else { return Ok(()) };
