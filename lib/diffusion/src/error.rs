@@ -127,3 +127,18 @@ pub(crate) fn io(
 pub(crate) fn argument<T>(message: impl Into<String>) -> Result<T> {
     Err(Error::Argument(message.into()))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_gpu_without_memory_is_told_as_such() {
+        let told = |text: &str| Error::Tensor(candle_core::Error::Msg(text.into()));
+        let driver = r#"DriverError(CUDA_ERROR_OUT_OF_MEMORY, "out of memory")"#;
+        assert!(told(driver).is_out_of_memory());
+        assert!(told("CublasError(CUBLAS_STATUS_ALLOC_FAILED)").is_out_of_memory());
+        assert!(!told("DriverError(CUDA_ERROR_ILLEGAL_ADDRESS)").is_out_of_memory());
+        assert!(!Error::Argument(driver.into()).is_out_of_memory());
+    }
+}

@@ -267,10 +267,8 @@ impl<'a> LoraTrainer<'a> {
             });
         }
         let mut gradients = sum.unwrap_or_default();
-        if self.config.accumulation > 1 {
-            for gradient in gradients.values_mut() {
-                *gradient = (&*gradient * share)?;
-            }
+        for gradient in gradients.values_mut() {
+            *gradient = (&*gradient * share)?;
         }
         let warmup = ((step + 1) as f64 / self.config.warmup_steps.max(1) as f64).min(1.0);
         let (rate, token_rate) = (

@@ -339,32 +339,31 @@ struct Means {
     /// Side of a block, and blocks of a row.
     block: usize,
     columns: usize,
-    /// Finite values of each block.
+    /// Sum and number of the finite values of each block. In f64 sums of halves are exact, so the order in which lines
+    /// arrive does not show.
+    sums: Vec<f64>,
     counts: Vec<u32>,
     line: Vec<f32>,
 }
 
 impl Means {
-    /// Adds the line, which begins at `(x, y)`, to the sums; the last infinite value stands until there is a finite one.
-    fn add(&mut self, sums: &mut [f32], (x, y): (usize, usize)) {
+    /// Adds the line, which begins at `(x, y)`. A block without a finite value has one of its values in `samples`.
+    fn add(&mut self, samples: &mut [f32], (x, y): (usize, usize)) {
         let first = y / self.block * self.columns + x / self.block;
         // A tile may begin within a block.
         let lead = (self.block - x % self.block).min(self.line.len());
         let (lead, rest) = self.line.split_at(lead);
         let parts = std::iter::once(lead).chain(rest.chunks(self.block));
         for (at, values) in (first..).zip(parts) {
-            let (mut sum, mut count) = (0.0, 0);
             for &value in values {
-                let finite = value.is_finite();
-                sum += if finite { value } else { 0.0 };
-                count += u32::from(finite);
+                match value.is_finite() {
+                    true => {
+                        self.sums[at] += f64::from(value);
+                        self.counts[at] += 1;
+                    }
+                    false => samples[at] = value,
+                }
             }
-            match (self.counts[at], count) {
-                (0, 0) => sums[at] = values.last().copied().unwrap_or(0.0),
-                (0, _) => sums[at] = sum,
-                _ => sums[at] += sum,
-            }
-            self.counts[at] += count;
         }
     }
 }
@@ -423,6 +422,7 @@ impl ReadSamples for WantedSamples {
             means: (wanted && block > 1).then(|| Means {
                 block,
                 columns,
+                sums: vec![0.0; columns * rows],
                 counts: vec![0; columns * rows],
                 line: Vec::new(),
             }),
@@ -473,11 +473,12 @@ impl SamplesReader for WantedSamplesReader {
 
     fn into_samples(self) -> Self::Samples {
         let (kind, mut samples) = self.kept?;
-        for (sum, &count) in samples
-            .iter_mut()
-            .zip(self.means.iter().flat_map(|m| &m.counts))
-        {
-            *sum /= count.max(1) as f32;
+        if let Some(Means { sums, counts, .. }) = self.means {
+            for (sample, (sum, count)) in samples.iter_mut().zip(sums.into_iter().zip(counts)) {
+                if count > 0 {
+                    *sample = (sum / f64::from(count)) as f32;
+                }
+            }
         }
         let precision = match kind {
             SampleType::F16 => Precision::Half,

@@ -114,7 +114,7 @@ impl Foresight {
     }
 
     /// Whether the cost of `target` is a guess: how many highlights smaller than a pixel the samples have missed is not known.
-    /// It has been between an eighth and twice of what was foreseen (docs/performance.md).
+    /// Such targets took from half to eight times what was foreseen (`benches/forecasts.rs`, twelve scenes).
     pub fn is_guess(&self, target: f64) -> bool {
         let reached = self.rounds.last().is_some_and(|r| r.0 <= target * target);
         self.highlights && !reached

@@ -175,7 +175,7 @@ impl Outlook {
         let because = match guessed.is_empty() {
             true => String::new(),
             false => format!(
-                "; for {} a guess, as there are highlights smaller than a pixel",
+                "; the time of {} is a guess: some highlights are smaller than a pixel",
                 guessed.join(" and ")
             ),
         };
@@ -337,7 +337,7 @@ mod tests {
         );
         assert!(!around(targets[1]).text().contains("guess"));
         let guessed = around(targets[1]).with_guesses(|e| e < targets[1]).text();
-        let end = "; for high a guess, as there are highlights smaller than a pixel";
+        let end = "; the time of high is a guess: some highlights are smaller than a pixel";
         assert!(guessed.ends_with(end), "{guessed}");
     }
 

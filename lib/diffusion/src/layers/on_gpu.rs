@@ -109,8 +109,9 @@ fn layers_agree_with_the_cpu() {
     assert_agree(gpu, "geglu", &[x], &[], &|t, _| geglu(&t[0]));
 }
 
-/// Scores up to a million, of which one weight takes all: the weights of each query sum to 1, so the gradient at the values
-/// sums to that at the result, up to bf16's rounding of each.
+/// Scores up to a million, of which one key takes all the weight: the gradient at the values, summed over the keys, is that at
+/// the result, summed over the queries. Weights and sums are each rounded to bf16, by 2^-9 of their value. Errors of single
+/// queries may cancel.
 #[test]
 fn attention_of_huge_scores_has_weights_that_sum_to_one() -> Result<()> {
     let Some(gpu) = gpu() else { return Ok(()) };

@@ -313,8 +313,8 @@ impl Course<'_> {
             let report = trainer.step(self.data).context("fine-tuning stopped")?;
             if trainer.recomputes() && !recomputed {
                 self.session.warn(
-                    "the GPU's memory ran out: activations are recomputed from here on, with a third more time \
-                     (lora.recompute = true does so from the start)",
+                    "the GPU's memory ran out: activations are recomputed from here on, which takes \
+                     longer (lora.recompute = true does so from the start)",
                 );
             }
             last_s = clock.elapsed().as_secs_f64();
