@@ -34,6 +34,8 @@ impl Stream {
     pub const TEST: Stream = Stream(9);
     /// The search for highlights.
     pub const HIGHLIGHTS: Stream = Stream(10);
+    /// Particles that guide paths.
+    pub const GUIDE: Stream = Stream(11);
 }
 
 /// Draws the numbers of one sample of one pixel, dimension after dimension.

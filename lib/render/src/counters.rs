@@ -21,10 +21,12 @@ pub enum RayKind {
     LightOnProxy,
     /// From the object to the proxy, for the photograph seen there.
     ProxyRadiance,
+    /// Of particles from the light, which tell paths where it comes from by way of the object.
+    Guide,
 }
 
 /// Number of [`RayKind`]s.
-const KINDS: usize = 8;
+const KINDS: usize = 9;
 
 /// The names under which [`RayCounts::named`] lists the kinds, in order.
 const NAMES: [&str; KINDS] = [
@@ -36,6 +38,7 @@ const NAMES: [&str; KINDS] = [
     "proxy_occlusion",
     "light_on_proxy",
     "proxy_radiance",
+    "guide",
 ];
 
 /// Rays traced, by kind. Each task counts its own and the sums are exact, so the counts are the
@@ -82,12 +85,12 @@ mod tests {
         let mut a = RayCounts::default();
         a.add(RayKind::Camera);
         let mut b = RayCounts::default();
-        b.add(RayKind::ProxyRadiance);
+        b.add(RayKind::Guide);
         b.add(RayKind::Camera);
         a.merge(&b);
         assert_eq!(a.get(RayKind::Camera), 2);
-        assert_eq!(a.get(RayKind::ProxyRadiance), 1);
+        assert_eq!(a.get(RayKind::Guide), 1);
         assert_eq!(a.total(), 3);
-        assert_eq!(a.named().last(), Some(("proxy_radiance", 1)));
+        assert_eq!(a.named().last(), Some(("guide", 1)));
     }
 }

@@ -25,6 +25,7 @@ use crate::bsdf::{Bsdf, BsdfSample};
 use crate::contribution::Carried;
 use crate::counters::{RayCounts, RayKind};
 use crate::features::PROXY_RADIANCE;
+use crate::guide::PathGuide;
 use crate::light::PathLight;
 use crate::photo::ProxyPhoto;
 use crate::render::Simulation;
@@ -62,6 +63,8 @@ pub struct PathContext<'a, L> {
     /// The same, but only for light that reaches them from where the light is sampled: a small source is then met by
     /// many paths, and shown blurred.
     pub min_lit_roughness: f32,
+    /// What is known of where light comes from by way of the object.
+    pub guide: Option<&'a PathGuide>,
 }
 
 /// Interactions after which Russian roulette may end a path. Earlier, the rays that it saves
@@ -87,6 +90,7 @@ impl<'a, L> PathContext<'a, L> {
             roulette_depth: ROULETTE_DEPTH,
             min_roughness: 0.0,
             min_lit_roughness: 0.0,
+            guide: None,
         }
     }
 }
@@ -379,10 +383,20 @@ impl<L: PathLight> PathContext<'_, L> {
             let lobe_number = sampler.next_1d();
             let direction_numbers = sampler.next_2d();
 
+            let cones = match self.guide {
+                Some(guide) if depth + 1 < self.max_depth && !bsdf.is_delta() => {
+                    guide.cones(&surface, -ray.direction)
+                }
+                _ => None,
+            };
+
             // ---- Light sampling -------------------------------------------------------------
             if !lit.is_delta() {
                 let light = self.light.sample(light_numbers);
-                let (mut value, bsdf_pdf) = lit.eval_pdf(light.direction);
+                let (mut value, mut bsdf_pdf) = lit.eval_pdf(light.direction);
+                if let Some(cones) = &cones {
+                    bsdf_pdf = cones.mixed(light.direction, bsdf_pdf);
+                }
                 if has(F, EXTENSIONS) && surface.enters(light.direction) {
                     let ExtensionPoint {
                         attenuation,
@@ -417,7 +431,11 @@ impl<L: PathLight> PathContext<'_, L> {
             }
 
             // ---- BSDF sampling --------------------------------------------------------------
-            let Some(sample) = bsdf.sample(lobe_number, direction_numbers) else {
+            let drawn = match &cones {
+                Some(cones) => cones.sample(&bsdf, lobe_number, direction_numbers),
+                None => bsdf.sample(lobe_number, direction_numbers),
+            };
+            let Some(sample) = drawn else {
                 break;
             };
             gather.scattered(&bsdf, &vertex, throughput, lobe_number, &sample);

@@ -20,11 +20,13 @@ use crate::blocker::Blocker;
 use crate::contribution::{LeaveOut, LeftOut};
 use crate::counters::RayCounts;
 use crate::error::RenderError;
+use crate::features::with_features;
 use crate::film::{Film, Viewing};
 use crate::footprint::Footprint;
 use crate::foreground::PathContext;
 use crate::foresight::Foresight;
 use crate::gbuffer;
+use crate::guide::PathGuide;
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet};
 use crate::light::{PathLight, PreparedLight, SceneLight};
@@ -263,7 +265,7 @@ impl<'a> Renderer<'a> {
         coarse: Option<&Film>,
         progress: &mut Watch,
     ) -> Result<Rendered, RenderError> {
-        let path =
+        let mut path =
             PathContext::from_camera(world, &light.on_object, simulation, settings.background);
         let plane = &light.on_plane;
         let blocker = self
@@ -272,6 +274,16 @@ impl<'a> Renderer<'a> {
             .bounding_sphere()
             .map(|whole| Blocker::new(whole, self.geometry.bvh.clusters()));
         let mut jobs = self.object_jobs(settings);
+        let guide = match simulation.max_depth {
+            0 | 1 => None,
+            _ => {
+                let pixels = jobs.iter().map(|job| job.pixels.len()).sum();
+                with_features!(world.mask, F => {
+                    PathGuide::new::<_, F>(world, &light.on_object, pixels, settings.seed)
+                })
+            }
+        };
+        path.guide = guide.as_ref();
         if let (Some(blocker), true) = (&blocker, simulation.shadow) {
             let irradiance: DVec3 = plane.iter().map(PlaneLight::irradiance).sum();
             let arriving = match self.geometry.proxy {
@@ -352,11 +364,15 @@ impl<'a> Renderer<'a> {
             coarse,
             progress,
         )?;
+        let mut counts = refined.counts;
+        if let Some(guide) = path.guide {
+            counts.merge(&guide.counts);
+        }
         Ok(Rendered {
             film: refined.film,
             divisor: 1,
             error: refined.error,
-            counts: refined.counts,
+            counts,
             samples: refined.samples,
             rounds: refined.rounds,
             foresight: refined.foresight,

@@ -395,6 +395,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
             },
             photo: None,
             min_roughness: MIN_CAUSTIC_ROUGHNESS,
+            guide: None,
             ..self.path
         };
         let alpha_key = hash_u64s(&[sampler.next_u64(), 1]);

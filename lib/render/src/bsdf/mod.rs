@@ -355,7 +355,7 @@ impl<const F: u32> Bsdf<F> {
             Technique::Coat | Technique::CoatFurther => return self.sample_coat(technique, u),
             Technique::Sheen => Sheen::sample(u),
         };
-        self.weigh(self.frame.to_world(local))
+        self.towards(self.frame.to_world(local))
     }
 
     /// The technique that `u` falls on; `None` if nothing is reflected.
@@ -386,12 +386,12 @@ impl<const F: u32> Bsdf<F> {
         if local.z <= 0.0 {
             return None;
         }
-        self.weigh(coat.frame.to_world(local))
+        self.towards(coat.frame.to_world(local))
     }
 
-    /// A drawn direction with the value and density of all lobes.
+    /// A drawn direction with the value and density of all lobes; `None` where nothing is reflected.
     #[inline]
-    fn weigh(&self, wi: Vec3) -> Option<BsdfSample> {
+    pub(crate) fn towards(&self, wi: Vec3) -> Option<BsdfSample> {
         let (value, pdf) = self.eval_pdf(wi);
         (pdf > 0.0 && value != Vec3::ZERO).then(|| BsdfSample {
             wi,

@@ -1,0 +1,182 @@
+use dipir_light::environment::EnvironmentSampler;
+use dipir_numerics::stats::Running;
+use dipir_scene::material::Material;
+use dipir_scene::proxy::Proxy;
+use dipir_scene::scene::Scene;
+use glam::Vec2;
+
+use super::*;
+use crate::features::ALL;
+use crate::foreground::PathContext;
+use crate::light::SceneLight;
+use crate::render::Renderer;
+use crate::shapes;
+use crate::testing::{camera, everything, sun};
+
+/// Pixels of a side of [`knot`]'s picture.
+const SIDE: u32 = 24;
+
+/// A knot of metal, whose folds reflect the sun to each other.
+fn knot(roughness: f32) -> Scene {
+    let mesh = shapes::torus_knot(Vec3::ZERO, 0.4, 0.13, 200, 24);
+    let metal = Material {
+        metallic: 1.0,
+        roughness,
+        ..Material::default()
+    };
+    let view = camera(Vec3::new(2.0, 1.2, 3.0), Vec3::ZERO, 30.0, SIDE);
+    crate::testing::scene(mesh, metal, view, Proxy::None)
+}
+
+fn sunny() -> EnvironmentSampler {
+    let direction = Vec3::new(0.55, 0.6, 0.35).normalize();
+    EnvironmentSampler::new(sun(direction, 6e4, 0.3, 256))
+}
+
+/// A guide as for a larger picture.
+fn guide(world: &World, seed: u64) -> Option<PathGuide> {
+    PathGuide::new::<_, ALL>(world, &sunny().on_object(), 1 << 14, seed)
+}
+
+#[test]
+fn directions_have_the_density_that_they_are_weighed_by() {
+    const SAMPLES: u32 = 1 << 14;
+    let scene = knot(0.3);
+    let world = Renderer::new(&scene).world(ALL).expect("a world");
+    let guide = guide(&world, 1).expect("folds that reflect the sun");
+    let mut guided = 0;
+    for pixel in 0..SIDE * SIDE {
+        let at = Vec2::new((pixel % SIDE) as f32, (pixel / SIDE) as f32);
+        let ray = world.camera().ray(at + 0.5);
+        let Some(hit) = world.closest::<ALL>(&ray, 0) else {
+            continue;
+        };
+        let surfaces = &world.surfaces;
+        let surface = surfaces.interact::<ALL>(ray.direction, hit.triangle, hit.u, hit.v);
+        let bsdf = Bsdf::<ALL>::new(&surface, -ray.direction);
+        let Some(cones) = guide.cones(&surface, -ray.direction) else {
+            continue;
+        };
+        guided += u32::from(cones.share > 0.2);
+        // What is reflected of a white sky, and its standard error, with the guide and without.
+        let estimates = [Some(&cones), None].map(|cones| {
+            let mut weights = Running::default();
+            for sample in 0..SAMPLES {
+                let mut draws = Sampler::new(3, Stream::TEST, pixel, sample);
+                let (u_lobe, u) = (draws.next_1d(), draws.next_2d());
+                let drawn = match cones {
+                    Some(cones) => cones.sample(&bsdf, u_lobe, u),
+                    None => bsdf.sample(u_lobe, u),
+                };
+                if let (Some(s), Some(cones)) = (&drawn, cones) {
+                    let density = cones.mixed(s.wi, bsdf.pdf(s.wi));
+                    assert!((s.pdf / density - 1.0).abs() < 1e-4, "{} {density}", s.pdf);
+                }
+                weights.push(f64::from(drawn.map_or(0.0, |s| s.weight.x)));
+            }
+            weights
+        });
+        let [with, without] = estimates.map(|e| e.mean());
+        let [a, b] = estimates.map(|e| e.std_error());
+        // Five standard errors of independent samples, which these, being stratified, do not reach.
+        let bound = 5.0 * a.hypot(b) + 1e-4;
+        assert!((with - without).abs() < bound, "{with} {without} {bound}");
+    }
+    assert!(guided > 4, "{guided}");
+}
+
+#[test]
+fn a_guided_picture_has_the_same_mean_and_less_noise() {
+    const SEEDS: u32 = 24;
+    const SAMPLES: u32 = 64;
+    let scene = knot(0.3);
+    let world = Renderer::new(&scene).world(ALL).expect("a world");
+    let light = sunny().on_object();
+    let guide = guide(&world, 1);
+    let plain = PathContext::from_camera(&world, &light, &everything(3), None);
+    // Mean of the picture, and noise of its pixels, by seed.
+    let render = |guide: Option<&PathGuide>| -> (Running, f64) {
+        let path = PathContext { guide, ..plain };
+        let pixels = |seed: u32| -> Vec<f64> {
+            let pixel = |p: u32| {
+                let corner = Vec2::new((p % SIDE) as f32, (p / SIDE) as f32);
+                let sum = (0..SAMPLES).map(|s| {
+                    let mut draws = Sampler::new(u64::from(seed), Stream::TEST, p, s);
+                    let found =
+                        path.camera_sample::<ALL>(corner, &mut draws, &mut RayCounts::default());
+                    f64::from(luminance(found.radiance))
+                });
+                sum.sum::<f64>() / f64::from(SAMPLES)
+            };
+            (0..SIDE * SIDE).map(pixel).collect()
+        };
+        let pictures: Vec<Vec<f64>> = (0..SEEDS).into_par_iter().map(pixels).collect();
+        let mut means = Running::default();
+        for picture in &pictures {
+            means.push(picture.iter().sum::<f64>() / picture.len() as f64);
+        }
+        let noise = (0..pictures[0].len()).map(|i| {
+            let mut values = Running::default();
+            pictures.iter().for_each(|picture| values.push(picture[i]));
+            values.variance()
+        });
+        (means, noise.sum())
+    };
+    let ((with, noise_with), (without, noise_without)) = (render(guide.as_ref()), render(None));
+    let bound = 4.0 * with.std_error().hypot(without.std_error());
+    let [mean_a, mean_b] = [with.mean(), without.mean()];
+    assert!((mean_a - mean_b).abs() < bound, "{mean_a} {mean_b} {bound}");
+    assert!(
+        bound < 0.03 * mean_b,
+        "the comparison says something: {bound} of {mean_b}"
+    );
+    // About half of the noise is left.
+    assert!(
+        noise_with < 0.7 * noise_without,
+        "{noise_with} {noise_without}"
+    );
+}
+
+#[test]
+fn surfaces_without_narrow_lobes_or_folds_have_no_guide() {
+    let rough = knot(0.8);
+    let world = Renderer::new(&rough).world(ALL).expect("a world");
+    assert!(guide(&world, 1).is_none());
+    let smooth = knot(0.0);
+    let world = Renderer::new(&smooth).world(ALL).expect("a world");
+    assert!(guide(&world, 1).is_none(), "mirrors reflect no cone");
+    let ball = Scene {
+        mesh: shapes::icosphere(Vec3::ZERO, 1.0, 3),
+        ..knot(0.3)
+    };
+    let world = Renderer::new(&ball).world(ALL).expect("a world");
+    assert!(guide(&world, 1).is_none());
+    let folded = knot(0.3);
+    let world = Renderer::new(&folded).world(ALL).expect("a world");
+    let even = crate::testing::sky(1.0).on_object();
+    assert!(PathGuide::new::<_, ALL>(&world, &even, 1 << 14, 1).is_none());
+}
+
+#[test]
+fn a_cell_keeps_the_flux_of_what_it_thins_out() {
+    let arrivals: Vec<Arrival> = (0..1000)
+        .map(|k| Arrival {
+            cell: 0,
+            from: Vec3::splat(k as f32),
+            flux: if k == 500 { 1000.0 } else { 1.0 },
+        })
+        .collect();
+    let group = Group::of(&arrivals, 0.5);
+    let flux: f32 = group.flux.iter().sum();
+    // Sums of a thousand terms.
+    assert!((flux / (0.5 * 1999.0) - 1.0).abs() < 1e-4, "{flux}");
+    let bright: f32 = (0..MOST)
+        .filter(|&i| group.x[i] == 500.0)
+        .map(|i| group.flux[i])
+        .sum();
+    // Systematic draws are off by one step at most.
+    assert!(
+        (bright - 500.0).abs() <= 0.5 * 1999.0 / MOST as f32,
+        "{bright}"
+    );
+}
