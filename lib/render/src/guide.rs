@@ -46,6 +46,8 @@ const FURTHER: f32 = 0.03;
 const DIELECTRIC: f32 = 0.04;
 /// Particles for each pixel of the object, whose first samples are 16 paths.
 const PARTICLES_PER_PIXEL: usize = 12;
+/// Fewest pixels of the object that a guide is made for: smaller pictures take as long without.
+const LEAST_PIXELS: usize = 1 << 13;
 /// Particles that one task traces.
 const CHUNK: usize = 4096;
 /// Tasks whose particles tell whether any arrive, and most tasks.
@@ -101,8 +103,8 @@ pub struct Cones {
 }
 
 impl PathGuide {
-    /// A guide for a picture in which the object covers about `pixels`; `None` where nothing arrives from narrow lobes of
-    /// the object. `F` has the features of `world`. Does not depend on the number of threads.
+    /// A guide for a picture in which the object covers about `pixels`; `None` where these are few, or nothing arrives from
+    /// narrow lobes of the object. `F` has the features of `world`. Does not depend on the number of threads.
     pub fn new<L: PathLight, const F: u32>(
         world: &World,
         light: &L,
@@ -113,7 +115,7 @@ impl PathGuide {
         let size = bounds.max - bounds.min;
         let side = size.max_element() / CELLS;
         let spread = side > 0.0 && side.is_finite();
-        if !spread || !has(F, SPECULAR) || world.escapes {
+        if !spread || !has(F, SPECULAR) || world.escapes || pixels < LEAST_PIXELS {
             return None;
         }
         let mut guide = Self {

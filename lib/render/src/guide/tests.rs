@@ -155,6 +155,8 @@ fn surfaces_without_narrow_lobes_or_folds_have_no_guide() {
     let world = Renderer::new(&folded).world(ALL).expect("a world");
     let even = crate::testing::sky(1.0).on_object();
     assert!(PathGuide::new::<_, ALL>(&world, &even, 1 << 14, 1).is_none());
+    let sunny = sunny().on_object();
+    assert!(PathGuide::new::<_, ALL>(&world, &sunny, LEAST_PIXELS - 1, 1).is_none());
 }
 
 #[test]
