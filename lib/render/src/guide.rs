@@ -1,11 +1,13 @@
 //! Where light comes from by way of the object itself: the sun in a fold of polished metal.
 //!
-//! A path meets such a reflection by chance, and the few that do are bright. So particles are traced from the light
-//! onto the object and on along its reflections [Jensen 1995, "Importance Driven Path Tracing using the Photon Map"].
-//! Where one arrives it leaves a beacon: the place that it was reflected from, and its flux. Beacons are collected in
-//! the cells of a grid. A vertex of a path in such a cell draws some of its directions from cones around those of its
-//! beacons that its own lobes reflect, the others from the BSDF, and weighs both by the density of their mixture: the
-//! picture stays unbiased, whatever the guide says.
+//! Few paths meet such a reflection, and those that do are bright: noise. Particles find it from the other end [Jensen
+//! 1995, "Importance Driven Path Tracing using the Photon Map"]. They are traced from the light onto the object and on
+//! along its reflections. Where a particle arrives it leaves a beacon: the place that it was reflected from, and its flux.
+//! A grid collects the beacons in its cells.
+//!
+//! A path that comes to a cell draws a share of its directions from cones around the cell's beacons, each as often as the
+//! surface reflects it. The BSDF draws the rest. Both are weighed by the density of their mixture, so the picture is
+//! unbiased, whatever the guide says.
 use std::f32::consts::{FRAC_1_PI, PI};
 
 use dipir_light::luminance::luminance;
@@ -28,13 +30,14 @@ const CELLS: f32 = 40.0;
 const MOST: usize = 48;
 /// Reflections that a particle is followed through.
 const BOUNCES: u64 = 3;
-/// Most directions that follow the guide, as a share.
+/// Largest share of directions that follow the guide.
 const MOST_GUIDED: f32 = 0.85;
 /// Density per steradian of reflections that leave beacons: what wider lobes reflect is found by chance.
 const NARROW: f32 = 1.0;
-/// A vertex at which a smaller share would follow the guide does without.
+/// Where a smaller share would follow the guide, none does.
 const LEAST_GUIDED: f32 = 0.003;
-/// How much brighter light that BSDF sampling has to find counts: it varies more than the guide's.
+/// Factor on the luminance of the light that BSDF sampling has to find: that light varies, and more samples should find
+/// it than its mean asks for.
 const UNEVEN: f32 = 2.0;
 /// Radius of the ball around a beacon that is aimed at, in sides of a cell.
 const RADIUS: f32 = 0.5;
@@ -50,8 +53,9 @@ const PARTICLES_PER_PIXEL: usize = 12;
 const LEAST_PIXELS: usize = 1 << 13;
 /// Particles that one task traces.
 const CHUNK: usize = 4096;
-/// Tasks whose particles tell whether any arrive, and most tasks.
+/// Tasks that tell whether any particles arrive.
 const FIRST: usize = 4;
+/// Most tasks: half a million particles.
 const MOST_CHUNKS: usize = 128;
 /// Directions in which the light is looked at.
 const LOOKS: u32 = 512;
@@ -67,8 +71,6 @@ pub struct PathGuide {
     beacons: Vec<Group>,
     /// Luminance of the light that BSDF sampling has to find.
     unsampled: f32,
-    /// Rays that were traced for it.
-    pub(crate) counts: RayCounts,
 }
 
 const NO_GROUP: u32 = u32::MAX;
@@ -104,12 +106,14 @@ pub struct Cones {
 
 impl PathGuide {
     /// A guide for a picture in which the object covers about `pixels`; `None` where these are few, or nothing arrives from
-    /// narrow lobes of the object. `F` has the features of `world`. Does not depend on the number of threads.
+    /// narrow lobes of the object. `F` has the features of `world`. Adds the rays of all particles to `counts`. Does not
+    /// depend on the number of threads.
     pub fn new<L: PathLight, const F: u32>(
         world: &World,
         light: &L,
         pixels: usize,
         seed: u64,
+        counts: &mut RayCounts,
     ) -> Option<Self> {
         let bounds = world.geometry.bvh.bounds()?;
         let size = bounds.max - bounds.min;
@@ -125,26 +129,25 @@ impl PathGuide {
             groups: Vec::new(),
             beacons: Vec::new(),
             unsampled: unsampled_luminance(light),
-            counts: RayCounts::default(),
         };
         let emitter = Emitter::new(world, light, seed);
         let chunks = (pixels * PARTICLES_PER_PIXEL / CHUNK).clamp(FIRST, MOST_CHUNKS);
         let mut arrivals = Vec::new();
         for part in [0..FIRST, FIRST..chunks] {
             let trace = |chunk: usize| {
-                let (mut found, mut counts) = (Vec::new(), RayCounts::default());
+                let (mut found, mut rays) = (Vec::new(), RayCounts::default());
                 for number in chunk * CHUNK..(chunk + 1) * CHUNK {
-                    emitter.trace::<F>(number as u32, &mut counts, |at, from, flux| {
+                    emitter.trace::<F>(number as u32, &mut rays, |at, from, flux| {
                         let cell = guide.cell(at);
                         found.push(Arrival { cell, from, flux });
                     });
                 }
-                (found, counts)
+                (found, rays)
             };
             let traced: Vec<_> = part.into_par_iter().map(trace).collect();
-            for (found, counts) in traced {
+            for (found, rays) in traced {
                 arrivals.extend(found);
-                guide.counts.merge(&counts);
+                counts.merge(&rays);
             }
             if arrivals.is_empty() {
                 return None;
@@ -223,7 +226,8 @@ impl PathGuide {
     }
 }
 
-/// Root mean square, over the sphere, of the luminance of `light` that is left when it is also sampled by itself.
+/// Root mean square over the sphere of the luminance of `light`, less what its own sampling takes of it beside even
+/// directions (balance heuristic).
 fn unsampled_luminance(light: &impl PathLight) -> f32 {
     const EVEN: f32 = 0.25 * FRAC_1_PI;
     let squares = (0..LOOKS).map(|k| {
@@ -363,13 +367,12 @@ struct Lobes {
 
 impl Lobes {
     fn of(surface: &SurfacePoint, wo: Vec3) -> Self {
-        let normal = surface.normal;
         let albedo = luminance(surface.base_color);
         let diffuse = albedo * (1.0 - surface.metallic) + FURTHER;
         let base = DIELECTRIC + (albedo - DIELECTRIC) * surface.metallic;
         let coat = DIELECTRIC * surface.coat.factor;
         Self {
-            mirrored: 2.0 * normal.dot(wo) * normal - wo,
+            mirrored: (-wo).reflect(surface.normal),
             diffuse: diffuse * FRAC_1_PI,
             glossy: [
                 [base, surface.roughness.powi(4)],

@@ -274,17 +274,19 @@ impl<'a> Renderer<'a> {
             .bounding_sphere()
             .map(|whole| Blocker::new(whole, self.geometry.bvh.clusters()));
         let mut jobs = self.object_jobs(settings);
+        let mut guide_rays = RayCounts::default();
         let guide = match simulation.max_depth {
             0 | 1 => None,
             _ => {
+                let (light, seed) = (&light.on_object, settings.seed);
                 let pixels = jobs.iter().map(|job| job.pixels.len()).sum();
                 with_features!(world.mask, F => {
-                    PathGuide::new::<_, F>(world, &light.on_object, pixels, settings.seed)
+                    PathGuide::new::<_, F>(world, light, pixels, seed, &mut guide_rays)
                 })
             }
         };
         path.guide = guide.as_ref();
-        if let (Some(blocker), true) = (&blocker, simulation.shadow) {
+        let mut rendered = if let (Some(blocker), true) = (&blocker, simulation.shadow) {
             let irradiance: DVec3 = plane.iter().map(PlaneLight::irradiance).sum();
             let arriving = match self.geometry.proxy {
                 ProxyGeometry::Plane(_) => Some(irradiance.as_vec3()),
@@ -314,7 +316,9 @@ impl<'a> Renderer<'a> {
             self.run(
                 jobs, settings, start, simulation, &path, &advance, coarse, progress,
             )
-        }
+        }?;
+        rendered.counts.merge(&guide_rays);
+        Ok(rendered)
     }
 
     fn run<L: PathLight>(
@@ -364,15 +368,11 @@ impl<'a> Renderer<'a> {
             coarse,
             progress,
         )?;
-        let mut counts = refined.counts;
-        if let Some(guide) = path.guide {
-            counts.merge(&guide.counts);
-        }
         Ok(Rendered {
             film: refined.film,
             divisor: 1,
             error: refined.error,
-            counts,
+            counts: refined.counts,
             samples: refined.samples,
             rounds: refined.rounds,
             foresight: refined.foresight,
