@@ -43,47 +43,81 @@ fn guide(world: &World, seed: u64) -> Option<PathGuide> {
     under(world, &sunny(), 1 << 14, seed)
 }
 
+/// The surfaces in the pixels of the picture that have cones, with the directions towards the camera.
+fn guided(world: &World, guide: &PathGuide) -> Vec<(SurfacePoint, Vec3, Cones)> {
+    let vertex = |pixel: u32| {
+        let at = Vec2::new((pixel % SIDE) as f32, (pixel / SIDE) as f32);
+        let ray = world.camera().ray(at + 0.5);
+        let hit = world.closest::<ALL>(&ray, 0)?;
+        let surfaces = &world.surfaces;
+        let surface = surfaces.interact::<ALL>(ray.direction, hit.triangle, hit.u, hit.v);
+        let wo = -ray.direction;
+        let cones = guide.cones(&surface, wo)?;
+        Some((surface, wo, cones))
+    };
+    (0..SIDE * SIDE).filter_map(vertex).collect()
+}
+
 #[test]
-fn directions_have_the_density_that_they_are_weighed_by() {
-    const SAMPLES: u32 = 1 << 14;
+fn cones_are_drawn_with_their_density() {
+    const DIRECTIONS: u32 = 1 << 18;
+    const DRAWN: u32 = 1 << 12;
     let scene = knot(0.3);
     let world = Renderer::new(&scene).world(ALL).expect("a world");
     let guide = guide(&world, 1).expect("folds that reflect the sun");
-    let mut guided = 0;
-    for pixel in 0..SIDE * SIDE {
-        let at = Vec2::new((pixel % SIDE) as f32, (pixel / SIDE) as f32);
-        let ray = world.camera().ray(at + 0.5);
-        let Some(hit) = world.closest::<ALL>(&ray, 0) else {
-            continue;
-        };
-        let surfaces = &world.surfaces;
-        let surface = surfaces.interact::<ALL>(ray.direction, hit.triangle, hit.u, hit.v);
-        let bsdf = Bsdf::<ALL>::new(&surface, -ray.direction);
-        let Some(cones) = guide.cones(&surface, -ray.direction) else {
-            continue;
-        };
-        guided += u32::from(cones.share > 0.2);
-        // What is reflected of a white sky, and its standard error, with the guide and without.
-        let estimates = [Some(&cones), None].map(|cones| {
+    let vertices = guided(&world, &guide);
+    let vertices = vertices.iter().filter(|(_, _, cones)| cones.share > 0.2);
+    let mut tried = 0;
+    for (_, _, cones) in vertices {
+        let (mut integral, mut moment) = (0.0f64, Vec3::ZERO);
+        for k in 0..DIRECTIONS {
+            let mut draws = Sampler::new(5, Stream::TEST, 0, k);
+            let wi = square_to_sphere(draws.next_2d());
+            let density = cones.pdf(wi) * (4.0 * PI / DIRECTIONS as f32);
+            integral += f64::from(density);
+            moment += wi * density;
+        }
+        // The narrowest cone holds 59 of the directions, and one in eight of them may be at its edge.
+        assert!((integral - 1.0).abs() < 0.05, "{integral}");
+        let mut mean = Vec3::ZERO;
+        for k in 0..DRAWN {
+            let mut draws = Sampler::new(6, Stream::TEST, 0, k);
+            let u_lobe = draws.next_1d();
+            mean += cones.direction(u_lobe, draws.next_2d()) / DRAWN as f32;
+        }
+        // The same share of a unit vector.
+        assert!(mean.distance(moment) < 0.05, "{mean} {moment}");
+        tried += 1;
+    }
+    assert!(tried > 4, "{tried}");
+}
+
+#[test]
+fn guided_directions_reflect_as_much_of_a_white_sky() {
+    const SAMPLES: u32 = 1 << 12;
+    let scene = knot(0.3);
+    let world = Renderer::new(&scene).world(ALL).expect("a world");
+    let guide = guide(&world, 1).expect("folds that reflect the sun");
+    let (mut difference, mut variance) = (0.0, 0.0);
+    for (pixel, (surface, wo, cones)) in guided(&world, &guide).iter().enumerate() {
+        let bsdf = Bsdf::<ALL>::new(surface, *wo);
+        let reflected = |draw: &dyn Fn(f32, Vec2) -> Option<BsdfSample>| {
             let mut weights = Running::default();
             for sample in 0..SAMPLES {
-                let mut draws = Sampler::new(3, Stream::TEST, pixel, sample);
+                let mut draws = Sampler::new(3, Stream::TEST, pixel as u32, sample);
                 let (u_lobe, u) = (draws.next_1d(), draws.next_2d());
-                let drawn = match cones {
-                    Some(cones) => cones.sample(&bsdf, u_lobe, u),
-                    None => bsdf.sample(u_lobe, u),
-                };
-                weights.push(f64::from(drawn.map_or(0.0, |s| s.weight.x)));
+                weights.push(f64::from(draw(u_lobe, u).map_or(0.0, |s| s.weight.x)));
             }
             weights
-        });
-        let [with, without] = estimates.map(|e| e.mean());
-        let [a, b] = estimates.map(|e| e.std_error());
-        // Five standard errors of independent samples, which these, being stratified, do not reach.
-        let bound = 5.0 * a.hypot(b);
-        assert!((with - without).abs() < bound, "{with} {without} {bound}");
+        };
+        let with = reflected(&|u_lobe, u| cones.sample(&bsdf, u_lobe, u));
+        let without = reflected(&|u_lobe, u| bsdf.sample(u_lobe, u));
+        difference += with.mean() - without.mean();
+        variance += with.std_error().powi(2) + without.std_error().powi(2);
     }
-    assert!(guided > 4, "{guided}");
+    // Standard errors are of independent samples: these are stratified, and closer.
+    let bound = 3.0 * f64::sqrt(variance);
+    assert!(difference.abs() < bound, "{difference} {bound}");
 }
 
 #[test]
@@ -191,16 +225,8 @@ fn the_guide_is_the_same_for_an_object_of_any_size() {
         scene.camera.position *= scale;
         let world = Renderer::new(&scene).world(ALL).expect("a world");
         let guide = guide(&world, 1).expect("folds that reflect the sun");
-        let share = |pixel: u32| {
-            let at = Vec2::new((pixel % SIDE) as f32, (pixel / SIDE) as f32);
-            let ray = world.camera().ray(at + 0.5);
-            let hit = world.closest::<ALL>(&ray, 0)?;
-            let surfaces = &world.surfaces;
-            let surface = surfaces.interact::<ALL>(ray.direction, hit.triangle, hit.u, hit.v);
-            Some(guide.cones(&surface, -ray.direction)?.share)
-        };
-        let shares = (0..SIDE * SIDE).map(|pixel| share(pixel).unwrap_or(0.0));
-        shares.collect()
+        let vertices = guided(&world, &guide);
+        vertices.iter().map(|(_, _, cones)| cones.share).collect()
     };
     // Powers of two change no digit of a product, so the particles are the same.
     let metre = shares(1.0);
