@@ -301,8 +301,11 @@ proptest! {
             let found = f64::from(*found.get(x, y));
             match finite.is_empty() {
                 true => prop_assert_eq!(found, f64::INFINITY),
-                // The mean is rounded to f32: values below 9 by 2^-21.
-                false => prop_assert!((found - finite.iter().sum::<f64>() / finite.len() as f64).abs() < 2f64.powi(-21)),
+                // A mean below 9 is rounded to f32 by at most 2^-21, a tie by just that, and sums
+                // of f64 in another order differ by far less than a hundredth of it.
+                false => prop_assert!(
+                    (found - finite.iter().sum::<f64>() / finite.len() as f64).abs() <= 1.01 * 2f64.powi(-21)
+                ),
             }
         }
     }
