@@ -83,6 +83,18 @@ fn overrides_replace_add_and_step_into_lists() {
 }
 
 #[test]
+fn an_override_takes_numbers_as_shells_see_them() {
+    let position = |set: &str| scene(TEXT, &[set]).unwrap().objects[0].position[0];
+    assert_eq!(position("scene.objects.0.position.0=.004"), 0.004);
+    assert_eq!(position("scene.objects.0.position.0 = -5."), -5.0);
+    // What only looks like a number stays text.
+    for name in [".5.png", "1.2.3", "e"] {
+        let scene = scene(TEXT, &[format!("scene.background={name}").as_str()]).unwrap();
+        assert_eq!(scene.background, PathBuf::from(name));
+    }
+}
+
+#[test]
 fn an_override_may_create_its_table() {
     let config = parse("", &["pipeline.threads=2"]).unwrap();
     assert_eq!(config.pipeline().unwrap().threads, 2);

@@ -147,11 +147,19 @@ pub(super) fn apply_override(root: &mut Node, text: &str) -> Result<(), ConfigEr
     let node = match DeValue::parse(value.trim()) {
         Ok(parsed) => node(&parsed, &at, key)?,
         Err(_) => Node {
-            value: Value::String(value.to_string()),
+            value: shell_number(value).unwrap_or_else(|| Value::String(value.to_string())),
             place: place.clone(),
         },
     };
     insert(root, &steps, node, &place).map_err(wrong)
+}
+
+/// A number as people write it on a command line and TOML does not: `.004`, `5.`.
+fn shell_number(text: &str) -> Option<Value> {
+    let text = text.trim();
+    let numeric = |b: u8| b.is_ascii_digit() || b"+-.eE".contains(&b);
+    let number = text.bytes().all(numeric).then(|| text.parse().ok())?;
+    number.map(Value::Float)
 }
 
 fn insert(target: &mut Node, steps: &[&str], node: Node, place: &Place) -> Result<(), String> {
