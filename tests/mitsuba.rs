@@ -115,6 +115,7 @@ fn foreground<const F: u32>(
         roulette_depth: u32::MAX,
         min_roughness: 0.0,
         min_lit_roughness: 0.0,
+        blur_caustics: false,
         guide: None,
     };
     let pixels = (0..SIZE * SIZE)

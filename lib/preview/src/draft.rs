@@ -98,6 +98,7 @@ pub(crate) fn settings(loaded: &LoadedScene, samples: u32) -> Settings<'_> {
         max_samples: samples,
         highlights: false,
         denoise: true,
+        blur_caustics: true,
         ..Settings::of_scene(loaded)
     }
 }

@@ -12,6 +12,8 @@
 //!
 //! What it cannot do: caustics from light through rough glass onto the object converge slowly, as
 //! in every unidirectional path tracer; refracted rays see the distant light, not the photograph.
+use std::f32::consts::PI;
+
 use dipir_imaging::raster::LinearImage;
 use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::Sampler;
@@ -63,6 +65,8 @@ pub struct PathContext<'a, L> {
     /// The same, but only for light that reaches them from where the light is sampled: a small source is then met by
     /// many paths, and shown blurred.
     pub min_lit_roughness: f32,
+    /// Whether surfaces behind a wide reflection are [blurred](BLUR).
+    pub blur_caustics: bool,
     /// What is known of where light comes from by way of the object.
     pub guide: Option<&'a PathGuide>,
 }
@@ -90,6 +94,7 @@ impl<'a, L> PathContext<'a, L> {
             roulette_depth: ROULETTE_DEPTH,
             min_roughness: 0.0,
             min_lit_roughness: 0.0,
+            blur_caustics: false,
             guide: None,
         }
     }
@@ -210,6 +215,18 @@ const DIMENSIONS_PER_VERTEX: u32 = 4;
 /// energy arrives without them. Known as path regularisation [Kaplanyan and Dachsbacher 2013].
 pub const MIN_CAUSTIC_ROUGHNESS: f32 = 0.6;
 
+/// Least alpha of the surfaces behind a reflection, as a share of the alpha of a lobe that reflects as widely. The sun in
+/// a coat that is seen by way of a diffuse surface is found by one path in thousands, too, and what such a surface shows
+/// of a blurred lobe is nearly what it shows of a sharp one.
+const BLUR: f32 = 0.5;
+
+/// Least roughness behind a reflection whose BSDF has the density `pdf` in its direction: GGX has at most `1 / (4 pi
+/// alpha^2)`.
+fn blurred_roughness(pdf: f32) -> f32 {
+    let alpha = BLUR / (4.0 * PI * pdf).sqrt();
+    alpha.sqrt().min(MIN_CAUSTIC_ROUGHNESS)
+}
+
 /// Paths keep at least this chance of going on, so that survivors' weights stay bounded.
 const MIN_SURVIVAL: f32 = 0.1;
 
@@ -300,6 +317,7 @@ impl<L: PathLight> PathContext<'_, L> {
         //                                           if the light could not have drawn it
         let mut leaves = false; //                   the segment is known to miss the object
         let mut filling = Vec3::ZERO; //             attenuation per metre of the segment
+        let mut least_roughness = self.min_roughness; // of the next surfaces
         let mut thickness = 0.0; //                  metres of it if the segment meets no inner side
         let first_dimension = sampler.dimension();
         let emits = has(F, EMISSION) && has(world.mask, EMISSION);
@@ -347,8 +365,8 @@ impl<L: PathLight> PathContext<'_, L> {
                 world
                     .surfaces
                     .interact::<F>(ray.direction, hit.triangle, hit.u, hit.v);
-            surface.roughness = surface.roughness.max(self.min_roughness);
-            surface.coat.roughness = surface.coat.roughness.max(self.min_roughness);
+            surface.roughness = surface.roughness.max(least_roughness);
+            surface.coat.roughness = surface.coat.roughness.max(least_roughness);
             let vertex = Vertex {
                 surfaces: &world.surfaces,
                 direction: ray.direction,
@@ -435,9 +453,15 @@ impl<L: PathLight> PathContext<'_, L> {
                 Some(cones) => cones.sample(&bsdf, lobe_number, direction_numbers),
                 None => bsdf.sample(lobe_number, direction_numbers),
             };
-            let Some(sample) = drawn else {
+            let Some(mut sample) = drawn else {
                 break;
             };
+            if self.blur_caustics && !sample.delta {
+                least_roughness = least_roughness.max(blurred_roughness(sample.pdf));
+            }
+            if let Some(cones) = &cones {
+                cones.weigh(&mut sample);
+            }
             gather.scattered(&bsdf, &vertex, throughput, lobe_number, &sample);
             throughput *= sample.weight;
             if throughput.max_element() <= 0.0 {

@@ -432,27 +432,26 @@ impl Cones {
         axis.to_world(square_to_cone(u, self.cosine[chosen]))
     }
 
-    /// As [`Bsdf::sample`], from the mixture.
+    /// As [`Bsdf::sample`], but drawn from the mixture. [`Cones::weigh`] makes weight and density those of the mixture.
     pub fn sample<const F: u32>(&self, bsdf: &Bsdf<F>, u_lobe: f32, u: Vec2) -> Option<BsdfSample> {
-        let sample = match u_lobe < self.share {
+        match u_lobe < self.share {
             true => bsdf.towards(self.direction(u_lobe / self.share, u)),
             false => {
                 let rest = (u_lobe - self.share) / (1.0 - self.share);
                 bsdf.sample(rest.min(1.0 - f32::EPSILON / 2.0), u)
             }
-        }?;
+        }
+    }
+
+    /// Weight and density of a drawn direction, from those of the BSDF alone to those of the mixture.
+    pub fn weigh(&self, sample: &mut BsdfSample) {
         if sample.delta {
-            return Some(BsdfSample {
-                weight: sample.weight / (1.0 - self.share),
-                ..sample
-            });
+            sample.weight /= 1.0 - self.share;
+            return;
         }
         let pdf = self.mixed(sample.wi, sample.pdf);
-        Some(BsdfSample {
-            weight: sample.weight * (sample.pdf / pdf),
-            pdf,
-            ..sample
-        })
+        sample.weight *= sample.pdf / pdf;
+        sample.pdf = pdf;
     }
 }
 

@@ -71,6 +71,9 @@ pub struct Settings<'a> {
     pub highlights: bool,
     /// Whether noise is [removed](crate::denoise) from object and shadow.
     pub denoise: bool,
+    /// Whether caustics on the object are blurred: what a wide lobe reflects of a sharp one
+    /// ([`PathContext::blur_caustics`]). Most of them are specks, else; how much it changes is in docs/performance.md.
+    pub blur_caustics: bool,
     /// A frame of more pixels is rendered at 1/2, 1/4 and so on of its resolution, the finest that has at most
     /// this many, and enlarged. A time budget chooses the resolution itself.
     pub most_pixels: Option<u64>,
@@ -113,6 +116,7 @@ impl Default for Settings<'_> {
             shadow_tolerance: 2e-4,
             highlights: true,
             denoise: false,
+            blur_caustics: false,
             most_pixels: None,
             leave_out: None,
         }
@@ -286,6 +290,7 @@ impl<'a> Renderer<'a> {
             }
         };
         path.guide = guide.as_ref();
+        path.blur_caustics = settings.blur_caustics;
         let mut rendered = if let (Some(blocker), true) = (&blocker, simulation.shadow) {
             let irradiance: DVec3 = plane.iter().map(PlaneLight::irradiance).sum();
             let arriving = match self.geometry.proxy {

@@ -46,7 +46,7 @@ pub const LIGHT: StageName = StageName {
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 9,
+    version: 10,
 };
 
 /// All stages, each after those that it reads.

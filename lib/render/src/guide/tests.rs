@@ -110,7 +110,11 @@ fn guided_directions_reflect_as_much_of_a_white_sky() {
             }
             weights
         };
-        let with = reflected(&|u_lobe, u| cones.sample(&bsdf, u_lobe, u));
+        let with = reflected(&|u_lobe, u| {
+            let mut sample = cones.sample(&bsdf, u_lobe, u)?;
+            cones.weigh(&mut sample);
+            Some(sample)
+        });
         let without = reflected(&|u_lobe, u| bsdf.sample(u_lobe, u));
         difference += with.mean() - without.mean();
         variance += with.std_error().powi(2) + without.std_error().powi(2);

@@ -39,6 +39,10 @@ pub struct CompositeTable {
     /// Whether noise is removed from object and shadow. What that does to the error is measured and stated.
     #[schemars(extend("x-default" = "true; false for the preset `high`"), example = false)]
     pub denoise: Option<bool>,
+    /// Whether caustics on the object are blurred, such as the sun's reflection by polished paint onto a matt part beside
+    /// it: fewer specks, in less time.
+    #[schemars(extend("default" = true), example = false)]
+    pub blur_caustics: Option<bool>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
     /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
     #[schemars(extend("x-default" = "the recovered curves with the recovered light, `none` with a map"), example = &"reinhard")]
@@ -137,6 +141,10 @@ impl CompositeTable {
     pub(super) fn denoise(&self, quality: Quality) -> bool {
         let by_preset = presets::of(quality).composite.denoise;
         self.denoise.unwrap_or(by_preset)
+    }
+
+    pub(super) fn blur_caustics(&self) -> bool {
+        self.blur_caustics.unwrap_or(true)
     }
 
     /// Most pixels at which object and shadow are rendered; a time budget chooses the resolution itself.
