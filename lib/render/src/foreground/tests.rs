@@ -1,11 +1,18 @@
 use dipir_imaging::raster::Raster;
 use dipir_light::environment::EnvironmentSampler;
-use dipir_scene::material::AlphaMode;
+use dipir_light::luminance::luminance;
+use dipir_numerics::sampler::{Sampler, Stream};
+use dipir_numerics::stats::Running;
+use dipir_scene::material::{AlphaMode, Clearcoat, Material};
 use dipir_scene::proxy::Proxy;
+use dipir_scene::scene::Scene;
+use rayon::prelude::*;
 
 use super::*;
-use crate::features::SPECULAR;
-use crate::render::Simulation;
+use crate::counters::RayCounts;
+use crate::features::{ALL, SPECULAR};
+use crate::light::SceneLight;
+use crate::render::{Renderer, Simulation};
 use crate::shapes::{cuboid, icosphere, quad, torus_knot};
 use crate::testing::{camera, everything, lambertian, matte, render, scene, settings, sky, sun};
 
@@ -399,4 +406,101 @@ fn emission_of_any_strength_leaves_layers_finite() {
         assert!(film.shadow.pixels().iter().any(|v| v.x > 0.1 * strength));
         assert!(r.error.rmse.is_finite() && r.error.upper_95.is_finite());
     }
+}
+
+/// A knot of matt paint under a polished coat.
+fn coated_knot() -> Scene {
+    let coat = Clearcoat {
+        factor: 1.0,
+        roughness: 0.15,
+        factor_texture: None,
+        roughness_texture: None,
+        normal_texture: None,
+    };
+    let paint = Material {
+        base_color: glam::Vec4::new(0.5, 0.5, 0.5, 1.0),
+        roughness: 1.0,
+        clearcoat: Some(coat),
+        ..Material::default()
+    };
+    let mesh = torus_knot(Vec3::ZERO, 0.4, 0.13, 200, 24);
+    let view = camera(Vec3::new(2.0, 1.2, 3.0), Vec3::ZERO, 30.0, 16);
+    scene(mesh, paint, view, Proxy::None)
+}
+
+/// By pixel of 16 x 16: the luminance of single paths that meet the object once, and what further interactions add.
+fn of_paths(light: &EnvironmentSampler, blur_caustics: bool) -> Vec<[Running; 2]> {
+    let scene = coated_knot();
+    let world = Renderer::new(&scene).world(ALL).expect("a world");
+    let light = light.on_object();
+    let to_depth = |depth: u32| PathContext {
+        blur_caustics,
+        ..PathContext::from_camera(&world, &light, &everything(depth), None)
+    };
+    let paths = [to_depth(1), to_depth(4)];
+    let pixel = |p: u32| {
+        let corner = Vec2::new((p % 16) as f32, (p / 16) as f32);
+        let mut found = [Running::default(); 2];
+        for sample in 0..2048 {
+            let [once, all] = paths.map(|path| {
+                let mut draws = Sampler::new(1, Stream::TEST, p, sample);
+                let rays = &mut RayCounts::default();
+                f64::from(luminance(
+                    path.camera_sample::<ALL>(corner, &mut draws, rays).radiance,
+                ))
+            });
+            found[0].push(once);
+            found[1].push(all - once);
+        }
+        found
+    };
+    (0..256).into_par_iter().map(pixel).collect()
+}
+
+/// Mean over the pixels and its standard error.
+fn mean_of(pixels: &[[Running; 2]], part: usize) -> (f64, f64) {
+    let n = pixels.len() as f64;
+    let mean = pixels.iter().map(|p| p[part].mean()).sum::<f64>() / n;
+    let error = pixels
+        .iter()
+        .map(|p| p[part].std_error().powi(2))
+        .sum::<f64>()
+        .sqrt()
+        / n;
+    (mean, error)
+}
+
+#[test]
+fn blurred_caustics_keep_the_light_of_a_white_sky() {
+    let [sharp, blurred] = [false, true].map(|blur| of_paths(&sky(1.0), blur));
+    assert_eq!(mean_of(&sharp, 0), mean_of(&blurred, 0), "seen directly");
+    let [(sharp, a), (blurred, b)] = [sharp, blurred].map(|pixels| mean_of(&pixels, 1));
+    // Both coats let as much pass, up to a hundredth: what a rough one reflects goes elsewhere.
+    let bound = 4.0 * a.hypot(b) + 0.01 * sharp;
+    assert!((sharp - blurred).abs() < bound, "{sharp} {blurred} {bound}");
+}
+
+#[test]
+fn blurred_caustics_are_less_noisy() {
+    let sun = sun(Vec3::new(0.55, 0.6, 0.35).normalize(), 6e4, 0.3, 256);
+    let sunny = EnvironmentSampler::new(sun);
+    let [sharp, blurred] = [false, true].map(|blur| of_paths(&sunny, blur));
+    let noise = |pixels: &[[Running; 2]]| pixels.iter().map(|p| p[1].variance()).sum::<f64>();
+    let (sharp, blurred) = (noise(&sharp), noise(&blurred));
+    // A quarter of it is left; seeds are fixed.
+    assert!(blurred < 0.5 * sharp, "{blurred} {sharp}");
+}
+
+#[test]
+fn what_follows_a_reflection_is_half_as_wide() {
+    let alpha = 0.09f32;
+    let found = blurred_roughness(1.0 / (4.0 * PI * alpha * alpha));
+    // f32 in a few steps.
+    assert!(
+        (found * found / (0.5 * alpha) - 1.0).abs() < 1e-5,
+        "{found}"
+    );
+    assert!(blurred_roughness(f32::MAX) < 1e-9);
+    assert_eq!(blurred_roughness(f32::INFINITY), 0.0);
+    assert_eq!(blurred_roughness(f32::MIN_POSITIVE), MIN_CAUSTIC_ROUGHNESS);
 }
