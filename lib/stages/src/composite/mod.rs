@@ -241,7 +241,7 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
         "tone": table.tone,
         "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
         "denoise": table.denoise(session.pipeline.quality),
-        "blur_caustics": table.blur_caustics(),
+        "blur_caustics": table.blur_caustics(session.pipeline.quality),
         "most_pixels": table.most_pixels(session.pipeline.quality),
         "stop": match table.stop(session.pipeline.quality) {
             Stop::Samples(n) => json!({"samples": n}),
@@ -298,7 +298,7 @@ fn render_under<L: SceneLight>(
         stop,
         max_samples: table.max_samples.unwrap_or(MAX_SAMPLES),
         denoise: table.denoise(session.pipeline.quality),
-        blur_caustics: table.blur_caustics(),
+        blur_caustics: table.blur_caustics(session.pipeline.quality),
         most_pixels: table.most_pixels(session.pipeline.quality),
         leave_out: effects.leave_out(loaded.description.effects()),
         ..Settings::of_scene(loaded)

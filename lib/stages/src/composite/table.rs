@@ -41,7 +41,7 @@ pub struct CompositeTable {
     pub denoise: Option<bool>,
     /// Whether caustics on the object are blurred, such as the sun's reflection by polished paint onto a matt part beside
     /// it: fewer specks, in less time.
-    #[schemars(extend("default" = true), example = false)]
+    #[schemars(extend("x-default" = "true; false for the preset `high`"), example = false)]
     pub blur_caustics: Option<bool>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
     /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
@@ -143,8 +143,8 @@ impl CompositeTable {
         self.denoise.unwrap_or(by_preset)
     }
 
-    pub(super) fn blur_caustics(&self) -> bool {
-        self.blur_caustics.unwrap_or(true)
+    pub(super) fn blur_caustics(&self, quality: Quality) -> bool {
+        self.blur_caustics.unwrap_or(quality != Quality::High)
     }
 
     /// Most pixels at which object and shadow are rendered; a time budget chooses the resolution itself.
