@@ -5,8 +5,9 @@
 //! reference with a tenth of the target's error, less the reference's own.
 //!
 //! Run with `cargo test -p dipir-render --bench calibration -- --bench [target=RMSE] [size=PIXELS]
-//! [samples=N] [highlights=0] [denoise=0] [NAME]`: `samples` draws so many in every pixel instead of stopping at the target,
-//! `highlights=0` leaves highlights to chance, `denoise=0` leaves noise, and only scenes whose name holds NAME are rendered.
+//! [samples=N] [highlights=0] [denoise=0] [blur=0] [NAME]`: `samples` draws so many in every pixel instead of stopping at the
+//! target, `highlights=0` leaves highlights to chance, `denoise=0` leaves noise, `blur=0` leaves caustics sharp as they are in
+//! the reference, and only scenes whose name holds NAME are rendered.
 //! Without `--bench`, as tests run it, one small scene proves that it works.
 mod gallery;
 
@@ -23,6 +24,7 @@ use dipir_render::render::{Rendered, Renderer, Settings, Simulation};
 use glam::Vec3;
 
 const SEEDS: u64 = 5;
+const MAX_SAMPLES: u32 = 1 << 20;
 /// What is behind everything where there is no photograph.
 const GREY: Vec3 = Vec3::splat(0.18);
 
@@ -38,7 +40,8 @@ fn main() {
     let size = value("size", if whole { 48.0 } else { 12.0 }) as u32;
     let target = value("target", if whole { 0.008 } else { 0.03 }) as f32;
     let samples = value("samples", 0.0) as u32;
-    let [highlights, denoise] = ["highlights", "denoise"].map(|key| value(key, 1.0) > 0.0);
+    let [highlights, denoise, blur_caustics] =
+        ["highlights", "denoise", "blur"].map(|key| value(key, 1.0) > 0.0);
     let stop = match samples {
         0 => Stop::TargetError(target),
         n => Stop::Samples(n),
@@ -61,23 +64,26 @@ fn main() {
     for (name, scene) in scenes {
         let renderer = Renderer::new(&scene);
         let simulation = EffectsPlan::everything(&scene, &Settings::default()).simulation();
-        let reference = render(
-            &renderer,
-            &light,
-            &simulation,
-            (Stop::TargetError(target / 10.0), true, false),
-            1 << 40,
-        );
+        let reference = Settings {
+            seed: 1 << 40,
+            stop: Stop::TargetError(target / 10.0),
+            max_samples: MAX_SAMPLES,
+            ..Settings::default()
+        };
+        let reference = render(&renderer, &light, &simulation, &reference);
         let (mut stated, mut bounds, mut squares, mut within) = (vec![], vec![], 0.0, 0);
         let mut rays = 0;
         for seed in 0..SEEDS {
-            let found = render(
-                &renderer,
-                &light,
-                &simulation,
-                (stop, highlights, denoise),
+            let settings = Settings {
                 seed,
-            );
+                stop,
+                max_samples: MAX_SAMPLES,
+                highlights,
+                denoise,
+                blur_caustics,
+                ..Settings::default()
+            };
+            let found = render(&renderer, &light, &simulation, &settings);
             let square = squared_difference(&found.film, &reference.film)
                 - reference.error.rmse * reference.error.rmse;
             squares += square.max(0.0) / SEEDS as f64;
@@ -123,20 +129,11 @@ fn render(
     renderer: &Renderer,
     light: &dipir_light::environment::EnvironmentSampler,
     simulation: &Simulation,
-    (stop, highlights, denoise): (Stop, bool, bool),
-    seed: u64,
+    settings: &Settings,
 ) -> Rendered {
-    let settings = Settings {
-        seed,
-        stop,
-        max_samples: 1 << 20,
-        highlights,
-        denoise,
-        ..Settings::default()
-    };
     let go_on = &mut |_: &_| ControlFlow::Continue(());
     renderer
-        .render(light, simulation, &settings, go_on)
+        .render(light, simulation, settings, go_on)
         .expect("renders")
 }
 
@@ -149,7 +146,14 @@ fn spent(
 ) -> f64 {
     let clock = Instant::now();
     let stop = Stop::TimeBudget(Duration::from_secs_f64(seconds));
-    render(renderer, light, simulation, (stop, true, true), 0);
+    let settings = Settings {
+        stop,
+        max_samples: MAX_SAMPLES,
+        denoise: true,
+        blur_caustics: true,
+        ..Settings::default()
+    };
+    render(renderer, light, simulation, &settings);
     clock.elapsed().as_secs_f64() / seconds
 }
 

@@ -12,8 +12,6 @@
 //!
 //! What it cannot do: caustics from light through rough glass onto the object converge slowly, as
 //! in every unidirectional path tracer; refracted rays see the distant light, not the photograph.
-use std::f32::consts::PI;
-
 use dipir_imaging::raster::LinearImage;
 use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::Sampler;
@@ -65,7 +63,7 @@ pub struct PathContext<'a, L> {
     /// The same, but only for light that reaches them from where the light is sampled: a small source is then met by
     /// many paths, and shown blurred.
     pub min_lit_roughness: f32,
-    /// Whether surfaces behind a wide reflection are [blurred](BLUR).
+    /// Whether surfaces that a path meets after a wide reflection count as at least half as wide: `WIDE`, `BLURRED`.
     pub blur_caustics: bool,
     /// What is known of where light comes from by way of the object.
     pub guide: Option<&'a PathGuide>,
@@ -215,17 +213,12 @@ const DIMENSIONS_PER_VERTEX: u32 = 4;
 /// energy arrives without them. Known as path regularisation [Kaplanyan and Dachsbacher 2013].
 pub const MIN_CAUSTIC_ROUGHNESS: f32 = 0.6;
 
-/// Least alpha of the surfaces behind a reflection, as a share of the alpha of a lobe that reflects as widely. The sun in
-/// a coat that is seen by way of a diffuse surface is found by one path in thousands, too, and what such a surface shows
-/// of a blurred lobe is nearly what it shows of a sharp one.
-const BLUR: f32 = 0.5;
+/// Density per steradian of a reflection below which it is wide: a matt surface reflects with at most `1 / pi`.
+const WIDE: f32 = 0.5;
 
-/// Least roughness behind a reflection whose BSDF has the density `pdf` in its direction: GGX has at most `1 / (4 pi
-/// alpha^2)`.
-fn blurred_roughness(pdf: f32) -> f32 {
-    let alpha = BLUR / (4.0 * PI * pdf).sqrt();
-    alpha.sqrt().min(MIN_CAUSTIC_ROUGHNESS)
-}
+/// Least roughness of what a path meets after a wide reflection, where caustics are blurred. One path in thousands finds the
+/// sun in a coat that lights a matt surface. At this roughness a lobe is half as wide as a matt one (alpha of .25 and .5).
+const BLURRED: f32 = 0.5;
 
 /// Paths keep at least this chance of going on, so that survivors' weights stay bounded.
 const MIN_SURVIVAL: f32 = 0.1;
@@ -317,7 +310,7 @@ impl<L: PathLight> PathContext<'_, L> {
         //                                           if the light could not have drawn it
         let mut leaves = false; //                   the segment is known to miss the object
         let mut filling = Vec3::ZERO; //             attenuation per metre of the segment
-        let mut least_roughness = self.min_roughness; // of the next surfaces
+        let mut least_roughness = self.min_roughness; // that the next surfaces count as having
         let mut thickness = 0.0; //                  metres of it if the segment meets no inner side
         let first_dimension = sampler.dimension();
         let emits = has(F, EMISSION) && has(world.mask, EMISSION);
@@ -456,8 +449,8 @@ impl<L: PathLight> PathContext<'_, L> {
             let Some(mut sample) = drawn else {
                 break;
             };
-            if self.blur_caustics && !sample.delta {
-                least_roughness = least_roughness.max(blurred_roughness(sample.pdf));
+            if self.blur_caustics && sample.pdf < WIDE {
+                least_roughness = least_roughness.max(BLURRED);
             }
             if let Some(cones) = &cones {
                 cones.weigh(&mut sample);

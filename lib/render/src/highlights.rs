@@ -358,7 +358,6 @@ impl<L: PathLight> PathContext<'_, L> {
     fn at_least_as_rough_as(&self, angle: f32) -> Self {
         Self {
             min_lit_roughness: angle.clamp(0.0, 1.0).sqrt(),
-            blur_caustics: false,
             guide: None,
             ..*self
         }

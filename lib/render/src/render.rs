@@ -71,8 +71,8 @@ pub struct Settings<'a> {
     pub highlights: bool,
     /// Whether noise is [removed](crate::denoise) from object and shadow.
     pub denoise: bool,
-    /// Whether caustics on the object are blurred: what a wide lobe reflects of a sharp one
-    /// ([`PathContext::blur_caustics`]). Most of them are specks, else; how much it changes is in docs/performance.md.
+    /// Whether [caustics](PathContext::blur_caustics) on the object are blurred. Sharp ones are found by few paths: specks.
+    /// The stated error leaves the blur out.
     pub blur_caustics: bool,
     /// A frame of more pixels is rendered at 1/2, 1/4 and so on of its resolution, the finest that has at most
     /// this many, and enlarged. A time budget chooses the resolution itself.

@@ -395,7 +395,6 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
             },
             photo: None,
             min_roughness: MIN_CAUSTIC_ROUGHNESS,
-            blur_caustics: false,
             guide: None,
             ..self.path
         };

@@ -158,8 +158,10 @@ pub(super) fn apply_override(root: &mut Node, text: &str) -> Result<(), ConfigEr
 fn shell_number(text: &str) -> Option<Value> {
     let text = text.trim();
     let numeric = |b: u8| b.is_ascii_digit() || b"+-.eE".contains(&b);
-    let number = text.bytes().all(numeric).then(|| text.parse().ok())?;
-    number.map(Value::Float)
+    match text.bytes().all(numeric) {
+        true => text.parse().ok().map(Value::Float),
+        false => None,
+    }
 }
 
 fn insert(target: &mut Node, steps: &[&str], node: Node, place: &Place) -> Result<(), String> {
