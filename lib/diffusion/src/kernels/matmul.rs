@@ -4,7 +4,7 @@
 use gemm::{Parallelism, gemm};
 
 use super::packed::{self, PackedColumns};
-use super::tiles;
+use super::{tiles, written};
 
 /// A row-major view: element (i, j) at `i * row + j * column`.
 #[derive(Clone, Copy)]
@@ -71,6 +71,15 @@ impl Engine {
     }
 }
 
+/// What a product is added to.
+#[derive(Clone, Copy)]
+pub(crate) enum Onto<'a> {
+    /// What is there, times a factor; for 0 that is not read.
+    Kept(f32),
+    /// The same numbers in every row.
+    Row(&'a [f32]),
+}
+
 /// `out[m x n] = keep * out + scale * a[m x k] b[k x n]`, where `out` has rows
 /// of stride `out_row` and contiguous columns.
 ///
@@ -112,7 +121,10 @@ pub(crate) unsafe fn product_by(
     if engine == Engine::Panels {
         assert!(packed::available(), "panels need AVX-512");
         // SAFETY: both views were checked, `out` is the caller's contract.
-        return unsafe { packed::product((m, n, k), out, out_row, keep, scale, a, b, threads) };
+        return unsafe {
+            let onto = Onto::Kept(keep);
+            packed::product((m, n, k), out, out_row, onto, scale, a, b, threads)
+        };
     }
     if engine == Engine::Tiles {
         // SAFETY: as above.
@@ -223,6 +235,54 @@ pub(crate) fn product(
     unsafe { product_at((m, n, k), out.as_mut_ptr(), n, keep, 1.0, a, b, threads) }
 }
 
+/// `a[m x k] b[k x n]`.
+fn product_of((m, n, k): (usize, usize, usize), a: Matrix, b: Matrix) -> Vec<f32> {
+    // SAFETY: all m n elements are written.
+    unsafe {
+        written(m * n, |out| {
+            product_at((m, n, k), out, n, 0.0, 1.0, a, b, Threads::All);
+        })
+    }
+}
+
+/// `row + a[m x k] b[k x n]` for every row.
+pub(super) fn product_onto_rows(
+    engine: Engine,
+    (m, n, k): (usize, usize, usize),
+    row: &[f32],
+    a: Matrix,
+    b: Matrix,
+) -> Vec<f32> {
+    assert_eq!(row.len(), n, "one number for each column");
+    a.check(m, k);
+    b.check(k, n);
+    if engine == Engine::Panels {
+        // SAFETY: the views and the row were checked, and all m n elements are written.
+        return unsafe {
+            written(m * n, |out| {
+                let onto = Onto::Row(row);
+                packed::product((m, n, k), out, n, onto, 1.0, a, b, Threads::All);
+            })
+        };
+    }
+    let (size, mut out) = ((m, n, k), row.repeat(m));
+    // SAFETY: `out` holds m rows of n elements, and the views were checked.
+    unsafe {
+        product_by(
+            engine,
+            size,
+            out.as_mut_ptr(),
+            n,
+            1.0,
+            1.0,
+            a,
+            b,
+            Threads::All,
+        )
+    };
+    out
+}
+
 /// Sizes of x [rows, inputs] and y [rows, outputs] of a fully connected layer.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LinearShape {
@@ -242,16 +302,14 @@ pub(crate) fn linear(
     w: &[f32],
     bias: Option<&[f32]>,
 ) -> Vec<f32> {
-    let (mut y, keep) = match bias {
-        Some(bias) => (bias.repeat(rows), 1.0),
-        None => (vec![0.0; rows * outputs], 0.0),
-    };
     let (a, b) = (
         Matrix::rows(x, inputs),
         Matrix::rows(w, inputs).transposed(),
     );
-    product((rows, outputs, inputs), &mut y, keep, a, b, Threads::All);
-    y
+    match bias {
+        Some(bias) => product_onto_rows(Engine::best(), (rows, outputs, inputs), bias, a, b),
+        None => product_of((rows, outputs, inputs), a, b),
+    }
 }
 
 /// Gradient of [`linear`] with respect to x, for the gradient `g` of y.
@@ -264,16 +322,8 @@ pub(crate) fn linear_vjp_input(
     g: &[f32],
     w: &[f32],
 ) -> Vec<f32> {
-    let mut dx = vec![0.0; rows * inputs];
-    product(
-        (rows, inputs, outputs),
-        &mut dx,
-        0.0,
-        Matrix::rows(g, outputs),
-        Matrix::rows(w, inputs),
-        Threads::All,
-    );
-    dx
+    let (a, b) = (Matrix::rows(g, outputs), Matrix::rows(w, inputs));
+    product_of((rows, inputs, outputs), a, b)
 }
 
 /// Gradient of [`linear`] with respect to w.
@@ -286,13 +336,11 @@ pub(crate) fn linear_vjp_weight(
     g: &[f32],
     x: &[f32],
 ) -> Vec<f32> {
-    let mut dw = vec![0.0; outputs * inputs];
     let (a, b) = (
         Matrix::rows(g, outputs).transposed(),
         Matrix::rows(x, inputs),
     );
-    product((outputs, inputs, rows), &mut dw, 0.0, a, b, Threads::All);
-    dw
+    product_of((outputs, inputs, rows), a, b)
 }
 
 /// Sum over rows: the gradient of a bias.

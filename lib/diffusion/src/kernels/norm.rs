@@ -2,8 +2,7 @@
 //! f32 partial sums, the deviation from the mean taken before squaring, so
 //! that a large common offset costs no digits.
 
-use rayon::prelude::*;
-
+use super::filled;
 use super::pointwise::{silu, silu_derivative};
 use super::simd::{CHUNK, sum_of, sum_of_2, vectorized};
 
@@ -58,25 +57,19 @@ vectorized! {
 
 /// y = gamma (x - mean) / deviation + beta by group, then SiLU if asked.
 pub(crate) fn group_norm(shape: GroupShape, x: &[f32], gamma: &[f32], beta: &[f32]) -> Vec<f32> {
-    let mut y = vec![0.0; x.len()];
     let len = shape.group_len();
     let per_group = shape.channels / shape.groups;
-    y.par_chunks_mut(len)
-        .zip(x.par_chunks(len))
-        .enumerate()
-        .for_each(|(job, (y, x))| {
-            let first = job % shape.groups * per_group;
-            let (mean, rstd) = statistics(x, shape.eps);
-            for (c, (y, x)) in y
-                .chunks_mut(shape.pixels)
-                .zip(x.chunks(shape.pixels))
-                .enumerate()
-            {
-                let scale = gamma[first + c] * rstd;
-                affine(x, scale, beta[first + c] - mean * scale, shape.silu, y);
-            }
-        });
-    y
+    let job = |job: usize, y: &mut [f32]| {
+        let x = &x[job * len..][..len];
+        let first = job % shape.groups * per_group;
+        let (mean, rstd) = statistics(x, shape.eps);
+        let channels = y.chunks_mut(shape.pixels).zip(x.chunks(shape.pixels));
+        for (c, (y, x)) in channels.enumerate() {
+            let scale = gamma[first + c] * rstd;
+            affine(x, scale, beta[first + c] - mean * scale, shape.silu, y);
+        }
+    };
+    filled(x.len(), len, 1, job).0
 }
 
 vectorized! {
@@ -119,52 +112,48 @@ pub(crate) fn group_norm_vjp(
     beta: &[f32],
     g: &[f32],
 ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
-    let mut dx = vec![0.0; x.len()];
     let len = shape.group_len();
     let per_group = shape.channels / shape.groups;
     let pixels = shape.pixels;
-    let sums: Vec<Vec<(f64, f64)>> = dx
-        .par_chunks_mut(len)
-        .zip(x.par_chunks(len).zip(g.par_chunks(len)))
-        .enumerate()
-        .map(|(job, (dx, (x, g)))| {
-            let first = job % shape.groups * per_group;
-            let (mean, rstd) = statistics(x, shape.eps);
-            let mut sums = Vec::with_capacity(per_group);
-            let (mut total, mut total_xhat) = (0f64, 0f64);
-            for c in 0..per_group {
-                let range = c * pixels..(c + 1) * pixels;
-                let (gamma, beta) = (gamma[first + c], beta[first + c]);
-                let (s, sx) = through_activation(
-                    &x[range.clone()],
-                    &g[range.clone()],
-                    mean,
-                    rstd,
-                    gamma,
-                    beta,
-                    shape.silu,
-                    &mut dx[range],
-                );
-                total += s * gamma as f64;
-                total_xhat += sx * gamma as f64;
-                sums.push((s, sx));
-            }
-            let offset = (total / len as f64 * rstd as f64) as f32;
-            let slope = (total_xhat / len as f64 * rstd as f64 * rstd as f64) as f32;
-            for c in 0..per_group {
-                let range = c * pixels..(c + 1) * pixels;
-                recenter(
-                    &x[range.clone()],
-                    gamma[first + c] * rstd,
-                    offset,
-                    slope,
-                    mean,
-                    &mut dx[range],
-                );
-            }
-            sums
-        })
-        .collect();
+    let job = |job: usize, dx: &mut [f32]| {
+        let (x, g) = (&x[job * len..][..len], &g[job * len..][..len]);
+        let first = job % shape.groups * per_group;
+        let (mean, rstd) = statistics(x, shape.eps);
+        let mut sums = Vec::with_capacity(per_group);
+        let (mut total, mut total_xhat) = (0f64, 0f64);
+        for c in 0..per_group {
+            let range = c * pixels..(c + 1) * pixels;
+            let (gamma, beta) = (gamma[first + c], beta[first + c]);
+            let (s, sx) = through_activation(
+                &x[range.clone()],
+                &g[range.clone()],
+                mean,
+                rstd,
+                gamma,
+                beta,
+                shape.silu,
+                &mut dx[range],
+            );
+            total += s * gamma as f64;
+            total_xhat += sx * gamma as f64;
+            sums.push((s, sx));
+        }
+        let offset = (total / len as f64 * rstd as f64) as f32;
+        let slope = (total_xhat / len as f64 * rstd as f64 * rstd as f64) as f32;
+        for c in 0..per_group {
+            let range = c * pixels..(c + 1) * pixels;
+            recenter(
+                &x[range.clone()],
+                gamma[first + c] * rstd,
+                offset,
+                slope,
+                mean,
+                &mut dx[range],
+            );
+        }
+        sums
+    };
+    let (dx, sums) = filled(x.len(), len, 1, job);
     let (mut dgamma, mut dbeta) = (vec![0f64; shape.channels], vec![0f64; shape.channels]);
     for (job, sums) in sums.iter().enumerate() {
         for (c, (s, sx)) in sums.iter().enumerate() {
@@ -191,13 +180,9 @@ vectorized! {
 
 /// Rows of `gamma.len()` elements, each normalised.
 pub(crate) fn layer_norm(x: &[f32], gamma: &[f32], beta: &[f32], eps: f32) -> Vec<f32> {
-    let mut y = vec![0.0; x.len()];
     let n = gamma.len();
-    y.par_chunks_mut(n)
-        .zip(x.par_chunks(n))
-        .with_min_len(16)
-        .for_each(|(y, x)| layer_norm_row(x, gamma, beta, eps, y));
-    y
+    let job = |row: usize, y: &mut [f32]| layer_norm_row(&x[row * n..][..n], gamma, beta, eps, y);
+    filled(x.len(), n, 16, job).0
 }
 
 vectorized! {
@@ -230,22 +215,19 @@ pub(crate) fn layer_norm_vjp(
     eps: f32,
 ) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let n = gamma.len();
-    let mut dx = vec![0.0; x.len()];
-    let partial: Vec<(Vec<f32>, Vec<f32>)> = dx
-        .par_chunks_mut(n * ROWS)
-        .zip(x.par_chunks(n * ROWS).zip(g.par_chunks(n * ROWS)))
-        .map(|(dx, (x, g))| {
-            let (mut dgamma, mut dbeta, mut xhat) = (vec![0f32; n], vec![0f32; n], vec![0f32; n]);
-            for ((dx, x), g) in dx.chunks_mut(n).zip(x.chunks(n)).zip(g.chunks(n)) {
-                layer_norm_row_vjp(x, gamma, g, eps, &mut xhat, dx);
-                for i in 0..n {
-                    dgamma[i] += g[i] * xhat[i];
-                    dbeta[i] += g[i];
-                }
+    let job = |job: usize, dx: &mut [f32]| {
+        let [x, g] = [x, g].map(|values| &values[job * n * ROWS..][..dx.len()]);
+        let (mut dgamma, mut dbeta, mut xhat) = (vec![0f32; n], vec![0f32; n], vec![0f32; n]);
+        for ((dx, x), g) in dx.chunks_mut(n).zip(x.chunks(n)).zip(g.chunks(n)) {
+            layer_norm_row_vjp(x, gamma, g, eps, &mut xhat, dx);
+            for i in 0..n {
+                dgamma[i] += g[i] * xhat[i];
+                dbeta[i] += g[i];
             }
-            (dgamma, dbeta)
-        })
-        .collect();
+        }
+        (dgamma, dbeta)
+    };
+    let (dx, partial) = filled(x.len(), n * ROWS, 1, job);
     let (mut dgamma, mut dbeta) = (vec![0f32; n], vec![0f32; n]);
     for (a, b) in &partial {
         for i in 0..n {

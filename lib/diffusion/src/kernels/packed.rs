@@ -7,7 +7,7 @@
 use rayon::prelude::*;
 
 use super::lanes::gather_narrow;
-use super::matmul::{Matrix, Threads};
+use super::matmul::{Matrix, Onto, Threads};
 use super::{SharedMut, with_scratch};
 
 /// Rows of the register tile: 14 x 2 registers of sums, 2 of B, of 32.
@@ -84,24 +84,24 @@ fn pack_pass(
 
 /// Where a product goes, and how.
 #[derive(Clone, Copy)]
-struct Output {
+struct Output<'a> {
     target: SharedMut,
     row: usize,
-    keep: f32,
+    onto: Onto<'a>,
     scale: f32,
 }
 
-/// `out = keep * out + scale * a b`.
+/// `out = onto + scale * a b`.
 ///
 /// # Safety
 /// [`available`] is true; `out` is valid for writes of m rows of n elements
-/// at stride `out_row` (and reads, if `keep` is not 0), used by nobody else
-/// meanwhile; the views cover m x k and k x n elements.
+/// at stride `out_row` (and reads, if some of it is kept), used by nobody else
+/// meanwhile; the views cover m x k and k x n elements, and a row added to all n.
 pub(super) unsafe fn product(
     (m, n, k): (usize, usize, usize),
     out: *mut f32,
     out_row: usize,
-    keep: f32,
+    onto: Onto,
     scale: f32,
     a: Matrix,
     b: Matrix,
@@ -136,7 +136,11 @@ pub(super) unsafe fn product(
                 let output = Output {
                     target: SharedMut(out.wrapping_add(first_column)),
                     row: out_row,
-                    keep: if first_depth == 0 { keep } else { 1.0 },
+                    onto: match (first_depth, onto) {
+                        (0, Onto::Row(row)) => Onto::Row(&row[first_column..]),
+                        (0, onto) => onto,
+                        _ => Onto::Kept(1.0),
+                    },
                     scale,
                 };
                 let size = (m, columns, depth);
@@ -171,7 +175,7 @@ pub(super) unsafe fn product_packed(
         let output = Output {
             target: SharedMut(out),
             row: out_row,
-            keep: if first_depth == 0 { keep } else { 1.0 },
+            onto: Onto::Kept(if first_depth == 0 { keep } else { 1.0 }),
             scale,
         };
         let panels = &b.panels[width * first_depth..][..width * depth];
@@ -217,7 +221,10 @@ unsafe fn one_pass(
             rows,
             columns: job_columns.min(columns - first),
             depth,
-            keep: output.keep,
+            onto: match output.onto {
+                Onto::Row(row) => Onto::Row(&row[first..]),
+                kept => kept,
+            },
             scale: output.scale,
             out_row: output.row,
         };
@@ -330,16 +337,16 @@ enum Rows<'a> {
 
 /// One job: a block of rows and columns over one depth.
 #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
-struct Block {
+struct Block<'a> {
     rows: usize,
     columns: usize,
     depth: usize,
-    keep: f32,
+    onto: Onto<'a>,
     scale: f32,
     out_row: usize,
 }
 
-impl Block {
+impl Block<'_> {
     /// # Safety
     /// `out` is the block's first element, valid as [`product`] demands; A
     /// and the packed B cover the block; AVX-512 is there.
@@ -361,6 +368,7 @@ impl Block {
                                 MR,
                                 b,
                                 self,
+                                first,
                                 (rows, columns),
                                 out,
                             );
@@ -372,6 +380,7 @@ impl Block {
                                 MR,
                                 b,
                                 self,
+                                first,
                                 (rows, columns),
                                 out,
                             );
@@ -383,6 +392,7 @@ impl Block {
                                 column,
                                 b,
                                 self,
+                                first,
                                 (rows, columns),
                                 out,
                             );
@@ -394,6 +404,7 @@ impl Block {
                                 column,
                                 b,
                                 self,
+                                first,
                                 (rows, columns),
                                 out,
                             );
@@ -409,7 +420,7 @@ impl Block {
 
 /// MR x 16 HALVES sums over the depth, of which `rows` x `columns` are stored.
 /// A's element (i, p) is at `i * a_row + p * a_column`; where it is PACKED
-/// these are 1 and MR.
+/// these are 1 and MR. `first` is the tile's first column in the block.
 ///
 /// # Safety
 /// As [`Block::run`]; `b` holds `depth` rows of NR elements, `a` reaches to
@@ -422,6 +433,7 @@ unsafe fn tile<const HALVES: usize, const PACKED: bool>(
     a_column: usize,
     b: &[f32],
     block: &Block,
+    first: usize,
     (rows, columns): (usize, usize),
     out: *mut f32,
 ) {
@@ -432,6 +444,12 @@ unsafe fn tile<const HALVES: usize, const PACKED: bool>(
     // masked loads and stores touch `rows` x `columns` elements of `out` only.
     unsafe {
         let starts: [*const f32; MR] = std::array::from_fn(|i| a.add(i.min(rows - 1) * a_row));
+        // The lines that are written come from memory meanwhile.
+        for i in 0..rows {
+            let line = out.wrapping_add(i * block.out_row).cast();
+            _mm_prefetch::<_MM_HINT_T0>(line);
+            _mm_prefetch::<_MM_HINT_T0>(line.wrapping_add(64));
+        }
         for p in 0..block.depth {
             let row = b.add(p * NR);
             let panel: [__m512; HALVES] =
@@ -455,7 +473,12 @@ unsafe fn tile<const HALVES: usize, const PACKED: bool>(
                 (1u16 << count) - 1
             }
         };
-        let (keep, scale) = (_mm512_set1_ps(block.keep), _mm512_set1_ps(block.scale));
+        // What is not kept may be anything, NaN too.
+        let (kept, added) = match block.onto {
+            Onto::Kept(keep) => (keep, None),
+            Onto::Row(row) => (0.0, Some(row.as_ptr().add(first))),
+        };
+        let (keep, scale) = (_mm512_set1_ps(kept), _mm512_set1_ps(block.scale));
         for i in 0..MR {
             if i >= rows {
                 break;
@@ -464,8 +487,10 @@ unsafe fn tile<const HALVES: usize, const PACKED: bool>(
                 let mask = mask(columns.saturating_sub(16 * half));
                 let at = out.add(i * block.out_row).wrapping_add(16 * half);
                 let mut value = _mm512_mul_ps(sums[i][half], scale);
-                // What is not kept may be anything, NaN too.
-                if block.keep != 0.0 {
+                if let Some(row) = added {
+                    let row = _mm512_maskz_loadu_ps(mask, row.wrapping_add(16 * half));
+                    value = _mm512_add_ps(value, row);
+                } else if kept != 0.0 {
                     let old = _mm512_maskz_loadu_ps(mask, at);
                     value = _mm512_fmadd_ps(old, keep, value);
                 }
@@ -477,7 +502,7 @@ unsafe fn tile<const HALVES: usize, const PACKED: bool>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::matmul::{Columns, Engine, product_by, product_columns};
+    use super::super::matmul::{Columns, Engine, product_by, product_columns, product_onto_rows};
     use super::*;
 
     /// Against sums in f64, for sizes at and off every block's border, all
@@ -543,6 +568,21 @@ mod tests {
                             out.iter().zip(&again).all(same),
                             "{engine:?} {m}x{n}x{k}: packed ahead gives other bytes"
                         );
+                        if keep == 1.0 {
+                            let row = &start[..n];
+                            let mut wanted = row.repeat(m);
+                            // SAFETY: as above.
+                            unsafe {
+                                let out = wanted.as_mut_ptr();
+                                let b = b_view;
+                                product_by(*engine, size, out, n, 1.0, 1.0, a_view, b, *threads);
+                            }
+                            let onto = product_onto_rows(*engine, size, row, a_view, b_view);
+                            assert!(
+                                onto.iter().zip(&wanted).all(same),
+                                "{engine:?} {m}x{n}x{k}: onto rows gives other bytes"
+                            );
+                        }
                         for i in 0..m {
                             for j in 0..n {
                                 let mut sum = if keep == 0.0 {

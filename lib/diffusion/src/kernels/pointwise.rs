@@ -1,7 +1,6 @@
 //! Activations and their derivatives, vectorised and in parallel.
 
-use rayon::prelude::*;
-
+use super::filled;
 use super::simd::{erf, exp, sigmoid, vectorized};
 
 /// Elements of one job: 64 KiB, small beside L2 and large beside a wake-up.
@@ -79,20 +78,17 @@ vectorized! {
 
 /// f(x), elementwise.
 pub(crate) fn eval(f: Activation, x: &[f32]) -> Vec<f32> {
-    let mut y = vec![0.0; x.len()];
-    y.par_chunks_mut(JOB)
-        .zip(x.par_chunks(JOB))
-        .for_each(|(y, x)| eval_job(f, x, y));
-    y
+    let job = |job: usize, y: &mut [f32]| eval_job(f, &x[job * JOB..][..y.len()], y);
+    filled(x.len(), JOB, 1, job).0
 }
 
 /// The gradient with respect to x: g f'(x).
 pub(crate) fn eval_vjp(f: Activation, x: &[f32], g: &[f32]) -> Vec<f32> {
-    let mut dx = vec![0.0; x.len()];
-    dx.par_chunks_mut(JOB)
-        .zip(x.par_chunks(JOB).zip(g.par_chunks(JOB)))
-        .for_each(|(dx, (x, g))| vjp_job(f, x, g, dx));
-    dx
+    let job = |job: usize, dx: &mut [f32]| {
+        let [x, g] = [x, g].map(|values| &values[job * JOB..][..dx.len()]);
+        vjp_job(f, x, g, dx)
+    };
+    filled(x.len(), JOB, 1, job).0
 }
 
 vectorized! {
@@ -118,20 +114,18 @@ vectorized! {
 
 /// Rows of `2 width` inputs, (value, gate), to rows of value * gelu(gate).
 pub(crate) fn geglu(x: &[f32], width: usize) -> Vec<f32> {
-    let mut y = vec![0.0; x.len() / 2];
-    y.par_chunks_mut(width)
-        .zip(x.par_chunks(2 * width))
-        .with_min_len(8)
-        .for_each(|(y, x)| geglu_row(x, y));
-    y
+    let job = |row: usize, y: &mut [f32]| geglu_row(&x[2 * row * width..][..2 * width], y);
+    filled(x.len() / 2, width, 8, job).0
 }
 
 /// Gradient of [`geglu`] with respect to its input.
 pub(crate) fn geglu_vjp(x: &[f32], width: usize, g: &[f32]) -> Vec<f32> {
-    let mut dx = vec![0.0; x.len()];
-    dx.par_chunks_mut(2 * width)
-        .zip(x.par_chunks(2 * width).zip(g.par_chunks(width)))
-        .with_min_len(8)
-        .for_each(|(dx, (x, g))| geglu_row_vjp(x, g, dx));
-    dx
+    let job = |row: usize, dx: &mut [f32]| {
+        let (x, g) = (
+            &x[2 * row * width..][..2 * width],
+            &g[row * width..][..width],
+        );
+        geglu_row_vjp(x, g, dx)
+    };
+    filled(x.len(), 2 * width, 8, job).0
 }
