@@ -7,5 +7,6 @@ pub mod distillation;
 pub mod error;
 pub mod reading;
 pub mod recover;
+mod timed;
 
 pub use error::{Error, Result};

@@ -21,6 +21,7 @@ use dipir_render::transport::{RecordSettings, Transport};
 use crate::distillation::{Adapter, Distillation, DistillationSettings};
 use crate::error::{Error, Result};
 use crate::reading::{self, Insertion, read_light, view_direction};
+use crate::timed::Timed;
 
 /// Side of the crops of a reference, pixels, when it is compared on crops.
 const CROP_SIDE: usize = 128;
@@ -93,6 +94,10 @@ pub struct Recovery {
     pub reading_s: f64,
     /// Seconds of the optimisation.
     pub optimization_s: f64,
+    /// Those of them that model or reference took.
+    pub guidance_s: f64,
+    /// Those of them in which transport was recorded anew.
+    pub records_s: f64,
 }
 
 /// Recovers the light and the tone curves under which the composite fits the target.
@@ -135,7 +140,7 @@ pub fn recover_light(
         return Err(Error::Interrupted);
     }
 
-    let mut guidance: Box<dyn Guidance> = match target {
+    let guidance: Box<dyn Guidance> = match target {
         Target::Reference(reference) => {
             let framing = match settings.crops {
                 true => Framing::Crops {
@@ -168,15 +173,16 @@ pub fn recover_light(
         }
     };
     let mut go_on = |_: f64| watch(Event::Recording);
-    let mut recorder = SceneRecorder {
+    let mut guidance = Timed::new(guidance);
+    let mut recorder = Timed::new(SceneRecorder {
         renderer: problem.renderer,
         settings: problem.record,
         progress: &mut go_on,
-    };
+    });
     let clock = Instant::now();
     let outcome = Optimization {
         objective,
-        guidance: &mut *guidance,
+        guidance: &mut guidance,
         recorder: Some(&mut recorder),
         settings: settings.clone(),
         start,
@@ -193,6 +199,8 @@ pub fn recover_light(
         rmse,
         reading_s,
         optimization_s: clock.elapsed().as_secs_f64(),
+        guidance_s: guidance.seconds,
+        records_s: recorder.seconds,
     })
 }
 

@@ -207,22 +207,25 @@ pub struct LightRun {
     pub samples: u32,
     /// Longest side of the picture, pixels.
     pub side: usize,
+    /// Columns and rows of the record's map of directions.
+    pub environment: [usize; 2],
     /// Longest side of the photograph, beyond which no preset goes.
     pub photo_side: usize,
     /// Seconds in which the stage recorded, or read what the scene stage had recorded.
     pub record_s: f64,
-    /// Seconds of the optimisation.
-    pub optimization_s: f64,
+    /// Seconds that model or reference took.
+    pub guidance_s: f64,
+    /// Other seconds of the optimisation: pictures from the record, and their gradients.
+    pub replay_s: f64,
     /// Other seconds, which no preset changes: reading the photograph, writing.
     pub rest_s: f64,
-    /// Whether a model guided: then the time grows with the steps alone, whatever the record.
+    /// Whether a model guided.
     pub by_model: bool,
 }
 
-/// An iteration's time grows with this power of a record's samples, as `docs/transport.md` measures: a
-/// record of 64 times the samples takes 6.6 times as long to replay, because they meet texels that a
-/// row has already.
-const REPLAY_POWER: f64 = 0.45;
+/// A picture from the record takes this power of its samples and of its texels in time: samples meet texels that a row has
+/// already. Measured with the demo's car and the gallery's knot (docs/performance.md).
+const REPLAY_POWERS: [f64; 2] = [0.35, 0.08];
 
 impl LightRun {
     /// About how long it would have taken with `preset`.
@@ -233,11 +236,13 @@ impl LightRun {
         let iterations = self
             .iterations
             .map_or(1.0, |n| preset.iterations as f64 / n.max(1) as f64);
-        let replay = match self.by_model {
-            true => 1.0,
-            false => pixels * samples.powf(REPLAY_POWER),
-        };
-        self.rest_s + self.record_s * pixels * samples + self.optimization_s * iterations * replay
+        let count = |[width, height]: [usize; 2]| (width * height).max(1) as f64;
+        let texels = count(preset.environment) / count(self.environment);
+        let replay = pixels * samples.powf(REPLAY_POWERS[0]) * texels.powf(REPLAY_POWERS[1]);
+        // A model sees its own size.
+        let guidance = if self.by_model { 1.0 } else { pixels };
+        let optimization = self.replay_s * replay + self.guidance_s * guidance;
+        self.rest_s + self.record_s * pixels * samples + optimization * iterations
     }
 
     /// Whether `preset` would have done the same.
@@ -245,6 +250,7 @@ impl LightRun {
         let same_steps = self.iterations.is_none_or(|n| n == preset.iterations);
         same_steps
             && self.samples == preset.samples
+            && self.environment == preset.environment
             && self.side == preset.size.min(self.photo_side)
     }
 
@@ -288,9 +294,11 @@ mod tests {
             iterations: Some(here.iterations),
             samples: here.samples,
             side: here.size,
+            environment: here.environment,
             photo_side: 4096,
             record_s: 2.0,
-            optimization_s: 10.0,
+            guidance_s: 0.0,
+            replay_s: 10.0,
             rest_s: 0.0,
             by_model,
         }
@@ -303,6 +311,51 @@ mod tests {
             let outlook = standard_run(by_model).outlook(Quality::Standard, &table);
             assert_eq!(outlook.0.len(), 2);
             assert!(outlook.0.iter().all(|e| e.error.is_none() == by_model));
+        }
+    }
+
+    /// Seconds of runs of each preset, as their manifests had them: of the demo's car and of the gallery's knot in its place,
+    /// guided by the embedded model, and of the car guided by a picture.
+    #[test]
+    fn what_other_presets_took_is_foretold_within_a_quarter() {
+        // Record or reading it, guidance, pictures from the record, the rest; and all of it.
+        let car = [
+            [0.01, 0.82, 0.25, 2.13, 3.21],
+            [0.04, 1.16, 1.80, 2.45, 5.45],
+            [0.26, 1.23, 4.43, 2.25, 8.17],
+        ];
+        let knot = [
+            [0.01, 1.05, 0.34, 2.59, 3.99],
+            [0.05, 1.12, 2.05, 2.76, 5.98],
+            [0.30, 1.40, 5.89, 2.56, 10.15],
+        ];
+        let picture = [
+            [1.12, 0.13, 1.45, 0.27, 2.97],
+            [8.51, 1.58, 27.17, 0.31, 37.57],
+            [53.70, 2.47, 66.35, 0.26, 122.78],
+        ];
+        for (runs, by_model) in [(car, true), (knot, true), (picture, false)] {
+            let run = |k: usize| {
+                let there = all().presets[k].light;
+                LightRun {
+                    // Where a model has read the light, no preset says how many steps refine it.
+                    iterations: (!by_model).then_some(there.iterations),
+                    samples: there.samples,
+                    side: there.size,
+                    environment: there.environment,
+                    photo_side: 960,
+                    record_s: runs[k][0],
+                    guidance_s: runs[k][1],
+                    replay_s: runs[k][2],
+                    rest_s: runs[k][3],
+                    by_model,
+                }
+            };
+            for (from, to) in [(0, 1), (1, 0), (1, 2), (2, 1)] {
+                let foretold = run(from).seconds_with(&all().presets[to].light);
+                let ratio = foretold / runs[to][4];
+                assert!((0.8..=1.25).contains(&ratio), "{from} of {to}: {ratio}");
+            }
         }
     }
 

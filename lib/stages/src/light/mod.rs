@@ -330,6 +330,8 @@ fn recover(
     })?;
     writer.set_timing("reading", loading_s + recovery.reading_s);
     writer.set_timing("optimization", recovery.optimization_s);
+    writer.set_timing("guidance", recovery.guidance_s);
+    writer.set_timing("records", recovery.records_s);
     Ok((recovery, resumed_at))
 }
 
@@ -344,14 +346,20 @@ fn light_run(scene: &SceneFolder, request: &Request, manifest: &Manifest) -> Lig
         Guide::Model { reading, .. } => (true, reading.is_some()),
     };
     let record_s = seconds("transport");
-    let optimization_s = seconds("optimization");
+    let (optimization_s, guidance_s, records_s) = (
+        seconds("optimization"),
+        seconds("guidance"),
+        seconds("records"),
+    );
     LightRun {
         iterations: (!refines).then_some(settings.iterations),
         samples: settings.samples,
         side: settings.size.min(photo_side),
         photo_side,
-        record_s,
-        optimization_s,
+        environment: settings.environment,
+        record_s: record_s + records_s,
+        guidance_s,
+        replay_s: (optimization_s - guidance_s - records_s).max(0.0),
         rest_s: (manifest.elapsed_s - record_s - optimization_s).max(0.0),
         by_model,
     }
