@@ -525,6 +525,9 @@ mod tests {
             (350, 5, 7),
             (40, 40, 600),
             (30, 33, 641),
+            // Two jobs, and two blocks of packed columns.
+            (20, 700, 40),
+            (2, 4100, 3),
             (2, 3, 0),
         ] {
             let a: Vec<f32> = (0..m * k).map(value).collect();
