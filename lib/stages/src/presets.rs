@@ -41,6 +41,7 @@ impl Preset {
             iterations: table.iterations.unwrap_or(self.light.iterations),
             samples: table.samples.unwrap_or(self.light.samples),
             size: table.size.unwrap_or(self.light.size),
+            environment: table.environment.unwrap_or(self.light.environment),
             ..self.light
         }
     }
@@ -403,19 +404,34 @@ mod tests {
             samples: 64 * here.samples,
             ..here
         };
-        // 64 times the paths; 6.5 times the replay.
-        assert!((run.seconds_with(&more) - 128.0 - 65.0).abs() < 0.5);
-        let model = standard_run(true);
+        // 64 times the paths; 4.29 times the pictures from them.
+        assert!((run.seconds_with(&more) - 128.0 - 42.9).abs() < 0.1);
+        let model = LightRun {
+            guidance_s: 8.0,
+            replay_s: 2.0,
+            ..standard_run(true)
+        };
         let half = LightPreset {
             iterations: here.iterations / 2,
             ..more
         };
-        assert!((model.seconds_with(&half) - 128.0 - 5.0).abs() < 1e-9);
+        assert!((model.seconds_with(&half) - 128.0 - 4.0 - 4.29).abs() < 0.01);
         let refined = LightRun {
             iterations: None,
             ..model
         };
-        assert!((refined.seconds_with(&half) - 128.0 - 10.0).abs() < 1e-9);
+        assert!((refined.seconds_with(&half) - 128.0 - 8.0 - 8.57).abs() < 0.01);
+        // A picture is compared pixel by pixel, a model sees its own size.
+        let wide = LightPreset {
+            size: 2 * here.size,
+            ..here
+        };
+        let by_picture = LightRun {
+            by_model: false,
+            ..model
+        };
+        assert!((model.seconds_with(&wide) - 8.0 - 8.0 - 8.0).abs() < 1e-9);
+        assert!((by_picture.seconds_with(&wide) - 8.0 - 32.0 - 8.0).abs() < 1e-9);
         let open = run.outlook(Quality::Standard, &LightTable::default()).0;
         assert_eq!(open.len(), 2);
         assert!(open[0].seconds < open[1].seconds);
@@ -423,6 +439,7 @@ mod tests {
             iterations: Some(here.iterations),
             samples: Some(here.samples),
             size: Some(here.size),
+            environment: Some(here.environment),
             ..LightTable::default()
         };
         // Nothing is left to a preset.
