@@ -63,7 +63,7 @@ pub struct PathContext<'a, L> {
     /// The same, but only for light that reaches them from where the light is sampled: a small source is then met by
     /// many paths, and shown blurred.
     pub min_lit_roughness: f32,
-    /// Whether surfaces that a path meets after a wide reflection count as at least half as wide: `WIDE`, `BLURRED`.
+    /// Whether surfaces that a path meets after a wide reflection count as at least as rough as `BLURRED`.
     pub blur_caustics: bool,
     /// What is known of where light comes from by way of the object.
     pub guide: Option<&'a PathGuide>,

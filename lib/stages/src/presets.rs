@@ -225,7 +225,7 @@ pub struct LightRun {
 }
 
 /// A picture from the record takes this power of its samples and of its texels in time: samples meet texels that a row has
-/// already. Measured with the demo's car and the gallery's knot (docs/performance.md).
+/// already. Chosen so that runs with the demo's car and the gallery's knot foretell one another (docs/performance.md).
 const REPLAY_POWERS: [f64; 2] = [0.35, 0.08];
 
 impl LightRun {

@@ -345,12 +345,8 @@ fn light_run(scene: &SceneFolder, request: &Request, manifest: &Manifest) -> Lig
         Guide::Reference { .. } | Guide::None => (false, false),
         Guide::Model { reading, .. } => (true, reading.is_some()),
     };
-    let record_s = seconds("transport");
-    let (optimization_s, guidance_s, records_s) = (
-        seconds("optimization"),
-        seconds("guidance"),
-        seconds("records"),
-    );
+    let [record_s, optimization_s, guidance_s, records_s] =
+        ["transport", "optimization", "guidance", "records"].map(seconds);
     LightRun {
         iterations: (!refines).then_some(settings.iterations),
         samples: settings.samples,
