@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use dipir_imaging::composite::composite;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
+use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentSampler;
 use dipir_light::map_with_lobes::MapWithLobes;
 use dipir_render::adaptive::Stop;
@@ -46,6 +47,7 @@ impl Draft {
         samples: u32,
         go_on: &mut dyn FnMut() -> ControlFlow<()>,
     ) -> Result<Self, RenderError> {
+        let tone = light.tone.as_ref();
         let rendered = match &light.map {
             Some(map) => {
                 let [width, height] = MAP;
@@ -55,12 +57,12 @@ impl Draft {
                 };
                 let map = EnvironmentSampler::new(map);
                 let light = MapWithLobes::new(map, light.lobes.clone());
-                render(loaded, &light, samples, go_on)
+                render(loaded, &light, tone, samples, go_on)
             }
-            None => render(loaded, &light.lobes, samples, go_on),
+            None => render(loaded, &light.lobes, tone, samples, go_on),
         }?;
         let film = rendered.film;
-        let (object, shadow) = match &light.tone {
+        let (object, shadow) = match tone {
             Some(curves) => (
                 curves.apply_object(&LinearImage(film.object), &film.alpha),
                 curves.apply_shadow(&LinearImage(film.shadow)),
@@ -83,10 +85,14 @@ impl Draft {
 fn render<L: SceneLight>(
     loaded: &LoadedScene,
     light: &L,
+    tone: Option<&ToneCurves>,
     samples: u32,
     go_on: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Result<Rendered, RenderError> {
-    let settings = settings(loaded, samples);
+    let settings = Settings {
+        tone,
+        ..settings(loaded, samples)
+    };
     let simulation = simulation(loaded, &settings);
     Renderer::new(&loaded.scene).render(light, &simulation, &settings, &mut |_| go_on())
 }

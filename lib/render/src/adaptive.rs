@@ -24,11 +24,12 @@ use crate::contribution::{LeaveOut, LeftOut};
 use crate::counters::RayCounts;
 use crate::denoise::{auxiliary::Auxiliary, denoise};
 use crate::error::RenderError;
-use crate::film::{Film, SquaredError, Viewing};
+use crate::film::Film;
 use crate::foresight::{Foresight, first_share};
 use crate::highlights::Found;
 use crate::job::{Job, Layer, REPLICATES};
 use crate::render::Simulation;
+use crate::viewing::{SquaredError, Viewing};
 
 /// Is told of the progress after every round and from time to time, and may break off.
 pub type Watch<'a> = dyn FnMut(&Progress) -> ControlFlow<()> + 'a;

@@ -6,15 +6,14 @@
 //! which noise does not count as contribution.
 use glam::Vec3;
 
-use dipir_imaging::composite::composite_pixel;
-
 use crate::counters::{RayCounts, RayKind};
 use crate::features::{PROXY_RADIANCE, has};
-use crate::film::{Film, Viewing};
+use crate::film::Film;
 use crate::foreground::Gather;
 use crate::job::{Job, REPLICATES};
 use crate::render::Simulation;
 use crate::shadow::{LightOnProxy, ShadowSums, ratio};
+use crate::viewing::Viewing;
 
 /// Most interactions that are told apart.
 const DEPTHS: usize = crate::effects::MAX_DEPTH as usize;
@@ -118,10 +117,9 @@ impl Measured {
         depth: u32,
         viewing: &Viewing,
     ) {
-        let background = viewing.background(x as usize, y as usize);
+        let pixel = (x as usize, y as usize);
         let colour = (found[0].sum + found[1].sum) / (REPLICATES as f32 * samples);
-        let shown =
-            |colour| viewing.shown(composite_pixel(background, colour, coverage, Vec3::ONE));
+        let shown = |colour| viewing.shown(pixel, colour, coverage, Vec3::ONE);
         let all = shown(colour);
         let mut add = |part, lost: [Vec3; REPLICATES]| {
             if lost != [Vec3::ZERO; REPLICATES] {
@@ -149,8 +147,7 @@ impl Measured {
         if alpha >= 1.0 {
             return;
         }
-        let background = viewing.background(x, y);
-        let shown = |ratio| viewing.shown(composite_pixel(background, object, alpha, ratio));
+        let shown = |ratio| viewing.shown((x, y), object, alpha, ratio);
         let with = found.map(|f| ratio(&f, samples, arriving));
         let mean = (with[0] + with[1]) / REPLICATES as f32;
         let all = shown(mean);

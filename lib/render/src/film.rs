@@ -1,11 +1,9 @@
-//! The pictures that follow from sums over image samples, and their errors.
-use dipir_imaging::composite::composite_pixel;
-use dipir_imaging::raster::{LinearImage, Raster};
-use dipir_imaging::transfer::Transfer;
+//! The pictures that follow from sums over image samples.
+use dipir_imaging::raster::Raster;
 use glam::Vec3;
 use rayon::prelude::*;
 
-use crate::job::{Developed, Job, Layer, REPLICATES};
+use crate::job::{Developed, Job, Layer};
 use crate::tiles::Tiles;
 
 /// The layers as estimated so far.
@@ -69,7 +67,7 @@ impl Film {
     }
 
     /// Standard error of the shadow, pooled over a pixel and its neighbours.
-    fn shadow_noise(&self, x: usize, y: usize) -> Vec3 {
+    pub(crate) fn shadow_noise(&self, x: usize, y: usize) -> Vec3 {
         let (width, height) = (self.shadow.width(), self.shadow.height());
         let (mut sum, mut count) = (Vec3::ZERO, 0.0);
         for y in y.saturating_sub(1)..(y + 2).min(height) {
@@ -213,190 +211,5 @@ impl Between {
         let [u, v] = self.fraction;
         let row = |y| get(self.x[0], y) * (1.0 - u) + get(self.x[1], y) * u;
         row(self.y[0]) * (1.0 - v) + row(self.y[1]) * v
-    }
-}
-
-/// The picture that the layers go into: decides which errors are seen.
-#[derive(Clone, Copy, Debug)]
-pub struct Viewing<'a> {
-    /// The photograph; mid-grey (0.18) if there is none.
-    pub background: Option<&'a LinearImage>,
-    /// From linear to display values.
-    pub transfer: Transfer,
-}
-
-/// Sums over pixels, of one job, of the squared display-referred error.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct SquaredError {
-    /// Estimated squared error, averaged over the channels, summed over pixels.
-    pub sum: f64,
-    /// Variance of `sum`.
-    pub variance: f64,
-}
-
-impl SquaredError {
-    /// The error of another job adds up: jobs draw independent samples.
-    pub fn merge(self, other: Self) -> Self {
-        Self {
-            sum: self.sum + other.sum,
-            variance: self.variance + other.variance,
-        }
-    }
-}
-
-impl Viewing<'_> {
-    /// The photograph at a pixel, linear.
-    pub fn background(&self, x: usize, y: usize) -> Vec3 {
-        self.background
-            .map_or(Vec3::splat(0.18), |image| *image.0.get(x, y))
-    }
-
-    /// Linear values as they are shown.
-    pub(crate) fn shown(&self, linear: Vec3) -> Vec3 {
-        let encode = |v: f32| self.transfer.encode_scalar(v.max(0.0)).clamp(0.0, 1.0);
-        Vec3::from(linear.to_array().map(encode))
-    }
-
-    /// The composite's display-referred squared error that comes from the noise of `job`,
-    /// to first order: the replicates' spread of the linear composite times the squared slope of
-    /// the transfer curve.
-    pub fn squared_error(&self, film: &Film, job: &Job) -> SquaredError {
-        self.squared_error_where(film, job, |_| true)
-    }
-
-    /// As [`squared_error`](Self::squared_error), of the pixels for which `holds` is true.
-    pub(crate) fn squared_error_where(
-        &self,
-        film: &Film,
-        job: &Job,
-        holds: impl Fn((u32, u32)) -> bool,
-    ) -> SquaredError {
-        let mut total = SquaredError::default();
-        if job.samples == 0 {
-            return total;
-        }
-        let pixels = job.pixels.iter().enumerate();
-        for (index, (x, y)) in pixels.filter(|(_, pixel)| holds(*pixel)) {
-            let (x, y) = (x as usize, y as usize);
-            let background = self.background(x, y);
-            let composite = |(value, coverage): (Vec3, f32)| match job.layer {
-                Layer::Object => {
-                    composite_pixel(background, value, coverage, *film.shadow.get(x, y))
-                }
-                _ => composite_pixel(
-                    background,
-                    *film.object.get(x, y),
-                    *film.alpha.get(x, y),
-                    value,
-                ),
-            };
-            let mean = composite(job.estimate(index, None));
-            let variance = match job.density {
-                Some(_) => job.colour_variance(index),
-                None => job.spread(mean, |k| composite(job.estimate(index, Some(k)))),
-            };
-            let squared = (0..3)
-                .map(|c| {
-                    let slope = self.slope(mean[c], variance[c].sqrt());
-                    f64::from(variance[c]) * slope * slope
-                })
-                .sum::<f64>()
-                / 3.0;
-            if squared.is_finite() {
-                total.sum += squared;
-                // Each is sigma^2 chi^2_{K-1} / (K - 1), so E[v^2] 2 / (K + 1) is its variance.
-                total.variance += squared * squared * 4.0 / (REPLICATES as f64 + 1.0);
-            }
-        }
-        total
-    }
-
-    /// Squared display-referred error for a squared error of the shadow ratio, or of the object's radiance, of which
-    /// `variance` is the size.
-    pub(crate) fn weight(
-        &self,
-        film: &Film,
-        layer: Layer,
-        (x, y): (u32, u32),
-        variance: Vec3,
-    ) -> Vec3 {
-        let (x, y) = (x as usize, y as usize);
-        let (object, alpha) = (*film.object.get(x, y), *film.alpha.get(x, y));
-        let background = self.background(x, y);
-        let mean = composite_pixel(background, object, alpha, *film.shadow.get(x, y));
-        let weight = |c: usize| {
-            let linear = match layer {
-                Layer::Object => 1.0,
-                _ => background[c] * (1.0 - alpha),
-            };
-            let weight = linear * self.slope(mean[c], linear * variance[c].sqrt()) as f32;
-            match weight.is_finite() {
-                true => weight * weight,
-                false => 0.0,
-            }
-        };
-        Vec3::new(weight(0), weight(1), weight(2))
-    }
-
-    /// Mean slope of the transfer curve within one standard error: clipped values cannot be wrong.
-    fn slope(&self, value: f32, std_error: f32) -> f64 {
-        let step = std_error.max(1e-4);
-        let encode = |x: f32| f64::from(self.transfer.encode_scalar(x.max(0.0)).clamp(0.0, 1.0));
-        (encode(value + step) - encode(value - step)) / (2.0 * f64::from(step))
-    }
-
-    /// Whether the layers change the photograph at this pixel by half an 8-bit step or more, and by more
-    /// than noise would: counted as touched, unshadowed pixels would make the mean error look smaller
-    /// than it is.
-    pub fn is_touched(&self, film: &Film, x: usize, y: usize) -> bool {
-        if *film.alpha.get(x, y) > 0.0 {
-            return true;
-        }
-        if *film.shadow.get(x, y) == Vec3::ONE {
-            return false;
-        }
-        let background = self.background(x, y);
-        let after = background * *film.shadow.get(x, y);
-        let encode = |x: f32| self.transfer.encode_scalar(x.max(0.0)).clamp(0.0, 1.0);
-        let seen = |c: usize| (encode(after[c]) - encode(background[c])).abs() > 0.5 / 255.0;
-        // Of noise alone, one in twenty is beyond two standard errors.
-        let is_sure = |c: usize| {
-            let noise = background[c] * film.shadow_noise(x, y)[c];
-            (after[c] - background[c]).abs() > 2.0 * noise
-        };
-        (0..3).any(|c| seen(c) && is_sure(c))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn noise_on_bright_ground_touches_nothing() {
-        let viewing = Viewing {
-            background: None,
-            transfer: Transfer::Srgb,
-        };
-        let mut film = Film::new(4, 4);
-        // Two 8-bit steps darker, once with less noise than that, once with more.
-        *film.shadow.get_mut(1, 1) = Vec3::splat(0.95);
-        let with_error = |film: &mut Film, error: f32| {
-            for i in 0..16 {
-                let variance = Vec3::splat(error * error);
-                film.shadow_variance.set(i % 4, i / 4, variance);
-            }
-        };
-        with_error(&mut film, 0.01);
-        assert!(viewing.is_touched(&film, 1, 1));
-        with_error(&mut film, 0.04);
-        assert!(!viewing.is_touched(&film, 1, 1));
-        // Less than half a step is not seen, however sure it is.
-        *film.shadow.get_mut(1, 1) = Vec3::splat(0.995);
-        with_error(&mut film, 0.0);
-        assert!(!viewing.is_touched(&film, 1, 1));
-        // Where the object covers anything, it touches.
-        *film.alpha.get_mut(2, 2) = 0.001;
-        assert!(viewing.is_touched(&film, 2, 2));
     }
 }

@@ -4,8 +4,8 @@
 //! with the same goals. A job's squared error is taken to fall with a power of its samples, the one that the jobs that
 //! grew have shown: 1 for independent samples, more where stratification helps.
 use crate::adaptive::{EstimatedError, goal};
-use crate::film::SquaredError;
 use crate::job::Job;
+use crate::viewing::SquaredError;
 
 /// The power before any job has grown: that of independent samples.
 const POWER: f64 = 1.0;

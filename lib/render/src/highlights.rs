@@ -11,7 +11,6 @@
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-use dipir_imaging::composite::composite_pixel;
 use dipir_light::luminance::luminance;
 use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_numerics::warp::square_to_sphere;
@@ -20,9 +19,10 @@ use rayon::prelude::*;
 
 use crate::counters::{RayCounts, RayKind};
 use crate::features::with_features;
-use crate::film::{Film, Viewing};
+use crate::film::Film;
 use crate::foreground::PathContext;
 use crate::light::PathLight;
+use crate::viewing::Viewing;
 
 /// Camera rays that measure how curved a surface is within a pixel.
 const RAYS_PER_PIXEL: u32 = 8;
@@ -464,13 +464,8 @@ fn noticed(
     (radiance, coverage): (Vec3, f32),
 ) -> f32 {
     let (x, y) = (x as usize, y as usize);
-    let background = viewing.background(x, y);
     let alpha = *film.alpha.get(x, y);
-    let shown = |radiance| {
-        let linear = composite_pixel(background, radiance, alpha, *film.shadow.get(x, y));
-        let encode = |v: f32| viewing.transfer.encode_scalar(v.max(0.0)).clamp(0.0, 1.0);
-        Vec3::from(linear.to_array().map(encode))
-    };
+    let shown = |radiance| viewing.shown((x, y), radiance, alpha, *film.shadow.get(x, y));
     let rescaled = radiance * (alpha / coverage.max(f32::MIN_POSITIVE));
     (shown(rescaled) - shown(*film.object.get(x, y)))
         .abs()

@@ -29,4 +29,5 @@ pub mod surface;
 mod testing;
 mod tiles;
 pub mod transport;
+pub mod viewing;
 pub mod world;

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_imaging::tone::ToneCurves;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::luminance::luminance_f64;
 use dipir_light::plane::PlaneLight;
@@ -21,7 +22,7 @@ use crate::contribution::{LeaveOut, LeftOut};
 use crate::counters::RayCounts;
 use crate::error::RenderError;
 use crate::features::with_features;
-use crate::film::{Film, Viewing};
+use crate::film::Film;
 use crate::footprint::Footprint;
 use crate::foreground::PathContext;
 use crate::foresight::Foresight;
@@ -31,6 +32,7 @@ use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet};
 use crate::light::{PathLight, PreparedLight, SceneLight};
 use crate::shadow::{Block, LightOnProxy, ShadowContext};
+use crate::viewing::Viewing;
 use crate::world::{Geometry, ProxyGeometry, World};
 
 /// Which phenomena are simulated: what remains of an effects plan for the kernels.
@@ -60,6 +62,9 @@ pub struct Settings<'a> {
     /// The photograph, linear, of the camera's size: weighs errors by what is seen of them, and
     /// is what the proxy looks like to rays from the object.
     pub background: Option<&'a LinearImage>,
+    /// What will be done to the layers before they are laid over the photograph, if anything: errors are measured
+    /// behind it.
+    pub tone: Option<&'a ToneCurves>,
     /// From linear to display values, in which errors are measured.
     pub transfer: Transfer,
     /// 1 where the photograph's own foreground hides the object, 0 where it does not; of the
@@ -110,6 +115,7 @@ impl Default for Settings<'_> {
             stop: Stop::TargetError(0.004),
             max_samples: 1 << 14,
             background: None,
+            tone: None,
             transfer: Transfer::Srgb,
             occluders: None,
             // Display values change by less than a tenth of an 8-bit step.
@@ -340,6 +346,7 @@ impl<'a> Renderer<'a> {
         let [width, height] = self.camera.resolution.map(|n| n as usize);
         let viewing = Viewing {
             background: settings.background,
+            tone: settings.tone.map(ToneCurves::mapper),
             transfer: settings.transfer,
         };
         let find_highlights = |film: &Film, jobs: &[Job]| {

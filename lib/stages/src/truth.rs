@@ -166,10 +166,12 @@ fn under_truth(
     truth: EnvironmentMap,
     tone: Option<Tone>,
 ) -> anyhow::Result<LinearImage> {
+    let curves = tone.and_then(Tone::curves);
     let settings = Settings {
         seed: session.pipeline.seed,
         stop: Stop::TargetError(ERROR),
         denoise: true,
+        tone: curves.as_ref(),
         ..frame.render_settings()
     };
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);

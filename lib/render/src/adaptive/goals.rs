@@ -1,7 +1,7 @@
 //! How many samples each job gets in a round.
 use super::{EstimatedError, Stop};
-use crate::film::SquaredError;
 use crate::job::{Job, REPLICATES};
+use crate::viewing::SquaredError;
 
 /// Samples per pixel and replicate of the first adaptive round: the fewest whose spread says
 /// anything about the error.

@@ -15,8 +15,9 @@ use rayon::prelude::*;
 
 use self::auxiliary::Auxiliary;
 use self::window::{BLOCK, Comparison, Halves, Window};
-use crate::film::{Film, SquaredError, Viewing};
+use crate::film::Film;
 use crate::job::{Job, Layer, REPLICATES};
+use crate::viewing::{SquaredError, Viewing};
 
 /// Tiles to each side whose noise is averaged for that of a tile, and whose errors for its bias and for whether its pixels
 /// are filtered.

@@ -59,6 +59,7 @@ fn object(surface: Surface, noise: f32, seed: u64) -> (Vec<Job>, Auxiliary, Film
 
 const VIEWING: Viewing = Viewing {
     background: None,
+    tone: None,
     transfer: Transfer::Linear,
 };
 

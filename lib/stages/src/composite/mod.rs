@@ -117,17 +117,19 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let stop = table.stop(session.pipeline.quality);
     let folder = COMPOSITE.folder(session);
     let mut writer = session.begin(plan(session, &table)?)?;
+    let curve = Curve::of(table.tone, &light);
     let course = render(
         session,
         &table,
         within(stop, clock, &inputs),
         &inputs,
         &light,
+        curve.curves(),
     )?;
     let Course { rendered, .. } = course;
     let effects = inputs.scene.effects.rendered(&rendered);
     writer.write_json("effects", "effects.json", &effects)?;
-    let layers = Composite::new(&inputs, rendered.film, &Curve::of(table.tone, &light));
+    let layers = Composite::new(&inputs, rendered.film, &curve);
     let picture = layers.picture()?;
     check_finite(&picture)?;
     let png = writer.output("picture", "composite.png")?;
@@ -265,19 +267,20 @@ fn render(
     stop: Stop,
     inputs: &Inputs,
     light: &Source,
+    tone: Option<&ToneCurves>,
 ) -> anyhow::Result<Course> {
     match light {
         Source::Map(light) => {
             let map = EnvironmentSampler::new(light.map.clone());
-            render_under(session, table, stop, inputs, &map)
+            render_under(session, table, stop, inputs, &map, tone)
         }
         Source::Recovered(light) => match &light.surroundings {
             Some(map) => {
                 let map = EnvironmentSampler::new(Arc::new(map.clone()));
                 let light = MapWithLobes::new(map, light.lobes.clone());
-                render_under(session, table, stop, inputs, &light)
+                render_under(session, table, stop, inputs, &light, tone)
             }
-            None => render_under(session, table, stop, inputs, &light.lobes),
+            None => render_under(session, table, stop, inputs, &light.lobes, tone),
         },
     }
 }
@@ -288,6 +291,7 @@ fn render_under<L: SceneLight>(
     stop: Stop,
     inputs: &Inputs,
     light: &L,
+    tone: Option<&ToneCurves>,
 ) -> anyhow::Result<Course> {
     let clock = Instant::now();
     let mut round = 0;
@@ -301,6 +305,7 @@ fn render_under<L: SceneLight>(
         blur_caustics: table.blur_caustics(session.pipeline.quality),
         most_pixels: table.most_pixels(session.pipeline.quality),
         leave_out: effects.leave_out(loaded.description.effects()),
+        tone,
         ..Settings::of_scene(loaded)
     };
     let renderer = Renderer::new(&loaded.scene);
@@ -438,6 +443,14 @@ impl Curve {
             },
             (None, Source::Map(_)) => Self::None,
             (None, Source::Recovered(light)) => Self::Recovered(Box::new(light.tone)),
+        }
+    }
+
+    /// The curves, if there are any.
+    fn curves(&self) -> Option<&ToneCurves> {
+        match self {
+            Self::None => None,
+            Self::Object(curves) | Self::Recovered(curves) => Some(curves),
         }
     }
 
