@@ -1,12 +1,12 @@
 //! Whether the error that a render states is its error, whether a target is met, and whether a time
 //! budget is kept, as tables in Markdown.
 //!
-//! Twelve kinds of scene, five seeds each. The true error of a render is its display-referred RMSE from a
-//! reference with a tenth of the target's error, less the reference's own.
+//! Twelve kinds of scene, five seeds each unless `seeds` says another number. The true error of a render is its
+//! display-referred RMSE from a reference with a tenth of the target's error, less the reference's own.
 //!
 //! Run with `cargo test -p dipir-render --bench calibration -- --bench [target=RMSE] [size=PIXELS]
-//! [samples=N] [highlights=0] [denoise=0] [blur=0] [NAME]`: `samples` draws so many in every pixel instead of stopping at the
-//! target, `highlights=0` leaves highlights to chance, `denoise=0` leaves noise, `blur=0` leaves caustics sharp as they are in
+//! [seeds=N] [samples=N] [highlights=0] [denoise=0] [blur=0] [NAME]`: `samples` draws so many in every pixel instead of
+//! stopping at the target, `highlights=0` leaves highlights to chance, `denoise=0` leaves noise, `blur=0` leaves caustics sharp as they are in
 //! the reference, and only scenes whose name holds NAME are rendered.
 //! Without `--bench`, as tests run it, one small scene proves that it works.
 mod gallery;
@@ -23,7 +23,6 @@ use dipir_render::film::Film;
 use dipir_render::render::{Rendered, Renderer, Settings, Simulation};
 use glam::Vec3;
 
-const SEEDS: u64 = 5;
 const MAX_SAMPLES: u32 = 1 << 20;
 /// What is behind everything where there is no photograph.
 const GREY: Vec3 = Vec3::splat(0.18);
@@ -40,6 +39,7 @@ fn main() {
     let size = value("size", if whole { 48.0 } else { 12.0 }) as u32;
     let target = value("target", if whole { 0.008 } else { 0.03 }) as f32;
     let samples = value("samples", 0.0) as u32;
+    let seeds = value("seeds", 5.0) as u64;
     let [highlights, denoise, blur_caustics] =
         ["highlights", "denoise", "blur"].map(|key| value(key, 1.0) > 0.0);
     let stop = match samples {
@@ -73,7 +73,7 @@ fn main() {
         let reference = render(&renderer, &light, &simulation, &reference);
         let (mut stated, mut bounds, mut squares, mut within) = (vec![], vec![], 0.0, 0);
         let mut rays = 0;
-        for seed in 0..SEEDS {
+        for seed in 0..seeds {
             let settings = Settings {
                 seed,
                 stop,
@@ -86,7 +86,7 @@ fn main() {
             let found = render(&renderer, &light, &simulation, &settings);
             let square = squared_difference(&found.film, &reference.film)
                 - reference.error.rmse * reference.error.rmse;
-            squares += square.max(0.0) / SEEDS as f64;
+            squares += square.max(0.0) / seeds as f64;
             within += u32::from(square.max(0.0).sqrt() <= found.error.upper_95);
             rays += found.counts.total();
             stated.push(found.error.rmse);
@@ -95,13 +95,13 @@ fn main() {
         let error = squares.sqrt();
         ratios.push(error / f64::from(target));
         all_within += within;
-        count += SEEDS;
+        count += seeds;
         println!(
-            "| {name} | {:.5} | {:.5} | {error:.5} | {:.2} | {within} of {SEEDS} | {:.2} |",
+            "| {name} | {:.5} | {:.5} | {error:.5} | {:.2} | {within} of {seeds} | {:.2} |",
             median(&stated).expect("some"),
             median(&bounds).expect("some"),
             ratios.last().expect("one"),
-            rays as f64 / (1e6 * SEEDS as f64),
+            rays as f64 / (1e6 * seeds as f64),
         );
         if whole && samples == 0 {
             budgets.push((

@@ -22,7 +22,7 @@ pub(crate) use self::goals::goal;
 use self::goals::{first_goal, next_goals};
 use crate::contribution::{LeaveOut, LeftOut};
 use crate::counters::RayCounts;
-use crate::denoise::{auxiliary::Auxiliary, denoise};
+use crate::denoise::{Denoiser, auxiliary::Auxiliary};
 use crate::error::RenderError;
 use crate::film::Film;
 use crate::foresight::{Foresight, first_share};
@@ -151,6 +151,7 @@ pub(crate) fn refine(
     };
     let mut search = RayCounts::default();
     let mut foresight = Foresight::new(limit, auxiliary.is_some());
+    let mut denoiser = auxiliary.map(Denoiser::new);
     let mut report = Progress::default();
     let (mut simulation, mut stop, mut left_out) = (simulation, stop, None::<LeftOut>);
     loop {
@@ -187,10 +188,11 @@ pub(crate) fn refine(
             let is_wanted = |job: &Job, goal| phase.holds(job) && is_wanted(job, goal);
             let advance = |job: &mut Job, goal: u32| advance(job, goal, &drawn);
             let report = |done| within_round(share(done));
+            let before: Vec<u32> = jobs.iter().map(|job| job.samples).collect();
             if draw(&mut jobs, &goals, phase, &is_wanted, &advance, report).is_break() {
                 return Err(RenderError::Interrupted);
             }
-            film.develop(&jobs);
+            film.develop_more(&jobs, &before);
         }
         let cost_of_round = jobs.iter().map(Job::cost).sum::<f64>() - cost_before;
         let seconds_of_round = round_start.elapsed().as_secs_f64();
@@ -222,7 +224,7 @@ pub(crate) fn refine(
             let begun = start_again(&mut jobs, found, goal, &advance);
             film.develop(&jobs[begun..]);
         }
-        let (errors, drawn) = errors_of(&mut film, &jobs, auxiliary, viewing);
+        let (errors, drawn) = errors_of(&mut film, &jobs, denoiser.as_mut(), viewing);
         let error = total_error(&errors, &film, viewing);
         let cost: f64 = jobs.iter().map(Job::cost).sum();
         foresight.learn(&jobs, &errors, &drawn, &error);
@@ -274,16 +276,16 @@ pub(crate) fn refine(
     }
 }
 
-/// The error that is left of each job, after its noise is removed from `film` if there are `auxiliary` pictures, and that of
-/// its samples before.
+/// The error that is left of each job, after its noise is removed from `film` if there is a `denoiser`, and that of its samples
+/// before.
 fn errors_of(
     film: &mut Film,
     jobs: &[Job],
-    auxiliary: Option<&Auxiliary>,
+    denoiser: Option<&mut Denoiser>,
     viewing: &Viewing,
 ) -> (Vec<SquaredError>, Vec<f64>) {
-    let denoised = match auxiliary {
-        Some(auxiliary) => denoise(film, jobs, auxiliary, viewing),
+    let denoised = match denoiser {
+        Some(denoiser) => denoiser.denoise(film, jobs, viewing),
         None => vec![None; jobs.len()],
     };
     let film = &*film;

@@ -82,8 +82,18 @@ impl Film {
     /// Takes over what `jobs` have found so far, later ones over earlier ones; those without
     /// samples change nothing.
     pub fn develop(&mut self, jobs: &[Job]) {
-        for jobs in jobs.chunks(DEVELOPED_AT_ONCE) {
-            let developed: Vec<Vec<Developed>> = jobs.par_iter().map(Job::developed).collect();
+        self.develop_more(jobs, &vec![0; jobs.len()]);
+    }
+
+    /// As [`develop`](Self::develop), of those jobs that have more samples than `before`.
+    pub(crate) fn develop_more(&mut self, jobs: &[Job], before: &[u32]) {
+        let chunks = jobs.chunks(DEVELOPED_AT_ONCE);
+        for (jobs, before) in chunks.zip(before.chunks(DEVELOPED_AT_ONCE)) {
+            let develop = |(job, &before): (&Job, &u32)| match job.samples > before {
+                true => job.developed(),
+                false => vec![],
+            };
+            let developed: Vec<Vec<Developed>> = jobs.par_iter().zip(before).map(develop).collect();
             for (job, developed) in jobs.iter().zip(developed) {
                 for ((x, y), (colour, coverage, variance)) in job.pixels.iter().zip(developed) {
                     let (x, y) = (x as usize, y as usize);

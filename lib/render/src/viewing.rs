@@ -48,7 +48,9 @@ impl Viewing<'_> {
     /// The picture at a pixel, linear, where the layers have these values.
     fn laid_over(&self, (x, y): (usize, usize), object: Vec3, alpha: f32, shadow: Vec3) -> Vec3 {
         let (object, shadow) = match &self.tone {
-            Some(tone) => (tone.object_pixel(object, alpha), self.toned_shadow(shadow)),
+            // Most of the ground is in no shadow.
+            Some(tone) if shadow == Vec3::ONE => (tone.object_pixel(object, alpha), shadow),
+            Some(tone) => (tone.object_pixel(object, alpha), tone.shadow_pixel(shadow)),
             None => (object, shadow),
         };
         composite_pixel(self.background(x, y), object, alpha, shadow)
@@ -70,17 +72,9 @@ impl Viewing<'_> {
         Vec3::from(linear.to_array().map(encode))
     }
 
-    fn toned_shadow(&self, shadow: Vec3) -> Vec3 {
-        match &self.tone {
-            // Most of the ground is in no shadow.
-            Some(tone) if shadow != Vec3::ONE => tone.shadow_pixel(shadow),
-            _ => shadow,
-        }
-    }
-
     /// The composite's display-referred squared error that comes from the noise of `job`,
-    /// to first order: the replicates' spread of the linear composite times the squared slope of
-    /// the transfer curve.
+    /// to first order: the replicates' spread of the linear composite, behind the tone curve, times the
+    /// squared slope of the transfer curve.
     pub fn squared_error(&self, film: &Film, job: &Job) -> SquaredError {
         self.squared_error_where(film, job, |_| true)
     }
@@ -114,11 +108,9 @@ impl Viewing<'_> {
                     };
                     let mean = composite(job.estimate(index, None));
                     let variance = job.spread(mean, |k| composite(job.estimate(index, Some(k))));
-                    let slope = |up: Vec3, down: Vec3, step| {
-                        (self.encoded(up) - self.encoded(down)) / (2.0 * step)
-                    };
                     let step = step(variance);
-                    let slope = slope(mean + step, mean - step, step);
+                    let rise = self.encoded(mean + step) - self.encoded(mean - step);
+                    let slope = rise / (2.0 * step);
                     variance * slope * slope
                 }
             };
@@ -196,10 +188,11 @@ mod tests {
         // Two 8-bit steps darker, once with less noise than that, once with more.
         *film.shadow.get_mut(1, 1) = Vec3::splat(0.95);
         let with_error = |film: &mut Film, error: f32| {
-            for i in 0..16 {
-                let variance = Vec3::splat(error * error);
-                film.shadow_variance.set(i % 4, i / 4, variance);
-            }
+            let variance = Vec3::splat(error * error);
+            let with_variance = |(i, &ratio)| ((i as u32 % 4, i as u32 / 4), (ratio, variance));
+            let shadow = film.shadow.clone();
+            let pixels = shadow.pixels().iter().enumerate().map(with_variance);
+            film.replace(Layer::PlaneShadow, pixels);
         };
         with_error(&mut film, 0.01);
         assert!(viewing.is_touched(&film, 1, 1));

@@ -46,7 +46,7 @@ pub const LIGHT: StageName = StageName {
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 10,
+    version: 11,
 };
 
 /// All stages, each after those that it reads.

@@ -23,6 +23,8 @@ use crate::viewing::{SquaredError, Viewing};
 /// are filtered.
 const NOISE_POOL: usize = 1;
 const BIAS_POOL: usize = 2;
+/// Tiles to each side whose samples decide about a tile's pixels, and about what its noise is averaged with.
+const AFFECTED: usize = 1 + NOISE_POOL;
 /// Jobs that are filtered at a time: bounds the memory that holds their pixels.
 const AT_ONCE: usize = 4096;
 
@@ -153,18 +155,27 @@ impl<'a> Tiles<'a> {
         halves
     }
 
-    /// The sums of the tiles up to `reach` away from that of `job`.
-    fn around(&self, job: &Job, reach: usize, sums: &[Sums]) -> Sums {
+    /// Whether the filter changes a pixel of its jobs.
+    fn is_filtered(&self, (x, y): (u32, u32)) -> bool {
+        self.kind == Kind::Shadow || self.halves(x as usize, y as usize).is_inside
+    }
+
+    /// The jobs of the tiles up to `reach` away from that of `job`.
+    fn near(&self, job: &Job, reach: usize) -> impl Iterator<Item = usize> {
         let rows = self.places.len() / self.columns;
         let [column, row] = [job.block.x, job.block.y].map(|n| n as usize / BLOCK);
+        let along =
+            move |at: usize, end: usize| at.saturating_sub(reach)..(at + reach + 1).min(end);
+        along(row, rows).flat_map(move |row| {
+            along(column, self.columns).filter_map(move |column| self.job(column, row))
+        })
+    }
+
+    /// Their sums.
+    fn around(&self, job: &Job, reach: usize, sums: &[Sums]) -> Sums {
         let mut all = Sums::default();
-        for row in row.saturating_sub(reach)..(row + reach + 1).min(rows) {
-            for column in column.saturating_sub(reach)..(column + reach + 1).min(self.columns) {
-                if let Some(job) = self.job(column, row) {
-                    all.add(&sums[job]);
-                }
-            }
-        }
+        self.near(job, reach)
+            .for_each(|other| all.add(&sums[other]));
         all
     }
 }
@@ -234,67 +245,169 @@ fn filter<const CHANNELS: usize, const PATCH: usize>(
     })
 }
 
-/// Filters the layers of `film`, which holds what `jobs` have found, and returns the error of every job that is
-/// filtered. Pixels where nothing near is shadowed stay as they are. Does nothing to a layer while any job of it has no
-/// samples.
-pub(crate) fn denoise(
-    film: &mut Film,
-    jobs: &[Job],
-    auxiliary: &Auxiliary,
-    viewing: &Viewing,
-) -> Vec<Option<Error>> {
-    let mut errors = vec![None; jobs.len()];
-    for kind in [Kind::Object, Kind::Shadow] {
-        let of_kind = || jobs.iter().filter(|job| kind.holds(job));
-        if of_kind().all(|job| job.samples > 0) {
-            let tiles = Tiles::new(kind, jobs, auxiliary, film);
-            denoise_kind(film, &tiles, viewing, &mut errors);
-        }
-    }
-    errors
+/// Filters layers after every round, anew where samples were added.
+pub(crate) struct Denoiser<'a> {
+    auxiliary: &'a Auxiliary,
+    /// Of every job; empty before the first round.
+    known: Vec<Known>,
 }
 
-fn denoise_kind(film: &mut Film, tiles: &Tiles, viewing: &Viewing, errors: &mut [Option<Error>]) {
+/// What is known of a job since it was filtered.
+#[derive(Clone, Copy, Debug, Default)]
+struct Known {
+    /// Those that were filtered, per pixel and replicate; 0 before.
+    samples: u32,
+    sums: Sums,
+    /// Whether the film has its filtered pixels.
+    is_shown: bool,
+}
+
+/// What follows for a job from its sums and those around it.
+struct Decision {
+    /// If its filtered pixels are better than those drawn.
+    error: Option<Error>,
+    /// Mean squared error around it, linear.
+    linear: f32,
+}
+
+impl<'a> Denoiser<'a> {
+    /// Has filtered nothing.
+    pub(crate) fn new(auxiliary: &'a Auxiliary) -> Self {
+        Self {
+            auxiliary,
+            known: vec![],
+        }
+    }
+
+    /// Filters the layers of `film`, which holds what `jobs` have found since, and what was filtered before; the jobs are
+    /// those of the call before, with as many samples or more. Returns the error of every job that is filtered. Pixels where
+    /// nothing near is shadowed stay as they are. Does nothing to a layer while any job of it has no samples.
+    pub(crate) fn denoise(
+        &mut self,
+        film: &mut Film,
+        jobs: &[Job],
+        viewing: &Viewing,
+    ) -> Vec<Option<Error>> {
+        self.known.resize(jobs.len(), Known::default());
+        let mut errors = vec![None; jobs.len()];
+        for kind in [Kind::Object, Kind::Shadow] {
+            let of_kind = || jobs.iter().filter(|job| kind.holds(job));
+            if of_kind().all(|job| job.samples > 0) {
+                let tiles = Tiles::new(kind, jobs, self.auxiliary, film);
+                denoise_kind(film, &tiles, viewing, &mut self.known, &mut errors);
+            }
+        }
+        errors
+    }
+}
+
+fn denoise_kind(
+    film: &mut Film,
+    tiles: &Tiles,
+    viewing: &Viewing,
+    known: &mut [Known],
+    errors: &mut [Option<Error>],
+) {
     let jobs = tiles.jobs;
-    let mut sums = vec![Sums::default(); jobs.len()];
-    for (jobs, sums) in jobs.chunks(AT_ONCE).zip(sums.chunks_mut(AT_ONCE)) {
-        let filter = |job: &Job| match tiles.kind {
-            kind if !kind.holds(job) => None,
-            Kind::Object => filter(OBJECT, tiles, job, film, viewing),
-            Kind::Shadow => filter(SHADOW, tiles, job, film, viewing),
+    let grown = |other: usize| jobs[other].samples > known[other].samples;
+    let is_stale = |job: &Job| tiles.kind.holds(job) && tiles.near(job, AFFECTED).any(grown);
+    let stale: Vec<bool> = jobs.par_iter().map(is_stale).collect();
+    filter_where(film, tiles, viewing, known, |index| stale[index]);
+    let sums: Vec<Sums> = known.iter().map(|k| k.sums).collect();
+    let decide = |(index, job): (usize, &Job)| {
+        let is_known = tiles.kind.holds(job) && sums[index].pixels > 0.0;
+        is_known.then(|| decision(tiles, film, viewing, (index, job), &sums))
+    };
+    let decisions: Vec<_> = jobs.par_iter().enumerate().map(decide).collect();
+    // What did not help before, and does with what is around it now.
+    let is_missing = |index: usize, known: &Known| {
+        let decision = decisions[index].as_ref();
+        decision.is_some_and(|d| d.error.is_some()) && !known.is_shown
+    };
+    let missing: Vec<bool> = known
+        .iter()
+        .enumerate()
+        .map(|(index, known)| is_missing(index, known))
+        .collect();
+    filter_where(film, tiles, viewing, known, |index| missing[index]);
+    for (index, decision) in decisions.into_iter().enumerate() {
+        let Some(decision) = decision else { continue };
+        let job = &jobs[index];
+        errors[index] = decision.error;
+        match decision.error.is_some() {
+            true if stale[index] || missing[index] => {
+                let filtered = job.pixels.iter().filter(|&p| tiles.is_filtered(p));
+                film.raise_variance(job.layer, filtered, decision.linear);
+            }
+            false if known[index].is_shown => {
+                film.develop(std::slice::from_ref(job));
+                known[index].is_shown = false;
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Filters the jobs whose number is `wanted`.
+fn filter_where(
+    film: &mut Film,
+    tiles: &Tiles,
+    viewing: &Viewing,
+    known: &mut [Known],
+    wanted: impl Fn(usize) -> bool,
+) {
+    let wanted: Vec<usize> = (0..tiles.jobs.len())
+        .filter(|&index| wanted(index))
+        .collect();
+    for indices in wanted.chunks(AT_ONCE) {
+        let filter = |&index: &usize| match tiles.kind {
+            Kind::Object => filter(OBJECT, tiles, &tiles.jobs[index], film, viewing),
+            Kind::Shadow => filter(SHADOW, tiles, &tiles.jobs[index], film, viewing),
         };
-        let filtered: Vec<_> = jobs.par_iter().map(filter).collect();
-        for ((job, sums), filtered) in jobs.iter().zip(sums).zip(filtered) {
+        let filtered: Vec<_> = indices.par_iter().map(filter).collect();
+        for (&index, filtered) in indices.iter().zip(filtered) {
+            let job = &tiles.jobs[index];
+            known[index] = Known {
+                samples: job.samples,
+                sums: filtered.as_ref().map(|f| f.sums).unwrap_or_default(),
+                is_shown: filtered.is_some(),
+            };
             if let Some(filtered) = filtered {
-                *sums = filtered.sums;
                 film.replace(job.layer, filtered.pixels.into_iter());
             }
         }
     }
-    for (index, job) in jobs.iter().enumerate() {
-        if sums[index].pixels == 0.0 {
-            continue;
-        }
-        let wide = tiles.around(job, BIAS_POOL, &sums);
-        if wide.error > wide.noise {
-            film.develop(std::slice::from_ref(job));
-            continue;
-        }
-        let is_filtered = |(x, y): (u32, u32)| tiles.halves(x as usize, y as usize).is_inside;
-        let near = tiles.around(job, NOISE_POOL, &sums);
-        let filtered = job.pixels.iter().filter(|&pixel| is_filtered(pixel));
-        film.raise_variance(job.layer, filtered, (near.linear / near.pixels) as f32);
-        let noise = near.residual / near.pixels;
-        let bias = ((wide.error - wide.residual) / wide.pixels).max(0.0);
-        let left = SquaredError {
-            sum: (noise + bias) * sums[index].pixels,
-            variance: sums[index].variance,
+}
+
+fn decision(
+    tiles: &Tiles,
+    film: &Film,
+    viewing: &Viewing,
+    (index, job): (usize, &Job),
+    sums: &[Sums],
+) -> Decision {
+    let wide = tiles.around(job, BIAS_POOL, sums);
+    let near = tiles.around(job, NOISE_POOL, sums);
+    let linear = (near.linear / near.pixels) as f32;
+    if wide.error > wide.noise {
+        return Decision {
+            error: None,
+            linear,
         };
-        let drawn = viewing.squared_error_where(film, job, |pixel| !is_filtered(pixel));
-        errors[index] = Some(Error {
+    }
+    let noise = near.residual / near.pixels;
+    let bias = ((wide.error - wide.residual) / wide.pixels).max(0.0);
+    let left = SquaredError {
+        sum: (noise + bias) * sums[index].pixels,
+        variance: sums[index].variance,
+    };
+    let drawn = viewing.squared_error_where(film, job, |pixel| !tiles.is_filtered(pixel));
+    Decision {
+        error: Some(Error {
             left: left.merge(drawn),
             drawn: sums[index].noise + drawn.sum,
-        });
+        }),
+        linear,
     }
 }
 

@@ -177,6 +177,62 @@ fn a_time_budget_ends_after_a_round_and_a_target_that_cannot_be_met_at_the_most_
     assert!(r.error.rmse > 1e-9 && r.samples <= 2 * 64 * 256);
 }
 
+/// What film and mid-grey show behind Reinhard's curve.
+fn toned(film: &Film) -> Vec<Vec3> {
+    let viewing = Viewing {
+        background: None,
+        tone: Some(ToneCurves::identity().mapper()),
+        transfer: Transfer::Srgb,
+    };
+    let (width, height) = (film.alpha.width(), film.alpha.height());
+    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    let shown = pixels.map(|(x, y)| {
+        let (object, alpha) = (*film.object.get(x, y), *film.alpha.get(x, y));
+        viewing.shown((x, y), object, alpha, *film.shadow.get(x, y))
+    });
+    shown.collect()
+}
+
+#[test]
+fn the_error_is_that_of_the_picture_behind_the_tone_curve() {
+    // As bright as snow in the sun: without the curve nearly all of the object is white, whatever its noise.
+    let s = knot_scene(24);
+    let direction = Vec3::new(0.5, 0.8, 0.4).normalize();
+    let bright = EnvironmentSampler::new(sun(direction, 2000.0, 4.0, 64));
+    let curves = ToneCurves::identity();
+    let with_tone = |samples, seed, tone| Settings {
+        transfer: Transfer::Srgb,
+        tone,
+        ..settings(samples, seed)
+    };
+    let simulation = lambertian(2);
+    let reference = with_tone(4096, 99, Some(&curves));
+    let reference = toned(&render(&s, &bright, &simulation, &reference).film);
+    let (mut stated, mut drawn, mut without) = (0.0, 0.0, 0.0);
+    for seed in 0..8 {
+        let r = render(
+            &s,
+            &bright,
+            &simulation,
+            &with_tone(16, seed, Some(&curves)),
+        );
+        let pixels = r.error.touched_pixels as f64;
+        stated += r.error.rmse.powi(2) * pixels;
+        let off = toned(&r.film).into_iter().zip(&reference);
+        drawn += off
+            .map(|(a, &b)| f64::from((a - b).length_squared()) / 3.0)
+            .sum::<f64>();
+        let r = render(&s, &bright, &simulation, &with_tone(16, seed, None));
+        without += r.error.rmse.powi(2) * r.error.touched_pixels as f64;
+    }
+    // Eight times some 200 pixels with one degree of freedom a channel, of unequal size.
+    let ratio = (stated / drawn).sqrt();
+    assert!((0.85..1.15).contains(&ratio), "{ratio}");
+    // What is clipped has no error without it, and the bright object's edges have more.
+    let ratio = (without / drawn).sqrt();
+    assert!(!(0.7..1.4).contains(&ratio), "{ratio}");
+}
+
 #[test]
 fn progress_can_break_off() {
     let s = knot_scene(16);
