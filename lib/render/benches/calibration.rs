@@ -6,8 +6,8 @@
 //!
 //! Run with `cargo test -p dipir-render --bench calibration -- --bench [target=RMSE] [size=PIXELS]
 //! [seeds=N] [samples=N] [highlights=0] [denoise=0] [blur=0] [NAME]`: `samples` draws so many in every pixel instead of
-//! stopping at the target, `highlights=0` leaves highlights to chance, `denoise=0` leaves noise, `blur=0` leaves caustics sharp as they are in
-//! the reference, and only scenes whose name holds NAME are rendered.
+//! stopping at the target, `highlights=0` leaves highlights to chance, `denoise=0` leaves noise, `blur=0` leaves caustics
+//! sharp as they are in the reference, and only scenes whose name holds NAME are rendered.
 //! Without `--bench`, as tests run it, one small scene proves that it works.
 mod gallery;
 

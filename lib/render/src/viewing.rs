@@ -175,7 +175,34 @@ fn step(variance: Vec3) -> Vec3 {
 
 #[cfg(test)]
 mod tests {
+    use dipir_imaging::tone::ToneCurves;
+
     use super::*;
+
+    #[test]
+    fn errors_are_weighed_by_the_slope_of_curve_and_photograph() {
+        let viewing = Viewing {
+            background: None,
+            tone: Some(ToneCurves::identity().mapper()),
+            transfer: Transfer::Linear,
+        };
+        let mut film = Film::new(1, 1);
+        for (radiance, alpha) in [(0.1, 1.0), (1.5, 1.0), (0.4, 0.5), (2.0, 0.9)] {
+            *film.object.get_mut(0, 0) = Vec3::splat(radiance);
+            *film.alpha.get_mut(0, 0) = alpha;
+            let weight = |layer| viewing.weight(&film, layer, (0, 0), Vec3::ZERO).x;
+            // Reinhard's derivative at the covered part's radiance; the photograph's mid-grey where it is seen.
+            let slopes = [
+                (Layer::Object, (1.0 + radiance / alpha).powi(-2)),
+                (Layer::PlaneShadow, 0.18 * (1.0 - alpha)),
+            ];
+            for (layer, slope) in slopes {
+                // Two values of at most 1, each rounded to 2^-24 a few times, over a step of 2e-4.
+                let off = (weight(layer).sqrt() - slope).abs();
+                assert!(off < 8.0 * 2f32.powi(-24) / 2e-4, "{layer:?}: {off}");
+            }
+        }
+    }
 
     #[test]
     fn noise_on_bright_ground_touches_nothing() {

@@ -3,9 +3,8 @@ use super::{EstimatedError, Stop};
 use crate::job::{Job, REPLICATES};
 use crate::viewing::SquaredError;
 
-/// Samples per pixel and replicate of the first round. The more, the less often pixels get more than they need: in photographs
-/// of many pixels nearly all of them. With half as many, more highlights are missed, and the error is more often above what is
-/// stated (`benches/calibration.rs`).
+/// Samples per pixel and replicate of the first round. More are wasted: most pixels of a large photograph need no more.
+/// Fewer miss highlights, and the error is more often above what is stated (`benches/calibration.rs`).
 const FIRST_ROUND: u32 = 4;
 
 /// No job grows faster than this from one round to the next, because early variances are
@@ -99,9 +98,6 @@ fn goals(jobs: &[Job], errors: &[SquaredError], scale: f64, limit: u32) -> Vec<u
 
 /// Samples per pixel and replicate of a job in the next round, of which it has `samples` and would best have `best`.
 pub(crate) fn goal(best: f64, samples: u32, limit: u32) -> u32 {
-    if best <= f64::from(samples) {
-        return samples;
-    }
     let wanted = best.min(f64::from(samples) * MAX_GROWTH).ceil() as u32;
     // Multiples of four keep the sequences stratified.
     let stratified = wanted.checked_next_multiple_of(4).unwrap_or(limit);

@@ -172,10 +172,10 @@ impl<'a> Tiles<'a> {
     }
 
     /// Their sums.
-    fn around(&self, job: &Job, reach: usize, sums: &[Sums]) -> Sums {
+    fn around(&self, job: &Job, reach: usize, known: &[Known]) -> Sums {
         let mut all = Sums::default();
         self.near(job, reach)
-            .for_each(|other| all.add(&sums[other]));
+            .for_each(|other| all.add(&known[other].sums));
         all
     }
 }
@@ -313,21 +313,18 @@ fn denoise_kind(
     let is_stale = |job: &Job| tiles.kind.holds(job) && tiles.near(job, AFFECTED).any(grown);
     let stale: Vec<bool> = jobs.par_iter().map(is_stale).collect();
     filter_where(film, tiles, viewing, known, |index| stale[index]);
-    let sums: Vec<Sums> = known.iter().map(|k| k.sums).collect();
     let decide = |(index, job): (usize, &Job)| {
-        let is_known = tiles.kind.holds(job) && sums[index].pixels > 0.0;
-        is_known.then(|| decision(tiles, film, viewing, (index, job), &sums))
+        let is_known = tiles.kind.holds(job) && known[index].sums.pixels > 0.0;
+        is_known.then(|| decision(tiles, film, viewing, (index, job), known))
     };
     let decisions: Vec<_> = jobs.par_iter().enumerate().map(decide).collect();
     // What did not help before, and does with what is around it now.
-    let is_missing = |index: usize, known: &Known| {
-        let decision = decisions[index].as_ref();
-        decision.is_some_and(|d| d.error.is_some()) && !known.is_shown
-    };
-    let missing: Vec<bool> = known
+    let helps = decisions
         .iter()
-        .enumerate()
-        .map(|(index, known)| is_missing(index, known))
+        .map(|d| matches!(d, Some(Decision { error: Some(_), .. })));
+    let missing: Vec<bool> = helps
+        .zip(known.iter())
+        .map(|(helps, known)| helps && !known.is_shown)
         .collect();
     filter_where(film, tiles, viewing, known, |index| missing[index]);
     for (index, decision) in decisions.into_iter().enumerate() {
@@ -384,10 +381,11 @@ fn decision(
     film: &Film,
     viewing: &Viewing,
     (index, job): (usize, &Job),
-    sums: &[Sums],
+    known: &[Known],
 ) -> Decision {
-    let wide = tiles.around(job, BIAS_POOL, sums);
-    let near = tiles.around(job, NOISE_POOL, sums);
+    let sums = &known[index].sums;
+    let wide = tiles.around(job, BIAS_POOL, known);
+    let near = tiles.around(job, NOISE_POOL, known);
     let linear = (near.linear / near.pixels) as f32;
     if wide.error > wide.noise {
         return Decision {
@@ -398,14 +396,14 @@ fn decision(
     let noise = near.residual / near.pixels;
     let bias = ((wide.error - wide.residual) / wide.pixels).max(0.0);
     let left = SquaredError {
-        sum: (noise + bias) * sums[index].pixels,
-        variance: sums[index].variance,
+        sum: (noise + bias) * sums.pixels,
+        variance: sums.variance,
     };
     let drawn = viewing.squared_error_where(film, job, |pixel| !tiles.is_filtered(pixel));
     Decision {
         error: Some(Error {
             left: left.merge(drawn),
-            drawn: sums[index].noise + drawn.sum,
+            drawn: sums.noise + drawn.sum,
         }),
         linear,
     }

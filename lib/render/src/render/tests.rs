@@ -208,29 +208,29 @@ fn the_error_is_that_of_the_picture_behind_the_tone_curve() {
     let simulation = lambertian(2);
     let reference = with_tone(4096, 99, Some(&curves));
     let reference = toned(&render(&s, &bright, &simulation, &reference).film);
-    let (mut stated, mut drawn, mut without) = (0.0, 0.0, 0.0);
+    let (mut stated, mut drawn, mut fourth, mut without) = (0.0, 0.0, 0.0, 0.0);
+    let sum = |r: &Rendered| r.error.rmse.powi(2) * r.error.touched_pixels as f64;
     for seed in 0..8 {
-        let r = render(
-            &s,
-            &bright,
-            &simulation,
-            &with_tone(16, seed, Some(&curves)),
-        );
-        let pixels = r.error.touched_pixels as f64;
-        stated += r.error.rmse.powi(2) * pixels;
-        let off = toned(&r.film).into_iter().zip(&reference);
-        drawn += off
-            .map(|(a, &b)| f64::from((a - b).length_squared()) / 3.0)
-            .sum::<f64>();
-        let r = render(&s, &bright, &simulation, &with_tone(16, seed, None));
-        without += r.error.rmse.powi(2) * r.error.touched_pixels as f64;
+        let rendered = [Some(&curves), None].map(|tone| {
+            let settings = with_tone(16, seed, tone);
+            render(&s, &bright, &simulation, &settings)
+        });
+        stated += sum(&rendered[0]);
+        without += sum(&rendered[1]);
+        for (a, &b) in toned(&rendered[0].film).into_iter().zip(&reference) {
+            let square = f64::from((a - b).length_squared()) / 3.0;
+            drawn += square;
+            fourth += square * square;
+        }
     }
-    // Eight times some 200 pixels with one degree of freedom a channel, of unequal size.
-    let ratio = (stated / drawn).sqrt();
-    assert!((0.85..1.15).contains(&ratio), "{ratio}");
-    // What is clipped has no error without it, and the bright object's edges have more.
-    let ratio = (without / drawn).sqrt();
-    assert!(!(0.7..1.4).contains(&ratio), "{ratio}");
+    // A sum of squares varies by less than the root of the sum of their squares. What is stated is a sum of the same kind:
+    // its ratio to what was drawn varies by root two of that.
+    let within = 3.0 * (2.0 * fourth).sqrt() / drawn;
+    let off = stated / drawn - 1.0;
+    assert!(off.abs() < within, "{off}, {within}");
+    // The edges of a bright object have more, what is clipped has none.
+    let off = without / drawn - 1.0;
+    assert!(off.abs() > 2.0 * within, "{off}, {within}");
 }
 
 #[test]
