@@ -74,6 +74,21 @@ fn the_report_says_which_candidate_is_used() {
     let project = project();
     let run = project.run(DIPIR, &["run", "-s", "light.candidate=2"]);
     run.expect_success();
+    let candidates: Value =
+        serde_json::from_slice(&project.read("out/light/candidates.json")).unwrap();
+    let used = candidates[1]["words"].as_str().unwrap();
+    assert!(
+        run.stdout.contains(&format!("\n  candidate 2: {used}\n")),
+        "{}",
+        run.stdout
+    );
+    // The estimate alone says where most light comes from.
+    assert_eq!(
+        run.stdout.matches("most light").count(),
+        1,
+        "{}",
+        run.stdout
+    );
     let page = String::from_utf8(project.read("out/report.html")).unwrap();
     assert!(page.contains(">used</td>"));
     let offers = |n: usize| page.contains(&format!("<code>--set light.candidate={n}</code>"));

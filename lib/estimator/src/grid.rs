@@ -3,7 +3,7 @@ use std::f32::consts::{PI, TAU};
 
 use dipir_light::environment::{EnvironmentMap, solid_angle};
 use dipir_scene::camera::Camera;
-use glam::Vec3;
+use glam::{Quat, Vec3};
 
 /// Columns and rows of the smooth part of the light: 22.5 degrees, finer detail is not recovered.
 pub const BASE: [usize; 2] = [16, 8];
@@ -73,6 +73,11 @@ pub fn heading(camera: &Camera) -> f64 {
         camera.rotation.y_axis.as_dvec3() * -forward.y.signum()
     };
     ahead.x.atan2(-ahead.z)
+}
+
+/// A direction in the world relative to the view: -z is ahead, +x to the right, elevation stays.
+pub fn relative(towards: Vec3, camera: &Camera) -> Vec3 {
+    Quat::from_rotation_y(heading(camera) as f32) * towards
 }
 
 /// The smooth part on `width` x `height` texels, relative to the view: interpolated between the middles of its

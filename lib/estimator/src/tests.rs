@@ -7,7 +7,7 @@ use dipir_scene::camera::{Camera, FieldOfView};
 use glam::{DVec3, Vec3};
 
 use crate::features::{FEATURES, OF_PARTS, SmallPhoto};
-use crate::grid::{BINS, bin_direction, direction, heading};
+use crate::grid::{BINS, bin_direction, direction, heading, relative};
 use crate::network::{HISTOGRAM, Network, OUTPUTS, Sight};
 use crate::posterior::{PeakPosterior, words};
 use crate::{Calibration, Estimator, LightEstimate, ViewEstimate, Visible, combine, merged};
@@ -198,6 +198,22 @@ fn looking_down_with_the_head_to_the_north_is_heading_north() {
         [8, 8],
     );
     assert!(heading(&up).abs() < 1e-6, "{}", heading(&up));
+}
+
+#[test]
+fn the_right_of_the_picture_is_the_right_of_the_view() {
+    let camera = camera(200.0, 60, 40);
+    // What the camera sees at its right edge, in the world.
+    let towards = camera.ray(glam::Vec2::new(60.0, 20.0)).direction;
+    let seen = relative(towards, &camera);
+    assert!(
+        (seen.y - towards.y).abs() < 1e-6,
+        "elevation stays: {seen} of {towards}"
+    );
+    assert!(seen.x > 0.3 && seen.z < -0.8, "{seen}");
+    let mut ahead = -camera.rotation.z_axis;
+    ahead.y = 0.0;
+    assert!((relative(ahead.normalize(), &camera) - Vec3::NEG_Z).length() < 1e-6);
 }
 
 #[test]

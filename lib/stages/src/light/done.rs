@@ -1,20 +1,14 @@
 //! What the light stage prints when it has run.
 use std::fmt;
 
+use dipir_estimator::grid::relative;
+use dipir_estimator::posterior::words;
 use dipir_optimize::history::Row;
-use glam::Vec3;
 use serde_json::{Value, json};
 
 use super::Done;
 use super::words::in_words;
 use crate::written;
-
-/// Degrees above the horizon, and counter-clockwise from +z seen from above.
-fn angles_deg(direction: Vec3) -> [f32; 2] {
-    let elevation = direction.y.clamp(-1.0, 1.0).asin();
-    let azimuth = direction.x.atan2(direction.z);
-    [elevation.to_degrees(), azimuth.to_degrees()]
-}
 
 impl Done {
     fn records(&self) -> usize {
@@ -30,7 +24,7 @@ impl Done {
         let history = &self.found.history;
         json!({
             "folder": self.folder,
-            "size": self.size,
+            "size": self.camera.resolution,
             "iterations": history.len(),
             "wanted": self.wanted,
             "resumed_at": self.resumed_at,
@@ -62,21 +56,29 @@ impl fmt::Display for Done {
                 if let Some(wanted) = self.wanted {
                     write!(f, " of {wanted} within light.time_budget_s,")?;
                 }
-                write!(f, " on {} x {} pixels", self.size[0], self.size[1])?
+                let [width, height] = self.camera.resolution;
+                write!(f, " on {width} x {height} pixels")?
             }
         }
         if let Some(rmse) = self.found.rmse {
             write!(f, ", {rmse:.5} of display-referred RMSE from the reference")?;
         }
-        if let Some(peak) = self.found.lighting.peak_direction() {
-            let [elevation, azimuth] = angles_deg(peak);
-            write!(
-                f,
-                "\n  most light comes from {elevation:.1} degrees above the horizon, {azimuth:.1} \
-                 degrees from +z towards +x"
-            )?;
+        let estimated = self.found.estimated.as_ref();
+        match estimated.filter(|_| self.found.history.is_empty()) {
+            // The estimate tells itself where its light comes from, with how sure it is.
+            Some(estimated) => {
+                if let Some(chosen) = estimated.chosen() {
+                    write!(f, "\n  {chosen}")?;
+                }
+            }
+            None => {
+                if let Some(peak) = self.found.lighting.peak_direction() {
+                    let seen = words(relative(peak, &self.camera));
+                    write!(f, "\n  most light comes {seen}")?;
+                }
+            }
         }
-        if let Some(estimated) = &self.found.estimated {
+        if let Some(estimated) = estimated {
             write!(f, "\n  {}", in_words(&estimated.estimate))?;
             if estimated.photographs > 1 {
                 write!(f, "\n  from {} photographs", estimated.photographs)?;
@@ -93,18 +95,5 @@ impl fmt::Display for Done {
             write!(f, "\n  {}", self.outlook.text())?;
         }
         Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn directions_are_told_as_heights_and_turns() {
-        assert_eq!(angles_deg(Vec3::Y)[0], 90.0);
-        assert_eq!(angles_deg(Vec3::Z), [0.0, 0.0]);
-        assert_eq!(angles_deg(Vec3::X), [0.0, 90.0]);
-        assert_eq!(angles_deg(Vec3::NEG_X), [0.0, -90.0]);
     }
 }

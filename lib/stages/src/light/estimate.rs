@@ -34,6 +34,8 @@ pub(super) struct Estimated {
     pub(super) estimate: LightEstimate,
     /// Lights that it allows, the most probable first.
     pub(super) candidates: Vec<CandidateEntry>,
+    /// The number of the one that is used, from 1; `None` for the mean of the distribution.
+    chosen: Option<usize>,
     /// The same as lights.
     pub(super) lights: Vec<Candidate>,
     /// The chosen light as lobes, its sources first.
@@ -46,6 +48,14 @@ pub(super) struct Estimated {
     pub(super) seen: Vec<Visible>,
     /// How many photographs tell it.
     pub(super) photographs: usize,
+}
+
+impl Estimated {
+    /// The candidate that is used, in words.
+    pub(super) fn chosen(&self) -> Option<String> {
+        let entry = self.candidates.get(self.chosen?.checked_sub(1)?)?;
+        Some(format!("candidate {}: {}", entry.candidate, entry.words))
+    }
 }
 
 /// The light of the whole photograph: a function of photograph, camera, other photographs of the place
@@ -97,6 +107,7 @@ pub(super) fn estimate(
     Ok(Estimated {
         estimate,
         candidates: entries,
+        chosen: table.candidate,
         lights: candidates,
         lobes,
         sources,

@@ -39,6 +39,7 @@ use dipir_pipeline::stage::{StagePlan, StageWriter};
 use dipir_prior::inversion::Reading;
 use dipir_render::render::Renderer;
 use dipir_render::transport::{RecordSettings, Transport};
+use dipir_scene::camera::Camera;
 use serde_json::Value;
 
 use crate::light::estimate::Estimated;
@@ -61,7 +62,8 @@ pub struct Done {
     found: Found,
     /// The iterations that were asked for, where a time budget decided how many were run.
     wanted: Option<usize>,
-    size: [u32; 2],
+    /// The camera of the picture that the light was recovered on.
+    camera: Camera,
     resumed_at: usize,
     /// What other presets would have taken; empty for a run that went on from a checkpoint.
     outlook: Outlook,
@@ -175,7 +177,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         manifest,
         found,
         wanted: budget.map(|_| request.settings.iterations),
-        size: inputs.frame.camera.resolution,
+        camera: inputs.frame.camera,
         resumed_at,
         outlook,
     })

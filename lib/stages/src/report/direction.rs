@@ -1,6 +1,6 @@
 //! Where most of the light comes from, drawn onto the photograph: an arrow on the ground and a disc in the sky.
 use dipir_estimator::LightEstimate;
-use dipir_estimator::grid::direction;
+use dipir_estimator::grid::{direction, heading, relative};
 use dipir_estimator::posterior::words;
 use dipir_imaging::transfer::Transfer;
 use dipir_scene::camera::Camera;
@@ -54,8 +54,10 @@ pub fn figure(
         drawn.extend(ground.arrow(truth, "truth"));
         drawn.extend(ground.disc(truth, "truth"));
     }
-    let relative = Quat::from_rotation_y(heading(&ground.camera)) * towards;
-    let mut caption = format!("Most light comes {}", words(relative));
+    let mut caption = format!(
+        "Most light comes {}",
+        words(relative(towards, &ground.camera))
+    );
     if estimate.is_some() {
         caption += "; shaded: where it comes from in four photographs of five";
     }
@@ -80,12 +82,6 @@ pub fn figure(
     )))
 }
 
-/// Angle by which the view is turned from -z to the right, radians.
-fn heading(camera: &Camera) -> f32 {
-    let ahead = -camera.rotation.z_axis;
-    ahead.x.atan2(-ahead.z)
-}
-
 /// The ground at the object's foot, as the camera sees it.
 struct Ground {
     camera: Camera,
@@ -99,7 +95,7 @@ impl Ground {
     /// The azimuths of the estimate's interval as a sector around the foot.
     fn sector(&self, estimate: &LightEstimate) -> Option<Html> {
         let arc = estimate.azimuth_deg;
-        let turn = Quat::from_rotation_y(-heading(&self.camera));
+        let turn = Quat::from_rotation_y(-heading(&self.camera) as f32);
         let steps = ((arc.high - arc.low) / STEP_DEG).ceil().clamp(1.0, 72.0) as usize;
         let rim = (0..=steps).map(|k| {
             let azimuth = arc.low + (arc.high - arc.low) * k as f64 / steps as f64;
