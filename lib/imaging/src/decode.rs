@@ -5,6 +5,7 @@ use crate::{
     file::{PhotoLimits, check_size},
     format::Format,
     jpeg_header,
+    png_colours::PngColours,
     raster::{LinearImage, Raster},
 };
 use glam::Vec3;
@@ -28,6 +29,8 @@ pub(crate) struct Decoded {
     /// How the stored picture is turned to be upright.
     orientation: Orientation,
     pub icc: Option<Vec<u8>>,
+    /// What a PNG says of its colours beside a profile.
+    pub png_colours: PngColours,
     /// Exif data from its TIFF header on.
     pub exif: Option<Vec<u8>>,
 }
@@ -80,7 +83,8 @@ impl Decoded {
                 limits.max_alloc = Some(PNG_METADATA_BYTES + 32 * width as u64);
                 let source = Cursor::new(bytes);
                 let decoder = PngDecoder::with_limits(source, limits).map_err(failed)?;
-                let decoded = Self::with(decoder, path, limit, failed)?;
+                let mut decoded = Self::with(decoder, path, limit, failed)?;
+                decoded.png_colours = PngColours::of(bytes);
                 Ok(decoded.with_profile_of(bytes, b"iCCP"))
             }
             Format::Jpeg => {
@@ -127,6 +131,7 @@ impl Decoded {
             samples,
             orientation: orientation.unwrap_or(Orientation::NoTransforms),
             icc,
+            png_colours: PngColours::default(),
             exif,
         })
     }

@@ -6,6 +6,7 @@
 use crate::{raster::LinearImage, transfer::Transfer};
 use glam::{DMat3, DVec3, Mat3, Vec3};
 use moxcms::{ColorDateTime, ColorProfile, DataColorSpace, ToneReprCurve};
+use png::ScaledFloat;
 use rayon::prelude::*;
 
 /// How the values of a photograph were encoded, and how a picture that looks like it is.
@@ -22,7 +23,7 @@ pub struct Encoding {
 pub(crate) enum Tag {
     Srgb,
     /// Exponent that encodes light.
-    Gamma(f32),
+    Gamma(ScaledFloat),
     /// An ICC profile for RGB.
     Profile(Vec<u8>),
 }
@@ -31,6 +32,8 @@ pub(crate) enum Tag {
 #[derive(Clone, Debug, PartialEq)]
 enum Curve {
     Named(Transfer),
+    /// A pure power.
+    Power(f32),
     Profile(ToneReprCurve),
 }
 
@@ -39,6 +42,9 @@ const STEPS: u16 = 255;
 /// A matrix this near to the identity and a curve this near to sRGB's are sRGB, as rounded by the
 /// makers of profiles.
 const SRGB_TOLERANCE: f64 = 2e-3;
+/// How a PNG says sRGB's curve by an exponent, and how near to that one is it [PNG, 11.3.2.4].
+const SRGB_GAMMA: f32 = 0.454_55;
+const GAMMA_TOLERANCE: f32 = 1e-3;
 
 impl Encoding {
     /// Rec.709 primaries and the curve `transfer`.
@@ -49,10 +55,35 @@ impl Encoding {
             from_rec709: Mat3::IDENTITY,
             tag: match transfer {
                 Transfer::Srgb => Tag::Srgb,
-                Transfer::Gamma22 => Tag::Gamma(1.0 / 2.2),
-                Transfer::Linear => Tag::Gamma(1.0),
+                Transfer::Gamma22 => Tag::Gamma(ScaledFloat::new(1.0 / 2.2)),
+                Transfer::Linear => Tag::Gamma(ScaledFloat::new(1.0)),
             },
         }
+    }
+
+    /// Rec.709 primaries and a pure power, of which a PNG's `gAMA` is the exponent that encodes
+    /// light; `None` for that of sRGB.
+    ///
+    /// # Errors
+    /// Why it cannot be used, as a clause.
+    pub(crate) fn of_gamma(gamma: ScaledFloat) -> Result<Option<Self>, String> {
+        let exponent = gamma.into_value();
+        if !(0.1..=10.0).contains(&exponent) {
+            return Err(format!("is {exponent}, not 0.1 to 10"));
+        }
+        let near = |other: f32| (exponent / other - 1.0).abs() <= GAMMA_TOLERANCE;
+        if near(SRGB_GAMMA) {
+            return Ok(None);
+        }
+        let curve = match near(1.0) {
+            true => Curve::Named(Transfer::Linear),
+            false => Curve::Power(1.0 / exponent),
+        };
+        Ok(Some(Self {
+            curves: [0; 3].map(|_| curve.clone()),
+            tag: Tag::Gamma(gamma),
+            ..Self::named(Transfer::Linear)
+        }))
     }
 
     /// The encoding that an ICC profile describes for an image of `channels` colours (1 or 3).
@@ -136,11 +167,11 @@ impl Encoding {
         Ok(encoding)
     }
 
-    /// The values of a file with the profile `icc`, read with a curve that the user names: the
-    /// result still carries the profile, so that it is shown as the file is.
-    pub(crate) fn overruled(transfer: Transfer, icc: Option<Self>) -> Self {
+    /// The values of a file with an encoding of its own, read with a curve that the user names: the
+    /// result still carries the file's profile or gamma, so that it is shown as the file is.
+    pub(crate) fn overruled(transfer: Transfer, of_file: Option<Self>) -> Self {
         let named = Self::named(transfer);
-        match icc {
+        match of_file {
             Some(of_file) => Self {
                 tag: of_file.tag,
                 ..named
@@ -217,6 +248,7 @@ impl Curve {
         let unit = (0..=max).map(|v| f32::from(v) / f32::from(max));
         match self {
             Self::Named(transfer) => unit.map(|v| transfer.decode_scalar(v)).collect(),
+            Self::Power(exponent) => unit.map(|v| v.powf(*exponent)).collect(),
             Self::Profile(curve) => match curve.make_linear_evaluator() {
                 Ok(curve) => unit
                     .map(|v| curve.evaluate_value(v).clamp(0.0, 1.0))

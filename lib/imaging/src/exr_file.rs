@@ -4,7 +4,8 @@ use crate::{
     error::ImagingError,
     format::Format,
     layer_rows::{LayerRows, Packing, RowChannel},
-    layers::{Layers, Precision},
+    layers::{Layers, Precision, check_name},
+    primaries::Primaries,
     raster::Raster,
 };
 use exr::{
@@ -213,6 +214,10 @@ fn read_small(
     let block = block_side(longest, window.size);
     let (width, height) = (width.div_ceil(block), height.div_ceil(block));
     let mut layers = Layers::from_file(width, height, path);
+    layers.primaries = image.attributes.chromaticities.map(|c| {
+        let [r, g, b, w] = [c.red, c.green, c.blue, c.white];
+        Primaries::new([r.0, r.1, g.0, g.1, b.0, b.1, w.0, w.1].map(f64::from))
+    });
     for part in image.layer_data {
         if part.attributes.environment_map == Some(EnvironmentMap::LatitudeLongitude) {
             layers.latlong = true;
@@ -236,6 +241,11 @@ fn read_small(
             let mut name = channel.name.to_string();
             if let (true, Some(part)) = (layers.contains(&name), &part_name) {
                 name = format!("{part}.{name}");
+            }
+            // Blender's passes have spaces in their names, and nothing here asks for them.
+            if check_name(&name).is_err() {
+                layers.note_skipped(name);
+                continue;
             }
             let samples = match block {
                 1 => place(values, part.size, offset, (width, height)),

@@ -9,6 +9,7 @@ use crate::{
     format::Format,
     hdr_file,
     layers::Layers,
+    primaries::{self, Primaries},
     raster::{LinearImage, Raster},
     transfer::Transfer,
 };
@@ -99,8 +100,9 @@ pub fn read_photo(path: impl AsRef<Path>, transfer: Transfer) -> Result<Photo, I
 /// or Radiance HDR.
 ///
 /// PNG and JPEG are decoded with their ICC profile if they have one and `transfer` is
-/// [`Transfer::Srgb`]; another curve overrules the file. PNG gamma chunks are ignored. OpenEXR and
-/// Radiance HDR are linear Rec.709 already.
+/// [`Transfer::Srgb`]; another curve overrules the file. So it is with a PNG's `gAMA`, where there is
+/// no profile. OpenEXR and Radiance HDR are linear light, of Rec.709 unless they name other
+/// primaries, from which it is converted.
 ///
 /// # Errors
 /// On a missing, empty, truncated or unsupported file, on more pixels than `limits` allow, and on
@@ -113,16 +115,6 @@ pub fn read_photo_within(
     let path = path.as_ref();
     let bytes = read_bytes(path, PHOTO_FORMATS)?;
     let limit = SizeLimit::Photo(limits);
-    let linear = |image: LinearImage, alpha| Photo {
-        facts: Facts::of_size([image.0.width() as u32, image.0.height() as u32]),
-        image,
-        alpha,
-        transfer,
-        encoding: Encoding::named(transfer),
-        values: None,
-        exif: None,
-        warnings: Vec::new(),
-    };
     match Format::of(&bytes) {
         Format::Png | Format::Jpeg => {
             let decoded = Decoded::of(&bytes, path, PHOTO_FORMATS, limit)?;
@@ -132,27 +124,91 @@ pub fn read_photo_within(
         Format::Exr => {
             let layers = read_colour(&bytes, path, limit)?;
             let alpha = layers.channel("A").ok().cloned();
-            Ok(linear(linear_of_layers(&layers, path)?, alpha))
+            let light = linear_of_layers(&layers, path)?;
+            linear_photo(light, alpha, path, transfer)
         }
-        Format::Hdr => Ok(linear(hdr_file::decode(&bytes, path, limit)?, None)),
+        Format::Hdr => {
+            let light = hdr_file::decode(&bytes, path, limit)?;
+            linear_photo(light, None, path, transfer)
+        }
         other => Err(other.refuse(path, PHOTO_FORMATS)),
     }
 }
 
+/// A photograph of light as stored, and the primaries that it is in, if its file names them.
+fn linear_photo(
+    (mut image, primaries): (LinearImage, Option<Primaries>),
+    alpha: Option<Raster<f32>>,
+    path: &Path,
+    transfer: Transfer,
+) -> Result<Photo, ImagingError> {
+    let mut warnings: Vec<String> = transparency(alpha.as_ref(), path).into_iter().collect();
+    match primaries.map_or(Ok(None), Primaries::to_rec709) {
+        Ok(None) => {}
+        Ok(Some(to_rec709)) => {
+            primaries::convert(&mut image, to_rec709);
+            check_finite(path, &image.0)?;
+        }
+        Err(why) => warnings.push(format!(
+            "`{}`: its primaries {why}; it is read as linear Rec.709: convert it to Rec.709 if its colours look wrong",
+            path.display()
+        )),
+    }
+    Ok(Photo {
+        facts: Facts::of_size([image.0.width() as u32, image.0.height() as u32]),
+        image,
+        alpha,
+        transfer,
+        encoding: Encoding::named(transfer),
+        values: None,
+        exif: None,
+        warnings,
+    })
+}
+
+/// Opacity that is less only by rounding is full.
+const OPAQUE: f32 = 0.999;
+
+/// A warning if some pixel of a photograph is not opaque.
+fn transparency(alpha: Option<&Raster<f32>>, path: &Path) -> Option<String> {
+    let opaque = |a: &f32| *a >= OPAQUE;
+    (!alpha?.pixels().iter().all(opaque)).then(|| {
+        format!(
+            "`{}`: the photograph's transparency is dropped; its pixels count as opaque",
+            path.display()
+        )
+    })
+}
+
 fn display_photo(mut decoded: Decoded, path: &Path, transfer: Transfer) -> Photo {
-    let mut warnings = Vec::new();
-    let profile = decoded.icc.as_deref().map(|icc| {
-        Encoding::of_profile(icc, decoded.colours()).map_err(|why| {
-            warnings.push(format!(
-                "`{}`: its colour profile {why}; it is read as sRGB: convert it to sRGB if its colours look wrong",
-                path.display()
-            ));
-        })
-    });
-    let profile = profile.and_then(Result::ok);
-    let encoding = match (transfer, profile) {
-        (Transfer::Srgb, Some(profile)) => profile,
-        (_, profile) => Encoding::overruled(transfer, profile),
+    let assumed = match transfer {
+        Transfer::Srgb => "sRGB",
+        Transfer::Gamma22 => "Rec.709 with a gamma of 2.2",
+        Transfer::Linear => "linear Rec.709",
+    };
+    let mut unused = Vec::new();
+    // A profile comes before `cICP`: it stands beside it for programs that do not know that chunk.
+    let of_file = match &decoded.icc {
+        Some(icc) => {
+            let profile = Encoding::of_profile(icc, decoded.colours());
+            let unusable =
+                |why| unused.push(format!("colour profile {why}; it is read as {assumed}"));
+            profile.map_err(unusable).ok()
+        }
+        None => {
+            let chunks = &decoded.png_colours;
+            chunks.encoding(decoded.colours(), assumed, &mut unused)
+        }
+    };
+    let alpha = decoded.opacity();
+    let name = path.display();
+    let unused = unused
+        .iter()
+        .map(|what| format!("`{name}`: its {what}: convert it to sRGB if its colours look wrong"));
+    let warnings = unused.chain(transparency(alpha.as_ref(), path)).collect();
+    let encoding = match (transfer, of_file) {
+        (Transfer::Srgb, Some(of_file)) => of_file,
+        (_, of_file) => Encoding::overruled(transfer, of_file),
     };
     let image = decoded.light(&encoding);
     let size = [image.0.width() as u32, image.0.height() as u32];
@@ -166,7 +222,7 @@ fn display_photo(mut decoded: Decoded, path: &Path, transfer: Transfer) -> Photo
     }
     Photo {
         image,
-        alpha: decoded.opacity(),
+        alpha,
         transfer,
         encoding,
         values: Some(decoded.values_8()),
@@ -178,15 +234,29 @@ fn display_photo(mut decoded: Decoded, path: &Path, transfer: Transfer) -> Photo
 
 /// Reads linear light from OpenEXR (bare `R`, `G`, `B`, or grey `Y`) or Radiance HDR. A
 /// display-referred file is an error, so is NaN or infinity, with the pixel named.
+///
+/// Light of other primaries is converted to Rec.709. Where that gives a pixel without values below
+/// 0 such a value, it becomes 0.
 pub fn read_linear(path: impl AsRef<Path>) -> Result<LinearImage, ImagingError> {
     let path = path.as_ref();
     let bytes = read_bytes(path, LINEAR_FORMATS)?;
     let limit = SizeLimit::Any;
-    match Format::of(&bytes) {
-        Format::Exr => linear_of_layers(&read_colour(&bytes, path, limit)?, path),
-        Format::Hdr => hdr_file::decode(&bytes, path, limit),
-        other => Err(other.refuse(path, LINEAR_FORMATS)),
+    let (mut image, primaries) = match Format::of(&bytes) {
+        Format::Exr => linear_of_layers(&read_colour(&bytes, path, limit)?, path)?,
+        Format::Hdr => hdr_file::decode(&bytes, path, limit)?,
+        other => return Err(other.refuse(path, LINEAR_FORMATS)),
+    };
+    let to_rec709 = primaries.map_or(Ok(None), Primaries::to_rec709);
+    let to_rec709 = to_rec709.map_err(|why| ImagingError::Unsupported {
+        path: path.to_owned(),
+        what: format!("has primaries that {why}"),
+        remedy: "save it in linear Rec.709",
+    })?;
+    if let Some(to_rec709) = to_rec709 {
+        primaries::convert_clipped(&mut image, to_rec709);
+        check_finite(path, &image.0)?;
     }
+    Ok(image)
 }
 
 /// Reads a mask in `[0, 1]` (white is 1) from PNG or JPEG, upright as people see it. Stored values
@@ -251,14 +321,18 @@ fn read_colour(bytes: &[u8], path: &Path, limit: SizeLimit) -> Result<Layers, Im
     exr_file::read(Cursor::new(bytes), length, path, Some(&names), limit)
 }
 
-fn linear_of_layers(layers: &Layers, path: &Path) -> Result<LinearImage, ImagingError> {
-    let colour = if !layers.contains("R") && layers.contains("Y") {
-        layers.channel("Y")?.map(|&v| Vec3::splat(v))
+/// Light as stored, and the primaries that it is in, if they are named. Grey has none.
+fn linear_of_layers(
+    layers: &Layers,
+    path: &Path,
+) -> Result<(LinearImage, Option<Primaries>), ImagingError> {
+    let (colour, primaries) = if !layers.contains("R") && layers.contains("Y") {
+        (layers.channel("Y")?.map(|&v| Vec3::splat(v)), None)
     } else {
-        layers.rgb("")?
+        (layers.rgb("")?, layers.primaries)
     };
     check_finite(path, &colour)?;
-    Ok(LinearImage(colour))
+    Ok((LinearImage(colour), primaries))
 }
 
 pub(crate) fn check_size(path: &Path, width: usize, height: usize) -> Result<(), ImagingError> {

@@ -4,6 +4,7 @@ use crate::{
     error::ImagingError,
     file::check_finite,
     format::Format,
+    primaries::Primaries,
     raster::{LinearImage, Raster},
 };
 use glam::Vec3;
@@ -16,11 +17,12 @@ const MOST_PIXELS_A_BYTE: usize = 2048;
 
 /// Decodes a file in RGBE. Its `EXPOSURE` and `COLORCORR` say by what the stored values were
 /// multiplied, over all of its lines; they are divided by it [Radiance file formats, "pictures"].
+/// With the light come the `PRIMARIES` that it is in, if they are named.
 pub(crate) fn decode(
     bytes: &[u8],
     path: &Path,
     limit: SizeLimit,
-) -> Result<LinearImage, ImagingError> {
+) -> Result<(LinearImage, Option<Primaries>), ImagingError> {
     let failed = |error| image_error(path, Format::Hdr, error);
     // Some programs sign with `#?RGBE`, which the strict decoder does not know.
     let decoder = if bytes.starts_with(b"#?RADIANCE") {
@@ -52,6 +54,9 @@ pub(crate) fn decode(
             "its EXPOSURE and COLORCORR are {stored_over_light}, not above 0"
         )));
     }
+    let mut lines = header.custom_attributes.iter().rev();
+    let primaries = lines.find(|(key, _)| key == "PRIMARIES");
+    let primaries = primaries.map(|(_, numbers)| Primaries::of_text(numbers));
     let mut samples = vec![[0.0f32; 3]; width * height];
     let bytes = bytemuck::cast_slice_mut(&mut samples);
     decoder.read_image(bytes).map_err(failed)?;
@@ -60,5 +65,5 @@ pub(crate) fn decode(
     let pixels = samples.into_iter().map(light).collect();
     let image = Raster::from_pixels(width, height, pixels);
     check_finite(path, &image)?;
-    Ok(LinearImage(image))
+    Ok((LinearImage(image), primaries))
 }

@@ -1,5 +1,7 @@
 //! Images of named channels, as compositing programs exchange them: OpenEXR files.
-use crate::{error::ImagingError, exr_file, layer_rows::LayerRows, raster::Raster};
+use crate::{
+    error::ImagingError, exr_file, layer_rows::LayerRows, primaries::Primaries, raster::Raster,
+};
 use glam::Vec3;
 use half::f16;
 use std::{
@@ -70,7 +72,9 @@ pub struct Layers {
     pub latlong: bool,
     attributes: BTreeMap<String, String>,
     path: Option<PathBuf>,
-    /// Channels of the file that were not asked for.
+    /// Those of the colours in the file (the `chromaticities` attribute).
+    pub(crate) primaries: Option<Primaries>,
+    /// Channels of the file that were not asked for, or whose name [`check_name`] refuses.
     skipped: Vec<String>,
 }
 
@@ -84,6 +88,7 @@ impl Layers {
             latlong: false,
             attributes: BTreeMap::new(),
             path: None,
+            primaries: None,
             skipped: Vec::new(),
         }
     }
@@ -259,8 +264,9 @@ impl Layers {
     ///
     /// The result has the size of the display window: pixels outside the data window are 0, those
     /// outside the display window are dropped. Channels of a further part whose name is taken
-    /// already get the part's name in front. Values are not checked for NaN or infinity: depth may
-    /// be infinite.
+    /// already get the part's name in front. Channels whose name this type refuses, as one with a
+    /// space, are left out. Values are not checked for NaN or infinity: depth may be infinite.
+    /// Colours are those of the file, in the primaries that it names.
     pub fn read_exr(path: impl AsRef<Path>) -> Result<Self, ImagingError> {
         exr_file::open(path.as_ref(), None)
     }

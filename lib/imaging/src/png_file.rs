@@ -6,12 +6,12 @@ use crate::{
     raster::{DisplayImage, LinearImage, Raster},
 };
 use glam::Vec3;
-use png::{BitDepth, ColorType, Compression, Filter, Info, ScaledFloat, SrgbRenderingIntent};
+use png::{BitDepth, ColorType, Compression, Filter, Info, SrgbRenderingIntent};
 use rayon::prelude::*;
 use std::{borrow::Cow, fs::File, io::BufWriter, io::Write, path::Path};
 
 /// Writes a picture as the photograph that it was made from: an 8-bit RGB PNG in the photograph's
-/// encoding, with its colour profile and its Exif data.
+/// encoding, with its colour profile or gamma and its Exif data.
 ///
 /// A pixel of `picture` that equals the photograph's keeps the value that the photograph's file has
 /// there. What the encoding cannot hold is clipped.
@@ -125,7 +125,7 @@ fn encode_png(
     match about.tag {
         None => {}
         Some(Tag::Srgb) => info.srgb = Some(SrgbRenderingIntent::Perceptual),
-        Some(Tag::Gamma(exponent)) => info.source_gamma = Some(ScaledFloat::new(*exponent)),
+        Some(Tag::Gamma(exponent)) => info.source_gamma = Some(*exponent),
         Some(Tag::Profile(icc)) => info.icc_profile = Some(Cow::Borrowed(icc)),
     }
     let file = File::create(path).map_err(|e| ImagingError::io("create", path, e))?;

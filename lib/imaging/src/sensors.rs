@@ -93,7 +93,7 @@ const ROWS: &[Row] = &[
     },
     Row {
         make: "sony",
-        models: &["dsc-rx10", "zv-1"],
+        models: &["dsc-rx10", "dsc-rx100", "zv-1"],
         size_mm: ONE_INCH,
     },
     Row {
@@ -213,6 +213,10 @@ mod tests {
         assert_eq!(size("NIKON", "COOLPIX P6000"), Some([7.44, 5.58]));
         assert_eq!(size("SONY", "ILCE-7M3"), Some(FULL_FRAME));
         assert_eq!(size("SONY", "ILCE-6000"), Some(APS_C));
+        assert_eq!(size("SONY", "DSC-RX1"), Some(FULL_FRAME));
+        assert_eq!(size("SONY", "DSC-RX10M4"), Some(ONE_INCH));
+        assert_eq!(size("SONY", "DSC-RX100"), Some(ONE_INCH));
+        assert_eq!(size("SONY", "DSC-RX100M7"), Some(ONE_INCH));
         assert_eq!(size("FUJIFILM", "X-T3"), Some(APS_C));
         assert_eq!(size("OLYMPUS CORPORATION", "E-M1MarkII"), Some(FOUR_THIRDS));
         assert_eq!(size("Apple", "iPhone 12"), None);

@@ -433,3 +433,20 @@ proptest! {
         }
     }
 }
+
+/// As Blender names its passes.
+#[test]
+fn channels_with_names_that_are_not_written_here_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    let channel = |name| AnyChannel::new(name, FlatSamples::F32(vec![2.5; 4]));
+    let channels = ["ViewLayer.Denoising Depth.Z", "Z"].map(channel);
+    let channels = AnyChannels::sort(SmallVec::from_vec(channels.into()));
+    let image = Image::from_channels((2, 2), channels);
+    image.write().to_file(&path).unwrap();
+    let layers = Layers::read_exr(&path).unwrap();
+    assert_eq!(layers.names().collect::<Vec<_>>(), ["Z"]);
+    assert_eq!(layers.channel("Z").unwrap().pixels(), [2.5; 4]);
+    let error = layers.channel("Y").unwrap_err().to_string();
+    assert!(error.contains("Denoising Depth"), "{error}");
+}

@@ -94,7 +94,8 @@ impl EnvironmentMap {
     }
 
     /// Reads a latitude-longitude OpenEXR or Radiance HDR file. NaN, infinite and negative
-    /// pixels are refused by name.
+    /// pixels are refused by name. Light of other primaries than Rec.709's is converted; what
+    /// Rec.709 cannot hold without values below 0 gets 0 for them.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, LightError> {
         let path = path.as_ref();
         let image = read_linear(path)?;
@@ -523,6 +524,20 @@ mod tests {
                  which is twice as wide as high; crop or convert it to 6 x 3"
             )
         );
+    }
+
+    #[test]
+    fn a_map_in_other_primaries_is_converted_and_stays_a_light() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("acescg.hdr");
+        let header = "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\
+                      PRIMARIES=.713 .293 .165 .83 .128 .044 .32168 .33767\n\n-Y 1 +X 2\n";
+        let (red, white) = ([128, 0, 0, 129], [128, 128, 128, 129]);
+        std::fs::write(&path, [header.as_bytes(), &red, &white].concat()).unwrap();
+        let map = EnvironmentMap::read(&path).unwrap();
+        let want = Vec3::new(1.705_05, 0.0, 0.0);
+        assert!(map.texel(0, 0).abs_diff_eq(want, 1e-4));
+        assert!(map.texel(0, 1).abs_diff_eq(Vec3::ONE, 1e-6));
     }
 
     #[test]
