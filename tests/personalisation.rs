@@ -286,6 +286,35 @@ fn what_is_missing_or_impossible_is_said_with_a_remedy() {
         "--features metal",
     );
     fails(LORA, &["--set", "lora.min_crop=0"], 2, "above 0, up to 1");
+    for (executable, setting, part) in [
+        (LORA, "lora.alpha=inf", "lora.alpha: inf is out of range"),
+        (
+            LORA,
+            "lora.word=my word",
+            "lora.word: \"my word\" cannot be learnt",
+        ),
+        (
+            CONCEPTS,
+            "concepts.guidance=nan",
+            "concepts.guidance: NaN is out of range",
+        ),
+        (
+            CONCEPTS,
+            "concepts.steps=1001",
+            "concepts.steps: 1001 is out of range; accepted: up to 1000",
+        ),
+    ] {
+        fails(executable, &["--set", setting], 2, part);
+    }
+    // Before the training.
+    let args = [
+        "--set",
+        "concepts.count=0",
+        "--set",
+        "lora.sheet_steps=1001",
+    ];
+    let part = "lora.sheet_steps: 1001 is out of range; accepted: up to 1000";
+    fails(LORA, &args, 2, part);
     // Without concept preservation no concepts are needed.
     run(folder.path(), LORA, &["--set", "concepts.count=0"]);
 }

@@ -79,12 +79,34 @@ impl ConfigFile {
                 } else {
                     accepted.join(", ")
                 };
-                Err(self.error(format!(
-                    "{key} = {value} is not supported, accepted: {accepted}; use a model of the Stable Diffusion 1 or 2 family"
-                )))
+                Err(self.unsupported(key, value, &accepted))
             }
             _ => Ok(()),
         }
+    }
+
+    /// Refuses `key` where it is null, which is not the same as absent there.
+    pub fn require_present(&self, key: &str, accepted: &Value) -> Result<()> {
+        match self.value.get(key) {
+            Some(Value::Null) => Err(self.unsupported(key, &Value::Null, &accepted.to_string())),
+            _ => Ok(()),
+        }
+    }
+
+    /// Refuses `key` where it has a value for each level.
+    pub fn require_single(&self, key: &str) -> Result<()> {
+        match self.get(key) {
+            Some(list @ Value::Array(_)) => {
+                Err(self.unsupported(key, list, "one number for all levels"))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn unsupported(&self, key: &str, value: &Value, accepted: &str) -> Error {
+        self.error(format!(
+            "{key} = {value} is not supported, accepted: {accepted}; use a model of the Stable Diffusion 1 or 2 family"
+        ))
     }
 
     /// An error about this file.

@@ -67,6 +67,14 @@ pub enum Error {
         /// What is wrong with its gradient.
         message: String,
     },
+    /// A model gave values that are not finite.
+    #[error(
+        "the model's output is not finite ({what}); `dipir-model check` shows which part of it is wrong"
+    )]
+    NotFinite {
+        /// Which values.
+        what: &'static str,
+    },
     /// The tokenizer could not be built or used.
     #[error("{path}: tokenizer: {message}")]
     Tokenizer {

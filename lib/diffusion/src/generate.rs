@@ -3,7 +3,7 @@
 use candle_core::{DType, Tensor};
 
 use crate::distillation::InpaintCondition;
-use crate::error::{Result, argument};
+use crate::error::{Error, Result, argument};
 use crate::model::Model;
 use crate::noise::NoiseStream;
 use crate::pass::Pass;
@@ -39,8 +39,19 @@ fn size_multiple(model: &Model) -> usize {
     model.vae.downscale()
 }
 
+/// Refuses values that are no numbers or without bound.
+fn check_finite(what: &'static str, values: &Tensor) -> Result<()> {
+    // 0 times anything else is NaN.
+    let sum = (values.to_dtype(DType::F32)? * 0.0)?.sum_all()?;
+    match sum.to_scalar::<f32>()? == 0.0 {
+        true => Ok(()),
+        false => Err(Error::NotFinite { what }),
+    }
+}
+
 /// Samples an image for `prompt`. `progress` is called after each step with
 /// the share that is done and returns false to stop early, which is an error.
+/// So is an output that is not finite.
 pub fn generate(
     model: &Model,
     prompt: &str,
@@ -90,11 +101,10 @@ pub fn generate(
             settings.guidance,
         )
     })?;
-    let image = model
-        .vae
-        .decode(&latents)?
-        .to_dtype(DType::F32)?
-        .clamp(-1f32, 1f32)?;
+    check_finite("sampled latents", &latents)?;
+    let image = model.vae.decode(&latents)?.to_dtype(DType::F32)?;
+    check_finite("decoded picture", &image)?;
+    let image = image.clamp(-1f32, 1f32)?;
     Ok(Generated { image, latents })
 }
 

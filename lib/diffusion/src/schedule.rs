@@ -5,6 +5,7 @@ use std::path::Path;
 
 use candle_core::Tensor;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use crate::config::ConfigFile;
 use crate::error::{Error, Result, argument};
@@ -99,6 +100,20 @@ impl Default for ScheduleConfig {
 /// Most timesteps of a training: a hundred times those of published models.
 const MAX_TIMESTEPS: usize = 100_000;
 
+/// How diffusers' schedulers begin that interpolate to noise, or scale it without bound.
+const FOREIGN_FAMILIES: [&str; 2] = ["FlowMatch", "EDM"];
+/// Others whose noise is not of a schedule of betas.
+const FOREIGN_SCHEDULERS: [&str; 8] = [
+    "AmusedScheduler",
+    "ConsistencyDecoderScheduler",
+    "CosineDPMSolverMultistepScheduler",
+    "DDPMWuerstchenScheduler",
+    "KarrasVeScheduler",
+    "ScoreSdeVeScheduler",
+    "ScoreSdeVpScheduler",
+    "VQDiffusionScheduler",
+];
+
 /// Stands for "no signal" where a division by it follows, as diffusers has it.
 pub(crate) const ALMOST_NO_SIGNAL: f64 = 5.960_464_477_539_063e-8; // 2^-24
 
@@ -110,9 +125,21 @@ pub struct NoiseSchedule {
 }
 
 impl NoiseSchedule {
-    /// Reads `scheduler_config.json`; the sampler that it names is ignored.
+    /// Reads `scheduler_config.json`; the sampler that it names is ignored, unless its noise is not of variances.
     pub fn load(folder: &Path) -> Result<Self> {
         let file = ConfigFile::read(&folder.join("scheduler_config.json"))?;
+        let class = file.get("_class_name").and_then(Value::as_str);
+        if let Some(class) = class
+            && (FOREIGN_FAMILIES
+                .iter()
+                .any(|start| class.starts_with(start))
+                || FOREIGN_SCHEDULERS.contains(&class))
+        {
+            return Err(file.error(format!(
+                "_class_name = \"{class}\" is not supported: its noise is not that of a schedule of betas; use a model of \
+                 the Stable Diffusion 1 or 2 family, or the scheduler that this one was trained with"
+            )));
+        }
         let config: ScheduleConfig = file.parse()?;
         Self::new(config).map_err(|e| match e {
             Error::Argument(message) => file.error(message),

@@ -156,9 +156,11 @@ impl Tokenizer {
     }
 
     /// Makes the word `word` one token of its own, e.g. one whose embedding
-    /// is learned. Words are compared in lower case.
+    /// is learned. It may hold punctuation, as `<sks>`; words are compared in
+    /// lower case, and an empty one is nowhere.
     pub fn add_placeholder(&mut self, word: &str, token: u32) {
-        self.placeholders.insert(word.to_lowercase(), token);
+        let word = word.chars().flat_map(char::to_lowercase).collect();
+        self.placeholders.insert(word, token);
     }
 
     /// Tokens of `text` without markers, not cut.
@@ -175,27 +177,32 @@ impl Tokenizer {
                 .get_ids()
                 .to_vec())
         };
-        if self.placeholders.is_empty() {
-            return encode(text);
-        }
-        let mut tokens = vec![];
-        let mut pending = String::new();
-        for word in text.split_inclusive(char::is_whitespace) {
-            // Punctuation may stand around a placeholder as around any word.
-            let bare = word.trim_matches(|c: char| !c.is_alphanumeric());
-            match self.placeholders.get(&bare.to_lowercase()) {
-                Some(&token) => {
-                    let start = word.find(bare).unwrap_or(0);
-                    pending.push_str(&word[..start]);
-                    tokens.extend(encode(&std::mem::take(&mut pending))?);
+        let (mut tokens, mut from, mut at) = (vec![], 0, 0);
+        while let Some(next) = text[at..].chars().next() {
+            match self.placeholder_at(text, at) {
+                Some((length, token)) => {
+                    tokens.extend(encode(&text[from..at])?);
                     tokens.push(token);
-                    pending.push_str(&word[start + bare.len()..]);
+                    at += length;
+                    from = at;
                 }
-                None => pending.push_str(word),
+                None => at += next.len_utf8(),
             }
         }
-        tokens.extend(encode(&pending)?);
+        tokens.extend(encode(&text[from..])?);
         Ok(tokens)
+    }
+
+    /// The longest placeholder that stands at byte `at` of `text`: its length there, and its token.
+    fn placeholder_at(&self, text: &str, at: usize) -> Option<(usize, u32)> {
+        let (before, rest) = text.split_at(at);
+        let found = self.placeholders.iter().filter_map(|(word, &token)| {
+            let length = length_in(rest, word)?;
+            let is_apart = !continues(before.chars().next_back(), word.chars().next())
+                && !continues(word.chars().next_back(), rest[length..].chars().next());
+            is_apart.then_some((length, token))
+        });
+        found.max_by_key(|(length, _)| *length)
     }
 
     /// Start marker, the text cut to fit, end marker, padding: always
@@ -207,6 +214,27 @@ impl Tokenizer {
         tokens.resize(self.length, self.pad);
         Ok(tokens)
     }
+}
+
+/// Bytes of `text` that are the lower-case `word` at its start.
+fn length_in(text: &str, word: &str) -> Option<usize> {
+    let (mut wanted, mut length) = (word, 0);
+    for c in text.chars() {
+        if wanted.is_empty() {
+            break;
+        }
+        for lower in c.to_lowercase() {
+            wanted = wanted.strip_prefix(lower)?;
+        }
+        length += c.len_utf8();
+    }
+    (length > 0 && wanted.is_empty()).then_some(length)
+}
+
+/// Whether one word goes on from the character `left` to `right`.
+fn continues(left: Option<char>, right: Option<char>) -> bool {
+    let is_of_a_word = |c: Option<char>| c.is_some_and(char::is_alphanumeric);
+    is_of_a_word(left) && is_of_a_word(right)
 }
 
 fn build(vocab: Vocab, merges: Merges) -> tokenizers::Result<Inner> {

@@ -268,20 +268,29 @@ fn read_adapter(
             }
             _ => return Ok(Err(format!("tensor {key:?} is not a single number"))),
         },
-        None => peft_alpha(metadata, &target.name).unwrap_or(rank as f64),
+        None => {
+            let alpha = peft_alpha(metadata, &target.name).unwrap_or(rank as f64);
+            match peft_field(metadata, "use_rslora").and_then(Value::as_bool) {
+                // The scale is alpha / sqrt(rank) [Kalajdzievski 2023].
+                Some(true) => alpha * (rank as f64).sqrt(),
+                _ => alpha,
+            }
+        }
     };
     Ok(Adapter::new(down, up, alpha).map_err(|e| format!("layer {:?}: {e}", target.name)))
+}
+
+/// A setting in the metadata of diffusers, for the UNet or for all.
+fn peft_field<'a>(metadata: &'a Value, name: &str) -> Option<&'a Value> {
+    metadata
+        .get(format!("unet.{name}"))
+        .or_else(|| metadata.get(name))
 }
 
 /// alpha of a layer by the metadata of diffusers: an entry of the pattern
 /// whose key ends the layer's name, or the common value.
 fn peft_alpha(metadata: &Value, layer: &str) -> Option<f64> {
-    let field = |name: &str| {
-        metadata
-            .get(format!("unet.{name}"))
-            .or_else(|| metadata.get(name))
-    };
-    let by_pattern = field("alpha_pattern")
+    let by_pattern = peft_field(metadata, "alpha_pattern")
         .and_then(Value::as_object)
         .and_then(|pattern| {
             pattern
@@ -289,5 +298,5 @@ fn peft_alpha(metadata: &Value, layer: &str) -> Option<f64> {
                 .find(|(key, _)| layer == key.as_str() || layer.ends_with(&format!(".{key}")))
                 .and_then(|(_, value)| value.as_f64())
         });
-    by_pattern.or_else(|| field("lora_alpha").and_then(Value::as_f64))
+    by_pattern.or_else(|| peft_field(metadata, "lora_alpha").and_then(Value::as_f64))
 }

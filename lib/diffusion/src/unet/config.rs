@@ -45,7 +45,7 @@ pub struct UNetConfig {
     pub norm_num_groups: usize,
     /// Added to variances in the residual blocks.
     pub norm_eps: f64,
-    /// Zeros on each side before a downsampling convolution.
+    /// Zeros on each side before a downsampling convolution; 0: one after the last row and column alone.
     pub downsample_padding: usize,
     /// Cosines before sines in the timestep embedding.
     pub flip_sin_to_cos: bool,
@@ -101,7 +101,10 @@ impl UNetConfig {
     pub fn from_file(file: &ConfigFile) -> Result<Self> {
         let none = [];
         file.require("_class_name", &[json!("UNet2DConditionModel")])?;
-        file.require("mid_block_type", &[json!("UNetMidBlock2DCrossAttn")])?;
+        let middle = json!("UNetMidBlock2DCrossAttn");
+        // Null leaves the block out.
+        file.require_present("mid_block_type", &middle)?;
+        file.require("mid_block_type", &[middle])?;
         file.require("act_fn", &[json!("silu"), json!("swish")])?;
         file.require("resnet_time_scale_shift", &[json!("default")])?;
         file.require("time_embedding_type", &[json!("positional")])?;
@@ -136,6 +139,9 @@ impl UNetConfig {
             file.require(key, &none)?;
         }
         file.require("addition_embed_type", &[json!("text")])?;
+        for key in ["layers_per_block", "cross_attention_dim"] {
+            file.require_single(key)?;
+        }
         let config: Self = file.parse()?;
         config.check().map_err(|message| file.error(message))?;
         Ok(config)

@@ -358,13 +358,12 @@ fn down_level(parameters: &Parameters, config: &UNetConfig, level: usize) -> Res
         .collect::<Result<_>>()?;
     let downsample = (level + 1 < channels.len()).then(|| {
         let layer = parameters.sub(format!("{prefix}.downsamplers.0.conv"));
-        Conv2d::new(
-            &layer,
-            (outputs, outputs),
-            3,
-            2,
-            Padding::Same(config.downsample_padding),
-        )
+        // Without padding of its own diffusers pads after the last row and column.
+        let padding = match config.downsample_padding {
+            0 => Padding::After(1),
+            n => Padding::Same(n),
+        };
+        Conv2d::new(&layer, (outputs, outputs), 3, 2, padding)
     });
     Ok(DownLevel {
         stages,

@@ -60,6 +60,7 @@ impl AutoencoderConfig {
         for key in ["shift_factor", "latents_mean", "latents_std"] {
             file.require(key, &[])?;
         }
+        file.require_single("layers_per_block")?;
         for (key, known) in [
             ("down_block_types", "DownEncoderBlock2D"),
             ("up_block_types", "UpDecoderBlock2D"),

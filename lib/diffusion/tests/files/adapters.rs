@@ -73,6 +73,40 @@ fn foreign_lora_keys_are_named() -> Outcome {
 }
 
 #[test]
+fn rank_stabilised_adapters_are_scaled_by_alpha_over_the_root_of_the_rank() -> Outcome {
+    let unet = load_unet(&family().join("unet"), DType::F32, &Device::Cpu)?;
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("lora.safetensors");
+    let module = "unet.down_blocks.0.attentions.0.transformer_blocks.0.attn1.to_q";
+    let matrix = |a, b| Tensor::ones((a, b), DType::F32, &Device::Cpu);
+    let tensors = BTreeMap::from([
+        (format!("{module}.lora_A.weight"), matrix(4, 16)?),
+        (format!("{module}.lora_B.weight"), matrix(16, 4)?),
+    ]);
+    for (metadata, scale) in [
+        (r#"{"unet.lora_alpha": 6}"#, 6.0 / 4.0),
+        (
+            r#"{"unet.lora_alpha": 6, "unet.use_rslora": false}"#,
+            6.0 / 4.0,
+        ),
+        (
+            r#"{"unet.lora_alpha": 6, "unet.use_rslora": true}"#,
+            6.0 / 2.0,
+        ),
+        (r#"{"lora_alpha": 6, "use_rslora": true}"#, 6.0 / 2.0),
+    ] {
+        let header = BTreeMap::from([("lora_adapter_metadata".into(), metadata.into())]);
+        write_safetensors(&path, &tensors, &header)?;
+        let lora = Lora::load(&path, &unet.adapter_targets(), DType::F32, &Device::Cpu)?;
+        let adapter = lora.adapters().values().next().ok_or("no adapter")?;
+        let y = adapter.forward(&matrix(1, 16)?)?.max_all()?;
+        // Ones: 16 inputs, then 4 of the rank.
+        assert_eq!(y.to_scalar::<f32>()?, 64.0 * scale, "{metadata}");
+    }
+    Ok(())
+}
+
+#[test]
 fn lora_files_of_older_tools_mean_the_same() -> Outcome {
     let unet = load_unet(&family().join("unet"), DType::F32, &Device::Cpu)?;
     let targets = unet.adapter_targets();

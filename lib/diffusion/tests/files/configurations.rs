@@ -1,7 +1,9 @@
 //! Configurations that contradict the weights.
-use candle_core::{DType, Device};
+use candle_core::{DType, Device, Tensor};
 use dipir_diffusion::Error;
 use dipir_diffusion::model::{Model, load_unet};
+use dipir_diffusion::pass::Pass;
+use dipir_diffusion::schedule::NoiseSchedule;
 
 use super::{Outcome, family, model_folder, unet_folder, unet_tensors};
 
@@ -33,6 +35,26 @@ fn unsupported_configurations_are_refused_by_key() -> Outcome {
             serde_json::json!(5),
             "no multiple of 5 heads",
         ),
+        (
+            "mid_block_type",
+            serde_json::Value::Null,
+            "mid_block_type = null is not supported, accepted: \"UNetMidBlock2DCrossAttn\"",
+        ),
+        (
+            "layers_per_block",
+            serde_json::json!([1, 2, 1]),
+            "layers_per_block = [1,2,1] is not supported, accepted: one number for all levels",
+        ),
+        (
+            "cross_attention_dim",
+            serde_json::json!([24, 24, 24]),
+            "cross_attention_dim = [24,24,24] is not supported, accepted: one number",
+        ),
+        (
+            "downsample_padding",
+            serde_json::json!(2),
+            "downsample_padding = 2; accepted: 0 or 1",
+        ),
     ] {
         let mut config: serde_json::Value = serde_json::from_str(&text)?;
         config[key] = value;
@@ -52,6 +74,80 @@ fn unsupported_configurations_are_refused_by_key() -> Outcome {
         load_unet(folder.path(), DType::F32, &Device::Cpu).is_ok(),
         "unknown keys are tolerated"
     );
+    Ok(())
+}
+
+/// Zeros after the last row and column are zeros before the first ones of the mirrored picture.
+#[test]
+fn without_downsample_padding_zeros_come_after_the_last_row_and_column() -> Outcome {
+    let mirrored = |t: &Tensor| -> candle_core::Result<Tensor> {
+        match t.dims() {
+            [_, _, height, width] if *height > 1 && *width > 1 => t.flip(&[2, 3])?.contiguous(),
+            _ => Ok(t.clone()),
+        }
+    };
+    let own = unet_tensors()?;
+    let mut other = own.clone();
+    for tensor in other.values_mut() {
+        *tensor = mirrored(tensor)?;
+    }
+    let x: Vec<f32> = (0..4 * 64).map(|n| (n as f32 * 0.7).sin()).collect();
+    let x = Tensor::from_vec(x, (1, 4, 8, 8), &Device::Cpu)?;
+    let context = Tensor::ones((1, 5, 24), DType::F32, &Device::Cpu)?;
+    let predict =
+        |tensors, padding: usize, x: &Tensor| -> Result<Tensor, Box<dyn std::error::Error>> {
+            let folder = unet_folder(tensors)?;
+            let path = folder.path().join("config.json");
+            let mut config: serde_json::Value = serde_json::from_slice(&std::fs::read(&path)?)?;
+            config["downsample_padding"] = padding.into();
+            std::fs::write(&path, config.to_string())?;
+            let unet = load_unet(folder.path(), DType::F32, &Device::Cpu)?;
+            Ok(unet.predict(x, &[500.0], &context, &Pass::default())?)
+        };
+    let found = predict(&own, 0, &x)?;
+    let wanted = mirrored(&predict(&other, 1, &mirrored(&x)?)?)?;
+    let apart = (&found - &wanted)?.abs()?.max_all()?.to_scalar::<f32>()?;
+    let size = wanted.abs()?.max_all()?.to_scalar::<f32>()?;
+    // Sums in another order.
+    assert!(apart < 1e-4 * size, "{apart} of {size}");
+    let padded = (predict(&own, 1, &x)? - &found)?.abs()?.max_all()?;
+    assert!(
+        padded.to_scalar::<f32>()? > 1e-3 * size,
+        "both paddings are one"
+    );
+    Ok(())
+}
+
+#[test]
+fn schedulers_whose_noise_is_not_of_variances_are_refused_by_class() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let load = |class: &str| {
+        let text = format!("{{\"_class_name\": \"{class}\", \"num_train_timesteps\": 1000}}");
+        std::fs::write(folder.path().join("scheduler_config.json"), text)?;
+        NoiseSchedule::load(folder.path())
+            .map(|_| ())
+            .map_err(|e| std::io::Error::other(e.to_string()))
+    };
+    for class in [
+        "FlowMatchEulerDiscreteScheduler",
+        "FlowMatchOfTomorrow",
+        "EDMDPMSolverMultistepScheduler",
+        "ScoreSdeVeScheduler",
+    ] {
+        let message = load(class).expect_err(class).to_string();
+        assert!(
+            message.contains(&format!("_class_name = \"{class}\" is not supported"))
+                && message.contains("scheduler_config.json"),
+            "{message}"
+        );
+    }
+    for class in [
+        "PNDMScheduler",
+        "EulerDiscreteScheduler",
+        "SchedulerOfTomorrow",
+    ] {
+        load(class)?;
+    }
     Ok(())
 }
 

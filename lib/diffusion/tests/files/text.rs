@@ -59,6 +59,38 @@ fn tokenizer_takes_nothing_a_thousand_words_and_a_placeholder() -> Outcome {
 }
 
 #[test]
+fn placeholders_may_hold_punctuation_and_stand_beside_it() -> Outcome {
+    let mut tokenizer = Tokenizer::load(&family().join("tokenizer"))?;
+    let plain = tokenizer.words("the style of")?;
+    let comma = tokenizer.words(",")?;
+    for (token, word) in (5000..).zip(["<SKS>", "*", "sks", "car", "sks-2", ""]) {
+        tokenizer.add_placeholder(word, token);
+    }
+    let around = |token: u32| [&plain[..], &[token], &plain[..]].concat();
+    for (word, token) in [("<sks>", 5000), ("*", 5001), ("Sks", 5002), ("sks-2", 5004)] {
+        let text = format!("the style of {word} the style of");
+        assert_eq!(tokenizer.words(&text)?, around(token), "{word}");
+    }
+    assert_eq!(
+        tokenizer.words("sks, <sks>sks-car")?,
+        [
+            &[5002],
+            &comma[..],
+            &[5000, 5002],
+            &tokenizer.words("-")?[..],
+            &[5003]
+        ]
+        .concat()
+    );
+    // Longer words that only begin or end as a placeholder are not it.
+    for word in ["sksx", "xsks", "cars", "sks1"] {
+        assert!(tokenizer.words(word)?.iter().all(|&t| t < 5000), "{word}");
+    }
+    assert_eq!(tokenizer.words("ﾖ İ *")?.last(), Some(&5001));
+    Ok(())
+}
+
+#[test]
 fn tokenizer_json_alone_gives_the_same_tokens() -> Outcome {
     let source = family().join("tokenizer");
     let vocab: serde_json::Value =

@@ -3,11 +3,11 @@ use std::collections::BTreeMap;
 
 use candle_core::{DType, Device, Tensor};
 use dipir_diffusion::Error;
-use dipir_diffusion::model::load_unet;
+use dipir_diffusion::model::{Model, load_unet};
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::weights::{Weights, write_safetensors};
 
-use super::{Outcome, unet_folder, unet_tensors};
+use super::{Outcome, model_folder, tensors, unet_folder, unet_tensors};
 
 #[test]
 fn missing_extra_and_mis_shaped_tensors_are_all_named() -> Outcome {
@@ -31,6 +31,42 @@ fn missing_extra_and_mis_shaped_tensors_are_all_named() -> Outcome {
         "\"up_blocks.7.surprise\" belongs to no layer",
     ] {
         assert!(message.contains(part), "{message}");
+    }
+    Ok(())
+}
+
+#[test]
+fn an_output_that_is_not_finite_is_refused() -> Outcome {
+    use dipir_diffusion::generate::{GenerateSettings, generate};
+    use dipir_diffusion::sampler::Solver;
+    let settings = GenerateSettings {
+        solver: Solver::DpmSolver2M,
+        steps: 2,
+        guidance: 5.0,
+        size: (16, 16),
+        seed: 1,
+    };
+    for (part, name, what) in [
+        ("unet", "conv_out.bias", "sampled latents"),
+        ("vae", "decoder.conv_out.bias", "decoded picture"),
+    ] {
+        let folder = model_folder()?;
+        let path = folder
+            .path()
+            .join(part)
+            .join("diffusion_pytorch_model.safetensors");
+        let mut weights = tensors(&path)?;
+        let bias = weights.get_mut(name).ok_or(name)?;
+        *bias = (&*bias * f64::NAN)?;
+        write_safetensors(&path, &weights, &BTreeMap::new())?;
+        let model = Model::load(folder.path(), DType::F32, &Device::Cpu)?;
+        let message = generate(&model, "a toy", &settings, &Pass::default(), None, |_| true)
+            .expect_err(part)
+            .to_string();
+        assert!(
+            message.contains(what) && message.contains("dipir-model check"),
+            "{message}"
+        );
     }
     Ok(())
 }

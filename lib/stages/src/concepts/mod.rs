@@ -53,15 +53,7 @@ pub struct Done {
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let table: ConceptsTable = session.config.table("concepts")?;
     let model_table: ModelTable = session.config.table("model")?;
-    if table.steps == 0 || !(table.guidance >= 0.0 && table.guidance.is_finite()) {
-        return Err(session
-            .config
-            .invalid(
-                "concepts.steps",
-                "steps must be at least 1 and guidance not negative",
-            )
-            .into());
-    }
+    table.check(&session.config)?;
     let without_cache = ConceptsTable {
         cache: None,
         ..table
@@ -90,6 +82,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let folder = CONCEPTS.folder(session);
     let mut writer = session.begin(plan)?;
     let model = model::load(session, &model_table)?;
+    model::check_steps(session, &model, "concepts.steps", table.steps)?;
     let side = table.size.unwrap_or_else(|| model.native_size());
 
     let mut list = ConceptList {

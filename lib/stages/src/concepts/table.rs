@@ -1,8 +1,13 @@
 //! The `[concepts]` table.
 use std::path::PathBuf;
 
+use dipir_pipeline::config::Config;
+use dipir_pipeline::error::ConfigError;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+
+/// Largest side of an image, pixels: four times that of published models.
+const MAX_SIZE: usize = 4096;
 
 /// The `[concepts]` table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -18,7 +23,7 @@ pub struct ConceptsTable {
     #[schemars(range(min = 0.0), example = 5.0)]
     pub guidance: f64,
     /// Side of the images, pixels.
-    #[schemars(extend("x-default" = "the model's own"), example = 512)]
+    #[schemars(range(min = 1, max = 4096), extend("x-default" = "the model's own"), example = 512)]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub size: Option<usize>,
     /// Folder of finished images that scenes of one class and model share, and in which an
@@ -38,5 +43,56 @@ impl Default for ConceptsTable {
             size: None,
             cache: None,
         }
+    }
+}
+
+impl ConceptsTable {
+    /// Refuses what no run can work with.
+    pub(super) fn check(&self, config: &Config) -> Result<(), ConfigError> {
+        let wrong = |key: &str, value: &dyn std::fmt::Display, accepted: &str| {
+            let message = format!("{value} is out of range; accepted: {accepted}");
+            Err(config.invalid(&format!("concepts.{key}"), message))
+        };
+        if self.steps == 0 {
+            return wrong("steps", &self.steps, "at least 1");
+        }
+        if !(self.guidance >= 0.0 && self.guidance.is_finite()) {
+            return wrong("guidance", &self.guidance, "at least 0");
+        }
+        match self.size {
+            Some(size) if !(1..=MAX_SIZE).contains(&size) => {
+                wrong("size", &size, &format!("1 to {MAX_SIZE}"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    #[test]
+    fn values_that_no_run_can_work_with_are_refused_by_line_and_key() {
+        let refusal = |line: &str| {
+            let text = format!("[concepts]\n{line}\n");
+            let config = Config::parse(Path::new("pipeline.toml"), &text, &[]).expect("TOML");
+            let table: ConceptsTable = config.table("concepts").expect("a table");
+            table.check(&config).err().map(|e| e.to_string())
+        };
+        for (line, key, accepted) in [
+            ("steps = 0", "steps: 0", "at least 1"),
+            ("guidance = nan", "guidance: NaN", "at least 0"),
+            ("guidance = -0.5", "guidance: -0.5", "at least 0"),
+            ("size = 0", "size: 0", "1 to 4096"),
+            ("size = 4097", "size: 4097", "1 to 4096"),
+        ] {
+            let wanted =
+                format!("pipeline.toml:2: concepts.{key} is out of range; accepted: {accepted}");
+            assert_eq!(refusal(line).as_deref(), Some(wanted.as_str()));
+        }
+        assert_eq!(refusal("size = 4096"), None);
     }
 }

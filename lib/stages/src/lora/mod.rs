@@ -62,19 +62,8 @@ pub struct Done {
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let table: LoraTable = session.config.table("lora")?;
     let model_table: ModelTable = session.config.table("model")?;
-    if !(table.min_crop > 0.0 && table.min_crop <= 1.0) {
-        return Err(session
-            .config
-            .invalid("lora.min_crop", "accepted: above 0, up to 1")
-            .into());
-    }
+    table.check(&session.config)?;
     let (background, transfer) = photo_of(session)?;
-    if table.time_budget_s.is_some_and(|s| !(s > 0.0)) {
-        let wrong = session
-            .config
-            .invalid("lora.time_budget_s", "accepted: above 0");
-        return Err(wrong.into());
-    }
     // The class is in the prompts of the sheet.
     let class = (table.sheet_steps > 0)
         .then(|| class(session))
@@ -214,6 +203,8 @@ fn train(
     writer: &mut StageWriter,
 ) -> anyhow::Result<Run> {
     let mut model = model::load(session, &session.config.table("model")?)?;
+    // Here, for the sheet comes after the training.
+    model::check_steps(session, &model, "lora.sheet_steps", table.sheet_steps)?;
     let start = table
         .learn_word
         .then(|| learnable(&mut model, &table.word))
@@ -425,7 +416,7 @@ fn learnable(model: &mut Model, word: &str) -> anyhow::Result<Tensor> {
 fn show(model: &Model, trainer: &LoraTrainer, data: &Data, path: &Path) -> anyhow::Result<()> {
     let settings = GenerateSettings {
         solver: Solver::DpmSolver2M,
-        steps: 20,
+        steps: 20.min(model.schedule.len()),
         guidance: 5.0,
         size: (data.size, data.size),
         seed: 1,

@@ -2,15 +2,20 @@
 use std::path::PathBuf;
 
 use dipir_diffusion::training::TrainingConfig;
+use dipir_pipeline::config::Config;
+use dipir_pipeline::error::ConfigError;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+
+/// Largest rank, above the width of any published adapter.
+const MAX_RANK: usize = 1024;
 
 /// The `[lora]` table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LoraTable {
     /// Rank of the adapters.
-    #[schemars(range(min = 1), example = 8)]
+    #[schemars(range(min = 1, max = 1024), example = 8)]
     pub rank: usize,
     /// Scale of the adapters times their rank.
     #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "the rank"), example = 8.0)]
@@ -34,7 +39,7 @@ pub struct LoraTable {
     /// Smallest crop of the photograph, as a share of its shorter side.
     #[schemars(extend("exclusiveMinimum" = 0), range(max = 1.0), example = 0.7)]
     pub min_crop: f64,
-    /// The word that stands for the photograph's light in prompts.
+    /// The word that stands for the photograph's light in prompts; one that is learnt has no white space.
     #[schemars(example = &"sks")]
     pub word: String,
     /// Whether an embedding for that word is learnt, too.
@@ -99,6 +104,56 @@ impl Default for LoraTable {
 }
 
 impl LoraTable {
+    /// Refuses what no run can work with.
+    pub(super) fn check(&self, config: &Config) -> Result<(), ConfigError> {
+        let wrong = |key: &str, value: &dyn std::fmt::Display, accepted: &str| {
+            let message = format!("{value} is out of range; accepted: {accepted}");
+            Err(config.invalid(&format!("lora.{key}"), message))
+        };
+        if !(1..=MAX_RANK).contains(&self.rank) {
+            return wrong("rank", &self.rank, &format!("1 to {MAX_RANK}"));
+        }
+        if self.accumulation == 0 {
+            return wrong("accumulation", &self.accumulation, "at least 1");
+        }
+        let above_0 = [
+            ("alpha", self.alpha.unwrap_or(1.0)),
+            ("learning_rate", self.learning_rate),
+        ];
+        for (key, value) in above_0 {
+            if !(value > 0.0 && value.is_finite()) {
+                return wrong(key, &value, "above 0");
+            }
+        }
+        let from_0 = [
+            ("prior_weight", self.prior_weight),
+            ("word_learning_rate", self.word_learning_rate),
+        ];
+        for (key, value) in from_0 {
+            if !(value >= 0.0 && value.is_finite()) {
+                return wrong(key, &value, "at least 0");
+            }
+        }
+        if !(self.min_crop > 0.0 && self.min_crop <= 1.0) {
+            return wrong("min_crop", &self.min_crop, "above 0, up to 1");
+        }
+        if let Some(s) = self.time_budget_s
+            && !(s > 0.0)
+        {
+            return wrong("time_budget_s", &s, "above 0");
+        }
+        let word = &self.word;
+        if self.learn_word && (word.is_empty() || word.contains(char::is_whitespace)) {
+            return Err(config.invalid(
+                "lora.word",
+                format!(
+                    "{word:?} cannot be learnt; accepted: one word without white space, as in \"sks\" or \"<sks>\""
+                ),
+            ));
+        }
+        Ok(())
+    }
+
     /// The settings of the training.
     pub(crate) fn training(&self, seed: u64) -> TrainingConfig {
         TrainingConfig {
@@ -140,5 +195,61 @@ impl LoraTable {
             cache: None,
             ..self.clone()
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    #[test]
+    fn values_that_no_run_can_work_with_are_refused_by_line_and_key() {
+        let refusal = |line: &str| {
+            let text = format!("[lora]\n{line}\n");
+            let config = Config::parse(Path::new("pipeline.toml"), &text, &[]).expect("TOML");
+            let table: LoraTable = config.table("lora").expect("a table");
+            table.check(&config).err().map(|e| e.to_string())
+        };
+        for (line, key, accepted) in [
+            ("rank = 0", "rank: 0", "1 to 1024"),
+            ("rank = 1025", "rank: 1025", "1 to 1024"),
+            ("accumulation = 0", "accumulation: 0", "at least 1"),
+            ("alpha = inf", "alpha: inf", "above 0"),
+            ("learning_rate = nan", "learning_rate: NaN", "above 0"),
+            ("prior_weight = -1.0", "prior_weight: -1", "at least 0"),
+            (
+                "word_learning_rate = inf",
+                "word_learning_rate: inf",
+                "at least 0",
+            ),
+            ("min_crop = 1.5", "min_crop: 1.5", "above 0, up to 1"),
+            ("time_budget_s = 0.0", "time_budget_s: 0", "above 0"),
+        ] {
+            let wanted =
+                format!("pipeline.toml:2: lora.{key} is out of range; accepted: {accepted}");
+            assert_eq!(refusal(line).as_deref(), Some(wanted.as_str()));
+        }
+        for word in ["", " ", "my word", " sks ", "a\tb"] {
+            let message = refusal(&format!("learn_word = true\nword = {word:?}"));
+            let message = message.expect("refused");
+            assert!(
+                message.contains("pipeline.toml:3: lora.word: "),
+                "{message}"
+            );
+        }
+        // Without learning, several words may stand for the light.
+        assert_eq!(refusal("word = \"my word\""), None);
+        for word in ["sks", "<sks>", "*"] {
+            assert_eq!(
+                refusal(&format!("learn_word = true\nword = {word:?}")),
+                None
+            );
+        }
+        assert_eq!(
+            refusal("rank = 1024\nalpha = 0.5\ntime_budget_s = inf"),
+            None
+        );
     }
 }

@@ -11,6 +11,7 @@ use dipir_cli::exit::Usage;
 use dipir_cli::session::Session;
 use dipir_diffusion::model::Model;
 use dipir_diffusion::schedule::Prediction;
+use dipir_pipeline::error::ConfigError;
 use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::stage::StagePlan;
 use dipir_prior::encoder;
@@ -97,6 +98,23 @@ pub fn load(session: &Session, table: &ModelTable) -> anyhow::Result<Loaded> {
     let path = table.path.as_ref().map(|path| session.resolve(path));
     open(path.as_deref(), dtype, prediction, &placed.device)
         .with_context(|| format!("cannot use {}", table.name()))
+}
+
+/// Refuses more denoising steps in `key` than the model has timesteps.
+pub(crate) fn check_steps(
+    session: &Session,
+    model: &Model,
+    key: &str,
+    steps: usize,
+) -> Result<(), ConfigError> {
+    let most = model.schedule.len();
+    match steps <= most {
+        true => Ok(()),
+        false => Err(session.config.invalid(
+            key,
+            format!("{steps} is out of range; accepted: up to {most}, the model's timesteps"),
+        )),
+    }
 }
 
 /// Loads the model at `path`, a folder or one file, or the embedded one.
