@@ -66,7 +66,7 @@ struct Table {
 pub fn read(more: Option<&Path>) -> anyhow::Result<Vec<Method>> {
     let mut methods = parse(TABLE).context("the built-in table")?;
     if let Some(path) = more {
-        let text = std::fs::read_to_string(path)
+        let text = dipir_files::read_to_string(path)
             .with_context(|| format!("cannot read {}", path.display()))?;
         let added = parse(&text).map_err(|e| Usage(format!("{}: {e}", path.display())))?;
         for method in added {
@@ -151,6 +151,13 @@ mod tests {
         for name in ["neutral", "projected", "fitted", "ours"] {
             assert!(methods.iter().any(|m| m.name == name), "{name}");
         }
+    }
+
+    #[test]
+    fn a_table_that_is_no_regular_file_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let message = format!("{:#}", read(Some(folder.path())).unwrap_err());
+        assert!(message.ends_with("not a regular file"), "{message}");
     }
 
     #[test]

@@ -58,7 +58,8 @@ pub fn image(path: &Path, alt: &str) -> anyhow::Result<String> {
 
 /// The PNG file as an address.
 pub fn address(path: &Path) -> anyhow::Result<String> {
-    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let bytes =
+        dipir_files::read(path).with_context(|| format!("cannot read {}", path.display()))?;
     Ok(format!(
         "data:image/png;base64,{}",
         BASE64_STANDARD.encode(bytes)
@@ -73,5 +74,12 @@ mod tests {
     fn nothing_that_is_put_in_becomes_markup() {
         assert_eq!(text("<b \"'&>"), "&lt;b &quot;&#39;&amp;&gt;");
         assert_eq!(json(&"</script>").unwrap(), "\"\\u003c/script>\"");
+    }
+
+    #[test]
+    fn a_picture_that_is_no_regular_file_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let message = format!("{:#}", address(folder.path()).unwrap_err());
+        assert!(message.ends_with("not a regular file"), "{message}");
     }
 }

@@ -194,8 +194,8 @@ fn pipeline_text(
 
 /// Kinds of places; the key is the panorama's file name without its extension.
 fn read_kinds(path: &Path) -> anyhow::Result<BTreeMap<String, String>> {
-    let text =
-        fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let text = dipir_files::read_to_string(path)
+        .with_context(|| format!("cannot read {}", path.display()))?;
     let mut kinds = BTreeMap::new();
     for (n, line) in text.lines().enumerate().filter(|(_, l)| !l.is_empty()) {
         let columns = line.split_once('\t');
@@ -311,6 +311,8 @@ mod tests {
         fs::write(&path, "square\tday\nhall indoors\n").unwrap();
         let message = read_kinds(&path).unwrap_err().to_string();
         assert!(message.ends_with("kinds.tsv:2: accepted: a panorama's name, a tab, a kind"));
+        let message = format!("{:#}", read_kinds(folder.path()).unwrap_err());
+        assert!(message.ends_with("not a regular file"), "{message}");
     }
 
     #[test]

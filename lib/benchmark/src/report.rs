@@ -3,7 +3,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use dipir_cli::exit::Usage;
 use dipir_evaluation::lpips::Lpips;
 use dipir_evaluation::results::{read_json, write, write_json};
@@ -67,7 +67,12 @@ fn read(evaluation: &EvaluationFolder, scenes: &[SceneInfo]) -> anyhow::Result<V
         for scene in scenes {
             let file = evaluation.run(&name, &scene.name).join("score.json");
             if file.is_file() {
-                let score: Score = read_json(&file)?;
+                let score: Score = read_json(&file).with_context(|| {
+                    format!(
+                        "a score cannot be used; delete {} and run dipir-evaluate run again",
+                        file.display()
+                    )
+                })?;
                 scores.insert(scene.name.clone(), score);
             }
         }
@@ -334,6 +339,20 @@ fn markdown_table(head: &[String], rows: &[Vec<String>]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_damaged_score_is_named_with_what_to_do() {
+        let folder = tempfile::tempdir().unwrap();
+        let evaluation = EvaluationFolder::new(folder.path());
+        let scene =
+            json!({"name": "a", "made_from": "", "map": "", "exposure_ev": 0.0, "tone": "none"});
+        let scene: SceneInfo = serde_json::from_value(scene).unwrap();
+        let file = evaluation.run("m", "a").join("score.json");
+        write(&file, "{").unwrap();
+        let error = read(&evaluation, &[scene]).map(|_| ()).unwrap_err();
+        let wanted = format!("delete {} and run dipir-evaluate run again", file.display());
+        assert!(format!("{error:#}").contains(&wanted), "{error:#}");
+    }
 
     #[test]
     fn scenes_of_a_kind_are_summed_up_apart_from_others() {

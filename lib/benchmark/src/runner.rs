@@ -297,7 +297,7 @@ fn toml_string(path: &Path) -> anyhow::Result<String> {
 
 /// The files of the objects that `pipeline` names.
 fn objects(pipeline: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let text = fs::read_to_string(pipeline)
+    let text = dipir_files::read_to_string(pipeline)
         .with_context(|| format!("cannot read {}", pipeline.display()))?;
     let table: toml::Table =
         toml::from_str(&text).with_context(|| format!("cannot read {}", pipeline.display()))?;

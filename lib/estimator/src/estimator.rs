@@ -78,7 +78,7 @@ impl Estimator {
     /// The estimator of a file that [`to_bytes`](Self::to_bytes) made.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, EstimatorError> {
         let path = path.as_ref();
-        let bytes = std::fs::read(path).map_err(|source| EstimatorError::Read {
+        let bytes = dipir_files::read(path).map_err(|source| EstimatorError::Read {
             path: path.to_owned(),
             source,
         })?;

@@ -99,7 +99,7 @@ fn report(
     let mut table = Table::new(&["channel", "stored", ">min", ">mean", ">max", ""]);
     let mut channels = serde_json::Map::new();
     for channel in shown {
-        let range = Range::of(channel.values.pixels());
+        let range = Range::of(channel.values.pixels().iter().map(|&v| v.into()));
         table.row(
             [channel.name.clone(), channel.stored.into()]
                 .into_iter()

@@ -1,10 +1,10 @@
 //! The range of many values.
-use dipir_numerics::sum::sum_f32;
+use dipir_numerics::sum::Neumaier;
 use serde_json::{Value, json};
 
 use crate::report::number;
 
-/// Least, mean and largest of the finite values, and how many are not finite.
+/// Least, mean and largest of the finite values, NaN without any, and how many are not finite.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Range {
     /// Least finite value.
@@ -20,22 +20,33 @@ pub struct Range {
 }
 
 impl Range {
-    /// The range of `values`; all 0 if none is finite.
-    pub fn of(values: &[f32]) -> Self {
-        let finite: Vec<f32> = values.iter().copied().filter(|v| v.is_finite()).collect();
-        let nan = values.iter().filter(|v| v.is_nan()).count();
-        let infinite = values.len() - finite.len() - nan;
-        let fold = |f: fn(f32, f32) -> f32| finite.iter().copied().reduce(f).unwrap_or(0.0);
+    /// The range of `values`.
+    pub fn of(values: impl IntoIterator<Item = f64>) -> Self {
+        let (mut min, mut max) = (f64::INFINITY, f64::NEG_INFINITY);
+        let (mut finite, mut nan, mut infinite) = (0usize, 0, 0);
+        let mut mean = Neumaier::default();
+        for value in values {
+            match value {
+                v if v.is_nan() => nan += 1,
+                v if v.is_infinite() => infinite += 1,
+                v => {
+                    (min, max) = (min.min(v), max.max(v));
+                    mean.add(v);
+                    finite += 1;
+                }
+            }
+        }
+        let known = |value: f64| if finite > 0 { value } else { f64::NAN };
         Self {
-            min: fold(f32::min).into(),
-            mean: sum_f32(&finite) / finite.len().max(1) as f64,
-            max: fold(f32::max).into(),
+            min: known(min),
+            mean: mean.total() / finite as f64,
+            max: known(max),
             nan,
             infinite,
         }
     }
 
-    /// The range for programs.
+    /// The range for programs; null without a finite value.
     pub fn to_json(self) -> Value {
         json!({
             "min": self.min, "mean": self.mean, "max": self.max,
@@ -51,11 +62,32 @@ impl Range {
             (0, i) => format!("{i} infinite"),
             (n, i) => format!("{n} NaN, {i} infinite"),
         };
-        [
-            number(self.min),
-            number(self.mean),
-            number(self.max),
-            strange,
-        ]
+        let cell = |value: f64| match value.is_nan() {
+            true => "-".into(),
+            false => number(value),
+        };
+        [cell(self.min), cell(self.mean), cell(self.max), strange]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_beyond_single_precision_keep_their_size() {
+        let range = Range::of([1e300, -1e-300, f64::INFINITY, f64::NAN]);
+        assert_eq!((range.min, range.max), (-1e-300, 1e300));
+        assert_eq!((range.mean, range.nan, range.infinite), (5e299, 1, 1));
+        // One that single precision would round to 1.
+        assert_eq!(Range::of([1.0 + 1e-12]).mean, 1.0 + 1e-12);
+    }
+
+    #[test]
+    fn without_a_finite_value_there_is_no_range() {
+        let range = Range::of([f64::NAN, f64::NEG_INFINITY]);
+        assert_eq!(range.cells(), ["-", "-", "-", "1 NaN, 1 infinite"]);
+        assert_eq!(range.to_json()["min"], Value::Null);
+        assert_eq!(Range::of([]).cells(), ["-", "-", "-", ""]);
     }
 }

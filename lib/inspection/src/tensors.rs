@@ -46,12 +46,11 @@ pub(crate) fn inspect(path: &Path) -> anyhow::Result<Report> {
     for ((name, view), range) in views.iter().zip(&ranges) {
         elements += view.shape().iter().map(|&n| n as u64).product::<u64>();
         let shape: Vec<String> = view.shape().iter().map(ToString::to_string).collect();
-        let cells = range.map_or_else(Default::default, Range::cells);
         let dtype = format!("{:?}", view.dtype());
         table.row(
             [name.clone(), dtype.clone(), shape.join(" x ")]
                 .into_iter()
-                .chain(cells),
+                .chain(cells(*range)),
         );
         let mut entry = range.map_or(json!({}), Range::to_json);
         entry["dtype"] = dtype.into();
@@ -82,22 +81,45 @@ pub(crate) fn inspect(path: &Path) -> anyhow::Result<Report> {
 /// The range of a tensor's values; `None` for types without a plain number.
 fn range(view: &TensorView) -> Option<Range> {
     let data = view.data();
-    let values: Vec<f32> = match view.dtype() {
-        Dtype::F32 => numbers(data, f32::from_le_bytes),
-        Dtype::F16 => numbers(data, |b| f16::from_le_bytes(b).to_f32()),
-        Dtype::BF16 => numbers(data, |b| bf16::from_le_bytes(b).to_f32()),
-        Dtype::F64 => numbers(data, |b| f64::from_le_bytes(b) as f32),
-        Dtype::I64 => numbers(data, |b| i64::from_le_bytes(b) as f32),
-        Dtype::I32 => numbers(data, |b| i32::from_le_bytes(b) as f32),
-        Dtype::U32 => numbers(data, |b| u32::from_le_bytes(b) as f32),
-        Dtype::I16 => numbers(data, |b| i16::from_le_bytes(b) as f32),
-        Dtype::U16 => numbers(data, |b| u16::from_le_bytes(b) as f32),
-        Dtype::U8 | Dtype::BOOL => data.iter().map(|&b| b.into()).collect(),
+    Some(match view.dtype() {
+        Dtype::F32 => of(data, |b| f32::from_le_bytes(b).into()),
+        Dtype::F16 => of(data, |b| f16::from_le_bytes(b).into()),
+        Dtype::BF16 => of(data, |b| bf16::from_le_bytes(b).into()),
+        Dtype::F64 => of(data, f64::from_le_bytes),
+        Dtype::I64 => of(data, |b| i64::from_le_bytes(b) as f64),
+        Dtype::U64 => of(data, |b| u64::from_le_bytes(b) as f64),
+        Dtype::I32 => of(data, |b| i32::from_le_bytes(b).into()),
+        Dtype::U32 => of(data, |b| u32::from_le_bytes(b).into()),
+        Dtype::I16 => of(data, |b| i16::from_le_bytes(b).into()),
+        Dtype::U16 => of(data, |b| u16::from_le_bytes(b).into()),
+        Dtype::I8 => of(data, |b| i8::from_le_bytes(b).into()),
+        Dtype::U8 | Dtype::BOOL => of(data, |b| u8::from_le_bytes(b).into()),
         _ => return None,
-    };
-    Some(Range::of(&values))
+    })
 }
 
-fn numbers<const N: usize>(data: &[u8], read: impl Fn([u8; N]) -> f32) -> Vec<f32> {
-    data.as_chunks::<N>().0.iter().map(|&b| read(b)).collect()
+fn of<const N: usize>(data: &[u8], read: impl Fn([u8; N]) -> f64) -> Range {
+    Range::of(data.as_chunks::<N>().0.iter().map(|&b| read(b)))
+}
+
+/// What a table says of a tensor's values.
+fn cells(range: Option<Range>) -> [String; 4] {
+    let none = || ["-", "-", "-", "no statistics of this type"].map(String::from);
+    range.map_or_else(none, Range::cells)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn doubles_keep_their_precision_and_types_without_statistics_say_so() -> anyhow::Result<()> {
+        let wide: Vec<u8> = [1e300f64, 1.0 + 1e-12].map(f64::to_le_bytes).concat();
+        let found = range(&TensorView::new(Dtype::F64, vec![2], &wide)?);
+        let ends = found.map(|r| (r.min, r.max));
+        assert_eq!(ends, Some((1.0 + 1e-12, 1e300)));
+        let found = range(&TensorView::new(Dtype::F8_E4M3, vec![1], &[7])?);
+        assert_eq!(cells(found), ["-", "-", "-", "no statistics of this type"]);
+        Ok(())
+    }
 }

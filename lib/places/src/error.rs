@@ -37,6 +37,14 @@ pub enum PlacesError {
     /// A setting that cannot be worked with.
     #[error("{0}")]
     Setting(String),
+    /// The loss of a training, or a weight, is not finite.
+    #[error(
+        "training is not finite any more after {step} steps; lower the learning rate or the weight decay"
+    )]
+    Diverged {
+        /// Steps so far.
+        step: usize,
+    },
     /// Training was stopped by the caller; what is finished is kept.
     #[error("training was stopped; the same command goes on from the folds that are finished")]
     Stopped,

@@ -177,7 +177,7 @@ pub fn read_places(folder: &Path) -> Result<Vec<Place>, PlacesError> {
 
 /// The first word of each kind; empty without a table.
 fn kinds(table: &Path) -> BTreeMap<String, String> {
-    let text = std::fs::read_to_string(table).unwrap_or_default();
+    let text = dipir_files::read_to_string(table).unwrap_or_default();
     let mut lines = text.lines();
     let header: Vec<&str> = lines.next().unwrap_or_default().split('\t').collect();
     let column = |name: &str| header.iter().position(|h| *h == name);

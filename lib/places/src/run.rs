@@ -154,14 +154,19 @@ fn checked(s: &Settings) -> Result<(), PlacesError> {
         && s.views > 0
         && s.judged > 0
         && t.hidden > 0
+        && t.epochs > 0
         && t.batch > 0;
+    let rates = t.learning_rate > 0.0
+        && t.learning_rate.is_finite()
+        && t.weight_decay >= 0.0
+        && t.weight_decay.is_finite();
     let shares = [t.dropout, t.feature_dropout, t.kind_dropout]
         .iter()
         .all(|d| (0.0..1.0).contains(d));
-    match sound && shares {
+    match sound && rates && shares {
         true => Ok(()),
         false => Err(PlacesError::Setting(
-            "training needs at least 2 folds, 1 network, 1 view, 1 judged view, 1 hidden unit, a batch of 1, and dropouts in [0, 1)".into(),
+            "training needs at least 2 folds, 1 network, 1 view, 1 judged view, 1 hidden unit, 1 epoch, a batch of 1, a learning rate above 0, a weight decay of 0 or more, and dropouts in [0, 1)".into(),
         )),
     }
 }
@@ -198,7 +203,6 @@ fn one_fold(
         let network = |sight: Sight, told: &mut dyn FnMut(f64, f64) -> bool| {
             let seed = seed ^ (sight as u64) << 56;
             train(&examples, &settings.training, probes, sight, seed, told)
-                .ok_or(PlacesError::Stopped)
         };
         let parts = network(Sight::Parts, &mut |done, loss| told(0.5 * done, loss))?;
         let kind = network(Sight::Kind, &mut |done, loss| told(0.5 + 0.5 * done, loss))?;

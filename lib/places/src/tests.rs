@@ -1,6 +1,7 @@
 //! Properties of the photographs, and a whole training in small.
 use std::path::Path;
 
+use dipir_estimator::network::Sight;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::luminance::luminance;
 use glam::{Vec2, Vec3};
@@ -8,7 +9,7 @@ use glam::{Vec2, Vec3};
 use crate::examples::Example;
 use crate::place::{Place, SMOOTH, folds};
 use crate::probes::{PROBES, Probes};
-use crate::trainer::Training;
+use crate::trainer::{Training, train};
 use crate::view::View;
 use crate::{PlacesError, Progress, Settings, run};
 
@@ -207,6 +208,57 @@ fn training_goes_on_from_finished_folds_to_the_same_bytes() {
     assert_eq!(kept.into_inner().unwrap(), [0]);
     let bytes = |s: &Settings| std::fs::read(&s.out).unwrap();
     assert_eq!(bytes(&whole), bytes(&stopped));
+}
+
+#[test]
+fn fewer_photographs_than_a_batch_are_one_batch() {
+    let (p, probes) = (place("yard", 0.3), Probes::default());
+    let examples: Vec<Example> = (0..3)
+        .map(|n| Example::new(&p, n, &View::drawn(3, 0, n), &probes, 3))
+        .collect();
+    let examples: Vec<&Example> = examples.iter().collect();
+    let network = |batch: usize, rate: f32| {
+        let settings = Training {
+            hidden: 8,
+            epochs: 2,
+            batch,
+            learning_rate: rate,
+            ..Training::default()
+        };
+        train(
+            &examples,
+            &settings,
+            &probes,
+            Sight::Parts,
+            1,
+            &mut |_, _| true,
+        )
+    };
+    // Three photographs and their mirror images.
+    let whole = network(6, 2e-3).unwrap();
+    assert!(
+        whole.output[0].iter().any(|w| *w != 0.0),
+        "nothing was learned"
+    );
+    assert_eq!(network(128, 2e-3).unwrap(), whole);
+    assert!(matches!(
+        network(6, 1e38),
+        Err(PlacesError::Diverged { .. })
+    ));
+}
+
+#[test]
+fn trainings_that_cannot_be_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |change: &dyn Fn(&mut Training)| {
+        let mut s = settings(folder.path(), "out.safetensors");
+        change(&mut s.training);
+        matches!(run(&s, &|_| true), Err(PlacesError::Setting(_)))
+    };
+    assert!(refused(&|t| t.epochs = 0));
+    assert!(refused(&|t| t.weight_decay = f32::NAN));
+    assert!(refused(&|t| t.learning_rate = f32::INFINITY));
+    assert!(!refused(&|_| ()), "an empty folder is another error");
 }
 
 #[test]

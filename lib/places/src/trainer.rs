@@ -8,6 +8,7 @@ use dipir_estimator::network::{
 use dipir_estimator::posterior::soft_bins;
 use serde::{Deserialize, Serialize};
 
+use crate::error::PlacesError;
 use crate::examples::{Example, Truth};
 use crate::loss::loss;
 use crate::network::{Dropout, Optimiser, SplitMix64, Weights, backward, forward, with_weights};
@@ -21,7 +22,7 @@ pub struct Training {
     pub hidden: usize,
     /// Passes over all photographs and their mirror images.
     pub epochs: usize,
-    /// Photographs in a step.
+    /// Photographs in a step; all of them where there are fewer.
     pub batch: usize,
     /// Highest learning rate; it rises over 100 steps and falls as a cosine.
     pub learning_rate: f32,
@@ -57,7 +58,8 @@ struct Row<'a> {
     reference: f32,
 }
 
-/// Trains a network from nothing. `progress` gets the share that is done and the mean of recent losses; `false` stops.
+/// Trains a network from nothing. `progress` gets the share that is done and the mean of recent losses; `false` stops. A
+/// loss or a weight that is not finite is an error.
 pub fn train(
     examples: &[&Example],
     settings: &Training,
@@ -65,7 +67,7 @@ pub fn train(
     sight: Sight,
     seed: u64,
     progress: &mut dyn FnMut(f64, f64) -> bool,
-) -> Option<Network> {
+) -> Result<Network, PlacesError> {
     let rows = rows(examples, probes);
     let network = start(&rows, sight, settings.hidden, seed);
     let inputs: Vec<Vec<f32>> = rows
@@ -92,13 +94,14 @@ pub fn train(
             })
             .collect(),
     };
-    let per_epoch = rows.len() / settings.batch;
+    let batch_size = settings.batch.min(rows.len()).max(1);
+    let per_epoch = rows.len() / batch_size;
     let total = (settings.epochs * per_epoch).max(1);
     let (mut step, mut late) = (0usize, f64::NAN);
     for _ in 0..settings.epochs {
         let mut order: Vec<usize> = (0..rows.len()).collect();
         random.shuffle(&mut order);
-        for batch in order.chunks_exact(settings.batch) {
+        for batch in order.chunks_exact(batch_size) {
             let x: Vec<f32> = batch
                 .iter()
                 .flat_map(|k| inputs[*k].iter().copied())
@@ -121,6 +124,9 @@ pub fn train(
                 );
             }
             let mean = f64::from(sum * share);
+            if !mean.is_finite() {
+                return Err(PlacesError::Diverged { step });
+            }
             late = if late.is_nan() {
                 mean
             } else {
@@ -134,11 +140,14 @@ pub fn train(
             optimiser.step(&mut w, &gradients, rate, settings.weight_decay);
             step += 1;
             if step % 20 == 0 && !progress(step as f64 / total as f64, late) {
-                return None;
+                return Err(PlacesError::Stopped);
             }
         }
     }
-    Some(with_weights(&network, &optimiser.mean))
+    if !optimiser.mean.iter().flatten().all(|w| w.is_finite()) {
+        return Err(PlacesError::Diverged { step });
+    }
+    Ok(with_weights(&network, &optimiser.mean))
 }
 
 fn rows<'a>(examples: &[&'a Example], probes: &Probes) -> Vec<Row<'a>> {

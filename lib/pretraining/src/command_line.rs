@@ -193,6 +193,9 @@ impl EncoderArgs {
     /// The run of these arguments. An error names a value that is out of range.
     pub fn run(&self) -> Result<EncoderRun, Usage> {
         check_rate(self.learning_rate)?;
+        if self.samples == 0 {
+            return Err(Usage("--samples 0: at least one picture is needed".into()));
+        }
         self.data.check()?;
         Ok(EncoderRun {
             out: self.data.out.clone(),
@@ -208,6 +211,7 @@ impl EncoderArgs {
 }
 
 #[derive(Args)]
+#[command(allow_negative_numbers = true)]
 pub struct LightArgs {
     /// Folder of panoramas, HDR or EXR; panoramas.tsv in it (columns name, kind) may name kinds of places
     #[arg(value_name = "PANORAMAS")]
@@ -257,6 +261,14 @@ impl LightArgs {
     /// The training of these arguments. An error names a value that is out of range.
     pub fn settings(&self) -> Result<LightSettings, Usage> {
         check_rate(f64::from(self.learning_rate))?;
+        let decay = self.decay;
+        if !(decay >= 0.0 && decay.is_finite()) {
+            let message = format!("--decay {decay}: accepted are 0 and more");
+            return Err(Usage(message));
+        }
+        if self.epochs == 0 {
+            return Err(Usage("--epochs 0: at least one pass is needed".into()));
+        }
         Ok(LightSettings {
             folds: self.folds,
             networks: self.networks,
@@ -324,5 +336,45 @@ fn check_rate(rate: f64) -> Result<(), Usage> {
             let message = format!("--learning-rate {rate}: accepted are numbers above 0");
             Err(Usage(message))
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Why the arguments are refused, if they are.
+    fn refusal(args: &[&str]) -> Option<String> {
+        let cli = Cli::try_parse_from([&["dipir-pretrain"], args].concat());
+        let checked = match cli.expect("arguments").command {
+            Command::Encoder(args) => args.run().map(|_| ()),
+            Command::Light(args) => args.settings().map(|_| ()),
+            _ => unreachable!("not tested here"),
+        };
+        checked.err().map(|Usage(message)| message)
+    }
+
+    #[test]
+    fn trainings_of_nothing_or_out_of_range_are_refused_by_option() {
+        for (option, value) in [
+            ("--decay", "nan"),
+            ("--decay", "inf"),
+            ("--decay", "-0.5"),
+            ("--learning-rate", "nan"),
+            ("--epochs", "0"),
+        ] {
+            let message = refusal(&["light", "panoramas", "out", option, value]).expect(option);
+            assert!(message.starts_with(option), "{message}");
+        }
+        assert_eq!(
+            refusal(&["light", "panoramas", "out", "--decay", "0"]),
+            None
+        );
+        let encoder = ["encoder", "--out", "model", "--cache", "cache"];
+        assert_eq!(
+            refusal(&[&encoder[..], &["--samples", "0"]].concat()).as_deref(),
+            Some("--samples 0: at least one picture is needed")
+        );
+        assert_eq!(refusal(&encoder), None);
     }
 }

@@ -146,7 +146,7 @@ fn networks(weights: &Path) -> anyhow::Result<Vec<Estimator>> {
         .collect::<anyhow::Result<Vec<_>>>()?;
     if networks.len() < 2 {
         let text = format!(
-            "{}: there is no {} beside it; train with `keep` to have it",
+            "{}: there is no {} beside it; train with --keep-folds to have it",
             weights.display(),
             file(0).display()
         );

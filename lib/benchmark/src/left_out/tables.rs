@@ -144,17 +144,26 @@ pub fn all(scenes: &[Scored]) -> String {
     for kind in kinds {
         add(kind, &|s| s.kind == kind);
     }
-    text += "\nMost worse than neutral light: ";
+    text + &worst(scenes)
+}
+
+/// The scenes in which the estimate is most worse than neutral light.
+fn worst(scenes: &[Scored]) -> String {
     let mut worst: Vec<(f64, &Scored)> = scenes
         .iter()
         .map(|s| (s.touched("estimate") - s.touched("neutral"), s))
+        .filter(|(difference, _)| *difference > 0.0)
         .collect();
     worst.sort_by(|a, b| b.0.total_cmp(&a.0));
     let named = worst
         .iter()
         .take(12)
         .map(|(d, s)| format!("{} ({d:+.3})", s.name));
-    text + &named.collect::<Vec<_>>().join(", ") + "\n"
+    let named: Vec<String> = named.collect();
+    match named.is_empty() {
+        true => "\nWorse than neutral light: none\n".into(),
+        false => format!("\nMost worse than neutral light: {}\n", named.join(", ")),
+    }
 }
 
 /// Rows of pictures of `count` scenes evenly drawn from all.
@@ -180,4 +189,45 @@ pub fn sheet(scenes: &[Scored], count: usize) -> DisplayImage {
         height,
         (0..width * height).map(pixel).collect(),
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_scenes_that_are_worse_are_named_as_worse() {
+        let scene = |name: &str, estimate: f64| {
+            let score = |rmse_touched: f64| PictureScores {
+                rmse: 0.0,
+                ssim: 1.0,
+                si_rmse: 0.0,
+                rmse_touched,
+                si_rmse_object: 0.0,
+            };
+            Scored {
+                name: name.into(),
+                kind: String::new(),
+                fold: 0,
+                sun: false,
+                scores: vec![
+                    ("neutral".into(), score(0.5)),
+                    ("estimate".into(), score(estimate)),
+                ],
+                exposed: Default::default(),
+                pictures: vec![],
+            }
+        };
+        let scenes = [
+            scene("a", 0.25),
+            scene("b", 0.75),
+            scene("c", 1.0),
+            scene("d", 0.5),
+        ];
+        assert_eq!(
+            worst(&scenes),
+            "\nMost worse than neutral light: c (+0.500), b (+0.250)\n"
+        );
+        assert_eq!(worst(&scenes[..1]), "\nWorse than neutral light: none\n");
+    }
 }
