@@ -27,11 +27,11 @@ const MOST_NUMBERS: usize = 1 << 12;
 /// the model is `fisheye` or `equidistant`. `size` is that of the image, where the file does not say it.
 ///
 /// # Errors
-/// If the matrix or the size is missing, or the coefficients are of another model.
+/// If the matrix or the size is missing, a list holds what is no number, or the coefficients are of another model.
 pub fn read(text: &str, size: Option<[f64; 2]>) -> Result<Lens, CameraError> {
     let found = match text.trim_start().starts_with('{') {
         true => Found::in_json(text)?,
-        false => Found::in_yaml(text),
+        false => Found::in_yaml(text)?,
     };
     let wrong = |detail: &str| CameraError::new(FORMAT, detail);
     let [fx, skew, cx, _, fy, cy, _, _, _] = found.matrix[..] else {
@@ -68,24 +68,24 @@ impl Found {
         let numbers = |names: &[&str]| {
             let mut out = Vec::new();
             if let Some(value) = get(names) {
-                flatten(value.get("data").unwrap_or(value), &mut out);
+                flatten(value.get("data").unwrap_or(value), &mut out)?;
             }
-            out
+            Ok::<_, CameraError>(out)
         };
         let number = |names: &[&str]| get(names).and_then(Value::as_f64);
         Ok(Self {
-            matrix: numbers(&MATRIX),
-            coefficients: numbers(&COEFFICIENTS),
+            matrix: numbers(&MATRIX)?,
+            coefficients: numbers(&COEFFICIENTS)?,
             size: number(&WIDTH).zip(number(&HEIGHT)).map(|(w, h)| [w, h]),
             model: get(&MODEL).and_then(Value::as_str).unwrap_or("").into(),
         })
     }
 
-    /// The few forms of YAML that calibrations are written in: `key: value`, and matrices as
-    /// `data: [ … ]` below their key.
-    fn in_yaml(text: &str) -> Self {
+    /// The few forms of YAML that calibrations are written in: `key: value`, lists, and matrices with their numbers as
+    /// `data` below their key.
+    fn in_yaml(text: &str) -> Result<Self, CameraError> {
         let value = |names: &[&str]| {
-            let mut lines = text.lines();
+            let mut lines = text.lines().map(without_comment);
             lines.find_map(|line| {
                 let (name, value) = line.split_once(':')?;
                 names.contains(&name.trim()).then(|| value.trim())
@@ -93,12 +93,12 @@ impl Found {
         };
         let number = |names: &[&str]| value(names)?.parse().ok();
         let model = value(&MODEL).unwrap_or("");
-        Self {
-            matrix: yaml_list(text, &MATRIX),
-            coefficients: yaml_list(text, &COEFFICIENTS),
+        Ok(Self {
+            matrix: yaml_list(text, &MATRIX)?,
+            coefficients: yaml_list(text, &COEFFICIENTS)?,
             size: number(&WIDTH).zip(number(&HEIGHT)).map(|(w, h)| [w, h]),
             model: model.trim_matches(['"', '\'']).into(),
-        }
+        })
     }
 
     fn distortion(&self) -> Result<Distortion, CameraError> {
@@ -127,41 +127,67 @@ impl Found {
     }
 }
 
-/// All numbers of nested lists.
-fn flatten(value: &Value, out: &mut Vec<f64>) {
+/// All numbers of nested lists; `null` has none.
+fn flatten(value: &Value, out: &mut Vec<f64>) -> Result<(), CameraError> {
     match value {
-        Value::Array(items) => items.iter().for_each(|item| flatten(item, out)),
-        other if out.len() < MOST_NUMBERS => out.extend(other.as_f64()),
-        _ => {}
+        Value::Array(items) => items.iter().try_for_each(|item| flatten(item, out)),
+        Value::Null => Ok(()),
+        _ if out.len() >= MOST_NUMBERS => Ok(()),
+        other => {
+            out.push(
+                other
+                    .as_f64()
+                    .ok_or_else(|| no_number(&other.to_string()))?,
+            );
+            Ok(())
+        }
     }
 }
 
-/// The numbers between the first brackets at or below a key, before the next key of its level.
-fn yaml_list(text: &str, names: &[&str]) -> Vec<f64> {
-    let mut at = 0;
-    for line in text.split_inclusive('\n') {
-        let key = line.split_once(':').map(|(name, _)| name.trim());
-        let after = at + line.len();
-        if key.is_some_and(|key| names.contains(&key)) {
-            let own = line.split_once(':').map_or("", |(_, value)| value);
-            let list = match own.contains('[') {
-                true => &text[after - own.len()..],
-                false => {
-                    let below = &text[after..];
-                    below.find("data:").map_or("", |data| &below[data..])
+fn without_comment(line: &str) -> &str {
+    line.split('#').next().unwrap_or_default()
+}
+
+/// The numbers of a list, in brackets or a line each, at a key or in `data` below it; none if the key is missing.
+fn yaml_list(text: &str, names: &[&str]) -> Result<Vec<f64>, CameraError> {
+    let indent = |line: &str| line.len() - line.trim_start().len();
+    let mut lines = text.lines().map(without_comment);
+    let found = lines.by_ref().find_map(|line| {
+        let (name, value) = line.split_once(':')?;
+        names.contains(&name.trim()).then(|| (indent(line), value))
+    });
+    let Some((level, own)) = found else {
+        return Ok(vec![]);
+    };
+    let below = lines.take_while(|line| {
+        let start = line.trim_start();
+        start.is_empty() || indent(line) > level || start.starts_with(['-', ']'])
+    });
+    let (mut list, mut in_data) = (vec![own], false);
+    for line in below {
+        match line.split_once(':') {
+            None => list.push(line),
+            Some(_) if in_data => break,
+            Some((name, value)) => {
+                in_data = name.trim() == "data";
+                if in_data {
+                    list = vec![value];
                 }
-            };
-            let inside = list
-                .split_once('[')
-                .and_then(|(_, rest)| rest.split_once(']'));
-            let inside = inside.map_or("", |(inside, _)| inside);
-            let items = inside
-                .split([',', '\n', ' '])
-                .filter(|v| !v.trim().is_empty());
-            let numbers = items.map(|v| v.trim().parse()).take(MOST_NUMBERS);
-            return numbers.collect::<Result<_, _>>().unwrap_or_default();
+            }
         }
-        at = after;
     }
-    Vec::new()
+    let words = list.iter().flat_map(|line| line.split([',', '[', ']']));
+    words
+        .flat_map(str::split_whitespace)
+        // The dash of a list's line, no value, and a type such as !!opencv-matrix.
+        .filter(|word| !["-", "null", "~"].contains(word) && !word.starts_with('!'))
+        .take(MOST_NUMBERS)
+        .map(|word| word.parse().map_err(|_| no_number(word)))
+        .collect()
+}
+
+fn no_number(word: &str) -> CameraError {
+    let word: String = word.chars().take(60).collect();
+    let detail = format!("\"{}\" is no number", word.escape_debug());
+    CameraError::new(FORMAT, detail)
 }

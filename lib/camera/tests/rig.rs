@@ -446,6 +446,11 @@ fn opencv_ros_nerfstudio_and_colmap_mean_the_same_distortion() {
         data: [520, 0, 330, 0, 521, 230, 0, 0, 1]\ndistortion_model: plumb_bob\n\
         distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [-0.2, 0.05, 0.001, -0.002, 0.01]\n";
     assert_eq!(opencv::read(ros, None).unwrap(), want);
+    let by_hand = "image_width: 640 # pixels\nimage_height: 480\nK:\n- [520, 0, 330]\n- [0, 521, 230] # y\n\
+        - [0, 0, 1]\nD:\n  - -0.2\n  - 0.05\n  - 0.001 # p1\n  - -0.002\n  - 0.01\nR: [1, 0, 0]\n";
+    assert_eq!(opencv::read(by_hand, None).unwrap(), want);
+    let tabs = OPENCV_YAML.replace("-0.2, 5.0e-2,", "-0.2,\t5.0e-2, # k1 k2\n  ");
+    assert_eq!(opencv::read(&tabs, None).unwrap(), want);
     let identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]];
     let nerf = json!({
         "fl_x": 520, "fl_y": 521, "cx": 330, "cy": 230, "w": 640, "h": 480,
@@ -470,6 +475,20 @@ fn opencv_ros_nerfstudio_and_colmap_mean_the_same_distortion() {
             lens: want
         }
     );
+}
+
+/// A lens that cannot be read is not a lens without distortion.
+#[test]
+fn what_is_no_number_in_a_calibration_is_quoted() {
+    let words = |text: &str, word: &str| {
+        let error = opencv::read(text, Some(SIZE)).unwrap_err().to_string();
+        assert!(error.contains(&format!("{word:?} is no number")), "{error}");
+    };
+    words(&OPENCV_YAML.replace("-0.2", ".Nan"), ".Nan");
+    words(&OPENCV_YAML.replace("520.", "five"), "five");
+    let json = "{\"K\": [500, 0, 320, 0, 500, 240, 0, 0, 1], \"D\": [0.1, ";
+    words(&format!("{json}true]}}"), "true");
+    assert!(opencv::read(&format!("{json}null]}}"), Some(SIZE)).is_ok());
 }
 
 #[test]

@@ -13,11 +13,11 @@ use crate::{depth, pcd, ply};
 pub struct Source<'a> {
     /// `.ply`, `.pcd`, `.bin`, `.exr` or `.png` with depths, COLMAP's folder or its `points3D`.
     pub path: &'a Path,
-    /// Which axis of the file points up; by default +z, +y for `.ply`, -y for COLMAP.
+    /// Which axis of the file points up; by default +z, +y for `.ply`, -y for COLMAP. Depth maps have none.
     pub up: Option<WorldUp>,
-    /// Metres of a unit of the file.
+    /// Metres of a unit of the file; of depths as PNG, a factor on their millimetres.
     pub scale: f64,
-    /// Where the sensor stood: KITTI's calibration (`.txt`) or a record of nuScenes (`.json`).
+    /// Where the sensor stood, not used by depth maps: KITTI's calibration (`.txt`) or a record of nuScenes (`.json`).
     pub pose: Option<&'a Path>,
     /// The photograph's camera, for depth maps.
     pub camera: &'a Camera,
@@ -31,6 +31,12 @@ pub fn part(path: &Path) -> PathBuf {
     }
 }
 
+/// Whether [`read`] takes the file for depths that the photograph's camera sees.
+pub fn is_depth(path: &Path) -> bool {
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    matches!(extension.as_deref(), Some("exr" | "png"))
+}
+
 /// Reads points.
 ///
 /// # Errors
@@ -39,13 +45,21 @@ pub fn read(source: &Source) -> Result<Cloud, PointsError> {
     let path = part(source.path);
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     let extension = extension.as_deref().unwrap_or_default();
-    if extension == "exr" {
-        return depth::points(&depth::read_exr(&path)?, source.camera);
+    if is_depth(&path) {
+        if source.up.is_some() || source.pose.is_some() {
+            return Err(PointsError::with_remedy(
+                "depth",
+                "the photograph's camera says where its points are, and points_up and points_pose do not",
+                "leave points_up and points_pose out",
+            ));
+        }
+        let depth = match extension {
+            "exr" => depth::read_exr(&path)?,
+            _ => depth::read_png(&read_bytes(&path)?)?,
+        };
+        return depth::points(&depth.map(|z| z * source.scale as f32), source.camera);
     }
     let bytes = read_bytes(&path)?;
-    if extension == "png" {
-        return depth::points(&depth::read_png(&bytes)?, source.camera);
-    }
     let is_colmap = path.file_stem().is_some_and(|s| s == "points3D");
     let (cloud, up) = match extension {
         "txt" | "bin" if is_colmap => {

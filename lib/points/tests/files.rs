@@ -213,7 +213,11 @@ fn a_depth_map_gives_the_points_that_the_camera_sees() {
     );
     grey.unwrap().save(&png).unwrap();
     for (path, tolerance) in [(exr, 1e-5), (png, 1e-3)] {
-        let cloud = file::read(&source(&path, &camera)).unwrap();
+        let depths = Source {
+            up: None,
+            ..source(&path, &camera)
+        };
+        let cloud = file::read(&depths).unwrap();
         assert_eq!(cloud.points.len(), 600);
         for point in &cloud.points {
             // Half a millimetre of the nearest depths is less in height.
@@ -221,6 +225,21 @@ fn a_depth_map_gives_the_points_that_the_camera_sees() {
         }
         assert_eq!(cloud.viewpoint, Some(camera.pose.position));
     }
+    // Twice as far is twice as far below the camera, which stands 0.75 m above the ground.
+    let exr = folder.path().join("depth.exr");
+    let far = Source {
+        scale: 2.0,
+        up: None,
+        ..source(&exr, &camera)
+    };
+    for point in &file::read(&far).unwrap().points {
+        assert!((point.y + 0.75).abs() < 1e-5, "{point}");
+    }
+    let error = file::read(&source(&exr, &camera)).unwrap_err().to_string();
+    assert!(
+        error.contains("leave points_up and points_pose out"),
+        "{error}"
+    );
     let wide = Raster::filled(40, 10, 1.0f32);
     let error = depth::points(&wide, &camera).unwrap_err().to_string();
     assert!(

@@ -75,7 +75,7 @@ impl SmallScene {
         let mut loaded =
             Scene::load(&config, &base_dir).map_err(|e| with_place(e, &session.config))?;
         let mut warnings = std::mem::take(&mut loaded.warnings);
-        warnings.extend(implausible(&loaded.scene));
+        warnings.extend(implausible(&loaded));
         let models = Model::all(&loaded);
         let full = loaded.scene.camera;
         let [width, height] = scaled(full.resolution, longest);

@@ -1,12 +1,14 @@
 //! Set-ups that can be meant but seldom are: a field of view in radians, a camera under the ground,
-//! an object that no pixel shows. Each is one sentence with the value that was found and the key
+//! an object that no pixel shows, a mask that hides nothing. Each is one sentence with the value that was found and the key
 //! to look at.
-use glam::{Vec2, Vec3};
+use dipir_cameras::Lens;
+use dipir_imaging::raster::Raster;
+use glam::{DVec2, Vec2, Vec3};
 
 use crate::camera::Camera;
 use crate::mesh::TriangleMesh;
 use crate::proxy::{Plane, Proxy};
-use crate::scene::Scene;
+use crate::scene::{LoadedScene, Scene};
 use crate::visibility::below_a_pixel;
 
 /// Vertical fields of view of lenses that people have: an 800 mm lens has 1.7 degrees.
@@ -16,10 +18,27 @@ const HEIGHT_M: [f32; 2] = [0.002, 60.0];
 /// An object smaller than this in the picture cannot be judged, pixels.
 const SMALLEST_PX: f32 = 3.0;
 
-/// What is unlikely about `scene`, one sentence each.
-pub fn implausible(scene: &Scene) -> Vec<String> {
+/// A fisheye whose picture ends before this angle from the axis is none, degrees.
+const LEAST_FISHEYE_DEG: f64 = 80.0;
+/// Steps from the optical axis to a corner in which the end of a lens's picture is looked for.
+const STEPS: usize = 256;
+
+/// What is unlikely about a scene, one sentence each.
+pub fn implausible(loaded: &LoadedScene) -> Vec<String> {
+    let lens = loaded.original.as_ref().map(|o| o.undistortion.lens());
+    let mut found = implausible_scene(&loaded.scene, lens);
+    found.extend(loaded.occluders.as_ref().and_then(hides_nothing));
+    found
+}
+
+/// `lens` is the photograph's, if it bends lines.
+fn implausible_scene(scene: &Scene, lens: Option<&Lens>) -> Vec<String> {
     let mut found = Vec::new();
-    found.extend(field_of_view(&scene.camera));
+    found.extend(lens.and_then(turns_back));
+    // A fisheye's is not that of the picture without distortion, which shows the inner part of it.
+    if !lens.is_some_and(|l| l.distortion.is_fisheye()) {
+        found.extend(field_of_view(&scene.camera));
+    }
     let ground = match &scene.proxy {
         Proxy::Plane(plane) => Some(plane),
         Proxy::None | Proxy::Mesh(_) => None,
@@ -55,6 +74,36 @@ fn field_of_view(camera: &Camera) -> Option<String> {
         "the camera's vertical field of view is {degrees:.2} degrees; lenses have {least} to {most}: \
          see [scene.camera] fov_deg, in degrees{meant}"
     ))
+}
+
+/// A lens whose picture would fold over itself before a corner of the photograph: no light falls there.
+fn turns_back(lens: &Lens) -> Option<String> {
+    let size = DVec2::from_array(lens.size);
+    let end = |corner: DVec2| {
+        let way = corner * size - lens.principal_px;
+        let seen = |share: f64| lens.distortion.direction(share * way / lens.focal_px);
+        let shares = (1..=STEPS).map(|i| i as f64 / STEPS as f64);
+        let share = shares.clone().find(|s| seen(*s).is_none())?;
+        let last = seen(share - 1.0 / STEPS as f64)?;
+        // Around the circle of a fisheye's picture there is nothing to see.
+        let circle = last.z < LEAST_FISHEYE_DEG.to_radians().cos();
+        (!(lens.distortion.is_fisheye() && circle)).then(|| share * way.length())
+    };
+    let corners = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]];
+    let ends = corners.into_iter().filter_map(|c| end(c.into()));
+    let percent = 100.0 * ends.reduce(f64::min)? / (0.5 * size.length());
+    Some(format!(
+        "the lens's curve turns back inside the picture, {percent:.0}% of the half diagonal from the optical axis, and what is \
+         beyond is wrong: check the lens's coefficients, [scene.camera] distortion (k1 = -0.12, not -12) or those of the \
+         camera's file, and its field of view"
+    ))
+}
+
+fn hides_nothing(mask: &Raster<f32>) -> Option<String> {
+    let hides = mask.pixels().iter().any(|v| *v > 0.0);
+    (!hides).then(|| {
+        "the mask of scene.occluders is black everywhere, so nothing stands before the objects; white is what hides them".into()
+    })
 }
 
 fn camera_below(camera: &Camera, plane: &Plane) -> Option<String> {
@@ -150,6 +199,8 @@ fn visibility(mesh: &TriangleMesh, camera: &Camera, size_is_told: bool) -> Optio
 
 #[cfg(test)]
 mod tests {
+    use dipir_cameras::Distortion;
+
     use super::*;
     use crate::camera::FieldOfView;
 
@@ -183,7 +234,7 @@ mod tests {
     }
 
     fn one(scene: &Scene, part: &str) {
-        let found = implausible(scene);
+        let found = implausible_scene(scene, None);
         assert!(
             found.len() == 1 && found[0].contains(part),
             "{part:?}: {found:?}"
@@ -192,7 +243,7 @@ mod tests {
 
     #[test]
     fn nothing_is_said_of_an_object_on_the_ground_before_the_camera() {
-        assert_eq!(implausible(&scene()), Vec::<String>::new());
+        assert_eq!(implausible_scene(&scene(), None), Vec::<String>::new());
     }
 
     #[test]
@@ -216,14 +267,16 @@ mod tests {
             point: Vec3::new(0.0, 1.9, 0.0),
             normal: Vec3::Y,
         });
-        assert!(implausible(&below)[0].contains("the camera is 0.30 m below the ground"));
+        assert!(
+            implausible_scene(&below, None)[0].contains("the camera is 0.30 m below the ground")
+        );
         let mut turned = scene();
         turned.proxy = Proxy::Plane(Plane {
             point: Vec3::ZERO,
             normal: Vec3::NEG_Y,
         });
-        assert!(implausible(&turned)[0].contains("points down"));
-        assert!(implausible(&turned)[0].contains("normal = [-0.00, 1.00, -0.00]"));
+        assert!(implausible_scene(&turned, None)[0].contains("points down"));
+        assert!(implausible_scene(&turned, None)[0].contains("normal = [-0.00, 1.00, -0.00]"));
     }
 
     #[test]
@@ -232,7 +285,7 @@ mod tests {
         for p in &mut scene.mesh.positions {
             *p *= 350.0;
         }
-        let found = implausible(&scene);
+        let found = implausible_scene(&scene, None);
         assert!(found[0].contains("350.0000 m tall"), "{found:?}");
         assert!(found[0].contains("scale = 0.01"), "{found:?}");
     }
@@ -247,7 +300,7 @@ mod tests {
             }
             let hidden = below_a_pixel(&scene.mesh, &scene.camera).is_some();
             assert_eq!(hidden, warnings == 0, "{scale}");
-            let found = implausible(&scene);
+            let found = implausible_scene(&scene, None);
             assert_eq!(found.len(), warnings, "{scale}: {found:?}");
         }
     }
@@ -266,8 +319,60 @@ mod tests {
             for p in &mut scene.mesh.positions {
                 *p += offset;
             }
-            let found = implausible(&scene);
+            let found = implausible_scene(&scene, None);
             assert!(found.iter().any(|f| f.contains(part)), "{part}: {found:?}");
         }
+    }
+
+    fn lens(distortion: Option<Distortion>) -> Lens {
+        Lens {
+            distortion: distortion.unwrap(),
+            ..Lens::pinhole([300.0, 200.0], DVec2::splat(180.0))
+        }
+    }
+
+    #[test]
+    fn a_lens_that_folds_the_picture_is_told_with_where_it_does() {
+        let brown = |k1| {
+            lens(Distortion::brown_conrady(
+                [k1, 0.0, 0.0, 0.0],
+                [0.0; 3],
+                [0.0; 2],
+            ))
+        };
+        let fisheye = |k1| lens(Distortion::kannala_brandt([k1, 0.0, 0.0, 0.0]));
+        for good in [brown(-0.12), brown(0.3), fisheye(-0.02)] {
+            assert_eq!(turns_back(&good), None);
+        }
+        // r (1 - 5 r^2) turns where it is two thirds of 1 / sqrt(15), .172 focal lengths: 31 pixels of 180.3.
+        let found = turns_back(&brown(-5.0)).unwrap();
+        assert!(found.contains(" 17% of the half diagonal"), "{found}");
+        assert!(turns_back(&brown(1e300)).is_some());
+        assert!(turns_back(&fisheye(-5.0)).is_some());
+        let found = implausible_scene(&scene(), Some(&brown(-5.0)));
+        assert!(found.len() == 1 && found[0].contains("17%"), "{found:?}");
+        // The picture of half a sphere is a circle in a larger frame.
+        let mut circular = fisheye(-0.05);
+        circular.focal_px = DVec2::splat(60.0);
+        assert_eq!(turns_back(&circular), None);
+    }
+
+    #[test]
+    fn the_field_of_view_of_a_fisheyes_working_picture_is_no_setting() {
+        let mut wide = scene();
+        wide.camera.focal_px = Vec2::splat(10.0);
+        let part = "vertical field of view is 145";
+        assert!(implausible_scene(&wide, None)[0].contains(part));
+        let fisheye = lens(Distortion::kannala_brandt([0.0; 4]));
+        let found = implausible_scene(&wide, Some(&fisheye));
+        assert!(!found.iter().any(|f| f.contains(part)), "{found:?}");
+    }
+
+    #[test]
+    fn a_black_mask_is_told() {
+        let mut mask = Raster::filled(3, 2, 0.0);
+        assert!(hides_nothing(&mask).unwrap().contains("scene.occluders"));
+        mask.pixels_mut()[4] = 0.01;
+        assert_eq!(hides_nothing(&mask), None);
     }
 }

@@ -2,7 +2,7 @@
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-use dipir_cameras::Camera as LensCamera;
+use dipir_cameras::{Camera as LensCamera, Lens};
 use dipir_imaging::file::{self, Photo};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
@@ -87,6 +87,21 @@ impl LoadedScene {
     /// The photo as it was taken.
     pub fn taken(&self) -> &Photo {
         self.original.as_ref().map_or(&self.photo, |o| &o.photo)
+    }
+
+    /// The lens of the photo as it was taken.
+    pub fn lens(&self) -> Lens {
+        match &self.original {
+            Some(original) => *original.undistortion.lens(),
+            None => {
+                let camera = &self.scene.camera;
+                let size = camera.resolution.map(f64::from);
+                Lens {
+                    principal_px: camera.principal_px.as_dvec2(),
+                    ..Lens::pinhole(size, camera.focal_px.as_dvec2())
+                }
+            }
+        }
     }
 
     /// A picture of the photo's size, undistorted as the photo.

@@ -1,9 +1,11 @@
 //! Other photographs of the scene's place.
 use std::path::{Path, PathBuf};
 
+use dipir_cameras::Lens;
 use dipir_imaging::file::{Photo, read_photo_within};
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
+use glam::DVec2;
 
 use crate::camera::{Camera, CameraSettings, FieldOfView};
 use crate::config::ViewConfig;
@@ -22,8 +24,6 @@ pub struct ViewSettings {
     /// Its exposure over that of the scene's photograph, stops, if that is written.
     pub exposure_stops: Option<f64>,
     pub(crate) camera: CameraSettings,
-    /// Of the scene's camera, for a photograph that does not tell its own.
-    pub(crate) lens: Option<FieldOfView>,
     pub(crate) transfer: Transfer,
     pub(crate) limits: Limits,
 }
@@ -48,16 +48,17 @@ impl ViewSettings {
         }
     }
 
-    /// Reads the photograph and its camera, relative to `base_dir`.
+    /// Reads the photograph and its camera, relative to `base_dir`. `scene_lens` is that of the scene's
+    /// photograph as it was taken.
     ///
     /// # Errors
-    /// On files that cannot be used, and a field of view that nothing tells.
-    pub fn load(&self, base_dir: &Path) -> Result<View, Error> {
+    /// On files that cannot be used, and a focal length without a sensor.
+    pub fn load(&self, base_dir: &Path, scene_lens: &Lens) -> Result<View, Error> {
         let path = base_dir.join(&self.background);
         let taken = read_photo_within(path, self.transfer, self.limits.photo())?;
         let resolution = [taken.image.0.width() as u32, taken.image.0.height() as u32];
         let (camera, undistortion) = self
-            .with_lens(&taken)
+            .with_lens(&taken, scene_lens)
             .with_facts(&taken.facts)
             .and_then(|c| c.resolve(resolution, base_dir))
             .map_err(|e| e.moved("scene.camera", &self.key.replace("background", "camera")))?;
@@ -73,14 +74,30 @@ impl ViewSettings {
     }
 
     /// The camera with the scene's field of view, if neither the table nor the photograph tells one.
-    fn with_lens(&self, photo: &Photo) -> CameraSettings {
+    fn with_lens(&self, photo: &Photo, scene_lens: &Lens) -> CameraSettings {
         let mut camera = self.camera.clone();
-        if let (CameraSettings::LookAt { field_of_view, .. }, Some(lens)) = (&mut camera, self.lens)
+        if let CameraSettings::LookAt {
+            field_of_view,
+            distortion,
+            ..
+        } = &mut camera
             && *field_of_view == FieldOfView::Photograph
             && photo.facts.field_of_view_rad().is_none()
         {
-            *field_of_view = lens;
+            let angle_rad = vertical_rad(scene_lens, distortion.is_fisheye());
+            *field_of_view = FieldOfView::Vertical(angle_rad as f32);
         }
         camera
     }
+}
+
+/// The vertical field of view of a lens, radians: what counts as that of a fisheye, or of a lens that is none.
+fn vertical_rad(lens: &Lens, fisheye: bool) -> f64 {
+    let half = 0.5 * lens.size[1] / lens.focal_px.y;
+    let bent = lens.distortion.direction(DVec2::new(0.0, half));
+    let half_rad = match bent.filter(|_| fisheye) {
+        Some(direction) => direction.y.atan2(direction.z),
+        None => half.atan(),
+    };
+    2.0 * half_rad
 }

@@ -168,7 +168,7 @@ impl Header {
             if !understood {
                 return Err(format!(
                     "line {number}: \"{}\" is not understood",
-                    line.trim()
+                    shown(line.trim())
                 ));
             }
         }
@@ -177,6 +177,12 @@ impl Header {
             None => Err("the header has no format".into()),
         }
     }
+}
+
+/// The beginning of what a file says, for a message.
+fn shown(text: &str) -> String {
+    let beginning: String = text.chars().take(60).collect();
+    beginning.escape_debug().to_string()
 }
 
 /// Adds the property that `words` describe to the last element.
@@ -216,7 +222,7 @@ impl Input<'_> {
             return match word.parse() {
                 Ok(number) => Ok(number),
                 Err(_) if word.is_empty() => Err("the file ends here".into()),
-                Err(_) => Err(format!("\"{word}\" is not a number")),
+                Err(_) => Err(format!("\"{}\" is not a number", shown(&word))),
             };
         }
         Ok(match kind {
@@ -242,5 +248,33 @@ impl Input<'_> {
             bytes.reverse();
         }
         Ok(from(bytes))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bad_line_or_word_is_quoted_in_one_short_line() {
+        let (escapes, long) = ("\u{1b}[31m", "x".repeat(5000));
+        let header = format!("ply\n{escapes}{long}\n");
+        let message = Header::read(header.as_bytes()).unwrap_err();
+        let start = "line 2: \"\\u{1b}[31mxxx";
+        assert!(
+            message.starts_with(start) && message.len() < 100,
+            "{message}"
+        );
+        let text = format!("{escapes}{long} 1");
+        let mut input = Input {
+            rest: text.as_bytes(),
+            format: Format::Ascii,
+        };
+        let message = input.number(Scalar::F32).unwrap_err();
+        let start = "\"\\u{1b}[31mxxx";
+        assert!(
+            message.starts_with(start) && message.len() < 100,
+            "{message}"
+        );
     }
 }

@@ -26,7 +26,7 @@ pub struct ProxyConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("enum" = ["z", "y", "-y"]), extend("x-default" = "`y` for `.ply`; for COLMAP that of the camera's `file`, else `-y`; others `z`"), example = &"z")]
     pub points_up: Option<String>,
-    /// Metres of a unit of `points`.
+    /// Metres of a unit of `points`; a factor on the metres of a depth map.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "1; for COLMAP the camera's `file_scale`"), example = 0.01)]
     pub points_scale: Option<f32>,

@@ -66,7 +66,6 @@ impl ViewConfig {
             background,
             exposure_stops: self.exposure_stops,
             camera: settings,
-            lens: scene.camera.as_ref().and_then(|c| c.field_of_view().ok()),
             transfer: scene.transfer()?,
             limits: scene.limits,
         })

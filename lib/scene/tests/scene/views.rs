@@ -1,10 +1,11 @@
 //! Other photographs of the place.
 use std::path::Path;
 
+use dipir_cameras::{Distortion, Lens};
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_scene::config::SceneConfig;
 use dipir_scene::views::View;
-use glam::Vec3;
+use glam::{DVec2, Vec3};
 use serde_json::json;
 
 const SCENE: &str = "background = \"photo.png\"\n[camera]\n";
@@ -15,12 +16,18 @@ fn picture(folder: &Path, name: &str, [width, height]: [usize; 2]) {
     dipir_imaging::file::write_png(folder.join(name), &DisplayImage(grey)).unwrap();
 }
 
+/// Of the scene's photograph: 50 degrees of a picture of other pixels.
+fn lens() -> Lens {
+    let focal = 200.0 / 25f64.to_radians().tan();
+    Lens::pinhole([600.0, 400.0], DVec2::splat(focal))
+}
+
 /// The first view of a scene with this camera.
 fn view(folder: &Path, camera: &str, table: &str) -> Result<View, String> {
     let text = format!("{SCENE}{camera}[[views]]\n{table}");
     let config: SceneConfig = toml::from_str(&text).unwrap();
     let views = config.views().map_err(|e| e.to_string())?;
-    views[0].load(folder).map_err(|e| e.to_string())
+    views[0].load(folder, &lens()).map_err(|e| e.to_string())
 }
 
 fn forward(view: &View) -> Vec3 {
@@ -32,13 +39,39 @@ fn angles_turn_a_view_to_the_side_first() {
     let folder = tempfile::tempdir().unwrap();
     picture(folder.path(), "side.png", [60, 40]);
     let table = "background = \"side.png\"\ncamera = { heading_deg = 90, pitch_deg = 30 }";
-    let view = view(folder.path(), TYPED, table).unwrap();
     let (sin, cos) = 30f32.to_radians().sin_cos();
-    assert!(forward(&view).distance(Vec3::new(cos, sin, 0.0)) < 1e-5);
-    // Neither the table nor the photograph tells the field of view: it is the scene's, along the height.
-    let focal = 20.0 / 25f32.to_radians().tan();
-    assert!((view.camera.focal_px.x - focal).abs() < 1e-3);
-    assert_eq!(view.camera.resolution, [60, 40]);
+    // Neither the table nor the photograph tells the field of view: it is the scene's, along the height, whatever
+    // tells that.
+    let exif = "position = [0, 1, 4]\npitch_deg = -8\n";
+    for camera in [TYPED, exif, "file = \"transforms.json\"\n"] {
+        let view = view(folder.path(), camera, table).unwrap();
+        assert!(forward(&view).distance(Vec3::new(cos, sin, 0.0)) < 1e-5);
+        let focal = 20.0 / 25f32.to_radians().tan();
+        assert!((view.camera.focal_px.x - focal).abs() < 1e-3);
+        assert_eq!(view.camera.resolution, [60, 40]);
+    }
+}
+
+#[test]
+fn a_view_with_the_scenes_fisheye_has_its_focal_length() {
+    let folder = tempfile::tempdir().unwrap();
+    picture(folder.path(), "b.png", [60, 40]);
+    let text = format!(
+        "{SCENE}{TYPED}[[views]]\nbackground = \"b.png\"\n\
+         camera = {{ heading_deg = 90, distortion = {{ fisheye = true, k1 = -0.02 }} }}"
+    );
+    let config: SceneConfig = toml::from_str(&text).unwrap();
+    let scene_lens = Lens {
+        distortion: Distortion::kannala_brandt([-0.02, 0.0, 0.0, 0.0]).unwrap(),
+        ..Lens::pinhole([600.0, 400.0], DVec2::splat(170.0))
+    };
+    let views = config.views().unwrap();
+    let view = views[0].load(folder.path(), &scene_lens).unwrap();
+    assert!(
+        (view.camera.focal_px.y - 17.0).abs() < 1e-3,
+        "{}",
+        view.camera.focal_px
+    );
 }
 
 #[test]
@@ -85,7 +118,6 @@ fn a_lens_that_bends_lines_is_undone() {
 fn wrong_views_are_explained_by_their_keys() {
     let folder = tempfile::tempdir().unwrap();
     picture(folder.path(), "b.png", [60, 40]);
-    let exif = "position = [0, 1, 4]\npitch_deg = -8\n";
     for (camera, table, wanted) in [
         (
             TYPED,
@@ -118,9 +150,9 @@ fn wrong_views_are_explained_by_their_keys() {
             "scene.views[0].camera.pitch_deg and scene.views[0].camera.up cannot both be given",
         ),
         (
-            exif,
-            "background = \"b.png\"\ncamera = { heading_deg = 90 }",
-            "scene.views[0].camera.fov_deg is missing; the photograph does not say it",
+            TYPED,
+            "background = \"b.png\"\ncamera = { heading_deg = 90, focal_mm = 50 }",
+            "scene.views[0].camera.sensor_mm is missing; the photograph does not say which sensor took it",
         ),
         (
             TYPED,

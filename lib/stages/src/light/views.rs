@@ -61,7 +61,7 @@ pub(super) fn estimate(
     }];
     let mut seen = Vec::new();
     for settings in settings(session)? {
-        let view = read(session, &settings)?;
+        let view = read(session, loaded, &settings)?;
         let stops = settings
             .exposure_stops
             .or_else(|| between(loaded.taken(), &view.taken));
@@ -86,10 +86,10 @@ pub(super) fn estimate(
     Ok((combine(&all)?, seen))
 }
 
-fn read(session: &Session, settings: &ViewSettings) -> anyhow::Result<View> {
+fn read(session: &Session, loaded: &LoadedScene, settings: &ViewSettings) -> anyhow::Result<View> {
     use dipir_scene::Error::{Config, Conflict, Missing};
     let view = settings
-        .load(&session.config.base_dir())
+        .load(&session.config.base_dir(), &loaded.lens())
         .map_err(|e| match e {
             Config { .. } | Missing { .. } | Conflict { .. } => with_place(e, &session.config),
             other => anyhow::Error::new(other).context(cannot_use(settings)),

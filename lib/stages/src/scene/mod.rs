@@ -79,7 +79,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     composite.check(&session.config)?;
     let mut loaded = Scene::load(&config, &session.config.base_dir())
         .map_err(|e| with_place(e, &session.config))?;
-    for warning in loaded.warnings.iter().chain(&implausible(&loaded.scene)) {
+    for warning in loaded.warnings.iter().chain(&implausible(&loaded)) {
         session.warn(warning);
     }
     let table: LightTable = session.config.table("light")?;
