@@ -1,12 +1,14 @@
 //! `dipir run --plan`: what a run would do and take, before anything starts.
 use dipir_cli::interrupt;
 use dipir_cli::session::{Session, duration, size};
+use dipir_pipeline::fingerprint::StaleReason;
 use dipir_pipeline::graph::{Graph, Node};
 use dipir_pipeline::manifest::{Manifest, peak_rss_bytes};
 use dipir_pipeline::status::State;
+use dipir_stages::composite::table::CompositeTable;
 use dipir_stages::graph;
 use dipir_stages::model::{self, ModelTable, forecast};
-use dipir_stages::names::{CONCEPTS, LIGHT, LORA};
+use dipir_stages::names::{COMPOSITE, CONCEPTS, LIGHT, LORA};
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -19,6 +21,53 @@ struct Expected {
     seconds: Option<f64>,
     peak_rss_bytes: Option<u64>,
     from: &'static str,
+}
+
+impl Expected {
+    fn idle(stage: &'static str) -> Self {
+        Self {
+            stage,
+            runs: false,
+            seconds: None,
+            peak_rss_bytes: None,
+            from: "it does not run",
+        }
+    }
+
+    /// By the run before, if any; `changed` says that it had other settings. Their time tells less than a budget.
+    fn running(
+        stage: &'static str,
+        earlier: Option<Manifest>,
+        changed: bool,
+        budget_s: Option<f64>,
+    ) -> Self {
+        let (seconds, from) = match (&earlier, changed) {
+            (Some(earlier), false) => (Some(earlier.elapsed_s), "as it took the last time"),
+            (_, _) if budget_s.is_some() => (budget_s, "its time budget"),
+            (Some(earlier), true) => (
+                Some(earlier.elapsed_s),
+                "as it took the last time, with other settings",
+            ),
+            (None, _) => (None, "nothing is known: it has not run here"),
+        };
+        Self {
+            stage,
+            runs: true,
+            seconds,
+            peak_rss_bytes: earlier.and_then(|e| e.peak_rss_bytes),
+            from,
+        }
+    }
+}
+
+/// Whether the outputs that are there were made with other parameters.
+fn has_other_settings(state: &State) -> bool {
+    let reasons = match state {
+        State::Stale { reasons } | State::Waits { reasons, .. } => reasons,
+        State::Fresh | State::Blocked { .. } | State::Unneeded { .. } => return false,
+    };
+    let is_parameter = |r: &StaleReason| matches!(r, StaleReason::Parameter { .. });
+    reasons.iter().any(is_parameter)
 }
 
 /// The stages of a run with their expected time and memory, for people and for programs.
@@ -35,18 +84,15 @@ pub fn plan(
         let idle = state.is_none_or(|s| matches!(s.state, State::Unneeded { .. }))
             || (!force && state.is_some_and(|s| matches!(s.state, State::Fresh)));
         let earlier = Manifest::read(&session.stage_folder(node.stage), "").ok();
-        let mut expected = Expected {
-            stage: node.stage,
-            runs: !idle,
-            seconds: None,
-            peak_rss_bytes: None,
-            from: "nothing is known: it has not run here",
+        let changed = state.is_some_and(|s| has_other_settings(&s.state));
+        let budget = match node.stage == COMPOSITE.name && (changed || earlier.is_none()) {
+            true => session.config.table("composite")?,
+            false => CompositeTable::default(),
         };
-        if let (true, Some(earlier)) = (expected.runs, earlier) {
-            expected.seconds = Some(earlier.elapsed_s);
-            expected.peak_rss_bytes = earlier.peak_rss_bytes;
-            expected.from = "as it took the last time";
-        }
+        let expected = match idle {
+            true => Expected::idle(node.stage),
+            false => Expected::running(node.stage, earlier, changed, budget.time_budget_s),
+        };
         all.push(expected);
     }
     measure(session, &mut all)?;
@@ -97,15 +143,86 @@ fn in_words(all: &[Expected]) -> String {
             }
         });
     }
-    let known: f64 = all.iter().filter_map(|e| e.seconds).sum();
+    let known: Vec<f64> = all.iter().filter_map(|e| e.seconds).collect();
+    let sum = duration(known.iter().fold(0.0, |sum, s| sum + s));
     let open = all.iter().filter(|e| e.runs && e.seconds.is_none()).count();
-    lines.push(match open {
-        0 => format!("{:10} about {}", "together", duration(known)),
-        n => format!(
-            "{:10} about {} and {n} of which nothing is known",
-            "together",
-            duration(known)
-        ),
-    });
+    let together = match (known.len(), open) {
+        (0, 0) => "nothing to do".to_string(),
+        (0, _) => "nothing is known".to_string(),
+        (_, 0) => format!("about {sum}"),
+        (_, n) => format!("about {sum} and {n} of which nothing is known"),
+    };
+    lines.push(format!("{:10} {together}", "together"));
     lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn manifest() -> Manifest {
+        Manifest {
+            schema: 2,
+            stage: COMPOSITE.name.into(),
+            version: 1,
+            params: Value::Null,
+            seed: 0,
+            device: "cpu".into(),
+            inputs: vec![],
+            outputs: vec![],
+            elapsed_s: 8.5,
+            timings_s: Default::default(),
+            peak_rss_bytes: Some(1 << 30),
+            estimated_error: None,
+        }
+    }
+
+    #[test]
+    fn an_earlier_time_with_other_settings_is_said_to_be_one() {
+        let of = |earlier: bool, changed, budget| {
+            let earlier = earlier.then(manifest);
+            let e = Expected::running(COMPOSITE.name, earlier, changed, budget);
+            (e.seconds, e.from)
+        };
+        let last = "as it took the last time";
+        assert_eq!(of(true, false, Some(60.0)), (Some(8.5), last));
+        let other = "as it took the last time, with other settings";
+        assert_eq!(of(true, true, None), (Some(8.5), other));
+        assert_eq!(of(true, true, Some(60.0)), (Some(60.0), "its time budget"));
+        assert_eq!(
+            of(false, false, Some(60.0)),
+            (Some(60.0), "its time budget")
+        );
+        assert_eq!(of(false, false, None).0, None);
+        let parameter = StaleReason::Parameter {
+            key: "quality".into(),
+            was: None,
+            now: None,
+        };
+        let on = vec!["scene"];
+        for (reason, is) in [(parameter, true), (StaleReason::NeverRun, false)] {
+            let reasons = vec![reason];
+            let stale = State::Stale {
+                reasons: reasons.clone(),
+            };
+            assert_eq!(has_other_settings(&stale), is);
+            let on = on.clone();
+            assert_eq!(has_other_settings(&State::Waits { on, reasons }), is);
+        }
+    }
+
+    #[test]
+    fn the_sum_is_of_what_runs() {
+        let idle = || Expected::idle("scene");
+        assert!(in_words(&[idle()]).ends_with("together   nothing to do"));
+        assert!(!json!([idle()]).to_string().contains("has not run here"));
+        let runs = |earlier| Expected::running("light", earlier, false, None);
+        assert!(in_words(&[idle(), runs(None)]).ends_with("together   nothing is known"));
+        assert!(in_words(&[idle(), runs(Some(manifest()))]).ends_with("about 8.50 s"));
+        let text = in_words(&[runs(Some(manifest())), runs(None)]);
+        assert!(
+            text.ends_with("about 8.50 s and 1 of which nothing is known"),
+            "{text}"
+        );
+    }
 }

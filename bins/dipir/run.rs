@@ -16,7 +16,7 @@ use dipir_pipeline::graph::{Graph, Node};
 use dipir_pipeline::hashing::Hashes;
 use dipir_pipeline::lock::{FolderLock, WhenLocked};
 use dipir_pipeline::runner::{self, Stopped, Work};
-use dipir_pipeline::status::State;
+use dipir_pipeline::status::{self, State};
 use dipir_stages::graph;
 use dipir_stages::truth::Truth;
 use serde_json::{Value, json};
@@ -133,6 +133,7 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
 fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String, Value)> {
     let (session, graph) = project.open()?;
     let nodes = selected(args, &graph)?;
+    check_taken(&session, &nodes)?;
     if args.plan {
         return plan::plan(&session, &graph, &nodes, args.force);
     }
@@ -187,6 +188,25 @@ fn selected<'a>(args: &RunArgs, graph: &'a Graph) -> anyhow::Result<Vec<&'a Node
         nodes.retain(|n| reached.contains(n));
     }
     Ok(nodes)
+}
+
+/// Refuses damaged files of stages that `--from` leaves out: no stage of the run would write them again.
+fn check_taken(session: &Session, nodes: &[&Node]) -> anyhow::Result<()> {
+    let runs = |stage: &str| nodes.iter().any(|n| n.stage == stage);
+    for node in nodes {
+        let taken: Vec<_> = node.reads.iter().filter(|s| !runs(s)).collect();
+        if taken.is_empty() {
+            continue;
+        }
+        // Without a plan its executable says what is wrong.
+        let Ok(plan) = graph::plan(session, node.stage) else {
+            continue;
+        };
+        for stage in taken {
+            status::check_taken(&plan, &session.stage_folder(stage))?;
+        }
+    }
+    Ok(())
 }
 
 fn all_fresh(session: &Session, graph: &Graph, nodes: &[&Node]) -> anyhow::Result<bool> {

@@ -53,7 +53,9 @@ pub struct CommonArgs {
 }
 
 /// Options about what is printed.
+// Every command has them, and so takes a negative number for a value: the option refuses it in words of its own.
 #[derive(Args, Clone, Copy, Debug, Default)]
+#[command(allow_negative_numbers = true)]
 pub struct OutputArgs {
     /// Print the result as JSON
     #[arg(long, global = true)]
@@ -66,4 +68,26 @@ pub struct OutputArgs {
     /// Print more about what is done
     #[arg(long, short = 'v', global = true)]
     pub verbose: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Cli {
+        #[arg(long)]
+        eye_height: f64,
+        #[command(flatten)]
+        output: OutputArgs,
+    }
+
+    #[test]
+    fn a_negative_number_is_a_value() {
+        let cli = Cli::try_parse_from(["x", "--eye-height", "-1", "-q"]).unwrap();
+        assert_eq!((cli.eye_height, cli.output.quiet), (-1.0, true));
+        assert!(Cli::try_parse_from(["x", "--eye-height", "-x"]).is_err());
+    }
 }

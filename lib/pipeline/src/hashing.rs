@@ -10,6 +10,7 @@ use std::fs::{File, Metadata};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
+use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
 
@@ -51,13 +52,13 @@ impl Identity {
     }
 
     /// Whether a change from now on would show in the times.
-    fn is_settled(&self) -> bool {
+    fn is_settled(&self, now: SystemTime) -> bool {
         // A tick is 10 ms at most on systems with fine clocks, 2 s on FAT.
         let tick_ns: i128 = match self.changed_ns % 1_000_000_000 {
             0 => 2_000_000_000,
             _ => 50_000_000,
         };
-        let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+        let now = now.duration_since(SystemTime::UNIX_EPOCH);
         let now = now.map_or(0, |d| d.as_nanos() as i128);
         now - self.changed_ns.max(self.modified_ns) > tick_ns
     }
@@ -160,13 +161,17 @@ impl Hashes {
 /// Length and BLAKE3 hash of a regular file. One that was hashed before and has not changed since
 /// is not read again.
 pub fn hash_file(path: &Path) -> Result<(u64, String), StageError> {
+    hash_at(path, SystemTime::now())
+}
+
+fn hash_at(path: &Path, now: SystemTime) -> Result<(u64, String), StageError> {
     let failed = |e| StageError::io("read", path, e);
     let mut file = dipir_files::open(path).map_err(failed)?;
     let before = Identity::of(&file.metadata().map_err(failed)?);
     if let Some(known) = before.and_then(|id| shared().known.get(&id).cloned()) {
         return Ok((before.map_or(0, |id| id.bytes), known));
     }
-    let before = before.filter(Identity::is_settled);
+    let before = before.filter(|id| id.is_settled(now));
     let (bytes, hash) = hash(&mut file).map_err(failed)?;
     let after = Identity::of(&file.metadata().map_err(failed)?);
     let mut shared = shared();
@@ -217,13 +222,15 @@ fn fill(file: &mut File, buffer: &mut [u8]) -> std::io::Result<usize> {
 #[cfg(test)]
 mod tests {
     use std::fs;
+    #[cfg(unix)]
+    use std::time::Duration;
 
     use super::*;
 
-    /// Long enough that a file is not young any more.
+    /// The hash, taken when the file is not young any more.
     #[cfg(unix)]
-    fn settle() {
-        std::thread::sleep(std::time::Duration::from_millis(80));
+    fn hash_later(path: &Path) -> (u64, String) {
+        hash_at(path, SystemTime::now() + Duration::from_secs(3)).unwrap()
     }
 
     fn reads_of(path: &Path) -> u32 {
@@ -259,20 +266,19 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         fs::write(&path, "one").unwrap();
-        settle();
-        let first = hash_file(&path).unwrap();
-        assert_eq!(hash_file(&path).unwrap(), first);
+        let first = hash_later(&path);
+        assert_eq!(hash_later(&path), first);
         assert_eq!(reads_of(&path), 1);
         // The same length, and the time of its last modification set back.
-        let time = fs::metadata(&path).unwrap().modified().unwrap();
-        fs::write(&path, "two").unwrap();
-        File::options()
-            .write(true)
-            .open(&path)
-            .unwrap()
-            .set_modified(time)
-            .unwrap();
-        assert_ne!(hash_file(&path).unwrap(), first);
+        let found = || fs::metadata(&path).unwrap();
+        let (time, was) = (found().modified().unwrap(), Identity::of(&found()));
+        // Until a tick of the file system's clock shows it.
+        while Identity::of(&found()) == was {
+            fs::write(&path, "two").unwrap();
+            let file = File::options().write(true).open(&path).unwrap();
+            file.set_modified(time).unwrap();
+        }
+        assert_ne!(hash_later(&path), first);
         assert_eq!(reads_of(&path), 2);
     }
 
@@ -294,8 +300,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let (path, handed) = (folder.path().join("a"), folder.path().join("hashes"));
         fs::write(&path, "one").unwrap();
-        settle();
-        let (_, hash) = hash_file(&path).unwrap();
+        let (_, hash) = hash_later(&path);
         Hashes::to_hand_over().write(&handed).unwrap();
         let read = Hashes::read(&handed);
         assert!(read.reads().is_empty());

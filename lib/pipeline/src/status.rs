@@ -13,6 +13,7 @@ use serde::Serialize;
 use crate::error::StageError;
 use crate::fingerprint::{StaleReason, in_words, stale_reasons};
 use crate::graph::{Graph, Node};
+use crate::manifest::Manifest;
 use crate::stage::StagePlan;
 
 /// Whether a stage has to run.
@@ -90,6 +91,19 @@ pub fn state_of(plan: Result<StagePlan, String>, folder: &Path) -> Result<State,
             reasons => State::Stale { reasons },
         },
     })
+}
+
+/// Refuses the outputs of an earlier stage in `folder` that `plan` reads if they are damaged, as their reader
+/// would.
+pub fn check_taken(plan: &StagePlan, folder: &Path) -> Result<(), StageError> {
+    let earlier = Manifest::read(folder, "")?;
+    for output in &earlier.outputs {
+        let path = Path::new(&earlier.stage).join(&output.path);
+        if plan.inputs.iter().any(|i| i.path == path) {
+            earlier.output(folder, &output.role)?;
+        }
+    }
+    Ok(())
 }
 
 /// The state of every stage of `graph`. `plan` says what a run would be, or why there can be none;
@@ -231,5 +245,25 @@ mod tests {
         let file = out.path().join("c/x");
         let start = format!("stale: {}: damaged: its BLAKE3 hash is", file.display());
         assert!(damaged.starts_with(&start), "{damaged}");
+    }
+
+    #[test]
+    fn damage_of_what_is_read_is_told_and_other_damage_is_not() {
+        let out = tempfile::tempdir().unwrap();
+        let folder = out.path().join("a");
+        let plan = StagePlan::new("a", 1, json!({}), 0);
+        let mut writer = StageWriter::begin(&folder, plan, WhenLocked::Refuse).unwrap();
+        for name in ["x", "y"] {
+            fs::write(writer.output(name, name).unwrap(), name).unwrap();
+        }
+        writer.finish().unwrap();
+        let mut plan = StagePlan::new("b", 1, json!({}), 0);
+        let earlier = Manifest::read(&folder, "").unwrap();
+        plan.outputs_of(&earlier, &["x"]).unwrap();
+        fs::write(folder.join("y"), "damaged").unwrap();
+        assert!(check_taken(&plan, &folder).is_ok());
+        fs::write(folder.join("x"), "damaged").unwrap();
+        let message = check_taken(&plan, &folder).unwrap_err().to_string();
+        assert!(message.ends_with("run the stage \"a\" again"), "{message}");
     }
 }
