@@ -6,14 +6,14 @@ use glam::{Quat, Vec3};
 
 use crate::estimate::LightEstimate;
 use crate::grid::{BINS, bin_direction};
-use crate::posterior::words;
+use crate::posterior::{soft_bins, words};
 
 /// Candidates stand at least this far apart, degrees.
 const APART_DEG: f32 = 40.0;
 /// Width of a candidate's source, radians: a sun's shadows, softened by a few degrees.
 const SOURCE_SIGMA: f32 = 0.03;
-/// A source that is there is at most this many times as strong as it is expected to be.
-const MOST_ENERGY: f64 = 4.0;
+/// Lights that are less probable than this are not shown.
+const LEAST: f64 = 1e-4;
 /// Lobes of the smooth part.
 const BASE_LOBES: usize = 12;
 
@@ -34,7 +34,7 @@ pub struct Candidate {
 
 impl LightEstimate {
     /// At most `count` lights, the most probable first: soft light without a sun, and suns that stand at least 40
-    /// degrees apart.
+    /// degrees apart, or the one sun whose direction is known.
     pub fn candidates(&self, count: usize) -> Vec<Candidate> {
         if count == 0 {
             return Vec::new();
@@ -47,11 +47,20 @@ impl LightEstimate {
             map: self.map(),
             lobes: self.lobes(2 * BASE_LOBES),
         }];
-        let centres = self.centres(count - 1);
-        let shares = self.shares(&centres);
-        for (k, share) in centres.iter().zip(&shares) {
-            all.push(self.sun(*k, self.sun_probability * share, &base));
+        let suns = match self.source {
+            Some(source) => vec![(source.direction, 1.0)],
+            None => {
+                let centres = self.centres(count - 1);
+                let shares = self.shares(&centres);
+                let to_world = Quat::from_rotation_y(-self.heading_rad as f32);
+                let towards = centres.iter().map(|k| to_world * bin_direction(*k));
+                towards.zip(shares).collect()
+            }
+        };
+        for (direction, share) in suns {
+            all.push(self.sun(direction, self.sun_probability * share, &base));
         }
+        all.retain(|c| c.probability > LEAST);
         let total: f64 = all.iter().map(|c| c.probability).sum();
         all.iter_mut()
             .for_each(|c| c.probability /= total.max(1e-12));
@@ -93,24 +102,26 @@ impl LightEstimate {
         shares
     }
 
-    fn sun(&self, bin: usize, probability: f64, base: &[SphericalGaussian]) -> Candidate {
-        let energy = (1.0 / self.sun_probability.max(1e-3)).min(MOST_ENERGY) as f32;
-        let mut weights = [0.0; BINS];
-        weights[bin] = 1.0;
-        let direction = Quat::from_rotation_y(-self.heading_rad as f32) * bin_direction(bin);
+    fn sun(&self, direction: Vec3, probability: f64, base: &[SphericalGaussian]) -> Candidate {
+        let peak = Vec3::from(self.peak) * self.energy_of_sun();
+        let sigma = SOURCE_SIGMA;
         let mut source = SphericalGaussian {
             direction,
             radiance: Vec3::ONE,
-            sigma: SOURCE_SIGMA,
+            sigma,
         };
-        source.radiance = Vec3::from(self.peak) * energy / source.solid_angle() as f32;
+        if let Some(known) = self.source_lobe() {
+            source.sigma = known.sigma;
+        }
+        source.radiance = peak / source.solid_angle() as f32;
         let mut lobes = vec![source];
         lobes.extend_from_slice(base);
+        let seen = Quat::from_rotation_y(self.heading_rad as f32) * direction;
         Candidate {
             probability,
-            words: words(bin_direction(bin)),
+            words: words(seen),
             direction: Some(direction),
-            map: self.map_with(&weights, energy),
+            map: self.map_with(&soft_bins(seen), self.energy_of_sun()),
             lobes,
         }
     }

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::estimate::{Interval, LightEstimate};
 use crate::grid::{BINS, bin_direction, direction};
-use crate::posterior::PeakPosterior;
+use crate::posterior::{PeakPosterior, words};
 
 /// Standard deviation of a direction within a bin, degrees: a bin is 15 degrees wide.
 const BIN_SIGMA_DEG: f64 = 4.4;
@@ -17,6 +17,12 @@ const SHARP_DEG: f64 = 6.0;
 const SUN_RADIUS_DEG: f64 = 0.27;
 /// The same behind clouds or haze.
 const HAZE_RADIUS_DEG: f64 = 10.0;
+/// A sun is a source with at least this share of all light.
+const LEAST_SHARE: f64 = 0.2;
+/// A source that is there is at most this many times as strong as it is expected to be.
+const MOST_ENERGY: f64 = 4.0;
+/// Standard deviations to either side that hold 80% of a normal variable.
+const NORMAL_80: f64 = 1.2816;
 /// A sun this far below the horizon lights nothing, degrees.
 const SET_DEG: f64 = -1.0;
 
@@ -27,6 +33,14 @@ pub struct KnownAngle {
     pub deg: f64,
     /// Its standard deviation.
     pub sigma_deg: f64,
+}
+
+impl KnownAngle {
+    /// The middle 80%, turned by `turn_deg`.
+    fn interval(&self, turn_deg: f64) -> Interval {
+        let (deg, half) = (self.deg + turn_deg, NORMAL_80 * self.sigma_deg);
+        Interval::new(deg - half, deg, deg + half)
+    }
 }
 
 /// What is known of the strongest source.
@@ -40,6 +54,8 @@ pub struct KnownSun {
     pub radius_deg: Option<f64>,
     /// Its share of all light.
     pub share: Option<f64>,
+    /// Whether it is known to shine: somebody saw it or a shadow that it casts. A clock does not know of clouds.
+    pub shines: bool,
 }
 
 /// A source whose direction is known.
@@ -76,6 +92,14 @@ impl LightEstimate {
             prior * (-0.5 * far).exp()
         };
         known.posterior = PeakPosterior::normalised((0..BINS).map(weight).collect());
+        if sun.shines {
+            let energy = known.energy_of_sun();
+            known.peak = known.peak.map(|p| p * energy);
+            known.sun_probability = 1.0;
+            let Interval { low, middle, high } = known.share;
+            let [low, middle, high] = [low, middle, high].map(|s| s.max(LEAST_SHARE));
+            known.share = Interval::new(low, middle, high);
+        }
         if let Some(share) = sun.share {
             known.set_share(share);
             known.share = Interval::new(share, share, share);
@@ -95,8 +119,20 @@ impl LightEstimate {
                 direction: Quat::from_rotation_y(-self.heading_rad as f32) * seen,
                 radius_deg: sun.radius_deg.unwrap_or(default),
             });
+            known = known.described();
+            // A bin is wider than what is known.
+            known.words = words(seen);
+            let turn = (azimuth.deg + 180.0).rem_euclid(360.0) - 180.0 - azimuth.deg;
+            known.azimuth_deg = azimuth.interval(turn);
+            known.elevation_deg = elevation.interval(0.0);
+            return known;
         }
         known.described()
+    }
+
+    /// How many times as strong as expected the strongest source is, if it is a sun.
+    pub(crate) fn energy_of_sun(&self) -> f32 {
+        (1.0 / self.sun_probability.max(1e-3)).min(MOST_ENERGY) as f32
     }
 
     /// Moves light between the strongest source and the rest, so that the source has `share` of it.
@@ -191,6 +227,60 @@ mod tests {
     }
 
     #[test]
+    fn a_sun_that_somebody_saw_is_as_strong_and_as_sharp_as_a_sun() {
+        let hazy = LightEstimate {
+            sun_probability: 0.4,
+            ..open()
+        };
+        let mut sun = KnownSun {
+            azimuth: angle(-200.0, 3.0),
+            elevation: angle(31.0, 3.0),
+            ..KnownSun::default()
+        };
+        let energy = |e: &LightEstimate| {
+            let lobe = e.source_lobe().unwrap();
+            (lobe.radiance.x * lobe.solid_angle() as f32, lobe.sigma)
+        };
+        let by_clock = hazy.knowing(&sun);
+        sun.shines = true;
+        let seen = hazy.knowing(&sun);
+        assert_eq!((by_clock.sun_probability, seen.sun_probability), (0.4, 1.0));
+        let (expected, wide) = energy(&by_clock);
+        let (there, narrow) = energy(&seen);
+        assert!(
+            (there / expected - 2.5).abs() < 1e-4,
+            "{there} of {expected}"
+        );
+        assert!((wide / narrow - 10.0 / 0.27).abs() < 1e-3);
+        assert!(seen.share.low >= 0.2);
+        // The words and the intervals are what is known, not what bins of 15 degrees hold.
+        assert_eq!(seen.words, "from behind, 31 degrees high");
+        assert!((seen.azimuth_deg.middle - 160.0).abs() < 1e-9);
+        assert!(seen.elevation_deg.high - seen.elevation_deg.low < 7.7);
+        // Other suns are not possible, nor is light without one.
+        let [only] = &seen.candidates(8)[..] else {
+            panic!("{:?}", seen.candidates(8).len())
+        };
+        let source = seen.source.unwrap();
+        assert_eq!(
+            (only.direction, only.probability),
+            (Some(source.direction), 1.0)
+        );
+        assert_eq!(only.lobes[0], seen.source_lobe().unwrap());
+        // A clock knows where the sun is, and not whether it shines.
+        let [soft, sunny] = &by_clock.candidates(8)[..] else {
+            panic!("{:?}", by_clock.candidates(8).len())
+        };
+        assert_eq!(
+            (soft.direction, sunny.direction),
+            (None, Some(source.direction))
+        );
+        let bright = |c: &crate::Candidate| c.map.integral().element_sum();
+        assert!((sunny.probability - 0.4).abs() < 1e-9);
+        assert!(bright(sunny) > 1.2 * bright(soft));
+    }
+
+    #[test]
     fn a_direction_that_is_known_badly_is_no_source_of_its_own() {
         let sun = KnownSun {
             azimuth: angle(-40.0, 20.0),
@@ -268,6 +358,7 @@ mod tests {
                             elevation: angle(deg.clamp(-0.5, 90.0), sigma),
                             radius_deg: Some(0.27),
                             share: Some(share),
+                            shines: share > 0.5,
                         };
                         let after = before.knowing(&sun);
                         let weights: f32 = after.posterior.weights.iter().sum();

@@ -22,16 +22,16 @@ pub struct SunTable {
     /// Longitude of the place, degrees east. It belongs to `latitude`.
     #[schemars(range(min = -180.0, max = 360.0), extend("x-default" = "the photograph's own"), example = 11.6)]
     pub longitude: Option<f64>,
-    /// Where the camera looked, degrees clockwise from north.
+    /// Where the camera looked, degrees clockwise from true north.
     #[schemars(range(min = -360.0, max = 360.0), extend("x-default" = "the photograph's own"), example = 225.0)]
     pub heading_deg: Option<f64>,
     /// Standard deviation of the heading, degrees.
-    #[schemars(range(min = 0.0, max = 180.0), extend("default" = COMPASS_SIGMA_DEG), example = 5.0)]
+    #[schemars(range(min = 0.0, max = 180.0), extend("x-default" = "10; 14 for the photograph's own heading from magnetic north"), example = 5.0)]
     pub heading_sure_deg: Option<f64>,
-    /// Azimuth of the sun, degrees clockwise, counted from `relative_to`. It replaces `time`.
+    /// Azimuth of the sun, degrees clockwise, counted from `relative_to`. It replaces `time`, and says that the sun shines.
     #[schemars(range(min = -360.0, max = 360.0), example = 60.0)]
     pub azimuth_deg: Option<f64>,
-    /// Elevation of the sun, degrees above the horizon. It replaces `time`.
+    /// Elevation of the sun, degrees above the horizon. It replaces `time`, and says that the sun shines.
     #[schemars(range(min = -90.0, max = 90.0), example = 35.0)]
     pub elevation_deg: Option<f64>,
     /// From where `azimuth_deg` counts.
@@ -65,6 +65,9 @@ pub enum RelativeTo {
 const SAID_SIGMA_DEG: f64 = 3.0;
 /// Standard deviation of a compass in a telephone or a hand, degrees.
 const COMPASS_SIGMA_DEG: f64 = 10.0;
+/// By how much magnetic north may be off true north, degrees: 20 in the north-west of America, the south of Africa and
+/// New Zealand, 0 to 10 in most other inhabited places.
+const DECLINATION_SIGMA_DEG: f64 = 10.0;
 /// By how much a clock of an unknown zone may be off the zone of its place: summer time.
 const ZONE_SIGMA_S: f64 = 3600.0;
 
@@ -79,6 +82,8 @@ pub struct Taken {
     pub longitude_deg: Option<f64>,
     /// Degrees clockwise from north.
     pub heading_deg: Option<f64>,
+    /// Whether that is magnetic north.
+    pub heading_is_magnetic: bool,
 }
 
 /// What is known of the sun, in angles of the world.
@@ -256,7 +261,11 @@ impl SunTable {
             .heading_deg
             .or(taken.heading_deg)
             .filter(|d| d.is_finite())?;
-        let sigma_deg = self.heading_sure_deg.unwrap_or(COMPASS_SIGMA_DEG);
+        let by_compass = match self.heading_deg.is_none() && taken.heading_is_magnetic {
+            true => COMPASS_SIGMA_DEG.hypot(DECLINATION_SIGMA_DEG),
+            false => COMPASS_SIGMA_DEG,
+        };
+        let sigma_deg = self.heading_sure_deg.unwrap_or(by_compass);
         Some(Angle { deg, sigma_deg })
     }
 
@@ -390,6 +399,7 @@ mod tests {
             latitude_deg: Some(48.0),
             longitude_deg: Some(0.0),
             heading_deg: Some(180.0),
+            heading_is_magnetic: false,
         };
         let got = known("", &taken, DVec3::NEG_Z).unwrap();
         let (azimuth, elevation) = (got.azimuth.unwrap(), got.elevation.unwrap());
@@ -400,6 +410,20 @@ mod tests {
             known("", &Taken::default(), DVec3::NEG_Z).unwrap(),
             Known::default()
         );
+        let taken = Taken {
+            time: Some("2026-06-21T12:02:00Z".into()),
+            heading_is_magnetic: true,
+            ..taken
+        };
+        let sigma = |text| {
+            known(text, &taken, DVec3::NEG_Z)
+                .unwrap()
+                .azimuth
+                .unwrap()
+                .sigma_deg
+        };
+        assert!((sigma("") - 14.14).abs() < 0.05, "{}", sigma(""));
+        assert!((sigma("heading_deg = 180") - 10.0).abs() < 0.05);
     }
 
     #[test]

@@ -145,6 +145,7 @@ fn known_sun(
         latitude_deg: facts.latitude_deg,
         longitude_deg: facts.longitude_deg,
         heading_deg: facts.heading.map(|h| h.deg),
+        heading_is_magnetic: facts.heading.is_some_and(|h| h.magnetic),
     };
     let sun = table.sun.clone().unwrap_or_default();
     let wrong = |key: &str, e: String| session.config.invalid(key, e);
@@ -193,5 +194,6 @@ fn known_sun(
         elevation: known.elevation.map(|a| angle(a, 0.0)),
         radius_deg: known.radius_deg,
         share: known.share,
+        shines: sun.azimuth_deg.is_some() || sun.elevation_deg.is_some() || table.shadow.is_some(),
     }))
 }

@@ -159,7 +159,17 @@ impl Request {
             start
         });
         let mut params = match &self.guide {
-            Guide::None => json!({"lobes": settings.lobes, "start": table.start}),
+            Guide::None => {
+                let mut params = json!({"lobes": settings.lobes, "start": table.start});
+                if self.start != First::Estimated {
+                    params["environment"] = json!(settings.environment);
+                }
+                // The mean of the photograph at that size.
+                if self.start == First::Neutral {
+                    params["size"] = json!(settings.size);
+                }
+                params
+            }
             Guide::Reference { .. } => {
                 json!({"light": settings, "guidance": GuidanceKind::Reference})
             }
