@@ -63,7 +63,7 @@ pub struct EstimatedError {
     pub rmse: f64,
     /// One-sided 95% confidence bound of it.
     pub upper_95: f64,
-    /// Those pixels.
+    /// Those pixels, without the ones that a time budget left to a coarser picture.
     pub touched_pixels: u64,
 }
 
@@ -225,7 +225,7 @@ pub(crate) fn refine(
             film.develop(&jobs[begun..]);
         }
         let (errors, drawn) = errors_of(&mut film, &jobs, denoiser.as_mut(), viewing);
-        let error = total_error(&errors, &film, viewing);
+        let error = total_error(&errors, &jobs, &film, viewing);
         let cost: f64 = jobs.iter().map(Job::cost).sum();
         foresight.learn(&jobs, &errors, &drawn, &error);
         let growth = match stop {
@@ -477,11 +477,33 @@ fn touched_pixels(film: &Film, viewing: &Viewing) -> u64 {
     rows.sum()
 }
 
-fn total_error(errors: &[SquaredError], film: &Film, viewing: &Viewing) -> EstimatedError {
+/// Of these the pixels without samples, which a coarser picture fills in: how wrong they are is not known.
+fn filled_pixels(jobs: &[Job], film: &Film, viewing: &Viewing) -> u64 {
+    let filled = |job: &Job| {
+        let pixels = job.pixels.iter().filter(|&(x, y)| {
+            let (x, y) = (x as usize, y as usize);
+            let covered = *film.alpha.get(x, y) > 0.0;
+            match job.layer {
+                Layer::Object => covered,
+                _ => !covered && viewing.is_touched(film, x, y),
+            }
+        });
+        pixels.count() as u64
+    };
+    jobs.iter().filter(|job| job.samples == 0).map(filled).sum()
+}
+
+fn total_error(
+    errors: &[SquaredError],
+    jobs: &[Job],
+    film: &Film,
+    viewing: &Viewing,
+) -> EstimatedError {
     let total = errors
         .iter()
         .fold(SquaredError::default(), |sum, e| sum.merge(*e));
     let touched = touched_pixels(film, viewing);
+    let touched = touched.saturating_sub(filled_pixels(jobs, film, viewing));
     let pixels = touched.max(1) as f64;
     // 1.645 standard errors bound a normal variable from above in 95% of cases. Of a sum of squares it
     // is the logarithm that is nearly normal: few pixels hold most of the error, and where the sum
@@ -519,44 +541,4 @@ fn fraction(
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn rounds_under_a_time_budget_grow_and_the_last_one_fills_what_is_left() {
-        // Ten times as long is left: as much as a round may grow.
-        assert_eq!(timed_growth(10.0, 1.0), TIMED_GROWTH - 1.0);
-        // All that is left fits into one round.
-        assert!((timed_growth(0.4, 1.0) - 0.4 * LAST_ROUND).abs() < 1e-12);
-        // Two rounds: neither so small that it is not worth it.
-        let growth = timed_growth(0.6, 1.0);
-        assert!((growth - 0.3 * LAST_ROUND).abs() < 1e-12);
-        assert!(timed_growth(0.6 - growth, 1.0 + growth) > LEAST_GROWTH);
-        for over in [(0.0, 1.0), (-1.0, 1.0), (0.01, 1.0)] {
-            assert_eq!(timed_growth(over.0, over.1), 0.0);
-        }
-    }
-
-    #[test]
-    fn a_budget_is_kept_within_a_tenth_while_rounds_differ_by_a_fifth() {
-        // Times are in units of the first round. The time of a round is predicted from the rate of the round before, at
-        // most 1.21 times wrong. The last round exceeds the rest of the budget by at most 0.97 * 1.21 - 1 of it, and that
-        // rest is at most a third of the budget: 6%. At most 0.03 / 0.97 * 1.21 of the budget stays unused: 4%.
-        for budget in [1.5, 3.0, 10.0, 100.0, 1e4] {
-            for first in [1.1, 1.0 / 1.1] {
-                let (mut elapsed, mut cost, mut rate) = (1.0, 1.0, 1.0);
-                for _ in 0..1000 {
-                    let growth = timed_growth(budget - elapsed, rate * cost);
-                    if growth == 0.0 {
-                        break;
-                    }
-                    rate = if rate == first { 1.0 / first } else { first };
-                    elapsed += rate * growth * cost;
-                    cost += growth * cost;
-                }
-                let share = elapsed / budget;
-                assert!((0.9..=1.1).contains(&share), "{share} of {budget}");
-            }
-        }
-    }
-}
+mod tests;

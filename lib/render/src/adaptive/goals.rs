@@ -11,6 +11,12 @@ const FIRST_ROUND: u32 = 4;
 /// uncertain.
 const MAX_GROWTH: f64 = 4.0;
 
+/// Noise of this display-referred RMSE in a tile is seen beside tiles without, and so is twice the target: such a tile gets
+/// more samples, though the target is reached without.
+const SEEN: f64 = 0.04;
+/// Samples per pixel and replicate that a tile may get for that.
+const MOST_FOR_TILE: u32 = 64;
+
 /// Samples per pixel and replicate of the first round, `limit` at most.
 pub(super) fn first_goal(stop: Stop, limit: u32) -> u32 {
     match stop {
@@ -37,14 +43,26 @@ pub(super) fn next_goals(
     match stop {
         Stop::Samples(n) => vec![n.div_ceil(REPLICATES as u32).max(1); jobs.len()],
         Stop::TargetError(target) => {
-            if error.upper_95 <= f64::from(target) {
-                return unchanged();
-            }
-            // The estimate itself has to come as far below the target as its bound lies above it.
-            let slack = error.rmse / error.upper_95;
-            let allowed = (f64::from(target) * slack).powi(2) * error.touched_pixels as f64;
-            let scale = spread(jobs, errors).map(|(root, c)| root * c).sum::<f64>() / allowed;
-            goals(jobs, errors, scale, limit)
+            let target = f64::from(target);
+            let scale = match error.upper_95 <= target {
+                true => 0.0,
+                false => {
+                    // The estimate itself has to come as far below the target as its bound lies above it.
+                    let slack = error.rmse / error.upper_95;
+                    let allowed = (target * slack).powi(2) * error.touched_pixels as f64;
+                    spread(jobs, errors).map(|(root, c)| root * c).sum::<f64>() / allowed
+                }
+            };
+            let goals = goals(jobs, errors, scale, limit);
+            let least = jobs
+                .iter()
+                .zip(errors)
+                .map(|(job, e)| unseen(job, e, target, limit));
+            goals
+                .into_iter()
+                .zip(least)
+                .map(|(n, least)| n.max(least))
+                .collect()
         }
         Stop::TimeBudget(_) => {
             let spent_already: f64 = jobs.iter().map(Job::cost).sum();
@@ -89,6 +107,13 @@ fn spread<'a>(
     })
 }
 
+/// Samples per pixel and replicate after which a tile's noise is not seen beside the others', however few such tiles are.
+fn unseen(job: &Job, error: &SquaredError, target: f64, limit: u32) -> u32 {
+    let most = SEEN.max(2.0 * target).powi(2) * job.pixels.len() as f64;
+    let best = f64::from(job.samples) * error.sum / most;
+    goal(best.min(f64::from(MOST_FOR_TILE)), job.samples, limit)
+}
+
 fn goals(jobs: &[Job], errors: &[SquaredError], scale: f64, limit: u32) -> Vec<u32> {
     spread(jobs, errors)
         .zip(jobs)
@@ -107,6 +132,38 @@ pub(crate) fn goal(best: f64, samples: u32, limit: u32) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_tile_whose_noise_is_seen_gets_more_though_the_target_is_reached() {
+        let block = crate::shadow::Block {
+            x: 0,
+            y: 0,
+            width: 8,
+            height: 8,
+        };
+        let pixels = crate::job::PixelSet::new(block, |_| true);
+        let mut job = Job::new(crate::job::Layer::PlaneShadow, block, pixels, None);
+        job.samples = 4;
+        let error = |rmse: f64| SquaredError {
+            sum: 64.0 * rmse * rmse,
+            variance: 0.0,
+        };
+        let reached = EstimatedError {
+            rmse: 0.01,
+            upper_95: 0.011,
+            touched_pixels: 1 << 20,
+        };
+        let next = |rmse: f64, jobs: &[Job]| {
+            let stop = Stop::TargetError(0.012);
+            next_goals(stop, 1000, jobs, &[error(rmse)], &reached, 0.0)[0]
+        };
+        assert_eq!(next(0.039, std::slice::from_ref(&job)), 4);
+        // Twice the noise that is allowed, four times the samples.
+        assert_eq!(next(0.08, std::slice::from_ref(&job)), 16);
+        // A caustic does not make a draft a final picture.
+        job.samples = 64;
+        assert_eq!(next(1.0, std::slice::from_ref(&job)), 64);
+    }
 
     #[test]
     fn a_job_that_has_enough_gets_nothing_and_others_whole_strata() {
