@@ -96,6 +96,29 @@ fn the_report_says_which_candidate_is_used() {
 }
 
 #[test]
+fn neutral_light_that_nothing_guides_runs_again_for_another_map() {
+    let project = project();
+    let ran = |sets: &[&str]| {
+        let mut args = vec!["run", "--until", "light", "--json"];
+        for set in ["light.start=neutral", "light.guidance=none"]
+            .iter()
+            .chain(sets)
+        {
+            args.extend(["-s", set]);
+        }
+        let run = project.run(DIPIR, &args);
+        run.expect_success();
+        serde_json::from_str::<Value>(&run.stdout).unwrap()["ran"].clone()
+    };
+    assert_eq!(ran(&[]), json!(["scene", "light"]));
+    assert_eq!(ran(&[]), json!([]));
+    for set in ["light.environment=[32,16]", "light.size=48"] {
+        assert_eq!(ran(&[set]), json!(["light"]), "{set}");
+        assert_eq!(ran(&[set]), json!([]), "{set}");
+    }
+}
+
+#[test]
 fn the_estimate_depends_on_photograph_and_camera_alone() {
     let project = project();
     lit(&project, &[]);

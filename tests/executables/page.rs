@@ -172,6 +172,21 @@ fn the_recovered_light_is_compared_with_the_true_one_once() {
     // The page says it; nothing is rendered to say it again.
     assert!(page(&project).contains("Against the true light"));
     assert_eq!(compared(&args), Value::Null);
+    // What no map can be placed with is refused before anything is compared.
+    for (set, message) in [
+        (
+            "report.truth_exposure_ev=1000",
+            "1000 is out of range; accepted: stops from -64 to 64",
+        ),
+        (
+            "report.truth_rotation_deg=nan",
+            "must be a finite angle in degrees",
+        ),
+    ] {
+        let refused = project.run(DIPIR, &["report", "--set", set]);
+        assert_eq!(refused.code, Some(2), "{}", refused.stderr);
+        assert!(refused.stderr.contains(message), "{}", refused.stderr);
+    }
     // A stop brighter it is another light from the same side.
     let brighter = [&args[..], &["--set", "report.truth_exposure_ev=1"]].concat();
     let brighter = compared(&brighter);

@@ -23,11 +23,12 @@ pub const LAST: &str = COMPOSITE.name;
 /// The graph of the session's configuration.
 pub fn graph(session: &Session) -> anyhow::Result<Graph> {
     // Read here so that an error in them is reported before anything runs.
-    let _: (SceneConfig, ModelTable, ReportTable) = (
+    let _: (SceneConfig, ModelTable) = (
         session.config.table("scene")?,
         session.config.table("model")?,
-        session.config.table("report")?,
     );
+    let report: ReportTable = session.config.table("report")?;
+    report.placement().check(&session.config)?;
     let method = Method::of(session)?;
     let light_is_given = method == Method::Given;
     let no_model = method.without_model();

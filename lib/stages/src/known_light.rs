@@ -7,6 +7,8 @@ use dipir_cli::session::Session;
 use dipir_imaging::raster::LinearImage;
 use dipir_light::environment::EnvironmentMap;
 use dipir_optimize::settings::LightTable;
+use dipir_pipeline::config::Config;
+use dipir_pipeline::error::ConfigError;
 use dipir_scene::camera::Camera;
 use dipir_scene::config::SceneConfig;
 use glam::{Vec2, Vec3};
@@ -37,31 +39,61 @@ pub fn known(session: &Session, table: &CompositeTable) -> anyhow::Result<Option
     let Some((_, path)) = known_params(table) else {
         return Ok(None);
     };
-    let location = session.resolve(path);
-    let map = EnvironmentMap::read(&location)
-        .with_context(|| format!("cannot use composite.environment = \"{}\"", path.display()))?;
-    let largest = map
-        .texels()
-        .iter()
-        .fold(0.0, |m: f32, t| m.max(t.max_element()));
-    let exposure = table.exposure_ev.exp2();
-    if !(largest * exposure).is_finite() {
-        return Err(session
-            .config
-            .invalid(
-                "composite.exposure_ev",
-                format!(
-                    "{} stops take the map's largest radiance, {largest}, beyond what 32-bit \
-                     numbers hold; expose it less",
-                    table.exposure_ev
-                ),
-            )
-            .into());
-    }
-    let map = map
-        .scaled(exposure)
-        .rotated_y(f64::from(table.rotation_deg).to_radians());
+    let map = table
+        .placement()
+        .read(session, "composite.environment", path)?;
     Ok(Some(Light { map: Arc::new(map) }))
+}
+
+/// How a map is brought to the photograph's scale and turned into its world. Keys are dotted.
+pub struct Placement {
+    /// Its key, and stops.
+    pub exposure_ev: (&'static str, f32),
+    /// Its key, and degrees about the vertical, counter-clockwise from above.
+    pub rotation_deg: (&'static str, f32),
+}
+
+impl Placement {
+    /// Refuses values that no map can be placed with.
+    pub fn check(&self, config: &Config) -> Result<(), ConfigError> {
+        let (key, stops) = self.exposure_ev;
+        if !(stops.abs() <= 64.0) {
+            let message = format!("{stops} is out of range; accepted: stops from -64 to 64");
+            return Err(config.invalid(key, message));
+        }
+        let (key, degrees) = self.rotation_deg;
+        if !degrees.is_finite() {
+            return Err(config.invalid(key, "must be a finite angle in degrees"));
+        }
+        Ok(())
+    }
+
+    /// The map of `path`, the value of `file_key`, exposed and turned.
+    ///
+    /// # Errors
+    /// On values that [`check`](Self::check) refuses, on a file that is no map, and on radiance beyond `f32`.
+    pub fn read(
+        &self,
+        session: &Session,
+        file_key: &str,
+        path: &Path,
+    ) -> anyhow::Result<EnvironmentMap> {
+        self.check(&session.config)?;
+        let map = EnvironmentMap::read(session.resolve(path))
+            .with_context(|| format!("cannot use {file_key} = \"{}\"", path.display()))?;
+        let most = |m: f32, t: &Vec3| m.max(t.max_element());
+        let largest = map.texels().iter().fold(0.0, most);
+        let (key, stops) = self.exposure_ev;
+        if !(largest * stops.exp2()).is_finite() {
+            let message = format!(
+                "{stops} stops take the map's largest radiance, {largest}, beyond what 32-bit numbers hold; expose it less"
+            );
+            return Err(session.config.invalid(key, message).into());
+        }
+        Ok(map
+            .scaled(stops.exp2())
+            .rotated_y(f64::from(self.rotation_deg.1).to_radians()))
+    }
 }
 
 /// Warns of keys that only an estimated light uses, where a map gives the light.

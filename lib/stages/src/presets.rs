@@ -55,6 +55,8 @@ pub struct CompositePreset {
     pub target_error: f32,
     /// Whether object and shadow are denoised.
     pub denoise: bool,
+    /// Whether caustics on the object are blurred.
+    pub blur_caustics: bool,
     /// Most pixels at which object and shadow are rendered.
     pub most_pixels: Option<u64>,
 }

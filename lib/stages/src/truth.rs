@@ -6,7 +6,6 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_imaging::composite::composite as over;
 use dipir_imaging::layers::Layers;
@@ -27,6 +26,7 @@ use serde_json::{Value, json};
 
 use crate::composite::table::{CompositeTable, Tone};
 use crate::interruption;
+use crate::known_light::Placement;
 use crate::names::{COMPOSITE, LIGHT, SCENE};
 use crate::scene::folder::SceneFolder;
 use crate::scene::transport::{self, Frame};
@@ -44,7 +44,7 @@ pub struct ReportTable {
     #[schemars(extend("format" = "path"), example = &"truth.exr")]
     pub truth: Option<PathBuf>,
     /// Exposure that brings that map to the photograph's scale, stops.
-    #[schemars(example = -1.5)]
+    #[schemars(range(min = -64, max = 64), example = -1.5)]
     pub truth_exposure_ev: f32,
     /// Turn of that map about the vertical, degrees, counter-clockwise from above.
     #[schemars(example = 90.0)]
@@ -52,6 +52,16 @@ pub struct ReportTable {
     /// Curve on the object's light under the true and the neutral light, as `composite.tone`.
     #[schemars(extend("default" = "none"), example = &"reinhard")]
     pub truth_tone: Option<Tone>,
+}
+
+impl ReportTable {
+    /// How the map of `truth` is used.
+    pub fn placement(&self) -> Placement {
+        Placement {
+            exposure_ev: ("report.truth_exposure_ev", self.truth_exposure_ev),
+            rotation_deg: ("report.truth_rotation_deg", self.truth_rotation_deg),
+        }
+    }
 }
 
 /// What was measured.
@@ -93,10 +103,7 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
     let folder = LIGHT.folder(session);
     let manifest = LIGHT.manifest(session)?;
     let recovered = Lighting::read(&manifest.output(&folder, "lighting")?)?;
-    let truth = EnvironmentMap::read(session.resolve(path))
-        .with_context(|| format!("cannot use report.truth = \"{}\"", path.display()))?
-        .scaled(table.truth_exposure_ev.exp2())
-        .rotated_y(f64::from(table.truth_rotation_deg).to_radians());
+    let truth = table.placement().read(session, "report.truth", path)?;
 
     let scene = SceneFolder::read(session)?;
     let (record, frame) = recorded(session, &scene)?;

@@ -8,6 +8,7 @@ use dipir_render::adaptive::Stop;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::known_light::Placement;
 use crate::presets;
 
 /// The `[composite]` table.
@@ -123,19 +124,15 @@ impl CompositeTable {
                 "0 is out of range; accepted: 1 or more".into(),
             );
         }
-        if !(self.exposure_ev.abs() <= 64.0) {
-            return wrong(
-                "exposure_ev",
-                format!(
-                    "{} is out of range; accepted: stops from -64 to 64",
-                    self.exposure_ev
-                ),
-            );
+        Ok(self.placement().check(config)?)
+    }
+
+    /// How the map of `environment` is used.
+    pub fn placement(&self) -> Placement {
+        Placement {
+            exposure_ev: ("composite.exposure_ev", self.exposure_ev),
+            rotation_deg: ("composite.rotation_deg", self.rotation_deg),
         }
-        if !self.rotation_deg.is_finite() {
-            return wrong("rotation_deg", "must be a finite angle in degrees".into());
-        }
-        Ok(())
     }
 
     pub(super) fn denoise(&self, quality: Quality) -> bool {
@@ -144,7 +141,8 @@ impl CompositeTable {
     }
 
     pub(super) fn blur_caustics(&self, quality: Quality) -> bool {
-        self.blur_caustics.unwrap_or(quality != Quality::High)
+        let by_preset = presets::of(quality).composite.blur_caustics;
+        self.blur_caustics.unwrap_or(by_preset)
     }
 
     /// Most pixels at which object and shadow are rendered; a time budget chooses the resolution itself.
