@@ -22,7 +22,7 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 9,
+    version: 10,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
@@ -46,7 +46,7 @@ pub const LIGHT: StageName = StageName {
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 11,
+    version: 12,
 };
 
 /// All stages, each after those that it reads.
