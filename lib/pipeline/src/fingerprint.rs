@@ -176,9 +176,17 @@ pub enum StaleReason {
     },
 }
 
+/// A value as it was written: a number of 32 bits without the digits that it got in 64.
+fn short(value: &str) -> String {
+    match value.parse::<f64>() {
+        Ok(v) if value.contains('.') && f64::from(v as f32) == v => format!("{:?}", v as f32),
+        _ => value.to_string(),
+    }
+}
+
 impl fmt::Display for StaleReason {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let shown = |v: &Option<String>| v.clone().unwrap_or_else(|| "unset".into());
+        let shown = |v: &Option<String>| v.as_deref().map_or("unset".into(), short);
         match self {
             Self::NeverRun => write!(f, "it has not run yet"),
             Self::ManifestDamaged { path, message } => write!(f, "{}: {message}", path.display()),
@@ -451,14 +459,14 @@ mod tests {
 
         let mut changed = first.clone();
         changed.params["class"] = json!("chair");
-        changed.params["position"][1] = json!(1.5);
+        changed.params["position"][1] = json!(0.02f32);
         changed.params["extra"] = json!(true);
         assert_eq!(
             reasons(&changed, &target),
             [
                 "class changed from \"car\" to \"chair\"",
                 "extra changed from unset to true",
-                "position.1 changed from 1.0 to 1.5",
+                "position.1 changed from 1.0 to 0.02",
             ]
         );
 

@@ -32,6 +32,13 @@ pub fn hidden(mesh: &TriangleMesh, materials: &[Material], camera: &Camera) -> V
             "its materials are fully transparent (alpha 0, in an MTL file \"d 0\")".into(),
         );
     }
+    if is_all_behind(mesh, materials, camera) {
+        return nothing(
+            "all its triangles are single-sided and seen from behind; is the camera inside it, or is it a sheet that needs \
+             both sides (doubleSided in glTF)?"
+                .into(),
+        );
+    }
     without
         .iter()
         .map(|m| {
@@ -41,6 +48,18 @@ pub fn hidden(mesh: &TriangleMesh, materials: &[Material], camera: &Camera) -> V
             )
         })
         .collect()
+}
+
+/// Whether the camera sees the back of every triangle, and no back shows.
+fn is_all_behind(mesh: &TriangleMesh, materials: &[Material], camera: &Camera) -> bool {
+    let eye = camera.position.as_dvec3();
+    let mut triangles = mesh.indices.iter().zip(&mesh.materials);
+    !mesh.indices.is_empty()
+        && triangles.all(|(corners, &material)| {
+            let [a, b, c] = corners.map(|i| mesh.positions[i as usize].as_dvec3());
+            let is_behind = (b - a).cross(c - a).dot(eye - a) <= 0.0;
+            is_behind && !materials[material as usize].double_sided
+        })
 }
 
 fn is_transparent(material: &Material, most_alpha: f32) -> bool {

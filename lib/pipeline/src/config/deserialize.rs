@@ -205,7 +205,7 @@ impl Node {
             Value::Integer(i) => Unexpected::Signed(*i),
             Value::Float(f) => Unexpected::Float(*f),
             Value::Boolean(b) => Unexpected::Bool(*b),
-            Value::Datetime => Unexpected::Other("a date"),
+            Value::Datetime(_) => Unexpected::Other("a date"),
             Value::Array(_) => Unexpected::Seq,
             Value::Table(_) => Unexpected::Map,
         }
@@ -279,7 +279,8 @@ impl<'de> de::Deserializer<'de> for &'de Node {
             Value::Integer(i) => visitor.visit_i64(*i),
             Value::Float(f) => visitor.visit_f64(*f),
             Value::Boolean(b) => visitor.visit_bool(*b),
-            Value::Datetime => Err(de::Error::invalid_type(self.unexpected(), &visitor)),
+            // A date needs no quotes where its text is wanted.
+            Value::Datetime(text) => visitor.visit_borrowed_str(text),
             Value::Array(items) => {
                 let mut access = Items {
                     nodes: items.iter(),

@@ -145,9 +145,25 @@ fn a_wrong_type_says_what_was_found_and_what_is_accepted() {
         "--set scene.samples=-1: scene.samples is the integer -1, accepted: a whole number, 0 or more"
     );
     assert_eq!(
+        message("[scene]\nsamples = 2026-06-21\n", &[]),
+        "pipeline.toml:2: scene.samples is the string \"2026-06-21\", accepted: a whole number, 0 or more"
+    );
+    assert_eq!(
         message("scene = 3\n", &[]),
         "pipeline.toml:1: scene is the integer 3, accepted: a table"
     );
+}
+
+#[test]
+fn a_date_needs_no_quotes() {
+    let text = "[pipeline]\nout = 2026-06-21T12:34:56+02:00\n";
+    let read = |text, sets: &[String]| {
+        let config = Config::parse(Path::new("pipeline.toml"), text, sets).unwrap();
+        config.pipeline().unwrap().out
+    };
+    assert_eq!(read(text, &[]), Path::new("2026-06-21T12:34:56+02:00"));
+    let set = ["pipeline.out=2026-06-21".to_string()];
+    assert_eq!(read("", &set), Path::new("2026-06-21"));
 }
 
 #[test]

@@ -21,7 +21,8 @@ pub(super) enum Value {
     Integer(i64),
     Float(f64),
     Boolean(bool),
-    Datetime,
+    /// As it is written.
+    Datetime(String),
     Array(Vec<Node>),
     Table(Vec<Entry>),
 }
@@ -114,7 +115,7 @@ fn node(
             }
         },
         DeValue::Boolean(b) => Value::Boolean(*b),
-        DeValue::Datetime(_) => Value::Datetime,
+        DeValue::Datetime(date) => Value::Datetime(date.to_string()),
         DeValue::Array(items) => Value::Array(
             items
                 .iter()

@@ -68,6 +68,19 @@ fn an_object_without_extent_says_why() {
 }
 
 #[test]
+fn a_sheet_that_is_seen_from_behind_says_why() {
+    let sheet = |double: bool| with_material(json!({ "doubleSided": double }));
+    let turned = "yaw_deg = 180.0";
+    let found = warnings("o.glb", &sheet(false), turned);
+    assert!(
+        found.len() == 1 && found[0].contains("single-sided and seen from behind"),
+        "{found:?}"
+    );
+    assert_eq!(warnings("o.glb", &sheet(true), turned), [""; 0]);
+    assert_eq!(warnings("o.glb", &sheet(false), ""), [""; 0]);
+}
+
+#[test]
 fn a_transparent_object_says_why() {
     let alpha = |mode: &str, alpha: f32| {
         with_material(json!({
