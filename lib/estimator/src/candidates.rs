@@ -104,15 +104,11 @@ impl LightEstimate {
 
     fn sun(&self, direction: Vec3, probability: f64, base: &[SphericalGaussian]) -> Candidate {
         let peak = Vec3::from(self.peak) * self.energy_of_sun();
-        let sigma = SOURCE_SIGMA;
         let mut source = SphericalGaussian {
             direction,
             radiance: Vec3::ONE,
-            sigma,
+            sigma: self.source_lobe().map_or(SOURCE_SIGMA, |known| known.sigma),
         };
-        if let Some(known) = self.source_lobe() {
-            source.sigma = known.sigma;
-        }
         source.radiance = peak / source.solid_angle() as f32;
         let mut lobes = vec![source];
         lobes.extend_from_slice(base);

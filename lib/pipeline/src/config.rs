@@ -224,6 +224,17 @@ impl Config {
         }
     }
 
+    /// As [`invalid`](Self::invalid), for a value that is not among those that are accepted.
+    pub fn out_of_range(
+        &self,
+        dotted: &str,
+        value: impl std::fmt::Display,
+        accepted: &str,
+    ) -> ConfigError {
+        let message = format!("{value} is out of range; accepted: {accepted}");
+        self.invalid(dotted, message)
+    }
+
     /// The `[pipeline]` table.
     pub fn pipeline(&self) -> Result<PipelineTable, ConfigError> {
         self.table("pipeline")

@@ -117,8 +117,8 @@ impl Viewing<'_> {
             let squared = f64::from(squared.element_sum()) / 3.0;
             if squared.is_finite() {
                 total.sum += squared;
-                // Each is sigma^2 chi^2_{K-1} / (K - 1), so E[v^2] 2 / (K + 1) is its variance. Twice that, for pixels
-                // differ from each other, too.
+                // Each is sigma^2 chi^2_{K-1} / (K - 1), so E[v^2] 2 / (K + 1) is its variance. It counts
+                // twice, because the true errors of single pixels spread as well.
                 total.variance += squared * squared * 4.0 / (REPLICATES as f64 + 1.0);
             }
         }

@@ -55,11 +55,13 @@ pub struct Placement {
 
 impl Placement {
     /// Refuses values that no map can be placed with.
+    ///
+    /// # Errors
+    /// Those values, by key.
     pub fn check(&self, config: &Config) -> Result<(), ConfigError> {
         let (key, stops) = self.exposure_ev;
         if !(stops.abs() <= 64.0) {
-            let message = format!("{stops} is out of range; accepted: stops from -64 to 64");
-            return Err(config.invalid(key, message));
+            return Err(config.out_of_range(key, stops, "stops from -64 to 64"));
         }
         let (key, degrees) = self.rotation_deg;
         if !degrees.is_finite() {

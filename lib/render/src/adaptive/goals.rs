@@ -11,8 +11,8 @@ const FIRST_ROUND: u32 = 4;
 /// uncertain.
 const MAX_GROWTH: f64 = 4.0;
 
-/// Noise of this display-referred RMSE in a tile is seen beside tiles without, and so is twice the target: such a tile gets
-/// more samples, though the target is reached without.
+/// A tile whose own display-referred RMSE is above this and above twice the target gets more samples, even when the target is
+/// reached: its noise is seen beside smooth tiles. Chosen by eye.
 const SEEN: f64 = 0.04;
 /// Samples per pixel and replicate that a tile may get for that.
 const MOST_FOR_TILE: u32 = 64;
@@ -107,7 +107,7 @@ fn spread<'a>(
     })
 }
 
-/// Samples per pixel and replicate after which a tile's noise is not seen beside the others', however few such tiles are.
+/// Samples per pixel and replicate that bring a tile's noise below [`SEEN`], [`MOST_FOR_TILE`] at most.
 fn unseen(job: &Job, error: &SquaredError, target: f64, limit: u32) -> u32 {
     let most = SEEN.max(2.0 * target).powi(2) * job.pixels.len() as f64;
     let best = f64::from(job.samples) * error.sum / most;

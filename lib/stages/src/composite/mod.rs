@@ -509,8 +509,8 @@ impl fmt::Display for Done {
         if self.divisor > 1 {
             write!(
                 f,
-                "\n  object and shadow at 1/{} of the photograph's resolution, then enlarged: the error is that before, and \
-                 edges are soft",
+                "\n  object and shadow at 1/{} of the photograph's resolution, enlarged: edges are soft, which the error \
+                 does not count",
                 self.divisor
             )?;
         }

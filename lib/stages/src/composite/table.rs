@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use dipir_imaging::tone::ToneCurves;
 use dipir_pipeline::config::{Config, Quality};
+use dipir_pipeline::error::ConfigError;
 use dipir_render::adaptive::Stop;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -83,48 +84,32 @@ pub(super) const MAX_SAMPLES: u32 = 1 << 14;
 
 impl CompositeTable {
     /// Refuses what no run can work with.
-    pub fn check(&self, config: &Config) -> anyhow::Result<()> {
-        let wrong = |key: &str, message: String| {
-            Err(anyhow::Error::new(
-                config.invalid(&format!("composite.{key}"), message),
-            ))
-        };
+    ///
+    /// # Errors
+    /// The first such value, by key.
+    pub fn check(&self, config: &Config) -> Result<(), ConfigError> {
         if let Some(e) = self.target_error
             && !(e > 0.0 && e <= 1.0)
         {
-            let range = "a display-referred RMSE above 0, at most 1, as in 0.004";
-            return wrong(
-                "target_error",
-                format!("{e} is out of range; accepted: {range}"),
-            );
+            let accepted = "a display-referred RMSE above 0, at most 1, as in 0.004";
+            return Err(config.out_of_range("composite.target_error", e, accepted));
         }
         if let Some(t) = self.time_budget_s
             && !(t > 0.0 && t < 1e9)
         {
-            return wrong(
-                "time_budget_s",
-                format!("{t} is out of range; accepted: seconds above 0"),
-            );
+            return Err(config.out_of_range("composite.time_budget_s", t, "seconds above 0"));
         }
         if self.target_error.is_some() && self.time_budget_s.is_some() {
-            return wrong(
-                "time_budget_s",
-                "excludes target_error; keep one of the two".into(),
-            );
+            let message = "excludes target_error; keep one of the two";
+            return Err(config.invalid("composite.time_budget_s", message));
         }
         if self.max_samples == Some(0) {
-            return wrong(
-                "max_samples",
-                "0 is out of range; accepted: 1 or more".into(),
-            );
+            return Err(config.out_of_range("composite.max_samples", 0, "1 or more"));
         }
         if self.most_pixels == Some(0) {
-            return wrong(
-                "most_pixels",
-                "0 is out of range; accepted: 1 or more".into(),
-            );
+            return Err(config.out_of_range("composite.most_pixels", 0, "1 or more"));
         }
-        Ok(self.placement().check(config)?)
+        self.placement().check(config)
     }
 
     /// How the map of `environment` is used.

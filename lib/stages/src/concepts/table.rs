@@ -49,19 +49,16 @@ impl Default for ConceptsTable {
 impl ConceptsTable {
     /// Refuses what no run can work with.
     pub(super) fn check(&self, config: &Config) -> Result<(), ConfigError> {
-        let wrong = |key: &str, value: &dyn std::fmt::Display, accepted: &str| {
-            let message = format!("{value} is out of range; accepted: {accepted}");
-            Err(config.invalid(&format!("concepts.{key}"), message))
-        };
         if self.steps == 0 {
-            return wrong("steps", &self.steps, "at least 1");
+            return Err(config.out_of_range("concepts.steps", self.steps, "at least 1"));
         }
         if !(self.guidance >= 0.0 && self.guidance.is_finite()) {
-            return wrong("guidance", &self.guidance, "at least 0");
+            return Err(config.out_of_range("concepts.guidance", self.guidance, "at least 0"));
         }
         match self.size {
             Some(size) if !(1..=MAX_SIZE).contains(&size) => {
-                wrong("size", &size, &format!("1 to {MAX_SIZE}"))
+                let accepted = format!("1 to {MAX_SIZE}");
+                Err(config.out_of_range("concepts.size", size, &accepted))
             }
             _ => Ok(()),
         }

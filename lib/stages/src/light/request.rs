@@ -164,7 +164,7 @@ impl Request {
                 if self.start != First::Estimated {
                     params["environment"] = json!(settings.environment);
                 }
-                // The mean of the photograph at that size.
+                // Neutral light is the mean of the photograph, taken at that size.
                 if self.start == First::Neutral {
                     params["size"] = json!(settings.size);
                 }

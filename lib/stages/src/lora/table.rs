@@ -107,8 +107,7 @@ impl LoraTable {
     /// Refuses what no run can work with.
     pub(super) fn check(&self, config: &Config) -> Result<(), ConfigError> {
         let wrong = |key: &str, value: &dyn std::fmt::Display, accepted: &str| {
-            let message = format!("{value} is out of range; accepted: {accepted}");
-            Err(config.invalid(&format!("lora.{key}"), message))
+            Err(config.out_of_range(&format!("lora.{key}"), value, accepted))
         };
         if !(1..=MAX_RANK).contains(&self.rank) {
             return wrong("rank", &self.rank, &format!("1 to {MAX_RANK}"));

@@ -110,10 +110,10 @@ pub(crate) fn check_steps(
     let most = model.schedule.len();
     match steps <= most {
         true => Ok(()),
-        false => Err(session.config.invalid(
-            key,
-            format!("{steps} is out of range; accepted: up to {most}, the model's timesteps"),
-        )),
+        false => {
+            let accepted = format!("up to {most}, the model's timesteps");
+            Err(session.config.out_of_range(key, steps, &accepted))
+        }
     }
 }
 
