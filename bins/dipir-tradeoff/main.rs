@@ -15,7 +15,7 @@ fn main() -> ExitCode {
 fn run(cli: &Cli) -> anyhow::Result<()> {
     let progress = Progress::new("tradeoff", cli.output.quiet);
     let outcome = sweep(cli, &mut |step: Step| {
-        progress.set(step.done as f64 / step.total as f64);
+        progress.set(step.share);
         let point = format!("{}: {} {}", step.scene, step.series, step.label);
         if cli.output.verbose && !cli.report_only {
             progress.note(&format!("{} of {}: {point}", step.done + 1, step.total));

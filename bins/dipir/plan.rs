@@ -7,6 +7,7 @@ use dipir_pipeline::manifest::{Manifest, peak_rss_bytes};
 use dipir_pipeline::status::State;
 use dipir_stages::composite::table::CompositeTable;
 use dipir_stages::graph;
+use dipir_stages::light;
 use dipir_stages::model::{self, ModelTable, forecast};
 use dipir_stages::names::{COMPOSITE, CONCEPTS, LIGHT, LORA};
 use serde::Serialize;
@@ -34,16 +35,22 @@ impl Expected {
         }
     }
 
-    /// By the run before, if any; `changed` says that it had other settings. Their time tells less than a budget.
+    /// By the run before, if any; `changed` says that it had other settings. Their time tells less than what is
+    /// `foretold` from it, and than a budget.
     fn running(
         stage: &'static str,
         earlier: Option<Manifest>,
         changed: bool,
         budget_s: Option<f64>,
+        foretold_s: Option<f64>,
     ) -> Self {
         let (seconds, from) = match (&earlier, changed) {
             (Some(earlier), false) => (Some(earlier.elapsed_s), "as it took the last time"),
             (_, _) if budget_s.is_some() => (budget_s, "its time budget"),
+            (_, true) if foretold_s.is_some() => (
+                foretold_s,
+                "from the times of the last run, which had other settings",
+            ),
             (Some(earlier), true) => (
                 Some(earlier.elapsed_s),
                 "as it took the last time, with other settings",
@@ -85,13 +92,19 @@ pub fn plan(
             || (!force && state.is_some_and(|s| matches!(s.state, State::Fresh)));
         let earlier = Manifest::read(&session.stage_folder(node.stage), "").ok();
         let changed = state.is_some_and(|s| has_other_settings(&s.state));
+        let foretold = earlier
+            .as_ref()
+            .filter(|_| changed && !idle && node.stage == LIGHT.name)
+            .and_then(|earlier| light::forecast::seconds(session, earlier));
         let budget = match node.stage == COMPOSITE.name && (changed || earlier.is_none()) {
             true => session.config.table("composite")?,
             false => CompositeTable::default(),
         };
         let expected = match idle {
             true => Expected::idle(node.stage),
-            false => Expected::running(node.stage, earlier, changed, budget.time_budget_s),
+            false => {
+                Expected::running(node.stage, earlier, changed, budget.time_budget_s, foretold)
+            }
         };
         all.push(expected);
     }
@@ -179,11 +192,12 @@ mod tests {
 
     #[test]
     fn an_earlier_time_with_other_settings_is_said_to_be_one() {
-        let of = |earlier: bool, changed, budget| {
+        let foretold = |earlier: bool, changed, budget, foretold| {
             let earlier = earlier.then(manifest);
-            let e = Expected::running(COMPOSITE.name, earlier, changed, budget);
+            let e = Expected::running(COMPOSITE.name, earlier, changed, budget, foretold);
             (e.seconds, e.from)
         };
+        let of = |earlier, changed, budget| foretold(earlier, changed, budget, None);
         let last = "as it took the last time";
         assert_eq!(of(true, false, Some(60.0)), (Some(8.5), last));
         let other = "as it took the last time, with other settings";
@@ -194,6 +208,8 @@ mod tests {
             (Some(60.0), "its time budget")
         );
         assert_eq!(of(false, false, None).0, None);
+        let by_it = "from the times of the last run, which had other settings";
+        assert_eq!(foretold(true, true, None, Some(3.0)), (Some(3.0), by_it));
         let parameter = StaleReason::Parameter {
             key: "quality".into(),
             was: None,
@@ -216,7 +232,7 @@ mod tests {
         let idle = || Expected::idle("scene");
         assert!(in_words(&[idle()]).ends_with("together   nothing to do"));
         assert!(!json!([idle()]).to_string().contains("has not run here"));
-        let runs = |earlier| Expected::running("light", earlier, false, None);
+        let runs = |earlier| Expected::running("light", earlier, false, None, None);
         assert!(in_words(&[idle(), runs(None)]).ends_with("together   nothing is known"));
         assert!(in_words(&[idle(), runs(Some(manifest()))]).ends_with("about 8.50 s"));
         let text = in_words(&[runs(Some(manifest())), runs(None)]);

@@ -76,11 +76,26 @@ fn a_full_disk_is_one_message_and_leaves_earlier_results() {
         let left = std::fs::read_dir(project.path("after")).unwrap();
         let left: Vec<_> = left
             .map(|e| e.unwrap().file_name().into_string().unwrap())
-            .filter(|name| name.ends_with(".partial"))
+            .filter(|name| name.ends_with(".partial") || name.ends_with(".lock"))
             .collect();
         assert!(left.is_empty(), "{stage}: {left:?}");
     }
     assert_eq!(before.len(), STAGES.len());
+}
+
+#[test]
+fn what_fills_a_disk_can_be_cleaned_away() {
+    let project = Project::new();
+    project.run(DIPIR, &["run", "-q"]).expect_success();
+    let script = "cp -r out disk/out && cat /dev/zero > disk/filler 2>/dev/null
+                  \"$1\" clean --out disk/out && ls -A disk/out";
+    if let Some(run) = on_a_disk_of(&project, "4m", script) {
+        run.expect_success();
+        assert_eq!(
+            run.stdout,
+            "removed disk/out/scene, disk/out/composite, disk/out/report.html\n"
+        );
+    }
 }
 
 #[test]

@@ -78,7 +78,7 @@ fn status_says_what_would_run_and_why() {
         status(&["--set", "composite.max_samples=64"]),
         format!(
             "scene      stale: the object object.obj has other content\n{unneeded}\
-             composite  stale: max_samples changed from 16384 to 64; runs after scene\n"
+             composite  stale: composite.max_samples changed from 16384 to 64; runs after scene\n"
         )
     );
     let value: Value = serde_json::from_str(&status(&["--json"])).unwrap();
@@ -118,6 +118,24 @@ fn until_and_from_select_stages_and_force_runs_them_once_more() {
         "error: --from lora: the stage is not needed: [light] guidance = \"reference\" asks no \
          diffusion model",
     );
+}
+
+#[test]
+fn a_plan_foretells_a_recovery_with_other_settings_by_the_last_one() {
+    let project = whole::project();
+    project.run(DIPIR, &["run", "-q"]).expect_success();
+    let light = |iterations: &str| -> Value {
+        let set = format!("light.iterations={iterations}");
+        let run = project.run(DIPIR, &["run", "--plan", "--json", "--set", &set]);
+        run.expect_success();
+        let value: Value = serde_json::from_str(&run.stdout).unwrap();
+        let all = value["plan"].as_array().unwrap();
+        all.iter().find(|e| e["stage"] == "light").unwrap().clone()
+    };
+    let [some, more] = ["100000", "200000"].map(light);
+    let from = "from the times of the last run, which had other settings";
+    assert_eq!(some["from"], from);
+    assert!(more["seconds"].as_f64() > some["seconds"].as_f64());
 }
 
 #[test]

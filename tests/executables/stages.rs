@@ -193,3 +193,39 @@ fn a_mask_of_the_photos_foreground_hides_the_object() {
     let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
     assert_eq!(layers.rgb("").unwrap(), layers.rgb("background").unwrap());
 }
+
+#[test]
+fn what_a_stage_or_a_later_one_writes_is_no_input_of_it() {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let text = text.replace("environment = \"sky.exr\"\n", "");
+    project.write("pipeline.toml", text);
+    project.run(DIPIR, &["run", "-q"]).expect_success();
+    let own = ["--set", "light.start=out/light/lighting.json"];
+    let refused = "error: the start \"out/light/lighting.json\" is written by the stage light, and a run would replace \
+                   it: copy it elsewhere and name the copy";
+    project.run(OPTIMIZE, &own).expect_error(2, refused);
+    for command in ["run", "status"] {
+        let run = project.run(DIPIR, &[&[command][..], &own].concat());
+        run.expect_error(2, refused);
+    }
+    let later = ["--set", "scene.background=./out/composite/composite.png"];
+    let run = project.run(SCENE, &later);
+    assert_eq!(run.code, Some(2));
+    assert!(
+        run.stderr.contains("is written by the stage composite"),
+        "{}",
+        run.stderr
+    );
+    // What an earlier stage writes may be named, and what is a copy.
+    let earlier = [
+        "status",
+        "--set",
+        "composite.environment=out/light/environment.exr",
+    ];
+    project.run(DIPIR, &earlier).expect_success();
+    project.write("lighting.json", project.read("out/light/lighting.json"));
+    project
+        .run(OPTIMIZE, &["--set", "light.start=lighting.json"])
+        .expect_success();
+}

@@ -21,22 +21,110 @@ pub struct Model {
     pub points: Vec<DVec3>,
 }
 
+/// Where the files of a model are.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Files {
+    folder: PathBuf,
+    extension: &'static str,
+    /// Folders of the project's models, in their order.
+    models: Vec<PathBuf>,
+}
+
+impl Files {
+    /// Of the model that `path` stands for: its folder, a project's, whose models are in `sparse` or in its numbered
+    /// folders, or one of the model's files. `None` if `path` is another file.
+    pub fn at(path: &Path) -> Option<Self> {
+        if path.is_dir() {
+            return Some(Self::in_folder(path));
+        }
+        let stem = path.file_stem()?.to_str()?;
+        let kind = path.extension()?.to_str()?;
+        let extension = EXTENSIONS.into_iter().find(|e| *e == kind)?;
+        STEMS.contains(&stem).then(|| Self {
+            folder: path.parent().unwrap_or(Path::new("")).into(),
+            extension,
+            models: Vec::new(),
+        })
+    }
+
+    fn in_folder(path: &Path) -> Self {
+        let sparse = path.join("sparse");
+        let own = [path, &sparse].into_iter().find(|f| has_model(f));
+        let models = match own {
+            Some(folder) => vec![folder.to_owned()],
+            None => [path, &sparse].into_iter().flat_map(numbered).collect(),
+        };
+        let folder = models.first().cloned().unwrap_or(path.into());
+        Self {
+            extension: match is_binary(&folder) {
+                true => "bin",
+                false => "txt",
+            },
+            folder,
+            models,
+        }
+    }
+
+    /// The file of `cameras`, `images` or `points3D`.
+    pub fn part(&self, stem: &str) -> PathBuf {
+        self.folder.join(format!("{stem}.{}", self.extension))
+    }
+
+    /// Which model was taken, if there are several, and how another is.
+    pub fn choice(&self) -> Option<String> {
+        let [first, second, ..] = &self.models[..] else {
+            return None;
+        };
+        Some(format!(
+            "COLMAP's project has {} models, and the one in {first:?} is read; for another write its folder, for instance {second:?}",
+            self.models.len()
+        ))
+    }
+
+    fn bytes(&self, stem: &str) -> Result<Vec<u8>, CameraError> {
+        let path = self.part(stem);
+        dipir_files::read(&path).map_err(|source| CameraError::Read { path, source })
+    }
+}
+
+const EXTENSIONS: [&str; 2] = ["bin", "txt"];
+const STEMS: [&str; 3] = ["cameras", "images", "points3D"];
+
+fn is_binary(folder: &Path) -> bool {
+    folder.join("cameras.bin").exists()
+}
+
+fn has_model(folder: &Path) -> bool {
+    is_binary(folder) || folder.join("cameras.txt").exists()
+}
+
+/// The models in folders of `parent` whose names are numbers, in their order.
+fn numbered(parent: &Path) -> Vec<PathBuf> {
+    let entries = parent.read_dir().into_iter().flatten().flatten();
+    let number = |path: PathBuf| Some((path.file_name()?.to_str()?.parse::<u32>().ok()?, path));
+    let all = entries.filter_map(|entry| number(entry.path()));
+    let mut all: Vec<_> = all.filter(|(_, path)| has_model(path)).collect();
+    all.sort();
+    all.into_iter().map(|(_, path)| path).collect()
+}
+
 /// Reads the model in `folder`, binary files first. Points may be missing. `up` is the axis of the
 /// model's world that points up.
 ///
 /// # Errors
 /// If a file is missing, cut short, or of a camera model that is not known.
 pub fn read(folder: &Path, up: WorldUp) -> Result<Model, CameraError> {
-    let points = match part(folder, "points3D").exists() {
-        true => bytes(folder, "points3D")?,
+    let files = Files::in_folder(folder);
+    let points = match files.part("points3D").exists() {
+        true => files.bytes("points3D")?,
         false => Vec::new(),
     };
-    of_parts(folder, &points, up)
+    of_parts(&files, &points, up)
 }
 
-/// The cameras of the model in `folder` by the names of their images. Errors as [`read`].
-pub fn read_cameras(folder: &Path, up: WorldUp) -> Result<Vec<(String, Camera)>, CameraError> {
-    Ok(of_parts(folder, &[], up)?.images)
+/// The cameras of a model by the names of their images. Errors as [`read`].
+pub fn read_cameras(files: &Files, up: WorldUp) -> Result<Vec<(String, Camera)>, CameraError> {
+    Ok(of_parts(files, &[], up)?.images)
 }
 
 /// The points of `points3D.txt` or, if `binary`, `points3D.bin`. Errors as [`read`].
@@ -48,38 +136,15 @@ pub fn read_points(points: &[u8], binary: bool, up: WorldUp) -> Result<Vec<DVec3
     }
 }
 
-/// The files of cameras and images in `folder`.
-pub fn parts(folder: &Path) -> Vec<PathBuf> {
-    ["cameras", "images"].map(|stem| part(folder, stem)).into()
-}
-
-/// A file of the model: binary, if its cameras are.
-pub fn part(folder: &Path, stem: &str) -> PathBuf {
-    let extension = match is_binary(folder) {
-        true => "bin",
-        false => "txt",
-    };
-    folder.join(format!("{stem}.{extension}"))
-}
-
-fn is_binary(folder: &Path) -> bool {
-    folder.join("cameras.bin").exists()
-}
-
-fn bytes(folder: &Path, stem: &str) -> Result<Vec<u8>, CameraError> {
-    let path = part(folder, stem);
-    dipir_files::read(&path).map_err(|source| CameraError::Read { path, source })
-}
-
 fn text(bytes: &[u8]) -> Result<&str, CameraError> {
     std::str::from_utf8(bytes).map_err(|_| CameraError::new(FORMAT, "it is not UTF-8"))
 }
 
-fn of_parts(folder: &Path, points: &[u8], up: WorldUp) -> Result<Model, CameraError> {
-    let (cameras, images) = (bytes(folder, "cameras")?, bytes(folder, "images")?);
-    match is_binary(folder) {
-        true => read_binary(&cameras, &images, points, up),
-        false => read_text(text(&cameras)?, text(&images)?, text(points)?, up),
+fn of_parts(files: &Files, points: &[u8], up: WorldUp) -> Result<Model, CameraError> {
+    let (cameras, images) = (files.bytes("cameras")?, files.bytes("images")?);
+    match files.extension {
+        "bin" => read_binary(&cameras, &images, points, up),
+        _ => read_text(text(&cameras)?, text(&images)?, text(points)?, up),
     }
 }
 

@@ -50,7 +50,7 @@ const SAME_SHAPE: f64 = 0.01;
 const KITTI_LEFT: u32 = 2;
 
 /// Reads the camera of a photograph from `path`: an `.fspy` project or its JSON, `transforms.json`,
-/// `.chan`, `.gltf` or `.glb`, a folder of COLMAP's, calibrations of OpenCV, ROS and KITTI, and
+/// `.chan`, `.gltf` or `.glb`, COLMAP's model, its folder or project, calibrations of OpenCV, ROS and KITTI, and
 /// records of nuScenes.
 ///
 /// # Errors
@@ -73,12 +73,17 @@ pub fn read(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
     Ok(found)
 }
 
-/// The files that [`read`] reads: `path` itself, or those of COLMAP's folder.
+/// The files that [`read`] reads: `path` itself, or those of COLMAP's model.
 pub fn parts(path: &Path) -> Vec<PathBuf> {
-    match path.is_dir() {
-        true => colmap::parts(path),
-        false => vec![path.into()],
+    match colmap::Files::at(path) {
+        Some(files) => ["cameras", "images"].map(|stem| files.part(stem)).into(),
+        None => vec![path.into()],
     }
+}
+
+/// Which of several models [`read`] reads.
+pub fn choice(path: &Path) -> Option<String> {
+    colmap::Files::at(path)?.choice()
 }
 
 fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
@@ -89,10 +94,21 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
         ground_at_origin,
     };
     let z_up = wanted.up.unwrap_or(WorldUp::Z);
-    if path.is_dir() {
+    if let Some(files) = colmap::Files::at(path) {
         // COLMAP's world is that of a first camera, unless it was turned.
-        let cameras = colmap::read_cameras(path, wanted.up.unwrap_or(WorldUp::MinusY))?;
-        return Ok(of(chosen(&cameras, wanted, "COLMAP")?, "COLMAP", false));
+        let cameras = colmap::read_cameras(&files, wanted.up.unwrap_or(WorldUp::MinusY))?;
+        let camera = chosen(&cameras, wanted, "COLMAP").map_err(|e| match (e, files.choice()) {
+            (
+                CameraError::Malformed {
+                    format,
+                    detail,
+                    remedy,
+                },
+                Some(choice),
+            ) => CameraError::with_remedy(format, format!("{detail}; {choice}"), remedy),
+            (e, _) => e,
+        })?;
+        return Ok(of(camera, "COLMAP", false));
     }
     let bytes = dipir_files::read(path).map_err(|source| CameraError::Read {
         path: path.into(),
@@ -126,7 +142,7 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
         _ => Err(CameraError::with_remedy(
             "camera's",
             "it is not a kind of file that is known",
-            "use .fspy, transforms.json, .chan, .glb, .gltf, a folder of COLMAP's, or a calibration \
+            "use .fspy, transforms.json, .chan, .glb, .gltf, COLMAP's folder or project, or a calibration \
              of OpenCV (.yaml, .json), KITTI (.txt) or nuScenes (.json)",
         )),
     }

@@ -39,7 +39,8 @@ impl LightEstimate {
         if count == 0 {
             return Vec::new();
         }
-        let base = fit(&self.base_map(), BASE_LOBES).lobes;
+        let shining = self.shining();
+        let base = fit(&shining.base_map(), BASE_LOBES).lobes;
         let mut all = vec![Candidate {
             probability: 1.0 - self.sun_probability,
             words: "soft light without a sun".into(),
@@ -58,7 +59,7 @@ impl LightEstimate {
             }
         };
         for (direction, share) in suns {
-            all.push(self.sun(direction, self.sun_probability * share, &base));
+            all.push(shining.sun(direction, self.sun_probability * share, &base));
         }
         all.retain(|c| c.probability > LEAST);
         let total: f64 = all.iter().map(|c| c.probability).sum();
@@ -102,14 +103,14 @@ impl LightEstimate {
         shares
     }
 
+    /// A sun of this estimate, which takes it for granted, over its smooth part.
     fn sun(&self, direction: Vec3, probability: f64, base: &[SphericalGaussian]) -> Candidate {
-        let peak = Vec3::from(self.peak) * self.energy_of_sun();
         let mut source = SphericalGaussian {
             direction,
             radiance: Vec3::ONE,
             sigma: self.source_lobe().map_or(SOURCE_SIGMA, |known| known.sigma),
         };
-        source.radiance = peak / source.solid_angle() as f32;
+        source.radiance = Vec3::from(self.peak) / source.solid_angle() as f32;
         let mut lobes = vec![source];
         lobes.extend_from_slice(base);
         let seen = Quat::from_rotation_y(self.heading_rad as f32) * direction;
@@ -117,7 +118,7 @@ impl LightEstimate {
             probability,
             words: words(seen),
             direction: Some(direction),
-            map: self.map_with(&soft_bins(seen), self.energy_of_sun()),
+            map: self.map_with(&soft_bins(seen)),
             lobes,
         }
     }

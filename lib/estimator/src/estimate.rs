@@ -89,20 +89,20 @@ impl LightEstimate {
     /// The mean light in the world: the smooth part, and the strongest source spread over where it may stand.
     pub fn map(&self) -> EnvironmentMap {
         let weights: Vec<f32> = self.posterior.weights.clone();
-        self.map_with(&weights, 1.0)
+        self.map_with(&weights)
     }
 
     /// The light without its strongest source, in the world.
     pub fn base_map(&self) -> EnvironmentMap {
-        self.map_with(&[0.0; BINS], 1.0)
+        self.map_with(&[0.0; BINS])
     }
 
-    /// The smooth part and the strongest source, `energy` times as strong, spread by `weights`.
-    pub(crate) fn map_with(&self, weights: &[f32], energy: f32) -> EnvironmentMap {
+    /// The smooth part and the strongest source, spread by `weights`.
+    pub(crate) fn map_with(&self, weights: &[f32]) -> EnvironmentMap {
         let [width, height] = MAP;
         let mut texels = smooth_map(&self.base, width, height);
         let grid = EnvironmentMap::constant(width, height, Vec3::ZERO);
-        let peak = Vec3::from(self.peak) * energy;
+        let peak = Vec3::from(self.peak);
         for (k, weight) in weights.iter().enumerate().filter(|w| *w.1 > 0.0) {
             let middle = bin_direction(k);
             let mut total = 0.0;

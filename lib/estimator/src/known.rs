@@ -96,16 +96,7 @@ impl LightEstimate {
         };
         known.posterior = PeakPosterior::normalised((0..BINS).map(weight).collect());
         if sun.shines {
-            let energy = known.energy_of_sun();
-            known.peak = known.peak.map(|p| p * energy);
-            known.sun_probability = 1.0;
-            // The smooth part holds the light of suns whose direction the photograph did not tell.
-            if known.source_share() < MEAN_SHARE {
-                known.set_share(MEAN_SHARE);
-            }
-            let Interval { low, middle, high } = known.share;
-            let [low, middle, high] = [low, middle, high].map(|s| s.max(LEAST_SHARE));
-            known.share = Interval::new(low, middle, high);
+            known = known.shining();
         }
         if let Some(share) = sun.share {
             known.set_share(share);
@@ -137,9 +128,20 @@ impl LightEstimate {
         known.described()
     }
 
-    /// How many times as strong as expected the strongest source is, if it is a sun.
-    pub(crate) fn energy_of_sun(&self) -> f32 {
-        (1.0 / self.sun_probability.max(1e-3)).min(MOST_ENERGY) as f32
+    /// The estimate, if the strongest source is a sun.
+    pub(crate) fn shining(&self) -> Self {
+        let mut shining = self.clone();
+        let energy = (1.0 / self.sun_probability.max(1e-3)).min(MOST_ENERGY) as f32;
+        shining.peak = self.peak.map(|p| p * energy);
+        shining.sun_probability = 1.0;
+        // The smooth part holds the light of suns whose direction the photograph did not tell.
+        if shining.source_share() < MEAN_SHARE {
+            shining.set_share(MEAN_SHARE);
+        }
+        let Interval { low, middle, high } = self.share;
+        let [low, middle, high] = [low, middle, high].map(|s| s.max(LEAST_SHARE));
+        shining.share = Interval::new(low, middle, high);
+        shining
     }
 
     /// The strongest source's share of all light.

@@ -3,10 +3,10 @@
 //! A profile of three curves and a matrix maps stored values to linear Rec.709: each value through
 //! its curve, then the matrix. Colours that Rec.709 cannot show come out below 0 or above 1, and go
 //! back to the values that they had.
-use crate::{raster::LinearImage, transfer::Transfer};
+use crate::{primaries::Primaries, raster::LinearImage, transfer::Transfer};
 use glam::{DMat3, DVec3, Mat3, Vec3};
 use moxcms::{ColorDateTime, ColorProfile, DataColorSpace, ToneReprCurve};
-use png::ScaledFloat;
+use png::{ScaledFloat, SourceChromaticities};
 use rayon::prelude::*;
 
 /// How the values of a photograph were encoded, and how a picture that looks like it is.
@@ -22,8 +22,8 @@ pub struct Encoding {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Tag {
     Srgb,
-    /// Exponent that encodes light.
-    Gamma(ScaledFloat),
+    /// Exponent that encodes light, and primaries.
+    Chunks(Option<ScaledFloat>, Option<SourceChromaticities>),
     /// An ICC profile for RGB.
     Profile(Vec<u8>),
 }
@@ -55,8 +55,8 @@ impl Encoding {
             from_rec709: Mat3::IDENTITY,
             tag: match transfer {
                 Transfer::Srgb => Tag::Srgb,
-                Transfer::Gamma22 => Tag::Gamma(ScaledFloat::new(1.0 / 2.2)),
-                Transfer::Linear => Tag::Gamma(ScaledFloat::new(1.0)),
+                Transfer::Gamma22 => Tag::Chunks(Some(ScaledFloat::new(1.0 / 2.2)), None),
+                Transfer::Linear => Tag::Chunks(Some(ScaledFloat::new(1.0)), None),
             },
         }
     }
@@ -81,9 +81,28 @@ impl Encoding {
         };
         Ok(Some(Self {
             curves: [0; 3].map(|_| curve.clone()),
-            tag: Tag::Gamma(gamma),
+            tag: Tag::Chunks(Some(gamma), None),
             ..Self::named(Transfer::Linear)
         }))
+    }
+
+    /// The curve of `of_gamma`, or sRGB's, with a PNG's `chromaticities` and its `gamma`, if that can be used.
+    ///
+    /// # Errors
+    /// Why they describe no colours, as a clause.
+    pub(crate) fn with_primaries(
+        of_gamma: Option<Self>,
+        gamma: Option<ScaledFloat>,
+        chromaticities: SourceChromaticities,
+    ) -> Result<Self, &'static str> {
+        let to_rec709 = Primaries::of_png(&chromaticities).to_rec709()?;
+        let to_rec709 = to_rec709.unwrap_or(Mat3::IDENTITY);
+        Ok(Self {
+            to_rec709,
+            from_rec709: to_rec709.as_dmat3().inverse().as_mat3(),
+            tag: Tag::Chunks(gamma, Some(chromaticities)),
+            ..of_gamma.unwrap_or_else(|| Self::named(Transfer::Srgb))
+        })
     }
 
     /// The encoding that an ICC profile describes for an image of `channels` colours (1 or 3).

@@ -232,7 +232,7 @@ fn display_photo(mut decoded: Decoded, path: &Path, transfer: Transfer) -> Photo
     }
 }
 
-/// Reads linear light from OpenEXR (bare `R`, `G`, `B`, or grey `Y`) or Radiance HDR. A
+/// Reads linear light from OpenEXR (bare `R`, `G`, `B`, or `X`, `Y`, `Z`, or grey `Y`) or Radiance HDR. A
 /// display-referred file is an error, so is NaN or infinity, with the pixel named.
 ///
 /// Light of other primaries is converted to Rec.709. Where that gives a pixel without values below
@@ -317,19 +317,22 @@ const MAX_FILE_BYTES: u64 = 1 << 32;
 
 fn read_colour(bytes: &[u8], path: &Path, limit: SizeLimit) -> Result<Layers, ImagingError> {
     let length = bytes.len() as u64;
-    let names = ["R", "G", "B", "A", "Y"];
+    let names = ["R", "G", "B", "A", "X", "Y", "Z"];
     exr_file::read(Cursor::new(bytes), length, path, Some(&names), limit)
 }
 
-/// Light as stored, and the primaries that it is in, if they are named. Grey has none.
+/// Light as stored, and the primaries that it is in, if they are named. Grey has none, and `X`, `Y`, `Z` are CIE XYZ.
 fn linear_of_layers(
     layers: &Layers,
     path: &Path,
 ) -> Result<(LinearImage, Option<Primaries>), ImagingError> {
-    let (colour, primaries) = if !layers.contains("R") && layers.contains("Y") {
-        (layers.channel("Y")?.map(|&v| Vec3::splat(v)), None)
-    } else {
+    let (colour, primaries) = if layers.contains("R") || !layers.contains("Y") {
         (layers.rgb("")?, layers.primaries)
+    } else if layers.contains("X") && layers.contains("Z") {
+        let (xyz, white) = Primaries::of_xyz(layers.primaries);
+        (layers.xyz("")?.map(|&v| v / white), Some(xyz))
+    } else {
+        (layers.channel("Y")?.map(|&v| Vec3::splat(v)), None)
     };
     check_finite(path, &colour)?;
     Ok((LinearImage(colour), primaries))

@@ -1,6 +1,6 @@
 //! What a PNG says of its colours beside a profile: its chunks `cICP`, `sRGB`, `gAMA` and `cHRM`.
 use crate::{encoding::Encoding, primaries::Primaries};
-use png::ScaledFloat;
+use png::{ScaledFloat, SourceChromaticities};
 
 /// The chunks of a PNG that tell its colours [PNG, third edition, 11.3.2].
 #[derive(Clone, Default)]
@@ -8,7 +8,7 @@ pub(crate) struct PngColours {
     code_points: Option<[u8; 4]>,
     srgb: bool,
     gamma: Option<ScaledFloat>,
-    primaries: Option<Primaries>,
+    chromaticities: Option<SourceChromaticities>,
 }
 
 /// sRGB as `cICP` says it: primaries, curve, matrix (none), full range.
@@ -31,10 +31,14 @@ impl PngColours {
                 b"cHRM" if data.len() == 32 => {
                     let at = |k: usize| {
                         let word = data[4 * k..].first_chunk().copied().unwrap_or_default();
-                        f64::from(u32::from_be_bytes(word)) / 1e5
+                        ScaledFloat::from_scaled(u32::from_be_bytes(word))
                     };
-                    // White comes first.
-                    found.primaries = Some(Primaries::new([2, 3, 4, 5, 6, 7, 0, 1].map(at)));
+                    found.chromaticities = Some(SourceChromaticities {
+                        white: (at(0), at(1)),
+                        red: (at(2), at(3)),
+                        green: (at(4), at(5)),
+                        blue: (at(6), at(7)),
+                    });
                 }
                 _ => {}
             }
@@ -62,19 +66,26 @@ impl PngColours {
         if self.srgb {
             return None;
         }
-        let gamma = self.gamma.map(Encoding::of_gamma).transpose();
-        let encoding = gamma.unwrap_or_else(|why| {
+        let mut gamma = self.gamma;
+        let of_gamma = gamma.map(Encoding::of_gamma).transpose();
+        let of_gamma = of_gamma.unwrap_or_else(|why| {
             unused.push(format!("gamma (gAMA) {why}; it is read as {assumed}"));
+            gamma = None;
             None
         });
+        let of_gamma = of_gamma.flatten();
         // Grey has no primaries.
-        let primaries = self.primaries.filter(|_| channels == 3);
-        if primaries.is_some_and(|p| !p.are_rec709(SRGB_TOLERANCE)) {
-            unused.push(
-                "primaries (cHRM) are not sRGB's and cannot be used; it is read with sRGB's".into(),
-            );
+        let own = self.chromaticities.filter(|_| channels == 3);
+        match own.filter(|c| !Primaries::of_png(c).are_rec709(SRGB_TOLERANCE)) {
+            None => of_gamma,
+            Some(own) => match Encoding::with_primaries(of_gamma.clone(), gamma, own) {
+                Ok(encoding) => Some(encoding),
+                Err(why) => {
+                    unused.push(format!("primaries (cHRM) {why}; it is read with sRGB's"));
+                    of_gamma
+                }
+            },
         }
-        encoding.flatten()
     }
 }
 

@@ -125,7 +125,10 @@ fn encode_png(
     match about.tag {
         None => {}
         Some(Tag::Srgb) => info.srgb = Some(SrgbRenderingIntent::Perceptual),
-        Some(Tag::Gamma(exponent)) => info.source_gamma = Some(*exponent),
+        Some(Tag::Chunks(gamma, chromaticities)) => {
+            info.source_gamma = *gamma;
+            info.source_chromaticities = *chromaticities;
+        }
         Some(Tag::Profile(icc)) => info.icc_profile = Some(Cow::Borrowed(icc)),
     }
     let file = File::create(path).map_err(|e| ImagingError::io("create", path, e))?;

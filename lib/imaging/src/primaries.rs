@@ -1,6 +1,7 @@
 //! The primaries of light that a file names, and the way to Rec.709.
 use crate::raster::LinearImage;
 use glam::{DMat3, DVec2, DVec3, Mat3, Vec3};
+use png::{ScaledFloat, SourceChromaticities};
 use rayon::prelude::*;
 
 /// Chromaticities (CIE x, y) of red, green, blue and white.
@@ -24,6 +25,15 @@ impl Primaries {
         Self([0, 2, 4, 6].map(|k| DVec2::new(numbers[k], numbers[k + 1])))
     }
 
+    /// Of a PNG's `cHRM`.
+    pub fn of_png(chunk: &SourceChromaticities) -> Self {
+        let of = |(x, y): (ScaledFloat, ScaledFloat)| {
+            // Hundred thousandths, exactly.
+            DVec2::new(x.into_scaled().into(), y.into_scaled().into()) / 1e5
+        };
+        Self([chunk.red, chunk.green, chunk.blue, chunk.white].map(of))
+    }
+
     /// As [`new`](Self::new), from the first eight words of a text. If they are not numbers, the
     /// primaries are NaN, which [`to_rec709`](Self::to_rec709) refuses.
     pub fn of_text(text: &str) -> Self {
@@ -31,6 +41,23 @@ impl Primaries {
         let numbers: Option<Vec<f64>> = words.map(|word| word.parse().ok()).collect();
         let eight = numbers.and_then(|n| n.try_into().ok());
         Self::new(eight.unwrap_or([f64::NAN; 8]))
+    }
+
+    /// CIE XYZ, and the values of its white, of luminance 1: that which `named` has, or D65 if there is none or it is
+    /// the centre of XYZ, by which files name XYZ itself.
+    pub fn of_xyz(named: Option<Self>) -> (Self, Vec3) {
+        const CENTRE: DVec2 = DVec2::splat(1.0 / 3.0);
+        let white = named.map_or(CENTRE, |own| own.0[3]);
+        let white = match (white - CENTRE).abs().max_element() > TOLERANCE {
+            true => white,
+            false => REC709.0[3],
+        };
+        let values = DVec3::new(white.x, white.y, 1.0 - white.x - white.y) / white.y;
+        // Where this is no white, `to_rec709` says so.
+        let is_light = values.is_finite() && values.min_element() > 0.0;
+        let values = if is_light { values } else { DVec3::ONE };
+        let xyz = Self([DVec2::X, DVec2::Y, DVec2::ZERO, white]);
+        (xyz, values.as_vec3())
     }
 
     /// Whether no chromaticity is further than `tolerance` from Rec.709's.

@@ -39,6 +39,25 @@ fn put_exr(folder: &TempDir, primaries: Option<[f32; 8]>) -> PathBuf {
     path
 }
 
+/// An OpenEXR file of one pixel of XYZ.
+fn put_xyz(folder: &TempDir, xyz: [f32; 3], white: Option<[f32; 2]>) -> PathBuf {
+    let path = folder.path().join("xyz.exr");
+    let channels = SpecificChannels::build()
+        .with_channel("X")
+        .with_channel("Y")
+        .with_channel("Z")
+        .with_pixel_fn(move |_| (xyz[0], xyz[1], xyz[2]));
+    let mut image = Image::from_channels((1, 1), channels);
+    image.attributes.chromaticities = white.map(|[x, y]| Chromaticities {
+        red: Vec2(1.0, 0.0),
+        green: Vec2(0.0, 1.0),
+        blue: Vec2(0.0, 0.0),
+        white: Vec2(x, y),
+    });
+    image.write().to_file(&path).unwrap();
+    path
+}
+
 /// A Radiance file of one pixel, red at 1.
 fn put_hdr(folder: &TempDir, lines: &str) -> PathBuf {
     let path = folder.path().join("light.hdr");
@@ -77,6 +96,33 @@ fn light_of_rec709_is_left_as_it_is() {
     let lines = "PRIMARIES= 0.64 0.33 0.30 0.60 0.15 0.06 0.3127 0.3290\n";
     let hdr = read_linear(put_hdr(&folder, lines)).unwrap();
     assert_eq!(first(&hdr), Vec3::X);
+}
+
+#[test]
+fn xyz_of_openexr_is_converted_and_is_not_read_as_grey() {
+    let folder = folder();
+    // Red of Rec.709 [IEC 61966-2-1]; the centre of XYZ names XYZ itself, and no white.
+    let red = [0.4124, 0.2126, 0.0193];
+    for white in [None, Some([0.3127, 0.329]), Some([1.0 / 3.0; 2])] {
+        let path = put_xyz(&folder, red, white);
+        let photo = read_photo(&path, Transfer::Srgb).unwrap();
+        assert_eq!(photo.warnings, Vec::<String>::new());
+        let got = first(&photo.image);
+        // The standard's matrix has four digits.
+        assert!(got.abs_diff_eq(Vec3::X, 1e-3), "{white:?}: {got}");
+        assert!(first(&read_linear(&path).unwrap()).abs_diff_eq(Vec3::X, 1e-3));
+    }
+    // White D50 of luminance 2 is white here.
+    let path = put_xyz(
+        &folder,
+        [2.0 * 0.9643, 2.0, 2.0 * 0.8251],
+        Some([0.3457, 0.3585]),
+    );
+    let got = first(&read_linear(&path).unwrap());
+    assert!(got.abs_diff_eq(Vec3::splat(2.0), 1e-3), "{got}");
+    let path = put_xyz(&folder, red, Some([0.3, 0.0]));
+    let photo = read_photo(&path, Transfer::Srgb).unwrap();
+    assert!(photo.warnings[0].contains("its primaries do not make their white"));
 }
 
 #[test]
@@ -198,6 +244,59 @@ fn the_gamma_of_a_png_is_read_and_the_picture_has_it() {
 }
 
 #[test]
+fn the_primaries_of_a_png_are_read_and_the_picture_has_them() {
+    let folder = folder();
+    let (p3, gamma18, gamma22, gamma20) = (
+        chromaticities(P3),
+        gamma(55_556),
+        gamma(45_455),
+        gamma(2_000_000),
+    );
+    let cases: [(&[u8], Option<u32>, f64); 4] = [
+        (&[], None, 2.2),
+        (&gamma18, Some(55_556), 1.8),
+        (&gamma22, Some(45_455), 2.2),
+        (&gamma20, None, 2.2),
+    ];
+    for (chunk, scaled, exponent) in cases {
+        let mut chunks: Vec<(&[u8; 4], &[u8])> = vec![(b"cHRM", &p3)];
+        if !chunk.is_empty() {
+            chunks.push((b"gAMA", chunk));
+        }
+        let photo = photo_with(&folder, &chunks, Transfer::Srgb);
+        // Only an exponent of 20 is said.
+        assert_eq!(photo.warnings.len(), usize::from(chunk == gamma20));
+        // White and grey stay as they are; the last colour is (255, 0, 7).
+        let pixels = photo.image.0.pixels();
+        assert!(pixels[510].abs_diff_eq(Vec3::ONE, 1e-6));
+        let grey = (128.0f64 / 255.0).powf(exponent);
+        assert!(
+            (f64::from(pixels[256].y) - grey).abs() < 0.01,
+            "{}",
+            pixels[256]
+        );
+        // Red of Display P3 in Rec.709 [SMPTE EG 432-1, to four digits].
+        let red = Vec3::new(1.2249, -0.0420, -0.0196);
+        assert!(pixels[511].abs_diff_eq(red, 0.01), "{}", pixels[511]);
+        let written = folder.path().join("picture.png");
+        write_picture(&written, &photo.image, &photo).unwrap();
+        let (values, written_gamma, srgb) = stored(&written);
+        assert_eq!(values, many_colours());
+        assert_eq!((written_gamma, srgb), (scaled, false));
+        let bytes = std::fs::read(&written).unwrap();
+        let at = bytes.windows(4).position(|w| w == b"cHRM").unwrap();
+        assert_eq!(bytes[at + 4..at + 36], p3);
+        // What is encoded anew has the same values: there is no seam.
+        let again = photo.encoding.encode_8(&photo.image);
+        assert_eq!(again.as_flattened(), many_colours(), "{scaled:?}");
+        assert_eq!(
+            read_photo(&written, Transfer::Srgb).unwrap().image,
+            photo.image
+        );
+    }
+}
+
+#[test]
 fn a_named_curve_overrules_the_gamma_of_a_png_and_the_picture_keeps_it() {
     let folder = folder();
     let chunk = gamma(55_556);
@@ -231,12 +330,12 @@ fn a_gamma_for_srgb_or_beside_srgb_changes_nothing() {
 fn chunks_of_colour_that_cannot_be_used_are_said() {
     let folder = folder();
     let plain = photo_with(&folder, &[], Transfer::Srgb);
-    let (p3, gamma0) = (chromaticities(P3), gamma(0));
+    let (p3, line, gamma0) = (chromaticities(P3), chromaticities([30_000; 8]), gamma(0));
     let cases: [(&[u8; 4], &[u8], &str); 4] = [
         (
             b"cHRM",
-            &p3,
-            "primaries (cHRM) are not sRGB's and cannot be used; it is read with sRGB's",
+            &line,
+            "primaries (cHRM) lie on one line; it is read with sRGB's",
         ),
         (
             b"cICP",

@@ -4,6 +4,7 @@
 //! `file:line: key is …, accepted: …`. The tables are read into the domain crates' own serde
 //! types; a type that refuses unknown fields makes a misspelt key an error that names the
 //! accepted keys and the nearest one.
+mod alternatives;
 mod deserialize;
 mod methods;
 mod renamed;
@@ -128,7 +129,7 @@ pub struct Config {
 
 impl Config {
     /// Reads `path` and applies `overrides`, each `table.key=value`: a TOML value, or else a bare
-    /// string. Later overrides win.
+    /// string. Later overrides win, and they take the place of keys of the file that exclude them.
     pub fn read(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let text = dipir_files::read_to_string(path).map_err(|e| ConfigError::Read {
             path: path.into(),
@@ -143,6 +144,7 @@ impl Config {
         for text in overrides {
             tree::apply_override(&mut root, text)?;
         }
+        alternatives::drop_replaced(&mut root, overrides);
         methods::fill(&mut root)?;
         let config = Self {
             path: path.into(),

@@ -186,7 +186,11 @@ fn short(value: &str) -> String {
 
 impl fmt::Display for StaleReason {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let shown = |v: &Option<String>| v.as_deref().map_or("unset".into(), short);
+        let shown = |v: &Option<String>| match v.as_deref() {
+            None | Some("null") => "unset".into(),
+            Some(role) if role.starts_with('<') => "a file".into(),
+            Some(value) => short(value),
+        };
         match self {
             Self::NeverRun => write!(f, "it has not run yet"),
             Self::ManifestDamaged { path, message } => write!(f, "{}: {message}", path.display()),

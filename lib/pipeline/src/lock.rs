@@ -98,10 +98,12 @@ fn sign(file: &mut File, path: &Path) -> Result<(), StageError> {
             message,
         )));
     }
-    file.set_len(0)
+    // On a full disk there is no room for it, and the lock holds without.
+    let _ = file
+        .set_len(0)
         .and_then(|()| file.rewind())
-        .and_then(|()| writeln!(file, "{HEAD}{}", std::process::id()))
-        .map_err(failed)
+        .and_then(|()| writeln!(file, "{HEAD}{}", std::process::id()));
+    Ok(())
 }
 
 /// Whether the open file is the one at `path`.

@@ -84,9 +84,13 @@ impl Mark {
         if known.as_ref() == Some(self) {
             return Ok(());
         }
+        let mut is_new = false;
         if !known.as_ref().is_some_and(is_ours) {
             match fs::symlink_metadata(folder) {
-                Err(e) if e.kind() == io::ErrorKind::NotFound => create_folder(folder)?,
+                Err(e) if e.kind() == io::ErrorKind::NotFound => {
+                    create_folder(folder)?;
+                    is_new = true;
+                }
                 Err(e) => return Err(StageError::io("read", folder, e)),
                 Ok(_) if is_empty(folder)? => {
                     // Of a run that was killed at this point: without content.
@@ -95,7 +99,11 @@ impl Mark {
                 Ok(_) => return Err(foreign(folder, Foreign::NoMark)),
             }
         }
-        self.write(folder)
+        self.write(folder).inspect_err(|_| {
+            if is_new {
+                let _ = fs::remove_dir(folder);
+            }
+        })
     }
 
     /// What in `folder` this mark calls ours.

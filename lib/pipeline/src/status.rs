@@ -47,6 +47,15 @@ pub enum State {
     },
 }
 
+impl State {
+    /// Lets `edit` change the reasons why it has to run, if there are any.
+    pub fn with_reasons(&mut self, edit: impl FnOnce(&mut Vec<StaleReason>)) {
+        if let Self::Stale { reasons } | Self::Waits { reasons, .. } = self {
+            edit(reasons);
+        }
+    }
+}
+
 /// A stage and its state.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageStatus {

@@ -58,3 +58,9 @@ impl PointsError {
         }
     }
 }
+
+/// The beginning of what a file says, for a message.
+pub(crate) fn shown(text: &str) -> String {
+    let beginning: String = text.chars().take(60).collect();
+    beginning.escape_debug().to_string()
+}

@@ -11,7 +11,7 @@ use crate::{depth, pcd, ply};
 /// Where points come from, and how their coordinates become the scene's.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Source<'a> {
-    /// `.ply`, `.pcd`, `.bin`, `.exr` or `.png` with depths, COLMAP's folder or its `points3D`.
+    /// `.ply`, `.pcd`, `.bin`, `.exr` or `.png` with depths, COLMAP's folder or project, or its `points3D`.
     pub path: &'a Path,
     /// Which axis of the file points up; by default +z, +y for `.ply`, -y for COLMAP. Depth maps have none.
     pub up: Option<WorldUp>,
@@ -23,11 +23,11 @@ pub struct Source<'a> {
     pub camera: &'a Camera,
 }
 
-/// The file that [`read`] reads at `path`, which may be COLMAP's folder.
+/// The file that [`read`] reads at `path`, which may be COLMAP's folder or project.
 pub fn part(path: &Path) -> PathBuf {
-    match path.is_dir() {
-        true => colmap::part(path, "points3D"),
-        false => path.into(),
+    match colmap::Files::at(path).filter(|_| path.is_dir()) {
+        Some(files) => files.part("points3D"),
+        None => path.into(),
     }
 }
 

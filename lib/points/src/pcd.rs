@@ -2,7 +2,7 @@
 use glam::{DQuat, DVec3};
 
 use crate::cloud::{Cloud, Collector};
-use crate::error::PointsError;
+use crate::error::{PointsError, shown};
 
 const FORMAT: &str = "PCD";
 /// Longer headers are none.
@@ -38,10 +38,7 @@ pub(crate) fn read(bytes: &[u8]) -> Result<Cloud, PointsError> {
         other => {
             return Err(PointsError::with_remedy(
                 FORMAT,
-                format!(
-                    "its data are \"{}\"; accepted: ascii, binary",
-                    other.escape_debug()
-                ),
+                format!("its data are \"{}\"; accepted: ascii, binary", shown(other)),
                 "convert it with pcl_convert_pcd_ascii_binary in.pcd out.pcd 1",
             ));
         }
@@ -69,7 +66,7 @@ fn header(bytes: &[u8]) -> Result<(Header, &[u8]), PointsError> {
         let end = end.map_or(bytes.len(), |n| at + n);
         let line = String::from_utf8_lossy(&bytes[at..end]).into_owned();
         at = (end + 1).min(bytes.len());
-        let bad = || wrong(format!("its header says \"{}\"", line.escape_debug()));
+        let bad = || wrong(format!("its header says \"{}\"", shown(&line)));
         let (key, values) = line.trim().split_once(' ').unwrap_or((line.trim(), ""));
         let words = || values.split_whitespace();
         let numbers = || -> Result<Vec<usize>, PointsError> {
@@ -156,4 +153,29 @@ fn binary(header: &Header, axes: [usize; 3], body: &[u8]) -> Result<Vec<DVec3>, 
         found.add(DVec3::from_array(places.map(at)));
     }
     Ok(found.points())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_lines_are_cut_in_messages() {
+        let long = "9".repeat(1 << 20);
+        let fields = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n";
+        let cut = &long[..60 - "POINTS ".len()];
+        for (line, said) in [
+            (
+                format!("POINTS {long}\n"),
+                format!("its header says \"POINTS {cut}\""),
+            ),
+            (
+                format!("DATA {long}\n"),
+                format!("its data are \"{}\"; accepted", &long[..60]),
+            ),
+        ] {
+            let error = read(format!("{fields}{line}").as_bytes()).unwrap_err();
+            assert!(error.to_string().contains(&said));
+        }
+    }
 }

@@ -148,6 +148,19 @@ fn every_format_gives_the_same_points() {
     // The folder stands for its points.
     let cloud = file::read(&source(folder.path(), &camera)).unwrap();
     near(&cloud.points, &ours(), "folder");
+    // And a project for those of its model.
+    let model = folder.path().join("project/sparse/0");
+    std::fs::create_dir_all(&model).unwrap();
+    std::fs::write(model.join("cameras.txt"), "").unwrap();
+    std::fs::rename(
+        folder.path().join("points3D.txt"),
+        model.join("points3D.txt"),
+    )
+    .unwrap();
+    let project = folder.path().join("project");
+    assert_eq!(file::part(&project), model.join("points3D.txt"));
+    let cloud = file::read(&source(&project, &camera)).unwrap();
+    near(&cloud.points, &ours(), "project");
 }
 
 #[test]

@@ -241,7 +241,7 @@ pub enum Which {
 pub struct FileSettings {
     /// Name of the key that names the file.
     pub key: &'static str,
-    /// The file or, of COLMAP's, the folder.
+    /// The file or, of COLMAP's, the folder of the model or the project.
     pub path: PathBuf,
     /// Which camera.
     pub which: Which,
@@ -259,6 +259,11 @@ impl FileSettings {
     /// The files that are read, as the configuration would name them.
     pub fn parts(&self, base_dir: &Path) -> Vec<PathBuf> {
         parts(&self.path, base_dir)
+    }
+
+    /// Which of several models is read, as a warning.
+    pub(crate) fn choice(&self, base_dir: &Path) -> Option<String> {
+        file::choice(&base_dir.join(&self.path))
     }
 
     fn resolve(
@@ -336,14 +341,24 @@ impl FileSettings {
 pub(crate) const FARTHEST_M: f32 = 1e7;
 
 /// The files that a camera's `path` stands for, as the configuration would name them: itself, or those
-/// of COLMAP's folder.
+/// of COLMAP's model.
 pub fn parts(path: &Path, base_dir: &Path) -> Vec<PathBuf> {
     let parts = file::parts(&base_dir.join(path));
-    let beside = |part: PathBuf| match (parts.len(), part.file_name()) {
-        (2.., Some(name)) => path.join(name),
-        _ => path.into(),
-    };
-    parts.iter().cloned().map(beside).collect()
+    parts
+        .iter()
+        .map(|part| named(part, path, base_dir))
+        .collect()
+}
+
+/// `part`, a file that `path` of the configuration stands for, as the configuration would name it.
+pub(crate) fn named(part: &Path, path: &Path, base_dir: &Path) -> PathBuf {
+    let whole = base_dir.join(path);
+    match part.strip_prefix(&whole) {
+        _ if part == whole => path.into(),
+        Ok(inside) => path.join(inside),
+        // A file beside the one that is named.
+        Err(_) => path.with_file_name(part.file_name().unwrap_or_default()),
+    }
 }
 
 /// The checked `[scene.camera]` table.
@@ -371,6 +386,24 @@ pub enum CameraSettings {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_files_of_a_model_are_named_as_the_configuration_would() {
+        let folder = tempfile::tempdir().unwrap();
+        let model = folder.path().join("shots/sparse/0");
+        std::fs::create_dir_all(&model).unwrap();
+        std::fs::write(model.join("cameras.txt"), "").unwrap();
+        for path in ["shots", "shots/sparse/0", "shots/sparse/0/images.txt"] {
+            let want = ["cameras.txt", "images.txt"].map(|n| Path::new("shots/sparse/0").join(n));
+            assert_eq!(parts(Path::new(path), folder.path()), want, "{path}");
+        }
+        assert_eq!(
+            parts(Path::new("calib.txt"), folder.path()),
+            [Path::new("calib.txt")]
+        );
+        let points = crate::ground::points_parts(Path::new("shots"), None, folder.path());
+        assert_eq!(points, [Path::new("shots/sparse/0/points3D.txt")]);
+    }
 
     #[test]
     fn a_focal_length_alone_is_enough_where_the_photograph_knows_its_sensor() {

@@ -9,7 +9,7 @@ use dipir_points::place::{self, Body};
 use dipir_points::{Cloud, Ground, PointsError};
 use glam::{DVec2, DVec3};
 
-use crate::camera::Camera;
+use crate::camera::{Camera, named};
 use crate::error::Error;
 use crate::mesh::TriangleMesh;
 use crate::plane_of_pixels::PixelPlane;
@@ -35,6 +35,11 @@ impl PointsSettings {
     /// The files that are read, as the configuration would name them.
     pub fn parts(&self, base_dir: &Path) -> Vec<PathBuf> {
         points_parts(&self.path, self.pose.as_deref(), base_dir)
+    }
+
+    /// Which of several models is read, as a warning.
+    pub fn choice(&self, base_dir: &Path) -> Option<String> {
+        dipir_cameras::file::choice(&base_dir.join(&self.path))
     }
 
     /// Reads the points and finds the ground that `view` sees.
@@ -70,11 +75,7 @@ impl PointsSettings {
 /// The files that `points` and `points_pose` stand for, as the configuration would name them.
 pub fn points_parts(path: &Path, pose: Option<&Path>, base_dir: &Path) -> Vec<PathBuf> {
     let part = dipir_points::file::part(&base_dir.join(path));
-    let named = match (base_dir.join(path) == part, part.file_name()) {
-        (false, Some(name)) => path.join(name),
-        _ => path.into(),
-    };
-    [Some(named), pose.map(Into::into)]
+    [Some(named(&part, path, base_dir)), pose.map(Into::into)]
         .into_iter()
         .flatten()
         .collect()

@@ -20,14 +20,17 @@ pub struct TriangleMesh {
     pub materials: Vec<u32>,
 }
 
+/// The smallest and the largest coordinates of `points`, or `None` if there are none.
+pub(crate) fn bounds(points: impl Iterator<Item = Vec3>) -> Option<(Vec3, Vec3)> {
+    let wider = |(low, high): (Vec3, Vec3), p: (Vec3, Vec3)| (low.min(p.0), high.max(p.1));
+    points.map(|p| (p, p)).reduce(wider)
+}
+
 impl TriangleMesh {
     /// The smallest and the largest coordinates of the vertices that triangles use, or `None` if
     /// there is no triangle.
     pub fn bounds(&self) -> Option<(Vec3, Vec3)> {
-        self.corners().fold(None, |bounds, p| {
-            let (low, high) = bounds.unwrap_or((p, p));
-            Some((low.min(p), high.max(p)))
-        })
+        bounds(self.corners())
     }
 
     /// The positions of all corners of all triangles.

@@ -6,15 +6,18 @@ use dipir_imaging::raster::Raster;
 use glam::{DVec2, Vec2, Vec3};
 
 use crate::camera::Camera;
-use crate::mesh::TriangleMesh;
+use crate::description::ObjectRecord;
+use crate::mesh::{TriangleMesh, bounds};
 use crate::proxy::{Plane, Proxy};
 use crate::scene::{LoadedScene, Scene};
-use crate::visibility::below_a_pixel;
+use crate::visibility::{below_a_pixel, short};
 
 /// Vertical fields of view of lenses that people have: an 800 mm lens has 1.7 degrees.
 const FIELD_OF_VIEW_DEG: [f32; 2] = [1.5, 140.0];
-/// Heights of objects that people insert, metres.
-const HEIGHT_M: [f32; 2] = [0.002, 60.0];
+/// Largest extents of objects that people insert, metres.
+const EXTENT_M: [f64; 2] = [0.005, 50.0];
+/// A model this large in its file is in millimetres, a smaller one in centimetres: half a metre and more, or less than five.
+const MILLIMETRES_FROM: f64 = 500.0;
 /// An object smaller than this in the picture cannot be judged, pixels.
 const SMALLEST_PX: f32 = 3.0;
 
@@ -26,13 +29,13 @@ const STEPS: usize = 256;
 /// What is unlikely about a scene, one sentence each.
 pub fn implausible(loaded: &LoadedScene) -> Vec<String> {
     let lens = loaded.original.as_ref().map(|o| o.undistortion.lens());
-    let mut found = implausible_scene(&loaded.scene, lens);
+    let mut found = implausible_scene(&loaded.scene, &loaded.description.objects, lens);
     found.extend(loaded.occluders.as_ref().and_then(hides_nothing));
     found
 }
 
 /// `lens` is the photograph's, if it bends lines.
-fn implausible_scene(scene: &Scene, lens: Option<&Lens>) -> Vec<String> {
+fn implausible_scene(scene: &Scene, objects: &[ObjectRecord], lens: Option<&Lens>) -> Vec<String> {
     let mut found = Vec::new();
     found.extend(lens.and_then(turns_back));
     // A fisheye's is not that of the picture without distortion, which shows the inner part of it.
@@ -44,14 +47,12 @@ fn implausible_scene(scene: &Scene, lens: Option<&Lens>) -> Vec<String> {
         Proxy::None | Proxy::Mesh(_) => None,
     };
     found.extend(ground.and_then(|plane| camera_below(&scene.camera, plane)));
-    let Some((low, high)) = scene.mesh.bounds() else {
+    let Some(whole) = scene.mesh.bounds() else {
         return found;
     };
-    // What is smaller than a pixel was warned of when it was loaded, and one warning of its size is enough.
-    let tiny = below_a_pixel(&scene.mesh, &scene.camera).is_some();
-    let unusual = height(high.y - low.y).filter(|_| !tiny);
-    let size_is_told = tiny || unusual.is_some();
-    found.extend(unusual);
+    let sizes = unusual_sizes(scene, objects);
+    let size_is_told = below_a_pixel(whole, &scene.camera).is_some() || !sizes.is_empty();
+    found.extend(sizes);
     found.extend(ground.and_then(|plane| object_below(&scene.mesh, plane)));
     found.extend(visibility(&scene.mesh, &scene.camera, size_is_told));
     found
@@ -126,18 +127,60 @@ fn camera_below(camera: &Camera, plane: &Plane) -> Option<String> {
     })
 }
 
-fn height(height: f32) -> Option<String> {
-    let [least, most] = HEIGHT_M;
-    if !height.is_finite() || height == 0.0 || (least..=most).contains(&height) {
+/// The unit that a model with this largest extent in its file is likely in, and its metres; `None` for metres.
+pub fn likely_unit(extent: f64) -> Option<(&'static str, f64)> {
+    let [least, most] = EXTENT_M;
+    match extent {
+        e if e >= MILLIMETRES_FROM => Some(("millimetres", 0.001)),
+        e if e > most => Some(("centimetres", 0.01)),
+        e if e > 0.0 && e < least => Some(("kilometres", 1000.0)),
+        _ => None,
+    }
+}
+
+/// One sentence for each object whose size is none that people insert.
+fn unusual_sizes(scene: &Scene, objects: &[ObjectRecord]) -> Vec<String> {
+    let mut rest = &scene.mesh.indices[..];
+    let mut found = Vec::new();
+    for (i, object) in objects.iter().enumerate() {
+        let (own, after) = rest.split_at(rest.len().min(object.triangles as usize));
+        rest = after;
+        let corners = own.iter().flatten();
+        let corners = corners.map(|&i| scene.mesh.positions[i as usize]);
+        let Some((low, high)) = bounds(corners) else {
+            continue;
+        };
+        // What is smaller than a pixel was warned of when it was loaded.
+        if below_a_pixel((low, high), &scene.camera).is_none() {
+            let extent = f64::from((high - low).max_element());
+            let scale = object.transform().determinant().abs().cbrt();
+            found.extend(unusual_size(i, extent, scale));
+        }
+    }
+    found
+}
+
+/// `extent` is that of the placed object, `scale` the factor on the lengths of its file.
+fn unusual_size(object: usize, extent: f64, scale: f64) -> Option<String> {
+    let [least, most] = EXTENT_M;
+    let usual = extent == 0.0 || (least..=most).contains(&extent);
+    if usual || !(extent.is_finite() && scale > 0.0) {
         return None;
     }
-    let unit = match height > most {
-        true => "a model in centimetres needs scale = 0.01, one in millimetres 0.001",
-        false => "a model in kilometres needs scale = 1000",
-    };
-    Some(format!(
-        "the objects are {height:.4} m tall; {unit}: see [[scene.objects]] scale or height_m"
-    ))
+    let key = format!("scene.objects[{object}]");
+    let in_file = extent / scale;
+    Some(match likely_unit(in_file) {
+        Some((unit, metres)) => format!(
+            "{key} is {} m large, and its file looks like {unit}: write scale = {metres} for {} m, or height_m",
+            short(extent),
+            short(in_file * metres)
+        ),
+        None => format!(
+            "{key} is {} m large, and in its file {} m: check its scale, a factor, or its height_m, metres",
+            short(extent),
+            short(in_file)
+        ),
+    })
 }
 
 fn object_below(mesh: &TriangleMesh, plane: &Plane) -> Option<String> {
@@ -200,9 +243,11 @@ fn visibility(mesh: &TriangleMesh, camera: &Camera, size_is_told: bool) -> Optio
 #[cfg(test)]
 mod tests {
     use dipir_cameras::Distortion;
+    use glam::{DMat4, DVec3};
 
     use super::*;
     use crate::camera::FieldOfView;
+    use crate::description::FileRecord;
 
     fn scene() -> Scene {
         let corners = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
@@ -234,7 +279,7 @@ mod tests {
     }
 
     fn one(scene: &Scene, part: &str) {
-        let found = implausible_scene(scene, None);
+        let found = implausible_scene(scene, &[], None);
         assert!(
             found.len() == 1 && found[0].contains(part),
             "{part:?}: {found:?}"
@@ -243,7 +288,7 @@ mod tests {
 
     #[test]
     fn nothing_is_said_of_an_object_on_the_ground_before_the_camera() {
-        assert_eq!(implausible_scene(&scene(), None), Vec::<String>::new());
+        assert_eq!(implausible_scene(&scene(), &[], None), Vec::<String>::new());
     }
 
     #[test]
@@ -268,26 +313,99 @@ mod tests {
             normal: Vec3::Y,
         });
         assert!(
-            implausible_scene(&below, None)[0].contains("the camera is 0.30 m below the ground")
+            implausible_scene(&below, &[], None)[0]
+                .contains("the camera is 0.30 m below the ground")
         );
         let mut turned = scene();
         turned.proxy = Proxy::Plane(Plane {
             point: Vec3::ZERO,
             normal: Vec3::NEG_Y,
         });
-        assert!(implausible_scene(&turned, None)[0].contains("points down"));
-        assert!(implausible_scene(&turned, None)[0].contains("normal = [-0.00, 1.00, -0.00]"));
+        assert!(implausible_scene(&turned, &[], None)[0].contains("points down"));
+        assert!(implausible_scene(&turned, &[], None)[0].contains("normal = [-0.00, 1.00, -0.00]"));
+    }
+
+    /// The object of [`scene`], `scale` times as large as in its file.
+    fn record(scale: f64) -> ObjectRecord {
+        ObjectRecord {
+            file: FileRecord {
+                path: "o.glb".into(),
+                blake3: String::new(),
+            },
+            dependencies: vec![],
+            transform: ObjectRecord::rows(&DMat4::from_scale(DVec3::splat(scale))),
+            vertices: 4,
+            triangles: 2,
+        }
     }
 
     #[test]
-    fn an_object_as_tall_as_a_tower_is_measured() {
-        let mut scene = scene();
-        for p in &mut scene.mesh.positions {
-            *p *= 350.0;
+    fn a_model_in_another_unit_is_told_with_its_scale() {
+        for (extent, scale, said) in [
+            (50.0, 1.0, None),
+            (
+                90.0,
+                1.0,
+                Some(
+                    "is 90 m large, and its file looks like centimetres: write scale = 0.01 for 0.90 m",
+                ),
+            ),
+            (
+                1800.0,
+                1.0,
+                Some(
+                    "is 1800 m large, and its file looks like millimetres: write scale = 0.001 for 1.80 m",
+                ),
+            ),
+            (
+                90.0,
+                0.05,
+                Some(
+                    "is 90 m large, and its file looks like millimetres: write scale = 0.001 for 1.80 m",
+                ),
+            ),
+            (
+                0.0009,
+                1.0,
+                Some(
+                    "is 9.0e-4 m large, and its file looks like kilometres: write scale = 1000 for 0.90 m",
+                ),
+            ),
+            (0.005, 1.0, None),
+            (
+                180.0,
+                100.0,
+                Some(
+                    "is 180 m large, and in its file 1.80 m: check its scale, a factor, or its height_m",
+                ),
+            ),
+        ] {
+            let found = unusual_size(2, extent, scale);
+            let said = said.map(|s| format!("scene.objects[2] {s}"));
+            match (&found, &said) {
+                (Some(found), Some(said)) => assert!(found.starts_with(said), "{found}"),
+                _ => assert_eq!(found, said, "{extent}"),
+            }
         }
-        let found = implausible_scene(&scene, None);
-        assert!(found[0].contains("350.0000 m tall"), "{found:?}");
-        assert!(found[0].contains("scale = 0.01"), "{found:?}");
+    }
+
+    #[test]
+    fn each_object_is_measured_for_itself() {
+        // Two objects of a metre, a hundred metres apart; then the second is stretched.
+        let mut scene = scene();
+        let other = scene.mesh.clone();
+        scene.mesh.append(other, 0);
+        let objects = [record(1.0), record(1.0)];
+        for p in &mut scene.mesh.positions[4..] {
+            p.x += 100.0;
+        }
+        assert_eq!(unusual_sizes(&scene, &objects), Vec::<String>::new());
+        scene.mesh.positions[5].x += 200.0;
+        let found = unusual_sizes(&scene, &objects);
+        assert!(
+            found.len() == 1 && found[0].starts_with("scene.objects[1] is 201 m large"),
+            "{found:?}"
+        );
     }
 
     #[test]
@@ -298,9 +416,10 @@ mod tests {
             for p in &mut scene.mesh.positions {
                 *p = *p * scale + Vec3::new(0.3, 0.0, 0.0);
             }
-            let hidden = below_a_pixel(&scene.mesh, &scene.camera).is_some();
+            let whole = scene.mesh.bounds().unwrap();
+            let hidden = below_a_pixel(whole, &scene.camera).is_some();
             assert_eq!(hidden, warnings == 0, "{scale}");
-            let found = implausible_scene(&scene, None);
+            let found = implausible_scene(&scene, &[record(scale.into())], None);
             assert_eq!(found.len(), warnings, "{scale}: {found:?}");
         }
     }
@@ -319,7 +438,7 @@ mod tests {
             for p in &mut scene.mesh.positions {
                 *p += offset;
             }
-            let found = implausible_scene(&scene, None);
+            let found = implausible_scene(&scene, &[], None);
             assert!(found.iter().any(|f| f.contains(part)), "{part}: {found:?}");
         }
     }
@@ -349,7 +468,7 @@ mod tests {
         assert!(found.contains(" 17% of the half diagonal"), "{found}");
         assert!(turns_back(&brown(1e300)).is_some());
         assert!(turns_back(&fisheye(-5.0)).is_some());
-        let found = implausible_scene(&scene(), Some(&brown(-5.0)));
+        let found = implausible_scene(&scene(), &[], Some(&brown(-5.0)));
         assert!(found.len() == 1 && found[0].contains("17%"), "{found:?}");
         // The picture of half a sphere is a circle in a larger frame.
         let mut circular = fisheye(-0.05);
@@ -362,9 +481,9 @@ mod tests {
         let mut wide = scene();
         wide.camera.focal_px = Vec2::splat(10.0);
         let part = "vertical field of view is 145";
-        assert!(implausible_scene(&wide, None)[0].contains(part));
+        assert!(implausible_scene(&wide, &[], None)[0].contains(part));
         let fisheye = lens(Distortion::kannala_brandt([0.0; 4]));
-        let found = implausible_scene(&wide, Some(&fisheye));
+        let found = implausible_scene(&wide, &[], Some(&fisheye));
         assert!(!found.iter().any(|f| f.contains(part)), "{found:?}");
     }
 

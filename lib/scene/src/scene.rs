@@ -167,6 +167,7 @@ impl Scene {
             for part in file.parts(base_dir) {
                 files.input("camera", &part);
             }
+            files.warn(file.choice(base_dir));
         }
         let (camera, undistortion) = settings
             .camera
@@ -336,11 +337,12 @@ impl<'a> Files<'a> {
         }
     }
 
-    /// Adds a warning, once, with the names in it made printable.
-    fn warn(&mut self, warning: String) {
-        let warning = printable(warning);
-        if !self.warnings.contains(&warning) {
-            self.warnings.push(warning);
+    /// Adds warnings, each once, with the names in them made printable.
+    fn warn(&mut self, warnings: impl IntoIterator<Item = String>) {
+        for warning in warnings.into_iter().map(printable) {
+            if !self.warnings.contains(&warning) {
+                self.warnings.push(warning);
+            }
         }
     }
 
@@ -482,6 +484,7 @@ impl<'a> Files<'a> {
                 for part in points.parts(self.base_dir) {
                     self.input("points", &part);
                 }
+                self.warn(points.choice(self.base_dir));
                 let (cloud, ground) = points.read(self.base_dir, view)?;
                 let proxy = ground::proxy(&ground);
                 (proxy, ProxyRecord::Ground(Box::new(ground)), Some(cloud))
@@ -583,9 +586,8 @@ impl Assembly {
             });
         }
         let materials = &self.materials[first_material as usize..];
-        for why in visibility::hidden(&mesh, materials, &self.camera) {
-            files.warn(format!("\"{}\": {why}", path.display()));
-        }
+        let hidden = visibility::hidden(&mesh, materials, &self.camera).into_iter();
+        files.warn(hidden.map(|why| format!("\"{}\": {why}", path.display())));
         record.transform = ObjectRecord::rows(&map);
         let total = self.mesh.positions.len() as u64 + mesh.positions.len() as u64;
         files

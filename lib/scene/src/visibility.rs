@@ -1,4 +1,6 @@
 //! Why nothing of an object can be seen.
+use glam::Vec3;
+
 use crate::camera::Camera;
 use crate::material::{AlphaMode, Material};
 use crate::mesh::TriangleMesh;
@@ -81,7 +83,7 @@ fn without_extent(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
     if (0..mesh.indices.len()).all(|t| mesh.scaled_normal(t).length_squared() == 0.0) {
         return Some("none of its triangles has an area (is a scale zero along an axis?)".into());
     }
-    let pixels = below_a_pixel(mesh, camera)?;
+    let pixels = below_a_pixel(mesh.bounds()?, camera)?;
     Some(format!(
         "it is {} m across, {} of a pixel; raise its scale, or write height_m",
         short(size),
@@ -90,7 +92,7 @@ fn without_extent(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
 }
 
 /// Two digits that count, with an exponent only where zeros would have to be counted.
-fn short(value: f64) -> String {
+pub(crate) fn short(value: f64) -> String {
     match value {
         1e-3..10.0 => format!("{value:.2}"),
         10.0..1e5 => format!("{value:.0}"),
@@ -98,9 +100,8 @@ fn short(value: f64) -> String {
     }
 }
 
-/// How much of a pixel the mesh takes, if that is less than one.
-pub(crate) fn below_a_pixel(mesh: &TriangleMesh, camera: &Camera) -> Option<f64> {
-    let (low, high) = mesh.bounds()?;
+/// How much of a pixel a mesh of these bounds takes, if that is less than one.
+pub(crate) fn below_a_pixel((low, high): (Vec3, Vec3), camera: &Camera) -> Option<f64> {
     let (low, high) = (low.as_dvec3(), high.as_dvec3());
     let size = low.distance(high);
     let distance = camera.position.as_dvec3().distance((low + high) * 0.5);

@@ -90,6 +90,9 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
         )?,
         None => View::of_photo(&photo.image, &photo.facts, &request.asked)?,
     };
+    for path in [&request.camera, &request.points].into_iter().flatten() {
+        warnings.extend(dipir_cameras::file::choice(path).filter(|c| !warnings.contains(c)));
+    }
     let widths: Vec<f64> = sizes.iter().map(|s| s.width_m).collect();
     let camera = view.camera(photo.facts.size);
     let found = points(request, &camera, folder)?;
@@ -314,6 +317,32 @@ mod tests {
         let texts: Vec<String> = texts.collect();
         assert!(texts[0].contains("192 x 128 pixels"), "{}", texts[0]);
         assert!(texts.iter().all(|text| *text == texts[0]), "{texts:?}");
+    }
+
+    #[test]
+    fn which_of_several_models_of_a_project_is_read_is_a_warning() {
+        let folder = tempfile::tempdir().unwrap();
+        let (photo, model) = (folder.path().join("photo.png"), folder.path().join("a.obj"));
+        std::fs::write(&model, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+        put_turned(&photo, [30, 20], &|x, _| x as u8, 1);
+        for name in ["0", "1"] {
+            let sparse = folder.path().join("sparse").join(name);
+            std::fs::create_dir_all(&sparse).unwrap();
+            let camera = "1 PINHOLE 30 20 25 25 15 10\n";
+            std::fs::write(sparse.join("cameras.txt"), camera).unwrap();
+            let image = "1 1 0 0 0 0 0 0 1 photo.png\n\n";
+            std::fs::write(sparse.join("images.txt"), image).unwrap();
+        }
+        let request = Request {
+            photo,
+            models: vec![model],
+            out: folder.path().join("pipeline.toml"),
+            camera: Some(folder.path().into()),
+            ..Request::default()
+        };
+        let warnings = draft(&request).unwrap().warnings;
+        let said = |w: &&String| w.starts_with("COLMAP's project has 2 models");
+        assert_eq!(warnings.iter().filter(said).count(), 1, "{warnings:?}");
     }
 
     #[test]

@@ -1,4 +1,5 @@
 //! How large a model is put into the picture.
+use dipir_scene::plausibility::likely_unit;
 use glam::DVec3;
 
 use crate::document::number;
@@ -6,6 +7,9 @@ use crate::error::SetupError;
 
 /// Largest extents that are believed to be metres.
 const BELIEVED_M: std::ops::RangeInclusive<f64> = 0.05..=5.0;
+
+/// A height below this is rounded too much when it is written.
+const LEAST_WRITTEN_M: f64 = 0.01;
 
 /// The size of an object.
 #[derive(Clone, Debug, PartialEq)]
@@ -26,6 +30,9 @@ pub struct Size {
 pub fn size(low: DVec3, high: DVec3, asked: Option<f64>) -> Result<Size, SetupError> {
     let extent = high - low;
     let largest = extent.max_element();
+    // What lies flat has no height to be set.
+    let flat = extent.y <= 1e-6 * largest;
+    let own_height = if flat { largest } else { extent.y };
     let own = format!(
         "{} x {} x {} m (width, height, depth)",
         short(extent.x),
@@ -48,18 +55,22 @@ pub fn size(low: DVec3, high: DVec3, asked: Option<f64>) -> Result<Size, SetupEr
                 width_m: extent.x.hypot(extent.z),
             });
         }
-        None => (
-            1.0,
-            format!("a guess, for the file has {own}, which are hardly metres"),
-        ),
+        None => match likely_unit(largest) {
+            Some((unit, metres)) if BELIEVED_M.contains(&(metres * largest)) => (
+                metres * own_height,
+                format!("a guess, for the file has {own}, which look like {unit}"),
+            ),
+            _ => (
+                1.0,
+                format!("a guess, for the file has {own}, which are hardly metres"),
+            ),
+        },
     };
     let (metres, why) = height;
-    // What lies flat has no height to be set.
-    let flat = extent.y <= 1e-6 * largest;
-    let factor = metres / if flat { largest } else { extent.y };
+    let factor = metres / own_height;
     let factor = if factor.is_finite() { factor } else { 1.0 };
     Ok(Size {
-        line: Some(match flat {
+        line: Some(match flat || metres < LEAST_WRITTEN_M {
             true => format!("scale = {factor:?}"),
             false => format!("height_m = {}", number(metres, 4)),
         }),
@@ -96,10 +107,29 @@ mod tests {
 
     #[test]
     fn a_size_that_cannot_becomes_a_metre_high() {
-        for scale in [1e-3, 100.0] {
+        for scale in [0.04, 10.0] {
             let chair = of(DVec3::new(0.6, 0.9, 0.8) * scale, None);
             assert_eq!(chair.line.as_deref(), Some("height_m = 1.0"));
             assert!((chair.width_m - 1.0 / 0.9).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn a_size_in_another_unit_becomes_metres() {
+        for (scale, unit) in [
+            (1e-3, "kilometres"),
+            (100.0, "centimetres"),
+            (1000.0, "millimetres"),
+        ] {
+            let chair = of(DVec3::new(0.6, 0.9, 0.8) * scale, None);
+            assert_eq!(chair.line.as_deref(), Some("height_m = 0.9"));
+            assert!((chair.width_m - 1.0).abs() < 1e-9);
+            assert!(chair.why.ends_with(unit), "{}", chair.why);
+        }
+        // What is flat, or nearly so, is scaled by its length.
+        for height in [0.0, 2.0] {
+            let carpet = of(DVec3::new(3000.0, height, 4000.0), None);
+            assert_eq!(carpet.line.as_deref(), Some("scale = 0.001"));
         }
     }
 

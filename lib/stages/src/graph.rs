@@ -13,9 +13,9 @@ use dipir_scene::config::SceneConfig;
 use crate::light::materials;
 use crate::light::method::Method;
 use crate::model::ModelTable;
-use crate::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE, StageName};
+use crate::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE, StageName, refuse_replaced};
 use crate::truth::ReportTable;
-use crate::{composite, concepts, light, lora, scene};
+use crate::{composite, concepts, light, lora, reasons, scene};
 
 /// The stage that everything leads to.
 pub const LAST: &str = COMPOSITE.name;
@@ -79,7 +79,9 @@ pub fn plan(session: &Session, stage: &str) -> anyhow::Result<StagePlan> {
         s if s == COMPOSITE.name => composite::plan_of,
         other => anyhow::bail!("there is no stage \"{other}\""),
     };
-    plan(session)
+    let plan = plan(session)?;
+    refuse_replaced(session, &plan)?;
+    Ok(plan)
 }
 
 /// The states of all stages that `needed` selects; an error if the configuration is wrong for one
@@ -99,7 +101,12 @@ pub fn assess(
             message
         })
     };
-    let states = status::assess(graph, needed, plan, |stage| session.stage_folder(stage))?;
+    let mut states = status::assess(graph, needed, plan, |stage| session.stage_folder(stage))?;
+    for status in &mut states {
+        status
+            .state
+            .with_reasons(|r| reasons::by_keys(status.stage, r));
+    }
     match wrong.take() {
         Some(e) => Err(e),
         None => Ok(states),
@@ -109,5 +116,7 @@ pub fn assess(
 /// The state of one stage, when everything that it reads is there.
 pub fn state_of(session: &Session, stage: &str) -> Result<State, StageError> {
     let plan = plan(session, stage).map_err(|e| describe(&e));
-    status::state_of(plan, &session.stage_folder(stage))
+    let mut state = status::state_of(plan, &session.stage_folder(stage))?;
+    state.with_reasons(|r| reasons::by_keys(stage, r));
+    Ok(state)
 }

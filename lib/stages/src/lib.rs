@@ -11,6 +11,7 @@ pub mod model;
 pub mod names;
 pub mod presets;
 pub mod preview;
+mod reasons;
 pub mod report;
 pub mod scene;
 pub mod truth;

@@ -1,10 +1,12 @@
 //! The stages by name: one table from which graph, report, inspection and manual derive.
+use std::fs;
 use std::path::PathBuf;
 
+use dipir_cli::exit::Usage;
 use dipir_cli::session::Session;
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::manifest::Manifest;
-use dipir_pipeline::stage::StagePlan;
+use dipir_pipeline::stage::{StagePlan, StageWriter};
 use serde_json::Value;
 
 /// What a stage is called and which version its code has.
@@ -22,7 +24,7 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 10,
+    version: 11,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
@@ -46,7 +48,7 @@ pub const LIGHT: StageName = StageName {
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 12,
+    version: 13,
 };
 
 /// All stages, each after those that it reads.
@@ -67,4 +69,40 @@ impl StageName {
     pub fn plan(&self, session: &Session, params: Value) -> StagePlan {
         StagePlan::new(self.name, self.version, params, session.pipeline.seed)
     }
+}
+
+/// Opens the folder of the planned stage for writing.
+///
+/// # Errors
+/// Those of [`refuse_replaced`] and [`Session::begin`].
+pub fn begin(session: &Session, plan: StagePlan) -> anyhow::Result<StageWriter> {
+    refuse_replaced(session, &plan)?;
+    Ok(session.begin(plan)?)
+}
+
+/// Refuses a plan that reads an output of its own stage or of a later one: the run would replace what it reads.
+pub fn refuse_replaced(session: &Session, plan: &StagePlan) -> anyhow::Result<()> {
+    for stage in ALL.iter().skip_while(|s| s.name != plan.stage) {
+        let (Ok(folder), Ok(manifest)) = (
+            fs::canonicalize(stage.folder(session)),
+            stage.manifest(session),
+        ) else {
+            continue;
+        };
+        let is_output = |path: &PathBuf| {
+            let found = fs::canonicalize(session.resolve(path));
+            let mut outputs = manifest.outputs.iter().map(|o| folder.join(&o.path));
+            found.is_ok_and(|found| outputs.any(|output| output == found))
+        };
+        if let Some(input) = plan.inputs.iter().find(|i| is_output(&i.path)) {
+            return Err(Usage(format!(
+                "the {} \"{}\" is written by the stage {}, and a run would replace it: copy it elsewhere and name the copy",
+                input.role,
+                input.path.display(),
+                stage.name
+            ))
+            .into());
+        }
+    }
+    Ok(())
 }

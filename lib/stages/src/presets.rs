@@ -232,7 +232,7 @@ const REPLAY_POWERS: [f64; 2] = [0.35, 0.08];
 
 impl LightRun {
     /// About how long it would have taken with `preset`.
-    fn seconds_with(&self, preset: &LightPreset) -> f64 {
+    pub(crate) fn seconds_with(&self, preset: &LightPreset) -> f64 {
         let side = preset.size.min(self.photo_side);
         let pixels = (side as f64 / self.side.max(1) as f64).powi(2);
         let samples = f64::from(preset.samples) / f64::from(self.samples.max(1));

@@ -158,6 +158,53 @@ impl Variant {
     }
 }
 
+/// Processor seconds to render a picture of 96 x 64 pixels to an error of 1: they grow with its inverse square (README).
+const RENDER_S: f64 = 4e-6;
+/// Those of all else in a run of scene and composite.
+const SET_UP_S: f64 = 0.4;
+/// Those of as many samples in each pixel, whatever the error.
+const SAMPLE_S: f64 = 0.004;
+
+/// About how long a render to `error` takes, by which shares of a sweep are told.
+pub fn render_cost(error: f64) -> f64 {
+    SET_UP_S + RENDER_S * error.powi(-2)
+}
+
+impl Variant {
+    /// About how long a run takes, by which shares of a sweep are told.
+    pub fn cost(&self) -> f64 {
+        let text = |key: &str| {
+            self.set
+                .iter()
+                .find(|(k, _)| k == key)
+                .map(|(_, v)| v.as_str())
+        };
+        let number = |key: &str| text(key).and_then(|v| v.parse::<f64>().ok());
+        let preset = presets::of(match text("pipeline.quality") {
+            Some("draft") => Quality::Draft,
+            Some("high") => Quality::High,
+            _ => Quality::Standard,
+        });
+        match self.part {
+            Part::Render => match number("composite.max_samples") {
+                Some(samples) => SET_UP_S + SAMPLE_S * samples,
+                None => render_cost(
+                    number("composite.target_error")
+                        .unwrap_or(preset.composite.target_error.into()),
+                ),
+            },
+            Part::Light => {
+                let of = |key: &str, usual: f64| number(key).unwrap_or(usual) / usual;
+                let steps = of("light.iterations", preset.light.iterations as f64);
+                let paths = of("light.samples", preset.light.samples.into());
+                // Paths are traced once, and looked at in every step.
+                let steps_and_paths = 0.75 * steps + 0.25 * paths;
+                preset.recovery.map_or(1.0, |r| r.cost_s) * steps_and_paths
+            }
+        }
+    }
+}
+
 /// What `set` changes of the standard preset. Variants that change the same are measured once.
 pub fn beyond_standard(set: &[(String, String)]) -> Vec<(String, String)> {
     let preset = presets::of(Quality::Standard);
@@ -267,6 +314,20 @@ mod tests {
         let render = variants(Part::Render, &[], 0);
         let same = render.iter().filter(|s| beyond_standard(&s.set).is_empty());
         assert_eq!(same.count(), 2);
+    }
+
+    #[test]
+    fn a_run_to_a_smaller_error_costs_more() {
+        let cost = |part, set: (&str, &str)| Variant::new(part, "", "", &[set]).cost();
+        let error = |e| cost(Part::Render, ("composite.target_error", e));
+        assert!(error("0.0005") > 15.0 * error("0.004"));
+        let quality = |part, q| cost(part, ("pipeline.quality", q));
+        for part in [Part::Render, Part::Light] {
+            assert!(quality(part, "draft") < quality(part, "standard"));
+            assert!(quality(part, "standard") < quality(part, "high"));
+        }
+        let steps = |n| cost(Part::Light, ("light.iterations", n));
+        assert!(steps("50") < 0.5 * steps("600"));
     }
 
     #[test]

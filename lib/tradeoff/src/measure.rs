@@ -13,7 +13,7 @@ use dipir_stages::names::{COMPOSITE, LIGHT, SCENE, StageName};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::knobs::{Part, Variant, beyond_standard};
+use crate::knobs::{Part, Variant, beyond_standard, render_cost};
 use crate::scenes::MeasuredScene;
 
 /// What one run of a variant showed.
@@ -218,6 +218,22 @@ impl SceneMeasurement<'_> {
             (Part::Light, Some(recover)) => self.light(recover, variant, seed, reference),
             _ => self.render(variant, seed, reference),
         }
+    }
+
+    /// About how long it takes to measure what is not measured of `variant`; with `with_reference` the render track's
+    /// reference, too, if it is not there.
+    pub fn cost(&self, variant: &Variant, repeats: u64, with_reference: bool) -> f64 {
+        let is_open = |seed: &u64| !self.sample_file(variant, *seed).is_file();
+        let open = (0..repeats).filter(is_open).count();
+        if open == 0 || (variant.part == Part::Light && self.scene.recover.is_none()) {
+            return 0.0;
+        }
+        let is_made = self.work().join("reference/done.json").is_file();
+        let reference = match with_reference && variant.part == Part::Render && !is_made {
+            true => render_cost(self.reference_error),
+            false => 0.0,
+        };
+        open as f64 * variant.cost() + reference
     }
 
     /// What is already measured of `variant`.

@@ -18,6 +18,8 @@ pub struct Step<'a> {
     pub done: usize,
     /// Points in all.
     pub total: usize,
+    /// Share of the sweep's time before it, as expected.
+    pub share: f64,
     /// The scene.
     pub scene: &'a str,
     /// The series.
@@ -79,11 +81,23 @@ pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome>
         let text = format!("no point is left to measure; --knob accepts: {known}");
         return Err(Usage(text).into());
     }
+    let mut costs = Vec::new();
+    let mut referred: Vec<&str> = Vec::new();
+    for (scene, variant) in &work {
+        let is_first = !referred.contains(&scene.name.as_str());
+        let cost = measurement(scene).cost(variant, cli.repeats, is_first);
+        if variant.part == Part::Render && cost > 0.0 {
+            referred.push(&scene.name);
+        }
+        costs.push(cost);
+    }
+    let all = costs.iter().sum::<f64>().max(f64::MIN_POSITIVE);
     let mut points: Vec<Point> = Vec::new();
     for (n, (scene, variant)) in work.iter().enumerate() {
         report(Step {
             done: n,
             total: work.len(),
+            share: costs[..n].iter().sum::<f64>() / all,
             scene: &scene.name,
             series: &variant.series,
             label: &variant.label,

@@ -338,8 +338,28 @@ impl<'de> de::Deserializer<'de> for &'de Node {
         .map_err(|e: ReadError| e.at(&self.place))
     }
 
+    fn deserialize_str<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        self.deserialize_string(visitor)
+    }
+
+    /// Text needs no quotes on a command line, whatever it looks like.
+    fn deserialize_string<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        match (&self.value, &self.place) {
+            (Value::Integer(_) | Value::Float(_) | Value::Boolean(_), Place::Flag(flag)) => {
+                match flag.split_once('=') {
+                    // Not within a list or a table.
+                    Some((_, text)) if !text.trim().starts_with(['[', '{']) => visitor
+                        .visit_str(text.trim())
+                        .map_err(|e: ReadError| e.at(&self.place)),
+                    _ => self.deserialize_any(visitor),
+                }
+            }
+            _ => self.deserialize_any(visitor),
+        }
+    }
+
     serde::forward_to_deserialize_any! {
-        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char str string bytes byte_buf
+        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char bytes byte_buf
         unit unit_struct seq tuple tuple_struct map struct identifier ignored_any
     }
 }

@@ -95,6 +95,18 @@ fn an_override_takes_numbers_as_shells_see_them() {
 }
 
 #[test]
+fn an_override_of_text_needs_no_quotes_whatever_it_looks_like() {
+    for text in ["2024", "007", "2.10", "5.", "1e3", "true", "0x1F"] {
+        let set = format!("scene.background = {text}");
+        let scene = scene(TEXT, &[&set]).unwrap();
+        assert_eq!(scene.background, PathBuf::from(text));
+    }
+    let list = message(TEXT, &["scene.objects=[{path = 3}]"]);
+    let end = "scene.objects.0.path is the integer 3, accepted: a path in quotes";
+    assert!(list.ends_with(end), "{list}");
+}
+
+#[test]
 fn an_override_may_create_its_table() {
     let config = parse("", &["pipeline.threads=2"]).unwrap();
     assert_eq!(config.pipeline().unwrap().threads, 2);

@@ -44,6 +44,24 @@ impl Node {
             _ => None,
         }
     }
+
+    /// Removes the key at `steps` from its table, if it is there.
+    pub fn remove(&mut self, steps: &[&str]) {
+        match (&mut self.value, steps) {
+            (Value::Table(entries), [step]) => entries.retain(|e| e.name != *step),
+            (Value::Table(entries), [step, rest @ ..]) => {
+                if let Some(entry) = entries.iter_mut().find(|e| e.name == *step) {
+                    entry.node.remove(rest);
+                }
+            }
+            (Value::Array(items), [step, rest @ ..]) => {
+                if let Some(item) = step.parse().ok().and_then(|i: usize| items.get_mut(i)) {
+                    item.remove(rest);
+                }
+            }
+            _ => {}
+        }
+    }
 }
 
 /// Parses a whole file.

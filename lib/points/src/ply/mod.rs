@@ -3,6 +3,8 @@ mod vertices;
 
 pub(crate) use vertices::read;
 
+use crate::error::shown;
+
 /// How numbers are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
@@ -177,12 +179,6 @@ impl Header {
             None => Err("the header has no format".into()),
         }
     }
-}
-
-/// The beginning of what a file says, for a message.
-fn shown(text: &str) -> String {
-    let beginning: String = text.chars().take(60).collect();
-    beginning.escape_debug().to_string()
 }
 
 /// Adds the property that `words` describe to the last element.

@@ -119,6 +119,32 @@ impl Resolver for Folder {
     }
 }
 
+/// The image of a texture, `what` in messages. `None`, with a warning, if the file is missing or the system keeps it back;
+/// what a limit of ours refuses is an error.
+pub(super) fn image(
+    resolver: &dyn Resolver,
+    uri: &str,
+    what: String,
+    warnings: &mut Vec<String>,
+) -> Result<Option<ImageSource>, Error> {
+    let path = named(uri);
+    match resolver.image(uri) {
+        Ok(image) => Ok(Some(image)),
+        Err(e) if e.kind() == io::ErrorKind::NotFound || e.raw_os_error().is_some() => {
+            warnings.push(format!(
+                "{what} \"{}\" cannot be read ({e}); the material's factors alone are used",
+                path.display()
+            ));
+            Ok(None)
+        }
+        Err(source) => Err(Error::Read {
+            role: what,
+            path,
+            source,
+        }),
+    }
+}
+
 /// Where a file that was asked for would have to lie, for messages.
 pub(super) fn named(uri: &str) -> PathBuf {
     Path::new(&percent_decoded(uri)).into()

@@ -14,6 +14,7 @@ use serde::Deserialize;
 use super::accessor::{Buffers, get};
 use super::container::{self, Resolver};
 use super::document::{Document, Instancing, Placement, raw_extension};
+use super::gltf_material::extensions::without_refraction;
 use super::gltf_material::{IMAGE_EXTENSIONS, MaterialReader, image_remedy};
 use super::gltf_mesh::MeshReader;
 use super::{Imported, Limits, lights};
@@ -101,6 +102,7 @@ pub fn load_gltf_bytes(
         });
     }
     warnings.extend(left_out(&document));
+    warnings.extend(without_refraction(&list));
     if !lights.is_empty() {
         warnings.push(format!(
             "the file's lights ({}) are not rendered: the light is that of the photo ({})",

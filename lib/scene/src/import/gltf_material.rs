@@ -16,7 +16,7 @@ use super::document::{self, Document, raw_extension};
 use crate::error::Error;
 use crate::material::{AlphaMode, Clearcoat, Material, TextureRef, Transmission};
 
-mod extensions;
+pub(super) mod extensions;
 use crate::texture::{Encoding, Filter, ImageSource, Texture, Wrap};
 
 const EXPORT: &str = "export the file again";
@@ -51,7 +51,8 @@ pub(super) struct MaterialReader<'a> {
     document: &'a Document<'a>,
     buffers: &'a Buffers<'a>,
     resolver: &'a dyn Resolver,
-    images: HashMap<usize, ImageSource>,
+    /// `None` where the file is missing.
+    images: HashMap<usize, Option<ImageSource>>,
     /// By glTF texture and encoding.
     known: HashMap<(usize, Encoding), u32>,
     pub textures: Vec<Texture>,
@@ -211,6 +212,13 @@ impl<'a> MaterialReader<'a> {
                 "emissiveTexture",
                 Encoding::Srgb,
             )?;
+            if source.emissive_texture.is_some() && material.emissive_texture.is_none() {
+                // What glows only in places shall not glow all over.
+                material.emissive = Vec3::ZERO;
+                self.warnings.push(format!(
+                    "{at}: without emissiveTexture it does not emit light"
+                ));
+            }
         }
         Ok(())
     }
@@ -329,7 +337,7 @@ impl<'a> MaterialReader<'a> {
         }))
     }
 
-    /// Our index of a glTF texture; `None` if it has no image.
+    /// Our index of a glTF texture; `None` if it has no image that can be read.
     fn texture_index(&mut self, index: usize, encoding: Encoding) -> Result<Option<u32>, Error> {
         if let Some(&known) = self.known.get(&(index, encoding)) {
             return Ok(Some(known));
@@ -372,7 +380,9 @@ impl<'a> MaterialReader<'a> {
                 lookup(get(samplers, sampler.value(), &place, "samplers")?)
             }
         };
-        let image = self.image(image, &format!("{at}.source"))?;
+        let Some(image) = self.image(image, &format!("{at}.source"))? else {
+            return Ok(None);
+        };
         self.textures.push(Texture {
             image,
             encoding,
@@ -384,7 +394,7 @@ impl<'a> MaterialReader<'a> {
         Ok(Some(ours))
     }
 
-    fn image(&mut self, index: usize, place: &str) -> Result<ImageSource, Error> {
+    fn image(&mut self, index: usize, place: &str) -> Result<Option<ImageSource>, Error> {
         if let Some(known) = self.images.get(&index) {
             return Ok(known.clone());
         }
@@ -394,9 +404,11 @@ impl<'a> MaterialReader<'a> {
             Some(name) => format!("{at} ({name})"),
             None => at.clone(),
         };
-        let embedded = |bytes: Vec<u8>| ImageSource::Bytes {
-            name: name.clone(),
-            bytes: Arc::from(bytes),
+        let embedded = |bytes: Vec<u8>| {
+            Some(ImageSource::Bytes {
+                name: name.clone(),
+                bytes: Arc::from(bytes),
+            })
         };
         let image = match (&source.uri, source.buffer_view) {
             (None, None) => {
@@ -411,11 +423,10 @@ impl<'a> MaterialReader<'a> {
             }
             (Some(uri), _) => match container::data_uri(uri, &at) {
                 Some(bytes) => embedded(bytes?),
-                None => self.resolver.image(uri).map_err(|source| Error::Read {
-                    role: format!("the texture {name}"),
-                    path: container::named(uri),
-                    source,
-                })?,
+                None => {
+                    let what = format!("the texture {name}");
+                    container::image(self.resolver, uri, what, &mut self.warnings)?
+                }
             },
         };
         self.images.insert(index, image.clone());

@@ -43,6 +43,8 @@ struct Draft {
     roughness_file: Option<String>,
     metallic_file: Option<String>,
     alpha_file: Option<String>,
+    /// Whether the file of `map_Ke` is missing.
+    lacks_emission: bool,
 }
 
 /// An image statement: the file and its options.
@@ -130,7 +132,7 @@ impl Library {
                     material.base_color = Vec4::ONE.with_w(material.base_color.w);
                 }
                 material.base_color_texture =
-                    Some(self.texture(&map, folder, resolver, Encoding::Srgb)?);
+                    self.texture(&map, folder, resolver, Encoding::Srgb)?;
                 draft.base_file = map.file;
             }
             "map_Ke" => {
@@ -138,14 +140,17 @@ impl Library {
                 if material.emissive == Vec3::ZERO {
                     material.emissive = Vec3::ONE;
                 }
-                material.emissive_texture =
-                    Some(self.texture(&map, folder, resolver, Encoding::Srgb)?);
+                material.emissive_texture = self.texture(&map, folder, resolver, Encoding::Srgb)?;
+                draft.lacks_emission = material.emissive_texture.is_none();
             }
             "map_Pr" => {
                 let map = Map::parse(rest);
                 material.metallic_roughness_texture =
-                    Some(self.texture(&map, folder, resolver, Encoding::Linear)?);
-                draft.roughness_file = Some(map.file);
+                    self.texture(&map, folder, resolver, Encoding::Linear)?;
+                draft.roughness_file = material
+                    .metallic_roughness_texture
+                    .is_some()
+                    .then_some(map.file);
             }
             "map_Pm" => draft.metallic_file = Some(Map::parse(rest).file),
             "map_d" => draft.alpha_file = Some(Map::parse(rest).file),
@@ -158,7 +163,7 @@ impl Library {
                 }
                 let map = Map::parse(rest);
                 let texture = self.texture(&map, folder, resolver, Encoding::Linear)?;
-                material.normal_texture = Some((texture, map.bump));
+                material.normal_texture = texture.map(|texture| (texture, map.bump));
             }
             _ => {}
         }
@@ -198,6 +203,13 @@ impl Library {
                 ));
             }
         }
+        if draft.lacks_emission {
+            // What glows only in places shall not glow all over.
+            material.emissive = Vec3::ZERO;
+            self.warnings.push(format!(
+                "material \"{name}\": without map_Ke it does not emit light"
+            ));
+        }
         if material.base_color.w < 1.0 {
             material.alpha_mode = AlphaMode::Blend;
         }
@@ -205,23 +217,24 @@ impl Library {
         self.materials.push(material);
     }
 
+    /// `None`, with a warning, if the file is missing.
     fn texture(
         &mut self,
         map: &Map,
         folder: &str,
         resolver: &dyn Resolver,
         encoding: Encoding,
-    ) -> Result<TextureRef, Error> {
+    ) -> Result<Option<TextureRef>, Error> {
         let file = format!("{folder}{}", map.file);
         let key = (file.clone(), encoding, map.clamp);
         let texture = match self.by_file.get(&key) {
             Some(&known) => known,
             None => {
-                let image = resolver.image(&file).map_err(|source| Error::Read {
-                    role: "the texture".into(),
-                    path: container::named(&file),
-                    source,
-                })?;
+                let what = "the texture".into();
+                let found = container::image(resolver, &file, what, &mut self.warnings)?;
+                let Some(image) = found else {
+                    return Ok(None);
+                };
                 let wrap = if map.clamp {
                     Wrap::ClampToEdge
                 } else {
@@ -238,11 +251,11 @@ impl Library {
                 index
             }
         };
-        Ok(TextureRef {
+        Ok(Some(TextureRef {
             texture,
             uv_set: 0,
             transform: map.transform,
-        })
+        }))
     }
 }
 

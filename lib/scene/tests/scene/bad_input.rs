@@ -245,23 +245,43 @@ fn required_extensions_that_cannot_be_ignored_are_refused_by_name() {
 }
 
 #[test]
-fn a_missing_texture_is_named_with_its_file() {
+fn a_missing_texture_is_warned_of_and_the_factors_alone_are_used() {
     let folder = tempfile::tempdir().unwrap();
     let mut glb = Glb::triangle(json!({ "material": 0 }));
     glb.push("images", json!({ "uri": "no%20paint.png" }));
     glb.push("textures", json!({ "source": 0 }));
+    let texture = json!({ "index": 0 });
     glb.push(
         "materials",
-        json!({ "pbrMetallicRoughness": { "baseColorTexture": { "index": 0 } } }),
+        json!({
+            "pbrMetallicRoughness": {
+                "baseColorFactor": [0.5, 0.25, 0.125, 1.0], "baseColorTexture": texture,
+            },
+            "normalTexture": texture, "emissiveTexture": texture, "emissiveFactor": [1.0, 1.0, 1.0],
+        }),
     );
     let path = folder.path().join("car.glb");
     std::fs::write(&path, glb.bytes()).unwrap();
+    let imported = load_object(&path).unwrap();
     assert_eq!(
-        load_object(&path).unwrap_err().to_string(),
-        format!(
-            "\"{}\": cannot read the texture images[0] \"no paint.png\": No such file or directory (os error 2)",
-            path.display()
-        )
+        imported.warnings,
+        [
+            "the texture images[0] \"no paint.png\" cannot be read (No such file or directory (os error 2)); the material's factors alone are used",
+            "materials[0]: without emissiveTexture it does not emit light",
+        ]
+    );
+    let material = &imported.materials[0];
+    assert_eq!(material.base_color.to_array(), [0.5, 0.25, 0.125, 1.0]);
+    assert!(material.base_color_texture.is_none() && material.normal_texture.is_none());
+    assert_eq!(material.emissive.to_array(), [0.0; 3]);
+    assert!(imported.textures.is_empty() && imported.dependencies.is_empty());
+    // What a limit refuses is an error.
+    glb.json["images"][0]["uri"] = json!("../paint.png");
+    std::fs::write(&path, glb.bytes()).unwrap();
+    let error = load_object(&path).unwrap_err().to_string();
+    assert!(
+        error.contains("\"../paint.png\": it lies outside of the object's folder"),
+        "{error}"
     );
 }
 
@@ -401,8 +421,16 @@ fn names_in_messages_cannot_command_a_terminal() {
     glb.push("textures", json!({ "source": 0 }));
     glb.push("materials", json!({ "normalTexture": { "index": 0 } }));
     assert_eq!(
-        message(&glb),
-        "cannot read the texture images[0] (\\u{1b}[2J) \"\\u{1b}]0;x\\u{7}.png\": no other files are read here"
+        glb.load().warnings,
+        [
+            "the texture images[0] (\\u{1b}[2J) \"\\u{1b}]0;x\\u{7}.png\" cannot be read (no other files are read here); the material's factors alone are used"
+        ]
+    );
+    glb.json["buffers"] = json!([{ "uri": "\u{1b}]0;x\u{7}.bin", "byteLength": 36 }]);
+    let error = message_of(glb.json.to_string().as_bytes());
+    assert_eq!(
+        error,
+        "cannot read buffers[0] \"\\u{1b}]0;x\\u{7}.bin\": no other files are read here"
     );
     let obj = "usemtl \u{1b}[31m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
     let imported = load_obj_bytes(obj.as_bytes(), &NoFiles, &Limits::default()).unwrap();

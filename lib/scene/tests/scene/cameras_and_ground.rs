@@ -300,3 +300,37 @@ fn ground_that_is_not_flat_becomes_a_mesh_on_which_pixels_are_points() {
     );
     assert!(matches!(flat.scene.proxy, Proxy::Plane(_)));
 }
+
+#[test]
+fn a_project_of_colmap_gives_camera_and_ground_and_its_choice_is_said_once() {
+    let folder = folder();
+    for model in ["0", "1"] {
+        let model = folder.path().join("project/sparse").join(model);
+        std::fs::create_dir_all(&model).unwrap();
+        let put = |name: &str, text: &str| std::fs::write(model.join(name), text).unwrap();
+        put("cameras.txt", "1 PINHOLE 300 200 250 250 150 100\n");
+        put("images.txt", "1 1 0 0 0 0 0 0 1 photo.png\n\n");
+        // Ground 1.6 m below the camera; y points down.
+        let points =
+            (0..400).map(|i| (f64::from(i % 20 - 10) * 0.4, 3.0 + f64::from(i / 20) * 0.5));
+        let points = points.map(|(x, z)| format!("1 {x} 1.6 {z} 9 9 9 0.1\n"));
+        put("points3D.txt", &points.collect::<String>());
+    }
+    let scene = loaded(
+        folder.path(),
+        "position = [0, -1.6, -5]",
+        "file = \"project\"",
+        "[proxy]\npoints = \"project\"",
+    );
+    let said = |w: &&String| w.starts_with("COLMAP's project has 2 models, and the one in ");
+    assert_eq!(scene.warnings.iter().filter(said).count(), 1);
+    let named: Vec<_> = scene
+        .inputs
+        .iter()
+        .map(|i| i.path.to_str().unwrap())
+        .collect();
+    for part in ["cameras.txt", "images.txt", "points3D.txt"] {
+        let path = format!("project/sparse/0/{part}");
+        assert!(named.contains(&path.as_str()), "{path}: {named:?}");
+    }
+}

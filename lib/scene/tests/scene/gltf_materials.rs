@@ -63,6 +63,38 @@ fn material_parameters_and_extensions_arrive() {
 }
 
 #[test]
+fn the_refraction_of_solids_is_said_to_be_left_out_once() {
+    let mut glb = Glb::triangle(json!({ "material": 0 }));
+    let mut material = |name: &str, ior: f32, thickness: f32, transmission: f32| {
+        glb.push(
+            "materials",
+            json!({ "name": name, "extensions": {
+                "KHR_materials_transmission": { "transmissionFactor": transmission },
+                "KHR_materials_ior": { "ior": ior },
+                "KHR_materials_volume": { "thicknessFactor": thickness },
+            } }),
+        );
+    };
+    material("glass", 1.5, 0.1, 1.0);
+    material("sheet", 1.5, 0.0, 1.0);
+    material("fog", 1.0, 0.1, 1.0);
+    material("opaque", 1.5, 0.1, 0.0);
+    material("", 1.33, 0.1, 0.5);
+    let warning = |names: &str| {
+        format!(
+            "the refraction of the solid {names} (KHR_materials_volume) is left out: light is attenuated there, but goes straight on"
+        )
+    };
+    assert_eq!(glb.load().warnings, [warning("\"glass\", materials[4]")]);
+    for i in 5..10 {
+        let copy = glb.json["materials"][4].clone();
+        assert_eq!(glb.push("materials", copy), i);
+    }
+    let names = "\"glass\", materials[4], materials[5], materials[6], materials[7] and 2 more";
+    assert_eq!(glb.load().warnings, [warning(names)]);
+}
+
+#[test]
 fn extensions_of_the_reflection_arrive_and_those_without_effect_do_not() {
     let mut glb = Glb::triangle(json!({ "material": 0 }));
     glb.push(

@@ -168,17 +168,45 @@ fn a_library_named_for_every_group_is_read_once() {
 }
 
 #[test]
-fn a_texture_that_a_library_names_must_exist() {
+fn a_texture_that_a_library_names_and_is_missing_is_warned_of() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("m.mtl"), "newmtl a\nmap_Kd gone.png\n").unwrap();
+    let statements = "newmtl a\nKd 0.5 0.25 0.125\nNs 30\nmap_Kd gone.png\nmap_Pr rough.png\n\
+                      bump bumps.png\nmap_Ke glow.png\nKe 1 1 1\n";
+    std::fs::write(folder.path().join("m.mtl"), statements).unwrap();
     let path = folder.path().join("m.obj");
-    std::fs::write(&path, format!("mtllib m.mtl\n{SQUARE}f 1 2 3\n")).unwrap();
-    assert_eq!(
-        load_object(&path).unwrap_err().to_string(),
+    std::fs::write(&path, format!("mtllib m.mtl\nusemtl a\n{SQUARE}f 1 2 3\n")).unwrap();
+    let imported = load_object(&path).unwrap();
+    let without = |name: &str| {
         format!(
-            "\"{}\": \"m.mtl\": cannot read the texture \"gone.png\": No such file or directory (os error 2)",
-            path.display()
+            "the texture \"{name}\" cannot be read (No such file or directory (os error 2)); the material's factors alone are used"
         )
+    };
+    assert_eq!(
+        imported.warnings,
+        [
+            without("gone.png"),
+            without("rough.png"),
+            "material \"a\": bump is read as a normal map".into(),
+            without("bumps.png"),
+            without("glow.png"),
+            "material \"a\": without map_Ke it does not emit light".into(),
+        ]
+    );
+    let material = &imported.materials[0];
+    assert_eq!(material.base_color, Vec4::new(0.5, 0.25, 0.125, 1.0));
+    assert_eq!(material.roughness, (2.0f32 / 32.0).powf(0.25));
+    assert_eq!(material.emissive, Vec3::ZERO);
+    assert!(imported.textures.is_empty());
+    // What a limit refuses is an error.
+    std::fs::write(
+        folder.path().join("m.mtl"),
+        "newmtl a\nmap_Kd ../gone.png\n",
+    )
+    .unwrap();
+    let error = load_object(&path).unwrap_err().to_string();
+    assert!(
+        error.contains("it lies outside of the object's folder"),
+        "{error}"
     );
 }
 

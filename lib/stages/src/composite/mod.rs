@@ -32,7 +32,7 @@ use crate::interruption;
 use crate::known_light::{self, Light};
 use crate::light::folder::{self as light_folder, Recovered};
 use crate::light::materials;
-use crate::names::COMPOSITE;
+use crate::names::{COMPOSITE, begin};
 use crate::presets::{Outlook, Preset};
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::written;
@@ -116,7 +116,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     };
     let stop = table.stop(session.pipeline.quality);
     let folder = COMPOSITE.folder(session);
-    let mut writer = session.begin(plan(session, &table)?)?;
+    let mut writer = begin(session, plan(session, &table)?)?;
     let curve = Curve::of(table.tone, &light);
     let course = render(
         session,

@@ -27,7 +27,7 @@ use dipir_scene::config::SceneConfig;
 use serde_json::{Value, json};
 
 use crate::model::{self, ModelTable};
-use crate::names::CONCEPTS;
+use crate::names::{CONCEPTS, begin};
 use crate::written;
 use folder::{ConceptEntry, ConceptList, read_latents};
 use table::ConceptsTable;
@@ -80,7 +80,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let plan = plan(session)?;
     let cache = cache_folder(session, &table, &plan, &class)?;
     let folder = CONCEPTS.folder(session);
-    let mut writer = session.begin(plan)?;
+    let mut writer = begin(session, plan)?;
     let model = model::load(session, &model_table)?;
     model::check_steps(session, &model, "concepts.steps", table.steps)?;
     let side = table.size.unwrap_or_else(|| model.native_size());

@@ -7,7 +7,8 @@ Every key of `pipeline.toml`: what it accepts, what holds without it, an example
 `dipir keys WORD` shows the keys whose name or description contains the word.
 
 On the command line a key is set by its dotted name, as in `--set scene.camera.fov_deg=40.0`; a number stands for
-`N`, 0 for the first object. Relative paths start from the folder of the file. The
+`N`, 0 for the first object. Such a key takes the place of the file's keys that exclude it, as `at_pixel` does of `position`,
+and text needs no quotes. Relative paths start from the folder of the file. The
 [demo's file](../pipeline.toml) is one to begin with.
 
 An editor that knows Taplo completes and checks the file with the schema that

@@ -74,6 +74,85 @@ fn every_example_is_accepted_in_the_file_and_on_the_command_line() {
     }
 }
 
+/// Whether the file's key `a` may stand in the way of the flag `b`: to leave a camera's file takes several keys, and an
+/// anchor is no place.
+fn may_stay(a: &str, b: &str) -> bool {
+    match a.rsplit_once('.').map(|(_, name)| name) {
+        Some("file") => !b.ends_with(".transforms"),
+        Some("transforms") => !b.ends_with(".file"),
+        _ => b.ends_with(".anchor"),
+    }
+}
+
+/// The two keys of a conflict that `[scene]` is refused for.
+fn conflict(text: &str, overrides: &[String]) -> Option<[String; 2]> {
+    let config = Config::parse(Path::new("pipeline.toml"), text, overrides).unwrap();
+    let scene: SceneConfig = config.table("scene").unwrap();
+    match scene.validate() {
+        Err(dipir_scene::Error::Conflict { first, second }) => {
+            Some([first, second].map(|key| key.replace("[0]", ".N")))
+        }
+        _ => None,
+    }
+}
+
+#[test]
+fn a_flag_takes_the_place_of_the_files_keys_that_exclude_it() {
+    let mut excluded = 0;
+    for table in ["scene.objects.N", "scene.camera", "scene.proxy"] {
+        let is_in = |k: &&Key| k.key.rsplit_once('.').is_some_and(|(t, _)| t == table);
+        let all: Vec<&Key> = keys().filter(is_in).collect();
+        for (a, b) in all.iter().flat_map(|a| all.iter().map(move |b| (a, b))) {
+            let text = |given: &[&Key]| {
+                let is_given = |name: &str| given.iter().any(|k| k.name() == name);
+                let table_of = |name: &str| match name == table {
+                    true => given
+                        .iter()
+                        .map(|k| format!("{} = {}\n", k.name(), k.example))
+                        .collect(),
+                    false => String::new(),
+                };
+                let mut text =
+                    "[scene]\nbackground = \"photo.jpg\"\n[[scene.objects]]\n".to_owned();
+                if !is_given("path") {
+                    text += "path = \"car.glb\"\n";
+                }
+                text += &table_of("scene.objects.N");
+                text += "[scene.camera]\n";
+                for (key, value) in [
+                    ("position", "[0.0, 1.0, 4.0]"),
+                    ("look_at", "[0.0, 0.0, 0.0]"),
+                ] {
+                    if !["file", "transforms", key].iter().any(|k| is_given(k)) {
+                        text += &format!("{key} = {value}\n");
+                    }
+                }
+                text + &table_of("scene.camera")
+                    + &(match table == "scene.proxy" {
+                        true => "[scene.proxy]\n".to_owned() + &table_of("scene.proxy"),
+                        false => String::new(),
+                    })
+            };
+            let exclude = |found: Option<[String; 2]>| {
+                found.is_some_and(|keys| keys.contains(&a.key) && keys.contains(&b.key))
+            };
+            if a.key != b.key && exclude(conflict(&text(&[a, b]), &[])) {
+                excluded += 1;
+                let flag = format!("{}={}", b.key.replace(".N.", ".0."), b.example);
+                let stays = exclude(conflict(&text(&[a]), &[flag]));
+                assert_eq!(
+                    stays,
+                    may_stay(&a.key, &b.key),
+                    "{} in the file, {} a flag",
+                    a.key,
+                    b.key
+                );
+            }
+        }
+    }
+    assert!(excluded > 40, "{excluded}");
+}
+
 #[test]
 fn every_key_has_a_sentence_and_an_example() {
     for key in keys() {

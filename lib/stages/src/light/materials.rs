@@ -24,7 +24,7 @@ use crate::known_light;
 use crate::light::folder::warn_of_another_scene;
 use crate::light::request::{read_reference, reference_of};
 use crate::light::resume::{self, Resume};
-use crate::names::LIGHT;
+use crate::names::{LIGHT, begin};
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::scene::transport::{self, Frame};
 use crate::written;
@@ -70,7 +70,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let decisive = settings_of(&table, settings.seed);
     let fingerprint = resume::run_fingerprint(&plan, &json!(decisive))?;
     let folder = LIGHT.folder(session);
-    let mut writer = session.begin(plan)?;
+    let mut writer = begin(session, plan)?;
     let renderer = Renderer::new(&scene.loaded.scene).with_camera(frame.camera);
     let sampler = EnvironmentSampler::new(light.map.clone());
     let simulation = scene.effects.simulation();

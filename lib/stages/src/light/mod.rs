@@ -5,6 +5,7 @@ mod candidates;
 mod done;
 mod estimate;
 pub mod folder;
+pub mod forecast;
 pub mod materials;
 pub(crate) mod method;
 pub(crate) mod request;
@@ -43,12 +44,13 @@ use dipir_scene::camera::Camera;
 use serde_json::Value;
 
 use crate::light::estimate::Estimated;
+use crate::light::forecast::light_run;
 use crate::light::request::{First, Guide, Request, first_light, read_reference};
 use crate::light::resume::{Resume, fingerprint};
 use crate::light::surroundings::{map_of, narrow_first, surroundings};
 use crate::model::{self, Loaded};
-use crate::names::LIGHT;
-use crate::presets::{LightRun, Outlook};
+use crate::names::{LIGHT, begin};
+use crate::presets::Outlook;
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::scene::transport::{self, Frame};
 use crate::{interruption, lora};
@@ -133,7 +135,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let inputs = Inputs::read(session, &request)?;
     let plan = plan(session)?;
     let fingerprint = fingerprint(&plan, &request.settings)?;
-    let mut writer = session.begin(plan)?;
+    let mut writer = begin(session, plan)?;
     let clock = Instant::now();
     let estimated = match request.start {
         First::Estimated => {
@@ -167,7 +169,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let budget = request.settings.time_budget_s;
     let outlook = match (resumed_at, &request.guide) {
         (0, Guide::Reference { .. } | Guide::Model { .. }) if budget.is_none() => {
-            light_run(&inputs.scene, &request, &manifest)
+            let resolution = inputs.scene.loaded.scene.camera.resolution;
+            light_run(resolution, &request.settings, &request.guide, &manifest)
                 .outlook(session.pipeline.quality, &request.table)
         }
         _ => Outlook::default(),
@@ -335,32 +338,6 @@ fn recover(
     writer.set_timing("guidance", recovery.guidance_s);
     writer.set_timing("records", recovery.records_s);
     Ok((recovery, resumed_at))
-}
-
-/// What took how long.
-fn light_run(scene: &SceneFolder, request: &Request, manifest: &Manifest) -> LightRun {
-    let settings = &request.settings;
-    let seconds = |name: &str| manifest.timings_s.get(name).copied().unwrap_or(0.0);
-    let resolution = scene.loaded.scene.camera.resolution;
-    let photo_side = resolution[0].max(resolution[1]) as usize;
-    let (by_model, refines) = match &request.guide {
-        Guide::Reference { .. } | Guide::None => (false, false),
-        Guide::Model { reading, .. } => (true, reading.is_some()),
-    };
-    let [record_s, optimization_s, guidance_s, records_s] =
-        ["transport", "optimization", "guidance", "records"].map(seconds);
-    LightRun {
-        iterations: (!refines).then_some(settings.iterations),
-        samples: settings.samples,
-        side: settings.size.min(photo_side),
-        photo_side,
-        environment: settings.environment,
-        record_s: record_s + records_s,
-        guidance_s,
-        replay_s: (optimization_s - guidance_s - records_s).max(0.0),
-        rest_s: (manifest.elapsed_s - record_s - optimization_s).max(0.0),
-        by_model,
-    }
 }
 
 /// What a run would be, from the configuration and the manifests of the stages that it reads.

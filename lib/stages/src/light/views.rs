@@ -62,9 +62,12 @@ pub(super) fn estimate(
     let mut seen = Vec::new();
     for settings in settings(session)? {
         let view = read(session, loaded, &settings)?;
-        let stops = settings
-            .exposure_stops
-            .or_else(|| between(loaded.taken(), &view.taken));
+        let told = between(loaded.taken(), &view.taken);
+        let stops = settings.exposure_stops.or(told);
+        let by_exif = by_exif(loaded.taken(), &view.taken);
+        if let Some(warning) = disagreement(&settings.key, settings.exposure_stops, by_exif) {
+            session.warn(&warning);
+        }
         if stops.is_none() {
             session.remark(|| {
                 format!(
@@ -105,6 +108,40 @@ fn between(photo: &Photo, other: &Photo) -> Option<f64> {
     if photo.values.is_none() && other.values.is_none() {
         return Some(0.0);
     }
+    by_exif(photo, other)
+}
+
+fn by_exif(photo: &Photo, other: &Photo) -> Option<f64> {
     let stops = other.facts.exposure_stops? - photo.facts.exposure_stops?;
     Some(stops.clamp(-30.0, 30.0))
+}
+
+/// What to say where the exposure that is written and that by Exif data are more than a stop apart.
+fn disagreement(key: &str, written: Option<f64>, by_exif: Option<f64>) -> Option<String> {
+    let (written, by_exif) = (written?, by_exif?);
+    ((written - by_exif).abs() > 1.0).then(|| {
+        format!(
+            "{} = {written:?}, but the Exif data of this photograph and of scene.background say {by_exif:.1}: {written:?} is \
+             used; remove the key to use the Exif data",
+            key.replace("background", "exposure_stops")
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_written_exposure_more_than_a_stop_off_the_exif_data_is_told() {
+        let told = |written, by_exif| disagreement("scene.views[0].background", written, by_exif);
+        assert_eq!(told(Some(1.0), Some(0.1)), None);
+        assert_eq!(told(None, Some(9.0)), None);
+        assert_eq!(told(Some(9.0), None), None);
+        assert_eq!(
+            told(Some(3.0), Some(-1.25)).unwrap(),
+            "scene.views[0].exposure_stops = 3.0, but the Exif data of this photograph and of scene.background say -1.2: 3.0 \
+             is used; remove the key to use the Exif data"
+        );
+    }
 }

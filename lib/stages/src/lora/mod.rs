@@ -39,7 +39,7 @@ use self::table::LoraTable;
 use crate::concepts::folder::{ConceptsFolder, read_latents};
 use crate::concepts::table::ConceptsTable;
 use crate::model::{self, ModelTable};
-use crate::names::{CONCEPTS, LORA};
+use crate::names::{CONCEPTS, LORA, begin};
 use crate::written;
 
 /// Fixed examples of each kind. Their losses are compared with one another, so that few do.
@@ -122,7 +122,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         .transpose()?;
     let fingerprint = resumable(session, &plan, &table)?;
     let base_hash = base_hash(&plan);
-    let mut writer = session.begin(plan)?;
+    let mut writer = begin(session, plan)?;
     if let Some(cache) = &cache
         && cache.restore(&mut writer)?
     {

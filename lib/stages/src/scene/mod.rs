@@ -29,7 +29,7 @@ use serde_json::{Value, json};
 
 use crate::composite::table::CompositeTable;
 use crate::light::method::Method;
-use crate::names::SCENE;
+use crate::names::{SCENE, begin};
 use crate::presets::Outlook;
 use crate::scene::transport::Frame;
 use crate::written;
@@ -91,7 +91,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         read.map(|i| (i.role.as_str(), i.path.as_path(), i.location.as_path())),
     )?;
     let folder = SCENE.folder(session);
-    let mut writer = session.begin(plan_of_this)?;
+    let mut writer = begin(session, plan_of_this)?;
 
     let settings = Settings {
         seed: session.pipeline.seed,

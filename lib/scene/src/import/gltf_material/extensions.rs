@@ -7,7 +7,7 @@ use super::MaterialReader;
 use crate::error::Error;
 use crate::import::document::{self, raw_extension};
 use crate::material::{
-    Anisotropy, Iridescence, MaterialExtensions, Sheen, Specular, TextureRef, Volume,
+    Anisotropy, Iridescence, Material, MaterialExtensions, Sheen, Specular, TextureRef, Volume,
 };
 use crate::texture::Encoding;
 
@@ -22,6 +22,30 @@ pub(super) const READ: [&str; 5] = [SPECULAR, SHEEN, ANISOTROPY, IRIDESCENCE, VO
 
 /// Attenuation to black within the distance has no finite coefficient: this is black enough.
 const LEAST_ATTENUATION: f32 = 1e-6;
+
+/// Names that a warning lists.
+const MOST_NAMES: usize = 5;
+
+/// A warning that names the solids whose refraction is left out.
+pub(in crate::import) fn without_refraction(materials: &[Material]) -> Option<String> {
+    let bends =
+        |m: &Material| m.transmission.is_some() && m.extensions.volume.is_some() && m.ior > 1.0;
+    let named = |(i, m): (usize, &Material)| match m.name.is_empty() {
+        true => format!("materials[{i}]"),
+        false => format!("\"{}\"", m.name),
+    };
+    let all = materials.iter().enumerate().filter(|(_, m)| bends(m));
+    let names: Vec<String> = all.map(named).collect();
+    let more = match names.len() {
+        0 => return None,
+        n if n > MOST_NAMES => format!(" and {} more", n - MOST_NAMES),
+        _ => String::new(),
+    };
+    Some(format!(
+        "the refraction of the solid {}{more} (KHR_materials_volume) is left out: light is attenuated there, but goes straight on",
+        names[..names.len().min(MOST_NAMES)].join(", ")
+    ))
+}
 
 impl MaterialReader<'_> {
     /// Reads those of [`READ`] that have an effect.

@@ -1,0 +1,83 @@
+//! Models of COLMAP: which one a folder or a file of a project stands for.
+use std::path::Path;
+
+use dipir_cameras::WorldUp;
+use dipir_cameras::file::{self, Wanted, Which};
+use glam::DVec3;
+
+const CAMERA: &str = "1 PINHOLE 640 480 500 500 320 240\n";
+
+/// A model of one camera, which stands at (0, 0, `z`) and took `name`.
+fn put(folder: &Path, z: f64, name: &str) {
+    std::fs::create_dir_all(folder).unwrap();
+    std::fs::write(folder.join("cameras.txt"), CAMERA).unwrap();
+    let images = format!("# comment\n1 1 0 0 0 0 0 {} 1 {name}\n\n", -z);
+    std::fs::write(folder.join("images.txt"), images).unwrap();
+}
+
+fn position(path: &Path, photo: &str) -> Result<DVec3, String> {
+    let wanted = Wanted {
+        size: [640.0, 480.0],
+        which: Which::Photo(Path::new(photo)),
+        up: Some(WorldUp::Y),
+        fov_deg: None,
+    };
+    let found = file::read(path, &wanted).map_err(|e| e.to_string())?;
+    Ok(found.pose.unwrap().position)
+}
+
+#[test]
+fn a_project_stands_for_its_model() {
+    for model in ["sparse", "sparse/0", "sparse/7"] {
+        let project = tempfile::tempdir().unwrap();
+        let folder = project.path().join(model);
+        put(&folder, 3.0, "a.jpg");
+        for path in [project.path(), &project.path().join("sparse"), &folder] {
+            assert_eq!(position(path, "a.jpg").unwrap().z, 3.0, "{model}");
+            assert_eq!(file::choice(path), None);
+            let parts = ["cameras.txt", "images.txt"].map(|name| folder.join(name));
+            assert_eq!(file::parts(path), parts);
+        }
+    }
+}
+
+#[test]
+fn of_several_models_the_first_is_read_and_how_to_take_another_is_said() {
+    let project = tempfile::tempdir().unwrap();
+    let sparse = project.path().join("sparse");
+    // 10 comes after 2, and what has no model or no number is passed over.
+    put(&sparse.join("10"), 10.0, "b.jpg");
+    put(&sparse.join("2"), 2.0, "a.jpg");
+    put(&sparse.join("old"), 1.0, "a.jpg");
+    std::fs::create_dir(sparse.join("0")).unwrap();
+    assert_eq!(position(project.path(), "a.jpg").unwrap().z, 2.0);
+    let choice = format!(
+        "COLMAP's project has 2 models, and the one in {:?} is read; for another write its folder, for instance {:?}",
+        sparse.join("2"),
+        sparse.join("10")
+    );
+    assert_eq!(file::choice(project.path()), Some(choice.clone()));
+    put(&sparse.join("2"), 2.0, "a.jpg\n\n2 1 0 0 0 0 0 0 1 c.jpg");
+    let error = position(project.path(), "b.jpg").unwrap_err();
+    let want = format!("it has 2 cameras, and none for \"b.jpg\"; {choice}; say which");
+    assert!(error.contains(&want), "{error}");
+    assert_eq!(position(&sparse.join("10"), "b.jpg").unwrap().z, 10.0);
+}
+
+#[test]
+fn a_file_of_a_model_is_no_calibration_and_is_read_with_those_beside_it() {
+    let folder = tempfile::tempdir().unwrap();
+    put(folder.path(), 3.0, "a.jpg");
+    // Of another model: the extension of the file that is named decides.
+    std::fs::write(folder.path().join("cameras.bin"), [0; 8]).unwrap();
+    for name in ["images.txt", "cameras.txt"] {
+        let path = folder.path().join(name);
+        assert_eq!(position(&path, "a.jpg").unwrap().z, 3.0);
+        assert_eq!(file::parts(&path).len(), 2);
+    }
+    std::fs::remove_file(folder.path().join("cameras.txt")).unwrap();
+    let error = position(&folder.path().join("images.txt"), "a.jpg").unwrap_err();
+    let missing = folder.path().join("cameras.txt");
+    let want = format!("cannot read the camera file \"{}\"", missing.display());
+    assert_eq!(error, want);
+}
