@@ -11,11 +11,11 @@ use dipir_pipeline::lock::{FolderLock, WhenLocked};
 use dipir_pipeline::mark::{Kind, Owned};
 use dipir_pipeline::{resume, stage};
 use dipir_stages::names::CONCEPTS;
-use dipir_stages::report;
+use dipir_stages::{report, shot};
 use serde_json::json;
 
 use crate::project::{ProjectArgs, Stage};
-use crate::run::{hashes_file, lock};
+use crate::run::hashes_file;
 
 #[derive(Args)]
 pub struct CleanArgs {
@@ -56,19 +56,42 @@ pub fn run(args: &CleanArgs) -> anyhow::Result<()> {
         |stage: &str| args.stages.is_empty() || args.stages.iter().any(|s| s.name() == stage);
     let stages = graph.nodes().iter().map(|n| n.stage);
     let stages: Vec<&'static str> = stages.filter(|stage| asked(stage)).collect();
+    let mut frames = shot::folders(out);
+    let is_ours = |frame: &Path| {
+        let mut owned = stages.iter().map(|s| Owned::of_stage(&frame.join(s), s));
+        owned.any(|o| o.is_some())
+    };
+    frames.retain(|frame| is_ours(frame));
+    let all = || std::iter::once(out).chain(&frames);
     let mut locks = Vec::new();
     if out.is_dir() && !args.dry_run {
-        locks.push(lock(&session)?);
-        for stage in &stages {
-            locks.push(FolderLock::take(&out.join(stage), WhenLocked::Refuse)?);
+        for out in all() {
+            locks.push(FolderLock::take_inside(out, "run", WhenLocked::Refuse)?);
+            for stage in &stages {
+                locks.push(FolderLock::take(&out.join(stage), WhenLocked::Refuse)?);
+            }
         }
     }
-    let found = find(args, out, &stages)?;
+    let mut found = Found::default();
+    for out in all() {
+        find(&mut found, args, out, &stages)?;
+    }
+    if !frames.is_empty() {
+        found.roots.extend(frames.iter().cloned());
+        found.roots.push(out.join(shot::FOLDER));
+    }
     let (removed, kept) = found.listed()?;
+    let roots = std::mem::take(&mut found.roots);
     if !args.dry_run {
         found.remove()?;
     }
     drop(locks);
+    if !args.dry_run {
+        for root in &roots {
+            // Only if nothing else is in it.
+            let _ = fs::remove_dir(root);
+        }
+    }
     session.result(
         || in_words(&removed, &kept, args.dry_run),
         || json!({"removed": removed, "kept": kept, "dry_run": args.dry_run}),
@@ -77,8 +100,12 @@ pub fn run(args: &CleanArgs) -> anyhow::Result<()> {
 }
 
 /// Looks for what is ours; an error if a stage's folder is another's.
-fn find(args: &CleanArgs, out: &Path, stages: &[&'static str]) -> anyhow::Result<Found> {
-    let mut found = Found::default();
+fn find(
+    found: &mut Found,
+    args: &CleanArgs,
+    out: &Path,
+    stages: &[&'static str],
+) -> anyhow::Result<()> {
     for stage in stages.iter().copied() {
         let folder = out.join(stage);
         if let Err(e) = stage::refuse_foreign(&folder, stage) {
@@ -120,7 +147,7 @@ fn find(args: &CleanArgs, out: &Path, stages: &[&'static str]) -> anyhow::Result
     if args.cache {
         found.add_folders_in(&out.join("concepts-cache"), Kind::Cache, CONCEPTS.name)?;
     }
-    Ok(found)
+    Ok(())
 }
 
 impl Found {
@@ -171,10 +198,6 @@ impl Found {
         }
         for file in &self.files {
             fs::remove_file(file).with_context(|| format!("cannot remove {}", file.display()))?;
-        }
-        for root in &self.roots {
-            // Only if nothing else is in it.
-            let _ = fs::remove_dir(root);
         }
         Ok(())
     }

@@ -9,6 +9,7 @@ mod preview;
 mod project;
 mod report;
 mod run;
+mod shot;
 mod status;
 mod suggestion;
 mod watch;
@@ -30,6 +31,7 @@ Examples:
   dipir run --until lora                    that stage and what it needs
   dipir run --from light --force            that stage and all that read it, once more
   dipir status                              what would run, and why
+  dipir shot frames/*.jpg                   every frame of a shot, under the light of one photograph
   dipir report                              show the run as one page, out/report.html
   dipir keys shadow                         keys of pipeline.toml that are about shadows
   dipir clean                               remove what the stages wrote
@@ -65,6 +67,8 @@ enum Command {
     Preview(preview::PreviewArgs),
     /// Run what is not up to date
     Run(run::RunArgs),
+    /// Put the objects into every frame of a shot, under one light
+    Shot(shot::ShotArgs),
     /// Say of each stage whether it is up to date, and if not, why
     Status(status::StatusArgs),
     /// Show which stage reads which
@@ -87,6 +91,7 @@ fn main() -> ExitCode {
         Command::Place(args) => place::run(&args),
         Command::Preview(args) => preview::run(&args),
         Command::Run(args) => run::run(&args),
+        Command::Shot(args) => shot::run(&args),
         Command::Status(args) => status::run(&args),
         Command::Graph(args) => status::graph(&args),
         Command::Report(args) => report::run(&args),

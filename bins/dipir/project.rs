@@ -36,6 +36,10 @@ pub struct ProjectArgs {
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
 
+    /// Folder of another run's light stage.
+    #[arg(skip)]
+    pub light: Option<PathBuf>,
+
     #[command(flatten)]
     pub output: OutputArgs,
 }
@@ -71,6 +75,7 @@ impl ProjectArgs {
             wait: false,
             supervised: false,
             hashes: None,
+            light: self.light.clone(),
             output: self.output,
         }
     }
@@ -146,6 +151,7 @@ impl FileArgs {
             set: self.set.clone(),
             out: None,
             seed: None,
+            light: None,
             output: self.output,
         }
     }

@@ -70,8 +70,7 @@ pub struct RunArgs {
     watch: bool,
 }
 
-/// Runs what is not up to date, in one project after the other. One that fails does not keep the
-/// others from running.
+/// Runs what is not up to date, in one project after the other.
 pub fn run(args: &RunArgs) -> anyhow::Result<()> {
     if args.jobs == 0 {
         return Err(Usage("--jobs 0: accepted: 1 or more".into()).into());
@@ -99,10 +98,20 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
         let message = "--out with several files: each has a folder of its own, [pipeline] out";
         return Err(Usage(message.into()).into());
     }
+    let named = |project: ProjectArgs| (project.file().to_owned(), project);
+    run_each(args, projects.into_iter().map(named))
+}
+
+/// Runs projects, each with what it is called, one after the other. One that fails does not keep the others from running.
+pub fn run_each(
+    args: &RunArgs,
+    projects: impl Iterator<Item = (PathBuf, ProjectArgs)>,
+) -> anyhow::Result<()> {
+    let output = args.project.output;
     let (mut results, mut failed) = (Vec::new(), None);
-    for project in &projects {
-        let name = project.file().display().to_string();
-        match run_one(args, project) {
+    for (name, project) in projects {
+        let name = name.display().to_string();
+        match run_one(args, &project) {
             Ok(done) => {
                 if !output.json {
                     output.result(|| format!("{name}: {}", done.0), || Value::Null);
@@ -129,8 +138,26 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
     }
 }
 
+impl RunArgs {
+    /// What a project needs, to `until` or to the end.
+    pub fn needed(project: ProjectArgs, until: Option<Stage>, threads: Option<usize>) -> Self {
+        Self {
+            project,
+            from: None,
+            until,
+            force: false,
+            plan: false,
+            jobs: 1,
+            threads,
+            wait: false,
+            draft: false,
+            watch: false,
+        }
+    }
+}
+
 /// Runs one project; what was done, for people and for programs.
-fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String, Value)> {
+pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String, Value)> {
     let (session, graph) = project.open()?;
     let nodes = selected(args, &graph)?;
     check_taken(&session, &nodes)?;
@@ -148,7 +175,8 @@ fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String, Val
         let _lock = lock_when(&session, when_locked)?;
         runner::run(&nodes, args.jobs, &mut work).map_err(stopped)?;
     }
-    let report = match dipir_stages::report::is_current(&session) {
+    let is_frame = project.light.is_some();
+    let report = match is_frame || dipir_stages::report::is_current(&session) {
         true => None,
         false => page(project, &session, &graph, &nodes),
     };
@@ -220,10 +248,6 @@ fn all_fresh(session: &Session, graph: &Graph, nodes: &[&Node]) -> anyhow::Resul
 }
 
 /// One run at a time in a folder of artifacts.
-pub fn lock(session: &Session) -> Result<FolderLock, StageError> {
-    lock_when(session, WhenLocked::Refuse)
-}
-
 fn lock_when(session: &Session, when_locked: WhenLocked) -> Result<FolderLock, StageError> {
     FolderLock::take_inside(&session.out, "run", when_locked)
 }
@@ -350,6 +374,9 @@ impl Work for Pipeline<'_> {
         }
         if let Some(out) = &project.out {
             command.arg("--out").arg(out);
+        }
+        if let Some(light) = &project.light {
+            command.arg("--light").arg(light);
         }
         if let Some(seed) = project.seed {
             command.args(["--seed", &seed.to_string()]);

@@ -20,6 +20,7 @@ mod pretraining;
 mod project;
 mod recovery;
 mod reproducibility;
+mod shot;
 mod stages;
 mod staleness;
 mod tradeoff;

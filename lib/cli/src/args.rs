@@ -47,6 +47,10 @@ pub struct CommonArgs {
     #[arg(long, value_name = "FILE", hide = true)]
     pub hashes: Option<PathBuf>,
 
+    /// Folder of a light stage that is read in place of the one in the folder of artifacts
+    #[arg(long, value_name = "DIR", hide = true)]
+    pub light: Option<PathBuf>,
+
     #[command(flatten)]
     #[allow(missing_docs)]
     pub output: OutputArgs,

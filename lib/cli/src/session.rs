@@ -16,6 +16,9 @@ use crate::interrupt;
 use crate::progress::Progress;
 use crate::style::{bold_yellow, color_on_stderr};
 
+/// The stage whose folder [`Session::light`] replaces.
+const LIGHT: &str = "light";
+
 /// What a stage needs of its command line and configuration.
 #[derive(Debug)]
 pub struct Session {
@@ -25,6 +28,8 @@ pub struct Session {
     pub pipeline: PipelineTable,
     /// Folder of all artifacts, relative to the current folder.
     pub out: PathBuf,
+    /// Folder of the light stage, if it is not in `out`: that stage does not run then.
+    pub light: Option<PathBuf>,
     when_locked: WhenLocked,
     output: OutputArgs,
     _hashes: HandBack,
@@ -84,6 +89,7 @@ impl Session {
             config,
             pipeline,
             out,
+            light: args.light.clone(),
             _hashes: HandBack(args.hashes.clone()),
             when_locked: match args.wait {
                 true => WhenLocked::Wait,
@@ -107,7 +113,10 @@ impl Session {
 
     /// The folder of a stage.
     pub fn stage_folder(&self, stage: &str) -> PathBuf {
-        self.out.join(stage)
+        match &self.light {
+            Some(light) if stage == LIGHT => light.clone(),
+            _ => self.out.join(stage),
+        }
     }
 
     /// Opens the folder of the planned stage for writing.

@@ -87,6 +87,7 @@ fn open(folder: &Path, set: &[&str]) -> Session {
         seed: None,
         wait: false,
         supervised: false,
+        light: None,
         hashes: None,
         output: OutputArgs {
             json: false,

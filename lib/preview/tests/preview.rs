@@ -45,6 +45,7 @@ fn project() -> (TempDir, Session) {
         seed: None,
         wait: false,
         supervised: false,
+        light: None,
         hashes: None,
         output: OutputArgs::default(),
     });

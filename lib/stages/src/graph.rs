@@ -30,8 +30,11 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
     let report: ReportTable = session.config.table("report")?;
     report.placement().check(&session.config)?;
     let method = Method::of(session)?;
-    let light_is_given = method == Method::Given;
     let no_model = method.without_model();
+    let no_light = match method {
+        Method::Given | Method::Taken => no_model,
+        _ => None,
+    };
     let no_concepts = match lora::preserves_concepts(session)? {
         true => no_model,
         false => no_model.or(Some("concepts.count or lora.prior_weight is 0")),
@@ -57,11 +60,11 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
         node(
             &LIGHT,
             chosen(&[(SCENE.name, true), (LORA.name, no_model.is_none())]),
-            light_is_given.then_some("[composite] environment gives the light"),
+            no_light,
         ),
         node(
             &COMPOSITE,
-            chosen(&[(SCENE.name, true), (LIGHT.name, !light_is_given)]),
+            chosen(&[(SCENE.name, true), (LIGHT.name, no_light.is_none())]),
             None,
         ),
     ]))

@@ -14,6 +14,7 @@ pub mod preview;
 mod reasons;
 pub mod report;
 pub mod scene;
+pub mod shot;
 pub mod truth;
 
 use std::fmt;

@@ -120,6 +120,9 @@ pub fn manifest(session: &Session) -> anyhow::Result<Manifest> {
 
 /// Warns if the light was recovered before the scene was set up anew.
 pub fn warn_of_another_scene(session: &Session, light: &Manifest, scene: &Manifest) {
+    if session.light.is_some() {
+        return;
+    }
     let of = |list: &[Artifact]| {
         let found = list.iter().find(|a| a.role == "scene");
         found.map(|a| a.blake3.clone())

@@ -8,6 +8,8 @@ use crate::model::ModelTable;
 /// A way to a light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Method {
+    /// Another run has the light, or the materials.
+    Taken,
     /// `[light] materials`: materials are recovered under a known light.
     Materials,
     /// `[composite] environment` gives the light.
@@ -28,6 +30,9 @@ impl Method {
         let table: LightTable = session.config.table("light")?;
         let composite: CompositeTable = session.config.table("composite")?;
         let model: ModelTable = session.config.table("model")?;
+        if session.light.is_some() {
+            return Ok(Self::Taken);
+        }
         if !table.materials.is_empty() {
             return Ok(Self::Materials);
         }
@@ -54,6 +59,7 @@ impl Method {
         match self {
             Self::Materials => Some("[light] materials asks no diffusion model"),
             Self::Given => Some("[composite] environment gives the light"),
+            Self::Taken => Some("the light is that of the shot"),
             Self::Start => Some("no diffusion model guides ([light] guidance)"),
             Self::Reference => Some("[light] guidance = \"reference\" asks no diffusion model"),
             Self::Model { adapted: false } => {

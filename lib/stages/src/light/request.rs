@@ -121,7 +121,7 @@ impl Request {
                 Guide::Reference { path, file }
             }
             Method::Model { adapted } => model_guide(session, &table, adapted)?,
-            Method::Start | Method::Materials | Method::Given => Guide::None,
+            Method::Start | Method::Materials | Method::Given | Method::Taken => Guide::None,
         };
         let start = First::of(session, &table, &guide)?;
         let views = views::settings(session)?;
