@@ -99,18 +99,19 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
         return Err(Usage(message.into()).into());
     }
     let named = |project: ProjectArgs| (project.file().to_owned(), project);
-    run_each(args, projects.into_iter().map(named))
+    run_each(args, projects.into_iter().map(named).collect())
 }
 
 /// Runs projects, each with what it is called, one after the other. One that fails does not keep the others from running.
-pub fn run_each(
-    args: &RunArgs,
-    projects: impl Iterator<Item = (PathBuf, ProjectArgs)>,
-) -> anyhow::Result<()> {
+pub fn run_each(args: &RunArgs, projects: Vec<(PathBuf, ProjectArgs)>) -> anyhow::Result<()> {
     let output = args.project.output;
     let (mut results, mut failed) = (Vec::new(), None);
-    for (name, project) in projects {
+    let all = projects.len();
+    for (k, (name, project)) in projects.into_iter().enumerate() {
         let name = name.display().to_string();
+        if !(output.quiet || output.json) {
+            eprintln!("{} ({} of {all})", printable(&name), k + 1);
+        }
         match run_one(args, &project) {
             Ok(done) => {
                 if !output.json {

@@ -82,5 +82,5 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
         }
     }
     let to_the_end = RunArgs::needed(base, None, args.threads);
-    run_each(&to_the_end, frames.into_iter())
+    run_each(&to_the_end, frames)
 }

@@ -72,6 +72,8 @@ fn the_readme_is_walked_through_as_written() {
     fs::remove_file(project.path("pipeline.toml")).unwrap();
     let photo = image::open(project.path("background.png")).unwrap();
     photo.to_rgb8().save(project.path("photo.jpg")).unwrap();
+    fs::create_dir(project.path("frames")).unwrap();
+    fs::copy(project.path("photo.jpg"), project.path("frames/1.jpg")).unwrap();
     let sky = dipir_light::environment::EnvironmentMap::read(project.path("sky.exr")).unwrap();
     sky.write(project.path("sky.hdr")).unwrap();
     let car = Path::new(env!("CARGO_MANIFEST_DIR")).join("data/demo/car.glb");
