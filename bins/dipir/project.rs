@@ -64,6 +64,19 @@ impl ProjectArgs {
         }
     }
 
+    /// The project that a stage's options name.
+    pub fn of(common: &CommonArgs) -> Self {
+        Self {
+            files: vec![common.pipeline.clone()],
+            pipeline: None,
+            set: common.set.clone(),
+            out: common.out.clone(),
+            seed: common.seed,
+            light: common.light.clone(),
+            output: common.output,
+        }
+    }
+
     /// The same for the executables of the stages.
     pub fn common(&self) -> CommonArgs {
         CommonArgs {

@@ -6,6 +6,7 @@ use std::thread::{self, JoinHandle};
 
 use anyhow::Context;
 use clap::Args;
+use dipir_cli::args::CommonArgs;
 use dipir_cli::ending;
 use dipir_cli::exit::{self, AlreadyReported, Usage, printable};
 use dipir_cli::interrupt::{self, Interrupted};
@@ -140,17 +141,17 @@ pub fn run_each(args: &RunArgs, projects: Vec<(PathBuf, ProjectArgs)>) -> anyhow
 }
 
 impl RunArgs {
-    /// What a project needs, to `until` or to the end.
-    pub fn needed(project: ProjectArgs, until: Option<Stage>, threads: Option<usize>) -> Self {
+    /// What is not up to date, to `until` or to the end.
+    pub fn needed(common: &CommonArgs, until: Option<Stage>) -> Self {
         Self {
-            project,
+            project: ProjectArgs::of(common),
             from: None,
             until,
             force: false,
             plan: false,
             jobs: 1,
-            threads,
-            wait: false,
+            threads: common.threads,
+            wait: common.wait,
             draft: false,
             watch: false,
         }

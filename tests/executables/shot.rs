@@ -76,10 +76,8 @@ fn every_frame_has_the_camera_of_its_name() {
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
     let (head, tail) = text.split_once("[scene.camera]\n").unwrap();
     let (_, tail) = tail.split_once("[scene.proxy]").unwrap();
-    let with = |head: &str, key: &str| {
-        let text = format!(
-            "{head}[scene.camera]\n{key} = \"transforms.json\"\n{key}_up = \"y\"\n[scene.proxy]{tail}"
-        );
+    let with = |camera: &str| {
+        let text = format!("{head}[scene.camera]\n{camera}\n[scene.proxy]{tail}");
         project.write("pipeline.toml", text);
     };
     let photo = project.read("background.png");
@@ -100,14 +98,21 @@ fn every_frame_has_the_camera_of_its_name() {
     ];
     let transforms = json!({ "camera_angle_x": 0.8, "w": 36, "h": 24, "frames": frames });
     project.write("transforms.json", transforms.to_string());
-    with(head, "file");
-    shot(&project, &["b.png", "a.png"]);
     let place = |name: &str| {
         let scene: Value =
             serde_json::from_slice(&project.read(&format!("out/{name}/scene/scene.json"))).unwrap();
         scene["camera"]["position"][0].as_f64().unwrap()
     };
-    assert_eq!(["frames/a", "frames/b", "."].map(place), [0.5, -0.5, 0.0]);
+    // Whether the photograph's own is found by its name or is chosen.
+    for own in ["", "image = \"background.png\"", "frame = 0"] {
+        with(&format!(
+            "file = \"transforms.json\"\nfile_up = \"y\"\n{own}"
+        ));
+        shot(&project, &["b.png", "a.png"]);
+        let places = ["frames/a", "frames/b", "."].map(place);
+        assert_eq!(places, [0.5, -0.5, 0.0], "{own}");
+        project.run(DIPIR, &["clean"]).expect_success();
+    }
     // What cannot be is said before anything runs.
     let refused = |args: &[&str], message: &str| {
         let run = project.run(DIPIR, &[&["shot"], args].concat());
@@ -122,7 +127,19 @@ fn every_frame_has_the_camera_of_its_name() {
         &["a.png", "--set", "scene.objects.0.at_pixel=[18, 16]"],
         "scene.objects[0].at_pixel is found anew in every frame, and the camera moves: write position and yaw_deg",
     );
-    with(head, "transforms");
+    // Frames of .chan have numbers.
+    let numbered = ["f_1.png", "f_02.png"];
+    numbered.iter().for_each(|name| project.write(name, &photo));
+    let cameras = "1 0.5 1.5 5 0 0 0 40\n2 -0.5 1.5 5 0 0 0 40\n";
+    project.write("camera.chan", cameras);
+    with("file = \"camera.chan\"\nframe = 1");
+    shot(&project, &numbered);
+    assert_eq!(["frames/f_1", "frames/f_02"].map(place), [0.5, -0.5]);
+    refused(
+        &["a.png"],
+        "a.png: its name does not end in the number of a frame of .chan",
+    );
+    with("transforms = \"transforms.json\"\ntransforms_up = \"y\"");
     refused(
         &["a.png"],
         "scene.camera.transforms names frames by number: write file in its place, which finds them by the names of their pictures",

@@ -16,9 +16,6 @@ use crate::interrupt;
 use crate::progress::Progress;
 use crate::style::{bold_yellow, color_on_stderr};
 
-/// The stage whose folder [`Session::light`] replaces.
-const LIGHT: &str = "light";
-
 /// What a stage needs of its command line and configuration.
 #[derive(Debug)]
 pub struct Session {
@@ -28,7 +25,7 @@ pub struct Session {
     pub pipeline: PipelineTable,
     /// Folder of all artifacts, relative to the current folder.
     pub out: PathBuf,
-    /// Folder of the light stage, if it is not in `out`: that stage does not run then.
+    /// Folder of another run's light stage, which is read in place of this run's own.
     pub light: Option<PathBuf>,
     when_locked: WhenLocked,
     output: OutputArgs,
@@ -113,10 +110,7 @@ impl Session {
 
     /// The folder of a stage.
     pub fn stage_folder(&self, stage: &str) -> PathBuf {
-        match &self.light {
-            Some(light) if stage == LIGHT => light.clone(),
-            _ => self.out.join(stage),
-        }
+        self.out.join(stage)
     }
 
     /// Opens the folder of the planned stage for writing.

@@ -16,7 +16,7 @@ use crate::visibility::{below_a_pixel, short};
 const FIELD_OF_VIEW_DEG: [f32; 2] = [1.5, 140.0];
 /// Largest extents of objects that people insert, metres.
 const EXTENT_M: [f64; 2] = [0.005, 50.0];
-/// A model this large in its file is in millimetres, a smaller one in centimetres: half a metre and more, or less than five.
+/// From this extent on, the units of a file are taken for millimetres (.5 m and more), below it for centimetres (5 m and less).
 const MILLIMETRES_FROM: f64 = 500.0;
 /// An object smaller than this in the picture cannot be judged, pixels.
 const SMALLEST_PX: f32 = 3.0;

@@ -55,9 +55,12 @@ pub const COMPOSITE: StageName = StageName {
 pub const ALL: [&StageName; 5] = [&SCENE, &CONCEPTS, &LORA, &LIGHT, &COMPOSITE];
 
 impl StageName {
-    /// The stage's folder among the session's artifacts.
+    /// The stage's folder among the session's artifacts, or that of the run whose light is taken.
     pub fn folder(&self, session: &Session) -> PathBuf {
-        session.stage_folder(self.name)
+        match &session.light {
+            Some(light) if self.name == LIGHT.name => light.clone(),
+            _ => session.stage_folder(self.name),
+        }
     }
 
     /// The manifest that the stage left; an error that names the executable if there is none.

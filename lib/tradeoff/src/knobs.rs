@@ -162,7 +162,7 @@ impl Variant {
 const RENDER_S: f64 = 4e-6;
 /// Those of all else in a run of scene and composite.
 const SET_UP_S: f64 = 0.4;
-/// Those of as many samples in each pixel, whatever the error.
+/// Those of one sample in every pixel, about.
 const SAMPLE_S: f64 = 0.004;
 
 /// About how long a render to `error` takes, by which shares of a sweep are told.
