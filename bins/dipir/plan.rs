@@ -1,4 +1,6 @@
-//! `dipir run --plan`: what a run would do and take, before anything starts.
+//! `--plan`: what a run would do and take, before anything starts.
+use std::path::PathBuf;
+
 use dipir_cli::interrupt;
 use dipir_cli::session::{Session, duration, size};
 use dipir_pipeline::fingerprint::StaleReason;
@@ -9,9 +11,12 @@ use dipir_stages::composite::table::CompositeTable;
 use dipir_stages::graph;
 use dipir_stages::light;
 use dipir_stages::model::{self, ModelTable, forecast};
-use dipir_stages::names::{COMPOSITE, CONCEPTS, LIGHT, LORA};
+use dipir_stages::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE};
 use serde::Serialize;
 use serde_json::{Value, json};
+
+use crate::project::ProjectArgs;
+use crate::run;
 
 /// What is expected of a stage.
 #[derive(Serialize)]
@@ -136,6 +141,54 @@ fn measure(session: &Session, all: &mut [Expected]) -> anyhow::Result<()> {
         }
     }
     Ok(())
+}
+
+/// What the frames of a shot would take, after what `light` takes: as long as those that are there took, else as the
+/// photograph's own picture.
+pub fn frames(
+    base: &Session,
+    light: Option<(String, Value)>,
+    frames: &[(PathBuf, ProjectArgs)],
+) -> anyhow::Result<(String, Value)> {
+    let runs = |e: &Value| e["runs"] == json!(true);
+    let stages = light.as_ref().and_then(|l| l.1["plan"].as_array());
+    // Another light concerns every frame.
+    let is_new_light = stages.is_some_and(|all| all.iter().any(runs));
+    let (mut stale, mut took) = (0, vec![]);
+    for (_, project) in frames {
+        let (session, graph) = project.open()?;
+        let nodes = graph.up_to(graph::LAST);
+        stale += usize::from(is_new_light || !run::all_fresh(&session, &graph, &nodes)?);
+        took.extend(seconds(&session));
+    }
+    if took.is_empty() {
+        took.extend(seconds(base));
+    }
+    let each = (!took.is_empty()).then(|| took.iter().sum::<f64>() / took.len() as f64);
+    let together = each.map(|each| each * stale as f64);
+    let all = frames.len();
+    let mut words = format!("frames     {stale} of {all} run");
+    words += &match (stale, each.zip(together)) {
+        (0, _) => String::new(),
+        (_, None) => "; nothing is known: none has run here".into(),
+        (_, Some((each, together))) => format!(
+            ", about {} each: about {}",
+            duration(each),
+            duration(together)
+        ),
+    };
+    let (light, mut json) = light.unwrap_or_else(|| (String::new(), json!({})));
+    if !light.is_empty() {
+        words = format!("{light}\n{words}");
+    }
+    json["frames"] = json!({"all": all, "run": stale, "seconds_each": each, "seconds": together});
+    Ok((words, json))
+}
+
+/// What the picture of a session took the last time.
+fn seconds(session: &Session) -> Option<f64> {
+    let of = |stage: &str| Manifest::read(&session.stage_folder(stage), "").ok();
+    Some(of(SCENE.name)?.elapsed_s + of(COMPOSITE.name)?.elapsed_s)
 }
 
 fn in_words(all: &[Expected]) -> String {

@@ -3,6 +3,7 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::thread::{self, JoinHandle};
+use std::time::Instant;
 
 use anyhow::Context;
 use clap::Args;
@@ -10,7 +11,7 @@ use dipir_cli::args::CommonArgs;
 use dipir_cli::ending;
 use dipir_cli::exit::{self, AlreadyReported, Usage, printable};
 use dipir_cli::interrupt::{self, Interrupted};
-use dipir_cli::session::{Session, check_threads};
+use dipir_cli::session::{Session, check_threads, duration};
 use dipir_cli::style::{bold, color_on_stderr};
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::graph::{Graph, Node};
@@ -108,12 +109,24 @@ pub fn run_each(args: &RunArgs, projects: Vec<(PathBuf, ProjectArgs)>) -> anyhow
     let output = args.project.output;
     let (mut results, mut failed) = (Vec::new(), None);
     let all = projects.len();
+    // Seconds of those that ran something, and their number.
+    let mut took = (0.0, 0);
     for (k, (name, project)) in projects.into_iter().enumerate() {
         let name = name.display().to_string();
         if !(output.quiet || output.json) {
-            eprintln!("{} ({} of {all})", printable(&name), k + 1);
+            let left = (all - k) as f64 * took.0 / f64::from(took.1.max(1));
+            let left = match took.1 {
+                0 => String::new(),
+                _ => format!(", about {} left", duration(left)),
+            };
+            eprintln!("{} ({} of {all}{left})", printable(&name), k + 1);
         }
-        match run_one(args, &project) {
+        let start = Instant::now();
+        let done = run_one(args, &project);
+        if matches!(&done, Ok((_, json)) if json["ran"] != json!([])) {
+            took = (took.0 + start.elapsed().as_secs_f64(), took.1 + 1);
+        }
+        match done {
             Ok(done) => {
                 if !output.json {
                     output.result(|| format!("{name}: {}", done.0), || Value::Null);
@@ -155,6 +168,12 @@ impl RunArgs {
             draft: false,
             watch: false,
         }
+    }
+
+    /// The same, of which nothing is started.
+    pub fn planned(mut self) -> Self {
+        self.plan = true;
+        self
     }
 }
 
@@ -239,7 +258,8 @@ fn check_taken(session: &Session, nodes: &[&Node]) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn all_fresh(session: &Session, graph: &Graph, nodes: &[&Node]) -> anyhow::Result<bool> {
+/// Whether nothing of `nodes` would run.
+pub fn all_fresh(session: &Session, graph: &Graph, nodes: &[&Node]) -> anyhow::Result<bool> {
     let states = graph::assess(session, graph, nodes)?;
     let fresh = |s: &State| matches!(s, State::Fresh | State::Unneeded { .. });
     // Stages that were not asked for count as up to date, whatever they are.

@@ -145,3 +145,119 @@ fn every_frame_has_the_camera_of_its_name() {
         "scene.camera.transforms names frames by number: write file in its place, which finds them by the names of their pictures",
     );
 }
+
+#[test]
+fn frames_are_exposed_as_their_exif_data_say() {
+    let project = project();
+    // Exposure time, f-number and ISO of a TIFF header with one directory.
+    let exif = |seconds: [u32; 2]| {
+        let mut bytes =
+            b"Exif\0\0II*\0\x08\0\0\0\x01\0\x69\x87\x04\0\x01\0\0\0\x1a\0\0\0\0\0\0\0".to_vec();
+        let entry = |tag: u16, kind: u16, value: u32| {
+            let mut e = [tag.to_le_bytes(), kind.to_le_bytes()].concat();
+            e.extend([1, 0, 0, 0]);
+            e.extend(value.to_le_bytes());
+            e
+        };
+        bytes.extend([3, 0]);
+        bytes.extend(entry(0x829a, 5, 68));
+        bytes.extend(entry(0x829d, 5, 76));
+        bytes.extend(entry(0x8827, 3, 100));
+        bytes.extend([0; 4]);
+        for number in [seconds[0], seconds[1], 2, 1] {
+            bytes.extend(number.to_le_bytes());
+        }
+        bytes
+    };
+    let jpeg = |name: &str, seconds| {
+        let picture = image::RgbImage::from_pixel(36, 24, image::Rgb([90, 100, 110]));
+        let mut encoded = std::io::Cursor::new(vec![]);
+        picture
+            .write_to(&mut encoded, image::ImageFormat::Jpeg)
+            .unwrap();
+        let encoded = encoded.into_inner();
+        let exif = exif(seconds);
+        let length = u16::try_from(exif.len() + 2).unwrap().to_be_bytes();
+        let all = [&encoded[..2], &[0xff, 0xe1], &length, &exif, &encoded[2..]];
+        project.write(name, all.concat());
+    };
+    jpeg("photo.jpg", [1, 100]);
+    jpeg("longer.jpg", [1, 50]);
+    jpeg("same.jpg", [1, 100]);
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write("pipeline.toml", text.replace("background.png", "photo.jpg"));
+    let stops = |name: &str| {
+        let manifest = format!("out/frames/{name}/composite/stage.json");
+        let value: Value = serde_json::from_slice(&project.read(&manifest)).unwrap();
+        value["params"]["light"]["exposure_ev"].as_f64().unwrap()
+    };
+    shot(&project, &["longer.jpg", "same.jpg"]);
+    assert_eq!(["longer", "same"].map(stops), [1.0, 0.0]);
+    shot(
+        &project,
+        &["longer.jpg", "--set", "composite.exposure_ev=0.5"],
+    );
+    assert_eq!(stops("longer"), 1.5);
+    shot(&project, &["longer.jpg", "--same-exposure"]);
+    assert_eq!(stops("longer"), 0.0);
+}
+
+#[test]
+fn a_shot_is_planned_before_it_runs() {
+    let project = project();
+    for name in ["a.png", "b.png"] {
+        project.write(name, project.read("background.png"));
+    }
+    let plan = |frames: &[&str]| -> Value {
+        let run = project.run(DIPIR, &[&["shot", "--plan", "--json"], frames].concat());
+        run.expect_success();
+        serde_json::from_str(&run.stdout).unwrap()
+    };
+    let first = plan(&["a.png", "b.png"]);
+    assert_eq!(first["frames"]["run"], 2);
+    assert_eq!(first["frames"]["seconds"], Value::Null);
+    assert_eq!(first["plan"][1]["runs"], true, "{first}");
+    assert!(!project.path("out").exists());
+    shot(&project, &["a.png"]);
+    let second = plan(&["a.png", "b.png"]);
+    assert_eq!(second["frames"]["run"], 1);
+    let seconds = |key: &str| second["frames"][key].as_f64().unwrap();
+    assert!(seconds("seconds") > 0.0);
+    assert_eq!(seconds("seconds"), seconds("seconds_each"));
+    // Of other settings the light runs again, and then every frame.
+    let draft = plan(&[
+        "a.png",
+        "b.png",
+        "--draft",
+        "--set",
+        "light.sun.azimuth_deg=30",
+    ]);
+    assert_eq!(draft["frames"]["run"], 2);
+}
+
+#[test]
+fn a_camera_that_stands_still_takes_pixels() {
+    let project = project();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let (head, tail) = text.split_once("[scene.camera]\n").unwrap();
+    let (_, tail) = tail.split_once("[scene.proxy]").unwrap();
+    let text = format!(
+        "{head}[scene.camera]\nfile = \"camera.json\"\nfile_up = \"y\"\nimage = \"background.png\"\n[scene.proxy]{tail}"
+    );
+    project.write("pipeline.toml", text);
+    let matrix = [
+        [1.0, 0.0, 0.0, 0.5],
+        [0.0, 1.0, 0.0, 1.5],
+        [0.0, 0.0, 1.0, 5.0],
+        [0.0, 0.0, 0.0, 1.0],
+    ];
+    let frame = json!({ "file_path": "background.png", "transform_matrix": matrix });
+    let file = json!({ "camera_angle_x": 0.8, "w": 36, "h": 24, "frames": [frame] });
+    project.write("camera.json", file.to_string());
+    project.write("other.png", project.read("background.png"));
+    let ran = shot(
+        &project,
+        &["other.png", "--set", "scene.objects.0.at_pixel=[18, 20]"],
+    );
+    assert_eq!(ran[0]["done"]["ran"], json!(["scene", "composite"]));
+}

@@ -73,6 +73,17 @@ pub fn read(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
     Ok(found)
 }
 
+/// Whether the file in `path` has one camera, whatever a picture is called. A file that cannot be read has none.
+pub fn has_one(path: &Path) -> bool {
+    let wanted = Wanted {
+        size: [1.0, 1.0],
+        which: Which::Photo(Path::new("")),
+        up: None,
+        fov_deg: Some(45.0),
+    };
+    found(path, &wanted).is_ok()
+}
+
 /// The files that [`read`] reads: `path` itself, or those of COLMAP's model.
 pub fn parts(path: &Path) -> Vec<PathBuf> {
     match colmap::Files::at(path) {

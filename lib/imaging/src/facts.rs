@@ -1,4 +1,7 @@
 //! What a photograph's Exif data say of how it was taken.
+use std::io::BufReader;
+use std::path::Path;
+
 use crate::sensors;
 use exif::{Exif, In, Tag, Value};
 use image::metadata::Orientation;
@@ -96,6 +99,17 @@ impl Facts {
             facts.read_place(&fields);
         }
         facts
+    }
+
+    /// [`Facts::exposure_stops`] of the PNG or JPEG in `path`, whose pixels are not read; `None` as well if it cannot be read.
+    pub fn exposure_stops_of(path: &Path) -> Option<f64> {
+        let mut file = BufReader::new(dipir_files::open(path).ok()?);
+        let mut reader = exif::Reader::new();
+        let read = reader
+            .continue_on_error(true)
+            .read_from_container(&mut file)
+            .or_else(|e| e.distill_partial_result(|_| {}));
+        Fields(&read.ok()?).exposure_stops()
     }
 
     /// Whether the upright picture's width is the stored picture's height.

@@ -3,11 +3,16 @@ use std::path::{Path, PathBuf};
 
 use dipir_cli::exit::{Usage, printable};
 use dipir_cli::session::Session;
+use dipir_imaging::facts::Facts;
 use dipir_scene::config::{CameraConfig, ObjectConfig, SceneConfig};
 use serde_json::json;
 
+use crate::composite::table::CompositeTable;
+
 /// Folder of the frames' artifacts in that of all.
 pub const FOLDER: &str = "frames";
+/// Exposures that differ by less are one, stops: cameras round times and f-numbers.
+const SAME_EXPOSURE: f64 = 0.05;
 
 /// Folders of the frames that were begun.
 pub fn folders(out: &Path) -> Vec<PathBuf> {
@@ -18,11 +23,27 @@ pub fn folders(out: &Path) -> Vec<PathBuf> {
     folders
 }
 
-/// What sets the frame in `path` in place of the session's photograph, as `KEY=VALUE`.
+/// How much more the frame in `path` is exposed than the session's photograph, stops, if the Exif data of both tell and
+/// they are not exposed alike.
+///
+/// # Errors
+/// If `[scene]` cannot be read.
+pub fn exposure_stops(session: &Session, path: &Path) -> anyhow::Result<Option<f64>> {
+    let scene: SceneConfig = session.config.table("scene")?;
+    let photo = scene.background.map(|b| session.config.base_dir().join(b));
+    let told = |path: &Path| Facts::exposure_stops_of(path);
+    let Some((photo, frame)) = photo.and_then(|p| told(&p)).zip(told(path)) else {
+        return Ok(None);
+    };
+    let stops = (frame - photo).clamp(-30.0, 30.0);
+    Ok((stops.abs() >= SAME_EXPOSURE).then_some(stops))
+}
+
+/// What sets the frame in `path`, exposed by `stops` more, in place of the session's photograph, as `KEY=VALUE`.
 ///
 /// # Errors
 /// If there is no such file, or what is placed or seen in it cannot be told from the configuration.
-pub fn overrides(session: &Session, path: &Path) -> anyhow::Result<Vec<String>> {
+pub fn overrides(session: &Session, path: &Path, stops: f64) -> anyhow::Result<Vec<String>> {
     let wrong = |why: &str| Usage(printable(&format!("{}: {why}", path.display())));
     let scene: SceneConfig = session.config.table("scene")?;
     let (true, Some(name)) = (path.is_file(), path.file_name()) else {
@@ -36,10 +57,18 @@ pub fn overrides(session: &Session, path: &Path) -> anyhow::Result<Vec<String>> 
         "scene.background={}",
         text(&std::path::absolute(path)?)?
     )];
+    if stops != 0.0 {
+        let composite: CompositeTable = session.config.table("composite")?;
+        let exposure_ev = f64::from(composite.exposure_ev) + stops;
+        set.push(format!("composite.exposure_ev={exposure_ev:.3}"));
+    }
     let Some(camera) = &scene.camera else {
         return Ok(set);
     };
-    if camera.file.is_some() {
+    if let Some(file) = &camera.file {
+        if dipir_cameras::file::has_one(&session.config.base_dir().join(file)) {
+            return Ok(set);
+        }
         refuse_pixels(&scene.objects)?;
     }
     if let Some(key) = key_of_frame(camera)? {
