@@ -42,7 +42,7 @@ pub enum ImagingError {
         remedy: String,
     },
     /// The format is right but the contents cannot be decoded, most often because the end is missing.
-    #[error("`{}` is damaged or cut short: {detail}; expected a complete {format} file: export or copy it again", path.display())]
+    #[error("`{}` is damaged or cut short: {}; expected a complete {format} file: export or copy it again", path.display(), in_words(detail))]
     Damaged {
         /// The file.
         path: PathBuf,
@@ -170,6 +170,28 @@ pub enum ImagingError {
 /// ask for all memory.
 pub const MAX_PIXELS: usize = 1 << 28;
 
+/// What a decoder met, its names of PNG's parts as the format has them.
+fn in_words(detail: &str) -> String {
+    const BEGIN: &str = "ChunkType { type: ";
+    let mut text = String::new();
+    let mut rest = detail;
+    let mut parts = Vec::new();
+    while let Some((before, after)) = rest.split_once(BEGIN) {
+        // `IDAT, critical: true, … }`; a type that is no text is quoted.
+        let end = after.find(',').unwrap_or(after.len());
+        parts.push(&after[..end]);
+        text = text + before + &after[..end];
+        rest = after.find('}').map_or("", |end| &after[end + 1..]);
+    }
+    text += rest;
+    match parts.as_slice() {
+        [part] if detail.contains("CRC error") => {
+            format!("a part of it ({part}) has a wrong checksum")
+        }
+        _ => text,
+    }
+}
+
 fn quoted(path: &Option<PathBuf>) -> String {
     match path {
         Some(path) => format!("`{}`", path.display()),
@@ -177,7 +199,7 @@ fn quoted(path: &Option<PathBuf>) -> String {
     }
 }
 
-fn listed(names: &[String]) -> String {
+pub(crate) fn listed(names: &[String]) -> String {
     if names.is_empty() {
         return "no channels".to_string();
     }
@@ -198,5 +220,22 @@ impl ImagingError {
             path: path.to_owned(),
             source,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_decoder_met_is_said_in_words() {
+        let kind = "ChunkType { type: IDAT, critical: true, private: false, reserved: false, safecopy: false }";
+        let crc = format!(
+            "Format error decoding Png: CRC error: expected 0x1 have 0x2 while decoding {kind} chunk."
+        );
+        assert_eq!(in_words(&crc), "a part of it (IDAT) has a wrong checksum");
+        let order = format!("Chunk {kind} must appear at most once.");
+        assert_eq!(in_words(&order), "Chunk IDAT must appear at most once.");
+        assert_eq!(in_words("unexpected end of file"), "unexpected end of file");
     }
 }

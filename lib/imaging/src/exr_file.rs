@@ -78,7 +78,8 @@ pub(crate) fn write(layers: &LayerRows, path: &Path) -> Result<(), ImagingError>
     );
     let file = File::create(path).map_err(|e| ImagingError::io("create", path, e))?;
     let mut writer = BufWriter::with_capacity(1 << 20, file);
-    let image = Image::from_layer(layer);
+    let mut image = Image::from_layer(layer);
+    image.attributes.chromaticities = layers.primaries.map(Primaries::to_exr);
     image
         .write()
         .to_buffered(&mut writer)
@@ -214,10 +215,9 @@ fn read_small(
     let block = block_side(longest, window.size);
     let (width, height) = (width.div_ceil(block), height.div_ceil(block));
     let mut layers = Layers::from_file(width, height, path);
-    layers.primaries = image.attributes.chromaticities.map(|c| {
-        let [r, g, b, w] = [c.red, c.green, c.blue, c.white];
-        Primaries::new([r.0, r.1, g.0, g.1, b.0, b.1, w.0, w.1].map(f64::from))
-    });
+    let chromaticities = image.attributes.chromaticities.as_ref();
+    layers.primaries = chromaticities.and_then(Primaries::of_exr);
+    layers.pixel_aspect = image.attributes.pixel_aspect;
     for part in image.layer_data {
         if part.attributes.environment_map == Some(EnvironmentMap::LatitudeLongitude) {
             layers.latlong = true;
@@ -247,6 +247,9 @@ fn read_small(
                 layers.note_skipped(name);
                 continue;
             }
+            if reaches_beyond(part.size, offset, window.size) {
+                layers.overscan.get_or_insert((part.size.0, part.size.1));
+            }
             let samples = match block {
                 1 => place(values, part.size, offset, (width, height)),
                 _ => Raster::from_pixels(width, height, values),
@@ -255,6 +258,14 @@ fn read_small(
         }
     }
     Ok(layers)
+}
+
+/// Whether a data window has pixels outside the display window.
+fn reaches_beyond(size: Vec2<usize>, offset: (i64, i64), display: Vec2<usize>) -> bool {
+    let beyond = |at: i64, length: usize, all: usize| {
+        at < 0 || at.saturating_add(length as i64) > all as i64
+    };
+    beyond(offset.0, size.0, display.0) || beyond(offset.1, size.1, display.1)
 }
 
 /// Moves a data window onto the display window.

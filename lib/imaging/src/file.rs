@@ -3,7 +3,7 @@ pub use crate::png_file::{write_picture, write_png, write_png_16, write_png_mask
 use crate::{
     decode::{Decoded, SizeLimit},
     encoding::Encoding,
-    error::{ImagingError, MAX_PIXELS},
+    error::{ImagingError, MAX_PIXELS, listed},
     exr_file,
     facts::Facts,
     format::Format,
@@ -18,6 +18,7 @@ use image::metadata::Orientation;
 use std::{io::Cursor, io::Read, path::Path};
 
 const DISPLAY_FORMATS: &str = "a PNG or JPEG image";
+const MASK_FORMATS: &str = "a PNG, JPEG or OpenEXR image";
 const LINEAR_FORMATS: &str = "an OpenEXR or Radiance HDR image (linear light)";
 const PHOTO_FORMATS: &str = "a PNG, JPEG, OpenEXR or Radiance HDR image";
 
@@ -102,11 +103,12 @@ pub fn read_photo(path: impl AsRef<Path>, transfer: Transfer) -> Result<Photo, I
 /// PNG and JPEG are decoded with their ICC profile if they have one and `transfer` is
 /// [`Transfer::Srgb`]; another curve overrules the file. So it is with a PNG's `gAMA`, where there is
 /// no profile. OpenEXR and Radiance HDR are linear light, of Rec.709 unless they name other
-/// primaries, from which it is converted.
+/// primaries, from which it is converted. Of OpenEXR the display window is read; pixels of the data window outside it
+/// are dropped, with a warning.
 ///
 /// # Errors
-/// On a missing, empty, truncated or unsupported file, on more pixels than `limits` allow, and on
-/// NaN or infinite light.
+/// On a missing, empty, truncated or unsupported file, on more pixels than `limits` allow, on
+/// NaN or infinite light, and on an OpenEXR file whose pixels are not square.
 pub fn read_photo_within(
     path: impl AsRef<Path>,
     transfer: Transfer,
@@ -123,9 +125,13 @@ pub fn read_photo_within(
         }
         Format::Exr => {
             let layers = read_colour(&bytes, path, limit)?;
+            drop(bytes);
+            check_square(&layers, path)?;
             let alpha = layers.channel("A").ok().cloned();
             let light = linear_of_layers(&layers, path)?;
-            linear_photo(light, alpha, path, transfer)
+            let mut photo = linear_photo(light, alpha, path, transfer)?;
+            photo.warnings.extend(overscan(&layers, path));
+            Ok(photo)
         }
         Format::Hdr => {
             let light = hdr_file::decode(&bytes, path, limit)?;
@@ -164,6 +170,36 @@ fn linear_photo(
         exif: None,
         warnings,
     })
+}
+
+/// Pixels are square unless their sides differ by more than this share: a pixel in a thousand.
+const SQUARE_TOLERANCE: f32 = 1e-3;
+
+/// Errors on pixels that are not square. A ratio that is no size says nothing.
+fn check_square(layers: &Layers, path: &Path) -> Result<(), ImagingError> {
+    let aspect = layers.pixel_aspect;
+    if !aspect.is_normal() || aspect < 0.0 || (aspect - 1.0).abs() <= SQUARE_TOLERANCE {
+        return Ok(());
+    }
+    Err(ImagingError::Unsupported {
+        path: path.to_owned(),
+        what: format!(
+            "has pixels that are {aspect:.3} times as wide as high (pixelAspectRatio of an anamorphic picture)"
+        ),
+        remedy: "scale it to square pixels first",
+    })
+}
+
+/// A warning if the file has pixels outside its display window.
+fn overscan(layers: &Layers, path: &Path) -> Option<String> {
+    let (width, height) = layers.overscan?;
+    Some(format!(
+        "`{}`: its data window of {width} x {height} pixels reaches beyond its display window of {} x {}; what is \
+         outside the display window is dropped",
+        path.display(),
+        layers.width(),
+        layers.height()
+    ))
 }
 
 /// Opacity that is less only by rounding is full.
@@ -259,19 +295,81 @@ pub fn read_linear(path: impl AsRef<Path>) -> Result<LinearImage, ImagingError> 
     Ok(image)
 }
 
-/// Reads a mask in `[0, 1]` (white is 1) from PNG or JPEG, upright as people see it. Stored values
-/// are coverage: no transfer and no profile is applied. Colour is weighted as Rec.709 luma, and
-/// opacity multiplies.
+/// Reads a mask in `[0, 1]` (white is 1) from PNG, JPEG or OpenEXR. Stored values are coverage: no transfer and no
+/// profile is applied.
+///
+/// PNG and JPEG are read upright as people see them. Colour is weighted as Rec.709 luma, and opacity multiplies.
+///
+/// Of OpenEXR the mask is the grey `Y`, else `R`, else `A`, else the only channel, on the display window as of a
+/// photograph. Values are limited to `[0, 1]`.
+///
+/// # Errors
+/// On a missing, empty, truncated or unsupported file, on OpenEXR with several channels of other names, and on NaN, with
+/// the pixel named.
 pub fn read_mask(path: impl AsRef<Path>) -> Result<Raster<f32>, ImagingError> {
     let path = path.as_ref();
-    let bytes = read_bytes(path, DISPLAY_FORMATS)?;
-    let decoded = Decoded::of(&bytes, path, DISPLAY_FORMATS, SizeLimit::Any)?;
+    let bytes = read_bytes(path, MASK_FORMATS)?;
+    if Format::of(&bytes) == Format::Exr {
+        return exr_mask(&bytes, path);
+    }
+    let decoded = Decoded::of(&bytes, path, MASK_FORMATS, SizeLimit::Any)?;
     let image = decoded.light(&Encoding::named(Transfer::Linear));
     let mut mask = image.0.map(|c| c.dot(crate::metrics::LUMA).min(1.0));
     if let Some(alpha) = decoded.opacity() {
         for (m, a) in mask.pixels_mut().iter_mut().zip(alpha.pixels()) {
             *m *= a;
         }
+    }
+    Ok(mask)
+}
+
+/// Channels that a mask may be, the first that is there.
+const MASK_CHANNELS: [&str; 3] = ["Y", "R", "A"];
+
+fn exr_mask(bytes: &[u8], path: &Path) -> Result<Raster<f32>, ImagingError> {
+    let length = bytes.len() as u64;
+    let read = |names: &[&str]| {
+        exr_file::read(
+            Cursor::new(bytes),
+            length,
+            path,
+            Some(names),
+            SizeLimit::Any,
+        )
+    };
+    let found = |layers: &Layers| {
+        let named = MASK_CHANNELS.into_iter().find(|name| layers.contains(name));
+        named.map(str::to_owned)
+    };
+    let mut layers = read(&MASK_CHANNELS)?;
+    let mut name = found(&layers);
+    if let (None, [only]) = (&name, layers.skipped()) {
+        let only = only.clone();
+        layers = read(&[&only])?;
+        name = layers.contains(&only).then_some(only);
+    }
+    let Some(name) = name else {
+        return Err(ImagingError::Unsupported {
+            path: path.to_owned(),
+            what: format!(
+                "has the channels {}, and none of `Y`, `R`, `A` for a mask",
+                listed(layers.skipped())
+            ),
+            remedy: "save the mask as the channel `Y`",
+        });
+    };
+    let mut mask = layers.channel(&name)?.clone();
+    if let Some(at) = mask.pixels().iter().position(|v| v.is_nan()) {
+        return Err(ImagingError::NotFinite {
+            path: path.to_owned(),
+            channel: name,
+            x: at % mask.width(),
+            y: at / mask.width(),
+            value: f32::NAN,
+        });
+    }
+    for value in mask.pixels_mut() {
+        *value = value.clamp(0.0, 1.0);
     }
     Ok(mask)
 }

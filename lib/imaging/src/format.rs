@@ -43,10 +43,10 @@ impl Format {
             Self::Other(TIFF)
         } else if starts(b"RIFF") && bytes.get(8..12) == Some(b"WEBP") {
             Self::Other("a WebP image")
-        } else if matches!(bytes.get(4..12), Some(b"ftypavif" | b"ftypavis")) {
-            Self::Other(AVIF)
-        } else if bytes.get(4..8) == Some(b"ftyp") {
-            Self::Other(HEIF)
+        } else if let (Some(b"ftyp"), Some(brand)) = (bytes.get(4..8), bytes.get(8..12)) {
+            Self::Other(of_brand(brand))
+        } else if is_movie(bytes) {
+            Self::Other(MOVIE)
         } else if starts(b"\xff\x0a") || starts(b"\0\0\0\x0cJXL ") {
             Self::Other(JPEG_XL)
         } else if starts(b"\xabKTX") {
@@ -101,9 +101,29 @@ const TIFF: &str = "a TIFF image";
 const RAW: &str = "a camera's raw file";
 const HEIF: &str = "a HEIF image";
 const AVIF: &str = "an AVIF image";
+const MOVIE: &str = "a movie";
 const JPEG_XL: &str = "a JPEG XL image";
 /// Extensions of raw files that begin as TIFF files do.
 const RAW_TIFFS: [&str; 7] = ["nef", "arw", "dng", "pef", "srw", "3fr", "nrw"];
+
+/// What a file of boxes holds, by its brand. Brands of still pictures are few; those of movies are many, and cameras have
+/// their own.
+fn of_brand(brand: &[u8]) -> &'static str {
+    match brand {
+        b"avif" | b"avis" => AVIF,
+        b"heic" | b"heix" | b"hevc" | b"hevx" | b"heim" | b"heis" | b"hevm" | b"hevs" | b"mif1"
+        | b"mif2" | b"msf1" | b"miaf" | b"avci" | b"avcs" => HEIF,
+        _ => MOVIE,
+    }
+}
+
+/// Whether a file without a brand holds a movie: QuickTime of old cameras, AVI, Matroska and WebM, MXF.
+fn is_movie(bytes: &[u8]) -> bool {
+    let boxes =
+        bytes.first() == Some(&0) && matches!(bytes.get(4..8), Some(b"moov" | b"mdat" | b"wide"));
+    let avi = bytes.starts_with(b"RIFF") && bytes.get(8..12) == Some(b"AVI ");
+    boxes || avi || bytes.starts_with(b"\x1aE\xdf\xa3") || bytes.starts_with(b"\x06\x0e+4")
+}
 
 /// How to convert, with the command of a usual converter.
 fn remedy(found: &str, path: &Path) -> String {
@@ -112,6 +132,13 @@ fn remedy(found: &str, path: &Path) -> String {
         AVIF => "avifdec",
         JPEG_XL => "djxl",
         RAW => "darktable-cli",
+        MOVIE => {
+            return format!(
+                "write its frames, for instance with `mkdir frames && ffmpeg -i \"{}\" frames/%04d.png`, and give one of \
+                 them, or all to `dipir shot frames/*.png`",
+                path.display()
+            );
+        }
         _ => return "convert the file".into(),
     };
     let to = path.with_extension("png");

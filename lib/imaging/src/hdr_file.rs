@@ -54,9 +54,9 @@ pub(crate) fn decode(
             "its EXPOSURE and COLORCORR are {stored_over_light}, not above 0"
         )));
     }
-    let mut lines = header.custom_attributes.iter().rev();
-    let primaries = lines.find(|(key, _)| key == "PRIMARIES");
-    let primaries = primaries.map(|(_, numbers)| Primaries::of_text(numbers));
+    let lines = header.custom_attributes.iter().rev();
+    let mut primaries = lines.filter(|(key, _)| key == "PRIMARIES");
+    let primaries = primaries.find_map(|(_, numbers)| Primaries::of_text(numbers));
     let mut samples = vec![[0.0f32; 3]; width * height];
     let bytes = bytemuck::cast_slice_mut(&mut samples);
     decoder.read_image(bytes).map_err(failed)?;

@@ -3,6 +3,7 @@ use crate::{
     error::{ImagingError, MAX_PIXELS},
     exr_file,
     layers::{Layers, Precision, check_name},
+    primaries::{Primaries, REC709},
     raster::Raster,
 };
 use rayon::prelude::*;
@@ -36,6 +37,8 @@ pub struct LayerRows<'a> {
     pub(crate) latlong: bool,
     pub(crate) attributes: BTreeMap<String, String>,
     pub(crate) packing: Packing,
+    /// Those of the colours, if there are any.
+    pub(crate) primaries: Option<Primaries>,
 }
 
 impl<'a> LayerRows<'a> {
@@ -48,6 +51,7 @@ impl<'a> LayerRows<'a> {
             latlong: false,
             attributes: BTreeMap::new(),
             packing: Packing::default(),
+            primaries: None,
         }
     }
 
@@ -60,6 +64,7 @@ impl<'a> LayerRows<'a> {
     pub(crate) fn of(layers: &'a Layers) -> Self {
         let mut rows = Self::new(layers.width(), layers.height());
         rows.latlong = layers.latlong;
+        rows.primaries = layers.primaries;
         for (name, value) in layers.attributes() {
             rows.attributes.insert(name.to_owned(), value.to_owned());
         }
@@ -96,13 +101,18 @@ impl<'a> LayerRows<'a> {
     }
 
     /// Adds the channels `names`, the components of what `pixel` gives for a pixel's index, row by row from the top
-    /// left. Errors as [`insert`](Self::insert).
+    /// left. `R`, `G`, `B`, bare or of a layer, are colour, of which the file says that it is linear Rec.709 (the
+    /// `chromaticities` attribute). Errors as [`insert`](Self::insert).
     pub fn insert_pixels<P: Into<[f32; N]>, const N: usize>(
         &mut self,
         names: [&str; N],
         precision: Precision,
         pixel: impl Fn(usize) -> P + Copy + Sync + 'a,
     ) -> Result<(), ImagingError> {
+        let suffixes = names.map(|name| name.rsplit('.').next().unwrap_or(name));
+        if suffixes[..] == ["R", "G", "B"] {
+            self.primaries = Some(REC709);
+        }
         let width = self.width;
         for (k, name) in names.into_iter().enumerate() {
             check_name(name)?;

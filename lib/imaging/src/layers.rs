@@ -1,6 +1,10 @@
 //! Images of named channels, as compositing programs exchange them: OpenEXR files.
 use crate::{
-    error::ImagingError, exr_file, layer_rows::LayerRows, primaries::Primaries, raster::Raster,
+    error::ImagingError,
+    exr_file,
+    layer_rows::LayerRows,
+    primaries::{Primaries, REC709},
+    raster::Raster,
 };
 use glam::Vec3;
 use half::f16;
@@ -74,6 +78,10 @@ pub struct Layers {
     path: Option<PathBuf>,
     /// Those of the colours in the file (the `chromaticities` attribute).
     pub(crate) primaries: Option<Primaries>,
+    /// How many times as wide as high the file's pixels are.
+    pub(crate) pixel_aspect: f32,
+    /// Columns and rows of a data window of the file of which pixels outside the display window were dropped.
+    pub(crate) overscan: Option<(usize, usize)>,
     /// Channels of the file that were not asked for, or whose name [`check_name`] refuses.
     skipped: Vec<String>,
 }
@@ -89,6 +97,8 @@ impl Layers {
             attributes: BTreeMap::new(),
             path: None,
             primaries: None,
+            pixel_aspect: 1.0,
+            overscan: None,
             skipped: Vec::new(),
         }
     }
@@ -182,13 +192,15 @@ impl Layers {
         Ok(())
     }
 
-    /// Adds colour as `R`, `G`, `B` of `layer`; bare names if `layer` is empty.
+    /// Adds colour as `R`, `G`, `B` of `layer`; bare names if `layer` is empty. A file says that it is linear
+    /// Rec.709 (the `chromaticities` attribute), unless these layers are those of a file of other primaries.
     pub fn insert_rgb(
         &mut self,
         layer: &str,
         precision: Precision,
         colour: &Raster<Vec3>,
     ) -> Result<(), ImagingError> {
+        self.primaries.get_or_insert(REC709);
         self.insert_triple(layer, ["R", "G", "B"], precision, colour)
     }
 
@@ -244,6 +256,11 @@ impl Layers {
         let z = self.channel(&channel_name(layer, suffixes[2]))?.pixels();
         let pixels = (0..x.len()).map(|i| Vec3::new(x[i], y[i], z[i])).collect();
         Ok(Raster::from_pixels(self.width, self.height, pixels))
+    }
+
+    /// Channels of the file that were not asked for, or whose name is refused.
+    pub(crate) fn skipped(&self) -> &[String] {
+        &self.skipped
     }
 
     fn missing(&self, name: &str) -> ImagingError {

@@ -1,5 +1,6 @@
 //! The primaries of light that a file names, and the way to Rec.709.
 use crate::raster::LinearImage;
+use exr::{math::Vec2, meta::attribute::Chromaticities};
 use glam::{DMat3, DVec2, DVec3, Mat3, Vec3};
 use png::{ScaledFloat, SourceChromaticities};
 use rayon::prelude::*;
@@ -9,7 +10,7 @@ use rayon::prelude::*;
 pub(crate) struct Primaries([DVec2; 4]);
 
 /// Rec.709 and sRGB, with the white D65.
-const REC709: Primaries = Primaries([
+pub(crate) const REC709: Primaries = Primaries([
     DVec2::new(0.64, 0.33),
     DVec2::new(0.30, 0.60),
     DVec2::new(0.15, 0.06),
@@ -20,9 +21,32 @@ const REC709: Primaries = Primaries([
 const TOLERANCE: f64 = 1e-4;
 
 impl Primaries {
-    /// `x` and `y` of red, green, blue and white.
-    pub fn new(numbers: [f64; 8]) -> Self {
-        Self([0, 2, 4, 6].map(|k| DVec2::new(numbers[k], numbers[k + 1])))
+    /// `x` and `y` of red, green, blue and white. `None` if all are 0: so Photoshop writes that it does not tell them.
+    pub fn new(numbers: [f64; 8]) -> Option<Self> {
+        let are_told = numbers.iter().any(|&n| n != 0.0);
+        are_told.then(|| Self([0, 2, 4, 6].map(|k| DVec2::new(numbers[k], numbers[k + 1]))))
+    }
+
+    /// Those of an OpenEXR file.
+    pub fn of_exr(attribute: &Chromaticities) -> Option<Self> {
+        let Chromaticities {
+            red: r,
+            green: g,
+            blue: b,
+            white: w,
+        } = attribute;
+        Self::new([r.0, r.1, g.0, g.1, b.0, b.1, w.0, w.1].map(f64::from))
+    }
+
+    /// As an OpenEXR file names them.
+    pub fn to_exr(self) -> Chromaticities {
+        let [red, green, blue, white] = self.0.map(|c| Vec2(c.x as f32, c.y as f32));
+        Chromaticities {
+            red,
+            green,
+            blue,
+            white,
+        }
     }
 
     /// Of a PNG's `cHRM`.
@@ -36,7 +60,7 @@ impl Primaries {
 
     /// As [`new`](Self::new), from the first eight words of a text. If they are not numbers, the
     /// primaries are NaN, which [`to_rec709`](Self::to_rec709) refuses.
-    pub fn of_text(text: &str) -> Self {
+    pub fn of_text(text: &str) -> Option<Self> {
         let words = text.split_whitespace().take(8);
         let numbers: Option<Vec<f64>> = words.map(|word| word.parse().ok()).collect();
         let eight = numbers.and_then(|n| n.try_into().ok());
@@ -131,7 +155,8 @@ mod tests {
     const ACESCG: [f64; 8] = [0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767];
 
     fn matrix(numbers: [f64; 8]) -> Mat3 {
-        Primaries::new(numbers).to_rec709().unwrap().unwrap()
+        let primaries = Primaries::new(numbers).unwrap();
+        primaries.to_rec709().unwrap().unwrap()
     }
 
     #[test]
@@ -161,20 +186,32 @@ mod tests {
 
     #[test]
     fn rec709_is_left_alone_within_its_tolerance() {
-        let with_red = |x| Primaries::new([x, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329]);
+        let with_red = |x| Primaries::new([x, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329]).unwrap();
         assert_eq!(with_red(0.640_09).to_rec709(), Ok(None));
         assert!(with_red(0.6402).to_rec709().unwrap().is_some());
         let text = "0.64 0.33 0.30 0.60 0.15 0.06 0.3127 0.3290";
-        assert_eq!(Primaries::of_text(text), REC709);
+        assert_eq!(Primaries::of_text(text), Some(REC709));
+        assert_eq!(
+            Primaries::of_exr(&REC709.to_exr()).unwrap().to_rec709(),
+            Ok(None)
+        );
+    }
+
+    #[test]
+    fn primaries_of_which_all_are_0_are_not_told() {
+        for text in ["0 0 0 0 0 0 0 0", "0.0 0 0 0 -0 0 0 0 1"] {
+            assert_eq!(Primaries::of_text(text), None, "{text}");
+        }
+        assert!(Primaries::of_text("0 0 0 0 0 0 0 0.1").is_some());
     }
 
     #[test]
     fn primaries_that_describe_no_colours_are_refused() {
-        let why = |numbers| Primaries::new(numbers).to_rec709().unwrap_err();
+        let why = |numbers| Primaries::new(numbers).unwrap().to_rec709().unwrap_err();
         let mut bad = ACESCG;
         bad[3] = f64::INFINITY;
         assert_eq!(why(bad), "are not eight finite numbers");
-        assert_eq!(why([0.0; 8]), "lie on one line");
+        assert_eq!(why([0.3; 8]), "lie on one line");
         assert_eq!(
             why([0.6, 0.3, 0.4, 0.3, 0.2, 0.3, 0.31, 0.33]),
             "lie on one line"
@@ -185,7 +222,8 @@ mod tests {
             assert_eq!(why(bad), "do not make their white");
         }
         for text in ["", "0.7 0.3 0.2", "a b c d e f g h"] {
-            assert!(Primaries::of_text(text).to_rec709().is_err(), "{text}");
+            let primaries = Primaries::of_text(text).unwrap();
+            assert!(primaries.to_rec709().is_err(), "{text}");
         }
     }
 

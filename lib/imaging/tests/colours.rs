@@ -135,6 +135,31 @@ fn the_primaries_of_radiance_hdr_are_those_of_its_last_line() {
     assert!(red.abs_diff_eq(0.5 * ACESCG_RED, 1e-4), "{red}");
 }
 
+/// As Photoshop writes that it does not tell them.
+#[test]
+fn primaries_of_which_all_are_0_are_not_told() {
+    let folder = folder();
+    let plain = read_linear(put_exr(&folder, None)).unwrap();
+    let path = put_exr(&folder, Some([0.0; 8]));
+    assert_eq!(read_linear(&path).unwrap(), plain);
+    let photo = read_photo(&path, Transfer::Srgb).unwrap();
+    assert_eq!((photo.image, photo.warnings), (plain, vec![]));
+
+    let path = put_hdr(&folder, "PRIMARIES=0 0 0 0 0 0 0 0\n");
+    assert_eq!(first(&read_linear(&path).unwrap()), Vec3::X);
+    let photo = read_photo(&path, Transfer::Srgb).unwrap();
+    assert_eq!(photo.warnings, Vec::<String>::new());
+    assert_eq!(first(&photo.image), Vec3::X);
+    // An earlier line that tells them stands.
+    let lines = "PRIMARIES=.713 .293 .165 .83 .128 .044 .32168 .33767\nPRIMARIES=0 0 0 0 0 0 0 0\n";
+    let red = first(
+        &read_photo(put_hdr(&folder, lines), Transfer::Srgb)
+            .unwrap()
+            .image,
+    );
+    assert!(red.abs_diff_eq(ACESCG_RED, 1e-4), "{red}");
+}
+
 #[test]
 fn primaries_that_describe_no_colours_are_said_of_a_photograph_and_refused_of_a_map() {
     let folder = folder();

@@ -6,9 +6,12 @@ use dipir_imaging::{
     layers::{Layers, Precision},
     raster::{LinearImage, Raster},
 };
-use exr::prelude::{
-    AnyChannel, AnyChannels, Encoding, FlatSamples, Image, ImageAttributes, IntegerBounds, Layer,
-    LayerAttributes, SmallVec, Text, Vec2, WritableImage,
+use exr::{
+    meta::attribute::Chromaticities,
+    prelude::{
+        AnyChannel, AnyChannels, Encoding, FlatSamples, Image, ImageAttributes, IntegerBounds,
+        Layer, LayerAttributes, SmallVec, SpecificChannels, Text, Vec2, WritableImage,
+    },
 };
 use glam::Vec3;
 use proptest::prelude::*;
@@ -73,6 +76,57 @@ fn the_file_declares_latlong_zip1_and_each_channels_type() {
         .collect();
     assert!(types.contains(&("depth.Z".to_string(), exr::prelude::SampleType::F32)));
     assert!(types.contains(&("shadow.G".to_string(), exr::prelude::SampleType::F16)));
+}
+
+#[test]
+fn a_file_of_colour_says_rec709_and_one_of_other_values_says_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    let told = |path: &std::path::Path| {
+        let meta = exr::meta::MetaData::read_from_file(path, true).unwrap();
+        meta.headers[0].shared_attributes.chromaticities
+    };
+    let rec709 = Chromaticities {
+        red: Vec2(0.64, 0.33),
+        green: Vec2(0.3, 0.6),
+        blue: Vec2(0.15, 0.06),
+        white: Vec2(0.3127, 0.329),
+    };
+    sample().write_exr(&path).unwrap();
+    assert_eq!(told(&path), Some(rec709));
+    let half = Precision::Half;
+    let mut rows = LayerRows::new(2, 1);
+    rows.insert_pixels(["sun.R", "sun.G", "sun.B"], half, |_| Vec3::ONE)
+        .unwrap();
+    rows.write_exr(&path).unwrap();
+    assert_eq!(told(&path), Some(rec709));
+
+    let mut rows = LayerRows::new(2, 1);
+    let normals = ["normal.X", "normal.Y", "normal.Z"];
+    rows.insert_pixels(normals, half, |_| Vec3::ONE).unwrap();
+    rows.write_exr(&path).unwrap();
+    assert_eq!(told(&path), None);
+    // Coordinates under the names of colours.
+    let mut map = Layers::new(2, 1);
+    for name in ["R", "G", "B"] {
+        map.insert(name, Precision::Full, ramp(2, 1)).unwrap();
+    }
+    map.write_exr(&path).unwrap();
+    assert_eq!(told(&path), None);
+    // Another program's file, written again.
+    let own = Chromaticities {
+        red: Vec2(0.713, 0.293),
+        ..rec709
+    };
+    let channels = SpecificChannels::rgb(|_| (1.0f32, 0.5f32, 0.25f32));
+    let mut image = Image::from_channels((2, 1), channels);
+    image.attributes.chromaticities = Some(own);
+    image.write().to_file(&path).unwrap();
+    let mut read = Layers::read_exr(&path).unwrap();
+    let colour = read.rgb("").unwrap();
+    read.insert_rgb("copy", half, &colour).unwrap();
+    read.write_exr(&path).unwrap();
+    assert_eq!(told(&path), Some(own));
 }
 
 #[test]

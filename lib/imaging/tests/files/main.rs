@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
 mod damaged;
+mod openexr;
 mod refused;
 
 fn folder() -> TempDir {

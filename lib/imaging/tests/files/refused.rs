@@ -84,6 +84,12 @@ fn files_that_a_converter_reads_are_refused_with_its_command() {
             "heif-convert -q 95",
         ),
         ("x.avif", b"\0\0\0\x18ftypavif", "an AVIF image", "avifdec"),
+        (
+            "x.heif",
+            b"\0\0\0\x18ftypmif1",
+            "a HEIF image",
+            "heif-convert -q 95",
+        ),
         ("x.jxl", b"\xff\x0a\0\0\0\0\0\0", "a JPEG XL image", "djxl"),
         (
             "x.CR2",
@@ -113,6 +119,35 @@ fn files_that_a_converter_reads_are_refused_with_its_command() {
         );
         assert_eq!(words(read_photo(&path, Transfer::Srgb).unwrap_err()), want);
     }
+}
+
+#[test]
+fn movies_are_refused_with_the_command_that_writes_their_frames() {
+    let folder = folder();
+    for (name, bytes) in [
+        ("x.mov", &b"\0\0\0\x14ftypqt  \0\0\0\0"[..]),
+        ("x.mp4", b"\0\0\0\x18ftypisom"),
+        ("x.mp4", b"\0\0\0\x18ftypmp42"),
+        ("x.m4v", b"\0\0\0\x18ftypM4V "),
+        ("x.mp4", b"\0\0\0\x18ftypavc1"),
+        ("x.3gp", b"\0\0\0\x18ftyp3gp5"),
+        ("x.mov", b"\0\0\0\x08wide\0\0\0\0mdat"),
+        ("x.avi", b"RIFF\0\0\0\0AVI LIST"),
+        ("x.webm", b"\x1aE\xdf\xa3\x9fB\x86\x81"),
+    ] {
+        let path = put(&folder, name, bytes);
+        let from = path.display();
+        let want = format!(
+            "`{from}` is a movie; expected a PNG, JPEG, OpenEXR or Radiance HDR image: write its frames, \
+             for instance with `mkdir frames && ffmpeg -i \"{from}\" frames/%04d.png`, and give one of \
+             them, or all to `dipir shot frames/*.png`"
+        );
+        assert_eq!(words(read_photo(&path, Transfer::Srgb).unwrap_err()), want);
+    }
+    // Words are no box.
+    let text = put(&folder, "x.txt", b"The wide world");
+    let error = words(read_photo(text, Transfer::Srgb).unwrap_err());
+    assert!(error.contains("not an image of a known format"), "{error}");
 }
 
 #[test]
