@@ -20,7 +20,7 @@ use dipir_scene::bvh::Hit;
 use dipir_scene::camera::Ray;
 use glam::{Vec2, Vec3};
 
-use crate::bsdf::features::{EMISSION, EXTENSIONS, has};
+use crate::bsdf::features::{EMISSION, EXTENSIONS, TRANSMISSION, has};
 use crate::bsdf::{Bsdf, BsdfSample};
 use crate::contribution::Carried;
 use crate::counters::{RayCounts, RayKind};
@@ -30,7 +30,7 @@ use crate::light::PathLight;
 use crate::photo::ProxyPhoto;
 use crate::render::Simulation;
 use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
-use crate::world::World;
+use crate::world::{World, is_sheet};
 
 /// Where paths begin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -312,6 +312,8 @@ impl<L: PathLight> PathContext<'_, L> {
         let mut filling = Vec3::ZERO; //             attenuation per metre of the segment
         let mut least_roughness = self.min_roughness; // that the next surfaces count as having
         let mut thickness = 0.0; //                  metres of it if the segment meets no inner side
+        let mut straight = has(F, TRANSMISSION) //   through sheets alone so far: the light behind them
+            && self.start != PathStart::Camera; //   is not of this path, for it takes the straight way
         let first_dimension = sampler.dimension();
         let emits = has(F, EMISSION) && has(world.mask, EMISSION);
 
@@ -343,6 +345,9 @@ impl<L: PathLight> PathContext<'_, L> {
                 if depth == 0 {
                     return 0.0;
                 }
+                if straight {
+                    break;
+                }
                 let (light, light_pdf) = self.light.eval_with_pdf(ray.direction);
                 let weight = balance_heuristic(sampled_pdf, light_pdf);
                 gather.after(depth);
@@ -358,6 +363,7 @@ impl<L: PathLight> PathContext<'_, L> {
                 world
                     .surfaces
                     .interact::<F>(ray.direction, hit.triangle, hit.u, hit.v);
+            straight = straight && is_sheet(&surface);
             surface.roughness = surface.roughness.max(least_roughness);
             surface.coat.roughness = surface.coat.roughness.max(least_roughness);
             let vertex = Vertex {
@@ -418,6 +424,8 @@ impl<L: PathLight> PathContext<'_, L> {
                 }
                 // Both densities may underflow to 0: then there is no such sample.
                 let returns = value != Vec3::ZERO || G::DERIVATIVES;
+                let behind = light.direction.dot(surface.geometric_normal) < 0.0;
+                let returns = returns && !(straight && behind);
                 if light.pdf > 0.0 && returns && light.radiance != Vec3::ZERO {
                     let shadow = world.leave(&surface, light.direction);
                     let known = world.escapes && is_outward(&surface, light.direction);
@@ -456,6 +464,7 @@ impl<L: PathLight> PathContext<'_, L> {
                 cones.weigh(&mut sample);
             }
             gather.scattered(&bsdf, &vertex, throughput, lobe_number, &sample);
+            straight = straight && sample.transmitted;
             throughput *= sample.weight;
             if throughput.max_element() <= 0.0 {
                 break;

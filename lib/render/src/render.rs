@@ -67,6 +67,8 @@ pub struct Settings<'a> {
     pub tone: Option<&'a ToneCurves>,
     /// From linear to display values, in which errors are measured.
     pub transfer: Transfer,
+    /// How much brighter the picture is shown than it is, where errors are measured: for linear light of any exposure.
+    pub gain: f32,
     /// 1 where the photograph's own foreground hides the object, 0 where it does not; of the
     /// camera's size.
     pub occluders: Option<&'a Raster<f32>>,
@@ -117,6 +119,7 @@ impl Default for Settings<'_> {
             background: None,
             tone: None,
             transfer: Transfer::Srgb,
+            gain: 1.0,
             occluders: None,
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
@@ -348,6 +351,7 @@ impl<'a> Renderer<'a> {
             background: settings.background,
             tone: settings.tone.map(ToneCurves::mapper),
             transfer: settings.transfer,
+            gain: settings.gain,
         };
         let find_highlights = |film: &Film, jobs: &[Job]| {
             if !settings.highlights || matches!(settings.stop, Stop::Samples(_)) {

@@ -23,6 +23,7 @@ use serde::{Deserialize, Serialize};
 use crate::blocker::{Blocker, Cone};
 use crate::contribution::Carried;
 use crate::counters::{RayCounts, RayKind};
+use crate::features::{ALPHA, TRANSMISSION, has};
 use crate::foreground::{Gather, MIN_CAUSTIC_ROUGHNESS, PathContext, PathStart};
 use crate::light::PathLight;
 use crate::world::{ProxyGeometry, ProxyPoint};
@@ -169,6 +170,15 @@ pub struct SampleRange {
 }
 
 impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
+    /// What is asked of surfaces: of those that light cannot pass, blocking alone asks nothing but their coverage.
+    pub fn features(&self) -> u32 {
+        let mask = self.path.world.mask;
+        match self.light_on_proxy.is_some() || has(mask, TRANSMISSION) {
+            true => mask,
+            false => mask & ALPHA,
+        }
+    }
+
     /// Gathers `samples` samples of every pixel of `block` on a plane. `sampler(x, y)` is the
     /// pixel's sequence; `add(x, y, gathered)` takes what one pixel's new samples found.
     pub fn plane_block<const F: u32, G: ShadowGather>(
@@ -264,8 +274,9 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                 let alpha_key = sampler.next_u64();
                 if light.weight != Vec3::ZERO {
                     counts.add(RayKind::Shadow);
-                    if world.shades::<F>(&point.ray(light.direction), alpha_key) {
-                        gather.blocked(light.direction, light.weight);
+                    let passing = world.passing::<F>(&point.ray(light.direction), alpha_key);
+                    if passing != Vec3::ONE {
+                        gather.blocked(light.direction, light.weight * (Vec3::ONE - passing));
                     }
                 }
             }
@@ -322,8 +333,9 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                     continue;
                 }
                 counts.add(RayKind::Shadow);
-                if world.shades::<F>(&ray, alpha_key) {
-                    gather.blocked(direction, weight);
+                let passing = world.passing::<F>(&ray, alpha_key);
+                if passing != Vec3::ONE {
+                    gather.blocked(direction, weight * (Vec3::ONE - passing));
                 }
             }
             if self.light_on_proxy.is_some() {

@@ -251,6 +251,12 @@ impl<'a> Surfaces<'a> {
         self.material(triangle).alpha_mode != AlphaMode::Opaque
     }
 
+    /// Whether light may pass through `triangle`.
+    #[inline]
+    pub fn transmits(&self, triangle: u32) -> bool {
+        self.material(triangle).transmission.is_some()
+    }
+
     /// Index into [`Scene::materials`].
     #[inline]
     pub fn material_index(&self, triangle: u32) -> u32 {

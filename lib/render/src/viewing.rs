@@ -17,6 +17,8 @@ pub struct Viewing<'a> {
     pub tone: Option<ToneMapper>,
     /// From linear to display values.
     pub transfer: Transfer,
+    /// How much brighter the picture is shown than it is.
+    pub gain: f32,
 }
 
 /// Sums over pixels, of one job, of the squared display-referred error.
@@ -68,7 +70,11 @@ impl Viewing<'_> {
     }
 
     fn encoded(&self, linear: Vec3) -> Vec3 {
-        let encode = |v: f32| self.transfer.encode_scalar(v.max(0.0)).clamp(0.0, 1.0);
+        let encode = |v: f32| {
+            self.transfer
+                .encode_scalar((v * self.gain).max(0.0))
+                .clamp(0.0, 1.0)
+        };
         Vec3::from(linear.to_array().map(encode))
     }
 
@@ -186,6 +192,7 @@ mod tests {
             background: None,
             tone: Some(ToneCurves::identity().mapper()),
             transfer: Transfer::Linear,
+            gain: 1.0,
         };
         let mut film = Film::new(1, 1);
         for (radiance, alpha) in [(0.1, 1.0), (1.5, 1.0), (0.4, 0.5), (2.0, 0.9)] {
@@ -211,6 +218,7 @@ mod tests {
             background: None,
             tone: None,
             transfer: Transfer::Srgb,
+            gain: 1.0,
         };
         let mut film = Film::new(4, 4);
         // Two 8-bit steps darker, once with less noise than that, once with more.

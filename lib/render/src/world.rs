@@ -10,10 +10,11 @@ use dipir_scene::ray_offset::spawn_origin;
 use dipir_scene::scene::Scene;
 use glam::Vec3;
 
+use crate::bsdf::Bsdf;
 use crate::bsdf::features::{ALPHA, EXTENSIONS, SPECULAR, TRANSMISSION, has};
 use crate::convexity::is_convex;
 use crate::error::RenderError;
-use crate::surface::{SurfacePoint, Surfaces};
+use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
 
 /// The proxy, ready for rays.
 pub enum ProxyGeometry {
@@ -184,12 +185,48 @@ impl<'a> World<'a> {
         })
     }
 
-    /// Whether the object hides the light from the proxy. Back faces do.
+    /// Share of the light along `ray` that reaches the proxy past the object: [sheets](is_sheet) let some of it pass
+    /// straight, all else hides it. Back faces do.
     #[inline]
-    pub fn shades<const F: u32>(&self, ray: &Ray, alpha_key: u64) -> bool {
-        self.geometry.bvh.occluded(ray, f32::INFINITY, |t, u, v| {
-            self.is_covered::<F>(t, u, v, alpha_key)
-        })
+    pub fn passing<const F: u32>(&self, ray: &Ray, alpha_key: u64) -> Vec3 {
+        let sheets = has(F, TRANSMISSION) && has(self.mask, TRANSMISSION);
+        let hidden = self.geometry.bvh.occluded(ray, f32::INFINITY, |t, u, v| {
+            !(sheets && self.surfaces.transmits(t)) && self.is_covered::<F>(t, u, v, alpha_key)
+        });
+        match (hidden, sheets) {
+            (true, _) => Vec3::ZERO,
+            (false, false) => Vec3::ONE,
+            (false, true) => self.through_sheets::<F>(ray, alpha_key),
+        }
+    }
+
+    /// What the sheets that `ray` meets let pass.
+    fn through_sheets<const F: u32>(&self, ray: &Ray, alpha_key: u64) -> Vec3 {
+        let (mut ray, mut left, mut filling) = (*ray, Vec3::ONE, Vec3::ZERO);
+        for _ in 0..MOST_SHEETS {
+            let hit = self.geometry.bvh.closest(&ray, f32::INFINITY, |t, u, v| {
+                self.is_covered::<F>(t, u, v, alpha_key)
+            });
+            let Some(hit) = hit else {
+                return left;
+            };
+            let Hit { triangle, u, v, .. } = hit;
+            let surface = self.surfaces.interact::<F>(ray.direction, triangle, u, v);
+            if !is_sheet(&surface) {
+                return Vec3::ZERO;
+            }
+            left *= Bsdf::<F>::new(&surface, -ray.direction).passing();
+            if has(F, EXTENSIONS) {
+                left *= ExtensionPoint::left_after(filling, hit.t);
+                let inside = surface.enters(ray.direction);
+                filling = surface.extension.attenuation * f32::from(inside);
+            }
+            if left.max_element() < LEAST_PASSING {
+                break;
+            }
+            ray = self.leave(&surface, ray.direction);
+        }
+        Vec3::ZERO
     }
 
     #[inline(always)]
@@ -227,6 +264,22 @@ impl<'a> World<'a> {
         }
     }
 }
+
+/// Whether a surface lets light pass without turning much of it aside. What such surfaces alone lie between the light and
+/// the proxy takes the straight way.
+#[inline]
+pub fn is_sheet(surface: &SurfacePoint) -> bool {
+    surface.transmission > 0.0 && surface.roughness <= SHEET_ROUGHNESS
+}
+
+/// Roughness up to which a transmissive surface is a sheet: its lobe is a few degrees wide.
+const SHEET_ROUGHNESS: f32 = 0.3;
+
+/// Sheets behind one another that light passes.
+const MOST_SHEETS: usize = 32;
+
+/// What is left of the light below which it counts as hidden.
+const LEAST_PASSING: f32 = 1e-4;
 
 /// Where `ray` meets the front of `plane`; `None` for rays that run along it, away from it or
 /// come from behind.

@@ -256,6 +256,31 @@ impl SunTable {
         Ok(known)
     }
 
+    /// What time, place and heading that are written say, if they say nothing: what is missing beside them.
+    pub fn idle(&self, taken: &Taken) -> Option<&'static str> {
+        let written = [self.latitude, self.longitude, self.heading_deg];
+        let said = self.azimuth_deg.is_some() || self.elevation_deg.is_some();
+        if said || (self.time.is_none() && written == [None; 3]) || self.by_time(taken).is_some() {
+            return None;
+        }
+        let time = self.time.is_some() || taken.time.is_some();
+        let place = [
+            self.latitude.or(taken.latitude_deg),
+            self.longitude.or(taken.longitude_deg),
+        ];
+        let place = place.iter().all(Option::is_some);
+        Some(match (time, place) {
+            (true, false) => {
+                "without a place the time says nothing of the sun: write latitude and longitude, too"
+            }
+            (false, true) => "without a time the place says nothing of the sun: write time, too",
+            (false, false) => {
+                "without a time and a place the heading says nothing of the sun: write time, latitude and longitude, too"
+            }
+            (true, true) => "time and place say nothing of the sun",
+        })
+    }
+
     fn heading(&self, taken: &Taken) -> Option<Angle> {
         let deg = self
             .heading_deg
@@ -374,6 +399,38 @@ mod tests {
 
     /// A noon in June at 48 degrees north, in which the sun stands in the south.
     const NOON: &str = "time = \"2026-06-21T12:02:00Z\"\nlatitude = 48.0\nlongitude = 0.0\n";
+
+    #[test]
+    fn what_says_nothing_is_told() {
+        let idle = |text: &str, taken: &Taken| sun(text).idle(taken).map(str::to_string);
+        let nothing = Taken::default();
+        let placed = Taken {
+            latitude_deg: Some(48.0),
+            longitude_deg: Some(0.0),
+            ..Taken::default()
+        };
+        let time = "time = \"2026-06-21T12:02:00Z\"";
+        assert!(idle(time, &nothing).unwrap().starts_with("without a place"));
+        assert_eq!(idle(time, &placed), None);
+        assert!(
+            idle("heading_deg = 30.0", &nothing)
+                .unwrap()
+                .contains("the heading")
+        );
+        assert!(
+            idle("heading_deg = 30.0", &placed)
+                .unwrap()
+                .starts_with("without a time")
+        );
+        for quiet in [
+            "",
+            "share = 0.5",
+            "azimuth_deg = 3.0\nheading_deg = 4.0",
+            NOON,
+        ] {
+            assert_eq!(idle(quiet, &nothing), None, "{quiet}");
+        }
+    }
 
     #[test]
     fn time_place_and_heading_give_both_angles_and_without_heading_the_elevation() {

@@ -223,6 +223,22 @@ impl<const F: u32> Bsdf<F> {
         self.albedo
     }
 
+    /// Share of the light from behind that comes through towards `wo`, as if nothing turned it aside.
+    pub fn passing(&self) -> Vec3 {
+        if !has(F, TRANSMISSION) {
+            return Vec3::ZERO;
+        }
+        let albedo = &self.base.albedo;
+        let mut passing = albedo.transmitted + albedo.transmitted_further;
+        if has(F, EXTENSIONS)
+            && let Some(fibres) = &self.sheen
+        {
+            passing *= fibres.over(self.base.wo.z);
+        }
+        let coat = self.coat_at(-self.wo);
+        passing * coat.map_or(1.0, |(c, _, p)| c.over_specular(p))
+    }
+
     /// Whether there is no lobe that light sampling could find.
     #[inline]
     pub fn is_delta(&self) -> bool {

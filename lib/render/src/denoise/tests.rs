@@ -61,6 +61,7 @@ const VIEWING: Viewing = Viewing {
     background: None,
     tone: None,
     transfer: Transfer::Linear,
+    gain: 1.0,
 };
 
 /// Squared error of `film` against `surface`, over the pixels that are wholly covered and for which `holds` is true.

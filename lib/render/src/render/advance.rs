@@ -6,7 +6,7 @@ use glam::{Vec2, Vec3};
 
 use crate::adaptive::Round;
 use crate::contribution::{Carried, Measured};
-use crate::features::{ALPHA, PROXY_RADIANCE, has, with_features};
+use crate::features::{PROXY_RADIANCE, has, with_features};
 use crate::foreground::PathContext;
 use crate::job::{Job, Layer, REPLICATES};
 use crate::light::PathLight;
@@ -124,13 +124,7 @@ pub(super) fn advance_shadow<L: PathLight, P: PlaneLight>(
 ) {
     shadow.path.max_depth = round.simulation.max_depth;
     shadow.light_on_proxy = round.simulation.light_on_proxy;
-    // Blocking alone asks nothing of a surface but its coverage.
-    let wanted = match shadow.light_on_proxy {
-        Some(_) => shadow.path.world.mask,
-        None if has(shadow.path.world.mask, ALPHA) => ALPHA,
-        None => 0,
-    };
-    with_features!(wanted, F => advance_shadow_with::<_, _, F>(&shadow, seed, job, goal, round));
+    with_features!(shadow.features(), F => advance_shadow_with::<_, _, F>(&shadow, seed, job, goal, round));
 }
 
 fn advance_shadow_with<L: PathLight, P: PlaneLight, const F: u32>(

@@ -183,6 +183,7 @@ fn toned(film: &Film) -> Vec<Vec3> {
         background: None,
         tone: Some(ToneCurves::identity().mapper()),
         transfer: Transfer::Srgb,
+        gain: 1.0,
     };
     let (width, height) = (film.alpha.width(), film.alpha.height());
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));

@@ -17,7 +17,7 @@ use super::{Header, Precision, RowSet, Sent, Shadow, ShadowKind, Transport, Weig
 use crate::blocker::Blocker;
 use crate::counters::RayCounts;
 use crate::error::RenderError;
-use crate::features::{ALPHA, has, with_features};
+use crate::features::with_features;
 use crate::footprint::Footprint;
 use crate::foreground::{Gather, PathContext};
 use crate::render::{Renderer, pixels_of};
@@ -440,19 +440,13 @@ impl Recorder<'_> {
         let Some(shadow) = &self.shadow else {
             return;
         };
-        // Blocking alone asks nothing of a surface but its coverage.
-        let wanted = match shadow.light_on_proxy {
-            Some(_) => self.world.mask,
-            None if has(self.world.mask, ALPHA) => ALPHA,
-            None => 0,
-        };
         let range = SampleRange {
             first: 0,
             count: self.settings.shadow_samples,
         };
         let mut counts = RayCounts::default();
         let sampler = |x, y| self.sampler(1, (x, y));
-        with_features!(wanted, F => if shadow.plane.is_empty() {
+        with_features!(shadow.features(), F => if shadow.plane.is_empty() {
             for (x, y) in pixels_of(block) {
                 let base = sampler(x, y);
                 let found = shadow.mesh_pixel::<F, ShadowRow>((x, y), range, &base, &mut counts);
