@@ -1,4 +1,5 @@
 //! What can be wrong with a camera's file.
+use std::borrow::Cow;
 use std::path::PathBuf;
 
 /// A file of cameras that cannot be used.
@@ -20,7 +21,7 @@ pub enum CameraError {
         /// What is wrong, and where.
         detail: String,
         /// What to do.
-        remedy: &'static str,
+        remedy: Cow<'static, str>,
     },
 }
 
@@ -29,19 +30,19 @@ impl CameraError {
         Self::Malformed {
             format,
             detail: detail.into(),
-            remedy: "export the camera again",
+            remedy: "export the camera again".into(),
         }
     }
 
     pub(crate) fn with_remedy(
         format: &'static str,
         detail: impl Into<String>,
-        remedy: &'static str,
+        remedy: impl Into<Cow<'static, str>>,
     ) -> Self {
         Self::Malformed {
             format,
             detail: detail.into(),
-            remedy,
+            remedy: remedy.into(),
         }
     }
 }

@@ -1,4 +1,5 @@
 //! The camera of a photograph in a file of any format that is known.
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
@@ -10,7 +11,8 @@ use crate::{chan, colmap, fspy, gltf, kitti, nuscenes, opencv, transforms};
 /// Which of a file's cameras is meant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Which<'a> {
-    /// The camera of the picture that has this file's name; if no picture has it, the only camera.
+    /// The camera of the picture with this path, as far from its end as they agree, and in a `.chan` file the frame
+    /// with the number at the end of its name; if no picture has its name, the only camera.
     Photo(&'a Path),
     /// By number: counted from 0; the frame in a `.chan` file, n of `Pn` in KITTI's.
     Number(u32),
@@ -42,12 +44,16 @@ pub struct Found {
     pub program: &'static str,
     /// Whether the ground goes through the origin, if the camera is above it.
     pub ground_at_origin: bool,
+    /// Whether the file has the field of view; otherwise it is the one that was asked for.
+    pub states_fov: bool,
 }
 
 /// By how much the shapes of two pictures may differ, relative.
 const SAME_SHAPE: f64 = 0.01;
 /// KITTI's left camera in colour.
 const KITTI_LEFT: u32 = 2;
+/// What to do about an axis that points up for no reason.
+const NO_AXIS: &str = "leave out which axis points up";
 
 /// Reads the camera of a photograph from `path`: an `.fspy` project or its JSON, `transforms.json`,
 /// `.chan`, `.gltf` or `.glb`, COLMAP's model, its folder or project, calibrations of OpenCV, ROS and KITTI, and
@@ -103,22 +109,24 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
         pose: Some(camera.pose),
         program,
         ground_at_origin,
+        states_fov: true,
     };
     let z_up = wanted.up.unwrap_or(WorldUp::Z);
     if let Some(files) = colmap::Files::at(path) {
         // COLMAP's world is that of a first camera, unless it was turned.
         let cameras = colmap::read_cameras(&files, wanted.up.unwrap_or(WorldUp::MinusY))?;
-        let camera = chosen(&cameras, wanted, "COLMAP").map_err(|e| match (e, files.choice()) {
-            (
-                CameraError::Malformed {
-                    format,
-                    detail,
-                    remedy,
-                },
-                Some(choice),
-            ) => CameraError::with_remedy(format, format!("{detail}; {choice}"), remedy),
-            (e, _) => e,
-        })?;
+        let camera =
+            *chosen(&cameras, wanted, "COLMAP").map_err(|e| match (e, files.choice()) {
+                (
+                    CameraError::Malformed {
+                        format,
+                        detail,
+                        remedy,
+                    },
+                    Some(choice),
+                ) => CameraError::with_remedy(format, format!("{detail}; {choice}"), remedy),
+                (e, _) => e,
+            })?;
         return Ok(of(camera, "COLMAP", false));
     }
     let bytes = dipir_files::read(path).map_err(|source| CameraError::Read {
@@ -129,15 +137,34 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
     match extension.as_deref().unwrap_or_default() {
         "chan" => {
             let text = String::from_utf8_lossy(&bytes);
-            let frames = chan::read(&text, wanted.size, wanted.fov_deg)?;
-            Ok(of(of_chan(&frames, wanted)?, ".chan", true))
+            let frames = chan::frames(&text, wanted.size, wanted.fov_deg)?;
+            let chan::Frame {
+                camera, states_fov, ..
+            } = *of_chan(&frames, wanted)?;
+            let pose = camera.pose.in_our_world(wanted.up.unwrap_or(WorldUp::Y));
+            Ok(Found {
+                states_fov,
+                ..of(Camera { pose, ..camera }, ".chan", true)
+            })
         }
-        "fspy" => Ok(of(fspy::read(&bytes, z_up)?, "fSpy", true)),
+        "fspy" => {
+            only(wanted, "fSpy")?;
+            Ok(of(fspy::read(&bytes, z_up)?, "fSpy", true))
+        }
         "gltf" | "glb" => {
-            let cameras = gltf::read(&bytes, wanted.size)?;
-            let turn = wanted.up.unwrap_or(WorldUp::Y);
-            let camera = chosen(&cameras, wanted, "glTF")?;
-            let pose = camera.pose.in_our_world(turn);
+            let cameras = gltf::read_at_rest(&bytes, wanted.size)?;
+            let gltf::AtRest {
+                camera,
+                is_animated,
+            } = *chosen(&cameras, wanted, "glTF")?;
+            if is_animated {
+                return Err(CameraError::with_remedy(
+                    "glTF",
+                    "its camera is animated, which is not read",
+                    "export .chan or transforms.json, or the camera of one frame without animation",
+                ));
+            }
+            let pose = camera.pose.in_our_world(wanted.up.unwrap_or(WorldUp::Y));
             Ok(of(Camera { pose, ..camera }, "glTF", true))
         }
         "json" => in_json(&bytes, wanted, z_up, of),
@@ -145,8 +172,19 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
         "txt" => {
             let index = match wanted.which {
                 Which::Number(n) => n,
-                _ => KITTI_LEFT,
+                Which::Photo(_) => KITTI_LEFT,
+                Which::Name(name) => {
+                    return Err(CameraError::with_remedy(
+                        "KITTI",
+                        format!("its cameras have numbers, and none the name {name:?}"),
+                        "say which by its number, for instance frame = 2 for P2",
+                    ));
+                }
             };
+            if wanted.up.is_some() {
+                let detail = "its world is that of its camera 0, of which -y points up";
+                return Err(CameraError::with_remedy("KITTI", detail, NO_AXIS));
+            }
             let camera = kitti::read(&String::from_utf8_lossy(&bytes), index, wanted.size)?;
             Ok(of(camera, "KITTI", false))
         }
@@ -171,60 +209,75 @@ fn in_json(
     let has = |key: &str| record.get(key).is_some();
     if has("frames") {
         let frames = transforms::read(bytes, Some(wanted.size), z_up)?;
-        let camera = chosen(&frames, wanted, "transforms.json")?;
+        let camera = *chosen(&frames, wanted, "transforms.json")?;
         return Ok(of(camera, "nerfstudio", false));
     }
     if has("camera_intrinsic") {
         let cameras = nuscenes::read(bytes, wanted.size, z_up)?;
-        return Ok(of(chosen(&cameras, wanted, "nuScenes")?, "nuScenes", true));
+        return Ok(of(*chosen(&cameras, wanted, "nuScenes")?, "nuScenes", true));
     }
     if has("cameraTransform") || has("cameraParameters") {
+        only(wanted, "fSpy")?;
         return Ok(of(fspy::read(bytes, z_up)?, "fSpy", true));
     }
     lens_alone(&String::from_utf8_lossy(bytes), wanted)
 }
 
 fn lens_alone(text: &str, wanted: &Wanted) -> Result<Found, CameraError> {
+    only(wanted, "OpenCV")?;
+    if wanted.up.is_some() {
+        let detail = "it describes a lens alone, which stands in no world";
+        return Err(CameraError::with_remedy("OpenCV", detail, NO_AXIS));
+    }
     Ok(Found {
         lens: opencv::read(text, Some(wanted.size))?,
         pose: None,
         program: "OpenCV",
         ground_at_origin: false,
+        states_fov: true,
     })
 }
 
-/// The camera that is wanted among those with names.
-fn chosen(
-    cameras: &[(String, Camera)],
+/// Errors if another camera than the first is wanted of a file that has one.
+fn only(wanted: &Wanted, format: &'static str) -> Result<(), CameraError> {
+    match wanted.which {
+        Which::Number(n @ 1..) => Err(CameraError::with_remedy(
+            format,
+            format!("it has one camera, and no camera {n}"),
+            "leave the number out",
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// What is wanted among cameras with names.
+fn chosen<'a, T>(
+    cameras: &'a [(String, T)],
     wanted: &Wanted,
     format: &'static str,
-) -> Result<Camera, CameraError> {
-    let named = |name: &Path| {
-        let same = |part: fn(&Path) -> Option<&std::ffi::OsStr>| {
-            let of = |c: &&(String, Camera)| part(Path::new(&c.0)) == part(name);
-            cameras.iter().find(of)
-        };
-        same(Path::file_name).or_else(|| same(Path::file_stem))
-    };
+) -> Result<&'a T, CameraError> {
     let (found, what) = match wanted.which {
-        Which::Number(n) => (cameras.get(n as usize), format!("no camera {n}")),
-        Which::Name(name) => (
-            cameras
-                .iter()
-                .find(|c| c.0 == name)
-                .or(named(name.as_ref())),
-            format!("none for {name:?}"),
+        Which::Number(n) => (
+            Some(n as usize).filter(|n| *n < cameras.len()),
+            format!("no camera {n}"),
         ),
-        Which::Photo(path) => (
-            named(path).or(match cameras {
-                [only] => Some(only),
-                _ => None,
-            }),
-            format!("none for {:?}", path.file_name().unwrap_or_default()),
-        ),
+        Which::Name(name) => {
+            let exact = nearest(cameras, format, name, |own| (own == name).then_some(()))?;
+            let by_path = || nearest(cameras, format, name, |own| agreement(own, name.as_ref()));
+            (
+                exact.map_or_else(by_path, |i| Ok(Some(i)))?,
+                format!("none for {name:?}"),
+            )
+        }
+        Which::Photo(path) => {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            let only = (cameras.len() == 1).then_some(0);
+            let by_path = nearest(cameras, format, &name, |own| agreement(own, path))?;
+            (by_path.or(only), format!("none for {name:?}"))
+        }
     };
     let cameras_are = cameras.len();
-    found.map(|c| c.1).ok_or_else(|| {
+    found.map(|i| &cameras[i].1).ok_or_else(|| {
         CameraError::with_remedy(
             format,
             format!("it has {cameras_are} cameras, and {what}"),
@@ -233,23 +286,263 @@ fn chosen(
     })
 }
 
-fn of_chan(frames: &[(i64, Camera)], wanted: &Wanted) -> Result<Camera, CameraError> {
-    let found = match wanted.which {
-        Which::Number(n) => frames.iter().find(|f| f.0 == i64::from(n)),
-        Which::Name(name) => frames.iter().find(|f| f.0.to_string() == name),
-        Which::Photo(_) => match frames {
-            [only] => Some(only),
-            _ => None,
-        },
+/// Which of `cameras` agrees best with what is called `name`. An error if two of them do.
+fn nearest<T, A: Ord>(
+    cameras: &[(String, T)],
+    format: &'static str,
+    name: &str,
+    agreement: impl Fn(&str) -> Option<A>,
+) -> Result<Option<usize>, CameraError> {
+    let all = cameras.iter().enumerate();
+    let all: Vec<(A, usize)> = all
+        .filter_map(|(i, (own, _))| Some((agreement(own)?, i)))
+        .collect();
+    let Some(best) = all.iter().map(|(agreement, _)| agreement).max() else {
+        return Ok(None);
     };
-    found.map(|f| f.1).ok_or_else(|| {
+    let mut best = all.iter().filter(|a| a.0 == *best).map(|a| a.1);
+    let (first, second) = (best.next(), best.next());
+    let Some((first, second)) = first.zip(second) else {
+        return Ok(first);
+    };
+    let names = [first, second].map(|i| &cameras[i].0);
+    let remedy = match names[0] == names[1] {
+        true => format!("say which by its number, for instance frame = {second}"),
+        false => format!("say which, for instance image = {:?}", names[1]),
+    };
+    let detail = format!(
+        "its cameras {:?} and {:?} match {name:?} equally well",
+        names[0], names[1]
+    );
+    Err(CameraError::with_remedy(format, detail, remedy))
+}
+
+/// How many components at the end of two paths are the same, and whether the last ones have the same extension;
+/// `None` if those differ in more.
+fn agreement(own: &str, other: &Path) -> Option<(usize, bool)> {
+    let own = Path::new(own);
+    let is_exact = own.file_name()? == other.file_name()?;
+    if !is_exact && stem(own) != stem(other) {
+        return None;
+    }
+    let [own, other] = [own, other].map(|path| path.components().rev().skip(1));
+    let same = own.zip(other).take_while(|(a, b)| a == b).count();
+    Some((1 + same, is_exact))
+}
+
+/// A path's last component without its extension. A number is no extension: `Camera.001`, `plate.1001`.
+fn stem(path: &Path) -> Option<&OsStr> {
+    let is_number = |e: &OsStr| e.as_encoded_bytes().iter().all(u8::is_ascii_digit);
+    match path.extension().is_some_and(is_number) {
+        true => path.file_name(),
+        false => path.file_stem(),
+    }
+}
+
+/// The digits at the end of a picture's name.
+fn number(picture: &Path) -> Option<i64> {
+    let stem = stem(picture)?.to_str()?;
+    let head = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+    stem[head.len()..].parse().ok()
+}
+
+fn of_chan<'a>(frames: &'a [chan::Frame], wanted: &Wanted) -> Result<&'a chan::Frame, CameraError> {
+    let (number, picture) = match wanted.which {
+        Which::Number(n) => (Some(i64::from(n)), None),
+        Which::Name(name) => (
+            name.parse().ok().or_else(|| number(name.as_ref())),
+            Some(name.as_ref()),
+        ),
+        Which::Photo(path) => (number(path), Some(path)),
+    };
+    let found = match (wanted.which, frames) {
+        (Which::Photo(_), [only]) => Some(only),
+        _ => frames.iter().find(|f| Some(f.number) == number),
+    };
+    found.ok_or_else(|| {
+        let name = picture.map(|p| p.file_name().unwrap_or_default());
+        let which = match (number, name) {
+            (Some(number), Some(name)) => {
+                format!("none of number {number}, with which {name:?} ends")
+            }
+            (Some(number), None) => format!("none of number {number}"),
+            (None, name) => format!(
+                "{:?} does not end in the number of one",
+                name.unwrap_or_default()
+            ),
+        };
         CameraError::with_remedy(
             ".chan",
-            format!(
-                "it has {} frames, and not the one that is wanted",
-                frames.len()
-            ),
+            format!("it has {} frames, and {which}", frames.len()),
             "say which by its number, the first in its line",
         )
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn named(names: &[&str]) -> Vec<(String, usize)> {
+        let all = names.iter().enumerate();
+        all.map(|(i, name)| (name.to_string(), i)).collect()
+    }
+
+    fn wanted(which: Which<'_>) -> Wanted<'_> {
+        Wanted {
+            size: [600.0, 400.0],
+            which,
+            up: None,
+            fov_deg: None,
+        }
+    }
+
+    /// Index of the one that is chosen, or what is wrong.
+    fn choice_of(names: &[&str], which: Which) -> Result<usize, String> {
+        let found = chosen(&named(names), &wanted(which), "COLMAP").copied();
+        found.map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn of_pictures_of_the_same_name_that_of_the_same_folders_is_chosen() {
+        let sides = ["left/0001.png", "right/0001.png", "right/0002.png"];
+        let of = |names: &[&str], path: &str| choice_of(names, Which::Photo(path.as_ref()));
+        assert_eq!(of(&sides, "/shots/left/0001.png"), Ok(0));
+        assert_eq!(of(&sides, "right/0001.png"), Ok(1));
+        // With other extensions, too, and the folder tells more than the extension.
+        assert_eq!(of(&sides, "right/0001.exr"), Ok(1));
+        assert_eq!(of(&["left/1.png", "right/1.jpg"], "right/1.png"), Ok(1));
+        assert_eq!(of(&["a/1.jpg", "a/1.png"], "b/1.png"), Ok(1));
+        assert_eq!(of(&["./a/1", "./b/1"], "in/b/1.png"), Ok(1));
+        // What is unique needs no folder.
+        assert_eq!(of(&sides, "elsewhere/0002.jpg"), Ok(2));
+        for (path, image) in [("0001.png", "0001.png"), ("up/0001.jpg", "0001.jpg")] {
+            let error = of(&sides, path).unwrap_err();
+            let want = format!(
+                "its cameras \"left/0001.png\" and \"right/0001.png\" match {image:?} equally well; \
+                 say which, for instance image = \"right/0001.png\""
+            );
+            assert!(error.ends_with(&want), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_name_is_one_camera_s() {
+        let of = |names: &[&str], name: &str| choice_of(names, Which::Name(name));
+        let sides = ["left/0001.png", "0001.png", "right/0001.png"];
+        for (name, want) in sides.iter().zip(0..) {
+            assert_eq!(of(&sides, name), Ok(want));
+        }
+        assert_eq!(of(&sides, "/shots/right/0001.png"), Ok(2));
+        let error = of(&["CAM", "CAM"], "CAM").unwrap_err();
+        let want = "match \"CAM\" equally well; say which by its number, for instance frame = 1";
+        assert!(error.ends_with(want), "{error}");
+        // Numbers at the end are no extensions.
+        let blender = ["Camera", "Camera.001"];
+        assert_eq!(of(&blender, "Camera.jpg"), Ok(0));
+        assert_eq!(of(&blender, "Camera.001.jpg"), Ok(1));
+        assert!(of(&blender, "Camera.002").unwrap_err().contains("none for"));
+        // Cameras without names have none that is asked for.
+        assert!(choice_of(&["", ""], Which::Photo(Path::new(""))).is_err());
+    }
+
+    /// What is read of a file with this name.
+    fn found_in(name: &str, text: &str, wanted: &Wanted) -> Result<Found, String> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        read(&path, wanted).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn a_chan_has_the_frame_with_the_number_of_the_picture() {
+        let chan = "1001 1 2 3 0 0 0 40\n1002 4 5 6 0 0 0 40\n";
+        let z =
+            |which| found_in("shot.chan", chan, &wanted(which)).map(|f| f.pose.unwrap().position.z);
+        let photo = |path| z(Which::Photo(Path::new(path)));
+        assert_eq!(photo("plates/plate.1001.png"), Ok(3.0));
+        assert_eq!(photo("plate_01002.exr"), Ok(6.0));
+        assert_eq!(z(Which::Name("plate.1002.png")), Ok(6.0));
+        assert_eq!(z(Which::Name("1002")), Ok(6.0));
+        let said = |path| photo(path).unwrap_err();
+        let want = "it has 2 frames, and none of number 1003, with which \"plate.1003.png\" ends; say which";
+        assert!(
+            said("plate.1003.png").contains(want),
+            "{}",
+            said("plate.1003.png")
+        );
+        let want = "it has 2 frames, and \"plate.png\" does not end in the number of one";
+        assert!(said("plate.png").contains(want), "{}", said("plate.png"));
+        let one = "7 1 2 3 0 0 0 40";
+        let of_one = wanted(Which::Photo(Path::new("plate.1003.png")));
+        assert!(found_in("shot.chan", one, &of_one).is_ok());
+    }
+
+    #[test]
+    fn a_chan_is_turned_up_and_says_whether_it_has_a_field_of_view() {
+        let of = |text: &str| {
+            let asked = Wanted {
+                up: Some(WorldUp::Z),
+                fov_deg: Some(50.0),
+                ..wanted(Which::Photo(Path::new("a.png")))
+            };
+            found_in("shot.chan", text, &asked).unwrap()
+        };
+        let (own, asked) = (of("1 1 2 3 0 0 0 40"), of("1 1 2 3 0 0 0"));
+        assert!(own.states_fov && !asked.states_fov);
+        assert_eq!(own.pose.unwrap().position.to_array(), [1.0, 3.0, -2.0]);
+    }
+
+    #[test]
+    fn an_animated_camera_is_refused_where_it_is_asked_for() {
+        let target = json!({ "node": 0, "path": "translation" });
+        let text = json!({
+            "nodes": [{ "name": "moving", "camera": 0 }, { "name": "still", "camera": 0 }],
+            "cameras": [{ "perspective": { "yfov": 0.7 } }],
+            "animations": [{ "channels": [{ "sampler": 0, "target": target }] }],
+        });
+        let of = |name| found_in("shot.gltf", &text.to_string(), &wanted(Which::Name(name)));
+        assert!(of("still").is_ok());
+        let error = of("moving").unwrap_err();
+        let want = "its camera is animated, which is not read; export .chan or transforms.json";
+        assert!(error.contains(want), "{error}");
+    }
+
+    #[test]
+    fn what_a_file_cannot_answer_is_refused() {
+        let kitti = "P2: 700 0 300 0 0 700 200 0 0 0 1 0\n";
+        let lens = "camera_matrix: [700, 0, 300, 0, 700, 200, 0, 0, 1]\n";
+        let photo = wanted(Which::Photo(Path::new("a.png")));
+        let up = Wanted {
+            up: Some(WorldUp::Z),
+            ..photo
+        };
+        for (name, text, asked, want) in [
+            (
+                "calib.txt",
+                kitti,
+                wanted(Which::Name("P3")),
+                "none the name \"P3\"; say which by its number",
+            ),
+            ("calib.txt", kitti, up, "of which -y points up; leave out"),
+            (
+                "lens.yaml",
+                lens,
+                up,
+                "a lens alone, which stands in no world",
+            ),
+            (
+                "lens.yaml",
+                lens,
+                wanted(Which::Number(2)),
+                "it has one camera, and no camera 2",
+            ),
+        ] {
+            assert!(found_in(name, text, &photo).is_ok(), "{name}");
+            let error = found_in(name, text, &asked).unwrap_err();
+            assert!(error.contains(want), "{error}");
+        }
+    }
 }

@@ -1,9 +1,13 @@
 //! Cameras in a glTF or GLB, as Blender exports them.
 //!
 //! The world has +y up and a camera looks down its own -z, as here. Nodes form a tree; a camera
-//! stands where its node does. Only the document is read, no buffers.
+//! stands where its node does. Only the document is read, no buffers, so that an animation is noticed and
+//! not followed.
+use std::collections::BTreeSet;
+
 use glam::{DMat3, DMat4, DQuat, DVec2, DVec3};
 use serde::Deserialize;
+use serde_json::Value;
 
 use crate::camera::{Camera, Lens, Pose};
 use crate::error::CameraError;
@@ -16,6 +20,8 @@ struct Document {
     nodes: Vec<Node>,
     #[serde(default)]
     cameras: Vec<GltfCamera>,
+    #[serde(default)]
+    animations: Vec<Animation>,
 }
 
 #[derive(Deserialize)]
@@ -45,6 +51,63 @@ struct Perspective {
     aspect_ratio: Option<f64>,
 }
 
+#[derive(Deserialize)]
+struct Animation {
+    #[serde(default)]
+    channels: Vec<Channel>,
+}
+
+#[derive(Deserialize)]
+struct Channel {
+    target: Target,
+}
+
+#[derive(Deserialize)]
+struct Target {
+    node: Option<usize>,
+    #[serde(default)]
+    path: String,
+    #[serde(default)]
+    extensions: Value,
+}
+
+/// What animations change, by index.
+#[derive(Default)]
+struct Animated {
+    nodes: BTreeSet<usize>,
+    cameras: BTreeSet<usize>,
+}
+
+impl Animated {
+    fn of(animations: &[Animation]) -> Self {
+        const MOVES: [&str; 4] = ["translation", "rotation", "scale", "matrix"];
+        let mut all = Self::default();
+        for Channel { target } in animations.iter().flat_map(|a| &a.channels) {
+            // KHR_animation_pointer names a value of the document: /nodes/3/translation.
+            let pointer = &target.extensions["KHR_animation_pointer"]["pointer"];
+            let steps: Vec<&str> = pointer.as_str().unwrap_or_default().split('/').collect();
+            let (node, camera): (Option<usize>, Option<usize>) = match steps[..] {
+                ["", "nodes", node, path, ..] if MOVES.contains(&path) => (node.parse().ok(), None),
+                ["", "cameras", camera, ..] => (None, camera.parse().ok()),
+                _ if MOVES.contains(&target.path.as_str()) => (target.node, None),
+                _ => (None, None),
+            };
+            all.nodes.extend(node);
+            all.cameras.extend(camera);
+        }
+        all
+    }
+}
+
+/// A camera at rest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AtRest {
+    /// As the document has it, whatever animations say.
+    pub camera: Camera,
+    /// Whether an animation moves it, or what it hangs from, or zooms.
+    pub is_animated: bool,
+}
+
 /// Reads all perspective cameras, in the order of their nodes. Their images have the height of `size`. Their width
 /// follows from the camera's aspect ratio; without one it is that of `size`. Their names are those of the cameras, else of
 /// their nodes.
@@ -52,6 +115,15 @@ struct Perspective {
 /// # Errors
 /// On a document that is damaged or without perspective cameras, and on nodes that are sheared.
 pub fn read(bytes: &[u8], size: [f64; 2]) -> Result<Vec<(String, Camera)>, CameraError> {
+    let cameras = read_at_rest(bytes, size)?.into_iter();
+    Ok(cameras.map(|(name, own)| (name, own.camera)).collect())
+}
+
+/// As [`read`], and which of them are animated. Animations themselves are not read.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_at_rest(bytes: &[u8], size: [f64; 2]) -> Result<Vec<(String, AtRest)>, CameraError> {
     let document: Document = serde_json::from_slice(json(bytes)?)
         .map_err(|e| CameraError::new(FORMAT, e.to_string()))?;
     let mut parents = vec![None; document.nodes.len()];
@@ -61,10 +133,11 @@ pub fn read(bytes: &[u8], size: [f64; 2]) -> Result<Vec<(String, Camera)>, Camer
             *slot.ok_or_else(|| CameraError::new(FORMAT, "a node's child is missing"))? = Some(i);
         }
     }
+    let animated = Animated::of(&document.animations);
     let mut cameras = Vec::new();
     for (i, node) in document.nodes.iter().enumerate() {
-        let Some(camera) = node.camera else { continue };
-        let camera = document.cameras.get(camera);
+        let Some(index) = node.camera else { continue };
+        let camera = document.cameras.get(index);
         let camera =
             camera.ok_or_else(|| CameraError::new(FORMAT, "a node's camera is missing"))?;
         let Some(perspective) = &camera.perspective else {
@@ -74,9 +147,15 @@ pub fn read(bytes: &[u8], size: [f64; 2]) -> Result<Vec<(String, Camera)>, Camer
             true => &node.name,
             false => &camera.name,
         };
-        let pose = pose(&document.nodes, &parents, i)?;
+        let nodes = above(&parents, i)?;
+        let pose = pose(&document.nodes, &nodes)?;
         let lens = lens(perspective, size)?;
-        cameras.push((name.clone(), Camera { pose, lens }));
+        let own = AtRest {
+            camera: Camera { pose, lens },
+            is_animated: animated.cameras.contains(&index)
+                || nodes.iter().any(|node| animated.nodes.contains(node)),
+        };
+        cameras.push((name.clone(), own));
     }
     match cameras.is_empty() {
         true => Err(CameraError::with_remedy(
@@ -118,19 +197,21 @@ fn lens(perspective: &Perspective, size: [f64; 2]) -> Result<Lens, CameraError> 
     Ok(lens)
 }
 
-/// Where node `i` stands.
-fn pose(nodes: &[Node], parents: &[Option<usize>], i: usize) -> Result<Pose, CameraError> {
-    let mut matrix = DMat4::IDENTITY;
-    let mut at = Some(i);
+/// Node `i` and those above it, from below.
+fn above(parents: &[Option<usize>], i: usize) -> Result<Vec<usize>, CameraError> {
+    let nodes = std::iter::successors(Some(i), |&i| parents[i]);
     // A path without a cycle visits no node twice.
-    for _ in 0..nodes.len() {
-        let Some(i) = at else { break };
-        matrix = nodes[i].matrix() * matrix;
-        at = parents[i];
+    let nodes: Vec<usize> = nodes.take(parents.len() + 1).collect();
+    match nodes.len() > parents.len() {
+        true => Err(CameraError::new(FORMAT, "its nodes form a cycle")),
+        false => Ok(nodes),
     }
-    if at.is_some() {
-        return Err(CameraError::new(FORMAT, "its nodes form a cycle"));
-    }
+}
+
+/// Where the first of these nodes stands, each of which hangs from the next.
+fn pose(nodes: &[Node], path: &[usize]) -> Result<Pose, CameraError> {
+    let own = path.iter().map(|&i| nodes[i].matrix());
+    let matrix = own.fold(DMat4::IDENTITY, |below, own| own * below);
     let axes = DMat3::from_mat4(matrix);
     // Only where a camera looks matters, not how its node is scaled.
     let unit = |v: DVec3| v.try_normalize();
@@ -164,5 +245,45 @@ impl Node {
             rotation,
             self.translation.map_or(DVec3::ZERO, DVec3::from_array),
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    /// Which of two cameras, that of a node below the first one and that of the third one, are animated.
+    fn animated(target: Value) -> Vec<bool> {
+        let channels = json!([{ "sampler": 0, "target": target }]);
+        let document = json!({
+            "nodes": [{ "children": [1] }, { "camera": 0 }, { "camera": 1 }, { "mesh": 0 }],
+            "cameras": [{ "perspective": { "yfov": 1.0 } }, { "perspective": { "yfov": 1.0 } }],
+            "animations": [{ "channels": channels, "samplers": [] }],
+        });
+        let cameras = read_at_rest(document.to_string().as_bytes(), [600.0, 400.0]).unwrap();
+        cameras.iter().map(|c| c.1.is_animated).collect()
+    }
+
+    #[test]
+    fn a_camera_is_animated_if_it_moves_hangs_from_what_moves_or_zooms() {
+        let pointer = |to: &str| {
+            let extensions = json!({ "KHR_animation_pointer": { "pointer": to } });
+            json!({ "path": "pointer", "extensions": extensions })
+        };
+        for (target, want) in [
+            (json!({ "node": 0, "path": "rotation" }), [true, false]),
+            (json!({ "node": 1, "path": "translation" }), [true, false]),
+            (json!({ "node": 2, "path": "scale" }), [false, true]),
+            (json!({ "node": 2, "path": "weights" }), [false, false]),
+            (json!({ "node": 3, "path": "rotation" }), [false, false]),
+            (pointer("/nodes/2/rotation"), [false, true]),
+            (pointer("/nodes/2/weights"), [false, false]),
+            (pointer("/cameras/0/perspective/yfov"), [true, false]),
+            (pointer("/materials/0/alphaCutoff"), [false, false]),
+        ] {
+            assert_eq!(animated(target.clone()), want, "{target}");
+        }
     }
 }
