@@ -46,11 +46,23 @@ pub(crate) fn read_png(bytes: &[u8]) -> Result<Raster<f32>, PointsError> {
     reader.limits(limits);
     let decoded = reader.decode().map_err(|e| wrong(e.to_string()))?;
     let image::DynamicImage::ImageLuma16(grey) = decoded else {
-        return Err(wrong(format!("its pixels are {:?}", decoded.color())));
+        return Err(wrong(format!("it is {}", in_words(decoded.color()))));
     };
     let (w, h) = (grey.width() as usize, grey.height() as usize);
     let metres = grey.into_raw().into_iter().map(|mm| f32::from(mm) * 1e-3);
     Ok(Raster::from_pixels(w, h, metres.collect()))
+}
+
+/// `a picture in colour with alpha, of 8 bits`.
+fn in_words(kind: image::ColorType) -> String {
+    let colours = if kind.has_color() {
+        "in colour"
+    } else {
+        "in grey"
+    };
+    let alpha = if kind.has_alpha() { " with alpha" } else { "" };
+    let bits = kind.bits_per_pixel() / u16::from(kind.channel_count());
+    format!("a picture {colours}{alpha}, of {bits} bits")
 }
 
 /// The points that a camera's depth map shows.
@@ -93,4 +105,31 @@ pub fn points(depth: &Raster<f32>, camera: &Camera) -> Result<Cloud, PointsError
         points: found.points(),
         viewpoint: Some(camera.pose.position),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use image::DynamicImage;
+
+    use super::*;
+
+    #[test]
+    fn a_png_that_is_no_depth_map_is_described_in_words() {
+        for (picture, said) in [
+            (DynamicImage::new_rgb8(2, 2), "in colour, of 8 bits"),
+            (
+                DynamicImage::new_rgba16(2, 2),
+                "in colour with alpha, of 16 bits",
+            ),
+            (DynamicImage::new_luma8(2, 2), "in grey, of 8 bits"),
+        ] {
+            let mut bytes = std::io::Cursor::new(Vec::new());
+            picture
+                .write_to(&mut bytes, image::ImageFormat::Png)
+                .unwrap();
+            let error = read_png(bytes.get_ref()).unwrap_err().to_string();
+            let said = format!("it is a picture {said}");
+            assert!(error.contains(&said), "{error}");
+        }
+    }
 }

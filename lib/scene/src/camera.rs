@@ -1,10 +1,10 @@
 //! A pinhole camera that looks down its own -z.
 use std::path::{Path, PathBuf};
 
-use dipir_cameras::file::{self, Wanted};
+use dipir_cameras::file::{self, Found, Wanted};
 use dipir_cameras::{CameraError, Distortion, Lens, Pose};
 use dipir_imaging::facts::Facts;
-use glam::{DMat3, DVec3, Mat3, Vec2, Vec3};
+use glam::{DMat3, DVec2, DVec3, Mat3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
@@ -178,7 +178,9 @@ impl CameraSettings {
                     return Ok((camera, None));
                 }
                 if let FieldOfView::Vertical(angle_rad) = field_of_view {
-                    camera.focal_px = distorted_focal(distortion, *angle_rad, camera);
+                    let height_px = f64::from(resolution[1]);
+                    let focal_px = distorted_focal(distortion, *angle_rad, height_px);
+                    camera.focal_px = focal_px.map_or(camera.focal_px, |f| Vec2::splat(f as f32));
                 }
                 let pose = Pose {
                     position: camera.position.as_dvec3(),
@@ -196,19 +198,13 @@ impl CameraSettings {
     }
 }
 
-/// Focal lengths of a fisheye with this vertical field of view; those of `camera` for other lenses,
-/// whose field of view counts without distortion.
-fn distorted_focal(distortion: &Distortion, angle_rad: f32, camera: Camera) -> Vec2 {
-    if !distortion.is_fisheye() {
-        return camera.focal_px;
-    }
+/// The focal length of a fisheye with this vertical field of view, pixels. `None` for other lenses, whose field of view
+/// counts without distortion.
+fn distorted_focal(distortion: &Distortion, angle_rad: f32, height_px: f64) -> Option<f64> {
     let (sin, cos) = (0.5 * f64::from(angle_rad)).sin_cos();
-    match distortion.image(DVec3::new(0.0, sin, cos)) {
-        Some(image) if image.point.y > 0.0 => {
-            Vec2::splat((0.5 * f64::from(camera.resolution[1]) / image.point.y) as f32)
-        }
-        _ => camera.focal_px,
-    }
+    let image = distortion.image(DVec3::new(0.0, sin, cos));
+    let image = image.filter(|i| distortion.is_fisheye() && i.point.y > 0.0);
+    image.map(|i| 0.5 * height_px / i.point.y)
 }
 
 fn of_lens(pose: &Pose, lens: &Lens, resolution: [u32; 2]) -> (Camera, Option<Undistortion>) {
@@ -251,8 +247,14 @@ pub struct FileSettings {
     pub scale: f32,
     /// Position, point looked at and up, for files of a lens alone.
     pub stand: Option<[Vec3; 3]>,
+    /// The first key that says where it stands or looks, for files of a lens alone.
+    pub stands_by: Option<&'static str>,
     /// Vertical field of view for a file without one, degrees.
     pub fov_deg: Option<f32>,
+    /// Where the optical axis meets the image, pixels, for a file that has it in the middle.
+    pub principal_px: Option<Vec2>,
+    /// How the lens bends lines, for a file without coefficients.
+    pub distortion: Option<Distortion>,
 }
 
 impl FileSettings {
@@ -272,10 +274,16 @@ impl FileSettings {
         base_dir: &Path,
     ) -> Result<(Camera, Option<Undistortion>), Error> {
         let path = base_dir.join(&self.path);
+        // Its folders tell pictures of the same name apart.
+        let photo = match &self.which {
+            Which::Photo(path) => base_dir.join(path),
+            _ => PathBuf::new(),
+        };
+        let photo = std::path::absolute(&photo).unwrap_or(photo);
         let wanted = Wanted {
             size: resolution.map(f64::from),
             which: match &self.which {
-                Which::Photo(path) => file::Which::Photo(path),
+                Which::Photo(_) => file::Which::Photo(&photo),
                 Which::Number(n) => file::Which::Number(*n),
                 Which::Name(name) => file::Which::Name(name),
             },
@@ -290,11 +298,60 @@ impl FileSettings {
             },
             other => Error::Camera(other).in_file(&path),
         })?;
-        let pose = match (found.pose, self.stand) {
-            (Some(pose), None) => Pose {
-                position: pose.position * f64::from(self.scale),
-                ..pose
+        let pose = self.pose(found.pose, resolution)?;
+        Ok(of_lens(&pose, &self.lens(&found)?, resolution))
+    }
+
+    /// An error about a key of the camera that the file, as far as `what` of it goes, excludes.
+    fn conflict(&self, what: &str, name: &str) -> Error {
+        Error::Conflict {
+            first: format!("{what}scene.camera.{}", self.key),
+            second: format!("scene.camera.{name}"),
+        }
+    }
+
+    /// The lens that the file describes, with what the table says of it.
+    fn lens(&self, found: &Found) -> Result<Lens, Error> {
+        let mut lens = found.lens;
+        if self.fov_deg.is_some() && found.states_fov {
+            return Err(self.conflict("a field of view in ", "fov_deg"));
+        }
+        if let Some(principal_px) = self.principal_px {
+            let size = DVec2::from_array(lens.size);
+            // Up to rounding of a picture that is scaled.
+            let off = (lens.principal_px / size - 0.5).abs().max_element();
+            if off > 1e-9 {
+                return Err(self.conflict("an optical axis in ", "principal_px"));
+            }
+            lens.principal_px = principal_px.as_dvec2();
+        }
+        if let Some(distortion) = self.distortion {
+            if !lens.distortion.is_none() {
+                return Err(self.conflict("coefficients of a lens in ", "distortion"));
+            }
+            lens.distortion = distortion;
+            if let Some(fov_deg) = self.fov_deg {
+                let height_px = lens.size[1];
+                let focal_px = distorted_focal(&distortion, fov_deg.to_radians(), height_px);
+                lens.focal_px = focal_px.map_or(lens.focal_px, DVec2::splat);
+            }
+        }
+        Ok(lens)
+    }
+
+    /// Where the camera stands: in `found` of the file, or as the table says.
+    fn pose(&self, found: Option<Pose>, resolution: [u32; 2]) -> Result<Pose, Error> {
+        let pose = match (found, self.stand) {
+            (Some(pose), _) => match self.stands_by {
+                Some(name) => return Err(self.conflict("", name)),
+                None => Pose {
+                    position: pose.position * f64::from(self.scale),
+                    ..pose
+                },
             },
+            (None, Some(_)) if self.scale != 1.0 => {
+                return Err(self.conflict("a lens alone in ", "file_scale"));
+            }
             (None, Some([position, look_at, up])) => {
                 let fov = FieldOfView::Photograph;
                 let camera = Camera::look_at(position, look_at, up, fov, resolution);
@@ -302,12 +359,6 @@ impl FileSettings {
                     position: position.as_dvec3(),
                     rotation: camera.rotation.as_dmat3(),
                 }
-            }
-            (Some(_), Some(_)) => {
-                return Err(Error::Conflict {
-                    first: format!("scene.camera.{}", self.key),
-                    second: "scene.camera.position".into(),
-                });
             }
             (None, None) => {
                 return Err(Error::Missing {
@@ -333,7 +384,7 @@ impl FileSettings {
                     .into(),
             });
         }
-        Ok(of_lens(&pose, &found.lens, resolution))
+        Ok(pose)
     }
 }
 

@@ -15,7 +15,7 @@ use glam::{DMat3, Vec2, Vec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::camera::{CameraSettings, FieldOfView, WorldUp};
+use crate::camera::{CameraSettings, FARTHEST_M, FieldOfView, WorldUp};
 use crate::error::Error;
 use crate::limits::Limits;
 use crate::pixels::Pixels;
@@ -38,7 +38,7 @@ pub struct SceneConfig {
     /// What the object is called in prompts to a diffusion model: a word or a few.
     #[schemars(extend("default" = "object"), example = &"car")]
     pub class: Option<String>,
-    /// Mask of what stands in front of the object in the photograph, a picture of the photograph's
+    /// Mask of what stands in front of the object in the photograph, a PNG, JPEG or EXR of the photograph's
     /// size: white hides the object, black shows it.
     #[schemars(extend("format" = "path"), example = &"foreground.png")]
     pub occluders: Option<PathBuf>,
@@ -153,7 +153,7 @@ pub struct CameraConfig {
     #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "the photograph's own, from its Exif data"), example = 36.0)]
     pub sensor_mm: Option<f32>,
     /// How the lens bends lines. The photograph is undistorted for everything that is computed, and the
-    /// result is bent back onto it.
+    /// result is bent back onto it. Beside `file` it is for one without coefficients.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub distortion: Option<DistortionConfig>,
     /// The camera's file of another program: fSpy (`.fspy`, `.json`), nerfstudio (`transforms.json`),
@@ -340,6 +340,7 @@ impl SceneConfig {
                 "name the photograph: background = \"photo.jpg\"",
             )
         })?;
+        named("scene.background", &background)?;
         let transfer = self.transfer()?;
         let class = self.class.as_deref().unwrap_or("object").trim();
         if class.is_empty() {
@@ -348,6 +349,9 @@ impl SceneConfig {
                 "\"\"",
                 "a word for the object, for instance class = \"car\"",
             ));
+        }
+        if let Some(mask) = &self.occluders {
+            named("scene.occluders", mask)?;
         }
         if self.objects.is_empty() {
             return Err(missing(
@@ -414,6 +418,7 @@ impl ObjectConfig {
                 "name the object's file: path = \"object.glb\"",
             )
         })?;
+        named(&key("path"), &path)?;
         let angle_rad = |name: &str, value: Option<f32>| match value.unwrap_or(0.0) {
             v if v.is_finite() => Ok(v.to_radians()),
             v => Err(wrong(&key(name), v, "a finite angle in degrees")),
@@ -472,7 +477,7 @@ impl ObjectConfig {
                 to: finite_pixel(&key("to_pixel"), self.to_pixel)?,
             },
             placement: Placement {
-                position: finite_point(&key("position"), self.position.unwrap_or_default())?,
+                position: near_point(&key("position"), self.position.unwrap_or_default())?,
                 yaw_rad: angle_rad("yaw_deg", self.yaw_deg)?,
                 pitch_rad: angle_rad("pitch_deg", self.pitch_deg)?,
                 roll_rad: angle_rad("roll_deg", self.roll_deg)?,
@@ -503,6 +508,24 @@ fn finite_point(key: &str, value: [f32; 3]) -> Result<Vec3, Error> {
         Ok(point)
     } else {
         Err(wrong(key, triple(point), "three finite numbers [x, y, z]"))
+    }
+}
+
+/// A finite point that is not too far out.
+fn near_point(key: &str, value: [f32; 3]) -> Result<Vec3, Error> {
+    let point = finite_point(key, value)?;
+    if point.abs().max_element() > FARTHEST_M {
+        let accepted = "metres, at most ten million from the origin, for instance [0.5, 0.0, -1.0]";
+        return Err(wrong(key, triple(point), accepted));
+    }
+    Ok(point)
+}
+
+/// Refuses a path without a letter, which would stand for the project's folder.
+fn named(key: &str, path: &Path) -> Result<(), Error> {
+    match path.to_string_lossy().trim().is_empty() {
+        true => Err(wrong(key, "empty", "the name of a file")),
+        false => Ok(()),
     }
 }
 

@@ -20,6 +20,7 @@ pub mod plausibility;
 pub mod printable;
 pub mod proxy;
 pub mod ray_offset;
+mod rebuilding;
 pub mod scene;
 pub mod texture;
 pub mod triangle;

@@ -7,9 +7,14 @@ use dipir_points::place::Body;
 use glam::{DMat3, DMat4, DQuat, DVec3, Vec3, swizzles::Vec3Swizzles};
 use serde::{Deserialize, Serialize};
 
+use crate::camera::FARTHEST_M;
 use crate::error::Error;
 use crate::mesh::TriangleMesh;
 use crate::proxy::Proxy;
+use crate::visibility::short;
+
+/// Largest extent of an object, metres.
+const LARGEST_M: f64 = 1e6;
 
 /// How large the object is.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -85,12 +90,14 @@ impl Placement {
         let foot = DVec3::new(anchor.x, low.y, anchor.z);
         let (contact, warning) = self.contact(proxy, key)?;
         let upright = DMat4::from_quat(DQuat::from_rotation_arc(DVec3::Y, up));
-        let map = DMat4::from_translation(contact)
+        let of_turned = DMat4::from_translation(contact)
             * upright
             * DMat4::from_scale(DVec3::splat(scale))
-            * DMat4::from_translation(-foot)
-            * DMat4::from_mat3(turn);
-        Ok((map, warning))
+            * DMat4::from_translation(-foot);
+        if !mesh.indices.is_empty() {
+            within_reach(&of_turned, scale, [low, high], key)?;
+        }
+        Ok((of_turned * DMat4::from_mat3(turn), warning))
     }
 
     /// The turn, and the bounds of the turned mesh.
@@ -183,6 +190,40 @@ impl Placement {
     }
 }
 
+/// Refuses an object that is too large or too far out; `map` moves its turned box, from `low` to `high`, and makes it
+/// `scale` times as large. Rays are exact to some millionths of the extent of all objects: with a wheel at the end of the
+/// world each would be tested against all triangles of a car, whose shadows would start metres away.
+fn within_reach(map: &DMat4, scale: f64, [low, high]: [DVec3; 2], key: &str) -> Result<(), Error> {
+    let size = scale * (high - low).max_element();
+    let refused = |value: String, accepted: &str| {
+        Err(Error::Config {
+            key: key.into(),
+            value,
+            accepted: accepted.into(),
+        })
+    };
+    // Comparisons of NaN, of what overflows, fail.
+    if !(size <= LARGEST_M) {
+        return refused(
+            format!("{} m large", short(size)),
+            "at most a thousand kilometres: see its scale or height_m, and whether a part of its file lies far out",
+        );
+    }
+    let corners = [0, 1, 2, 3, 4, 5, 6, 7].map(|k| {
+        let upper = [k & 1, k >> 1 & 1, k >> 2].map(|bit| bit as f64);
+        map.transform_point3(low + (high - low) * DVec3::from_array(upper))
+    });
+    let farthest = corners.map(|p| p.abs().max_element()).into_iter();
+    let farthest = farthest.fold(0.0, f64::max);
+    if !(farthest <= f64::from(FARTHEST_M)) {
+        return refused(
+            format!("{} m from the scene's origin", short(farthest)),
+            "at most ten million metres: see its position, and where its file has it (anchor = \"center\" moves it to the position)",
+        );
+    }
+    Ok(())
+}
+
 /// The height of the mesh's highest point on the vertical line through `position`.
 fn highest(mesh: &TriangleMesh, position: DVec3) -> Option<f64> {
     let target = position.xz();
@@ -200,4 +241,83 @@ fn highest(mesh: &TriangleMesh, position: DVec3) -> Option<f64> {
         best = Some(best.map_or(y, |b| b.max(y)));
     }
     best
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A triangle whose third corner lies at `far`.
+    fn triangle(far: Vec3) -> TriangleMesh {
+        TriangleMesh {
+            positions: vec![Vec3::ZERO, Vec3::X, far],
+            indices: vec![[0, 1, 2]],
+            ..TriangleMesh::default()
+        }
+    }
+
+    fn resolved(mesh: &TriangleMesh, position: Vec3, size: Size) -> Result<DMat4, String> {
+        let placement = Placement {
+            position,
+            yaw_rad: 0.3,
+            pitch_rad: 0.0,
+            roll_rad: 0.0,
+            size,
+            rest: None,
+            anchor: Anchor::Origin,
+        };
+        let resolved = placement.resolve(mesh, DVec3::ZERO, &Proxy::None, "scene.objects[2]");
+        resolved.map(|r| r.0).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn an_object_beyond_reach_is_refused_with_its_size() {
+        let usual = triangle(Vec3::Y);
+        let with_a_far_part = triangle(Vec3::new(0.0, 1.0, 9_007_199_254_740_993.0));
+        let size = "; accepted: at most a thousand kilometres: see its scale or height_m, and whether a part of its file lies far out";
+        let place = "; accepted: at most ten million metres: see its position, and where its file has it (anchor = \"center\" moves it to the position)";
+        let zero = Vec3::ZERO;
+        for (mesh, position, scale, refusal) in [
+            (&usual, zero, Size::Scale(1.0), None),
+            (&usual, zero, Size::Scale(5e5), None),
+            (&with_a_far_part, zero, Size::Scale(1e-12), None),
+            (&usual, Vec3::splat(9e6), Size::Scale(1.0), None),
+            (
+                &usual,
+                zero,
+                Size::Height(3e6),
+                Some(("3.0e6 m large", size)),
+            ),
+            (
+                &usual,
+                zero,
+                Size::Scale(1e38),
+                Some(("1.0e38 m large", size)),
+            ),
+            (
+                &with_a_far_part,
+                zero,
+                Size::Height(1.4),
+                Some(("1.2e16 m large", size)),
+            ),
+            (
+                &usual,
+                Vec3::X * 3e7,
+                Size::Scale(1.0),
+                Some(("3.0e7 m from the scene's origin", place)),
+            ),
+        ] {
+            let found = resolved(mesh, position, scale);
+            match refusal {
+                None => assert!(found.is_ok(), "{found:?}"),
+                Some((value, accepted)) => assert_eq!(
+                    found.unwrap_err(),
+                    format!("scene.objects[2] is {value}{accepted}")
+                ),
+            }
+        }
+        let far_in_its_file = triangle(Vec3::new(-4e30, 0.0, 4e30));
+        let error = resolved(&far_in_its_file, zero, Size::Scale(1e38)).unwrap_err();
+        assert!(error.contains("e68 m large"), "{error}");
+    }
 }

@@ -1,23 +1,26 @@
 //! Set-ups that can be meant but seldom are: a field of view in radians, a camera under the ground,
 //! an object that no pixel shows, a mask that hides nothing. Each is one sentence with the value that was found and the key
 //! to look at.
+mod grey;
+mod in_picture;
+mod size;
+
 use dipir_cameras::Lens;
 use dipir_imaging::raster::Raster;
-use glam::{DVec2, Vec2, Vec3};
+use glam::{DVec2, Vec3};
 
 use crate::camera::Camera;
-use crate::description::ObjectRecord;
-use crate::mesh::{TriangleMesh, bounds};
+use crate::description::{ObjectRecord, ProxyRecord};
+use crate::mesh::TriangleMesh;
 use crate::proxy::{Plane, Proxy};
 use crate::scene::{LoadedScene, Scene};
 use crate::visibility::{below_a_pixel, short};
+use size::{Part, parts, proxy_without_unit, too_wide};
+
+pub use size::likely_unit;
 
 /// Vertical fields of view of lenses that people have: an 800 mm lens has 1.7 degrees.
 const FIELD_OF_VIEW_DEG: [f32; 2] = [1.5, 140.0];
-/// Largest extents of objects that people insert, metres.
-const EXTENT_M: [f64; 2] = [0.005, 50.0];
-/// From this extent on, the units of a file are taken for millimetres (.5 m and more), below it for centimetres (5 m and less).
-const MILLIMETRES_FROM: f64 = 500.0;
 /// An object smaller than this in the picture cannot be judged, pixels.
 const SMALLEST_PX: f32 = 3.0;
 
@@ -29,8 +32,25 @@ const STEPS: usize = 256;
 /// What is unlikely about a scene, one sentence each.
 pub fn implausible(loaded: &LoadedScene) -> Vec<String> {
     let lens = loaded.original.as_ref().map(|o| o.undistortion.lens());
+    let Scene {
+        mesh,
+        materials,
+        camera,
+        ..
+    } = &loaded.scene;
     let mut found = implausible_scene(&loaded.scene, &loaded.description.objects, lens);
-    found.extend(loaded.occluders.as_ref().and_then(hides_nothing));
+    if let ProxyRecord::Mesh(record) = &loaded.description.proxy {
+        found.extend(proxy_without_unit(record, &loaded.scene.proxy));
+    }
+    if let Some(mask) = &loaded.occluders {
+        found.extend(hides_nothing(mask));
+        found.extend(in_picture::hides_all(mask, mesh, camera));
+    }
+    found.extend(grey::coloured_in_grey(
+        &loaded.taken().image,
+        mesh,
+        materials,
+    ));
     found
 }
 
@@ -50,11 +70,27 @@ fn implausible_scene(scene: &Scene, objects: &[ObjectRecord], lens: Option<&Lens
     let Some(whole) = scene.mesh.bounds() else {
         return found;
     };
-    let sizes = unusual_sizes(scene, objects);
-    let size_is_told = below_a_pixel(whole, &scene.camera).is_some() || !sizes.is_empty();
-    found.extend(sizes);
+    let parts = parts(scene, objects);
+    let sizes: Vec<Option<String>> = parts
+        .iter()
+        .map(|p| p.unusual_size(&scene.camera))
+        .collect();
+    let size_is_told =
+        below_a_pixel(whole, &scene.camera).is_some() || sizes.iter().any(Option::is_some);
+    for (part, size) in parts.iter().zip(sizes) {
+        if size.is_none() {
+            found.extend(part.without_unit());
+            found.extend(in_picture::too_near(&scene.mesh, part, &scene.camera));
+        }
+        found.extend(size);
+    }
+    found.extend(too_wide(whole));
     found.extend(ground.and_then(|plane| object_below(&scene.mesh, plane)));
-    found.extend(visibility(&scene.mesh, &scene.camera, size_is_told));
+    found.extend(in_picture::visibility(
+        &scene.mesh,
+        &scene.camera,
+        size_is_told,
+    ));
     found
 }
 
@@ -72,8 +108,9 @@ fn field_of_view(camera: &Camera) -> Option<String> {
         false => String::new(),
     };
     Some(format!(
-        "the camera's vertical field of view is {degrees:.2} degrees; lenses have {least} to {most}: \
-         see [scene.camera] fov_deg, in degrees{meant}"
+        "the camera's vertical field of view is {} degrees; lenses have {least} to {most}: \
+         see [scene.camera] fov_deg, in degrees{meant}",
+        short(degrees.into())
     ))
 }
 
@@ -120,65 +157,9 @@ fn camera_below(camera: &Camera, plane: &Plane) -> Option<String> {
             -x, -y, -z
         ),
         false => format!(
-            "the camera is {:.2} m below the ground, so no shadow is caught; raise [scene.camera] \
+            "the camera is {} m below the ground, so no shadow is caught; raise [scene.camera] \
              position, or lower [scene.proxy] plane point",
-            -above
-        ),
-    })
-}
-
-/// The unit that a model with this largest extent in its file is likely in, and its metres; `None` for metres.
-pub fn likely_unit(extent: f64) -> Option<(&'static str, f64)> {
-    let [least, most] = EXTENT_M;
-    match extent {
-        e if e >= MILLIMETRES_FROM => Some(("millimetres", 0.001)),
-        e if e > most => Some(("centimetres", 0.01)),
-        e if e > 0.0 && e < least => Some(("kilometres", 1000.0)),
-        _ => None,
-    }
-}
-
-/// One sentence for each object whose size is none that people insert.
-fn unusual_sizes(scene: &Scene, objects: &[ObjectRecord]) -> Vec<String> {
-    let mut rest = &scene.mesh.indices[..];
-    let mut found = Vec::new();
-    for (i, object) in objects.iter().enumerate() {
-        let (own, after) = rest.split_at(rest.len().min(object.triangles as usize));
-        rest = after;
-        let corners = own.iter().flatten();
-        let corners = corners.map(|&i| scene.mesh.positions[i as usize]);
-        let Some((low, high)) = bounds(corners) else {
-            continue;
-        };
-        // What is smaller than a pixel was warned of when it was loaded.
-        if below_a_pixel((low, high), &scene.camera).is_none() {
-            let extent = f64::from((high - low).max_element());
-            let scale = object.transform().determinant().abs().cbrt();
-            found.extend(unusual_size(i, extent, scale));
-        }
-    }
-    found
-}
-
-/// `extent` is that of the placed object, `scale` the factor on the lengths of its file.
-fn unusual_size(object: usize, extent: f64, scale: f64) -> Option<String> {
-    let [least, most] = EXTENT_M;
-    let usual = extent == 0.0 || (least..=most).contains(&extent);
-    if usual || !(extent.is_finite() && scale > 0.0) {
-        return None;
-    }
-    let key = format!("scene.objects[{object}]");
-    let in_file = extent / scale;
-    Some(match likely_unit(in_file) {
-        Some((unit, metres)) => format!(
-            "{key} is {} m large, and its file looks like {unit}: write scale = {metres} for {} m, or height_m",
-            short(extent),
-            short(in_file * metres)
-        ),
-        None => format!(
-            "{key} is {} m large, and in its file {} m: check its scale, a factor, or its height_m, metres",
-            short(extent),
-            short(in_file)
+            short((-above).into())
         ),
     })
 }
@@ -188,54 +169,9 @@ fn object_below(mesh: &TriangleMesh, plane: &Plane) -> Option<String> {
     let highest = mesh.positions.iter().map(above).fold(f32::MIN, f32::max);
     (highest < 0.0).then(|| {
         format!(
-            "the objects lie {:.2} m or more below the ground, which hides them; raise \
+            "the objects lie {} m or more below the ground, which hides them; raise \
              [[scene.objects]] position",
-            -highest
-        )
-    })
-}
-
-fn visibility(mesh: &TriangleMesh, camera: &Camera, size_is_told: bool) -> Option<String> {
-    let (mut low, mut high) = (Vec2::INFINITY, Vec2::NEG_INFINITY);
-    let mut behind = 0;
-    for &point in &mesh.positions {
-        match camera.project(point) {
-            Some(pixel) => (low, high) = (low.min(pixel), high.max(pixel)),
-            None => behind += 1,
-        }
-    }
-    if behind == mesh.positions.len() {
-        return Some(
-            "the objects are behind the camera, so the picture does not show them; see \
-             [scene.camera] look_at and [[scene.objects]] position"
-                .into(),
-        );
-    }
-    // What reaches behind the camera can cover any pixel.
-    if behind > 0 {
-        return None;
-    }
-    let [width, height] = camera.resolution.map(|n| n as f32);
-    let sides = [
-        (high.x <= 0.0, "left of"),
-        (low.x >= width, "right of"),
-        (high.y <= 0.0, "above"),
-        (low.y >= height, "below"),
-    ];
-    if let Some((_, side)) = sides.iter().find(|(out, _)| *out) {
-        return Some(format!(
-            "the objects are {side} the picture (pixels {:.0} to {:.0} across and {:.0} to {:.0} down, of \
-             {width} x {height}), so it does not show them; move [[scene.objects]] position or turn \
-             [scene.camera] look_at",
-            low.x, high.x, low.y, high.y
-        ));
-    }
-    let size = high - low;
-    (size.max_element() < SMALLEST_PX && !size_is_told).then(|| {
-        format!(
-            "the objects take {:.1} x {:.1} pixels of the picture; see [[scene.objects]] scale and \
-             position, in metres",
-            size.x, size.y
+            short((-highest).into())
         )
     })
 }
@@ -243,13 +179,13 @@ fn visibility(mesh: &TriangleMesh, camera: &Camera, size_is_told: bool) -> Optio
 #[cfg(test)]
 mod tests {
     use dipir_cameras::Distortion;
-    use glam::{DMat4, DVec3};
+    use glam::{DMat4, DVec3, Vec2};
 
     use super::*;
     use crate::camera::FieldOfView;
     use crate::description::FileRecord;
 
-    fn scene() -> Scene {
+    pub(super) fn scene() -> Scene {
         let corners = [Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z];
         let mesh = TriangleMesh {
             positions: corners.to_vec(),
@@ -326,7 +262,7 @@ mod tests {
     }
 
     /// The object of [`scene`], `scale` times as large as in its file.
-    fn record(scale: f64) -> ObjectRecord {
+    pub(super) fn record(scale: f64) -> ObjectRecord {
         ObjectRecord {
             file: FileRecord {
                 path: "o.glb".into(),
@@ -340,72 +276,14 @@ mod tests {
     }
 
     #[test]
-    fn a_model_in_another_unit_is_told_with_its_scale() {
-        for (extent, scale, said) in [
-            (50.0, 1.0, None),
-            (
-                90.0,
-                1.0,
-                Some(
-                    "is 90 m large, and its file looks like centimetres: write scale = 0.01 for 0.90 m",
-                ),
-            ),
-            (
-                1800.0,
-                1.0,
-                Some(
-                    "is 1800 m large, and its file looks like millimetres: write scale = 0.001 for 1.80 m",
-                ),
-            ),
-            (
-                90.0,
-                0.05,
-                Some(
-                    "is 90 m large, and its file looks like millimetres: write scale = 0.001 for 1.80 m",
-                ),
-            ),
-            (
-                0.0009,
-                1.0,
-                Some(
-                    "is 9.0e-4 m large, and its file looks like kilometres: write scale = 1000 for 0.90 m",
-                ),
-            ),
-            (0.005, 1.0, None),
-            (
-                180.0,
-                100.0,
-                Some(
-                    "is 180 m large, and in its file 1.80 m: check its scale, a factor, or its height_m",
-                ),
-            ),
-        ] {
-            let found = unusual_size(2, extent, scale);
-            let said = said.map(|s| format!("scene.objects[2] {s}"));
-            match (&found, &said) {
-                (Some(found), Some(said)) => assert!(found.starts_with(said), "{found}"),
-                _ => assert_eq!(found, said, "{extent}"),
-            }
-        }
-    }
-
-    #[test]
-    fn each_object_is_measured_for_itself() {
-        // Two objects of a metre, a hundred metres apart; then the second is stretched.
+    fn small_heights_are_told_with_digits_that_count() {
         let mut scene = scene();
-        let other = scene.mesh.clone();
-        scene.mesh.append(other, 0);
-        let objects = [record(1.0), record(1.0)];
-        for p in &mut scene.mesh.positions[4..] {
-            p.x += 100.0;
-        }
-        assert_eq!(unusual_sizes(&scene, &objects), Vec::<String>::new());
-        scene.mesh.positions[5].x += 200.0;
-        let found = unusual_sizes(&scene, &objects);
-        assert!(
-            found.len() == 1 && found[0].starts_with("scene.objects[1] is 201 m large"),
-            "{found:?}"
-        );
+        scene.proxy = Proxy::Plane(Plane {
+            point: Vec3::new(0.0, 1.0004, 0.0),
+            normal: Vec3::Y,
+        });
+        let found = implausible_scene(&scene, &[], None);
+        assert!(found[0].contains("lie 4.0e-4 m or more below"), "{found:?}");
     }
 
     #[test]

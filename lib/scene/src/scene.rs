@@ -10,7 +10,7 @@ use dipir_points::Cloud;
 use glam::{DMat4, DVec2};
 
 use crate::camera::{Camera, CameraSettings};
-use crate::config::{EffectsConfig, ProxySettings, SceneConfig};
+use crate::config::{ProxySettings, SceneConfig};
 use crate::description::{FileRecord, ObjectRecord, PhotoRecord, ProxyRecord, SceneDescription};
 use crate::error::Error;
 use crate::features::SceneFeatures;
@@ -123,7 +123,7 @@ impl LoadedScene {
 }
 
 /// The working photo and mask, and the original if there is something to undo.
-fn undistort(
+pub(crate) fn undistort(
     photo: Photo,
     occluders: Option<Raster<f32>>,
     undistortion: Option<Undistortion>,
@@ -152,6 +152,24 @@ fn undistort(
 impl Scene {
     /// Reads all files that `config` names, relative to `base_dir`, and places the objects.
     pub fn load(config: &SceneConfig, base_dir: &Path) -> Result<LoadedScene, Error> {
+        Self::load_in(config, base_dir, None)
+    }
+
+    /// As [`Scene::load`], of a frame of a shot: objects and proxy are as in its `photo`, and so is a camera that stands
+    /// still.
+    pub fn load_frame(
+        config: &SceneConfig,
+        base_dir: &Path,
+        photo: &SceneDescription,
+    ) -> Result<LoadedScene, Error> {
+        Self::load_in(config, base_dir, Some(photo))
+    }
+
+    fn load_in(
+        config: &SceneConfig,
+        base_dir: &Path,
+        of_shot: Option<&SceneDescription>,
+    ) -> Result<LoadedScene, Error> {
         let settings = config.validate()?;
         let mut files = Files::new(base_dir, settings.limits);
         let (photo, background) = files.photo(&settings.background, settings.transfer)?;
@@ -169,14 +187,21 @@ impl Scene {
             }
             files.warn(file.choice(base_dir));
         }
-        let (camera, undistortion) = settings
-            .camera
-            .with_facts(&photo.facts)?
-            .resolve(resolution, base_dir)?;
+        let (camera, undistortion) =
+            match of_shot.filter(|_| settings.camera.stands_still(base_dir)) {
+                Some(of_shot) => of_shot.seen_in(resolution)?,
+                None => settings
+                    .camera
+                    .with_facts(&photo.facts)?
+                    .resolve(resolution, base_dir)?,
+            };
         let (occluders, occluders_record) = occluders.unzip();
         let (photo, occluders, original) = undistort(photo, occluders, undistortion);
         let view = ground::view(&camera, undistortion.as_ref());
-        let (proxy, proxy_record, cloud) = files.proxy(&settings.proxy, &view)?;
+        let (proxy, proxy_record, cloud) = match of_shot {
+            Some(of_shot) => (files.recorded(&of_shot.proxy)?, of_shot.proxy.clone(), None),
+            None => files.proxy(&settings.proxy, &view)?,
+        };
         let mut places = Places {
             view,
             ground: match (&proxy_record, &proxy) {
@@ -191,7 +216,14 @@ impl Scene {
         };
         let mut assembly = Assembly::new(camera, settings.objects.iter().map(|o| o.path.clone()));
         let mut objects = Vec::new();
-        for (i, object) in settings.objects.iter().enumerate() {
+        for record in of_shot.iter().flat_map(|of_shot| &of_shot.objects) {
+            objects.push(assembly.again(&mut files, record)?);
+        }
+        let to_place = match of_shot {
+            Some(_) => &[],
+            None => &settings.objects[..],
+        };
+        for (i, object) in to_place.iter().enumerate() {
             let key = format!("scene.objects[{i}]");
             let pixels = match &undistortion {
                 Some(way) => object.pixels.undistorted(way, &key)?,
@@ -213,7 +245,9 @@ impl Scene {
             files.warnings.extend(warning);
             objects.push(placed);
         }
-        files.warnings.extend(repeated(&objects));
+        if of_shot.is_none() {
+            files.warnings.extend(repeated(&objects));
+        }
         let (scene, lights) = assembly.into_scene(proxy);
         Ok(LoadedScene {
             scene,
@@ -244,62 +278,6 @@ impl Scene {
     }
 }
 
-impl SceneDescription {
-    /// Rebuilds the scene from the files it was made of; an error if one of them changed.
-    pub fn load(&self, base_dir: &Path) -> Result<LoadedScene, Error> {
-        let mut files = Files::new(base_dir, self.limits);
-        files.check("the background", &self.background.file)?;
-        let (photo, background) =
-            files.photo(&self.background.file.path, self.background.transfer)?;
-        let resolution = [background.width, background.height];
-        let occluders = match &self.occluders {
-            None => None,
-            Some(record) => {
-                files.check("the occluders' mask", record)?;
-                files.input("occluders", &record.path);
-                Some(files.mask(&record.path, resolution)?)
-            }
-        };
-        let undistortion = self.lens.as_ref().and_then(Undistortion::of);
-        let (photo, occluders, original) = undistort(photo, occluders, undistortion);
-        let proxy = match &self.proxy {
-            ProxyRecord::None => Proxy::None,
-            ProxyRecord::Plane(plane) => Proxy::Plane(*plane),
-            ProxyRecord::Mesh(record) => {
-                files.check_object("the proxy mesh", record)?;
-                Proxy::Mesh(files.proxy_mesh(&record.file.path)?.0)
-            }
-            ProxyRecord::Ground(ground) => ground::proxy(ground),
-        };
-        let mut assembly = Assembly::new(
-            self.camera,
-            self.objects.iter().map(|o| o.file.path.clone()),
-        );
-        for object in &self.objects {
-            files.check_object("the object", object)?;
-            assembly.add(&mut files, &object.file.path, |_| {
-                Ok((object.transform(), ()))
-            })?;
-        }
-        let (scene, lights) = assembly.into_scene(proxy);
-        Ok(LoadedScene {
-            scene,
-            photo,
-            original,
-            occluders,
-            description: self.clone(),
-            lights,
-            inputs: files.inputs,
-            warnings: files.warnings,
-        })
-    }
-
-    /// What the user says about effects.
-    pub fn effects(&self) -> &EffectsConfig {
-        &self.effects
-    }
-}
-
 /// A warning if objects of the same file stand at the same place.
 fn repeated(objects: &[ObjectRecord]) -> Option<String> {
     let mut seen = HashSet::new();
@@ -318,16 +296,16 @@ fn repeated(objects: &[ObjectRecord]) -> Option<String> {
 }
 
 /// Reads files relative to a folder and keeps the list.
-struct Files<'a> {
+pub(crate) struct Files<'a> {
     base_dir: &'a Path,
     limits: Limits,
-    inputs: Vec<Input>,
-    warnings: Vec<String>,
+    pub(crate) inputs: Vec<Input>,
+    pub(crate) warnings: Vec<String>,
     hashes: HashMap<PathBuf, String>,
 }
 
 impl<'a> Files<'a> {
-    fn new(base_dir: &'a Path, limits: Limits) -> Self {
+    pub(crate) fn new(base_dir: &'a Path, limits: Limits) -> Self {
         Self {
             base_dir,
             limits,
@@ -346,7 +324,7 @@ impl<'a> Files<'a> {
         }
     }
 
-    fn input(&mut self, role: &str, path: &Path) {
+    pub(crate) fn input(&mut self, role: &str, path: &Path) {
         let input = Input {
             role: role.into(),
             path: path.into(),
@@ -384,7 +362,7 @@ impl<'a> Files<'a> {
         Ok(hash)
     }
 
-    fn check(&mut self, role: &str, record: &FileRecord) -> Result<(), Error> {
+    pub(crate) fn check(&mut self, role: &str, record: &FileRecord) -> Result<(), Error> {
         let found = self.hash(role, &record.path)?;
         if found == record.blake3 {
             return Ok(());
@@ -397,7 +375,7 @@ impl<'a> Files<'a> {
         })
     }
 
-    fn check_object(&mut self, role: &str, record: &ObjectRecord) -> Result<(), Error> {
+    pub(crate) fn check_object(&mut self, role: &str, record: &ObjectRecord) -> Result<(), Error> {
         self.check(role, &record.file)?;
         for dependency in &record.dependencies {
             self.check(&format!("a part of {role}"), dependency)?;
@@ -405,7 +383,11 @@ impl<'a> Files<'a> {
         Ok(())
     }
 
-    fn photo(&mut self, path: &Path, transfer: Transfer) -> Result<(Photo, PhotoRecord), Error> {
+    pub(crate) fn photo(
+        &mut self,
+        path: &Path,
+        transfer: Transfer,
+    ) -> Result<(Photo, PhotoRecord), Error> {
         let photo =
             file::read_photo_within(self.base_dir.join(path), transfer, self.limits.photo())?;
         self.warnings.extend(photo.warnings.iter().cloned());
@@ -418,7 +400,11 @@ impl<'a> Files<'a> {
         Ok((photo, record))
     }
 
-    fn mask(&self, path: &Path, [width, height]: [u32; 2]) -> Result<Raster<f32>, Error> {
+    pub(crate) fn mask(
+        &self,
+        path: &Path,
+        [width, height]: [u32; 2],
+    ) -> Result<Raster<f32>, Error> {
         let mask = file::read_mask(self.base_dir.join(path))?;
         if (mask.width(), mask.height()) == (width as usize, height as usize) {
             return Ok(mask);
@@ -492,7 +478,10 @@ impl<'a> Files<'a> {
         })
     }
 
-    fn proxy_mesh(&mut self, path: &Path) -> Result<(TriangleMesh, ObjectRecord), Error> {
+    pub(crate) fn proxy_mesh(
+        &mut self,
+        path: &Path,
+    ) -> Result<(TriangleMesh, ObjectRecord), Error> {
         let (mut imported, record) = self.import("proxy", path)?;
         imported
             .mesh
@@ -503,7 +492,7 @@ impl<'a> Files<'a> {
 
 /// Puts objects together into one mesh. A file that several objects use is read once, and they share
 /// its materials.
-struct Assembly {
+pub(crate) struct Assembly {
     camera: Camera,
     mesh: TriangleMesh,
     materials: Vec<Material>,
@@ -515,7 +504,7 @@ struct Assembly {
 }
 
 impl Assembly {
-    fn new(camera: Camera, paths: impl Iterator<Item = PathBuf>) -> Self {
+    pub(crate) fn new(camera: Camera, paths: impl Iterator<Item = PathBuf>) -> Self {
         let mut pending = HashMap::new();
         for path in paths {
             *pending.entry(path).or_insert(0) += 1;
@@ -531,7 +520,7 @@ impl Assembly {
         }
     }
 
-    fn into_scene(self, proxy: Proxy) -> (Scene, Vec<PunctualLight>) {
+    pub(crate) fn into_scene(self, proxy: Proxy) -> (Scene, Vec<PunctualLight>) {
         let scene = Scene {
             mesh: self.mesh,
             materials: self.materials,
@@ -543,7 +532,7 @@ impl Assembly {
     }
 
     /// Adds the object in `path`; `place` gives the map from its file's coordinates to the world.
-    fn add<W>(
+    pub(crate) fn add<W>(
         &mut self,
         files: &mut Files,
         path: &Path,

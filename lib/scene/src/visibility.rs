@@ -91,10 +91,13 @@ fn without_extent(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
     ))
 }
 
-/// Two digits that count, with an exponent only where zeros would have to be counted.
+/// Two digits that count, or three, with an exponent only where zeros would have to be counted.
 pub(crate) fn short(value: f64) -> String {
     match value {
-        1e-3..10.0 => format!("{value:.2}"),
+        0.0 => "0".into(),
+        1e-3..1e-2 => format!("{value:.4}"),
+        1e-2..1e-1 => format!("{value:.3}"),
+        1e-1..10.0 => format!("{value:.2}"),
         10.0..1e5 => format!("{value:.0}"),
         _ => format!("{value:.1e}"),
     }
@@ -107,4 +110,25 @@ pub(crate) fn below_a_pixel((low, high): (Vec3, Vec3), camera: &Camera) -> Optio
     let distance = camera.position.as_dvec3().distance((low + high) * 0.5);
     let pixels = size * f64::from(camera.focal_px.max_element()) / distance;
     (distance > size && pixels < 1.0).then_some(pixels)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::short;
+
+    #[test]
+    fn no_length_is_rounded_to_nothing() {
+        for (value, text) in [
+            (0.0, "0"),
+            (0.0004, "4.0e-4"),
+            (0.004, "0.0040"),
+            (0.0123, "0.012"),
+            (0.9, "0.90"),
+            (1.8, "1.80"),
+            (1800.0, "1800"),
+            (8.7e15, "8.7e15"),
+        ] {
+            assert_eq!(short(value), text);
+        }
+    }
 }

@@ -73,13 +73,11 @@ impl CameraConfig {
             ("roll_deg", self.roll_deg.is_some()),
             ("heading_deg", self.heading_deg.is_some()),
         ];
+        // Where files may lack it, it is known when they are read.
         let lens = [
-            ("principal_px", self.principal_px.is_some()),
-            // A .chan file may lack it.
             ("fov_deg", self.fov_deg.is_some() && !is_chan(path)),
             ("focal_mm", self.focal_mm.is_some()),
             ("sensor_mm", self.sensor_mm.is_some()),
-            ("distortion", self.distortion.is_some()),
         ];
         let other = [
             ("file", of_transforms && self.file.is_some()),
@@ -91,6 +89,7 @@ impl CameraConfig {
                 !of_transforms && self.transforms_up.is_some(),
             ),
         ];
+        let stands_by = stands.iter().find(|(_, given)| *given).map(|s| s.0);
         let stands = stands.into_iter().filter(|_| of_transforms);
         let all = stands.chain(lens).chain(other);
         if let Some((name, _)) = all.clone().find(|(_, given)| *given) {
@@ -113,6 +112,9 @@ impl CameraConfig {
             let accepted = "metres above 0 of a unit of the file, for instance file_scale = 0.01";
             return Err(wrong("scene.camera.file_scale", scale, accepted));
         }
+        if self.fov_deg.is_some() {
+            self.field_of_view()?;
+        }
         let has_stand = self.position.is_some() && !of_transforms;
         Ok(CameraSettings::File(FileSettings {
             key,
@@ -127,7 +129,13 @@ impl CameraConfig {
                 true => Some(self.stand()?),
                 false => None,
             },
+            stands_by,
             fov_deg: self.fov_deg,
+            principal_px: finite_pixel("scene.camera.principal_px", self.principal_px)?,
+            distortion: match &self.distortion {
+                None => None,
+                Some(table) => Some(table.validate()?),
+            },
         }))
     }
 }
@@ -146,4 +154,182 @@ pub(super) fn world_up(key: &str, word: &Option<String>) -> Result<Option<WorldU
         Some("-y") => Some(WorldUp::MinusY),
         Some(other) => return Err(wrong_word(key, other, &["z", "y", "-y"])),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_cameras::Lens;
+    use glam::DVec2;
+
+    use super::*;
+
+    /// A camera at (0, 2, 0) that looks along -z, in one frame or more of each kind of file.
+    const CHAN: &str = "1001 0 2 0 0 0 0 40\n1002 1 2 0 0 0 0 40\n";
+    const WITHOUT_FOV: &str = "1 0 2 0 0 0 0\n";
+    const GLTF: &str = r#"{ "nodes": [{ "camera": 0, "translation": [0, 2, 0] }],
+        "cameras": [{ "perspective": { "yfov": 0.6981317007977318 } }] }"#;
+    const FRAME: &str =
+        r#""transform_matrix": [[1,0,0,0],[0,0,-1,0],[0,1,0,2],[0,0,0,1]], "fl_x": 549.4954838892"#;
+    const OPENCV: &str = "camera_matrix: [500, 0, 300, 0, 500, 200, 0, 0, 1]\n";
+
+    fn transforms(more: &str) -> String {
+        format!(r#"{{ "w": 600, "h": 400, "frames": [{{ "file_path": "a", {FRAME} {more} }}] }}"#)
+    }
+
+    /// The camera of `in/plate.1001.png`, of 600 x 400 pixels, with its lens if that bends lines. Of `lines` those of
+    /// `[scene.camera]` but for the name of its file.
+    fn resolved(
+        (name, text): (&str, &str),
+        lines: &str,
+    ) -> Result<(crate::camera::Camera, Option<Lens>), String> {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join(name), text).unwrap();
+        let config: CameraConfig = toml::from_str(&format!("file = \"{name}\"\n{lines}")).unwrap();
+        let settings = config.validate(Path::new("in/plate.1001.png"));
+        let found = settings.and_then(|s| s.resolve([600, 400], folder.path()));
+        let (camera, undistortion) = found.map_err(|e| e.to_string())?;
+        Ok((camera, undistortion.map(|u| *u.lens())))
+    }
+
+    const LENS: &str = "principal_px = [310.0, 190.0]\ndistortion = { k1 = -0.1 }\n";
+
+    #[test]
+    fn a_file_without_a_lens_takes_that_of_the_table() {
+        let plain = transforms("");
+        for file in [
+            ("shot.chan", CHAN),
+            ("shot.gltf", GLTF),
+            ("transforms.json", &plain),
+        ] {
+            let (camera, lens) = resolved(file, LENS).unwrap();
+            let lens = lens.unwrap();
+            let k1 = Distortion::brown_conrady([-0.1, 0.0, 0.0, 0.0], [0.0; 3], [0.0; 2]);
+            assert_eq!(Some(lens.distortion), k1, "{}", file.0);
+            assert_eq!(lens.principal_px, DVec2::new(310.0, 190.0));
+            assert!((lens.focal_px - 549.4954838892).abs().max_element() < 1e-6);
+            // The camera is that of the undistorted picture, which shows more.
+            assert!(camera.resolution > [600, 400] && camera.position == Vec3::new(0.0, 2.0, 0.0));
+            let (straight, none) = resolved(file, "principal_px = [310.0, 190.0]").unwrap();
+            assert_eq!(straight.principal_px, Vec2::new(310.0, 190.0));
+            assert!(none.is_none());
+        }
+    }
+
+    #[test]
+    fn a_lens_in_a_file_excludes_that_of_the_table() {
+        let bent = transforms(r#", "k1": 0.02"#);
+        let shifted = transforms(r#", "cx": 310"#);
+        let stands = "position = [0.0, 1.0, 0.0]\npitch_deg = 0.0\n";
+        for (file, lines, want) in [
+            (
+                ("transforms.json", &*bent),
+                "distortion = { k1 = 0.0 }",
+                "coefficients of a lens in scene.camera.file and scene.camera.distortion cannot both",
+            ),
+            (
+                ("transforms.json", &*shifted),
+                "principal_px = [310.0, 190.0]",
+                "an optical axis in scene.camera.file and scene.camera.principal_px cannot both",
+            ),
+            (
+                (
+                    "lens.yaml",
+                    &*format!("{OPENCV}distortion_coefficients: [0.1, 0, 0, 0]"),
+                ),
+                &*format!("{stands}distortion = {{ k1 = -0.1 }}"),
+                "coefficients of a lens in scene.camera.file and scene.camera.distortion cannot both",
+            ),
+        ] {
+            assert!(resolved(file, if file.0 == "lens.yaml" { stands } else { "" }).is_ok());
+            let error = resolved(file, lines).unwrap_err();
+            assert!(error.starts_with(want), "{error}");
+        }
+        assert!(
+            resolved(
+                ("lens.yaml", OPENCV),
+                &format!("{stands}distortion = {{ k1 = -0.1 }}")
+            )
+            .is_ok()
+        );
+    }
+
+    #[test]
+    fn a_key_that_the_file_has_is_refused() {
+        for key in [
+            "pitch_deg = 1.0",
+            "roll_deg = 1.0",
+            "heading_deg = 1.0",
+            "look_at = [0.0, 0.0, 0.0]",
+            "up = [0.0, 1.0, 0.0]",
+        ] {
+            let name = key.split(' ').next().unwrap();
+            let error = resolved(("shot.chan", CHAN), key).unwrap_err();
+            let want = format!("scene.camera.file and scene.camera.{name} cannot both be given");
+            assert!(error.starts_with(&want), "{error}");
+        }
+        for (file, want) in [
+            (
+                ("shot.chan", CHAN),
+                "a field of view in scene.camera.file and scene.camera.fov_deg cannot both",
+            ),
+            (
+                ("shot.gltf", GLTF),
+                "scene.camera.file and scene.camera.fov_deg cannot both",
+            ),
+        ] {
+            let error = resolved(file, "fov_deg = 40.0").unwrap_err();
+            assert!(error.starts_with(want), "{error}");
+        }
+        let error = resolved(("shot.chan", WITHOUT_FOV), "fov_deg = 190.0").unwrap_err();
+        assert!(error.starts_with("scene.camera.fov_deg is 190"), "{error}");
+        let stands = "position = [0.0, 1.0, 0.0]\npitch_deg = 0.0\nfile_scale = 2.0";
+        let error = resolved(("lens.yaml", OPENCV), stands).unwrap_err();
+        let want = "a lens alone in scene.camera.file and scene.camera.file_scale cannot both";
+        assert!(error.starts_with(want), "{error}");
+    }
+
+    #[test]
+    fn a_fisheye_beside_a_chan_has_the_field_of_view_that_is_written() {
+        let file = ("shot.chan", WITHOUT_FOV);
+        let (pinhole, none) = resolved(file, "fov_deg = 120.0").unwrap();
+        assert!(none.is_none() && (pinhole.focal_px.y - 200.0 / 3f32.sqrt()).abs() < 1e-3);
+        let fisheye = "fov_deg = 120.0\ndistortion = { fisheye = true }";
+        let lens = resolved(file, fisheye).unwrap().1.unwrap();
+        // 60 degrees are seen at 200 pixels, and the image's radius is the angle.
+        assert!((lens.focal_px.y - 200.0 / 60f64.to_radians()).abs() < 1e-3);
+    }
+
+    #[test]
+    fn folders_tell_photographs_of_the_same_name_apart() {
+        let frame = |name: &str, x: f64| {
+            format!(
+                r#"{{ "file_path": "{name}", "fl_x": 500,
+                "transform_matrix": [[1,0,0,{x}],[0,1,0,0],[0,0,1,0],[0,0,0,1]] }}"#
+            )
+        };
+        let frames = [frame("left/1.png", 1.0), frame("right/1.png", 2.0)].join(",");
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("transforms.json");
+        std::fs::write(&file, format!(r#"{{ "frames": [{frames}] }}"#)).unwrap();
+        let config = CameraConfig {
+            file: Some(file),
+            ..CameraConfig::default()
+        };
+        let x = |base_dir: &str, photo: &str| {
+            let settings = config.validate(Path::new(photo)).unwrap();
+            let found = settings.resolve([600, 400], &folder.path().join(base_dir));
+            found
+                .map(|(camera, _)| camera.position.x)
+                .map_err(|e| e.to_string())
+        };
+        assert_eq!(x("", "right/1.png"), Ok(2.0));
+        assert_eq!(x("", "left/1.png"), Ok(1.0));
+        // From a configuration in the folder itself.
+        assert_eq!(x("right", "1.png"), Ok(2.0));
+        assert!(
+            x("", "1.png")
+                .unwrap_err()
+                .contains("image = \"right/1.png\"")
+        );
+    }
 }

@@ -126,6 +126,15 @@ impl ProxyConfig {
                 return Err(missing(&format!("scene.proxy.{of}"), &remedy));
             }
         }
+        for (name, path) in [
+            ("mesh", &self.mesh),
+            ("points", &self.points),
+            ("points_pose", &self.points_pose),
+        ] {
+            if let Some(path) = path {
+                named(&format!("scene.proxy.{name}"), path)?;
+            }
+        }
         match given[..] {
             ["plane"] => self.plane.map_or(Ok(ProxySettings::None), |p| p.validate()),
             ["mesh"] => Ok(ProxySettings::Mesh(self.mesh.clone().unwrap_or_default())),
@@ -229,7 +238,7 @@ impl ProxyConfig {
 
 impl PlaneConfig {
     fn validate(&self) -> Result<ProxySettings, Error> {
-        let point = finite_point("scene.proxy.plane.point", self.point)?;
+        let point = near_point("scene.proxy.plane.point", self.point)?;
         let normal = finite_point("scene.proxy.plane.normal", self.normal)?;
         let unit = normal.as_dvec3().normalize_or_zero().as_vec3();
         if unit == Vec3::ZERO {

@@ -37,6 +37,7 @@ impl ViewConfig {
                 "name another photograph of the place: background = \"behind.jpg\"",
             )
         })?;
+        named(&key, &background)?;
         if scene.background.as_ref() == Some(&background) {
             let accepted = "another photograph than scene.background";
             return Err(wrong(

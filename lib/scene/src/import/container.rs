@@ -70,11 +70,9 @@ impl Folder {
         }
         // Some exporters forget to encode: the name as it stands is the second guess.
         let decoded = percent_decoded(uri);
-        if !self.limits.allow_outside && (leaves_folder(&decoded) || leaves_folder(uri)) {
-            return Err(io::Error::new(
-                io::ErrorKind::PermissionDenied,
-                "it lies outside of the object's folder; copy it into that, or set scene.limits.allow_outside = true",
-            ));
+        let allow_outside = self.limits.allow_outside;
+        if !allow_outside && (leaves_folder(&decoded) || leaves_folder(uri)) {
+            return Err(outside());
         }
         let (decoded, literal) = (self.path.join(decoded), self.path.join(uri));
         let found = if decoded.is_file() || !literal.is_file() {
@@ -82,6 +80,9 @@ impl Folder {
         } else {
             literal
         };
+        if !allow_outside && !self.holds(&found)? {
+            return Err(outside());
+        }
         // Opened to refuse now what is no regular file, though it be read later.
         let bytes = dipir_files::open(&found)?.metadata()?.len();
         self.limits
@@ -93,6 +94,22 @@ impl Folder {
         }
         Ok(found)
     }
+
+    /// Whether `file` lies in the folder once links are followed.
+    fn holds(&self, file: &Path) -> io::Result<bool> {
+        let folder = match self.path.as_os_str().is_empty() {
+            true => Path::new("."),
+            false => &self.path,
+        };
+        Ok(file.canonicalize()?.starts_with(folder.canonicalize()?))
+    }
+}
+
+fn outside() -> io::Error {
+    io::Error::new(
+        io::ErrorKind::PermissionDenied,
+        "it lies outside of the object's folder; copy it into that, or set scene.limits.allow_outside = true",
+    )
 }
 
 /// Whether a relative path climbs out of the folder that it starts from.

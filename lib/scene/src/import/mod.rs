@@ -32,7 +32,7 @@ use crate::light::PunctualLight;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
 use crate::printable::printable;
-use crate::texture::{Texture, check_sizes};
+use crate::texture::{ImageSource, Texture, check_sizes};
 
 /// An object as its file describes it, node transforms applied and instances expanded.
 #[derive(Clone, Debug)]
@@ -107,6 +107,11 @@ pub fn load_object_within(path: &Path, limits: &Limits) -> Result<Imported, Erro
     };
     let mut imported = loaded.map_err(|e| e.in_file(path))?;
     imported.dependencies = folder.into_used();
+    for texture in &mut imported.textures {
+        if let ImageSource::Bytes { name, .. } = &mut texture.image {
+            *name = format!("{}: {name}", path.display());
+        }
+    }
     Ok(imported)
 }
 

@@ -1,4 +1,4 @@
-//! STL files, binary and ASCII.
+//! STL files, binary and ASCII. That they have no unit is said where objects are placed, [`crate::plausibility`].
 use std::collections::HashMap;
 
 use glam::Vec3;
@@ -136,12 +136,6 @@ impl<'a> Mesh<'a> {
             });
         }
         self.mesh.materials = vec![0; self.mesh.indices.len()];
-        Ok(Imported {
-            warnings: vec![
-                "STL has no unit; its numbers are read as metres (for millimetres write scale = 0.001)"
-                    .into(),
-            ],
-            ..Imported::of(self.mesh, grey())
-        })
+        Ok(Imported::of(self.mesh, grey()))
     }
 }

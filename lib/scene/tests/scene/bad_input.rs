@@ -303,6 +303,32 @@ fn a_png_of_zero_bytes_is_refused_when_it_is_decoded() {
 }
 
 #[test]
+fn a_damaged_texture_inside_a_model_is_told_with_the_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("car.glb");
+    let mut glb = Glb::triangle(json!({ "material": 0 }));
+    glb.push(
+        "images",
+        json!({ "uri": "data:image/png;base64,iVBORw0KGgo=" }),
+    );
+    glb.push("images", json!({ "uri": "data:image/png;base64,AAAA" }));
+    for image in 0..2 {
+        glb.push("textures", json!({ "source": image }));
+    }
+    glb.push(
+        "materials",
+        json!({ "normalTexture": { "index": 0 }, "emissiveTexture": { "index": 1 }, "emissiveFactor": [1, 1, 1] }),
+    );
+    std::fs::write(&path, glb.bytes()).unwrap();
+    let imported = load_object(&path).unwrap();
+    assert_eq!(imported.textures.len(), 2);
+    for texture in &imported.textures {
+        let error = texture.decode().unwrap_err().to_string();
+        assert!(error.contains("car.glb: images["), "{error}");
+    }
+}
+
+#[test]
 fn a_node_with_two_parents_or_a_cycle_is_refused() {
     let mut glb = Glb::triangle(json!({}));
     glb.json["scenes"] = json!([{ "nodes": [0] }]);
@@ -409,6 +435,48 @@ fn files_outside_of_the_objects_folder_are_refused_unless_allowed() {
     assert!(load(absolute, true).is_ok());
     assert!(load("./x/../t.bin", false).is_err(), "x does not exist");
     assert!(load("./t.bin", false).is_ok());
+}
+
+#[cfg(unix)]
+#[test]
+fn links_that_lead_out_of_the_objects_folder_are_refused_unless_allowed() {
+    use std::os::unix::fs::symlink;
+    let folder = tempfile::tempdir().unwrap();
+    let inside = folder.path().join("models");
+    let outside = folder.path().join("other");
+    for made in [&inside, &outside] {
+        std::fs::create_dir(made).unwrap();
+        let bytes = TRIANGLE.map(f32::to_le_bytes);
+        std::fs::write(made.join("t.bin"), bytes.as_flattened()).unwrap();
+    }
+    symlink(outside.join("t.bin"), inside.join("out.bin")).unwrap();
+    symlink("t.bin", inside.join("in.bin")).unwrap();
+    symlink("../other", inside.join("textures")).unwrap();
+    symlink(&inside, folder.path().join("way")).unwrap();
+    let load = |through: &str, uri: &str, allow_outside: bool| {
+        let mut glb = Glb::triangle(json!({}));
+        glb.json["buffers"] = json!([{ "uri": uri, "byteLength": 36 }]);
+        let path = folder.path().join(through).join("t.gltf");
+        std::fs::write(&path, glb.json.to_string()).unwrap();
+        let limits = Limits {
+            allow_outside,
+            ..Limits::default()
+        };
+        load_object_within(&path, &limits).map_err(|e| e.to_string())
+    };
+    for through in ["models", "way"] {
+        for uri in ["out.bin", "textures/t.bin"] {
+            let error = load(through, uri, false).unwrap_err();
+            assert!(
+                error.ends_with(
+                    ": it lies outside of the object's folder; copy it into that, or set scene.limits.allow_outside = true"
+                ),
+                "{uri}: {error}"
+            );
+            assert!(load(through, uri, true).is_ok());
+        }
+        assert!(load(through, "in.bin", false).is_ok());
+    }
 }
 
 #[test]

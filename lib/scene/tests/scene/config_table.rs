@@ -114,6 +114,14 @@ fn wrong_values_are_quoted_with_the_accepted_form() {
         "scene.objects[0].position is [0.0, NaN, 0.0]; accepted: three finite numbers [x, y, z]"
     );
     assert_eq!(
+        message(&object("position = [3e38, 0, 0]")),
+        "scene.objects[0].position is [3e38, 0.0, 0.0]; accepted: metres, at most ten million from the origin, for instance [0.5, 0.0, -1.0]"
+    );
+    assert_eq!(
+        message(&table("", "[proxy]\nplane = { point = [0, 0, -2e7] }")),
+        "scene.proxy.plane.point is [0.0, 0.0, -20000000.0]; accepted: metres, at most ten million from the origin, for instance [0.5, 0.0, -1.0]"
+    );
+    assert_eq!(
         message(&object("rest = \"floor\"")),
         "scene.objects[0].rest is \"floor\"; accepted: \"proxy\" or \"position\""
     );
@@ -129,6 +137,28 @@ fn wrong_values_are_quoted_with_the_accepted_form() {
         message(&table("", "[effects]\nmax_depth = 9")),
         "scene.effects.max_depth is 9; accepted: interactions from 1 to 8, for instance max_depth = 3"
     );
+}
+
+#[test]
+fn an_empty_path_is_refused_by_its_key() {
+    for (table, key) in [
+        (table("", "[proxy]\nmesh = \"\""), "scene.proxy.mesh"),
+        (table("", "[proxy]\npoints = \" \""), "scene.proxy.points"),
+        (table("occluders = \"\"", ""), "scene.occluders"),
+        (
+            format!("background = \"\"\n{OBJECT}{CAMERA}"),
+            "scene.background",
+        ),
+        (
+            format!("background = \"photo.jpg\"\n[[objects]]\npath = \"\"\n{CAMERA}"),
+            "scene.objects[0].path",
+        ),
+    ] {
+        assert_eq!(
+            message(&table),
+            format!("{key} is empty; accepted: the name of a file")
+        );
+    }
 }
 
 #[test]

@@ -1,0 +1,133 @@
+//! A scene again, from what `scene.json` says of it.
+use std::path::Path;
+
+use dipir_cameras::Pose;
+
+use crate::camera::{Camera, CameraSettings};
+use crate::config::EffectsConfig;
+use crate::description::{ObjectRecord, ProxyRecord, SceneDescription};
+use crate::error::Error;
+use crate::ground;
+use crate::proxy::Proxy;
+use crate::scene::{Assembly, Files, LoadedScene, undistort};
+use crate::undistortion::Undistortion;
+
+/// By how much the shapes of a shot's photograph and a frame may differ, relative.
+const SAME_SHAPE: f64 = 0.01;
+
+impl SceneDescription {
+    /// Rebuilds the scene from the files it was made of; an error if one of them changed.
+    pub fn load(&self, base_dir: &Path) -> Result<LoadedScene, Error> {
+        let mut files = Files::new(base_dir, self.limits);
+        files.check("the background", &self.background.file)?;
+        let (photo, background) =
+            files.photo(&self.background.file.path, self.background.transfer)?;
+        let resolution = [background.width, background.height];
+        let occluders = match &self.occluders {
+            None => None,
+            Some(record) => {
+                files.check("the occluders' mask", record)?;
+                files.input("occluders", &record.path);
+                Some(files.mask(&record.path, resolution)?)
+            }
+        };
+        let undistortion = self.lens.as_ref().and_then(Undistortion::of);
+        let (photo, occluders, original) = undistort(photo, occluders, undistortion);
+        let proxy = files.recorded(&self.proxy)?;
+        let mut assembly = Assembly::new(
+            self.camera,
+            self.objects.iter().map(|o| o.file.path.clone()),
+        );
+        for object in &self.objects {
+            assembly.again(&mut files, object)?;
+        }
+        let (scene, lights) = assembly.into_scene(proxy);
+        Ok(LoadedScene {
+            scene,
+            photo,
+            original,
+            occluders,
+            description: self.clone(),
+            lights,
+            inputs: files.inputs,
+            warnings: files.warnings,
+        })
+    }
+
+    /// What the user says about effects.
+    pub fn effects(&self) -> &EffectsConfig {
+        &self.effects
+    }
+
+    /// The camera, and what undoes its lens's distortion, for a picture of `resolution` from the same place.
+    ///
+    /// # Errors
+    /// If that picture has another shape.
+    pub(crate) fn seen_in(
+        &self,
+        resolution: [u32; 2],
+    ) -> Result<(Camera, Option<Undistortion>), Error> {
+        let [w, h] = resolution.map(f64::from);
+        let photo = [self.background.width, self.background.height];
+        let shape = f64::from(photo[0]) / f64::from(photo[1]);
+        if (w / h / shape - 1.0).abs() > SAME_SHAPE {
+            return Err(Error::Config {
+                key: "scene.background".into(),
+                value: format!("a frame of {w} x {h} pixels"),
+                accepted: format!(
+                    "one of the shape of the shot's photograph, {} x {}, whose camera stands still",
+                    photo[0], photo[1]
+                ),
+            });
+        }
+        let lens = self.lens.as_ref().map(|lens| lens.scaled([w, h]));
+        Ok(match lens.as_ref().and_then(Undistortion::of) {
+            Some(way) => {
+                let pose = Pose {
+                    position: self.camera.position.as_dvec3(),
+                    rotation: self.camera.rotation.as_dmat3(),
+                };
+                (way.camera(&pose), Some(way))
+            }
+            None => (self.camera.scaled(resolution), None),
+        })
+    }
+}
+
+impl CameraSettings {
+    /// Whether every picture has the same camera.
+    pub(crate) fn stands_still(&self, base_dir: &Path) -> bool {
+        match self {
+            Self::LookAt { .. } => true,
+            Self::File(file) => dipir_cameras::file::has_one(&base_dir.join(&file.path)),
+        }
+    }
+}
+
+impl Files<'_> {
+    /// A proxy as it is written down.
+    pub(crate) fn recorded(&mut self, record: &ProxyRecord) -> Result<Proxy, Error> {
+        Ok(match record {
+            ProxyRecord::None => Proxy::None,
+            ProxyRecord::Plane(plane) => Proxy::Plane(*plane),
+            ProxyRecord::Mesh(record) => {
+                self.check_object("the proxy mesh", record)?;
+                Proxy::Mesh(self.proxy_mesh(&record.file.path)?.0)
+            }
+            ProxyRecord::Ground(ground) => ground::proxy(ground),
+        })
+    }
+}
+
+impl Assembly {
+    /// Adds an object where it is written down to be; an error if its files changed.
+    pub(crate) fn again(
+        &mut self,
+        files: &mut Files,
+        object: &ObjectRecord,
+    ) -> Result<ObjectRecord, Error> {
+        files.check_object("the object", object)?;
+        let map = object.transform();
+        Ok(self.add(files, &object.file.path, |_| Ok((map, ())))?.0)
+    }
+}
