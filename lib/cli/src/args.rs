@@ -51,6 +51,10 @@ pub struct CommonArgs {
     #[arg(long, value_name = "DIR", hide = true)]
     pub light: Option<PathBuf>,
 
+    /// Folder of the scene stage of a shot's photograph, where objects and ground are as in every frame
+    #[arg(long, value_name = "DIR", hide = true)]
+    pub placed: Option<PathBuf>,
+
     #[command(flatten)]
     #[allow(missing_docs)]
     pub output: OutputArgs,

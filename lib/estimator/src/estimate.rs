@@ -78,6 +78,17 @@ impl LightEstimate {
         self
     }
 
+    /// The same light with all radiance times a factor, for a photograph that is so much brighter.
+    pub fn scaled(mut self, factor: f32) -> Self {
+        self.reference *= f64::from(factor);
+        self.base
+            .as_flattened_mut()
+            .iter_mut()
+            .for_each(|v| *v *= factor);
+        self.peak.iter_mut().for_each(|v| *v *= factor);
+        self
+    }
+
     /// The direction of the strongest source in the world: the one that is known, else the most probable.
     pub fn mode(&self) -> Vec3 {
         if let Some(source) = &self.source {

@@ -79,6 +79,12 @@ impl Visible {
         }
     }
 
+    /// The same part of a photograph in which nothing is clipped.
+    pub fn unclipped(mut self) -> Self {
+        self.clipped.fill(0.0);
+        self
+    }
+
     /// The same part with all radiance times a factor; a smaller one, if it took radiance beyond all numbers.
     pub fn scaled(self, factor: f32) -> Self {
         let texels = self.map.texels().iter();

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use dipir_cli::exit::{Usage, printable};
 use dipir_cli::session::Session;
 use dipir_imaging::facts::Facts;
-use dipir_scene::config::{CameraConfig, ObjectConfig, SceneConfig};
+use dipir_scene::config::{CameraConfig, SceneConfig};
 use serde_json::json;
 
 use crate::composite::table::CompositeTable;
@@ -42,13 +42,13 @@ pub fn exposure_stops(session: &Session, path: &Path) -> anyhow::Result<Option<f
 /// What sets the frame in `path`, exposed by `stops` more, in place of the session's photograph, as `KEY=VALUE`.
 ///
 /// # Errors
-/// If there is no such file, or what is placed or seen in it cannot be told from the configuration.
+/// If there is no such file or mask, or its camera cannot be told from the configuration.
 pub fn overrides(session: &Session, path: &Path, stops: f64) -> anyhow::Result<Vec<String>> {
     let wrong = |why: &str| Usage(printable(&format!("{}: {why}", path.display())));
     let scene: SceneConfig = session.config.table("scene")?;
-    let (true, Some(name)) = (path.is_file(), path.file_name()) else {
+    if !path.is_file() {
         return Err(wrong("there is no such file").into());
-    };
+    }
     let text = |path: &Path| match path.to_str() {
         Some(text) => Ok(json!(text).to_string()),
         None => Err(wrong("its path is not UTF-8")),
@@ -62,21 +62,27 @@ pub fn overrides(session: &Session, path: &Path, stops: f64) -> anyhow::Result<V
         let exposure_ev = f64::from(composite.exposure_ev) + stops;
         set.push(format!("composite.exposure_ev={exposure_ev:.3}"));
     }
+    if let Some(mask) = mask_of(&scene, path) {
+        if !session.config.base_dir().join(&mask).is_file() {
+            let mask = mask.display();
+            return Err(wrong(&format!("its mask {mask} is missing")).into());
+        }
+        set.push(format!("scene.occluders={}", text(&mask)?));
+    }
     let Some(camera) = &scene.camera else {
         return Ok(set);
     };
-    if let Some(file) = &camera.file {
-        if dipir_cameras::file::has_one(&session.config.base_dir().join(file)) {
-            return Ok(set);
-        }
-        refuse_pixels(&scene.objects)?;
+    if let Some(file) = &camera.file
+        && dipir_cameras::file::has_one(&session.config.base_dir().join(file))
+    {
+        return Ok(set);
     }
     if let Some(key) = key_of_frame(camera)? {
         let value = match key {
             "frame" => number(path)
                 .ok_or_else(|| wrong("its name does not end in the number of a frame of .chan"))?
                 .to_string(),
-            _ => text(Path::new(name))?,
+            _ => text(&std::path::absolute(path)?)?,
         };
         set.push(format!("scene.camera.{key}={value}"));
     }
@@ -98,29 +104,34 @@ fn key_of_frame(camera: &CameraConfig) -> anyhow::Result<Option<&'static str>> {
     })
 }
 
-/// The digits at the end of a file's name.
-fn number(path: &Path) -> Option<u32> {
-    let stem = path.file_stem()?.to_str()?;
-    let head = stem.trim_end_matches(|c: char| c.is_ascii_digit());
-    stem[head.len()..].parse().ok()
+/// The mask of a frame: named as the photograph's is after the photograph, or with the frame's number where that has the
+/// photograph's. `None` if the photograph's own is the mask of all.
+fn mask_of(scene: &SceneConfig, frame: &Path) -> Option<PathBuf> {
+    let mask = scene.occluders.as_ref()?;
+    let (of_mask, of_photo) = (stem(mask)?, stem(scene.background.as_ref()?)?);
+    let of_frame = stem(frame)?;
+    let [(head, n), (_, photo), (_, number)] = [of_mask, of_photo, of_frame].map(split);
+    let name = match (of_mask == of_photo, n == photo) {
+        (true, _) => of_frame.to_string(),
+        (false, true) if !n.is_empty() && !number.is_empty() => format!("{head}{number}"),
+        _ => return None,
+    };
+    let extension = mask.extension()?.to_str()?;
+    Some(mask.with_file_name(format!("{name}.{extension}")))
 }
 
-/// Refuses what would be placed anew in every frame.
-fn refuse_pixels(objects: &[ObjectConfig]) -> anyhow::Result<()> {
-    for (i, object) in objects.iter().enumerate() {
-        let keys = [
-            ("at_pixel", object.at_pixel.is_some()),
-            ("to_pixel", object.to_pixel.is_some()),
-            ("place", object.place.is_some()),
-        ];
-        if let Some((key, _)) = keys.iter().find(|key| key.1) {
-            let message = format!(
-                "scene.objects[{i}].{key} is found anew in every frame, and the camera moves: write position and yaw_deg"
-            );
-            return Err(Usage(message).into());
-        }
-    }
-    Ok(())
+fn stem(path: &Path) -> Option<&str> {
+    path.file_stem()?.to_str()
+}
+
+/// A name, and the digits at its end.
+fn split(stem: &str) -> (&str, &str) {
+    stem.split_at(stem.trim_end_matches(|c: char| c.is_ascii_digit()).len())
+}
+
+/// The number at the end of a file's name.
+fn number(path: &Path) -> Option<u32> {
+    split(stem(path)?).1.parse().ok()
 }
 
 #[cfg(test)]
@@ -136,6 +147,38 @@ mod tests {
             ("99999999999.jpg", None),
         ] {
             assert_eq!(number(Path::new(name)), wanted, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_frame_has_the_mask_of_its_number() {
+        let mask = |photo: &str, mask: &str, frame: &str| {
+            let scene = SceneConfig {
+                background: Some(photo.into()),
+                occluders: Some(mask.into()),
+                ..SceneConfig::default()
+            };
+            let found = mask_of(&scene, Path::new(frame))?;
+            Some(found.to_str().unwrap().to_string())
+        };
+        for (photo, given, frame, wanted) in [
+            (
+                "a/f.1001.jpg",
+                "m/roto.1001.png",
+                "b/f.1002.jpg",
+                Some("m/roto.1002.png"),
+            ),
+            ("f_01.jpg", "m/f_01.png", "f_07.jpg", Some("m/f_07.png")),
+            ("left.jpg", "m/left.png", "right.jpg", Some("m/right.png")),
+            ("f_01.jpg", "bonnet.png", "f_02.jpg", None),
+            ("f_01.jpg", "roto_7.png", "f_02.jpg", None),
+            ("f_01.jpg", "roto_01.png", "still.jpg", None),
+        ] {
+            assert_eq!(
+                mask(photo, given, frame).as_deref(),
+                wanted,
+                "{given} {frame}"
+            );
         }
     }
 }

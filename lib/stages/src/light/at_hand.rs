@@ -14,6 +14,7 @@ use dipir_scene::scene::LoadedScene;
 
 use crate::composite::table::{CompositeTable, Tone};
 use crate::light::estimate::{distribution, estimate};
+use crate::light::exposed;
 use crate::light::folder::{self, Recovered};
 use crate::light::request::first_light;
 use crate::light::surroundings::surroundings;
@@ -99,7 +100,7 @@ pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand
         map: light.surroundings.map(Arc::new),
         tone: match composite.tone {
             Some(tone) => tone.curves(),
-            None => Some(light.tone),
+            None => exposed::tone(loaded.taken(), light.tone),
         },
         origin,
     })
@@ -160,7 +161,7 @@ fn estimated(
         found.lobes.truncate(found.sources);
         return Ok((found.lobes, found.smooth, found.seen));
     }
-    let (estimate, seen) = distribution(session, table, loaded)?;
+    let (estimate, seen, _) = distribution(session, table, loaded)?;
     Ok(match estimate.source_lobe() {
         Some(source) => (vec![source], estimate.base_map(), seen),
         None => (Vec::new(), estimate.map(), seen),

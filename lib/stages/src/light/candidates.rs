@@ -1,7 +1,7 @@
 //! The contact sheet of the lights that the photograph allows: the object under each, to choose by eye.
 use std::sync::Arc;
 
-use dipir_estimator::{BORDER_DEG, Candidate, Visible, merged};
+use dipir_estimator::{Candidate, merged};
 use dipir_imaging::composite::composite;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::tone::ToneCurves;
@@ -14,6 +14,7 @@ use dipir_scene::scene::LoadedScene;
 use glam::Vec3;
 
 use super::estimate::Estimated;
+use super::exposed;
 use super::surroundings::with_others;
 use crate::interruption;
 use crate::scene::transport::Frame;
@@ -28,8 +29,22 @@ const SAMPLES: u32 = 16;
 const MAP: [usize; 2] = [128, 64];
 /// Pixels between pictures; under each is a bar this high, as long as its light is probable.
 const GAP: usize = 6;
+/// Digits 1 to 9: five rows of three bits, from the top.
+const DIGITS: [u16; 9] = [
+    0b010_110_010_010_111,
+    0b110_001_010_100_111,
+    0b110_001_010_001_110,
+    0b101_101_111_001_001,
+    0b111_100_110_001_110,
+    0b011_100_110_101_010,
+    0b111_001_010_010_010,
+    0b010_101_010_101_010,
+    0b010_101_011_001_110,
+];
+/// Pixels of a bit of a digit.
+const BIT: usize = 3;
 
-/// The object under each light in the order of their numbers, row by row. The bar under a picture is as long as its
+/// The object under each light with the number that chooses it, row by row. The bar under a picture is as long as its
 /// light is probable.
 pub(super) fn sheet(
     loaded: &LoadedScene,
@@ -43,9 +58,10 @@ pub(super) fn sheet(
         stop: Stop::Samples(SAMPLES),
         ..frame.render_settings()
     };
-    let photo = &loaded.photo.image;
-    let seen = Visible::new(photo, &loaded.scene.camera, MAP[0], MAP[1], BORDER_DEG);
-    let tone = ToneCurves::identity();
+    let (photo, taken) = (&loaded.photo.image, loaded.taken());
+    let seen = exposed::visible(taken, photo, &loaded.scene.camera, MAP);
+    let tone = exposed::tone(taken, ToneCurves::identity());
+    let gain = exposed::gain(taken, photo);
     let picture = |c: &Candidate| -> anyhow::Result<Raster<Vec3>> {
         let (smooth, sources) = match c.direction {
             Some(_) => (estimated.estimate.base_map(), &c.lobes[..1]),
@@ -61,10 +77,15 @@ pub(super) fn sheet(
             .render(&light, simulation, &settings, &mut |_| interruption())
             .map_err(crate::render_error)?
             .film;
-        let object = tone.apply_object(&LinearImage(film.object), &film.alpha);
+        let object = LinearImage(film.object);
+        let object = match &tone {
+            Some(tone) => tone.apply_object(&object, &film.alpha),
+            None => object,
+        };
         let shadow = LinearImage(film.shadow);
         let linear = composite(&frame.background, &object, &film.alpha, &shadow)?;
-        Ok(loaded.photo.transfer.encode(&linear).0)
+        let shown = LinearImage(linear.0.map(|p| *p * gain));
+        Ok(loaded.photo.transfer.encode(&shown).0)
     };
     let candidates = &estimated.lights;
     let pictures = candidates
@@ -91,6 +112,7 @@ fn laid_out(pictures: &[Raster<Vec3>], chances: &[f64]) -> DisplayImage {
                 *sheet.get_mut(left + x, top + y) = *picture.get(x, y);
             }
         }
+        number(&mut sheet, n, [left, top]);
         let length = (chances[n] * w as f64).round() as usize;
         for y in 0..GAP {
             for x in 0..w {
@@ -102,22 +124,60 @@ fn laid_out(pictures: &[Raster<Vec3>], chances: &[f64]) -> DisplayImage {
     DisplayImage(sheet)
 }
 
+/// Writes the number of picture `n`, counted from 0, into its corner: white on black. Beyond 9 there is none.
+fn number(sheet: &mut Raster<Vec3>, n: usize, [left, top]: [usize; 2]) {
+    let Some(digit) = DIGITS.get(n) else { return };
+    let is_lit = |column: usize, row: usize| {
+        (1..4).contains(&column)
+            && (1..6).contains(&row)
+            && digit >> (14 - 3 * (row - 1) - (column - 1)) & 1 == 1
+    };
+    for (y, x) in (0..7 * BIT).flat_map(|y| (0..5 * BIT).map(move |x| (y, x))) {
+        let (x_at, y_at) = (left + x, top + y);
+        if x_at < sheet.width() && y_at < sheet.height() {
+            let lit = if is_lit(x / BIT, y / BIT) { 1.0 } else { 0.0 };
+            *sheet.get_mut(x_at, y_at) = Vec3::splat(lit);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
+    fn every_picture_has_its_number() {
+        let pictures = vec![Raster::filled(40, 30, Vec3::splat(0.5)); 9];
+        let sheet = laid_out(&pictures, &[0.1; 9]).0;
+        // The bits of a digit as they stand in the sheet.
+        let read = |n: usize| {
+            let (left, top) = (
+                GAP + n % COLUMNS * (40 + GAP),
+                GAP + n / COLUMNS * (30 + 3 * GAP),
+            );
+            let bits = (0..15).map(|k| {
+                let (x, y) = (left + BIT + k % 3 * BIT, top + BIT + k / 3 * BIT);
+                u16::from(sheet.get(x, y).x == 1.0)
+            });
+            bits.fold(0, |all, bit| all << 1 | bit)
+        };
+        assert_eq!((0..9).map(read).collect::<Vec<_>>(), DIGITS);
+        // A seven: a bar above, the rest leans to the left.
+        assert_eq!(read(6), 0b111_001_010_010_010);
+    }
+
+    #[test]
     fn pictures_stand_in_rows_of_four_over_bars_of_their_probability() {
         let pictures: Vec<_> = (0..6)
-            .map(|n| Raster::filled(20, 10, Vec3::splat(n as f32 / 6.0)))
+            .map(|n| Raster::filled(40, 30, Vec3::splat(n as f32 / 6.0)))
             .collect();
         let chances = [0.5, 0.1, 0.1, 0.1, 0.1, 0.1];
         let sheet = laid_out(&pictures, &chances).0;
-        assert_eq!((sheet.width(), sheet.height()), (4 * 26 + 6, 2 * 28 + 6));
+        assert_eq!((sheet.width(), sheet.height()), (4 * 46 + 6, 2 * 48 + 6));
         // The sixth is the second of the second row.
-        assert_eq!(sheet.get(GAP + 26 + 3, GAP + 28 + 3).x, 5.0 / 6.0);
-        let bar = GAP + 10 + GAP / 2;
-        let lit = (0..20).filter(|x| sheet.get(GAP + x, bar).x > 0.8).count();
-        assert_eq!(lit, 10);
+        assert_eq!(sheet.get(GAP + 46 + 30, GAP + 48 + 3).x, 5.0 / 6.0);
+        let bar = GAP + 30 + GAP / 2;
+        let lit = (0..40).filter(|x| sheet.get(GAP + x, bar).x > 0.8).count();
+        assert_eq!(lit, 20);
     }
 }

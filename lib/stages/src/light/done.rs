@@ -1,6 +1,7 @@
 //! What the light stage prints when it has run.
 use std::fmt;
 
+use dipir_cli::output::json_path;
 use dipir_estimator::grid::relative;
 use dipir_estimator::posterior::words;
 use dipir_optimize::history::Row;
@@ -23,7 +24,7 @@ impl Done {
     pub fn to_json(&self) -> Value {
         let history = &self.found.history;
         json!({
-            "folder": self.folder,
+            "folder": json_path(&self.folder),
             "size": self.camera.resolution,
             "iterations": history.len(),
             "wanted": self.wanted,

@@ -66,8 +66,7 @@ pub(super) fn estimate(
     loaded: &LoadedScene,
     lobes: usize,
 ) -> anyhow::Result<Estimated> {
-    let (estimate, seen) = distribution(session, table, loaded)?;
-    let known = known_sun(session, table, loaded, &estimate)?;
+    let (estimate, seen, known) = distribution(session, table, loaded)?;
     if let Some(below) = known.and_then(|sun| sun.elevation).filter(|e| e.deg < 0.0) {
         session.warn(&format!(
             "the sun is {:.0} degrees below the horizon, as [light] sun or the photograph's time and place say, and \
@@ -117,16 +116,31 @@ pub(super) fn estimate(
     })
 }
 
-/// The light as a distribution, with what is known of the sun, and what the other photographs of the place show of it.
+/// The light as a distribution with what is known of the sun, what the other photographs of the place show of it, and
+/// what is known.
 pub(super) fn distribution(
     session: &Session,
     table: &LightTable,
     loaded: &LoadedScene,
-) -> anyhow::Result<(LightEstimate, Vec<Visible>)> {
+) -> anyhow::Result<(LightEstimate, Vec<Visible>, Option<KnownSun>)> {
     let (estimate, seen) = views::estimate(session, loaded)?;
-    Ok(match known_sun(session, table, loaded, &estimate)? {
-        Some(sun) => (estimate.knowing(&sun), seen),
-        None => (estimate, seen),
+    let known = known_sun(session, table, loaded, &estimate)?;
+    let estimate = match &known {
+        Some(sun) => estimate.knowing(sun),
+        None => estimate,
+    };
+    Ok((estimate, seen, known))
+}
+
+/// What to say where the sun that is known and the one of a drawn shadow are more than three standard deviations apart.
+fn contradiction(what: &str, sun: Angle, shadow: Angle) -> Option<String> {
+    let apart = (sun.deg - shadow.deg + 180.0).rem_euclid(360.0) - 180.0;
+    (apart.abs() > 3.0 * sun.sigma_deg.hypot(shadow.sigma_deg)).then(|| {
+        format!(
+            "light.shadow puts the sun {:.0} degrees in {what} from where light.sun or the photograph's own data have it; \
+             the shadow is used",
+            apart.abs()
+        )
     })
 }
 
@@ -152,6 +166,9 @@ fn known_sun(
     let mut known = sun
         .resolve("light.sun", &taken, forward)
         .map_err(|e| wrong("light.sun", e.to_string()))?;
+    if let Some(missing) = table.sun.as_ref().and_then(|sun| sun.idle(&taken)) {
+        session.warn(&format!("light.sun: {missing}"));
+    }
     if let Some(shadow) = &table.shadow {
         let shadow = shadow
             .resolve("light.shadow")
@@ -177,6 +194,13 @@ fn known_sun(
         };
         let found = sun_of_shadow(&shadow, &ground, ray)
             .map_err(|e| wrong("light.shadow", e.to_string()))?;
+        let azimuths = known.azimuth.map(|a| (a, found.azimuth));
+        let elevations = known.elevation.zip(found.elevation);
+        for (what, both) in [("azimuth", azimuths), ("elevation", elevations)] {
+            if let Some(warning) = both.and_then(|(sun, shadow)| contradiction(what, sun, shadow)) {
+                session.warn(&warning);
+            }
+        }
         known.azimuth = Some(found.azimuth);
         known.elevation = found.elevation.or(known.elevation);
     }

@@ -3,6 +3,7 @@ use std::fmt;
 use std::path::PathBuf;
 
 use dipir_cli::interrupt::Interrupted;
+use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_light::environment::EnvironmentSampler;
@@ -254,7 +255,7 @@ impl Done {
     /// For programs.
     pub fn to_json(&self) -> Value {
         json!({
-            "folder": self.folder,
+            "folder": json_path(&self.folder),
             "materials": self.outcome.materials,
             "iterations": self.outcome.losses.len(),
             "resumed_at": self.resumed_at,

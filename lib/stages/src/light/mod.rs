@@ -4,6 +4,7 @@ pub mod at_hand;
 mod candidates;
 mod done;
 mod estimate;
+pub(crate) mod exposed;
 pub mod folder;
 pub mod forecast;
 pub mod materials;
@@ -49,11 +50,11 @@ use crate::light::request::{First, Guide, Request, first_light, read_reference};
 use crate::light::resume::{Resume, fingerprint};
 use crate::light::surroundings::{map_of, narrow_first, surroundings};
 use crate::model::{self, Loaded};
-use crate::names::{LIGHT, begin};
+use crate::names::{LIGHT, LORA, begin};
 use crate::presets::Outlook;
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::scene::transport::{self, Frame};
-use crate::{interruption, lora};
+use crate::{interruption, lora, upstream};
 
 pub(crate) use words::{percent, quantities};
 
@@ -118,6 +119,10 @@ impl Model {
             return Ok(None);
         };
         let mut loaded = model::load(session, table)?;
+        if settings.adapt {
+            let now = lora::plan_with(session, false)?;
+            upstream::warn_of_other_settings(session, &LORA, "the LoRA was", &now);
+        }
         let adapter = settings
             .adapt
             .then(|| lora::folder::read(session, &mut loaded))

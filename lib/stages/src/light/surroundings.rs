@@ -1,10 +1,12 @@
 //! The light around the place as a map. Where the photograph shows the surroundings, the map shows
 //! them as the photograph does.
-use dipir_estimator::{BORDER_DEG, Visible, merged, overlaid};
+use dipir_estimator::{Visible, merged, overlaid};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::rasterize::rasterize;
 use dipir_scene::scene::LoadedScene;
+
+use super::exposed;
 
 /// Columns and rows of the map: texels of .7 degrees, about what a photograph resolves of its own
 /// view when it is reflected by a small object.
@@ -35,7 +37,7 @@ pub(super) fn surroundings(
     match visible {
         true => {
             let camera = &loaded.scene.camera;
-            let seen = Visible::new(&loaded.photo.image, camera, width, height, BORDER_DEG);
+            let seen = exposed::visible(loaded.taken(), &loaded.photo.image, camera, MAP);
             merged(&seen, &with_others(others, light))
         }
         false => light.resampled(width, height),

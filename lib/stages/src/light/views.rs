@@ -1,13 +1,14 @@
 //! The other photographs of the place, `[[scene.views]]`.
 use anyhow::Context;
 use dipir_cli::session::Session;
-use dipir_estimator::{BORDER_DEG, Estimator, LightEstimate, ViewEstimate, Visible, combine};
+use dipir_estimator::{Estimator, LightEstimate, ViewEstimate, Visible, combine};
 use dipir_imaging::file::Photo;
 use dipir_pipeline::stage::StagePlan;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::scene::LoadedScene;
 use dipir_scene::views::{View, ViewSettings};
 
+use super::exposed;
 use super::surroundings::MAP;
 use crate::scene::with_place;
 
@@ -54,7 +55,8 @@ pub(super) fn estimate(
     loaded: &LoadedScene,
 ) -> anyhow::Result<(LightEstimate, Vec<Visible>)> {
     let estimator = Estimator::embedded().context("cannot read the embedded light estimator")?;
-    let own = estimator.estimate(&loaded.photo.image, &loaded.scene.camera);
+    let camera = &loaded.scene.camera;
+    let own = exposed::estimate(&estimator, loaded.taken(), &loaded.photo.image, camera);
     let mut all = vec![ViewEstimate {
         estimate: own,
         stops: Some(0.0),
@@ -78,11 +80,11 @@ pub(super) fn estimate(
             });
         }
         all.push(ViewEstimate {
-            estimate: estimator.estimate(&view.image, &view.camera),
+            estimate: exposed::estimate(&estimator, &view.taken, &view.image, &view.camera),
             stops,
         });
         if let Some(stops) = stops {
-            let visible = Visible::new(&view.image, &view.camera, MAP[0], MAP[1], BORDER_DEG);
+            let visible = exposed::visible(&view.taken, &view.image, &view.camera, MAP);
             seen.push(visible.scaled((-stops).exp2() as f32));
         }
     }

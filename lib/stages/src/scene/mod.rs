@@ -9,6 +9,7 @@ use std::time::Instant;
 
 use dipir_cli::exit::Usage;
 use dipir_cli::interrupt;
+use dipir_cli::output::json_path;
 use dipir_cli::session::{Session, duration, size};
 use dipir_optimize::settings::{LightTable, Settings as RecoverySettings};
 use dipir_pipeline::config::Config;
@@ -21,7 +22,7 @@ use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
 use dipir_scene::camera::parts;
 use dipir_scene::config::SceneConfig;
-use dipir_scene::description::ProxyRecord;
+use dipir_scene::description::{ProxyRecord, SceneDescription};
 use dipir_scene::ground::points_parts;
 use dipir_scene::plausibility::implausible;
 use dipir_scene::scene::{LoadedScene, Scene};
@@ -77,8 +78,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let config: SceneConfig = session.config.table("scene")?;
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
-    let mut loaded = Scene::load(&config, &session.config.base_dir())
-        .map_err(|e| with_place(e, &session.config))?;
+    let mut loaded = load(session, &config)?.map_err(|e| with_place(e, &session.config))?;
     for warning in loaded.warnings.iter().chain(&implausible(&loaded)) {
         session.warn(warning);
     }
@@ -137,6 +137,21 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         },
         record,
         outlook: outlook.unwrap_or_default(),
+    })
+}
+
+/// Reads the scene; that of a frame has the objects and the ground of its shot's photograph.
+fn load(
+    session: &Session,
+    config: &SceneConfig,
+) -> anyhow::Result<Result<LoadedScene, dipir_scene::Error>> {
+    let base_dir = session.config.base_dir();
+    Ok(match &session.placed {
+        None => Scene::load(config, &base_dir),
+        Some(folder) => {
+            let photo = Manifest::read(folder, SCENE.executable)?.output(folder, "scene")?;
+            Scene::load_frame(config, &base_dir, &SceneDescription::read(&photo)?)
+        }
     })
 }
 
@@ -283,6 +298,10 @@ fn plan_with<'a>(
     for (role, path, location) in files {
         plan.input(role, path, location)?;
     }
+    if let Some(folder) = &session.placed {
+        let path = folder.join("scene.json");
+        plan.input("photograph of the shot", &path, &path)?;
+    }
     Ok(plan)
 }
 
@@ -302,7 +321,7 @@ impl Done {
     /// For programs.
     pub fn to_json(&self) -> Value {
         json!({
-            "folder": self.folder,
+            "folder": json_path(&self.folder),
             "triangles": self.triangles,
             "materials": self.materials,
             "resolution": self.resolution,

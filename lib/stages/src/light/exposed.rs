@@ -1,0 +1,59 @@
+//! Photographs of linear light, as OpenEXR and Radiance have it: they are exposed as they come, no value is white, and
+//! nothing is clipped. They are looked at as a camera would expose them.
+use dipir_estimator::{BORDER_DEG, Estimator, LightEstimate, Visible};
+use dipir_imaging::file::Photo;
+use dipir_imaging::raster::LinearImage;
+use dipir_imaging::tone::ToneCurves;
+use dipir_scene::camera::Camera;
+
+use crate::scene::background::automatic_exposure_ev;
+
+/// Whether a photograph, as it was read, is linear light without a white.
+pub(crate) fn is_linear(taken: &Photo) -> bool {
+    taken.values.is_none()
+}
+
+/// What brings `image`, the photograph that was `taken` without its lens, to the exposure of a camera: 1 for what a
+/// camera has exposed.
+pub(crate) fn gain(taken: &Photo, image: &LinearImage) -> f32 {
+    match is_linear(taken) {
+        // Beyond a million times, numbers say nothing of a picture.
+        true => automatic_exposure_ev(image).clamp(-20.0, 20.0).exp2(),
+        false => 1.0,
+    }
+}
+
+/// The light of a photograph, on its scale.
+pub(super) fn estimate(
+    estimator: &Estimator,
+    taken: &Photo,
+    image: &LinearImage,
+    camera: &Camera,
+) -> LightEstimate {
+    let gain = gain(taken, image);
+    if gain == 1.0 {
+        return estimator.estimate(image, camera);
+    }
+    let exposed = LinearImage(image.0.map(|p| *p * gain));
+    estimator.estimate(&exposed, camera).scaled(gain.recip())
+}
+
+/// What a photograph shows of the light, in `size` texels.
+pub(super) fn visible(
+    taken: &Photo,
+    image: &LinearImage,
+    camera: &Camera,
+    size: [usize; 2],
+) -> Visible {
+    let seen = Visible::new(image, camera, size[0], size[1], BORDER_DEG);
+    match is_linear(taken) {
+        true => seen.unclipped(),
+        false => seen,
+    }
+}
+
+/// The curve on the object where the configuration names none: the one that was recovered. Where none was, linear light
+/// has none.
+pub(crate) fn tone(taken: &Photo, found: ToneCurves) -> Option<ToneCurves> {
+    (!is_linear(taken) || found != ToneCurves::identity()).then_some(found)
+}
