@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use dipir_cli::args::OutputArgs;
 use dipir_cli::exit::{Usage, printable};
+use dipir_cli::output::json_path;
 use dipir_setup::view::CameraOptions;
 use dipir_setup::{Draft, Request, SetupError, draft};
 use dipir_stages::report::quoted;
@@ -28,7 +29,8 @@ pub struct InitArgs {
     )]
     out: PathBuf,
 
-    /// Height of the objects, metres [default: their files' own size, if it can be metres, else 1]
+    /// Height of the objects, metres [default: their files' own size, in metres or the unit that is
+    /// likely, else 1]
     #[arg(long, value_name = "H")]
     height_m: Option<f64>,
 
@@ -51,7 +53,7 @@ pub struct InitArgs {
     fov: Option<f64>,
 
     /// How far the camera looks up (or, below 0, down), degrees [default: what the photograph
-    /// shows, else with the horizon 40% from the top]
+    /// shows, else with the horizon about 40% from the top]
     #[arg(
         long,
         value_name = "DEG",
@@ -187,7 +189,12 @@ fn said(draft: &Draft) -> String {
             true => "wherever it is free".into(),
             false => format!("at pixel {x}, {y}"),
         };
-        text += &format!("  {}: {place}; {}\n", object.path, object.size_why);
+        let appears = match object.appearance() {
+            Some(words) if object.auto => format!("; at pixel {x}, {y} it {words}"),
+            Some(words) => format!(", {words}"),
+            None => String::new(),
+        };
+        text += &format!("  {}: {place}{appears}; {}\n", object.path, object.size_why);
     }
     let [place, look, whole] = commands(&draft.path);
     text + &format!(
@@ -201,14 +208,16 @@ fn json(draft: &Draft) -> Value {
     let view = &document.view;
     let objects = document.objects.iter();
     json!({
-        "file": draft.path,
+        "file": json_path(&draft.path),
+        "out": document.out,
         "camera": {
             "position": view.position.to_array(), "position_why": view.position_why,
             "direction_why": view.aim_why,
             "fov_deg": view.fov_deg, "fov_why": view.fov_why,
         },
         "objects": objects.map(|o| json!({
-            "path": o.path, "at_pixel": o.at_pixel, "size_why": o.size_why,
+            "path": o.path, "at_pixel": o.at_pixel, "appears_px": o.appears_px,
+            "size_why": o.size_why,
         })).collect::<Vec<_>>(),
         "next": commands(&draft.path),
     })

@@ -305,7 +305,7 @@ fn what_is_placed_on_the_page_is_what_the_run_makes() {
     project
         .run(DIPIR, &["run", "place.toml", "-q", "--draft"])
         .expect_success();
-    let run = load_from_memory(&project.read("out/composite/composite.png"))
+    let run = load_from_memory(&project.read("out-place/composite/composite.png"))
         .unwrap()
         .to_rgb8();
     let bare = load_from_memory(&project.read("photo.png"))

@@ -23,7 +23,7 @@ fn what_is_written_runs_as_it_is() {
     }
     let known = ["-p", "first.toml", "-s", "composite.environment=sky.exr"];
     project.run_both(&known);
-    let scene: Value = serde_json::from_slice(&project.read("out/scene/scene.json")).unwrap();
+    let scene: Value = serde_json::from_slice(&project.read("out-first/scene/scene.json")).unwrap();
     let rows = &scene["objects"][0]["transform"];
     // The ground is y = 0, and the tetrahedron keeps its own size.
     let [up, height] = [1, 3].map(|column| rows[1][column].as_f64().unwrap());
@@ -139,7 +139,7 @@ fn a_depth_map_gives_the_ground_and_objects_find_their_place() {
     let known = ["-p", "first.toml", "-s", "composite.environment=sky.exr"];
     let scene = project.run(SCENE, &known);
     scene.expect_success();
-    let scene: Value = serde_json::from_slice(&project.read("out/scene/scene.json")).unwrap();
+    let scene: Value = serde_json::from_slice(&project.read("out-first/scene/scene.json")).unwrap();
     let ground = &scene["proxy"]["ground"];
     assert!(
         ground["point"][1].as_f64().unwrap().abs() < 1e-3,

@@ -32,7 +32,7 @@ fn frames_are_lit_by_one_light_and_made_once() {
     project.write("same_0001.png", photo);
     write_png(
         project.path("other_0002.png"),
-        &DisplayImage(Raster::filled(24, 36, Vec3::new(0.1, 0.3, 0.9))),
+        &DisplayImage(Raster::filled(36, 24, Vec3::new(0.1, 0.3, 0.9))),
     )
     .unwrap();
     let light = project.artifacts("out/light");
@@ -119,13 +119,14 @@ fn every_frame_has_the_camera_of_its_name() {
         run.expect_error(2, &format!("error: {message}"));
     };
     refused(&["a.png", "gone.png"], "gone.png: there is no such file");
+    for dots in ["...png", "..png"] {
+        project.write(dots, &photo);
+        let why = "without its extension this is no name of a folder; rename the file, as in frame_0001.png";
+        refused(&["a.png", dots], &format!("{dots}: {why}"));
+    }
     refused(
         &["a.png", "./a.png"],
         "./a.png: another frame has the same name",
-    );
-    refused(
-        &["a.png", "--set", "scene.objects.0.at_pixel=[18, 16]"],
-        "scene.objects[0].at_pixel is found anew in every frame, and the camera moves: write position and yaw_deg",
     );
     // Frames of .chan have numbers.
     let numbered = ["f_1.png", "f_02.png"];
@@ -236,7 +237,69 @@ fn a_shot_is_planned_before_it_runs() {
 }
 
 #[test]
-fn a_camera_that_stands_still_takes_pixels() {
+fn objects_and_ground_are_as_in_the_photograph() {
+    let project = project();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let (head, tail) = text.split_once("[scene.camera]\n").unwrap();
+    let (_, tail) = tail.split_once("[scene.proxy]").unwrap();
+    let (_, tail) = tail.split_once("\n\n").unwrap();
+    let moving = "file = \"transforms.json\"\nfile_up = \"y\"";
+    let text = format!(
+        "{head}[scene.camera]\n{moving}\n[scene.proxy]\ncamera_height_m = 1.6\n\n{tail}"
+    );
+    project.write("pipeline.toml", text);
+    let frame = |name: &str, place: [f64; 2]| {
+        let matrix = [
+            [1.0, 0.0, 0.0, place[0]],
+            [0.0, 1.0, 0.0, place[1]],
+            [0.0, 0.0, 1.0, 5.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ];
+        project.write(name, project.read("background.png"));
+        json!({ "file_path": name, "transform_matrix": matrix })
+    };
+    let frames = [
+        frame("f.0.png", [0.0, 1.6]),
+        frame("f.1.png", [0.5, 1.9]),
+    ];
+    project.write("background.png", project.read("f.0.png"));
+    let file = json!({ "camera_angle_x": 0.8, "w": 36, "h": 24, "frames": frames });
+    project.write("transforms.json", file.to_string());
+    let black = DisplayImage(Raster::filled(36, 24, Vec3::ZERO));
+    write_png(project.path("roto.0.png"), &black).unwrap();
+    let at_pixel = [
+        "--set",
+        "scene.background=f.0.png",
+        "--set",
+        "scene.objects.0.at_pixel=[18, 20]",
+        "--set",
+        "scene.occluders=roto.0.png",
+    ];
+    let run = project.run(DIPIR, &[&["shot", "f.1.png"][..], &at_pixel].concat());
+    run.expect_error(2, "error: f.1.png: its mask roto.1.png is missing");
+    write_png(project.path("roto.1.png"), &black).unwrap();
+    shot(&project, &[&["f.1.png"][..], &at_pixel].concat());
+    let of = |folder: &str| -> Value {
+        let path = format!("{folder}/scene/scene.json");
+        serde_json::from_slice(&project.read(&path)).unwrap()
+    };
+    let (photo, frame) = (of("out"), of("out/frames/f.1"));
+    assert_eq!(frame["objects"][0]["transform"], photo["objects"][0]["transform"]);
+    assert_eq!(frame["proxy"], photo["proxy"]);
+    assert_ne!(frame["camera"], photo["camera"]);
+    assert_eq!(frame["occluders"]["path"], "roto.1.png");
+    // Another place in the photograph is another place in every frame.
+    let elsewhere = ["--set", "scene.objects.0.at_pixel=[10, 20]"];
+    let ran = shot(&project, &[&["f.1.png"][..], &at_pixel, &elsewhere].concat());
+    assert_eq!(ran[0]["done"]["ran"], json!(["scene", "composite"]));
+    assert_ne!(of("out/frames/f.1")["objects"], frame["objects"]);
+    let status = project.run(DIPIR, &["status"]);
+    status.expect_success();
+    assert!(status.stdout.contains("1 in "), "{}", status.stdout);
+}
+
+#[test]
+fn a_camera_that_stands_still_is_that_of_the_photograph() {
     let project = project();
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
     let (head, tail) = text.split_once("[scene.camera]\n").unwrap();
@@ -254,10 +317,25 @@ fn a_camera_that_stands_still_takes_pixels() {
     let frame = json!({ "file_path": "background.png", "transform_matrix": matrix });
     let file = json!({ "camera_angle_x": 0.8, "w": 36, "h": 24, "frames": [frame] });
     project.write("camera.json", file.to_string());
-    project.write("other.png", project.read("background.png"));
-    let ran = shot(
-        &project,
-        &["other.png", "--set", "scene.objects.0.at_pixel=[18, 20]"],
-    );
-    assert_eq!(ran[0]["done"]["ran"], json!(["scene", "composite"]));
+    let picture = |name: &str, width, height| {
+        let grey = DisplayImage(Raster::filled(width, height, Vec3::splat(0.4)));
+        write_png(project.path(name), &grey).unwrap();
+    };
+    picture("half.png", 18, 12);
+    picture("wide.png", 36, 12);
+    shot(&project, &["half.png"]);
+    let camera = |folder: &str| -> Value {
+        let path = format!("{folder}/scene/scene.json");
+        let scene: Value = serde_json::from_slice(&project.read(&path)).unwrap();
+        scene["camera"].clone()
+    };
+    let (photo, half) = (camera("out"), camera("out/frames/half"));
+    assert_eq!(half["position"], photo["position"]);
+    let focal = |camera: &Value| camera["focal_px"][1].as_f64().unwrap();
+    // Each is rounded to f32 on its own.
+    assert!((focal(&half) / focal(&photo) - 0.5).abs() < 1e-6);
+    let run = project.run(DIPIR, &["shot", "half.png", "wide.png"]);
+    assert_ne!(run.code, Some(0));
+    assert!(run.stderr.contains("a frame of 36 x 12 pixels"), "{}", run.stderr);
+    assert!(run.stderr.ends_with("1 of 2 failed: wide.png\n"), "{}", run.stderr);
 }

@@ -47,7 +47,8 @@ const CLEARANCE_M: f64 = 0.25;
 const LOW: (f64, f64) = (4.0, 0.1);
 
 impl Search<'_> {
-    /// The foot of the body at the best place; `None` if there is none.
+    /// The foot of the body at the best place; `None` if there is none. In the picture it is beside other
+    /// objects, and before or behind them only if all other places are taken.
     pub fn place(&self, body: &Body) -> Option<DVec3> {
         let surroundings = self
             .cloud
@@ -55,14 +56,27 @@ impl Search<'_> {
         let mut candidates = self.candidates(body);
         candidates.sort_by(|a, b| a.0.total_cmp(&b.0));
         let feet = candidates.into_iter().map(|c| c.1);
-        let mut free = feet.filter(|foot| self.is_apart(*foot, body));
-        match &surroundings {
-            None => free.next(),
-            Some(around) => {
-                let eye = self.camera.pose.position;
-                free.find(|foot| around.is_free(*foot, body, self.ground, eye))
+        let eye = self.camera.pose.position;
+        let is_free = |foot: DVec3| match &surroundings {
+            None => true,
+            Some(around) => around.is_free(foot, body, self.ground, eye),
+        };
+        let boxes = self.taken.iter();
+        let boxes: Vec<[DVec2; 2]> = boxes
+            .filter_map(|(foot, its)| self.seen(*foot, its))
+            .collect();
+        let mut before = None;
+        for foot in feet.filter(|foot| self.is_apart(*foot, body)) {
+            let seen = self.seen(foot, body);
+            let clear = seen.is_none_or(|own| !boxes.iter().any(|other| overlap(own, *other)));
+            if (clear || before.is_none()) && is_free(foot) {
+                if clear {
+                    return Some(foot);
+                }
+                before = Some(foot);
             }
         }
+        before
     }
 
     /// Feet that are in the picture, with what speaks against them.
@@ -99,24 +113,34 @@ impl Search<'_> {
     /// Of the picture's height, if all of the body is in the picture and its foot is not hidden.
     fn height_in_picture(&self, foot: DVec3, body: &Body) -> Option<f64> {
         let size = DVec2::from_array(self.camera.lens.size);
+        let [low, high] = self.seen(foot, body)?;
+        let inside =
+            (low / size).min_element() > MARGIN && (high / size).max_element() < 1.0 - MARGIN;
+        if !inside {
+            return None;
+        }
+        let pixel = |point: DVec3| Some(self.camera.project(point)?.pixel);
+        let up = self.ground.normal;
+        let (low, high) = (pixel(foot)?, pixel(foot + body.height_m * up)?);
+        let height = low.distance(high) / size.y;
+        (height > LEAST_HEIGHT && !(self.hidden)(low)).then_some(height)
+    }
+
+    /// The box of pixels around the body; `None` if it reaches where the camera does not see.
+    fn seen(&self, foot: DVec3, body: &Body) -> Option<[DVec2; 2]> {
         let up = self.ground.normal;
         let right = up.any_orthonormal_vector();
         let ahead = up.cross(right);
-        let seen = |point: DVec3| {
-            let pixel = self.camera.project(point)?.pixel;
-            let share = pixel / size;
-            let inside = share.min_element() > MARGIN && share.max_element() < 1.0 - MARGIN;
-            inside.then_some(pixel)
-        };
+        let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
         for i in 0..8 {
             let angle = f64::from(i) * std::f64::consts::FRAC_PI_4;
             let side = body.radius_m * (angle.cos() * right + angle.sin() * ahead);
-            seen(foot + side)?;
-            seen(foot + side + body.height_m * up)?;
+            for point in [foot + side, foot + side + body.height_m * up] {
+                let pixel = self.camera.project(point)?.pixel;
+                (low, high) = (low.min(pixel), high.max(pixel));
+            }
         }
-        let (low, high) = (seen(foot)?, seen(foot + body.height_m * up)?);
-        let height = low.distance(high) / size.y;
-        (height > LEAST_HEIGHT && !(self.hidden)(low)).then_some(height)
+        Some([low, high])
     }
 
     fn is_apart(&self, foot: DVec3, body: &Body) -> bool {
@@ -125,6 +149,10 @@ impl Search<'_> {
         };
         self.taken.iter().all(apart)
     }
+}
+
+fn overlap([a, b]: [DVec2; 2], [c, d]: [DVec2; 2]) -> bool {
+    a.cmplt(d).all() && c.cmplt(b).all()
 }
 
 /// The points of a scene, by whether they are ground.
@@ -211,5 +239,104 @@ impl Surroundings {
             }
         }
         sides == [true; 4]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_cameras::{Lens, Pose};
+    use glam::DMat3;
+
+    use super::*;
+
+    /// Eyes of somebody who looks down a little.
+    fn camera() -> Camera {
+        Camera {
+            pose: Pose {
+                position: DVec3::new(0.0, 1.6, 0.0),
+                rotation: DMat3::from_rotation_x(-0.15),
+            },
+            lens: Lens::pinhole([900.0, 600.0], DVec2::splat(800.0)),
+        }
+    }
+
+    fn ground() -> Ground {
+        Ground {
+            point: DVec3::ZERO,
+            normal: DVec3::Y,
+            points: 0,
+            inliers: 0,
+            residual_m: 0.0,
+            relief: None,
+        }
+    }
+
+    /// Places of bodies, one after another, and the box of each in the picture.
+    fn placed(bodies: &[Body], draw: u32) -> Vec<(DVec3, [DVec2; 2])> {
+        let (camera, ground) = (camera(), ground());
+        let (mut taken, mut found) = (Vec::new(), Vec::new());
+        for body in bodies {
+            let search = Search {
+                camera: &camera,
+                ground: &ground,
+                cloud: None,
+                taken: &taken,
+                hidden: &|_| false,
+                draw,
+            };
+            let foot = search.place(body).unwrap();
+            found.push((foot, search.seen(foot, body).unwrap()));
+            taken.push((foot, *body));
+        }
+        found
+    }
+
+    #[test]
+    fn objects_stand_beside_each_other_in_the_picture() {
+        let body = Body {
+            radius_m: 0.3,
+            height_m: 0.9,
+        };
+        for draw in 0..8 {
+            let found = placed(&[body; 4], draw);
+            for (i, (foot, own)) in found.iter().enumerate() {
+                for (other, its) in &found[..i] {
+                    assert!(
+                        !overlap(*own, *its),
+                        "draw {draw}: {own} {its}",
+                        own = own[0],
+                        its = its[0]
+                    );
+                    assert!(foot.distance(*other) > 0.85);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn where_no_place_beside_them_is_left_objects_are_apart_on_the_ground() {
+        let (camera, ground) = (camera(), ground());
+        let wide = Body {
+            radius_m: 2.5,
+            height_m: 3.0,
+        };
+        let post = Body {
+            radius_m: 0.2,
+            height_m: 1.2,
+        };
+        // It fills the picture.
+        let taken = [(DVec3::new(0.0, 0.0, -5.0), wide)];
+        let search = Search {
+            camera: &camera,
+            ground: &ground,
+            cloud: None,
+            taken: &taken,
+            hidden: &|_| false,
+            draw: 0,
+        };
+        let foot = search.place(&post).unwrap();
+        let boxes = [(foot, post), taken[0]].map(|(foot, body)| search.seen(foot, &body));
+        assert!(overlap(boxes[0].unwrap(), boxes[1].unwrap()));
+        assert!(foot.distance(taken[0].0) > 2.95);
     }
 }

@@ -6,7 +6,7 @@ use dipir_cameras::{CameraError, Lens, Pose, WorldUp};
 use glam::{DVec2, DVec3};
 
 use crate::error::SetupError;
-use crate::view::{Aim, CameraOptions, EYE_HEIGHT_M, View};
+use crate::view::{Aim, CameraFile, CameraOptions, EYE_HEIGHT_M, View};
 
 /// Most that a lens bends a corner, and that pixels differ from squares at a corner, pixels.
 const MOST_BENT_PX: f64 = 1.0;
@@ -31,12 +31,13 @@ pub fn read(
     let is_chan = path
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("chan"));
+    let fov_is_known = |fov_deg: f64| SetupError::Value {
+        option: "--fov",
+        value: fov_deg.to_string(),
+        accepted: "left out, for the camera's file says it",
+    };
     if let Some(fov_deg) = asked.fov_deg.filter(|_| !is_chan) {
-        return Err(SetupError::Value {
-            option: "--fov",
-            value: fov_deg.to_string(),
-            accepted: "left out, for the camera's file says it",
-        });
+        return Err(fov_is_known(fov_deg));
     }
     // A field of view along the longer side is vertical in an upright picture only.
     let longer = size[0].max(size[1]);
@@ -44,9 +45,11 @@ pub fn read(
         let half = (0.5 * deg.to_radians()).tan() * size[1] / longer;
         2.0 * half.atan().to_degrees()
     };
+    // As `dipir run` looks for it: folders tell pictures of the same name apart.
+    let whole = std::path::absolute(photo);
     let wanted = Wanted {
         size,
-        which: Which::Photo(photo),
+        which: Which::Photo(whole.as_deref().unwrap_or(photo)),
         up,
         fov_deg: asked.fov_deg.map(vertical),
     };
@@ -57,26 +60,40 @@ pub fn read(
             source,
         },
     })?;
+    if let Some(fov_deg) = asked.fov_deg.filter(|_| found.states_fov) {
+        return Err(fov_is_known(fov_deg));
+    }
     let pose = found.pose.ok_or_else(|| SetupError::Camera {
         path: path.into(),
         detail: "it describes a lens alone".into(),
         remedy: "leave --camera out, and write file = \"…\" into [scene.camera] beside position and direction",
     })?;
-    let lens = found.lens;
-    let focal = lens.focal_px;
-    let oblong = (focal.x / focal.y - 1.0).abs() * 0.5 * size[0];
     let mut view = view(
         &pose,
-        &lens,
+        &found.lens,
         found.ground_at_origin,
         found.program,
         path,
         asked,
     );
-    if bent_px(&lens) > MOST_BENT_PX || oblong > MOST_BENT_PX {
-        view.file = Some((path.into(), up));
-    }
+    view.file = more_than_numbers(path, &found.lens).map(|why| CameraFile {
+        path: path.into(),
+        up,
+        fov_deg: (!found.states_fov).then_some(view.fov_deg),
+        why,
+    });
     Ok(view)
+}
+
+/// What the file at `path` says that the numbers of a view do not, in words; `lens` is the photograph's.
+fn more_than_numbers(path: &Path, lens: &Lens) -> Option<&'static str> {
+    if !file::has_one(path) {
+        return Some("it has several cameras, of which that of the photograph's name is taken");
+    }
+    let focal = lens.focal_px;
+    let oblong = (focal.x / focal.y - 1.0).abs() * 0.5 * lens.size[0];
+    let is_more = bent_px(lens) > MOST_BENT_PX || oblong > MOST_BENT_PX;
+    is_more.then_some("its lens bends lines or its pixels are not square")
 }
 
 fn view(
@@ -142,7 +159,13 @@ fn bent_px(lens: &Lens) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use dipir_imaging::raster::{DisplayImage, Raster};
+    use dipir_pipeline::config::Config;
+    use dipir_scene::camera::Camera;
+    use dipir_scene::config::SceneConfig;
+
     use super::*;
+    use crate::project::{Request, draft};
 
     /// A camera 2 m over the origin's ground that looks down by atan(1/2), in Blender's world.
     const FSPY: &str = r#"{
@@ -210,9 +233,18 @@ mod tests {
             error.contains("it has 2 cameras, and none for \"b.jpg\""),
             "{error}"
         );
-        // A lens with distortion is no pinhole: the configuration then names the file.
-        let view = of(file(["a.jpg", "b.jpg"], -0.2)).unwrap();
-        assert!(view.file.is_some_and(|f| f.0.ends_with("transforms.json")));
+        assert!(view.file.unwrap().why.contains("several cameras"));
+        // A lens with distortion is no pinhole: the configuration names the file for that, too.
+        let one = |k1: f64| {
+            let frame = frame("b.jpg", 3.0);
+            let text = format!(
+                r#"{{ "fl_x": 500, "w": 600, "h": 400, "k1": {k1}, "frames": [{frame}] }}"#
+            );
+            of(text).unwrap().file
+        };
+        assert_eq!(one(0.0), None);
+        let bent = one(-0.2).unwrap();
+        assert!(bent.path.ends_with("transforms.json") && bent.why.contains("bends lines"));
     }
 
     #[test]
@@ -235,5 +267,105 @@ mod tests {
         };
         let drop = 5.0 * 10f64.to_radians().sin();
         assert!((look_at.y - (1.7 - drop)).abs() < 1e-9);
+    }
+
+    /// What `dipir init` writes for `in/plate.0002.png` of 30 x 20 pixels and a camera's file with this name in the
+    /// same folder, and the camera that `dipir run` has for it.
+    fn written(name: &str, text: &str, request: Request) -> (String, Camera, Camera) {
+        let folder = tempfile::tempdir().unwrap();
+        let folder = folder.path();
+        let at = |name: &str| folder.join(name);
+        std::fs::create_dir(at("in")).unwrap();
+        let grey = DisplayImage(Raster::filled(30, 20, glam::Vec3::splat(0.5)));
+        dipir_imaging::file::write_png(at("in/plate.0002.png"), &grey).unwrap();
+        std::fs::write(at("a.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+        std::fs::write(at(name), text).unwrap();
+        let draft = draft(&Request {
+            photo: at("in/plate.0002.png"),
+            models: vec![at("a.obj")],
+            out: at("pipeline.toml"),
+            camera: Some(at(name)),
+            ..request
+        });
+        let document = draft.unwrap().document;
+        let text = document.text();
+        let config = Config::parse(&at("pipeline.toml"), &text, &[]).unwrap();
+        let settings = config.table::<SceneConfig>("scene").unwrap().validate();
+        let (camera, _) = settings.unwrap().camera.resolve([30, 20], folder).unwrap();
+        (text, camera, document.view.camera([30, 20]))
+    }
+
+    #[test]
+    fn a_file_of_several_cameras_is_named_and_means_the_same_camera() {
+        let frame = |name: &str, z: f64| {
+            format!(
+                r#"{{ "file_path": "{name}", "transform_matrix":
+                [[1,0,0,0],[0,1,0,{z}],[0,0,1,3],[0,0,0,1]] }}"#
+            )
+        };
+        let frames = [
+            frame("on/plate.0002.png", 1.0),
+            frame("in/plate.0002.png", 2.0),
+        ]
+        .join(",");
+        let transforms = format!(r#"{{ "fl_x": 25, "frames": [{frames}] }}"#);
+        let y_up = Request {
+            camera_up: Some(WorldUp::Y),
+            ..Request::default()
+        };
+        let wide = Request {
+            asked: CameraOptions {
+                fov_deg: Some(50.0),
+                ..CameraOptions::default()
+            },
+            ..Request::default()
+        };
+        let chan = "1 0 1.5 4 -10 0 0\n2 0 1.7 4 -10 0 0\n";
+        for (name, text, request, keys) in [
+            (
+                "transforms.json",
+                &*transforms,
+                y_up,
+                "file = \"transforms.json\"\nfile_up = \"y\"\n",
+            ),
+            (
+                "shot.chan",
+                chan,
+                wide,
+                "file = \"shot.chan\"\nfov_deg = 34.5",
+            ),
+        ] {
+            let (text, got, want) = written(name, text, request);
+            assert!(
+                text.contains(keys) && text.contains("several cameras"),
+                "{text}"
+            );
+            // Digits of the file, and single precision.
+            assert!(got.position.distance(want.position) < 1e-5, "{name}");
+            let apart = (got.rotation - want.rotation).to_cols_array();
+            assert!(apart.iter().all(|e| e.abs() < 1e-5), "{name}");
+            assert!((got.focal_px / want.focal_px - 1.0).abs().max_element() < 1e-5);
+            assert_eq!(got.principal_px, want.principal_px);
+        }
+    }
+
+    #[test]
+    fn a_field_of_view_that_the_file_has_is_not_asked_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("shot.chan");
+        let asked = CameraOptions {
+            fov_deg: Some(50.0),
+            ..CameraOptions::default()
+        };
+        let of = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            read(&path, Path::new("a.jpg"), [600, 400], None, &asked).map_err(|e| e.to_string())
+        };
+        assert!(of("1 0 1.7 4 0 0 0").is_ok());
+        let error = of("1 0 1.7 4 0 0 0 40").unwrap_err();
+        assert!(
+            error.starts_with("--fov is 50; accepted: left out"),
+            "{error}"
+        );
     }
 }

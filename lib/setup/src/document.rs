@@ -3,7 +3,9 @@ use dipir_cameras::WorldUp;
 use dipir_imaging::facts::Facts;
 use glam::DVec3;
 
-use crate::view::{Aim, View};
+use crate::light::{comment, light};
+use crate::model::Raised;
+use crate::view::{Aim, CameraFile, View};
 
 /// An object's table.
 #[derive(Clone, Debug, PartialEq)]
@@ -18,11 +20,17 @@ pub struct Object {
     pub size_line: Option<String>,
     /// Where the size comes from.
     pub size_why: String,
+    /// How wide and how high it appears at that pixel, pixels.
+    pub appears_px: Option<[f64; 2]>,
+    /// Whether its file may have it on its back.
+    pub may_lie: bool,
 }
 
 /// What a first `pipeline.toml` says.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Document {
+    /// The folder of the results.
+    pub out: String,
     /// The photograph, as the file names it.
     pub photo: String,
     /// Of the photograph.
@@ -39,6 +47,8 @@ pub struct Document {
     pub camera_file: Option<String>,
     /// Points that tell the ground.
     pub points: Option<Points>,
+    /// Limits that the models exceed.
+    pub raised: Vec<Raised>,
 }
 
 /// Points of the scene.
@@ -59,20 +69,24 @@ impl Document {
     pub fn text(&self) -> String {
         let mut text = String::from(
             "# Written by dipir init: a first guess that runs. Change what is wrong and run it again; what does\n\
-             # not depend on it is kept. Paths are relative to this file. Lengths are in metres, +y is up, and\n\
+             # not depend on it is kept. Relative paths begin at this file. Lengths are in metres, +y is up, and\n\
              # pixels count from the top left corner of the upright photograph.\n\
              #   dipir place          a page in the browser: put objects, camera and light right\n\
              #   dipir preview        the same view as preview.png\n\
              #   dipir run --draft    a quick look; with --watch again after every change\n\
              #   dipir run            the picture\n\n\
-             [pipeline]\nout = \"out\"\nquality = \"standard\"            # draft | standard | high\n\n",
+             [pipeline]\n",
+        );
+        text += &format!(
+            "out = {}\nquality = \"standard\"            # draft | standard | high\n\n",
+            quoted(&self.out)
         );
         text += &self.scene();
         for object in &self.objects {
             text += &object.text();
         }
         text += &match (&self.camera_file, &self.view.file) {
-            (Some(name), Some((_, up))) => camera_of_file(name, *up, &self.view),
+            (Some(name), Some(file)) => camera_of_file(name, file, &self.view),
             _ => camera(&self.view),
         };
         text += "[scene.proxy]                   # the ground that takes the shadow\n";
@@ -83,6 +97,14 @@ impl Document {
                 number(self.view.ground_y, 6)
             ),
         };
+        if !self.raised.is_empty() {
+            text += "[scene.limits]\n";
+            for raised in &self.raised {
+                text += &comment(&printable(&format!("raised {}", raised.why)));
+                text += &format!("{} = {}\n", raised.key, raised.value);
+            }
+            text.push('\n');
+        }
         text += &light(&self.facts);
         text
     }
@@ -102,7 +124,31 @@ impl Document {
     }
 }
 
+/// What appears smaller shows little of itself, pixels.
+const SMALL_PX: f64 = 24.0;
+/// What is this many times as wide as high is told by its width.
+const LOW: f64 = 4.0;
+
 impl Object {
+    /// How large it appears: `appears 41 pixels high`, and what to do if that is little.
+    pub fn appearance(&self) -> Option<String> {
+        let [width, height] = self.appears_px?;
+        let (pixels, way) = match width > LOW * height {
+            true => (width, "wide"),
+            false => (height, "high"),
+        };
+        let count = format!("{pixels:.0}");
+        let unit = if count == "1" { "pixel" } else { "pixels" };
+        let small = match pixels < SMALL_PX {
+            true => {
+                ", which is small: for a close-up lower the camera (--eye-height), or move the object down in the \
+                 picture (at_pixel)"
+            }
+            false => "",
+        };
+        Some(format!("appears {count} {unit} {way}{small}"))
+    }
+
     fn text(&self) -> String {
         let [x, y] = self.at_pixel.map(|v| number(v, 1));
         let place = match self.auto {
@@ -116,11 +162,16 @@ impl Object {
         };
         let mut text = format!(
             "[[scene.objects]]\npath = {}\n{place}\
-             yaw_deg = 0.0                   # turn, counter-clockwise from above; or to_pixel = [x, y], which it faces\n\
-             # size: {}\n",
-            quoted(&self.path),
-            self.size_why
+             yaw_deg = 0.0                   # turn, counter-clockwise from above; or to_pixel = [x, y], which it faces\n",
+            quoted(&self.path)
         );
+        if self.may_lie {
+            text += "# pitch_deg = -90.0             # if it lies on its back\n";
+        }
+        if let Some(words) = self.appearance() {
+            text += &comment(&format!("at pixel {x}, {y} it {words}"));
+        }
+        text += &format!("# size: {}\n", self.size_why);
         if let Some(line) = &self.size_line {
             text += line;
             text.push('\n');
@@ -156,14 +207,19 @@ pub(crate) fn axis(up: WorldUp) -> &'static str {
     }
 }
 
-fn camera_of_file(name: &str, up: Option<WorldUp>, view: &View) -> String {
+fn camera_of_file(name: &str, file: &CameraFile, view: &View) -> String {
     let mut text = format!(
-        "[scene.camera]\n# {}; its lens bends lines or its pixels are not square\nfile = {}\n",
-        view.aim_why,
+        "[scene.camera]\n# {}\n# {}\nfile = {}\n",
+        view.position_why,
+        file.why,
         quoted(name)
     );
-    if let Some(up) = up {
+    if let Some(up) = file.up {
         text += &format!("file_up = \"{}\"\n", axis(up));
+    }
+    if let Some(fov_deg) = file.fov_deg {
+        let fov_deg = number(fov_deg, 5);
+        text += &format!("fov_deg = {fov_deg}    # vertical, which the file does not say\n");
     }
     text + "\n"
 }
@@ -208,49 +264,6 @@ fn camera(view: &View) -> String {
     )
 }
 
-/// The `[light]` table. The light is estimated from the photograph and from what its file holds of
-/// the sun.
-fn light(facts: &Facts) -> String {
-    let mut known = Vec::new();
-    let mut example = Vec::new();
-    if let Some(time) = &facts.time {
-        known.push(format!("the time {}", printable(time)));
-        example.push(format!("time = {}", quoted(time)));
-    }
-    if let (Some(latitude), Some(longitude)) = (facts.latitude_deg, facts.longitude_deg) {
-        known.push("the place".into());
-        example.push(format!(
-            "latitude = {}, longitude = {}",
-            number(latitude, 5),
-            number(longitude, 5)
-        ));
-    }
-    if let Some(heading) = facts.heading {
-        let north = if heading.magnetic { "magnetic" } else { "true" };
-        known.push(format!(
-            "the heading, {:.0} degrees from {north} north",
-            heading.deg
-        ));
-        example.push(format!("heading_deg = {}", number(heading.deg, 1)));
-    }
-    let mut text = match known.is_empty() {
-        true => String::from(
-            "# The light is estimated from the photograph, whose file says nothing of time and place. Who knows\n\
-             # where the sun was says so:\n",
-        ),
-        false => format!(
-            "# The light is estimated from the photograph. Its file says {}, which are\n\
-             # used for the sun; to say otherwise:\n",
-            known.join(", ")
-        ),
-    };
-    if example.is_empty() {
-        example.push("azimuth_deg = 90.0, elevation_deg = 40.0".into());
-    }
-    text += &format!("# [light]\n# sun = {{ {} }}\n", example.join(", "));
-    text
-}
-
 /// A number as TOML, with at most `digits` behind the point and at least one.
 pub(crate) fn number(value: f64, digits: usize) -> String {
     let text = format!("{value:.digits$}");
@@ -288,7 +301,7 @@ pub(crate) fn quoted(text: &str) -> String {
 }
 
 /// Text that ends no comment.
-fn printable(text: &str) -> String {
+pub(crate) fn printable(text: &str) -> String {
     text.chars().filter(|c| !c.is_control()).collect()
 }
 
@@ -306,6 +319,7 @@ mod tests {
 
     fn document(view: View) -> Document {
         Document {
+            out: "out".into(),
             photo: "my \"best\"\\photo\n.jpg".into(),
             facts: Facts {
                 make: Some("Maker\nof = 1".into()),
@@ -326,17 +340,25 @@ mod tests {
                 auto: false,
                 size_line: Some("height_m = 1.0".into()),
                 size_why: "a guess".into(),
+                appears_px: Some([80.0, 120.0]),
+                may_lie: false,
             }],
             view,
             camera_file: None,
             points: None,
+            raised: vec![],
         }
     }
 
     #[test]
     fn points_a_file_and_a_free_place_are_keys_that_are_read() {
         let mut document = document(View {
-            file: Some(("rig.json".into(), Some(WorldUp::Z))),
+            file: Some(CameraFile {
+                path: "rig.json".into(),
+                up: Some(WorldUp::Z),
+                fov_deg: None,
+                why: "it has several cameras",
+            }),
             ..View::default()
         });
         document.camera_file = Some("rig.json".into());
@@ -406,6 +428,55 @@ mod tests {
         let uncommented = format!("{before}[light]\nsun{after}");
         let config = Config::parse(Path::new("pipeline.toml"), &uncommented, &[]).unwrap();
         assert!(config.has("light.sun.heading_deg") && config.has("light.sun.latitude"));
+    }
+
+    #[test]
+    fn raised_limits_and_the_folder_of_the_results_are_keys_that_are_read() {
+        let mut document = document(View::default());
+        document.out = "out-b \"2\"".into();
+        document.raised = vec![Raised {
+            key: "texture_pixels",
+            value: 1 << 28,
+            why: "for \"a\nb.glb\": it has many".into(),
+        }];
+        let text = document.text();
+        assert_eq!(scene(&text).limits.texture_pixels, 1 << 28);
+        let config = Config::parse(Path::new("pipeline.toml"), &text, &[]).unwrap();
+        assert_eq!(config.pipeline().unwrap().out, Path::new("out-b \"2\""));
+    }
+
+    #[test]
+    fn what_may_lie_on_its_back_gets_the_line_that_turns_it() {
+        let mut document = document(View::default());
+        assert!(!document.text().contains("on its back"));
+        document.objects[0].may_lie = true;
+        let text = document.text();
+        assert_eq!(scene(&text).objects[0].pitch_deg, None);
+        let turned = text.replace("# pitch_deg = -90.0 ", "pitch_deg = -90.0 ");
+        assert_eq!(scene(&turned).objects[0].pitch_deg, Some(-90.0));
+    }
+
+    #[test]
+    fn how_large_an_object_appears_is_said_and_a_small_one_told() {
+        let mut document = document(View::default());
+        assert!(
+            document
+                .text()
+                .contains("\n# at pixel 450.0, 400.3 it appears 120 pixels high\n")
+        );
+        let object = &mut document.objects[0];
+        let mut of = |size| {
+            object.appears_px = Some(size);
+            object.appearance().unwrap()
+        };
+        assert_eq!(of([30.0, 41.3]), "appears 41 pixels high");
+        assert_eq!(of([300.0, 2.0]), "appears 300 pixels wide");
+        let small = of([20.0, 23.0]);
+        for part in ["23 pixels high, which is small", "--eye-height", "at_pixel"] {
+            assert!(small.contains(part), "{part}: {small}");
+        }
+        object.appears_px = None;
+        assert_eq!(object.appearance(), None);
     }
 
     #[test]

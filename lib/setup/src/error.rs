@@ -19,6 +19,19 @@ pub enum SetupError {
         /// The model.
         path: PathBuf,
     },
+    /// A model's textures are larger than any limit allows.
+    #[error(
+        "\"{}\": {what}, and at most {limit} are read; scale them down: gltf-transform resize --width 8192 --height 8192 IN.glb OUT.glb",
+        path.display()
+    )]
+    Textures {
+        /// The model.
+        path: PathBuf,
+        /// Which, and how large.
+        what: String,
+        /// The limit, pixels.
+        limit: u64,
+    },
     /// A camera's file is damaged.
     #[error("\"{}\": {source}", path.display())]
     CameraFile {

@@ -7,9 +7,12 @@
 pub mod camera_file;
 pub mod document;
 pub mod error;
+mod light;
+pub mod model;
 pub mod project;
 pub mod size;
 pub mod spots;
+mod turn;
 pub mod view;
 
 pub use error::SetupError;

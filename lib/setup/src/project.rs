@@ -1,7 +1,7 @@
 //! From files to the text that names them.
 use std::fs::OpenOptions;
 use std::io::{ErrorKind, Write};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use dipir_cameras::WorldUp;
 use dipir_imaging::file::read_photo;
@@ -10,14 +10,14 @@ use dipir_points::Ground;
 use dipir_points::ground::Shape;
 use dipir_scene::camera::Camera;
 use dipir_scene::ground::{self, PointsSettings};
-use dipir_scene::import::load_object;
 use dipir_scene::proxy::Plane;
 
 use crate::camera_file;
 use crate::document::{Document, Object, Points, axis};
 use crate::error::SetupError;
-use crate::size::{Size, size};
-use crate::spots::spots;
+use crate::model::Models;
+use crate::size::Kind;
+use crate::spots::{appears, spots};
 use crate::view::{CameraOptions, View};
 
 /// What a first configuration is made from.
@@ -73,11 +73,11 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
     }
     request.asked.check()?;
     let folder = request.out.parent().unwrap_or(Path::new(""));
-    let mut warnings = Vec::new();
-    let mut sizes = Vec::new();
-    for path in &request.models {
-        sizes.push(size_of(path, request.height_m, &mut warnings)?);
-    }
+    let mut models = Models::default();
+    let sizes = request.models.iter();
+    let sizes = sizes.map(|path| models.size_of(path, request.height_m));
+    let sizes = sizes.collect::<Result<Vec<_>, _>>()?;
+    let mut warnings = models.warnings;
     let photo = read_photo(&request.photo, Transfer::Srgb)?;
     warnings.extend(photo.warnings);
     let view = match &request.camera {
@@ -88,7 +88,11 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
             request.camera_up,
             &request.asked,
         )?,
-        None => View::of_photo(&photo.image, &photo.facts, &request.asked)?,
+        None => {
+            let (view, no_ground) = View::of_photo(&photo.image, &photo.facts, &request.asked)?;
+            warnings.extend(no_ground.filter(|_| request.points.is_none()));
+            view
+        }
     };
     for path in [&request.camera, &request.points].into_iter().flatten() {
         warnings.extend(dipir_cameras::file::choice(path).filter(|c| !warnings.contains(c)));
@@ -120,6 +124,8 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
             path: beside(path, folder)?,
             at_pixel,
             auto: request.place_auto,
+            appears_px: appears(&camera, &plane, at_pixel, size.width_m, size.height_m),
+            may_lie: Kind::of(path) == Kind::Bare,
             size_line: size.line,
             size_why: size.why,
         })
@@ -127,17 +133,19 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
     let (class, class_why) = class(request);
     Ok(Draft {
         document: Document {
+            out: out_folder(&request.out),
             photo: beside(&request.photo, folder)?,
             facts: photo.facts,
             class,
             class_why,
             objects: objects.collect::<Result<_, SetupError>>()?,
             camera_file: match &view.file {
-                Some((path, _)) => Some(beside(path, folder)?),
+                Some(file) => Some(beside(&file.path, folder)?),
                 None => None,
             },
             view,
             points: found.map(|f| f.0),
+            raised: models.raised,
         },
         path: request.out.clone(),
         warnings,
@@ -207,17 +215,13 @@ impl Draft {
     }
 }
 
-fn size_of(
-    path: &Path,
-    height_m: Option<f64>,
-    warnings: &mut Vec<String>,
-) -> Result<Size, SetupError> {
-    let imported = load_object(path)?;
-    let named = |w: &String| format!("\"{}\": {w}", path.display());
-    warnings.extend(imported.warnings.iter().map(named));
-    let bounds = imported.mesh.bounds();
-    let (low, high) = bounds.ok_or_else(|| SetupError::Empty { path: path.into() })?;
-    size(low.as_dvec3(), high.as_dvec3(), height_m)
+/// The folder of the results: `out` for `pipeline.toml`, and `out-b` for `b.toml` beside it.
+fn out_folder(file: &Path) -> String {
+    let name = file.file_name().unwrap_or_default().to_string_lossy();
+    match name.strip_suffix(".toml").unwrap_or(&name) {
+        "pipeline" if name.ends_with(".toml") => "out".into(),
+        stem => format!("out-{stem}"),
+    }
 }
 
 /// The word for prompts: as asked, else the words of the first model's name.
@@ -242,14 +246,42 @@ fn class(request: &Request) -> (String, &'static str) {
 fn beside(path: &Path, folder: &Path) -> Result<String, SetupError> {
     let [path, folder] = [path, folder].map(|p| p.strip_prefix(".").unwrap_or(p));
     let named = match path.strip_prefix(folder) {
-        Ok(rest) => rest.to_owned(),
-        Err(_) => std::path::absolute(path).map_err(|source| SetupError::Read {
-            path: path.into(),
-            source,
-        })?,
+        Ok(rest) if rest.is_relative() => rest.to_owned(),
+        _ => match way(path, folder) {
+            Some(way) => way,
+            None => std::path::absolute(path).map_err(|source| SetupError::Read {
+                path: path.into(),
+                source,
+            })?,
+        },
     };
     let text = named.into_os_string().into_string();
     text.map_err(|_| SetupError::NotUtf8 { path: path.into() })
+}
+
+/// The way from `folder` to `path` by `..`; `None` if they share no folder but the root.
+fn way(path: &Path, folder: &Path) -> Option<PathBuf> {
+    let here = |p: &Path| match p.as_os_str().is_empty() {
+        true => Path::new(".").canonicalize().ok(),
+        false => p.canonicalize().ok(),
+    };
+    // Links of folders are followed, for `..` leads out of what they point to; a link of the file stays.
+    let path = match (path.parent(), path.file_name()) {
+        (Some(parent), Some(name)) => here(parent)?.join(name),
+        _ => here(path)?,
+    };
+    let folder = here(folder)?;
+    let common = path.components().zip(folder.components());
+    let common = common.take_while(|(a, b)| a == b).count();
+    let is_folder = |c: Component| matches!(c, Component::Normal(_));
+    if !path.components().take(common).any(is_folder) {
+        return None;
+    }
+    let up = folder
+        .components()
+        .skip(common)
+        .map(|_| Component::ParentDir);
+    Some(up.chain(path.components().skip(common)).collect())
 }
 
 #[cfg(test)]
@@ -320,6 +352,36 @@ mod tests {
     }
 
     #[test]
+    fn models_without_a_unit_and_a_second_file_are_written_as_such() {
+        let folder = tempfile::tempdir().unwrap();
+        let (photo, model) = (folder.path().join("photo.png"), folder.path().join("a.ply"));
+        put_turned(&photo, [192, 128], &|_, y| y as u8, 1);
+        let head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n";
+        let body = "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n10 0 0\n0 10 0\n3 0 1 2\n";
+        std::fs::write(&model, format!("{head}{body}")).unwrap();
+        let request = Request {
+            photo,
+            models: vec![model],
+            out: folder.path().join("b.toml"),
+            asked: CameraOptions {
+                pitch_deg: Some(-10.0),
+                ..CameraOptions::default()
+            },
+            ..Request::default()
+        };
+        let document = draft(&request).unwrap().document;
+        let object = &document.objects[0];
+        assert!(object.may_lie && object.size_line.as_deref() == Some("scale = 0.01"));
+        // A tenth of a metre, some metres away.
+        let [_, height] = object.appears_px.unwrap();
+        assert!((1.0..10.0).contains(&height), "{height}");
+        let text = document.text();
+        for part in ["out = \"out-b\"", "which is small", "# pitch_deg = -90.0"] {
+            assert!(text.contains(part), "{part}: {text}");
+        }
+    }
+
+    #[test]
     fn which_of_several_models_of_a_project_is_read_is_a_warning() {
         let folder = tempfile::tempdir().unwrap();
         let (photo, model) = (folder.path().join("photo.png"), folder.path().join("a.obj"));
@@ -368,5 +430,42 @@ mod tests {
         assert_eq!(named("./in/photo.jpg", "in"), "photo.jpg");
         let elsewhere = named("photo.jpg", "projects");
         assert!(Path::new(&elsewhere).is_absolute() && elsewhere.ends_with("photo.jpg"));
+    }
+
+    #[test]
+    fn files_elsewhere_are_named_by_the_way_to_them() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = |name: &str| {
+            let path = root.path().join(name);
+            std::fs::create_dir_all(&path).unwrap();
+            path
+        };
+        let [photos, other, deep] = ["x", "other", "other/deep"].map(folder);
+        let named = |path: PathBuf, folder: &Path| beside(&path, folder).unwrap();
+        assert_eq!(named(photos.join("photo.png"), &other), "../x/photo.png");
+        assert_eq!(named(photos.join("photo.png"), &deep), "../../x/photo.png");
+        assert_eq!(named(other.join("a.glb"), &deep), "../a.glb");
+        // A file that is found there is the same file.
+        std::fs::write(photos.join("photo.png"), "p").unwrap();
+        #[cfg(unix)]
+        {
+            let link = root.path().join("link");
+            std::os::unix::fs::symlink(&deep, &link).unwrap();
+            let way = named(photos.join("photo.png"), &link);
+            assert_eq!(std::fs::read(link.join(way)).unwrap(), b"p");
+        }
+        // The root alone is nothing that moves together.
+        #[cfg(unix)]
+        assert_eq!(named("/etc/photo.png".into(), &other), "/etc/photo.png");
+    }
+
+    #[test]
+    fn each_file_has_its_own_folder_of_results() {
+        let of = |path: &str| out_folder(path.as_ref());
+        assert_eq!(of("pipeline.toml"), "out");
+        assert_eq!(of("elsewhere/pipeline.toml"), "out");
+        assert_eq!(of("b.toml"), "out-b");
+        assert_eq!(of("in/my b.v2.toml"), "out-my b.v2");
+        assert_eq!(of("pipeline"), "out-pipeline");
     }
 }

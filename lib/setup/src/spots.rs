@@ -62,6 +62,24 @@ pub fn spots(
     Ok(found)
 }
 
+/// How wide and how high what stands at `spot` appears, pixels; `None` if it reaches behind the camera.
+pub fn appears(
+    camera: &Camera,
+    plane: &Plane,
+    spot: [f64; 2],
+    width_m: f64,
+    height_m: f64,
+) -> Option<[f64; 2]> {
+    let foot = ground_at(camera, plane, DVec2::from_array(spot))?;
+    let rotation = camera.rotation.as_dmat3();
+    let from = foot - camera.position.as_dvec3();
+    let depth = -from.dot(rotation.z_axis);
+    let top = foot + height_m * plane.normal.as_dvec3().normalize();
+    let top = camera.project(top.as_vec3())?.as_dvec2();
+    let width = f64::from(camera.focal_px.x) * width_m / depth;
+    Some([width, top.distance(DVec2::from_array(spot))])
+}
+
 /// A tenth of a pixel is fine enough to be typed.
 fn number_of_pixel(value: f64) -> f64 {
     (value * 10.0).round() / 10.0
@@ -124,6 +142,19 @@ mod tests {
         });
         // 0.5 + 0.3 + 0.2 m, to a tenth of a pixel.
         assert!((a.distance(b) - 1.0).abs() < 1e-3, "{}", a.distance(b));
+    }
+
+    #[test]
+    fn an_object_appears_as_large_as_its_distance_makes_it() {
+        let view = view(0.0, 0.0, 40.0);
+        let (camera, plane) = (view.camera([1500, 1000]), view.plane());
+        let focal = f64::from(camera.focal_px.x);
+        // 1.6 m below the eye and 8 m away.
+        let spot = [750.0, 500.0 + focal / 5.0];
+        let [width, height] = appears(&camera, &plane, spot, 0.4, 1.0).unwrap();
+        assert!((width - focal * 0.05).abs() < 0.05, "{width}");
+        assert!((height - focal * 0.125).abs() < 0.05, "{height}");
+        assert_eq!(appears(&camera, &plane, [750.0, 100.0], 0.4, 1.0), None);
     }
 
     #[test]

@@ -10,6 +10,7 @@ use dipir_scene::proxy::Plane;
 use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 
 use crate::error::SetupError;
+use crate::turn::{self, Turn};
 
 /// How a camera is turned.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,8 +44,8 @@ pub struct View {
     pub principal_px: Option<DVec2>,
     /// Height of the ground, metres.
     pub ground_y: f64,
-    /// The file that says more of the camera than is said here, and which axis of it points up.
-    pub file: Option<(PathBuf, Option<WorldUp>)>,
+    /// The file that says more of the camera than is said here.
+    pub file: Option<CameraFile>,
     /// Where the position comes from.
     pub position_why: String,
     /// Where the turn comes from.
@@ -53,20 +54,25 @@ pub struct View {
     pub fov_why: String,
 }
 
+/// A file that is named in place of what it says.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CameraFile {
+    /// The file.
+    pub path: PathBuf,
+    /// Which axis of its world points up, if that was asked for.
+    pub up: Option<WorldUp>,
+    /// Vertical field of view, degrees, if the file has none.
+    pub fov_deg: Option<f64>,
+    /// What of it numbers would not say.
+    pub why: &'static str,
+}
+
 /// Height of the eyes of somebody who stands, metres.
 pub const EYE_HEIGHT_M: f64 = 1.6;
 /// Field of view along the longer side where the picture does not state it, degrees.
 pub const DEFAULT_FOV_DEG: f64 = 55.0;
-/// Row of the horizon where it is unknown, of the height from the top.
-pub const DEFAULT_HORIZON: f64 = 0.4;
-/// A turn that leaves less ground than this share of the height is not believed.
-const LOWEST_HORIZON: f64 = 0.85;
-/// Half widths of 90% intervals up to which what the picture shows is used, degrees, and relative.
-const MOST_PITCH_HALF_DEG: f64 = 12.0;
-const MOST_ROLL_HALF_DEG: f64 = 3.5;
+/// Half width of the 90% interval, relative, up to which the field of view that the picture shows is used.
 const MOST_FOV_HALF: f64 = 0.35;
-/// Straight lines are named as a reason if as many agree.
-const LEAST_LINES: f64 = 6.0;
 
 impl Default for View {
     /// Level, at the height of the eyes, 40 degrees.
@@ -141,7 +147,8 @@ impl CameraOptions {
 }
 
 impl View {
-    /// The camera of a photograph, from what is asked, its data and what it shows.
+    /// The camera of a photograph, from what is asked, its data and what it shows, and a warning if the
+    /// picture seems to show no ground.
     ///
     /// # Errors
     /// As [`CameraOptions::check`], and on weights of another version in the program.
@@ -149,10 +156,10 @@ impl View {
         image: &LinearImage,
         facts: &Facts,
         asked: &CameraOptions,
-    ) -> Result<Self, SetupError> {
+    ) -> Result<(Self, Option<String>), SetupError> {
         asked.check()?;
         let size = [image.0.width() as f64, image.0.height() as f64];
-        let (lens, aim, aim_why) = lens_and_aim(image, size, facts, asked)?;
+        let (lens, turn) = lens_and_turn(image, size, facts, asked)?;
         let (eye, position_why) = match asked.eye_height_m {
             Some(height) => (height, "as --eye-height says"),
             None => (
@@ -161,15 +168,16 @@ impl View {
                  the ground is twice as large and as far",
             ),
         };
-        Ok(Self {
+        let view = Self {
             position: DVec3::new(0.0, eye, 0.0),
-            aim,
+            aim: turn.aim,
             fov_deg: rounded(2.0 * (0.5 * size[1] / lens.focal_px).atan().to_degrees()),
-            aim_why,
+            aim_why: turn.why,
             position_why: position_why.into(),
             fov_why: lens.why,
             ..Self::default()
-        })
+        };
+        Ok((view, turn.warning))
     }
 
     /// The camera for a picture of this size.
@@ -210,7 +218,7 @@ impl View {
 }
 
 /// To a hundredth, which is what a file that is read by people should say.
-fn rounded(value: f64) -> f64 {
+pub(crate) fn rounded(value: f64) -> f64 {
     (value * 100.0).round() / 100.0
 }
 
@@ -300,82 +308,31 @@ fn focal_px(size: [f64; 2], fov_deg: f64) -> f64 {
     0.5 * size[0].max(size[1]) / (0.5 * fov_deg.to_radians()).tan()
 }
 
-/// Lens and turn, and why the turn.
-fn lens_and_aim(
+/// Lens and turn, and why.
+fn lens_and_turn(
     image: &LinearImage,
     size: [f64; 2],
     facts: &Facts,
     asked: &CameraOptions,
-) -> Result<(Lens, Aim, String), SetupError> {
+) -> Result<(Lens, Turn), SetupError> {
     let known = Lens::known(size, facts, asked.fov_deg);
     let estimator = CameraEstimator::embedded()?;
     let evidence = Evidence::new(image);
     let lens = known.unwrap_or_else(|| Lens::shown(size, &estimator.weighed(&evidence, None)));
-    let (aim, why) = match asked.pitch_deg {
-        Some(pitch) => (turned(pitch, 0.0), "as --pitch says".into()),
+    let turn = match asked.pitch_deg {
+        Some(pitch) => Turn {
+            aim: turn::turned(pitch, 0.0),
+            why: "as --pitch says".into(),
+            warning: None,
+        },
         // The turn belongs to the focal length that the file will say.
-        None => aim(
+        None => turn::shown(
             size,
             lens.focal_px,
             &estimator.weighed(&evidence, Some(lens.relative(size))),
         ),
     };
-    Ok((lens, aim, why))
-}
-
-fn turned(pitch: f64, roll: f64) -> Aim {
-    Aim::Turned {
-        pitch_deg: rounded(pitch),
-        roll_deg: rounded(roll),
-    }
-}
-
-/// How the camera is turned, and why.
-fn aim(size: [f64; 2], focal_px: f64, seen: &CameraEstimate) -> (Aim, String) {
-    let row = |pitch_deg: f64| 0.5 * size[1] + focal_px * pitch_deg.to_radians().tan();
-    let (pitch, roll) = (seen.pitch_deg, seen.roll_deg);
-    let agreeing = seen.agreeing.upright + seen.agreeing.level;
-    let lines = match agreeing >= LEAST_LINES {
-        true => format!(
-            "{agreeing:.0} of {} straight lines and the look",
-            seen.lines
-        ),
-        false => "the look".into(),
-    };
-    let horizon = row(pitch.middle);
-    if pitch.half_width() <= MOST_PITCH_HALF_DEG && horizon < LOWEST_HORIZON * size[1] {
-        let sure = roll.half_width() <= MOST_ROLL_HALF_DEG;
-        // Cameras are held level, unless the picture says otherwise.
-        let (roll_deg, used) = match (sure, roll.holds(0.0)) {
-            (false, _) => (0.0, ", which is too wide: 0 is used"),
-            (true, true) => (0.0, ", which may be level: 0 is used"),
-            (true, false) => (roll.middle, ""),
-        };
-        let why = format!(
-            "from {lines} of the picture: pitch {:.1} to {:.1}, roll {:.1} to {:.1} degrees \
-             (90%){used}; horizon at row {horizon:.0}; or --pitch",
-            pitch.low, pitch.high, roll.low, roll.high
-        );
-        return (turned(pitch.middle, roll_deg), why);
-    }
-    let default = (DEFAULT_HORIZON - 0.5) * size[1] / focal_px;
-    let why = match pitch.half_width() > MOST_PITCH_HALF_DEG {
-        true => format!(
-            "neither straight lines nor the look of the picture tell it: a pitch of {:.0} to {:.0} \
-             degrees is possible (90%)",
-            pitch.low, pitch.high
-        ),
-        false => format!(
-            "the picture seems to show no ground: a pitch of {:.0} to {:.0} degrees (90%)",
-            pitch.low, pitch.high
-        ),
-    };
-    let why = format!(
-        "a guess, for {why}. It puts the horizon at row {:.0}, 40% from the top; a larger \
-         pitch_deg moves it down. dipir place shows horizon and ground to set them by eye; or --pitch",
-        DEFAULT_HORIZON * size[1]
-    );
-    (turned(default.atan().to_degrees(), 0.0), why)
+    Ok((lens, turn))
 }
 
 #[cfg(test)]
@@ -393,7 +350,9 @@ mod tests {
     fn a_picture_that_tells_nothing_gets_the_defaults_and_is_told_so() {
         for [w, h] in [[900, 600], [600, 900]] {
             let facts = Facts::of_size([w as u32, h as u32]);
-            let view = View::of_photo(&grey(w, h), &facts, &CameraOptions::default()).unwrap();
+            let asked = CameraOptions::default();
+            let (view, warning) = View::of_photo(&grey(w, h), &facts, &asked).unwrap();
+            assert_eq!(warning, None);
             let camera = view.camera([w as u32, h as u32]);
             // The pitch is rounded to a hundredth of a degree: .08 pixels at a focal length of 900 pixels.
             let row = horizon_row(&camera, &view.plane(), 0.5 * w as f64).unwrap();
@@ -418,7 +377,7 @@ mod tests {
             eye_height_m: Some(3.0),
             ..CameraOptions::default()
         };
-        let view = View::of_photo(&grey(900, 600), &facts, &asked).unwrap();
+        let (view, _) = View::of_photo(&grey(900, 600), &facts, &asked).unwrap();
         let focal = view.camera([900, 600]).focal_px.x;
         // A hundredth of a degree of 41.
         assert!((focal - 800.0).abs() < 0.3, "{focal}");
@@ -433,7 +392,7 @@ mod tests {
         );
         assert_eq!(view.position.y, 3.0);
         asked.fov_deg = Some(90.0);
-        let view = View::of_photo(&grey(900, 600), &facts, &asked).unwrap();
+        let (view, _) = View::of_photo(&grey(900, 600), &facts, &asked).unwrap();
         let focal = view.camera([900, 600]).focal_px.x;
         assert!((focal - 450.0).abs() < 0.2, "{focal}");
     }

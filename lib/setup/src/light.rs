@@ -1,0 +1,211 @@
+//! The `[light]` table: the light is estimated from the photograph and from what its file holds of the sun.
+use dipir_imaging::facts::Facts;
+
+use crate::document::{number, printable, quoted};
+
+/// Columns of a comment.
+const COLUMNS: usize = 100;
+
+/// What the photograph's file says of the sun.
+struct Told<'a> {
+    time: Option<&'a str>,
+    /// Latitude and longitude, degrees.
+    place: Option<[f64; 2]>,
+    /// Degrees from north, and which north.
+    heading: Option<(f64, &'static str)>,
+}
+
+impl<'a> Told<'a> {
+    /// A year 0 and a place of 0, 0 are what devices write that know neither.
+    fn of(facts: &'a Facts) -> Self {
+        let time = facts.time.as_deref();
+        let place = facts.latitude_deg.zip(facts.longitude_deg);
+        Self {
+            time: time.filter(|t| !t.starts_with("0000")),
+            place: place.map(<[f64; 2]>::from).filter(|p| *p != [0.0; 2]),
+            heading: facts.heading.map(|h| {
+                let north = if h.magnetic { "magnetic" } else { "true" };
+                (h.deg, north)
+            }),
+        }
+    }
+
+    /// What is there: `the time 2026-06-21T12:34:56 and the place`.
+    fn known(&self) -> Vec<String> {
+        let time = self.time.map(|t| format!("the time {}", printable(t)));
+        let place = self.place.map(|_| "the place".into());
+        let heading = self
+            .heading
+            .map(|(deg, north)| format!("the heading, {deg:.0} degrees from {north} north"));
+        [time, place, heading].into_iter().flatten().collect()
+    }
+
+    /// What follows of the sun, and how to say more.
+    fn consequence(&self) -> &'static str {
+        match (
+            self.time.is_some(),
+            self.place.is_some(),
+            self.heading.is_some(),
+        ) {
+            (true, true, true) => "The sun is taken from them; to say otherwise:",
+            (true, true, false) => {
+                "They give how high the sun stands; without a heading nothing follows of its direction: write \
+                 heading_deg, where the camera looked, clockwise from north (180.0 is an example):"
+            }
+            (true, false, _) => {
+                "Without a place nothing follows of the sun: write latitude and longitude (these are examples):"
+            }
+            (false, true, _) => {
+                "Without a time nothing follows of the sun: write time (this is an example):"
+            }
+            (false, false, _) => {
+                "Without time and place nothing follows of the sun: write time, latitude and longitude (these are \
+                 examples):"
+            }
+        }
+    }
+
+    /// What is known and examples of what is missing, as keys of `sun`.
+    fn keys(&self) -> String {
+        let time = self.time.unwrap_or("2026-06-21T12:00:00+02:00");
+        let [latitude, longitude] = self.place.unwrap_or([48.14, 11.58]);
+        let mut keys = format!(
+            "time = {}, latitude = {}, longitude = {}",
+            quoted(time),
+            number(latitude, 5),
+            number(longitude, 5)
+        );
+        let by_default = (self.time.is_some() && self.place.is_some()).then_some(180.0);
+        if let Some(deg) = self.heading.map(|h| h.0).or(by_default) {
+            keys += &format!(", heading_deg = {}", number(deg, 1));
+        }
+        keys
+    }
+}
+
+/// The comment that stands for the table, and shows how to write it.
+pub(crate) fn light(facts: &Facts) -> String {
+    let told = Told::of(facts);
+    let known = told.known();
+    let (words, keys) = match &known[..] {
+        [] => (
+            "The light is estimated from the photograph, whose file says nothing of time and place. Who knows \
+             where the sun was says so:"
+                .into(),
+            "azimuth_deg = 90.0, elevation_deg = 40.0".into(),
+        ),
+        known => (
+            format!(
+                "The light is estimated from the photograph. Its file says {}. {}",
+                listed(known),
+                told.consequence()
+            ),
+            told.keys(),
+        ),
+    };
+    format!("{}# [light]\n# sun = {{ {keys} }}\n", comment(&words))
+}
+
+/// `a, b and c`.
+fn listed(words: &[String]) -> String {
+    match words {
+        [] => String::new(),
+        [one] => one.clone(),
+        [first @ .., last] => format!("{} and {last}", first.join(", ")),
+    }
+}
+
+/// Lines of a comment.
+pub(crate) fn comment(words: &str) -> String {
+    let mut text = String::new();
+    let mut line = String::from("#");
+    for word in words.split_whitespace() {
+        if line.len() > 1 && line.len() + 1 + word.len() > COLUMNS {
+            text += &line;
+            text.push('\n');
+            line = "#".into();
+        }
+        line.push(' ');
+        line += word;
+    }
+    text + &line + "\n"
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_imaging::facts::Heading;
+
+    use super::*;
+
+    /// The comment in one line, of a file with a time, a place and a heading, where these are given.
+    fn said(time: Option<&str>, place: Option<[f64; 2]>, heading: bool) -> String {
+        let facts = Facts {
+            time: time.map(Into::into),
+            latitude_deg: place.map(|p| p[0]),
+            longitude_deg: place.map(|p| p[1]),
+            heading: heading.then_some(Heading {
+                deg: 213.4,
+                magnetic: true,
+            }),
+            ..Facts::of_size([900, 600])
+        };
+        light(&facts).replace("\n# ", " ")
+    }
+
+    const TIME: Option<&str> = Some("2026-06-21T12:34:56+02:00");
+    const PLACE: Option<[f64; 2]> = Some([48.1, -11.5]);
+
+    #[test]
+    fn what_is_missing_for_the_sun_is_said() {
+        for (text, part) in [
+            (
+                said(TIME, PLACE, true),
+                "says the time 2026-06-21T12:34:56+02:00, the place and the heading, 213 degrees from \
+                 magnetic north. The sun is taken from them",
+            ),
+            (
+                said(TIME, PLACE, false),
+                "without a heading nothing follows of its direction: write heading_deg",
+            ),
+            (
+                said(TIME, None, false),
+                "Its file says the time 2026-06-21T12:34:56+02:00. Without a place nothing follows of the sun: \
+                 write latitude and longitude",
+            ),
+            (said(TIME, None, true), "Without a place nothing follows"),
+            (
+                said(None, PLACE, false),
+                "Its file says the place. Without a time nothing follows of the sun: write time",
+            ),
+            (
+                said(None, None, true),
+                "Without time and place nothing follows",
+            ),
+            (said(None, None, false), "nothing of time and place"),
+        ] {
+            assert!(text.contains(part), "{part}: {text}");
+            assert!(!text.contains("are used"), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_time_and_a_place_of_zero_are_none() {
+        let zero = Some("0000-00-00T00:00:00");
+        assert_eq!(said(zero, Some([0.0; 2]), false), said(None, None, false));
+        assert_eq!(said(TIME, Some([0.0; 2]), true), said(TIME, None, true));
+        // On the equator, and on the meridian of Greenwich.
+        for place in [[0.0, 9.5], [51.5, 0.0]] {
+            assert!(said(TIME, Some(place), true).contains("the place"));
+        }
+    }
+
+    #[test]
+    fn comments_are_wrapped() {
+        let text = comment(&"word ".repeat(50));
+        assert!(
+            text.lines()
+                .all(|l| l.starts_with("# word") && l.len() <= COLUMNS)
+        );
+        assert_eq!(text.matches("word").count(), 50);
+    }
+}
