@@ -1,7 +1,6 @@
 //! `dipir-evaluate`: how good the light of a method is, where the truth is known.
 use std::process::ExitCode;
 
-use clap::Parser;
 use dipir_benchmark::command_line::{
     Cli, Command, LeftOutArgs, MakeArgs, MethodsArgs, ReportArgs, RunArgs, SpheresArgs,
     StudyCommand, StudyCountArgs, StudyPageArgs,
@@ -11,11 +10,12 @@ use dipir_benchmark::methods::{self, Method};
 use dipir_benchmark::run::Step;
 use dipir_benchmark::{left_out, make, report, run, spheres, study};
 use dipir_cli::exit::{self, describe};
+use dipir_cli::output::{json_path, json_paths};
 use dipir_cli::progress::Progress;
 use serde_json::json;
 
 fn main() -> ExitCode {
-    exit::run(|| match Cli::parse().command {
+    exit::run(|| match exit::parse::<Cli>()?.command {
         Command::Make(args) => make_scenes(&args),
         Command::Run(args) => run_methods(&args),
         Command::Report(args) => write_report(&args),
@@ -35,7 +35,7 @@ fn make_scenes(args: &MakeArgs) -> anyhow::Result<()> {
     let scenes = evaluation.root().join("scenes");
     args.folder.output.result(
         || format!("{} scenes in {}", made.len(), scenes.display()),
-        || json!({"scenes": made, "folder": evaluation.root()}),
+        || json!({"scenes": made, "folder": json_path(evaluation.root())}),
     );
     Ok(())
 }
@@ -67,7 +67,7 @@ fn compare_left_out(args: &LeftOutArgs) -> anyhow::Result<()> {
 fn run_methods(args: &RunArgs) -> anyhow::Result<()> {
     let output = &args.folder.output;
     let progress = Progress::new("evaluate", output.quiet);
-    let outcome = run::run(args, &|step: Step| {
+    let ended = |step: Step| {
         let Step {
             done,
             total,
@@ -78,7 +78,8 @@ fn run_methods(args: &RunArgs) -> anyhow::Result<()> {
         if output.verbose {
             progress.note(&format!("{done} of {total}: {scene}, {method}"));
         }
-    })?;
+    };
+    let outcome = run::run(args, &|line| output.warn(line), &ended)?;
     progress.done();
     for (which, error) in &outcome.failures {
         output.warn(&format!("{which}: {}", describe(error)));
@@ -97,7 +98,7 @@ fn run_methods(args: &RunArgs) -> anyhow::Result<()> {
                 outcome.folder.display()
             )
         },
-        || json!({"scenes": outcome.scenes, "methods": outcome.methods, "folder": args.folder.out}),
+        || json!({"scenes": outcome.scenes, "methods": outcome.methods, "folder": json_path(&args.folder.out)}),
     );
     Ok(())
 }
@@ -110,7 +111,7 @@ fn write_report(args: &ReportArgs) -> anyhow::Result<()> {
             let names: Vec<String> = names.collect();
             format!("{}\nwrote {}", written.tables.trim_end(), names.join(", "))
         },
-        || json!({"files": written.files}),
+        || json!({"files": json_paths(&written.files)}),
     );
     Ok(())
 }
@@ -126,7 +127,7 @@ fn write_study(args: &StudyPageArgs) -> anyhow::Result<()> {
                 page.pairs
             )
         },
-        || json!({"page": page.file, "pairs": page.pairs}),
+        || json!({"page": json_path(&page.file), "pairs": page.pairs}),
     );
     Ok(())
 }

@@ -93,11 +93,11 @@ pub struct MakeArgs {
     #[arg(long, value_name = "TSV", requires = "hdri")]
     pub kinds: Option<PathBuf>,
 
-    /// Seed of what is drawn
+    /// Seed of what is drawn; scenes of one kind in a folder have one
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
 
-    /// Width and height of the photographs
+    /// Width and height of the photographs; scenes of one kind in a folder have the same
     #[arg(long, value_name = "WxH", default_value = "192x128", value_parser = parse_size)]
     pub size: [usize; 2],
 }
@@ -118,7 +118,7 @@ pub struct RunArgs {
     #[command(flatten)]
     pub folder: FolderArgs,
 
-    /// Only these methods, by name; may be repeated
+    /// Only these methods, by name, beside those of --environment-from; may be repeated
     #[arg(long, value_name = "NAME")]
     pub method: Vec<String>,
 
@@ -135,11 +135,12 @@ pub struct RunArgs {
     #[arg(long, value_name = "NAME")]
     pub scene: Vec<String>,
 
-    /// The diffusion model of the methods that ask one [default: the embedded one]
+    /// The diffusion model of the methods that ask one and have none of their own [default: the embedded one]. Methods
+    /// that need a model that knows light are left out where this one does not
     #[arg(long, value_name = "DIR")]
     pub model: Option<PathBuf>,
 
-    /// Set a key for every method, as in --set light.iterations=100; may be repeated. Relative
+    /// Set a key for every method, as in --set lora.steps=200, that none of them sets itself; may be repeated. Relative
     /// concepts.cache and lora.cache start from the evaluation's folder
     #[arg(long = "set", short = 's', value_name = "KEY=VALUE")]
     pub set: Vec<String>,

@@ -17,6 +17,25 @@ pub struct EvaluationFolder {
 /// The folder of the truth among the runs; no method may have this name.
 pub const TRUTH: &str = "truth";
 
+/// What the scenes of one set have in common.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Drawn {
+    /// "panoramas", or the kind of generated places.
+    pub set: String,
+    /// The seed of what is drawn.
+    pub seed: u64,
+    /// Width and height of the photographs.
+    pub size: [usize; 2],
+}
+
+impl Drawn {
+    fn options(&self) -> String {
+        let [width, height] = self.size;
+        format!("--seed {} --size {width}x{height}", self.seed)
+    }
+}
+
 /// What is known of a scene, beside its `pipeline.toml`: the content of `scene.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -34,6 +53,9 @@ pub struct SceneInfo {
     /// The kind of place, if it is known: the report has a table by kind.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kind: Option<String>,
+    /// How it was drawn, if `dipir-evaluate make` made it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub drawn: Option<Drawn>,
 }
 
 impl EvaluationFolder {
@@ -84,6 +106,34 @@ impl EvaluationFolder {
             .iter()
             .map(|n| read_json(&folder.join(n).join("scene.json")))
             .collect()
+    }
+
+    /// Refuses to add scenes that are `drawn` so to those of the same set that were drawn otherwise.
+    ///
+    /// # Errors
+    /// If there are such scenes, or one that is there cannot be read.
+    pub fn refuse_others(&self, drawn: &Drawn) -> anyhow::Result<()> {
+        let folder = self.root.join("scenes");
+        for name in folders(&folder)? {
+            let file = folder.join(&name).join("scene.json");
+            // A scene without it is not finished.
+            if !file.is_file() {
+                continue;
+            }
+            let info: SceneInfo = read_json(&file)?;
+            let other = info.drawn.filter(|d| d.set == drawn.set && d != drawn);
+            if let Some(other) = other {
+                let text = format!(
+                    "{} holds {name}, made with {}, and {} is asked for: a set has one seed and one size; ask \
+                     for the same, name another folder with --out, or remove the scenes that are there",
+                    folder.display(),
+                    other.options(),
+                    drawn.options()
+                );
+                return Err(Usage(text).into());
+            }
+        }
+        Ok(())
     }
 
     /// The scenes whose names begin with one of `prefixes`; all if there are no prefixes.

@@ -11,29 +11,34 @@ use dipir_pretraining::scene::Setting;
 use dipir_scene::export::to_obj;
 use dipir_stages::composite::table::Tone;
 
-use crate::folder::{EvaluationFolder, SceneInfo};
+use crate::folder::{Drawn, EvaluationFolder, SceneInfo};
 
 /// Columns and rows of the true light.
 const MAP: [usize; 2] = [512, 256];
 /// Key of these places. Training, tuning and quality checks have others.
 const SEED: u64 = 0xeba1_5ce2;
 
-/// Makes the scene number `index` under `seed`, `side` pixels high and wide, unless it is there; its name.
-pub fn make(
-    evaluation: &EvaluationFolder,
-    seed: u64,
-    index: u64,
-    side: usize,
-    setting: Setting,
-) -> anyhow::Result<String> {
-    let place = GeneratedPhotograph::draw(SEED ^ seed, index, side as u32, setting);
-    let stage = &place.scene;
-    let class = stage.shape.word();
-    let kind = match setting {
+/// The kind of place, which is the set that its scenes belong to.
+pub fn kind(setting: Setting) -> &'static str {
+    match setting {
         Setting::Open => "generated",
         Setting::Street => "street",
         Setting::Courtyard => "yard",
-    };
+    }
+}
+
+/// Makes the scene number `index`, `drawn` as asked and square, unless it is there; its name.
+pub fn make(
+    evaluation: &EvaluationFolder,
+    drawn: &Drawn,
+    index: u64,
+    setting: Setting,
+) -> anyhow::Result<String> {
+    let side = drawn.size[1];
+    let place = GeneratedPhotograph::draw(SEED ^ drawn.seed, index, side as u32, setting);
+    let stage = &place.scene;
+    let class = stage.shape.word();
+    let kind = kind(setting);
     let name = format!("{kind}-{index:03}-{class}");
     let folder = evaluation.scene(&name);
     if folder.join("scene.json").is_file() {
@@ -78,6 +83,7 @@ pub fn make(
         exposure_ev: f64::from(exposure.log2()),
         tone: Tone::None,
         kind: Some(kind.into()),
+        drawn: Some(drawn.clone()),
     };
     // Last: a scene is there once this file is.
     write_json(&folder.join("scene.json"), &info)?;

@@ -4,7 +4,10 @@
 //!
 //! Everything is in one folder: `scenes/`, `maps/` and `objects/` that are made, `runs/METHOD/SCENE/`
 //! with pictures and scores, `work/` where stages run, and the report.
+mod check;
+mod chosen;
 pub mod command_line;
+pub mod definition;
 pub mod folder;
 mod generated;
 pub mod left_out;

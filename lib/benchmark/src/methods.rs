@@ -6,6 +6,8 @@ use dipir_cli::exit::Usage;
 use dipir_stages::names::{self, StageName};
 use serde::{Deserialize, Serialize};
 
+use crate::folder::TRUTH;
+
 /// The stages that a method may run before the composite, in their order.
 pub const BEFORE_COMPOSITE: [&StageName; 4] =
     [&names::SCENE, &names::CONCEPTS, &names::LORA, &names::LIGHT];
@@ -50,6 +52,39 @@ pub struct Method {
     /// Whether a diffusion model is asked.
     #[serde(default)]
     pub model: bool,
+}
+
+/// The key of `set` that gives a row a diffusion model of its own.
+pub const MODEL_PATH: &str = "model.path";
+
+/// The dotted key that `key=value` sets.
+pub fn key_of(set: &str) -> String {
+    let key = set.split_once('=').map_or(set, |(key, _)| key);
+    let steps: Vec<&str> = key.split('.').map(str::trim).collect();
+    steps.join(".")
+}
+
+impl Method {
+    /// The row of the picture under the true light.
+    pub fn truth() -> Self {
+        Self {
+            name: TRUTH.into(),
+            title: "Truth".into(),
+            light: Source::Truth,
+            stages: scene_alone(),
+            set: Vec::new(),
+            model: false,
+        }
+    }
+
+    /// The text that the row sets a key to, without quotation marks.
+    pub fn value(&self, key: &str) -> Option<String> {
+        let set = self.set.iter().rev().find(|s| key_of(s) == key)?;
+        let (_, value) = set.split_once('=')?;
+        let table: Option<toml::Table> = toml::from_str(&format!("value = {value}")).ok();
+        let quoted = table.as_ref().and_then(|t| t.get("value")?.as_str());
+        Some(quoted.unwrap_or(value.trim()).to_owned())
+    }
 }
 
 fn scene_alone() -> Vec<String> {
@@ -100,6 +135,18 @@ fn parse(text: &str) -> anyhow::Result<Vec<Method>> {
                 "method \"{}\": no stage before the composite is called \"{other}\"; accepted: {}",
                 method.name,
                 accepted.join(", ")
+            );
+        }
+        if method.light == Source::Imported {
+            anyhow::bail!(
+                "method \"{}\": light = \"imported\" has no maps; name their folder with --environment-from",
+                method.name
+            );
+        }
+        if method.value(MODEL_PATH).is_some() && !method.model {
+            anyhow::bail!(
+                "method \"{}\": {MODEL_PATH} is the model that is asked; add model = true",
+                method.name
             );
         }
         let recovers = method.stages.iter().any(|s| s == names::LIGHT.name);
@@ -172,6 +219,16 @@ mod tests {
             "method \"a\": light = \"recovered\" and the stage \"light\" go together"
         );
         assert!(message("[[method]]\nname = \"a\"\ncolour = 1\n").contains("colour"));
+        assert_eq!(
+            message(
+                "[[method]]\nname = \"a\"\ntitle = \"\"\nlight = \"neutral\"\nset = [\"model.path=sd\"]\n"
+            ),
+            "method \"a\": model.path is the model that is asked; add model = true"
+        );
+        assert_eq!(
+            message("[[method]]\nname = \"a\"\ntitle = \"\"\nlight = \"imported\"\n"),
+            "method \"a\": light = \"imported\" has no maps; name their folder with --environment-from"
+        );
         assert_eq!(
             message(
                 "[[method]]\nname = \"a\"\ntitle = \"\"\nlight = \"recovered\"\nstages = [\"optimize\"]\n"

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use dipir_cli::exit::Usage;
-use dipir_evaluation::results::{write, write_json};
+use dipir_evaluation::results::{read_json, write, write_json};
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
@@ -18,7 +18,7 @@ use dipir_stages::scene::background::{MID_GREY, PanoramaView, exposure_ev_to};
 use glam::Vec3;
 
 use crate::command_line::MakeArgs;
-use crate::folder::{EvaluationFolder, SceneInfo};
+use crate::folder::{Drawn, EvaluationFolder, SceneInfo};
 
 /// Vertical field of view of every photograph, degrees.
 const FOV_DEG: f32 = 40.0;
@@ -46,6 +46,7 @@ pub fn make(
     args: &MakeArgs,
     evaluation: &EvaluationFolder,
     folder: &Path,
+    drawn: &Drawn,
     progress: &dyn Fn(f64),
 ) -> anyhow::Result<Vec<String>> {
     let kinds = args.kinds.as_deref().map(read_kinds).transpose()?;
@@ -61,26 +62,47 @@ pub fn make(
         let (p, m) = pair(n as usize, panoramas.len(), models.len());
         let (panorama, model) = (&panoramas[p], &models[m]);
         let name = format!("{:03}-{}-{}", n, safe_stem(panorama), safe_stem(model));
+        let stem = panorama.file_stem().unwrap_or_default().to_string_lossy();
+        let kind = kinds.as_ref().and_then(|k| k.get(stem.as_ref()).cloned());
         let done = evaluation.scene(&name).join("scene.json");
-        if !done.is_file() {
+        if done.is_file() {
+            refuse_other_kind(&done, kind)?;
+        } else {
             if kept.as_ref().is_none_or(|(path, _)| path != panorama) {
                 kept = Some((panorama.clone(), read_map(panorama)?));
             }
             if let Some((_, map)) = &kept {
-                let stem = panorama.file_stem().unwrap_or_default().to_string_lossy();
-                let kind = kinds.as_ref().and_then(|k| k.get(stem.as_ref()).cloned());
                 let source = Source {
                     panorama,
                     map,
                     model,
                     kind,
                 };
-                make_one(evaluation, args, n, &name, source)?;
+                make_one(evaluation, drawn, n, &name, source)?;
             }
         }
         made.push(name);
     }
     Ok(made)
+}
+
+/// Refuses a scene that is there as of another kind than `asked`, if one is.
+fn refuse_other_kind(file: &Path, asked: Option<String>) -> anyhow::Result<()> {
+    let info: SceneInfo = read_json(file)?;
+    match asked {
+        Some(asked) if info.kind.as_ref() != Some(&asked) => {
+            let had = info
+                .kind
+                .map_or("no kind".into(), |k| format!("the kind \"{k}\""));
+            let text = format!(
+                "the scene in {} has {had}, and --kinds says \"{asked}\"; name another folder with --out, or remove \
+                 the scene",
+                file.parent().unwrap_or(file).display()
+            );
+            Err(Usage(text).into())
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Panorama and model of scene number `n`. Both change from scene to scene, and every pair comes once
@@ -100,7 +122,7 @@ struct Source<'a> {
 
 fn make_one(
     evaluation: &EvaluationFolder,
-    args: &MakeArgs,
+    drawn: &Drawn,
     n: u64,
     name: &str,
     source: Source,
@@ -109,7 +131,7 @@ fn make_one(
     fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
     let map_name = format!("{}.exr", safe_stem(source.panorama));
     write_map(&evaluation.root().join("maps").join(&map_name), source.map)?;
-    let mut draw = Sampler::new(args.seed, Stream::PILOT, n as u32, 0);
+    let mut draw = Sampler::new(drawn.seed, Stream::PILOT, n as u32, 0);
     let yaw_deg = (draw.next_1d() * 360.0).round();
     let turn_deg = (draw.next_1d() * 360.0).round();
     let view = PanoramaView {
@@ -117,8 +139,8 @@ fn make_one(
         yaw_rad: yaw_deg.to_radians(),
         pitch_rad: PITCH_DEG.to_radians(),
         roll_rad: 0.0,
-        width: args.size[0],
-        height: args.size[1],
+        width: drawn.size[0],
+        height: drawn.size[1],
     };
     let image = view.take(source.map);
     let exposure_ev = exposure_ev(&image);
@@ -141,6 +163,7 @@ fn make_one(
         exposure_ev,
         tone: Tone::Reinhard,
         kind: source.kind,
+        drawn: Some(drawn.clone()),
     };
     // Last: a scene is there once this file is.
     write_json(&folder.join("scene.json"), &info)

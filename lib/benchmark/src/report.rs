@@ -13,9 +13,10 @@ use dipir_imaging::raster::DisplayImage;
 use serde_json::{Value, json};
 
 use crate::command_line::ReportArgs;
+use crate::definition::Definition;
 use crate::folder::{EvaluationFolder, SceneInfo, TRUTH};
-use crate::methods;
-use crate::metrics::{COMPARED, METRICS, Metric};
+use crate::methods::{self, Source};
+use crate::metrics::{COMPARED, METRICS, Metric, SECONDS};
 use crate::score::Score;
 
 /// Seed of every bootstrap.
@@ -56,6 +57,8 @@ pub fn report(args: &ReportArgs) -> anyhow::Result<Written> {
 pub(crate) struct Column {
     pub name: String,
     pub title: String,
+    /// What all scores were made with.
+    pub definition: Definition,
     pub scores: BTreeMap<String, Score>,
 }
 
@@ -76,10 +79,12 @@ fn read(evaluation: &EvaluationFolder, scenes: &[SceneInfo]) -> anyhow::Result<V
                 scores.insert(scene.name.clone(), score);
             }
         }
-        if let Some(title) = scores.values().next().map(|s| s.title.clone()) {
+        if let Some(first) = scores.values().next() {
+            refuse_mixture(&name, &scores)?;
             columns.push(Column {
+                title: first.title.clone(),
+                definition: first.definition.clone(),
                 name,
-                title,
                 scores,
             });
         }
@@ -99,6 +104,26 @@ fn read(evaluation: &EvaluationFolder, scenes: &[SceneInfo]) -> anyhow::Result<V
     };
     columns.sort_by_key(place);
     Ok(columns)
+}
+
+/// Refuses scores of one method that were not made alike.
+fn refuse_mixture(name: &str, scores: &BTreeMap<String, Score>) -> anyhow::Result<()> {
+    let mut all = scores.iter();
+    let Some((first, Score { definition, .. })) = all.next() else {
+        return Ok(());
+    };
+    let found = all.find_map(|(s, score)| Some((s, definition.unlike(&score.definition)?)));
+    let Some((other, [a, b])) = found else {
+        return Ok(());
+    };
+    let option = match definition.row.light {
+        Source::Imported => "--environment-from and the folder of its maps".to_owned(),
+        _ => format!("--method {name}"),
+    };
+    bail!(
+        "the scores of the method \"{name}\" were made in more than one way: {first} with {a}, {other} with {b}; run \
+         dipir-evaluate run with {option} and the same options for all scenes, or report on some scenes with --scene"
+    )
 }
 
 /// Adds LPIPS to the scores of pictures.
@@ -173,6 +198,8 @@ pub(crate) struct Report {
     pub baseline: Option<usize>,
     /// One for each column.
     pub rows: Vec<Row>,
+    /// What the table does not say, a line each: what seconds are, what methods were made with, which are not compared.
+    pub notes: Vec<String>,
     /// One for each kind of place that is known.
     pub kinds: Vec<KindRow>,
 }
@@ -180,6 +207,11 @@ pub(crate) struct Report {
 impl Report {
     fn new(columns: Vec<Column>, baseline: Option<usize>, scenes: &[SceneInfo]) -> Self {
         let metrics = present(&columns);
+        // What separates a method from the one that others are compared with.
+        let apart = |k: usize| {
+            let b = baseline.filter(|b| *b != k)?;
+            columns[k].definition.unlike_shared(&columns[b].definition)
+        };
         let row = |(k, column): (usize, &Column)| {
             let summary = |m: &&Metric| {
                 let values: Vec<f64> = column.scores.values().filter_map(m.of).collect();
@@ -188,11 +220,21 @@ impl Report {
             Row {
                 metrics: metrics.iter().map(summary).collect(),
                 difference: baseline
-                    .filter(|b| *b != k)
+                    .filter(|b| *b != k && apart(k).is_none())
                     .and_then(|b| difference(column, &columns[b])),
             }
         };
         let rows = columns.iter().enumerate().map(row).collect();
+        let mut notes = vec![format!("{}: {}", SECONDS.name, SECONDS.about)];
+        notes.extend(made_with(&columns));
+        for (k, column) in columns.iter().enumerate() {
+            if let (Some([own, other]), Some(b)) = (apart(k), baseline) {
+                notes.push(format!(
+                    "{} is not compared with {}: it was made with {own}, the other with {other}",
+                    column.title, columns[b].title
+                ));
+            }
+        }
         let kinds: BTreeSet<&String> = scenes.iter().filter_map(|s| s.kind.as_ref()).collect();
         let kinds = kinds.into_iter().map(|k| KindRow::new(k, scenes, &columns));
         Self {
@@ -201,6 +243,7 @@ impl Report {
             metrics,
             baseline,
             rows,
+            notes,
         }
     }
 
@@ -215,7 +258,7 @@ impl Report {
             let names = self.metrics.iter().map(|m| m.name);
             let medians: BTreeMap<&str, &Option<Summary>> = names.zip(&row.metrics).collect();
             json!({
-                "name": column.name, "title": column.title, "medians": medians,
+                "name": column.name, "title": column.title, "definition": column.definition, "medians": medians,
                 "beside_baseline": row.difference, "scores": column.scores.values().collect::<Vec<_>>(),
             })
         });
@@ -229,17 +272,32 @@ impl Report {
             "compared_by": COMPARED.name,
             "methods": methods.collect::<Vec<_>>(),
             "kinds": kinds.collect::<Vec<_>>(),
+            "notes": self.notes,
         })
     }
 
     fn csv(&self) -> String {
         let heads: Vec<&str> = self.metrics.iter().map(|m| m.name).collect();
-        let mut out = format!("method,scene,\"{}\"\n", heads.join("\",\""));
+        let mut out = format!(
+            "method,scene,\"{}\",\"stages in seconds\",model,set,\"target error\"\n",
+            heads.join("\",\"")
+        );
         for column in &self.columns {
             for (scene, score) in &column.scores {
                 let cell = |m: &&Metric| (m.of)(score).map_or(String::new(), |v| v.to_string());
                 let cells: Vec<String> = self.metrics.iter().map(cell).collect();
-                let _ = writeln!(out, "{},{scene},{}", column.name, cells.join(","));
+                let ran: Vec<&str> = score.seconds.iter().map(|(s, _)| s.as_str()).collect();
+                let made = &score.definition;
+                let _ = writeln!(
+                    out,
+                    "{},{scene},{},{},{},{},{}",
+                    column.name,
+                    cells.join(","),
+                    quoted(&ran.join(" ")),
+                    quoted(&made.model_in_words()),
+                    quoted(&made.set_in_words()),
+                    made.target_error
+                );
             }
         }
         out
@@ -250,6 +308,10 @@ impl Report {
             return String::new();
         };
         let mut out = markdown_table(head, rows);
+        out.push('\n');
+        for note in &self.notes {
+            let _ = writeln!(out, "- {note}");
+        }
         if let [head, rows @ ..] = &self.kinds_table()[..] {
             let _ = write!(out, "\n{} by kind of place:\n\n", COMPARED.name);
             out += &markdown_table(head, rows);
@@ -323,6 +385,25 @@ fn difference(column: &Column, baseline: &Column) -> Option<Summary> {
     Summary::of(&all, SEED)
 }
 
+/// What methods were made with, a line for those that were made alike.
+fn made_with(columns: &[Column]) -> Vec<String> {
+    let mut lines: Vec<(String, Vec<&str>)> = Vec::new();
+    for column in columns {
+        let words = column.definition.in_words();
+        match lines.iter_mut().find(|(w, _)| *w == words) {
+            Some((_, titles)) => titles.push(&column.title),
+            None => lines.push((words, vec![&column.title])),
+        }
+    }
+    let line = |(words, titles): (String, Vec<&str>)| format!("{}: {words}", titles.join(", "));
+    lines.into_iter().map(line).collect()
+}
+
+/// A cell of CSV.
+fn quoted(text: &str) -> String {
+    format!("\"{}\"", text.replace('"', "\"\""))
+}
+
 fn cell(summary: &Option<Summary>, digits: usize) -> String {
     summary.as_ref().map_or("-".into(), |s| s.text(digits))
 }
@@ -339,6 +420,7 @@ fn markdown_table(head: &[String], rows: &[Vec<String>]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::definition::tests::of;
 
     #[test]
     fn a_damaged_score_is_named_with_what_to_do() {
@@ -354,15 +436,115 @@ mod tests {
         assert!(format!("{error:#}").contains(&wanted), "{error:#}");
     }
 
+    fn score(rmse_touched: f64, made: &Definition) -> Score {
+        let picture = json!({"rmse": 0.0, "ssim": 1.0, "si_rmse": 0.0, "rmse_touched": rmse_touched,
+            "si_rmse_object": 0.0});
+        serde_json::from_value(json!({"key": "", "method": "m", "title": "M", "scene": "",
+            "definition": made, "picture": picture, "light": null,
+            "seconds": [["dipir-light", 2.0], ["dipir-composite", 1.0]], "peak_rss_bytes": 0}))
+        .unwrap()
+    }
+
+    fn column(name: &str, made: Definition) -> Column {
+        Column {
+            name: name.into(),
+            title: made.row.title.clone(),
+            scores: [("a".to_owned(), score(0.1, &made))].into(),
+            definition: made,
+        }
+    }
+
+    #[test]
+    fn scores_of_one_method_that_were_not_made_alike_are_refused() {
+        let scores = |other: Definition| -> BTreeMap<String, Score> {
+            let first = of("ours", "embedded", &["lora.steps=200"]);
+            [("a", first), ("b", other)]
+                .map(|(n, d)| (n.to_owned(), score(0.1, &d)))
+                .into()
+        };
+        refuse_mixture("ours", &scores(of("ours", "embedded", &["lora.steps=200"]))).unwrap();
+        let message = |other| {
+            refuse_mixture("ours", &scores(other))
+                .unwrap_err()
+                .to_string()
+        };
+        assert_eq!(
+            message(of("ours", "embedded", &["lora.steps=500"])),
+            "the scores of the method \"ours\" were made in more than one way: a with --set lora.steps=200, b with \
+             --set lora.steps=500; run dipir-evaluate run with --method ours and the same options for all scenes, or \
+             report on some scenes with --scene"
+        );
+        let other = message(of("ours", "sd", &["lora.steps=200"]));
+        assert!(
+            other.contains("a with the embedded model (embedded), b with the model sd"),
+            "{other}"
+        );
+    }
+
+    #[test]
+    fn a_mixture_in_the_folder_is_refused_unless_the_scenes_that_are_chosen_are_alike() {
+        let folder = tempfile::tempdir().unwrap();
+        let evaluation = EvaluationFolder::new(folder.path());
+        let scenes = ["a", "b"].map(|name| -> SceneInfo {
+            serde_json::from_value(
+                json!({"name": name, "made_from": "", "map": "", "exposure_ev": 0.0,
+                "tone": "none"}),
+            )
+            .unwrap()
+        });
+        for (scene, set) in scenes.iter().zip(["lora.steps=1", "lora.steps=2"]) {
+            let made = of("ours", "embedded", &[set]);
+            let file = evaluation.run("ours", &scene.name).join("score.json");
+            write_json(&file, &score(0.1, &made)).unwrap();
+        }
+        assert!(read(&evaluation, &scenes).is_err());
+        let one = read(&evaluation, &scenes[..1]).unwrap();
+        assert_eq!(one[0].definition.set["lora.steps"], "1");
+    }
+
+    #[test]
+    fn methods_that_share_no_model_or_settings_are_not_compared_and_the_report_says_so() {
+        let columns = vec![
+            column("neutral", of("neutral", "", &[])),
+            column("read", of("read", "sd", &[])),
+            column("sds", of("sds", "embedded", &["light.lobes=8"])),
+            column("ours", of("ours", "embedded", &[])),
+        ];
+        let report = Report::new(columns, Some(3), &[]);
+        let compared: Vec<bool> = report.rows.iter().map(|r| r.difference.is_some()).collect();
+        assert_eq!(compared, [true, false, false, false]);
+        let markdown = report.markdown();
+        for line in [
+            "- Light as read, no guidance is not compared with Ours: it was made with the model sd (sd000000), the \
+             other with the embedded model (embedded)\n",
+            "- Ours (SDS) is not compared with Ours: it was made with --set light.lobes=8, the other with no --set \
+             light.lobes\n",
+            "- Ours (SDS): the embedded model (embedded), --set light.lobes=8, --target-error 0.004\n",
+            "so seconds do not compare methods\n",
+        ] {
+            assert!(markdown.contains(line), "{markdown}");
+        }
+        let csv = report.csv();
+        assert!(csv.contains("\"seconds\",\"stages in seconds\",model,set,\"target error\"\n"));
+        let row = "sds,a,0,0.1,1,0,0,3,\"dipir-light dipir-composite\",\"the embedded model (embedded)\",\
+                   \"--set light.lobes=8\",0.004\n";
+        assert!(csv.contains(row), "{csv}");
+        let json = report.json();
+        assert_eq!(json["methods"][1]["definition"]["model"]["path"], "sd");
+        assert_eq!(json["methods"][2]["definition"]["set"]["light.lobes"], "8");
+        let folder = tempfile::tempdir().unwrap();
+        let page = report
+            .html(&EvaluationFolder::new(folder.path()), &[])
+            .unwrap();
+        assert!(
+            page.contains("<li>Ours (SDS) is not compared with Ours: "),
+            "{page}"
+        );
+    }
+
     #[test]
     fn scenes_of_a_kind_are_summed_up_apart_from_others() {
-        let score = |rmse_touched: f64| -> Score {
-            let picture = json!({"rmse": 0.0, "ssim": 1.0, "si_rmse": 0.0, "rmse_touched": rmse_touched,
-                "si_rmse_object": 0.0});
-            serde_json::from_value(json!({"key": "", "method": "m", "title": "M", "scene": "",
-                "picture": picture, "light": null, "seconds": [], "peak_rss_bytes": 0}))
-            .unwrap()
-        };
+        let made = of("neutral", "", &[]);
         let scene = |name: &str, kind: Option<&str>| -> SceneInfo {
             serde_json::from_value(
                 json!({"name": name, "made_from": "", "map": "", "exposure_ev": 0.0,
@@ -374,7 +556,8 @@ mod tests {
         let columns = vec![Column {
             name: "m".into(),
             title: "M".into(),
-            scores: scores.map(|(n, v)| (n.to_owned(), score(v))).into(),
+            definition: made.clone(),
+            scores: scores.map(|(n, v)| (n.to_owned(), score(v, &made))).into(),
         }];
         let scenes = [
             scene("a", Some("indoors")),

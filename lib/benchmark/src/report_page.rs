@@ -24,6 +24,10 @@ impl Report {
             let (name, about) = (text(metric.name), text(metric.about));
             page.push(&format!("<li>{name}: {about}</li>"));
         }
+        // What seconds are is among the metrics already.
+        for note in &self.notes[1..] {
+            page.push(&format!("<li>{}</li>", text(note)));
+        }
         page.push("</ul>");
         if !self.kinds.is_empty() {
             page.push(&format!("<h2>{} by kind of place</h2>", COMPARED.name));

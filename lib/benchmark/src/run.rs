@@ -7,9 +7,9 @@ use dipir_cli::executables::Executables;
 use dipir_cli::exit::Usage;
 use dipir_cli::interrupt;
 
+use crate::chosen::choose;
 use crate::command_line::RunArgs;
-use crate::folder::{EvaluationFolder, TRUTH};
-use crate::methods::{self, Method};
+use crate::folder::{EvaluationFolder, SceneInfo};
 use crate::runner::Runner;
 
 /// A method that has ended on a scene, whether it failed or not.
@@ -36,34 +36,18 @@ pub struct Outcome {
     pub failures: Vec<(String, anyhow::Error)>,
 }
 
-/// Runs what is not done yet. `report` gets every run that ends.
+/// Runs what is not done yet. `note` gets a line for each method that is left out, `report` every run that ends.
 ///
 /// # Errors
-/// If there are no scenes, the arguments name what is not there, or the user interrupts. Runs that fail
-/// are no error: they are in the outcome, and the others go on.
-pub fn run(args: &RunArgs, report: &(dyn Fn(Step) + Sync)) -> anyhow::Result<Outcome> {
-    if !(args.target_error > 0.0 && args.target_error < 1.0) || args.jobs == 0 {
-        let text = "--target-error must lie above 0 and below 1, --jobs must be at least 1";
-        return Err(Usage(text.into()).into());
-    }
+/// If there are no scenes, the arguments name what is not there or set what cannot be set, or the user interrupts. Runs
+/// that fail are no error: they are in the outcome, and the others go on.
+pub fn run(
+    args: &RunArgs,
+    note: &dyn Fn(&str),
+    report: &(dyn Fn(Step) + Sync),
+) -> anyhow::Result<Outcome> {
     interrupt::listen()?;
-    let evaluation = EvaluationFolder::new(&args.folder.out);
-    let scenes = evaluation.chosen(&args.scene)?;
-    let methods = chosen_methods(args)?;
-    let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
-    let threads = if args.threads == 0 {
-        cores
-    } else {
-        args.threads
-    };
-    let runner = Runner {
-        evaluation,
-        executables: Executables::beside_this()?,
-        args,
-        methods,
-        model: dipir_stages::model::digest(args.model.as_deref())?,
-        threads: (threads / args.jobs).max(1),
-    };
+    let (runner, scenes) = prepare(args, note)?;
     let total = scenes.len() * runner.methods.len();
     let (next, done) = (AtomicUsize::new(0), AtomicUsize::new(0));
     let failures: Mutex<Vec<(String, anyhow::Error)>> = Mutex::new(Vec::new());
@@ -98,28 +82,61 @@ pub fn run(args: &RunArgs, report: &(dyn Fn(Step) + Sync)) -> anyhow::Result<Out
     })
 }
 
-/// Methods with the folder of their maps, if they are imported ones.
-fn chosen_methods(args: &RunArgs) -> anyhow::Result<Vec<(Method, Option<PathBuf>)>> {
-    let all = methods::read(args.methods.as_deref())?;
-    for name in &args.method {
-        if !all.iter().any(|m| m.name == *name) {
-            let names: Vec<&str> = all.iter().map(|m| m.name.as_str()).collect();
-            return Err(Usage(format!("--method {name}: accepted: {}", names.join(", "))).into());
-        };
+/// What runs on which scenes. Nothing that the arguments or the configuration get wrong is left to find for a run.
+fn prepare<'a>(
+    args: &'a RunArgs,
+    note: &dyn Fn(&str),
+) -> anyhow::Result<(Runner<'a>, Vec<SceneInfo>)> {
+    if !(args.target_error > 0.0 && args.target_error < 1.0) || args.jobs == 0 {
+        let text = "--target-error must lie above 0 and below 1, --jobs must be at least 1";
+        return Err(Usage(text.into()).into());
     }
-    let mut chosen: Vec<_> = all
-        .into_iter()
-        .filter(|m| args.method.is_empty() || args.method.contains(&m.name))
-        .map(|m| (m, None))
-        .collect();
-    if !args.environment_from.is_empty() && args.method.is_empty() {
-        chosen.clear();
+    let evaluation = EvaluationFolder::new(&args.folder.out);
+    let scenes = evaluation.chosen(&args.scene)?;
+    let methods = choose(args, note)?;
+    let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
+    let threads = if args.threads == 0 {
+        cores
+    } else {
+        args.threads
+    };
+    let runner = Runner {
+        evaluation,
+        executables: Executables::beside_this()?,
+        args,
+        methods,
+        threads: (threads / args.jobs).max(1),
+    };
+    if let Some(first) = scenes.first() {
+        runner.check(first)?;
     }
-    for folder in &args.environment_from {
-        chosen.push((methods::imported(folder)?, Some(folder.clone())));
+    Ok((runner, scenes))
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_evaluation::results::write;
+
+    use super::*;
+    use crate::chosen::tests::arguments;
+
+    #[test]
+    fn a_wrong_setting_is_found_before_anything_runs() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = folder.path().join("scenes/a");
+        let info = "{\"name\": \"a\", \"made_from\": \"\", \"map\": \"map.exr\", \"exposure_ev\": 0, \"tone\": \"none\"}";
+        write(&scene.join("scene.json"), info).unwrap();
+        let pipeline = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"a.obj\"\n";
+        write(&scene.join("pipeline.toml"), pipeline).unwrap();
+        let out = folder.path().to_str().unwrap();
+        for set in ["lora.stepps=3", "light.guidance=lds"] {
+            let args = arguments(&["--out", out, "-s", set]);
+            let error = prepare(&args, &|_| {}).map(|_| ()).unwrap_err();
+            assert!(error.is::<Usage>(), "{error:#}");
+            assert!(
+                error.to_string().starts_with(&format!("--set {set}: ")),
+                "{error:#}"
+            );
+        }
     }
-    if chosen.iter().any(|(m, _)| m.name == TRUTH) {
-        return Err(Usage(format!("no method may be called \"{TRUTH}\"")).into());
-    }
-    Ok(chosen)
 }

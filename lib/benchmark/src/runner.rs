@@ -17,10 +17,12 @@ use dipir_scene::description::SceneDescription;
 use dipir_stages::names::{self, StageName};
 use serde_json::{Value, json};
 
+use crate::chosen::Chosen;
 use crate::command_line::RunArgs;
+use crate::definition::{Definition, UsedModel};
 use crate::folder::{EvaluationFolder, SceneInfo, TRUTH};
 use crate::lights;
-use crate::methods::{BEFORE_COMPOSITE, Method, Source};
+use crate::methods::{BEFORE_COMPOSITE, MODEL_PATH, Method, Source};
 use crate::score::{Score, Truth};
 
 /// Raised whenever the same run would get another score.
@@ -36,10 +38,8 @@ pub struct Runner<'a> {
     pub executables: Executables,
     /// What was asked for.
     pub args: &'a RunArgs,
-    /// Methods, with the folder of their maps if those are imported.
-    pub methods: Vec<(Method, Option<PathBuf>)>,
-    /// Hash of the diffusion model.
-    pub model: String,
+    /// Methods with their models.
+    pub methods: Vec<Chosen>,
     /// Worker threads of each executable.
     pub threads: usize,
 }
@@ -51,15 +51,15 @@ impl Runner<'_> {
             Ok(truth) => truth,
             Err(e) => {
                 let text = format!("{e:#}");
-                for (method, _) in &self.methods {
-                    report(&method.name, Some(anyhow!("{text}")));
+                for chosen in &self.methods {
+                    report(&chosen.method.name, Some(anyhow!("{text}")));
                 }
                 return;
             }
         };
-        for (method, maps) in &self.methods {
-            let result = self.method(scene, method, maps.as_deref(), &truth);
-            report(&method.name, result.err());
+        for chosen in &self.methods {
+            let result = self.method(scene, chosen, &truth);
+            report(&chosen.method.name, result.err());
             if interrupt::asked() {
                 return;
             }
@@ -88,6 +88,7 @@ impl Runner<'_> {
             let score = Score {
                 key,
                 method: TRUTH.into(),
+                definition: self.definition(&Method::truth(), None),
                 title: "Truth".into(),
                 scene: scene.name.clone(),
                 picture: None,
@@ -105,25 +106,20 @@ impl Runner<'_> {
         )
     }
 
-    fn method(
-        &self,
-        scene: &SceneInfo,
-        method: &Method,
-        maps: Option<&Path>,
-        truth: &Truth,
-    ) -> anyhow::Result<()> {
+    fn method(&self, scene: &SceneInfo, chosen: &Chosen, truth: &Truth) -> anyhow::Result<()> {
+        let method = &chosen.method;
         let folder = self.evaluation.run(&method.name, &scene.name);
         let score_file = folder.join("score.json");
+        let maps = chosen.maps.as_deref();
         let imported = maps.map(|f| map_in(f, &scene.name)).transpose()?;
-        let model = method.model.then_some(&self.model);
-        let params = json!({"method": method, "model": model});
+        let params = json!({"method": method, "model": chosen.digest()});
         let key = self.fingerprint(scene, params, imported.as_deref())?;
         if Score::is_done(&score_file, &key) {
             return Ok(());
         }
-        let work = self.shared_work(scene, method)?;
+        let work = self.shared_work(scene, chosen)?;
         let mut run = StageRuns::new(self, scene, &work, 0);
-        self.configure(&mut run, method)?;
+        run.set = self.settings(chosen)?;
         let given = match method.light {
             Source::Recovered => None,
             _ => Some(self.map(scene, method, imported.as_deref(), &truth.map)?),
@@ -154,6 +150,7 @@ impl Runner<'_> {
         let score = Score {
             key,
             method: method.name.clone(),
+            definition: self.definition(method, chosen.model.as_ref().map(|m| m.used.clone())),
             title: method.title.clone(),
             scene: scene.name.clone(),
             picture: Some(compare_pictures(&found, &truth.picture, &truth.touched)),
@@ -167,7 +164,8 @@ impl Runner<'_> {
 
     /// Where the stages of a method work. Methods that differ in `[light]` and `[composite]` alone share
     /// what runs before.
-    fn shared_work(&self, scene: &SceneInfo, method: &Method) -> anyhow::Result<PathBuf> {
+    fn shared_work(&self, scene: &SceneInfo, chosen: &Chosen) -> anyhow::Result<PathBuf> {
+        let method = &chosen.method;
         let before_light = |s: &&String| !s.starts_with("light.") && !s.starts_with("composite.");
         let params = json!({
             // Where the light is given, no transport is recorded.
@@ -177,28 +175,36 @@ impl Runner<'_> {
             },
             "set": method.set.iter().filter(before_light).collect::<Vec<_>>(),
             "is_adapted": method.stages.len() > 2,
-            "model": method.model.then_some(&self.model),
+            "model": chosen.digest(),
         });
         let key = self.fingerprint(scene, params, None)?;
         Ok(self.evaluation.work(&scene.name, &key[..16]))
     }
 
-    /// The keys of `pipeline.toml` that method and command line set.
-    fn configure(&self, run: &mut StageRuns, method: &Method) -> anyhow::Result<()> {
-        run.set(
-            "composite.target_error",
-            &self.args.target_error.to_string(),
-        );
-        for set in method.set.iter().chain(&self.args.set) {
-            run.set.push(shared_cache(set, self.evaluation.root())?);
+    /// What the scores of a method are made with.
+    fn definition(&self, row: &Method, model: Option<UsedModel>) -> Definition {
+        Definition::new(row, model, &self.args.set, self.args.target_error)
+    }
+
+    /// The keys of `pipeline.toml` that the command line sets.
+    pub fn common_settings(&self) -> anyhow::Result<Vec<String>> {
+        let mut all = vec![format!("composite.target_error={}", self.args.target_error)];
+        for set in &self.args.set {
+            all.push(shared_cache(set, self.evaluation.root())?);
         }
-        if let (true, Some(model)) = (method.model, &self.args.model) {
-            let model = model
-                .canonicalize()
-                .with_context(|| format!("there is no model in {}", model.display()))?;
-            run.set("model.path", &toml_string(&model)?);
+        Ok(all)
+    }
+
+    /// Those that command line, method and model set.
+    pub fn settings(&self, chosen: &Chosen) -> anyhow::Result<Vec<String>> {
+        let mut all = self.common_settings()?;
+        for set in &chosen.method.set {
+            all.push(shared_cache(set, self.evaluation.root())?);
         }
-        Ok(())
+        if let Some(file) = chosen.model.as_ref().and_then(|m| m.file.as_ref()) {
+            all.push(format!("{MODEL_PATH}={}", toml_string(file)?));
+        }
+        Ok(all)
     }
 
     /// The map of a method that recovers nothing, on the photograph's scale.
@@ -285,7 +291,7 @@ fn map_in(folder: &Path, scene: &str) -> anyhow::Result<PathBuf> {
 }
 
 /// An absolute path as a TOML string: relative ones would start from the scene's folder.
-fn toml_string(path: &Path) -> anyhow::Result<String> {
+pub(crate) fn toml_string(path: &Path) -> anyhow::Result<String> {
     let absolute =
         std::path::absolute(path).with_context(|| format!("cannot find {}", path.display()))?;
     let text = absolute

@@ -7,6 +7,8 @@ use dipir_imaging::raster::DisplayImage;
 use dipir_light::environment::EnvironmentMap;
 use serde::{Deserialize, Serialize};
 
+use crate::definition::Definition;
+
 /// How good a method is on a scene: the content of `score.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Score {
@@ -14,6 +16,8 @@ pub struct Score {
     pub key: String,
     /// The method's name.
     pub method: String,
+    /// What it was made with, beside the scene.
+    pub definition: Definition,
     /// Its title.
     pub title: String,
     /// The scene.
