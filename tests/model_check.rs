@@ -41,6 +41,49 @@ fn every_part_agrees_and_is_timed_on_the_cpu() {
 }
 
 #[test]
+fn what_was_read_is_told_and_a_light_that_the_model_cannot_read_stops_no_check() {
+    let pipeline = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("pipeline.toml");
+    let pipeline = pipeline.display().to_string();
+    let args = [
+        "--small",
+        "--device",
+        "cpu",
+        "--json",
+        "--set",
+        "light.start=read",
+        "--set",
+        "light.guidance=lds",
+    ];
+    let model = reference("sd15");
+    let output = check(&[&[model.as_str(), "-p", pipeline.as_str()], &args[..]].concat());
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(0), "{text}");
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let why = report["no_forecast"].as_str().unwrap();
+    assert!(why.contains("--set light.start=auto"), "{why}");
+    assert!(report["works"].as_array().unwrap().is_empty());
+    let found = &report["description"];
+    assert_eq!(found["prediction"], "epsilon");
+    assert_eq!(
+        (&found["inpainting"], &found["timesteps"]),
+        (&false.into(), &1000.into())
+    );
+    assert!(found["stored"]["unet"][0].is_string() && found["betas"][0].is_number());
+    let output = check(&[
+        &model,
+        "--small",
+        "--device",
+        "cpu",
+        "--prediction",
+        "v_prediction",
+    ]);
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    for part in ["prediction   v_prediction", "on the disk", "family"] {
+        assert!(text.contains(part), "{text}");
+    }
+}
+
+#[test]
 fn a_wrong_key_is_named_before_the_model_is_read() {
     let pipeline = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("pipeline.toml");
     let pipeline = pipeline.display().to_string();

@@ -219,6 +219,41 @@ fn a_time_budget_ends_the_training_early_and_says_so() {
 }
 
 #[test]
+fn concepts_of_another_class_or_model_are_warned_of() {
+    let folder = project("sd15");
+    run(folder.path(), CONCEPTS, &[]);
+    let warnings = |args: &[&str]| {
+        let output = command(folder.path(), LORA, args).output().unwrap();
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(0), "{text}");
+        text
+    };
+    assert!(!warnings(&[]).contains("other settings"));
+    let other = warnings(&["--set", "scene.class=car"]);
+    for part in [
+        "the concept images were made",
+        "scene.class changed from \"toy\" to \"car\"",
+        "run dipir-concepts again",
+    ] {
+        assert!(other.contains(part), "{other}");
+    }
+    let copy = folder.path().join("copy");
+    let family =
+        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("lib/diffusion/tests/references/sd15");
+    for part in ["", "unet", "vae", "text_encoder", "tokenizer", "scheduler"] {
+        fs::create_dir_all(copy.join(part)).unwrap();
+        for entry in fs::read_dir(family.join(part)).unwrap().flatten() {
+            if entry.path().is_file() {
+                fs::copy(entry.path(), copy.join(part).join(entry.file_name())).unwrap();
+            }
+        }
+    }
+    assert!(!warnings(&["--set", "model.path=copy"]).contains("another model"));
+    fs::write(copy.join("model_index.json"), "{\"_name\": 1}").unwrap();
+    assert!(warnings(&["--set", "model.path=copy"]).contains("(another model)"));
+}
+
+#[test]
 fn a_killed_lora_run_resumes_to_the_same_bytes() {
     let folder = project("sd15");
     run(folder.path(), CONCEPTS, &[]);
@@ -272,7 +307,12 @@ fn what_is_missing_or_impossible_is_said_with_a_remedy() {
         "f32, bf16, f16",
     );
     fails(CONCEPTS, &["--set", "concepts.guidence=3"], 2, "guidance");
-    fails(CONCEPTS, &["--set", "concepts.size=15"], 1, "multiples of");
+    fails(
+        CONCEPTS,
+        &["--set", "concepts.size=15"],
+        2,
+        "concepts.size: 15 is out of range; accepted: multiples of",
+    );
     fails(
         CONCEPTS,
         &["--set", "pipeline.device=tpu"],
@@ -315,6 +355,17 @@ fn what_is_missing_or_impossible_is_said_with_a_remedy() {
     ];
     let part = "lora.sheet_steps: 1001 is out of range; accepted: up to 1000";
     fails(LORA, &args, 2, part);
+    fails(
+        LORA,
+        &[
+            "--set",
+            "lora.path=nowhere.safetensors",
+            "--set",
+            "lora.learn_word=false",
+        ],
+        2,
+        "lora.path: \"nowhere.safetensors\" is not there",
+    );
     // Without concept preservation no concepts are needed.
     run(folder.path(), LORA, &["--set", "concepts.count=0"]);
 }

@@ -1,14 +1,13 @@
 //! `dipir-concepts`: images of the object's class from the un-adapted model.
 use std::process::ExitCode;
 
-use clap::Parser;
 use dipir_cli::exit;
 use dipir_cli::session::Session;
 use dipir_stages::command_line::concepts::Cli;
 
 fn main() -> ExitCode {
     exit::run(|| {
-        let session = Session::start(&Cli::parse().common)?;
+        let session = Session::start(&exit::parse::<Cli>()?.common)?;
         let done = session.on_worker(|| dipir_stages::concepts::run(&session))?;
         session.result(|| done.to_string(), || done.to_json());
         Ok(())

@@ -11,6 +11,7 @@ use dipir_cli::session::{Session, duration, size};
 use dipir_diffusion::check::{
     Agreement, PART_COUNT, Reference, Times, TimesSettings, compare, sizes, times,
 };
+use dipir_diffusion::description::Description;
 use dipir_diffusion::model::Model;
 use dipir_diffusion::schedule::Prediction;
 use dipir_diffusion::training::TrainingConfig;
@@ -25,6 +26,8 @@ use serde_json::json;
 #[derive(Serialize)]
 struct Report {
     model: String,
+    /// What was read of it.
+    description: Description,
     version: &'static str,
     device: String,
     precision: String,
@@ -37,12 +40,20 @@ struct Report {
     peak_rss_bytes: Option<u64>,
     pipeline: Option<String>,
     works: Vec<Work>,
+    /// Why nothing is foretold of the pipeline.
+    no_forecast: Option<String>,
 }
 
 pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     let output = args.common.output;
     let session = session(args)?;
-    if let Some(session) = &session {
+    let no_forecast = session
+        .as_ref()
+        .map(forecast::hindrance)
+        .transpose()?
+        .flatten();
+    let foretold = session.as_ref().filter(|_| no_forecast.is_none());
+    if let Some(session) = foretold {
         // What the configuration has wrong is said before minutes are spent.
         forecast::works(session, &Times::default())?;
     }
@@ -60,10 +71,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
         None if device.is_cpu() => DType::F32,
         None => DType::BF16,
     };
-    let prediction = args.prediction.as_deref().map(model::prediction);
-    let prediction = prediction
-        .transpose()
-        .map_err(|m| Usage(format!("--prediction: {m}")))?;
+    let prediction = prediction(args, session.as_ref())?;
     let name = match &path {
         Some(path) => path.display().to_string(),
         None => "the embedded model".into(),
@@ -85,12 +93,13 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
     let times = measure(session.as_ref(), &model, &progress).map_err(interrupted);
     progress.done();
     let times = times?;
-    let works = match &session {
+    let works = match foretold {
         Some(session) => forecast::works(session, &times)?,
         None => vec![],
     };
     let report = Report {
         model: name,
+        description: Description::of(&model)?,
         version: env!("CARGO_PKG_VERSION"),
         device: placed_name(&device),
         precision: dtype.as_str().into(),
@@ -107,6 +116,7 @@ pub fn run(args: &CheckArgs) -> anyhow::Result<()> {
             .as_ref()
             .map(|s| s.config.path().display().to_string()),
         works,
+        no_forecast,
     };
     output.result(|| report.in_words(), || json!(report));
     match report.agreement.iter().all(Agreement::holds) {
@@ -139,6 +149,21 @@ fn chosen(args: &CheckArgs, session: Option<&Session>) -> anyhow::Result<Option<
     };
     let table: ModelTable = session.config.table("model")?;
     Ok(table.path.map(|path| session.resolve(&path)))
+}
+
+/// What the UNet predicts, if the command line says it, or the configuration of the model that is named there.
+fn prediction(args: &CheckArgs, session: Option<&Session>) -> anyhow::Result<Option<Prediction>> {
+    if let Some(word) = &args.prediction {
+        let found = model::prediction(word).map_err(|m| Usage(format!("--prediction: {m}")))?;
+        return Ok(Some(found));
+    }
+    let Some(session) = session.filter(|_| args.model.is_none()) else {
+        return Ok(None);
+    };
+    let table: ModelTable = session.config.table("model")?;
+    let found = table.prediction.as_deref().map(model::prediction);
+    let found = found.transpose();
+    Ok(found.map_err(|m| session.config.invalid("model.prediction", m))?)
 }
 
 fn open(
@@ -228,9 +253,13 @@ impl Report {
             _ => String::new(),
         };
         let mut text = format!(
-            "{} on {} in {}{multiplied}, against {}\n\n  part                     size        error\n",
+            "{} on {} in {}{multiplied}, against {}\n\n",
             self.model, self.device, self.precision, self.reference
         );
+        for (name, what) in self.description.in_words() {
+            let _ = writeln!(text, "  {name:12} {what}");
+        }
+        text += "\n  part                     size        error\n";
         for part in &self.agreement {
             let unit = match part.part {
                 "text encoder" => "tokens",
@@ -275,8 +304,14 @@ impl Report {
                 work.halved_by.join("; ")
             );
         }
-        if self.pipeline.is_some() && self.works.is_empty() {
-            let _ = writeln!(text, "\n  pipeline.toml asks no diffusion model");
+        match (&self.pipeline, &self.no_forecast) {
+            (Some(file), Some(why)) => {
+                let _ = writeln!(text, "\n  {file}: nothing is foretold of its stages: {why}");
+            }
+            (Some(_), None) if self.works.is_empty() => {
+                let _ = writeln!(text, "\n  pipeline.toml asks no diffusion model");
+            }
+            _ => {}
         }
         text.truncate(text.trim_end().len());
         text

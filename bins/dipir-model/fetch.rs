@@ -7,6 +7,7 @@ use anyhow::Context;
 use candle_core::{DType, Device};
 use dipir_cli::exit::Usage;
 use dipir_cli::interrupt::{self, Interrupted};
+use dipir_cli::output::json_path;
 use dipir_cli::progress::Progress;
 use dipir_diffusion::model::Model;
 use dipir_hub::{Error, Hub, Outcome, Revision, SOURCE_FILE, Source, Variant};
@@ -140,7 +141,7 @@ fn finish(
         },
         || {
             json!({
-                "folder": target, "repo": revision.repo, "commit": revision.commit,
+                "folder": json_path(target), "repo": revision.repo, "commit": revision.commit,
                 "already_there": there, "files": outcome.files, "bytes": outcome.bytes,
                 "received": outcome.received,
             })

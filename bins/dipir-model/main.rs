@@ -5,12 +5,11 @@ mod fetch;
 
 use std::process::ExitCode;
 
-use clap::Parser;
 use dipir_cli::exit;
 use dipir_stages::command_line::model::{Cli, Command};
 
 fn main() -> ExitCode {
-    exit::run(|| match Cli::parse().command {
+    exit::run(|| match exit::parse::<Cli>()?.command {
         Command::Fetch(args) => fetch::run(&args),
         Command::Check(args) => check::run(&args),
     })

@@ -17,6 +17,7 @@ mod manual;
 mod page;
 mod pipeline;
 mod pretraining;
+mod printing;
 mod project;
 mod recovery;
 mod reproducibility;

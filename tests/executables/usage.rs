@@ -124,6 +124,106 @@ fn a_photograph_is_cut_out_of_a_panorama() {
 }
 
 #[test]
+fn what_gives_no_photograph_is_refused_by_option() {
+    let project = Project::new();
+    let base = ["background", "--from", "sky.exr", "--size", "8x4"];
+    for (option, value, accepted) in [
+        ("--yaw", "nan", "NaN: accepted: -360 to 360"),
+        ("--pitch", "inf", "inf: accepted: -90 to 90"),
+        ("--exposure-ev", "nan", "NaN: accepted: -64 to 64"),
+        ("--exposure-ev", "65", "65: accepted: -64 to 64"),
+        ("--fov", "1e-30", "accepted: 0.1 to 179"),
+    ] {
+        let run = project.run(SCENE, &[&base[..], &[option, value, "o.png"]].concat());
+        assert_eq!(run.code, Some(2), "{}", run.stderr);
+        let told = run.stderr.starts_with(&format!("error: {option} "));
+        assert!(told && run.stderr.trim_end().ends_with(accepted), "{}", run.stderr);
+    }
+    for name in ["o.jpg", "o", "o.exr"] {
+        let message = format!(
+            "error: {name}: the photograph is written as a PNG: name it so, as in photo.png"
+        );
+        let run = project.run(SCENE, &[&base[..], &[name]].concat());
+        run.expect_error(2, &message);
+        assert!(!project.path(name).exists());
+    }
+    let args = ["background.png", "--png", "o.png", "--exposure-ev", "nan"];
+    let message = "error: --exposure-ev NaN: accepted: -64 to 64";
+    project.run(INSPECT, &args).expect_error(2, message);
+}
+
+#[test]
+fn no_picture_replaces_what_it_is_made_from() {
+    let project = Project::new();
+    // A photograph that dipir made would be replaced.
+    let cut = ["background", "--from", "sky.exr", "--size", "36x24", "bg.png"];
+    project.run(SCENE, &cut).expect_success();
+    let before = project.read("bg.png");
+    let set = ["--set", "scene.background=bg.png"];
+    let run = project.run(DIPIR, &[&["preview", "--wire", "-o", "./bg.png"], &set[..]].concat());
+    run.expect_error(
+        2,
+        "error: ./bg.png is what scene.background names, and the preview would replace it: name another \
+         file with --out",
+    );
+    let run = project.run(INSPECT, &["bg.png", "--png", "./bg.png"]);
+    run.expect_error(
+        2,
+        "error: --png ./bg.png: that is the file which is shown; name another file",
+    );
+    assert!(project.read("bg.png") == before);
+    project.run(INSPECT, &["bg.png", "--png", "o.png"]).expect_success();
+    project.run(INSPECT, &["bg.png", "--png", "o.png"]).expect_success();
+}
+
+#[test]
+fn a_value_of_the_command_line_is_called_by_its_option() {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let text = text.replace("environment = \"sky.exr\"\n", "");
+    let shadow = "[light.shadow]\nfoot = [4.0, 20.0]\ntip = [6.0, 18.0]\n";
+    project.write("pipeline.toml", text + shadow);
+    let set = "light.shadow.height_m=-1";
+    let accepted = "metres above 0, as in 1.8";
+    let message = format!("error: --set {set}: light.shadow.height_m is -1; accepted: {accepted}");
+    let run = project.run(DIPIR, &["run", "--until", "light", "--set", set]);
+    assert!(run.code == Some(2) && run.stderr.contains(&message), "{}", run.stderr);
+    // A device is read where none is used, too.
+    let message = "error: --set pipeline.device=foo: pipeline.device: \"foo\" is no device; \
+                   accepted: cpu, cuda:N, metal:N, auto";
+    for command in ["run", "status"] {
+        let run = project.run(DIPIR, &[command, "--set", "pipeline.device=foo"]);
+        run.expect_error(2, message);
+    }
+    for seconds in ["1e-300", "1e300"] {
+        let set = format!("composite.time_budget_s={seconds}");
+        let run = project.run(DIPIR, &["run", "--set", &set]);
+        let accepted = "is out of range; accepted: seconds from 0.01 to 1e7, as in 60";
+        let message =
+            format!("error: --set {set}: composite.time_budget_s: {seconds} {accepted}");
+        run.expect_error(2, &message);
+    }
+}
+
+#[test]
+fn several_files_are_looked_at_before_the_first_runs() {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write("b.toml", &text);
+    let run = project.run(DIPIR, &["run", "pipeline.toml", "b.toml"]);
+    let message = "error: pipeline.toml and b.toml write one folder, out: give each its own, [pipeline] out";
+    run.expect_error(2, message);
+    let run = project.run(DIPIR, &["run", "pipeline.toml", "gone.toml"]);
+    assert_eq!(run.code, Some(2));
+    assert!(run.stderr.starts_with("error: there is no gone.toml; "), "{}", run.stderr);
+    assert!(!project.path("out").exists());
+    project.write("b.toml", format!("[pipeline]\nout = \"x/../out\"\n{text}"));
+    std::fs::create_dir(project.path("x")).unwrap();
+    let run = project.run(DIPIR, &["run", "pipeline.toml", "b.toml"]);
+    assert_eq!(run.code, Some(2), "{}", run.stderr);
+}
+
+#[test]
 fn earlier_names_are_answered_with_the_present_ones() {
     let project = Project::new();
     let error = |executable: &str, args: &[&str], message: &str| {

@@ -1,12 +1,14 @@
 //! Latent diffusion models at any size: model folders in the diffusers
 //! layout, layers whose gradients pass, samplers, LoRA and score distillation.
 
+mod added_tokens;
 pub mod check;
 pub mod concepts;
 pub mod config;
 pub mod crop;
 #[cfg(feature = "cuda")]
 mod cuda;
+pub mod description;
 pub mod distillation;
 pub mod error;
 pub mod extent;

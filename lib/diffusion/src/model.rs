@@ -49,10 +49,21 @@ impl Model {
     /// `dtype`, which has to be f32 on the CPU. Checks that the parts fit
     /// each other.
     pub fn load(folder: &Path, dtype: DType, device: &Device) -> Result<Self> {
+        Self::load_as(folder, None, dtype, device)
+    }
+
+    /// As [`Self::load`]; `prediction` is what the UNet predicts, whatever
+    /// `scheduler_config.json` says.
+    pub fn load_as(
+        folder: &Path,
+        prediction: Option<Prediction>,
+        dtype: DType,
+        device: &Device,
+    ) -> Result<Self> {
         check_precision(dtype, device)?;
         refuse_foreign(&ConfigFile::read(&folder.join("model_index.json"))?)?;
         // What is small comes first: its errors cost nothing.
-        let schedule = NoiseSchedule::load(&folder.join("scheduler"))?;
+        let schedule = NoiseSchedule::load_as(&folder.join("scheduler"), prediction)?;
         let tokenizer = Tokenizer::load(&folder.join("tokenizer"))?;
         let text_encoder = TextEncoder::load(&folder.join("text_encoder"), dtype, device)?;
         let unet = load_unet(&folder.join("unet"), dtype, device)?;

@@ -114,6 +114,30 @@ const FOREIGN_SCHEDULERS: [&str; 8] = [
     "VQDiffusionScheduler",
 ];
 
+/// Keys of samplers that change what is sampled.
+const SAMPLER_KEYS: [&str; 6] = [
+    "use_karras_sigmas",
+    "use_exponential_sigmas",
+    "use_beta_sigmas",
+    "use_flow_sigmas",
+    "use_lu_lambdas",
+    "thresholding",
+];
+/// Samplers of models that are made for a few steps of them.
+const FEW_STEPS: [&str; 2] = ["LCMScheduler", "TCDScheduler"];
+
+/// Settings of the file that other samplers than ours heed.
+fn unused(file: &ConfigFile, class: &str) -> Vec<String> {
+    let is_set = |key: &str| file.get(key).and_then(Value::as_bool) == Some(true);
+    let few_steps = FEW_STEPS.contains(&class).then(|| class.to_owned());
+    let keys = SAMPLER_KEYS.iter().filter(|key| is_set(key));
+    // Others carry the key and do not heed it.
+    let clips = class.starts_with("DDIM") || class.starts_with("DDPM");
+    let clips = (clips && is_set("clip_sample")).then(|| "clip_sample".to_owned());
+    let keys = keys.map(|key| (*key).to_owned());
+    few_steps.into_iter().chain(keys).chain(clips).collect()
+}
+
 /// Stands for "no signal" where a division by it follows, as diffusers has it.
 pub(crate) const ALMOST_NO_SIGNAL: f64 = 5.960_464_477_539_063e-8; // 2^-24
 
@@ -122,11 +146,17 @@ pub(crate) const ALMOST_NO_SIGNAL: f64 = 5.960_464_477_539_063e-8; // 2^-24
 pub struct NoiseSchedule {
     config: ScheduleConfig,
     alpha_bars: Vec<f64>,
+    unused: Vec<String>,
 }
 
 impl NoiseSchedule {
     /// Reads `scheduler_config.json`; the sampler that it names is ignored, unless its noise is not of variances.
     pub fn load(folder: &Path) -> Result<Self> {
+        Self::load_as(folder, None)
+    }
+
+    /// As [`Self::load`]; `prediction` takes the place of what the file says of it.
+    pub fn load_as(folder: &Path, prediction: Option<Prediction>) -> Result<Self> {
         let file = ConfigFile::read(&folder.join("scheduler_config.json"))?;
         let class = file.get("_class_name").and_then(Value::as_str);
         if let Some(class) = class
@@ -140,11 +170,21 @@ impl NoiseSchedule {
                  the Stable Diffusion 1 or 2 family, or the scheduler that this one was trained with"
             )));
         }
-        let config: ScheduleConfig = file.parse()?;
-        Self::new(config).map_err(|e| match e {
+        let mut config: ScheduleConfig = file.parse()?;
+        config.prediction_type = prediction.unwrap_or(config.prediction_type);
+        let schedule = Self::new(config).map_err(|e| match e {
             Error::Argument(message) => file.error(message),
             other => other,
+        })?;
+        Ok(Self {
+            unused: unused(&file, class.unwrap_or_default()),
+            ..schedule
         })
+    }
+
+    /// What `scheduler_config.json` asks of its sampler and nothing here does, as keys or classes that name it.
+    pub fn unused(&self) -> &[String] {
+        &self.unused
     }
 
     /// Computes the schedule in f64. Refuses variances outside [0, 1), and a noise prediction where the last timestep
@@ -172,7 +212,11 @@ impl NoiseSchedule {
                 *a = ((a.sqrt() - last) * first / (first - last)).powi(2);
             }
         }
-        Ok(Self { config, alpha_bars })
+        Ok(Self {
+            config,
+            alpha_bars,
+            unused: vec![],
+        })
     }
 
     /// The configuration.

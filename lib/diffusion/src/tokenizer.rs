@@ -16,6 +16,7 @@ use tokenizers::{
     NormalizerWrapper, PreTokenizerWrapper, SplitDelimiterBehavior, TokenizerBuilder,
 };
 
+use crate::added_tokens;
 use crate::config::ConfigFile;
 use crate::error::{Error, Result, io};
 
@@ -57,8 +58,8 @@ pub struct Tokenizer {
     pad: u32,
     length: usize,
     vocab_size: usize,
-    /// Placeholder words and the token that each becomes.
-    placeholders: BTreeMap<String, u32>,
+    /// Words of their own, in lower case, and the tokens that each becomes.
+    placeholders: BTreeMap<String, Vec<u32>>,
 }
 
 impl std::fmt::Debug for Tokenizer {
@@ -72,7 +73,8 @@ impl std::fmt::Debug for Tokenizer {
 
 impl Tokenizer {
     /// Loads the folder `tokenizer/` of a model: `vocab.json` with
-    /// `merges.txt`, or else `tokenizer.json`.
+    /// `merges.txt`, or else `tokenizer.json`. Added tokens are words of their
+    /// own.
     pub fn load(folder: &Path) -> Result<Self> {
         let (vocab, merges) = if folder.join("vocab.json").is_file() {
             read_vocab_and_merges(folder)?
@@ -83,9 +85,11 @@ impl Tokenizer {
             path: folder.to_owned(),
             message,
         };
+        let is_known = |word: &str, id: u32| vocab.get(word) == Some(&id);
+        let added = added_tokens::read(folder, is_known)?;
         let id = |token: &str| {
-            vocab
-                .get(token)
+            let found = vocab.get(token).or_else(|| added.get(token));
+            found
                 .copied()
                 .ok_or_else(|| fail(format!("the vocabulary lacks the marker {token}")))
         };
@@ -100,9 +104,10 @@ impl Tokenizer {
                 "model_max_length = {length} has no room for both markers"
             )));
         }
-        let vocab_size = vocab.values().copied().max().unwrap_or(0) as usize + 1;
+        let ids = vocab.values().chain(added.values());
+        let vocab_size = ids.copied().max().unwrap_or(0) as usize + 1;
         let inner = build(vocab, merges).map_err(|e| fail(e.to_string()))?;
-        Ok(Self {
+        let mut tokenizer = Self {
             inner,
             path: folder.to_owned(),
             start,
@@ -111,7 +116,11 @@ impl Tokenizer {
             length,
             vocab_size,
             placeholders: BTreeMap::new(),
-        })
+        };
+        for (word, tokens) in added_tokens::sequences(&added) {
+            tokenizer.set_apart(&word, tokens);
+        }
+        Ok(tokenizer)
     }
 
     /// CLIP's own tokenizer, for models that come without one.
@@ -159,8 +168,12 @@ impl Tokenizer {
     /// is learned. It may hold punctuation, as `<sks>`; words are compared in
     /// lower case, and an empty one is nowhere.
     pub fn add_placeholder(&mut self, word: &str, token: u32) {
+        self.set_apart(word, vec![token]);
+    }
+
+    fn set_apart(&mut self, word: &str, tokens: Vec<u32>) {
         let word = word.chars().flat_map(char::to_lowercase).collect();
-        self.placeholders.insert(word, token);
+        self.placeholders.insert(word, tokens);
     }
 
     /// Tokens of `text` without markers, not cut.
@@ -180,9 +193,9 @@ impl Tokenizer {
         let (mut tokens, mut from, mut at) = (vec![], 0, 0);
         while let Some(next) = text[at..].chars().next() {
             match self.placeholder_at(text, at) {
-                Some((length, token)) => {
+                Some((length, own)) => {
                     tokens.extend(encode(&text[from..at])?);
-                    tokens.push(token);
+                    tokens.extend(own);
                     at += length;
                     from = at;
                 }
@@ -193,14 +206,14 @@ impl Tokenizer {
         Ok(tokens)
     }
 
-    /// The longest placeholder that stands at byte `at` of `text`: its length there, and its token.
-    fn placeholder_at(&self, text: &str, at: usize) -> Option<(usize, u32)> {
+    /// The longest placeholder that stands at byte `at` of `text`: its length there, and its tokens.
+    fn placeholder_at(&self, text: &str, at: usize) -> Option<(usize, &[u32])> {
         let (before, rest) = text.split_at(at);
-        let found = self.placeholders.iter().filter_map(|(word, &token)| {
+        let found = self.placeholders.iter().filter_map(|(word, tokens)| {
             let length = length_in(rest, word)?;
             let is_apart = !continues(before.chars().next_back(), word.chars().next())
                 && !continues(word.chars().next_back(), rest[length..].chars().next());
-            is_apart.then_some((length, token))
+            is_apart.then_some((length, tokens.as_slice()))
         });
         found.max_by_key(|(length, _)| *length)
     }

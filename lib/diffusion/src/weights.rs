@@ -42,10 +42,10 @@ struct ShardIndex {
 
 impl Weights {
     /// Opens the weights called `stem` in `folder`: `stem.safetensors`, the
-    /// shards of `stem.safetensors.index.json`, or the half-precision variant
-    /// `stem.fp16.safetensors`, in this order.
+    /// shards of `stem.safetensors.index.json`, or the half-precision variants
+    /// `stem.fp16.safetensors` and `stem.bf16.safetensors`, in this order.
     pub fn open(folder: &Path, stem: &str) -> Result<Self> {
-        for variant in ["", ".fp16"] {
+        for variant in ["", ".fp16", ".bf16"] {
             let single = folder.join(format!("{stem}{variant}.safetensors"));
             if single.is_file() {
                 return Self::open_file(&single);
@@ -60,16 +60,25 @@ impl Weights {
                 }
             }
         }
-        let pickled = folder.join(format!("{stem}.bin"));
-        let remedy = if pickled.is_file() {
-            "only a .bin file is there: convert it with diffusers' save_pretrained(..., safe_serialization=True)"
-        } else {
-            "fetch the model's folder again with its *.safetensors files"
+        let found = others(folder, stem);
+        let is_pickled =
+            |name: &String| name.ends_with(".bin") || name.ends_with(".bin.index.json");
+        let there = match found.is_empty() {
+            true => String::new(),
+            false => format!("there is {}: ", found.join(", ")),
+        };
+        let remedy = match found.first() {
+            None => "fetch the model's folder again with its *.safetensors files".into(),
+            Some(_) if found.iter().all(is_pickled) => {
+                "convert it with diffusers' save_pretrained(..., safe_serialization=True)"
+                    .to_owned()
+            }
+            Some(_) => format!("rename the variant that is wanted to {stem}.safetensors"),
         };
         Err(Error::Weights {
             path: folder.to_owned(),
             problems: vec![format!(
-                "no {stem}.safetensors and no {stem}.safetensors.index.json; {remedy}"
+                "no {stem}.safetensors, no {stem}.safetensors.index.json, and neither of them as .fp16 or .bf16; {there}{remedy}"
             )],
         })
     }
@@ -223,6 +232,20 @@ impl Weights {
         }
     }
 
+    /// Precisions of the stored numbers, that of most bytes first; whole numbers are left out.
+    pub fn precisions(&self) -> Vec<String> {
+        let mut bytes: BTreeMap<String, usize> = BTreeMap::new();
+        for entry in self.entries.values() {
+            let name = format!("{:?}", entry.dtype);
+            if name.contains('F') {
+                *bytes.entry(name).or_default() += entry.range.len();
+            }
+        }
+        let mut found: Vec<_> = bytes.into_iter().collect();
+        found.sort_by_key(|(_, bytes)| std::cmp::Reverse(*bytes));
+        found.into_iter().map(|(name, _)| name).collect()
+    }
+
     /// Names in byte order.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.entries.keys().map(String::as_str)
@@ -270,6 +293,19 @@ impl Weights {
         let tensor = Tensor::from_raw_buffer(bytes, stored, &entry.shape, &Device::Cpu)?;
         Ok(Some(tensor.to_dtype(dtype)?.to_device(device)?))
     }
+}
+
+/// Names of the files in `folder` that are called `stem` with something behind, in order.
+fn others(folder: &Path, stem: &str) -> Vec<String> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let names = entries.map(|e| e.file_name().to_string_lossy().into_owned());
+    let is_variant = |name: &String| {
+        let rest = name.strip_prefix(stem);
+        rest.is_some_and(|r| r.starts_with(['.', '-']))
+    };
+    let mut names: Vec<String> = names.filter(is_variant).collect();
+    names.sort();
+    names
 }
 
 /// Writes tensors and header strings to `path`, through a temporary file

@@ -251,6 +251,27 @@ fn write(folder: &Path, tensors: &Tensors) -> Result<PathBuf, dipir_diffusion::E
 }
 
 #[test]
+fn clip_s_names_may_lack_their_prefix() -> Outcome {
+    let whole = export("sd15", Encoder::Clip)?;
+    let short: Tensors = whole
+        .iter()
+        .map(|(name, t)| (name.replace(".text_model.", "."), t.clone()))
+        .collect();
+    let folder = tempfile::tempdir()?;
+    let states = |tensors: &Tensors| -> Result<Vec<f32>, Box<dyn std::error::Error>> {
+        let mut file = SingleFile::open(&write(folder.path(), tensors)?, None)?;
+        assert_eq!(file.encoder, Encoder::Clip);
+        file.unet.norm_num_groups = 4;
+        file.vae.norm_num_groups = 4;
+        let (_, _, text) = file.networks(DType::F32, &Device::Cpu)?;
+        let states = text.forward(&[vec![1, 2, 3]], None)?;
+        Ok(states.flatten_all()?.to_vec1()?)
+    };
+    assert_eq!(states(&short)?, states(&whole)?);
+    Ok(())
+}
+
+#[test]
 fn a_single_file_gives_the_same_bytes_as_the_folder_that_it_was_made_of() -> Outcome {
     for (name, encoder) in [
         ("sd15", Encoder::Clip),

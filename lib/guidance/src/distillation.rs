@@ -92,6 +92,12 @@ impl DistillationSettings {
             let message = format!("{side} is refused; accepted: multiples of 8 from 32 to 1024");
             return wrong("crop", message);
         }
+        if let Some(scale) = table.guidance_scale
+            && !scale.is_finite()
+        {
+            let message = format!("{scale} is refused; accepted: finite numbers, as in 7.5");
+            return wrong("guidance_scale", message);
+        }
         Ok(Self {
             guidance: table.guidance,
             timesteps,
@@ -380,6 +386,21 @@ mod tests {
             assert_eq!(refusal.key, "crop");
             let message = format!("{bad} is refused; accepted: multiples of 8 from 32 to 1024");
             assert_eq!(refusal.message, message);
+        }
+    }
+
+    #[test]
+    fn a_scale_of_guidance_is_a_finite_number() {
+        let with = |guidance_scale| {
+            let table = LightTable {
+                guidance_scale: Some(guidance_scale),
+                ..Default::default()
+            };
+            DistillationSettings::new(&table, false)
+        };
+        assert_eq!(with(-1.5).unwrap().guidance_scale, -1.5);
+        for bad in [f64::NAN, f64::INFINITY] {
+            assert_eq!(with(bad).unwrap_err().key, "guidance_scale");
         }
     }
 

@@ -35,10 +35,7 @@ pub fn graph(session: &Session) -> anyhow::Result<Graph> {
         Method::Given | Method::Taken => no_model,
         _ => None,
     };
-    let no_concepts = match lora::preserves_concepts(session)? {
-        true => no_model,
-        false => no_model.or(Some("concepts.count or lora.prior_weight is 0")),
-    };
+    let no_concepts = no_model.or(lora::without_concepts(session)?);
     let chosen = |stages: &[(&'static str, bool)]| -> Vec<&'static str> {
         let chosen = stages.iter().filter(|(_, on)| *on);
         chosen.map(|(stage, _)| *stage).collect()

@@ -16,6 +16,7 @@ pub mod report;
 pub mod scene;
 pub mod shot;
 pub mod truth;
+mod upstream;
 
 use std::fmt;
 use std::ops::ControlFlow;

@@ -30,13 +30,13 @@ pub const SCENE: StageName = StageName {
 pub const CONCEPTS: StageName = StageName {
     name: "concepts",
     executable: "dipir-concepts",
-    version: 1,
+    version: 2,
 };
 /// Personalises the model to the photograph.
 pub const LORA: StageName = StageName {
     name: "lora",
     executable: "dipir-lora",
-    version: 3,
+    version: 4,
 };
 /// Recovers light and tone curves.
 pub const LIGHT: StageName = StageName {

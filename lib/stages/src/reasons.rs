@@ -4,8 +4,9 @@ use dipir_pipeline::fingerprint::StaleReason;
 use crate::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE};
 
 /// Keys that choose what a stage does. What comes or goes with them needs no telling.
-const CHOICES: [&str; 5] = [
+const CHOICES: [&str; 6] = [
     RECORD,
+    "lora.path",
     "light.guidance",
     "light.start",
     "light.materials",
@@ -82,6 +83,7 @@ fn named(stage: &str, key: String, was: Option<String>, now: Option<String>) -> 
         }
         (_, "class") => "scene.class".into(),
         (_, "precision") => "model.precision".into(),
+        (_, "prediction") => "model.prediction".into(),
         (s, "transfer") if s == LORA.name => "scene.transfer".into(),
         (s, _) if s == CONCEPTS.name || s == LORA.name => key.clone(),
         (s, _) if s == SCENE.name => below("transport").map_or_else(|| key.clone(), light),
@@ -161,9 +163,10 @@ mod tests {
             (
                 "lora",
                 json!({"class": "a", "lora": {"rank": 4}, "transfer": "srgb", "precision": "f32"}),
-                json!({"class": "b", "lora": {"rank": 8}, "transfer": "linear", "precision": "bf16"}),
+                json!({"class": "b", "lora": {"rank": 8}, "transfer": "linear", "precision": "bf16", "prediction": "epsilon"}),
                 "scene.class changed from \"a\" to \"b\"; lora.rank changed from 4 to 8; \
-                 model.precision changed from \"f32\" to \"bf16\"; scene.transfer changed from \"srgb\" to \"linear\"",
+                 model.precision changed from \"f32\" to \"bf16\"; model.prediction changed from unset to \"epsilon\"; \
+                 scene.transfer changed from \"srgb\" to \"linear\"",
             ),
             (
                 "scene",
@@ -188,6 +191,15 @@ mod tests {
         assert_eq!(
             told("light", estimated(), neutral),
             "light.start changed from \"auto\" to \"neutral\""
+        );
+        let own = json!({"lora": {"path": "a.safetensors", "word": "sks"}, "precision": "f32"});
+        assert_eq!(
+            told(
+                "lora",
+                json!({"lora": {"rank": 4, "word": "sks"}, "precision": "f32"}),
+                own
+            ),
+            "lora.path changed from unset to \"a.safetensors\""
         );
         let recorded =
             json!({"scene": {"class": null}, "transport": {"size": 96, "environment": [64, 32]}});

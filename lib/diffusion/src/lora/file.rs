@@ -7,7 +7,8 @@ use std::path::Path;
 use candle_core::{DType, Device, Tensor};
 use serde_json::{Value, json};
 
-use super::{Adapter, AdapterTarget, Lora};
+use super::settings::{ACCEPTED, METADATA, OWN_PREFIX, Settings};
+use super::{Adapter, AdapterTarget, Lora, lora_files};
 use crate::error::{Error, Result};
 use crate::weights::{Weights, write_safetensors};
 
@@ -22,8 +23,6 @@ pub enum LoraStyle {
 
 /// Free-form facts for the header: prompts, hash of the base model...
 pub type LoraInfo = BTreeMap<String, String>;
-
-const PEFT_METADATA: &str = "lora_adapter_metadata";
 
 impl Lora {
     /// Writes the adapters, in f32, with rank, alpha and `info` in the header.
@@ -56,10 +55,7 @@ impl Lora {
         match style {
             LoraStyle::Peft => {
                 header.insert("format".into(), "pt".into());
-                header.insert(
-                    PEFT_METADATA.into(),
-                    self.peft_metadata(rank, alpha).to_string(),
-                );
+                header.insert(METADATA.into(), self.peft_metadata(rank, alpha).to_string());
             }
             LoraStyle::Kohya => {
                 header.insert("ss_network_module".into(), "networks.lora".into());
@@ -97,8 +93,9 @@ impl Lora {
         })
     }
 
-    /// Reads a file of either style, or of diffusers before PEFT
-    /// (`.lora.down.weight`), for the layers `targets` of a UNet. The
+    /// Reads a file of either style, of diffusers before PEFT
+    /// (`.lora.down.weight`) or of PEFT itself, with the `adapter_config.json`
+    /// beside it, for the layers `targets` of a UNet; or that of a folder. The
     /// adapters are frozen. Keys that fit no layer are errors that name them.
     pub fn load(
         path: &Path,
@@ -106,22 +103,35 @@ impl Lora {
         dtype: DType,
         device: &Device,
     ) -> Result<Self> {
+        let (path, _) = &lora_files(path)?;
         let weights = Weights::open_file(path)?;
+        let refused = |problems| {
+            Err(Error::Lora {
+                path: path.to_owned(),
+                problems,
+            })
+        };
+        if let Some(key) = weights.names().find(|key| is_of_dora(key)) {
+            return refused(vec![format!(
+                "it is a DoRA, for it holds magnitudes ({key:?}); {ACCEPTED}"
+            )]);
+        }
         let mut problems = vec![];
         let parts = sort_keys(&weights, targets, &mut problems);
-        let metadata = match weights.metadata().get(PEFT_METADATA) {
-            Some(text) => serde_json::from_str(text).map_err(|e| Error::Lora {
-                path: path.to_owned(),
-                problems: vec![format!("metadata {PEFT_METADATA:?} is not JSON: {e}")],
-            })?,
-            None => Value::Null,
+        // Keys of another model say more than what is said of them.
+        let settings = match Settings::read(path, &weights)? {
+            Ok(settings) => settings,
+            Err(problem) => {
+                problems.push(problem);
+                return refused(problems);
+            }
         };
         let mut lora = Self::default();
         for target in targets {
             let Some(part) = parts.get(target.name.as_str()) else {
                 continue;
             };
-            match read_adapter(&weights, target, part, &metadata, dtype, device)? {
+            match read_adapter(&weights, target, part, &settings, dtype, device)? {
                 Ok(adapter) => lora.insert_frozen(&target.name, adapter),
                 Err(problem) => problems.push(problem),
             }
@@ -129,14 +139,16 @@ impl Lora {
         if lora.adapters.is_empty() && problems.is_empty() {
             problems.push("it holds no adapter".into());
         }
-        if !problems.is_empty() {
-            return Err(Error::Lora {
-                path: path.to_owned(),
-                problems,
-            });
+        match problems.is_empty() {
+            true => Ok(lora),
+            false => refused(problems),
         }
-        Ok(lora)
     }
+}
+
+/// Whether a tensor is the magnitude of a weight-decomposed adapter [Liu et al. 2024].
+fn is_of_dora(key: &str) -> bool {
+    key.contains(".lora_magnitude_vector") || key.ends_with(".dora_scale")
 }
 
 /// The keys that belong to one layer.
@@ -188,7 +200,7 @@ fn sort_keys<'a>(
         let layer = match module.strip_prefix("lora_unet_") {
             Some(flat) => kohya.get(flat).copied(),
             None => {
-                let name = module.strip_prefix("base_model.model.").unwrap_or(module);
+                let name = module.strip_prefix(OWN_PREFIX).unwrap_or(module);
                 let name = name.strip_prefix("unet.").unwrap_or(name);
                 // diffusers before PEFT wrote `attn1.processor.to_out_lora.down`.
                 let mut renamed = name.replace(".processor.", ".");
@@ -199,7 +211,7 @@ fn sort_keys<'a>(
             }
         };
         let Some(layer) = layer else {
-            let own = module.strip_prefix("base_model.model.").unwrap_or(module);
+            let own = module.strip_prefix(OWN_PREFIX).unwrap_or(module);
             let of_text = ["lora_te", "text_encoder", "text_model"];
             let hint = if of_text.iter().any(|start| own.starts_with(start)) {
                 "adapts the text encoder, accepted are adapters of the UNet; train or export with the UNet only"
@@ -219,7 +231,7 @@ fn read_adapter(
     weights: &Weights,
     target: &AdapterTarget,
     part: &Part,
-    metadata: &Value,
+    settings: &Settings,
     dtype: DType,
     device: &Device,
 ) -> Result<Result<Adapter, String>> {
@@ -268,35 +280,10 @@ fn read_adapter(
             }
             _ => return Ok(Err(format!("tensor {key:?} is not a single number"))),
         },
-        None => {
-            let alpha = peft_alpha(metadata, &target.name).unwrap_or(rank as f64);
-            match peft_field(metadata, "use_rslora").and_then(Value::as_bool) {
-                // The scale is alpha / sqrt(rank) [Kalajdzievski 2023].
-                Some(true) => alpha * (rank as f64).sqrt(),
-                _ => alpha,
-            }
-        }
+        None => match settings.alpha(&target.name, rank) {
+            Ok(alpha) => alpha,
+            Err(problem) => return Ok(Err(problem)),
+        },
     };
     Ok(Adapter::new(down, up, alpha).map_err(|e| format!("layer {:?}: {e}", target.name)))
-}
-
-/// A setting in the metadata of diffusers, for the UNet or for all.
-fn peft_field<'a>(metadata: &'a Value, name: &str) -> Option<&'a Value> {
-    metadata
-        .get(format!("unet.{name}"))
-        .or_else(|| metadata.get(name))
-}
-
-/// alpha of a layer by the metadata of diffusers: an entry of the pattern
-/// whose key ends the layer's name, or the common value.
-fn peft_alpha(metadata: &Value, layer: &str) -> Option<f64> {
-    let by_pattern = peft_field(metadata, "alpha_pattern")
-        .and_then(Value::as_object)
-        .and_then(|pattern| {
-            pattern
-                .iter()
-                .find(|(key, _)| layer == key.as_str() || layer.ends_with(&format!(".{key}")))
-                .and_then(|(_, value)| value.as_f64())
-        });
-    by_pattern.or_else(|| peft_field(metadata, "lora_alpha").and_then(Value::as_f64))
 }

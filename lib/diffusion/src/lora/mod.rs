@@ -1,12 +1,14 @@
 //! Low-rank adaptation of the attention projections [Hu et al. 2022].
 
 mod file;
+mod settings;
 
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Device, Tensor, Var};
 
 pub use file::{LoraInfo, LoraStyle};
+pub use settings::lora_files;
 
 use crate::error::{Result, argument};
 use crate::layers::Linear;

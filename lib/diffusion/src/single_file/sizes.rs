@@ -65,13 +65,19 @@ pub(super) fn foreign(weights: &Weights) -> Option<String> {
 }
 
 pub(super) fn encoder(weights: &Weights) -> Option<Encoder> {
-    if weights.contains(&format!(
-        "{CLIP}text_model.embeddings.token_embedding.weight"
-    )) {
+    if clip_prefix(weights).is_some() {
         return Some(Encoder::Clip);
     }
     let open = weights.contains(&format!("{OPEN_CLIP}token_embedding.weight"));
     open.then_some(Encoder::OpenClip)
+}
+
+/// What stands before the names of CLIP's tensors: transformers 5 leaves out `text_model.`.
+fn clip_prefix(weights: &Weights) -> Option<String> {
+    let prefixes = ["text_model.", ""].map(|part| format!("{CLIP}{part}"));
+    let has =
+        |prefix: &String| weights.contains(&format!("{prefix}embeddings.token_embedding.weight"));
+    prefixes.into_iter().find(has)
 }
 
 /// Shape of the tensor `name` below `prefix`.
@@ -177,7 +183,7 @@ pub(super) fn vae(weights: &Weights) -> Option<AutoencoderConfig> {
 pub(super) fn text(weights: &Weights, encoder: Encoder) -> Option<TextEncoderConfig> {
     let (prefix, tokens, positions, hidden_act) = match encoder {
         Encoder::Clip => (
-            format!("{CLIP}text_model."),
+            clip_prefix(weights)?,
             "embeddings.token_embedding.weight",
             "embeddings.position_embedding.weight",
             "quick_gelu",

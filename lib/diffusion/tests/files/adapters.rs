@@ -154,3 +154,126 @@ fn lora_files_of_older_tools_mean_the_same() -> Outcome {
     }
     Ok(())
 }
+
+/// The scale of the first adapter that a file of ones holds.
+fn scale_of_ones(path: &Path, rank: usize) -> Result<f64, Box<dyn std::error::Error>> {
+    let unet = load_unet(&family().join("unet"), DType::F32, &Device::Cpu)?;
+    let lora = Lora::load(path, &unet.adapter_targets(), DType::F32, &Device::Cpu)?;
+    let adapter = lora.adapters().values().next().ok_or("no adapter")?;
+    let ones = Tensor::ones((1, 16), DType::F32, &Device::Cpu)?;
+    let y = adapter.forward(&ones)?.max_all()?.to_scalar::<f32>()?;
+    Ok(f64::from(y) / (16 * rank) as f64)
+}
+
+#[test]
+fn adapters_that_peft_wrote_have_the_alpha_of_the_configuration_beside_them() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("adapter_model.safetensors");
+    let config = folder.path().join("adapter_config.json");
+    let layer = "down_blocks.0.attentions.0.transformer_blocks.0.attn1.to_q";
+    let ones = |a, b| Tensor::ones((a, b), DType::F32, &Device::Cpu);
+    let tensors = BTreeMap::from([
+        (
+            format!("base_model.model.{layer}.lora_A.weight"),
+            ones(4, 16)?,
+        ),
+        (
+            format!("base_model.model.{layer}.lora_B.weight"),
+            ones(16, 4)?,
+        ),
+    ]);
+    let header = BTreeMap::from([("format".into(), "pt".into())]);
+    write_safetensors(&path, &tensors, &header)?;
+    let refusal = |part: &str| -> Outcome {
+        let message = scale_of_ones(&path, 4).expect_err(part).to_string();
+        assert!(message.contains(part), "{message}");
+        Ok(())
+    };
+    refusal("nothing tells its alpha")?;
+    refusal("put that file beside it")?;
+    for (text, scale) in [
+        (
+            r#"{"r": 4, "lora_alpha": 16, "peft_type": "LORA", "use_dora": false}"#,
+            4.0,
+        ),
+        (r#"{"r": 4, "lora_alpha": 16, "use_rslora": true}"#, 8.0),
+        (
+            r#"{"r": 4, "lora_alpha": 16, "alpha_pattern": {"attn2.to_q": 1, "to_q": 8, "attn1.to_q": 2}}"#,
+            2.0,
+        ),
+        (
+            r#"{"r": 8, "lora_alpha": 16, "rank_pattern": {"attn1.to_q": 4}, "alpha_pattern": {"^to_q": 1}}"#,
+            4.0,
+        ),
+    ] {
+        std::fs::write(&config, text)?;
+        assert_eq!(scale_of_ones(&path, 4)?, scale, "{text}");
+        assert_eq!(scale_of_ones(folder.path(), 4)?, scale, "{text}");
+    }
+    for (text, part) in [
+        (r#"{"r": 4}"#, "has no number lora_alpha"),
+        (
+            r#"{"r": 4, "lora_alpha": 16, "use_dora": true}"#,
+            "it is a DoRA (use_dora)",
+        ),
+        (
+            r#"{"r": 4, "lora_alpha": 16, "peft_type": "LOHA"}"#,
+            "peft_type = \"LOHA\"",
+        ),
+        (
+            r#"{"r": 8, "lora_alpha": 16}"#,
+            "of rank 4, the settings of the training say 8",
+        ),
+        (
+            r#"{"r": 4, "lora_alpha": 16, "alpha_pattern": {".*to_q": 1}}"#,
+            "the regular expression \".*to_q\"",
+        ),
+        (
+            r#"{"r": 4, "lora_alpha": 16, "init_lora_weights": "pissa_niter_4"}"#,
+            "changes the model's own weights",
+        ),
+        ("[]", "adapter_config.json"),
+    ] {
+        std::fs::write(&config, text)?;
+        refusal(part)?;
+    }
+    // Keys of others do not take a configuration that happens to be there.
+    std::fs::write(&config, r#"{"r": 4, "lora_alpha": 16}"#)?;
+    let others: BTreeMap<String, Tensor> = tensors
+        .iter()
+        .map(|(k, v)| (k.replace("base_model.model", "unet"), v.clone()))
+        .collect();
+    write_safetensors(&path, &others, &header)?;
+    assert_eq!(scale_of_ones(&path, 4)?, 1.0);
+    Ok(())
+}
+
+#[test]
+fn what_is_no_lora_is_called_by_its_name() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("lora.safetensors");
+    let layer = "unet.down_blocks.0.attentions.0.transformer_blocks.0.attn1.to_q";
+    let zeros = |a| Tensor::zeros((a, 16), DType::F32, &Device::Cpu);
+    for end in [
+        "lora_magnitude_vector",
+        "lora_magnitude_vector.weight",
+        "dora_scale",
+    ] {
+        let tensors = BTreeMap::from([
+            (format!("{layer}.{end}"), zeros(1)?),
+            (format!("{layer}.lora_A.weight"), zeros(4)?),
+        ]);
+        write_safetensors(&path, &tensors, &BTreeMap::new())?;
+        let message = scale_of_ones(&path, 4).expect_err(end).to_string();
+        assert!(message.contains("it is a DoRA"), "{message}");
+    }
+    let pickled = folder.path().join("pytorch_lora_weights.bin");
+    for (path, part) in [
+        (pickled.as_path(), "accepted: a .safetensors file"),
+        (folder.path(), "holds neither"),
+    ] {
+        let message = scale_of_ones(path, 4).expect_err(part).to_string();
+        assert!(message.contains(part), "{message}");
+    }
+    Ok(())
+}

@@ -1,9 +1,10 @@
 //! Configurations that contradict the weights.
 use candle_core::{DType, Device, Tensor};
 use dipir_diffusion::Error;
+use dipir_diffusion::description::Description;
 use dipir_diffusion::model::{Model, load_unet};
 use dipir_diffusion::pass::Pass;
-use dipir_diffusion::schedule::NoiseSchedule;
+use dipir_diffusion::schedule::{NoiseSchedule, Prediction};
 
 use super::{Outcome, family, model_folder, unet_folder, unet_tensors};
 
@@ -148,6 +149,87 @@ fn schedulers_whose_noise_is_not_of_variances_are_refused_by_class() -> Outcome 
     ] {
         load(class)?;
     }
+    Ok(())
+}
+
+#[test]
+fn settings_of_samplers_that_nothing_heeds_are_told() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let unused = |text: &str| -> Result<Vec<String>, Box<dyn std::error::Error>> {
+        std::fs::write(folder.path().join("scheduler_config.json"), text)?;
+        Ok(NoiseSchedule::load(folder.path())?.unused().to_vec())
+    };
+    let karras = r#"{"_class_name": "HeunDiscreteScheduler", "use_karras_sigmas": true, "thresholding": true}"#;
+    assert_eq!(unused(karras)?, ["use_karras_sigmas", "thresholding"]);
+    assert_eq!(
+        unused(r#"{"_class_name": "LCMScheduler"}"#)?,
+        ["LCMScheduler"]
+    );
+    let clips =
+        r#"{"_class_name": "DDIMScheduler", "clip_sample": true, "use_karras_sigmas": false}"#;
+    assert_eq!(unused(clips)?, ["clip_sample"]);
+    let none = r#"{"_class_name": "PNDMScheduler", "clip_sample": true, "skip_prk_steps": true}"#;
+    assert!(unused(none)?.is_empty());
+    Ok(())
+}
+
+#[test]
+fn a_prediction_that_is_given_overrules_the_folder_s() -> Outcome {
+    let folder = model_folder()?;
+    let load = |prediction| Model::load_as(folder.path(), prediction, DType::F32, &Device::Cpu);
+    let own = load(None)?;
+    let given = load(Some(Prediction::Velocity))?;
+    assert_eq!(own.schedule.prediction(), Prediction::Epsilon);
+    assert_eq!(given.schedule.prediction(), Prediction::Velocity);
+    assert_eq!(own.schedule.alpha_bar(500)?, given.schedule.alpha_bar(500)?);
+    // What contradicts the rest of the file is refused by the file.
+    let path = folder.path().join("scheduler/scheduler_config.json");
+    let text = r#"{"rescale_betas_zero_snr": true, "prediction_type": "v_prediction"}"#;
+    std::fs::write(path, text)?;
+    load(None)?;
+    let message = load(Some(Prediction::Epsilon))
+        .expect_err("no sample")
+        .to_string();
+    assert!(message.contains("scheduler_config.json"), "{message}");
+    Ok(())
+}
+
+#[test]
+fn what_was_read_of_a_model_is_described() -> Outcome {
+    let folder = model_folder()?;
+    let half: std::collections::BTreeMap<String, Tensor> = unet_tensors()?
+        .into_iter()
+        .map(|(name, t)| Ok((name, t.to_dtype(DType::BF16)?)))
+        .collect::<Result<_, Error>>()?;
+    let unet = folder
+        .path()
+        .join("unet/diffusion_pytorch_model.safetensors");
+    dipir_diffusion::weights::write_safetensors(&unet, &half, &Default::default())?;
+    let model = Model::load(folder.path(), DType::F32, &Device::Cpu)?;
+    let found = Description::of(&model)?;
+    assert_eq!(found.stored["unet"], ["BF16"]);
+    assert_eq!(found.stored["vae"], ["F16"]);
+    assert_eq!(
+        (found.inpainting, found.native_size),
+        (false, model.native_size())
+    );
+    let words = found.in_words();
+    let of = |name: &str| {
+        words
+            .iter()
+            .find(|(n, _)| *n == name)
+            .map(|(_, w)| w.as_str())
+    };
+    assert_eq!(of("prediction"), Some("epsilon"));
+    assert_eq!(
+        of("family"),
+        Some("a model of other sizes (text states of 24)")
+    );
+    assert!(
+        of("noise").is_some_and(|n| n.contains("1000 timesteps")),
+        "{words:?}"
+    );
+    assert_eq!(of("not used"), None);
     Ok(())
 }
 

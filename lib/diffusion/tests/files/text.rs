@@ -2,12 +2,13 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use candle_core::{DType, Device};
+use candle_core::{DType, Device, Tensor};
+use dipir_diffusion::model::Model;
 use dipir_diffusion::text_encoder::TextEncoder;
 use dipir_diffusion::tokenizer::Tokenizer;
 use dipir_diffusion::weights::write_safetensors;
 
-use super::{Outcome, family, tensors};
+use super::{Outcome, family, model_folder, tensors};
 
 #[test]
 fn text_encoder_loads_with_and_without_the_prefix() -> Outcome {
@@ -103,5 +104,78 @@ fn tokenizer_json_alone_gives_the_same_tokens() -> Outcome {
     let (a, b) = (Tokenizer::load(&source)?, Tokenizer::load(folder.path())?);
     let prompt = "a photo of the strangest 12 cars, isn't it? ☺";
     assert_eq!(a.encode(prompt)?, b.encode(prompt)?);
+    Ok(())
+}
+
+#[test]
+fn added_tokens_are_words_with_embeddings_of_their_own() -> Outcome {
+    let folder = model_folder()?;
+    let plain = Tokenizer::load(&folder.path().join("tokenizer"))?;
+    let first = plain.vocab_size() as u32;
+    let (before, after) = (plain.words("a photo of a")?, plain.words("in rain")?);
+    let listed =
+        |id: u32, word: &str| serde_json::json!({"id": id, "content": word, "special": false});
+    let all = [
+        (first, "<cat>"),
+        (first + 1, "<dog>"),
+        (first + 2, "<dog>_1"),
+    ];
+    let list: Vec<_> = all.iter().map(|(id, word)| listed(*id, word)).collect();
+    let map: serde_json::Map<_, _> = all
+        .iter()
+        .map(|(id, w)| ((*w).into(), (*id).into()))
+        .collect();
+    let decoder: serde_json::Map<_, _> = all
+        .iter()
+        .map(|(id, w)| (id.to_string(), listed(*id, w)))
+        .collect();
+    for (name, text) in [
+        ("added_tokens.json", serde_json::json!(map)),
+        (
+            "tokenizer_config.json",
+            serde_json::json!({"added_tokens_decoder": decoder}),
+        ),
+        ("tokenizer.json", serde_json::json!({"added_tokens": list})),
+    ] {
+        let path = folder.path().join("tokenizer").join(name);
+        let earlier = std::fs::read(&path).ok();
+        std::fs::write(&path, text.to_string())?;
+        let tokenizer = Tokenizer::load(&folder.path().join("tokenizer"))?;
+        assert_eq!(tokenizer.vocab_size(), first as usize + 3, "{name}");
+        for (word, own) in [("<Cat>", &[first][..]), ("<dog>", &[first + 1, first + 2])] {
+            let words = tokenizer.words(&format!("a photo of a {word} in rain"))?;
+            assert_eq!(words, [&before[..], own, &after].concat(), "{name}");
+        }
+        // The embeddings are the text encoder's.
+        let message = Model::load(folder.path(), DType::F32, &Device::Cpu).expect_err(name);
+        let wanted = format!(
+            "tokenizer has {} tokens, text_encoder has vocab_size",
+            first + 3
+        );
+        assert!(message.to_string().contains(&wanted), "{message}");
+        match earlier {
+            Some(text) => std::fs::write(&path, text)?,
+            None => std::fs::remove_file(&path)?,
+        }
+    }
+    let text = folder.path().join("text_encoder");
+    let mut weights = tensors(&text.join("model.safetensors"))?;
+    let table = weights
+        .get_mut("text_model.embeddings.token_embedding.weight")
+        .ok_or("no table")?;
+    let own = (Tensor::ones((3, table.dims()[1]), DType::F32, &Device::Cpu)? * 0.1)?;
+    *table = Tensor::cat(&[&*table, &own], 0)?;
+    let size = table.dims()[0];
+    write_safetensors(&text.join("model.safetensors"), &weights, &BTreeMap::new())?;
+    let config = std::fs::read_to_string(text.join("config.json"))?;
+    let mut config: serde_json::Value = serde_json::from_str(&config)?;
+    config["vocab_size"] = size.into();
+    std::fs::write(text.join("config.json"), config.to_string())?;
+    let path = folder.path().join("tokenizer/added_tokens.json");
+    std::fs::write(path, serde_json::json!(map).to_string())?;
+    let model = Model::load(folder.path(), DType::F32, &Device::Cpu)?;
+    model.encode_prompts(&["a <cat>"], None)?;
+    let values = model.text_encoder.embedding(first)?.to_vec1::<f32>()?;
+    assert_eq!(values[0], 0.1);
     Ok(())
 }

@@ -151,6 +151,36 @@ fn half_precision_files_are_read_as_f32() -> Outcome {
     Ok(())
 }
 
+#[test]
+fn variants_are_read_and_other_files_are_listed() -> Outcome {
+    let folder = unet_folder(&unet_tensors()?)?;
+    let file = |variant: &str| {
+        folder
+            .path()
+            .join(format!("diffusion_pytorch_model{variant}"))
+    };
+    let load = || load_unet(folder.path(), DType::F32, &Device::Cpu);
+    std::fs::rename(file(".safetensors"), file(".bf16.safetensors"))?;
+    load()?;
+    std::fs::rename(file(".bf16.safetensors"), file(".non_ema.safetensors"))?;
+    let refusal = |parts: &[&str]| {
+        let message = load().expect_err("refused").to_string();
+        assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+    };
+    refusal(&[
+        "there is diffusion_pytorch_model.non_ema.safetensors",
+        "rename the variant that is wanted to diffusion_pytorch_model.safetensors",
+    ]);
+    std::fs::rename(file(".non_ema.safetensors"), file(".fp16.bin"))?;
+    refusal(&[
+        "there is diffusion_pytorch_model.fp16.bin",
+        "safe_serialization=True",
+    ]);
+    std::fs::remove_file(file(".fp16.bin"))?;
+    refusal(&["fetch the model's folder again"]);
+    Ok(())
+}
+
 /// A safetensors file of this header and data.
 fn file(header: &str, data: &[u8]) -> Vec<u8> {
     let mut bytes = (header.len() as u64).to_le_bytes().to_vec();

@@ -11,6 +11,7 @@ Examples:
   dipir-lora --set lora.time_budget_s=600   train no longer than that
   dipir-lora --set lora.cache=../loras      train once for all scenes of one photograph
   dipir-lora --set concepts.count=0         without concept preservation
+  dipir-lora --set lora.path=my.safetensors use a finished LoRA; nothing is trained
 
 Reads OUT/concepts/, which dipir-concepts writes. Writes OUT/lora/: lora.safetensors (diffusers,
 PEFT) lora_kohya.safetensors (A1111, ComfyUI) word.safetensors (with lora.learn_word) sheet.png

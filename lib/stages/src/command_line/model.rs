@@ -12,6 +12,7 @@ Examples:
   dipir-model check models/sd21 -p scene/pipeline.toml  and what that scene will take
   dipir-model check models/sd21 --json > check.json     for a bug report
 
+Says what was read: family, prediction, noise, size, precision on the disk.
 Compares text encoder, UNet, autoencoder and the gradient of its encoder at a small size and at that
 of the model: on a GPU with the same model on the CPU in f32, on the CPU with the same layers made of
 candle's operations. Then times the parts, and says what the stages of pipeline.toml would take.
@@ -66,7 +67,7 @@ pub struct CheckArgs {
     #[arg(long)]
     pub precision: Option<String>,
 
-    /// With one file, what its UNet predicts: epsilon or v_prediction
+    /// What its UNet predicts, whatever its files say: epsilon or v_prediction
     #[arg(long)]
     pub prediction: Option<String>,
 

@@ -8,9 +8,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
+use dipir_cli::output::json_path;
 use dipir_cli::session::{Session, duration};
 use dipir_imaging::composite::{composite, composite_pixel};
-use dipir_imaging::file::write_picture;
+use dipir_imaging::file::{Photo, write_picture};
 use dipir_imaging::layer_rows::{LayerRows, Packing};
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::{LinearImage, Raster};
@@ -31,7 +32,7 @@ use serde_json::{Value, json};
 use crate::interruption;
 use crate::known_light::{self, Light};
 use crate::light::folder::{self as light_folder, Recovered};
-use crate::light::materials;
+use crate::light::{exposed, materials};
 use crate::names::{COMPOSITE, begin};
 use crate::presets::{Outlook, Preset};
 use crate::scene::folder::{self as scene_folder, SceneFolder};
@@ -117,7 +118,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let stop = table.stop(session.pipeline.quality);
     let folder = COMPOSITE.folder(session);
     let mut writer = begin(session, plan(session, &table)?)?;
-    let curve = Curve::of(table.tone, &light);
+    let curve = Curve::of(table.tone, &light, inputs.scene.loaded.taken());
     let course = render(
         session,
         &table,
@@ -306,6 +307,7 @@ fn render_under<L: SceneLight>(
         most_pixels: table.most_pixels(session.pipeline.quality),
         leave_out: effects.leave_out(loaded.description.effects()),
         tone,
+        gain: exposed::gain(loaded.taken(), &loaded.photo.image),
         ..Settings::of_scene(loaded)
     };
     let renderer = Renderer::new(&loaded.scene);
@@ -435,14 +437,17 @@ enum Curve {
 
 impl Curve {
     /// The table's, else the one that was recovered with the light, else none.
-    fn of(tone: Option<Tone>, light: &Source) -> Self {
+    fn of(tone: Option<Tone>, light: &Source, taken: &Photo) -> Self {
         match (tone, light) {
             (Some(tone), _) => match tone.curves() {
                 Some(curves) => Self::Object(Box::new(curves)),
                 None => Self::None,
             },
             (None, Source::Map(_)) => Self::None,
-            (None, Source::Recovered(light)) => Self::Recovered(Box::new(light.tone)),
+            (None, Source::Recovered(light)) => match exposed::tone(taken, light.tone) {
+                Some(tone) => Self::Recovered(Box::new(tone)),
+                None => Self::None,
+            },
         }
     }
 
@@ -476,9 +481,9 @@ impl Done {
     /// For programs.
     pub fn to_json(&self) -> Value {
         json!({
-            "folder": self.folder,
-            "picture": self.folder.join("composite.png"),
-            "layers": self.folder.join("composite.exr"),
+            "folder": json_path(&self.folder),
+            "picture": json_path(self.folder.join("composite.png")),
+            "layers": json_path(self.folder.join("composite.exr")),
             "estimated_error": self.error,
             "samples": self.samples,
             "rays": self.rays,

@@ -29,7 +29,7 @@ pub struct CompositeTable {
     #[schemars(extend("exclusiveMinimum" = 0), range(max = 1.0), example = 0.002)]
     pub target_error: Option<f32>,
     /// Rendering stops after about this time, seconds. It replaces `target_error`.
-    #[schemars(extend("exclusiveMinimum" = 0), example = 60.0)]
+    #[schemars(range(min = LEAST_BUDGET_S, max = MOST_BUDGET_S), example = 60.0)]
     pub time_budget_s: Option<f64>,
     /// Most samples in any pixel.
     #[schemars(range(min = 1), extend("default" = MAX_SAMPLES), example = 1024)]
@@ -82,6 +82,10 @@ impl Tone {
 /// Most samples in any pixel, unless the table says otherwise.
 pub(super) const MAX_SAMPLES: u32 = 1 << 14;
 
+/// Least and most seconds of a budget: no first round is faster, and no one waits for longer than months.
+const LEAST_BUDGET_S: f64 = 0.01;
+const MOST_BUDGET_S: f64 = 1e7;
+
 impl CompositeTable {
     /// Refuses what no run can work with.
     ///
@@ -95,9 +99,12 @@ impl CompositeTable {
             return Err(config.out_of_range("composite.target_error", e, accepted));
         }
         if let Some(t) = self.time_budget_s
-            && !(t > 0.0 && t < 1e9)
+            && !(LEAST_BUDGET_S..=MOST_BUDGET_S).contains(&t)
         {
-            return Err(config.out_of_range("composite.time_budget_s", t, "seconds above 0"));
+            // The digits that were written, not 301 of them.
+            let t = format!("{t:?}");
+            let accepted = "seconds from 0.01 to 1e7, as in 60";
+            return Err(config.out_of_range("composite.time_budget_s", t, accepted));
         }
         if self.target_error.is_some() && self.time_budget_s.is_some() {
             let message = "excludes target_error; keep one of the two";

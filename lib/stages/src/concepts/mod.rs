@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use candle_core::{DType, Device, Tensor};
 use dipir_cli::interrupt;
+use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_diffusion::concepts::{Concept, class_prompt, concept};
 use dipir_diffusion::generate::{GenerateSettings, generate};
@@ -83,7 +84,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let mut writer = begin(session, plan)?;
     let model = model::load(session, &model_table)?;
     model::check_steps(session, &model, "concepts.steps", table.steps)?;
-    let side = table.size.unwrap_or_else(|| model.native_size());
+    let side = side(session, &table, &model)?;
+    model::warn_of_sampler(session, &model);
 
     let mut list = ConceptList {
         class_prompt: class_prompt(&class),
@@ -139,6 +141,24 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         made,
         reused: table.count - made,
     })
+}
+
+/// The side of the images; refused where the model's latents cannot make it.
+fn side(session: &Session, table: &ConceptsTable, model: &Model) -> anyhow::Result<usize> {
+    let multiple = model.vae.downscale();
+    match table.size {
+        None => Ok(model.native_size()),
+        Some(size) if size.is_multiple_of(multiple) => Ok(size),
+        Some(size) => {
+            let accepted = format!(
+                "multiples of {multiple}, the pixels that a latent one of the model stands for"
+            );
+            Err(session
+                .config
+                .out_of_range("concepts.size", size, &accepted)
+                .into())
+        }
+    }
 }
 
 /// The cache of this class, model and settings: named by what decides an image, not by how many
@@ -227,7 +247,7 @@ impl Done {
     /// For programs.
     pub fn to_json(&self) -> Value {
         json!({
-            "folder": self.folder, "made": self.made, "reused": self.reused,
+            "folder": json_path(&self.folder), "made": self.made, "reused": self.reused,
             "elapsed_s": self.manifest.elapsed_s, "peak_rss_bytes": self.manifest.peak_rss_bytes,
         })
     }

@@ -8,7 +8,7 @@ use dipir_optimize::history::Row;
 use serde_json::{Value, json};
 
 use super::Done;
-use super::words::in_words;
+use super::words::{in_words, is_unplaced_sun};
 use crate::written;
 
 impl Done {
@@ -81,6 +81,14 @@ impl fmt::Display for Done {
         }
         if let Some(estimated) = estimated {
             write!(f, "\n  {}", in_words(&estimated.estimate))?;
+            if estimated.chosen().is_none() && is_unplaced_sun(&estimated.estimate) {
+                write!(
+                    f,
+                    "\n  the sun probably shines, but its direction is not known, so that shadows are soft: draw a shadow \
+                     (light.shadow), say where the sun is (light.sun), or choose one of {} by its number (light.candidate)",
+                    self.folder.join("candidates.png").display()
+                )?;
+            }
             if estimated.photographs > 1 {
                 write!(f, "\n  from {} photographs", estimated.photographs)?;
             }

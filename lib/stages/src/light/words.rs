@@ -25,6 +25,11 @@ pub(super) fn in_words(estimate: &LightEstimate) -> String {
     )
 }
 
+/// Whether a sun is more probable than none, but its direction is not known.
+pub(super) fn is_unplaced_sun(estimate: &LightEstimate) -> bool {
+    estimate.sun_probability >= 0.5 && estimate.source.is_none()
+}
+
 /// Azimuth, elevation, exposure and share.
 pub(crate) fn quantities(estimate: &LightEstimate) -> [Quantity; 4] {
     let (azimuth, elevation) = (&estimate.azimuth_deg, &estimate.elevation_deg);

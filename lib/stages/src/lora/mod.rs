@@ -1,8 +1,10 @@
 //! The LoRA stage: personalises the model to the photograph, keeping the object's class.
+mod base;
 mod cache;
 mod data;
 pub mod folder;
 mod history;
+mod own;
 mod resume;
 mod sheet;
 pub mod table;
@@ -14,6 +16,7 @@ use std::time::Instant;
 use anyhow::Context;
 use candle_core::Tensor;
 use dipir_cli::interrupt;
+use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_diffusion::generate::{GenerateSettings, generate};
 use dipir_diffusion::lora::{LoraInfo, LoraStyle};
@@ -25,21 +28,26 @@ use dipir_diffusion::validation::Validation;
 use dipir_imaging::file::{read_photo_within, write_png};
 use dipir_imaging::transfer::Transfer;
 use dipir_pipeline::fingerprint::Fingerprint;
-use dipir_pipeline::manifest::{Artifact, Manifest};
+use dipir_pipeline::manifest::Manifest;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
 use dipir_scene::config::SceneConfig;
 use serde_json::{Value, json};
 
+use self::base::base_hash;
 use self::cache::Cache;
 use self::data::Data;
 use self::history::History;
 use self::resume::Resume;
 use self::sheet::Sheet;
 use self::table::LoraTable;
-use crate::concepts::folder::{ConceptsFolder, read_latents};
 use crate::concepts::table::ConceptsTable;
+use crate::concepts::{
+    self,
+    folder::{ConceptsFolder, read_latents},
+};
 use crate::model::{self, ModelTable};
 use crate::names::{CONCEPTS, LORA, begin};
+use crate::upstream;
 use crate::written;
 
 /// Fixed examples of each kind. Their losses are compared with one another, so that few do.
@@ -56,13 +64,23 @@ pub struct Done {
     resumed_at: usize,
     wanted: usize,
     from_cache: bool,
+    /// The LoRA of `lora.path`, where none was trained.
+    own: Option<own::Read>,
 }
 
 /// What a run would be, from the configuration and the concept stage's manifest.
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
+    plan_with(session, preserves_concepts(session)?)
+}
+
+/// What a run would be, but for the concepts stage's results if they are not `with_concepts`.
+pub(crate) fn plan_with(session: &Session, with_concepts: bool) -> anyhow::Result<StagePlan> {
     let table: LoraTable = session.config.table("lora")?;
     let model_table: ModelTable = session.config.table("model")?;
     table.check(&session.config)?;
+    if let Some(path) = &table.path {
+        return own::plan(session, &table, path);
+    }
     let (background, transfer) = photo_of(session)?;
     // The class is in the prompts of the sheet.
     let class = (table.sheet_steps > 0)
@@ -74,7 +92,7 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let mut plan = LORA.plan(session, params);
     plan.device = session.pipeline.device.clone();
     plan.input("background", &background, &session.resolve(&background))?;
-    if preserves_concepts(session)? {
+    if with_concepts {
         let concepts = CONCEPTS.manifest(session)?;
         plan.outputs_of(&concepts, &["concepts", "latents"])?;
     }
@@ -88,11 +106,21 @@ fn class(session: &Session) -> anyhow::Result<String> {
     Ok(scene.class.unwrap_or_else(|| "object".into()))
 }
 
+/// Why training uses no concept images.
+pub(crate) fn without_concepts(session: &Session) -> anyhow::Result<Option<&'static str>> {
+    let table: LoraTable = session.config.table("lora")?;
+    Ok(match preserves_concepts(session)? {
+        true => None,
+        false if table.path.is_some() => Some("lora.path names a finished LoRA"),
+        false => Some("concepts.count or lora.prior_weight is 0"),
+    })
+}
+
 /// Whether training uses concept images beside the photograph.
 pub fn preserves_concepts(session: &Session) -> anyhow::Result<bool> {
     let table: LoraTable = session.config.table("lora")?;
     let concepts: ConceptsTable = session.config.table("concepts")?;
-    Ok(concepts.count > 0 && table.prior_weight != 0.0)
+    Ok(table.path.is_none() && concepts.count > 0 && table.prior_weight != 0.0)
 }
 
 /// The photograph, as the configuration names it, and how it is encoded.
@@ -116,6 +144,13 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let table: LoraTable = session.config.table("lora")?;
     // First, for it checks the configuration.
     let plan = plan(session)?;
+    if let Some(path) = &table.path {
+        return own::run(session, &table, path);
+    }
+    if preserves_concepts(session)? {
+        let now = concepts::plan(session)?;
+        upstream::warn_of_other_settings(session, &CONCEPTS, "the concept images were", &now);
+    }
     let cache = table.cache.as_deref();
     let cache = cache
         .map(|folder| Cache::open(session, folder, &plan))
@@ -142,6 +177,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         resumed_at: run.resumed_at,
         wanted: table.steps,
         from_cache: false,
+        own: None,
     })
 }
 
@@ -157,15 +193,6 @@ fn resumable(
         "lora": table.without_steps(), "transfer": transfer, "precision": model_table.precision,
     });
     Ok(Fingerprint::of_plan(plan).params(decides).finish())
-}
-
-/// The hash of the weights that are adapted: of the UNet's file, or of the one file of the model.
-fn base_hash(plan: &StagePlan) -> Option<String> {
-    let is_model = |i: &&Artifact| i.role == "model";
-    let of_unet = |i: &&Artifact| i.path.to_string_lossy().contains("unet/diffusion");
-    let mut inputs = plan.inputs.iter().filter(is_model);
-    let found = inputs.clone().find(of_unet).or_else(|| inputs.next());
-    found.map(|i| i.blake3.clone())
 }
 
 /// Ends a run whose results another scene has made.
@@ -185,6 +212,7 @@ fn from_cache(session: &Session, writer: StageWriter, wanted: usize) -> anyhow::
         resumed_at: 0,
         wanted,
         from_cache: true,
+        own: None,
     })
 }
 
@@ -301,7 +329,7 @@ impl Course<'_> {
                 interrupt::check()?;
             }
             let (clock, recomputed) = (Instant::now(), trainer.recomputes());
-            let report = trainer.step(self.data).context("fine-tuning stopped")?;
+            let report = trainer.step(self.data).map_err(|e| self.stopped(e))?;
             if trainer.recomputes() && !recomputed {
                 self.session.warn(
                     "the GPU's memory ran out: activations are recomputed from here on, which takes \
@@ -331,6 +359,16 @@ impl Course<'_> {
         let seen = self.validate(trainer, history, |share| progress.set(share));
         progress.done();
         seen
+    }
+
+    /// An update that failed, with the key that mends it where the gradient is not finite.
+    fn stopped(&self, error: dipir_diffusion::Error) -> anyhow::Error {
+        let diverged = matches!(error, dipir_diffusion::Error::Gradient { .. });
+        let rate = self.table.learning_rate;
+        anyhow::Error::new(error).context(match diverged {
+            true => format!("fine-tuning stopped; lower lora.learning_rate, which is {rate}"),
+            false => "fine-tuning stopped".into(),
+        })
     }
 
     /// Adds the losses of the fixed examples, unless they are known. Ctrl-C keeps the updates so far.
@@ -378,21 +416,33 @@ fn show_change(
     if table.sheet_steps == 0 {
         return Ok(Value::Null);
     }
-    let class = class(session)?;
-    let own = format!(
-        "a photo of a {class} in a scene in the style of {} rendering",
-        table.word
-    );
-    let prompts = vec![data.prompt.clone(), own, format!("a photo of a {class}")];
+    let [own, plain] = class_prompts(&class(session)?, &table.word);
     let sheet = Sheet {
-        prompts,
+        prompts: vec![data.prompt.clone(), own, plain],
         steps: table.sheet_steps,
     };
     let progress = session.progress("sheet");
     let path = writer.output("sheet", "sheet.png")?;
-    let difference = sheet.write(data.model, trainer, &path, |share| progress.set(share))?;
+    let learned = trainer.learned();
+    let difference = sheet.write(
+        data.model,
+        trainer.lora(),
+        learned.as_ref(),
+        &path,
+        |share| {
+            progress.set(share);
+        },
+    )?;
     progress.done();
     Ok(json!({"prompts": sheet.prompts, "steps": sheet.steps, "rms_difference": difference}))
+}
+
+/// Prompts that guide the light: for the class in the photograph's light, and for the class alone.
+fn class_prompts(class: &str, word: &str) -> [String; 2] {
+    [
+        format!("a photo of a {class} in a scene in the style of {word} rendering"),
+        format!("a photo of a {class}"),
+    ]
 }
 
 /// Gives `word` a token of its own and returns the embedding that it starts from: the mean of
@@ -486,11 +536,11 @@ impl Done {
     pub fn to_json(&self) -> Value {
         let ends = self.history.ends();
         json!({
-            "folder": self.folder, "steps": self.history.updates.len(), "resumed_at": self.resumed_at,
+            "folder": json_path(&self.folder), "steps": self.history.updates.len(), "resumed_at": self.resumed_at,
             "from_cache": self.from_cache,
             "loss_at_start": ends.map(|e| e.0.instance_loss), "loss_at_end": ends.map(|e| e.1.instance_loss),
             "class_loss_at_start": ends.map(|e| e.0.prior_loss), "class_loss_at_end": ends.map(|e| e.1.prior_loss),
-            "change": ends.map(|e| e.1.change),
+            "change": ends.map(|e| e.1.change), "own": self.own.as_ref().map(own::Read::to_json),
             "elapsed_s": self.manifest.elapsed_s, "peak_rss_bytes": self.manifest.peak_rss_bytes,
         })
     }
@@ -499,6 +549,9 @@ impl Done {
 impl fmt::Display for Done {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         written(f, &self.folder, &self.manifest)?;
+        if let Some(own) = &self.own {
+            return write!(f, "\n  {}", own.in_words());
+        }
         let updates = self.history.updates.len();
         write!(f, "\n  {updates} updates")?;
         if self.from_cache {
@@ -528,3 +581,6 @@ impl fmt::Display for Done {
         )
     }
 }
+
+#[cfg(test)]
+mod tests;

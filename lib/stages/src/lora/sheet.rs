@@ -3,10 +3,11 @@ use std::path::Path;
 
 use dipir_cli::interrupt;
 use dipir_diffusion::generate::{GenerateSettings, generate};
+use dipir_diffusion::lora::Lora;
 use dipir_diffusion::model::Model;
 use dipir_diffusion::pass::Pass;
 use dipir_diffusion::sampler::Solver;
-use dipir_diffusion::training::LoraTrainer;
+use dipir_diffusion::text_encoder::LearnedTokens;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use glam::Vec3;
@@ -40,12 +41,13 @@ impl Sheet {
     pub(super) fn write(
         &self,
         model: &Model,
-        trainer: &LoraTrainer,
+        lora: &Lora,
+        learned: Option<&LearnedTokens>,
         path: &Path,
         mut progress: impl FnMut(f64),
     ) -> anyhow::Result<f64> {
         let adapted = Pass {
-            lora: Some(trainer.lora().constant(model.dtype())?.into()),
+            lora: Some(lora.constant(model.dtype())?.into()),
             ..Pass::default()
         };
         let (mut rows, mut squares) = (vec![], 0.0);
@@ -54,7 +56,7 @@ impl Sheet {
         for (index, prompt) in self.prompts.iter().enumerate() {
             let mut row = vec![];
             for pass in [&Pass::default(), &adapted] {
-                row.push(self.sample(model, trainer, prompt, index, pass, |part| {
+                row.push(self.sample(model, learned, prompt, index, pass, |part| {
                     progress((done + part) / pictures);
                 })?);
                 done += 1.0;
@@ -71,7 +73,7 @@ impl Sheet {
     fn sample(
         &self,
         model: &Model,
-        trainer: &LoraTrainer,
+        learned: Option<&LearnedTokens>,
         prompt: &str,
         index: usize,
         pass: &Pass,
@@ -85,8 +87,7 @@ impl Sheet {
             size: (side, side),
             seed: 1 + index as u64,
         };
-        let learned = trainer.learned();
-        let generated = generate(model, prompt, &settings, pass, learned.as_ref(), |part| {
+        let generated = generate(model, prompt, &settings, pass, learned, |part| {
             progress(part);
             !interrupt::asked()
         });

@@ -14,6 +14,11 @@ const MAX_RANK: usize = 1024;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LoraTable {
+    /// A finished LoRA that is used in place of one that is trained here, with the keys of diffusers, peft or kohya: a
+    /// `.safetensors` file, or a folder that peft or diffusers wrote.
+    #[schemars(extend("format" = "path"), extend("x-default" = "none: one is trained on the photograph"), example = &"style.safetensors")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub path: Option<PathBuf>,
     /// Rank of the adapters.
     #[schemars(range(min = 1, max = 1024), example = 8)]
     pub rank: usize,
@@ -80,6 +85,7 @@ impl Default for LoraTable {
     fn default() -> Self {
         let training = TrainingConfig::default();
         Self {
+            path: None,
             rank: training.rank,
             alpha: None,
             steps: training.steps,
@@ -140,6 +146,12 @@ impl LoraTable {
             && !(s > 0.0)
         {
             return wrong("time_budget_s", &s, "above 0");
+        }
+        if self.path.is_some() && self.learn_word {
+            return Err(config.invalid(
+                "lora.learn_word",
+                "true has no meaning with lora.path, for nothing is trained then; leave one of them out",
+            ));
         }
         let word = &self.word;
         if self.learn_word && (word.is_empty() || word.contains(char::is_whitespace)) {
@@ -238,6 +250,9 @@ mod tests {
                 "{message}"
             );
         }
+        let message = refusal("path = \"a.safetensors\"\nlearn_word = true").expect("refused");
+        let part = "pipeline.toml:3: lora.learn_word: true has no meaning with lora.path";
+        assert!(message.contains(part), "{message}");
         // Without learning, several words may stand for the light.
         assert_eq!(refusal("word = \"my word\""), None);
         for word in ["sks", "<sks>", "*"] {

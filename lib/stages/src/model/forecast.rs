@@ -4,10 +4,11 @@ use dipir_diffusion::bf16_products;
 use dipir_diffusion::check::{Times, TimesSettings, times};
 use dipir_diffusion::model::Model;
 use dipir_guidance::distillation::default_crop;
-use dipir_optimize::settings::GuidanceKind;
+use dipir_optimize::settings::{GuidanceKind, LightTable, Start};
 use serde::Serialize;
 
 use crate::concepts::table::ConceptsTable;
+use crate::light::method::Method;
 use crate::light::request::{Guide, Request};
 use crate::lora::preserves_concepts;
 use crate::lora::table::LoraTable;
@@ -46,6 +47,23 @@ pub fn measure(
     Ok(times(model, &settings(session, model)?, progress)?)
 }
 
+/// Why nothing can be foretold of the session's configuration, if its light has to be read by a model that knows none.
+pub fn hindrance(session: &Session) -> anyhow::Result<Option<String>> {
+    let light: LightTable = session.config.table("light")?;
+    let model: ModelTable = session.config.table("model")?;
+    let reads = matches!(light.start, Start::Read | Start::Encoder);
+    // With materials or a map of the light nothing is read.
+    let asks = matches!(Method::of(session)?, Method::Model { .. });
+    Ok((reads && asks && !model.knows_light(session)).then(|| {
+        format!(
+            "light.start = \"{}\" needs a model that knows light, and {} has no {}; --set light.start=auto takes any",
+            String::from(light.start),
+            model.name(),
+            dipir_prior::encoder::FILE
+        )
+    }))
+}
+
 /// Whether a stage asks a model under the session's configuration.
 pub fn asks_model(session: &Session) -> anyhow::Result<bool> {
     Ok(matches!(Request::of(session)?.guide, Guide::Model { .. }))
@@ -62,7 +80,7 @@ pub fn works(session: &Session, times: &Times) -> anyhow::Result<Vec<Work>> {
         if preserves_concepts(session)? {
             works.push(concepts(session, times)?);
         }
-        works.push(lora(session, times)?);
+        works.extend(lora(session, times)?);
     }
     let iterations = request.settings.iterations;
     // Ten steps of a sampler take the place of one, from the drawn timestep down: half of them on average.
@@ -125,8 +143,12 @@ fn concepts(session: &Session, times: &Times) -> anyhow::Result<Work> {
     })
 }
 
-fn lora(session: &Session, times: &Times) -> anyhow::Result<Work> {
+/// The training of a LoRA, if one is trained.
+fn lora(session: &Session, times: &Times) -> anyhow::Result<Option<Work>> {
     let table: LoraTable = session.config.table("lora")?;
+    if table.path.is_some() {
+        return Ok(None);
+    }
     let updates = (table.steps * table.accumulation) as f64 * times.lora_step_s;
     let mut halved_by = vec![format!("lora.steps = {}", table.steps.div_ceil(2))];
     if table.prior_weight != 0.0 {
@@ -140,10 +162,10 @@ fn lora(session: &Session, times: &Times) -> anyhow::Result<Work> {
         1 => format!("{} updates", table.steps),
         n => format!("{} updates of {n} examples", table.steps),
     };
-    Ok(Work {
+    Ok(Some(Work {
         stage: LORA.name,
         what,
         seconds: updates.min(table.time_budget_s.unwrap_or(f64::INFINITY)),
         halved_by,
-    })
+    }))
 }

@@ -32,8 +32,8 @@ pub struct ModelTable {
     /// (AMX). `f16` needs a GPU.
     #[schemars(extend("enum" = ["f32", "bf16", "f16"]), example = &"bf16")]
     pub precision: String,
-    /// With a model in one file: what its UNet predicts.
-    #[schemars(extend("enum" = ["epsilon", "v_prediction"]), extend("x-default" = "what its header or a `.yaml` beside it says; `epsilon` for Stable Diffusion 1"), example = &"v_prediction")]
+    /// What its UNet predicts, whatever the model's files say.
+    #[schemars(extend("enum" = ["epsilon", "v_prediction"]), extend("x-default" = "what a folder's `scheduler_config.json`, a file's header or a `.yaml` beside it says; `epsilon` for Stable Diffusion 1"), example = &"v_prediction")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub prediction: Option<String>,
 }
@@ -100,6 +100,23 @@ pub fn load(session: &Session, table: &ModelTable) -> anyhow::Result<Loaded> {
         .with_context(|| format!("cannot use {}", table.name()))
 }
 
+/// Warns where the model's scheduler asks for pictures that are sampled otherwise than here.
+pub(crate) fn warn_of_sampler(session: &Session, model: &Model) {
+    if let Some(warning) = sampler_warning(model.schedule.unused()) {
+        session.warn(&warning);
+    }
+}
+
+fn sampler_warning(unused: &[String]) -> Option<String> {
+    (!unused.is_empty()).then(|| {
+        format!(
+            "{} of the model's scheduler_config.json: not used; pictures are sampled by DPM-Solver++(2M) at the schedule's \
+             own timesteps",
+            unused.join(", ")
+        )
+    })
+}
+
 /// Refuses more denoising steps in `key` than the model has timesteps.
 pub(crate) fn check_steps(
     session: &Session,
@@ -135,7 +152,7 @@ pub fn open(
     let one_file = path.is_file() || path.extension().is_some_and(|e| e == "safetensors");
     let model = match one_file {
         true => Model::load_file(&path, prediction, dtype, device)?,
-        false => Model::load(&path, dtype, device)?,
+        false => Model::load_as(&path, prediction, dtype, device)?,
     };
     Ok(Loaded {
         model,
@@ -290,4 +307,19 @@ pub fn digest(folder: Option<&Path>) -> anyhow::Result<String> {
     }
     let fingerprint = Fingerprint::of("model").inputs(&plan.inputs).finish();
     Ok(fingerprint.as_str().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scheduler_s_settings_that_nothing_heeds_are_warned_of() {
+        assert_eq!(sampler_warning(&[]), None);
+        let warning = sampler_warning(&["use_karras_sigmas".into(), "thresholding".into()]);
+        let warning = warning.expect("a warning");
+        for part in ["use_karras_sigmas, thresholding of", "DPM-Solver++(2M)"] {
+            assert!(warning.contains(part), "{warning}");
+        }
+    }
 }

@@ -62,6 +62,13 @@ pub fn section(report: &Report) -> Section {
 /// What the adapter changed: in words, and the sheet.
 fn change(run: &(PathBuf, Manifest), training: &Value) -> anyhow::Result<Vec<Html>> {
     let mut parts = Vec::new();
+    if let Some(path) = training["own"]["path"].as_str() {
+        let note = format!(
+            "The adapter was read from {path} ({} layers), not trained on the photograph.",
+            training["own"]["layers"]
+        );
+        parts.push(Html::element("p", &[("class", "soft")], [Html::text(note)]));
+    }
     let rows = training["validation"].as_array();
     if let Some((first, last)) = rows.and_then(|r| Some((r.first()?, r.last()?))) {
         let number = |row: &Value, key: &str| row[key].as_f64().unwrap_or(f64::NAN);
