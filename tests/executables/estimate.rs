@@ -1,6 +1,9 @@
 //! Light estimated from the photograph alone: what happens where a configuration names none.
+use dipir_imaging::layers::{Layers, Precision};
+use dipir_imaging::raster::Raster;
 use dipir_light::environment::EnvironmentMap;
 use dipir_optimize::lighting::Lighting;
+use glam::Vec3;
 use serde_json::{Value, json};
 
 use crate::project::*;
@@ -269,4 +272,36 @@ fn a_lighting_of_lobes_alone_written_by_hand_is_enough() {
     let light = Lighting::read(&project.path("out/light/lighting.json")).unwrap();
     assert_eq!((light.lobes.len(), light.exposure), (1, 1.0));
     project.run(COMPOSITE, &[]).expect_success();
+}
+
+#[test]
+fn a_plate_of_linear_light_is_lit_at_its_own_exposure() {
+    let project = project();
+    let picture = |gain: f32| {
+        let value = |n: usize| Vec3::new(0.1, 0.15, 0.2) * (gain * (0.2 + n as f32 / 432.0));
+        let pixels = (0..36 * 24).map(value).collect();
+        let mut plate = Layers::new(36, 24);
+        let colour = Raster::from_pixels(36, 24, pixels);
+        plate.insert_rgb("", Precision::Full, &colour).unwrap();
+        plate.write_exr(project.path("plate.exr")).unwrap();
+        let set = ["--set", "scene.background=plate.exr", "--set"];
+        let samples = "composite.max_samples=64";
+        project
+            .run(DIPIR, &[&["run"], &set[..], &[samples]].concat())
+            .expect_success();
+        let made = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
+        made.rgb("object").unwrap()
+    };
+    let (dim, bright) = (picture(0.0625), picture(16.0));
+    let most = |object: &Raster<Vec3>| {
+        let values = object.pixels().iter().map(|p| p.max_element());
+        values.fold(0.0, f32::max)
+    };
+    // No curve holds it below white.
+    assert!(most(&bright) > 1.0, "{}", most(&bright));
+    for (dim, bright) in dim.pixels().iter().zip(bright.pixels()) {
+        // Layers have half precision.
+        let off = (*bright - 256.0 * *dim).abs().max_element();
+        assert!(off < 0.01 * bright.max_element() + 1e-3, "{dim} {bright}");
+    }
 }

@@ -262,6 +262,10 @@ fn a_second_run_at_the_same_time_is_refused_in_one_message() {
     first.kill().unwrap();
     first.wait().unwrap();
     second.expect_error(1, &message);
+    let message = format!(
+        "error: out is being written by process {}; wait for it to end, and nothing was removed",
+        first.id()
+    );
     cleaned.expect_error(1, &message);
     // The child of the killed run stops by itself, and the next run waits for it.
     project.run(DIPIR, &["run"]).expect_success();

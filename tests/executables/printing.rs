@@ -47,14 +47,29 @@ fn a_folder_whose_name_is_not_utf_8_is_worked_in_and_told_of() {
     ] {
         run(DIPIR, args, "pipeline.toml").expect_success();
     }
-    told(run(DIPIR, &["run", "--force", "--json"], "pipeline.toml"), "report");
+    told(
+        run(DIPIR, &["run", "--force", "--json"], "pipeline.toml"),
+        "report",
+    );
     told(run(DIPIR, &["report", "--json"], "pipeline.toml"), "report");
     let wire = ["preview", "--wire", "--json"];
     told(run(DIPIR, &wire, "pipeline.toml"), "preview");
-    told(run(DIPIR, &["clean", "--json", "--dry-run"], "pipeline.toml"), "removed");
+    told(
+        run(DIPIR, &["clean", "--json", "--dry-run"], "pipeline.toml"),
+        "removed",
+    );
     told(run(SCENE, &["--json", "-p"], "pipeline.toml"), "folder");
-    told(run(COMPOSITE, &["--json", "-p"], "pipeline.toml"), "picture");
-    for file in ["background.png", "object.obj", "out/scene/scene.json", "out/scene", "sky.exr"] {
+    told(
+        run(COMPOSITE, &["--json", "-p"], "pipeline.toml"),
+        "picture",
+    );
+    for file in [
+        "background.png",
+        "object.obj",
+        "out/scene/scene.json",
+        "out/scene",
+        "sky.exr",
+    ] {
         run(INSPECT, &[], file).expect_success();
         told(run(INSPECT, &["--json"], file), "path");
     }
@@ -68,7 +83,12 @@ fn without_reader(project: &Project, executable: &str, args: &[&str]) -> Option<
     let script = "\"$@\" 2>&1 >/dev/null | exec 0<&-; exit ${PIPESTATUS[0]}";
     let mut all = vec!["-c", script, "bash", executable];
     all.extend(args);
-    project.command("bash", &all).output().unwrap().status.code()
+    project
+        .command("bash", &all)
+        .output()
+        .unwrap()
+        .status
+        .code()
 }
 
 #[cfg(target_os = "linux")]
@@ -78,12 +98,27 @@ fn the_work_goes_on_where_nobody_reads_what_is_said_of_it() {
     let run = |args: &[&str]| {
         let full = File::options().write(true).open("/dev/full").unwrap();
         let mut command = project.command(DIPIR, args);
-        command.stderr(Stdio::from(full)).output().unwrap().status.code()
+        command
+            .stderr(Stdio::from(full))
+            .output()
+            .unwrap()
+            .status
+            .code()
     };
     assert_eq!(run(&["run"]), Some(0));
     assert_eq!(run(&["run", "--force", "-v"]), Some(0));
-    assert_eq!(without_reader(&project, DIPIR, &["run", "--force"]), Some(0));
-    project.write("b.toml", [&b"[pipeline]\nout = \"b\"\n"[..], &project.read("pipeline.toml")].concat());
+    assert_eq!(
+        without_reader(&project, DIPIR, &["run", "--force"]),
+        Some(0)
+    );
+    project.write(
+        "b.toml",
+        [
+            &b"[pipeline]\nout = \"b\"\n"[..],
+            &project.read("pipeline.toml"),
+        ]
+        .concat(),
+    );
     assert_eq!(run(&["run", "pipeline.toml", "b.toml"]), Some(0));
     assert!(project.path("b/composite/composite.png").exists());
     // An error is an error all the same.
@@ -120,7 +155,10 @@ fn a_result_that_cannot_be_printed_is_one_error() {
     }
     // All stages run, and then it is said once.
     let run = printed(DIPIR, &["run"]);
-    assert_eq!((run.code, run.stderr.matches("error: ").count()), (Some(1), 1));
+    assert_eq!(
+        (run.code, run.stderr.matches("error: ").count()),
+        (Some(1), 1)
+    );
     assert!(project.path("out/composite/composite.png").exists());
     // A reader that has seen enough is none.
     for args in ["keys --schema", "--help"] {

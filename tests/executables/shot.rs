@@ -244,9 +244,8 @@ fn objects_and_ground_are_as_in_the_photograph() {
     let (_, tail) = tail.split_once("[scene.proxy]").unwrap();
     let (_, tail) = tail.split_once("\n\n").unwrap();
     let moving = "file = \"transforms.json\"\nfile_up = \"y\"";
-    let text = format!(
-        "{head}[scene.camera]\n{moving}\n[scene.proxy]\ncamera_height_m = 1.6\n\n{tail}"
-    );
+    let text =
+        format!("{head}[scene.camera]\n{moving}\n[scene.proxy]\ncamera_height_m = 1.6\n\n{tail}");
     project.write("pipeline.toml", text);
     let frame = |name: &str, place: [f64; 2]| {
         let matrix = [
@@ -258,10 +257,7 @@ fn objects_and_ground_are_as_in_the_photograph() {
         project.write(name, project.read("background.png"));
         json!({ "file_path": name, "transform_matrix": matrix })
     };
-    let frames = [
-        frame("f.0.png", [0.0, 1.6]),
-        frame("f.1.png", [0.5, 1.9]),
-    ];
+    let frames = [frame("f.0.png", [0.0, 1.6]), frame("f.1.png", [0.5, 1.9])];
     project.write("background.png", project.read("f.0.png"));
     let file = json!({ "camera_angle_x": 0.8, "w": 36, "h": 24, "frames": frames });
     project.write("transforms.json", file.to_string());
@@ -284,13 +280,19 @@ fn objects_and_ground_are_as_in_the_photograph() {
         serde_json::from_slice(&project.read(&path)).unwrap()
     };
     let (photo, frame) = (of("out"), of("out/frames/f.1"));
-    assert_eq!(frame["objects"][0]["transform"], photo["objects"][0]["transform"]);
+    assert_eq!(
+        frame["objects"][0]["transform"],
+        photo["objects"][0]["transform"]
+    );
     assert_eq!(frame["proxy"], photo["proxy"]);
     assert_ne!(frame["camera"], photo["camera"]);
     assert_eq!(frame["occluders"]["path"], "roto.1.png");
     // Another place in the photograph is another place in every frame.
     let elsewhere = ["--set", "scene.objects.0.at_pixel=[10, 20]"];
-    let ran = shot(&project, &[&["f.1.png"][..], &at_pixel, &elsewhere].concat());
+    let ran = shot(
+        &project,
+        &[&["f.1.png"][..], &at_pixel, &elsewhere].concat(),
+    );
     assert_eq!(ran[0]["done"]["ran"], json!(["scene", "composite"]));
     assert_ne!(of("out/frames/f.1")["objects"], frame["objects"]);
     let status = project.run(DIPIR, &["status"]);
@@ -336,6 +338,14 @@ fn a_camera_that_stands_still_is_that_of_the_photograph() {
     assert!((focal(&half) / focal(&photo) - 0.5).abs() < 1e-6);
     let run = project.run(DIPIR, &["shot", "half.png", "wide.png"]);
     assert_ne!(run.code, Some(0));
-    assert!(run.stderr.contains("a frame of 36 x 12 pixels"), "{}", run.stderr);
-    assert!(run.stderr.ends_with("1 of 2 failed: wide.png\n"), "{}", run.stderr);
+    assert!(
+        run.stderr.contains("a frame of 36 x 12 pixels"),
+        "{}",
+        run.stderr
+    );
+    assert!(
+        run.stderr.ends_with("1 of 2 failed: wide.png\n"),
+        "{}",
+        run.stderr
+    );
 }

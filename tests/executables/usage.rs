@@ -137,7 +137,11 @@ fn what_gives_no_photograph_is_refused_by_option() {
         let run = project.run(SCENE, &[&base[..], &[option, value, "o.png"]].concat());
         assert_eq!(run.code, Some(2), "{}", run.stderr);
         let told = run.stderr.starts_with(&format!("error: {option} "));
-        assert!(told && run.stderr.trim_end().ends_with(accepted), "{}", run.stderr);
+        assert!(
+            told && run.stderr.trim_end().ends_with(accepted),
+            "{}",
+            run.stderr
+        );
     }
     for name in ["o.jpg", "o", "o.exr"] {
         let message = format!(
@@ -156,11 +160,21 @@ fn what_gives_no_photograph_is_refused_by_option() {
 fn no_picture_replaces_what_it_is_made_from() {
     let project = Project::new();
     // A photograph that dipir made would be replaced.
-    let cut = ["background", "--from", "sky.exr", "--size", "36x24", "bg.png"];
+    let cut = [
+        "background",
+        "--from",
+        "sky.exr",
+        "--size",
+        "36x24",
+        "bg.png",
+    ];
     project.run(SCENE, &cut).expect_success();
     let before = project.read("bg.png");
     let set = ["--set", "scene.background=bg.png"];
-    let run = project.run(DIPIR, &[&["preview", "--wire", "-o", "./bg.png"], &set[..]].concat());
+    let run = project.run(
+        DIPIR,
+        &[&["preview", "--wire", "-o", "./bg.png"], &set[..]].concat(),
+    );
     run.expect_error(
         2,
         "error: ./bg.png is what scene.background names, and the preview would replace it: name another \
@@ -172,8 +186,12 @@ fn no_picture_replaces_what_it_is_made_from() {
         "error: --png ./bg.png: that is the file which is shown; name another file",
     );
     assert!(project.read("bg.png") == before);
-    project.run(INSPECT, &["bg.png", "--png", "o.png"]).expect_success();
-    project.run(INSPECT, &["bg.png", "--png", "o.png"]).expect_success();
+    project
+        .run(INSPECT, &["bg.png", "--png", "o.png"])
+        .expect_success();
+    project
+        .run(INSPECT, &["bg.png", "--png", "o.png"])
+        .expect_success();
 }
 
 #[test]
@@ -187,7 +205,11 @@ fn a_value_of_the_command_line_is_called_by_its_option() {
     let accepted = "metres above 0, as in 1.8";
     let message = format!("error: --set {set}: light.shadow.height_m is -1; accepted: {accepted}");
     let run = project.run(DIPIR, &["run", "--until", "light", "--set", set]);
-    assert!(run.code == Some(2) && run.stderr.contains(&message), "{}", run.stderr);
+    assert!(
+        run.code == Some(2) && run.stderr.contains(&message),
+        "{}",
+        run.stderr
+    );
     // A device is read where none is used, too.
     let message = "error: --set pipeline.device=foo: pipeline.device: \"foo\" is no device; \
                    accepted: cpu, cuda:N, metal:N, auto";
@@ -199,8 +221,7 @@ fn a_value_of_the_command_line_is_called_by_its_option() {
         let set = format!("composite.time_budget_s={seconds}");
         let run = project.run(DIPIR, &["run", "--set", &set]);
         let accepted = "is out of range; accepted: seconds from 0.01 to 1e7, as in 60";
-        let message =
-            format!("error: --set {set}: composite.time_budget_s: {seconds} {accepted}");
+        let message = format!("error: --set {set}: composite.time_budget_s: {seconds} {accepted}");
         run.expect_error(2, &message);
     }
 }
@@ -211,11 +232,16 @@ fn several_files_are_looked_at_before_the_first_runs() {
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
     project.write("b.toml", &text);
     let run = project.run(DIPIR, &["run", "pipeline.toml", "b.toml"]);
-    let message = "error: pipeline.toml and b.toml write one folder, out: give each its own, [pipeline] out";
+    let message =
+        "error: pipeline.toml and b.toml write one folder, out: give each its own, [pipeline] out";
     run.expect_error(2, message);
     let run = project.run(DIPIR, &["run", "pipeline.toml", "gone.toml"]);
     assert_eq!(run.code, Some(2));
-    assert!(run.stderr.starts_with("error: there is no gone.toml; "), "{}", run.stderr);
+    assert!(
+        run.stderr.starts_with("error: there is no gone.toml; "),
+        "{}",
+        run.stderr
+    );
     assert!(!project.path("out").exists());
     project.write("b.toml", format!("[pipeline]\nout = \"x/../out\"\n{text}"));
     std::fs::create_dir(project.path("x")).unwrap();

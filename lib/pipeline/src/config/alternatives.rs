@@ -88,13 +88,14 @@ fn replaced_by(table: &str, key: &str, value: &str) -> Vec<&'static str> {
         .collect()
 }
 
-/// Whether a camera's `file` may lack what `key` says: OpenCV's files describe the lens alone, `.chan` files may lack
-/// the field of view.
+/// Whether a camera's `file` may lack what `key` says: OpenCV's files describe the lens alone, `.chan` and glTF no lens,
+/// `.chan` files may lack the field of view.
 fn completes(key: &str, file: &str) -> bool {
     let extension = Path::new(file.trim_matches(['"', '\''])).extension();
     match extension.and_then(|e| e.to_str()) {
         Some("yaml" | "yml" | "json") => STAND.split(' ').any(|k| k == key),
-        Some("chan") => key == "fov_deg",
+        Some("chan") => ["fov_deg", "distortion", "principal_px"].contains(&key),
+        Some("glb" | "gltf") => ["distortion", "principal_px"].contains(&key),
         _ => false,
     }
 }
@@ -114,6 +115,7 @@ position = [0.0, 1.0, 4.0]
 look_at = [0.0, 0.0, 0.0]
 focal_mm = 35.0
 sensor_mm = 36.0
+distortion = { k1 = -0.1 }
 [scene.proxy]
 points = "scan.bin"
 points_up = "z"
@@ -163,8 +165,13 @@ sun = { time = "2026-06-21T12:34:56+02:00", latitude = 48.1, longitude = 11.6 }
             ),
             (
                 "scene.camera.file=shot.fspy",
-                "scene.camera.position scene.camera.look_at scene.camera.focal_mm",
+                "scene.camera.position scene.camera.look_at scene.camera.focal_mm scene.camera.distortion",
                 "scene.camera.file",
+            ),
+            (
+                "scene.camera.file=shot.chan",
+                "scene.camera.position scene.camera.focal_mm",
+                "scene.camera.distortion",
             ),
             (
                 "scene.camera.file=lens.yaml",
