@@ -1,14 +1,13 @@
 //! `dipir-composite`: the object in the photograph, with its layers.
 use std::process::ExitCode;
 
-use clap::Parser;
 use dipir_cli::exit;
 use dipir_cli::session::Session;
 use dipir_stages::command_line::composite::Cli;
 
 fn main() -> ExitCode {
     exit::run(|| {
-        let cli = Cli::parse();
+        let cli = exit::parse::<Cli>()?;
         let session = Session::start(&cli.common)?;
         let stop = dipir_stages::composite::StopArgs {
             target_error: cli.target_error,

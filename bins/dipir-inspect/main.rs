@@ -2,7 +2,6 @@
 use std::process::ExitCode;
 
 use anyhow::bail;
-use clap::Parser;
 use dipir_cli::exit::{self, Usage, printable};
 use dipir_cli::style::{bold, color_on_stdout};
 use dipir_inspection::command_line::Cli;
@@ -10,7 +9,7 @@ use dipir_inspection::inspect;
 use dipir_inspection::report::Report;
 
 fn main() -> ExitCode {
-    exit::run(|| run(&Cli::parse()))
+    exit::run(|| run(&exit::parse::<Cli>()?))
 }
 
 fn run(args: &Cli) -> anyhow::Result<()> {

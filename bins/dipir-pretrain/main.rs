@@ -4,10 +4,10 @@ use std::process::ExitCode;
 use std::sync::Mutex;
 use std::time::Instant;
 
-use clap::Parser;
 use dipir_cli::args::OutputArgs;
 use dipir_cli::exit;
 use dipir_cli::interrupt::{self, Interrupted};
+use dipir_cli::output::json_path;
 use dipir_cli::progress::Progress;
 use dipir_cli::session::duration;
 use dipir_places::Progress as Step;
@@ -24,7 +24,7 @@ use serde_json::json;
 
 fn main() -> ExitCode {
     exit::run(|| {
-        let cli = Cli::parse();
+        let cli = exit::parse::<Cli>()?;
         // All commands look for an interruption every few seconds, and a training saves its weights then.
         interrupt::listen_patiently()?;
         match &cli.command {
@@ -90,7 +90,7 @@ fn train(args: &TrainArgs, output: &OutputArgs) -> anyhow::Result<()> {
         },
         || {
             json!({
-                "folder": folder, "examples": summary.seen, "resumed_at": summary.resumed_at,
+                "folder": json_path(&folder), "examples": summary.seen, "resumed_at": summary.resumed_at,
                 "loss": summary.loss, "elapsed_s": seconds,
             })
         },
@@ -119,7 +119,7 @@ fn train_encoder(args: &EncoderArgs, output: &OutputArgs) -> anyhow::Result<()> 
     let path = args.data.out.join(encoder::FILE);
     output.result(
         || format!("wrote {}, loss {loss:.4}", path.display()),
-        || json!({"file": path, "examples": args.samples, "loss": loss}),
+        || json!({"file": json_path(&path), "examples": args.samples, "loss": loss}),
     );
     Ok(())
 }
@@ -159,7 +159,7 @@ fn train_light(args: &LightArgs, output: &OutputArgs) -> anyhow::Result<()> {
                 duration(seconds)
             )
         },
-        || json!({"file": file, "standard": outcome.standard, "any": outcome.any, "elapsed_s": seconds}),
+        || json!({"file": json_path(&file), "standard": outcome.standard, "any": outcome.any, "elapsed_s": seconds}),
     );
     Ok(())
 }

@@ -1,10 +1,11 @@
 //! `dipir-scene`: sets the scene up for all later stages.
+use std::ffi::OsStr;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use clap::Parser;
 use dipir_cli::args::CommonArgs;
-use dipir_cli::exit::{self, Usage};
+use dipir_cli::exit::{self, Usage, printable};
+use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_imaging::marked_png::write_display;
 use dipir_imaging::raster::LinearImage;
@@ -16,7 +17,7 @@ use serde_json::json;
 
 fn main() -> ExitCode {
     exit::run(|| {
-        let cli = Cli::parse();
+        let cli = exit::parse::<Cli>()?;
         match &cli.command {
             Some(Command::Background(args)) => background(args),
             None => set_up(&cli.common),
@@ -31,14 +32,39 @@ fn set_up(args: &CommonArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn background(args: &BackgroundArgs) -> anyhow::Result<()> {
-    if !(args.fov > 0.0 && args.fov < 180.0) {
-        return Err(Usage(format!(
-            "--fov {}: accepted: above 0 and below 180",
-            args.fov
-        ))
-        .into());
+/// Refuses what gives no photograph.
+fn check(args: &BackgroundArgs) -> Result<(), Usage> {
+    let ranges = [
+        ("--fov", args.fov, 0.1, 179.0),
+        ("--yaw", args.yaw, -360.0, 360.0),
+        ("--pitch", args.pitch, -90.0, 90.0),
+        (
+            "--exposure-ev",
+            args.exposure_ev.unwrap_or_default(),
+            -64.0,
+            64.0,
+        ),
+    ];
+    for (option, value, least, most) in ranges {
+        if !(least..=most).contains(&value) {
+            let message = format!("{option} {value}: accepted: {least} to {most}");
+            return Err(Usage(message));
+        }
     }
+    let is_png = |e: &OsStr| e.eq_ignore_ascii_case("png");
+    match args.png.extension().is_some_and(is_png) {
+        true => Ok(()),
+        false => {
+            let path = args.png.display();
+            let message =
+                format!("{path}: the photograph is written as a PNG: name it so, as in photo.png");
+            Err(Usage(printable(&message)))
+        }
+    }
+}
+
+fn background(args: &BackgroundArgs) -> anyhow::Result<()> {
+    check(args)?;
     let map = EnvironmentMap::read(&args.from)
         .with_context(|| format!("cannot cut a photograph out of {}", args.from.display()))?;
     let view = PanoramaView {
@@ -75,7 +101,7 @@ fn background(args: &BackgroundArgs) -> anyhow::Result<()> {
         },
         || {
             json!({
-                "png": args.png, "exposure_ev": exposure_ev, "fov_deg": args.fov,
+                "png": json_path(&args.png), "exposure_ev": exposure_ev, "fov_deg": args.fov,
                 "forward": -rotation.z_axis,
             })
         },

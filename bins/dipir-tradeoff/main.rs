@@ -1,15 +1,15 @@
 //! `dipir-tradeoff`: what accuracy costs, knob by knob and together.
 use std::process::ExitCode;
 
-use clap::Parser;
 use dipir_cli::exit;
+use dipir_cli::output::json_paths;
 use dipir_cli::progress::Progress;
 use dipir_tradeoff::command_line::Cli;
 use dipir_tradeoff::sweep::{Step, sweep};
 use serde_json::json;
 
 fn main() -> ExitCode {
-    exit::run(|| run(&Cli::parse()))
+    exit::run(|| run(&exit::parse::<Cli>()?))
 }
 
 fn run(cli: &Cli) -> anyhow::Result<()> {
@@ -29,7 +29,7 @@ fn run(cli: &Cli) -> anyhow::Result<()> {
             let names: Vec<String> = names.map(|f| format!("  {}", f.display())).collect();
             format!("{} points; wrote\n{}", outcome.points, names.join("\n"))
         },
-        || json!({"points": outcome.points, "files": outcome.files}),
+        || json!({"points": outcome.points, "files": json_paths(&outcome.files)}),
     );
     Ok(())
 }

@@ -2,9 +2,10 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use clap::Args;
 use dipir_cli::exit::{Usage, printable};
+use dipir_cli::output::json_paths;
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::hashing::Hashes;
 use dipir_pipeline::lock::{FolderLock, WhenLocked};
@@ -66,9 +67,11 @@ pub fn run(args: &CleanArgs) -> anyhow::Result<()> {
     let mut locks = Vec::new();
     if out.is_dir() && !args.dry_run {
         for out in all() {
-            locks.push(FolderLock::take_inside(out, "run", WhenLocked::Refuse)?);
+            let lock = FolderLock::take_inside(out, "run", WhenLocked::Refuse);
+            locks.push(lock.map_err(without_wait)?);
             for stage in &stages {
-                locks.push(FolderLock::take(&out.join(stage), WhenLocked::Refuse)?);
+                let lock = FolderLock::take(&out.join(stage), WhenLocked::Refuse);
+                locks.push(lock.map_err(without_wait)?);
             }
         }
     }
@@ -94,9 +97,20 @@ pub fn run(args: &CleanArgs) -> anyhow::Result<()> {
     }
     session.result(
         || in_words(&removed, &kept, args.dry_run),
-        || json!({"removed": removed, "kept": kept, "dry_run": args.dry_run}),
+        || json!({"removed": json_paths(&removed), "kept": json_paths(&kept), "dry_run": args.dry_run}),
     );
     Ok(())
+}
+
+/// The message about a folder that is written, in the words of a command that has no `--wait`.
+fn without_wait(error: StageError) -> anyhow::Error {
+    match error {
+        StageError::Locked { folder, holder } => anyhow!(
+            "{} is being written by {holder}; wait for it to end, and nothing was removed",
+            folder.display()
+        ),
+        other => other.into(),
+    }
 }
 
 /// Looks for what is ours; an error if a stage's folder is another's.

@@ -2,7 +2,7 @@
 use clap::Args;
 use dipir_cli::args::OutputArgs;
 use dipir_cli::exit::Usage;
-use dipir_cli::session::print_line;
+use dipir_cli::output::print_line;
 use dipir_cli::style::{bold, color_on_stdout, faint};
 use dipir_stages::keys::{self, Table};
 use serde_json::json;

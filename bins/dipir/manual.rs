@@ -1,6 +1,5 @@
 //! `dipir completions` and `dipir man`, for all executables.
 use std::fs;
-use std::io::{Write, stdout};
 use std::path::PathBuf;
 
 use anyhow::Context;
@@ -8,7 +7,8 @@ use clap::{Args, Command, CommandFactory, ValueEnum};
 use clap_complete::Shell;
 use clap_mangen::Man;
 use dipir_benchmark::command_line as evaluate;
-use dipir_cli::session::print_line;
+use dipir_cli::exit::printable;
+use dipir_cli::output::{print_bytes, print_line};
 use dipir_inspection::command_line as inspect;
 use dipir_stages::command_line::{composite, concepts, light, lora, model, scene};
 use dipir_tradeoff::command_line as tradeoff;
@@ -84,8 +84,7 @@ pub fn completions(args: &CompletionsArgs) -> anyhow::Result<()> {
     let name = command.get_name().to_string();
     let mut text = Vec::new();
     clap_complete::generate(args.shell, &mut command, name, &mut text);
-    // A reader that went away, as head does, is no error.
-    let _ = stdout().write_all(&text);
+    print_bytes(&text);
     Ok(())
 }
 
@@ -93,7 +92,7 @@ pub fn man(args: &ManArgs) -> anyhow::Result<()> {
     let Some(folder) = &args.dir else {
         let mut text = Vec::new();
         Man::new(args.executable.command()).render(&mut text)?;
-        let _ = stdout().write_all(&text);
+        print_bytes(&text);
         return Ok(());
     };
     fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
@@ -101,6 +100,9 @@ pub fn man(args: &ManArgs) -> anyhow::Result<()> {
         clap_mangen::generate_to(executable.command(), folder)
             .with_context(|| format!("cannot write to {}", folder.display()))?;
     }
-    print_line(&format!("wrote the pages to {}", folder.display()));
+    print_line(&printable(&format!(
+        "wrote the pages to {}",
+        folder.display()
+    )));
     Ok(())
 }

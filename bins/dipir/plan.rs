@@ -143,22 +143,23 @@ fn measure(session: &Session, all: &mut [Expected]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What the frames of a shot would take, after what `light` takes: as long as those that are there took, else as the
+/// What the frames of a shot would take, after the plan of its `photo`: as long as those that are there took, else as the
 /// photograph's own picture.
 pub fn frames(
     base: &Session,
-    light: Option<(String, Value)>,
+    photo: (String, Value),
     frames: &[(PathBuf, ProjectArgs)],
 ) -> anyhow::Result<(String, Value)> {
     let runs = |e: &Value| e["runs"] == json!(true);
-    let stages = light.as_ref().and_then(|l| l.1["plan"].as_array());
-    // Another light concerns every frame.
-    let is_new_light = stages.is_some_and(|all| all.iter().any(runs));
+    // Objects and light are those of the photograph.
+    let concerns_all = photo.1["plan"]
+        .as_array()
+        .is_some_and(|all| all.iter().any(runs));
     let (mut stale, mut took) = (0, vec![]);
     for (_, project) in frames {
         let (session, graph) = project.open()?;
         let nodes = graph.up_to(graph::LAST);
-        stale += usize::from(is_new_light || !run::all_fresh(&session, &graph, &nodes)?);
+        stale += usize::from(concerns_all || !run::all_fresh(&session, &graph, &nodes)?);
         took.extend(seconds(&session));
     }
     if took.is_empty() {
@@ -177,12 +178,9 @@ pub fn frames(
             duration(together)
         ),
     };
-    let (light, mut json) = light.unwrap_or_else(|| (String::new(), json!({})));
-    if !light.is_empty() {
-        words = format!("{light}\n{words}");
-    }
+    let (of_photo, mut json) = photo;
     json["frames"] = json!({"all": all, "run": stale, "seconds_each": each, "seconds": together});
-    Ok((words, json))
+    Ok((format!("{of_photo}\n{words}"), json))
 }
 
 /// What the picture of a session took the last time.

@@ -1,9 +1,11 @@
 //! `dipir preview`.
-use std::path::PathBuf;
+use std::fs;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
-use dipir_cli::exit::printable;
-use dipir_cli::session::duration;
+use dipir_cli::exit::{Usage, printable};
+use dipir_cli::output::json_path;
+use dipir_cli::session::{Session, duration};
 use dipir_preview::picture::Preview;
 use serde_json::json;
 
@@ -27,12 +29,13 @@ pub struct PreviewArgs {
 /// Draws what is configured, without running a stage.
 pub fn run(args: &PreviewArgs) -> anyhow::Result<()> {
     let session = args.project.start()?;
+    let path = args.out.clone();
+    let path = path.unwrap_or_else(|| session.config.base_dir().join("preview.png"));
+    refuse_input(&session, &path)?;
     let preview = Preview::new(&session, !args.wire)?;
     for warning in &preview.arrangement.warnings {
         session.warn(warning);
     }
-    let path = args.out.clone();
-    let path = path.unwrap_or_else(|| session.config.base_dir().join("preview.png"));
     preview.write(&path)?;
     let light = preview.light.map(|l| l.words());
     let took = duration(preview.seconds);
@@ -41,7 +44,23 @@ pub fn run(args: &PreviewArgs) -> anyhow::Result<()> {
             let light = light.map_or_else(String::new, |l| format!("; light: {l}"));
             printable(&format!("wrote {} in {took}{light}", path.display()))
         },
-        || json!({"preview": path, "light": light, "seconds": preview.seconds}),
+        || json!({"preview": json_path(&path), "light": light, "seconds": preview.seconds}),
     );
     Ok(())
+}
+
+/// Refuses to draw over a file that the project reads.
+fn refuse_input(session: &Session, path: &Path) -> Result<(), Usage> {
+    let Ok(found) = fs::canonicalize(path) else {
+        return Ok(());
+    };
+    let is_it =
+        |text: &str| fs::canonicalize(session.resolve(Path::new(text))).ok() == Some(found.clone());
+    match session.config.texts().iter().find(|(_, text)| is_it(text)) {
+        None => Ok(()),
+        Some((key, _)) => Err(Usage(printable(&format!(
+            "{} is what {key} names, and the preview would replace it: name another file with --out",
+            path.display()
+        )))),
+    }
 }

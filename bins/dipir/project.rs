@@ -40,6 +40,10 @@ pub struct ProjectArgs {
     #[arg(skip)]
     pub light: Option<PathBuf>,
 
+    /// Folder of the scene stage of the photograph whose shot this is a frame of.
+    #[arg(skip)]
+    pub placed: Option<PathBuf>,
+
     #[command(flatten)]
     pub output: OutputArgs,
 }
@@ -73,6 +77,7 @@ impl ProjectArgs {
             out: common.out.clone(),
             seed: common.seed,
             light: common.light.clone(),
+            placed: common.placed.clone(),
             output: common.output,
         }
     }
@@ -89,6 +94,7 @@ impl ProjectArgs {
             supervised: false,
             hashes: None,
             light: self.light.clone(),
+            placed: self.placed.clone(),
             output: self.output,
         }
     }
@@ -111,6 +117,19 @@ impl ProjectArgs {
         words.iter().map(|w| quoted(w)).collect()
     }
 
+    /// Refuses a file that is not there.
+    pub fn check_there(&self) -> Result<(), Usage> {
+        let file = self.file();
+        match file.try_exists() {
+            Ok(false) => Err(Usage(printable(&format!(
+                "there is no {}; name another file, as in dipir run photo/pipeline.toml, or {}",
+                file.display(),
+                suggestion::beginning()
+            )))),
+            _ => Ok(()),
+        }
+    }
+
     /// Reads the configuration and draws the graph.
     pub fn open(&self) -> anyhow::Result<(Session, Graph)> {
         if let [_, second, ..] = &self.files[..] {
@@ -120,15 +139,7 @@ impl ProjectArgs {
             );
             return Err(Usage(message).into());
         }
-        let file = self.file();
-        if matches!(file.try_exists(), Ok(false)) {
-            let message = format!(
-                "there is no {}; name another file, as in dipir run photo/pipeline.toml, or {}",
-                file.display(),
-                suggestion::beginning()
-            );
-            return Err(Usage(printable(&message)).into());
-        }
+        self.check_there()?;
         let session = Session::open(&self.common())?;
         let graph = graph::graph(&session)?;
         Ok((session, graph))
@@ -165,6 +176,7 @@ impl FileArgs {
             out: None,
             seed: None,
             light: None,
+            placed: None,
             output: self.output,
         }
     }

@@ -3,6 +3,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use dipir_cli::exit::{Usage, describe};
+use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_pipeline::graph::{Graph, Node};
 use dipir_stages::graph;
@@ -28,7 +29,7 @@ pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
     let (path, truth) = write(&args.project, &session, &graph, &needed)?;
     session.result(
         || in_words(&path, truth.as_ref()),
-        || json!({"report": path, "truth": truth}),
+        || json!({"report": json_path(&path), "truth": truth}),
     );
     Ok(())
 }

@@ -11,6 +11,7 @@ use dipir_cli::args::CommonArgs;
 use dipir_cli::ending;
 use dipir_cli::exit::{self, AlreadyReported, Usage, printable};
 use dipir_cli::interrupt::{self, Interrupted};
+use dipir_cli::output::{json_path, say};
 use dipir_cli::session::{Session, check_threads, duration};
 use dipir_cli::style::{bold, color_on_stderr};
 use dipir_pipeline::error::StageError;
@@ -21,7 +22,7 @@ use dipir_pipeline::runner::{self, Stopped, Work};
 use dipir_pipeline::status::{self, State};
 use dipir_stages::graph;
 use dipir_stages::truth::Truth;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use crate::plan;
 use crate::project::{ProjectArgs, Stage};
@@ -100,14 +101,49 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
         let message = "--out with several files: each has a folder of its own, [pipeline] out";
         return Err(Usage(message.into()).into());
     }
+    check_several(&projects)?;
     let named = |project: ProjectArgs| (project.file().to_owned(), project);
     run_each(args, projects.into_iter().map(named).collect())
+}
+
+/// Refuses files that are not there, and two with one folder of artifacts: the later would replace what the earlier wrote.
+fn check_several(projects: &[ProjectArgs]) -> anyhow::Result<()> {
+    let mut outs: Vec<(PathBuf, &Path)> = Vec::new();
+    for project in projects {
+        project.check_there()?;
+        // What is wrong with the configuration its own run says.
+        let Ok(session) = Session::open(&project.common()) else {
+            continue;
+        };
+        let out = in_full(&session.out);
+        if let Some((_, other)) = outs.iter().find(|(known, _)| *known == out) {
+            let message = format!(
+                "{} and {} write one folder, {}: give each its own, [pipeline] out",
+                other.display(),
+                project.file().display(),
+                session.out.display()
+            );
+            return Err(Usage(printable(&message)).into());
+        }
+        outs.push((out, project.file()));
+    }
+    Ok(())
+}
+
+/// The path without links and detours, as far as it is there.
+fn in_full(path: &Path) -> PathBuf {
+    let path = std::path::absolute(path).unwrap_or_else(|_| path.into());
+    match (path.canonicalize(), path.parent(), path.file_name()) {
+        (Ok(found), _, _) => found,
+        (_, Some(parent), Some(name)) => in_full(parent).join(name),
+        _ => path,
+    }
 }
 
 /// Runs projects, each with what it is called, one after the other. One that fails does not keep the others from running.
 pub fn run_each(args: &RunArgs, projects: Vec<(PathBuf, ProjectArgs)>) -> anyhow::Result<()> {
     let output = args.project.output;
-    let (mut results, mut failed) = (Vec::new(), None);
+    let (mut results, mut failed) = (Vec::new(), Vec::new());
     let all = projects.len();
     // Seconds of those that ran something, and their number.
     let mut took = (0.0, 0);
@@ -119,7 +155,7 @@ pub fn run_each(args: &RunArgs, projects: Vec<(PathBuf, ProjectArgs)>) -> anyhow
                 0 => String::new(),
                 _ => format!(", about {} left", duration(left)),
             };
-            eprintln!("{} ({} of {all}{left})", printable(&name), k + 1);
+            say(format!("{} ({} of {all}{left})", printable(&name), k + 1));
         }
         let start = Instant::now();
         let done = run_one(args, &project);
@@ -139,7 +175,7 @@ pub fn run_each(args: &RunArgs, projects: Vec<(PathBuf, ProjectArgs)>) -> anyhow
                 if !e.is::<AlreadyReported>() {
                     exit::print(&e.context(name.clone()));
                 }
-                failed.get_or_insert(code);
+                failed.push((code, name.clone()));
                 results.push(json!({"file": name, "exit_code": code}));
             }
         }
@@ -147,10 +183,18 @@ pub fn run_each(args: &RunArgs, projects: Vec<(PathBuf, ProjectArgs)>) -> anyhow
     if output.json {
         output.result(String::new, || json!({"runs": results}));
     }
-    match failed {
-        Some(code) => Err(AlreadyReported(code).into()),
-        None => Ok(()),
+    let Some((code, _)) = failed.first() else {
+        return Ok(());
+    };
+    if !output.json {
+        let names: Vec<_> = failed.iter().map(|f| printable(&f.1)).collect();
+        say(format!(
+            "{} of {all} failed: {}",
+            names.len(),
+            names.join(", ")
+        ));
     }
+    Err(AlreadyReported(*code).into())
 }
 
 impl RunArgs {
@@ -175,6 +219,12 @@ impl RunArgs {
         self.plan = true;
         self
     }
+
+    /// The same, up to date or not.
+    pub fn forced(mut self, force: bool) -> Self {
+        self.force = force;
+        self
+    }
 }
 
 /// Runs one project; what was done, for people and for programs.
@@ -196,7 +246,7 @@ pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String,
         let _lock = lock_when(&session, when_locked)?;
         runner::run(&nodes, args.jobs, &mut work).map_err(stopped)?;
     }
-    let is_frame = project.light.is_some();
+    let is_frame = project.placed.is_some();
     let report = match is_frame || dipir_stages::report::is_current(&session) {
         true => None,
         false => page(project, &session, &graph, &nodes),
@@ -317,7 +367,7 @@ impl<'a> Pipeline<'a> {
     fn say(&self, node: &Node, text: &str) {
         if !self.args.project.output.quiet {
             let name = bold(node.stage, color_on_stderr());
-            eprintln!("{name}: {}", printable(text));
+            say(format!("{name}: {}", printable(text)));
         }
     }
 
@@ -333,9 +383,12 @@ impl<'a> Pipeline<'a> {
             Some((path, truth)) => format!("{done}\n{}", report::in_words(path, truth.as_ref())),
         };
         let (path, truth) = page.unzip();
+        let reads = Hashes::of_this_process();
+        let read = |(path, n): (&PathBuf, &u32)| (path.to_string_lossy().into_owned(), json!(n));
+        let hashed: Map<String, Value> = reads.reads().iter().map(read).collect();
         let json = json!({
-            "stages": names, "ran": self.ran, "results": self.results, "report": path,
-            "truth": truth.flatten(), "hashed": Hashes::of_this_process().reads(),
+            "stages": names, "ran": self.ran, "results": self.results, "report": path.map(json_path),
+            "truth": truth.flatten(), "hashed": hashed,
         });
         (printable(&done), json)
     }
@@ -399,6 +452,9 @@ impl Work for Pipeline<'_> {
         }
         if let Some(light) = &project.light {
             command.arg("--light").arg(light);
+        }
+        if let Some(placed) = &project.placed {
+            command.arg("--placed").arg(placed);
         }
         if let Some(seed) = project.seed {
             command.args(["--seed", &seed.to_string()]);
@@ -481,11 +537,35 @@ fn stopped(stopped: Stopped<anyhow::Error>) -> anyhow::Error {
             Some(code) if code == i32::from(exit::INTERRUPTED) => Interrupted.into(),
             // The stage has printed what was wrong.
             Some(code) => AlreadyReported(u8::try_from(code).unwrap_or(exit::FAILED)).into(),
+            None if ending::is_told(status) => AlreadyReported(exit::FAILED).into(),
             None => anyhow::anyhow!(
                 "the stage \"{stage}\" ended without a word ({status}): {}; run again to go on \
                  where it was",
                 ending::cause(status)
             ),
         },
+    }
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use std::os::unix::process::ExitStatusExt;
+    use std::process::ExitStatus;
+
+    use super::*;
+
+    #[test]
+    fn what_a_stage_has_said_is_not_said_again() {
+        let ended = |signal: i32| {
+            let status = ExitStatus::from_raw(signal);
+            stopped(Stopped::Failed {
+                stage: "light",
+                status,
+            })
+        };
+        // As an allocation that fails ends it.
+        assert!(ended(6).is::<AlreadyReported>());
+        let killed = ended(9).to_string();
+        assert!(killed.contains("ended without a word"), "{killed}");
     }
 }

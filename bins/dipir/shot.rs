@@ -1,11 +1,12 @@
 //! `dipir shot`: the objects in every frame of a shot, under one light.
-use std::path::PathBuf;
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use dipir_cli::args::CommonArgs;
 use dipir_cli::exit::{Usage, printable};
 use dipir_cli::session::Session;
-use dipir_stages::names::LIGHT;
+use dipir_stages::names::{LIGHT, SCENE};
 use dipir_stages::shot;
 use serde_json::Value;
 
@@ -23,6 +24,10 @@ pub struct ShotArgs {
     #[arg(long)]
     same_exposure: bool,
 
+    /// Make every frame that is named, up to date or not
+    #[arg(long)]
+    force: bool,
+
     /// As --set pipeline.quality=draft
     #[arg(long)]
     draft: bool,
@@ -35,7 +40,7 @@ pub struct ShotArgs {
     common: CommonArgs,
 }
 
-/// Recovers the light once, and puts the objects into every frame under it.
+/// Places the objects and recovers the light once, in the photograph, and puts the objects into every frame.
 pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     let mut common = args.common.clone();
     if args.draft {
@@ -44,26 +49,27 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     let base = ProjectArgs::of(&common);
     let (session, graph) = base.open()?;
     let mut frames = frames(args, &session, &base)?;
-    let until_light = RunArgs::needed(&common, Some(Stage::Light));
     let is_recovered = graph.node(LIGHT.name).is_some_and(|n| n.unneeded.is_none());
-    if is_recovered {
-        for (_, frame) in &mut frames {
-            frame.light = Some(LIGHT.folder(&session));
-        }
+    for (_, frame) in &mut frames {
+        frame.placed = Some(SCENE.folder(&session));
+        frame.light = is_recovered.then(|| LIGHT.folder(&session));
     }
+    let last = match is_recovered {
+        true => Stage::Light,
+        false => Stage::Scene,
+    };
+    let of_photo = RunArgs::needed(&common, Some(last));
     if args.plan {
-        let light = is_recovered.then(|| run_one(&until_light.planned(), &base));
-        let (words, json) = plan::frames(&session, light.transpose()?, &frames)?;
+        let photo = run_one(&of_photo.planned(), &base)?;
+        let (words, json) = plan::frames(&session, photo, &frames)?;
         common.output.result(|| words, || json);
         return Ok(());
     }
-    if is_recovered {
-        let done = run_one(&until_light, &base)?;
-        if !common.output.json {
-            common.output.result(|| done.0, || Value::Null);
-        }
+    let done = run_one(&of_photo, &base)?;
+    if !common.output.json {
+        common.output.result(|| done.0, || Value::Null);
     }
-    run_each(&RunArgs::needed(&common, None), frames)
+    run_each(&RunArgs::needed(&common, None).forced(args.force), frames)
 }
 
 /// The frames, each with its project.
@@ -74,6 +80,7 @@ fn frames(
 ) -> anyhow::Result<Vec<(PathBuf, ProjectArgs)>> {
     let mut frames: Vec<(PathBuf, ProjectArgs)> = Vec::new();
     for path in &args.frames {
+        let name = name(path)?;
         let stops = match args.same_exposure {
             true => 0.0,
             false => shot::exposure_stops(session, path)?.unwrap_or_default(),
@@ -83,7 +90,6 @@ fn frames(
         if stops != 0.0 {
             session.remark(|| format!("{}: exposed by {stops:.2} stops more", path.display()));
         }
-        let name = path.file_stem().unwrap_or_default();
         frame.out = Some(session.out.join(shot::FOLDER).join(name));
         if frames.iter().any(|(_, other)| other.out == frame.out) {
             let message = format!("{}: another frame has the same name", path.display());
@@ -92,4 +98,35 @@ fn frames(
         frames.push((path.clone(), frame));
     }
     Ok(frames)
+}
+
+/// The name of a frame's folder: that of its file without the extension.
+fn name(path: &Path) -> Result<&OsStr, Usage> {
+    match path.file_stem() {
+        // Names of another folder.
+        None => {}
+        Some(name) if name.is_empty() || name == "." || name == ".." => {}
+        Some(name) => return Ok(name),
+    }
+    let message = format!(
+        "{}: without its extension this is no name of a folder; rename the file, as in frame_0001.png",
+        path.display()
+    );
+    Err(Usage(printable(&message)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_of_dots_is_no_name_of_a_folder() {
+        for wrong in ["...png", "..png", "a/...png", "..", "/"] {
+            let told = name(Path::new(wrong)).unwrap_err().to_string();
+            assert!(told.starts_with(&format!("{wrong}: ")), "{told}");
+        }
+        for (path, folder) in [("a/b.png", "b"), (".b.png", ".b"), ("....png", "...")] {
+            assert_eq!(name(Path::new(path)).unwrap(), folder);
+        }
+    }
 }

@@ -1,9 +1,13 @@
 //! `dipir status` and `dipir graph`.
+use std::path::PathBuf;
+
 use clap::Args;
 use dipir_cli::exit::printable;
 use dipir_cli::style::{bold, color_on_stdout, faint};
+use dipir_pipeline::mark::Owned;
 use dipir_pipeline::status::{StageStatus, State};
-use dipir_stages::graph;
+use dipir_stages::names::COMPOSITE;
+use dipir_stages::{graph, shot};
 use serde_json::json;
 
 use crate::project::{ProjectArgs, Stage};
@@ -33,7 +37,19 @@ pub fn run(args: &StatusArgs) -> anyhow::Result<()> {
     let (session, graph) = args.project.open()?;
     let needed = graph.up_to(args.until.map_or(graph::LAST, Stage::name));
     let all = graph::assess(&session, &graph, &needed)?;
-    session.result(|| in_words(&all), || json!({"stages": all}));
+    let frames = shot::folders(&session.out);
+    let is_made =
+        |frame: &&PathBuf| Owned::of_stage(&frame.join(COMPOSITE.name), COMPOSITE.name).is_some();
+    let made = frames.iter().filter(is_made).count();
+    let words = || match made {
+        0 => in_words(&all),
+        _ => format!(
+            "{}\nframes     {made} in {}; dipir shot --plan FRAME… says which of them are up to date",
+            in_words(&all),
+            printable(&session.out.join(shot::FOLDER).display().to_string()),
+        ),
+    };
+    session.result(words, || json!({"stages": all, "frames": made}));
     Ok(())
 }
 

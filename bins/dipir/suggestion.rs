@@ -4,7 +4,7 @@ use std::path::Path;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, Parser};
-use dipir_cli::exit::Usage;
+use dipir_cli::exit::{self, Usage};
 use dipir_pipeline::config::{nearest, renamed};
 
 use crate::{Cli, manual};
@@ -18,7 +18,7 @@ pub fn parse() -> anyhow::Result<Cli> {
     };
     match meant(&error) {
         Some(message) => Err(Usage(message).into()),
-        None => error.exit(),
+        None => Err(exit::answered(&error)),
     }
 }
 

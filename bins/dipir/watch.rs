@@ -10,6 +10,7 @@ use std::time::{Duration, SystemTime};
 use anyhow::Context;
 use dipir_cli::exit::{AlreadyReported, INTERRUPTED};
 use dipir_cli::interrupt;
+use dipir_cli::output::say;
 use dipir_cli::session::Session;
 use dipir_stages::names;
 
@@ -38,7 +39,7 @@ pub fn watch(project: &ProjectArgs) -> anyhow::Result<()> {
             return Err(AlreadyReported(INTERRUPTED).into());
         }
         if !project.output.quiet {
-            eprintln!("waiting for a change of the files that were read; Ctrl-C ends this");
+            say("waiting for a change of the files that were read; Ctrl-C ends this");
         }
         if !changed(project, before) {
             return Ok(());

@@ -134,7 +134,8 @@ fn every_frame_has_the_camera_of_its_name() {
     let cameras = "1 0.5 1.5 5 0 0 0 40\n2 -0.5 1.5 5 0 0 0 40\n";
     project.write("camera.chan", cameras);
     with("file = \"camera.chan\"\nframe = 1");
-    shot(&project, &numbered);
+    // Another run in the same folder may be waited for.
+    shot(&project, &["--wait", "f_1.png", "f_02.png"]);
     assert_eq!(["frames/f_1", "frames/f_02"].map(place), [0.5, -0.5]);
     refused(
         &["a.png"],

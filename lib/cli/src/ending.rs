@@ -31,6 +31,20 @@ extern "C" fn say_aborted(_: libc::c_int) {
     }
 }
 
+/// Whether the process printed what it ended by, though it gave no exit code: it aborted, as one does when memory runs out.
+pub fn is_told(status: ExitStatus) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::process::ExitStatusExt;
+        status.signal() == Some(libc::SIGABRT)
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = status;
+        false
+    }
+}
+
 /// What ended a process that gave no exit code, as far as the system reports it.
 pub fn cause(status: ExitStatus) -> &'static str {
     #[cfg(unix)]
@@ -39,9 +53,6 @@ pub fn cause(status: ExitStatus) -> &'static str {
         match status.signal() {
             Some(libc::SIGKILL) => {
                 return "somebody killed it, or the system did for want of memory";
-            }
-            Some(libc::SIGABRT) => {
-                return "it could not go on, as the lines above say";
             }
             Some(libc::SIGXFSZ) => return "a file grew beyond the limit (ulimit -f)",
             Some(libc::SIGXCPU) => return "it used more processor time than the limit (ulimit -t)",
@@ -69,6 +80,11 @@ mod tests {
             cause(Command::new("sh").args(["-c", &script]).status().unwrap())
         };
         assert!(ended("KILL").contains("want of memory"));
+        let told = |signal: &str| {
+            let script = format!("kill -{signal} $$");
+            is_told(Command::new("sh").args(["-c", &script]).status().unwrap())
+        };
+        assert!(told("ABRT") && !told("KILL"));
         assert!(ended("XCPU").contains("ulimit -t"));
         assert!(ended("TERM").contains("another program"));
         let done = Command::new("true").status().unwrap();

@@ -1,12 +1,14 @@
 //! From an error to a message and an exit code.
 use std::fmt;
-use std::io::{Write, stderr};
+use std::io::{Write, stdout};
 use std::process::ExitCode;
 
+use clap::Parser;
 use dipir_pipeline::error::ConfigError;
 
 use crate::ending;
 use crate::interrupt::{self, Interrupted};
+use crate::output;
 use crate::session::check_threads;
 use crate::style::{bold_red, color_on_stderr};
 
@@ -47,7 +49,8 @@ impl std::error::Error for AlreadyReported {}
 pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
     one_tensor_thread();
     ending::prepare();
-    let code = match few_threads().and_then(|()| main()) {
+    let done = few_threads().and_then(|()| main());
+    let code = match done.and_then(|()| printed()) {
         Ok(()) => DONE,
         Err(error) => {
             let code = code_of(&error);
@@ -65,11 +68,37 @@ pub fn run(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
     ExitCode::from(code)
 }
 
+/// Reads the command line. What help and `--version` print has been printed then, and the error is only the exit code.
+pub fn parse<C: Parser>() -> anyhow::Result<C> {
+    C::try_parse().map_err(|e| answered(&e))
+}
+
+/// Prints what the parser of the command line answers; the exit code.
+pub fn answered(error: &clap::Error) -> anyhow::Error {
+    let printed = error.print();
+    if error.use_stderr() {
+        return AlreadyReported(USAGE).into();
+    }
+    output::noted(printed.and_then(|()| stdout().flush()));
+    match output::all_printed() {
+        Ok(()) => AlreadyReported(DONE).into(),
+        Err(e) => e,
+    }
+}
+
+/// Fails if the result could not be printed. A stage of a run leaves that to the process which started it and prints to the
+/// same place: its own work is done.
+fn printed() -> anyhow::Result<()> {
+    match interrupt::is_supervised() {
+        true => Ok(()),
+        false => output::all_printed(),
+    }
+}
+
 /// Prints what went wrong with all its causes.
 pub fn print(error: &anyhow::Error) {
     let label = bold_red("error:", color_on_stderr());
-    // A reader that went away is no reason to end otherwise.
-    let _ = writeln!(stderr(), "{label} {}", printable(&describe(error)));
+    output::say(format!("{label} {}", printable(&describe(error))));
 }
 
 /// Makes the tensor library do its element-wise work on the calling thread. Its pool of spinning

@@ -1,7 +1,7 @@
 //! Ctrl-C: the work is asked to stop; if it does not within a moment, the process ends anyway,
 //! its unfinished folder removed.
 use std::fmt;
-use std::io::{Read, Write, stderr, stdin};
+use std::io::{Read, stdin};
 use std::path::{Path, PathBuf};
 use std::process;
 use std::sync::Mutex;
@@ -13,6 +13,7 @@ use anyhow::Context;
 use dipir_pipeline::stage::discard;
 
 use crate::exit::INTERRUPTED;
+use crate::output;
 
 static ASKED: AtomicBool = AtomicBool::new(false);
 /// Whether another process waits for this one, and tells the user when it is stopped.
@@ -84,10 +85,14 @@ fn stop() {
 
 /// Tells the user, unless another process does.
 pub(crate) fn say() {
-    if !SUPERVISED.load(Ordering::SeqCst) {
-        // Whoever read this may be gone, which is no reason to stay.
-        let _ = writeln!(stderr(), "{MESSAGE}");
+    if !is_supervised() {
+        output::say(MESSAGE);
     }
+}
+
+/// Whether another process started this one and waits for it.
+pub(crate) fn is_supervised() -> bool {
+    SUPERVISED.load(Ordering::SeqCst)
 }
 
 /// Notes the folder to remove when the process ends early.

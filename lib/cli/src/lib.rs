@@ -8,6 +8,7 @@ pub mod ending;
 pub mod executables;
 pub mod exit;
 pub mod interrupt;
+pub mod output;
 pub mod progress;
 pub mod session;
 pub mod style;

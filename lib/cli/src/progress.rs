@@ -1,7 +1,7 @@
 //! A progress bar on standard error; where that is not a terminal, a line every half minute and
 //! what is worth keeping.
 use std::fmt::Write as _;
-use std::io::{IsTerminal, Write as _, stderr};
+use std::io::{IsTerminal, stderr};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 use crate::exit::printable;
+use crate::output::say;
 
 /// Steps of a bar; fine enough for a wide terminal.
 const STEPS: u64 = 1000;
@@ -156,10 +157,7 @@ impl Progress {
                 let course = locked(&course);
                 format!("{title}: {}", course.in_words(course.begun.elapsed()))
             };
-            write_lines(LINE_EVERY, line, |line| {
-                // Whoever read this may be gone, which is no reason to end.
-                let _ = writeln!(stderr(), "{line}");
-            })
+            write_lines(LINE_EVERY, line, |line| say(line))
         });
         Self {
             bar,
@@ -191,7 +189,7 @@ impl Progress {
         match self.bar.is_hidden() {
             false => self.bar.println(line),
             true if self.quiet => {}
-            true => eprintln!("{line}"),
+            true => say(line),
         }
     }
 

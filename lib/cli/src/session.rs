@@ -1,5 +1,4 @@
 //! One run of a stage: its configuration read, its threads started, its output decided.
-use std::io::{Write, stdout};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -13,6 +12,7 @@ use serde_json::Value;
 use crate::args::{CommonArgs, OutputArgs};
 use crate::exit::{Usage, printable};
 use crate::interrupt;
+use crate::output::{print_line, say};
 use crate::progress::Progress;
 use crate::style::{bold_yellow, color_on_stderr};
 
@@ -27,6 +27,8 @@ pub struct Session {
     pub out: PathBuf,
     /// Folder of another run's light stage, which is read in place of this run's own.
     pub light: Option<PathBuf>,
+    /// Folder of the scene stage of a shot's photograph, if this run is of a frame: objects and ground are as there.
+    pub placed: Option<PathBuf>,
     when_locked: WhenLocked,
     output: OutputArgs,
     _hashes: HandBack,
@@ -87,6 +89,7 @@ impl Session {
             pipeline,
             out,
             light: args.light.clone(),
+            placed: args.placed.clone(),
             _hashes: HandBack(args.hashes.clone()),
             when_locked: match args.wait {
                 true => WhenLocked::Wait,
@@ -119,7 +122,8 @@ impl Session {
         let writer = match StageWriter::begin(&folder, plan.clone(), WhenLocked::Refuse) {
             Err(StageError::Locked { holder, .. }) if self.when_locked == WhenLocked::Wait => {
                 if !self.output.quiet {
-                    eprintln!("waiting for {holder}, which writes {}", folder.display());
+                    let folder = printable(&folder.display().to_string());
+                    say(format!("waiting for {holder}, which writes {folder}"));
                 }
                 StageWriter::begin(&folder, plan, WhenLocked::Wait)?
             }
@@ -147,7 +151,7 @@ impl Session {
     /// Prints a remark that only `--verbose` shows.
     pub fn remark(&self, message: impl FnOnce() -> String) {
         if self.output.verbose {
-            eprintln!("{}", printable(&message()));
+            say(printable(&message()));
         }
     }
 
@@ -162,7 +166,7 @@ impl OutputArgs {
     pub fn warn(&self, message: &str) {
         if !self.quiet {
             let label = bold_yellow("warning:", color_on_stderr());
-            eprintln!("{label} {}", printable(message));
+            say(format!("{label} {}", printable(message)));
         }
     }
 
@@ -174,12 +178,6 @@ impl OutputArgs {
             print_line(&human());
         }
     }
-}
-
-/// Prints a line on standard output; a reader that went away, as `head` does, is no error.
-pub fn print_line(text: &str) {
-    let mut out = stdout().lock();
-    let _ = writeln!(out, "{text}").and_then(|()| out.flush());
 }
 
 /// Refuses more worker threads than any machine has use for.

@@ -2,6 +2,7 @@
 use std::path::Path;
 
 use anyhow::bail;
+use dipir_cli::output::json_path;
 use dipir_cli::session::{duration, size};
 use dipir_pipeline::manifest::{FILE_NAME, Manifest};
 use serde_json::json;
@@ -38,7 +39,7 @@ pub(crate) fn inspect(path: &Path) -> anyhow::Result<Report> {
     }
     let mut text = summary(&manifest);
     text.push_str(&table.render());
-    let mut json = json!({"path": path, "kind": "stage", "whole": damages.is_empty()});
+    let mut json = json!({"path": json_path(path), "kind": "stage", "whole": damages.is_empty()});
     json["manifest"] = serde_json::to_value(&manifest)?;
     json["manifest"]["outputs"] = outputs.into();
     Ok(Report {

@@ -2,6 +2,7 @@
 use std::path::Path;
 
 use anyhow::Context;
+use dipir_cli::output::json_path;
 use dipir_pipeline::manifest::Manifest;
 use serde_json::{Value, json};
 
@@ -30,7 +31,7 @@ pub(crate) fn inspect(path: &Path) -> anyhow::Result<Report> {
     Ok(Report {
         title: format!("{}: {kind}", path.display()),
         text,
-        json: json!({"path": path, "kind": kind, "content": value}),
+        json: json!({"path": json_path(path), "kind": kind, "content": value}),
         problems: Vec::new(),
     })
 }

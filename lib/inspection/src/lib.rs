@@ -38,6 +38,7 @@ enum Kind {
 pub fn inspect(path: &Path, view: &ViewArgs) -> anyhow::Result<Report> {
     let metadata = std::fs::metadata(path)
         .map_err(|e| anyhow::anyhow!("cannot read {}: {}", path.display(), reason(&e)))?;
+    view.check(path)?;
     if metadata.is_dir() {
         view.refuse("a folder")?;
         return folder::inspect(path);

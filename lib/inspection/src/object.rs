@@ -1,6 +1,7 @@
 //! 3D objects, as the scene importer sees them.
 use std::path::Path;
 
+use dipir_cli::output::json_path;
 use dipir_scene::import::load_object;
 use dipir_scene::material::{AlphaMode, Material};
 use dipir_scene::texture::decode_textures;
@@ -94,7 +95,7 @@ pub(crate) fn inspect(path: &Path) -> anyhow::Result<Report> {
         title: format!("{}: 3D object", path.display()),
         text,
         json: json!({
-            "path": path, "kind": "object", "triangles": mesh.indices.len(),
+            "path": json_path(path), "kind": "object", "triangles": mesh.indices.len(),
             "vertices": mesh.positions.len(), "textures": object.textures.len(),
             "attributes": attributes, "min_m": low, "max_m": high, "materials": materials,
             "warnings": object.warnings,

@@ -2,6 +2,7 @@
 use std::path::Path;
 
 use anyhow::Context;
+use dipir_cli::output::json_path;
 use dipir_imaging::file::read_photo;
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::Raster;
@@ -118,7 +119,7 @@ fn report(
         text.push_str(&format!("  {name}: {value}\n"));
     }
     let mut json = json!({
-        "path": path, "kind": "image", "format": format, "width": width, "height": height,
+        "path": json_path(path), "kind": "image", "format": format, "width": width, "height": height,
         "latlong": layers.latlong, "channels": channels, "attributes": attributes,
     });
     if let Some(map) = map {

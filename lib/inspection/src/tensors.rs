@@ -3,6 +3,7 @@
 use std::fs::File;
 use std::path::Path;
 
+use dipir_cli::output::json_path;
 use half::{bf16, f16};
 use memmap2::Mmap;
 use rayon::prelude::*;
@@ -71,7 +72,7 @@ pub(crate) fn inspect(path: &Path) -> anyhow::Result<Report> {
         ),
         text,
         json: json!({
-            "path": path, "kind": "safetensors", "elements": elements,
+            "path": json_path(path), "kind": "safetensors", "elements": elements,
             "tensors": entries, "metadata": metadata,
         }),
         problems: Vec::new(),

@@ -1,8 +1,9 @@
 //! `--png`: a picture of one layer that any viewer shows.
+use std::fs;
 use std::path::Path;
 
 use anyhow::Context;
-use dipir_cli::exit::Usage;
+use dipir_cli::exit::{Usage, printable};
 use dipir_imaging::layers::Layers;
 use dipir_imaging::marked_png::write_display;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
@@ -19,6 +20,25 @@ impl ViewArgs {
         match self.png {
             Some(_) => Err(Usage(format!("--png shows images, this is {what}"))),
             None => Ok(()),
+        }
+    }
+
+    /// Refuses an exposure that no picture has, and a picture in place of the file `path` that it shows.
+    pub fn check(&self, path: &Path) -> Result<(), Usage> {
+        if let Some(stops) = self.exposure_ev
+            && !(-64.0..=64.0).contains(&stops)
+        {
+            return Err(Usage(format!("--exposure-ev {stops}: accepted: -64 to 64")));
+        }
+        let in_full = |path: &Path| fs::canonicalize(path).ok();
+        match &self.png {
+            Some(png) if in_full(png).is_some_and(|png| Some(png) == in_full(path)) => {
+                Err(Usage(printable(&format!(
+                    "--png {}: that is the file which is shown; name another file",
+                    png.display()
+                ))))
+            }
+            _ => Ok(()),
         }
     }
 }

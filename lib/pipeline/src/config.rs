@@ -217,12 +217,20 @@ impl Config {
         }
     }
 
-    /// An error about the value of a dotted key, found by its reader.
+    /// An error about the value of a dotted key, found by its reader. A message about a table that begins with a key of it is
+    /// about that key.
     pub fn invalid(&self, dotted: &str, message: impl Into<String>) -> ConfigError {
+        let message = message.into();
+        let begins = message.split_whitespace().next().unwrap_or_default();
+        let begins = begins.trim_end_matches(':');
+        let key = match begins.strip_prefix(dotted) {
+            Some(rest) if rest.starts_with('.') => begins,
+            _ => dotted,
+        };
         ConfigError::Invalid {
-            at: self.nearest_place(dotted),
-            key: dotted.into(),
-            message: message.into(),
+            at: self.nearest_place(key),
+            key: key.into(),
+            message,
         }
     }
 
@@ -237,9 +245,30 @@ impl Config {
         self.invalid(dotted, message)
     }
 
-    /// The `[pipeline]` table.
+    /// The `[pipeline]` table. Whether there is such a device is found out where a model is loaded onto it.
     pub fn pipeline(&self) -> Result<PipelineTable, ConfigError> {
-        self.table("pipeline")
+        let table: PipelineTable = self.table("pipeline")?;
+        let device = &table.device;
+        let is_numbered = |(kind, number): (&str, &str)| {
+            ["cuda", "metal"].contains(&kind) && number.parse::<usize>().is_ok()
+        };
+        let is_known = ["cpu", "auto"].contains(&device.as_str())
+            || device.split_once(':').is_some_and(is_numbered);
+        match is_known {
+            true => Ok(table),
+            false => {
+                let message =
+                    format!("\"{device}\" is no device; accepted: cpu, cuda:N, metal:N, auto");
+                Err(self.invalid("pipeline.device", message))
+            }
+        }
+    }
+
+    /// All texts of the file and of `--set` with their dotted keys. Which of them name files their readers know.
+    pub fn texts(&self) -> Vec<(String, String)> {
+        let mut found = Vec::new();
+        self.root.collect_texts("", &mut found);
+        found
     }
 
     /// The file that was read.

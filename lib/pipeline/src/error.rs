@@ -102,7 +102,7 @@ pub enum ConfigError {
         dotted: String,
     },
     /// A value that its reader refuses, for the reason given.
-    #[error("{at}: {key}: {message}")]
+    #[error("{at}: {}", about(key, message))]
     Invalid {
         /// Where.
         at: Place,
@@ -111,6 +111,14 @@ pub enum ConfigError {
         /// The reader's own words.
         message: String,
     },
+}
+
+/// A message, with the key in front unless it begins with that.
+fn about(key: &str, message: &str) -> String {
+    match message.starts_with(key) {
+        true => message.into(),
+        false => format!("{key}: {message}"),
+    }
 }
 
 fn did_you_mean(nearest: &Option<String>) -> String {
@@ -136,7 +144,7 @@ fn quoted(values: &[String]) -> String {
 #[derive(Debug, thiserror::Error)]
 pub enum StageError {
     /// The file system refused.
-    #[error("cannot {action} {}: {}{}", path.display(), plain(source), remedy(source))]
+    #[error("cannot {action} {}: {}{}", path.display(), plain(source), remedy(action, source))]
     Io {
         /// A verb, as in "write".
         action: &'static str,
@@ -275,8 +283,12 @@ pub(crate) fn plain(error: &io::Error) -> String {
     reason
 }
 
-fn remedy(error: &io::Error) -> &'static str {
+fn remedy(action: &str, error: &io::Error) -> &'static str {
     match error.kind() {
+        io::ErrorKind::PermissionDenied if action == "read" => {
+            "; it is there, but you may not read it: allow it, as with chmod u+r"
+        }
+        _ if action == "read" => "",
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
             "; free some space or choose another folder with --out (earlier results are untouched)"
         }
@@ -288,5 +300,22 @@ fn remedy(error: &io::Error) -> &'static str {
         }
         io::ErrorKind::AlreadyExists => "; move it away or choose another folder with --out",
         _ => "",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_read_is_not_answered_with_where_to_write() {
+        let denied = || io::Error::from(io::ErrorKind::PermissionDenied);
+        let told = |action| StageError::io(action, "a.png", denied()).to_string();
+        assert_eq!(
+            told("read"),
+            "cannot read a.png: permission denied; it is there, but you may not read it: allow it, as with \
+             chmod u+r"
+        );
+        assert!(told("write").contains("choose a folder that you may write with --out"));
     }
 }

@@ -12,7 +12,7 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 use serde_json::Value;
 
 use crate::error::{Damage, StageError};
@@ -123,6 +123,7 @@ pub enum StaleReason {
     /// Its `stage.json` cannot be read, so nothing is known of its outputs.
     ManifestDamaged {
         /// The file.
+        #[serde(serialize_with = "lossy")]
         path: PathBuf,
         /// Why not.
         message: String,
@@ -155,6 +156,7 @@ pub enum StaleReason {
         /// Its role.
         role: String,
         /// Where it is.
+        #[serde(serialize_with = "lossy")]
         path: PathBuf,
     },
     /// An input that was not there before.
@@ -170,10 +172,16 @@ pub enum StaleReason {
     /// An output is not as it was written.
     OutputDamaged {
         /// The file.
+        #[serde(serialize_with = "lossy")]
         path: PathBuf,
         /// How it differs.
         damage: Damage,
     },
+}
+
+/// A path as text, what is not UTF-8 in it replaced by U+FFFD.
+fn lossy<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(&path.to_string_lossy())
 }
 
 /// A value as it was written: a number of 32 bits without the digits that it got in 64.

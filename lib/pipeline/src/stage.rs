@@ -143,7 +143,13 @@ impl StageWriter {
         let name = name.as_ref();
         check_inside(name)?;
         let path = self.partial.join(name);
-        if let Some(parent) = path.parent() {
+        // Made again, the folder would not bear the mark that it is ours.
+        if !is_folder(&self.partial) {
+            let why = "it was removed while the stage ran; run again";
+            let source = io::Error::new(io::ErrorKind::NotFound, why);
+            return Err(StageError::io("write", &self.partial, source));
+        }
+        if let Some(parent) = path.parent().filter(|p| *p != self.partial) {
             create_folder(parent)?;
         }
         self.outputs.push((role.into(), name.into()));
@@ -245,7 +251,7 @@ static UNFINISHED: Mutex<()> = Mutex::new(());
 /// Removes the folder that a [`StageWriter`] of this process has not finished.
 pub fn discard(partial: &Path) {
     let _no_swap = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
-    if is_unfinished(partial) {
+    if is_unfinished(partial) || is_empty(partial).unwrap_or(false) {
         let _ = fs::remove_dir_all(partial);
     }
 }

@@ -1,16 +1,19 @@
 //! A project while it is being arranged.
+use std::io;
 use std::ops::ControlFlow;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
+use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::Raster;
 use dipir_imaging::resize::{Filter, resize};
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_optimize::settings::LightTable;
 use dipir_pipeline::config::Config;
+use dipir_pipeline::manifest::plain_reason;
 use dipir_preview::arrangement::{Arrangement, Placed};
 use dipir_preview::draft::Draft;
 use dipir_preview::lines::{Kind, Piece};
@@ -39,8 +42,6 @@ use crate::vanishing::{Lines, Solution, solve, turn_of_camera};
 const LONGEST: u32 = 1280;
 /// The mask's file, beside the project's.
 const MASK_FILE: &str = "holdout.png";
-/// Most objects that a page may ask for.
-const MOST_OBJECTS: usize = 200;
 
 /// The project, its photograph scaled, and what was painted.
 pub struct Desk {
@@ -165,7 +166,7 @@ impl Desk {
 
     /// The file's text with `edit`, and what it means.
     fn edited(&self, edit: &Edit) -> anyhow::Result<(String, Config, Arrangement)> {
-        check(edit)?;
+        edit.check()?;
         let mut document = Document::parse(&held(&self.text))?;
         document.order_objects(&edit.objects)?;
         document.apply_light(edit)?;
@@ -245,7 +246,7 @@ impl Desk {
         };
         let edit = Edit::none(arrangement.objects.len());
         Ok(json!({
-            "file": self.path,
+            "file": json_path(&self.path),
             "size": arrangement.camera.resolution,
             "shown": self.size,
             "names": arrangement.objects.iter().map(name).collect::<Vec<_>>(),
@@ -429,27 +430,29 @@ impl Desk {
         config.table::<SceneConfig>("scene")?.validate()?;
         let mut rendered = held(&self.rendered);
         let mut base = held(&self.text);
-        let found = dipir_files::read_to_string(&self.path)?;
+        let found = dipir_files::read_to_string(&self.path)
+            .with_context(|| format!("cannot read \"{}\"", self.path.display()))?;
         if found != *base {
             bail!(
                 "the file was changed by another program; reload the page after starting dipir place anew"
             );
         }
-        rendered.session.config = config;
-        // Every table is read once more, as a run would.
-        graph::graph(&rendered.session)?;
+        // Every table is read once more, and the light found, as a run would.
+        self.arrange(&mut rendered, edit, &arrangement, config)?;
+        let graph = graph::graph(&rendered.session)?;
+        graph::assess(&rendered.session, &graph, &graph.up_to(graph::LAST))?;
         let mut written = Vec::new();
         if let Some(path) = &mask {
             let [w, h] = arrangement.camera.resolution.map(|n| n as usize);
             let whole = resize(&self.raster(&painted), w, h, Filter::Tent);
             let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
             let values: Vec<u8> = whole.pixels().iter().map(byte).collect();
-            png::write(path, &png::encode(w, h, &values)?)?;
+            png::write(path, &png::encode(w, h, &values)?).map_err(|e| unwritten(path, &e))?;
             rendered.own_mask = Some(self.raster(&painted));
             written.push(path.display().to_string());
         }
         dipir_files::rewrite(&self.path, base.as_bytes(), text.as_bytes())
-            .with_context(|| format!("cannot write \"{}\"", self.path.display()))?;
+            .map_err(|e| unwritten(&self.path, &e))?;
         written.push(self.path.display().to_string());
         *base = text;
         Ok(written)
@@ -474,39 +477,10 @@ impl Rendered {
     }
 }
 
-/// Refuses numbers that make no sense before anything is computed from them.
-fn check(edit: &Edit) -> anyhow::Result<()> {
-    if edit.objects.len() > MOST_OBJECTS {
-        bail!("more than {MOST_OBJECTS} objects are not placed here");
-    }
-    let finite = |values: &[f64]| values.iter().all(|v| v.is_finite() && v.abs() < 1e7);
-    for object in &edit.objects {
-        let size = object.size.unwrap_or(1.0);
-        let yaw = object.yaw_deg.unwrap_or(0.0);
-        if !(finite(&object.at.unwrap_or_default()) && finite(&[yaw]) && size > 0.0 && size < 1e6) {
-            bail!("an object's pixel, turn or size is no usable number");
-        }
-    }
-    if let Some(height) = edit.height_m
-        && !(height > 1e-3 && height < 1e5)
-    {
-        bail!("the camera stands between a millimetre and 100 km above the ground");
-    }
-    if let Some(turn) = &edit.turn
-        && !(turn.pitch_deg.abs() <= 90.0
-            && turn.roll_deg.abs() <= 180.0
-            && (1.0..170.0).contains(&turn.fov_deg))
-    {
-        bail!(
-            "the camera's pitch is within 90 degrees, its roll within 180, its view from 1 to 170"
-        );
-    }
-    if !finite(&[edit.exposure_ev.unwrap_or(0.0)])
-        || edit.exposure_ev.is_some_and(|e| e.abs() > 20.0)
-    {
-        bail!("an exposure is within 20 stops");
-    }
-    Ok(())
+/// That the file cannot be written. The name of the one beside it, which becomes it, says nothing to anybody.
+fn unwritten(path: &Path, error: &io::Error) -> anyhow::Error {
+    let reason = plain_reason(error);
+    anyhow!("cannot write \"{}\": {reason}", path.display())
 }
 
 fn height_over(camera: &Camera, ground: &Plane) -> f64 {

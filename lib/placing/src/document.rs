@@ -130,7 +130,7 @@ impl Document {
             .get_mut("objects")
             .context("scene.objects is missing")?;
         let order = objects.iter().map(|o| o.of);
-        let missing = |of: usize| format!("there is no object {}", of + 1);
+        let missing = |of: usize| format!("there is no object {}", of.saturating_add(1));
         match list {
             Item::ArrayOfTables(tables) => {
                 if order.clone().eq(0..tables.len()) {
@@ -167,7 +167,7 @@ impl Document {
                 .map(|t| t as _),
             _ => None,
         };
-        found.with_context(|| format!("there is no object {}", index + 1))
+        found.with_context(|| format!("there is no object {}", index.saturating_add(1)))
     }
 
     /// Whether the object stands at a `position` in metres, not at a pixel.
@@ -346,7 +346,9 @@ mod tests {
         assert!(text.find("[7.0, 8.0]").unwrap() < camera, "{text}");
         document.order_objects(&[of(1)]).unwrap();
         assert!(!document.text().contains("[1, 2]"));
-        document.order_objects(&[of(3)]).unwrap_err();
+        for none in [3, usize::MAX] {
+            document.order_objects(&[of(none)]).unwrap_err();
+        }
         document.order_objects(&[]).unwrap_err();
     }
 

@@ -1,5 +1,9 @@
 //! What the page changes of a `pipeline.toml`.
+use anyhow::bail;
 use serde::{Deserialize, Serialize};
+
+/// Most objects that a page may ask for.
+const MOST_OBJECTS: usize = 200;
 
 /// Changes of a file; what is absent stays as it is.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -101,5 +105,63 @@ impl Edit {
             objects: (0..objects).map(object).collect(),
             ..Self::default()
         }
+    }
+
+    /// Refuses numbers that make no sense before anything is computed from them.
+    ///
+    /// # Errors
+    /// The first of them.
+    pub fn check(&self) -> anyhow::Result<()> {
+        if self.objects.len() > MOST_OBJECTS {
+            bail!("more than {MOST_OBJECTS} objects are not placed here");
+        }
+        let finite = |values: &[f64]| values.iter().all(|v| v.is_finite() && v.abs() < 1e7);
+        for object in &self.objects {
+            let size = object.size.unwrap_or(1.0);
+            let yaw = object.yaw_deg.unwrap_or(0.0);
+            if !(finite(&object.at.unwrap_or_default())
+                && finite(&[yaw])
+                && size > 0.0
+                && size < 1e6)
+            {
+                bail!("an object's pixel, turn or size is no usable number");
+            }
+        }
+        if let Some(height) = self.height_m
+            && !(height > 1e-3 && height < 1e5)
+        {
+            bail!("the camera stands between a millimetre and 100 km above the ground");
+        }
+        if let Some(turn) = &self.turn
+            && !(turn.pitch_deg.abs() <= 90.0
+                && turn.roll_deg.abs() <= 180.0
+                && (1.0..170.0).contains(&turn.fov_deg))
+        {
+            bail!(
+                "the camera's pitch is within 90 degrees, its roll within 180, its view from 1 to 170"
+            );
+        }
+        if !finite(&[self.exposure_ev.unwrap_or(0.0)])
+            || self.exposure_ev.is_some_and(|e| e.abs() > 20.0)
+        {
+            bail!("an exposure is within 20 stops");
+        }
+        if let Some(sun) = &self.sun
+            && !(sun.azimuth_deg.abs() <= 360.0 && sun.elevation_deg.abs() <= 90.0)
+        {
+            bail!("the sun's azimuth is within 360 degrees, its elevation within 90");
+        }
+        if let Some(shadow) = &self.shadow {
+            if !(finite(&shadow.foot) && finite(&shadow.tip)) {
+                bail!("a shadow's foot or tip is no usable pixel");
+            }
+            if shadow.foot == shadow.tip {
+                bail!("a shadow's foot and tip are two pixels");
+            }
+            if shadow.height_m.is_some_and(|h| !(1e-3..=1e4).contains(&h)) {
+                bail!("what throws the shadow is between a millimetre and 10 km high");
+            }
+        }
+        Ok(())
     }
 }

@@ -88,6 +88,7 @@ fn open(folder: &Path, set: &[&str]) -> Session {
         wait: false,
         supervised: false,
         light: None,
+        placed: None,
         hashes: None,
         output: OutputArgs {
             json: false,
@@ -334,6 +335,10 @@ fn what_cannot_be_is_not_saved() {
         json!({"objects": [{"of": 7}]}),
         json!({"objects": [{"of": 0, "size": -1.0}]}),
         json!({"objects": [{"of": 0}], "unknown": 1}),
+        json!({"objects": [{"of": u64::MAX}]}),
+        json!({"objects": [{"of": 0}], "shadow": {"foot": [9.0, 150.0], "tip": [9.0, 150.0]}}),
+        json!({"objects": [{"of": 0}], "shadow": {"foot": [9.0, 150.0], "tip": [30.0, 140.0], "height_m": -1.0}}),
+        json!({"objects": [{"of": 0}], "sun": {"azimuth_deg": 1e300, "elevation_deg": 30.0}}),
     ] {
         assert_eq!(place.post("save", &edit).status, 422, "{edit}");
     }
@@ -347,6 +352,54 @@ fn what_cannot_be_is_not_saved() {
         fs::read_to_string(place.file("pipeline.toml")).unwrap(),
         other
     );
+}
+
+#[test]
+fn a_light_that_a_run_refuses_is_not_saved() {
+    let folder = tempfile::tempdir().unwrap();
+    project(folder.path(), &[]);
+    let text = TEXT.split("[light]").next().unwrap();
+    fs::write(folder.path().join("pipeline.toml"), text).unwrap();
+    let session = open(folder.path(), &[]);
+    let place = Running::of(folder, session);
+    let saved = |foot: [f64; 2]| {
+        let shadow = json!({"foot": foot, "tip": [60.0, 150.0]});
+        let edit = json!({"objects": [{"of": 0}], "shadow": shadow});
+        place.post("save", &edit)
+    };
+    // No ground is seen above the horizon.
+    let answer = saved([20.0, 5.0]);
+    let told = String::from_utf8_lossy(&answer.body).into_owned();
+    assert!(
+        answer.status == 422 && told.contains("light.shadow"),
+        "{told}"
+    );
+    let now = || fs::read_to_string(place.file("pipeline.toml")).unwrap();
+    assert_eq!(now(), text);
+    assert_eq!(saved([20.0, 170.0]).status, 200);
+    assert!(now().contains("foot = [20.0, 170.0]"));
+}
+
+#[cfg(unix)]
+#[test]
+fn a_save_that_fails_names_the_file_that_was_to_be_written() {
+    use std::os::unix::fs::PermissionsExt;
+    let place = Running::new();
+    let allow = |mode| {
+        fs::set_permissions(place.folder.path(), fs::Permissions::from_mode(mode)).unwrap();
+    };
+    allow(0o555);
+    let probe = fs::write(place.file("probe"), "");
+    let answer = place.post("save", &moved_to(200.0, 150.0));
+    allow(0o755);
+    if probe.is_ok() {
+        eprintln!("nothing is forbidden to this user: not tested");
+        return;
+    }
+    let told: Value = serde_json::from_slice(&answer.body).unwrap();
+    let path = place.file("pipeline.toml");
+    let expected = format!("cannot write \"{}\": permission denied", path.display());
+    assert_eq!(told["error"], expected);
 }
 
 #[test]

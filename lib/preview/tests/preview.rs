@@ -46,6 +46,7 @@ fn project() -> (TempDir, Session) {
         wait: false,
         supervised: false,
         light: None,
+        placed: None,
         hashes: None,
         output: OutputArgs::default(),
     });

@@ -323,3 +323,59 @@ fn a_configuration_that_is_a_device_or_a_folder_is_refused_at_once() {
         );
     }
 }
+
+#[test]
+fn a_message_about_a_key_of_a_table_is_placed_at_that_key_and_names_it_once() {
+    let text = "[light]\n[light.shadow]\nheight_m = 1\ntip = [1, 2]\n";
+    let set = ["light.shadow.height_m=-1".to_string()];
+    let config = Config::parse(Path::new("p.toml"), text, &set).unwrap();
+    let told = |message: &str| config.invalid("light.shadow", message).to_string();
+    assert_eq!(
+        told("light.shadow.height_m is -1"),
+        "--set light.shadow.height_m=-1: light.shadow.height_m is -1"
+    );
+    assert_eq!(
+        told("light.shadow.tip is odd"),
+        "p.toml:4: light.shadow.tip is odd"
+    );
+    assert_eq!(
+        told("needs a plane"),
+        "p.toml:2: light.shadow: needs a plane"
+    );
+}
+
+#[test]
+fn a_device_is_one_of_those_that_are_accepted_whether_it_is_used_or_not() {
+    let of = |device: &str| {
+        let set = [format!("pipeline.device={device}")];
+        let config = Config::parse(Path::new("p.toml"), "", &set).unwrap();
+        config
+            .pipeline()
+            .map(|t| t.device)
+            .map_err(|e| e.to_string())
+    };
+    for device in ["cpu", "auto", "cuda:0", "metal:1"] {
+        assert_eq!(of(device).unwrap(), device);
+    }
+    for device in ["foo", "cuda", "cuda:x", "cpu:0", ""] {
+        let told = of(device).unwrap_err();
+        let end = format!("\"{device}\" is no device; accepted: cpu, cuda:N, metal:N, auto");
+        assert!(told.ends_with(&end), "{told}");
+    }
+}
+
+#[test]
+fn texts_have_their_keys() {
+    let text = "[scene]\nbackground = \"a.png\"\nobjects = [{ path = \"b.glb\", scale = 2 }]\n";
+    let set = ["composite.environment=sky.hdr".to_string()];
+    let config = Config::parse(Path::new("p.toml"), text, &set).unwrap();
+    let named = |key: &str, text: &str| (key.to_string(), text.to_string());
+    assert_eq!(
+        config.texts(),
+        [
+            named("scene.background", "a.png"),
+            named("scene.objects.0.path", "b.glb"),
+            named("composite.environment", "sky.hdr"),
+        ]
+    );
+}

@@ -45,6 +45,28 @@ impl Node {
         }
     }
 
+    /// Adds the texts at and below this node, which is called `key`.
+    pub fn collect_texts(&self, key: &str, into: &mut Vec<(String, String)>) {
+        let below = |step: &str| match key {
+            "" => step.to_string(),
+            key => format!("{key}.{step}"),
+        };
+        match &self.value {
+            Value::String(text) => into.push((key.into(), text.clone())),
+            Value::Table(entries) => {
+                for entry in entries {
+                    entry.node.collect_texts(&below(&entry.name), into);
+                }
+            }
+            Value::Array(items) => {
+                for (i, item) in items.iter().enumerate() {
+                    item.collect_texts(&below(&i.to_string()), into);
+                }
+            }
+            _ => {}
+        }
+    }
+
     /// Removes the key at `steps` from its table, if it is there.
     pub fn remove(&mut self, steps: &[&str]) {
         match (&mut self.value, steps) {

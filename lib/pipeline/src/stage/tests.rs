@@ -351,3 +351,31 @@ fn inputs_of_one_role_are_told_apart() {
     let roles: Vec<_> = plan.inputs.iter().map(|a| a.role.as_str()).collect();
     assert_eq!(roles, ["object", "object 2", "object 3"]);
 }
+
+#[test]
+fn a_folder_that_vanishes_meanwhile_is_not_made_again_without_its_mark() {
+    let parent = tempfile::tempdir().unwrap();
+    let target = parent.path().join("out/scene");
+    let mut writer = StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap();
+    fs::remove_dir_all(parent.path().join("out")).unwrap();
+    for name in ["a.png", "images/0000.png"] {
+        let error = writer.output("image", name).unwrap_err().to_string();
+        assert!(
+            error.ends_with("it was removed while the stage ran; run again"),
+            "{error}"
+        );
+    }
+    drop(writer);
+    assert!(!parent.path().join("out").exists());
+    // An empty one holds nothing of anybody's.
+    for _ in 0..2 {
+        fs::create_dir_all(parent.path().join("out/.scene.partial")).unwrap();
+        run(&target, "pixels");
+        assert_eq!(names(&parent.path().join("out")), ["scene"]);
+    }
+    // Nor does one whose mark is gone when its writer ends.
+    let writer = StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap();
+    fs::remove_file(writer.partial().join(".dipir")).unwrap();
+    drop(writer);
+    assert_eq!(names(&parent.path().join("out")), ["scene"]);
+}
