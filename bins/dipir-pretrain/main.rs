@@ -90,7 +90,7 @@ fn train(args: &TrainArgs, output: &OutputArgs) -> anyhow::Result<()> {
         },
         || {
             json!({
-                "folder": json_path(&folder), "examples": summary.seen, "resumed_at": summary.resumed_at,
+                "folder": json_path(folder), "examples": summary.seen, "resumed_at": summary.resumed_at,
                 "loss": summary.loss, "elapsed_s": seconds,
             })
         },
@@ -159,7 +159,7 @@ fn train_light(args: &LightArgs, output: &OutputArgs) -> anyhow::Result<()> {
                 duration(seconds)
             )
         },
-        || json!({"file": json_path(&file), "standard": outcome.standard, "any": outcome.any, "elapsed_s": seconds}),
+        || json!({"file": json_path(file), "standard": outcome.standard, "any": outcome.any, "elapsed_s": seconds}),
     );
     Ok(())
 }

@@ -216,8 +216,11 @@ pub(crate) mod tests {
         }
     }
 
-    /// Names of the chosen methods with the paths of their models, and what was noted.
-    fn chosen(typed: &[&str]) -> anyhow::Result<(Vec<(String, Option<String>)>, Vec<String>)> {
+    /// A method's name and the path of its model.
+    type Named = (String, Option<String>);
+
+    /// The chosen methods, and what was noted.
+    fn chosen(typed: &[&str]) -> anyhow::Result<(Vec<Named>, Vec<String>)> {
         let notes = RefCell::new(Vec::new());
         let all = choose(&arguments(typed), &|line| {
             notes.borrow_mut().push(line.to_owned())

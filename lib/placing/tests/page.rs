@@ -380,28 +380,6 @@ fn a_light_that_a_run_refuses_is_not_saved() {
     assert!(now().contains("foot = [20.0, 170.0]"));
 }
 
-#[cfg(unix)]
-#[test]
-fn a_save_that_fails_names_the_file_that_was_to_be_written() {
-    use std::os::unix::fs::PermissionsExt;
-    let place = Running::new();
-    let allow = |mode| {
-        fs::set_permissions(place.folder.path(), fs::Permissions::from_mode(mode)).unwrap();
-    };
-    allow(0o555);
-    let probe = fs::write(place.file("probe"), "");
-    let answer = place.post("save", &moved_to(200.0, 150.0));
-    allow(0o755);
-    if probe.is_ok() {
-        eprintln!("nothing is forbidden to this user: not tested");
-        return;
-    }
-    let told: Value = serde_json::from_slice(&answer.body).unwrap();
-    let path = place.file("pipeline.toml");
-    let expected = format!("cannot write \"{}\": permission denied", path.display());
-    assert_eq!(told["error"], expected);
-}
-
 #[test]
 fn a_mask_replaces_no_file_of_anothers() {
     let place = Running::new();
