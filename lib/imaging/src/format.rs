@@ -28,9 +28,9 @@ impl Format {
         } else if starts(b"#?") {
             Self::Hdr
         } else if starts(b"GIF8") {
-            Self::Other("a GIF image")
+            Self::Other(GIF)
         } else if starts(b"BM") {
-            Self::Other("a BMP image")
+            Self::Other(BMP)
         } else if bytes.get(8..11) == Some(b"CR\x02")
             || starts(b"FUJIFILMCCD-RAW")
             || starts(b"IIU\0")
@@ -42,7 +42,7 @@ impl Format {
         } else if starts(b"II*\0") || starts(b"MM\0*") {
             Self::Other(TIFF)
         } else if starts(b"RIFF") && bytes.get(8..12) == Some(b"WEBP") {
-            Self::Other("a WebP image")
+            Self::Other(WEBP)
         } else if let (Some(b"ftyp"), Some(brand)) = (bytes.get(4..8), bytes.get(8..12)) {
             Self::Other(of_brand(brand))
         } else if is_movie(bytes) {
@@ -97,6 +97,9 @@ impl Format {
     }
 }
 
+const GIF: &str = "a GIF image";
+const BMP: &str = "a BMP image";
+const WEBP: &str = "a WebP image";
 const TIFF: &str = "a TIFF image";
 const RAW: &str = "a camera's raw file";
 const HEIF: &str = "a HEIF image";
@@ -132,6 +135,7 @@ fn remedy(found: &str, path: &Path) -> String {
         AVIF => "avifdec",
         JPEG_XL => "djxl",
         RAW => "darktable-cli",
+        GIF | BMP | WEBP | TIFF => "magick",
         MOVIE => {
             return format!(
                 "write its frames, for instance with `mkdir frames && ffmpeg -i \"{}\" frames/%04d.png`, and give one of \
@@ -141,7 +145,11 @@ fn remedy(found: &str, path: &Path) -> String {
         }
         _ => return "convert the file".into(),
     };
-    let to = path.with_extension("png");
+    let mut to = path.with_extension("png");
+    // What is there stays.
+    if to == path {
+        to = path.with_extension("converted.png");
+    }
     format!(
         "convert it, for instance with `{tool} \"{}\" \"{}\"`",
         path.display(),

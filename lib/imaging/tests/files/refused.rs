@@ -57,16 +57,35 @@ fn display_pixels_where_light_is_wanted_are_refused() {
 #[test]
 fn files_of_other_formats_are_named_as_what_they_are() {
     let folder = folder();
-    for (bytes, found) in [
-        (&b"GIF89a......"[..], "a GIF image"),
-        (b"RIFF\0\0\0\0WEBPVP8 ", "a WebP image"),
-        (b"II*\0\0\0\0\0", "a TIFF image"),
-        (b"hello", "not an image of a known format"),
-        (b"x", "not an image of a known format"),
+    for (name, bytes, found, to) in [
+        ("x.gif", &b"GIF89a......"[..], "a GIF image", Some("x.png")),
+        (
+            "x.webp",
+            b"RIFF\0\0\0\0WEBPVP8 ",
+            "a WebP image",
+            Some("x.png"),
+        ),
+        // Its own name says something else: it is not written over.
+        (
+            "x.png",
+            b"II*\0\0\0\0\0",
+            "a TIFF image",
+            Some("x.converted.png"),
+        ),
+        ("x.png", b"hello", "not an image of a known format", None),
+        ("x.png", b"x", "not an image of a known format", None),
     ] {
-        let path = put(&folder, "x.png", bytes);
+        let path = put(&folder, name, bytes);
+        let convert = match to {
+            Some(to) => format!(
+                "convert it, for instance with `magick \"{}\" \"{}\"`",
+                path.display(),
+                path.with_file_name(to).display()
+            ),
+            None => "convert the file".into(),
+        };
         let want = format!(
-            "`{}` is {found}; expected a PNG, JPEG, OpenEXR or Radiance HDR image: convert the file",
+            "`{}` is {found}; expected a PNG, JPEG, OpenEXR or Radiance HDR image: {convert}",
             path.display()
         );
         assert_eq!(words(read_photo(&path, Transfer::Srgb).unwrap_err()), want);
