@@ -15,6 +15,28 @@ fn project() -> Project {
     project
 }
 
+/// Puts `camera` in place of the project's `[scene.camera]`, and `ground`, if there is one, of its `[scene.proxy]`.
+fn set_camera(project: &Project, camera: &str, ground: Option<&str>) {
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let (head, tail) = text.split_once("[scene.camera]\n").unwrap();
+    let (_, tail) = tail.split_once("[scene.proxy]\n").unwrap();
+    let (own, tail) = tail.split_once("\n\n").unwrap();
+    let ground = ground.unwrap_or(own);
+    let text = format!("{head}[scene.camera]\n{camera}\n[scene.proxy]\n{ground}\n\n{tail}");
+    project.write("pipeline.toml", text);
+}
+
+/// A frame of `transforms.json` from a place 5 m before the object, which looks along -z.
+fn frame_at(name: &str, [x, y]: [f64; 2]) -> Value {
+    let matrix = [
+        [1.0, 0.0, 0.0, x],
+        [0.0, 1.0, 0.0, y],
+        [0.0, 0.0, 1.0, 5.0],
+        [0.0, 0.0, 0.0, 1.0],
+    ];
+    json!({ "file_path": name, "transform_matrix": matrix })
+}
+
 fn shot(project: &Project, frames: &[&str]) -> Vec<Value> {
     let run = project.run(DIPIR, &[&["shot", "--json"], frames].concat());
     run.expect_success();
@@ -73,23 +95,11 @@ fn frames_are_lit_by_one_light_and_made_once() {
 #[test]
 fn every_frame_has_the_camera_of_its_name() {
     let project = project();
-    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
-    let (head, tail) = text.split_once("[scene.camera]\n").unwrap();
-    let (_, tail) = tail.split_once("[scene.proxy]").unwrap();
-    let with = |camera: &str| {
-        let text = format!("{head}[scene.camera]\n{camera}\n[scene.proxy]{tail}");
-        project.write("pipeline.toml", text);
-    };
+    let with = |camera: &str| set_camera(&project, camera, None);
     let photo = project.read("background.png");
     let frame = |name: &str, x: f64| {
         project.write(name, &photo);
-        let matrix = [
-            [1.0, 0.0, 0.0, x],
-            [0.0, 1.0, 0.0, 1.5],
-            [0.0, 0.0, 1.0, 5.0],
-            [0.0, 0.0, 0.0, 1.0],
-        ];
-        json!({ "file_path": name, "transform_matrix": matrix })
+        frame_at(name, [x, 1.5])
     };
     let frames = [
         frame("background.png", 0.0),
@@ -240,23 +250,11 @@ fn a_shot_is_planned_before_it_runs() {
 #[test]
 fn objects_and_ground_are_as_in_the_photograph() {
     let project = project();
-    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
-    let (head, tail) = text.split_once("[scene.camera]\n").unwrap();
-    let (_, tail) = tail.split_once("[scene.proxy]").unwrap();
-    let (_, tail) = tail.split_once("\n\n").unwrap();
     let moving = "file = \"transforms.json\"\nfile_up = \"y\"";
-    let text =
-        format!("{head}[scene.camera]\n{moving}\n[scene.proxy]\ncamera_height_m = 1.6\n\n{tail}");
-    project.write("pipeline.toml", text);
+    set_camera(&project, moving, Some("camera_height_m = 1.6"));
     let frame = |name: &str, place: [f64; 2]| {
-        let matrix = [
-            [1.0, 0.0, 0.0, place[0]],
-            [0.0, 1.0, 0.0, place[1]],
-            [0.0, 0.0, 1.0, 5.0],
-            [0.0, 0.0, 0.0, 1.0],
-        ];
         project.write(name, project.read("background.png"));
-        json!({ "file_path": name, "transform_matrix": matrix })
+        frame_at(name, place)
     };
     let frames = [frame("f.0.png", [0.0, 1.6]), frame("f.1.png", [0.5, 1.9])];
     project.write("background.png", project.read("f.0.png"));
@@ -304,20 +302,11 @@ fn objects_and_ground_are_as_in_the_photograph() {
 #[test]
 fn a_camera_that_stands_still_is_that_of_the_photograph() {
     let project = project();
-    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
-    let (head, tail) = text.split_once("[scene.camera]\n").unwrap();
-    let (_, tail) = tail.split_once("[scene.proxy]").unwrap();
-    let text = format!(
-        "{head}[scene.camera]\nfile = \"camera.json\"\nfile_up = \"y\"\nimage = \"background.png\"\n[scene.proxy]{tail}"
-    );
-    project.write("pipeline.toml", text);
-    let matrix = [
-        [1.0, 0.0, 0.0, 0.5],
-        [0.0, 1.0, 0.0, 1.5],
-        [0.0, 0.0, 1.0, 5.0],
-        [0.0, 0.0, 0.0, 1.0],
-    ];
-    let frame = json!({ "file_path": "background.png", "transform_matrix": matrix });
+    let still = "file = \"camera.json\"
+file_up = \"y\"
+image = \"background.png\"";
+    set_camera(&project, still, None);
+    let frame = frame_at("background.png", [0.5, 1.5]);
     let file = json!({ "camera_angle_x": 0.8, "w": 36, "h": 24, "frames": [frame] });
     project.write("camera.json", file.to_string());
     let picture = |name: &str, width, height| {
