@@ -189,7 +189,7 @@ fn said(draft: &Draft) -> String {
             true => "wherever it is free".into(),
             false => format!("at pixel {x}, {y}"),
         };
-        let appears = match object.appearance() {
+        let appears = match object.appearance(document.facts.size) {
             Some(words) if object.auto => format!("; at pixel {x}, {y} it {words}"),
             Some(words) => format!(", {words}"),
             None => String::new(),

@@ -144,11 +144,12 @@ fn measure(session: &Session, all: &mut [Expected]) -> anyhow::Result<()> {
 }
 
 /// What the frames of a shot would take, after the plan of its `photo`: as long as those that are there took, else as the
-/// photograph's own picture.
+/// photograph's own picture. With `force` all run.
 pub fn frames(
     base: &Session,
     photo: (String, Value),
     frames: &[(PathBuf, ProjectArgs)],
+    force: bool,
 ) -> anyhow::Result<(String, Value)> {
     let runs = |e: &Value| e["runs"] == json!(true);
     // Objects and light are those of the photograph.
@@ -159,7 +160,7 @@ pub fn frames(
     for (_, project) in frames {
         let (session, graph) = project.open()?;
         let nodes = graph.up_to(graph::LAST);
-        stale += usize::from(concerns_all || !run::all_fresh(&session, &graph, &nodes)?);
+        stale += usize::from(force || concerns_all || !run::all_fresh(&session, &graph, &nodes)?);
         took.extend(seconds(&session));
     }
     if took.is_empty() {

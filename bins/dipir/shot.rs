@@ -46,6 +46,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     if args.draft {
         common.set.push("pipeline.quality=draft".into());
     }
+    refuse_pipeline(&args.frames)?;
     let base = ProjectArgs::of(&common);
     let (session, graph) = base.open()?;
     let mut frames = frames(args, &session, &base)?;
@@ -61,7 +62,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     let of_photo = RunArgs::needed(&common, Some(last));
     if args.plan {
         let photo = run_one(&of_photo.planned(), &base)?;
-        let (words, json) = plan::frames(&session, photo, &frames)?;
+        let (words, json) = plan::frames(&session, photo, &frames, args.force)?;
         common.output.result(|| words, || json);
         return Ok(());
     }
@@ -70,6 +71,19 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
         common.output.result(|| done.0, || Value::Null);
     }
     run_each(&RunArgs::needed(&common, None).forced(args.force), frames)
+}
+
+/// Refuses a file that configures stages among the frames: other commands take it there.
+fn refuse_pipeline(frames: &[PathBuf]) -> Result<(), Usage> {
+    let is_pipeline = |path: &&PathBuf| path.extension().is_some_and(|e| e == "toml");
+    match frames.iter().find(is_pipeline) {
+        None => Ok(()),
+        Some(file) => {
+            let file = file.display();
+            let message = format!("{file} is no frame: write dipir shot --pipeline {file} FRAME…");
+            Err(Usage(printable(&message)))
+        }
+    }
 }
 
 /// The frames, each with its project.
@@ -88,7 +102,9 @@ fn frames(
         let mut frame = base.clone();
         frame.set.extend(shot::overrides(session, path, stops)?);
         if stops != 0.0 {
-            session.remark(|| format!("{}: exposed by {stops:.2} stops more", path.display()));
+            let than = if stops > 0.0 { "more" } else { "less" };
+            let stops = stops.abs();
+            session.remark(|| format!("{}: exposed by {stops:.2} stops {than}", path.display()));
         }
         frame.out = Some(session.out.join(shot::FOLDER).join(name));
         if frames.iter().any(|(_, other)| other.out == frame.out) {

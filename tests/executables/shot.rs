@@ -129,6 +129,14 @@ fn every_frame_has_the_camera_of_its_name() {
         run.expect_error(2, &format!("error: {message}"));
     };
     refused(&["a.png", "gone.png"], "gone.png: there is no such file");
+    refused(
+        &["a.png", "."],
+        ".: it is a folder: name the pictures in it",
+    );
+    refused(
+        &["pipeline.toml", "a.png"],
+        "pipeline.toml is no frame: write dipir shot --pipeline pipeline.toml FRAME…",
+    );
     for dots in ["...png", "..png"] {
         project.write(dots, &photo);
         let why = "without its extension this is no name of a folder; rename the file, as in frame_0001.png";
@@ -233,6 +241,7 @@ fn a_shot_is_planned_before_it_runs() {
     shot(&project, &["a.png"]);
     let second = plan(&["a.png", "b.png"]);
     assert_eq!(second["frames"]["run"], 1);
+    assert_eq!(plan(&["a.png", "b.png", "--force"])["frames"]["run"], 2);
     let seconds = |key: &str| second["frames"][key].as_f64().unwrap();
     assert!(seconds("seconds") > 0.0);
     assert_eq!(seconds("seconds"), seconds("seconds_each"));
@@ -329,7 +338,8 @@ image = \"background.png\"";
     let run = project.run(DIPIR, &["shot", "half.png", "wide.png"]);
     assert_ne!(run.code, Some(0));
     assert!(
-        run.stderr.contains("a frame of 36 x 12 pixels"),
+        run.stderr
+            .contains("it has 36 x 12 pixels, and the photograph"),
         "{}",
         run.stderr
     );

@@ -22,6 +22,7 @@ pub mod proxy;
 pub mod ray_offset;
 mod rebuilding;
 pub mod scene;
+mod taken;
 pub mod texture;
 pub mod triangle;
 pub mod undistortion;

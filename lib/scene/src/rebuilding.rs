@@ -71,14 +71,11 @@ impl SceneDescription {
         let photo = [self.background.width, self.background.height];
         let shape = f64::from(photo[0]) / f64::from(photo[1]);
         if (w / h / shape - 1.0).abs() > SAME_SHAPE {
-            return Err(Error::Config {
-                key: "scene.background".into(),
-                value: format!("a frame of {w} x {h} pixels"),
-                accepted: format!(
-                    "one of the shape of the shot's photograph, {} x {}, whose camera stands still",
-                    photo[0], photo[1]
-                ),
-            });
+            let detail = format!(
+                "it has {w} x {h} pixels, and the photograph of the shot, whose camera stands still, {} x {}",
+                photo[0], photo[1]
+            );
+            return Err(Error::malformed(detail, "give it that shape"));
         }
         let lens = self.lens.as_ref().map(|lens| lens.scaled([w, h]));
         Ok(match lens.as_ref().and_then(Undistortion::of) {

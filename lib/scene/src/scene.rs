@@ -23,6 +23,7 @@ use crate::mesh::TriangleMesh;
 use crate::placement::Anchor;
 use crate::printable::printable;
 use crate::proxy::Proxy;
+use crate::taken::taken;
 use crate::texture::Texture;
 use crate::undistortion::Undistortion;
 use crate::visibility;
@@ -189,7 +190,9 @@ impl Scene {
         }
         let (camera, undistortion) =
             match of_shot.filter(|_| settings.camera.stands_still(base_dir)) {
-                Some(of_shot) => of_shot.seen_in(resolution)?,
+                Some(of_shot) => of_shot
+                    .seen_in(resolution)
+                    .map_err(|e| e.in_file(&settings.background))?,
                 None => settings
                     .camera
                     .with_facts(&photo.facts)?
@@ -202,6 +205,20 @@ impl Scene {
             Some(of_shot) => (files.recorded(&of_shot.proxy)?, of_shot.proxy.clone(), None),
             None => files.proxy(&settings.proxy, &view)?,
         };
+        let taken = match of_shot {
+            Some(_) => Vec::new(),
+            None => {
+                let (objects, limits) = (&settings.objects, &settings.limits);
+                taken(
+                    objects,
+                    base_dir,
+                    limits,
+                    &camera,
+                    &proxy,
+                    undistortion.as_ref(),
+                )?
+            }
+        };
         let mut places = Places {
             view,
             ground: match (&proxy_record, &proxy) {
@@ -212,7 +229,7 @@ impl Scene {
             cloud,
             occluders: occluders.as_ref(),
             undistortion: undistortion.as_ref(),
-            taken: Vec::new(),
+            taken,
         };
         let mut assembly = Assembly::new(camera, settings.objects.iter().map(|o| o.path.clone()));
         let mut objects = Vec::new();

@@ -83,7 +83,7 @@ impl Document {
         );
         text += &self.scene();
         for object in &self.objects {
-            text += &object.text();
+            text += &object.text(self.facts.size);
         }
         text += &match (&self.camera_file, &self.view.file) {
             (Some(name), Some(file)) => camera_of_file(name, file, &self.view),
@@ -130,8 +130,8 @@ const SMALL_PX: f64 = 24.0;
 const LOW: f64 = 4.0;
 
 impl Object {
-    /// How large it appears: `appears 41 pixels high`, and what to do if that is little.
-    pub fn appearance(&self) -> Option<String> {
+    /// How large it appears: `appears 41 pixels high`, and what to do if that is little or more than the `picture`, pixels.
+    pub fn appearance(&self, picture: [u32; 2]) -> Option<String> {
         let [width, height] = self.appears_px?;
         let (pixels, way) = match width > LOW * height {
             true => (width, "wide"),
@@ -139,17 +139,19 @@ impl Object {
         };
         let count = format!("{pixels:.0}");
         let unit = if count == "1" { "pixel" } else { "pixels" };
-        let small = match pixels < SMALL_PX {
-            true => {
-                ", which is small: for a close-up lower the camera (--eye-height), or move the object down in the \
-                 picture (at_pixel)"
-            }
-            false => "",
+        let [across, down] = picture.map(f64::from);
+        let advice = if pixels < SMALL_PX {
+            ", which is small: for a close-up lower the camera (--eye-height), or move the object down in the picture \
+             (at_pixel)"
+        } else if width > across || height > down {
+            ", which is more than the picture: make it smaller (--height-m), or move it up in the picture (at_pixel)"
+        } else {
+            ""
         };
-        Some(format!("appears {count} {unit} {way}{small}"))
+        Some(format!("appears {count} {unit} {way}{advice}"))
     }
 
-    fn text(&self) -> String {
+    fn text(&self, picture: [u32; 2]) -> String {
         let [x, y] = self.at_pixel.map(|v| number(v, 1));
         let place = match self.auto {
             true => format!(
@@ -168,7 +170,7 @@ impl Object {
         if self.may_lie {
             text += "# pitch_deg = -90.0             # if it lies on its back\n";
         }
-        if let Some(words) = self.appearance() {
+        if let Some(words) = self.appearance(picture) {
             text += &comment(&format!("at pixel {x}, {y} it {words}"));
         }
         text += &format!("# size: {}\n", self.size_why);
@@ -467,7 +469,7 @@ mod tests {
         let object = &mut document.objects[0];
         let mut of = |size| {
             object.appears_px = Some(size);
-            object.appearance().unwrap()
+            object.appearance([900, 600]).unwrap()
         };
         assert_eq!(of([30.0, 41.3]), "appears 41 pixels high");
         assert_eq!(of([300.0, 2.0]), "appears 300 pixels wide");
@@ -475,8 +477,13 @@ mod tests {
         for part in ["23 pixels high, which is small", "--eye-height", "at_pixel"] {
             assert!(small.contains(part), "{part}: {small}");
         }
+        let large = of([500.0, 601.0]);
+        assert!(
+            large.contains("601 pixels high, which is more than the picture"),
+            "{large}"
+        );
         object.appears_px = None;
-        assert_eq!(object.appearance(), None);
+        assert_eq!(object.appearance([900, 600]), None);
     }
 
     #[test]

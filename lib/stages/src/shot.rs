@@ -46,6 +46,9 @@ pub fn exposure_stops(session: &Session, path: &Path) -> anyhow::Result<Option<f
 pub fn overrides(session: &Session, path: &Path, stops: f64) -> anyhow::Result<Vec<String>> {
     let wrong = |why: &str| Usage(printable(&format!("{}: {why}", path.display())));
     let scene: SceneConfig = session.config.table("scene")?;
+    if path.is_dir() {
+        return Err(wrong("it is a folder: name the pictures in it").into());
+    }
     if !path.is_file() {
         return Err(wrong("there is no such file").into());
     }

@@ -19,7 +19,7 @@ pub(super) fn coloured_in_grey(
         mesh.colors.iter().copied().any(has_colour) || materials.iter().any(may_have_colour);
     (in_colour && is_grey(photo)).then(|| {
         "the photograph is grey, and the objects keep their colours: for a grey picture take the colour out of the result, \
-         as in magick composite.png -colorspace gray grey.png, or give the objects grey textures and base colours"
+         as in magick composite.png -colorspace gray grey.png"
             .into()
     })
 }

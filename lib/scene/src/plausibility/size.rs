@@ -10,6 +10,8 @@ use crate::visibility::{below_a_pixel, short};
 
 /// Largest extents of objects that people insert, metres.
 const EXTENT_M: [f64; 2] = [0.005, 50.0];
+/// Up to this extent the numbers of a file without a unit are believed to be metres; from there on they look like centimetres.
+const METRES_UP_TO: f64 = 5.0;
 /// From this extent on, the units of a file are taken for millimetres (.5 m and more), below it for centimetres (5 m and less).
 const MILLIMETRES_FROM: f64 = 500.0;
 /// Rays are exact to some millionths of the extent of all objects: beyond this one, metres, details of a hand's breadth are
@@ -79,17 +81,17 @@ impl Part<'_> {
         }
     }
 
-    /// A sentence about numbers of a file without a unit that are taken as they are: with `scale` or `height_m` they are
-    /// multiplied by another factor than 1.
+    /// A sentence about numbers of a file without a unit that are taken as they are and make a large thing: with `scale`
+    /// or `height_m` they are multiplied by another factor than 1.
     pub fn without_unit(&self) -> Option<String> {
+        let (number, extent) = (self.number, self.extent());
         let as_they_are = (self.scale() - 1.0).abs() < 1e-6;
-        (as_they_are && is_stl(self.record)).then(|| {
-            let (number, extent) = (self.number, self.extent());
+        (as_they_are && is_stl(self.record) && extent > METRES_UP_TO).then(|| {
             format!(
                 "scene.objects[{number}] is {} m large, for STL has no unit and its numbers are read as metres: for \
-                 millimetres write scale = 0.001, which makes it {} m, or write height_m",
+                 centimetres write scale = 0.01, which makes it {} m, or write height_m",
                 short(extent),
-                short(0.001 * extent)
+                short(0.01 * extent)
             )
         })
     }
@@ -229,16 +231,28 @@ mod tests {
 
     #[test]
     fn the_missing_unit_of_an_stl_is_told_where_nothing_is_set() {
-        let told = |path: &str, scale: f64| {
+        let told = |path: &str, scale: f64, metres: f32| {
             let mut record = record(scale);
             record.file.path = path.into();
-            implausible_scene(&scene(), &[record], None)
+            let mut scene = scene();
+            scene.mesh.positions.iter_mut().for_each(|p| *p *= metres);
+            let found = implausible_scene(&scene, &[record], None);
+            found.into_iter().find(|w| w.contains("STL"))
         };
-        let found = told("part.STL", 1.0);
-        let said = "scene.objects[0] is 1.00 m large, for STL has no unit";
-        assert!(found.len() == 1 && found[0].starts_with(said), "{found:?}");
-        assert_eq!(told("part.stl", 0.7), Vec::<String>::new());
-        assert_eq!(told("part.glb", 1.0), Vec::<String>::new());
+        let found = told("part.STL", 1.0, 8.0).unwrap();
+        let said = "scene.objects[0] is 8.00 m large, for STL has no unit";
+        assert!(found.starts_with(said), "{found}");
+        assert!(
+            found.contains("scale = 0.01, which makes it 0.080 m"),
+            "{found}"
+        );
+        for (path, scale, metres) in [
+            ("a.stl", 0.7, 8.0),
+            ("a.glb", 1.0, 8.0),
+            ("a.stl", 1.0, 1.0),
+        ] {
+            assert_eq!(told(path, scale, metres), None, "{path} {scale} {metres}");
+        }
         let proxy = Proxy::Mesh(scene().mesh);
         let mut room = record(1.0);
         assert_eq!(proxy_without_unit(&room, &proxy), None);

@@ -282,6 +282,39 @@ fn the_ground_of_points_is_in_scene_json_and_objects_find_a_free_place_on_it() {
 }
 
 #[test]
+fn a_place_that_is_looked_for_is_apart_from_objects_that_have_one() {
+    let folder = folder();
+    let auto = "height_m = 0.4\nplace = \"auto\"";
+    let at = |scene: &LoadedScene, object: usize| {
+        let rows = scene.description.objects[object].transform;
+        Vec3::from_array([0, 1, 2].map(|i| rows[i][3] as f32))
+    };
+    let proxy = "[proxy]\nplane = {}";
+    let alone = loaded(folder.path(), auto, STANDS, proxy);
+    let place = at(&alone, 0);
+    let fixed = format!(
+        "height_m = 0.4\nposition = [{}, {}, {}]",
+        place.x, place.y, place.z
+    );
+    let next = "\n[[objects]]\npath = \"cube.obj\"\n";
+    for (order, objects) in [(fixed.as_str(), auto), (auto, fixed.as_str())]
+        .iter()
+        .enumerate()
+    {
+        let both = [objects.0, next, objects.1].concat();
+        let found = loaded(folder.path(), &both, STANDS, proxy);
+        let (stands, looked_for) = (at(&found, order), at(&found, 1 - order));
+        assert_eq!(stands, place, "{order}");
+        // Radii of 0.28 m.
+        assert!(looked_for.distance(place) > 0.56, "{order}: {looked_for}");
+        let column = |p: Vec3| found.scene.camera.project(p).unwrap().x;
+        let apart = (column(looked_for) - column(place)).abs();
+        // A cube of .4 m at 4 m is 21 pixels wide.
+        assert!(apart > 20.0, "{order}: {apart} pixels");
+    }
+}
+
+#[test]
 fn ground_that_is_not_flat_becomes_a_mesh_on_which_pixels_are_points() {
     let folder = folder();
     scan(folder.path(), 0.15);
