@@ -129,9 +129,10 @@ fn every_frame_has_the_camera_of_its_name() {
         run.expect_error(2, &format!("error: {message}"));
     };
     refused(&["a.png", "gone.png"], "gone.png: there is no such file");
+    std::fs::create_dir(project.path("all")).unwrap();
     refused(
-        &["a.png", "."],
-        ".: it is a folder: name the pictures in it",
+        &["a.png", "all"],
+        "all: it is a folder: name the pictures in it",
     );
     refused(
         &["pipeline.toml", "a.png"],

@@ -1,4 +1,5 @@
 //! `scene.json`: what a scene was made of, so that another executable rebuilds the same.
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use dipir_cameras::Lens;
@@ -140,5 +141,22 @@ impl SceneDescription {
             return Err(Error::malformed(detail, AGAIN).in_file(path));
         }
         Ok(description)
+    }
+}
+
+/// A warning if objects of the same file stand at the same place.
+pub(crate) fn repeated(objects: &[ObjectRecord]) -> Option<String> {
+    let mut seen = HashSet::new();
+    for object in objects {
+        seen.insert((
+            &object.file.path,
+            object.transform.map(|row| row.map(f64::to_bits)),
+        ));
+    }
+    match objects.len() - seen.len() {
+        0 => None,
+        n => Some(format!(
+            "scene.objects: {n} of them stand where the same file stands already, and are drawn once"
+        )),
     }
 }

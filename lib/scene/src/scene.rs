@@ -1,5 +1,5 @@
 //! Everything of a scene that a renderer needs, except the light.
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use dipir_cameras::{Camera as LensCamera, Lens};
@@ -11,7 +11,9 @@ use glam::{DMat4, DVec2};
 
 use crate::camera::{Camera, CameraSettings};
 use crate::config::{ProxySettings, SceneConfig};
-use crate::description::{FileRecord, ObjectRecord, PhotoRecord, ProxyRecord, SceneDescription};
+use crate::description::{
+    FileRecord, ObjectRecord, PhotoRecord, ProxyRecord, SceneDescription, repeated,
+};
 use crate::error::Error;
 use crate::features::SceneFeatures;
 use crate::ground::{self, Places};
@@ -292,23 +294,6 @@ impl Scene {
     /// Which kinds of surface the triangles have.
     pub fn features(&self) -> SceneFeatures {
         SceneFeatures::of(self)
-    }
-}
-
-/// A warning if objects of the same file stand at the same place.
-fn repeated(objects: &[ObjectRecord]) -> Option<String> {
-    let mut seen = HashSet::new();
-    for object in objects {
-        seen.insert((
-            &object.file.path,
-            object.transform.map(|row| row.map(f64::to_bits)),
-        ));
-    }
-    match objects.len() - seen.len() {
-        0 => None,
-        n => Some(format!(
-            "scene.objects: {n} of them stand where the same file stands already, and are drawn once"
-        )),
     }
 }
 
