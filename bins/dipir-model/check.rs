@@ -151,13 +151,16 @@ fn chosen(args: &CheckArgs, session: Option<&Session>) -> anyhow::Result<Option<
     Ok(table.path.map(|path| session.resolve(&path)))
 }
 
-/// What the UNet predicts, if the command line says it, or the configuration of the model that is named there.
+/// What the UNet predicts, if the command line says it, or the configuration of the model that is named there. With a
+/// model on the command line the file's own key is another model's, and one that `--set` sets is this one's.
 fn prediction(args: &CheckArgs, session: Option<&Session>) -> anyhow::Result<Option<Prediction>> {
     if let Some(word) = &args.prediction {
         let found = model::prediction(word).map_err(|m| Usage(format!("--prediction: {m}")))?;
         return Ok(Some(found));
     }
-    let Some(session) = session.filter(|_| args.model.is_none()) else {
+    let is_set = |set: &String| set.trim_start().starts_with("model.prediction");
+    let is_meant = args.model.is_none() || args.common.set.iter().any(is_set);
+    let Some(session) = session.filter(|_| is_meant) else {
         return Ok(None);
     };
     let table: ModelTable = session.config.table("model")?;

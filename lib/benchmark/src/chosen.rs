@@ -160,17 +160,20 @@ fn model(path: Option<Named>) -> anyhow::Result<ChosenModel> {
 fn refuse_set(set: &[String], chosen: &[Chosen]) -> anyhow::Result<()> {
     for pair in set.iter().filter(|s| s.contains('=')) {
         let key = key_of(pair);
-        for (own, option) in [
-            (MODEL_PATH, "--model"),
-            ("composite.target_error", "--target-error"),
+        for (own, instead) in [
+            (MODEL_PATH, "use --model for that"),
+            ("composite.target_error", "use --target-error for that"),
+            ("pipeline.seed", "every method has seed 0"),
+            ("pipeline.out", "use --out for that"),
         ] {
             if overlap(&key, own) {
-                return Err(Usage(format!("--set {pair}: use {option} for that")).into());
+                return Err(Usage(format!("--set {pair}: {instead}")).into());
             }
         }
         for Chosen { method, .. } in chosen {
             let of_map: &[&str] = match method.light {
-                Source::Recovered => &[],
+                // A map would take the place of what is recovered.
+                Source::Recovered => &["composite.environment"],
                 _ => &["composite.environment", "composite.tone"],
             };
             let own = method.set.iter().map(|s| key_of(s));
@@ -254,6 +257,12 @@ pub(crate) mod tests {
         assert!(refused(&table).contains("sets light.learning_rates.radiance itself"));
         let map = ["--method", "neutral", "-s", "composite.environment=a.exr"];
         assert!(refused(&map).contains("the method \"neutral\" sets composite.environment itself"));
+        let map = ["--method", "ours", "-s", "composite.environment=a.exr"];
+        assert!(refused(&map).contains("the method \"ours\" sets composite.environment itself"));
+        assert_eq!(
+            refused(&["-s", "pipeline.seed=7"]),
+            "--set pipeline.seed=7: every method has seed 0"
+        );
         assert_eq!(
             refused(&["--method", "ours", "-s", "model.path=sd"]),
             "--set model.path=sd: use --model for that"

@@ -70,7 +70,7 @@ impl Runner<'_> {
     fn truth(&self, scene: &SceneInfo) -> anyhow::Result<Truth> {
         let folder = self.evaluation.run(TRUTH, &scene.name);
         let score_file = folder.join("score.json");
-        let key = self.fingerprint(scene, json!(TRUTH), None)?;
+        let key = self.fingerprint(scene, json!(TRUTH), &[], None)?;
         let map_file = self.evaluation.scene(&scene.name).join(&scene.map);
         if !Score::is_done(&score_file, &key) {
             let work = self.evaluation.work(&scene.name, TRUTH);
@@ -113,7 +113,7 @@ impl Runner<'_> {
         let maps = chosen.maps.as_deref();
         let imported = maps.map(|f| map_in(f, &scene.name)).transpose()?;
         let params = json!({"method": method, "model": chosen.digest()});
-        let key = self.fingerprint(scene, params, imported.as_deref())?;
+        let key = self.fingerprint(scene, params, &method.set, imported.as_deref())?;
         if Score::is_done(&score_file, &key) {
             return Ok(());
         }
@@ -177,7 +177,7 @@ impl Runner<'_> {
             "is_adapted": method.stages.len() > 2,
             "model": chosen.digest(),
         });
-        let key = self.fingerprint(scene, params, None)?;
+        let key = self.fingerprint(scene, params, &method.set, None)?;
         Ok(self.evaluation.work(&scene.name, &key[..16]))
     }
 
@@ -230,11 +230,13 @@ impl Runner<'_> {
         })
     }
 
-    /// Hash of what decides a run: the scene's files, the settings, `params`, and an imported map.
+    /// Hash of what decides a run: the scene's files, the settings, those of the method (`set`), the files that they name,
+    /// `params`, and an imported map.
     fn fingerprint(
         &self,
         scene: &SceneInfo,
         params: Value,
+        set: &[String],
         imported: Option<&Path>,
     ) -> anyhow::Result<String> {
         let folder = self.evaluation.scene(&scene.name);
@@ -260,8 +262,37 @@ impl Runner<'_> {
         if let Some(map) = imported {
             add("map", map)?;
         }
+        for set in self.args.set.iter().chain(set) {
+            for file in files_of(set, &folder) {
+                add(set, &file)?;
+            }
+        }
         Ok(Fingerprint::of_plan(&plan).finish().as_str().to_owned())
     }
+}
+
+/// The files that a setting names from a scene's `folder`: a file, or those in a folder. A cache is what runs leave, not
+/// what they begin with.
+fn files_of(set: &str, folder: &Path) -> Vec<PathBuf> {
+    let Some((key, value)) = set.split_once('=').filter(|(k, _)| !k.contains("cache")) else {
+        return Vec::new();
+    };
+    let value = value.trim().trim_matches(['"', '\'']);
+    if value.is_empty() || key.trim() == MODEL_PATH {
+        return Vec::new();
+    }
+    let path = folder.join(value);
+    let mut files = match path.is_file() {
+        true => vec![path],
+        false => fs::read_dir(path).map_or(Vec::new(), |all| {
+            all.flatten()
+                .map(|e| e.path())
+                .filter(|p| p.is_file())
+                .collect()
+        }),
+    };
+    files.sort();
+    files
 }
 
 /// `set`, where it names a cache by a relative path, with that path from the evaluation's `folder`: all scenes share it.
@@ -399,5 +430,29 @@ mod tests {
         assert_eq!(of("lora.cache=loras"), "lora.cache=\"/evaluation/loras\"");
         assert_eq!(of("lora.cache=/elsewhere"), "lora.cache=\"/elsewhere\"");
         assert_eq!(of("lora.steps=3"), "lora.steps=3");
+    }
+
+    #[test]
+    fn files_that_a_setting_names_count() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        fs::create_dir(at("lora")).unwrap();
+        for name in ["map.exr", "lora/b.json", "lora/a.safetensors"] {
+            fs::write(at(name), "").unwrap();
+        }
+        for (set, files) in [
+            ("light.reference=map.exr", &["map.exr"][..]),
+            (
+                "lora.path = \"lora\"",
+                &["lora/a.safetensors", "lora/b.json"],
+            ),
+            ("lora.cache=lora", &[]),
+            ("model.path=lora", &[]),
+            ("light.guidance=sds", &[]),
+            ("scene.class=\"\"", &[]),
+        ] {
+            let wanted: Vec<PathBuf> = files.iter().map(|f| at(f)).collect();
+            assert_eq!(files_of(set, folder.path()), wanted, "{set}");
+        }
     }
 }

@@ -31,6 +31,9 @@ pub(crate) fn warn_of_other_settings(
     }
 }
 
+/// Keys of a table that say how a result is made, and show in no result.
+const UNSEEN: [&str; 4] = ["recompute", "sheet_steps", "sample_every", "validate_every"];
+
 /// What differs, in words.
 fn differences(stage: &str, was: &Manifest, now: &StagePlan) -> Option<String> {
     let mut found = vec![];
@@ -41,6 +44,12 @@ fn differences(stage: &str, was: &Manifest, now: &StagePlan) -> Option<String> {
         });
     }
     found.extend(parameter_changes(&was.params, &now.params));
+    found.retain(|reason| match reason {
+        StaleReason::Parameter { key, .. } => {
+            !UNSEEN.iter().any(|k| key.ends_with(&format!(".{k}")))
+        }
+        _ => true,
+    });
     reasons::by_keys(stage, &mut found);
     let mut words = vec![];
     if !found.is_empty() {
@@ -103,6 +112,9 @@ mod tests {
         let class = told(&plan(params("cup"), b"a"));
         let wanted = "scene.class changed from \"cup\" to \"car\"";
         assert_eq!(class.as_deref(), Some(wanted));
+        let mut unseen = params("car");
+        unseen["lora"] = json!({"recompute": true});
+        assert_eq!(told(&plan(unseen, b"a")), None);
         let model = told(&plan(params("car"), b"b"));
         assert_eq!(model.as_deref(), Some("another model"));
         let seed = told(&StagePlan {

@@ -176,7 +176,7 @@ fn cache_folder(
     // How many images there are does not show in any of them.
     let params = json!({
         "class": class, "steps": table.steps, "guidance": table.guidance, "size": table.size,
-        "precision": plan.params["precision"],
+        "precision": plan.params["precision"], "prediction": plan.params["prediction"],
     });
     let fingerprint = Fingerprint::of_plan(plan).params(params).finish();
     Ok(Resume::open(

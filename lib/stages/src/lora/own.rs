@@ -128,6 +128,17 @@ fn finite(lora: Lora) -> anyhow::Result<Lora> {
     Ok(lora)
 }
 
+/// A root mean square difference of display values that is not seen: a tenth of an 8-bit step.
+const LEAST_SEEN: f64 = 0.1 / 255.0;
+
+/// The LoRA's file or folder, as the configuration names it.
+fn path_of(table: &LoraTable) -> String {
+    table
+        .path
+        .as_ref()
+        .map_or(String::new(), |p| p.display().to_string())
+}
+
 /// Writes the sheet, if one is wanted: what it shows, and how far both columns are apart.
 fn sheet(
     session: &Session,
@@ -147,6 +158,14 @@ fn sheet(
     let path = writer.output("sheet", "sheet.png")?;
     let difference = sheet.write(model, lora, None, &path, |share| progress.set(share))?;
     progress.done();
+    if difference < LEAST_SEEN {
+        session.warn(&format!(
+            "{}: on the sheet it moves display values by {difference:.5}, which is not seen: is it of this model, its alpha \
+             not 0, and does lora.word (\"{}\") hold the words that it knows?",
+            path_of(table),
+            table.word
+        ));
+    }
     let shown = json!({
         "prompts": sheet.prompts, "steps": sheet.steps, "rms_difference": difference,
     });
