@@ -84,7 +84,7 @@ impl fmt::Display for Done {
             if estimated.chosen().is_none() && is_unplaced_sun(&estimated.estimate) {
                 write!(
                     f,
-                    "\n  the sun probably shines, but its direction is not known, so that shadows are soft: draw a shadow \
+                    "\n  the sun probably shines, but its direction is not known well enough for a sharp shadow: draw one \
                      (light.shadow), say where the sun is (light.sun), or choose one of {} by its number (light.candidate)",
                     self.folder.join("candidates.png").display()
                 )?;

@@ -25,7 +25,7 @@ pub(super) fn in_words(estimate: &LightEstimate) -> String {
     )
 }
 
-/// Whether a sun is more probable than none, but its direction is not known.
+/// Whether a sun is more probable than none, but its direction is not known well enough for a sharp shadow.
 pub(super) fn is_unplaced_sun(estimate: &LightEstimate) -> bool {
     estimate.sun_probability >= 0.5 && estimate.source.is_none()
 }
