@@ -143,8 +143,8 @@ fn measure(session: &Session, all: &mut [Expected]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What the frames of a shot would take, after the plan of its `photo`: as long as those that are there took, else as the
-/// photograph's own picture. With `force` all run.
+/// What the frames of a shot would take, after the plan of its photograph (`photo`). A frame takes as long as the frames that
+/// have run, or as the photograph's own picture if none has. With `force` all frames run.
 pub fn frames(
     base: &Session,
     photo: (String, Value),

@@ -93,6 +93,7 @@ fn frames(
     base: &ProjectArgs,
 ) -> anyhow::Result<Vec<(PathBuf, ProjectArgs)>> {
     let mut frames: Vec<(PathBuf, ProjectArgs)> = Vec::new();
+    let stands_still = shot::camera_stands_still(session)?;
     for path in &args.frames {
         let name = name(path)?;
         let stops = match args.same_exposure {
@@ -100,7 +101,9 @@ fn frames(
             false => shot::exposure_stops(session, path)?.unwrap_or_default(),
         };
         let mut frame = base.clone();
-        frame.set.extend(shot::overrides(session, path, stops)?);
+        frame
+            .set
+            .extend(shot::overrides(session, path, stops, stands_still)?);
         if stops != 0.0 {
             let than = if stops > 0.0 { "more" } else { "less" };
             let stops = stops.abs();

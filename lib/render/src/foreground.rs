@@ -312,8 +312,8 @@ impl<L: PathLight> PathContext<'_, L> {
         let mut filling = Vec3::ZERO; //             attenuation per metre of the segment
         let mut least_roughness = self.min_roughness; // that the next surfaces count as having
         let mut thickness = 0.0; //                  metres of it if the segment meets no inner side
-        let mut straight = has(F, TRANSMISSION) //   through sheets alone so far: the light behind them
-            && self.start != PathStart::Camera; //   is not of this path, for it takes the straight way
+        // The path has met sheets alone: the shadow ray counts the light behind them.
+        let mut straight = has(F, TRANSMISSION) && self.start != PathStart::Camera;
         let first_dimension = sampler.dimension();
         let emits = has(F, EMISSION) && has(world.mask, EMISSION);
 

@@ -265,8 +265,8 @@ impl<'a> World<'a> {
     }
 }
 
-/// Whether a surface lets light pass without turning much of it aside. What such surfaces alone lie between the light and
-/// the proxy takes the straight way.
+/// Whether light passes a surface nearly straight. Light that meets such surfaces alone on its way to the proxy is counted
+/// along the shadow ray, and not by paths.
 #[inline]
 pub fn is_sheet(surface: &SurfacePoint) -> bool {
     surface.transmission > 0.0 && surface.roughness <= SHEET_ROUGHNESS

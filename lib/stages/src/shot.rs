@@ -39,11 +39,28 @@ pub fn exposure_stops(session: &Session, path: &Path) -> anyhow::Result<Option<f
     Ok((stops.abs() >= SAME_EXPOSURE).then_some(stops))
 }
 
-/// What sets the frame in `path`, exposed by `stops` more, in place of the session's photograph, as `KEY=VALUE`.
+/// Whether all frames have one camera.
+///
+/// # Errors
+/// If `[scene]` cannot be read.
+pub fn camera_stands_still(session: &Session) -> anyhow::Result<bool> {
+    let scene: SceneConfig = session.config.table("scene")?;
+    let file = scene.camera.and_then(|camera| camera.file);
+    let has_one = |file| dipir_cameras::file::has_one(&session.config.base_dir().join(file));
+    Ok(file.is_none_or(has_one))
+}
+
+/// What sets the frame in `path`, exposed by `stops` more, in place of the session's photograph, as `KEY=VALUE`. The camera
+/// is its own, unless it `stands_still`.
 ///
 /// # Errors
 /// If there is no such file or mask, or its camera cannot be told from the configuration.
-pub fn overrides(session: &Session, path: &Path, stops: f64) -> anyhow::Result<Vec<String>> {
+pub fn overrides(
+    session: &Session,
+    path: &Path,
+    stops: f64,
+    stands_still: bool,
+) -> anyhow::Result<Vec<String>> {
     let wrong = |why: &str| Usage(printable(&format!("{}: {why}", path.display())));
     let scene: SceneConfig = session.config.table("scene")?;
     if path.is_dir() {
@@ -75,9 +92,7 @@ pub fn overrides(session: &Session, path: &Path, stops: f64) -> anyhow::Result<V
     let Some(camera) = &scene.camera else {
         return Ok(set);
     };
-    if let Some(file) = &camera.file
-        && dipir_cameras::file::has_one(&session.config.base_dir().join(file))
-    {
+    if stands_still && camera.transforms.is_none() {
         return Ok(set);
     }
     if let Some(key) = key_of_frame(camera)? {
@@ -107,8 +122,9 @@ fn key_of_frame(camera: &CameraConfig) -> anyhow::Result<Option<&'static str>> {
     })
 }
 
-/// The mask of a frame: named as the photograph's is after the photograph, or with the frame's number where that has the
-/// photograph's. `None` if the photograph's own is the mask of all.
+/// The mask of a frame, beside that of the photograph. If the photograph's mask has the photograph's name, the frame's mask
+/// has the frame's; if it ends in the photograph's number, the frame's ends in the frame's. Otherwise `None`: all frames
+/// have the photograph's.
 fn mask_of(scene: &SceneConfig, frame: &Path) -> Option<PathBuf> {
     let mask = scene.occluders.as_ref()?;
     let (of_mask, of_photo) = (stem(mask)?, stem(scene.background.as_ref()?)?);

@@ -256,7 +256,7 @@ impl SunTable {
         Ok(known)
     }
 
-    /// What time, place and heading that are written say, if they say nothing: what is missing beside them.
+    /// What is missing, if a time, a place or a heading is written and nothing follows of the sun.
     pub fn idle(&self, taken: &Taken) -> Option<&'static str> {
         let written = [self.latitude, self.longitude, self.heading_deg];
         let said = self.azimuth_deg.is_some() || self.elevation_deg.is_some();

@@ -1,5 +1,5 @@
-//! Photographs of linear light, as OpenEXR and Radiance have it: they are exposed as they come, no value is white, and
-//! nothing is clipped. They are looked at as a camera would expose them.
+//! Photographs of linear light, as OpenEXR and Radiance store it. Their exposure is arbitrary, no value is white, and
+//! nothing is clipped: they are looked at as a camera would expose them.
 use dipir_estimator::{BORDER_DEG, Estimator, LightEstimate, Visible};
 use dipir_imaging::file::Photo;
 use dipir_imaging::raster::LinearImage;
@@ -13,8 +13,8 @@ pub(crate) fn is_linear(taken: &Photo) -> bool {
     taken.values.is_none()
 }
 
-/// What brings `image`, the photograph that was `taken` without its lens, to the exposure of a camera: 1 for what a
-/// camera has exposed.
+/// The factor that exposes a photograph as a camera would; 1 if a camera exposed it. `taken` is the photograph as it was
+/// read, `image` the same without the distortion of its lens.
 pub(crate) fn gain(taken: &Photo, image: &LinearImage) -> f32 {
     match is_linear(taken) {
         // Beyond a million times, numbers say nothing of a picture.
