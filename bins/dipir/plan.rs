@@ -10,6 +10,7 @@ use dipir_pipeline::status::State;
 use dipir_stages::composite::table::CompositeTable;
 use dipir_stages::graph;
 use dipir_stages::light;
+use dipir_stages::lora::table::LoraTable;
 use dipir_stages::model::{self, ModelTable, forecast};
 use dipir_stages::names::{COMPOSITE, CONCEPTS, LIGHT, LORA, SCENE};
 use serde::Serialize;
@@ -82,6 +83,11 @@ fn has_other_settings(state: &State) -> bool {
     reasons.iter().any(is_parameter)
 }
 
+/// Whether a run of the LoRA stage with these parameters trained one. How long that took says nothing of one that is read.
+fn trains(params: &Value) -> bool {
+    params["lora"]["path"].is_null()
+}
+
 /// The stages of a run with their expected time and memory, for people and for programs.
 pub fn plan(
     session: &Session,
@@ -90,12 +96,14 @@ pub fn plan(
     force: bool,
 ) -> anyhow::Result<(String, Value)> {
     let states = graph::assess(session, graph, nodes)?;
+    let trained = session.config.table::<LoraTable>("lora")?.path.is_none();
     let mut all = vec![];
     for node in nodes {
         let state = states.iter().find(|s| s.stage == node.stage);
         let idle = state.is_none_or(|s| matches!(s.state, State::Unneeded { .. }))
             || (!force && state.is_some_and(|s| matches!(s.state, State::Fresh)));
         let earlier = Manifest::read(&session.stage_folder(node.stage), "").ok();
+        let earlier = earlier.filter(|e| node.stage != LORA.name || trains(&e.params) == trained);
         let changed = state.is_some_and(|s| has_other_settings(&s.state));
         let foretold = earlier
             .as_ref()
@@ -277,6 +285,12 @@ mod tests {
             let on = on.clone();
             assert_eq!(has_other_settings(&State::Waits { on, reasons }), is);
         }
+    }
+
+    #[test]
+    fn a_lora_that_was_read_is_not_one_that_was_trained() {
+        assert!(trains(&json!({"lora": {"rank": 4}})));
+        assert!(!trains(&json!({"lora": {"path": "a.safetensors"}})));
     }
 
     #[test]

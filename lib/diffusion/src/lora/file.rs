@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 use super::settings::{ACCEPTED, METADATA, OWN_PREFIX, Settings};
 use super::{Adapter, AdapterTarget, Lora, lora_files};
 use crate::error::{Error, Result};
+use crate::single_file::original_attention;
 use crate::weights::{Weights, write_safetensors};
 
 /// Whose keys a file has.
@@ -25,11 +26,13 @@ pub enum LoraStyle {
 pub type LoraInfo = BTreeMap<String, String>;
 
 impl Lora {
-    /// Writes the adapters, in f32, with rank, alpha and `info` in the header.
+    /// Writes the adapters, in f32, with rank, alpha and `info` in the header. Matrices of layers that are 1x1 convolutions
+    /// in the model's files have two more dimensions of 1, as other programs want them.
     pub fn save(&self, path: &Path, style: LoraStyle, info: &LoraInfo) -> Result<()> {
         let mut tensors = BTreeMap::new();
         for (name, adapter) in &self.adapters {
-            let (down, up) = (adapter.down().detach(), adapter.up().detach());
+            let [down, up] = [adapter.down(), adapter.up()].map(|m| adapter.as_stored(m));
+            let (down, up) = (down?, up?);
             match style {
                 LoraStyle::Peft => {
                     tensors.insert(format!("unet.{name}.lora_A.weight"), down);
@@ -93,10 +96,10 @@ impl Lora {
         })
     }
 
-    /// Reads a file of either style, of diffusers before PEFT
-    /// (`.lora.down.weight`) or of PEFT itself, with the `adapter_config.json`
-    /// beside it, for the layers `targets` of a UNet; or that of a folder. The
-    /// adapters are frozen. Keys that fit no layer are errors that name them.
+    /// Reads a file of either style, of diffusers before PEFT (`.lora.down.weight`) or of PEFT itself, with the
+    /// `adapter_config.json` beside it, for the layers `targets` of a UNet; or that of a folder. kohya's keys may have the
+    /// original names of blocks (`lora_unet_input_blocks_1_1_...`). The adapters are frozen. Keys that fit no layer are
+    /// errors that name them.
     pub fn load(
         path: &Path,
         targets: &[AdapterTarget],
@@ -172,15 +175,33 @@ const UP: [&str; 4] = [
     "_lora.up.weight",
 ];
 
+/// Residual blocks of a level on the way down: one fewer than on the way up, where each of them may have attention.
+fn layers_per_block(targets: &[AdapterTarget]) -> usize {
+    let index = |t: &AdapterTarget| {
+        let (_, rest) = t
+            .name
+            .strip_prefix("up_blocks.")?
+            .split_once(".attentions.")?;
+        rest.split('.').next()?.parse().ok()
+    };
+    targets.iter().filter_map(index).max().unwrap_or(0)
+}
+
 fn sort_keys<'a>(
     weights: &Weights,
     targets: &'a [AdapterTarget],
     problems: &mut Vec<String>,
 ) -> BTreeMap<&'a str, Part> {
     let dotted: BTreeSet<&str> = targets.iter().map(|t| t.name.as_str()).collect();
+    let flat = |name: &str| name.replace('.', "_");
+    let layers = layers_per_block(targets);
+    let originals = targets
+        .iter()
+        .filter_map(|t| Some((flat(&original_attention(&t.name, layers)?), t.name.as_str())));
     let kohya: BTreeMap<String, &str> = targets
         .iter()
-        .map(|t| (t.name.replace('.', "_"), t.name.as_str()))
+        .map(|t| (flat(&t.name), t.name.as_str()))
+        .chain(originals)
         .collect();
     let mut parts: BTreeMap<&str, Part> = BTreeMap::new();
     for key in weights.names() {
@@ -285,5 +306,9 @@ fn read_adapter(
             Err(problem) => return Ok(Err(problem)),
         },
     };
-    Ok(Adapter::new(down, up, alpha).map_err(|e| format!("layer {:?}: {e}", target.name)))
+    let adapter = Adapter::new(down, up, alpha).map(|adapter| match target.pointwise_conv {
+        true => adapter.of_pointwise_conv(),
+        false => adapter,
+    });
+    Ok(adapter.map_err(|e| format!("layer {:?}: {e}", target.name)))
 }

@@ -43,6 +43,7 @@ pub struct Adapter {
     down: Linear,
     up: Linear,
     scale: f64,
+    pointwise_conv: bool,
 }
 
 impl Adapter {
@@ -62,6 +63,26 @@ impl Adapter {
             down: Linear::from_tensors(down, None)?,
             up: Linear::from_tensors(up, None)?,
             scale,
+            pointwise_conv: false,
+        })
+    }
+
+    /// The same for a layer that is a 1x1 convolution in the model's files: there [rank, inputs, 1, 1] and
+    /// [outputs, rank, 1, 1] are the shapes of its matrices.
+    pub fn of_pointwise_conv(self) -> Self {
+        Self {
+            pointwise_conv: true,
+            ..self
+        }
+    }
+
+    /// One of its matrices in the shape that files have.
+    fn as_stored(&self, matrix: &Tensor) -> Result<Tensor> {
+        let (rows, columns) = matrix.dims2()?;
+        let matrix = matrix.detach();
+        Ok(match self.pointwise_conv {
+            true => matrix.reshape((rows, columns, 1, 1))?,
+            false => matrix,
         })
     }
 
@@ -163,8 +184,12 @@ impl Lora {
         let mut lora = Self::default();
         for (name, adapter) in &self.adapters {
             let (down, up) = (constant(&adapter.down)?, constant(&adapter.up)?);
-            let scale = adapter.scale;
-            lora.insert_frozen(name, Adapter { down, up, scale });
+            let constant = Adapter {
+                down,
+                up,
+                ..*adapter
+            };
+            lora.insert_frozen(name, constant);
         }
         Ok(lora)
     }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
+use tokenizers::utils::SysRegex;
 
 use crate::config::ConfigFile;
 use crate::error::{Error, Result};
@@ -52,7 +53,61 @@ pub fn lora_files(path: &Path) -> Result<(PathBuf, Option<PathBuf>)> {
 }
 
 /// Settings of the training that matter for reading its result.
-pub(super) struct Settings(Value);
+#[derive(Default)]
+pub(super) struct Settings {
+    value: Value,
+    ranks: Vec<Pattern>,
+    alphas: Vec<Pattern>,
+}
+
+/// A number for the layers whose whole name, or its end after a dot, a regular expression matches, as in peft.
+struct Pattern {
+    layers: SysRegex,
+    number: f64,
+}
+
+/// Whether a value is of the kind that a setting takes.
+type Accepts = fn(&Value) -> bool;
+
+/// Settings that are used here, and what peft takes for each.
+const ACCEPTED_VALUES: [(&str, &str, Accepts); 8] = [
+    ("r", WHOLE_NUMBER, is_rank),
+    ("lora_alpha", NUMBER, Value::is_number),
+    ("use_rslora", "true or false", Value::is_boolean),
+    ("use_dora", "true or false", Value::is_boolean),
+    ("peft_type", "a text", Value::is_string),
+    ("init_lora_weights", "true, false or a text", |v| {
+        v.is_boolean() || v.is_string()
+    }),
+    ("rank_pattern", PATTERNS, Value::is_object),
+    ("alpha_pattern", PATTERNS, Value::is_object),
+];
+const PATTERNS: &str = "names of layers with their numbers, as in {\"to_q\": 8}";
+const NUMBER: &str = "a number without quotes";
+const WHOLE_NUMBER: &str = "a whole number above 0, without quotes";
+
+fn is_rank(value: &Value) -> bool {
+    value.as_f64().is_some_and(|r| r >= 1.0 && r.fract() == 0.0)
+}
+
+/// Characters of a value that a message quotes.
+const QUOTED: usize = 60;
+
+/// `"key": value`, as the file has it.
+fn quoted(key: &str, value: &Value) -> String {
+    let text = value.to_string();
+    let cut = match text.char_indices().nth(QUOTED) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text,
+    };
+    format!("{key:?}: {cut}")
+}
+
+/// Whether a key is one that peft writes, on its own or for a UNet that is not part of a pipeline.
+fn is_of_peft(key: &str) -> bool {
+    let is_matrix = key.ends_with(".lora_A.weight") || key.ends_with(".lora_B.weight");
+    key.starts_with(OWN_PREFIX) || (is_matrix && !key.starts_with("unet."))
+}
 
 impl Settings {
     /// Those of the file `path`, or what is wrong with them.
@@ -60,22 +115,24 @@ impl Settings {
         if let Some(text) = weights.metadata().get(METADATA) {
             let value = serde_json::from_str(text);
             let value = value.map_err(|e| format!("metadata {METADATA:?} is not JSON: {e}"));
-            return Ok(value.and_then(|value| Self(value).checked(METADATA)));
+            return Ok(value.and_then(|value| Self::checked(value, METADATA)));
         }
-        if !weights.names().any(|key| key.starts_with(OWN_PREFIX)) {
-            return Ok(Ok(Self(Value::Null)));
+        if !weights.names().any(is_of_peft) {
+            return Ok(Ok(Self::default()));
         }
         let config = path.with_file_name(CONFIG);
         if config.is_file() {
             let value = ConfigFile::read(&config)?.parse::<Value>()?;
-            let settings = Self(value);
-            if settings.field("lora_alpha").is_none_or(|a| !a.is_number()) {
-                return Ok(Err(format!("{CONFIG} beside it has no number lora_alpha")));
-            }
-            return Ok(settings.checked(CONFIG));
+            return Ok(Self::checked(value, CONFIG).and_then(|settings| {
+                match settings.field("lora_alpha") {
+                    Some(_) => Ok(settings),
+                    None => Err(format!("{CONFIG} beside it has no number lora_alpha")),
+                }
+            }));
         }
-        if weights.names().any(|key| key.ends_with(".alpha")) {
-            return Ok(Ok(Self(Value::Null)));
+        let is_own = weights.names().any(|key| key.starts_with(OWN_PREFIX));
+        if !is_own || weights.names().any(|key| key.ends_with(".alpha")) {
+            return Ok(Ok(Self::default()));
         }
         Ok(Err(format!(
             "nothing tells its alpha: its keys ({OWN_PREFIX}...) are those of peft, which writes alpha into {CONFIG}; put \
@@ -83,21 +140,41 @@ impl Settings {
         )))
     }
 
-    /// Refuses what is no plain LoRA.
-    fn checked(self, source: &str) -> Result<Self, String> {
-        if self.field("use_dora").and_then(Value::as_bool) == Some(true) {
+    /// The settings `value` of `source`. Refused is what is no plain LoRA, or has values of another kind than peft's.
+    fn checked(value: Value, source: &str) -> Result<Self, String> {
+        if !value.is_object() {
+            return Err(format!("{source} is not a JSON object"));
+        }
+        let mut settings = Self {
+            value,
+            ..Self::default()
+        };
+        let mut wrong = vec![];
+        for (name, accepted, is_accepted) in ACCEPTED_VALUES {
+            if let Some((key, value)) = settings.entry(name)
+                && !is_accepted(value)
+            {
+                wrong.push(format!("{} (accepted: {accepted})", quoted(&key, value)));
+            }
+        }
+        if !wrong.is_empty() {
+            return Err(format!("{source} has {}; correct it", wrong.join(", ")));
+        }
+        settings.ranks = settings.patterns(source, "rank_pattern", WHOLE_NUMBER, is_rank)?;
+        settings.alphas = settings.patterns(source, "alpha_pattern", NUMBER, Value::is_number)?;
+        if settings.field("use_dora").and_then(Value::as_bool) == Some(true) {
             return Err(format!(
                 "{source} says that it is a DoRA (use_dora); {ACCEPTED}"
             ));
         }
-        match self.field("peft_type").and_then(Value::as_str) {
+        match settings.field("peft_type").and_then(Value::as_str) {
             None | Some("LORA") => {}
             Some(other) => return Err(format!("{source} has peft_type = {other:?}; {ACCEPTED}")),
         }
-        let init = self.field("init_lora_weights").and_then(Value::as_str);
+        let init = settings.field("init_lora_weights").and_then(Value::as_str);
         let init = init.map(str::to_lowercase);
         match init.filter(|i| CHANGES_BASE.iter().any(|start| i.starts_with(start))) {
-            None => Ok(self),
+            None => Ok(settings),
             Some(init) => Err(format!(
                 "{source} has init_lora_weights = {init:?}, which changes the model's own weights; save it with peft's \
                  path_initial_model_for_weight_conversion"
@@ -105,19 +182,58 @@ impl Settings {
         }
     }
 
-    /// A setting, for the UNet or for all.
+    /// A setting, for the UNet or for all, and its key.
+    fn entry(&self, name: &str) -> Option<(String, &Value)> {
+        let keys = [format!("unet.{name}"), name.to_owned()];
+        let mut found = keys
+            .into_iter()
+            .filter_map(|key| self.value.get(&key).map(|value| (key, value)));
+        found.next().filter(|(_, value)| !value.is_null())
+    }
+
     fn field(&self, name: &str) -> Option<&Value> {
-        let own = self.0.get(format!("unet.{name}"));
-        own.or_else(|| self.0.get(name)).filter(|v| !v.is_null())
+        self.entry(name).map(|(_, value)| value)
+    }
+
+    /// The numbers that `name` gives to layers, in the file's order.
+    fn patterns(
+        &self,
+        source: &str,
+        name: &str,
+        accepted: &str,
+        is_accepted: Accepts,
+    ) -> Result<Vec<Pattern>, String> {
+        let Some(entries) = self.field(name).and_then(Value::as_object) else {
+            return Ok(vec![]);
+        };
+        let pattern = |(key, value): (&String, &Value)| {
+            let number = value.as_f64().filter(|_| is_accepted(value));
+            let number = number.ok_or_else(|| {
+                let quoted = quoted(key, value);
+                format!("{source} has {quoted} in {name} (accepted: {accepted}); correct it")
+            })?;
+            let layers = SysRegex::new(&format!(r"^(.*\.)?({key})$")).map_err(|e| {
+                format!(
+                    "{source}: {name} has {key:?}, which is no regular expression ({e}); correct it"
+                )
+            })?;
+            Ok(Pattern { layers, number })
+        };
+        entries.iter().map(pattern).collect()
     }
 
     /// alpha over the rank times the rank, of a layer whose matrices have `rank`; the rank where nothing is said.
     pub(super) fn alpha(&self, layer: &str, rank: usize) -> Result<f64, String> {
-        let wanted = match self.of_pattern("rank_pattern", layer)? {
-            Some(rank) => Some(rank),
-            None => self.field("r").and_then(Value::as_f64),
+        let number = |patterns: &[Pattern], name: &str| {
+            let first = patterns
+                .iter()
+                .find(|p| p.layers.find_iter(layer).next().is_some());
+            match first {
+                Some(pattern) => Some(pattern.number),
+                None => self.field(name).and_then(Value::as_f64),
+            }
         };
-        if let Some(wanted) = wanted
+        if let Some(wanted) = number(&self.ranks, "r")
             && wanted != rank as f64
         {
             return Err(format!(
@@ -125,39 +241,12 @@ impl Settings {
                  another LoRA"
             ));
         }
-        let alpha = match self.of_pattern("alpha_pattern", layer)? {
-            Some(alpha) => Some(alpha),
-            None => self.field("lora_alpha").and_then(Value::as_f64),
-        };
-        let alpha = alpha.unwrap_or(rank as f64);
+        let alpha = number(&self.alphas, "lora_alpha").unwrap_or(rank as f64);
         Ok(match self.field("use_rslora").and_then(Value::as_bool) {
             // The scale is alpha / sqrt(rank) [Kalajdzievski 2023].
             Some(true) => alpha * (rank as f64).sqrt(),
             _ => alpha,
         })
-    }
-
-    /// The number of the pattern's first key that is the layer's name, or its end. A key that starts with `^` is all of it.
-    fn of_pattern(&self, name: &str, layer: &str) -> Result<Option<f64>, String> {
-        let Some(pattern) = self.field(name).and_then(Value::as_object) else {
-            return Ok(None);
-        };
-        for (key, value) in pattern {
-            let (plain, whole) = match key.strip_prefix('^') {
-                Some(rest) => (rest, true),
-                None => (key.as_str(), false),
-            };
-            let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '.';
-            if !plain.chars().all(is_plain) {
-                return Err(format!(
-                    "{name} has the regular expression {key:?}; accepted: names of layers, or their ends"
-                ));
-            }
-            if layer == plain || (!whole && layer.ends_with(&format!(".{plain}"))) {
-                return Ok(value.as_f64());
-            }
-        }
-        Ok(None)
     }
 }
 

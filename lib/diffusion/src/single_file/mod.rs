@@ -13,6 +13,8 @@ use std::path::{Path, PathBuf};
 
 use candle_core::{DType, Device};
 
+pub(crate) use names::original_attention;
+
 use crate::error::{Error, Result};
 use crate::model::Model;
 use crate::parameters::Parameters;

@@ -50,6 +50,25 @@ pub(super) fn unet(name: &str, layers: usize) -> String {
     .unwrap_or_else(stays)
 }
 
+/// The reverse for a layer of an attention: `down_blocks.1.attentions.0.proj_in` to `input_blocks.4.1.proj_in`. Nothing for
+/// other layers.
+pub(crate) fn original_attention(name: &str, layers: usize) -> Option<String> {
+    if let Some(rest) = name.strip_prefix("mid_block.attentions.0.") {
+        return Some(format!("middle_block.1.{rest}"));
+    }
+    let (block, rest) = name.split_once('.')?;
+    let (level, rest) = rest.split_once(".attentions.")?;
+    let (index, rest) = rest.split_once('.')?;
+    let (level, index): (usize, usize) = (level.parse().ok()?, index.parse().ok()?);
+    let n = level * (layers + 1) + index;
+    match block {
+        // The first is the convolution of the input.
+        "down_blocks" => Some(format!("input_blocks.{}.1.{rest}", n + 1)),
+        "up_blocks" => Some(format!("output_blocks.{n}.1.{rest}")),
+        _ => None,
+    }
+}
+
 /// `3.0.rest` to (3, 0, `rest`).
 fn two_numbers(text: &str) -> Option<(usize, usize, &str)> {
     let (first, rest) = text.split_once('.')?;
@@ -192,4 +211,42 @@ pub(super) fn open_clip(name: &str, layers: usize) -> Vec<String> {
         ("mlp.c_proj.", "mlp.fc2."),
     ];
     vec![of(&replaced(rest, &PARTS))]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn layers_of_attentions_are_found_under_their_original_names() {
+        for (original, name) in [
+            (
+                "input_blocks.1.1.proj_in",
+                "down_blocks.0.attentions.0.proj_in",
+            ),
+            (
+                "input_blocks.8.1.proj_in",
+                "down_blocks.2.attentions.1.proj_in",
+            ),
+            ("middle_block.1.proj_in", "mid_block.attentions.0.proj_in"),
+            (
+                "output_blocks.3.1.proj_in",
+                "up_blocks.1.attentions.0.proj_in",
+            ),
+            (
+                "output_blocks.11.1.proj_in",
+                "up_blocks.3.attentions.2.proj_in",
+            ),
+        ] {
+            assert_eq!(unet(original, 2), name);
+            assert_eq!(original_attention(name, 2).as_deref(), Some(original));
+        }
+        for name in [
+            "conv_in",
+            "down_blocks.0.resnets.0.conv1",
+            "time_embedding.linear_1",
+        ] {
+            assert_eq!(original_attention(name, 2), None, "{name}");
+        }
+    }
 }

@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use candle_core::{DType, Device, Tensor};
-use dipir_diffusion::lora::Lora;
+use dipir_diffusion::lora::{Lora, LoraInfo, LoraStyle};
 use dipir_diffusion::model::load_unet;
 use dipir_diffusion::weights::{Weights, write_safetensors};
 
@@ -225,8 +225,8 @@ fn adapters_that_peft_wrote_have_the_alpha_of_the_configuration_beside_them() ->
             "of rank 4, the settings of the training say 8",
         ),
         (
-            r#"{"r": 4, "lora_alpha": 16, "alpha_pattern": {".*to_q": 1}}"#,
-            "the regular expression \".*to_q\"",
+            r#"{"r": 4, "lora_alpha": 16, "alpha_pattern": {"to_[qk": 1}}"#,
+            "has \"to_[qk\", which is no regular expression",
         ),
         (
             r#"{"r": 4, "lora_alpha": 16, "init_lora_weights": "pissa_niter_4"}"#,
@@ -237,14 +237,219 @@ fn adapters_that_peft_wrote_have_the_alpha_of_the_configuration_beside_them() ->
         std::fs::write(&config, text)?;
         refusal(part)?;
     }
+    // So have keys without a prefix, of a UNet on its own.
+    let renamed = |prefix: &str| -> BTreeMap<String, Tensor> {
+        let entries = tensors.iter();
+        let entries = entries.map(|(k, v)| (k.replace("base_model.model.", prefix), v.clone()));
+        entries.collect()
+    };
+    write_safetensors(&path, &renamed(""), &header)?;
+    for (text, scale) in [
+        (r#"{"r": 4, "lora_alpha": 16}"#, 4.0),
+        (r#"{"r": 4, "lora_alpha": 16, "use_rslora": true}"#, 8.0),
+        (
+            r#"{"r": 4, "lora_alpha": 16, "alpha_pattern": {"to_q": 8}}"#,
+            2.0,
+        ),
+    ] {
+        std::fs::write(&config, text)?;
+        assert_eq!(scale_of_ones(&path, 4)?, scale, "{text}");
+    }
+    std::fs::remove_file(&config)?;
+    assert_eq!(scale_of_ones(&path, 4)?, 1.0);
     // Keys of others do not take a configuration that happens to be there.
     std::fs::write(&config, r#"{"r": 4, "lora_alpha": 16}"#)?;
-    let others: BTreeMap<String, Tensor> = tensors
-        .iter()
-        .map(|(k, v)| (k.replace("base_model.model", "unet"), v.clone()))
-        .collect();
-    write_safetensors(&path, &others, &header)?;
+    write_safetensors(&path, &renamed("unet."), &header)?;
     assert_eq!(scale_of_ones(&path, 4)?, 1.0);
+    Ok(())
+}
+
+/// What a file of ones with these settings in its header is read as: the scale, or what is wrong.
+fn scale_with_metadata(metadata: &str) -> Result<f64, Box<dyn std::error::Error>> {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("lora.safetensors");
+    let layer = "unet.down_blocks.0.attentions.0.transformer_blocks.0.attn1.to_q";
+    let ones = |a, b| Tensor::ones((a, b), DType::F32, &Device::Cpu);
+    let tensors = BTreeMap::from([
+        (format!("{layer}.lora_A.weight"), ones(4, 16)?),
+        (format!("{layer}.lora_B.weight"), ones(16, 4)?),
+    ]);
+    let header = BTreeMap::from([("lora_adapter_metadata".into(), metadata.into())]);
+    write_safetensors(&path, &tensors, &header)?;
+    scale_of_ones(&path, 4)
+}
+
+#[test]
+fn patterns_are_regular_expressions_of_the_end_of_a_name() -> Outcome {
+    // What peft's get_pattern_key finds for down_blocks.0.attentions.0.transformer_blocks.0.attn1.to_q.
+    for (pattern, is_found) in [
+        ("to_q", true),
+        ("o_q", false),
+        ("to_", false),
+        ("attn1.to_q", true),
+        ("attn..to_q", true),
+        ("to.q", true),
+        (".to_q", false),
+        (r"attn1\\.to_q", true),
+        (r"attn\\d.to_[qk]", true),
+        ("to_k|to_q", true),
+        (".*to_q", true),
+        ("down_blocks.*", true),
+        ("^to_q", false),
+        (
+            "^down_blocks.0.attentions.0.transformer_blocks.0.attn1.to_q",
+            true,
+        ),
+        ("attn1.to_q$", true),
+        ("attentions.*attn2.*", false),
+    ] {
+        let metadata =
+            format!(r#"{{"unet.lora_alpha": 8, "unet.alpha_pattern": {{"{pattern}": 2}}}}"#);
+        let scale = if is_found { 0.5 } else { 2.0 };
+        assert_eq!(scale_with_metadata(&metadata)?, scale, "{pattern}");
+        let metadata = format!(r#"{{"r": 4, "rank_pattern": {{"{pattern}": 8}}}}"#);
+        assert_eq!(
+            scale_with_metadata(&metadata).is_err(),
+            is_found,
+            "{pattern}"
+        );
+    }
+    // The first that fits counts.
+    let metadata = r#"{"alpha_pattern": {"attn2.*": 1, "attn1.*": 2, "to_q": 4}}"#;
+    assert_eq!(scale_with_metadata(metadata)?, 0.5);
+    Ok(())
+}
+
+#[test]
+fn settings_of_a_wrong_type_are_quoted() -> Outcome {
+    for (metadata, part) in [
+        (
+            r#"{"lora_alpha": "16"}"#,
+            "lora_adapter_metadata has \"lora_alpha\": \"16\" (accepted: a number without quotes); correct it",
+        ),
+        (
+            r#"{"unet.lora_alpha": 16, "unet.use_rslora": "yes"}"#,
+            "has \"unet.use_rslora\": \"yes\" (accepted: true or false)",
+        ),
+        (
+            r#"{"r": 4.5, "use_dora": 1}"#,
+            "has \"r\": 4.5 (accepted: a whole number above 0, without quotes), \"use_dora\": 1 (accepted: true or false)",
+        ),
+        (
+            r#"{"alpha_pattern": [["to_q", 8]]}"#,
+            "\"alpha_pattern\": [[\"to_q\",8]] (accepted:",
+        ),
+        (
+            r#"{"alpha_pattern": {"to_q": "8"}}"#,
+            "has \"to_q\": \"8\" in alpha_pattern (accepted: a number without quotes)",
+        ),
+        (
+            r#"{"rank_pattern": {"to_v": 0}}"#,
+            "has \"to_v\": 0 in rank_pattern (accepted: a whole number above 0",
+        ),
+        (r#"{"peft_type": 3}"#, "\"peft_type\": 3 (accepted: a text)"),
+        ("[16]", "lora_adapter_metadata is not a JSON object"),
+    ] {
+        let message = scale_with_metadata(metadata).expect_err(metadata);
+        assert!(message.to_string().contains(part), "{message}");
+    }
+    let nothing_said = r#"{"lora_alpha": null, "use_rslora": null, "init_lora_weights": true}"#;
+    assert_eq!(scale_with_metadata(nothing_said)?, 1.0);
+    Ok(())
+}
+
+#[test]
+fn matrices_of_convolutions_have_the_shape_of_convolutions_in_files() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("lora.safetensors");
+    // Stable Diffusion 1 has convolutions there, 2 has matrices.
+    for (family, dims) in [(family(), 4), (family().with_file_name("sd21"), 2)] {
+        let targets = load_unet(&family.join("unet"), DType::F32, &Device::Cpu)?.adapter_targets();
+        let layers = [
+            "down_blocks.0.attentions.0.proj_in",
+            "up_blocks.1.attentions.1.proj_out",
+        ];
+        let mut flat = BTreeMap::new();
+        for layer in layers {
+            let target = targets.iter().find(|t| t.name == layer).ok_or(layer)?;
+            let ones = |a, b| Tensor::ones((a, b), DType::F32, &Device::Cpu);
+            flat.insert(
+                format!("unet.{layer}.lora_A.weight"),
+                ones(4, target.inputs)?,
+            );
+            flat.insert(
+                format!("unet.{layer}.lora_B.weight"),
+                ones(target.outputs, 4)?,
+            );
+        }
+        write_safetensors(&path, &flat, &BTreeMap::new())?;
+        let lora = Lora::load(&path, &targets, DType::F32, &Device::Cpu)?;
+        // What trains or guides has matrices; a copy in another precision is written alike.
+        for lora in [&lora, &lora.constant(DType::F32)?] {
+            for style in [LoraStyle::Peft, LoraStyle::Kohya] {
+                lora.save(&path, style, &LoraInfo::new())?;
+                let written = tensors(&path)?;
+                let matrices = written.iter().filter(|(key, _)| !key.ends_with(".alpha"));
+                for (key, matrix) in matrices {
+                    assert_eq!(matrix.dims().len(), dims, "{key}: {:?}", matrix.dims());
+                    assert!(matrix.dims()[2..].iter().all(|&n| n == 1), "{key}");
+                }
+                let again = Lora::load(&path, &targets, DType::F32, &Device::Cpu)?;
+                for (name, adapter) in lora.adapters() {
+                    let other = again.adapter(name).ok_or(name.as_str())?;
+                    let values = |t: &Tensor| t.to_vec2::<f32>();
+                    assert_eq!(values(adapter.down())?, values(other.down())?);
+                    assert_eq!(values(adapter.up())?, values(other.up())?);
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn kohya_files_with_the_original_names_of_blocks_mean_the_same() -> Outcome {
+    let unet = load_unet(&family().join("unet"), DType::F32, &Device::Cpu)?;
+    let targets = unet.adapter_targets();
+    let load = |path: &Path| Lora::load(path, &targets, DType::F32, &Device::Cpu);
+    let known = family().join("lora_kohya.safetensors");
+    let wanted = load(&known)?;
+    // A level of this UNet has one block and what shrinks it on the way down, two on the way up.
+    let original = |key: &str| {
+        key.replace("down_blocks_0_attentions_0", "input_blocks_1_1")
+            .replace("down_blocks_1_attentions_0", "input_blocks_3_1")
+            .replace("mid_block_attentions_0", "middle_block_1")
+            .replace("up_blocks_1_attentions_0", "output_blocks_2_1")
+            .replace("up_blocks_1_attentions_1", "output_blocks_3_1")
+            .replace("up_blocks_2_attentions_0", "output_blocks_4_1")
+            .replace("up_blocks_2_attentions_1", "output_blocks_5_1")
+    };
+    let renamed: BTreeMap<String, Tensor> = tensors(&known)?
+        .into_iter()
+        .map(|(key, tensor)| (original(&key), tensor))
+        .collect();
+    assert!(renamed.keys().all(|key| !key.contains("attentions")));
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("lora.safetensors");
+    write_safetensors(&path, &renamed, &BTreeMap::new())?;
+    let found = load(&path)?;
+    assert_eq!(found.adapters().len(), wanted.adapters().len());
+    for (name, adapter) in wanted.adapters() {
+        let other = found.adapter(name).ok_or(name.as_str())?;
+        assert_eq!(other.alpha(), adapter.alpha(), "{name}");
+        let values = |t: &Tensor| t.to_vec2::<f32>();
+        assert_eq!(values(other.up())?, values(adapter.up())?, "{name}");
+    }
+    // Of a larger model.
+    let key = "lora_unet_input_blocks_7_1_transformer_blocks_0_attn1_to_q.lora_down.weight";
+    let matrix = Tensor::zeros((4, 16), DType::F32, &Device::Cpu)?;
+    write_safetensors(
+        &path,
+        &BTreeMap::from([(key.into(), matrix)]),
+        &BTreeMap::new(),
+    )?;
+    let message = load(&path).expect_err(key).to_string();
+    assert!(message.contains("belongs to no layer"), "{message}");
     Ok(())
 }
 

@@ -66,7 +66,10 @@ pub(crate) enum First {
 impl First {
     fn of(session: &Session, table: &LightTable, guide: &Guide) -> anyhow::Result<Self> {
         let first = match (&table.start, guide) {
-            (Start::File(_), _) => Self::File,
+            (Start::File(path), _) => {
+                refuse_misspelt(session, path)?;
+                Self::File
+            }
             (Start::Neutral, _) | (Start::Auto, Guide::Reference { .. }) => Self::Neutral,
             (
                 _,
@@ -261,6 +264,24 @@ fn model_guide(session: &Session, table: &LightTable, adapted: bool) -> anyhow::
     })
 }
 
+/// Refuses a start that was meant as one of the words: a name without extension, and no such file. A file with an extension
+/// that is not there is refused where it is read.
+fn refuse_misspelt(session: &Session, path: &Path) -> anyhow::Result<()> {
+    if path.extension().is_some() || (path.file_name().is_some() && session.resolve(path).exists())
+    {
+        return Ok(());
+    }
+    let word = path.to_string_lossy();
+    let mut message = format!(
+        "\"{word}\" is neither a file nor one of these words; accepted: auto, estimated, read, encoder, neutral, or a \
+         lighting.json"
+    );
+    if word.to_lowercase().starts_with("candidate") {
+        message += "; a candidate is chosen by its number in candidates.png, as in start = \"estimated\" and candidate = 2";
+    }
+    Err(session.config.invalid("light.start", message).into())
+}
+
 /// Lobes of a light: every sample of a picture looks at each of them.
 const MOST_LOBES: usize = 4096;
 
@@ -272,6 +293,7 @@ pub(super) fn first_light(
     let Start::File(path) = &table.start else {
         return Ok(None);
     };
+    refuse_misspelt(session, path)?;
     let file = session.resolve(path);
     let read = || -> anyhow::Result<Lighting> {
         // A pipe would be waited for, and a device be read without end.
@@ -338,4 +360,49 @@ pub(super) fn read_reference(
     }
     let image = scene.loaded.undistorted(image);
     Ok(transfer.encode(&frame.scale(&image)))
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use dipir_cli::exit;
+
+    use super::*;
+    use crate::command_line::light::Cli;
+
+    #[test]
+    fn a_start_that_is_neither_a_word_nor_a_file_is_told_what_there_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("pipeline.toml");
+        std::fs::write(&file, "[scene]\nbackground = \"photo.png\"\n").unwrap();
+        std::fs::write(folder.path().join("mine"), "{}").unwrap();
+        let start = |start: &str| {
+            let path = file.display().to_string();
+            let set = format!("light.start={start:?}");
+            let args = ["dipir-light", "-q", "-p", &path, "--set", &set];
+            let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+            Request::of(&session).map(|request| request.start)
+        };
+        let words = "accepted: auto, estimated, read, encoder, neutral, or a lighting.json";
+        let number = "start = \"estimated\" and candidate = 2";
+        for (value, has_number) in [
+            ("candidate", true),
+            ("candidate 2", true),
+            ("natural", false),
+            ("", false),
+        ] {
+            let error = start(value).unwrap_err();
+            assert_eq!(exit::code_of(&error), exit::USAGE);
+            let message = exit::describe(&error);
+            assert!(
+                message.contains(&format!("light.start: {value:?} is neither")),
+                "{message}"
+            );
+            assert!(message.contains(words), "{message}");
+            assert_eq!(message.contains(number), has_number, "{message}");
+        }
+        for there in ["mine", "./mine", "none.json"] {
+            assert_eq!(start(there).unwrap(), First::File, "{there}");
+        }
+    }
 }

@@ -6,7 +6,7 @@ pub mod folder;
 mod history;
 mod own;
 mod resume;
-mod sheet;
+pub(crate) mod sheet;
 pub mod table;
 
 use std::fmt;
@@ -420,6 +420,7 @@ fn show_change(
     let sheet = Sheet {
         prompts: vec![data.prompt.clone(), own, plain],
         steps: table.sheet_steps,
+        of: "what was trained".into(),
     };
     let progress = session.progress("sheet");
     let path = writer.output("sheet", "sheet.png")?;

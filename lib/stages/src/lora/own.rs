@@ -2,11 +2,13 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use candle_core::DType;
+use candle_core::{DType, Tensor};
 use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_diffusion::lora::{Lora, LoraInfo, LoraStyle, lora_files};
 use dipir_diffusion::model::Model;
+use dipir_diffusion::noise::NoiseStream;
+use dipir_diffusion::pass::Pass;
 use dipir_pipeline::stage::{StagePlan, StageWriter};
 use serde_json::{Value, json};
 
@@ -20,6 +22,8 @@ use crate::names::{LORA, begin};
 
 /// Role of its files among the stage's inputs.
 const ROLE: &str = "LoRA";
+/// Raised whenever a file gives other outputs. It is added to the stage's version, so that nothing is trained again for it.
+const VERSION: u32 = 1;
 
 /// What was read.
 pub(super) struct Read {
@@ -56,6 +60,7 @@ pub(super) fn plan(session: &Session, table: &LoraTable, path: &Path) -> anyhow:
         "lora": {"path": json_path(named(&file)), "word": table.word, "sheet_steps": table.sheet_steps},
     });
     let mut plan = LORA.plan(session, params);
+    plan.version += VERSION;
     plan.device = session.pipeline.device.clone();
     for location in std::iter::once(&file).chain(&config) {
         plan.input(ROLE, &named(location), location)?;
@@ -77,6 +82,7 @@ pub(super) fn run(session: &Session, table: &LoraTable, path: &Path) -> anyhow::
     let lora = Lora::load(&session.resolve(path), &targets, DType::F32, model.device())
         .map_err(anyhow::Error::from)
         .and_then(finite)
+        .and_then(|lora| predicting(&model, lora))
         .with_context(|| format!("cannot use lora.path = \"{}\"", path.display()))?;
     let info = LoraInfo::from([
         ("word".to_owned(), table.word.clone()),
@@ -113,19 +119,61 @@ pub(super) fn run(session: &Session, table: &LoraTable, path: &Path) -> anyhow::
     })
 }
 
+/// Whether every value of a tensor in f32 is finite.
+fn all_finite(values: &Tensor) -> candle_core::Result<bool> {
+    // 0 times anything else is NaN.
+    let sum = (values * 0.0)?.sum_all()?.to_scalar::<f32>()?;
+    Ok(sum == 0.0)
+}
+
 /// Refuses matrices that are not finite: every prediction with them would not be, either.
 fn finite(lora: Lora) -> anyhow::Result<Lora> {
     for (layer, adapter) in lora.adapters() {
         for matrix in [adapter.down(), adapter.up()] {
-            // 0 times anything else is NaN.
-            let sum = (matrix * 0.0).and_then(|m| m.sum_all()?.to_scalar::<f32>())?;
             anyhow::ensure!(
-                sum == 0.0,
+                all_finite(matrix)?,
                 "the matrices of layer \"{layer}\" are not finite; train the LoRA again, or export it in f32"
             );
         }
     }
     Ok(lora)
+}
+
+/// Refuses a LoRA with which the model's prediction is not finite, where it is without: the model is whole.
+fn predicting(model: &Model, lora: Lora) -> anyhow::Result<Lora> {
+    let config = model.unet.config();
+    // The smallest picture that every level of the network can halve.
+    let side = 1 << (config.levels() - 1);
+    let dims = [1, config.in_channels, side, side];
+    let noise = NoiseStream::new(1, 0).normal_tensor(&dims, DType::F32, model.device())?;
+    let noise = noise.to_dtype(model.dtype())?;
+    let context = model.encode_prompts(&[""], None)?;
+    let middle = [(model.schedule.len() / 2) as f64];
+    let is_finite = |pass: &Pass| -> anyhow::Result<bool> {
+        let prediction = model.unet.predict(&noise, &middle, &context, pass)?;
+        Ok(all_finite(&prediction.to_dtype(DType::F32)?)?)
+    };
+    let adapted = Pass {
+        lora: Some(lora.constant(model.dtype())?.into()),
+        ..Pass::default()
+    };
+    // Without it only where something is wrong, for it takes as long.
+    if is_finite(&adapted)? || !is_finite(&Pass::default())? {
+        return Ok(lora);
+    }
+    let (mut largest, mut of) = (0.0, "");
+    for (layer, adapter) in lora.adapters() {
+        for matrix in [adapter.down(), adapter.up()] {
+            let value = matrix.abs()?.max_all()?.to_scalar::<f32>()?;
+            if value > largest {
+                (largest, of) = (value, layer);
+            }
+        }
+    }
+    anyhow::bail!(
+        "with it the model's prediction is not finite, without it it is: its values reach {largest:.1e} (layer \"{of}\"); \
+         train the LoRA again with a lower learning rate, or use one that was saved earlier"
+    )
 }
 
 /// A root mean square difference of display values that is not seen: a tenth of an 8-bit step.
@@ -153,6 +201,7 @@ fn sheet(
     let sheet = Sheet {
         prompts: class_prompts(&class(session)?, &table.word).into(),
         steps: table.sheet_steps,
+        of: format!("lora.path = \"{}\"", path_of(table)),
     };
     let progress = session.progress("sheet");
     let path = writer.output("sheet", "sheet.png")?;

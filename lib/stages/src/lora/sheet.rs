@@ -2,6 +2,7 @@
 use std::path::Path;
 
 use dipir_cli::interrupt;
+use dipir_diffusion::Error;
 use dipir_diffusion::generate::{GenerateSettings, generate};
 use dipir_diffusion::lora::Lora;
 use dipir_diffusion::model::Model;
@@ -13,7 +14,7 @@ use dipir_imaging::raster::{DisplayImage, Raster};
 use glam::Vec3;
 
 /// Longest side of a picture that is sampled, pixels: a quarter of the time of Stable Diffusion's own.
-const LONGEST: usize = 256;
+pub(crate) const LONGEST: usize = 256;
 /// Shortest side of a picture on the sheet: smaller ones are enlarged, pixel by pixel.
 const SHORTEST: usize = 128;
 /// Pixels between pictures.
@@ -25,6 +26,8 @@ pub(super) struct Sheet {
     pub(super) prompts: Vec<String>,
     /// Denoising steps.
     pub(super) steps: usize,
+    /// What the LoRA is called in messages.
+    pub(super) of: String,
 }
 
 /// The side of a model's pictures on the sheet, a multiple of what it needs.
@@ -56,8 +59,16 @@ impl Sheet {
         for (index, prompt) in self.prompts.iter().enumerate() {
             let mut row = vec![];
             for pass in [&Pass::default(), &adapted] {
-                row.push(self.sample(model, learned, prompt, index, pass, |part| {
+                let picture = self.sample(model, learned, prompt, index, pass, |part| {
                     progress((done + part) / pictures);
+                });
+                // The picture without it, which comes first, is finite then: it is not the model that is wrong.
+                let of_lora = |e: &anyhow::Error| {
+                    pass.lora.is_some() && matches!(e.downcast_ref(), Some(Error::NotFinite { .. }))
+                };
+                row.push(picture.map_err(|e| match of_lora(&e) {
+                    true => self.not_finite(),
+                    false => e,
                 })?);
                 done += 1.0;
             }
@@ -68,6 +79,14 @@ impl Sheet {
         }
         write_png(path, &DisplayImage(arranged(&rows)))?;
         Ok((squares / self.prompts.len().max(1) as f64).sqrt())
+    }
+
+    fn not_finite(&self) -> anyhow::Error {
+        anyhow::anyhow!(
+            "cannot use {}: the model's pictures are finite without it and not finite with it; train the LoRA again with a \
+             lower learning rate",
+            self.of
+        )
     }
 
     fn sample(

@@ -147,6 +147,13 @@ impl LoraTable {
         {
             return wrong("time_budget_s", &s, "above 0");
         }
+        if self.path.as_ref().is_some_and(|p| p.as_os_str().is_empty()) {
+            return Err(config.invalid(
+                "lora.path",
+                "is empty: name a .safetensors file, or a folder that peft or diffusers wrote, as in path = \
+                 \"style.safetensors\"; without the key one is trained",
+            ));
+        }
         if self.path.is_some() && self.learn_word {
             return Err(config.invalid(
                 "lora.learn_word",
@@ -252,6 +259,9 @@ mod tests {
         }
         let message = refusal("path = \"a.safetensors\"\nlearn_word = true").expect("refused");
         let part = "pipeline.toml:3: lora.learn_word: true has no meaning with lora.path";
+        assert!(message.contains(part), "{message}");
+        let message = refusal("path = \"\"").expect("refused");
+        let part = "pipeline.toml:2: lora.path: is empty: name a .safetensors file";
         assert!(message.contains(part), "{message}");
         // Without learning, several words may stand for the light.
         assert_eq!(refusal("word = \"my word\""), None);

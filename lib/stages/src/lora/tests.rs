@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use candle_core::{DType, Device, Tensor};
 use clap::Parser;
 use dipir_cli::exit;
+use dipir_diffusion::check::Times;
 use dipir_diffusion::weights::{Weights, write_safetensors};
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_pipeline::manifest::hash_file;
@@ -14,6 +15,7 @@ use tempfile::TempDir;
 use super::*;
 use crate::command_line::lora::Cli;
 use crate::graph::{graph, state_of};
+use crate::model::forecast;
 
 fn family() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../diffusion/tests/references/sd15")
@@ -150,6 +152,70 @@ fn a_lora_that_does_not_fit_is_refused_by_key_and_name() {
     let (message, code) = refusal(&own);
     assert!(message.contains("lora.path: "), "{message}");
     assert_eq!(code, exit::USAGE);
+}
+
+#[test]
+fn a_lora_of_huge_values_is_named_and_not_the_model() {
+    let folder = project();
+    peft_folder(&folder, 6.0, |t| (t * 1e18).unwrap());
+    for steps in ["lora.sheet_steps=0", "lora.sheet_steps=1"] {
+        let (message, code) = refusal(&session(&folder, &["lora.path=lora", steps]));
+        for part in [
+            "cannot use lora.path = \"lora\"",
+            "prediction is not finite",
+            "its values reach",
+        ] {
+            assert!(message.contains(part), "{message}");
+        }
+        assert!(!message.contains("dipir-model check"), "{message}");
+        assert_eq!(code, exit::FAILED);
+    }
+}
+
+#[test]
+fn a_sheet_that_is_not_finite_with_the_lora_alone_is_not_laid_on_the_model() {
+    let folder = project();
+    peft_folder(&folder, 6.0, |t| (t * 1e18).unwrap());
+    let own = session(&folder, &[]);
+    let model = model::load(&own, &own.config.table("model").unwrap()).unwrap();
+    let targets = model.unet.adapter_targets();
+    let path = folder.path().join("lora");
+    let lora = dipir_diffusion::lora::Lora::load(&path, &targets, DType::F32, &Device::Cpu);
+    let sheet = Sheet {
+        prompts: vec!["a toy".into()],
+        steps: 1,
+        of: "the LoRA x".into(),
+    };
+    let to = folder.path().join("sheet.png");
+    let error = sheet.write(&model, &lora.unwrap(), None, &to, |_| ());
+    let message = error.expect_err("not finite").to_string();
+    assert!(message.contains("cannot use the LoRA x: "), "{message}");
+}
+
+#[test]
+fn what_reading_a_lora_takes_is_foretold() {
+    let folder = project();
+    let times = Times {
+        size: 512,
+        unet_s: 1.0,
+        sampling_step_s: 2.0,
+        decode_s: 8.0,
+        lora_step_s: 1000.0,
+        ..Times::default()
+    };
+    let work = |sets: &[&str]| {
+        let works = forecast::works(&session(&folder, sets), &times).unwrap();
+        works.into_iter().find(|w| w.stage == "lora").unwrap()
+    };
+    // Two pictures without and two with it, of a quarter of the pixels.
+    let read = work(&["lora.path=lora", "lora.sheet_steps=12"]);
+    assert_eq!(read.seconds, 1.0 + 4.0 * (12.0 * 2.0 + 8.0) / 4.0);
+    let words = "check of a finished LoRA, 4 pictures of 12 steps for its sheet";
+    assert_eq!(read.what, words);
+    assert_eq!(read.halved_by, ["lora.sheet_steps = 6"]);
+    let checked = work(&["lora.path=lora", "lora.sheet_steps=0"]);
+    assert_eq!((checked.seconds, checked.halved_by), (1.0, vec![]));
+    assert_eq!(work(&[]).seconds, 2000.0);
 }
 
 #[test]

@@ -11,6 +11,7 @@ use crate::concepts::table::ConceptsTable;
 use crate::light::method::Method;
 use crate::light::request::{Guide, Request};
 use crate::lora::preserves_concepts;
+use crate::lora::sheet;
 use crate::lora::table::LoraTable;
 use crate::model::ModelTable;
 use crate::names::{CONCEPTS, LIGHT, LORA};
@@ -80,7 +81,7 @@ pub fn works(session: &Session, times: &Times) -> anyhow::Result<Vec<Work>> {
         if preserves_concepts(session)? {
             works.push(concepts(session, times)?);
         }
-        works.extend(lora(session, times)?);
+        works.push(lora(session, times)?);
     }
     let iterations = request.settings.iterations;
     // Ten steps of a sampler take the place of one, from the drawn timestep down: half of them on average.
@@ -143,11 +144,35 @@ fn concepts(session: &Session, times: &Times) -> anyhow::Result<Work> {
     })
 }
 
-/// The training of a LoRA, if one is trained.
-fn lora(session: &Session, times: &Times) -> anyhow::Result<Option<Work>> {
+/// Pictures on the sheet of a finished LoRA: two prompts, each without it and with it.
+const OWN_PICTURES: usize = 4;
+
+/// What a finished LoRA takes: its check, which asks the model once, and its sheet.
+fn own_lora(table: &LoraTable, times: &Times) -> Work {
+    let steps = table.sheet_steps;
+    // As for the images of concepts.
+    let scale = (sheet::LONGEST.min(times.size) as f64 / times.size as f64).powi(2);
+    let picture = (steps as f64 * times.sampling_step_s + times.decode_s) * scale + times.text_s;
+    let (mut what, mut seconds) = ("check of a finished LoRA".to_owned(), times.unet_s);
+    if steps > 0 {
+        what += &format!(", {OWN_PICTURES} pictures of {steps} steps for its sheet");
+        seconds += OWN_PICTURES as f64 * picture;
+    }
+    let halved = steps.div_ceil(2);
+    let halved = (halved < steps).then(|| format!("lora.sheet_steps = {halved}"));
+    Work {
+        stage: LORA.name,
+        what,
+        seconds,
+        halved_by: halved.into_iter().collect(),
+    }
+}
+
+/// The training of a LoRA, or the check of a finished one.
+fn lora(session: &Session, times: &Times) -> anyhow::Result<Work> {
     let table: LoraTable = session.config.table("lora")?;
     if table.path.is_some() {
-        return Ok(None);
+        return Ok(own_lora(&table, times));
     }
     let updates = (table.steps * table.accumulation) as f64 * times.lora_step_s;
     let mut halved_by = vec![format!("lora.steps = {}", table.steps.div_ceil(2))];
@@ -162,10 +187,10 @@ fn lora(session: &Session, times: &Times) -> anyhow::Result<Option<Work>> {
         1 => format!("{} updates", table.steps),
         n => format!("{} updates of {n} examples", table.steps),
     };
-    Ok(Some(Work {
+    Ok(Work {
         stage: LORA.name,
         what,
         seconds: updates.min(table.time_budget_s.unwrap_or(f64::INFINITY)),
         halved_by,
-    }))
+    })
 }
