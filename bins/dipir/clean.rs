@@ -59,8 +59,10 @@ pub fn run(args: &CleanArgs) -> anyhow::Result<()> {
     let stages: Vec<&'static str> = stages.filter(|stage| asked(stage)).collect();
     let mut frames = shot::folders(out);
     let is_ours = |frame: &Path| {
-        let mut owned = stages.iter().map(|s| Owned::of_stage(&frame.join(s), s));
-        owned.any(|o| o.is_some())
+        stages.iter().any(|stage| {
+            let folder = frame.join(stage);
+            Owned::of_stage(&folder, stage).is_some() || !stage::untidy(&folder, stage).is_empty()
+        })
     };
     frames.retain(|frame| is_ours(frame));
     let all = || std::iter::once(out).chain(&frames);

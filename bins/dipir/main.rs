@@ -2,6 +2,7 @@
 mod clean;
 mod init;
 mod keys;
+mod made;
 mod manual;
 mod place;
 mod plan;

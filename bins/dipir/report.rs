@@ -26,7 +26,7 @@ pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
         return Err(Usage(message.into()).into());
     }
     let needed = graph.up_to(graph::LAST);
-    let (path, truth) = write(&args.project, &session, &graph, &needed)?;
+    let (path, truth) = write(&args.project, &session, &graph, &needed, &[])?;
     session.result(
         || in_words(&path, truth.as_ref()),
         || json!({"report": json_path(&path), "truth": truth}),
@@ -34,12 +34,13 @@ pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Writes the page; where it is, and the comparison with the true light, if that is known.
+/// Writes the page, with the frames that `failed`; where it is, and the comparison with the true light, if that is known.
 pub fn write(
     args: &ProjectArgs,
     session: &Session,
     graph: &Graph,
     needed: &[&Node],
+    failed: &[String],
 ) -> anyhow::Result<(PathBuf, Option<Truth>)> {
     let status = graph::assess(session, graph, needed)?;
     let truth = truth::compare(session).unwrap_or_else(|e| {
@@ -54,6 +55,7 @@ pub fn write(
         status: &status,
         options: &args.options(),
         truth: truth.as_ref(),
+        failed,
     };
     Ok((report.write()?, truth))
 }

@@ -24,6 +24,7 @@ use dipir_stages::graph;
 use dipir_stages::truth::Truth;
 use serde_json::{Map, Value, json};
 
+use crate::made::MadeFolders;
 use crate::plan;
 use crate::project::{ProjectArgs, Stage};
 use crate::report;
@@ -103,7 +104,7 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
     }
     check_several(&projects)?;
     let named = |project: ProjectArgs| (project.file().to_owned(), project);
-    run_each(args, projects.into_iter().map(named).collect())
+    run_each(args, projects.into_iter().map(named).collect(), |_| ())
 }
 
 /// Refuses files that are not there, and two with one folder of artifacts: the later would replace what the earlier wrote.
@@ -141,7 +142,12 @@ fn in_full(path: &Path) -> PathBuf {
 }
 
 /// Runs projects, each with what it is called, one after the other. One that fails does not keep the others from running.
-pub fn run_each(args: &RunArgs, projects: Vec<(PathBuf, ProjectArgs)>) -> anyhow::Result<()> {
+/// `at_end` learns which failed.
+pub fn run_each(
+    args: &RunArgs,
+    projects: Vec<(PathBuf, ProjectArgs)>,
+    at_end: impl FnOnce(&[String]),
+) -> anyhow::Result<()> {
     let output = args.project.output;
     let (mut results, mut failed) = (Vec::new(), Vec::new());
     let all = projects.len();
@@ -180,14 +186,16 @@ pub fn run_each(args: &RunArgs, projects: Vec<(PathBuf, ProjectArgs)>) -> anyhow
             }
         }
     }
+    let (codes, failed): (Vec<_>, Vec<_>) = failed.into_iter().unzip();
+    at_end(&failed);
     if output.json {
         output.result(String::new, || json!({"runs": results}));
     }
-    let Some((code, _)) = failed.first() else {
+    let Some(code) = codes.first() else {
         return Ok(());
     };
     if !output.json {
-        let names: Vec<_> = failed.iter().map(|f| printable(&f.1)).collect();
+        let names: Vec<_> = failed.iter().map(|name| printable(name)).collect();
         say(format!(
             "{} of {all} failed: {}",
             names.len(),
@@ -235,6 +243,9 @@ pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String,
     if args.plan {
         return plan::plan(&session, &graph, &nodes, args.force);
     }
+    let is_frame = project.placed.is_some();
+    // Dropped after all that is written there: a frame that fails leaves no empty folder.
+    let _made = is_frame.then(|| MadeFolders::make(&session.out));
     let mut work = Pipeline::new(args, project, &session)?;
     let all_fresh = all_fresh(&session, &graph, &nodes)?;
     if args.force || !all_fresh {
@@ -246,18 +257,23 @@ pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String,
         let _lock = lock_when(&session, when_locked)?;
         runner::run(&nodes, args.jobs, &mut work).map_err(stopped)?;
     }
-    let is_frame = project.placed.is_some();
     let report = match is_frame || dipir_stages::report::is_current(&session) {
         true => None,
-        false => page(project, &session, &graph, &nodes),
+        false => page(project, &session, &graph, &nodes, &[]),
     };
     Ok(work.conclude(&nodes, report))
 }
 
 /// The page that shows the run. What the stages wrote stands without it, so that it cannot be
 /// written is no failure of the run.
-fn page(project: &ProjectArgs, session: &Session, graph: &Graph, nodes: &[&Node]) -> Option<Page> {
-    match report::write(project, session, graph, nodes) {
+pub fn page(
+    project: &ProjectArgs,
+    session: &Session,
+    graph: &Graph,
+    nodes: &[&Node],
+    failed: &[String],
+) -> Option<Page> {
+    match report::write(project, session, graph, nodes, failed) {
         Ok(page) => Some(page),
         Err(e) => {
             session.warn(&format!("there is no report: {}", exit::describe(&e)));

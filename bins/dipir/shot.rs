@@ -7,12 +7,12 @@ use dipir_cli::args::CommonArgs;
 use dipir_cli::exit::{Usage, printable};
 use dipir_cli::session::Session;
 use dipir_stages::names::{LIGHT, SCENE};
-use dipir_stages::shot;
+use dipir_stages::{graph, report, shot};
 use serde_json::Value;
 
 use crate::plan;
 use crate::project::{ProjectArgs, Stage};
-use crate::run::{RunArgs, run_each, run_one};
+use crate::run::{RunArgs, page, run_each, run_one};
 
 #[derive(Args)]
 pub struct ShotArgs {
@@ -70,7 +70,19 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     if !common.output.json {
         common.output.result(|| done.0, || Value::Null);
     }
-    run_each(&RunArgs::needed(&common, None).forced(args.force), frames)
+    let of_frames = RunArgs::needed(&common, None).forced(args.force);
+    run_each(&of_frames, frames, |failed| {
+        // The page of the photograph shows its frames.
+        if failed.is_empty() && report::is_current(&session) {
+            return;
+        }
+        let nodes = graph.up_to(graph::LAST);
+        let page = page(&base, &session, &graph, &nodes, failed);
+        if let Some((path, _)) = page.filter(|_| !common.output.json) {
+            let words = || format!("wrote {}", printable(&path.display().to_string()));
+            common.output.result(words, || Value::Null);
+        }
+    })
 }
 
 /// Refuses a file that configures stages among the frames: other commands take it there.

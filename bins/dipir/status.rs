@@ -1,12 +1,8 @@
 //! `dipir status` and `dipir graph`.
-use std::path::PathBuf;
-
 use clap::Args;
 use dipir_cli::exit::printable;
 use dipir_cli::style::{bold, color_on_stdout, faint};
-use dipir_pipeline::mark::Owned;
 use dipir_pipeline::status::{StageStatus, State};
-use dipir_stages::names::COMPOSITE;
 use dipir_stages::{graph, shot};
 use serde_json::json;
 
@@ -38,9 +34,7 @@ pub fn run(args: &StatusArgs) -> anyhow::Result<()> {
     let needed = graph.up_to(args.until.map_or(graph::LAST, Stage::name));
     let all = graph::assess(&session, &graph, &needed)?;
     let frames = shot::folders(&session.out);
-    let is_made =
-        |frame: &&PathBuf| Owned::of_stage(&frame.join(COMPOSITE.name), COMPOSITE.name).is_some();
-    let made = frames.iter().filter(is_made).count();
+    let made = frames.iter().filter(|frame| shot::is_made(frame)).count();
     let words = || match made {
         0 => in_words(&all),
         _ => format!(

@@ -88,6 +88,11 @@ fn frames_are_lit_by_one_light_and_made_once() {
     // What is in the folder of frames and not ours stays.
     std::fs::create_dir(project.path("out/frames/empty")).unwrap();
     project.write("out/frames/notes.txt", "mine");
+    // What a frame that was killed left goes.
+    let begun = "out/frames/killed/.scene.partial";
+    std::fs::create_dir_all(project.path(begun)).unwrap();
+    let mark = r#"{"made_by":"dipir","schema":1,"kind":"unfinished","stage":"scene","files":[]}"#;
+    project.write(&format!("{begun}/.dipir"), mark);
     project.run(DIPIR, &["clean"]).expect_success();
     assert_eq!(project.names("out/frames"), ["empty", "notes.txt"]);
 }
@@ -165,6 +170,58 @@ fn every_frame_has_the_camera_of_its_name() {
         &["a.png"],
         "scene.camera.transforms names frames by number: write file in its place, which finds them by the names of their pictures",
     );
+}
+
+#[test]
+fn a_movie_among_the_frames_is_told_before_anything_runs() {
+    let project = project();
+    project.write("a.png", project.read("background.png"));
+    project.write("clip.mp4", b"\0\0\0\x18ftypisom");
+    project.run(DIPIR, &["shot", "a.png", "clip.mp4"]).expect_error(
+        1,
+        "error: `clip.mp4` is a movie; expected a PNG, JPEG, OpenEXR or Radiance HDR image: write its frames, for instance \
+         with `mkdir frames && ffmpeg -i \"clip.mp4\" frames/%04d.png`, and give one of them, or all to \
+         `dipir shot frames/*.png`",
+    );
+    assert!(!project.path("out").exists());
+}
+
+#[test]
+fn a_frame_that_fails_leaves_no_folder() {
+    let project = project();
+    project.write("a.png", project.read("background.png"));
+    project.write("cut.png", &project.read("background.png")[..60]);
+    let failed = |frames: &[&str]| {
+        let run = project.run(DIPIR, &[&["shot", "--same-exposure"], frames].concat());
+        assert_eq!(run.code, Some(1), "{}", run.stderr);
+    };
+    failed(&["cut.png"]);
+    assert!(!project.path("out/frames").exists());
+    let page = || String::from_utf8(project.read("out/report.html")).unwrap();
+    assert!(page().contains("0 made; 1 failed: cut.png.<"));
+    failed(&["cut.png", "a.png"]);
+    assert_eq!(project.names("out/frames"), ["a"]);
+    for part in [
+        "<h2>Frames</h2>",
+        "<a href=\"frames/a/composite/composite.png\">a</a>",
+        "1 made; 1 failed: cut.png.",
+    ] {
+        assert!(page().contains(part), "{part}: {}", page());
+    }
+    let before = page();
+    shot(&project, &["a.png"]);
+    assert_eq!(page(), before, "nothing has changed");
+    project.write("b c.png", project.read("a.png"));
+    shot(&project, &["b c.png"]);
+    let link = "<a href=\"frames/b%20c/composite/composite.png\">b c</a>";
+    assert!(page().contains(link) && page().contains("2 made. "));
+    assert_eq!(project.names("out/frames"), ["a", "b c"]);
+    // A folder that was there is not ours.
+    std::fs::create_dir(project.path("out/frames/cut")).unwrap();
+    failed(&["cut.png"]);
+    assert_eq!(project.names("out/frames"), ["a", "b c", "cut"]);
+    project.run(DIPIR, &["clean"]).expect_success();
+    assert_eq!(project.names("out/frames"), ["cut"]);
 }
 
 #[test]

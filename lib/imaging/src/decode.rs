@@ -287,7 +287,8 @@ pub(crate) fn image_error(path: &Path, format: Format, error: image::ImageError)
             remedy: match format {
                 Format::Hdr => "save it as OpenEXR, or as Radiance HDR in RGBE from the top left",
                 _ => "save it as an 8-bit RGB PNG",
-            },
+            }
+            .into(),
         },
         other => ImagingError::Damaged {
             path: path.to_owned(),

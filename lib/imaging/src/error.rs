@@ -1,4 +1,5 @@
 //! What can go wrong with images and their files.
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 /// A failure to read, write or combine images. Every message names the file, channel or pixel
@@ -59,7 +60,7 @@ pub enum ImagingError {
         /// What it uses, as a clause: `is a CMYK JPEG`.
         what: String,
         /// What to do instead.
-        remedy: &'static str,
+        remedy: Cow<'static, str>,
     },
     /// NaN or infinity where light or a display value must be.
     #[error("`{}` holds {value} in channel {channel} of the pixel in column {x}, row {y} (from the top left); expected finite values: repair the pixel", path.display())]

@@ -301,7 +301,7 @@ fn read_error(path: &Path, error: exr::error::Error) -> ImagingError {
         exr::error::Error::NotSupported(what) => ImagingError::Unsupported {
             path: path.to_owned(),
             what: format!("uses {what}"),
-            remedy: "save it as scan lines with ZIP compression",
+            remedy: "save it as scan lines with ZIP compression".into(),
         },
         other => ImagingError::Damaged {
             path: path.to_owned(),

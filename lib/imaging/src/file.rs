@@ -141,6 +141,23 @@ pub fn read_photo_within(
     }
 }
 
+/// Refuses a file whose first bytes say that [`read_photo`] does not read it: a movie, a raw file. Whether the file is whole
+/// it does not tell.
+///
+/// # Errors
+/// On a file of another format, and on one that cannot be opened.
+pub fn check_format(path: impl AsRef<Path>) -> Result<(), ImagingError> {
+    let path = path.as_ref();
+    let mut start = Vec::new();
+    let file = dipir_files::open(path);
+    file.and_then(|f| f.take(Format::SNIFF_LENGTH as u64).read_to_end(&mut start))
+        .map_err(|e| ImagingError::io("read", path, e))?;
+    match Format::of(&start) {
+        other @ Format::Other(_) if !start.is_empty() => Err(other.refuse(path, PHOTO_FORMATS)),
+        _ => Ok(()),
+    }
+}
+
 /// A photograph of light as stored, and the primaries that it is in, if its file names them.
 fn linear_photo(
     (mut image, primaries): (LinearImage, Option<Primaries>),
@@ -186,7 +203,7 @@ fn check_square(layers: &Layers, path: &Path) -> Result<(), ImagingError> {
         what: format!(
             "has pixels that are {aspect:.3} times as wide as high (pixelAspectRatio of an anamorphic picture)"
         ),
-        remedy: "scale it to square pixels first",
+        remedy: "scale it to square pixels first".into(),
     })
 }
 
@@ -286,7 +303,7 @@ pub fn read_linear(path: impl AsRef<Path>) -> Result<LinearImage, ImagingError> 
     let to_rec709 = to_rec709.map_err(|why| ImagingError::Unsupported {
         path: path.to_owned(),
         what: format!("has primaries that {why}"),
-        remedy: "save it in linear Rec.709",
+        remedy: "save it in linear Rec.709".into(),
     })?;
     if let Some(to_rec709) = to_rec709 {
         primaries::convert_clipped(&mut image, to_rec709);
@@ -355,7 +372,7 @@ fn exr_mask(bytes: &[u8], path: &Path) -> Result<Raster<f32>, ImagingError> {
                 "has the channels {}, and none of `Y`, `R`, `A` for a mask",
                 listed(layers.skipped())
             ),
-            remedy: "save the mask as the channel `Y`",
+            remedy: "save the mask as the channel `Y`".into(),
         });
     };
     let mut mask = layers.channel(&name)?.clone();

@@ -145,13 +145,18 @@ fn remedy(found: &str, path: &Path) -> String {
         }
         _ => return "convert the file".into(),
     };
+    conversion(tool, "", path)
+}
+
+/// How to make a PNG of the file with a command line, whose `options` stand between the two names.
+pub(crate) fn conversion(tool: &str, options: &str, path: &Path) -> String {
     let mut to = path.with_extension("png");
     // What is there stays.
     if to == path {
         to = path.with_extension("converted.png");
     }
     format!(
-        "convert it, for instance with `{tool} \"{}\" \"{}\"`",
+        "convert it, for instance with `{tool} \"{}\" {options}\"{}\"`",
         path.display(),
         to.display()
     )

@@ -1,6 +1,7 @@
 //! What a JPEG file's markers say before it is decoded: the decoder fills in missing data without
 //! an error, converts ink to light by a rule of its own, and panics on some layouts.
 use crate::error::ImagingError;
+use crate::format;
 use std::path::Path;
 
 /// The brightness of 8 x 8 pixels takes a bit at least: a file that declares more is cut off or made to waste time.
@@ -17,7 +18,7 @@ pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
     let unsupported = |what: String| ImagingError::Unsupported {
         path: path.to_owned(),
         what,
-        remedy: "save it as 8-bit RGB",
+        remedy: "save it as 8-bit RGB".into(),
     };
     let mut at = 2;
     loop {
@@ -40,7 +41,13 @@ pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
                 return Err(damaged("the frame header is cut off"));
             };
             match (bits, components) {
-                (_, 4) => return Err(unsupported("is a CMYK JPEG".to_string())),
+                (_, 4) => {
+                    return Err(ImagingError::Unsupported {
+                        path: path.to_owned(),
+                        what: "is a CMYK JPEG".to_string(),
+                        remedy: format::conversion("magick", "-colorspace sRGB ", path).into(),
+                    });
+                }
                 (8, _) => {}
                 _ => return Err(unsupported(format!("is a {bits}-bit JPEG"))),
             }

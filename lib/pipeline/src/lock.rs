@@ -5,6 +5,7 @@
 //! done. A process that gets the lock of a file that is no longer at its name starts over, so that
 //! two processes never hold locks on two files of the same name.
 use std::fs::{self, File, TryLockError};
+use std::io::ErrorKind::NotFound;
 use std::io::{self, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
@@ -12,6 +13,8 @@ use crate::error::StageError;
 
 /// How lock files begin; the number of the process follows.
 const HEAD: &str = "dipir lock ";
+/// How often a folder that goes while its lock is taken is made again.
+const TRIES: usize = 100;
 
 /// What to do when another process writes the folder.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -43,8 +46,19 @@ impl FolderLock {
         name: &str,
         when_locked: WhenLocked,
     ) -> Result<Self, StageError> {
+        let path = lock_path(&folder.join(name));
+        for _ in 0..TRIES {
+            // A run that fails removes the folder that it made: then making it or its lock can fail.
+            if create_folder(folder).is_err() {
+                continue;
+            }
+            match Self::take_file(&path, folder, when_locked) {
+                Err(StageError::Io { source, .. }) if source.kind() == NotFound => {}
+                taken => return taken,
+            }
+        }
         create_folder(folder)?;
-        Self::take_file(&lock_path(&folder.join(name)), folder, when_locked)
+        Self::take_file(&path, folder, when_locked)
     }
 
     fn take_file(path: &Path, folder: &Path, when_locked: WhenLocked) -> Result<Self, StageError> {
@@ -225,6 +239,24 @@ mod tests {
             }
         });
         assert_eq!(most.into_inner(), 1);
+    }
+
+    #[test]
+    fn a_folder_that_goes_while_others_wait_is_made_again() {
+        let parent = tempfile::tempdir().unwrap();
+        let folder = parent.path().join("frames/a");
+        std::thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| {
+                    for _ in 0..50 {
+                        let lock = FolderLock::take_inside(&folder, "run", WhenLocked::Wait);
+                        drop(lock.unwrap());
+                        let _ = fs::remove_dir(&folder);
+                    }
+                });
+            }
+        });
+        assert!(!folder.exists());
     }
 
     #[test]

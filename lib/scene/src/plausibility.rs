@@ -80,7 +80,12 @@ fn implausible_scene(scene: &Scene, objects: &[ObjectRecord], lens: Option<&Lens
     for (part, size) in parts.iter().zip(sizes) {
         if size.is_none() {
             found.extend(part.without_unit());
-            found.extend(in_picture::too_near(&scene.mesh, part, &scene.camera));
+            found.extend(in_picture::too_near(
+                &scene.mesh,
+                part,
+                &parts,
+                &scene.camera,
+            ));
         }
         found.extend(size);
     }

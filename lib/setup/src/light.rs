@@ -1,10 +1,15 @@
 //! The `[light]` table: the light is estimated from the photograph and from what its file holds of the sun.
 use dipir_imaging::facts::Facts;
+use dipir_sun::table::{SunTable, Taken};
+use glam::DVec3;
 
 use crate::document::{number, printable, quoted};
 
 /// Columns of a comment.
 const COLUMNS: usize = 100;
+
+/// Where the middle of the sun stands when it sets, degrees: the air bends its light, and its upper edge sets last.
+const SUNSET_DEG: f64 = -0.833;
 
 /// What the photograph's file says of the sun.
 struct Told<'a> {
@@ -38,6 +43,33 @@ impl<'a> Told<'a> {
             .heading
             .map(|(deg, north)| format!("the heading, {deg:.0} degrees from {north} north"));
         [time, place, heading].into_iter().flatten().collect()
+    }
+
+    /// Where the sun was by time and place, if that is below the horizon.
+    fn below_horizon(&self) -> Option<String> {
+        let [latitude, longitude] = self.place?;
+        let taken = Taken {
+            time: self.time.map(Into::into),
+            latitude_deg: Some(latitude),
+            longitude_deg: Some(longitude),
+            ..Taken::default()
+        };
+        // Without a heading the elevation alone follows, and no way of looking matters.
+        let known = SunTable::default().resolve("light.sun", &taken, DVec3::NEG_Z);
+        let sun = known.ok()?.elevation.filter(|e| e.deg < SUNSET_DEG)?;
+        let unsure = match sun.sigma_deg >= 0.5 {
+            true => format!(
+                " (give or take {:.0}, for the time has no zone)",
+                sun.sigma_deg
+            ),
+            false => String::new(),
+        };
+        let count = format!("{:.0}", -sun.deg);
+        let unit = if count == "1" { "degree" } else { "degrees" };
+        Some(format!(
+            "By time and place the sun was {count} {unit} below the horizon{unsure} and lights nothing: it was night, or the \
+             camera's clock is wrong. If it is, write the time:"
+        ))
     }
 
     /// What follows of the sun, and how to say more.
@@ -98,7 +130,8 @@ pub(crate) fn light(facts: &Facts) -> String {
             format!(
                 "The light is estimated from the photograph. Its file says {}. {}",
                 listed(known),
-                told.consequence()
+                told.below_horizon()
+                    .unwrap_or_else(|| told.consequence().into())
             ),
             told.keys(),
         ),
@@ -185,6 +218,31 @@ mod tests {
         ] {
             assert!(text.contains(part), "{part}: {text}");
             assert!(!text.contains("are used"), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_sun_below_the_horizon_is_said() {
+        // The sun's midnight is 46 minutes after that of Greenwich, and 2 for the equation of time: it is 90 - 48.1 - 23.4
+        // degrees below.
+        let night = said(Some("2026-06-21T02:48:00+02:00"), PLACE, true);
+        let told = "By time and place the sun was 18 degrees below the horizon and lights nothing: it was night, or the \
+                    camera's clock is wrong. If it is, write the time: ";
+        assert!(night.contains(told), "{night}");
+        assert!(!night.contains("is taken from them"), "{night}");
+        assert!(night.contains("sun = { time = "), "{night}");
+        let unsure = said(Some("2026-06-21T00:48:00"), PLACE, false);
+        let part = "below the horizon (give or take ";
+        assert!(
+            unsure.contains(part) && unsure.contains(", for the time has no zone)"),
+            "{unsure}"
+        );
+        for known in [
+            said(TIME, PLACE, true),
+            said(TIME, None, true),
+            said(Some("night"), PLACE, true),
+        ] {
+            assert!(!known.contains("below"), "{known}");
         }
     }
 

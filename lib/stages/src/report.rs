@@ -3,6 +3,7 @@
 //! It shows the stages that have run. Where an artifact cannot be read, its section says why.
 mod curves;
 mod direction;
+mod frames;
 pub mod html;
 mod learning;
 mod lighting;
@@ -20,6 +21,7 @@ use dipir_pipeline::status::StageStatus;
 use dipir_scene::config::SceneConfig;
 
 use crate::names;
+use crate::shot;
 use crate::truth::Truth;
 use html::Html;
 pub use stages::quoted;
@@ -42,6 +44,8 @@ pub struct Report<'a> {
     pub options: &'a [String],
     /// The comparison with the true light, where that is known.
     pub truth: Option<&'a Truth>,
+    /// Frames of a shot that have just failed.
+    pub failed: &'a [String],
 }
 
 /// A section: its markup, nothing without its artifacts, or why it cannot be shown.
@@ -75,9 +79,10 @@ impl Report<'_> {
             Ok(None) => Ok(None),
             Err(e) => Err(anyhow::anyhow!("{}", describe(e))),
         };
-        let sections: [(&str, Section); 8] = [
+        let sections: [(&str, Section); 9] = [
             ("", of_composite(result::before_and_after)),
             ("Against the true light", Ok(self.truth.map(result::truth))),
+            ("Frames", frames::section(self)),
             ("Stages", stages::table(self)),
             ("Layers", of_composite(result::layers)),
             ("Light and tone", lighting::section(self)),
@@ -173,13 +178,19 @@ pub fn is_current(session: &Session) -> bool {
     }
 }
 
-/// A hash of what the page is made of: every stage's manifest, which names its files by hash, and
-/// what is compared with.
+/// A hash of what the page is made of: every stage's manifest, which names its files by hash, that of
+/// every frame's picture, and what is compared with.
 fn key(session: &Session) -> anyhow::Result<String> {
     let mut hasher = blake3::Hasher::new();
     hasher.update(format!("report {VERSION}").as_bytes());
     for stage in names::ALL {
         let manifest = std::fs::read(stage.folder(session).join(FILE_NAME));
+        hasher.update(&manifest.unwrap_or_default());
+        hasher.update(b"|");
+    }
+    for frame in shot::folders(&session.out) {
+        let manifest = std::fs::read(frame.join(names::COMPOSITE.name).join(FILE_NAME));
+        hasher.update(frame.to_string_lossy().as_bytes());
         hasher.update(&manifest.unwrap_or_default());
         hasher.update(b"|");
     }

@@ -4,10 +4,12 @@ use std::path::{Path, PathBuf};
 use dipir_cli::exit::{Usage, printable};
 use dipir_cli::session::Session;
 use dipir_imaging::facts::Facts;
+use dipir_pipeline::mark::Owned;
 use dipir_scene::config::{CameraConfig, SceneConfig};
 use serde_json::json;
 
 use crate::composite::table::CompositeTable;
+use crate::names::COMPOSITE;
 
 /// Folder of the frames' artifacts in that of all.
 pub const FOLDER: &str = "frames";
@@ -21,6 +23,11 @@ pub fn folders(out: &Path) -> Vec<PathBuf> {
     let mut folders: Vec<PathBuf> = folders.map(|e| e.path()).collect();
     folders.sort();
     folders
+}
+
+/// Whether the picture of the frame in the folder `frame` is made.
+pub fn is_made(frame: &Path) -> bool {
+    Owned::of_stage(&frame.join(COMPOSITE.name), COMPOSITE.name).is_some()
 }
 
 /// How much more the frame in `path` is exposed than the session's photograph, stops, if the Exif data of both tell and
@@ -54,7 +61,7 @@ pub fn camera_stands_still(session: &Session) -> anyhow::Result<bool> {
 /// is its own, unless it `stands_still`.
 ///
 /// # Errors
-/// If there is no such file or mask, or its camera cannot be told from the configuration.
+/// If there is no such file or mask, if it is of a format that is not read, or its camera cannot be told from the configuration.
 pub fn overrides(
     session: &Session,
     path: &Path,
@@ -69,6 +76,7 @@ pub fn overrides(
     if !path.is_file() {
         return Err(wrong("there is no such file").into());
     }
+    dipir_imaging::file::check_format(path)?;
     let text = |path: &Path| match path.to_str() {
         Some(text) => Ok(json!(text).to_string()),
         None => Err(wrong("its path is not UTF-8")),

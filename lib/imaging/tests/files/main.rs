@@ -2,8 +2,8 @@
 use dipir_imaging::{
     ImagingError,
     file::{
-        PhotoLimits, decode_texture, read_linear, read_mask, read_photo, read_photo_within,
-        write_png, write_png_16, write_png_mask,
+        PhotoLimits, check_format, decode_texture, read_linear, read_mask, read_photo,
+        read_photo_within, write_png, write_png_16, write_png_mask,
     },
     layers::{Layers, Precision},
     raster::{DisplayImage, LinearImage, Raster},

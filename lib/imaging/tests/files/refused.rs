@@ -162,7 +162,12 @@ fn movies_are_refused_with_the_command_that_writes_their_frames() {
              them, or all to `dipir shot frames/*.png`"
         );
         assert_eq!(words(read_photo(&path, Transfer::Srgb).unwrap_err()), want);
+        assert_eq!(words(check_format(&path).unwrap_err()), want);
     }
+    // Of files that may be read the format alone is looked at.
+    let begun = put(&folder, "x.jpg", &[0xff, 0xd8, 0xff, 0xe0]);
+    check_format(&begun).unwrap();
+    read_photo(&begun, Transfer::Srgb).unwrap_err();
     // Words are no box.
     let text = put(&folder, "x.txt", b"The wide world");
     let error = words(read_photo(text, Transfer::Srgb).unwrap_err());
@@ -257,7 +262,7 @@ fn a_radiance_hdr_of_another_layout_is_told_what_works() {
 }
 
 #[test]
-fn a_cmyk_jpeg_is_refused() {
+fn a_cmyk_jpeg_is_refused_with_the_command_of_a_converter() {
     let folder = folder();
     let mut file = jpeg(&[90; 12], 2, 2, ExtendedColorType::Rgb8);
     let frame = file.windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
@@ -266,8 +271,11 @@ fn a_cmyk_jpeg_is_refused() {
     assert_eq!(
         words(read_photo(&path, Transfer::Srgb).unwrap_err()),
         format!(
-            "`{}` is a CMYK JPEG, which is not supported; save it as 8-bit RGB",
-            path.display()
+            "`{}` is a CMYK JPEG, which is not supported; convert it, for instance with \
+             `magick \"{}\" -colorspace sRGB \"{}\"`",
+            path.display(),
+            path.display(),
+            path.with_extension("png").display()
         )
     );
 }

@@ -9,6 +9,12 @@ use crate::visibility::short;
 
 /// An object that covers more than this share of the picture's width and of its height is unusual.
 const MOST_COVERED: f32 = 0.8;
+/// An object that is this many times as wide as the picture is unusual.
+const WIDEST: f32 = 3.0;
+/// What covers less than this share of the picture's height is hardly seen.
+const LEAST_SEEN: f32 = 0.05;
+/// What is thinner than this share of its length is a floor, a wall or a sheet, which may well go beyond the picture.
+const SHEET: f32 = 0.02;
 /// From this value on a mask hides all that the picture could show.
 const HIDDEN: f32 = 0.99;
 
@@ -62,8 +68,14 @@ pub(super) fn visibility(
     })
 }
 
-/// A sentence about an object around the camera, or one that leaves little of the photograph to be seen.
-pub(super) fn too_near(mesh: &TriangleMesh, part: &Part, camera: &Camera) -> Option<String> {
+/// A sentence about an object around the camera, one that leaves little of the photograph to be seen, or one that goes far
+/// beyond both sides of it, unless it is a ground under others of `parts`.
+pub(super) fn too_near(
+    mesh: &TriangleMesh,
+    part: &Part,
+    parts: &[Part],
+    camera: &Camera,
+) -> Option<String> {
     let [low, high] = part.bounds;
     let extent = short(f64::from((high - low).max_element()));
     let object = format!("scene.objects[{}] ({extent} m large)", part.number);
@@ -77,11 +89,37 @@ pub(super) fn too_near(mesh: &TriangleMesh, part: &Part, camera: &Camera) -> Opt
     let [low, high] = seen(mesh, part.triangles, camera)?;
     let picture = Vec2::from_array(camera.resolution.map(|n| n as f32));
     let covered = (high.min(picture) - low.max(Vec2::ZERO)) / picture;
-    (covered.min_element() > MOST_COVERED).then(|| {
-        let [across, down] = (100.0 * covered).to_array();
-        format!(
+    let [across, down] = (100.0 * covered).to_array();
+    if covered.min_element() > MOST_COVERED {
+        return Some(format!(
             "{object} covers {across:.0}% of the picture's width and {down:.0}% of its height: {size}"
+        ));
+    }
+    let too_wide = high.x - low.x > WIDEST * picture.x
+        && covered.x > MOST_COVERED
+        && covered.y > LEAST_SEEN
+        && !is_sheet(part)
+        && !carries_another(part, parts);
+    too_wide.then(|| {
+        format!(
+            "{object} goes far beyond both sides of the picture, and covers {down:.0}% of its height: {size}"
         )
+    })
+}
+
+fn is_sheet(part: &Part) -> bool {
+    let [low, high] = part.bounds;
+    let extent = high - low;
+    extent.min_element() <= SHEET * extent.max_element()
+}
+
+/// Whether the middle of another object is above this one, or in it.
+fn carries_another(part: &Part, parts: &[Part]) -> bool {
+    let [low, high] = part.bounds;
+    parts.iter().any(|other| {
+        let middle = 0.5 * (other.bounds[0] + other.bounds[1]);
+        let inside = middle.cmpgt(low) & middle.cmplt(high);
+        other.number != part.number && inside.test(0) && inside.test(2) && middle.y > low.y
     })
 }
 
@@ -158,7 +196,7 @@ mod tests {
     fn near(scene: &Scene) -> Option<String> {
         let objects = [record(1.0)];
         let parts = parts(scene, &objects);
-        too_near(&scene.mesh, &parts[0], &scene.camera)
+        too_near(&scene.mesh, &parts[0], &parts, &scene.camera)
     }
 
     #[test]
@@ -200,6 +238,48 @@ mod tests {
             p.x = -0.4;
         }
         assert_eq!(near(&wall), None);
+    }
+
+    /// A thing of these extents, metres, its middle at the origin of the ground.
+    fn lying(extent: Vec3) -> Scene {
+        let mut scene = scene();
+        for p in &mut scene.mesh.positions {
+            *p = *p * extent - Vec3::new(0.5, 0.0, 0.5) * extent;
+        }
+        scene
+    }
+
+    #[test]
+    fn a_low_object_far_beyond_both_sides_of_the_picture_is_told() {
+        // A plate of 25 cm whose file is read as metres: the camera is above it, 1.6 m high.
+        let plate = lying(Vec3::new(25.0, 1.4, 25.0));
+        let found = near(&plate).unwrap();
+        let said =
+            "scene.objects[0] (25 m large) goes far beyond both sides of the picture, and covers ";
+        assert!(
+            found.starts_with(said) && found.contains("is its size right?"),
+            "{found}"
+        );
+        // A bus of 12 m before the camera, a floor, and a plate far away.
+        assert_eq!(near(&lying(Vec3::new(12.0, 2.0, 2.5))), None);
+        assert_eq!(near(&lying(Vec3::new(25.0, 0.3, 25.0))), None);
+        let mut away = plate.clone();
+        for p in &mut away.mesh.positions {
+            p.z -= 45.0;
+        }
+        assert_eq!(near(&away), None);
+        // What another object stands on is a ground.
+        let mut ground = plate;
+        let mut thing = scene().mesh;
+        for p in &mut thing.positions {
+            p.y += 1.4;
+        }
+        ground.mesh.append(thing, 0);
+        let objects = [record(1.0), record(1.0)];
+        let parts = parts(&ground, &objects);
+        for part in &parts {
+            assert_eq!(too_near(&ground.mesh, part, &parts, &ground.camera), None);
+        }
     }
 
     #[test]
