@@ -7,13 +7,14 @@ use std::time::Instant;
 use dipir_cli::args::OutputArgs;
 use dipir_cli::exit;
 use dipir_cli::interrupt::{self, Interrupted};
-use dipir_cli::output::json_path;
+use dipir_cli::output::{json_path, print_bytes};
 use dipir_cli::progress::Progress;
 use dipir_cli::session::duration;
 use dipir_places::Progress as Step;
 use dipir_places::figures::table;
+use dipir_places::place::Place;
 use dipir_pretraining::command_line::{
-    CheckArgs, Cli, Command, DataArgs, EncoderArgs, LightArgs, SheetArgs, TrainArgs,
+    CheckArgs, Cli, Command, DataArgs, EncoderArgs, FoldsArgs, LightArgs, SheetArgs, TrainArgs,
 };
 use dipir_pretraining::dataset::{Dataset, SceneMix};
 use dipir_pretraining::trainer::TrainerSettings;
@@ -31,6 +32,7 @@ fn main() -> ExitCode {
             Command::Train(args) => train(args, &cli.output),
             Command::Encoder(args) => train_encoder(args, &cli.output),
             Command::Light(args) => train_light(args, &cli.output),
+            Command::Folds(args) => folds(args),
             Command::Check(args) => check(args, &cli.output),
             Command::Sheet(args) => sheet(args),
         }
@@ -161,6 +163,16 @@ fn train_light(args: &LightArgs, output: &OutputArgs) -> anyhow::Result<()> {
         },
         || json!({"file": json_path(file), "standard": outcome.standard, "any": outcome.any, "elapsed_s": seconds}),
     );
+    Ok(())
+}
+
+fn folds(args: &FoldsArgs) -> anyhow::Result<()> {
+    let places = dipir_places::place::read_places(&args.panoramas)?;
+    let count = usize::try_from(args.folds)?;
+    let folds = dipir_places::place::folds(&places, count);
+    let line = |(place, fold): (&Place, &usize)| format!("{}\t{fold}\n", place.name);
+    let text: String = places.iter().zip(&folds).map(line).collect();
+    print_bytes(text.as_bytes());
     Ok(())
 }
 

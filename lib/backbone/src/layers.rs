@@ -35,6 +35,36 @@ pub(crate) struct Layer {
     pub bias: Vec<f32>,
 }
 
+impl Layer {
+    /// Values of so many cells before the weights' part is added.
+    fn start(&self, cells: usize, tuned: Option<&Scale>) -> Vec<f32> {
+        match tuned {
+            None => self.bias.repeat(cells),
+            Some(_) => vec![0.0; cells * self.bias.len()],
+        }
+    }
+}
+
+/// What takes the place of a layer's bias, and what its outputs are multiplied by before.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Scale {
+    pub factor: Vec<f32>,
+    pub bias: Vec<f32>,
+}
+
+impl Scale {
+    fn apply(tuned: Option<&Self>, values: &mut [f32]) {
+        let Some(Self { factor, bias }) = tuned else {
+            return;
+        };
+        for cell in values.chunks_exact_mut(bias.len()) {
+            for ((v, s), b) in cell.iter_mut().zip(factor).zip(bias) {
+                *v = *v * s + b;
+            }
+        }
+    }
+}
+
 /// The side of a square kernel and its step.
 #[derive(Clone, Copy)]
 pub(crate) struct Window {
@@ -69,9 +99,9 @@ impl Window {
 }
 
 /// A map times a matrix, cell by cell.
-pub(crate) fn pointwise(map: &Map, layer: &Layer) -> Map {
+pub(crate) fn pointwise(map: &Map, layer: &Layer, tuned: Option<&Scale>) -> Map {
     let (cells, inputs, outputs) = (map.width * map.height, map.channels, layer.bias.len());
-    let mut values = layer.bias.repeat(cells);
+    let mut values = layer.start(cells, tuned);
     let size = (cells, outputs, inputs);
     product(
         size,
@@ -80,6 +110,7 @@ pub(crate) fn pointwise(map: &Map, layer: &Layer) -> Map {
         &mut values,
         true,
     );
+    Scale::apply(tuned, &mut values);
     Map {
         channels: outputs,
         values,
@@ -103,14 +134,14 @@ pub(crate) fn dense(map: &Map, layer: &Layer, window: Window) -> Map {
         channels: taps * n,
         values: patches,
     };
-    pointwise(&patches, layer)
+    pointwise(&patches, layer, None)
 }
 
 /// A convolution of each channel with itself.
-pub(crate) fn by_channel(map: &Map, layer: &Layer, window: Window) -> Map {
+pub(crate) fn by_channel(map: &Map, layer: &Layer, window: Window, tuned: Option<&Scale>) -> Map {
     let n = map.channels;
     let (columns, rows) = (window.line(map.width).0, window.line(map.height).0);
-    let mut values = layer.bias.repeat(columns * rows);
+    let mut values = layer.start(columns * rows, tuned);
     window.taps(map, |to, k, from| {
         let input = &map.values[from * n..(from + 1) * n];
         let weight = &layer.weight[k * n..(k + 1) * n];
@@ -119,6 +150,7 @@ pub(crate) fn by_channel(map: &Map, layer: &Layer, window: Window) -> Map {
             *o += x * w;
         }
     });
+    Scale::apply(tuned, &mut values);
     Map {
         width: columns,
         height: rows,

@@ -5,7 +5,9 @@
 mod layers;
 mod network;
 mod product;
+mod tuned;
 
 pub use layers::Map;
 pub use network::{Backbone, BackboneError, CHANNELS};
 pub use product::product;
+pub use tuned::{TUNED_FROM, Tuned};

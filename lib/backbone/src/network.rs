@@ -6,7 +6,8 @@ use glam::Vec3;
 use half::f16;
 use safetensors::{Dtype, SafeTensors};
 
-use crate::layers::{Layer, Map, Window, by_channel, clamped, dense, pointwise};
+use crate::layers::{Layer, Map, Scale, Window, by_channel, clamped, dense, pointwise};
+use crate::tuned::{TUNED_FROM, Tuned};
 
 /// Channels of the two maps: after block 10 and after block 14.
 pub const CHANNELS: [usize; 2] = [112, 192];
@@ -34,7 +35,7 @@ const BLOCKS: [[usize; 2]; 15] = [
 /// Why weights are refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("the weights of the backbone are not usable: {0}")]
-pub struct BackboneError(String);
+pub struct BackboneError(pub(crate) String);
 
 /// Expansion, convolution by channel, projection.
 struct Block {
@@ -108,6 +109,11 @@ impl Backbone {
 
     /// The two maps of a picture in display values, `[0, 1]`. Pixels that are no numbers count as black.
     pub fn maps(&self, picture: &Raster<Vec3>) -> [Map; 2] {
+        self.maps_behind(self.front(picture), None)
+    }
+
+    /// The map before block [`TUNED_FROM`]: what the maps of all tunings have in common.
+    pub fn front(&self, picture: &Raster<Vec3>) -> Map {
         let value =
             |v: f32| (if v.is_nan() { 0.0 } else { v.clamp(0.0, 1.0) } * 255.0 - 127.0) / 128.0;
         let values = picture
@@ -121,9 +127,18 @@ impl Backbone {
             values: values.collect(),
         };
         let mut x = clamped(dense(&input, &self.stem, Window { side: 3, step: 2 }));
+        for block in &self.blocks[..TUNED_FROM] {
+            x = block.apply(x, None);
+        }
+        x
+    }
+
+    /// The two maps behind a [`front`](Self::front), as the network is or tuned.
+    pub fn maps_behind(&self, front: Map, tuned: Option<&Tuned>) -> [Map; 2] {
+        let mut x = front;
         let mut kept = Vec::with_capacity(2);
-        for (n, block) in self.blocks.iter().enumerate() {
-            x = block.apply(x);
+        for (n, block) in self.blocks.iter().enumerate().skip(TUNED_FROM) {
+            x = block.apply(x, tuned.map(|t| &t.blocks[n - TUNED_FROM]));
             if KEPT.contains(&n) {
                 kept.push(x.clone());
             }
@@ -131,17 +146,25 @@ impl Backbone {
         let deep = kept.pop().unwrap_or_else(|| x.clone());
         [kept.pop().unwrap_or(x), deep]
     }
+
+    /// Outputs of the three layers of each block from [`TUNED_FROM`] on.
+    pub(crate) fn tuned_sizes(&self) -> Vec<[usize; 3]> {
+        let of = |b: &Block| {
+            let wide = b.depthwise.bias.len();
+            [wide, wide, b.project.bias.len()]
+        };
+        self.blocks[TUNED_FROM..].iter().map(of).collect()
+    }
 }
 
 impl Block {
-    fn apply(&self, x: Map) -> Map {
-        let wide = self.expand.as_ref().map(|e| clamped(pointwise(&x, e)));
-        let deep = clamped(by_channel(
-            wide.as_ref().unwrap_or(&x),
-            &self.depthwise,
-            self.window,
-        ));
-        let mut y = pointwise(&deep, &self.project);
+    fn apply(&self, x: Map, tuned: Option<&[Scale; 3]>) -> Map {
+        let scale = |k: usize| tuned.map(|t| &t[k]);
+        let expand = |e| clamped(pointwise(&x, e, scale(0)));
+        let wide = self.expand.as_ref().map(expand);
+        let wide = wide.as_ref().unwrap_or(&x);
+        let deep = clamped(by_channel(wide, &self.depthwise, self.window, scale(1)));
+        let mut y = pointwise(&deep, &self.project, scale(2));
         if self.window.step == 1 && y.channels == x.channels {
             y.values
                 .iter_mut()

@@ -1,7 +1,9 @@
 //! From a photograph and its camera to its light.
 use std::collections::HashMap;
 use std::path::Path;
+use std::sync::Arc;
 
+use dipir_backbone::Tuned;
 use dipir_imaging::raster::LinearImage;
 use dipir_light::luminance::luminance_f64;
 use dipir_scene::camera::Camera;
@@ -14,8 +16,8 @@ use crate::features::SmallPhoto;
 use crate::grid::{BASE_TEXELS, BINS, base_texel, heading, mirrored_bin, mirrored_texel};
 use crate::histogram::{SHARES, STOPS, Scale};
 use crate::network::{
-    ENERGY, EXPOSURE, HISTOGRAM, LOG_ENERGY, LOG_RADIANCE, MAP, Member, SHARE, SUN, from_bytes,
-    to_bytes,
+    ENERGY, EXPOSURE, HISTOGRAM, LOG_ENERGY, LOG_RADIANCE, MAP, Member, SHARE, SUN, Weights,
+    from_bytes, to_bytes,
 };
 use crate::posterior::PeakPosterior;
 
@@ -55,17 +57,30 @@ impl Default for Calibration {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Estimator {
     members: Vec<Member>,
+    /// Tunings of the backbone, each for as many members, in their order.
+    tuned: Vec<Arc<Tuned>>,
     calibration: Calibration,
 }
 
 impl Estimator {
-    /// Pairs of networks, of which there has to be one.
-    pub fn new(members: Vec<Member>, calibration: Calibration) -> Result<Self, EstimatorError> {
+    /// Pairs of networks, of which there has to be one, and the tunings of the backbone that they see: each of as many
+    /// pairs, in their order, or none.
+    pub fn new(
+        members: Vec<Member>,
+        tuned: Vec<Arc<Tuned>>,
+        calibration: Calibration,
+    ) -> Result<Self, EstimatorError> {
         if members.is_empty() {
             return Err(EstimatorError::Weights("there is no network".into()));
         }
+        if !members.len().is_multiple_of(tuned.len().max(1)) {
+            let (pairs, tunings) = (members.len(), tuned.len());
+            let text = format!("{pairs} pairs of networks cannot share {tunings} tunings evenly");
+            return Err(EstimatorError::Weights(text));
+        }
         Ok(Self {
             members,
+            tuned,
             calibration,
         })
     }
@@ -87,25 +102,29 @@ impl Estimator {
 
     /// The estimator of a safetensors file's bytes.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, EstimatorError> {
-        let (members, metadata) = from_bytes(bytes)?;
+        let Weights {
+            members,
+            tuned,
+            metadata,
+        } = from_bytes(bytes)?;
         let text = metadata.get(CALIBRATION).ok_or_else(|| {
             EstimatorError::Weights(format!("the metadata has no `{CALIBRATION}`"))
         })?;
         let calibration = serde_json::from_str(text)
             .map_err(|e| EstimatorError::Weights(format!("`{CALIBRATION}`: {e}")))?;
-        Self::new(members, calibration)
+        Self::new(members, tuned, calibration)
     }
 
     /// The same networks with another calibration.
     pub fn calibrated(&self, calibration: Calibration) -> Self {
         Self {
-            members: self.members.clone(),
             calibration,
+            ..self.clone()
         }
     }
 
     /// What the networks say of the exposure and of the share, bin by bin, for the calibration of intervals.
-    pub fn histograms(&self, features: &[Vec<f32>; 2]) -> [Vec<f64>; 2] {
+    pub fn histograms(&self, features: &[[Vec<f32>; 2]]) -> [Vec<f64>; 2] {
         let sum = self.sum(features);
         [sum.exposure, sum.share]
     }
@@ -113,8 +132,10 @@ impl Estimator {
     /// The networks of all, with the calibration of the first.
     pub fn joined(all: &[Self]) -> Result<Self, EstimatorError> {
         let members = all.iter().flat_map(|e| e.members.iter().cloned()).collect();
+        let tuned = all.iter().flat_map(|e| e.tuned.iter().cloned()).collect();
         Self::new(
             members,
+            tuned,
             all.first().map(|e| e.calibration).unwrap_or_default(),
         )
     }
@@ -123,7 +144,8 @@ impl Estimator {
     pub fn to_bytes(&self) -> Result<Vec<u8>, EstimatorError> {
         let text = serde_json::to_string(&self.calibration)
             .map_err(|e| EstimatorError::Weights(e.to_string()))?;
-        to_bytes(&self.members, HashMap::from([(CALIBRATION.into(), text)]))
+        let metadata = HashMap::from([(CALIBRATION.into(), text)]);
+        to_bytes(&self.members, &self.tuned, metadata)
     }
 
     /// The light of a whole photograph, which is decoded by its transfer function: values in `[0, 1]`.
@@ -133,14 +155,19 @@ impl Estimator {
 
     /// The light of a photograph at the size that is looked at, taken towards an azimuth in the world.
     pub fn of_small_photo(&self, small: &SmallPhoto, heading_rad: f64) -> LightEstimate {
-        let features = [small.features(), small.mirrored().features()];
+        let features = small.both_sides(&self.tuned);
         self.of_features(&features, small.reference(), heading_rad)
     }
 
-    /// The light of a photograph's features and those of its mirror image, averaged.
+    /// Tunings of the backbone that the networks see.
+    pub fn tuned(&self) -> &[Arc<Tuned>] {
+        &self.tuned
+    }
+
+    /// The light of a photograph's features and those of its mirror image, averaged: one pair for each tuning.
     pub fn of_features(
         &self,
-        features: &[Vec<f32>; 2],
+        features: &[[Vec<f32>; 2]],
         reference: f32,
         heading_rad: f64,
     ) -> LightEstimate {
@@ -149,9 +176,12 @@ impl Estimator {
             .estimate(count, reference, heading_rad, &self.calibration)
     }
 
-    fn sum(&self, features: &[Vec<f32>; 2]) -> Sum {
+    fn sum(&self, features: &[[Vec<f32>; 2]]) -> Sum {
         let mut sums = [Sum::default(), Sum::default()];
-        for member in &self.members {
+        assert_eq!(features.len(), self.tuned.len().max(1), "tunings");
+        let each = self.members.len() / features.len();
+        for (n, member) in self.members.iter().enumerate() {
+            let features = &features[n / each];
             for (sum, network) in sums.iter_mut().zip(member) {
                 let plain = self.read(&network.forward(&features[0]), false);
                 let mirrored = self.read(&network.forward(&features[1]), true);

@@ -2,7 +2,9 @@
 //! elevation in the world: too little to recognise a place by, which is why light that is learned from few places
 //! carries over. The others say what kind of place it is: what a network sees in it that was trained on a million
 //! photographs of all kinds.
-use dipir_backbone::{Backbone, CHANNELS, Map};
+use std::sync::Arc;
+
+use dipir_backbone::{Backbone, CHANNELS, Map, Tuned};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::resize::{Filter, resize};
 use dipir_imaging::transfer::Transfer;
@@ -108,13 +110,28 @@ impl SmallPhoto {
         (sum / self.pixels.len() as f64) as f32 + 1e-3
     }
 
-    /// The [`FEATURES`] numbers.
-    pub fn features(&self) -> Vec<f32> {
-        let mut all = self.of_parts();
-        let maps = Backbone::embedded().maps(&self.looked);
-        all.extend(maps.iter().flat_map(Map::mean));
-        debug_assert_eq!(all.len(), FEATURES);
-        all
+    /// The [`FEATURES`] numbers, for each of the backbone's tunings; once, without, where there is none.
+    pub fn features(&self, tuned: &[Arc<Tuned>]) -> Vec<Vec<f32>> {
+        let (parts, backbone) = (self.of_parts(), Backbone::embedded());
+        let front = backbone.front(&self.looked);
+        let with = |tuned: Option<&Tuned>| {
+            let maps = backbone.maps_behind(front.clone(), tuned);
+            let mut all = parts.clone();
+            all.extend(maps.iter().flat_map(Map::mean));
+            debug_assert_eq!(all.len(), FEATURES);
+            all
+        };
+        match tuned.is_empty() {
+            true => vec![with(None)],
+            false => tuned.iter().map(|t| with(Some(t))).collect(),
+        }
+    }
+
+    /// The features of the picture and of its mirror image, for each tuning.
+    pub fn both_sides(&self, tuned: &[Arc<Tuned>]) -> Vec<[Vec<f32>; 2]> {
+        let mirrored = self.mirrored().features(tuned);
+        let pairs = self.features(tuned).into_iter().zip(mirrored);
+        pairs.map(|(plain, mirrored)| [plain, mirrored]).collect()
     }
 
     fn of_parts(&self) -> Vec<f32> {

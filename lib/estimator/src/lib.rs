@@ -29,4 +29,4 @@ pub use posterior::PeakPosterior;
 pub use visible::{BORDER_DEG, Visible, merged, overlaid};
 
 /// Raised whenever the same photograph and camera get another estimate.
-pub const VERSION: u32 = 5;
+pub const VERSION: u32 = 6;

@@ -1,7 +1,9 @@
 //! The network: two hidden layers from features to light, small enough to be applied by plain loops, which give the
 //! same bytes on any number of threads.
 use std::collections::HashMap;
+use std::sync::Arc;
 
+use dipir_backbone::Tuned;
 use safetensors::tensor::{SafeTensors, TensorView};
 
 use crate::error::EstimatorError;
@@ -148,9 +150,11 @@ fn layer([weight, bias]: &[Vec<f32>; 2], x: &[f32]) -> Vec<f32> {
 /// A network of each [`Sight`].
 pub type Member = [Network; 2];
 
-/// The bytes of a safetensors file with networks as `member.N.parts.*` and `member.N.kind.*`, and `metadata`.
+/// The bytes of a safetensors file with networks as `member.N.parts.*` and `member.N.kind.*`, tunings of the backbone as
+/// `tuned.N.*`, and `metadata`.
 pub fn to_bytes(
     members: &[Member],
+    tuned: &[Arc<Tuned>],
     metadata: HashMap<String, String>,
 ) -> Result<Vec<u8>, EstimatorError> {
     let refused = |e: safetensors::SafeTensorError| EstimatorError::Weights(e.to_string());
@@ -166,6 +170,12 @@ pub fn to_bytes(
             stored.push((format!("member.{n}.{sight}.{name}"), shape, bytes));
         }
     }
+    for (n, tuned) in tuned.iter().enumerate() {
+        for (name, values) in tuned.tensors(&format!("tuned.{n}")) {
+            let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            stored.push((name, vec![values.len()], bytes));
+        }
+    }
     let views = stored
         .iter()
         .map(|(name, shape, bytes)| {
@@ -177,8 +187,29 @@ pub fn to_bytes(
     safetensors::serialize(views, Some(metadata)).map_err(refused)
 }
 
-/// The networks and the metadata of such bytes.
-pub fn from_bytes(bytes: &[u8]) -> Result<(Vec<Member>, HashMap<String, String>), EstimatorError> {
+/// What such bytes hold.
+pub struct Weights {
+    /// Pairs of networks.
+    pub members: Vec<Member>,
+    /// Tunings of the backbone, each for as many of the pairs, in their order; none where all see it as it is.
+    pub tuned: Vec<Arc<Tuned>>,
+    /// The file's metadata.
+    pub metadata: HashMap<String, String>,
+}
+
+/// All tunings `tuned.N.*` of a file.
+pub fn tunings(file: &SafeTensors<'_>) -> Result<Vec<Arc<Tuned>>, EstimatorError> {
+    let mut all = Vec::new();
+    while let Some(tuned) = Tuned::read(file, &format!("tuned.{}", all.len()))
+        .map_err(|e| EstimatorError::Weights(e.to_string()))?
+    {
+        all.push(Arc::new(tuned));
+    }
+    Ok(all)
+}
+
+/// The networks, the tunings and the metadata of such bytes.
+pub fn from_bytes(bytes: &[u8]) -> Result<Weights, EstimatorError> {
     let refused = |e: safetensors::SafeTensorError| EstimatorError::Weights(e.to_string());
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(refused)?;
     let file = SafeTensors::deserialize(bytes).map_err(refused)?;
@@ -195,7 +226,11 @@ pub fn from_bytes(bytes: &[u8]) -> Result<(Vec<Member>, HashMap<String, String>)
             first(0)
         )));
     }
-    Ok((members, header.metadata().clone().unwrap_or_default()))
+    Ok(Weights {
+        members,
+        tuned: tunings(&file)?,
+        metadata: header.metadata().clone().unwrap_or_default(),
+    })
 }
 
 fn network(file: &SafeTensors<'_>, n: usize, sight: Sight) -> Result<Network, EstimatorError> {

@@ -47,7 +47,7 @@ fn brighter(by: [f32; 2]) -> Estimator {
     };
     let [parts, kind] = Sight::ALL;
     let pair = [network(parts, by[0]), network(kind, by[1])];
-    Estimator::new(vec![pair], Calibration::default()).unwrap()
+    Estimator::new(vec![pair], Vec::new(), Calibration::default()).unwrap()
 }
 
 /// A picture that is not its own mirror image.
@@ -534,7 +534,7 @@ fn features_are_of_the_whole_photograph_at_any_size() {
         SmallPhoto::new(&photo(64, 64), &camera(64)),
         SmallPhoto::new(&photo(256, 256), &camera(256)),
     );
-    let (a, b) = (small.features(), large.features());
+    let [a, b] = [small, large].map(|photo| photo.features(&[]).remove(0));
     assert!(a.len() == FEATURES && b.len() == FEATURES);
     // The ramps are sampled at pixel corners: they differ by 3/8 of a pixel of the smaller one, under .006.
     let most = a[..OF_PARTS]
@@ -572,4 +572,27 @@ fn the_embedded_estimator_is_bounded_on_any_photograph() {
     assert!(finite(&estimate));
     // A light that is a thousand times the photograph is no answer to a picture of middle greys.
     assert!(estimate.exposure_stops.middle.abs() < 10.0, "{estimate:?}");
+}
+
+#[test]
+fn each_tuning_of_the_backbone_is_for_as_many_networks() {
+    let whole = Estimator::embedded().unwrap();
+    let tuned = whole.tuned();
+    assert!(tuned.len() > 1);
+    let bytes = whole.to_bytes().unwrap();
+    assert_eq!(Estimator::from_bytes(&bytes).unwrap(), whole);
+    let small = SmallPhoto::new(&photo(64, 64), &camera(0.0, 64, 64));
+    let features = small.features(tuned);
+    assert_eq!(features.len(), tuned.len());
+    for (a, b) in features.iter().zip(&features[1..]) {
+        assert!(a[..OF_PARTS] == b[..OF_PARTS] && a[OF_PARTS..] != b[OF_PARTS..]);
+    }
+    let weights = crate::network::from_bytes(&estimator().to_bytes().unwrap()).unwrap();
+    let three = vec![weights.members[0].clone(); 3];
+    let refused = Estimator::new(three, tuned[..2].to_vec(), Calibration::default());
+    let refused = refused.unwrap_err().to_string();
+    assert!(
+        refused.contains("3 pairs") && refused.contains("2 tunings"),
+        "{refused}"
+    );
 }

@@ -1,6 +1,8 @@
 //! Photographs of places as features, with the light that is to be learned from each.
 use std::f32::consts::TAU;
+use std::sync::Arc;
 
+use dipir_backbone::Tuned;
 use dipir_estimator::grid::{BASE, BASE_TEXELS};
 use dipir_light::luminance::luminance;
 use glam::Vec3;
@@ -31,13 +33,22 @@ pub struct Truth {
     pub log_base: Vec<[f32; 3]>,
 }
 
+/// How photographs and lights are looked at.
+#[derive(Clone, Copy)]
+pub struct Seen<'a> {
+    /// The lights.
+    pub probes: &'a Probes,
+    /// Tunings of the backbone, one for each fold, or none.
+    pub tuned: &'a [Arc<Tuned>],
+}
+
 /// One photograph.
 #[derive(Clone, Debug)]
 pub struct Example {
     /// Number of the place.
     pub place: usize,
-    /// Features of the photograph and of its mirror image.
-    pub features: [Vec<f32>; 2],
+    /// Features of the photograph and of its mirror image, for each tuning of the backbone; once where there is none.
+    pub features: Vec<[Vec<f32>; 2]>,
     /// Mean linear luminance.
     pub reference: f32,
     /// What is to be learned.
@@ -46,7 +57,8 @@ pub struct Example {
 
 impl Example {
     /// The photograph that `view` takes of a place.
-    pub fn new(place: &Place, number: usize, view: &View, probes: &Probes, seed: u64) -> Self {
+    pub fn new(place: &Place, number: usize, view: &View, seen: &Seen<'_>, seed: u64) -> Self {
+        let probes = seen.probes;
         let (small, gain, curve) = view.take(place, seed);
         let reference = small.reference();
         let mut truth = Truth::new(place, view.heading, gain * curve / reference, probes);
@@ -55,10 +67,17 @@ impl Example {
         }
         Self {
             place: number,
-            features: [small.features(), small.mirrored().features()],
+            features: small.both_sides(seen.tuned),
             reference,
             truth,
         }
+    }
+}
+
+impl Example {
+    /// The features that the networks of fold `f` see.
+    pub fn of_fold(&self, f: usize) -> &[[Vec<f32>; 2]] {
+        std::slice::from_ref(&self.features[f % self.features.len()])
     }
 }
 
@@ -128,31 +147,25 @@ impl Truth {
 }
 
 /// `count` photographs of each place.
-pub fn drawn(places: &[Place], count: usize, probes: &Probes, seed: u64) -> Vec<Example> {
+pub fn drawn(places: &[Place], count: usize, seen: &Seen<'_>, seed: u64) -> Vec<Example> {
     (0..places.len() * count)
         .into_par_iter()
         .map(|k| {
             let (place, n) = (k / count, k % count);
             let view = View::drawn(seed, place, n);
-            Example::new(
-                &places[place],
-                place,
-                &view,
-                probes,
-                seed ^ (k as u64) << 20,
-            )
+            Example::new(&places[place], place, &view, seen, seed ^ (k as u64) << 20)
         })
         .collect()
 }
 
 /// `count` photographs of each place as the evaluation takes them, around the horizon.
-pub fn standard(places: &[Place], count: usize, probes: &Probes) -> Vec<Example> {
+pub fn standard(places: &[Place], count: usize, seen: &Seen<'_>) -> Vec<Example> {
     (0..places.len() * count)
         .into_par_iter()
         .map(|k| {
             let (place, n) = (k / count, k % count);
             let view = View::standard((n * SMOOTH[0] / count + 7 * place) % SMOOTH[0]);
-            Example::new(&places[place], place, &view, probes, 0)
+            Example::new(&places[place], place, &view, seen, 0)
         })
         .collect()
 }

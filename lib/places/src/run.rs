@@ -1,15 +1,17 @@
 //! From a folder of panoramas to weights and figures.
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 
+use dipir_backbone::Tuned;
 use dipir_estimator::network::Sight;
 use dipir_estimator::{Calibration, Estimator};
 use rayon::prelude::*;
+use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 
 use crate::error::PlacesError;
-use crate::examples::{Example, drawn, standard};
+use crate::examples::{Example, Seen, drawn, standard};
 use crate::figures::{Case, Figures, calibration, figures};
 use crate::place::{Place, folds, read_places};
 use crate::probes::Probes;
@@ -38,6 +40,8 @@ pub struct Settings {
     pub facing: f32,
     /// Reflectance of the surfaces that are to look as the camera's curve shows them.
     pub albedo: Option<f32>,
+    /// Tunings of the backbone, one for each fold, which they leave out: `lib/estimator/weights/tune.py` makes them.
+    pub tuned: Option<PathBuf>,
     /// How networks are trained.
     pub training: Training,
     /// Whether the networks of each fold stay beside the weights as `.foldN`, calibrated on the other folds: for
@@ -52,14 +56,15 @@ impl Settings {
         Self {
             panoramas,
             out,
-            folds: 6,
+            folds: 5,
             networks: 2,
-            views: 128,
+            views: 256,
             judged: 8,
             places: None,
             seed: 1,
             facing: 0.8,
             albedo: Some(0.3),
+            tuned: None,
             training: Training::default(),
             keep: false,
         }
@@ -111,8 +116,16 @@ pub fn run(
     progress(Progress::Places(places.len()));
     let fold = folds(&places, settings.folds);
     let probes = Probes::seen(settings.facing, settings.albedo);
-    let photographs = drawn(&places, settings.views, &probes, settings.seed);
-    let judged = standard(&places, settings.judged, &probes);
+    let tuned = match &settings.tuned {
+        Some(path) => tunings(path, &places, &fold, settings.folds)?,
+        None => Vec::new(),
+    };
+    let seen = Seen {
+        probes: &probes,
+        tuned: &tuned,
+    };
+    let photographs = drawn(&places, settings.views, &seen, settings.seed);
+    let judged = standard(&places, settings.judged, &seen);
     progress(Progress::Photographs(photographs.len() + judged.len()));
     let stopped = AtomicBool::new(false);
     let failure: Mutex<Option<PlacesError>> = Mutex::new(None);
@@ -120,7 +133,7 @@ pub fn run(
         .into_par_iter()
         .map(|f| {
             let kept = |p: Progress| !stopped.load(Ordering::Relaxed) && progress(p);
-            let member = one_fold(settings, f, &fold, &photographs, &probes, &kept);
+            let member = one_fold(settings, f, &fold, &photographs, &seen, &kept);
             if member.is_err() {
                 stopped.store(true, Ordering::Relaxed);
             }
@@ -177,22 +190,24 @@ fn one_fold(
     f: usize,
     fold: &[usize],
     photographs: &[Example],
-    probes: &Probes,
+    seen: &Seen<'_>,
     progress: &dyn Fn(Progress) -> bool,
 ) -> Result<Estimator, PlacesError> {
+    let own: Vec<Arc<Tuned>> = seen.tuned.get(f).cloned().into_iter().collect();
     let file = settings.out.with_extension(format!("fold{f}"));
     let note = settings.out.with_extension(format!("fold{f}.json"));
     let wanted = serde_json::to_string(settings).unwrap_or_default();
     if std::fs::read_to_string(&note).is_ok_and(|text| text == wanted)
         && let Ok(member) = Estimator::load(&file)
+        && member.tuned() == own
     {
         progress(Progress::Kept(f));
         return Ok(member);
     }
-    let seen = learned(settings, f, fold);
+    let places = learned(settings, f, fold);
     let examples: Vec<&Example> = photographs
         .iter()
-        .filter(|e| seen.contains(&e.place))
+        .filter(|e| places.contains(&e.place))
         .collect();
     let mut networks = Vec::new();
     for n in 0..settings.networks {
@@ -202,13 +217,21 @@ fn one_fold(
         let seed = settings.seed ^ (f as u64 + 1) << 32 ^ (n as u64) << 48;
         let network = |sight: Sight, told: &mut dyn FnMut(f64, f64) -> bool| {
             let seed = seed ^ (sight as u64) << 56;
-            train(&examples, &settings.training, probes, sight, seed, told)
+            train(
+                &examples,
+                f,
+                &settings.training,
+                seen.probes,
+                sight,
+                seed,
+                told,
+            )
         };
         let parts = network(Sight::Parts, &mut |done, loss| told(0.5 * done, loss))?;
         let kind = network(Sight::Kind, &mut |done, loss| told(0.5 + 0.5 * done, loss))?;
         networks.push([parts, kind]);
     }
-    let member = Estimator::new(networks, Calibration::default())?;
+    let member = Estimator::new(networks, own, Calibration::default())?;
     write(&file, &member.to_bytes()?)?;
     write(&note, wanted.as_bytes())?;
     Ok(member)
@@ -222,21 +245,65 @@ fn learned(settings: &Settings, f: usize, fold: &[usize]) -> Vec<usize> {
     seen
 }
 
-/// Estimates of photographs by the networks that `of` gives for each fold.
-fn cases<'m>(
+/// Tunings of the backbone, of which fold `f`'s left out the places of fold `f`.
+fn tunings(
+    path: &Path,
+    places: &[Place],
+    fold: &[usize],
+    folds: usize,
+) -> Result<Vec<Arc<Tuned>>, PlacesError> {
+    let refused = |why: String| PlacesError::Setting(format!("`{}`: {why}", path.display()));
+    let bytes = std::fs::read(path).map_err(|source| PlacesError::File {
+        what: "read",
+        path: path.to_owned(),
+        source,
+    })?;
+    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| refused(e.to_string()))?;
+    let file = SafeTensors::deserialize(&bytes).map_err(|e| refused(e.to_string()))?;
+    let text = header.metadata().as_ref().and_then(|m| m.get("left_out"));
+    let left_out: Vec<Vec<String>> =
+        text.and_then(|t| serde_json::from_str(t).ok())
+            .ok_or_else(|| {
+                refused("the metadata has no `left_out`, a list of names for each fold".into())
+            })?;
+    let tuned = dipir_estimator::network::tunings(&file)?;
+    if tuned.len() != folds || left_out.len() != folds {
+        let found = tuned.len().min(left_out.len());
+        return Err(refused(format!("holds {found} folds, not {folds}")));
+    }
+    let others = places
+        .iter()
+        .zip(fold)
+        .find(|(p, f)| !left_out[**f].contains(&p.name));
+    match others {
+        Some((place, f)) => Err(refused(format!(
+            "fold {f} did not leave out `{}`: it was made with other folds",
+            place.name
+        ))),
+        None => Ok(tuned),
+    }
+}
+
+/// Estimates of photographs by the networks of their place's fold, or of the fold `later` ones after it.
+fn cases(
     examples: &[&Example],
     places: &[Place],
     fold: &[usize],
-    of: impl Fn(usize) -> &'m Estimator + Sync,
+    members: &[Estimator],
+    later: usize,
 ) -> Vec<Case> {
     examples
         .par_iter()
-        .map(|e| Case {
-            estimate: of(fold[e.place]).of_features(&e.features, e.reference, 0.0),
-            histograms: of(fold[e.place]).histograms(&e.features),
-            example: (*e).clone(),
-            kind: places[e.place].kind.clone(),
-            fold: fold[e.place],
+        .map(|e| {
+            let f = (fold[e.place] + later) % members.len();
+            let features = e.of_fold(f);
+            Case {
+                estimate: members[f].of_features(features, e.reference, 0.0),
+                histograms: members[f].histograms(features),
+                example: (*e).clone(),
+                kind: places[e.place].kind.clone(),
+                fold: fold[e.place],
+            }
         })
         .collect()
 }
@@ -270,14 +337,12 @@ fn finish(
     let every = (settings.views / settings.judged).max(1);
     let any: Vec<&Example> = photographs.iter().step_by(every).collect();
     let both: Vec<&Example> = judged.iter().chain(&any).copied().collect();
-    let raw = cases(&both, places, fold, |f| &members[f]);
+    let raw = cases(&both, places, fold, members, 0);
     let (found, crossed) = calibrations(members, &raw, probes);
     let calibrated: Vec<Estimator> = members.iter().map(|m| m.calibrated(found)).collect();
     let left_out =
-        |examples: &[&Example]| figures(&cases(examples, places, fold, |f| &crossed[f]), probes);
-    let seen = cases(&judged, places, fold, |f| {
-        &calibrated[(f + 1) % calibrated.len()]
-    });
+        |examples: &[&Example]| figures(&cases(examples, places, fold, &crossed, 0), probes);
+    let seen = cases(&judged, places, fold, &calibrated, 1);
     let outcome = Outcome {
         settings: settings.clone(),
         places: places

@@ -13,7 +13,7 @@ use glam::Mat3;
 use rayon::prelude::*;
 
 use crate::error::PlacesError;
-use crate::examples::Example;
+use crate::examples::{Example, Seen};
 use crate::figures::{Case, Figures, figures, picture_error};
 use crate::place::{Place, SMOOTH, folds, read_places};
 use crate::probes::Probes;
@@ -115,7 +115,11 @@ impl Shot {
             false => View::standard(heading),
         };
         let seed = (k as u64) << 20;
-        let example = Example::new(&places[place], place, &view, probes, seed);
+        let seen = Seen {
+            probes,
+            tuned: network.tuned(),
+        };
+        let example = Example::new(&places[place], place, &view, &seen, seed);
         let (photo, gain, _) = view.photograph(&places[place], seed);
         Self {
             estimate: network.of_features(&example.features, example.reference, 0.0),

@@ -1,13 +1,16 @@
 //! Properties of the photographs, and a whole training in small.
 use std::path::Path;
 
+use dipir_estimator::Estimator;
 use dipir_estimator::network::Sight;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::luminance::luminance;
 use glam::{Vec2, Vec3};
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
 
-use crate::examples::Example;
-use crate::place::{Place, SMOOTH, folds};
+use crate::examples::{Example, Seen};
+use crate::place::{Place, SMOOTH, folds, read_places};
 use crate::probes::{PROBES, Probes};
 use crate::trainer::{Training, train};
 use crate::view::View;
@@ -39,6 +42,10 @@ fn place(name: &str, grey: f32) -> Place {
     Place::new(name, "outdoor", panorama(grey))
 }
 
+fn seen(probes: &Probes) -> Seen<'_> {
+    Seen { probes, tuned: &[] }
+}
+
 #[test]
 fn a_place_comes_apart_into_smooth_light_and_its_sun() {
     let p = place("yard", 0.3);
@@ -53,20 +60,20 @@ fn a_place_comes_apart_into_smooth_light_and_its_sun() {
 fn the_sun_is_found_relative_to_the_view() {
     let (p, probes) = (place("yard", 0.3), Probes::default());
     // Heading by a quarter turn to the right looks at the sun.
-    let e = Example::new(&p, 0, &View::standard(SMOOTH[0] / 4), &probes, 0);
+    let e = Example::new(&p, 0, &View::standard(SMOOTH[0] / 4), &seen(&probes), 0);
     assert!(
         e.truth.peak.x.abs() < 0.03 && e.truth.peak.z < -0.7,
         "{}",
         e.truth.peak
     );
-    let e = Example::new(&p, 0, &View::standard(0), &probes, 0);
+    let e = Example::new(&p, 0, &View::standard(0), &seen(&probes), 0);
     assert!(e.truth.peak.x > 0.7, "{}", e.truth.peak);
 }
 
 #[test]
 fn probes_hold_the_irradiance_of_the_panorama() {
     let (p, probes) = (place("yard", 0.3), Probes::default());
-    let e = Example::new(&p, 0, &View::standard(0), &probes, 0);
+    let e = Example::new(&p, 0, &View::standard(0), &seen(&probes), 0);
     let (_, gain, curve) = View::standard(0).take(&p, 0);
     let scale = gain * curve / e.reference;
     for (k, normal) in probes.normals.iter().enumerate() {
@@ -214,7 +221,7 @@ fn training_goes_on_from_finished_folds_to_the_same_bytes() {
 fn fewer_photographs_than_a_batch_are_one_batch() {
     let (p, probes) = (place("yard", 0.3), Probes::default());
     let examples: Vec<Example> = (0..3)
-        .map(|n| Example::new(&p, n, &View::drawn(3, 0, n), &probes, 3))
+        .map(|n| Example::new(&p, n, &View::drawn(3, 0, n), &seen(&probes), 3))
         .collect();
     let examples: Vec<&Example> = examples.iter().collect();
     let network = |batch: usize, rate: f32| {
@@ -227,6 +234,7 @@ fn fewer_photographs_than_a_batch_are_one_batch() {
         };
         train(
             &examples,
+            0,
             &settings,
             &probes,
             Sight::Parts,
@@ -281,8 +289,8 @@ fn with_an_albedo_the_light_to_learn_shows_a_surface_as_the_curve_does() {
     let (plain, told) = (Probes::default(), Probes::seen(0.0, Some(0.3)));
     let view = View::standard(0);
     let (_, _, curve) = view.take(&p, 0);
-    let a = Example::new(&p, 0, &view, &plain, 0);
-    let b = Example::new(&p, 0, &view, &told, 0);
+    let a = Example::new(&p, 0, &view, &seen(&plain), 0);
+    let b = Example::new(&p, 0, &view, &seen(&told), 0);
     for (light, shown) in a.truth.all.iter().zip(&b.truth.all) {
         // `x / (1 + x)` of the exposed light.
         let exposed = 0.3 * light.y * a.reference / curve;
@@ -292,4 +300,62 @@ fn with_an_albedo_the_light_to_learn_shows_a_surface_as_the_curve_does() {
             "{display} {exposed}"
         );
     }
+}
+
+/// A file of two tunings, whose folds left out `left_out`.
+fn tunings(path: &Path, left_out: &[Vec<String>]) {
+    let embedded = Estimator::embedded().unwrap();
+    let tuned = embedded.tuned().iter().take(2).enumerate();
+    let tensors = tuned.flat_map(|(k, t)| t.tensors(&format!("tuned.{k}")));
+    let stored: Vec<(String, Vec<u8>)> = tensors
+        .map(|(name, v)| (name, v.iter().flat_map(|v| v.to_le_bytes()).collect()))
+        .collect();
+    let views = stored.iter().map(|(name, bytes)| {
+        let shape = vec![bytes.len() / 4];
+        (
+            name.clone(),
+            TensorView::new(Dtype::F32, shape, bytes).unwrap(),
+        )
+    });
+    let text = serde_json::to_string(left_out).unwrap();
+    let metadata = [("left_out".to_string(), text)].into();
+    std::fs::write(path, safetensors::serialize(views, Some(metadata)).unwrap()).unwrap();
+}
+
+#[test]
+fn the_networks_of_a_fold_see_through_the_tuning_that_left_out_its_places() {
+    let folder = tempfile::tempdir().unwrap();
+    write_panoramas(folder.path());
+    let places = read_places(folder.path()).unwrap();
+    let fold = folds(&places, 2);
+    let file = folder.path().join("tuned.safetensors");
+    let of = |f: usize| {
+        let own = places.iter().zip(&fold).filter(|(_, g)| **g == f);
+        own.map(|(p, _)| p.name.clone()).collect::<Vec<_>>()
+    };
+    tunings(&file, &[of(0), of(1)]);
+    let plain = settings(folder.path(), "plain.safetensors");
+    let tuned = Settings {
+        tuned: Some(file.clone()),
+        keep: true,
+        ..settings(folder.path(), "out.safetensors")
+    };
+    run(&plain, &|_| true).unwrap();
+    run(&tuned, &|_| true).unwrap();
+    let load = |path: &Path| Estimator::load(path).unwrap();
+    let (whole, embedded) = (load(&tuned.out), Estimator::embedded().unwrap());
+    assert_eq!(whole.tuned(), &embedded.tuned()[..2]);
+    for f in 0..2 {
+        let one = load(&tuned.out.with_extension(format!("fold{f}")));
+        assert_eq!(one.tuned(), &embedded.tuned()[f..=f]);
+    }
+    assert!(load(&plain.out).tuned().is_empty());
+    tunings(&file, &[of(1), of(0)]);
+    let refused = run(&tuned, &|_| true).unwrap_err().to_string();
+    assert!(
+        refused.contains("other folds") && refused.contains("tuned.safetensors"),
+        "{refused}"
+    );
+    let refused = run(&Settings { folds: 3, ..tuned }, &|_| true).unwrap_err();
+    assert!(refused.to_string().contains("2 folds, not 3"), "{refused}");
 }

@@ -58,17 +58,18 @@ struct Row<'a> {
     reference: f32,
 }
 
-/// Trains a network from nothing. `progress` gets the share that is done and the mean of recent losses; `false` stops. A
+/// Trains a network of a fold from nothing. `progress` gets the share that is done and the mean of recent losses; `false` stops. A
 /// loss or a weight that is not finite is an error.
 pub fn train(
     examples: &[&Example],
+    fold: usize,
     settings: &Training,
     probes: &Probes,
     sight: Sight,
     seed: u64,
     progress: &mut dyn FnMut(f64, f64) -> bool,
 ) -> Result<Network, PlacesError> {
-    let rows = rows(examples, probes);
+    let rows = rows(examples, fold, probes);
     let network = start(&rows, sight, settings.hidden, seed);
     let inputs: Vec<Vec<f32>> = rows
         .iter()
@@ -150,10 +151,10 @@ pub fn train(
     Ok(with_weights(&network, &optimiser.mean))
 }
 
-fn rows<'a>(examples: &[&'a Example], probes: &Probes) -> Vec<Row<'a>> {
+fn rows<'a>(examples: &[&'a Example], fold: usize, probes: &Probes) -> Vec<Row<'a>> {
     let both = |e: &&'a Example| {
         let row = |n: usize, truth: Truth| Row {
-            features: &e.features[n],
+            features: &e.of_fold(fold)[0][n],
             truth,
             reference: e.reference,
         };

@@ -48,6 +48,8 @@ pub enum Command {
     Encoder(EncoderArgs),
     /// Train the light estimator on panoramas of real places, and measure it on places left out
     Light(LightArgs),
+    /// Print the folds of the places of a folder, for lib/estimator/weights/tune.py: a name, a tab and a number a line
+    Folds(FoldsArgs),
     /// Measure how well a model recognises light, on held-out scenes
     Check(CheckArgs),
     /// Sample pictures under captions of light
@@ -220,13 +222,13 @@ pub struct LightArgs {
     #[arg(value_name = "OUT")]
     pub out: PathBuf,
     /// Folds of places; each is left out once
-    #[arg(long, value_name = "N", default_value_t = 6)]
+    #[arg(long, value_name = "N", default_value_t = 5)]
     pub folds: usize,
     /// Networks of each fold, whose answers are averaged
     #[arg(long, value_name = "N", default_value_t = 2)]
     pub networks: usize,
     /// Photographs of each place to train on
-    #[arg(long, value_name = "N", default_value_t = 128)]
+    #[arg(long, value_name = "N", default_value_t = 256)]
     pub views: usize,
     /// Photographs of each place on which the networks are judged
     #[arg(long, value_name = "N", default_value_t = 8)]
@@ -234,6 +236,9 @@ pub struct LightArgs {
     /// Train on at most this many places of each fold: for the error over the number of places
     #[arg(long, value_name = "N")]
     pub places: Option<usize>,
+    /// Tunings of the backbone by lib/estimator/weights/tune.py, one for each fold
+    #[arg(long, value_name = "FILE")]
+    pub tuned: Option<PathBuf>,
     /// Key of all random numbers
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub seed: u64,
@@ -275,6 +280,7 @@ impl LightArgs {
             views: self.views,
             judged: self.judged,
             places: self.places,
+            tuned: self.tuned.clone(),
             seed: self.seed,
             training: Training {
                 hidden: self.hidden,
@@ -288,6 +294,16 @@ impl LightArgs {
             ..LightSettings::new(self.panoramas.clone(), self.out.clone())
         })
     }
+}
+
+#[derive(Args)]
+pub struct FoldsArgs {
+    /// Folder of panoramas
+    #[arg(value_name = "PANORAMAS")]
+    pub panoramas: PathBuf,
+    /// Folds of places
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u64).range(2..=1000))]
+    pub folds: u64,
 }
 
 #[derive(Args)]
