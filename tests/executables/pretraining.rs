@@ -245,6 +245,27 @@ fn the_light_estimator_is_trained_on_a_folder_of_panoramas() {
         let file = project.path("out/places").with_extension(extension);
         assert!(file.is_file(), "{}", file.display());
     }
+    let folds = project.run(PRETRAIN, &["folds", "maps", "--folds", "2"]);
+    folds.expect_success();
+    assert_eq!(folds.stdout, "hall\t0\nyard\t1\n");
+    let few = project.run(PRETRAIN, &["folds", "maps"]);
+    assert_eq!((few.code, few.stdout.as_str()), (Some(1), ""));
+    assert!(few.stderr.contains("2 panoramas"), "{}", few.stderr);
+    // What was tuned without other places.
+    let tuned = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/lib/estimator/weights/tuned.safetensors"
+    );
+    let other = project.run(
+        PRETRAIN,
+        &[&command[..], &small, &["--tuned", tuned]].concat(),
+    );
+    assert_eq!(other.code, Some(1));
+    assert!(
+        other.stderr.contains("holds 5 folds, not 2"),
+        "{}",
+        other.stderr
+    );
     let none = project.run(PRETRAIN, &["light", "nowhere", "out/places.safetensors"]);
     assert_eq!(none.code, Some(1));
     assert!(
