@@ -2,7 +2,7 @@
 //! ceiling, and how large things look, says how a camera was held.
 //!
 //! A narrow view of a panorama is blurred, a photograph is not. So that sharpness tells nothing of the field of view,
-//! no picture is looked at with more than 64 pixels along its longer side, a little blurred, and networks learn from
+//! no picture is looked at with more than 96 pixels along its longer side, a little blurred, and networks learn from
 //! pictures that are more and less so.
 use dipir_backbone::{Backbone, CHANNELS, Map};
 use dipir_imaging::raster::{LinearImage, Raster};
@@ -12,8 +12,8 @@ use glam::Vec3;
 
 use crate::pose::{Pose, log_focal};
 
-/// Pixels along the longer side that are looked at: at 24 degrees a panorama of 1024 columns has 68.
-const LONGEST: usize = 64;
+/// Pixels along the longer side that are looked at: as many as a panorama of 1024 columns has at 34 degrees.
+const LONGEST: usize = 96;
 /// How often neighbours of a photograph's are averaged, by 1 2 1.
 pub(crate) const BLUR: usize = 1;
 /// Most blur that networks learn from.
