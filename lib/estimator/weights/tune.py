@@ -1,7 +1,7 @@
 """Turns the backbone's last blocks to light: a scale and a bias for each output of the layers of blocks 9 to 14.
 
 usage: dipir-pretrain folds PANORAMAS > folds.tsv
-       tune.py PANORAMAS folds.tsv tuned.safetensors [STEPS]        (needs numpy and torch; a GPU makes it minutes)
+       tune.py PANORAMAS folds.tsv tuned.safetensors [STEPS]        (*.hdr; needs numpy and torch, and a GPU to be quick)
 
 One tuning for each fold, trained on photographs of the places of all others: `tuned.FOLD.block.N.LAYER.scale` and `.bias`
 (float32); `left_out` in the metadata names the places that each fold left out. A head of two hidden layers, which is
