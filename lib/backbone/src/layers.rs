@@ -36,7 +36,7 @@ pub(crate) struct Layer {
 }
 
 impl Layer {
-    /// Values of so many cells before the weights' part is added.
+    /// What the products are added to, for so many cells: the bias, or 0 where a [`Scale`] brings its own.
     fn start(&self, cells: usize, tuned: Option<&Scale>) -> Vec<f32> {
         match tuned {
             None => self.bias.repeat(cells),
@@ -45,7 +45,7 @@ impl Layer {
     }
 }
 
-/// What takes the place of a layer's bias, and what its outputs are multiplied by before.
+/// Changes a layer: its outputs without their bias are multiplied by `factor`, then `bias` is added.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Scale {
     pub factor: Vec<f32>,

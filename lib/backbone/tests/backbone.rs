@@ -8,6 +8,9 @@ use proptest::prelude::*;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 
+/// The file that is built into the program.
+const WHOLE: &[u8] = include_bytes!("../weights/lite0.safetensors");
+
 /// The picture of `weights/make.py`.
 fn picture(width: usize, height: usize) -> Raster<Vec3> {
     let pixel = |k: usize| {
@@ -45,17 +48,14 @@ fn maps_are_those_of_torch() {
 
 #[test]
 fn weights_that_do_not_fit_are_refused() {
-    let whole = include_bytes!("../weights/lite0.safetensors");
-    assert!(Backbone::from_bytes(whole).is_ok());
-    assert!(Backbone::from_bytes(&whole[..whole.len() / 2]).is_err());
-    let text = String::from_utf8_lossy(whole).find("block.3.project.bias");
-    let mut other = whole.to_vec();
+    assert!(Backbone::from_bytes(WHOLE).is_ok());
+    assert!(Backbone::from_bytes(&WHOLE[..WHOLE.len() / 2]).is_err());
+    let text = String::from_utf8_lossy(WHOLE).find("block.3.project.bias");
+    let mut other = WHOLE.to_vec();
     other[text.unwrap()] = b'x';
     let refused = Backbone::from_bytes(&other).err().unwrap().to_string();
     assert!(refused.contains("block.3.project.bias"), "{refused}");
 }
-
-const WHOLE: &[u8] = include_bytes!("../weights/lite0.safetensors");
 
 /// Tensors by name: type, shape, bytes.
 type Stored = BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>;

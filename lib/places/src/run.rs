@@ -253,7 +253,7 @@ fn tunings(
     folds: usize,
 ) -> Result<Vec<Arc<Tuned>>, PlacesError> {
     let refused = |why: String| PlacesError::Setting(format!("`{}`: {why}", path.display()));
-    let bytes = std::fs::read(path).map_err(|source| PlacesError::File {
+    let bytes = dipir_files::read(path).map_err(|source| PlacesError::File {
         what: "read",
         path: path.to_owned(),
         source,

@@ -2,14 +2,14 @@
 use std::path::Path;
 
 use dipir_estimator::Estimator;
-use dipir_estimator::network::Sight;
+use dipir_estimator::network::{Sight, from_bytes};
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::luminance::luminance;
 use glam::{Vec2, Vec3};
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 
-use crate::examples::{Example, Seen};
+use crate::examples::{Example, Seen, drawn};
 use crate::place::{Place, SMOOTH, folds, read_places};
 use crate::probes::{PROBES, Probes};
 use crate::trainer::{Training, train};
@@ -302,10 +302,16 @@ fn with_an_albedo_the_light_to_learn_shows_a_surface_as_the_curve_does() {
     }
 }
 
-/// A file of two tunings, whose folds left out `left_out`.
-fn tunings(path: &Path, left_out: &[Vec<String>]) {
+/// Names of the places of a fold.
+fn names_of(places: &[Place], fold: &[usize], f: usize) -> Vec<String> {
+    let own = places.iter().zip(fold).filter(|(_, g)| **g == f);
+    own.map(|(p, _)| p.name.clone()).collect()
+}
+
+/// A file of two of the embedded tunings, from number `first` on, whose folds left out `left_out`.
+fn tunings(path: &Path, first: usize, left_out: &[Vec<String>]) {
     let embedded = Estimator::embedded().unwrap();
-    let tuned = embedded.tuned().iter().take(2).enumerate();
+    let tuned = embedded.tuned()[first..first + 2].iter().enumerate();
     let tensors = tuned.flat_map(|(k, t)| t.tensors(&format!("tuned.{k}")));
     let stored: Vec<(String, Vec<u8>)> = tensors
         .map(|(name, v)| (name, v.iter().flat_map(|v| v.to_le_bytes()).collect()))
@@ -329,11 +335,8 @@ fn the_networks_of_a_fold_see_through_the_tuning_that_left_out_its_places() {
     let places = read_places(folder.path()).unwrap();
     let fold = folds(&places, 2);
     let file = folder.path().join("tuned.safetensors");
-    let of = |f: usize| {
-        let own = places.iter().zip(&fold).filter(|(_, g)| **g == f);
-        own.map(|(p, _)| p.name.clone()).collect::<Vec<_>>()
-    };
-    tunings(&file, &[of(0), of(1)]);
+    let of = |f: usize| names_of(&places, &fold, f);
+    tunings(&file, 0, &[of(0), of(1)]);
     let plain = settings(folder.path(), "plain.safetensors");
     let tuned = Settings {
         tuned: Some(file.clone()),
@@ -345,12 +348,32 @@ fn the_networks_of_a_fold_see_through_the_tuning_that_left_out_its_places() {
     let load = |path: &Path| Estimator::load(path).unwrap();
     let (whole, embedded) = (load(&tuned.out), Estimator::embedded().unwrap());
     assert_eq!(whole.tuned(), &embedded.tuned()[..2]);
+    let probes = Probes::default();
+    let through = Seen {
+        probes: &probes,
+        tuned: whole.tuned(),
+    };
+    let photographs = drawn(&places, tuned.views, &through, tuned.seed);
     for f in 0..2 {
-        let one = load(&tuned.out.with_extension(format!("fold{f}")));
-        assert_eq!(one.tuned(), &embedded.tuned()[f..=f]);
+        let path = tuned.out.with_extension(format!("fold{f}"));
+        assert_eq!(load(&path).tuned(), &embedded.tuned()[f..=f]);
+        // What the networks of the fold learned from.
+        let learned = photographs.iter().filter(|e| fold[e.place] != f);
+        let rows: Vec<&Vec<f32>> = learned.flat_map(|e| &e.of_fold(f)[0]).collect();
+        let weights = from_bytes(&std::fs::read(&path).unwrap()).unwrap();
+        let [_, kind] = &weights.members[0];
+        for (n, mean) in kind.mean.iter().enumerate() {
+            let seen = |r: &&Vec<f32>| f64::from(*Sight::Kind.of(r).nth(n).unwrap());
+            let wanted = rows.iter().map(seen).sum::<f64>() / rows.len() as f64;
+            // The same sum in the same order; rounded once to single precision, 6e-8 of it.
+            assert!(
+                (f64::from(*mean) - wanted).abs() <= 1e-7 * wanted.abs(),
+                "{n}"
+            );
+        }
     }
     assert!(load(&plain.out).tuned().is_empty());
-    tunings(&file, &[of(1), of(0)]);
+    tunings(&file, 0, &[of(1), of(0)]);
     let refused = run(&tuned, &|_| true).unwrap_err().to_string();
     assert!(
         refused.contains("other folds") && refused.contains("tuned.safetensors"),
@@ -358,4 +381,33 @@ fn the_networks_of_a_fold_see_through_the_tuning_that_left_out_its_places() {
     );
     let refused = run(&Settings { folds: 3, ..tuned }, &|_| true).unwrap_err();
     assert!(refused.to_string().contains("2 folds, not 3"), "{refused}");
+}
+
+#[test]
+fn a_finished_fold_of_another_tuning_is_trained_again() {
+    let folder = tempfile::tempdir().unwrap();
+    write_panoramas(folder.path());
+    let places = read_places(folder.path()).unwrap();
+    let fold = folds(&places, 2);
+    let of = |f: usize| names_of(&places, &fold, f);
+    let file = folder.path().join("tuned.safetensors");
+    let mut asked = Settings {
+        tuned: Some(file.clone()),
+        ..settings(folder.path(), "out.safetensors")
+    };
+    // 3 steps a pass: progress is told at step 20.
+    asked.training.epochs = 8;
+    let one_thread = rayon::ThreadPoolBuilder::new()
+        .num_threads(1)
+        .build()
+        .unwrap();
+    tunings(&file, 0, &[of(0), of(1)]);
+    let end = one_thread.install(|| run(&asked, &|p| !matches!(p, Progress::Training(1, ..))));
+    assert!(matches!(end, Err(PlacesError::Stopped)));
+    assert!(asked.out.with_extension("fold0").exists());
+    tunings(&file, 2, &[of(0), of(1)]);
+    run(&asked, &|p| !matches!(p, Progress::Kept(_))).unwrap();
+    let embedded = Estimator::embedded().unwrap();
+    let found = Estimator::load(&asked.out).unwrap();
+    assert_eq!(found.tuned(), &embedded.tuned()[2..4]);
 }

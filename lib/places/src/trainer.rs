@@ -58,8 +58,8 @@ struct Row<'a> {
     reference: f32,
 }
 
-/// Trains a network of a fold from nothing. `progress` gets the share that is done and the mean of recent losses; `false` stops. A
-/// loss or a weight that is not finite is an error.
+/// Trains a network of a fold from nothing. `progress` gets the share that is done and the mean of recent losses; `false`
+/// stops. A loss or a weight that is not finite is an error.
 pub fn train(
     examples: &[&Example],
     fold: usize,
