@@ -18,6 +18,8 @@ pub struct Lens {
     pub distortion: Distortion,
 }
 
+/// The middle of the first pixel, pixels from the top left corner. OpenCV and those who follow it count from there.
+pub(crate) const FIRST_PIXEL: DVec2 = DVec2::splat(0.5);
 /// Pixels along a side of the largest picture.
 const MOST_PIXELS: f64 = 1e7;
 /// Focal lengths in sides of the picture: 179.9 degrees are seen at the shortest, 2 seconds of arc at the longest.

@@ -1,7 +1,8 @@
 //! `.chan` files, as Nuke and Blender write cameras of a shot.
 //!
 //! A line is a frame: number, position x y z, rotation x y z in degrees, and the vertical field of
-//! view in degrees. The world has +y up; a rotation turns about z, then x, then y.
+//! view in degrees. The world has +y up; a rotation turns about z, then x, then y: ZXY, which is Nuke's order by default
+//! and a choice in Blender. The file does not say it.
 use std::collections::BTreeMap;
 
 use glam::{DMat3, DVec2, DVec3};

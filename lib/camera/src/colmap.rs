@@ -176,9 +176,9 @@ pub fn read_text(
         lenses.insert(id, lens(model, [*w, *h], parameters)?);
     }
     let mut model = Model::default();
-    // Each image is a line followed by one of its points, which may be empty.
-    let mut lines = records(images).skip_while(|l| l.is_empty());
-    while let Some(line) = lines.next() {
+    // Each image is a line followed by one of its points, which may be empty; further empty lines mean nothing.
+    let mut lines = records(images);
+    while let Some(line) = lines.find(|l| !l.is_empty()) {
         let words: Vec<&str> = line.splitn(10, char::is_whitespace).collect();
         let numbers: Option<Vec<f64>> = words
             .iter()

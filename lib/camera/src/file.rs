@@ -82,7 +82,8 @@ pub fn read(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
 /// Whether the file in `path` has one camera, whatever a picture is called. A file that cannot be read has none.
 pub fn has_one(path: &Path) -> bool {
     let wanted = Wanted {
-        size: [1.0, 1.0],
+        // Of any picture: the width of a camera of another shape shall be no fraction of a pixel.
+        size: [1e3, 1e3],
         which: Which::Photo(Path::new("")),
         up: None,
         fov_deg: Some(45.0),
@@ -213,14 +214,27 @@ fn in_json(
         return Ok(of(camera, "nerfstudio", false));
     }
     if has("camera_intrinsic") {
-        let cameras = nuscenes::read(bytes, wanted.size, z_up)?;
-        return Ok(of(*chosen(&cameras, wanted, "nuScenes")?, "nuScenes", true));
+        return Ok(of(of_nuscenes(bytes, wanted, z_up)?, "nuScenes", true));
     }
     if has("cameraTransform") || has("cameraParameters") {
         only(wanted, "fSpy")?;
         return Ok(of(fspy::read(bytes, z_up)?, "fSpy", true));
     }
     lens_alone(&String::from_utf8_lossy(bytes), wanted)
+}
+
+/// The camera that is wanted by the first name of each record or, if none has it, by its others.
+fn of_nuscenes(bytes: &[u8], wanted: &Wanted, up: WorldUp) -> Result<Camera, CameraError> {
+    let all = nuscenes::read_named(bytes, wanted.size, up)?;
+    let by = |name: &dyn Fn(&nuscenes::Names) -> Option<String>| {
+        let named = all
+            .iter()
+            .map(|(names, c)| (name(names).unwrap_or_default(), *c));
+        let named: Vec<(String, Camera)> = named.collect();
+        chosen(&named, wanted, "nuScenes").copied()
+    };
+    let others = || (0..3).find_map(|k| by(&|names| names[k].clone()).ok());
+    by(&|names| names.iter().flatten().next().cloned()).or_else(|e| others().ok_or(e))
 }
 
 fn lens_alone(text: &str, wanted: &Wanted) -> Result<Found, CameraError> {

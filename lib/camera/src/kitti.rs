@@ -1,10 +1,10 @@
 //! KITTI's `calib` texts.
 //!
 //! `P2: …` (or `P_rect_02: …`) is a projection of twelve numbers by rows, from the rectified frame of
-//! the first camera, in image axes, to pixels.
+//! the first camera, in image axes, to pixels, which count from the middle of the first one.
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::camera::{Camera, Lens, Pose, WorldUp};
+use crate::camera::{Camera, FIRST_PIXEL, Lens, Pose, WorldUp};
 use crate::error::CameraError;
 
 const FORMAT: &str = "KITTI calibration";
@@ -24,7 +24,7 @@ pub fn read(text: &str, index: u32, size: [f64; 2]) -> Result<Camera, CameraErro
         return Err(wrong("is not a projection of a rectified camera"));
     }
     let lens = Lens {
-        principal_px: DVec2::new(p[2], p[6]),
+        principal_px: DVec2::new(p[2], p[6]) + FIRST_PIXEL,
         ..Lens::pinhole(size, DVec2::new(p[0], p[5]))
     };
     lens.check(FORMAT)?;
@@ -42,14 +42,15 @@ pub fn read(text: &str, index: u32, size: [f64; 2]) -> Result<Camera, CameraErro
 /// `R0_rect` (or `R_rect`, or none for an identity).
 ///
 /// # Errors
-/// If the file has no such matrix, or one that does not rotate.
+/// If the file has no such matrix, or one that does not rotate, or `R0_rect` is not nine numbers.
 pub fn read_scanner(text: &str) -> Result<(DMat3, DVec3), CameraError> {
     let [r00, r01, r02, tx, r10, r11, r12, ty, r20, r21, r22, tz] =
         numbers(text, ["Tr_velo_to_cam", "Tr"])?;
     let rotation = DMat3::from_cols_array(&[r00, r10, r20, r01, r11, r21, r02, r12, r22]);
-    let rectify = match numbers(text, ["R0_rect", "R_rect"]) {
-        Ok(rows) => DMat3::from_cols_array(&rows).transpose(),
-        Err(_) => DMat3::IDENTITY,
+    let names = ["R0_rect", "R_rect"];
+    let rectify = match record(text, names) {
+        Some(_) => DMat3::from_cols_array(&numbers(text, names)?).transpose(),
+        None => DMat3::IDENTITY,
     };
     let turn = WorldUp::MinusY.to_ours() * rectify;
     let pose = Pose::from_axes(turn * rotation, turn * DVec3::new(tx, ty, tz));
@@ -57,13 +58,15 @@ pub fn read_scanner(text: &str) -> Result<(DMat3, DVec3), CameraError> {
     Ok((pose.rotation, pose.position))
 }
 
+/// The first line of one of the names: the name and what is behind it.
+fn record<'a>(text: &'a str, names: [&str; 2]) -> Option<(&'a str, &'a str)> {
+    let mut lines = text.lines().filter_map(|line| line.split_once(':'));
+    lines.find(|(name, _)| names.contains(&name.trim()))
+}
+
 /// The numbers behind the first of the names that is there.
 fn numbers<const N: usize>(text: &str, names: [&str; 2]) -> Result<[f64; N], CameraError> {
-    let line = text.lines().find_map(|line| {
-        let (name, values) = line.split_once(':')?;
-        names.contains(&name.trim()).then_some((name, values))
-    });
-    let Some((name, line)) = line else {
+    let Some((name, line)) = record(text, names) else {
         let detail = format!("it has neither {} nor {}", names[0], names[1]);
         return Err(CameraError::new(FORMAT, detail));
     };

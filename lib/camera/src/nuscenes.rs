@@ -2,11 +2,12 @@
 //!
 //! A sensor has `translation` (metres) and `rotation` (quaternion w x y z) into the vehicle, whose
 //! frame has +x forward, +y to the left, +z up and its origin on the ground; a camera has
-//! `camera_intrinsic`, three rows of three. A record may bring the vehicle's own `ego_pose` along.
+//! `camera_intrinsic`, three rows of three, in pixels from the middle of the first one. A record may
+//! bring the vehicle's own `ego_pose` along.
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::Deserialize;
 
-use crate::camera::{Camera, Lens, Pose, WorldUp};
+use crate::camera::{Camera, FIRST_PIXEL, Lens, Pose, WorldUp};
 use crate::error::CameraError;
 
 const FORMAT: &str = "nuScenes";
@@ -66,8 +67,8 @@ fn records(json: &[u8]) -> Result<Vec<Record>, CameraError> {
     }
 }
 
-/// Reads all cameras; records of other sensors are passed over. `size` is that of the image, for
-/// records without `width` and `height`.
+/// Reads all cameras by the first of their names; records of other sensors are passed over. `size` is that of the image,
+/// for records without `width` and `height`.
 ///
 /// # Errors
 /// On records without a rotation, and intrinsics that are no pinhole's.
@@ -76,6 +77,23 @@ pub fn read(
     size: [f64; 2],
     up: WorldUp,
 ) -> Result<Vec<(String, Camera)>, CameraError> {
+    let cameras = read_named(json, size, up)?.into_iter();
+    let first = |(names, camera): (Names, Camera)| {
+        let name = names.into_iter().flatten().next();
+        (name.unwrap_or_default(), camera)
+    };
+    Ok(cameras.map(first).collect())
+}
+
+/// What a record may be called by: its channel, the file of its picture and its token.
+pub(crate) type Names = [Option<String>; 3];
+
+/// As [`read`], with all names.
+pub(crate) fn read_named(
+    json: &[u8],
+    size: [f64; 2],
+    up: WorldUp,
+) -> Result<Vec<(Names, Camera)>, CameraError> {
     let mut cameras = Vec::new();
     for record in records(json)? {
         if record.camera_intrinsic.is_empty() {
@@ -89,7 +107,7 @@ pub fn read(
         }
         let own = record.width.zip(record.height).map(|(w, h)| [w, h]);
         let lens = Lens {
-            principal_px: DVec2::new(cx, cy),
+            principal_px: DVec2::new(cx, cy) + FIRST_PIXEL,
             ..Lens::pinhole(own.unwrap_or(size), DVec2::new(fx, fy))
         };
         lens.check(FORMAT)?;
@@ -99,8 +117,8 @@ pub fn read(
         let pose = Pose::from_axes(axes, position)
             .ok_or_else(|| CameraError::new(FORMAT, "a record does not rotate"))?;
         let pose = pose.in_our_world(up);
-        let name = record.channel.or(record.filename).or(record.token);
-        cameras.push((name.unwrap_or_default(), Camera { pose, lens }));
+        let names = [record.channel, record.filename, record.token];
+        cameras.push((names, Camera { pose, lens }));
     }
     Ok(cameras)
 }

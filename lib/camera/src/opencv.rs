@@ -1,9 +1,9 @@
 //! Lenses that OpenCV and ROS calibrate: `camera_matrix`, `distortion_coefficients`, and the image's
-//! size, as YAML or JSON.
+//! size, as YAML or JSON. Pixels count from the middle of the first one.
 use glam::DVec2;
 use serde_json::Value;
 
-use crate::camera::Lens;
+use crate::camera::{FIRST_PIXEL, Lens};
 use crate::distortion::Distortion;
 use crate::error::CameraError;
 
@@ -19,6 +19,7 @@ const COEFFICIENTS: [&str; 5] = [
 ];
 const WIDTH: [&str; 3] = ["image_width", "image_Width", "width"];
 const HEIGHT: [&str; 3] = ["image_height", "image_Height", "height"];
+/// The first that is there counts: beside the model of the distortion, that of the camera says `pinhole`.
 const MODEL: [&str; 2] = ["distortion_model", "camera_model"];
 /// More numbers than any matrix of a calibration has.
 const MOST_NUMBERS: usize = 1 << 12;
@@ -44,7 +45,7 @@ pub fn read(text: &str, size: Option<[f64; 2]>) -> Result<Lens, CameraError> {
         return Err(wrong("it has no image_width and image_height"));
     };
     let lens = Lens {
-        principal_px: DVec2::new(cx, cy),
+        principal_px: DVec2::new(cx, cy) + FIRST_PIXEL,
         distortion: found.distortion()?,
         ..Lens::pinhole(size, DVec2::new(fx, fy))
     };
@@ -92,7 +93,7 @@ impl Found {
             })
         };
         let number = |names: &[&str]| value(names)?.parse().ok();
-        let model = value(&MODEL).unwrap_or("");
+        let model = MODEL.iter().find_map(|name| value(&[name])).unwrap_or("");
         Ok(Self {
             matrix: yaml_list(text, &MATRIX)?,
             coefficients: yaml_list(text, &COEFFICIENTS)?,

@@ -81,3 +81,16 @@ fn a_file_of_a_model_is_no_calibration_and_is_read_with_those_beside_it() {
     let want = format!("cannot read the camera file \"{}\"", missing.display());
     assert_eq!(error, want);
 }
+
+#[test]
+fn empty_lines_after_images_mean_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    // Of each image two lines, of which the second is empty, and further ones.
+    put(
+        folder.path(),
+        3.0,
+        "a.jpg\n\n\n\n2 1 0 0 0 0 0 -4 1 b.jpg\n\n\n",
+    );
+    assert_eq!(position(folder.path(), "a.jpg").unwrap().z, 3.0);
+    assert_eq!(position(folder.path(), "b.jpg").unwrap().z, 4.0);
+}

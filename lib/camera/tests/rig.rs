@@ -216,7 +216,7 @@ fn nuscenes_json(rig: &[Camera]) -> String {
         records.push(json!({
             "token": "a camera", "channel": format!("CAM_{i}"), "rotation": [q.w, q.x, q.y, q.z],
             "translation": (to_z_up * camera.pose.position).to_array(),
-            "camera_intrinsic": [[520, 0, 320], [0, 520, 240], [0, 0, 1]],
+            "camera_intrinsic": [[520, 0, 319.5], [0, 520, 239.5], [0, 0, 1]],
         }));
     }
     json!(records).to_string()
@@ -424,8 +424,8 @@ fn fspy_projects_without_a_camera_or_of_another_version_are_explained_in_one_lin
 }
 
 const OPENCV_YAML: &str = "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n\
-camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 520., 0., 330., 0., 521.,\n       \
-230., 0., 0., 1. ]\ndistortion_coefficients: !!opencv-matrix\n   rows: 5\n   cols: 1\n   dt: d\n   \
+camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 520., 0., 329.5, 0., 521.,\n       \
+229.5, 0., 0., 1. ]\ndistortion_coefficients: !!opencv-matrix\n   rows: 5\n   cols: 1\n   dt: d\n   \
 data: [ -0.2, 5.0e-2, 1e-3, -2e-3, 0.01 ]\n";
 
 #[test]
@@ -438,15 +438,15 @@ fn opencv_ros_nerfstudio_and_colmap_mean_the_same_distortion() {
     };
     assert_eq!(opencv::read(OPENCV_YAML, None).unwrap(), want);
     let json = json!({
-        "camera_matrix": [[520, 0, 330], [0, 521, 230], [0, 0, 1]],
+        "camera_matrix": [[520, 0, 329.5], [0, 521, 229.5], [0, 0, 1]],
         "distortion_coefficients": [[-0.2, 0.05, 1e-3, -2e-3, 0.01]],
     });
     assert_eq!(opencv::read(&json.to_string(), Some(SIZE)).unwrap(), want);
     let ros = "image_width: 640\nimage_height: 480\ncamera_matrix:\n  rows: 3\n  cols: 3\n  \
-        data: [520, 0, 330, 0, 521, 230, 0, 0, 1]\ndistortion_model: plumb_bob\n\
+        data: [520, 0, 329.5, 0, 521, 229.5, 0, 0, 1]\ndistortion_model: plumb_bob\n\
         distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [-0.2, 0.05, 0.001, -0.002, 0.01]\n";
     assert_eq!(opencv::read(ros, None).unwrap(), want);
-    let by_hand = "image_width: 640 # pixels\nimage_height: 480\nK:\n- [520, 0, 330]\n- [0, 521, 230] # y\n\
+    let by_hand = "image_width: 640 # pixels\nimage_height: 480\nK:\n- [520, 0, 329.5]\n- [0, 521, 229.5] # y\n\
         - [0, 0, 1]\nD:\n  - -0.2\n  - 0.05\n  - 0.001 # p1\n  - -0.002\n  - 0.01\nR: [1, 0, 0]\n";
     assert_eq!(opencv::read(by_hand, None).unwrap(), want);
     let tabs = OPENCV_YAML.replace("-0.2, 5.0e-2,", "-0.2,\t5.0e-2, # k1 k2\n  ");
@@ -522,7 +522,7 @@ fn lenses_of_no_picture_are_refused() {
 #[test]
 fn kittis_projection_is_met() {
     let camera = kitti::read(KITTI, 2, [1242.0, 375.0]).unwrap();
-    // 2 m to the right, 1.65 m below and 10 m ahead of camera 0, by the matrix.
+    // 2 m to the right, 1.65 m below and 10 m ahead of camera 0, by the matrix, from the middle of the first pixel.
     let point = DVec3::new(2.0, 1.65, 10.0);
     let w = point.z + 0.002;
     let want = DVec2::new(
@@ -531,7 +531,7 @@ fn kittis_projection_is_met() {
     );
     let ours = DVec3::new(point.x, -point.y, -point.z);
     let got = camera.project(ours).unwrap().pixel;
-    assert!(got.abs_diff_eq(want, 1e-9), "{got} {want}");
+    assert!(got.abs_diff_eq(want + 0.5, 1e-9), "{got} {want}");
     // 10 m ahead of the scanner, 2 m to its right and 1.7 m below it.
     let (rotation, position) = kitti::read_scanner(KITTI).unwrap();
     let seen = rotation * DVec3::new(10.0, -2.0, -1.7) + position;

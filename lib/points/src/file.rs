@@ -106,6 +106,13 @@ fn sensor(path: &Path, up: Option<WorldUp>) -> Result<(DMat3, DVec3), PointsErro
         .is_some_and(|e| e.eq_ignore_ascii_case("json"));
     Ok(match is_json {
         true => nuscenes::sensor(&bytes, up.unwrap_or(WorldUp::Z))?,
+        false if up.is_some() => {
+            return Err(PointsError::with_remedy(
+                "KITTI",
+                "its scanner stands in the world of its camera 0, of which -y points up",
+                "leave points_up out",
+            ));
+        }
         false => kitti::read_scanner(&String::from_utf8_lossy(&bytes))?,
     })
 }

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::cloud::Cloud;
 use crate::error::PointsError;
-use crate::plane::{Plane, ransac, refine};
+use crate::plane::{ransac, refine};
 use crate::relief::{Relief, relief};
 
 /// The ground of a scene, and how sure it is.
@@ -217,14 +217,5 @@ impl Ground {
             "{shape}, on which {} of {} points lie within {:.3} m (rms)",
             self.inliers, self.points, self.residual_m
         )
-    }
-}
-
-impl From<&Ground> for Plane {
-    fn from(ground: &Ground) -> Self {
-        Self {
-            normal: ground.normal,
-            offset: ground.normal.dot(ground.point),
-        }
     }
 }

@@ -20,7 +20,10 @@ struct Header {
     sizes: Vec<usize>,
     kinds: Vec<String>,
     counts: Vec<usize>,
-    points: usize,
+    /// Width and height of the grid of points.
+    grid: [usize; 2],
+    /// Product of the two, where it is not stated.
+    points: Option<usize>,
     viewpoint: Vec<f64>,
     data: String,
 }
@@ -47,13 +50,17 @@ pub(crate) fn read(bytes: &[u8]) -> Result<Cloud, PointsError> {
         points,
         viewpoint: Some(DVec3::ZERO),
     };
-    let [tx, ty, tz, qw, qx, qy, qz] = header.viewpoint[..] else {
+    if header.viewpoint.is_empty() {
         return Ok(cloud);
+    }
+    let no_pose = || wrong("its viewpoint is no rotation and position");
+    let [tx, ty, tz, qw, qx, qy, qz] = header.viewpoint[..] else {
+        return Err(no_pose());
     };
     let (q, t) = (DQuat::from_xyzw(qx, qy, qz, qw), DVec3::new(tx, ty, tz));
     let turns = (q.length() - 1.0).abs() < 1e-3 && t.is_finite();
     if !turns {
-        return Err(wrong("its viewpoint is no rotation and position"));
+        return Err(no_pose());
     }
     Ok(cloud.moved(1.0, glam::DMat3::from_quat(q.normalize()), t))
 }
@@ -67,7 +74,10 @@ fn header(bytes: &[u8]) -> Result<(Header, &[u8]), PointsError> {
         let line = String::from_utf8_lossy(&bytes[at..end]).into_owned();
         at = (end + 1).min(bytes.len());
         let bad = || wrong(format!("its header says \"{}\"", shown(&line)));
-        let (key, values) = line.trim().split_once(' ').unwrap_or((line.trim(), ""));
+        let (key, values) = line
+            .trim()
+            .split_once(char::is_whitespace)
+            .unwrap_or((line.trim(), ""));
         let words = || values.split_whitespace();
         let numbers = || -> Result<Vec<usize>, PointsError> {
             words().map(|w| w.parse().map_err(|_| bad())).collect()
@@ -77,7 +87,9 @@ fn header(bytes: &[u8]) -> Result<(Header, &[u8]), PointsError> {
             "SIZE" => header.sizes = numbers()?,
             "TYPE" => header.kinds = words().map(Into::into).collect(),
             "COUNT" => header.counts = numbers()?,
-            "POINTS" => header.points = values.trim().parse().map_err(|_| bad())?,
+            "WIDTH" => header.grid[0] = values.trim().parse().map_err(|_| bad())?,
+            "HEIGHT" => header.grid[1] = values.trim().parse().map_err(|_| bad())?,
+            "POINTS" => header.points = Some(values.trim().parse().map_err(|_| bad())?),
             "VIEWPOINT" => {
                 let values = words().map(|w| w.parse::<f64>().map_err(|_| bad()));
                 header.viewpoint = values.collect::<Result<_, _>>()?;
@@ -93,6 +105,11 @@ fn header(bytes: &[u8]) -> Result<(Header, &[u8]), PointsError> {
 }
 
 impl Header {
+    fn points(&self) -> usize {
+        let [width, height] = self.grid;
+        self.points.unwrap_or(width.saturating_mul(height))
+    }
+
     fn checked(mut self) -> Result<Self, PointsError> {
         let n = self.fields.len();
         if self.counts.is_empty() {
@@ -110,9 +127,11 @@ impl Header {
 fn ascii(header: &Header, axes: [usize; 3], body: &str) -> Result<Vec<DVec3>, PointsError> {
     let column = |field: usize| header.counts[..field].iter().sum::<usize>();
     let columns = axes.map(column);
-    let mut found = Collector::new(header.points);
-    let lines = body.lines().filter(|l| !l.trim().is_empty());
-    for (i, line) in lines.take(header.points).enumerate() {
+    let count = header.points();
+    let mut found = Collector::new(count);
+    let mut lines = body.lines().filter(|l| !l.trim().is_empty());
+    for i in 0..count {
+        let line = lines.next().ok_or_else(|| wrong("it is cut short"))?;
         let words: Vec<&str> = line.split_whitespace().collect();
         let at = |k: usize| words.get(columns[k]).and_then(|w| w.parse().ok());
         let (Some(x), Some(y), Some(z)) = (at(0), at(1), at(2)) else {
@@ -135,12 +154,13 @@ fn binary(header: &Header, axes: [usize; 3], body: &[u8]) -> Result<Vec<DVec3>, 
             return Err(wrong("its coordinates are no numbers of 4 or 8 bytes"));
         }
     }
-    if stride > MOST_STRIDE || body.len() / stride.max(1) < header.points {
+    let count = header.points();
+    if stride > MOST_STRIDE || body.len() / stride.max(1) < count {
         return Err(wrong("it is cut short"));
     }
     let places = axes.map(|field| (offset(field), header.sizes[field]));
-    let mut found = Collector::new(header.points);
-    for point in body.chunks_exact(stride).take(header.points) {
+    let mut found = Collector::new(count);
+    for point in body.chunks_exact(stride).take(count) {
         let at = |(offset, size): (usize, usize)| {
             let bytes = &point[offset..offset + size];
             match bytes.first_chunk::<8>() {

@@ -39,6 +39,8 @@ const BEST: DVec2 = DVec2::new(0.5, 0.72);
 const BEST_HEIGHT: f64 = 0.3;
 /// Least height in the picture, of the picture's height.
 const LEAST_HEIGHT: f64 = 0.03;
+/// What is lower than this share of its radius, as a rug, has no height to judge by: that of the box around it counts.
+const FLAT: f64 = 0.1;
 /// Share of the picture's size that is kept free at its border.
 const MARGIN: f64 = 0.01;
 /// Air around the object, metres.
@@ -121,9 +123,12 @@ impl Search<'_> {
         }
         let pixel = |point: DVec3| Some(self.camera.project(point)?.pixel);
         let up = self.ground.normal;
-        let (low, high) = (pixel(foot)?, pixel(foot + body.height_m * up)?);
-        let height = low.distance(high) / size.y;
-        (height > LEAST_HEIGHT && !(self.hidden)(low)).then_some(height)
+        let (stands, top) = (pixel(foot)?, pixel(foot + body.height_m * up)?);
+        let height = match body.height_m < FLAT * body.radius_m {
+            true => high.y - low.y,
+            false => stands.distance(top),
+        } / size.y;
+        (height > LEAST_HEIGHT && !(self.hidden)(stands)).then_some(height)
     }
 
     /// The box of pixels around the body; `None` if it reaches where the camera does not see.
@@ -338,5 +343,22 @@ mod tests {
         let boxes = [(foot, post), taken[0]].map(|(foot, body)| search.seen(foot, &body));
         assert!(overlap(boxes[0].unwrap(), boxes[1].unwrap()));
         assert!(foot.distance(taken[0].0) > 2.95);
+    }
+
+    #[test]
+    fn a_rug_has_a_place_though_it_has_hardly_a_height() {
+        for height_m in [0.0, 0.01] {
+            let rug = Body {
+                radius_m: 0.9,
+                height_m,
+            };
+            for draw in 0..3 {
+                let [(foot, [low, high])] = placed(&[rug], draw)[..] else {
+                    panic!("one place");
+                };
+                assert_eq!(foot.y, 0.0);
+                assert!((high - low).y > LEAST_HEIGHT * 600.0);
+            }
+        }
     }
 }

@@ -336,3 +336,51 @@ proptest! {
         let _ = file::depth_png(&damaged(&pcd("binary")));
     }
 }
+
+#[test]
+fn the_number_of_points_in_pcd_is_that_of_its_grid_where_it_is_not_stated() {
+    let whole = String::from_utf8(pcd("ascii")).unwrap();
+    let lines = whole.lines().filter(|l| !l.starts_with("POINTS"));
+    let short: Vec<&str> = lines.collect();
+    let tabs = whole.replace("FIELDS intensity x", "FIELDS\tintensity x");
+    for text in [short.join("\n"), tabs] {
+        assert_eq!(
+            file::pcd(text.as_bytes()).unwrap().points.len(),
+            POINTS.len()
+        );
+    }
+}
+
+#[test]
+fn points_and_numbers_that_are_missing_in_pcd_are_told() {
+    let whole = String::from_utf8(pcd("ascii")).unwrap();
+    let (head, _) = whole.trim_end().rsplit_once('\n').unwrap();
+    let pose = whole.replace("VIEWPOINT 0 0 0 1 0 0 0", "VIEWPOINT 5 0 0 1 0 0");
+    for (text, said) in [
+        (head, "it is cut short"),
+        (&pose, "its viewpoint is no rotation and position"),
+    ] {
+        let error = file::pcd(text.as_bytes()).unwrap_err().to_string();
+        assert!(error.contains(said), "{error}");
+    }
+}
+
+#[test]
+fn an_axis_beside_a_calibration_of_kitti_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let camera = camera();
+    let (scan, pose) = (folder.path().join("a.bin"), folder.path().join("calib.txt"));
+    std::fs::write(&scan, sweep(4)).unwrap();
+    std::fs::write(&pose, "Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n").unwrap();
+    let of = |up| {
+        let source = Source {
+            up,
+            pose: Some(&pose),
+            ..source(&scan, &camera)
+        };
+        file::read(&source).map_err(|e| e.to_string())
+    };
+    assert!(of(None).is_ok());
+    let error = of(Some(WorldUp::Y)).unwrap_err();
+    assert!(error.contains("leave points_up out"), "{error}");
+}

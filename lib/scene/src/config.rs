@@ -399,13 +399,19 @@ impl SceneConfig {
             background,
             transfer,
             class: class.into(),
-            occluders: self.occluders.clone(),
+            occluders: self.used_occluders().cloned(),
             objects,
             camera,
             proxy,
             effects: self.effects,
             limits: self.limits,
         })
+    }
+
+    /// The mask, unless the effect is switched off.
+    fn used_occluders(&self) -> Option<&PathBuf> {
+        let is_off = self.effects.occluders == Some(EffectSwitch::Off);
+        self.occluders.as_ref().filter(|_| !is_off)
     }
 }
 

@@ -233,15 +233,18 @@ impl Scene {
             undistortion: undistortion.as_ref(),
             taken,
         };
-        let mut assembly = Assembly::new(camera, settings.objects.iter().map(|o| o.path.clone()));
-        let mut objects = Vec::new();
-        for record in of_shot.iter().flat_map(|of_shot| &of_shot.objects) {
-            objects.push(assembly.again(&mut files, record)?);
-        }
+        let recorded = of_shot.map_or(&[][..], |of_shot| &of_shot.objects[..]);
         let to_place = match of_shot {
             Some(_) => &[],
             None => &settings.objects[..],
         };
+        let paths = recorded.iter().map(|o| &o.file.path);
+        let paths = paths.chain(to_place.iter().map(|o| &o.path)).cloned();
+        let mut assembly = Assembly::new(camera, paths);
+        let mut objects = Vec::new();
+        for record in recorded {
+            objects.push(assembly.again(&mut files, record)?);
+        }
         for (i, object) in to_place.iter().enumerate() {
             let key = format!("scene.objects[{i}]");
             let pixels = match &undistortion {

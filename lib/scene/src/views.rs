@@ -84,19 +84,27 @@ impl ViewSettings {
             && *field_of_view == FieldOfView::Photograph
             && photo.facts.field_of_view_rad().is_none()
         {
-            let angle_rad = vertical_rad(scene_lens, distortion.is_fisheye());
+            let image = &photo.image.0;
+            let (own, scene) = (
+                image.width() as f64 - image.height() as f64,
+                scene_lens.size,
+            );
+            // The same camera, held upright for one of the two: its width sees what is the other's height.
+            let side = usize::from(own * (scene[0] - scene[1]) >= 0.0);
+            let angle_rad = field_of_view_rad(scene_lens, side, distortion.is_fisheye());
             *field_of_view = FieldOfView::Vertical(angle_rad as f32);
         }
         camera
     }
 }
 
-/// The vertical field of view of a lens, radians: what counts as that of a fisheye, or of a lens that is none.
-fn vertical_rad(lens: &Lens, fisheye: bool) -> f64 {
-    let half = 0.5 * lens.size[1] / lens.focal_px.y;
-    let bent = lens.distortion.direction(DVec2::new(0.0, half));
+/// The field of view of a lens along its width (side 0) or height (1), radians: what counts as that of a fisheye, or of a
+/// lens that is none.
+fn field_of_view_rad(lens: &Lens, side: usize, fisheye: bool) -> f64 {
+    let half = 0.5 * lens.size[side] / lens.focal_px[side];
+    let bent = lens.distortion.direction(DVec2::AXES[side] * half);
     let half_rad = match bent.filter(|_| fisheye) {
-        Some(direction) => direction.y.atan2(direction.z),
+        Some(direction) => direction[side].atan2(direction.z),
         None => half.atan(),
     };
     2.0 * half_rad

@@ -115,7 +115,8 @@ impl CameraConfig {
         if self.fov_deg.is_some() {
             self.field_of_view()?;
         }
-        let has_stand = self.position.is_some() && !of_transforms;
+        // Of another file it is refused, whether or not a direction is beside it.
+        let has_stand = self.position.is_some() && !of_transforms && may_be_a_lens(path);
         Ok(CameraSettings::File(FileSettings {
             key,
             path: path.into(),
@@ -143,6 +144,15 @@ impl CameraConfig {
 fn is_chan(path: &Path) -> bool {
     let extension = path.extension();
     extension.is_some_and(|e| e.eq_ignore_ascii_case("chan"))
+}
+
+/// Whether it may be a calibration of a lens alone.
+fn may_be_a_lens(path: &Path) -> bool {
+    let is = |kind: &str| {
+        path.extension()
+            .is_some_and(|e| e.eq_ignore_ascii_case(kind))
+    };
+    is("yaml") || is("yml") || is("json")
 }
 
 /// An axis by its word.
@@ -256,6 +266,7 @@ mod tests {
     #[test]
     fn a_key_that_the_file_has_is_refused() {
         for key in [
+            "position = [0.0, 1.0, 0.0]",
             "pitch_deg = 1.0",
             "roll_deg = 1.0",
             "heading_deg = 1.0",

@@ -169,6 +169,10 @@ pub(super) fn named(uri: &str) -> PathBuf {
 
 /// `%20` and the like replaced by what they stand for; what is no valid escape stays.
 fn percent_decoded(uri: &str) -> String {
+    String::from_utf8(percent_decoded_bytes(uri)).unwrap_or_else(|_| uri.to_owned())
+}
+
+fn percent_decoded_bytes(uri: &str) -> Vec<u8> {
     let bytes = uri.as_bytes();
     let mut out = Vec::with_capacity(bytes.len());
     let mut i = 0;
@@ -190,7 +194,7 @@ fn percent_decoded(uri: &str) -> String {
             }
         }
     }
-    String::from_utf8(out).unwrap_or_else(|_| uri.to_owned())
+    out
 }
 
 /// The payload of a `data:` URI, or `None` if `uri` is not one.
@@ -210,7 +214,7 @@ pub(super) fn data_uri(uri: &str, place: &str) -> Option<Result<Vec<u8>, Error>>
             )
         })
     } else {
-        Ok(percent_decoded(payload).into_bytes())
+        Ok(percent_decoded_bytes(payload))
     })
 }
 

@@ -24,6 +24,39 @@ pub(super) fn grey() -> Material {
     }
 }
 
+/// The first word of a line and what follows it, without a comment. A name of a material may hold a `#`, as `Material #25`
+/// does: a comment behind it is cut off where no material has the whole name. Names of files hold it within a word.
+pub(super) fn statement(line: &str) -> (&str, &str) {
+    let line = line.trim();
+    let (word, rest) = line
+        .split_once(char::is_whitespace)
+        .map_or((line, ""), |(w, r)| (w, r.trim()));
+    let is_file = |word: &str| {
+        let names = ["mtllib", "norm", "bump"];
+        names.contains(&word) || word.starts_with("map_")
+    };
+    let blank = |at: usize| {
+        rest[..at]
+            .chars()
+            .next_back()
+            .is_none_or(char::is_whitespace)
+    };
+    match word {
+        word if word.starts_with('#') => ("", ""),
+        "usemtl" | "newmtl" => (word, rest),
+        word if is_file(word) => {
+            let mut marks = rest.match_indices('#').map(|(at, _)| at);
+            let end = marks.find(|at| blank(*at)).unwrap_or(rest.len());
+            (word, rest[..end].trim())
+        }
+        word => (word, without_comment(rest)),
+    }
+}
+
+fn without_comment(text: &str) -> &str {
+    text.split('#').next().unwrap_or_default().trim()
+}
+
 /// The materials of all libraries of a file.
 #[derive(Default)]
 pub(super) struct Library {
@@ -57,7 +90,10 @@ struct Map {
 
 impl Library {
     pub fn index_of(&self, name: &str) -> Option<u32> {
-        self.by_name.get(name).copied()
+        let found = self.by_name.get(name);
+        found
+            .or_else(|| self.by_name.get(without_comment(name)))
+            .copied()
     }
 
     /// Reads a library; `name` is its path relative to the object, which textures are relative to.
@@ -67,10 +103,7 @@ impl Library {
         let text = String::from_utf8_lossy(bytes);
         let mut current: Option<(Material, Draft)> = None;
         for (i, line) in text.lines().enumerate() {
-            let line = line.split('#').next().unwrap_or("").trim();
-            let (word, rest) = line
-                .split_once(char::is_whitespace)
-                .map_or((line, ""), |(w, r)| (w, r.trim()));
+            let (word, rest) = statement(line);
             if word == "newmtl" {
                 if let Some(done) = current.take() {
                     self.finish(done);
@@ -213,7 +246,10 @@ impl Library {
         if material.base_color.w < 1.0 {
             material.alpha_mode = AlphaMode::Blend;
         }
-        self.by_name.insert(name, self.materials.len() as u32);
+        let index = self.materials.len() as u32;
+        let short = without_comment(&name).to_owned();
+        self.by_name.entry(short).or_insert(index);
+        self.by_name.insert(name, index);
         self.materials.push(material);
     }
 

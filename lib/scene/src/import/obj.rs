@@ -6,10 +6,10 @@ use std::borrow::Cow;
 use std::collections::{HashMap, HashSet};
 
 use dipir_imaging::transfer::Transfer;
-use glam::{DVec3, Mat3, Vec2, Vec3, Vec4};
+use glam::{DVec3, Vec2, Vec3, Vec4};
 
 use super::container::{self, Resolver};
-use super::mtl::Library;
+use super::mtl::{self, Library};
 use super::tangents;
 use super::{Imported, Limits, polygon};
 use crate::error::Error;
@@ -44,13 +44,15 @@ pub fn load_obj_bytes(
     reader.finish()
 }
 
-/// Lines by number, comments cut off, continuation lines joined.
+/// Lines by number, continuation lines joined. A comment ends with its line: one may end with the name of a folder, `C:\models\`.
 fn logical_lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
     let mut lines = bytes.split(|b| *b == b'\n').enumerate();
     std::iter::from_fn(move || {
         let (number, first) = lines.next()?;
         let mut text = String::from_utf8_lossy(first);
-        while let Some(head) = text.trim_end().strip_suffix('\\') {
+        while !text.contains('#')
+            && let Some(head) = text.trim_end().strip_suffix('\\')
+        {
             let mut joined = head.to_owned();
             let Some((_, next)) = lines.next() else {
                 return Some((number + 1, Cow::Owned(joined)));
@@ -98,10 +100,7 @@ struct Reader {
 
 impl Reader {
     fn statement(&mut self, line: &str, resolver: &dyn Resolver) -> Result<(), Problem> {
-        let line = line.split('#').next().unwrap_or("").trim();
-        let (word, rest) = line
-            .split_once(char::is_whitespace)
-            .map_or((line, ""), |(w, r)| (w, r.trim()));
+        let (word, rest) = mtl::statement(line);
         match word {
             "v" => self.vertex(rest)?,
             "vt" => {
@@ -232,6 +231,10 @@ impl Reader {
                     .read(&bytes, name, resolver)
                     .map_err(|e| Problem::from(e.in_file(path)))
             }
+            // One statement may name several; a name with blanks is tried first.
+            Err(_) if are_libraries(name) => name
+                .split_whitespace()
+                .try_for_each(|one| self.read_library(one, resolver)),
             Err(e) => {
                 self.warnings.push(format!(
                     "material library \"{name}\" cannot be read ({e}); grey is used"
@@ -253,7 +256,7 @@ impl Reader {
             *m = (*m).min(default);
         }
         if self.uses_default {
-            materials.push(super::mtl::grey());
+            materials.push(mtl::grey());
         }
         self.gather(&materials);
         let mut warnings = self.warnings;
@@ -274,7 +277,7 @@ impl Reader {
     fn gather(&mut self, materials: &[Material]) {
         let n = self.mesh.positions.len();
         let reads_uv = materials.iter().any(|m| m.texture_refs().next().is_some());
-        let has_normal_map = materials.iter().any(|m| m.normal_texture.is_some());
+        let normal_map = materials.iter().find_map(|m| m.normal_texture);
         if reads_uv {
             if !self.has[0] {
                 self.warnings
@@ -308,13 +311,20 @@ impl Reader {
                 ));
             }
         }
-        if has_normal_map {
+        if let Some((map, _)) = normal_map {
             if self.mesh.normals.is_empty() {
                 self.mesh.split_flat();
             }
-            tangents::generate(&mut self.mesh, 0, &Mat3::IDENTITY);
+            // Maps of several materials are mirrored alike, if at all.
+            tangents::generate(&mut self.mesh, 0, &map.transform);
         }
     }
+}
+
+/// Whether these are the names of several libraries.
+fn are_libraries(names: &str) -> bool {
+    let is_one = |name: &str| name.to_ascii_lowercase().ends_with(".mtl");
+    names.contains(char::is_whitespace) && names.split_whitespace().all(is_one)
 }
 
 /// Up to `N` numbers, at least `least`; the rest is zero. Returns how many there were.

@@ -14,10 +14,16 @@ const EXPORT: &str = "export the file again";
 pub fn load_ply_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> {
     let (header, mut input) = Header::read(bytes).map_err(|e| Error::malformed(e, EXPORT))?;
     let count = |name: &str| {
-        let element = header.elements.iter().find(|e| e.name == name);
-        element.map_or(0, |e| e.count)
+        let mut elements = header.elements.iter().filter(|e| e.name == name);
+        match (elements.next(), elements.next()) {
+            (Some(_), Some(_)) => Err(Error::malformed(
+                format!("element {name} is there twice"),
+                EXPORT,
+            )),
+            (one, _) => Ok(one.map_or(0, |e| e.count)),
+        }
     };
-    let (vertices, faces) = (count("vertex"), count("face"));
+    let (vertices, faces) = (count("vertex")?, count("face")?);
     if faces == 0 && vertices > 0 {
         return Err(Error::malformed(
             format!("the file is a cloud of {vertices} points without faces"),

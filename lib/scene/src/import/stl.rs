@@ -85,7 +85,13 @@ fn read_text(bytes: &[u8], mesh: &mut Mesh) -> Result<(), Error> {
             _ => {}
         }
     }
-    Ok(())
+    match corners.is_empty() {
+        true => Ok(()),
+        false => Err(Error::malformed(
+            "the file ends within a facet",
+            "export or copy the file again",
+        )),
+    }
 }
 
 /// Collects triangles; corners at the same place become one vertex.

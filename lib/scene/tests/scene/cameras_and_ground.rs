@@ -99,7 +99,7 @@ fn a_file_and_transforms_are_the_same_camera() {
 #[test]
 fn a_calibration_is_a_lens_that_stands_where_the_table_says() {
     let folder = folder();
-    let yaml = "image_width: 300\nimage_height: 200\ncamera_matrix:\n  data: [250, 0, 160, 0, 251, 95, 0, 0, 1]\n";
+    let yaml = "image_width: 300\nimage_height: 200\ncamera_matrix:\n  data: [250, 0, 159.5, 0, 251, 94.5, 0, 0, 1]\n";
     std::fs::write(folder.path().join("lens.yaml"), yaml).unwrap();
     let lines = "file = \"lens.yaml\"\nposition = [0, 1.6, 4]\npitch_deg = -8";
     let camera = loaded(folder.path(), "", lines, "").scene.camera;
@@ -366,4 +366,17 @@ fn a_project_of_colmap_gives_camera_and_ground_and_its_choice_is_said_once() {
         let path = format!("project/sparse/0/{part}");
         assert!(named.contains(&path.as_str()), "{path}: {named:?}");
     }
+}
+
+#[test]
+fn a_frame_has_the_objects_of_its_shot_whatever_the_configuration_has() {
+    let folder = folder();
+    let second = "[[objects]]\npath = \"cube.obj\"\nposition = [2, 0, 0]";
+    let shot = loaded(folder.path(), second, STANDS, "").description;
+    let one =
+        format!("background = \"photo.png\"\n[[objects]]\npath = \"cube.obj\"\n[camera]\n{STANDS}");
+    let config: SceneConfig = toml::from_str(&one).unwrap();
+    let frame = Scene::load_frame(&config, folder.path(), &shot).unwrap();
+    assert_eq!(frame.description.objects, shot.objects);
+    assert_eq!(frame.scene.mesh.indices.len(), 24);
 }

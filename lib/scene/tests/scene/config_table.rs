@@ -238,3 +238,17 @@ fn wrong_cameras_are_explained() {
         "scene.camera.file is missing; name the camera's file that scene.camera.frame is about"
     );
 }
+
+#[test]
+fn a_mask_of_occluders_that_is_switched_off_is_not_used() {
+    let of = |effects: &str| {
+        let settings = parse(&table("occluders = \"mask.png\"", effects)).validate();
+        settings.unwrap().occluders
+    };
+    assert_eq!(of(""), Some("mask.png".into()));
+    assert_eq!(
+        of("[effects]\noccluders = \"on\"\n"),
+        Some("mask.png".into())
+    );
+    assert_eq!(of("[effects]\noccluders = \"off\"\n"), None);
+}

@@ -411,6 +411,14 @@ fn data_uris_and_percent_encoded_files_are_found() {
     )
     .unwrap();
     assert_eq!(imported.mesh.positions, [Vec3::ZERO; 3]);
+
+    // The same triangle, percent-encoded: its bytes are no UTF-8.
+    let encoded: String = bytes.iter().map(|b| format!("%{b:02x}")).collect();
+    let uri = format!("data:application/octet-stream,{encoded}");
+    glb.json["buffers"] = json!([{ "uri": uri, "byteLength": 36 }]);
+    let text = glb.json.to_string();
+    let imported = load_gltf_bytes(text.as_bytes(), &NoFiles, &Limits::default()).unwrap();
+    assert_eq!(imported.mesh.positions[1], Vec3::X);
 }
 
 #[test]

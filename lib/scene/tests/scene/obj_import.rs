@@ -168,6 +168,28 @@ fn a_library_named_for_every_group_is_read_once() {
 }
 
 #[test]
+fn one_statement_may_name_several_libraries() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    std::fs::write(file("a.mtl"), "newmtl a\nPm 0.25\n").unwrap();
+    std::fs::write(file("b.mtl"), "newmtl b\nPm 0.5\n").unwrap();
+    let text = format!("mtllib a.mtl b.mtl gone.mtl\n{SQUARE}usemtl b\nf 1 2 3\n");
+    std::fs::write(file("m.obj"), text).unwrap();
+    let imported = load_object(&file("m.obj")).unwrap();
+    let metal: Vec<f32> = imported.materials.iter().map(|m| m.metallic).collect();
+    assert_eq!(
+        (metal, &imported.mesh.materials[..]),
+        (vec![0.25, 0.5], &[1][..])
+    );
+    assert!(imported.warnings.len() == 1 && imported.warnings[0].contains("\"gone.mtl\""));
+    // A name may have blanks.
+    std::fs::rename(file("b.mtl"), file("a.mtl b.mtl")).unwrap();
+    let text = format!("mtllib a.mtl b.mtl\n{SQUARE}usemtl b\nf 1 2 3\n");
+    std::fs::write(file("m.obj"), text).unwrap();
+    assert_eq!(load_object(&file("m.obj")).unwrap().materials.len(), 1);
+}
+
+#[test]
 fn a_texture_that_a_library_names_and_is_missing_is_warned_of() {
     let folder = tempfile::tempdir().unwrap();
     let statements = "newmtl a\nKd 0.5 0.25 0.125\nNs 30\nmap_Kd gone.png\nmap_Pr rough.png\n\
@@ -283,4 +305,61 @@ fn one_number_is_a_grey_and_alpha_may_have_a_halo() {
             file("m.obj").display()
         )
     );
+}
+
+#[test]
+fn a_mark_within_a_name_belongs_to_it_and_a_comment_behind_one_does_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    std::fs::write(file("wood#2.png"), one_texel_png([1.0; 3])).unwrap();
+    std::fs::write(
+        file("m.mtl"),
+        "newmtl Material #1\nPm 0.1\nnewmtl Material #2 \nPm 0.2 # metal\n\
+         newmtl red # paint\nPm 0.3\nmap_Kd wood#2.png # of oak\n",
+    )
+    .unwrap();
+    std::fs::write(
+        file("m.obj"),
+        format!(
+            "mtllib m.mtl # beside\n{SQUARE}vt 0 0\nusemtl Material #2\nf 1/1 2/1 3/1\nusemtl Material #1\nf 1/1 2/1 4/1\n\
+             usemtl red\nf 1/1 3/1 4/1\nusemtl red # again\nf 2/1 3/1 4/1 # last\n"
+        ),
+    )
+    .unwrap();
+    let imported = load_object(&file("m.obj")).unwrap();
+    assert_eq!(imported.warnings, [""; 0]);
+    let metal = |m: &u32| imported.materials[*m as usize].metallic;
+    let all: Vec<f32> = imported.mesh.materials.iter().map(metal).collect();
+    assert_eq!(all, [0.2, 0.1, 0.3, 0.3]);
+    assert_eq!(imported.dependencies, [file("m.mtl"), file("wood#2.png")]);
+}
+
+#[test]
+fn a_comment_ends_with_its_line() {
+    let folder = "# from C:\\models\\\n";
+    let imported = load(&format!("{folder}{SQUARE}f 1 2 \\\n3\n"));
+    assert_eq!(imported.mesh.indices, [[0, 1, 2]]);
+    assert_eq!(imported.mesh.positions[1], Vec3::X);
+}
+
+#[test]
+fn tangents_go_along_the_normal_map_as_its_options_turn_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    std::fs::write(file("n.png"), one_texel_png([0.5, 0.5, 1.0])).unwrap();
+    std::fs::write(
+        file("m.obj"),
+        format!("mtllib m.mtl\n{SQUARE}vt 0 0\nvt 1 0\nvt 1 1\nusemtl a\nf 1/1 2/2 3/3\n"),
+    )
+    .unwrap();
+    // Mirrored, the map's u grows along -x, and its v as before.
+    for (option, want) in [
+        ("", Vec3::X.extend(1.0)),
+        ("-s -1 1 1 ", Vec3::NEG_X.extend(-1.0)),
+    ] {
+        let library = format!("newmtl a\nnorm {option}n.png\n");
+        std::fs::write(file("m.mtl"), library).unwrap();
+        let imported = load_object(&file("m.obj")).unwrap();
+        assert_eq!(imported.mesh.tangents, [want; 3], "{option}");
+    }
 }

@@ -144,6 +144,11 @@ fn broken_plys_say_where() {
         ),
         (
             "end_header\n",
+            "element vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
+            "element vertex is there twice; export the file again",
+        ),
+        (
+            "end_header\n",
             "",
             "line 14: \"0 0 0 255 0 188\" is not understood; export the file again",
         ),
@@ -211,6 +216,16 @@ fn broken_stls_say_where() {
     assert_eq!(
         stl(b"solid a\nvertex 1 2 3\nendfacet\n").unwrap_err(),
         "line 3: a facet of 1 corners; accepted: 3; export the file again"
+    );
+    assert_eq!(
+        stl(b"solid a\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendfacet\nvertex 0 0 0\nvertex 1")
+            .unwrap_err(),
+        "line 7: accepted: vertex x y z; export the file again"
+    );
+    assert_eq!(
+        stl(b"solid a\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendfacet\nvertex 0 0 0\n")
+            .unwrap_err(),
+        "the file ends within a facet; export or copy the file again"
     );
     assert_eq!(
         stl(b"solid a\nendsolid\n").unwrap_err(),

@@ -53,6 +53,23 @@ fn angles_turn_a_view_to_the_side_first() {
 }
 
 #[test]
+fn a_view_held_upright_has_the_scenes_focal_length() {
+    let folder = tempfile::tempdir().unwrap();
+    let table = "background = \"b.png\"\ncamera = { heading_deg = 90 }";
+    // Of pictures of a tenth of the scene's size.
+    let focal = 20.0 / 25f32.to_radians().tan();
+    for size in [[60, 40], [40, 60]] {
+        picture(folder.path(), "b.png", size);
+        let view = view(folder.path(), TYPED, table).unwrap();
+        assert!(
+            (view.camera.focal_px - focal).abs().max_element() < 1e-3,
+            "{size:?}: {}",
+            view.camera.focal_px
+        );
+    }
+}
+
+#[test]
 fn a_view_with_the_scenes_fisheye_has_its_focal_length() {
     let folder = tempfile::tempdir().unwrap();
     picture(folder.path(), "b.png", [60, 40]);
