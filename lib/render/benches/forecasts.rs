@@ -65,7 +65,7 @@ fn main() {
             let (foresight, target) = (&runs[from].foresight, PRESETS[to].0.into());
             let foreseen = foresight.cost_with(target, PRESETS[to].1);
             let ratio = foreseen * cost(&runs[from]) / cost(&runs[to]);
-            (ratio, foresight.is_guess(target))
+            (ratio, foresight.guess(target, PRESETS[to].1).is_some())
         });
         let told = ratios.map(|(ratio, guess)| match guess {
             true => format!("{ratio:.2} (guess)"),

@@ -18,8 +18,8 @@ use std::time::{Duration, Instant};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-pub(crate) use self::goals::goal;
 use self::goals::{first_goal, next_goals};
+pub(crate) use self::goals::{goal, unseen};
 use crate::contribution::{LeaveOut, LeftOut};
 use crate::counters::RayCounts;
 use crate::denoise::{Denoiser, auxiliary::Auxiliary};
@@ -149,7 +149,7 @@ pub(crate) fn refine(
         Stop::TimeBudget(budget) => coarse.is_some() && start.elapsed() >= budget,
         _ => false,
     };
-    let mut search = RayCounts::default();
+    let mut others = Effort::default();
     let mut foresight = Foresight::new(limit, auxiliary.is_some());
     let mut denoiser = auxiliary.map(Denoiser::new);
     let mut report = Progress::default();
@@ -211,7 +211,7 @@ pub(crate) fn refine(
         }
         if round == 1 && !is_late() {
             let found = find_highlights(&film, &jobs);
-            search = found.counts;
+            others.counts = found.counts;
             if !found.pixels.is_empty() {
                 foresight.learn_of_highlights();
             }
@@ -221,8 +221,9 @@ pub(crate) fn refine(
                 measures: None,
             };
             let advance = |job: &mut Job, goal: u32| advance(job, goal, &drawn);
-            let begun = start_again(&mut jobs, found, goal, &advance);
+            let begun = start_again(&mut jobs, found, goal, &mut others, &advance);
             film.develop(&jobs[begun..]);
+            foresight.learn_of_effort(others.counts.total() + others.samples);
         }
         let (errors, drawn) = errors_of(&mut film, &jobs, denoiser.as_mut(), viewing);
         let error = total_error(&errors, &jobs, &film, viewing);
@@ -247,8 +248,8 @@ pub(crate) fn refine(
         report = Progress {
             round,
             error,
-            samples: jobs.iter().map(Job::samples_drawn).sum(),
-            rays: jobs.iter().map(|j| j.counts.total()).sum::<u64>() + search.total(),
+            samples: jobs.iter().map(Job::samples_drawn).sum::<u64>() + others.samples,
+            rays: jobs.iter().map(|j| j.counts.total()).sum::<u64>() + others.counts.total(),
             elapsed: start.elapsed(),
             fraction: if done {
                 1.0
@@ -260,7 +261,7 @@ pub(crate) fn refine(
             return Err(RenderError::Interrupted);
         }
         if done {
-            let mut counts = search;
+            let mut counts = others.counts;
             jobs.iter().for_each(|job| counts.merge(&job.counts));
             return Ok(Refined {
                 film,
@@ -433,18 +434,31 @@ fn share_of_time(elapsed: Duration, budget: Duration) -> f64 {
     (elapsed.as_secs_f64() / budget.as_secs_f64().max(1e-9)).min(1.0)
 }
 
+/// Effort that no job accounts for.
+#[derive(Clone, Copy, Debug, Default)]
+struct Effort {
+    counts: RayCounts,
+    samples: u64,
+}
+
 /// Gives every pixel that `found` names a job of its own, behind the others, and brings it to `goal` samples.
-/// Returns the first of them.
+/// Returns the first of them. Adds to `others` the samples that are given up, and the rays of jobs that end.
 fn start_again(
     jobs: &mut Vec<Job>,
     found: Found,
     goal: u32,
+    others: &mut Effort,
     advance: &(impl Fn(&mut Job, u32) + Sync),
 ) -> usize {
     let names: HashSet<(u32, u32)> = found.pixels.iter().map(|f| f.0).collect();
     if !names.is_empty() {
-        let objects = jobs.iter_mut().filter(|job| job.layer == Layer::Object);
-        objects.for_each(|job| job.give_up(|pixel| names.contains(&pixel)));
+        for job in jobs.iter_mut().filter(|job| job.layer == Layer::Object) {
+            others.samples += job.samples_drawn();
+            job.give_up(|pixel| names.contains(&pixel));
+            others.samples -= job.samples_drawn();
+        }
+        let ended = jobs.iter().filter(|job| job.pixels.is_empty());
+        ended.for_each(|job| others.counts.merge(&job.counts));
         jobs.retain(|job| !job.pixels.is_empty());
     }
     let first = jobs.len();

@@ -3,7 +3,7 @@
 //! The rounds of [`crate::adaptive`] are played through on the jobs' squared errors and costs instead of their samples,
 //! with the same goals. A job's squared error is taken to fall with a power of its samples, the one that the jobs that
 //! grew have shown: 1 for independent samples, more where stratification helps.
-use crate::adaptive::{EstimatedError, goal};
+use crate::adaptive::{EstimatedError, goal, unseen};
 use crate::job::Job;
 use crate::viewing::SquaredError;
 
@@ -33,6 +33,17 @@ struct Point {
     samples: f64,
     /// Of one such sample.
     cost: f64,
+    /// Of the job.
+    pixels: f64,
+}
+
+/// What is not known of a cost. How far such costs are off, `benches/forecasts.rs` says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Guess {
+    /// How many highlights smaller than a pixel the samples have missed.
+    Highlights,
+    /// How much noise the denoiser would remove: it did not run.
+    Denoiser,
 }
 
 /// What is known of the jobs.
@@ -45,6 +56,10 @@ pub struct Foresight {
     /// Squared error in units of what a target of 1 allows, and cost: after every round.
     rounds: Vec<(f64, f64)>,
     power: f64,
+    /// The power of the first round in which jobs grew that tell it.
+    early: Option<f64>,
+    /// Cost that every target pays once, beside the jobs.
+    once: f64,
     /// Whether noise is removed.
     denoises: bool,
     /// Whether highlights smaller than a pixel were found.
@@ -66,6 +81,8 @@ impl Foresight {
             denoises,
             highlights: false,
             power: POWER,
+            early: None,
+            once: 0.0,
             allowed: 0.0,
             limit,
         }
@@ -90,6 +107,7 @@ impl Foresight {
                     drawn,
                     samples,
                     cost: (job.cost() / samples).max(1e-9),
+                    pixels: job.pixels.len() as f64,
                 }
             });
         let points: Vec<Point> = points.collect();
@@ -97,6 +115,7 @@ impl Foresight {
             self.first.clone_from(&points);
         } else if let Some(power) = power(&self.last, &points) {
             self.power = power;
+            self.early.get_or_insert(power);
         }
         self.last = points;
         let slack = match error.upper_95 > 0.0 {
@@ -105,7 +124,18 @@ impl Foresight {
         };
         self.allowed = slack.powi(2) * error.touched_pixels as f64;
         self.rounds
-            .push((sum(&self.last) / self.allowed, spent(&self.last)));
+            .push((sum(&self.last) / self.allowed, self.spent(&self.last)));
+    }
+
+    /// Adds what every target takes once beside the jobs: rays and samples.
+    pub(crate) fn learn_of_effort(&mut self, effort: u64) {
+        self.once += effort as f64;
+        self.rounds.iter_mut().for_each(|r| r.1 += effort as f64);
+    }
+
+    /// What jobs and all else have cost.
+    fn spent(&self, points: &[Point]) -> f64 {
+        self.once + points.iter().map(|p| p.cost * p.samples).sum::<f64>()
     }
 
     /// Highlights smaller than a pixel were found.
@@ -113,11 +143,14 @@ impl Foresight {
         self.highlights = true;
     }
 
-    /// Whether the cost of `target` is a guess: how many highlights smaller than a pixel the samples have missed is not known.
-    /// Such targets took from half to eight times what was foreseen (`benches/forecasts.rs`, twelve scenes).
-    pub fn is_guess(&self, target: f64) -> bool {
+    /// Why the cost of `target`, with noise removed or not, is a guess; None if it is an estimate.
+    pub fn guess(&self, target: f64, denoises: bool) -> Option<Guess> {
         let reached = self.rounds.last().is_some_and(|r| r.0 <= target * target);
-        self.highlights && !reached
+        match () {
+            () if self.highlights && !reached => Some(Guess::Highlights),
+            () if denoises && !self.denoises => Some(Guess::Denoiser),
+            () => None,
+        }
     }
 
     /// What reaching the 95% bound `target` costs in all, over what was spent so far. Below 1 for targets that earlier
@@ -128,49 +161,59 @@ impl Foresight {
 
     /// As [`cost_of`](Self::cost_of), where noise is removed or not, whatever was done.
     pub fn cost_with(&self, target: f64, denoises: bool) -> f64 {
-        let (first, power) = match (self.denoises, denoises) {
+        let (share, power) = match (self.denoises, denoises) {
             (true, false) => {
                 let [first, last] = [&self.first, &self.last].map(|p| as_drawn(p));
                 let power = power(&first, &last).unwrap_or(POWER);
-                return self.played(&first, &last, power, target);
+                return self.played((&first, power), (&last, power), target);
             }
-            (false, true) => (scaled(&self.first, DENOISED), POWER),
-            _ => (self.first.clone(), self.power),
-        };
-        let share = match self.denoises == denoises {
-            true => 1.0,
-            false => DENOISED,
+            (false, true) => (DENOISED, POWER),
+            _ => (1.0, self.power),
         };
         // A round that reached the target has shown what is enough.
         let reached = self.rounds.iter().find(|r| r.0 * share <= target * target);
-        let most = reached.map_or(f64::INFINITY, |r| r.1 / spent(&self.last));
-        let last = scaled(&self.last, share);
-        self.played(&first, &last, power, target).min(most)
+        let most = reached.map_or(f64::INFINITY, |r| r.1 / self.spent(&self.last));
+        let [first, last] = [&self.first, &self.last].map(|p| scaled(p, share));
+        let early = self.early.unwrap_or(power);
+        let cost = self.played((&first, early), (&last, power), target);
+        cost.min(most)
     }
 
-    /// The rounds after `last` are played through, or those after `first` for a target that `last` has reached.
-    fn played(&self, first: &[Point], last: &[Point], power: f64, target: f64) -> f64 {
+    /// The rounds after `last` are played through, or those after `first` for a target that `last` has reached, each with
+    /// its power.
+    fn played(&self, first: (&[Point], f64), last: (&[Point], f64), target: f64) -> f64 {
         let allowed = self.allowed * target * target;
-        let mut points = match sum(last) > allowed {
-            true => last.to_vec(),
-            false => first.to_vec(),
-        };
+        let (points, power) = if sum(last.0) > allowed { last } else { first };
+        let mut points = points.to_vec();
         for _ in 0..ROUNDS {
-            if sum(&points) <= allowed || !self.play(&mut points, power, allowed) {
+            if !self.play(&mut points, power, target) {
                 break;
             }
         }
-        let ratio = spent(&points) / spent(&self.last);
+        let ratio = self.spent(&points) / self.spent(&self.last);
         if ratio.is_finite() { ratio } else { 1.0 }
     }
 
     /// One round more; whether any job has grown.
-    fn play(&self, points: &mut [Point], power: f64, allowed: f64) -> bool {
+    fn play(&self, points: &mut [Point], power: f64, target: f64) -> bool {
+        let allowed = self.allowed * target * target;
         let root = |p: &Point| (p.squared_error * p.samples / p.cost).sqrt();
-        let scale = points.iter().map(|p| root(p) * p.cost).sum::<f64>() / allowed;
+        let scale = match sum(points) <= allowed {
+            true => 0.0,
+            false => points.iter().map(|p| root(p) * p.cost).sum::<f64>() / allowed,
+        };
         let mut grown = false;
         for point in points {
-            let goal = f64::from(goal(root(point) * scale, point.samples as u32, self.limit));
+            let samples = point.samples as u32;
+            let least = unseen(
+                samples,
+                point.squared_error,
+                point.pixels,
+                target,
+                self.limit,
+            );
+            let goal = goal(root(point) * scale, samples, self.limit).max(least);
+            let goal = f64::from(goal);
             if goal > point.samples {
                 point.squared_error *= (goal / point.samples).powf(-power);
                 point.samples = goal;
@@ -209,10 +252,6 @@ fn as_drawn(points: &[Point]) -> Vec<Point> {
     drawn.collect()
 }
 
-fn spent(points: &[Point]) -> f64 {
-    points.iter().map(|p| p.cost * p.samples).sum()
-}
-
 /// The power of the samples with which the squared error of the jobs that grew has fallen, found by bisection. None if
 /// they held little of it.
 fn power(before: &[Point], after: &[Point]) -> Option<f64> {
@@ -249,6 +288,7 @@ mod tests {
             drawn: 2.0 * squared_error,
             samples,
             cost: 1.0,
+            pixels: 1.0,
         };
         errors.iter().map(point).collect()
     }
@@ -261,6 +301,8 @@ mod tests {
             denoises: true,
             highlights: false,
             power,
+            early: None,
+            once: 0.0,
             allowed: errors.len() as f64,
             limit: 1 << 20,
         }
@@ -330,10 +372,52 @@ mod tests {
             rounds: vec![(0.04, 80.0)],
             ..known(&[4.0; 10], 1.0)
         };
-        assert!(!one.is_guess(0.1));
+        assert_eq!(one.guess(0.1, true), None);
         one.learn_of_highlights();
-        assert!(one.is_guess(0.1));
-        assert!(!one.is_guess(0.2));
+        assert_eq!(one.guess(0.1, true), Some(Guess::Highlights));
+        assert_eq!(one.guess(0.2, true), None);
+    }
+
+    #[test]
+    fn what_a_denoiser_that_did_not_run_removes_is_guessed() {
+        let one = known(&[4.0; 10], 1.0);
+        assert_eq!(one.guess(0.1, false), None);
+        let without = Foresight {
+            denoises: false,
+            ..one
+        };
+        assert_eq!(without.guess(0.1, true), Some(Guess::Denoiser));
+        assert_eq!(without.guess(0.1, false), None);
+    }
+
+    #[test]
+    fn effort_beside_the_jobs_is_paid_once() {
+        // Ten jobs of 8 samples, 80 rays beside them.
+        let mut one = known(&[4.0; 10], 1.0);
+        one.learn_of_effort(80);
+        let cost = one.cost_of(0.2);
+        assert!((cost - 0.5 * (1.0 + 100.0)).abs() < 0.5, "{cost}");
+    }
+
+    #[test]
+    fn a_target_that_is_reached_is_played_with_the_power_of_the_first_rounds() {
+        let mut one = known(&[1.0; 10], 1.0);
+        one.last = points(&[1e-4; 10], 800.0);
+        let independent = one.cost_of(0.25);
+        one.early = Some(2.0);
+        let stratified = one.cost_of(0.25);
+        // 16 times the 8 samples; 4 times, of which the last round does not know, see above.
+        assert!((independent - 0.16).abs() < 1e-9, "{independent}");
+        assert!((0.04..=0.08).contains(&stratified), "{stratified}");
+    }
+
+    #[test]
+    fn a_tile_whose_noise_is_seen_gets_more_though_the_target_is_reached() {
+        // One pixel of a hundred has noise of .08, where .04 is seen: four times its samples.
+        let mut errors = [0.0; 100];
+        errors[0] = 0.08 * 0.08;
+        let cost = known(&errors, 1.0).cost_of(0.01);
+        assert!((cost - 1.03).abs() < 1e-9, "{cost}");
     }
 
     #[test]

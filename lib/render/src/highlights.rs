@@ -59,7 +59,7 @@ const WITHIN_CELL: f32 = 1.0 - f32::EPSILON * 128.0;
 
 /// Density of the samples within a pixel, on the unit square: a mixture of a uniform one and one for each scan, which
 /// is constant on its cells.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct PixelDensity {
     scans: Vec<Scan>,
 }
@@ -394,7 +394,7 @@ impl<L: PathLight> PathContext<'_, L> {
         let corner = Vec2::new(x as f32, y as f32);
         let mut cells: Vec<u32> = (0..SIDES[0] * SIDES[0]).collect();
         let mut usual = None;
-        let mut density = PixelDensity { scans: Vec::new() };
+        let mut density = PixelDensity::default();
         // After the samples that tested candidates.
         let mut index = PATHS_PER_PIXEL[1];
         for (number, side) in SIDES.into_iter().enumerate() {

@@ -332,6 +332,7 @@ impl<'a> Renderer<'a> {
             )
         }?;
         rendered.counts.merge(&guide_rays);
+        rendered.foresight.learn_of_effort(guide_rays.total());
         Ok(rendered)
     }
 

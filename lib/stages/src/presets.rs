@@ -5,6 +5,7 @@ use std::sync::OnceLock;
 use dipir_cli::session::duration;
 use dipir_optimize::settings::{LightPreset, LightTable};
 use dipir_pipeline::config::Quality;
+use dipir_render::foresight::Guess;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
@@ -105,8 +106,8 @@ pub struct Estimate {
     pub quality: Quality,
     /// About so many seconds.
     pub seconds: f64,
-    /// Whether it is a guess, because some pixels have highlights smaller than they are.
-    pub guess: bool,
+    /// Why it is a guess, if it is one.
+    pub guess: Option<Guess>,
     /// The error that it is made for, display-referred RMSE.
     pub error: Option<f64>,
 }
@@ -132,7 +133,7 @@ impl Outlook {
             estimate(p).map(|(seconds, error)| Estimate {
                 quality: p.quality,
                 seconds,
-                guess: false,
+                guess: None,
                 error,
             })
         };
@@ -151,16 +152,16 @@ impl Outlook {
         let estimate = |p: &Preset| Estimate {
             quality: p.quality,
             seconds: seconds(p),
-            guess: false,
+            guess: None,
             error: Some(target(&p)),
         };
         Self(chosen.map(estimate).collect())
     }
 
-    /// The same, where `is_guess` tells of an error whether its estimate is a guess.
-    pub fn with_guesses(mut self, is_guess: impl Fn(f64) -> bool) -> Self {
+    /// The same, where `why` tells of a preset why its estimate is a guess.
+    pub fn with_guesses(mut self, why: impl Fn(&Preset) -> Option<Guess>) -> Self {
         for estimate in &mut self.0 {
-            estimate.guess = estimate.error.is_some_and(&is_guess);
+            estimate.guess = why(of(estimate.quality));
         }
         self
     }
@@ -173,15 +174,17 @@ impl Outlook {
                 .map_or(String::new(), |e| format!(" (error {e:.3})"));
             format!("{} about {}{error}", name(e.quality), duration(e.seconds))
         };
-        let guessed = self.0.iter().filter(|e| e.guess).map(|e| name(e.quality));
-        let guessed: Vec<&str> = guessed.collect();
-        let because = match guessed.is_empty() {
-            true => String::new(),
-            false => format!(
-                "; the time of {} is a guess: some highlights are smaller than a pixel",
-                guessed.join(" and ")
-            ),
+        let because = |e: &Estimate| {
+            let why = match e.guess? {
+                Guess::Highlights => "some highlights are smaller than a pixel",
+                Guess::Denoiser => "the denoiser, which it uses, was off",
+            };
+            Some(format!(
+                "; the time of {} is a guess: {why}",
+                name(e.quality)
+            ))
         };
+        let because: String = self.0.iter().filter_map(because).collect();
         match self.0.is_empty() {
             true => String::new(),
             false => {
@@ -196,7 +199,7 @@ impl Outlook {
 
     /// For programs.
     pub fn to_json(&self) -> Value {
-        let one = |e: &Estimate| json!({"quality": name(e.quality), "seconds": e.seconds, "guess": e.guess, "error": e.error});
+        let one = |e: &Estimate| json!({"quality": name(e.quality), "seconds": e.seconds, "guess": e.guess.is_some(), "error": e.error});
         self.0.iter().map(one).collect()
     }
 }
@@ -392,9 +395,13 @@ mod tests {
                 .starts_with("other presets would have taken: draft about")
         );
         assert!(!around(targets[1]).text().contains("guess"));
-        let guessed = around(targets[1]).with_guesses(|e| e < targets[1]).text();
+        let of_high = |p: &Preset| (p.quality == Quality::High).then_some(Guess::Highlights);
+        let guessed = around(targets[1]).with_guesses(of_high).text();
         let end = "; the time of high is a guess: some highlights are smaller than a pixel";
         assert!(guessed.ends_with(end), "{guessed}");
+        let guessed = around(targets[1]).with_guesses(|_| Some(Guess::Denoiser));
+        let one = "; the time of draft is a guess: the denoiser, which it uses, was off";
+        assert!(guessed.text().contains(one), "{}", guessed.text());
     }
 
     #[test]

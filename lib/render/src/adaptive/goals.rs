@@ -57,7 +57,7 @@ pub(super) fn next_goals(
             let least = jobs
                 .iter()
                 .zip(errors)
-                .map(|(job, e)| unseen(job, e, target, limit));
+                .map(|(job, e)| unseen(job.samples, e.sum, job.pixels.len() as f64, target, limit));
             goals
                 .into_iter()
                 .zip(least)
@@ -108,10 +108,10 @@ fn spread<'a>(
 }
 
 /// Samples per pixel and replicate that bring a tile's noise below [`SEEN`], [`MOST_FOR_TILE`] at most.
-fn unseen(job: &Job, error: &SquaredError, target: f64, limit: u32) -> u32 {
-    let most = SEEN.max(2.0 * target).powi(2) * job.pixels.len() as f64;
-    let best = f64::from(job.samples) * error.sum / most;
-    goal(best.min(f64::from(MOST_FOR_TILE)), job.samples, limit)
+pub(crate) fn unseen(samples: u32, error: f64, pixels: f64, target: f64, limit: u32) -> u32 {
+    let most = SEEN.max(2.0 * target).powi(2) * pixels;
+    let best = f64::from(samples) * error / most;
+    goal(best.min(f64::from(MOST_FOR_TILE)), samples, limit)
 }
 
 fn goals(jobs: &[Job], errors: &[SquaredError], scale: f64, limit: u32) -> Vec<u32> {

@@ -68,3 +68,46 @@ fn a_budget_is_kept_within_a_tenth_while_rounds_differ_by_a_fifth() {
         }
     }
 }
+
+#[test]
+fn samples_and_rays_of_pixels_that_start_again_are_counted() {
+    use crate::counters::RayKind;
+    use crate::highlights::PixelDensity;
+
+    let block = |x| Block {
+        x,
+        y: 0,
+        width: 2,
+        height: 1,
+    };
+    let job = |x| {
+        let mut job = Job::new(
+            Layer::Object,
+            block(x),
+            PixelSet::new(block(x), |_| true),
+            None,
+        );
+        job.samples = 4;
+        (0..16).for_each(|_| job.counts.add(RayKind::Camera));
+        job
+    };
+    let mut jobs = vec![job(0), job(8)];
+    let drawn = |jobs: &[Job]| jobs.iter().map(Job::samples_drawn).sum::<u64>();
+    let rays = |jobs: &[Job]| jobs.iter().map(|job| job.counts.total()).sum::<u64>();
+    let before = (drawn(&jobs), rays(&jobs));
+    // All of the first job, and half of the second one.
+    let found = Found {
+        pixels: [(0, 0), (1, 0), (8, 0)]
+            .map(|pixel| (pixel, PixelDensity::default()))
+            .to_vec(),
+        ..Found::default()
+    };
+    let mut others = Effort::default();
+    let begun = start_again(&mut jobs, found, 0, &mut others, &|_, _| {});
+    assert_eq!((begun, jobs.len()), (1, 4));
+    let after = (
+        drawn(&jobs) + others.samples,
+        rays(&jobs) + others.counts.total(),
+    );
+    assert_eq!(after, before);
+}

@@ -34,7 +34,7 @@ use crate::known_light::{self, Light};
 use crate::light::folder::{self as light_folder, Recovered};
 use crate::light::{exposed, materials};
 use crate::names::{COMPOSITE, begin};
-use crate::presets::{Outlook, Preset};
+use crate::presets::{CompositePreset, Outlook, Preset};
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::written;
 use table::{CompositeTable, MAX_SAMPLES, Tone};
@@ -159,12 +159,12 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let resolution = inputs.scene.loaded.scene.camera.resolution;
     let pixels_of = |most: Option<u64>| f64::from(divisor_for(resolution, most)).powi(-2);
     let here = f64::from(rendered.divisor).powi(-2);
+    let denoises = |preset: &CompositePreset| table.denoise.unwrap_or(preset.denoise);
     // The same error takes as many samples a pixel at any resolution.
     let with_preset = |preset: &Preset| {
         let preset = &preset.composite;
         let pixels = pixels_of(table.most_pixels.or(preset.most_pixels)) / here;
-        let denoises = table.denoise.unwrap_or(preset.denoise);
-        let cost = foresight.cost_with(preset.target_error.into(), denoises);
+        let cost = foresight.cost_with(preset.target_error.into(), denoises(preset));
         seconds + course.seconds * (pixels * cost - 1.0)
     };
     let quality = session.pipeline.quality;
@@ -175,7 +175,10 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         }),
         false => Outlook::around_error(error, with_preset),
     };
-    let outlook = outlook.with_guesses(|target| foresight.is_guess(target));
+    let outlook = outlook.with_guesses(|preset| {
+        let preset = &preset.composite;
+        foresight.guess(preset.target_error.into(), denoises(preset))
+    });
     Ok(Done {
         folder,
         manifest,
