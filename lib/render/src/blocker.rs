@@ -38,11 +38,6 @@ impl Blocker {
         }
     }
 
-    /// The ball around the object.
-    pub fn whole(&self) -> Sphere {
-        self.whole
-    }
-
     /// Smallest radius whose inflation is noticed: the ball's around the object.
     pub fn radius(&self) -> f32 {
         self.whole.radius

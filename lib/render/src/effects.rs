@@ -121,13 +121,12 @@ impl Effect {
         )
     }
 
-    /// What must be simulated too for this effect to mean anything.
-    fn needs(self) -> Option<Effect> {
+    /// What must be simulated too for this effect to mean anything; these need nothing themselves.
+    fn needs(self) -> &'static [Effect] {
         match self {
-            Effect::ProxyOcclusion | Effect::EmissionOnProxy | Effect::BounceToProxy => {
-                Some(Effect::Shadow)
-            }
-            _ => None,
+            Effect::ProxyOcclusion | Effect::BounceToProxy => &[Effect::Shadow],
+            Effect::EmissionOnProxy => &[Effect::Shadow, Effect::Emission],
+            _ => &[],
         }
     }
 }
@@ -235,18 +234,6 @@ impl EffectsPlan {
             e.reason = reason;
         }
     }
-
-    /// The same plan without `effect`.
-    fn without(&self, effect: Effect) -> Self {
-        let mut plan = self.clone();
-        plan.set(effect, false, String::new());
-        for dependent in Effect::ALL {
-            if dependent.needs() == Some(effect) {
-                plan.set(dependent, false, String::new());
-            }
-        }
-        plan
-    }
 }
 
 /// Why `scene` cannot show `effect` at all; `None` if it can.
@@ -345,15 +332,15 @@ impl EffectsPlan {
         };
         let is_planned = config.mode() == EffectsMode::Planned;
         for effect in Effect::ALL {
-            if absence(scene, settings, effect).is_some() {
+            let switch = switch(config, effect);
+            // A mask that is switched off is not even loaded.
+            let is_unused = effect == Effect::Occluders && switch == EffectSwitch::Off;
+            if absence(scene, settings, effect).is_some() && !is_unused {
                 continue;
             }
-            match switch(config, effect) {
+            match switch {
                 EffectSwitch::On => plan.set(effect, true, "switched on by the user".into()),
-                EffectSwitch::Off => {
-                    plan = plan.without(effect);
-                    plan.set(effect, false, "switched off by the user".into());
-                }
+                EffectSwitch::Off => plan.set(effect, false, "switched off by the user".into()),
                 EffectSwitch::Auto if is_planned && plan.is_enabled(effect) => {
                     let reason = match effect.is_measured() {
                         true => "the scene can show it",
@@ -364,8 +351,9 @@ impl EffectsPlan {
                 EffectSwitch::Auto => {}
             }
         }
-        explain_dependents(&mut plan);
+        leave_out_dependents(&mut plan);
         if is_planned
+            && plan.is_enabled(Effect::Interreflection)
             && switch(config, Effect::Interreflection) == EffectSwitch::Auto
             && renderer.geometry().convex
             && !lets_light_pass(scene)
@@ -374,6 +362,10 @@ impl EffectsPlan {
             plan.set(Effect::Interreflection, false, why.into());
         }
         plan.max_depth = config.max_depth.unwrap_or(MAX_DEPTH);
+        if plan.max_depth <= 1 && plan.is_enabled(Effect::Interreflection) {
+            let why = "max_depth allows one interaction";
+            plan.set(Effect::Interreflection, false, why.into());
+        }
         if !plan.is_enabled(Effect::Interreflection) {
             plan.max_depth = plan.max_depth.min(1);
         }
@@ -481,14 +473,12 @@ fn lets_light_pass(scene: &Scene) -> bool {
     scene.materials.iter().any(opens)
 }
 
-/// Switched-off effects take those along that mean nothing without them.
-fn explain_dependents(plan: &mut EffectsPlan) {
+/// Effects that are left out take those along that mean nothing without them, even if the user switched these on.
+fn leave_out_dependents(plan: &mut EffectsPlan) {
     for effect in Effect::ALL {
-        if let Some(needed) = effect.needs() {
-            let was = plan.effects.iter().find(|e| e.name == effect);
-            if was.is_some_and(|e| e.reason.is_empty()) {
-                plan.set(effect, false, format!("nothing without {}", needed.name()));
-            }
+        let missing = effect.needs().iter().find(|&&n| !plan.is_enabled(n));
+        if let (true, Some(needed)) = (plan.is_enabled(effect), missing) {
+            plan.set(effect, false, format!("nothing without {}", needed.name()));
         }
     }
 }

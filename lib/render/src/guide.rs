@@ -47,7 +47,7 @@ const TANGENTS: [f32; 2] = [0.03, 1.0];
 const FURTHER: f32 = 0.03;
 /// Reflectance of a dielectric at normal incidence.
 const DIELECTRIC: f32 = 0.04;
-/// Particles for each pixel of the object, whose first samples are 16 paths.
+/// Particles for each pixel of the object, whose first samples are 8 paths.
 const PARTICLES_PER_PIXEL: usize = 12;
 /// Fewest pixels of the object that a guide is made for: smaller pictures take as long without.
 const LEAST_PIXELS: usize = 1 << 13;

@@ -154,16 +154,17 @@ pub fn torus_knot(center: Vec3, scale: f32, tube: f32, along: u32, around: u32) 
 /// that only one of the two has are dropped.
 pub fn append(mesh: &mut TriangleMesh, other: TriangleMesh, material: u32) {
     let first = mesh.positions.len() as u32;
-    let keep = |a: bool, b: bool| a && b || first == 0;
-    if keep(!mesh.normals.is_empty(), !other.normals.is_empty()) {
-        mesh.normals.extend(other.normals);
-    } else {
-        mesh.normals.clear();
+    fn join<T>(mine: &mut Vec<T>, theirs: Vec<T>, first: u32) {
+        match !mine.is_empty() && !theirs.is_empty() || first == 0 {
+            true => mine.extend(theirs),
+            false => mine.clear(),
+        }
     }
-    if keep(!mesh.uvs[0].is_empty(), !other.uvs[0].is_empty()) {
-        mesh.uvs[0].extend(&other.uvs[0]);
-    } else {
-        mesh.uvs[0].clear();
+    join(&mut mesh.normals, other.normals, first);
+    join(&mut mesh.tangents, other.tangents, first);
+    join(&mut mesh.colors, other.colors, first);
+    for (mine, theirs) in mesh.uvs.iter_mut().zip(other.uvs) {
+        join(mine, theirs, first);
     }
     mesh.positions.extend(other.positions);
     mesh.materials.extend(vec![material; other.indices.len()]);
@@ -193,5 +194,26 @@ mod tests {
         assert!((sphere - 4.18879).abs() < 0.02, "{sphere}");
         assert_eq!(volume(&cuboid(Vec3::ZERO, Vec3::new(1.0, 2.0, 3.0))), 6.0);
         assert!(volume(&torus_knot(Vec3::ZERO, 1.0, 0.3, 128, 16)) > 0.5);
+    }
+
+    #[test]
+    fn attributes_that_only_one_mesh_has_are_dropped() {
+        let plain = quad(Vec3::ZERO, Vec3::X, Vec3::Y);
+        let mut full = plain.clone();
+        full.normals = vec![Vec3::Z; 4];
+        full.tangents = vec![Vec3::X.extend(1.0); 4];
+        full.colors = vec![glam::Vec4::ONE; 4];
+        full.uvs[1] = vec![Vec2::ONE; 4];
+        for (mut first, second) in [(full.clone(), plain.clone()), (plain, full.clone())] {
+            append(&mut first, second, 1);
+            assert_eq!((first.positions.len(), first.uvs[0].len()), (8, 8));
+            assert_eq!((first.normals.len(), first.tangents.len()), (0, 0));
+            assert_eq!((first.colors.len(), first.uvs[1].len()), (0, 0));
+            assert_eq!(first.materials, [0, 0, 1, 1]);
+        }
+        let mut both = full.clone();
+        append(&mut both, full, 0);
+        assert_eq!((both.normals.len(), both.tangents.len()), (8, 8));
+        assert_eq!((both.colors.len(), both.uvs[1].len()), (8, 8));
     }
 }

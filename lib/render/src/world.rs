@@ -202,13 +202,18 @@ impl<'a> World<'a> {
 
     /// What the sheets that `ray` meets let pass.
     fn through_sheets<const F: u32>(&self, ray: &Ray, alpha_key: u64) -> Vec3 {
-        let (mut ray, mut left, mut filling) = (*ray, Vec3::ONE, Vec3::ZERO);
+        let (mut ray, mut left) = (*ray, Vec3::ONE);
+        // Attenuation per metre of the segment, and metres of it if the segment meets no inner side.
+        let (mut filling, mut thickness) = (Vec3::ZERO, 0.0);
         for _ in 0..MOST_SHEETS {
             let hit = self.geometry.bvh.closest(&ray, f32::INFINITY, |t, u, v| {
                 self.is_covered::<F>(t, u, v, alpha_key)
             });
             let Some(hit) = hit else {
-                return left;
+                return match has(F, EXTENSIONS) {
+                    true => left * ExtensionPoint::left_after(filling, thickness),
+                    false => left,
+                };
             };
             let Hit { triangle, u, v, .. } = hit;
             let surface = self.surfaces.interact::<F>(ray.direction, triangle, u, v);
@@ -220,6 +225,7 @@ impl<'a> World<'a> {
                 left *= ExtensionPoint::left_after(filling, hit.t);
                 let inside = surface.enters(ray.direction);
                 filling = surface.extension.attenuation * f32::from(inside);
+                thickness = surface.extension.thickness;
             }
             if left.max_element() < LEAST_PASSING {
                 break;

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::knobs::{Part, Variant, beyond_standard, render_cost};
-use crate::scenes::MeasuredScene;
+use crate::scenes::{MeasuredScene, folder_of};
 
 /// What one run of a variant showed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -101,7 +101,7 @@ const PICTURE_ERROR: &str = "0.003";
 
 impl SceneMeasurement<'_> {
     fn work(&self) -> PathBuf {
-        self.out.join("work").join(folder_name(&self.scene.name))
+        self.out.join("work").join(folder_name(self.scene))
     }
 
     fn stage(
@@ -128,9 +128,14 @@ impl SceneMeasurement<'_> {
         self.executables.run(stage.executable, &arguments)
     }
 
+    fn reference_folder(&self) -> PathBuf {
+        self.work()
+            .join(format!("reference-{}", self.reference_error))
+    }
+
     /// The render track's reference: everything simulated, sampled to the reference's error.
     fn converged_picture(&self) -> anyhow::Result<Reference> {
-        let folder = self.work().join("reference");
+        let folder = self.reference_folder();
         let done = folder.join("done.json");
         if !done.is_file() {
             let set = settings(&[
@@ -228,7 +233,7 @@ impl SceneMeasurement<'_> {
         if open == 0 || (variant.part == Part::Light && self.scene.recover.is_none()) {
             return 0.0;
         }
-        let is_made = self.work().join("reference/done.json").is_file();
+        let is_made = self.reference_folder().join("done.json").is_file();
         let reference = match with_reference && variant.part == Part::Render && !is_made {
             true => render_cost(self.reference_error),
             false => 0.0,
@@ -247,8 +252,10 @@ impl SceneMeasurement<'_> {
 
     fn sample_file(&self, variant: &Variant, seed: u64) -> PathBuf {
         let name = format!("{}-{seed}.json", key(&beyond_standard(&variant.set)));
-        let folder = self.out.join("points").join(folder_name(&self.scene.name));
-        folder.join(variant.part.name()).join(name)
+        let folder = self.out.join("points").join(folder_name(self.scene));
+        folder
+            .join(track_folder(variant.part, self.reference_error))
+            .join(name)
     }
 
     fn render(
@@ -346,7 +353,62 @@ fn key(set: &[(String, String)]) -> String {
     blake3::hash(text.join("\n").as_bytes()).to_hex()[..12].to_owned()
 }
 
-fn folder_name(scene: &str) -> String {
+/// Where what belongs to a scene is kept. Projects of the user's may lie in folders of the same name: theirs has a hash of
+/// their place.
+fn folder_name(scene: &MeasuredScene) -> String {
     let keep = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
-    scene.chars().map(keep).collect()
+    let plain = |name: &str| name.chars().map(keep).collect::<String>();
+    if scene.recover.is_some() {
+        return plain(&scene.name);
+    }
+    let place = scene.lit.canonicalize();
+    let place = place.unwrap_or_else(|_| scene.lit.clone());
+    let hash = blake3::hash(place.as_os_str().as_encoded_bytes()).to_hex();
+    format!("{}-{}", plain(&folder_of(&scene.lit)), &hash[..8])
+}
+
+/// Where the points of a track are kept: errors of renders are known beside one reference alone.
+fn track_folder(part: Part, reference_error: f64) -> String {
+    match part {
+        Part::Render => format!("{}-{reference_error}", part.name()),
+        Part::Light => part.name().to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scenes::projects;
+
+    #[test]
+    fn projects_in_folders_of_the_same_name_are_kept_apart() {
+        let folder = tempfile::tempdir().unwrap();
+        let files = ["a/photo/pipeline.toml", "b/photo/pipeline.toml"].map(|p| {
+            let path = folder.path().join(p);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(&path, "").unwrap();
+            path
+        });
+        let [first, second] = files.clone().map(|f| projects(&[f]).remove(0));
+        assert_eq!(
+            (first.name.as_str(), second.name.as_str()),
+            ("photo", "photo")
+        );
+        assert_ne!(folder_name(&first), folder_name(&second));
+        // Beside one another, tables tell them apart, too.
+        let both = projects(&files);
+        assert_ne!(both[0].name, both[1].name);
+        assert_eq!(both[0].name, files[0].display().to_string());
+        // What was measured of one alone is found again.
+        assert_eq!(folder_name(&both[0]), folder_name(&first));
+    }
+
+    #[test]
+    fn points_beside_another_reference_are_measured_again() {
+        let of = |part| [2e-4, 1e-3].map(|error| track_folder(part, error));
+        let [fine, coarse] = of(Part::Render);
+        assert_ne!(fine, coarse);
+        let [fine, coarse] = of(Part::Light);
+        assert_eq!(fine, coarse);
+    }
 }

@@ -100,15 +100,25 @@ pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<M
     Ok(scene)
 }
 
-/// A project of the user's.
-pub fn given(pipeline: &Path) -> MeasuredScene {
-    let folder = pipeline.parent().and_then(|f| f.canonicalize().ok());
-    let name = folder.as_deref().and_then(Path::file_name);
-    MeasuredScene {
-        name: name.map_or("project".into(), |n| n.to_string_lossy().into_owned()),
-        lit: pipeline.into(),
+/// Projects of the user's, named by their folders; by their files where folders have the same name.
+pub fn projects(pipelines: &[PathBuf]) -> Vec<MeasuredScene> {
+    let folders: Vec<String> = pipelines.iter().map(|p| folder_of(p)).collect();
+    let named = |(pipeline, folder): (&PathBuf, &String)| MeasuredScene {
+        name: match folders.iter().filter(|f| *f == folder).count() {
+            1 => folder.clone(),
+            _ => pipeline.display().to_string(),
+        },
+        lit: pipeline.clone(),
         recover: None,
-    }
+    };
+    pipelines.iter().zip(&folders).map(named).collect()
+}
+
+/// The name of the folder that a file lies in.
+pub fn folder_of(file: &Path) -> String {
+    let folder = file.parent().and_then(|f| f.canonicalize().ok());
+    let name = folder.as_deref().and_then(Path::file_name);
+    name.map_or("project".into(), |n| n.to_string_lossy().into_owned())
 }
 
 /// A bowl with a wall, open above, that stands on y = 0.

@@ -47,6 +47,14 @@ pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome>
         let text = "--reference-error must lie above 0 and below 1, --repeats must be at least 1";
         return Err(Usage(text.into()).into());
     }
+    let known = knobs::names();
+    if let Some(unknown) = cli.knob.iter().find(|k| !known.contains(&k.as_str())) {
+        let text = format!(
+            "no series is called \"{unknown}\"; --knob accepts: {}",
+            known.join(", ")
+        );
+        return Err(Usage(text).into());
+    }
     interrupt::listen()?;
     let executables = Executables::beside_this()?;
     let scenes = chosen_scenes(cli)?;
@@ -77,9 +85,8 @@ pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome>
         }
     }
     if work.is_empty() {
-        let known = knobs::names().join(", ");
-        let text = format!("no point is left to measure; --knob accepts: {known}");
-        return Err(Usage(text).into());
+        let text = "no point is left to measure: scene and track have none of the --knob";
+        return Err(Usage(text.into()).into());
     }
     let mut costs = Vec::new();
     let mut referred: Vec<&str> = Vec::new();
@@ -135,7 +142,7 @@ fn chosen_parts(cli: &Cli) -> anyhow::Result<&'static [Part]> {
 
 fn chosen_scenes(cli: &Cli) -> anyhow::Result<Vec<MeasuredScene>> {
     if !cli.pipeline.is_empty() {
-        return Ok(cli.pipeline.iter().map(|p| scenes::given(p)).collect());
+        return Ok(scenes::projects(&cli.pipeline));
     }
     let names: Vec<&str> = match cli.scene.is_empty() {
         true => scenes::NAMES.to_vec(),
@@ -151,4 +158,23 @@ fn chosen_scenes(cli: &Cli) -> anyhow::Result<Vec<MeasuredScene>> {
         scenes::built_in(name, &folder.join(name.replace(' ', "-")), cli.size)
     };
     names.into_iter().map(make).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[test]
+    fn a_series_that_does_not_exist_is_refused_beside_one_that_does() {
+        let arguments = ["dipir-tradeoff", "--knob", "depth", "--knob", "dept"];
+        let refused = sweep(&Cli::parse_from(arguments), &mut |_| {});
+        let text = refused.err().expect("is refused").to_string();
+        assert!(
+            text.starts_with("no series is called \"dept\"; --knob accepts: "),
+            "{text}"
+        );
+        assert!(text.contains("depth"), "{text}");
+    }
 }

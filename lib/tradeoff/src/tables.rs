@@ -212,6 +212,7 @@ fn csv(parts: &[TrackRows]) -> String {
     for (part, scenes) in parts {
         for (scene, rows) in scenes {
             for row in rows {
+                let scene = scene.replace('"', "\"\"");
                 let (low, high) = row.interval.unwrap_or((f64::NAN, f64::NAN));
                 let _ = writeln!(
                     text,
@@ -356,6 +357,17 @@ mod tests {
         assert_eq!(both.len(), 2);
         assert!((both[0].cost_s - 2.0).abs() < 1e-12);
         assert!((both[0].error / (0.02 * 1.0101) - 1.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn quotes_in_the_name_of_a_scene_are_doubled_in_a_table() {
+        let scenes = by_scene(&[point("my \"best\" shot", "1", 0.04, 1.0)], "render");
+        let text = csv(&[("render", scenes)]);
+        let row = text.lines().nth(1).unwrap();
+        assert!(
+            row.starts_with("render,\"my \"\"best\"\" shot\",\"samples\","),
+            "{row}"
+        );
     }
 
     #[test]

@@ -166,6 +166,47 @@ fn what_the_user_switches_wins() {
 }
 
 #[test]
+fn what_means_nothing_alone_is_left_out_though_the_user_switches_it_on() {
+    let mut glowing = matte(Vec3::splat(0.5));
+    glowing.emissive = Vec3::splat(2.0);
+    let s = scene(icosphere(Vec3::Y, 0.5, 2), glowing, view(), ground());
+    let no_shadow = EffectsConfig {
+        shadow: Some(EffectSwitch::Off),
+        emission_on_proxy: Some(EffectSwitch::On),
+        ..EffectsConfig::default()
+    };
+    let no_emission = EffectsConfig {
+        emission: Some(EffectSwitch::Off),
+        bounce_to_proxy: Some(EffectSwitch::Off),
+        ..EffectsConfig::default()
+    };
+    for (config, reason) in [
+        (no_shadow, "nothing without shadow"),
+        (no_emission, "nothing without emission"),
+    ] {
+        let p = possible(&s, &config, &settings(64, 1));
+        let e = find(&p, Effect::EmissionOnProxy);
+        assert_eq!((e.enabled, e.reason.as_str()), (false, reason));
+        assert_eq!(p.simulation().light_on_proxy, None);
+    }
+}
+
+#[test]
+fn a_depth_of_one_leaves_interreflection_out_from_the_beginning() {
+    let knot = torus_knot(Vec3::Y * 0.7, 0.4, 0.17, 96, 12);
+    let s = scene(knot, matte(Vec3::splat(0.9)), view(), ground());
+    let shallow = EffectsConfig {
+        max_depth: Some(1),
+        ..EffectsConfig::default()
+    };
+    let p = planned(&s, &shallow, &settings(16, 1));
+    let e = find(&p, Effect::Interreflection);
+    let reason = "max_depth allows one interaction";
+    assert_eq!((e.enabled, e.reason.as_str()), (false, reason));
+    assert_eq!(e.contribution, None);
+}
+
+#[test]
 fn light_that_reaches_the_proxy_is_found_and_simulated() {
     let mut glowing = matte(Vec3::splat(0.5));
     glowing.emissive = Vec3::splat(4.0);
@@ -498,4 +539,23 @@ fn the_same_bytes_come_from_any_number_of_threads_when_effects_are_left_out() {
     assert_eq!(a.film.object, b.film.object);
     assert_eq!(a.film.shadow, b.film.shadow);
     assert_eq!((a.left_out, a.counts), (b.left_out, b.counts));
+}
+
+#[test]
+fn occluders_that_are_switched_off_are_said_to_be() {
+    let ball = icosphere(Vec3::Y * 0.5, 0.5, 1);
+    let s = scene(ball, matte(Vec3::splat(0.5)), view(), ground());
+    let off = EffectsConfig {
+        occluders: Some(EffectSwitch::Off),
+        ..EffectsConfig::default()
+    };
+    let reason = |config: &EffectsConfig| {
+        let plan = possible(&s, config, &settings(8, 1));
+        let found = find(&plan, Effect::Occluders);
+        assert!(!found.enabled);
+        found.reason.clone()
+    };
+    assert_eq!(reason(&off), "switched off by the user");
+    let without = reason(&EffectsConfig::default());
+    assert_eq!(without, "no mask of the photo's foreground is given");
 }

@@ -356,6 +356,23 @@ fn a_volume_attenuates_by_the_length_of_the_way_through_it() {
 }
 
 #[test]
+fn a_volume_that_attenuates_beyond_all_numbers_leaves_layers_finite() {
+    let mut black = filled(Vec3::splat(1e-6), 1.0);
+    let volume = black.extensions.volume.as_mut().expect("is filled");
+    volume.attenuation_distance = 1e-40;
+    // From outside, and from the side on which a sheet leads out of the object.
+    let cube = cuboid(Vec3::splat(-0.5), Vec3::splat(0.5));
+    let sheet = quad(Vec3::new(-0.5, -0.5, 0.0), Vec3::X, Vec3::Y);
+    for (mesh, position) in [(cube, Vec3::Z * 5.0), (sheet, Vec3::Z * -5.0)] {
+        let view = camera(position, Vec3::ZERO, 20.0, 8);
+        let s = scene(mesh, black.clone(), view, crate::testing::ground());
+        let film = render(&s, &sky(1.0), &everything(8), &settings(16, 1)).film;
+        let mut layers = film.object.pixels().iter().chain(film.shadow.pixels());
+        assert!(layers.all(|v| v.is_finite()), "{position}");
+    }
+}
+
+#[test]
 fn a_rough_sheet_attenuates_the_light_that_either_technique_finds() {
     let color = Vec3::new(0.25, 0.5, 0.9);
     let view = camera(Vec3::Z * 5.0, Vec3::ZERO, 0.5, 4);

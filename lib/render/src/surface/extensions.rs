@@ -121,7 +121,9 @@ impl Surfaces<'_> {
         }
         if let Some(v) = &extensions.volume {
             let color = v.attenuation_color.to_array();
-            all.attenuation = -Vec3::from(color.map(f32::ln)) / v.attenuation_distance;
+            let attenuation = -Vec3::from(color.map(f32::ln)) / v.attenuation_distance;
+            // Within a tiny distance it exceeds all numbers, and 0 m of that would be no number.
+            all.attenuation = attenuation.min(Vec3::splat(f32::MAX));
             all.thickness = v.thickness * read(&v.thickness_texture).y;
         }
         all

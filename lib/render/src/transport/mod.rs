@@ -15,6 +15,9 @@
 //! What is recorded is what the samples saw: the noise of a record is frozen, the same in every
 //! replay. Light that the object sends to the proxy is a third set of rows, `S`, and with what it
 //! emits the ratio is `1 - (B L - S L - emitted) / (E L)`.
+//!
+//! `B` has no colour. What coloured glass lets pass is in `S`; where no light of the object is recorded on the proxy, such
+//! glass blocks the luminance of what it takes, in all channels alike.
 use std::ops::Range;
 
 use dipir_imaging::raster::Raster;

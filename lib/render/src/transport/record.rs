@@ -4,6 +4,7 @@ use std::ops::ControlFlow;
 use dipir_imaging::raster::Raster;
 use dipir_light::cosine::{CosineCells, CosineWeightedMap};
 use dipir_light::environment::{EnvironmentMap, EnvironmentSampler, texel_of};
+use dipir_light::luminance::luminance;
 use dipir_light::plane::PlaneLight;
 use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::{Sampler, Stream};
@@ -28,9 +29,6 @@ fn grey_map([width, height]: [usize; 2], values: &[f32]) -> Result<EnvironmentMa
     let texels = values.iter().map(|&v| Vec3::splat(v)).collect();
     Ok(EnvironmentMap::new(width, height, texels)?)
 }
-
-/// Side of the blocks of pixels that are recorded as one task.
-const BLOCK: u32 = 8;
 
 /// Blocks between two reports of progress.
 const BATCH: usize = 64;
@@ -65,6 +63,8 @@ impl Gather for RowGather<'_> {
 struct ShadowRow {
     /// Direction, weight, and whether the object blocks it.
     found: Vec<(Vec3, f32, bool)>,
+    /// Direction and weight of what coloured glass blocks.
+    tinted: Vec<(Vec3, Vec3)>,
     /// Direction and weight of light that comes by way of the object.
     sent: Vec<(Vec3, Vec3)>,
     /// Light of the object's own.
@@ -107,7 +107,10 @@ impl ShadowGather for ShadowRow {
 
     #[inline]
     fn blocked(&mut self, direction: Vec3, light: Vec3) {
-        self.found.push((direction, light.x, true));
+        match light == Vec3::splat(light.x) {
+            true => self.found.push((direction, light.x, true)),
+            false => self.tinted.push((direction, light)),
+        }
     }
 
     #[inline]
@@ -125,6 +128,8 @@ struct Recorder<'a> {
     path: PathContext<'a, UnitLight>,
     shadow: Option<ShadowContext<'a, UnitLight, UnitOnPlane>>,
     footprint: Footprint,
+    /// What is recorded as one task.
+    blocks: Vec<Block>,
     settings: &'a RecordSettings<'a>,
 }
 
@@ -221,6 +226,7 @@ impl Transport {
                 geometry.bvh.bounds(),
                 geometry.bvh.clusters(),
             ),
+            blocks: renderer.blocks().collect(),
             world: &world,
             path,
             shadow,
@@ -342,17 +348,7 @@ impl Recorder<'_> {
         &self,
         progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
     ) -> Result<Vec<Recorded<C, G>>, RenderError> {
-        let [width, height] = self.world.camera().resolution;
-        let blocks: Vec<Block> = (0..height.div_ceil(BLOCK))
-            .flat_map(|j| (0..width.div_ceil(BLOCK)).map(move |i| (i * BLOCK, j * BLOCK)))
-            .map(|(x, y)| Block {
-                x,
-                y,
-                width: BLOCK.min(width - x),
-                height: BLOCK.min(height - y),
-            })
-            .collect();
-        let texels = self.settings.texels();
+        let (blocks, texels) = (&self.blocks, self.settings.texels());
         let mut parts = Vec::with_capacity(blocks.len());
         for batch in blocks.chunks(BATCH) {
             let mut found: Vec<Recorded<C, G>> = batch
@@ -478,10 +474,19 @@ impl Recorder<'_> {
             return;
         }
         let samples = self.settings.shadow_samples as f32;
+        let texel = |direction| texel_index(direction, self.settings.environment);
+        // Rows of the shadow have no colour: what coloured glass lets pass is sent, or else it blocks all channels alike.
+        let is_sent = self.sends_light().is_some();
         let mut push = |part: &mut Part<G>, blocked: bool, scale: f32| {
             for &(direction, weight, _) in found.found.iter().filter(|f| f.2 == blocked) {
-                let texel = texel_index(direction, self.settings.environment);
-                row.add(texel, Vec3::splat(weight));
+                row.add(texel(direction), Vec3::splat(weight));
+            }
+            for &(direction, light) in found.tinted.iter().filter(|_| blocked) {
+                let weight = match is_sent {
+                    true => light.max_element(),
+                    false => luminance(light),
+                };
+                row.add(texel(direction), Vec3::splat(weight));
             }
             part.push(pixel, row, scale);
         };
@@ -493,13 +498,16 @@ impl Recorder<'_> {
             push(&mut out.blocked, true, 1.0 / samples);
             push(&mut out.arriving, false, 1.0 / samples);
         }
-        if self.sends_light().is_some() {
+        if is_sent {
             let scale = match self.world.geometry.proxy {
                 ProxyGeometry::Plane(_) => seen / samples,
                 _ => 1.0 / samples,
             };
             for &(direction, weight) in &found.sent {
-                row.add(texel_index(direction, self.settings.environment), weight);
+                row.add(texel(direction), weight);
+            }
+            for &(direction, light) in &found.tinted {
+                row.add(texel(direction), Vec3::splat(light.max_element()) - light);
             }
             out.sent.push(pixel, row, scale);
             out.emitted.push((pixel, found.local * scale));

@@ -438,6 +438,51 @@ fn recording_can_be_broken_off() {
     assert!(matches!(stopped, Err(RenderError::Interrupted)));
 }
 
+#[test]
+fn the_shadow_of_coloured_glass_has_its_colour_where_sent_light_is_recorded_else_its_luminance() {
+    let color = Vec3::new(1.0, 0.5, 0.25);
+    let mut glass = matte(color);
+    glass.roughness = 0.0;
+    glass.transmission = Some(dipir_scene::material::Transmission {
+        factor: 1.0,
+        texture: None,
+    });
+    // It hides the sky from the ground that is looked at.
+    let sheet = quad(
+        Vec3::new(-400.0, 2.0, 400.0),
+        Vec3::X * 800.0,
+        Vec3::NEG_Z * 800.0,
+    );
+    let view = camera(Vec3::new(0.0, 1.0, 2.0), Vec3::ZERO, 20.0, 4);
+    let white = vec![Vec3::ONE; ENVIRONMENT[0] * ENVIRONMENT[1]];
+    for proxy in [ground(), self::sheet()] {
+        let s = scene(sheet.clone(), glass.clone(), view, proxy);
+        let shadow = |light_on_proxy| {
+            let simulation = Simulation {
+                light_on_proxy,
+                ..everything(2)
+            };
+            let settings = RecordSettings {
+                precision: Precision::Single,
+                ..small(simulation)
+            };
+            let ratios = record(&s, &settings).shadow(&white);
+            ratios.pixels().iter().sum::<Vec3>() / ratios.pixels().len() as f32
+        };
+        let coloured = shadow(Some(LightOnProxy {
+            emission: true,
+            bounce: false,
+        }));
+        let grey = shadow(None);
+        // The same rays pass in every channel. Sums of f32, a few ulp of 1.
+        let most = coloured.x;
+        assert!((0.7..1.0).contains(&most), "{coloured}");
+        assert!(coloured.abs_diff_eq(most * color, 1e-5), "{coloured}");
+        let wanted = Vec3::splat(luminance(coloured));
+        assert!(grey.abs_diff_eq(wanted, 1e-5), "{grey} {wanted}");
+    }
+}
+
 /// A sky with a patch of 3 x 3 texels, about 50 degrees high, that begins in `column`.
 fn patch(column: usize) -> EnvironmentMap {
     let texels = (0..ENVIRONMENT[0] * ENVIRONMENT[1]).map(|k| {

@@ -106,3 +106,26 @@ fn of_an_even_sky_glass_takes_what_it_reflects() {
         );
     }
 }
+
+#[test]
+fn the_sun_is_attenuated_over_the_thickness_of_a_sheet_without_an_inner_side() {
+    let towards = Vec3::new(0.0, 0.906, 0.423).normalize();
+    let light = EnvironmentSampler::new(sun(towards, 1e4, 0.0, 128));
+    let mut s = under_glass(0.0, Vec3::ONE);
+    // Its front faces the ground, as that of the panes that paths attenuate faces the camera.
+    s.mesh.indices.iter_mut().for_each(|t| t.swap(1, 2));
+    let glass = &mut s.materials[0];
+    // Schlick's factor of an index of 1 is below 1e-5 at 25 degrees.
+    glass.ior = 1.0;
+    let color = Vec3::new(0.25, 0.5, 0.9);
+    glass.extensions.volume = Some(dipir_scene::material::Volume {
+        thickness: 3.0,
+        thickness_texture: None,
+        attenuation_color: color,
+        attenuation_distance: 2.0,
+    });
+    let found = mean_shadow(&render(&s, &light, &everything(4), &settings(64, 5)));
+    let exact = color.powf(1.5);
+    // No noise: all rays pass alike.
+    assert!(found.abs_diff_eq(exact, 1e-3), "{found} {exact}");
+}
