@@ -124,6 +124,12 @@ fn round(x: f64) -> usize {
     x.round_ties_even().max(0.0) as usize
 }
 
+/// Number `i` of the timesteps from 0 to `last` in `parts` equal parts, by NumPy's products: 15 of 30 parts of 999 are
+/// below 499.5, where they would be 500 in another order.
+fn evenly(i: usize, last: usize, parts: usize) -> usize {
+    round(i as f64 * (last as f64 / parts as f64))
+}
+
 fn ddim_timesteps(schedule: &NoiseSchedule, steps: usize) -> Result<Vec<usize>> {
     let n = schedule.len();
     let spacing = schedule
@@ -134,7 +140,7 @@ fn ddim_timesteps(schedule: &NoiseSchedule, steps: usize) -> Result<Vec<usize>> 
     let mut timesteps: Vec<usize> = match spacing {
         Spacing::Linspace if steps == 1 => vec![0],
         Spacing::Linspace => (0..steps)
-            .map(|i| round(i as f64 * (n - 1) as f64 / (steps - 1) as f64))
+            .map(|i| evenly(i, n - 1, steps - 1))
             .rev()
             .collect(),
         Spacing::Leading => (0..steps).map(|i| i * (n / steps) + offset).rev().collect(),
@@ -152,10 +158,7 @@ fn dpm_timesteps(schedule: &NoiseSchedule, steps: usize) -> Result<Vec<usize>> {
         .unwrap_or(Spacing::Linspace);
     let offset = schedule.config().steps_offset;
     let mut timesteps: Vec<usize> = match spacing {
-        Spacing::Linspace => (1..=steps)
-            .map(|i| round(i as f64 * (n - 1) as f64 / steps as f64))
-            .rev()
-            .collect(),
+        Spacing::Linspace => (1..=steps).map(|i| evenly(i, n - 1, steps)).rev().collect(),
         Spacing::Leading => (1..=steps)
             .map(|i| i * (n / (steps + 1)) + offset)
             .rev()
@@ -227,4 +230,24 @@ pub fn edit(
         .schedule
         .add_noise(latents, noise, sampler.timesteps[first])?;
     sample(sampler, first, &start, predict)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::schedule::ScheduleConfig;
+
+    /// Of DPMSolverMultistepScheduler.set_timesteps(30) and DDIMScheduler.set_timesteps(31), diffusers 0.42.1.
+    #[test]
+    fn timesteps_halfway_between_two_are_those_of_diffusers() {
+        let schedule = NoiseSchedule::new(ScheduleConfig {
+            timestep_spacing: Some(Spacing::Linspace),
+            ..ScheduleConfig::default()
+        });
+        let schedule = schedule.expect("valid schedule");
+        for (solver, steps) in [(Solver::DpmSolver2M, 30), (Solver::Ddim, 31)] {
+            let sampler = Sampler::new(&schedule, solver, steps).expect("steps");
+            assert_eq!(sampler.timesteps()[14..17], [533, 499, 466], "{solver:?}");
+        }
+    }
 }

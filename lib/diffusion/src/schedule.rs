@@ -187,8 +187,8 @@ impl NoiseSchedule {
         &self.unused
     }
 
-    /// Computes the schedule in f64. Refuses variances outside [0, 1), and a noise prediction where the last timestep
-    /// is noise alone: it does not determine the sample.
+    /// Computes the schedule in f64. Refuses variances outside [0, 1), variances without noise that are to be rescaled, and
+    /// a noise prediction where the last timestep is noise alone: it does not determine the sample.
     pub fn new(config: ScheduleConfig) -> Result<Self> {
         let betas = betas(&config)?;
         let mut alpha_bars: Vec<f64> = betas
@@ -208,9 +208,22 @@ impl NoiseSchedule {
                 alpha_bars[0].sqrt(),
                 alpha_bars[alpha_bars.len() - 1].sqrt(),
             );
+            if first == last {
+                return argument(
+                    "rescale_betas_zero_snr: the last timestep has no more noise than the first; check num_train_timesteps, beta_start and beta_end",
+                );
+            }
             for a in &mut alpha_bars {
                 *a = ((a.sqrt() - last) * first / (first - last)).powi(2);
             }
+        }
+        // A noisy sample is divided by the signal, in f32.
+        let signal = alpha_bars[alpha_bars.len() - 1].sqrt();
+        if config.prediction_type == Prediction::Epsilon && signal < f64::from(f32::MIN_POSITIVE) {
+            return argument(format!(
+                "the last of {} timesteps has no signal, and prediction_type = \"epsilon\" cannot give the sample there; check num_train_timesteps and the betas, or use v_prediction",
+                alpha_bars.len()
+            ));
         }
         Ok(Self {
             config,
@@ -348,7 +361,7 @@ impl NoiseSchedule {
     pub fn sample_of(&self, output: &Tensor, x_t: &Tensor, t: usize) -> Result<Tensor> {
         let (signal, sigma) = self.signal_and_noise(t)?;
         match self.config.prediction_type {
-            // The constructor refuses schedules in which the signal reaches 0.
+            // The constructor refuses schedules whose signal vanishes.
             Prediction::Epsilon => Ok(((x_t - (output * sigma)?)? / signal)?),
             Prediction::Velocity => Ok(((x_t * signal)? - (output * sigma)?)?),
             Prediction::Sample => Ok(output.clone()),
@@ -499,6 +512,50 @@ mod tests {
         };
         let message = NoiseSchedule::new(config).expect_err("refused").to_string();
         assert!(message.contains("use v_prediction"), "{message}");
+    }
+
+    #[test]
+    fn noise_predictions_need_a_signal_that_numbers_hold() {
+        // (1 - .01)^100000 = e^-1005: the sample would be divided by 0.
+        let config = ScheduleConfig {
+            num_train_timesteps: 100_000,
+            ..ScheduleConfig::default()
+        };
+        let message = NoiseSchedule::new(config.clone())
+            .expect_err("refused")
+            .to_string();
+        assert!(
+            message.contains("last of 100000 timesteps has no signal"),
+            "{message}"
+        );
+        let config = ScheduleConfig {
+            prediction_type: Prediction::Velocity,
+            ..config
+        };
+        assert!(NoiseSchedule::new(config).is_ok());
+    }
+
+    #[test]
+    fn noise_that_does_not_grow_cannot_be_rescaled_to_noise_alone() {
+        let without_noise = ScheduleConfig {
+            beta_start: 0.0,
+            beta_end: 0.0,
+            rescale_betas_zero_snr: true,
+            prediction_type: Prediction::Velocity,
+            ..ScheduleConfig::default()
+        };
+        let one_timestep = ScheduleConfig {
+            num_train_timesteps: 1,
+            beta_start: 0.1,
+            ..without_noise.clone()
+        };
+        for config in [without_noise, one_timestep] {
+            let message = NoiseSchedule::new(config).expect_err("refused").to_string();
+            assert!(
+                message.contains("no more noise than the first"),
+                "{message}"
+            );
+        }
     }
 
     #[test]

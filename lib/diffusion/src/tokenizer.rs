@@ -117,6 +117,7 @@ impl Tokenizer {
             vocab_size,
             placeholders: BTreeMap::new(),
         };
+        tokenizer.set_markers_apart();
         for (word, tokens) in added_tokens::sequences(&added) {
             tokenizer.set_apart(&word, tokens);
         }
@@ -134,7 +135,7 @@ impl Tokenizer {
             path: path.clone(),
             message: e.to_string(),
         })?;
-        Ok(Self {
+        let mut tokenizer = Self {
             inner,
             path,
             start,
@@ -146,7 +147,15 @@ impl Tokenizer {
             length: DEFAULT_LENGTH,
             vocab_size,
             placeholders: BTreeMap::new(),
-        })
+        };
+        tokenizer.set_markers_apart();
+        Ok(tokenizer)
+    }
+
+    /// Markers that stand in a text are markers, as in CLIP.
+    fn set_markers_apart(&mut self) {
+        self.set_apart(START, vec![self.start]);
+        self.set_apart(END, vec![self.end]);
     }
 
     /// Largest token + 1.

@@ -323,7 +323,7 @@ pub fn write_safetensors(
 }
 
 /// The bytes that [`write_safetensors`] writes: header keys in sorted order.
-pub fn serialize_safetensors(
+fn serialize_safetensors(
     tensors: &BTreeMap<String, Tensor>,
     metadata: &BTreeMap<String, String>,
 ) -> Result<Vec<u8>> {

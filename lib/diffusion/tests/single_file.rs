@@ -338,6 +338,16 @@ fn what_the_second_family_predicts_is_asked_for_or_found_beside_the_file() -> Ou
     let file = SingleFile::open(&path, None)?;
     assert_eq!(file.schedule.prediction_type, Prediction::Velocity);
     assert_eq!(file.unet.sample_size, 96);
+    let yaml = folder.path().join("model.yaml");
+    std::fs::write(&yaml, "params:\n  parameterization: v  # not eps\n")?;
+    let file = SingleFile::open(&path, None)?;
+    assert_eq!(file.schedule.prediction_type, Prediction::Velocity);
+    std::fs::write(&yaml, "params:\n  parameterization: \"x0\"\n")?;
+    let message = SingleFile::open(&path, None).expect_err("x0").to_string();
+    assert!(
+        message.contains("parameterization: \"x0\" is not supported"),
+        "{message}"
+    );
     let header = BTreeMap::from([("modelspec.prediction_type".to_owned(), "epsilon".to_owned())]);
     write_safetensors(&path, &tensors, &header)?;
     let file = SingleFile::open(&path, None)?;

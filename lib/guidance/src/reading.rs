@@ -163,7 +163,9 @@ fn crops(photo: &Raster<Vec3>, place: &Insertion<'_>) -> Vec<Crop> {
         .map(|scale| crop_of(photo, camera, square(size, middle, CROP * longer * scale)))
         .into();
     let near = ground_depth(camera, proxy, corner + extent * Vec2::new(0.5, 1.0));
-    let mut found: Vec<(f32, Vec2, f32, Crop)> = vec![];
+    // Scores and places alone: of a large photograph there are many more crops than are taken.
+    let mut found: Vec<(f32, Vec2, f32)> = vec![];
+    let crop_at = |at: Vec2, side: f32| crop_of(photo, camera, square(size, at, side));
     for own in OWN_SIZES {
         // The side of a crop whose foot is at a row of pixels: as many metres there as the first crop has at the object.
         let side_at = |row: f32| {
@@ -186,10 +188,9 @@ fn crops(photo: &Raster<Vec3>, place: &Insertion<'_>) -> Vec<Crop> {
             let mut x = 0.5 * side;
             while fits && x + 0.5 * side <= size.0 as f32 {
                 let at = Vec2::new(x, middle);
-                let crop = crop_of(photo, camera, square(size, at, side));
-                let score = interest(&crop.picture);
+                let score = interest(&crop_at(at, side).picture);
                 if score > LEAST_INTEREST {
-                    found.push((score, at, side, crop));
+                    found.push((score, at, side));
                 }
                 x += 0.12 * side;
             }
@@ -198,14 +199,14 @@ fn crops(photo: &Raster<Vec3>, place: &Insertion<'_>) -> Vec<Crop> {
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
     let mut taken: Vec<(Vec2, f32)> = vec![];
-    for (_, at, side, crop) in found {
+    for (_, at, side) in found {
         if chosen.len() == CROPS {
             break;
         }
         let apart = |(t, s): &(Vec2, f32)| t.distance(at) > 0.35 * side.max(*s);
         if taken.iter().all(apart) {
             taken.push((at, side));
-            chosen.push(crop);
+            chosen.push(crop_at(at, side));
         }
     }
     chosen

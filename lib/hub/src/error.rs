@@ -101,7 +101,7 @@ pub enum Error {
     /// Reading or writing failed.
     #[error("cannot {action} {path}: {source}", path = path.display())]
     Io {
-        /// `read` or `write`.
+        /// `read`, `write` or `remove`.
         action: &'static str,
         /// Where.
         path: PathBuf,

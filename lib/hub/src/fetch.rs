@@ -102,7 +102,10 @@ pub fn fetch(
             }
         }
         if let Err(error) = verify_file(file, &part) {
-            fs::remove_file(&part).map_err(io("write", &part))?;
+            // A part that could not be read may be whole: it stays.
+            if let Error::Hash { .. } = &error {
+                fs::remove_file(&part).map_err(io("remove", &part))?;
+            }
             return Err(error);
         }
         fs::rename(&part, &target).map_err(io("write", &target))?;
@@ -142,16 +145,19 @@ fn length(path: &Path) -> Result<u64> {
     Ok(fs::metadata(path).map_err(io("read", path))?.len())
 }
 
-/// Makes `partial` a folder of this source: the files of another source that its note lists go, and
-/// a folder without a note is another's and is refused.
+/// Makes `partial` a folder of this source: the files of its note that this source does not want go, and a folder
+/// without a note is another's and is refused.
 fn prepare(partial: &Path, source: &Source) -> Result<()> {
     let note = partial.join(SOURCE_FILE);
     let earlier = fs::read(&note)
         .ok()
         .and_then(|text| serde_json::from_slice::<Source>(&text).ok());
     match &earlier {
-        Some(e) if e.repo == source.repo && e.commit == source.commit => {}
-        Some(e) => remove_listed(partial, e)?,
+        // The same commit, maybe in another precision.
+        Some(e) if e.repo == source.repo && e.commit == source.commit => {
+            remove_listed(partial, e, &source.files)?;
+        }
+        Some(e) => remove_listed(partial, e, &[])?,
         None if is_free(partial)? => {}
         None => {
             return Err(Error::Foreign {
@@ -191,14 +197,15 @@ fn is_free(folder: &Path) -> Result<bool> {
     Ok(true)
 }
 
-/// Removes what an earlier fetch of another source left, whole or in part, and nothing else.
-fn remove_listed(partial: &Path, earlier: &Source) -> Result<()> {
+/// Removes the files of an earlier fetch but those to `keep`, whole or in part, and nothing else.
+fn remove_listed(partial: &Path, earlier: &Source, keep: &[String]) -> Result<()> {
     use std::path::Component;
     let is_inside = |name: &&String| {
         let mut parts = Path::new(name).components();
         parts.all(|c| matches!(c, Component::Normal(_)))
     };
-    for name in earlier.files.iter().filter(is_inside) {
+    let gone = earlier.files.iter().filter(|name| !keep.contains(name));
+    for name in gone.filter(is_inside) {
         let path = partial.join(name);
         for path in [part_of(&path), path] {
             match fs::remove_file(&path) {
@@ -242,7 +249,11 @@ impl Run {
         if file.size == Some(there) && there > 0 {
             return Ok(());
         }
-        let (mut reader, continued) = hub.open(url, there)?;
+        let (mut reader, continued) = match hub.open(url, there) {
+            // Nothing follows the part, and without a size it is not known to be whole: it is received anew.
+            Err(Error::Status { status: 416, .. }) if there > 0 => (hub.open(url, 0)?.0, false),
+            opened => opened?,
+        };
         if !continued {
             out.set_len(0).map_err(io("write", part))?;
             self.outcome.bytes -= there;
@@ -360,6 +371,81 @@ mod tests {
         let error = prepare(&partial, &source("2")).expect_err("no note");
         assert!(error.to_string().contains("did not begin"), "{error}");
         assert!(partial.join("notes").exists());
+    }
+
+    #[test]
+    fn weights_of_another_precision_do_not_stay_beside_those_that_are_wanted() {
+        let folder = tempfile::tempdir().expect("folder");
+        let partial = folder.path().join(".model.partial");
+        let source = |weights: &str| Source {
+            repo: "a/b".into(),
+            commit: "1".into(),
+            files: vec!["config.json".into(), weights.into()],
+        };
+        prepare(&partial, &source("full")).expect("new");
+        for name in ["config.json", "full", "full.part"] {
+            fs::write(partial.join(name), "x").expect("write");
+        }
+        prepare(&partial, &source("half")).expect("the same commit");
+        assert!(partial.join("config.json").exists());
+        assert!(!partial.join("full").exists() && !partial.join("full.part").exists());
+    }
+
+    /// Answers requests on this machine: `content`, or that there is nothing from a byte on.
+    fn serve(content: &'static str) -> String {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+        let address = format!("http://{}", listener.local_addr().expect("address"));
+        std::thread::spawn(move || {
+            for stream in listener.incoming() {
+                let mut stream = stream.expect("connection");
+                let (mut request, mut buffer) = (vec![], [0; 1024]);
+                while !request.ends_with(b"\r\n\r\n") {
+                    let count = stream.read(&mut buffer).expect("request");
+                    assert!(count > 0, "a request ends with an empty line");
+                    request.extend(&buffer[..count]);
+                }
+                let request = String::from_utf8_lossy(&request).to_lowercase();
+                let (status, body) = match request.contains("\nrange:") {
+                    true => ("416 Range Not Satisfiable", ""),
+                    false => ("200 OK", content),
+                };
+                let length = body.len();
+                let answer = format!(
+                    "HTTP/1.1 {status}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n{body}"
+                );
+                stream.write_all(answer.as_bytes()).expect("answer");
+            }
+        });
+        address
+    }
+
+    #[test]
+    fn a_part_of_unknown_size_that_cannot_go_on_is_received_anew() {
+        let folder = tempfile::tempdir().expect("folder");
+        let hub = Hub::new(&serve("hello\n"), None).expect("hub");
+        let files = [RemoteFile {
+            path: "x".into(),
+            size: None,
+            sha256: None,
+            git_hash: Some("ce013625030ba8dba906f756967f9e9ca394464a".into()),
+        }];
+        let revision = Revision {
+            repo: "a/b".into(),
+            commit: "1".into(),
+            files: files.to_vec(),
+        };
+        let source = Source {
+            repo: "a/b".into(),
+            commit: "1".into(),
+            files: vec!["x".into()],
+        };
+        // The run before was killed after the last byte.
+        prepare(folder.path(), &source).expect("new");
+        fs::write(folder.path().join("x.part"), "hello\n").expect("write");
+        let outcome = fetch(&hub, &revision, &files, folder.path(), 0, |_| true).expect("whole");
+        assert_eq!((outcome.bytes, outcome.received), (6, 6));
+        let text = fs::read_to_string(folder.path().join("x")).expect("read");
+        assert_eq!(text, "hello\n");
     }
 
     #[test]

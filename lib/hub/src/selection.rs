@@ -41,10 +41,13 @@ pub fn select(revision: &Revision, variant: Variant) -> Result<Vec<RemoteFile>> 
         take("tokenizer/tokenizer.json", &mut problems);
     }
     for (part, _) in WEIGHTS {
-        // A VAE that is an exact rearrangement has no weights.
         take(&format!("{part}/config.json"), &mut problems);
     }
-    for optional in ["tokenizer_config.json", "special_tokens_map.json"] {
+    for optional in [
+        "added_tokens.json",
+        "special_tokens_map.json",
+        "tokenizer_config.json",
+    ] {
         wanted.extend(find(&format!("tokenizer/{optional}")));
     }
     for (part, stem) in WEIGHTS {
@@ -91,25 +94,29 @@ fn weights<'a>(
         ];
         let index = files.iter().find(|f| index.contains(&f.path))?;
         let start = format!("{part}/{stem}{half}-");
-        let mut all: Vec<&RemoteFile> = files
-            .iter()
-            .filter(|f| {
-                f.path
-                    .strip_prefix(&start)
-                    .and_then(|rest| rest.strip_suffix(".safetensors"))
-                    .is_some_and(is_shard)
-            })
-            .collect();
+        let shard_of = |f: &'a RemoteFile| {
+            let rest = f.path.strip_prefix(&start)?;
+            Some((f, shard(rest.strip_suffix(".safetensors")?)?))
+        };
+        let (mut all, numbers): (Vec<&RemoteFile>, Vec<(usize, usize)>) =
+            files.iter().filter_map(shard_of).unzip();
+        let is_whole = |count: usize| (1..=count).all(|n| numbers.contains(&(n, count)));
+        if !numbers.iter().any(|&(_, count)| is_whole(count)) {
+            return None;
+        }
         all.push(index);
         Some(all)
     })
 }
 
-/// `00001-of-00002`.
-fn is_shard(text: &str) -> bool {
-    let number = |t: &str| !t.is_empty() && t.bytes().all(|b| b.is_ascii_digit());
-    text.split_once("-of-")
-        .is_some_and(|(a, b)| number(a) && number(b))
+/// `00001-of-00002` as (1, 2).
+fn shard(text: &str) -> Option<(usize, usize)> {
+    let number = |t: &str| {
+        let digits = t.bytes().all(|b| b.is_ascii_digit());
+        digits.then(|| t.parse().ok()).flatten()
+    };
+    let (n, count) = text.split_once("-of-")?;
+    Some((number(n)?, number(count)?))
 }
 
 fn lacking(files: &[RemoteFile], part: &str, stem: &str, variant: Variant) -> String {
@@ -120,6 +127,16 @@ fn lacking(files: &[RemoteFile], part: &str, stem: &str, variant: Variant) -> St
     };
     if variant == Variant::Half && weights(files, part, stem, Variant::Full).is_some() {
         return format!("no {stem}.fp16.safetensors, only full precision; leave --variant out");
+    }
+    let indices = [
+        ".safetensors.index.json",
+        ".safetensors.index.fp16.json",
+        ".fp16.safetensors.index.json",
+    ];
+    if indices.into_iter().any(has) {
+        return format!(
+            "there is an index of {stem}, but not all of its shards; take another revision"
+        );
     }
     if has(".bin") || has(".fp16.bin") {
         return format!(
@@ -180,12 +197,15 @@ mod tests {
             "text_encoder/model.fp16.safetensors",
             "vae/diffusion_pytorch_model.fp16.safetensors",
             "tokenizer/special_tokens_map.json",
+            "tokenizer/added_tokens.json",
         ];
         let full = names(&published, Variant::Full).expect("complete");
-        assert_eq!(full.len(), COMMON.len() + 3, "{full:?}");
+        assert_eq!(full.len(), COMMON.len() + 4, "{full:?}");
+        // The tokenizer reads it: words of their own, as textual inversion adds them.
+        assert!(full.contains(&"tokenizer/added_tokens.json".to_owned()));
         assert!(full.contains(&"unet/diffusion_pytorch_model.safetensors".to_owned()));
         let half = names(&published, Variant::Half).expect("complete");
-        assert_eq!(half.len(), COMMON.len() + 3, "{half:?}");
+        assert_eq!(half.len(), COMMON.len() + 4, "{half:?}");
         assert!(
             half.iter()
                 .filter(|n| n.ends_with(".safetensors"))
@@ -206,6 +226,15 @@ mod tests {
         let found = names(&published, Variant::Full).expect("complete");
         assert_eq!(found.iter().filter(|n| n.starts_with("unet/")).count(), 4);
         assert!(!found.iter().any(|n| n.contains("..")), "{found:?}");
+        // Without the second one, or with an index alone, it is no model.
+        for left in [3, 2] {
+            let message = names(&published[..left], Variant::Full)
+                .expect_err("a shard is missing")
+                .to_string();
+            let wanted =
+                "unet: there is an index of diffusion_pytorch_model, but not all of its shards";
+            assert!(message.contains(wanted), "{message}");
+        }
     }
 
     #[test]

@@ -235,6 +235,22 @@ fn a_deeper_model_starts_with_the_output_of_the_shallow_one() {
 }
 
 #[test]
+fn no_more_than_all_of_the_scenes_are_done() {
+    let cache = tempfile::tempdir().unwrap();
+    std::fs::create_dir(cache.path().join("scenes")).unwrap();
+    // A file holds 64 scenes. The work stops before it is read.
+    std::fs::write(cache.path().join("scenes/scenes-00000.safetensors"), "").unwrap();
+    let mut shares = vec![];
+    let stop = &mut |share| {
+        shares.push(share);
+        ControlFlow::Break(())
+    };
+    let mix = SceneMix::OpenAndStreets;
+    let none = crate::training_run::scenes(cache.path(), 10, mix, 1, stop).unwrap();
+    assert!(none.is_none() && shares == [1.0], "{shares:?}");
+}
+
+#[test]
 fn a_truncated_file_of_scenes_is_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let data = scenes(folder.path());

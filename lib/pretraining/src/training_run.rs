@@ -42,7 +42,8 @@ pub fn scenes(
         objects: ObjectSet::Training,
     };
     Dataset::make(&cache.join("scenes"), &settings, &mut |done| {
-        progress(done as f64 / count as f64)
+        // The last file may hold more than are asked for.
+        progress((done as f64 / count as f64).min(1.0))
     })
 }
 

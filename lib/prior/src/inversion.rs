@@ -150,8 +150,9 @@ fn crop_energies(
     Ok(sum)
 }
 
-/// Estimates the light from `crops` of one photograph. The first `same` of them show one place and together count as
-/// one crop. `progress` is called with the share that is done and may stop the search; then the result is `None`.
+/// Estimates the light from `crops` of one photograph. The first `same` of them show one place: in the mean of the
+/// encoder's answers they count as one crop together, in the sum of energies as one each. `progress` is called with the
+/// share that is done and may stop the search; then the result is `None`.
 pub fn invert(
     model: &Model,
     encoder: &LightEncoder,

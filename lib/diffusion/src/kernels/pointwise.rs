@@ -65,7 +65,7 @@ vectorized! {
 }
 
 vectorized! {
-    /// `g` becomes g f'(x).
+    /// g f'(x) into `dx`.
     fn vjp_job(f: Activation, x: &[f32], g: &[f32], dx: &mut [f32]) {
         let triples = dx.iter_mut().zip(x.iter().zip(g));
         match f {

@@ -8,8 +8,8 @@ thread_local! {
     static COMPOSED: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Runs `work` with every layer composed of candle's operations, as on a GPU, instead of the crate's own kernels. Holds for
-/// this thread. It is slower and takes more memory: it is what the kernels are compared with.
+/// Runs `work` with every layer composed of candle's operations, as on devices without kernels of the crate's own. Holds
+/// for this thread. It is slower and takes more memory: it is what the kernels are compared with.
 pub fn composed<T>(work: impl FnOnce() -> T) -> T {
     struct Restore(bool);
     impl Drop for Restore {

@@ -243,7 +243,17 @@ fn sort_keys<'a>(
             continue;
         };
         let part = parts.entry(layer).or_default();
-        *[&mut part.down, &mut part.up, &mut part.alpha][which] = Some(key.to_owned());
+        let place = match which {
+            0 => &mut part.down,
+            1 => &mut part.up,
+            _ => &mut part.alpha,
+        };
+        match place {
+            None => *place = Some(key.to_owned()),
+            Some(other) => problems.push(format!(
+                "keys {other:?} and {key:?} are of one matrix or alpha; keep one of them"
+            )),
+        }
     }
     parts
 }

@@ -42,6 +42,8 @@ impl AdapterTarget {
 pub struct Adapter {
     down: Linear,
     up: Linear,
+    /// As given: the scale times the rank may round to another number.
+    alpha: f64,
     scale: f64,
     pointwise_conv: bool,
 }
@@ -58,11 +60,11 @@ impl Adapter {
                 up.dims()
             ));
         }
-        let scale = alpha / rank as f64;
         Ok(Self {
             down: Linear::from_tensors(down, None)?,
             up: Linear::from_tensors(up, None)?,
-            scale,
+            alpha,
+            scale: alpha / rank as f64,
             pointwise_conv: false,
         })
     }
@@ -76,10 +78,10 @@ impl Adapter {
         }
     }
 
-    /// One of its matrices in the shape that files have.
+    /// One of its matrices in f32 and in the shape that files have.
     fn as_stored(&self, matrix: &Tensor) -> Result<Tensor> {
         let (rows, columns) = matrix.dims2()?;
-        let matrix = matrix.detach();
+        let matrix = matrix.detach().to_dtype(DType::F32)?;
         Ok(match self.pointwise_conv {
             true => matrix.reshape((rows, columns, 1, 1))?,
             false => matrix,
@@ -93,7 +95,7 @@ impl Adapter {
 
     /// alpha, the scale times the rank.
     pub fn alpha(&self) -> f64 {
-        self.scale * self.rank() as f64
+        self.alpha
     }
 
     /// Matrix [rank, inputs], "A" of PEFT and "down" of kohya.

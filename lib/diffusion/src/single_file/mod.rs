@@ -197,10 +197,20 @@ fn said_prediction(path: &Path, weights: &Weights) -> Result<Option<Prediction>>
         return Ok(None);
     }
     let text = dipir_files::read_to_string(&yaml).map_err(crate::error::io("read", &yaml))?;
-    let parameterization = text.lines().find_map(|line| {
-        let value = line.trim().strip_prefix("parameterization:")?;
-        of_word(value.trim().trim_matches(['"', '\'']))
-    });
-    // The original code's default.
-    Ok(Some(parameterization.unwrap_or(Prediction::Epsilon)))
+    let mut values = text
+        .lines()
+        .filter_map(|line| line.trim().strip_prefix("parameterization:"));
+    let Some(value) = values.next() else {
+        // The original code's default.
+        return Ok(Some(Prediction::Epsilon));
+    };
+    // What follows # is a comment.
+    let word = value.split('#').next().unwrap_or_default().trim();
+    match of_word(word.trim_matches(['"', '\''])) {
+        Some(prediction) => Ok(Some(prediction)),
+        None => Err(refused(
+            &yaml,
+            &format!("parameterization: {word} is not supported; accepted: eps, v"),
+        )),
+    }
 }

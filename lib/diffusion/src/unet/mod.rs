@@ -189,46 +189,6 @@ impl UNet {
         context: &Tensor,
         pass: &Pass,
     ) -> Result<Tensor> {
-        let (output, _) = self.forward_and_middle(sample, timesteps, context, pass)?;
-        Ok(output)
-    }
-
-    /// As [`UNet::forward`], without a graph. On the CPU each row of the batch takes a thread of its own: the layers of a
-    /// small network are too short to be shared among threads.
-    pub fn predict(
-        &self,
-        sample: &Tensor,
-        timesteps: &[f64],
-        context: &Tensor,
-        pass: &Pass,
-    ) -> Result<Tensor> {
-        let rows = sample.dim(0)?;
-        if rows == 1 || !sample.device().is_cpu() {
-            return Ok(self.forward(sample, timesteps, context, pass)?.detach());
-        }
-        let timesteps = self.check(sample, timesteps, context)?;
-        let outputs = (0..rows).into_par_iter().map(|row| {
-            let adapted = pass.lora_rows.is_none_or(|rows| row < rows);
-            let pass = Pass {
-                lora: pass.lora.clone().filter(|_| adapted),
-                ..Pass::default()
-            };
-            let (sample, context) = (sample.narrow(0, row, 1)?, context.narrow(0, row, 1)?);
-            let output = self.forward(&sample, &timesteps[row..=row], &context, &pass)?;
-            Ok(output.detach())
-        });
-        let outputs = outputs.collect::<Result<Vec<Tensor>>>()?;
-        Ok(Tensor::cat(&outputs, 0)?)
-    }
-
-    /// As [`UNet::forward`], with what the middle block makes of it: [batch, channels, h, w] of the coarsest level.
-    pub fn forward_and_middle(
-        &self,
-        sample: &Tensor,
-        timesteps: &[f64],
-        context: &Tensor,
-        pass: &Pass,
-    ) -> Result<(Tensor, Tensor)> {
         let timesteps = self.check(sample, timesteps, context)?;
         // Recomputed segments take the timestep vector as a constant, which
         // it is not where text is part of it.
@@ -265,7 +225,6 @@ impl UNet {
         for stage in &self.middle {
             x = run(stage, &x, &time, context, pass)?;
         }
-        let middle = x.clone();
         for level in &self.up {
             for stage in &level.stages {
                 let Some(skip) = skips.pop() else {
@@ -278,8 +237,35 @@ impl UNet {
                 x = upsample.forward(&upsample_nearest(&x, height, width)?)?;
             }
         }
-        let output = self.conv_out.forward(&self.norm_out.forward(&x)?)?;
-        Ok((output, middle))
+        self.conv_out.forward(&self.norm_out.forward(&x)?)
+    }
+
+    /// As [`UNet::forward`], without a graph. On the CPU each row of the batch takes a thread of its own: the layers of a
+    /// small network are too short to be shared among threads.
+    pub fn predict(
+        &self,
+        sample: &Tensor,
+        timesteps: &[f64],
+        context: &Tensor,
+        pass: &Pass,
+    ) -> Result<Tensor> {
+        let rows = sample.dim(0)?;
+        if rows == 1 || !sample.device().is_cpu() {
+            return Ok(self.forward(sample, timesteps, context, pass)?.detach());
+        }
+        let timesteps = self.check(sample, timesteps, context)?;
+        let outputs = (0..rows).into_par_iter().map(|row| {
+            let adapted = pass.lora_rows.is_none_or(|rows| row < rows);
+            let pass = Pass {
+                lora: pass.lora.clone().filter(|_| adapted),
+                ..Pass::default()
+            };
+            let (sample, context) = (sample.narrow(0, row, 1)?, context.narrow(0, row, 1)?);
+            let output = self.forward(&sample, &timesteps[row..=row], &context, &pass)?;
+            Ok(output.detach())
+        });
+        let outputs = outputs.collect::<Result<Vec<Tensor>>>()?;
+        Ok(Tensor::cat(&outputs, 0)?)
     }
 
     fn check(&self, sample: &Tensor, timesteps: &[f64], context: &Tensor) -> Result<Vec<f64>> {

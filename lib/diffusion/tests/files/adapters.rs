@@ -408,6 +408,50 @@ fn matrices_of_convolutions_have_the_shape_of_convolutions_in_files() -> Outcome
 }
 
 #[test]
+fn adapters_are_written_in_f32_with_the_alpha_that_was_given() -> Outcome {
+    let targets = load_unet(&family().join("unet"), DType::F32, &Device::Cpu)?.adapter_targets();
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("lora.safetensors");
+    // 1 / 49 * 49 is not 1 in f64.
+    let lora = Lora::new(&targets, 49, 1.0, 7, &Device::Cpu)?;
+    for style in [LoraStyle::Peft, LoraStyle::Kohya] {
+        for lora in [&lora, &lora.constant(DType::BF16)?] {
+            lora.save(&path, style, &LoraInfo::new())?;
+            let weights = Weights::open_file(&path)?;
+            assert_eq!(weights.precisions(), ["F32"]);
+            assert_eq!(weights.metadata()["alpha"], "1");
+            if style == LoraStyle::Peft {
+                let settings = &weights.metadata()["lora_adapter_metadata"];
+                assert!(settings.contains("\"unet.lora_alpha\":1,"), "{settings}");
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn two_keys_of_one_matrix_are_named() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("lora.safetensors");
+    let layer = "down_blocks.0.attentions.0.transformer_blocks.0.attn1.to_q";
+    let flat = layer.replace('.', "_");
+    let ones = |a, b| Tensor::ones((a, b), DType::F32, &Device::Cpu);
+    let tensors = BTreeMap::from([
+        (format!("unet.{layer}.lora_A.weight"), ones(4, 16)?),
+        (format!("unet.{layer}.lora_B.weight"), ones(16, 4)?),
+        // Of another LoRA: which one counts?
+        (format!("lora_unet_{flat}.lora_up.weight"), ones(16, 4)?),
+    ]);
+    write_safetensors(&path, &tensors, &BTreeMap::new())?;
+    let message = scale_of_ones(&path, 4).expect_err("two").to_string();
+    assert!(
+        message.contains("lora_up.weight\" and \"unet."),
+        "{message}"
+    );
+    Ok(())
+}
+
+#[test]
 fn kohya_files_with_the_original_names_of_blocks_mean_the_same() -> Outcome {
     let unet = load_unet(&family().join("unet"), DType::F32, &Device::Cpu)?;
     let targets = unet.adapter_targets();

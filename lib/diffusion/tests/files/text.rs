@@ -5,7 +5,7 @@ use std::path::Path;
 use candle_core::{DType, Device, Tensor};
 use dipir_diffusion::model::Model;
 use dipir_diffusion::text_encoder::TextEncoder;
-use dipir_diffusion::tokenizer::Tokenizer;
+use dipir_diffusion::tokenizer::{Padding, Tokenizer};
 use dipir_diffusion::weights::write_safetensors;
 
 use super::{Outcome, family, model_folder, tensors};
@@ -56,6 +56,24 @@ fn tokenizer_takes_nothing_a_thousand_words_and_a_placeholder() -> Outcome {
     );
     assert_eq!(tokenizer.words("sks")?, [5000]);
     assert!(!tokenizer.words("sksx")?.contains(&5000));
+    Ok(())
+}
+
+/// Tokens of transformers' CLIPTokenizer, 5.24.
+#[test]
+fn markers_in_a_text_are_markers() -> Outcome {
+    let tokenizer = Tokenizer::clip(Padding::End)?;
+    for (text, wanted) in [
+        ("a<|startoftext|>b", vec![320, 49406, 321]),
+        ("<|endoftext|> x", vec![49407, 343]),
+        ("<|ENDOFTEXT|>", vec![49407]),
+    ] {
+        assert_eq!(tokenizer.words(text)?, wanted, "{text}");
+    }
+    // Those of a folder have other numbers.
+    let tokenizer = Tokenizer::load(&family().join("tokenizer"))?;
+    let end = tokenizer.encode("")?[1];
+    assert_eq!(tokenizer.words("<|endoftext|>")?, [end]);
     Ok(())
 }
 
