@@ -62,10 +62,11 @@ impl LightEstimate {
             all.push(shining.sun(direction, self.sun_probability * share, &base));
         }
         all.retain(|c| c.probability > LEAST);
+        all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
+        all.truncate(count);
         let total: f64 = all.iter().map(|c| c.probability).sum();
         all.iter_mut()
             .for_each(|c| c.probability /= total.max(1e-12));
-        all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
         all
     }
 

@@ -289,6 +289,7 @@ mod tests {
         );
         assert_eq!(only.lobes[0], seen.source_lobe().unwrap());
         // A clock knows where the sun is, and not whether it shines.
+        assert_eq!(by_clock.candidates(1).len(), 1);
         let [soft, sunny] = &by_clock.candidates(8)[..] else {
             panic!("{:?}", by_clock.candidates(8).len())
         };

@@ -123,14 +123,18 @@ impl View {
         let height = shrunk(clean.height(), h, camera.focal_px.y);
         Self {
             pixels: resize(&clean, width, height, Filter::Area),
-            camera: camera.scaled([width as u32, height as u32]),
+            // Light is far away. In f32 a direction added to a position far from the origin loses its digits.
+            camera: Camera {
+                position: Vec3::ZERO,
+                ..camera.scaled([width as u32, height as u32])
+            },
             border_rad: border_deg.to_radians().max(1e-4),
         }
     }
 
     /// Radiance from a direction and how far inside the picture it lies, 0 at the border to 1.
     fn sample(&self, towards: Vec3) -> Option<(Vec3, f32)> {
-        let at = self.camera.project(self.camera.position + towards)?;
+        let at = self.camera.project(towards)?;
         let size = Vec2::new(self.pixels.width() as f32, self.pixels.height() as f32);
         if !(at.cmpge(Vec2::ZERO).all() && at.cmplt(size).all()) {
             return None;
@@ -222,4 +226,28 @@ fn border_ratios(visible: &Visible, unseen: &EnvironmentMap) -> Vec<f32> {
             (sum / total).exp2()
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_scene::camera::FieldOfView;
+
+    use super::*;
+
+    #[test]
+    fn what_is_seen_of_far_light_does_not_depend_on_where_the_camera_stands() {
+        let pixels = (0..60 * 40).map(|k| Vec3::splat(((k * 7919) % 1009) as f32 / 1009.0));
+        let photo = LinearImage(Raster::from_pixels(60, 40, pixels.collect()));
+        let ahead = Vec3::new(0.3, -0.1, -1.0);
+        let view = FieldOfView::Vertical(0.9);
+        let here = Camera::look_at(Vec3::ZERO, ahead, Vec3::Y, view, [60, 40]);
+        // As in a map's coordinates, where f32 has steps of half a metre.
+        let there = Camera {
+            position: Vec3::new(500_000.0, 100.0, 5_000_000.0),
+            ..here
+        };
+        let [a, b] = [here, there].map(|camera| Visible::new(&photo, &camera, 64, 32, 6.0));
+        assert!(a.alpha.iter().any(|&seen| seen > 0.9));
+        assert_eq!((a.map, a.alpha), (b.map, b.alpha));
+    }
 }

@@ -173,6 +173,8 @@ impl Facts {
 
     fn read_place(&mut self, fields: &Fields) {
         let signed = |tag, sign_tag, negative: &str, most: f64| {
+            // Devices that do not know their place write degrees of 0/0.
+            fields.number(tag)?;
             let parts = fields.rationals(tag)?;
             let [degrees, minutes, seconds] = [0, 1, 2].map(|i| parts.get(i).copied());
             let value = degrees? + minutes.unwrap_or(0.0) / 60.0 + seconds.unwrap_or(0.0) / 3600.0;
@@ -184,7 +186,9 @@ impl Facts {
         };
         let latitude = signed(Tag::GPSLatitude, Tag::GPSLatitudeRef, "S", 90.0);
         let longitude = signed(Tag::GPSLongitude, Tag::GPSLongitudeRef, "W", 180.0);
-        if let (Some(latitude), Some(longitude)) = (latitude, longitude) {
+        // Others write zeros.
+        let place = latitude.zip(longitude).filter(|p| *p != (0.0, 0.0));
+        if let Some((latitude, longitude)) = place {
             self.latitude_deg = Some(latitude);
             self.longitude_deg = Some(longitude);
         }

@@ -21,14 +21,21 @@ const ROWS: &[Row] = &[
     Row {
         make: "canon",
         models: &[
-            "eos-1d x", "eos-1ds", "eos 5d", "eos 6d", "eos rp", "eos r3", "eos r5", "eos r6",
-            "eos r8", "eos r1",
+            "eos-1d x", "eos-1d c", "eos-1ds", "eos 5d", "eos 6d", "eos rp", "eos r3", "eos r5",
+            "eos r6", "eos r8", "eos r1",
         ],
         size_mm: FULL_FRAME,
     },
     Row {
         make: "canon",
-        models: &["eos r7", "eos r10", "eos r50", "eos r100", "eos m"],
+        models: &[
+            "eos r7",
+            "eos r10",
+            "eos r50",
+            "eos r100",
+            "eos rebel",
+            "eos m",
+        ],
         size_mm: APS_C_CANON,
     },
     Row {
@@ -63,6 +70,11 @@ const ROWS: &[Row] = &[
     },
     Row {
         make: "nikon",
+        models: &["z fc"],
+        size_mm: APS_C,
+    },
+    Row {
+        make: "nikon",
         models: &[
             "d3", "d4", "d5", "d6", "d600", "d610", "d700", "d750", "d780", "d800", "d810", "d850",
             "df", "z 5", "z 6", "z 7", "z 8", "z 9", "z f",
@@ -71,7 +83,7 @@ const ROWS: &[Row] = &[
     },
     Row {
         make: "nikon",
-        models: &["d", "z 30", "z 50", "z50", "z fc"],
+        models: &["d", "z 30", "z 50", "z50"],
         size_mm: APS_C,
     },
     Row {
@@ -82,7 +94,14 @@ const ROWS: &[Row] = &[
     Row {
         make: "sony",
         models: &[
-            "ilce-1", "ilce-7", "ilce-9", "ilca-99", "slt-a99", "dslr-a8", "dslr-a9", "dsc-rx1",
+            "ilce-1",
+            "ilce-7",
+            "ilce-9",
+            "ilca-99",
+            "slt-a99",
+            "dslr-a850",
+            "dslr-a900",
+            "dsc-rx1",
         ],
         size_mm: FULL_FRAME,
     },
@@ -100,6 +119,11 @@ const ROWS: &[Row] = &[
         make: "fujifilm",
         models: &["gfx"],
         size_mm: [43.8, 32.9],
+    },
+    Row {
+        make: "fujifilm",
+        models: &["x-s1"],
+        size_mm: [8.8, 6.6],
     },
     Row {
         make: "fujifilm",
@@ -123,7 +147,7 @@ const ROWS: &[Row] = &[
     },
     Row {
         make: "panasonic",
-        models: &["dmc-g", "dc-g", "dmc-gh", "dc-gh"],
+        models: &["dmc-g", "dc-g"],
         size_mm: FOUR_THIRDS,
     },
     Row {
@@ -153,6 +177,11 @@ const ROWS: &[Row] = &[
     },
     Row {
         make: "ricoh",
+        models: &["gr digital"],
+        size_mm: [7.3, 5.5],
+    },
+    Row {
+        make: "ricoh",
         models: &["gr", "pentax k"],
         size_mm: APS_C,
     },
@@ -163,7 +192,12 @@ const ROWS: &[Row] = &[
     },
     Row {
         make: "dji",
-        models: &["fc6310", "l1d"],
+        models: &["fc6310"],
+        size_mm: ONE_INCH,
+    },
+    Row {
+        make: "hasselblad",
+        models: &["l1d"],
         size_mm: ONE_INCH,
     },
     Row {
@@ -176,15 +210,15 @@ const ROWS: &[Row] = &[
 /// Long and short side of the sensor of a camera, millimetres, if the table has it.
 pub(crate) fn size_mm(make: Option<&str>, model: Option<&str>) -> Option<[f64; 2]> {
     let (make, model) = (make?.to_lowercase(), model?.to_lowercase());
-    // Some makers begin the name with their own.
+    // Some makers begin the name with their own; that of an OM-1 is no more than its own.
     let first = make.split_whitespace().next().unwrap_or_default();
     let name = model
         .strip_prefix(&make)
         .or_else(|| model.strip_prefix(first))
         .unwrap_or(&model)
         .trim_start();
-    let fits =
-        |row: &&Row| make.starts_with(row.make) && row.models.iter().any(|m| begins(name, m));
+    let is_named = |word: &&str| begins(name, word) || begins(&model, word);
+    let fits = |row: &&Row| make.starts_with(row.make) && row.models.iter().any(is_named);
     ROWS.iter().find(fits).map(|row| row.size_mm)
 }
 
@@ -218,8 +252,42 @@ mod tests {
         assert_eq!(size("SONY", "DSC-RX100"), Some(ONE_INCH));
         assert_eq!(size("SONY", "DSC-RX100M7"), Some(ONE_INCH));
         assert_eq!(size("FUJIFILM", "X-T3"), Some(APS_C));
+        assert_eq!(size("FUJIFILM", "X-S10"), Some(APS_C));
         assert_eq!(size("OLYMPUS CORPORATION", "E-M1MarkII"), Some(FOUR_THIRDS));
         assert_eq!(size("Apple", "iPhone 12"), None);
         assert_eq!(size_mm(None, Some("E-M1")), None);
+    }
+
+    #[test]
+    fn a_camera_whose_name_begins_as_anothers_has_its_own_sensor() {
+        let size = |make, model| size_mm(Some(make), Some(model));
+        assert_eq!(size("Canon", "Canon EOS REBEL T3i"), Some(APS_C_CANON));
+        assert_eq!(size("Canon", "Canon EOS-1D C"), Some(FULL_FRAME));
+        assert_eq!(size("NIKON CORPORATION", "NIKON Z fc"), Some(APS_C));
+        assert_eq!(size("NIKON CORPORATION", "NIKON Z f"), Some(FULL_FRAME));
+        assert_eq!(size("SONY", "DSLR-A900"), Some(FULL_FRAME));
+        assert_eq!(size("SONY", "DSLR-A580"), Some(APS_C));
+        assert_eq!(size("FUJIFILM", "X-S1"), Some([8.8, 6.6]));
+        assert_eq!(size("Hasselblad", "L1D-20c"), Some(ONE_INCH));
+        assert_eq!(size("OM Digital Solutions", "OM-1"), Some(FOUR_THIRDS));
+        assert_eq!(size("RICOH", "GR DIGITAL 4"), Some([7.3, 5.5]));
+        assert_eq!(
+            size("RICOH IMAGING COMPANY, LTD.", "RICOH GR III"),
+            Some(APS_C)
+        );
+    }
+
+    #[test]
+    fn every_name_of_the_table_finds_its_own_row() {
+        for row in ROWS {
+            for model in row.models {
+                assert_eq!(
+                    size_mm(Some(row.make), Some(model)),
+                    Some(row.size_mm),
+                    "{} {model}",
+                    row.make
+                );
+            }
+        }
     }
 }

@@ -513,6 +513,25 @@ fn without_an_offset_the_satellites_time_is_taken_and_nonsense_is_left_out() {
     assert_eq!(facts, dipir_imaging::facts::Facts::of_size([2, 2]));
 }
 
+#[test]
+fn a_place_that_the_device_did_not_know_is_none() {
+    let place_of = |latitude: [(u32, u32); 3], longitude: [(u32, u32); 3]| {
+        let gps = vec![
+            text(1, "N"),
+            rationals(2, &latitude),
+            text(3, "E"),
+            rationals(4, &longitude),
+        ];
+        let facts = with_exif(&exif(vec![], vec![], gps), (2, 2)).facts;
+        facts.latitude_deg.zip(facts.longitude_deg)
+    };
+    let [unknown, zero, nine] = [[(0, 0); 3], [(0, 1); 3], [(9, 1), (30, 1), (0, 0)]];
+    assert_eq!(place_of(unknown, unknown), None);
+    assert_eq!(place_of(nine, unknown), None);
+    assert_eq!(place_of(zero, zero), None);
+    assert_eq!(place_of(zero, nine), Some((0.0, 9.5)));
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(256))]
 

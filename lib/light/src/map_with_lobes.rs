@@ -1,11 +1,10 @@
 //! The sum of an environment map and spherical Gaussians.
-use glam::{DVec3, Vec2, Vec3};
+use glam::{Vec2, Vec3};
 
-use crate::environment::{EnvironmentMap, EnvironmentSampler};
+use crate::environment::EnvironmentSampler;
 use crate::gaussian::SgMixture;
 use crate::illuminant::{Illuminant, LightSample};
 use crate::luminance::luminance_f64;
-use crate::rasterize::rasterize;
 
 /// Light that is an environment map plus a mixture of lobes.
 ///
@@ -92,20 +91,6 @@ impl MapWithLobes {
     pub fn lobes(&self) -> &SgMixture {
         &self.lobes
     }
-
-    /// Radiance integrated over the sphere, per channel.
-    pub fn integral(&self) -> DVec3 {
-        self.map.map().integral() + self.lobes.integral()
-    }
-
-    /// Both parts on one map of `width` x `height` texels, each the mean over its cell: the
-    /// integral over the sphere is kept. Panics on an empty size.
-    pub fn rasterised(&self, width: usize, height: usize) -> EnvironmentMap {
-        let map = self.map.map().resampled(width, height);
-        let lobes = rasterize(self.lobes.lobes(), width, height);
-        let sums = map.texels().iter().zip(lobes.texels());
-        EnvironmentMap::from_trusted(width, height, sums.map(|(&a, &b)| a + b).collect())
-    }
 }
 
 impl Illuminant for MapWithLobes {
@@ -148,6 +133,7 @@ impl Illuminant for MapWithLobes {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::environment::EnvironmentMap;
     use crate::testing::{chi_squared, directions, lobe, speckled, uniform};
 
     fn lobes() -> SgMixture {
@@ -178,7 +164,6 @@ mod tests {
             assert_eq!(light.eval(d), map.eval(d) + Illuminant::eval(&lobes, d));
             assert_eq!(light.eval_pdf(d), (light.eval(d), light.pdf(d)));
         }
-        assert_eq!(light.integral(), map.map().integral() + lobes.integral());
     }
 
     #[test]
@@ -222,26 +207,5 @@ mod tests {
         let dark = MapWithLobes::new(black_map(), black_lobes());
         assert_eq!(dark.sample(Vec2::splat(0.4)).pdf, 0.0);
         assert_eq!(dark.pdf(Vec3::X), 0.0);
-    }
-
-    #[test]
-    fn on_a_map_of_any_size_no_energy_is_lost() {
-        let light = MapWithLobes::new(map(), lobes());
-        for (width, height) in [(24, 12), (64, 32), (10, 7), (1, 1)] {
-            let raster = light.rasterised(width, height);
-            assert_eq!((raster.width(), raster.height()), (width, height));
-            // The quadrature over texels that are wider than a lobe is good to 1e-4.
-            let ratio = raster.integral() / light.integral();
-            assert!((ratio - 1.0).abs().max_element() < 1e-4, "{ratio}");
-        }
-        // On its own grid, the map is as it was.
-        let own = MapWithLobes::new(map(), black_lobes()).rasterised(24, 12);
-        let map = map();
-        let error = own.texels().iter().zip(map.map().texels());
-        assert!(
-            error
-                .map(|(a, b)| (a - b).abs().max_element() / b.max_element())
-                .all(|e| e <= f32::EPSILON)
-        );
     }
 }

@@ -48,20 +48,6 @@ impl FromIterator<f64> for Neumaier {
     }
 }
 
-/// Terms of one chunk of a parallel sum. A constant, because the chunks fix the rounding.
-const CHUNK: usize = 1 << 14;
-
-/// The sum of `terms` in f64, compensated; the same bytes for any number of threads.
-pub fn sum_f32(terms: &[f32]) -> f64 {
-    par_reduce(
-        terms.len(),
-        CHUNK,
-        |r| terms[r].iter().map(|&x| x as f64).collect::<Neumaier>(),
-        Neumaier::merge,
-    )
-    .map_or(0.0, |s| s.total())
-}
-
 /// Maps the chunks `[0, chunk)`, `[chunk, 2 chunk)`... of `0..n` in parallel and folds the
 /// results from first to last, so that the answer does not depend on the number of threads.
 /// `None` if `n` is 0.
@@ -82,6 +68,13 @@ pub fn par_reduce<T: Send>(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Compensated sums of chunks, merged.
+    fn sum_f32(terms: &[f32]) -> f64 {
+        let chunk = |r: Range<usize>| terms[r].iter().map(|&x| x as f64).collect::<Neumaier>();
+        let sum = par_reduce(terms.len(), 1 << 14, chunk, Neumaier::merge);
+        sum.map_or(0.0, |s| s.total())
+    }
 
     #[test]
     fn ten_million_terms_over_nine_decades_keep_six_digits() {

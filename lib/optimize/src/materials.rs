@@ -197,8 +197,13 @@ impl<L: SceneLight> MaterialOptimization<'_, L> {
                 self.keep(&state)?;
             }
         }
+        // Without a step there is nothing to average.
+        let found = match settings.iterations {
+            0 => &state.parameters,
+            _ => &state.mean,
+        };
         Ok(MaterialOutcome {
-            materials: self.recovered(&state.mean, start),
+            materials: self.recovered(found, start),
             losses: state.losses,
         })
     }

@@ -193,6 +193,24 @@ fn the_strength_of_emission_alone_is_recovered() {
 }
 
 #[test]
+fn without_a_step_the_material_is_that_of_the_start() {
+    let case = Case::new(&material([0.9, 0.7, 0.4], 1.0, 0.35));
+    let settings = MaterialSettings {
+        iterations: 0,
+        ..SETTINGS
+    };
+    let go_on = &mut |_| ControlFlow::Continue(());
+    let outcome = case.run(settings, None, go_on).unwrap();
+    let (found, start) = (&outcome.materials[0], &case.start.materials[0]);
+    assert_eq!(Vec3::from(found.base_color), start.base_color.truncate());
+    assert_eq!(
+        (found.metallic, found.roughness),
+        (start.metallic, start.roughness)
+    );
+    assert_eq!(found.emissive_strength, 1.0);
+}
+
+#[test]
 fn killed_at_any_step_and_started_again_the_material_is_the_same_bytes() {
     let case = Case::new(&material([0.9, 0.7, 0.4], 1.0, 0.35));
     let settings = MaterialSettings {

@@ -122,10 +122,16 @@ impl Optimization<'_> {
             }
         }
         let settings = self.settings.clone();
-        let mut stopped_early = false;
+        // A checkpoint may be of the last iteration before the end.
+        let mut stopped_early =
+            stands_still(&state.history, settings.patience, settings.fused_at());
         while state.iteration < settings.iterations && !stopped_early {
             let clock = Instant::now();
             let iteration = state.iteration;
+            let preview =
+                settings.preview_every > 0 && iteration.is_multiple_of(settings.preview_every);
+            // Who breaks off at a preview goes on from before the iteration changed anything.
+            let before = preview.then(|| state.clone());
 
             // Schedule.
             let fusion = settings.fusion(iteration);
@@ -161,10 +167,10 @@ impl Optimization<'_> {
             });
 
             // Previews show what the step starts from.
-            if settings.preview_every > 0 && iteration.is_multiple_of(settings.preview_every) {
+            if let Some(before) = before {
                 let picture = &forward.picture;
                 if watch(Event::Preview { iteration, picture }).is_break() {
-                    return self.interrupt(&state);
+                    return self.interrupt(&before);
                 }
             }
 

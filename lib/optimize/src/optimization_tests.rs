@@ -550,5 +550,7 @@ fn previews_come_when_they_are_due_and_last_of_all_the_final_picture() {
     assert_eq!(seen[3].1, outcome.picture);
 }
 
+#[path = "interruption_tests.rs"]
+mod interruption;
 #[path = "time_budget_tests.rs"]
 mod time_budget;

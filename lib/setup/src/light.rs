@@ -21,13 +21,11 @@ struct Told<'a> {
 }
 
 impl<'a> Told<'a> {
-    /// A year 0 and a place of 0, 0 are what devices write that know neither.
     fn of(facts: &'a Facts) -> Self {
-        let time = facts.time.as_deref();
         let place = facts.latitude_deg.zip(facts.longitude_deg);
         Self {
-            time: time.filter(|t| !t.starts_with("0000")),
-            place: place.map(<[f64; 2]>::from).filter(|p| *p != [0.0; 2]),
+            time: facts.time.as_deref(),
+            place: place.map(<[f64; 2]>::from),
             heading: facts.heading.map(|h| {
                 let north = if h.magnetic { "magnetic" } else { "true" };
                 (h.deg, north)
@@ -247,11 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn a_time_and_a_place_of_zero_are_none() {
-        let zero = Some("0000-00-00T00:00:00");
-        assert_eq!(said(zero, Some([0.0; 2]), false), said(None, None, false));
-        assert_eq!(said(TIME, Some([0.0; 2]), true), said(TIME, None, true));
-        // On the equator, and on the meridian of Greenwich.
+    fn a_place_on_the_equator_or_on_the_meridian_of_greenwich_is_a_place() {
         for place in [[0.0, 9.5], [51.5, 0.0]] {
             assert!(said(TIME, Some(place), true).contains("the place"));
         }

@@ -39,7 +39,14 @@ impl Time {
     pub fn at_longitude(self, longitude_deg: f64) -> f64 {
         match self.zone_known {
             true => self.unix_s,
-            false => self.unix_s - 3600.0 * (longitude_deg / 15.0).round(),
+            false => {
+                // 270 degrees east are 90 west, where it is 6 hours earlier and not 18 later.
+                let east_deg = match longitude_deg > 180.0 {
+                    true => longitude_deg - 360.0,
+                    false => longitude_deg,
+                };
+                self.unix_s - 3600.0 * (east_deg / 15.0).round()
+            }
         }
     }
 }
@@ -139,6 +146,9 @@ mod tests {
         assert!(!local.zone_known);
         // The place's own zone: an hour from Greenwich at 15 degrees.
         assert_eq!(local.at_longitude(13.4), unix("2026-06-21T11:34:56Z"));
+        // One place has one zone, whichever way its longitude is counted.
+        assert_eq!(local.at_longitude(-90.0), unix("2026-06-21T18:34:56Z"));
+        assert_eq!(local.at_longitude(270.0), local.at_longitude(-90.0));
     }
 
     #[test]
