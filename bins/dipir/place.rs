@@ -31,6 +31,13 @@ pub struct PlaceArgs {
 pub fn run(args: &PlaceArgs) -> anyhow::Result<()> {
     let session = args.project.start_waiting()?;
     let output = args.project.output;
+    let set = session.config.overrides();
+    if !set.is_empty() {
+        output.warn(&format!(
+            "the page cannot change what --set sets, and does not save it: {}",
+            set.join(", ")
+        ));
+    }
     let place = Place::listen(Desk::open(session)?, args.port)?;
     let address = place.address();
     output.result(

@@ -125,6 +125,7 @@ impl Default for PipelineTable {
 pub struct Config {
     path: PathBuf,
     root: Node,
+    overrides: Vec<String>,
 }
 
 impl Config {
@@ -149,6 +150,7 @@ impl Config {
         let config = Self {
             path: path.into(),
             root,
+            overrides: overrides.to_vec(),
         };
         renamed::check(&config)?;
         config.check_tables()?;
@@ -269,6 +271,11 @@ impl Config {
         let mut found = Vec::new();
         self.root.collect_texts("", &mut found);
         found
+    }
+
+    /// What replaced or added keys of the file, each `table.key=value`.
+    pub fn overrides(&self) -> &[String] {
+        &self.overrides
     }
 
     /// The file that was read.

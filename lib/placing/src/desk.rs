@@ -46,6 +46,8 @@ const MASK_FILE: &str = "holdout.png";
 /// The project, its photograph scaled, and what was painted.
 pub struct Desk {
     path: PathBuf,
+    /// What the command line sets; it holds whatever the page changes, and is not saved.
+    overrides: Vec<String>,
     props: Arc<Props>,
     /// The photograph as a PNG, and its size.
     photo: Vec<u8>,
@@ -116,6 +118,7 @@ impl Desk {
         let values = png::values(&picture, [0, 0, size[0], size[1]]);
         Ok(Self {
             path,
+            overrides: session.config.overrides().to_vec(),
             props: small.props.clone(),
             photo: png::encode(size[0], size[1], &values)?,
             size,
@@ -184,8 +187,13 @@ impl Desk {
         Ok((text, config, arrangement))
     }
 
+    /// A text of the file with what the command line sets.
+    fn config(&self, text: &str) -> anyhow::Result<Config> {
+        Ok(Config::parse(&self.path, text, &self.overrides)?)
+    }
+
     fn arranged(&self, text: &str) -> anyhow::Result<(Config, Arrangement)> {
-        let config = Config::parse(&self.path, text, &[])?;
+        let config = self.config(text)?;
         let scene: SceneConfig = config.table("scene")?;
         let arrangement = self.props.arranged(&scene)?;
         Ok((config, arrangement))
@@ -196,7 +204,7 @@ impl Desk {
         // The camera alone: a turn may leave objects above the horizon that are put elsewhere.
         let camera_of = |document: &Document| -> anyhow::Result<(Camera, Plane)> {
             let (_, arranged) = self.arranged(&held(&self.text))?;
-            let config = Config::parse(&self.path, &document.text(), &[])?;
+            let config = self.config(&document.text())?;
             let scene: SceneConfig = config.table("scene")?;
             let camera = self.props.camera(&scene)?;
             Ok((camera, arranged.ground()))
@@ -205,7 +213,9 @@ impl Desk {
             let (camera, _) = camera_of(document)?;
             document.turn(turn, &camera)?;
         }
-        if let Some(height) = edit.height_m {
+        if let Some(height) = edit.height_m
+            && !document.height_over_ground(height)?
+        {
             let (camera, ground) = camera_of(document)?;
             let normal = ground.normal.as_dvec3();
             let lift = height - height_over(&camera, &ground);
@@ -215,15 +225,24 @@ impl Desk {
     }
 
     fn put_objects(&self, document: &mut Document, edit: &Edit) -> anyhow::Result<()> {
-        let config = Config::parse(&self.path, &document.text(), &[])?;
-        let camera = self.props.camera(&config.table("scene")?)?;
+        let config = self.config(&document.text())?;
+        let scene: SceneConfig = config.table("scene")?;
+        let camera = self.props.camera(&scene)?;
         let (_, before) = self.arranged(&held(&self.text))?;
-        let ground = before.ground();
+        let ground = match self.props.plane(&scene)? {
+            Some(plane) => plane,
+            None => before.ground(),
+        };
         for (i, object) in edit.objects.iter().enumerate() {
             let Some(at) = object.at else { continue };
+            let is_by_position = document.is_by_position(i)?;
+            if !is_by_position && matches!(before.proxy, Proxy::Mesh(_)) {
+                document.put_at_pixel(i, at)?;
+                continue;
+            }
             let seen = ground_at(&camera, &ground, DVec2::from_array(at));
             let point = seen.context("no ground is seen there: it is above the horizon")?;
-            match document.is_by_position(i)? || !matches!(before.proxy, Proxy::Plane(_)) {
+            match is_by_position {
                 true => document.put_at(i, point)?,
                 false => document.put_at_pixel(i, at)?,
             }
@@ -380,7 +399,7 @@ impl Desk {
                 }
             }
             let text = held(&self.text).clone();
-            let said: CompositeTable = Config::parse(&self.path, &text, &[])?.table("composite")?;
+            let said: CompositeTable = self.config(&text)?.table("composite")?;
             relighting.light_up(&key, edit, f64::from(said.exposure_ev), light);
         }
         let Some((piece, light, camera)) = relighting.picture(edit)? else {
@@ -426,8 +445,10 @@ impl Desk {
             document.occluders(MASK_FILE)?;
         }
         let text = document.text();
-        let config = Config::parse(&self.path, &text, &[])?;
-        config.table::<SceneConfig>("scene")?.validate()?;
+        // What is saved is to be right without the command line, too.
+        let alone = Config::parse(&self.path, &text, &[])?;
+        alone.table::<SceneConfig>("scene")?.validate()?;
+        let config = self.config(&text)?;
         let mut rendered = held(&self.rendered);
         let mut base = held(&self.text);
         let found = dipir_files::read_to_string(&self.path)

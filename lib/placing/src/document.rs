@@ -71,9 +71,12 @@ impl Document {
     /// Turns the camera; `camera` is the one that the text says.
     ///
     /// # Errors
-    /// If another file holds the camera.
+    /// If another file holds the camera, or its lens.
     pub fn turn(&mut self, turn: &Turn, camera: &Camera) -> anyhow::Result<()> {
         let table = self.camera()?;
+        if table.contains_key("file") {
+            bail!("the camera comes from scene.camera.file and is not changed here");
+        }
         for key in ["focal_mm", "sensor_mm"] {
             table.remove(key);
         }
@@ -105,6 +108,10 @@ impl Document {
     /// If another file holds the camera.
     pub fn shift_camera(&mut self, camera: &Camera, shift: DVec3) -> anyhow::Result<()> {
         let table = self.camera()?;
+        // Beside a file that tells a lens alone the position is written here.
+        if table.contains_key("file") && !table.contains_key("position") {
+            bail!("the camera comes from scene.camera.file and is not changed here");
+        }
         let written = |v: DVec3| numbers(v.to_array().map(|x| rounded(x, 5)));
         let position = camera.position.as_dvec3();
         set(table, "position", written(position + shift));
@@ -115,6 +122,25 @@ impl Document {
             set(table, "look_at", written(DVec3::new(x, y, z) + shift));
         }
         Ok(())
+    }
+
+    /// Says how high the camera stands over a ground that is told from the camera; `false` if the ground is told otherwise.
+    ///
+    /// # Errors
+    /// If lengths on the ground say how high.
+    pub fn height_over_ground(&mut self, height_m: f64) -> anyhow::Result<bool> {
+        let scene = self.table("scene")?;
+        let proxy = scene.get_mut("proxy").and_then(Item::as_table_like_mut);
+        match proxy {
+            Some(table) if table.contains_key("camera_height_m") => {
+                set(table, "camera_height_m", rounded(height_m, 5));
+                Ok(true)
+            }
+            Some(table) if table.contains_key("lengths_m") => {
+                bail!("scene.proxy.lengths_m says how high the camera stands; change it there")
+            }
+            _ => Ok(false),
+        }
     }
 
     /// Brings the objects into the order of `objects`, some of them copied or left out.
@@ -309,6 +335,9 @@ impl Document {
 
 #[cfg(test)]
 mod tests {
+    use dipir_scene::camera::FieldOfView;
+    use glam::Vec3;
+
     use super::*;
 
     const TEXT: &str = "# Mine.\n[scene]\nbackground = \"a.png\" # the street\n\n\
@@ -350,6 +379,32 @@ mod tests {
             document.order_objects(&[of(none)]).unwrap_err();
         }
         document.order_objects(&[]).unwrap_err();
+    }
+
+    #[test]
+    fn a_camera_of_another_file_is_not_changed() {
+        let look = Vec3::ZERO;
+        let view = FieldOfView::Vertical(0.7);
+        let camera = Camera::look_at(Vec3::new(0.0, 1.6, 2.0), look, Vec3::Y, view, [12, 8]);
+        let turn = Turn {
+            pitch_deg: -3.0,
+            roll_deg: 0.0,
+            fov_deg: 40.0,
+        };
+        let text = "[scene.camera]\nfile = \"track.chan\"\n";
+        let mut document = Document::parse(text).unwrap();
+        for error in [
+            document.turn(&turn, &camera).unwrap_err(),
+            document.shift_camera(&camera, DVec3::Y).unwrap_err(),
+        ] {
+            assert!(error.to_string().contains("scene.camera.file"), "{error}");
+        }
+        assert_eq!(document.text(), text);
+        // A file that tells a lens alone has the position beside it.
+        let lens = format!("{text}position = [0.0, 1.6, 2.0]\n");
+        let mut document = Document::parse(&lens).unwrap();
+        document.shift_camera(&camera, DVec3::Y).unwrap();
+        assert!(document.text().contains("position = [0.0, 2.6, 2.0]"));
     }
 
     #[test]

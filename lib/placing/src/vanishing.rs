@@ -108,6 +108,9 @@ fn turn_of(lines: &Lines, camera: &Camera) -> anyhow::Result<(Turn, bool)> {
         let d = direction(first, focal.y / scale);
         // The turn for which up is at right angles to the street.
         let pitch = ((d.y * roll.cos() - d.x * roll.sin()) / d.z).atan();
+        if !pitch.is_finite() {
+            bail!("the lines run along the horizon and do not tell where it is");
+        }
         let turn = Turn {
             pitch_deg: pitch.to_degrees(),
             roll_deg: roll.to_degrees(),
@@ -275,6 +278,25 @@ mod tests {
         let found = solve(&lines, &camera(&level)).unwrap();
         assert!((found.turn.pitch_deg + 9.0).abs() < 0.02, "{found:?}");
         assert!(!found.found_fov && found.uncertain_deg.pitch_deg > 0.0);
+    }
+
+    #[test]
+    fn two_lines_along_the_horizon_do_not_tell_where_it_is() {
+        let level = Turn {
+            pitch_deg: 0.0,
+            roll_deg: 0.0,
+            fov_deg: 50.0,
+        };
+        let lines = Lines {
+            first: [
+                [[100.0, 600.0], [900.0, 600.0]],
+                [[100.0, 700.0], [900.0, 700.0]],
+            ],
+            second: None,
+            direction: Second::Level,
+        };
+        let error = solve(&lines, &camera(&level)).unwrap_err().to_string();
+        assert!(error.contains("along the horizon"), "{error}");
     }
 
     #[test]

@@ -2,31 +2,20 @@
 use std::fs;
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::session::Session;
-use dipir_imaging::file::write_png;
-use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_placing::desk::Desk;
 use dipir_placing::server::Place;
-use glam::Vec3;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// A box of a metre on a grey photograph, seen from the height of the eyes, under neutral light.
-const TEXT: &str = "# The street.\n[scene]\nbackground = \"photo.png\" # mine\n\n\
-    [[scene.objects]]\npath = \"box.obj\"\nat_pixel = [150.0, 150.0] # at the kerb\n\n\
-    [scene.camera]\nposition = [0.0, 1.6, 0.0]\npitch_deg = -10.0 # guessed\nfov_deg = 50.0\n\n\
-    [scene.proxy]\nplane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }\n\n\
-    [light]\nstart = \"neutral\"\n";
-
-const BOX: &str = "v -.5 0 -.5\nv .5 0 -.5\nv .5 1 -.5\nv -.5 1 -.5\nv -.5 0 .5\nv .5 0 .5\nv .5 1 .5\nv -.5 1 .5\n\
-    f 1 4 3 2\nf 5 6 7 8\nf 1 5 8 4\nf 2 3 7 6\nf 4 8 7 3\nf 1 2 6 5\n";
+mod project;
+use project::{TEXT, open, project};
 
 /// More than any answer takes on a slow machine.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -67,36 +56,6 @@ impl Answer {
             field.eq_ignore_ascii_case(name).then_some(value)
         })
     }
-}
-
-/// The project of [`TEXT`] with some keys changed, as `KEY=VALUE`.
-fn project(folder: &Path, set: &[&str]) -> Session {
-    let grey = Raster::filled(300, 200, Vec3::splat(0.5));
-    write_png(folder.join("photo.png"), &DisplayImage(grey)).unwrap();
-    fs::write(folder.join("box.obj"), BOX).unwrap();
-    fs::write(folder.join("pipeline.toml"), TEXT).unwrap();
-    open(folder, set)
-}
-
-fn open(folder: &Path, set: &[&str]) -> Session {
-    Session::open(&CommonArgs {
-        pipeline: folder.join("pipeline.toml"),
-        set: set.iter().map(|s| (*s).to_owned()).collect(),
-        out: None,
-        threads: None,
-        seed: None,
-        wait: false,
-        supervised: false,
-        light: None,
-        placed: None,
-        hashes: None,
-        output: OutputArgs {
-            json: false,
-            quiet: true,
-            verbose: false,
-        },
-    })
-    .unwrap()
 }
 
 impl Running {

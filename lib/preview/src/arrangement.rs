@@ -4,12 +4,12 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use dipir_imaging::facts::Facts;
 use dipir_scene::camera::Camera;
-use dipir_scene::config::SceneConfig;
+use dipir_scene::config::{ProxySettings, SceneConfig};
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::placement::{Anchor, Placement};
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::LoadedScene;
-use glam::{DMat3, DMat4, DQuat, DVec3, Vec3};
+use glam::{DMat3, DMat4, DQuat, DVec3, Vec2, Vec3};
 
 /// An object's file, read.
 #[derive(Clone, Debug)]
@@ -105,7 +105,7 @@ fn part(mesh: &TriangleMesh, triangles: std::ops::Range<usize>) -> TriangleMesh 
 
 impl Arrangement {
     /// Places the objects of `config`. Photograph and models are those that were read; a plane
-    /// may be another one. An object with `place = "auto"` stays where `loaded_maps`, from its file to
+    /// may be another one, also because the camera is that sees its pixels. An object with `place = "auto"` stays where `loaded_maps`, from its file to
     /// the world, have it.
     pub fn new(
         config: &SceneConfig,
@@ -120,9 +120,9 @@ impl Arrangement {
         // Of a lens that distorts, the camera of the undistorted picture, which is what is shown.
         let (camera, undistortion) = lens.resolve(facts.size, base_dir)?;
         let mut warnings = Vec::new();
-        let proxy = match &settings.proxy {
-            dipir_scene::config::ProxySettings::Plane(plane) => Proxy::Plane(*plane),
-            _ => loaded_proxy.clone(),
+        let proxy = match &undistortion {
+            Some(_) if matches!(settings.proxy, ProxySettings::Pixels(_)) => loaded_proxy.clone(),
+            _ => plane_of(&settings.proxy, &camera)?.map_or(loaded_proxy.clone(), Proxy::Plane),
         };
         let mut objects = Vec::new();
         for (i, object) in settings.objects.iter().enumerate() {
@@ -169,6 +169,24 @@ impl Arrangement {
             },
         }
     }
+}
+
+/// The plane that is written, or that lies where `camera`, whose lens bends nothing, sees its pixels; `None` if the proxy
+/// is told otherwise.
+pub(crate) fn plane_of(proxy: &ProxySettings, camera: &Camera) -> anyhow::Result<Option<Plane>> {
+    let pixels = match proxy {
+        ProxySettings::Plane(plane) => return Ok(Some(*plane)),
+        ProxySettings::Pixels(pixels) => pixels,
+        _ => return Ok(None),
+    };
+    let ray = |pixel: &Vec2| camera.ray(*pixel).direction.as_dvec3();
+    let rays: Vec<DVec3> = pixels.pixels.iter().map(ray).collect();
+    let found = pixels.found(&rays)?;
+    let point = camera.position.as_dvec3() - found.height_m * found.normal;
+    Ok(Some(Plane {
+        point: point.as_vec3(),
+        normal: found.normal.as_vec3(),
+    }))
 }
 
 impl Placed {

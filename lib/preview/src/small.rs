@@ -10,12 +10,12 @@ use dipir_scene::camera::Camera;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::plausibility::implausible;
-use dipir_scene::proxy::Proxy;
+use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::{LoadedScene, Scene};
 use dipir_stages::scene::with_place;
 use glam::DMat4;
 
-use crate::arrangement::{Arrangement, Model};
+use crate::arrangement::{Arrangement, Model, plane_of};
 
 /// What was read of a project.
 pub struct SmallScene {
@@ -45,6 +45,14 @@ impl Props {
     pub fn camera(&self, config: &SceneConfig) -> anyhow::Result<Camera> {
         let settings = config.validate()?.camera.with_facts(&self.facts)?;
         Ok(settings.resolve(self.facts.size, &self.base_dir)?.0)
+    }
+
+    /// The plane of `config`'s proxy as its camera sees it, whatever its objects; `None` if the proxy is told otherwise.
+    ///
+    /// # Errors
+    /// On a configuration that cannot be used.
+    pub fn plane(&self, config: &SceneConfig) -> anyhow::Result<Option<Plane>> {
+        plane_of(&config.validate()?.proxy, &self.camera(config)?)
     }
 
     /// Where the objects of `config` stand; nothing is read but the camera's file.

@@ -23,6 +23,7 @@ export async function ask(route, body) {
 
 export async function ownMask() {
   const response = await fetch("mask.bin");
+  if (!response.ok) throw await failed(response);
   return new Uint8ClampedArray(await response.arrayBuffer());
 }
 
@@ -56,11 +57,14 @@ export function latest(work) {
     next = { argument };
     if (running) return;
     running = true;
-    while (next) {
-      const { argument: taken } = next;
-      next = null;
-      await work(taken);
+    try {
+      while (next) {
+        const { argument: taken } = next;
+        next = null;
+        await work(taken);
+      }
+    } finally {
+      running = false;
     }
-    running = false;
   };
 }

@@ -26,6 +26,11 @@ export class Dial {
       if (held) move(event, true);
       held = false;
     });
+    // The system took the pointer away: the sun stays where it was shown last.
+    canvas.addEventListener("pointercancel", () => {
+      if (held && this.sun) change(this.sun, true);
+      held = false;
+    });
     canvas.addEventListener("keydown", (event) => {
       const step = { ArrowLeft: [-5, 0], ArrowRight: [5, 0], ArrowUp: [0, 5], ArrowDown: [0, -5] }[event.key];
       if (!step) return;

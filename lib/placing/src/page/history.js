@@ -9,7 +9,6 @@ export class History {
     this.past = [];
     this.future = [];
     this.now = start;
-    this.saved = start;
   }
 
   // Replaces the state for the time of a drag.

@@ -50,7 +50,7 @@ const page = {
 
   copy() {
     const list = [...history.now.edit.objects];
-    const [x, y] = page.view.objects[page.chosen].contact ?? [0, 0];
+    const [x, y] = list[page.chosen].at ?? page.view.objects[page.chosen]?.contact ?? [0, 0];
     const aside = 60 / picture.scale;
     list.splice(page.chosen + 1, 0, { ...list[page.chosen], at: [Math.min(x + aside, state.size[0] - 1), y] });
     edit({ objects: list }, true);
@@ -119,6 +119,7 @@ async function shoot(samples) {
     const found = await api.draft(edit, samples);
     if (found === undefined) return;
     showPicture(found);
+    if (edit !== history.now.edit) return; // a picture of the newer one follows
     $("canvas").dataset.samples = samples;
     if (samples < 32) soon = setTimeout(() => shoot(32), 700);
     else await api.relight(edit); // records, so that the sun turns at once
@@ -185,20 +186,26 @@ function refresh() {
 async function takeMask() {
   const data = layer.getContext("2d").getImageData(0, 0, layer.width, layer.height).data;
   const mask = new Uint8ClampedArray(layer.width * layer.height).map((_, k) => data[4 * k + 3]);
-  await setMask(mask);
-  edit({ mask: true }, true, mask);
+  if (await setMask(mask)) edit({ mask: true }, true, mask);
 }
 
-// Shows a mask and sends it.
+// Shows a mask and sends it; whether it arrived.
 async function setMask(mask) {
   const context = layer.getContext("2d");
   const image = context.createImageData(layer.width, layer.height);
   mask.forEach((value, k) => image.data.set([255, 47, 109, value], 4 * k));
   context.putImageData(image, 0, 0);
-  await api.sendMask(mask);
+  try {
+    await api.sendMask(mask);
+    return true;
+  } catch (error) {
+    say(error.message, true);
+    return false;
+  }
 }
 
 async function step(way) {
+  if (saving) return;
   const before = history.now.mask;
   if (!history[way]()) return;
   if (history.now.mask !== before) await setMask(history.now.mask ?? ownMask());
@@ -226,7 +233,16 @@ const solve = api.latest(async () => {
   $("use-lines").disabled = !solved;
 });
 
+let saving = false;
+
+// Sizes are factors on those of the file: what is sent twice is applied twice, and what is changed meanwhile is lost.
 async function save() {
+  if (saving) return;
+  saving = true;
+  const main = document.querySelector("main");
+  const field = document.activeElement;
+  if (field?.matches("input")) field.blur(); // takes what is being typed
+  main.inert = true;
   try {
     const { written, state: next } = await api.ask("save", history.now.edit);
     state = next;
@@ -237,6 +253,10 @@ async function save() {
     refresh();
   } catch (error) {
     say(error.message, true);
+  } finally {
+    saving = false;
+    main.inert = false;
+    field?.focus({ preventScroll: true });
   }
 }
 
@@ -264,7 +284,7 @@ number("azimuth", (v) => edit({ sun: { ...sunNow(), azimuth_deg: v }, shadow: nu
 number("elevation", (v) => edit({ sun: { ...sunNow(), elevation_deg: v }, shadow: null }, true));
 number("yaw", (v) => page.change({ yaw_deg: v }, true));
 number("height", (v) => {
-  const now = page.view.objects[page.chosen].size_m[1];
+  const now = page.view.objects[page.chosen]?.size_m[1];
   const size = history.now.edit.objects[page.chosen].size ?? 1;
   if (v > 0 && now > 0) page.change({ size: (size * v) / now }, true);
 });
@@ -308,8 +328,7 @@ $("use-shadow").addEventListener("click", () => {
 });
 $("clear").addEventListener("click", async () => {
   const mask = new Uint8ClampedArray(layer.width * layer.height);
-  await setMask(mask);
-  edit({ mask: true }, true, mask);
+  if (await setMask(mask)) edit({ mask: true }, true, mask);
 });
 for (const input of document.querySelectorAll("#tools input")) {
   input.addEventListener("change", () => {

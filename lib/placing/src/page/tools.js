@@ -86,6 +86,8 @@ export class Tools {
     page.picture.canvas.setPointerCapture(event.pointerId);
     const at = page.picture.at(event);
     this.pointers.set(event.pointerId, at);
+    // A further finger takes part in what the first one began.
+    if (this.pointers.size > 1) return;
     this.before = page.history.now;
     if (this.name === "mask") return page.paint(at, at, false);
     if (this.ends) {
@@ -163,8 +165,10 @@ export class Tools {
   }
 
   turn(degrees) {
-    const shown = this.page.view.objects[this.page.chosen];
-    if (shown) this.page.change({ yaw_deg: shown.yaw_deg + degrees }, true);
+    const { chosen, history, view } = this.page;
+    // What is shown may be older than the last turn.
+    const yaw = history.now.edit.objects[chosen]?.yaw_deg ?? view.objects[chosen]?.yaw_deg;
+    if (yaw !== undefined) this.page.change({ yaw_deg: yaw + degrees }, true);
   }
 
   size(factor) {
@@ -177,7 +181,7 @@ export class Tools {
     const { page } = this;
     const step = (event.shiftKey ? 10 : 2) / page.picture.scale;
     const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    const contact = page.view.objects[page.chosen]?.contact;
+    const contact = page.history.now.edit.objects[page.chosen]?.at ?? page.view.objects[page.chosen]?.contact;
     const other = {
       q: () => this.turn(5), Q: () => this.turn(1), e: () => this.turn(-5), E: () => this.turn(-1),
       "+": () => this.size(1.04), "=": () => this.size(1.04), "-": () => this.size(1 / 1.04),
