@@ -208,6 +208,11 @@ impl Found {
         // First, for what others put beside an earlier result moves to the stage's folder.
         for (folder, stage) in &self.untidy {
             stage::tidy(folder, stage)?;
+            // A result that a kill kept from its place is back there.
+            let is_known = self.folders.iter().any(|(known, _)| known == folder);
+            if let Some(owned) = Owned::of_stage(folder, stage).filter(|_| !is_known) {
+                owned.remove(folder)?;
+            }
         }
         for (folder, owned) in &self.folders {
             owned.remove(folder)?;
@@ -233,4 +238,30 @@ fn in_words(removed: &[PathBuf], kept: &[PathBuf], dry_run: bool) -> String {
         text += &format!("\nleft alone, as no stage wrote it: {}", listed(kept));
     }
     printable(&text)
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_pipeline::stage::{StagePlan, StageWriter};
+
+    use super::*;
+
+    #[test]
+    fn a_result_that_a_kill_kept_from_its_place_is_removed() {
+        for suffix in ["partial", "previous"] {
+            let out = tempfile::tempdir().unwrap();
+            let folder = out.path().join("scene");
+            let plan = StagePlan::new("scene", 1, json!({}), 0);
+            let writer = StageWriter::begin(&folder, plan, WhenLocked::Refuse).unwrap();
+            writer.finish().unwrap();
+            fs::rename(&folder, out.path().join(format!(".scene.{suffix}"))).unwrap();
+            let found = Found {
+                untidy: vec![(folder, "scene")],
+                ..Found::default()
+            };
+            assert_eq!(found.listed().unwrap().0.len(), 1);
+            found.remove().unwrap();
+            assert_eq!(fs::read_dir(out.path()).unwrap().count(), 0, "{suffix}");
+        }
+    }
 }

@@ -2,7 +2,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use dipir_cli::exit::{Usage, describe};
+use dipir_cli::exit::{Usage, describe, printable};
 use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_pipeline::graph::{Graph, Node};
@@ -28,7 +28,7 @@ pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
     let needed = graph.up_to(graph::LAST);
     let (path, truth) = write(&args.project, &session, &graph, &needed, &[])?;
     session.result(
-        || in_words(&path, truth.as_ref()),
+        || printable(&in_words(&path, truth.as_ref())),
         || json!({"report": json_path(&path), "truth": truth}),
     );
     Ok(())

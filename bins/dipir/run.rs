@@ -171,7 +171,10 @@ pub fn run_each(
         match done {
             Ok(done) => {
                 if !output.json {
-                    output.result(|| format!("{name}: {}", done.0), || Value::Null);
+                    output.result(
+                        || format!("{}: {}", printable(&name), done.0),
+                        || Value::Null,
+                    );
                 }
                 results.push(json!({"file": name, "done": done.1}));
             }

@@ -2,7 +2,7 @@
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::thread;
 use std::time::{Duration, SystemTime};
@@ -64,12 +64,14 @@ fn changed(project: &ProjectArgs, before: Stamps) -> bool {
     false
 }
 
-fn stamp(path: &PathBuf) -> Option<(SystemTime, u64)> {
-    let found = fs::metadata(path).ok()?;
+/// None for a folder, too: what runs write changes it.
+fn stamp(path: &Path) -> Option<(SystemTime, u64)> {
+    let found = fs::metadata(path).ok().filter(fs::Metadata::is_file)?;
     Some((found.modified().ok()?, found.len()))
 }
 
-/// The project's file and the files that its stages read, except those that they wrote themselves.
+/// The project's file, what it names, there or not, and the files that its stages read, except those that they wrote
+/// themselves.
 fn stamps(project: &ProjectArgs) -> Stamps {
     let mut files: Vec<PathBuf> = project.each().iter().map(|p| p.file().to_owned()).collect();
     for project in project.each() {
@@ -77,13 +79,51 @@ fn stamps(project: &ProjectArgs) -> Stamps {
         let Ok(session) = Session::open(&project.common()) else {
             continue;
         };
+        let named = session.config.texts().into_iter();
+        let mut read: Vec<PathBuf> = named.map(|(_, text)| text.into()).collect();
         for stage in names::ALL {
-            let Ok(manifest) = stage.manifest(&session) else {
-                continue;
-            };
-            let read = manifest.inputs.iter().map(|i| session.resolve(&i.path));
-            files.extend(read.filter(|path| !path.starts_with(&session.out)));
+            if let Ok(manifest) = stage.manifest(&session) {
+                read.extend(manifest.inputs.into_iter().map(|i| i.path));
+            }
         }
+        let written = names::ALL.map(|stage| session.stage_folder(stage.name));
+        let read = read.iter().map(|path| session.resolve(path));
+        files.extend(read.filter(|path| !written.iter().any(|folder| path.starts_with(folder))));
     }
     files.into_iter().map(|p| (p.clone(), stamp(&p))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_cli::args::OutputArgs;
+
+    use super::*;
+
+    #[test]
+    fn files_of_the_project_are_watched_though_it_is_the_folder_of_artifacts_and_lacks_some() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let text = "[pipeline]\nout = \".\"\n[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"a.obj\"\n\
+                    [composite]\nenvironment = \"light/environment.exr\"\n";
+        fs::write(at("pipeline.toml"), text).unwrap();
+        fs::write(at("photo.png"), "x").unwrap();
+        let project = ProjectArgs {
+            files: vec![at("pipeline.toml")],
+            pipeline: None,
+            set: Vec::new(),
+            out: None,
+            seed: None,
+            light: None,
+            placed: None,
+            output: OutputArgs::default(),
+        };
+        let watched = stamps(&project);
+        assert!(watched[&at("pipeline.toml")].is_some());
+        assert!(watched[&at("photo.png")].is_some());
+        assert_eq!(watched[&at("a.obj")], None);
+        // What a stage wrote.
+        assert!(!watched.contains_key(&at("light/environment.exr")));
+        // A folder changes with what is written in it.
+        assert_eq!(watched[&at(".")], None);
+    }
 }

@@ -98,6 +98,7 @@ mod tests {
     use crate::chosen::choose;
     use crate::chosen::tests::arguments;
     use crate::folder::EvaluationFolder;
+    use crate::parts::Parts;
 
     /// What is said of a scene under the arguments of a run.
     fn said(typed: &[&str]) -> anyhow::Result<()> {
@@ -114,6 +115,7 @@ mod tests {
             methods: choose(&args, &|_| {})?,
             args: &args,
             threads: 1,
+            parts: Parts::default(),
         };
         runner.check(&scene)
     }

@@ -163,7 +163,7 @@ pub struct ReportArgs {
     #[command(flatten)]
     pub folder: FolderArgs,
 
-    /// The method that others are compared with, scene by scene [default: ours, if there]
+    /// The method that others are compared with, scene by scene [default: ours, else neutral]
     #[arg(long, value_name = "NAME")]
     pub baseline: Option<String>,
 

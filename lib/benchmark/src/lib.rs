@@ -17,6 +17,7 @@ pub mod methods;
 mod metrics;
 mod page;
 mod panoramas;
+mod parts;
 pub mod report;
 mod report_page;
 pub mod run;

@@ -169,18 +169,30 @@ fn make_one(
     write_json(&folder.join("scene.json"), &info)
 }
 
-/// Writes the map that all scenes of a panorama share, unless it is there.
+/// Writes the map that all scenes of a panorama share, unless it is there; refuses another panorama's of that name.
 fn write_map(path: &Path, map: &EnvironmentMap) -> anyhow::Result<()> {
-    if path.is_file() {
-        return Ok(());
-    }
     if let Some(folder) = path.parent() {
         fs::create_dir_all(folder)
             .with_context(|| format!("cannot create {}", folder.display()))?;
     }
     let partial = path.with_extension("partial.exr");
     map.write(&partial)?;
-    fs::rename(&partial, path).with_context(|| format!("cannot write {}", path.display()))
+    if !path.is_file() {
+        return fs::rename(&partial, path)
+            .with_context(|| format!("cannot write {}", path.display()));
+    }
+    let written = EnvironmentMap::read(&partial)?;
+    fs::remove_file(&partial).with_context(|| format!("cannot remove {}", partial.display()))?;
+    let there = EnvironmentMap::read(path)?;
+    if (there.width(), there.texels()) != (written.width(), written.texels()) {
+        let text = format!(
+            "{} is the map of another panorama, whose name differs in nothing that a name of a file here shows; rename \
+             one of the two, or name another folder with --out",
+            path.display()
+        );
+        return Err(Usage(text).into());
+    }
+    Ok(())
 }
 
 /// The scene's `pipeline.toml`: the camera above the ground, the object in front of it.
@@ -336,6 +348,18 @@ mod tests {
         assert!(message.ends_with("kinds.tsv:2: accepted: a panorama's name, a tab, a kind"));
         let message = format!("{:#}", read_kinds(folder.path()).unwrap_err());
         assert!(message.ends_with("not a regular file"), "{message}");
+    }
+
+    #[test]
+    fn a_map_is_shared_by_scenes_of_one_panorama_and_not_of_two_whose_names_are_alike() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("maps/sky.exr");
+        let map = |value: f32| EnvironmentMap::constant(8, 4, Vec3::splat(value));
+        write_map(&path, &map(0.3)).unwrap();
+        write_map(&path, &map(0.3)).unwrap();
+        let error = write_map(&path, &map(0.7)).unwrap_err();
+        assert!(error.is::<Usage>(), "{error:#}");
+        assert_eq!(fs::read_dir(folder.path().join("maps")).unwrap().count(), 1);
     }
 
     #[test]

@@ -10,6 +10,7 @@ use dipir_cli::interrupt;
 use crate::chosen::choose;
 use crate::command_line::RunArgs;
 use crate::folder::{EvaluationFolder, SceneInfo};
+use crate::parts::Parts;
 use crate::runner::Runner;
 
 /// A method that has ended on a scene, whether it failed or not.
@@ -106,6 +107,7 @@ fn prepare<'a>(
         args,
         methods,
         threads: (threads / args.jobs).max(1),
+        parts: Parts::default(),
     };
     if let Some(first) = scenes.first() {
         runner.check(first)?;

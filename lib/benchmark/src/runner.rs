@@ -12,6 +12,7 @@ use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
 use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::{Artifact, FILE_NAME};
+use dipir_pipeline::mark::Owned;
 use dipir_pipeline::stage::StagePlan;
 use dipir_scene::description::SceneDescription;
 use dipir_stages::names::{self, StageName};
@@ -23,6 +24,7 @@ use crate::definition::{Definition, UsedModel};
 use crate::folder::{EvaluationFolder, SceneInfo, TRUTH};
 use crate::lights;
 use crate::methods::{BEFORE_COMPOSITE, MODEL_PATH, Method, Source};
+use crate::parts::Parts;
 use crate::score::{Score, Truth};
 
 /// Raised whenever the same run would get another score.
@@ -42,6 +44,8 @@ pub struct Runner<'a> {
     pub methods: Vec<Chosen>,
     /// Worker threads of each executable.
     pub threads: usize,
+    /// The other files of objects.
+    pub parts: Parts,
 }
 
 impl Runner<'_> {
@@ -258,6 +262,9 @@ impl Runner<'_> {
         add("truth", &folder.join(&scene.map))?;
         for (n, object) in objects(&folder.join("pipeline.toml"))?.iter().enumerate() {
             add(&format!("object {n}"), object)?;
+            for part in self.parts.of(object) {
+                add(&format!("part of object {n}"), &part)?;
+            }
         }
         if let Some(map) = imported {
             add("map", map)?;
@@ -404,21 +411,53 @@ impl<'a> StageRuns<'a> {
         let described = self.work.join("scene/scene.json");
         fs::copy(described, folder.join("scene.json")).with_context(failed)?;
         for stage in [names::LIGHT.name, names::COMPOSITE.name] {
-            let (from, to) = (self.work.join(stage), folder.join(stage));
-            if to.join("stage.json").is_file() {
-                fs::remove_dir_all(&to).with_context(failed)?;
-            }
-            if from.is_dir() {
-                fs::rename(&from, &to).with_context(failed)?;
-            }
+            replace(&self.work.join(stage), &folder.join(stage), stage).with_context(failed)?;
         }
         Ok(())
     }
 }
 
+/// Puts the result `from` of `stage`, if it is there, in the place of an earlier one. What others put beside that stays.
+fn replace(from: &Path, to: &Path, stage: &str) -> anyhow::Result<()> {
+    let is_there = from.is_dir();
+    match Owned::of_stage(to, stage) {
+        Some(earlier) if is_there => earlier.absorb(to, from)?,
+        Some(earlier) => earlier.remove(to)?,
+        None => {}
+    }
+    if is_there {
+        fs::rename(from, to)?;
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
+    use dipir_pipeline::lock::WhenLocked;
+    use dipir_pipeline::stage::StageWriter;
+
     use super::*;
+
+    #[test]
+    fn what_others_put_beside_an_earlier_result_stays_with_the_new_one() {
+        let root = tempfile::tempdir().unwrap();
+        let (from, to) = (root.path().join("work/light"), root.path().join("light"));
+        let run = |content: &str| {
+            let plan = StagePlan::new("light", 1, json!({}), 0);
+            let mut writer = StageWriter::begin(&from, plan, WhenLocked::Refuse).unwrap();
+            fs::write(writer.output("map", "map.exr").unwrap(), content).unwrap();
+            writer.finish().unwrap();
+            replace(&from, &to, "light").unwrap();
+        };
+        run("first");
+        fs::write(to.join("notes.txt"), "mine").unwrap();
+        run("second");
+        assert_eq!(fs::read(to.join("map.exr")).unwrap(), b"second");
+        assert_eq!(fs::read(to.join("notes.txt")).unwrap(), b"mine");
+        // A run without this stage.
+        replace(&from, &to, "light").unwrap();
+        assert!(to.join("notes.txt").exists() && !to.join("map.exr").exists());
+    }
 
     #[test]
     fn a_relative_cache_starts_from_the_evaluation_and_nothing_else_changes() {

@@ -26,6 +26,20 @@ function shuffled(pairs, next) {
   return list;
 }
 function key() { return "dipir-study-" + data.seed + "-" + who; }
+// What a browser does not keep is still on the page.
+function keep() {
+  try { localStorage.setItem(key(), JSON.stringify(choices)); } catch { }
+}
+// The choices of an earlier visit, as far as they are about the pairs of this page.
+function kept() {
+  let found = [];
+  try { found = JSON.parse(localStorage.getItem(key()) || "[]"); } catch { }
+  const sides = (a, b) => [a, b].sort().join("\n");
+  const fits = (choice, k) => k < order.length && choice.scene === order[k].scene
+    && sides(choice.preferred, choice.over) === sides(order[k].left, order[k].right);
+  const other = found.findIndex((choice, k) => !fits(choice, k));
+  return other < 0 ? found : found.slice(0, other);
+}
 function show() {
   const done = choices.length >= order.length;
   at("pairs").classList.toggle("hidden", done);
@@ -41,7 +55,7 @@ function choose(side) {
   if (!pair) { return; }
   const [preferred, over] = side === "left" ? [pair.left, pair.right] : [pair.right, pair.left];
   choices.push({ scene: pair.scene, preferred, over });
-  localStorage.setItem(key(), JSON.stringify(choices));
+  keep();
   show();
 }
 function start(event) {
@@ -50,7 +64,7 @@ function start(event) {
   if (!who) { return; }
   seed = (data.seed + hashed(who)) % 4294967296;
   order = shuffled(data.pairs, random(seed));
-  choices = JSON.parse(localStorage.getItem(key()) || "[]").slice(0, order.length);
+  choices = kept();
   at("start").classList.add("hidden");
   at("task").classList.remove("hidden");
   show();
@@ -66,7 +80,7 @@ function save() {
 at("start").addEventListener("submit", start);
 at("choose-left").addEventListener("click", () => choose("left"));
 at("choose-right").addEventListener("click", () => choose("right"));
-at("back").addEventListener("click", () => { choices.pop(); show(); });
+at("back").addEventListener("click", () => { choices.pop(); keep(); show(); });
 for (const button of document.querySelectorAll(".save")) { button.addEventListener("click", save); }
 document.addEventListener("keydown", (event) => {
   if (!order.length || event.target.tagName === "INPUT") { return; }

@@ -202,8 +202,9 @@ fn start_threads(threads: usize) -> anyhow::Result<()> {
 /// `1.2 s`, `3 min 20 s`, `4 h 18 min`.
 pub fn duration(seconds: f64) -> String {
     match seconds {
-        s if s < 10.0 => format!("{s:.2} s"),
-        s if s < 60.0 => format!("{s:.1} s"),
+        s if s < 9.995 => format!("{s:.2} s"),
+        s if s < 59.95 => format!("{s:.1} s"),
+        s if s < 60.0 => duration(60.0),
         s if s < 3600.0 => format!("{} min {:02} s", (s / 60.0) as u64, (s % 60.0) as u64),
         s => format!(
             "{} h {:02} min",
@@ -221,7 +222,8 @@ pub fn size(bytes: u64) -> String {
     }
     let mut value = bytes as f64 / 1024.0;
     let mut unit = 0;
-    while value >= 1024.0 && unit + 1 < UNITS.len() {
+    // As rounded below.
+    while value >= 1023.95 && unit + 1 < UNITS.len() {
         value /= 1024.0;
         unit += 1;
     }
@@ -236,10 +238,13 @@ mod tests {
     fn durations_and_sizes_read_well() {
         assert_eq!(duration(1.234), "1.23 s");
         assert_eq!(duration(59.0), "59.0 s");
+        assert_eq!(duration(9.996), "10.0 s");
+        assert_eq!(duration(59.96), "1 min 00 s");
         assert_eq!(duration(15491.0), "4 h 18 min");
         assert_eq!(duration(200.4), "3 min 20 s");
         assert_eq!(size(512), "512 B");
         assert_eq!(size(1536), "1.5 KiB");
+        assert_eq!(size((1 << 20) - 1), "1.0 MiB");
         assert_eq!(size(3 << 30), "3.0 GiB");
     }
 }

@@ -118,9 +118,38 @@ fn features(m: &Material) -> Vec<&'static str> {
         ("double-sided", m.double_sided),
         ("clearcoat", m.clearcoat.is_some()),
         ("transmission", m.transmission.is_some()),
+        ("volume", m.extensions.volume.is_some()),
+        ("specular", m.extensions.specular.is_some()),
+        ("sheen", m.extensions.sheen.is_some()),
+        ("anisotropy", m.extensions.anisotropy.is_some()),
+        ("iridescence", m.extensions.iridescence.is_some()),
         ("unlit", m.unlit),
     ]
     .into_iter()
     .filter_map(|(name, there)| there.then_some(name))
     .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_scene::material::{Anisotropy, MaterialExtensions};
+
+    use super::*;
+
+    #[test]
+    fn an_extension_of_the_material_is_told() {
+        let material = Material {
+            extensions: MaterialExtensions {
+                anisotropy: Some(Anisotropy {
+                    strength: 1.0,
+                    rotation_rad: 0.0,
+                    texture: None,
+                }),
+                ..MaterialExtensions::default()
+            },
+            ..Material::default()
+        };
+        assert!(features(&material).contains(&"anisotropy"));
+        assert!(!features(&Material::default()).contains(&"anisotropy"));
+    }
 }

@@ -30,7 +30,7 @@ pub enum WhenLocked {
 #[derive(Debug)]
 pub struct FolderLock {
     path: PathBuf,
-    _file: File,
+    file: File,
 }
 
 impl FolderLock {
@@ -81,7 +81,7 @@ impl FolderLock {
             if is_at(&file, path) {
                 sign(&mut file, path)?;
                 let path = path.into();
-                return Ok(Self { path, _file: file });
+                return Ok(Self { path, file });
             }
         }
     }
@@ -89,8 +89,9 @@ impl FolderLock {
 
 impl Drop for FolderLock {
     fn drop(&mut self) {
-        // Without a way to tell whether a file is still at its name, the file has to stay there.
-        if cfg!(unix) {
+        // Where it was removed meanwhile, the name can be another process's lock, or a file of the user's. Without a way to
+        // tell, the file has to stay.
+        if cfg!(unix) && is_at(&self.file, &self.path) {
             let _ = fs::remove_file(&self.path);
         }
     }
@@ -219,6 +220,22 @@ mod tests {
                    choose another folder with --out";
         assert!(error.to_string().ends_with(end), "{error}");
         assert_eq!(fs::read(lock_path(&folder)).unwrap(), b"years of work");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn what_came_to_the_name_of_a_lock_while_it_was_held_stays() {
+        let parent = tempfile::tempdir().unwrap();
+        let folder = parent.path().join("scene");
+        let first = FolderLock::take(&folder, WhenLocked::Refuse).unwrap();
+        fs::remove_file(lock_path(&folder)).unwrap();
+        let second = FolderLock::take(&folder, WhenLocked::Refuse).unwrap();
+        drop(first);
+        FolderLock::take(&folder, WhenLocked::Refuse).unwrap_err();
+        fs::remove_file(lock_path(&folder)).unwrap();
+        fs::write(lock_path(&folder), "mine").unwrap();
+        drop(second);
+        assert_eq!(fs::read(lock_path(&folder)).unwrap(), b"mine");
     }
 
     #[test]

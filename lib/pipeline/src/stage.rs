@@ -14,7 +14,7 @@ use std::time::Instant;
 use crate::error::{Foreign, StageError};
 use crate::lock::{FolderLock, WhenLocked, create_folder, sibling};
 use crate::manifest::{Artifact, FILE_NAME, Manifest, SCHEMA, check_inside, peak_rss_bytes};
-use crate::mark::{Kind, Mark, Owned, foreign, is_empty, is_folder};
+use crate::mark::{self, Kind, Mark, Owned, foreign, is_empty, is_folder};
 
 /// What identifies a run of a stage, before it has run.
 #[derive(Clone, Debug, PartialEq)]
@@ -252,8 +252,33 @@ static UNFINISHED: Mutex<()> = Mutex::new(());
 pub fn discard(partial: &Path) {
     let _no_swap = UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner);
     if is_unfinished(partial) || is_empty(partial).unwrap_or(false) {
-        let _ = fs::remove_dir_all(partial);
+        let _ = remove_unfinished(partial);
     }
+}
+
+/// Removes an unfinished folder. What a kill leaves of it bears its mark or is empty.
+fn remove_unfinished(partial: &Path) -> io::Result<()> {
+    let mark = Mark::read(partial);
+    for path in mark_last(partial)? {
+        match is_folder(&path) {
+            true => fs::remove_dir_all(&path)?,
+            false => fs::remove_file(&path)?,
+        }
+    }
+    // A thread of this process may have written there meanwhile.
+    fs::remove_dir(partial).inspect_err(|_| {
+        if let Some(mark) = mark {
+            let _ = mark.write(partial);
+        }
+    })
+}
+
+/// What is in an unfinished folder, its mark last.
+fn mark_last(partial: &Path) -> io::Result<Vec<PathBuf>> {
+    let entries: io::Result<Vec<_>> = fs::read_dir(partial)?.collect();
+    let mut paths: Vec<PathBuf> = entries?.iter().map(fs::DirEntry::path).collect();
+    paths.sort_by_key(|path| path.ends_with(mark::FILE_NAME));
+    Ok(paths)
 }
 
 fn is_unfinished(folder: &Path) -> bool {
@@ -269,12 +294,17 @@ pub fn tidy(target: &Path, stage: &str) -> Result<(), StageError> {
         return Ok(());
     }
     if is_unfinished(&partial) || is_empty(&partial)? {
-        return fs::remove_dir_all(&partial).map_err(|e| StageError::io("remove", &partial, e));
+        return remove_unfinished(&partial).map_err(|e| StageError::io("remove", &partial, e));
     }
-    // An earlier result that has been replaced, or a result that a kill kept from its place.
     match Owned::of_stage(&partial, stage) {
+        // An earlier result that has been replaced.
         Some(owned) if is_folder(target) => owned.absorb(&partial, target),
-        Some(owned) => owned.remove(&partial),
+        // A result that a kill kept from its place, or an earlier one, with what others put beside it.
+        Some(_) if fs::symlink_metadata(target).is_err() => {
+            fs::rename(&partial, target).map_err(|e| StageError::io("restore", target, e))
+        }
+        // Whoever writes there refuses what is at the target.
+        Some(_) => Ok(()),
         None => Err(foreign(&partial, Foreign::NoMark)),
     }
 }

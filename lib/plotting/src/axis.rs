@@ -106,7 +106,11 @@ fn with_room((low, high): (f64, f64), log: bool, padded: bool) -> (f64, f64) {
         (true, true) => (low / 1.25, high * 1.25),
         (true, false) if high > low * 1.001 => (low, high),
         (true, false) => (low * 0.5, high * 2.0),
-        (false, _) if high - low <= 1e-12 * high.abs().max(1e-12) => (low - 0.5, high + 0.5),
+        (false, _) if high - low <= 1e-12 * high.abs().max(1e-12) => {
+            // Beyond 1e16 a half is lost.
+            let room = (1e-3 * high.abs()).max(0.5);
+            (low - room, high + room)
+        }
         (false, true) => (low - 0.05 * (high - low), high + 0.05 * (high - low)),
         (false, false) => (low, high),
     }
@@ -187,9 +191,12 @@ mod tests {
     #[test]
     fn a_single_value_has_a_range_around_it() {
         for (log, padded) in [(false, false), (true, false), (true, true), (false, true)] {
-            let (low, high) = with_room((2.0, 2.0), log, padded);
-            assert!(low < 2.0 && 2.0 < high);
+            for value in [2.0, 1e18] {
+                let (low, high) = with_room((value, value), log, padded);
+                assert!(low < value && value < high);
+            }
         }
+        assert!(ticks(false, [-1e18, -1e18]).len() > 1);
     }
 
     #[test]

@@ -24,31 +24,31 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 12,
+    version: 13,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
     name: "concepts",
     executable: "dipir-concepts",
-    version: 2,
+    version: 3,
 };
 /// Personalises the model to the photograph.
 pub const LORA: StageName = StageName {
     name: "lora",
     executable: "dipir-lora",
-    version: 4,
+    version: 5,
 };
 /// Recovers light and tone curves.
 pub const LIGHT: StageName = StageName {
     name: "light",
     executable: "dipir-light",
-    version: 7,
+    version: 8,
 };
 /// Renders the picture and its layers.
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 14,
+    version: 15,
 };
 
 /// All stages, each after those that it reads.

@@ -131,17 +131,20 @@ fn key_of_frame(camera: &CameraConfig) -> anyhow::Result<Option<&'static str>> {
 }
 
 /// The mask of a frame, beside that of the photograph. If the photograph's mask has the photograph's name, the frame's mask
-/// has the frame's; if it ends in the photograph's number, the frame's ends in the frame's. Otherwise `None`: all frames
-/// have the photograph's.
+/// has the frame's; if it ends in the photograph's number, the frame's ends in the frame's, with as many digits. Otherwise
+/// `None`: all frames have the photograph's.
 fn mask_of(scene: &SceneConfig, frame: &Path) -> Option<PathBuf> {
     let mask = scene.occluders.as_ref()?;
     let (of_mask, of_photo) = (stem(mask)?, stem(scene.background.as_ref()?)?);
     let of_frame = stem(frame)?;
     let [(head, n), (_, photo), (_, number)] = [of_mask, of_photo, of_frame].map(split);
-    let name = match (of_mask == of_photo, n == photo) {
-        (true, _) => of_frame.to_string(),
-        (false, true) if !n.is_empty() && !number.is_empty() => format!("{head}{number}"),
-        _ => return None,
+    let value = |digits: &str| digits.parse::<u64>().ok();
+    let name = match of_mask == of_photo {
+        true => of_frame.to_string(),
+        false if value(n)? == value(photo)? => {
+            format!("{head}{:0width$}", value(number)?, width = n.len())
+        }
+        false => return None,
     };
     let extension = mask.extension()?.to_str()?;
     Some(mask.with_file_name(format!("{name}.{extension}")))
@@ -196,6 +199,13 @@ mod tests {
                 Some("m/roto.1002.png"),
             ),
             ("f_01.jpg", "m/f_01.png", "f_07.jpg", Some("m/f_07.png")),
+            (
+                "f_9.jpg",
+                "roto.0009.png",
+                "f_10.jpg",
+                Some("roto.0010.png"),
+            ),
+            ("f_09.jpg", "roto.9.png", "f_10.jpg", Some("roto.10.png")),
             ("left.jpg", "m/left.png", "right.jpg", Some("m/right.png")),
             ("f_01.jpg", "bonnet.png", "f_02.jpg", None),
             ("f_01.jpg", "roto_7.png", "f_02.jpg", None),

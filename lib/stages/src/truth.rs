@@ -230,19 +230,53 @@ impl Truth {
     /// One sentence.
     pub fn in_words(&self) -> String {
         let share = 100.0 * (self.rmse_recovered / self.rmse_neutral - 1.0);
-        let direction = match share <= 0.0 {
-            true => "below",
-            false => "above",
+        let than = match share {
+            // Nothing that the object or its shadow touches is in the picture, or neutral light is the true one.
+            s if !s.is_finite() => "beside".to_string(),
+            s if s <= 0.0 => format!("{:.0}% below", s.abs()),
+            s => format!("{s:.0}% above"),
         };
         let sun = match self.sun_error_deg {
             Some(angle) => format!("most light comes from {angle:.1} degrees off the true sun; "),
             None => String::new(),
         };
         format!(
-            "{sun}RMSE of the picture {:.4}, {:.0}% {direction} the {:.4} under neutral light",
-            self.rmse_recovered,
-            share.abs(),
-            self.rmse_neutral
+            "{sun}RMSE of the picture {:.4}, {than} the {:.4} under neutral light",
+            self.rmse_recovered, self.rmse_neutral
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_error_is_told_beside_that_of_neutral_light() {
+        let words = |rmse_recovered, rmse_neutral| {
+            let truth = Truth {
+                sun_error_deg: None,
+                rmse_recovered,
+                rmse_neutral,
+                peak: None,
+            };
+            truth.in_words()
+        };
+        let ends = |recovered, neutral, end: &str| {
+            let words = words(recovered, neutral);
+            assert!(words.ends_with(end), "{words}");
+        };
+        ends(
+            0.05,
+            0.1,
+            "0.0500, 50% below the 0.1000 under neutral light",
+        );
+        ends(
+            0.2,
+            0.1,
+            "0.2000, 100% above the 0.1000 under neutral light",
+        );
+        ends(0.1, 0.1, "0.1000, 0% below the 0.1000 under neutral light");
+        ends(0.0, 0.0, "0.0000, beside the 0.0000 under neutral light");
     }
 }

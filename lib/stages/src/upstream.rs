@@ -64,8 +64,8 @@ fn differences(stage: &str, was: &Manifest, now: &StagePlan) -> Option<String> {
     (!words.is_empty()).then(|| words.join("; "))
 }
 
-/// Hashes of all files of a role.
-fn hashes<'a>(files: &'a [Artifact], role: &str) -> BTreeSet<&'a str> {
+/// Hashes of all files of a role, whatever their numbers.
+pub(crate) fn hashes<'a>(files: &'a [Artifact], role: &str) -> BTreeSet<&'a str> {
     let of_role = files.iter().filter(|f| unnumbered(&f.role) == role);
     of_role.map(|f| f.blake3.as_str()).collect()
 }

@@ -12,6 +12,7 @@ use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_render::adaptive::Stop;
 use dipir_render::effects::EffectsPlan;
 use dipir_render::render::{Renderer, Settings};
+use dipir_stages::names;
 use glam::Vec3;
 
 use super::scene::{DrawnScene, SIDE};
@@ -140,6 +141,9 @@ impl Layers {
 fn key(scene: &DrawnScene, light: &EnvironmentMap, target_error: f32) -> String {
     let mut hash = blake3::Hasher::new();
     hash.update(scene.name.as_bytes());
+    // Raised whenever pictures change.
+    hash.update(&names::COMPOSITE.version.to_le_bytes());
+    hash.update(format!("{:?}", scene.scene.materials).as_bytes());
     let floats = |hash: &mut blake3::Hasher, values: &[f32]| {
         let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
         hash.update(&bytes);
@@ -158,4 +162,49 @@ fn key(scene: &DrawnScene, light: &EnvironmentMap, target_error: f32) -> String 
     floats(&mut hash, &flat(scene.photo.0.pixels()));
     floats(&mut hash, &flat(light.texels()));
     hash.finalize().to_hex()[..32].to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_render::shapes::torus_knot;
+    use dipir_scene::camera::{Camera, FieldOfView};
+    use dipir_scene::material::Material;
+    use dipir_scene::proxy::Proxy;
+    use dipir_scene::scene::Scene;
+
+    use super::*;
+
+    #[test]
+    fn another_material_is_rendered_anew() {
+        let scene = |roughness: f32| DrawnScene {
+            name: "a".into(),
+            scene: Scene {
+                mesh: torus_knot(Vec3::ZERO, 0.4, 0.1, 8, 4),
+                materials: vec![Material {
+                    roughness,
+                    ..Material::default()
+                }],
+                textures: vec![],
+                camera: Camera::look_at(
+                    Vec3::Z,
+                    Vec3::ZERO,
+                    Vec3::Y,
+                    FieldOfView::Vertical(1.0),
+                    [4, 4],
+                ),
+                proxy: Proxy::None,
+            },
+            photo: LinearImage(Raster::filled(4, 4, Vec3::ONE)),
+            shown: DisplayImage(Raster::filled(4, 4, Vec3::ONE)),
+            truth: Arc::new(EnvironmentMap::constant(8, 4, Vec3::ONE)),
+            heading: 0,
+            exposure: 1.0,
+        };
+        let of = |roughness: f32| {
+            let scene = scene(roughness);
+            key(&scene, &scene.truth, 0.01)
+        };
+        assert_eq!(of(0.5), of(0.5));
+        assert_ne!(of(0.5), of(0.25));
+    }
 }

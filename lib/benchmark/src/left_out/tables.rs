@@ -168,7 +168,8 @@ fn worst(scenes: &[Scored]) -> String {
 
 /// Rows of pictures of `count` scenes evenly drawn from all.
 pub fn sheet(scenes: &[Scored], count: usize) -> DisplayImage {
-    let chosen: Vec<&Scored> = (0..count.min(scenes.len()))
+    let count = count.min(scenes.len());
+    let chosen: Vec<&Scored> = (0..count)
         .map(|k| &scenes[k * scenes.len() / count])
         .collect();
     let columns = chosen.first().map_or(1, |s| s.pictures.len());
@@ -194,6 +195,25 @@ pub fn sheet(scenes: &[Scored], count: usize) -> DisplayImage {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_sheet_with_room_for_more_scenes_shows_each_once() {
+        let scene = |value: f32| Scored {
+            name: String::new(),
+            kind: String::new(),
+            fold: 0,
+            sun: false,
+            scores: vec![],
+            exposed: Default::default(),
+            pictures: vec![DisplayImage(Raster::filled(SIDE, SIDE, Vec3::splat(value)))],
+        };
+        let shown = sheet(&[0.25, 0.5, 0.75].map(scene), 24).0;
+        let side = SIDE * ENLARGED;
+        let at = |column: usize, row: usize| shown.get(column * side, row * side).x;
+        assert_eq!((shown.width(), shown.height()), (2 * side, 2 * side));
+        let all = [at(0, 0), at(1, 0), at(0, 1), at(1, 1)];
+        assert_eq!(all, [0.25, 0.5, 0.75, 0.0]);
+    }
 
     #[test]
     fn only_scenes_that_are_worse_are_named_as_worse() {

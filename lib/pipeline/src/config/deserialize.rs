@@ -128,7 +128,14 @@ impl de::Error for ReadError {
     }
 
     fn invalid_value(found: Unexpected<'_>, accepted: &dyn Expected) -> Self {
-        Self::invalid_type(found, accepted)
+        match (found, accepted.to_string().as_str()) {
+            // Too large a number is one of 0 or more, too.
+            (Unexpected::Signed(0..), "u32") => Self::new(Finding::Wrong {
+                found: in_words(found),
+                accepted: format!("a whole number from 0 to {}", u32::MAX),
+            }),
+            _ => Self::invalid_type(found, accepted),
+        }
     }
 
     fn invalid_length(length: usize, accepted: &dyn Expected) -> Self {

@@ -157,6 +157,10 @@ fn a_wrong_type_says_what_was_found_and_what_is_accepted() {
         "--set scene.samples=-1: scene.samples is the integer -1, accepted: a whole number, 0 or more"
     );
     assert_eq!(
+        message(TEXT, &["scene.samples=4294967296"]),
+        "--set scene.samples=4294967296: scene.samples is the integer 4294967296, accepted: a whole number from 0 to 4294967295"
+    );
+    assert_eq!(
         message("[scene]\nsamples = 2026-06-21\n", &[]),
         "pipeline.toml:2: scene.samples is the string \"2026-06-21\", accepted: a whole number, 0 or more"
     );

@@ -209,6 +209,48 @@ fn leftovers_of_a_killed_run_are_cleared() {
 }
 
 #[test]
+fn a_kill_while_an_unfinished_folder_is_removed_blocks_no_later_run() {
+    let out = tempfile::tempdir().unwrap();
+    let (target, partial) = (out.path().join("scene"), out.path().join(".scene.partial"));
+    // A mark, two files and a folder.
+    for removed in 0..=4 {
+        let mark = Mark::new(Kind::Unfinished, "scene", vec![]);
+        mark.make(&partial).unwrap();
+        for name in ["!a.png", "z.png"] {
+            fs::write(partial.join(name), "x").unwrap();
+        }
+        fs::create_dir(partial.join("images")).unwrap();
+        let paths = mark_last(&partial).unwrap();
+        assert_eq!(paths.len(), 4);
+        for path in &paths[..removed] {
+            let gone = fs::remove_file(path).or_else(|_| fs::remove_dir(path));
+            gone.unwrap();
+        }
+        run(&target, "new");
+        assert_eq!(names(out.path()), ["scene"], "{removed} were removed");
+    }
+}
+
+#[test]
+fn a_result_without_its_place_is_put_there_with_what_others_put_beside_it() {
+    let out = tempfile::tempdir().unwrap();
+    let (target, partial) = (out.path().join("scene"), out.path().join(".scene.partial"));
+    run(&target, "first");
+    fs::write(target.join("notes.txt"), "mine").unwrap();
+    fs::rename(&target, &partial).unwrap();
+    drop(StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap());
+    assert_eq!(names(out.path()), ["scene"]);
+    assert_eq!(fs::read(target.join("images/0000.png")).unwrap(), b"first");
+    assert_eq!(fs::read(target.join("notes.txt")).unwrap(), b"mine");
+    // Something of another's at its place is not replaced.
+    fs::rename(&target, &partial).unwrap();
+    fs::write(&target, "mine").unwrap();
+    StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap_err();
+    assert_eq!(fs::read(&target).unwrap(), b"mine");
+    assert!(partial.join("notes.txt").exists());
+}
+
+#[test]
 fn a_folder_at_the_name_of_the_unfinished_one_that_is_not_ours_is_left_alone() {
     let out = tempfile::tempdir().unwrap();
     let target = out.path().join("scene");

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::Done;
 use super::words::{in_words, is_unplaced_sun};
-use crate::written;
+use crate::{shown, written};
 
 impl Done {
     fn records(&self) -> usize {
@@ -86,7 +86,7 @@ impl fmt::Display for Done {
                     f,
                     "\n  the sun probably shines, but its direction is not known well enough for a sharp shadow: draw one \
                      (light.shadow), say where the sun is (light.sun), or choose one of {} by its number (light.candidate)",
-                    self.folder.join("candidates.png").display()
+                    shown(&self.folder.join("candidates.png"))
                 )?;
             }
             if estimated.photographs > 1 {

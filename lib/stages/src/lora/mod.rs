@@ -189,9 +189,12 @@ fn resumable(
 ) -> anyhow::Result<Fingerprint> {
     let model_table: ModelTable = session.config.table("model")?;
     let (_, transfer) = photo_of(session)?;
-    let decides = json!({
+    let mut decides = json!({
         "lora": table.without_steps(), "transfer": transfer, "precision": model_table.precision,
     });
+    if let Some(prediction) = plan.params.get("prediction") {
+        decides["prediction"] = prediction.clone();
+    }
     Ok(Fingerprint::of_plan(plan).params(decides).finish())
 }
 

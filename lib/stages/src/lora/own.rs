@@ -19,6 +19,7 @@ use super::table::LoraTable;
 use super::{Done, class, class_prompts};
 use crate::model::{self, ModelTable};
 use crate::names::{LORA, begin};
+use crate::shown;
 
 /// Role of its files among the stage's inputs.
 const ROLE: &str = "LoRA";
@@ -235,7 +236,7 @@ impl Read {
             [least, most] if least == most => format!("rank {least}"),
             [least, most] => format!("rank {least} to {most}"),
         };
-        let mut words = format!("{}: {} layers of {ranks}", self.path.display(), self.layers);
+        let mut words = format!("{}: {} layers of {ranks}", shown(&self.path), self.layers);
         if let Some(difference) = self.difference {
             words += &format!("; on the sheet it moves display values by {difference:.4}");
         }

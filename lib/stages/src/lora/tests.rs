@@ -259,6 +259,20 @@ fn the_base_model_is_known_by_the_hash_of_its_unet() {
 }
 
 #[test]
+fn a_training_is_gone_on_with_by_more_steps_and_not_by_another_prediction() {
+    let folder = project();
+    let of = |set: &str| {
+        let session = session(&folder, &[set]);
+        let table = session.config.table("lora").unwrap();
+        resumable(&session, &plan(&session).unwrap(), &table).unwrap()
+    };
+    let first = of("lora.steps=2");
+    assert_eq!(of("lora.steps=9"), first);
+    assert_ne!(of("model.prediction=v_prediction"), first);
+    assert_ne!(of("lora.rank=2"), first);
+}
+
+#[test]
 fn a_training_that_diverges_names_its_rate() {
     let folder = project();
     let sets = [

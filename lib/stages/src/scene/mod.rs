@@ -13,7 +13,7 @@ use dipir_cli::output::json_path;
 use dipir_cli::session::{Session, duration, size};
 use dipir_optimize::settings::{LightTable, Settings as RecoverySettings};
 use dipir_pipeline::config::Config;
-use dipir_pipeline::manifest::Manifest;
+use dipir_pipeline::manifest::{Artifact, Manifest};
 use dipir_pipeline::stage::StagePlan;
 use dipir_points::Ground;
 use dipir_render::effects::EffectsPlan;
@@ -33,6 +33,7 @@ use crate::light::method::Method;
 use crate::names::{SCENE, begin};
 use crate::presets::Outlook;
 use crate::scene::transport::Frame;
+use crate::upstream::hashes;
 use crate::written;
 
 /// What the stage did.
@@ -203,16 +204,40 @@ fn record(
     transport::record(session, &renderer, &record_settings)
 }
 
+/// What begins the role of a file that an object consists of.
+const PART_OF: &str = "part of ";
+
 /// What a run would be. The files that an object consists of are known only once it has been read.
 /// They are taken from the manifest of the last run: the same object has the same files.
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
-    let config: SceneConfig = session.config.table("scene")?;
     let recorded = match SCENE.manifest(session) {
         Ok(manifest) => manifest.inputs,
         Err(_) => Vec::new(),
     };
-    let parts = recorded.iter().filter(|a| a.role.starts_with("part of "));
+    let parts = recorded.iter().filter(|a| a.role.starts_with(PART_OF));
+    let parts: Vec<&Artifact> = parts.collect();
+    let whole = plan_with_parts(session, &parts);
+    if whole.is_ok() {
+        return whole;
+    }
+    // Another object has other files.
+    let is_there = |part: &&Artifact| session.resolve(&part.path).exists();
+    let (there, gone): (Vec<_>, Vec<_>) = parts.into_iter().partition(is_there);
+    let is_of_another = |part: &&Artifact, now: &StagePlan| {
+        let object = unnumbered(&part.role).trim_start_matches(PART_OF);
+        hashes(&recorded, object) != hashes(&now.inputs, object)
+    };
+    match plan_with_parts(session, &there) {
+        Ok(now) if gone.iter().all(|part| is_of_another(part, &now)) => Ok(now),
+        _ => whole,
+    }
+}
+
+/// The plan with the files that the configuration names and these `parts` of objects.
+fn plan_with_parts(session: &Session, parts: &[&Artifact]) -> anyhow::Result<StagePlan> {
+    let config: SceneConfig = session.config.table("scene")?;
     let named = named_files(&config, &session.config.base_dir());
+    let parts = parts.iter();
     let files = named
         .iter()
         .map(|(role, path)| (*role, path.as_path()))
@@ -391,5 +416,59 @@ impl fmt::Display for Done {
                 "\n  light transport: not recorded, for no light is optimised"
             ),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use clap::Parser;
+    use dipir_imaging::file::write_png;
+    use dipir_imaging::raster::{DisplayImage, Raster};
+    use dipir_pipeline::fingerprint::{in_words, stale_reasons};
+    use glam::Vec3;
+
+    use super::*;
+    use crate::command_line::scene::Cli;
+
+    #[test]
+    fn a_file_that_only_the_object_before_had_may_be_gone() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let photo = DisplayImage(Raster::filled(36, 24, Vec3::splat(0.5)));
+        write_png(at("photo.png"), &photo).unwrap();
+        let object = |material: &str| {
+            let text = format!(
+                "mtllib {material}\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+            );
+            fs::write(at("object.obj"), text).unwrap();
+        };
+        object("a.mtl");
+        fs::write(at("a.mtl"), "newmtl m\nKd 0.5 0.5 0.5\n").unwrap();
+        let text = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"object.obj\"\nposition = [0.0, 0.0, 0.0]\n\
+                    [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 0.5, 0.0]\nfov_deg = 40.0\n\
+                    [scene.proxy]\nplane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }\n";
+        fs::write(at("pipeline.toml"), text).unwrap();
+        let file = at("pipeline.toml").display().to_string();
+        let args = ["dipir-scene", "-q", "-p", file.as_str()];
+        let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+        run(&session).unwrap();
+        let told = || {
+            let plan = plan(&session).map_err(|e| dipir_cli::exit::describe(&e))?;
+            let reasons = stale_reasons(&plan, &SCENE.folder(&session)).unwrap();
+            Ok::<_, String>(in_words(&reasons))
+        };
+        assert_eq!(told(), Ok(String::new()));
+        fs::rename(at("a.mtl"), at("b.mtl")).unwrap();
+        let missing = told().unwrap_err();
+        assert!(missing.contains("a.mtl"), "{missing}");
+        object("b.mtl");
+        assert_eq!(
+            told().unwrap(),
+            "the object object.obj has other content; it no longer reads the part of object"
+        );
+        run(&session).unwrap();
+        assert_eq!(told(), Ok(String::new()));
     }
 }
