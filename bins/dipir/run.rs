@@ -554,14 +554,17 @@ fn stopped(stopped: Stopped<anyhow::Error>) -> anyhow::Error {
         }
         Stopped::Failed { stage, status } => match status.code() {
             Some(code) if code == i32::from(exit::INTERRUPTED) => Interrupted.into(),
-            // The stage has printed what was wrong.
-            Some(code) => AlreadyReported(u8::try_from(code).unwrap_or(exit::FAILED)).into(),
             None if ending::is_told(status) => AlreadyReported(exit::FAILED).into(),
-            None => anyhow::anyhow!(
-                "the stage \"{stage}\" ended without a word ({status}): {}; run again to go on \
-                 where it was",
-                ending::cause(status)
-            ),
+            code => match code.and_then(|code| u8::try_from(code).ok()) {
+                // The stage has printed what was wrong.
+                Some(code) => AlreadyReported(code).into(),
+                // A signal or, on Windows, a code that says how the system ended it.
+                None => anyhow::anyhow!(
+                    "the stage \"{stage}\" ended without a word ({status}): {}; run again to go on \
+                     where it was",
+                    ending::cause(status)
+                ),
+            },
         },
     }
 }

@@ -1,8 +1,7 @@
 //! `.chan` files, as Nuke and Blender write cameras of a shot.
 //!
 //! A line is a frame: number, position x y z, rotation x y z in degrees, and the vertical field of
-//! view in degrees. The world has +y up; a rotation turns about z, then x, then y: ZXY, which is Nuke's order by default
-//! and a choice in Blender. The file does not say it.
+//! view in degrees. The world has +y up. The file does not say in which order its rotations turn.
 use std::collections::BTreeMap;
 
 use glam::{DMat3, DVec2, DVec3};
@@ -11,6 +10,30 @@ use crate::camera::{Camera, Lens, Pose};
 use crate::error::CameraError;
 
 const FORMAT: &str = ".chan";
+
+/// The axes about which rotations turn, the first one first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Turns([usize; 3]);
+
+impl Turns {
+    /// About z, then x, then y, as Nuke turns by default.
+    pub const ZXY: Self = Self([2, 0, 1]);
+
+    /// From a word such as `zxy`; `None` if it does not name each axis once.
+    pub fn parse(word: &str) -> Option<Self> {
+        let axes: Option<Vec<usize>> = word.chars().map(|c| "xyz".find(c)).collect();
+        let axes: [usize; 3] = axes?.try_into().ok()?;
+        let is_whole = (0..3).all(|axis| axes.contains(&axis));
+        is_whole.then_some(Self(axes))
+    }
+
+    /// The rotation by angles about x, y and z, radians.
+    fn rotation(self, angles_rad: [f64; 3]) -> DMat3 {
+        let about = |axis: usize| DMat3::from_axis_angle(DVec3::AXES[axis], angles_rad[axis]);
+        let [first, second, third] = self.0.map(about);
+        third * second * first
+    }
+}
 
 /// A line of the file.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,7 +46,7 @@ pub struct Frame {
     pub states_fov: bool,
 }
 
-/// Reads all frames with their numbers, for images of `size` pixels. `fov_deg` is the vertical field
+/// Reads all frames with their numbers, turned as by Nuke, for images of `size` pixels. `fov_deg` is the vertical field
 /// of view where the file has none.
 ///
 /// # Errors
@@ -33,21 +56,26 @@ pub fn read(
     size: [f64; 2],
     fov_deg: Option<f64>,
 ) -> Result<Vec<(i64, Camera)>, CameraError> {
-    let frames = frames(text, size, fov_deg)?;
+    let frames = frames(text, size, fov_deg, Turns::ZXY)?;
     Ok(frames.iter().map(|f| (f.number, f.camera)).collect())
 }
 
-/// As [`read`], and where the fields of view come from.
+/// As [`read`], of rotations that turn as `turns` says, and where the fields of view come from.
 ///
 /// # Errors
 /// On lines that are no frames or of the same frame, and where no field of view is known.
-pub fn frames(text: &str, size: [f64; 2], fov_deg: Option<f64>) -> Result<Vec<Frame>, CameraError> {
+pub fn frames(
+    text: &str,
+    size: [f64; 2],
+    fov_deg: Option<f64>,
+    turns: Turns,
+) -> Result<Vec<Frame>, CameraError> {
     let lines = text.lines().enumerate();
     let lines = lines.filter(|(_, l)| !l.trim().is_empty() && !l.trim_start().starts_with('#'));
     let mut line_of = BTreeMap::new();
     lines
         .map(|(index, line)| {
-            let frame = frame(index + 1, line, size, fov_deg)?;
+            let frame = frame(index + 1, line, size, fov_deg, turns)?;
             match line_of.insert(frame.number, index + 1) {
                 None => Ok(frame),
                 Some(first) => {
@@ -66,6 +94,7 @@ fn frame(
     line: &str,
     size: [f64; 2],
     fov_deg: Option<f64>,
+    turns: Turns,
 ) -> Result<Frame, CameraError> {
     let wrong = |detail: &str| CameraError::new(FORMAT, format!("line {number}: {detail}"));
     let values: Option<Vec<f64>> = line.split_whitespace().map(|v| v.parse().ok()).collect();
@@ -79,9 +108,7 @@ fn frame(
     if !(fov > 0.0 && fov < 180.0) {
         return Err(wrong("its field of view is not between 0 and 180 degrees"));
     }
-    let [x, y, z] = [*rx, *ry, *rz].map(f64::to_radians);
-    let rotation =
-        DMat3::from_rotation_y(y) * DMat3::from_rotation_x(x) * DMat3::from_rotation_z(z);
+    let rotation = turns.rotation([*rx, *ry, *rz].map(f64::to_radians));
     let focal = 0.5 * size[1] / (0.5 * fov.to_radians()).tan();
     let lens = Lens::pinhole(size, DVec2::splat(focal));
     lens.check(FORMAT)?;
@@ -98,6 +125,8 @@ fn frame(
 
 #[cfg(test)]
 mod tests {
+    use glam::EulerRot;
+
     use super::*;
 
     #[test]
@@ -109,9 +138,35 @@ mod tests {
     }
 
     #[test]
+    fn rotations_turn_about_the_axes_in_the_order_that_is_named() {
+        let text = "1 0 1 5 -20 30 40 50\n";
+        let rotation = |word: &str| {
+            let turns = Turns::parse(word).unwrap();
+            frames(text, [600.0, 400.0], None, turns).unwrap()[0]
+                .camera
+                .pose
+                .rotation
+        };
+        let [x, y, z] = [-20f64, 30.0, 40.0].map(f64::to_radians);
+        for (word, order, angles) in [
+            ("zxy", EulerRot::YXZ, [y, x, z]),
+            ("xyz", EulerRot::ZYX, [z, y, x]),
+            ("yzx", EulerRot::XZY, [x, z, y]),
+        ] {
+            // Glam names the last turn first.
+            let want = DMat3::from_euler(order, angles[0], angles[1], angles[2]);
+            assert!(rotation(word).abs_diff_eq(want, 1e-12), "{word}");
+        }
+        assert_eq!(Turns::parse("zxy"), Some(Turns::ZXY));
+        for word in ["", "xy", "xxy", "xyzx", "xyw"] {
+            assert_eq!(Turns::parse(word), None, "{word}");
+        }
+    }
+
+    #[test]
     fn a_line_says_whether_it_has_a_field_of_view() {
         let text = "1 0 1 5 0 0 0 40\n2 0 1 4 0 0 0\n";
-        let frames = frames(text, [600.0, 400.0], Some(40.0)).unwrap();
+        let frames = frames(text, [600.0, 400.0], Some(40.0), Turns::ZXY).unwrap();
         assert_eq!(frames[0].camera.lens, frames[1].camera.lens);
         assert!(frames[0].states_fov && !frames[1].states_fov);
     }

@@ -137,6 +137,7 @@ pub fn read_points(points: &[u8], binary: bool, up: WorldUp) -> Result<Vec<DVec3
 }
 
 fn text(bytes: &[u8]) -> Result<&str, CameraError> {
+    let bytes = dipir_files::without_byte_order_mark(bytes);
     std::str::from_utf8(bytes).map_err(|_| CameraError::new(FORMAT, "it is not UTF-8"))
 }
 

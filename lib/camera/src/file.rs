@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 
 use crate::camera::{Camera, Lens, Pose, WorldUp};
+use crate::chan::Turns;
 use crate::error::CameraError;
 use crate::{chan, colmap, fspy, gltf, kitti, nuscenes, opencv, transforms};
 
@@ -31,6 +32,8 @@ pub struct Wanted<'a> {
     pub up: Option<WorldUp>,
     /// Vertical field of view of a `.chan` file that has none, degrees.
     pub fov_deg: Option<f64>,
+    /// How rotations of a `.chan` file turn; by default [`Turns::ZXY`]. Other files say it themselves.
+    pub turns: Option<Turns>,
 }
 
 /// A photograph's camera.
@@ -87,6 +90,7 @@ pub fn has_one(path: &Path) -> bool {
         which: Which::Photo(Path::new("")),
         up: None,
         fov_deg: Some(45.0),
+        turns: None,
     };
     found(path, &wanted).is_ok()
 }
@@ -134,11 +138,13 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
         path: path.into(),
         source,
     })?;
+    let bytes = dipir_files::without_byte_order_mark(&bytes);
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     match extension.as_deref().unwrap_or_default() {
         "chan" => {
-            let text = String::from_utf8_lossy(&bytes);
-            let frames = chan::frames(&text, wanted.size, wanted.fov_deg)?;
+            let text = String::from_utf8_lossy(bytes);
+            let turns = wanted.turns.unwrap_or(Turns::ZXY);
+            let frames = chan::frames(&text, wanted.size, wanted.fov_deg, turns)?;
             let chan::Frame {
                 camera, states_fov, ..
             } = *of_chan(&frames, wanted)?;
@@ -150,10 +156,10 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
         }
         "fspy" => {
             only(wanted, "fSpy")?;
-            Ok(of(fspy::read(&bytes, z_up)?, "fSpy", true))
+            Ok(of(fspy::read(bytes, z_up)?, "fSpy", true))
         }
         "gltf" | "glb" => {
-            let cameras = gltf::read_at_rest(&bytes, wanted.size)?;
+            let cameras = gltf::read_at_rest(bytes, wanted.size)?;
             let gltf::AtRest {
                 camera,
                 is_animated,
@@ -168,8 +174,8 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
             let pose = camera.pose.in_our_world(wanted.up.unwrap_or(WorldUp::Y));
             Ok(of(Camera { pose, ..camera }, "glTF", true))
         }
-        "json" => in_json(&bytes, wanted, z_up, of),
-        "yaml" | "yml" => lens_alone(&String::from_utf8_lossy(&bytes), wanted),
+        "json" => in_json(bytes, wanted, z_up, of),
+        "yaml" | "yml" => lens_alone(&String::from_utf8_lossy(bytes), wanted),
         "txt" => {
             let index = match wanted.which {
                 Which::Number(n) => n,
@@ -186,7 +192,7 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
                 let detail = "its world is that of its camera 0, of which -y points up";
                 return Err(CameraError::with_remedy("KITTI", detail, NO_AXIS));
             }
-            let camera = kitti::read(&String::from_utf8_lossy(&bytes), index, wanted.size)?;
+            let camera = kitti::read(&String::from_utf8_lossy(bytes), index, wanted.size)?;
             Ok(of(camera, "KITTI", false))
         }
         _ => Err(CameraError::with_remedy(
@@ -334,7 +340,9 @@ fn nearest<T, A: Ord>(
 /// How many components at the end of two paths are the same, and whether the last ones have the same extension;
 /// `None` if those differ in more.
 fn agreement(own: &str, other: &Path) -> Option<(usize, bool)> {
-    let own = Path::new(own);
+    // Programs on Windows separate folders by `\`.
+    let own = own.replace('\\', "/");
+    let own = Path::new(&own);
     let is_exact = own.file_name()? == other.file_name()?;
     if !is_exact && stem(own) != stem(other) {
         return None;
@@ -410,6 +418,7 @@ mod tests {
             which,
             up: None,
             fov_deg: None,
+            turns: None,
         }
     }
 

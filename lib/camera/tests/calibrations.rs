@@ -77,6 +77,7 @@ fn found_x(name: &str, text: &str, which: Which) -> Result<f64, String> {
         which,
         up: None,
         fov_deg: None,
+        turns: None,
     };
     let found = file::read(&path, &wanted).map_err(|e| e.to_string())?;
     Ok(found.pose.unwrap().position.x)

@@ -21,6 +21,7 @@ fn position(path: &Path, photo: &str) -> Result<DVec3, String> {
         which: Which::Photo(Path::new(photo)),
         up: Some(WorldUp::Y),
         fov_deg: None,
+        turns: None,
     };
     let found = file::read(path, &wanted).map_err(|e| e.to_string())?;
     Ok(found.pose.unwrap().position)
@@ -93,4 +94,43 @@ fn empty_lines_after_images_mean_nothing() {
     );
     assert_eq!(position(folder.path(), "a.jpg").unwrap().z, 3.0);
     assert_eq!(position(folder.path(), "b.jpg").unwrap().z, 4.0);
+}
+
+#[test]
+fn texts_of_windows_are_read_and_their_pictures_are_found_by_name() {
+    const MARK: &str = "\u{feff}";
+    let windows = |text: &str| format!("{MARK}{}", text.replace('\n', "\r\n"));
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let frame = |name: &str, z: f64| {
+        format!(
+            r#"{{"file_path": "images\\{name}", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,{z}],[0,0,0,1]]}}"#
+        )
+    };
+    let frames = [frame("b.jpg", 1.0), frame("a.jpg", 3.0)].join(",\n");
+    let transforms = format!("{{\"fl_x\": 500, \"w\": 640, \"h\": 480, \"frames\": [{frames}]}}\n");
+    for (name, text) in [
+        ("transforms.json", transforms.as_str()),
+        ("shot.chan", "1 0 0 3 0 0 0 40\n2 0 0 4 0 0 0 40\n"),
+        ("cameras.txt", &format!("# cameras\n{CAMERA}")),
+        (
+            "images.txt",
+            "# images\n1 1 0 0 0 0 0 -1 1 right\\a1.jpg\n\n2 1 0 0 0 0 0 -3 1 left\\a1.jpg\n\n",
+        ),
+        ("calib.txt", "P2: 500 0 320 -1500 0 500 240 0 0 0 1 0\n"),
+    ] {
+        std::fs::write(at(name), windows(text)).unwrap();
+    }
+    assert_eq!(position(&at("transforms.json"), "c/a.jpg").unwrap().z, 3.0);
+    assert_eq!(position(&at("shot.chan"), "a1.jpg").unwrap().z, 3.0);
+    assert_eq!(position(&at("images.txt"), "left/a1.jpg").unwrap().z, 3.0);
+    let wanted = Wanted {
+        size: [640.0, 480.0],
+        which: Which::Number(2),
+        up: None,
+        fov_deg: None,
+        turns: None,
+    };
+    let calibrated = file::read(&at("calib.txt"), &wanted).unwrap();
+    assert_eq!(calibrated.pose.unwrap().position.x, 3.0);
 }

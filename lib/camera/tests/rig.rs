@@ -228,6 +228,7 @@ fn wanted(which: Which<'_>) -> file::Wanted<'_> {
         which,
         up: None,
         fov_deg: None,
+        turns: None,
     }
 }
 

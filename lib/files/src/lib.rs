@@ -10,7 +10,9 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read};
 use std::path::Path;
 
-pub use own::{beginning, begins_with, left_of_replacing, open_own, replace, sync_folder};
+pub use own::{
+    beginning, begins_with, left_of_replacing, open_own, replace, sync_file, sync_folder,
+};
 pub use rewrite::rewrite;
 
 /// Opens a regular file for reading. Symbolic links are followed.
@@ -56,6 +58,11 @@ pub fn read_to_string(path: impl AsRef<Path>) -> io::Result<String> {
     let mut text = String::new();
     file.read_to_string(&mut text)?;
     Ok(text)
+}
+
+/// The bytes of a text without the byte order mark that editors on Windows put before it.
+pub fn without_byte_order_mark(bytes: &[u8]) -> &[u8] {
+    bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
 }
 
 #[cfg(all(test, unix))]

@@ -75,6 +75,18 @@ pub fn left_of_replacing(path: &Path, mark: &[u8]) -> Option<PathBuf> {
     mark.starts_with(&left).then_some(partial)
 }
 
+/// Flushes the content of a regular file, one that this program wrote, to the disk.
+pub fn sync_file(path: &Path) -> io::Result<()> {
+    check_regular(&fs::metadata(path)?)?;
+    let mut options = OpenOptions::new();
+    // Windows flushes through handles that may write; elsewhere a file without that permission is flushed, too.
+    options.read(cfg!(unix)).write(cfg!(not(unix)));
+    do_not_wait(&mut options);
+    let file = options.open(path)?;
+    check_regular(&file.metadata()?)?;
+    file.sync_all()
+}
+
 /// Flushes the names in a folder to the disk, where the file system can.
 pub fn sync_folder(folder: &Path) -> io::Result<()> {
     if cfg!(not(unix)) {
@@ -189,6 +201,22 @@ mod tests {
         assert_eq!(left_of_replacing(&path, MARK), None);
         assert_eq!(fs::read(&partial).unwrap(), b"mine");
         assert_eq!(fs::read(&path).unwrap(), content("x"));
+    }
+
+    #[test]
+    fn what_is_flushed_is_a_file_and_stays_as_it_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("page");
+        fs::write(&path, "x").unwrap();
+        sync_file(&path).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"x");
+        sync_file(folder.path()).unwrap_err();
+        let missing = folder.path().join("none");
+        assert_eq!(
+            sync_file(&missing).unwrap_err().kind(),
+            io::ErrorKind::NotFound
+        );
+        assert!(!missing.exists());
     }
 
     #[cfg(unix)]

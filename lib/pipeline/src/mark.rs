@@ -2,9 +2,10 @@
 //!
 //! Nothing is removed that neither such a list nor a stage's manifest names. Symbolic links are
 //! never followed here, and never removed.
+use std::borrow::Cow;
 use std::fs;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::{MAIN_SEPARATOR, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
@@ -160,8 +161,11 @@ impl Owned {
     }
 
     fn covers(&self, name: &Path) -> bool {
-        let name = name.to_str().unwrap_or_default();
-        let covers = |pattern: &String| pattern == name || fits(pattern, name);
+        let name = slashed(name.to_str().unwrap_or_default(), MAIN_SEPARATOR);
+        let covers = |pattern: &String| {
+            let pattern = slashed(pattern, MAIN_SEPARATOR);
+            pattern == name || fits(&pattern, &name)
+        };
         name == FILE_NAME || self.files.iter().any(covers)
     }
 
@@ -268,6 +272,14 @@ fn free_name(path: &Path) -> PathBuf {
     let mut numbers = 0..;
     let free = |n: &usize| fs::symlink_metadata(named(*n)).is_err();
     named(numbers.find(free).unwrap_or_default())
+}
+
+/// The text of a path with `/` between its parts, as marks and manifests have them.
+fn slashed(path: &str, separator: char) -> Cow<'_, str> {
+    match separator == '/' || !path.contains(separator) {
+        true => Cow::Borrowed(path),
+        false => Cow::Owned(path.replace(separator, "/")),
+    }
 }
 
 /// Whether `name` is `pattern` with digits for every `#`.
@@ -393,6 +405,17 @@ mod tests {
         fs::write(out.path().join("1.png"), "mine").unwrap();
         mark.make(out.path()).unwrap_err();
         assert!(Mark::read(out.path()).is_none());
+    }
+
+    #[test]
+    fn files_in_folders_are_ours_whatever_separates_names_of_the_system() {
+        let name = slashed("previews\\000015.png", '\\');
+        assert_eq!(name, "previews/000015.png");
+        assert!(fits("previews/#.png", &name));
+        // Elsewhere it is a letter of the name.
+        assert_eq!(slashed("a\\b", '/'), "a\\b");
+        let mark = Mark::new(Kind::Cache, "lora", vec!["samples/#.png".into()]);
+        assert!(mark.owned().covers(&Path::new("samples").join("1.png")));
     }
 
     #[cfg(unix)]

@@ -333,9 +333,7 @@ fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<(), StageErr
 }
 
 fn flush(path: &Path) -> Result<(), StageError> {
-    let file = dipir_files::open(path).map_err(|e| StageError::io("read", path, e))?;
-    let flushed = file.sync_all();
-    flushed.map_err(|e| StageError::io("write", path, e))
+    dipir_files::sync_file(path).map_err(|e| StageError::io("write", path, e))
 }
 
 fn sync_folder(folder: &Path) -> Result<(), StageError> {

@@ -101,11 +101,12 @@ fn read_bytes(path: &Path) -> Result<Vec<u8>, PointsError> {
 /// The sensor's rotation and position in our world.
 fn sensor(path: &Path, up: Option<WorldUp>) -> Result<(DMat3, DVec3), PointsError> {
     let bytes = read_bytes(path)?;
+    let bytes = dipir_files::without_byte_order_mark(&bytes);
     let is_json = path
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("json"));
     Ok(match is_json {
-        true => nuscenes::sensor(&bytes, up.unwrap_or(WorldUp::Z))?,
+        true => nuscenes::sensor(bytes, up.unwrap_or(WorldUp::Z))?,
         false if up.is_some() => {
             return Err(PointsError::with_remedy(
                 "KITTI",
@@ -113,7 +114,7 @@ fn sensor(path: &Path, up: Option<WorldUp>) -> Result<(DMat3, DVec3), PointsErro
                 "leave points_up out",
             ));
         }
-        false => kitti::read_scanner(&String::from_utf8_lossy(&bytes))?,
+        false => kitti::read_scanner(&String::from_utf8_lossy(bytes))?,
     })
 }
 

@@ -1,6 +1,7 @@
 //! A pinhole camera that looks down its own -z.
 use std::path::{Path, PathBuf};
 
+use dipir_cameras::chan::Turns;
 use dipir_cameras::file::{self, Found, Wanted};
 use dipir_cameras::{CameraError, Distortion, Lens, Pose};
 use dipir_imaging::facts::Facts;
@@ -243,6 +244,8 @@ pub struct FileSettings {
     pub which: Which,
     /// Which axis of the file's world points up; `None` as the program that wrote it has it.
     pub up: Option<WorldUp>,
+    /// How rotations of a `.chan` file turn; `None` as by Nuke.
+    pub turns: Option<Turns>,
     /// Metres of a unit of the file's world.
     pub scale: f32,
     /// Position, point looked at and up, for files of a lens alone.
@@ -289,6 +292,7 @@ impl FileSettings {
             },
             up: self.up,
             fov_deg: self.fov_deg.map(f64::from),
+            turns: self.turns,
         };
         let found = file::read(&path, &wanted).map_err(|e| match e {
             CameraError::Read { path, source } => Error::Read {

@@ -171,6 +171,10 @@ pub struct CameraConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("enum" = ["z", "y", "-y"]), extend("x-default" = "as the program that wrote it has it: COLMAP `-y`, glTF and `.chan` `y`, others `z`"), example = &"z")]
     pub file_up: Option<String>,
+    /// The axes about which rotations of a `.chan` file turn, the first one first; Blender's export is `xyz` unless it is told.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("enum" = ["zxy", "xyz", "xzy", "yxz", "yzx", "zyx"]), extend("default" = "zxy"), example = &"xyz")]
+    pub file_rotation_order: Option<String>,
     /// Metres of a unit of the world of `file`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("exclusiveMinimum" = 0), extend("default" = 1.0), example = 0.01)]

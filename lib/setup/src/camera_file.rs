@@ -52,6 +52,7 @@ pub fn read(
         which: Which::Photo(whole.as_deref().unwrap_or(photo)),
         up,
         fov_deg: asked.fov_deg.map(vertical),
+        turns: None,
     };
     let found = file::read(path, &wanted).map_err(|source| match source {
         CameraError::Read { path, source } => SetupError::Read { path, source },
@@ -340,6 +341,8 @@ mod tests {
                 text.contains(keys) && text.contains("several cameras"),
                 "{text}"
             );
+            let tells_of_turns = text.contains("# file_rotation_order = \"xyz\"");
+            assert_eq!(tells_of_turns, name == "shot.chan", "{text}");
             // Digits of the file, and single precision.
             assert!(got.position.distance(want.position) < 1e-5, "{name}");
             let apart = (got.rotation - want.rotation).to_cols_array();

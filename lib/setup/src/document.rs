@@ -223,6 +223,9 @@ fn camera_of_file(name: &str, file: &CameraFile, view: &View) -> String {
         let fov_deg = number(fov_deg, 5);
         text += &format!("fov_deg = {fov_deg}    # vertical, which the file does not say\n");
     }
+    if name.to_ascii_lowercase().ends_with(".chan") {
+        text += "# file_rotation_order = \"xyz\"    # of Blender's export, unless its rotation order was set to ZXY\n";
+    }
     text + "\n"
 }
 

@@ -255,8 +255,14 @@ fn beside(path: &Path, folder: &Path) -> Result<String, SetupError> {
             })?,
         },
     };
+    let is_portable = named.is_relative();
     let text = named.into_os_string().into_string();
-    text.map_err(|_| SetupError::NotUtf8 { path: path.into() })
+    let text = text.map_err(|_| SetupError::NotUtf8 { path: path.into() })?;
+    Ok(match is_portable {
+        // So that the project is read on other systems, too.
+        true => text.replace(std::path::MAIN_SEPARATOR, "/"),
+        false => text,
+    })
 }
 
 /// The way from `folder` to `path` by `..`; `None` if they share no folder but the root.

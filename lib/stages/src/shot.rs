@@ -122,7 +122,10 @@ fn key_of_frame(camera: &CameraConfig) -> anyhow::Result<Option<&'static str>> {
                        which finds them by the names of their pictures";
         return Err(Usage(message.into()).into());
     }
-    let is_chan = |file: &PathBuf| file.extension().is_some_and(|e| e == "chan");
+    let is_chan = |file: &PathBuf| {
+        let extension = file.extension();
+        extension.is_some_and(|e| e.eq_ignore_ascii_case("chan"))
+    };
     Ok(match &camera.file {
         Some(file) if is_chan(file) => Some("frame"),
         Some(_) if camera.image.is_some() || camera.frame.is_some() => Some("image"),
@@ -177,6 +180,21 @@ mod tests {
             ("99999999999.jpg", None),
         ] {
             assert_eq!(number(Path::new(name)), wanted, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_chan_names_frames_by_number_however_its_extension_is_written() {
+        for (file, key) in [
+            ("s.chan", Some("frame")),
+            ("S.CHAN", Some("frame")),
+            ("s.glb", None),
+        ] {
+            let camera = CameraConfig {
+                file: Some(file.into()),
+                ..CameraConfig::default()
+            };
+            assert_eq!(key_of_frame(&camera).unwrap(), key, "{file}");
         }
     }
 

@@ -75,6 +75,7 @@ impl Engine {
 #[derive(Clone, Copy)]
 pub(crate) enum Onto<'a> {
     /// What is there, times a factor; for 0 that is not read.
+    #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
     Kept(f32),
     /// The same numbers in every row.
     Row(&'a [f32]),

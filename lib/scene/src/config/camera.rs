@@ -19,6 +19,7 @@ impl CameraConfig {
             ("frame", self.frame.is_some()),
             ("image", self.image.is_some()),
             ("file_up", self.file_up.is_some()),
+            ("file_rotation_order", self.file_rotation_order.is_some()),
             ("file_scale", self.file_scale.is_some()),
             ("transforms_up", self.transforms_up.is_some()),
         ] {

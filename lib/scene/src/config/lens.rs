@@ -1,5 +1,6 @@
 //! What `[scene.camera]` says of another program's file, and of a lens that bends lines.
 use dipir_cameras::Distortion;
+use dipir_cameras::chan::Turns;
 
 use super::*;
 use crate::camera::{FileSettings, Which};
@@ -125,6 +126,7 @@ impl CameraConfig {
                 true => world_up("scene.camera.transforms_up", &self.transforms_up)?,
                 false => world_up("scene.camera.file_up", &self.file_up)?,
             },
+            turns: turns(&self.file_rotation_order, path)?,
             scale,
             stand: match has_stand {
                 true => Some(self.stand()?),
@@ -164,6 +166,20 @@ pub(super) fn world_up(key: &str, word: &Option<String>) -> Result<Option<WorldU
         Some("-y") => Some(WorldUp::MinusY),
         Some(other) => return Err(wrong_word(key, other, &["z", "y", "-y"])),
     })
+}
+
+fn turns(word: &Option<String>, file: &Path) -> Result<Option<Turns>, Error> {
+    let Some(word) = word else { return Ok(None) };
+    let key = "scene.camera.file_rotation_order";
+    if !is_chan(file) {
+        let accepted = "nothing here: files other than .chan say how they turn";
+        return Err(wrong(key, format_args!("\"{word}\""), accepted));
+    }
+    let all = ["zxy", "xyz", "xzy", "yxz", "yzx", "zyx"];
+    match Turns::parse(word) {
+        None => Err(wrong_word(key, word, &all)),
+        found => Ok(found),
+    }
 }
 
 #[cfg(test)]
@@ -261,6 +277,24 @@ mod tests {
             )
             .is_ok()
         );
+    }
+
+    #[test]
+    fn a_chan_turns_in_the_order_that_is_written() {
+        let turned = "1 0 2 0 90 0 90 40\n";
+        let backward = |key: &str| {
+            let (camera, _) = resolved(("shot.chan", turned), key).unwrap();
+            camera.rotation.z_axis
+        };
+        // About z: +z stays; about x: to -y. In the other order: to -y, then about z to +x.
+        assert!(backward("").abs_diff_eq(-Vec3::Y, 1e-6));
+        let other = backward("file_rotation_order = \"xyz\"");
+        assert!(other.abs_diff_eq(Vec3::X, 1e-6), "{other}");
+        let error = resolved(("shot.chan", turned), "file_rotation_order = \"xy\"").unwrap_err();
+        let want = "scene.camera.file_rotation_order is \"xy\"; accepted: \"zxy\", \"xyz\"";
+        assert!(error.starts_with(want), "{error}");
+        let error = resolved(("shot.gltf", GLTF), "file_rotation_order = \"xyz\"").unwrap_err();
+        assert!(error.contains("files other than .chan say"), "{error}");
     }
 
     #[test]

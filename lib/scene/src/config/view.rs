@@ -98,6 +98,10 @@ impl ViewConfig {
                 .or(of_scene.file_up)
                 .or(of_scene.transforms_up),
             file_scale: own.file_scale.or(of_scene.file_scale),
+            file_rotation_order: own
+                .file_rotation_order
+                .clone()
+                .or(of_scene.file_rotation_order),
             ..own
         })
     }

@@ -250,7 +250,7 @@ const COPY: &str = "export or copy the file again";
 /// The JSON text of a glTF file and the binary chunk behind it, if it is a GLB.
 pub(super) fn split(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), Error> {
     if !bytes.starts_with(b"glTF") {
-        let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+        let text = dipir_files::without_byte_order_mark(bytes);
         return match text.iter().find(|b| !b.is_ascii_whitespace()) {
             Some(b'{') => Ok((text, None)),
             None => Err(Error::malformed("the file is empty", COPY)),

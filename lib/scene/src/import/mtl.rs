@@ -100,7 +100,7 @@ impl Library {
     pub fn read(&mut self, bytes: &[u8], name: &str, resolver: &dyn Resolver) -> Result<(), Error> {
         let name = name.replace('\\', "/");
         let folder = name.rfind('/').map_or("", |i| &name[..=i]);
-        let text = String::from_utf8_lossy(bytes);
+        let text = String::from_utf8_lossy(dipir_files::without_byte_order_mark(bytes));
         let mut current: Option<(Material, Draft)> = None;
         for (i, line) in text.lines().enumerate() {
             let (word, rest) = statement(line);

@@ -31,7 +31,7 @@ pub fn load_obj_bytes(
         limits: *limits,
         ..Reader::default()
     };
-    for (number, line) in logical_lines(bytes) {
+    for (number, line) in logical_lines(dipir_files::without_byte_order_mark(bytes)) {
         reader
             .statement(&line, resolver)
             .map_err(|problem| match problem {

@@ -257,6 +257,22 @@ fn comments_foreign_letters_and_blanks_do_no_harm() {
 }
 
 #[test]
+fn a_byte_order_mark_hides_neither_the_first_line_nor_the_first_material() {
+    const MARK: &str = "\u{feff}";
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let object = format!("{MARK}mtllib a.mtl\r\n{SQUARE}usemtl red\r\nf 1 2 3\r\n");
+    std::fs::write(at("a.obj"), object).unwrap();
+    std::fs::write(at("a.mtl"), format!("{MARK}newmtl red\r\nKd 1 0 0\r\n")).unwrap();
+    let imported = load_object(&at("a.obj")).unwrap();
+    assert!(imported.warnings.is_empty(), "{:?}", imported.warnings);
+    assert_eq!(
+        imported.materials[0].base_color,
+        Vec4::new(1.0, 0.0, 0.0, 1.0)
+    );
+}
+
+#[test]
 fn corners_without_coordinates_take_none_from_others() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("p.png"), one_texel_png([1.0; 3])).unwrap();

@@ -21,6 +21,7 @@ pub fn bf16_products() -> Option<&'static str> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
     /// AMX: a tile of 16 rows times a tile of 16 columns, 32 deep, an instruction.
+    #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
     Tiles,
     /// Products in f32: runs everywhere, slower than the kernels for f32.
     Plain,
@@ -33,12 +34,11 @@ fn kind() -> Kind {
 
 /// Those that can run here, the fastest first.
 pub(super) fn kinds() -> Vec<Kind> {
-    let mut kinds = vec![Kind::Plain];
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx512f") && amx::available() {
-        kinds.insert(0, Kind::Tiles);
+        return vec![Kind::Tiles, Kind::Plain];
     }
-    kinds
+    vec![Kind::Plain]
 }
 
 /// This thread's right to multiply, until it is dropped.
