@@ -1,6 +1,6 @@
 """Draws docs/images/transport.svg from the table of lib/render/benches/transport.rs.
 
-    cargo bench -p dipir-render --bench transport -- transport.csv
+    cargo bench -p dipir-render --bench transport -- "$PWD/transport.csv"
     python3 -m venv venv && venv/bin/pip install matplotlib
     venv/bin/python benches/plot_transport.py transport.csv docs/images/transport.svg
 """

@@ -4,7 +4,7 @@
 //! independent renders. Here 16 renders with different seeds give ours. Two tests on each layer
 //! of each case:
 //! - the image mean of every channel differs by less than 4 joint standard errors (a false alarm
-//!   in 1 of 16,000 means; 60 are tested, with fixed seeds);
+//!   in 1 of 16,000 means; 42 are tested, with fixed seeds);
 //! - at most 1% of the pixels' z-scores exceed 3.5 in magnitude. For Gaussian estimates with 15
 //!   and 23 degrees of freedom it would be 0.1%; glints and penumbrae are skewed.
 use std::path::{Path, PathBuf};

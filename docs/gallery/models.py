@@ -100,11 +100,14 @@ def write_glb(name, parts):
         accessors[at].update({"min": low, "max": high})
         primitives.append({"attributes": {"POSITION": at, "NORMAL": at + 1}, "indices": at + 2, "material": len(materials)})
         materials.append(material)
-    write(name, {
+    document = {
         "asset": {"version": "2.0", "generator": "docs/gallery/models.py"}, "scene": 0, "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}], "meshes": [{"primitives": primitives}], "materials": materials,
-        "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(blob)}],
-        "extensionsUsed": sorted({e for m in materials for e in m.get("extensions", {})})}, blob)
+        "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(blob)}]}
+    # glTF allows no empty list.
+    if used := sorted({e for m in materials for e in m["extensions"]}):
+        document["extensionsUsed"] = used
+    write(name, document, blob)
 
 
 def write(name, document, blob):

@@ -2,7 +2,7 @@
 //! one script alone. Where the system lets nobody mount, the tests say so and prove nothing.
 #![cfg(target_os = "linux")]
 use crate::project::*;
-use crate::whole::{self, STAGES, all_artifacts, run_all};
+use crate::whole::{self, all_artifacts, run_all};
 
 /// Runs `script` with an empty disk of `size` in the folder `disk`; `$1` is `dipir`. `None` if it
 /// cannot be mounted.
@@ -35,6 +35,7 @@ fn a_full_disk_is_one_message_and_leaves_earlier_results() {
     let project = whole::project();
     run_all(&project, &[]);
     let before = all_artifacts(&project, "out");
+    assert!(before.iter().all(|(_, files)| !files.is_empty()));
     // Every stage writes anew, and has 0 to 8 KiB for it: not even a manifest, or the first files.
     for (stage, kib) in [
         ("scene", 0),
@@ -80,7 +81,6 @@ fn a_full_disk_is_one_message_and_leaves_earlier_results() {
             .collect();
         assert!(left.is_empty(), "{stage}: {left:?}");
     }
-    assert_eq!(before.len(), STAGES.len());
 }
 
 #[test]

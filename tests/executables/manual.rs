@@ -4,7 +4,7 @@ use std::process::Stdio;
 
 use crate::project::*;
 
-const EXECUTABLES: [&str; 8] = [
+const EXECUTABLES: [&str; 11] = [
     "dipir",
     "dipir-scene",
     "dipir-concepts",
@@ -13,6 +13,9 @@ const EXECUTABLES: [&str; 8] = [
     "dipir-composite",
     "dipir-inspect",
     "dipir-model",
+    "dipir-evaluate",
+    "dipir-tradeoff",
+    "dipir-pretrain",
 ];
 
 #[test]

@@ -250,7 +250,7 @@ fn the_light_estimator_is_trained_on_a_folder_of_panoramas() {
     assert_eq!(folds.stdout, "hall\t0\nyard\t1\n");
     let few = project.run(PRETRAIN, &["folds", "maps"]);
     assert_eq!((few.code, few.stdout.as_str()), (Some(1), ""));
-    assert!(few.stderr.contains("2 panoramas"), "{}", few.stderr);
+    assert!(few.stderr.contains("of 2 places"), "{}", few.stderr);
     // What was tuned without other places.
     let tuned = concat!(
         env!("CARGO_MANIFEST_DIR"),

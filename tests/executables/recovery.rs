@@ -163,22 +163,6 @@ fn light_is_recovered_from_a_picture_and_lights_the_composite() {
 }
 
 #[test]
-fn one_thread_and_two_recover_the_same_bytes() {
-    let project = project();
-    for (threads, out) in [("1", "one"), ("2", "two")] {
-        for executable in [SCENE, OPTIMIZE, COMPOSITE] {
-            project
-                .run(executable, &["-j", threads, "-o", out])
-                .expect_success();
-        }
-    }
-    for stage in ["scene", "light", "composite"] {
-        let one = project.artifacts(&format!("one/{stage}"));
-        assert!(one == project.artifacts(&format!("two/{stage}")), "{stage}");
-    }
-}
-
-#[test]
 fn a_scene_without_a_record_is_recorded_when_light_is_recovered() {
     let project = project();
     project.run(SCENE, &[]).expect_success();

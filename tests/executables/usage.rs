@@ -4,7 +4,19 @@ use crate::project::*;
 #[test]
 fn help_of_every_executable_shows_examples_and_exit_codes() {
     let project = Project::new();
-    for executable in [SCENE, OPTIMIZE, COMPOSITE, INSPECT] {
+    for executable in [
+        DIPIR,
+        SCENE,
+        env!("CARGO_BIN_EXE_dipir-concepts"),
+        env!("CARGO_BIN_EXE_dipir-lora"),
+        OPTIMIZE,
+        COMPOSITE,
+        env!("CARGO_BIN_EXE_dipir-model"),
+        INSPECT,
+        EVALUATE,
+        TRADEOFF,
+        PRETRAIN,
+    ] {
         let run = project.run(executable, &["--help"]);
         run.expect_success();
         assert!(run.stdout.contains("Usage:"), "{}", run.stdout);
@@ -61,6 +73,7 @@ fn quiet_runs_print_nothing() {
 fn output_is_free_of_colour_where_there_is_no_terminal() {
     let project = Project::new();
     let run = project.run(SCENE, &["--set", "scene.x=1"]);
+    assert!(run.stderr.starts_with("error: "), "{:?}", run.stderr);
     assert!(!run.stderr.contains('\x1b'), "{:?}", run.stderr);
 }
 

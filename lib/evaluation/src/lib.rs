@@ -1,4 +1,4 @@
-//! Scores of pictures and lights, medians with intervals, Pareto fronts, charts, and the counts of a user
+//! Scores of pictures and lights, medians with intervals, Pareto fronts, files of results, and the counts of a user
 //! study. Nothing here renders or starts programs, and nothing of the pipeline imports it.
 pub mod front;
 pub mod lpips;

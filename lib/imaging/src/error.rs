@@ -98,14 +98,6 @@ pub enum ImagingError {
         /// Why not, as a clause.
         reason: &'static str,
     },
-    /// An attribute that cannot be stored.
-    #[error("attribute `{name}` {reason}; use a name such as `dipirExposure` and plain text")]
-    BadAttribute {
-        /// The name.
-        name: String,
-        /// Why not, as a clause.
-        reason: &'static str,
-    },
     /// A tone file that does not describe four spline curves.
     #[error("`{}` is not a tone file: {detail}; expected `foreground` and three `shadow` curves of 6 knots each, rising from 0 to 1: write it again with the optimisation", path.display())]
     BadTone {

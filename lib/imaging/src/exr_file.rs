@@ -56,13 +56,6 @@ pub(crate) fn write(layers: &LayerRows, path: &Path) -> Result<(), ImagingError>
     if layers.latlong {
         attributes.environment_map = Some(EnvironmentMap::LatitudeLongitude);
     }
-    for (name, value) in &layers.attributes {
-        // Checked when they were set.
-        attributes.other.insert(
-            Text::new_or_panic(name),
-            AttributeValue::Text(Text::new_or_panic(value)),
-        );
-    }
     let encoding = Encoding {
         compression: match layers.packing {
             Packing::Small => Compression::ZIP1,

@@ -35,7 +35,6 @@ pub struct LayerRows<'a> {
     pub(crate) height: usize,
     pub(crate) channels: BTreeMap<String, RowChannel<'a>>,
     pub(crate) latlong: bool,
-    pub(crate) attributes: BTreeMap<String, String>,
     pub(crate) packing: Packing,
     /// Those of the colours, if there are any.
     pub(crate) primaries: Option<Primaries>,
@@ -49,7 +48,6 @@ impl<'a> LayerRows<'a> {
             height,
             channels: BTreeMap::new(),
             latlong: false,
-            attributes: BTreeMap::new(),
             packing: Packing::default(),
             primaries: None,
         }
@@ -65,9 +63,6 @@ impl<'a> LayerRows<'a> {
         let mut rows = Self::new(layers.width(), layers.height());
         rows.latlong = layers.latlong;
         rows.primaries = layers.primaries;
-        for (name, value) in layers.attributes() {
-            rows.attributes.insert(name.to_owned(), value.to_owned());
-        }
         for (name, channel) in layers.channels() {
             rows.add(name.to_owned(), channel.precision, &channel.samples);
         }

@@ -118,32 +118,7 @@ impl Layers {
         self.attributes.insert(name, value);
     }
 
-    /// Sets a text attribute. The name starts with `dipir` by convention, so that it cannot meet
-    /// one that OpenEXR defines; it is at most 31 bytes of printable ASCII, and the text is ASCII.
-    pub fn set_attribute(&mut self, name: &str, value: &str) -> Result<(), ImagingError> {
-        let reason =
-            if name.is_empty() || name.len() > 31 || !name.bytes().all(|b| b.is_ascii_graphic()) {
-                "must have 1 to 31 printable ASCII characters"
-            } else if DEFINED_ATTRIBUTES.contains(&name) {
-                "is defined by OpenEXR"
-            } else if !value.is_ascii() {
-                "has a text with characters outside ASCII"
-            } else {
-                self.keep_attribute(name.to_string(), value.to_string());
-                return Ok(());
-            };
-        Err(ImagingError::BadAttribute {
-            name: name.to_string(),
-            reason,
-        })
-    }
-
-    /// The text attribute `name`.
-    pub fn attribute(&self, name: &str) -> Option<&str> {
-        self.attributes.get(name).map(String::as_str)
-    }
-
-    /// All text attributes, in alphabetical order.
+    /// All text attributes of the file, in alphabetical order. They are not written.
     pub fn attributes(&self) -> impl Iterator<Item = (&str, &str)> {
         self.attributes
             .iter()
@@ -295,40 +270,6 @@ impl Layers {
         exr_file::open(path.as_ref(), Some(longest))
     }
 }
-
-/// Attributes with a meaning of their own [OpenEXR, standard attributes], most of them not text.
-const DEFINED_ATTRIBUTES: [&str; 30] = [
-    "channels",
-    "compression",
-    "dataWindow",
-    "displayWindow",
-    "lineOrder",
-    "pixelAspectRatio",
-    "screenWindowCenter",
-    "screenWindowWidth",
-    "tiles",
-    "name",
-    "type",
-    "version",
-    "chunkCount",
-    "view",
-    "chromaticities",
-    "whiteLuminance",
-    "adoptedNeutral",
-    "renderingTransform",
-    "lookModTransform",
-    "xDensity",
-    "owner",
-    "comments",
-    "capDate",
-    "envmap",
-    "wrapmodes",
-    "multiView",
-    "preview",
-    "software",
-    "keyCode",
-    "timeCode",
-];
 
 /// `layer.suffix`, or the bare suffix for the beauty layer.
 fn channel_name(layer: &str, suffix: &str) -> String {

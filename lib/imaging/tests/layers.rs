@@ -7,7 +7,7 @@ use dipir_imaging::{
     raster::{LinearImage, Raster},
 };
 use exr::{
-    meta::attribute::Chromaticities,
+    meta::attribute::{AttributeValue, Chromaticities},
     prelude::{
         AnyChannel, AnyChannels, Encoding, FlatSamples, Image, ImageAttributes, IntegerBounds,
         Layer, LayerAttributes, SmallVec, SpecificChannels, Text, Vec2, WritableImage,
@@ -24,7 +24,7 @@ fn ramp(width: usize, height: usize) -> Raster<f32> {
     )
 }
 
-/// A composite's layers: mixed precision, dotted names, attributes.
+/// A composite's layers: mixed precision, dotted names.
 fn sample() -> Layers {
     let mut layers = Layers::new(5, 3);
     let colour = ramp(5, 3).map(|&v| Vec3::new(v, 0.5 * v, 1.0));
@@ -39,21 +39,39 @@ fn sample() -> Layers {
     *depth.get_mut(4, 2) = f32::INFINITY;
     layers.insert("depth.Z", Precision::Full, depth).unwrap();
     layers.latlong = true;
-    layers.set_attribute("dipirExposure", "0.5").unwrap();
     layers
 }
 
 #[test]
-fn mixed_precision_names_and_attributes_round_trip() {
+fn mixed_precision_and_names_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.exr");
     sample().write_exr(&path).unwrap();
     let back = Layers::read_exr(&path).unwrap();
     assert_eq!(back, sample());
     assert!(back.latlong);
-    assert_eq!(back.attribute("dipirExposure"), Some("0.5"));
     assert_eq!(back.rgb("shadow").unwrap(), sample().rgb("shadow").unwrap());
     assert_eq!(back.xyz("normal").unwrap(), sample().xyz("normal").unwrap());
+}
+
+#[test]
+fn texts_that_other_programs_wrote_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.exr");
+    let channel = AnyChannel::new("R", FlatSamples::F32(vec![1.0]));
+    let channels = AnyChannels::sort(SmallVec::from_vec(vec![channel]));
+    let mut attributes = LayerAttributes::named(Text::new_or_panic("beauty"));
+    let told = AttributeValue::Text(Text::new_or_panic("0.5"));
+    attributes
+        .other
+        .insert(Text::new_or_panic("exposureEv"), told);
+    let number = AttributeValue::F32(2.0);
+    attributes.other.insert(Text::new_or_panic("gain"), number);
+    let layer = Layer::new((1, 1), attributes, Encoding::SMALL_LOSSLESS, channels);
+    Image::from_layer(layer).write().to_file(&path).unwrap();
+    let layers = Layers::read_exr(&path).unwrap();
+    let found: Vec<_> = layers.attributes().collect();
+    assert_eq!(found, [("exposureEv", "0.5")]);
 }
 
 #[test]
@@ -300,12 +318,6 @@ fn names_that_compositing_programs_refuse_are_refused() {
             format!("channel name `{name}` {reason}; use a name such as `R` or `shadow.R`")
         );
     }
-    let error = layers.set_attribute("compression", "none").unwrap_err();
-    assert_eq!(
-        error.to_string(),
-        "attribute `compression` is defined by OpenEXR; use a name such as `dipirExposure` and \
-         plain text"
-    );
 }
 
 #[test]

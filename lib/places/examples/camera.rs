@@ -15,10 +15,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut settings = Settings::new(PathBuf::from(panoramas), PathBuf::from(out));
     for argument in arguments {
         let (key, value) = argument.split_once('=').ok_or("arguments are key=value")?;
-        let (training, key) = match key.strip_prefix("whole.") {
-            Some(key) => (&mut settings.wholes, key),
-            None => (&mut settings.scorers, key),
-        };
         match key {
             "folds" => settings.folds = value.parse()?,
             "views" => settings.views = value.parse()?,
@@ -26,14 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             "judged" => settings.judged = value.parse()?,
             "built" => settings.built = value.parse()?,
             "seed" => settings.seed = value.parse()?,
-            "hidden" => training.hidden = value.parse()?,
-            "epochs" => training.epochs = value.parse()?,
-            "dropout" => training.dropout = value.parse()?,
-            "features" => training.feature_dropout = value.parse()?,
-            "batch" => training.batch = value.parse()?,
-            "decay" => training.weight_decay = value.parse()?,
-            "rate" => training.learning_rate = value.parse()?,
-            _ => return Err(format!("unknown key `{key}`").into()),
+            _ => set(&mut settings, key, value)?,
         }
     }
     let shown = AtomicUsize::new(0);
@@ -55,5 +44,24 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "panoramas of half the resolution: field of view times {:.3}",
         outcome.blurred
     );
+    Ok(())
+}
+
+/// Sets how the networks are trained.
+fn set(settings: &mut Settings, key: &str, value: &str) -> Result<(), Box<dyn std::error::Error>> {
+    let (training, name) = match key.strip_prefix("whole.") {
+        Some(name) => (&mut settings.wholes, name),
+        None => (&mut settings.scorers, key),
+    };
+    match name {
+        "hidden" => training.hidden = value.parse()?,
+        "epochs" => training.epochs = value.parse()?,
+        "dropout" => training.dropout = value.parse()?,
+        "features" => training.feature_dropout = value.parse()?,
+        "batch" => training.batch = value.parse()?,
+        "decay" => training.weight_decay = value.parse()?,
+        "rate" => training.learning_rate = value.parse()?,
+        _ => return Err(format!("unknown key `{key}`").into()),
+    }
     Ok(())
 }

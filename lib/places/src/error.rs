@@ -16,11 +16,11 @@ pub enum PlacesError {
         source: std::io::Error,
     },
     /// The folder holds too few panoramas.
-    #[error("`{}` holds {found} panoramas (*.hdr, *.exr); {folds} folds need at least {folds} places", path.display())]
+    #[error("`{}` holds panoramas (*.hdr, *.exr) of {found} places; {folds} folds need at least {folds}", path.display())]
     TooFew {
         /// The folder.
         path: PathBuf,
-        /// Panoramas found.
+        /// Places found; one that is seen again counts once.
         found: usize,
         /// Folds asked for.
         folds: usize,

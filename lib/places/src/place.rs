@@ -1,5 +1,5 @@
 //! A real place: its panorama, and its light taken apart into a smooth part and the strongest source.
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use dipir_light::environment::EnvironmentMap;
@@ -196,6 +196,26 @@ fn kinds(table: &Path) -> BTreeMap<String, String> {
             Some(((*cells.get(name)?).to_string(), word.to_string()))
         })
         .collect()
+}
+
+/// The [`folds`] of a folder's places, none of them empty.
+///
+/// # Errors
+/// If there are fewer places than folds.
+pub(crate) fn filled_folds(
+    folder: &Path,
+    places: &[Place],
+    count: usize,
+) -> Result<Vec<usize>, PlacesError> {
+    let groups: BTreeSet<&str> = places.iter().map(|p| p.group.as_str()).collect();
+    match groups.len() {
+        found if found < count => Err(PlacesError::TooFew {
+            path: folder.to_owned(),
+            found,
+            folds: count,
+        }),
+        _ => Ok(folds(places, count)),
+    }
 }
 
 /// The fold of each place, dealt out by kind and by the strongest source's share, groups together.

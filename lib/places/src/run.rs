@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex};
 use dipir_backbone::Tuned;
 use dipir_estimator::network::Sight;
 use dipir_estimator::{Calibration, Estimator};
+use dipir_numerics::hashing::hash_u64s;
 use rayon::prelude::*;
 use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
@@ -13,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::PlacesError;
 use crate::examples::{Example, Seen, drawn, standard};
 use crate::figures::{Case, Figures, calibration, figures};
-use crate::place::{Place, folds, read_places};
+use crate::place::{Place, filled_folds, read_places};
 use crate::probes::Probes;
 use crate::trainer::{Training, train};
 
@@ -109,12 +110,10 @@ pub fn run(
 ) -> Result<Outcome, PlacesError> {
     checked(settings)?;
     let places = read_places(&settings.panoramas)?;
-    if places.len() < settings.folds {
-        let (path, found, folds) = (settings.panoramas.clone(), places.len(), settings.folds);
-        return Err(PlacesError::TooFew { path, found, folds });
+    let fold = filled_folds(&settings.panoramas, &places, settings.folds)?;
+    if !progress(Progress::Places(places.len())) {
+        return Err(PlacesError::Stopped);
     }
-    progress(Progress::Places(places.len()));
-    let fold = folds(&places, settings.folds);
     let probes = Probes::seen(settings.facing, settings.albedo);
     let tuned = match &settings.tuned {
         Some(path) => tunings(path, &places, &fold, settings.folds)?,
@@ -126,24 +125,25 @@ pub fn run(
     };
     let photographs = drawn(&places, settings.views, &seen, settings.seed);
     let judged = standard(&places, settings.judged, &seen);
-    progress(Progress::Photographs(photographs.len() + judged.len()));
+    if !progress(Progress::Photographs(photographs.len() + judged.len())) {
+        return Err(PlacesError::Stopped);
+    }
+    let asked = asked(settings, &places, &fold);
     let stopped = AtomicBool::new(false);
     let failure: Mutex<Option<PlacesError>> = Mutex::new(None);
     let members: Vec<Option<Estimator>> = (0..settings.folds)
         .into_par_iter()
         .map(|f| {
             let kept = |p: Progress| !stopped.load(Ordering::Relaxed) && progress(p);
-            let member = one_fold(settings, f, &fold, &photographs, &seen, &kept);
-            if member.is_err() {
+            let member = one_fold(settings, &asked, f, &fold, &photographs, &seen, &kept);
+            let failed = |e| {
+                // Before the others are stopped: theirs are no causes.
+                if let Ok(mut slot) = failure.lock() {
+                    slot.get_or_insert(e);
+                }
                 stopped.store(true, Ordering::Relaxed);
-            }
-            member
-                .map_err(|e| {
-                    failure
-                        .lock()
-                        .map(|mut slot| slot.get_or_insert(e).to_string())
-                })
-                .ok()
+            };
+            member.map_err(failed).ok()
         })
         .collect();
     if let Some(error) = failure.into_inner().ok().flatten() {
@@ -176,6 +176,13 @@ fn checked(s: &Settings) -> Result<(), PlacesError> {
     let shares = [t.dropout, t.feature_dropout, t.kind_dropout]
         .iter()
         .all(|d| (0.0..1.0).contains(d));
+    if s.out.extension().is_some_and(|e| e == "json") {
+        let text = format!(
+            "`{}`: the figures are written there; call the weights otherwise, as in places.safetensors",
+            s.out.display()
+        );
+        return Err(PlacesError::Setting(text));
+    }
     match sound && rates && shares {
         true => Ok(()),
         false => Err(PlacesError::Setting(
@@ -184,9 +191,22 @@ fn checked(s: &Settings) -> Result<(), PlacesError> {
     }
 }
 
-/// The network that has not seen fold `f`: read from a finished run of the same settings, or trained.
+/// What decides on the networks of every fold: the settings, and the places with their folds and a hash of their light.
+fn asked(settings: &Settings, places: &[Place], fold: &[usize]) -> String {
+    let light = |p: &Place| {
+        let values = p.panorama.texels().iter().flat_map(|t| t.to_array());
+        let bits: Vec<u64> = values.map(|v| u64::from(v.to_bits())).collect();
+        hash_u64s(&bits)
+    };
+    let of = |(p, f): (&Place, &usize)| (p.name.clone(), *f, light(p));
+    let places: Vec<(String, usize, u64)> = places.iter().zip(fold).map(of).collect();
+    serde_json::to_string(&(settings, places)).unwrap_or_default()
+}
+
+/// The network that has not seen fold `f`: read from a finished run of which the same was asked, or trained.
 fn one_fold(
     settings: &Settings,
+    asked: &str,
     f: usize,
     fold: &[usize],
     photographs: &[Example],
@@ -196,8 +216,7 @@ fn one_fold(
     let own: Vec<Arc<Tuned>> = seen.tuned.get(f).cloned().into_iter().collect();
     let file = settings.out.with_extension(format!("fold{f}"));
     let note = settings.out.with_extension(format!("fold{f}.json"));
-    let wanted = serde_json::to_string(settings).unwrap_or_default();
-    if std::fs::read_to_string(&note).is_ok_and(|text| text == wanted)
+    if std::fs::read_to_string(&note).is_ok_and(|text| text == asked)
         && let Ok(member) = Estimator::load(&file)
         && member.tuned() == own
     {
@@ -233,7 +252,7 @@ fn one_fold(
     }
     let member = Estimator::new(networks, own, Calibration::default())?;
     write(&file, &member.to_bytes()?)?;
-    write(&note, wanted.as_bytes())?;
+    write(&note, asked.as_bytes())?;
     Ok(member)
 }
 
@@ -369,11 +388,18 @@ fn finish(
             false => drop(std::fs::remove_file(file(format!("fold{f}")))),
         }
     }
+    // Whoever reads the folds takes all that are there: none may be left of an earlier run with more of them.
+    for f in crossed.len().. {
+        let earlier = settings.out.with_extension(format!("fold{f}"));
+        if Estimator::load(&earlier).is_err() || std::fs::remove_file(&earlier).is_err() {
+            break;
+        }
+    }
     Ok(outcome)
 }
 
 /// Written beside its place and renamed, so that it is there whole or not at all.
-fn write(path: &Path, bytes: &[u8]) -> Result<(), PlacesError> {
+pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<(), PlacesError> {
     let failed = |source| PlacesError::File {
         what: "write",
         path: path.to_owned(),

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 use crate::error::PlacesError;
 use crate::examples::{Example, Seen};
 use crate::figures::{Case, Figures, figures, picture_error};
-use crate::place::{Place, SMOOTH, folds, read_places};
+use crate::place::{Place, SMOOTH, filled_folds, read_places};
 use crate::probes::Probes;
 use crate::view::View;
 
@@ -59,11 +59,7 @@ pub fn run(panoramas: &Path, weights: &Path, any: bool) -> Result<Vec<Row>, Plac
         let text = format!("{} is missing; train with --keep-folds", path.display());
         return Err(PlacesError::Setting(text));
     }
-    if places.is_empty() {
-        let (path, found, folds) = (panoramas.to_owned(), 0, networks.len());
-        return Err(PlacesError::TooFew { path, found, folds });
-    }
-    let fold = folds(&places, networks.len());
+    let fold = filled_folds(panoramas, &places, networks.len())?;
     let probes = Probes::seen(0.8, Some(0.3));
     let shots: Vec<Shot> = (0..places.len() * AROUND)
         .into_par_iter()

@@ -267,6 +267,11 @@ fn trainings_that_cannot_be_are_refused() {
     assert!(refused(&|t| t.weight_decay = f32::NAN));
     assert!(refused(&|t| t.learning_rate = f32::INFINITY));
     assert!(!refused(&|_| ()), "an empty folder is another error");
+    let figures = run(&settings(folder.path(), "out.json"), &|_| true).unwrap_err();
+    assert!(
+        figures.to_string().contains("out.json`: the figures"),
+        "{figures}"
+    );
 }
 
 #[test]
@@ -410,4 +415,74 @@ fn a_finished_fold_of_another_tuning_is_trained_again() {
     let embedded = Estimator::embedded().unwrap();
     let found = Estimator::load(&asked.out).unwrap();
     assert_eq!(found.tuned(), &embedded.tuned()[2..4]);
+}
+
+#[test]
+fn a_finished_fold_of_other_panoramas_is_trained_again() {
+    let folder = tempfile::tempdir().unwrap();
+    write_panoramas(folder.path());
+    let mut asked = settings(folder.path(), "out.safetensors");
+    // 3 steps a pass: progress is told at step 20.
+    asked.training.epochs = 8;
+    let one_thread = rayon::ThreadPoolBuilder::new()
+        .num_threads(1)
+        .build()
+        .unwrap();
+    let end = one_thread.install(|| run(&asked, &|p| !matches!(p, Progress::Training(1, ..))));
+    assert!(matches!(end, Err(PlacesError::Stopped)));
+    assert!(asked.out.with_extension("fold0").exists());
+    panorama(0.9).write(folder.path().join("yard.exr")).unwrap();
+    let kept = std::sync::Mutex::new(Vec::new());
+    let note = |p: Progress| {
+        if let Progress::Kept(f) = p {
+            kept.lock().unwrap().push(f);
+        }
+        true
+    };
+    run(&asked, &note).unwrap();
+    assert!(kept.into_inner().unwrap().is_empty());
+}
+
+#[test]
+fn one_place_seen_four_times_is_too_few_for_two_folds() {
+    let folder = tempfile::tempdir().unwrap();
+    for n in 1..5 {
+        let file = folder.path().join(format!("yard_0{n}.exr"));
+        panorama(0.1 * n as f32).write(file).unwrap();
+    }
+    let end = run(&settings(folder.path(), "out.safetensors"), &|_| true);
+    assert!(
+        matches!(end, Err(PlacesError::TooFew { found: 1, .. })),
+        "{:?}",
+        end.err()
+    );
+}
+
+#[test]
+fn a_training_that_is_stopped_early_draws_no_photograph() {
+    let folder = tempfile::tempdir().unwrap();
+    write_panoramas(folder.path());
+    let asked = settings(folder.path(), "out.safetensors");
+    let end = run(&asked, &|p| match p {
+        Progress::Places(_) => false,
+        other => panic!("{other:?}"),
+    });
+    assert!(matches!(end, Err(PlacesError::Stopped)));
+}
+
+#[test]
+fn no_fold_is_left_of_an_earlier_training_with_more_of_them() {
+    let folder = tempfile::tempdir().unwrap();
+    write_panoramas(folder.path());
+    let trained = |folds: usize| {
+        let asked = Settings {
+            folds,
+            keep: true,
+            ..settings(folder.path(), "out.safetensors")
+        };
+        run(&asked, &|_| true).unwrap();
+        [0, 1, 2].map(|f| asked.out.with_extension(format!("fold{f}")).exists())
+    };
+    assert_eq!(trained(3), [true, true, true]);
+    assert_eq!(trained(2), [true, true, false]);
 }

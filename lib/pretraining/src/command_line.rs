@@ -21,7 +21,7 @@ Examples:
   dipir-pretrain encoder --out model --cache scenes    train its light encoder
   dipir-pretrain train --out model --cache scenes --from data/prior --relit 0.4 --learning-rate 4e-4
                                                        continue the training of a model
-  dipir-pretrain light panoramas places.safetensors    train the light estimator on panoramas of real places
+  dipir-pretrain light panoramas places.safetensors    train the light estimator on real places
   dipir-pretrain check model                           how well it recognises light in new scenes
   dipir-pretrain check model --first 1000 --scenes 48  the same on other scenes, to tune on
   dipir-pretrain sheet model sheet.png                 pictures under captions of light
@@ -30,7 +30,7 @@ An interrupted training goes on from CACHE/checkpoint.safetensors. data/prior/RE
 that model was made.
 Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted.";
 
-/// Train the small model that estimates light, and measure it
+/// Train the small model and the light estimator, and measure them
 #[derive(Parser)]
 #[command(name = "dipir-pretrain", version, after_help = EXAMPLES)]
 pub struct Cli {

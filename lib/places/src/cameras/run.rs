@@ -15,7 +15,8 @@ use crate::cameras::figures::{Case, Row};
 use crate::cameras::trainer::{Sample, train, train_whole};
 use crate::error::PlacesError;
 use crate::network::SplitMix64;
-use crate::place::{Place, folds, read_places};
+use crate::place::{Place, filled_folds, read_places};
+use crate::run::write;
 use crate::shot::{JUDGED, LEARNED, Range, Shot};
 
 pub use crate::cameras::trainer::Training;
@@ -121,15 +122,17 @@ struct Judged {
 /// places left out are found.
 ///
 /// # Errors
-/// If panoramas cannot be read or weights not be written.
+/// If settings cannot be worked with, panoramas cannot be read or are too few, a training diverges, or weights cannot be
+/// written.
 pub fn run(
     settings: &Settings,
     progress: &(dyn Fn(Progress) + Sync),
 ) -> Result<Outcome, PlacesError> {
+    checked(settings)?;
     let places = read_places(&settings.panoramas)?;
     progress(Progress::Places(places.len()));
-    let fold = folds(&places, settings.folds);
-    let trained = networks(&places, &fold, settings, progress);
+    let fold = filled_folds(&settings.panoramas, &places, settings.folds)?;
+    let trained = networks(&places, &fold, settings, progress)?;
     let photographs = judged(&places, settings);
     let scores = scores(&trained, &photographs, &fold, settings);
     progress(Progress::Judged(photographs.len()));
@@ -140,12 +143,7 @@ pub fn run(
         members: trained,
         trust,
     };
-    let bytes = whole.to_bytes()?;
-    std::fs::write(&settings.out, bytes).map_err(|source| PlacesError::File {
-        what: "write",
-        path: settings.out.clone(),
-        source,
-    })?;
+    write(&settings.out, &whole.to_bytes()?)?;
     Ok(Outcome {
         trust,
         rows,
@@ -154,13 +152,29 @@ pub fn run(
     })
 }
 
+fn checked(s: &Settings) -> Result<(), PlacesError> {
+    let sound = |t: &Training| {
+        let counts = t.hidden > 0 && t.epochs > 0 && t.batch > 0;
+        let rate = t.learning_rate > 0.0 && t.learning_rate.is_finite();
+        let decay = t.weight_decay >= 0.0 && t.weight_decay.is_finite();
+        let shares = [t.dropout, t.feature_dropout];
+        counts && rate && decay && shares.iter().all(|d| (0.0..1.0).contains(d))
+    };
+    match s.folds >= 2 && s.views > 0 && s.judged > 0 && sound(&s.scorers) && sound(&s.wholes) {
+        true => Ok(()),
+        false => Err(PlacesError::Setting(
+            "training needs at least 2 folds, 1 view, 1 judged view, 1 hidden unit, 1 epoch, a batch of 1, a rate above 0, a decay of 0 or more, and dropouts in [0, 1)".into(),
+        )),
+    }
+}
+
 /// Two networks for each fold, which they leave out.
 fn networks(
     places: &[Place],
     fold: &[usize],
     settings: &Settings,
     progress: &(dyn Fn(Progress) + Sync),
-) -> Vec<Member> {
+) -> Result<Vec<Member>, PlacesError> {
     let (count, folds) = (settings.views, settings.folds);
     let of_place = |k: usize| {
         let (place, pose, image) = taken(places, &LEARNED, settings.seed, k, count);
@@ -186,25 +200,26 @@ fn networks(
         let seed = settings.seed + 1000 + (without[0] * folds + without[1]) as u64;
         train_whole(&learned, &settings.wholes, seed)
     };
-    let wholes: Vec<Network> = pairs.par_iter().map(whole).collect();
+    let wholes = pairs.par_iter().map(whole);
+    let wholes = wholes.collect::<Result<Vec<Network>, _>>()?;
     progress(Progress::Wholes(wholes.len()));
     let without = |a: usize, b: usize| {
         let pair = [a.min(b), a.max(b)];
         let at = pairs.iter().position(|p| *p == pair);
         &wholes[at.expect("all pairs are there")]
     };
-    let member = |left_out: usize| {
+    let member = |left_out: usize| -> Result<Member, PlacesError> {
         let learned = samples.iter().filter(|s| s.0 != left_out);
         let learned = learned.map(|s| (&s.1, s.1.told(without(left_out, s.0))));
         let learned: Vec<(&Sample, Vec<f32>)> = learned.collect();
         let seed = settings.seed + left_out as u64;
         let scorer = train(&learned, &settings.scorers, seed, &mut |done, loss| {
             progress(Progress::Training(left_out, done, loss));
-        });
-        Member {
+        })?;
+        Ok(Member {
             whole: without(left_out, left_out).clone(),
             scorer,
-        }
+        })
     };
     (0..folds).into_par_iter().map(member).collect()
 }

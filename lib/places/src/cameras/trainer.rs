@@ -4,6 +4,7 @@ use dipir_calibration::network::{Network, SCORED};
 use dipir_calibration::pose::Pose;
 use dipir_calibration::whole::{FOCALS, PITCHES, TOLD, Table, WHOLE, Whole, shares};
 
+use crate::error::PlacesError;
 use crate::network::{Dropout, Optimiser, SplitMix64, Weights, backward, forward};
 
 /// How networks are trained.
@@ -78,8 +79,12 @@ impl Sample {
 }
 
 /// Trains a network from nothing to tell how probable the true camera is from pictures as a whole, as they are and
-/// mirrored.
-pub(crate) fn train_whole(samples: &[&Sample], settings: &Training, seed: u64) -> Network {
+/// mirrored. Weights that are not finite are an error.
+pub(crate) fn train_whole(
+    samples: &[&Sample],
+    settings: &Training,
+    seed: u64,
+) -> Result<Network, PlacesError> {
     let sides: Vec<(&[f32], &Pose)> = samples
         .iter()
         .flat_map(|s| s.whole.sides.iter().map(|side| (&side[..], &s.poses[0])))
@@ -101,18 +106,18 @@ pub(crate) fn train_whole(samples: &[&Sample], settings: &Training, seed: u64) -
         (loss, backward(w, &pass, &gradient))
     };
     let start = network.layers.clone();
-    network.layers = descend(start, sides.len(), settings, seed, step, &mut |_, _| ());
-    network
+    network.layers = descend(start, sides.len(), settings, seed, step, &mut |_, _| ())?;
+    Ok(network)
 }
 
 /// Trains a network from nothing by the probability of the true camera, from photographs and what is told of them as a
-/// whole. `progress` is told the share that is done and the mean loss of late.
+/// whole. `progress` is told the share that is done and the mean loss of late. Weights that are not finite are an error.
 pub(crate) fn train(
     samples: &[(&Sample, Vec<f32>)],
     settings: &Training,
     seed: u64,
     progress: &mut dyn FnMut(f64, f64),
-) -> Network {
+) -> Result<Network, PlacesError> {
     let rows = samples.iter().flat_map(rows);
     let mut network = start(rows, [SCORED, settings.hidden, 1], seed);
     let dropout = Dropout {
@@ -130,8 +135,8 @@ pub(crate) fn train(
         (loss, backward(w, &pass, &gradient))
     };
     let start = network.layers.clone();
-    network.layers = descend(start, samples.len(), settings, seed, step, progress);
-    network
+    network.layers = descend(start, samples.len(), settings, seed, step, progress)?;
+    Ok(network)
 }
 
 /// Lowers a loss of `count` samples, of which `step` gives loss and gradient for some; returns the mean weights of late.
@@ -142,7 +147,7 @@ fn descend(
     seed: u64,
     step: impl Fn(&Weights, &[usize], &mut SplitMix64) -> (f64, Weights),
     progress: &mut dyn FnMut(f64, f64),
-) -> Weights {
+) -> Result<Weights, PlacesError> {
     let mut optimiser = Optimiser::new(&w);
     let mut random = SplitMix64::new(seed);
     let batch_size = settings.batch.min(count).max(1);
@@ -168,7 +173,10 @@ fn descend(
             }
         }
     }
-    optimiser.mean
+    match optimiser.mean.iter().flatten().all(|w| w.is_finite()) {
+        true => Ok(optimiser.mean),
+        false => Err(PlacesError::Diverged { step: steps }),
+    }
 }
 
 /// What a photograph is scored by under each camera.
@@ -342,7 +350,7 @@ mod tests {
         };
         let nothing = |s: &Sample| vec![0.0; s.poses.len() * TOLD];
         let all: Vec<(&Sample, Vec<f32>)> = samples.iter().map(|s| (s, nothing(s))).collect();
-        let network = train(&all, &settings, 1, &mut |_, _| ());
+        let network = train(&all, &settings, 1, &mut |_, _| ()).unwrap();
         for s in &all {
             let scores: Vec<f32> = rows(s).map(|row| network.outputs(&row)[0]).collect();
             assert!(scores[1..].iter().all(|o| *o < scores[0]), "{scores:?}");
@@ -390,7 +398,7 @@ mod tests {
             ..Training::of_wholes()
         };
         let all: Vec<&Sample> = samples.iter().collect();
-        let network = train_whole(&all, &settings, 1);
+        let network = train_whole(&all, &settings, 1).unwrap();
         for s in &samples {
             let table = Table::mean(&[network.outputs(&s.whole.sides[0])]);
             let own = table.told(&s.poses[0])[0];
