@@ -27,7 +27,8 @@ pub struct CleanArgs {
     #[arg(long = "stage", value_name = "STAGE")]
     stages: Vec<Stage>,
 
-    /// Remove the concept images that scenes share, too
+    /// Remove finished concept images in concepts-cache of the folder of artifacts, too; a folder that [concepts] cache
+    /// names stays
     #[arg(long)]
     cache: bool,
 

@@ -12,16 +12,17 @@ Examples:
   dipir-evaluate run --method neutral --method fitted          some of the methods
   dipir-evaluate run --jobs 4                                  all of them, four scenes at a time
   dipir-evaluate run --model path/to/model                     with another diffusion model
-  dipir-evaluate run --environment-from estimates/             another estimator: estimates/SCENE.exr
+  dipir-evaluate run --environment-from estimates/             another estimator's maps: SCENE.exr
   dipir-evaluate report                                        tables and a page of what is there
   dipir-evaluate report --scene generated                      of some scenes
   dipir-evaluate report --lpips alex.safetensors               with LPIPS
   dipir-evaluate study page --method ours                      a page that asks people
   dipir-evaluate study count answers/*.json                    majorities of the answers
-  dipir-evaluate left-out maps/ places.safetensors             composites on places that were left out of training
-  dipir-evaluate spheres true.exr estimate.exr                 two lights, by what three spheres show of them
+  dipir-evaluate left-out maps/ places.safetensors             composites on places left out
+  dipir-evaluate spheres true.exr estimate.exr                 two lights, by three spheres
 
-Everything is in one folder, ./evaluation unless --out says otherwise: scenes/, runs/, report.*.
+Everything is in one folder, ./evaluation unless --out says otherwise: scenes/, runs/, work/,
+report.*, study.html, left-out.*.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 
 /// Measure how good the light of a method is, on scenes whose true light is known

@@ -92,7 +92,8 @@ impl From<Start> for String {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LightTable {
-    /// Steps of the optimiser; 0 keeps the light that it would start from.
+    /// Steps of the optimiser; 0 keeps the light that it would start from. Without this key 50 where a model reads the
+    /// start off the photograph, and 200 for `materials`.
     #[schemars(range(min = 0, max = 1000000), example = 300)]
     pub iterations: Option<usize>,
     /// Seconds that the optimisation may take: its first step is timed, and as many of `iterations`
@@ -108,9 +109,9 @@ pub struct LightTable {
     /// photograph's size; EXR or HDR (linear), PNG or JPEG (encoded as the photograph).
     #[schemars(extend("format" = "path"), example = &"reference.exr")]
     pub reference: Option<PathBuf>,
-    /// Where the optimisation starts, and what `recover_light = false` keeps: `auto`, `estimated`
-    /// (from the photograph), `read` or `encoder` (by a model that knows light), `neutral` (nearly
-    /// uniform), or a `lighting.json`.
+    /// Where the optimisation starts, and what `recover_light = false` keeps: `estimated` (from the photograph), `read` or
+    /// `encoder` (by a model that knows light), `neutral` (nearly uniform), or a `lighting.json`. `auto` is `neutral` with
+    /// a reference, `read` under a model that knows light, else `estimated`.
     #[schemars(with = "String", extend("anyOf" = [{"enum": ["auto", "estimated", "read", "encoder", "neutral"]}, {"format": "path"}]), example = &"neutral")]
     pub start: Start,
     /// With an estimated start: the candidate of `candidates.json` that is used, counted from 1.
@@ -160,7 +161,8 @@ pub struct LightTable {
     /// texels.
     #[schemars(extend("x-default" = "`half` where the environment has few enough texels, else `single`"), example = &"single")]
     pub precision: Option<Precision>,
-    /// How far each parameter moves per step.
+    /// How far each parameter moves per step. Where a model reads the start off the photograph, a twentieth of these
+    /// defaults holds, unless one of them is set to another value.
     pub learning_rates: LearningRates,
     /// Weight of the consistency of both light sets.
     #[schemars(range(min = 0.0, max = 1e6), extend("default" = CONSISTENCY), example = 0.1)]

@@ -1,7 +1,7 @@
 """Loads LoRA files that this project wrote into diffusers, and the reverse.
 
-    cargo run -p dipir-diffusion --example export_lora -- tests/references/sd21 OUT
-    python check_lora.py sd21 OUT
+    cd lib/diffusion && cargo run --example export_lora -- tests/references/sd21 OUT
+    python tests/references/check_lora.py sd21 OUT
 
 OUT holds lora.safetensors (PEFT keys), lora_kohya.safetensors and
 prediction.safetensors (sample, context, timestep and the prediction with the

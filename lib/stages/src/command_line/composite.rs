@@ -10,8 +10,9 @@ Examples:
   dipir-composite --target-error 0.01                  stop at a display-referred RMSE of 0.01
   dipir-composite --time-budget 20                     or after 20 seconds
 
-Reads OUT/scene, which dipir-scene writes. Writes OUT/composite/: composite.png, composite.exr
-(layers: R G B A, object, shadow, background, depth, normal, albedo), stage.json.
+Reads OUT/scene/ and OUT/light/, which dipir-scene and dipir-light write. Writes OUT/composite/:
+composite.png, composite.exr (layers: R G B A, object, shadow, background, depth, normal, albedo),
+effects.json, stage.json; of a lens that bends lines st_distort.exr st_undistort.exr.
 Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 
 /// Render the objects and their shadow at full quality and lay them over the photograph

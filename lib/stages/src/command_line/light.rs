@@ -7,10 +7,10 @@ Examples:
   dipir-light                                 [light] of ./pipeline.toml
   dipir-light --set light.reference=shot.png --set light.guidance=reference
                                                  light under which the object looks as in shot.png
-  dipir-light --set light.recover_light=false      tone curves alone
-  dipir-light --set 'light.materials=[\"paint\"]'
+  dipir-light --set light.recover_light=false      under a guidance: tone curves alone
+  dipir-light --set 'light.materials=[\"paint\"]' --set light.reference=shot.png
                                                  a material, under [composite] environment
-  dipir-light --set pipeline.quality=high     finer environment, more lobes
+  dipir-light --set pipeline.quality=high     under a guidance: more paths, a larger picture
 
 Reads OUT/scene/, which dipir-scene writes. Writes OUT/light/: lighting.json environment.exr
 tone.json stage.json; of an estimate, estimate.json candidates.json candidates.png

@@ -21,7 +21,7 @@ Exit codes: 0 done, 1 failed, 2 wrong usage or configuration, 130 interrupted.";
 
 /// Fine-tune a LoRA of the diffusion model on the photograph
 ///
-/// Reads the tables [model], [concepts] and [lora] and the keys scene.background and
+/// Reads the tables [model], [concepts] and [lora] and the keys scene.background, scene.class and
 /// scene.transfer.
 #[derive(Parser)]
 #[command(name = "dipir-lora", version, after_help = EXAMPLES)]

@@ -8,14 +8,15 @@ const CHECK_EXAMPLES: &str = "\
 Examples:
   dipir-model check                                     the embedded model, on a GPU if there is one
   dipir-model check models/sd21 --device cuda:0         in bf16, against the CPU in f32
-  dipir-model check v1-5.safetensors --device cpu       one file; kernels against composed operations
+  dipir-model check v1-5.safetensors --device cpu       one file; kernels against plain operations
   dipir-model check models/sd21 -p scene/pipeline.toml  and what that scene will take
   dipir-model check models/sd21 --json > check.json     for a bug report
 
 Says what was read: family, prediction, noise, size, precision on the disk.
-Compares text encoder, UNet, autoencoder and the gradient of its encoder at a small size and at that
-of the model: on a GPU with the same model on the CPU in f32, on the CPU with the same layers made of
-candle's operations. Then times the parts, and says what the stages of pipeline.toml would take.
+Compares text encoder, UNet, autoencoder and the gradient of its encoder at a small size and at
+that of the model: on a GPU with the same model on the CPU in f32, on the CPU with the same layers
+made of candle's operations. Then times the parts, and says what the stages of pipeline.toml would
+take.
 Exit codes: 0 all parts agree, 1 failed or a part does not agree, 2 wrong usage, 130 interrupted.";
 
 const EXAMPLES: &str = "\
@@ -33,7 +34,7 @@ compared with the hub's hash; the folder appears when all of it is there and loa
 Environment: HF_ENDPOINT, HF_TOKEN (for gated models), HTTPS_PROXY.
 Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted.";
 
-/// Fetch diffusion models from a hub
+/// Fetch diffusion models from a hub, and check them on this machine
 #[derive(Parser)]
 #[command(name = "dipir-model", version, after_help = EXAMPLES)]
 pub struct Cli {

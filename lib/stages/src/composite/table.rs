@@ -19,10 +19,11 @@ pub struct CompositeTable {
     /// Environment map that lights the object, equirectangular, HDR or EXR.
     #[schemars(extend("format" = "path"), extend("x-default" = "none: the recovered light"), example = &"sky.exr")]
     pub environment: Option<PathBuf>,
-    /// Exposure that brings the map to the photograph's scale, stops.
+    /// Exposure of the light, stops. It brings a map to the photograph's scale, and makes a light that was found brighter
+    /// or dimmer.
     #[schemars(range(min = -64.0, max = 64.0), example = -1.5)]
     pub exposure_ev: f32,
-    /// Turn of the map about the vertical, degrees, counter-clockwise from above.
+    /// Turn of the light about the vertical, degrees, counter-clockwise from above.
     #[schemars(example = 90.0)]
     pub rotation_deg: f32,
     /// Rendering stops at this error, display-referred RMSE with white at 1.
