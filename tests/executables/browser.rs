@@ -61,7 +61,8 @@ impl Browser {
             session: String::new(),
             _driver: driver,
         };
-        let options = json!({"args": ["--headless", "--no-sandbox", "--disable-gpu", "--window-size=1200,900"]});
+        let options = json!({"args": ["--headless", "--no-sandbox", "--disable-gpu", "--window-size=1200,900",
+            "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"]});
         let wanted = json!({"capabilities": {"alwaysMatch": {"goog:chromeOptions": options}}});
         let made = browser.ask("POST", "/session", &wanted);
         browser.session = format!("/session/{}", made["sessionId"].as_str().unwrap());
@@ -128,28 +129,54 @@ impl Browser {
         self.script(&format!("document.querySelector('{selector}').click()"));
     }
 
-    /// Presses the pointer at a place of an element, shares of its size, and drags it to another.
-    fn drag(&self, id: &str, from: [f64; 2], to: [f64; 2]) {
+    /// Left, top, width and height of an element that is brought into view.
+    fn place(&self, id: &str) -> [f64; 4] {
         let find = format!(
             "const e = document.getElementById('{id}'); e.scrollIntoView({{block: 'center'}}); \
             const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]"
         );
         let found = self.script(&find);
-        let [x, y, w, h] = [0, 1, 2, 3].map(|k| found[k].as_f64().unwrap());
-        let steps = (0..=10).map(|k| {
-            let t = f64::from(k) / 10.0;
-            let at = [0, 1].map(|k| from[k] + t * (to[k] - from[k]));
-            let (x, y) = (
-                (x + w * at[0]).round() as i64,
-                (y + h * at[1]).round() as i64,
-            );
-            json!({"type": "pointerMove", "duration": 30, "x": x, "y": y})
-        });
-        let mut steps: Vec<Value> = steps.collect();
+        [0, 1, 2, 3].map(|k| found[k].as_f64().unwrap())
+    }
+
+    /// Presses the pointer at a place of an element, shares of its size, and drags it to another.
+    fn drag(&self, id: &str, from: [f64; 2], to: [f64; 2]) {
+        let mut steps = way(self.place(id), from, to);
         steps.insert(1, json!({"type": "pointerDown", "button": 0}));
         steps.push(json!({"type": "pointerUp", "button": 0}));
         let pointer = json!({"type": "pointer", "id": "mouse", "actions": steps});
         self.post("actions", &json!({"actions": [pointer]}));
+    }
+
+    /// Drags a finger over an element; a second one comes down half-way, moves as far, and is lifted first.
+    fn two_fingers(&self, id: &str, [one, two]: [[[f64; 2]; 2]; 2]) {
+        let place = self.place(id);
+        let down = || json!({"type": "pointerDown", "button": 0});
+        let up = || json!({"type": "pointerUp", "button": 0});
+        let pause = || json!({"type": "pause"});
+        let mut first = way(place, one[0], one[1]);
+        first.insert(1, down());
+        let mut second = way(place, two[0], two[1]);
+        second.insert(1, down());
+        second.push(up());
+        // Each list holds a step a tick.
+        first.extend((0..7).map(|_| pause()));
+        first.push(up());
+        second.splice(0..0, (0..6).map(|_| pause()));
+        let finger = |id: &str, steps: &[Value]| json!({"type": "pointer", "id": id, "parameters": {"pointerType": "touch"}, "actions": steps});
+        let fingers = [finger("one", &first), finger("two", &second)];
+        self.post("actions", &json!({"actions": fingers}));
+    }
+
+    /// Types keys, one after the other, with nothing between them.
+    fn keys(&self, keys: &str) {
+        let press = |key: char| {
+            let key = key.to_string();
+            ["keyDown", "keyUp"].map(|t| json!({"type": t, "value": key}))
+        };
+        let steps: Vec<Value> = keys.chars().flat_map(press).collect();
+        let keyboard = json!({"type": "key", "id": "keyboard", "actions": steps});
+        self.post("actions", &json!({"actions": [keyboard]}));
     }
 
     fn count(&self, route: &str) -> u64 {
@@ -174,6 +201,20 @@ impl Drop for Browser {
             self.ask("DELETE", &self.session, &json!({}));
         }
     }
+}
+
+/// The pointer on its way between two shares of a rectangle.
+fn way([x, y, w, h]: [f64; 4], from: [f64; 2], to: [f64; 2]) -> Vec<Value> {
+    let step = |k: u32| {
+        let t = f64::from(k) / 10.0;
+        let at = [0, 1].map(|k| from[k] + t * (to[k] - from[k]));
+        let (x, y) = (
+            (x + w * at[0]).round() as i64,
+            (y + h * at[1]).round() as i64,
+        );
+        json!({"type": "pointerMove", "duration": 30, "x": x, "y": y})
+    };
+    (0..=10).map(step).collect()
 }
 
 /// How many requests to the server of the page were answered, as a script.
@@ -201,9 +242,8 @@ fn photo() -> DisplayImage {
     DisplayImage(picture)
 }
 
-#[test]
-#[ignore = "needs ChromeDriver and Chromium"]
-fn what_is_placed_on_the_page_is_what_the_run_makes() {
+/// A project, its page, the page's address, and a browser that shows it.
+fn opened() -> (Project, Stopped, String, Browser) {
     let project = Project::new();
     write_png(project.path("photo.png"), &photo()).unwrap();
     let init = [
@@ -220,15 +260,25 @@ fn what_is_placed_on_the_page_is_what_the_run_makes() {
         "-8",
     ];
     project.run(DIPIR, &init).expect_success();
-    let before = String::from_utf8(project.read("place.toml")).unwrap();
     let mut command = project.command(DIPIR, &["place", "place.toml", "--no-open", "--json"]);
     command.stderr(Stdio::inherit());
-    let (_server, line) = start(command, "http://");
+    let (server, line) = start(command, "http://");
     let address = line.split('"').find(|part| part.starts_with("http://"));
+    let address = address.expect("an address").to_owned();
     let browser = Browser::new();
-    browser.post("url", &json!({"url": address.expect("an address")}));
+    browser.post("url", &json!({"url": address}));
     browser.wait("document.documentElement.dataset.ready");
     browser.wait("document.getElementById('origin').textContent");
+    (project, server, address, browser)
+}
+
+const SAVED: &str = "document.getElementById('status').textContent.startsWith('Wrote ')";
+
+#[test]
+#[ignore = "needs ChromeDriver and Chromium"]
+fn what_is_placed_on_the_page_is_what_the_run_makes() {
+    let (project, _server, _, browser) = opened();
+    let before = String::from_utf8(project.read("place.toml")).unwrap();
     browser.screenshot("opened.png");
 
     // The object follows the pointer, wherever it is taken.
@@ -295,7 +345,7 @@ fn what_is_placed_on_the_page_is_what_the_run_makes() {
         .to_rgb8();
 
     browser.click("#save");
-    browser.wait("document.getElementById('status').textContent.startsWith('Wrote ')");
+    browser.wait(SAVED);
     let after = String::from_utf8(project.read("place.toml")).unwrap();
     assert!(after.contains("azimuth_deg") && after != before, "{after}");
     for comment in before.lines().filter(|l| l.starts_with('#')) {
@@ -315,6 +365,87 @@ fn what_is_placed_on_the_page_is_what_the_run_makes() {
     assert!(changed > 6.0, "the page shows hardly an object: {changed}");
     // .12 was measured: the grain of two drafts, and edges that the page scales. An object elsewhere makes 1 or more.
     assert!(off < 0.2 * changed, "{off} of {changed} levels");
+}
+
+#[test]
+#[ignore = "needs ChromeDriver and Chromium"]
+fn hasty_hands_two_fingers_two_tabs_and_a_server_that_ends_lose_nothing() {
+    let (project, server, address, browser) = opened();
+    let says = |id: &str, text: &str| {
+        let text = json!(text);
+        browser.wait(&format!(
+            "document.getElementById('{id}').textContent.includes({text})"
+        ));
+    };
+    let shows = |id: &str, number: f64| {
+        browser.wait(&format!(
+            "document.getElementById('{id}').value === '{number}'"
+        ));
+    };
+    let file = || String::from_utf8(project.read("place.toml")).unwrap();
+
+    // Keys that come faster than answers all count, and are undone as one.
+    browser.click("#canvas");
+    browser.script("document.getElementById('canvas').focus()");
+    browser.keys("qqqq");
+    shows("yaw", 20.0);
+    browser.click("#undo");
+    shows("yaw", 0.0);
+
+    // A copy is chosen by the keyboard, which stays in the list.
+    browser.keys("c");
+    browser.wait("document.querySelectorAll('#objects input').length === 2");
+    browser.script("document.querySelector('#objects input').focus()");
+    let chosen = "document.activeElement === document.querySelectorAll('#objects input')[1]";
+    browser.keys("\u{E014}");
+    browser.wait(&format!("{chosen} && document.activeElement.checked"));
+    browser.script("document.getElementById('canvas').focus()");
+    browser.keys("\u{E017}");
+    browser.wait("document.querySelectorAll('#objects input').length === 1");
+
+    // A second finger sizes what the first one drags; both are one change.
+    let place = browser.text("where");
+    let fingers = [[[0.5, 0.6], [0.5, 0.62]], [[0.6, 0.62], [0.8, 0.62]]];
+    browser.two_fingers("canvas", fingers);
+    // 1.6 m before; the fingers are about .1 apart at first, and .3 at last.
+    browser.wait("document.getElementById('height').valueAsNumber > 3.2");
+    browser.click("#undo");
+    says("where", &place);
+
+    // What is typed is saved, once, however long the keys are held.
+    let hold = "const f = document.getElementById('height'); f.focus(); f.value = 2; \
+        f.dispatchEvent(new Event('input', {bubbles: true})); \
+        for (let k = 0; k < 9; k += 1) f.dispatchEvent(new KeyboardEvent('keydown', \
+        {key: 's', ctrlKey: true, repeat: k > 0, bubbles: true, cancelable: true}))";
+
+    // Another tab has read the same file.
+    let first = browser.ask("GET", &format!("{}/window", browser.session), &json!({}));
+    let second = browser.post("window/new", &json!({"type": "tab"}));
+    let go = |handle: &Value| browser.post("window", &json!({"handle": handle}));
+    go(&second["handle"]);
+    browser.post("url", &json!({"url": address}));
+    browser.wait("document.documentElement.dataset.ready");
+    browser.script("document.getElementById('canvas').focus()");
+    browser.keys("+++");
+    go(&first);
+    browser.script(hold);
+    browser.wait(SAVED);
+    assert_eq!(browser.count("save"), 1);
+    let saved = file();
+    assert!(saved.contains("height_m = 2.0\n"), "{saved}");
+    go(&second["handle"]);
+    browser.click("#save");
+    says("status", "reload the page");
+    assert_eq!(file(), saved);
+
+    // The server ends while pages are open.
+    go(&first);
+    drop(server);
+    browser.script("document.getElementById('canvas').focus()");
+    browser.keys("e");
+    says("status", "does not answer");
+    browser.screenshot("ended.png");
+    assert_eq!(file(), saved);
 }
 
 /// Levels of 255, over the picture at the size of the page's.

@@ -1,6 +1,5 @@
 //! A project while it is being arranged.
 use std::io;
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,14 +9,11 @@ use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::Raster;
 use dipir_imaging::resize::{Filter, resize};
-use dipir_light::gaussian::SphericalGaussian;
 use dipir_optimize::settings::LightTable;
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::plain_reason;
 use dipir_preview::arrangement::{Arrangement, Placed};
 use dipir_preview::draft::Draft;
-use dipir_preview::lines::{Kind, Piece};
-use dipir_preview::marks::{Grid, horizon, outline, stick};
 use dipir_preview::png;
 use dipir_preview::relit::Relit;
 use dipir_preview::small::{Props, SmallScene};
@@ -30,13 +26,15 @@ use dipir_scene::scene::LoadedScene;
 use dipir_stages::composite::table::CompositeTable;
 use dipir_stages::graph;
 use dipir_stages::light::at_hand::{AtHand, at_hand};
-use glam::{DVec2, DVec3};
+use glam::DVec2;
 use serde_json::{Value, json};
 
 use crate::document::Document;
+use crate::drafts::Drafts;
 use crate::edit::Edit;
 use crate::relighting::Relighting;
-use crate::vanishing::{Lines, Solution, solve, turn_of_camera};
+use crate::shown::{description, height_over, view};
+use crate::vanishing::{Lines, Solution, solve};
 
 /// Longest side of the photograph on the page, pixels.
 const LONGEST: u32 = 1280;
@@ -54,11 +52,12 @@ pub struct Desk {
     size: [usize; 2],
     /// The file's text, as it was read or last saved.
     text: Mutex<String>,
+    /// Counts texts that were saved; it changes while `text` is held.
+    revision: AtomicU64,
     /// What the page painted, row by row; empty if nothing.
     mask: Mutex<Vec<u8>>,
     rendered: Mutex<Rendered>,
-    /// Counts pictures that were asked for: an older one is broken off.
-    drafts: Arc<AtomicU64>,
+    drafts: Drafts,
     /// Counts masks that were painted.
     masks: AtomicU64,
     relighting: Mutex<Relighting>,
@@ -123,6 +122,7 @@ impl Desk {
             photo: png::encode(size[0], size[1], &values)?,
             size,
             text: Mutex::new(text),
+            revision: AtomicU64::new(0),
             mask: Mutex::default(),
             rendered: Mutex::new(Rendered {
                 session,
@@ -130,7 +130,7 @@ impl Desk {
                 small,
                 light: None,
             }),
-            drafts: Arc::default(),
+            drafts: Drafts::default(),
             masks: AtomicU64::new(0),
             relighting: Mutex::default(),
         })
@@ -170,6 +170,7 @@ impl Desk {
     /// The file's text with `edit`, and what it means.
     fn edited(&self, edit: &Edit) -> anyhow::Result<(String, Config, Arrangement)> {
         edit.check()?;
+        self.check_revision(edit)?;
         let mut document = Document::parse(&held(&self.text))?;
         document.order_objects(&edit.objects)?;
         document.apply_light(edit)?;
@@ -185,6 +186,16 @@ impl Desk {
         let text = document.text();
         let (config, arrangement) = self.arranged(&text)?;
         Ok((text, config, arrangement))
+    }
+
+    /// Refuses an edit of a text that was replaced.
+    fn check_revision(&self, edit: &Edit) -> anyhow::Result<()> {
+        if edit.revision != self.revision.load(Ordering::SeqCst) {
+            bail!(
+                "the file was saved since this page read it, as from another tab; reload the page"
+            );
+        }
+        Ok(())
     }
 
     /// A text of the file with what the command line sets.
@@ -255,7 +266,10 @@ impl Desk {
     /// # Errors
     /// If the file cannot be used any more.
     pub fn state(&self) -> anyhow::Result<Value> {
-        let text = held(&self.text).clone();
+        let (text, revision) = {
+            let text = held(&self.text);
+            (text.clone(), self.revision.load(Ordering::SeqCst))
+        };
         let (config, arrangement) = self.arranged(&text)?;
         let exposure = config.table::<CompositeTable>("composite")?;
         let models = &self.props.models;
@@ -263,7 +277,10 @@ impl Desk {
             let name = models[o.model].path.file_stem().unwrap_or_default();
             name.to_string_lossy().into_owned()
         };
-        let edit = Edit::none(arrangement.objects.len());
+        let edit = Edit {
+            revision,
+            ..Edit::none(arrangement.objects.len())
+        };
         Ok(json!({
             "file": json_path(&self.path),
             "size": arrangement.camera.resolution,
@@ -315,7 +332,8 @@ impl Desk {
         Ok(height_over(camera, &ground) * length_m / found)
     }
 
-    /// Renders the objects; `None` if they change nothing. A newer call breaks an older one off.
+    /// Renders the objects; `None` if they change nothing. A newer call of the same `tab` breaks an
+    /// older one off.
     ///
     /// # Errors
     /// If it cannot be, and [`Superseded`].
@@ -323,8 +341,9 @@ impl Desk {
         &self,
         edit: &Edit,
         samples: u32,
+        tab: u32,
     ) -> anyhow::Result<Result<Option<Crop>, Superseded>> {
-        let go_on = self.newest();
+        let go_on = self.drafts.newest(tab);
         let (_, config, arrangement) = self.edited(edit)?;
         let mut rendered = held(&self.rendered);
         if go_on().is_break() {
@@ -347,16 +366,6 @@ impl Desk {
         })))
     }
 
-    /// Breaks off older drafts; whether there is none newer than this.
-    fn newest(&self) -> impl Fn() -> ControlFlow<()> + Send + 'static {
-        let ticket = self.drafts.fetch_add(1, Ordering::SeqCst) + 1;
-        let drafts = self.drafts.clone();
-        move || match drafts.load(Ordering::SeqCst) == ticket {
-            true => ControlFlow::Continue(()),
-            false => ControlFlow::Break(()),
-        }
-    }
-
     /// The objects as `edit` places them, and their light.
     fn arrange<'a>(
         &self,
@@ -373,12 +382,16 @@ impl Desk {
 
     /// The objects under another sun or exposure, at a low resolution and many times a second: they are
     /// recorded first, unless they stand as they did the last time. `None` if they change nothing.
-    /// A newer draft breaks it off, and it breaks off older ones.
+    /// A newer draft of the same `tab` breaks it off, and it breaks off older ones.
     ///
     /// # Errors
     /// If it cannot be, and [`Superseded`].
-    pub fn relight(&self, edit: &Edit) -> anyhow::Result<Result<Option<Crop>, Superseded>> {
-        let go_on = self.newest();
+    pub fn relight(
+        &self,
+        edit: &Edit,
+        tab: u32,
+    ) -> anyhow::Result<Result<Option<Crop>, Superseded>> {
+        let go_on = self.drafts.newest(tab);
         let mut relighting = held(&self.relighting);
         let masks = self.masks.load(Ordering::SeqCst);
         let key = format!("{masks} {:?} {}", edit.without_light(), held(&self.text));
@@ -431,8 +444,8 @@ impl Desk {
     /// Writes the file and, if one was painted, the mask; what was written, one line each.
     ///
     /// # Errors
-    /// If it cannot be, or the file was changed by another program since it was read. Nothing is
-    /// written then.
+    /// If it cannot be, or the file was changed by another program or saved since it was read. Nothing
+    /// is written then.
     pub fn save(&self, edit: &Edit) -> anyhow::Result<Vec<String>> {
         let (text, _, arrangement) = self.edited(edit)?;
         let mut document = Document::parse(&text)?;
@@ -451,11 +464,13 @@ impl Desk {
         let config = self.config(&text)?;
         let mut rendered = held(&self.rendered);
         let mut base = held(&self.text);
+        // Another save may have come between.
+        self.check_revision(edit)?;
         let found = dipir_files::read_to_string(&self.path)
             .with_context(|| format!("cannot read \"{}\"", self.path.display()))?;
         if found != *base {
             bail!(
-                "the file was changed by another program; reload the page after starting dipir place anew"
+                "the file was changed by another program; start dipir place anew to go on from it"
             );
         }
         // Every table is read once more, and the light found, as a run would.
@@ -475,6 +490,9 @@ impl Desk {
         dipir_files::rewrite(&self.path, base.as_bytes(), text.as_bytes())
             .map_err(|e| unwritten(&self.path, &e))?;
         written.push(self.path.display().to_string());
+        if text != *base {
+            self.revision.fetch_add(1, Ordering::SeqCst);
+        }
         *base = text;
         Ok(written)
     }
@@ -502,88 +520,4 @@ impl Rendered {
 fn unwritten(path: &Path, error: &io::Error) -> anyhow::Error {
     let reason = plain_reason(error);
     anyhow!("cannot write \"{}\": {reason}", path.display())
-}
-
-fn height_over(camera: &Camera, ground: &Plane) -> f64 {
-    let from = camera.position.as_dvec3() - ground.point.as_dvec3();
-    ground.normal.as_dvec3().dot(from)
-}
-
-/// What the page draws and says.
-fn view(arrangement: &Arrangement, grid: bool) -> Value {
-    let camera = &arrangement.camera;
-    let ground = arrangement.ground();
-    let project = |p: DVec3| camera.project(p.as_vec3()).map(|p| p.to_array());
-    let object = |o: &Placed| {
-        let pieces = outline(camera, o);
-        let size = o.size();
-        json!({
-            "contact": project(o.contact),
-            "yaw_deg": o.yaw_rad.to_degrees(),
-            "size_m": size.to_array(),
-            "distance_m": o.contact.distance(camera.position.as_dvec3()),
-            "lines": pieces.iter().map(line).collect::<Vec<_>>(),
-        })
-    };
-    let focus = arrangement.objects.first();
-    let stick = focus.and_then(|o| stick(camera, o));
-    let (stick, label) = stick.unzip();
-    let turn = turn_of_camera(camera);
-    let mut view = json!({
-        "objects": arrangement.objects.iter().map(object).collect::<Vec<_>>(),
-        "horizon": horizon(camera, &ground).iter().map(line).collect::<Vec<_>>(),
-        "stick": stick.iter().flatten().map(line).collect::<Vec<_>>(),
-        "stick_label": label.map(|l| json!({"at": l.at.to_array(), "text": l.text})),
-        "camera": {
-            "pitch_deg": turn.pitch_deg, "roll_deg": turn.roll_deg, "fov_deg": turn.fov_deg,
-            "height_m": height_over(camera, &ground),
-        },
-        "warnings": arrangement.warnings,
-    });
-    if grid {
-        let found = Grid::new(camera, &ground, focus.map(|o| o.contact));
-        view["grid"] = found.pieces.iter().map(line).collect();
-        view["spacing_m"] = found.spacing_m.into();
-    }
-    view
-}
-
-/// Kind, ends and opacity.
-fn line(piece: &Piece) -> Value {
-    let kind = match piece.kind {
-        Kind::Grid => 0,
-        Kind::MainGrid => 1,
-        Kind::Horizon => 2,
-        Kind::Box => 3,
-        Kind::Front => 4,
-        Kind::Stick => 5,
-    };
-    let short = |x: f64| (x * 10.0).round() / 10.0;
-    let (a, b) = (piece.from, piece.to);
-    let opacity = (f64::from(piece.opacity) * 100.0).round() / 100.0;
-    json!([
-        kind,
-        short(a.x),
-        short(a.y),
-        short(b.x),
-        short(b.y),
-        opacity
-    ])
-}
-
-/// A light in words and numbers.
-fn description(light: &AtHand, camera: &Camera) -> Value {
-    let strongest = light.lobes.lobes().iter().max_by(|a, b| {
-        let power = |l: &SphericalGaussian| l.integral().element_sum();
-        power(a).total_cmp(&power(b))
-    });
-    let sun = strongest.map(|lobe| {
-        let d = lobe.direction.as_dvec3();
-        let forward = -camera.rotation.z_axis.as_dvec3();
-        let azimuth = |v: DVec3| v.x.atan2(-v.z);
-        let from_view = (azimuth(d) - azimuth(forward)).to_degrees();
-        let azimuth_deg = (from_view + 180.0).rem_euclid(360.0) - 180.0;
-        json!({"azimuth_deg": azimuth_deg, "elevation_deg": d.y.clamp(-1.0, 1.0).asin().to_degrees()})
-    });
-    json!({"origin": light.origin.words(), "fixed": light.origin.is_fixed(), "sun": sun})
 }

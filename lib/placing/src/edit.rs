@@ -9,6 +9,9 @@ const MOST_OBJECTS: usize = 200;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Edit {
+    /// How often the file had been saved when it was read: sizes and objects are those of that text.
+    #[serde(default)]
+    pub revision: u64,
     /// All objects, in the order in which the file will have them.
     pub objects: Vec<ObjectEdit>,
     /// How the camera is turned, and how wide it sees.
@@ -95,7 +98,7 @@ pub struct ShadowEdit {
 }
 
 impl Edit {
-    /// An edit that changes nothing, for a file with this many objects.
+    /// An edit that changes nothing of a file as it was opened, with this many objects.
     pub fn none(objects: usize) -> Self {
         let object = |of| ObjectEdit {
             of,

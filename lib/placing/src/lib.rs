@@ -4,8 +4,10 @@
 //! parser, one renderer for page, preview and pipeline.
 pub mod desk;
 pub mod document;
+mod drafts;
 pub mod edit;
 pub mod gate;
 pub mod relighting;
 pub mod server;
+mod shown;
 pub mod vanishing;

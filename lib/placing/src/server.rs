@@ -216,11 +216,10 @@ impl Site {
                 .map(|(written, state)| Answer::json(json!({"written": written, "state": state}))),
             "draft" => parsed::<DraftAsked>(body).and_then(|a| {
                 let samples = a.samples.clamp(1, MOST_SAMPLES);
-                self.desk.draft(&a.edit, samples).map(Answer::picture)
+                desk.draft(&a.edit, samples, a.tab).map(Answer::picture)
             }),
-            "relight" => {
-                parsed::<Edit>(body).and_then(|edit| desk.relight(&edit).map(Answer::picture))
-            }
+            "relight" => parsed::<RelightAsked>(body)
+                .and_then(|a| desk.relight(&a.edit, a.tab).map(Answer::picture)),
             other => Err(anyhow!("{other} is not answered")),
         };
         answer.unwrap_or_else(|e| Answer::error(&e))
@@ -242,6 +241,18 @@ struct ViewAsked {
 struct DraftAsked {
     edit: Edit,
     samples: u32,
+    /// A number that the tab drew.
+    #[serde(default)]
+    tab: u32,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RelightAsked {
+    edit: Edit,
+    /// A number that the tab drew.
+    #[serde(default)]
+    tab: u32,
 }
 
 #[derive(Deserialize)]

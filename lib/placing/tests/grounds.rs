@@ -94,7 +94,7 @@ fn a_ground_through_pixels_is_shown_as_it_will_be_for_a_turned_camera() {
         (height(&shown) / height(&saved) - 1.0).abs() < 1e-5,
         "{shown} {saved}"
     );
-    let lifted = edit(json!({"objects": [{"of": 0}], "height_m": 2.5}));
+    let lifted = edit(json!({"objects": [{"of": 0}], "height_m": 2.5, "revision": 1}));
     let error = desk.view(&lifted, false).unwrap_err().to_string();
     assert!(error.contains("scene.proxy.lengths_m"), "{error}");
 }

@@ -314,6 +314,41 @@ fn what_cannot_be_is_not_saved() {
 }
 
 #[test]
+fn an_edit_of_a_text_that_was_saved_over_is_refused() {
+    let place = Running::new();
+    let revision = || place.get("state").json()["edit"]["revision"].clone();
+    // Two tabs read the file.
+    let first = revision();
+    let larger = json!({"objects": [{"of": 0, "size": 2.0}], "revision": first});
+    let moved = json!({"objects": [{"of": 0, "at": [200.0, 150.0]}], "revision": first});
+    let next = place.post("save", &larger).json()["state"]["edit"]["revision"].clone();
+    let saved = fs::read_to_string(place.file("pipeline.toml")).unwrap();
+    assert!(saved.contains("scale = 2.0"), "{saved}");
+    for edit in [&moved, &larger] {
+        let drawn = place.post("view", &json!({"edit": edit, "grid": false}));
+        let answer = place.post("save", edit);
+        for answer in [drawn, answer] {
+            let told = String::from_utf8_lossy(&answer.body).into_owned();
+            assert!(answer.status == 422 && told.contains("reload"), "{told}");
+        }
+        let now = fs::read_to_string(place.file("pipeline.toml")).unwrap();
+        assert_eq!(now, saved);
+    }
+    // A page that is loaded again, and one that saved, go on.
+    assert_eq!(revision(), next);
+    let moved = json!({"objects": [{"of": 0, "at": [200.0, 150.0]}], "revision": next});
+    let same = json!({"objects": [{"of": 0}], "revision": next});
+    assert_eq!(place.post("save", &same).status, 200);
+    // What changed nothing holds nobody up.
+    assert_eq!(place.post("save", &moved).status, 200);
+    let now = fs::read_to_string(place.file("pipeline.toml")).unwrap();
+    assert!(
+        now.contains("scale = 2.0") && now.contains("[200.0, 150.0]"),
+        "{now}"
+    );
+}
+
+#[test]
 fn a_light_that_a_run_refuses_is_not_saved() {
     let folder = tempfile::tempdir().unwrap();
     project(folder.path(), &[]);
@@ -355,7 +390,9 @@ fn a_mask_replaces_no_file_of_anothers() {
         TEXT
     );
     fs::remove_file(place.file("holdout.png")).unwrap();
-    place.post("save", &edit).json();
+    let saved = place.post("save", &edit).json();
+    let mut edit = edit;
+    edit["revision"] = saved["state"]["edit"]["revision"].clone();
     place.post("save", &edit).json();
     let text = fs::read_to_string(place.file("pipeline.toml")).unwrap();
     assert!(text.contains("occluders = \"holdout.png\""), "{text}");
@@ -364,7 +401,7 @@ fn a_mask_replaces_no_file_of_anothers() {
     // All is hidden: the objects change nothing.
     let hidden = place.post(
         "draft",
-        &json!({"edit": {"objects": [{"of": 0}]}, "samples": 1}),
+        &json!({"edit": {"objects": [{"of": 0}], "revision": edit["revision"]}, "samples": 1}),
     );
     assert_eq!(hidden.status, 204);
 }
@@ -463,7 +500,7 @@ fn turning_the_sun_and_the_exposure_shows_what_a_draft_shows() {
     let mut last: Option<Answer> = None;
     for (azimuth, elevation, stops) in [(60.0, 40.0, 0.0), (-50.0, 30.0, 0.0), (100.0, 55.0, 1.0)] {
         let edit = lit(azimuth, elevation, stops);
-        let relit = place.post("relight", &edit);
+        let relit = place.post("relight", &json!({"edit": edit}));
         let draft = place.post("draft", &json!({"edit": edit, "samples": 32}));
         for answer in [&relit, &draft] {
             let about: Value = serde_json::from_str(answer.header("X-Draft").unwrap()).unwrap();

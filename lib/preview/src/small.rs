@@ -89,13 +89,18 @@ impl SmallScene {
         let [width, height] = scaled(full.resolution, longest);
         loaded.scene.camera = full.scaled([width, height]);
         let (w, h) = (width as usize, height as usize);
-        loaded.photo.values = None;
         loaded.photo.alpha = None;
         if full.resolution != [width, height] {
             loaded.photo.image = LinearImage(resize(&loaded.photo.image.0, w, h, Filter::Area));
             loaded.occluders = loaded
                 .occluders
                 .map(|mask| resize(&mask, w, h, Filter::Area));
+            // A photograph without values is taken for linear light, which has another exposure and no curve.
+            if loaded.photo.values.is_some() {
+                let shown = loaded.photo.transfer.encode(&loaded.photo.image).0;
+                let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+                loaded.photo.values = Some(shown.map(|p| p.to_array().map(byte)));
+            }
         }
         let props = Arc::new(Props {
             models,

@@ -16,7 +16,7 @@ use dipir_preview::picture::Preview;
 use dipir_preview::relit::Relit;
 use dipir_preview::small::SmallScene;
 use dipir_render::error::RenderError;
-use dipir_stages::light::at_hand::{AtHand, Origin};
+use dipir_stages::light::at_hand::{AtHand, Origin, at_hand};
 use glam::{DVec3, Vec3};
 use tempfile::TempDir;
 
@@ -67,6 +67,20 @@ fn objects_that_are_arranged_again_stand_where_they_were_loaded() {
     }
     assert_eq!(small.loaded.scene.camera.resolution, [150, 100]);
     assert_eq!(arrangement.camera.resolution, [300, 200]);
+}
+
+#[test]
+fn a_photograph_stays_one_that_a_camera_exposed_at_any_size() {
+    let (_folder, session) = project();
+    for longest in [150, 300] {
+        let (small, _) = SmallScene::load(&session, longest).unwrap();
+        let photo = &small.loaded.photo;
+        let values = photo.values.as_ref().expect("values of 8 bits");
+        assert_eq!(values.width(), photo.image.0.width());
+        assert_eq!(values.pixels()[0], [128; 3]);
+        // As a run does, a draft bends the light of the object.
+        assert!(at_hand(&session, &small.loaded).unwrap().tone.is_some());
+    }
 }
 
 #[test]

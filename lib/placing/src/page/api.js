@@ -9,44 +9,43 @@ async function failed(response) {
   }
 }
 
-export async function state() {
-  const response = await fetch("state");
-  if (!response.ok) throw await failed(response);
-  return response.json();
+// An answer; one to a picture that a newer one broke off is 409.
+async function request(route, body) {
+  let response;
+  try {
+    response = await fetch(route, body === undefined ? {} : { method: "POST", body });
+  } catch {
+    throw new Error("dipir place does not answer. If it was ended, start it again and open the address that it prints.");
+  }
+  if (!response.ok && response.status !== 409) throw await failed(response);
+  return response;
 }
 
-export async function ask(route, body) {
-  const response = await fetch(route, { method: "POST", body: JSON.stringify(body) });
-  if (!response.ok) throw await failed(response);
-  return response.json();
-}
+export const state = async () => (await request("state")).json();
 
-export async function ownMask() {
-  const response = await fetch("mask.bin");
-  if (!response.ok) throw await failed(response);
-  return new Uint8ClampedArray(await response.arrayBuffer());
-}
+export const ask = async (route, body) => (await request(route, JSON.stringify(body))).json();
 
-export async function sendMask(bytes) {
-  const response = await fetch("mask", { method: "POST", body: bytes });
-  if (!response.ok) throw await failed(response);
-}
+export const ownMask = async () => new Uint8ClampedArray(await (await request("mask.bin")).arrayBuffer());
+
+export const sendMask = (bytes) => request("mask", bytes);
 
 // A picture as {image, place, light}; null if the objects change nothing, undefined if a newer one was
 // asked for.
 async function picture(route, body) {
-  const response = await fetch(route, { method: "POST", body: JSON.stringify(body) });
+  const response = await request(route, JSON.stringify(body));
   if (response.status === 409) return undefined;
   if (response.status === 204) return null;
-  if (!response.ok) throw await failed(response);
   const about = JSON.parse(response.headers.get("X-Draft"));
   return { image: await createImageBitmap(await response.blob()), ...about };
 }
 
-export const draft = (edit, samples) => picture("draft", { edit, samples });
+// A newer picture breaks off the older ones of its own tab alone.
+const tab = Math.floor(Math.random() * 2 ** 32);
+
+export const draft = (edit, samples) => picture("draft", { edit, samples, tab });
 
 // The same objects under another sun or exposure: coarse, and at once where they are recorded.
-export const relight = (edit) => picture("relight", edit);
+export const relight = (edit) => picture("relight", { edit, tab });
 
 // Calls `work` with the latest argument only: while one call runs, all but the last that come are
 // dropped.

@@ -17,7 +17,7 @@ export class Picture {
     this.fit();
   }
 
-  // Fills the width, but no more than two thirds of the window's height.
+  // Fills the width, but no more than a part of the window's height.
   fit() {
     const parent = this.canvas.parentElement.clientWidth;
     const [w, h] = this.size;
@@ -34,7 +34,8 @@ export class Picture {
 
   at(event) {
     const box = this.canvas.getBoundingClientRect();
-    return [(event.clientX - box.left) / this.scale, (event.clientY - box.top) / this.scale];
+    const [w, h] = this.size;
+    return [((event.clientX - box.left) * w) / box.width, ((event.clientY - box.top) * h) / box.height];
   }
 
   lines(list, faded = 1) {
@@ -108,9 +109,8 @@ export class Picture {
       this.lines(grid);
       this.lines(view.horizon);
       this.lines(view.stick);
-      if (view.stick_label) this.text(view.stick_label.at, view.stick_label.text);
     }
-    if (tool === "mask") return;
-    view.objects.forEach((object, k) => this.lines(object.lines, k === chosen ? 1 : 0.45));
+    if (tool !== "mask") view.objects.forEach((object, k) => this.lines(object.lines, k === chosen ? 1 : 0.45));
+    if (showGrid && view.stick_label) this.text(view.stick_label.at, view.stick_label.text);
   }
 }

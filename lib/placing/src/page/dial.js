@@ -1,12 +1,12 @@
 // The sun on a disc seen from above: the middle is overhead, the rim the horizon, ahead is up.
 
 export class Dial {
-  // `change(sun, done)` is told of {azimuth_deg, elevation_deg}.
+  // `change(sun, done, kind)` is told of {azimuth_deg, elevation_deg}.
   constructor(canvas, change) {
     this.canvas = canvas;
     this.change = change;
     this.sun = null;
-    let held = false;
+    let held = null; // the pointer that drags
     const move = (event, done) => {
       const box = canvas.getBoundingClientRect();
       const half = box.width / 2;
@@ -17,19 +17,22 @@ export class Dial {
       change({ azimuth_deg, elevation_deg }, done);
     };
     canvas.addEventListener("pointerdown", (event) => {
-      held = true;
+      if (held !== null) return;
+      held = event.pointerId;
       canvas.setPointerCapture(event.pointerId);
       move(event, false);
     });
-    canvas.addEventListener("pointermove", (event) => held && move(event, false));
+    canvas.addEventListener("pointermove", (event) => held === event.pointerId && move(event, false));
     canvas.addEventListener("pointerup", (event) => {
-      if (held) move(event, true);
-      held = false;
+      if (held !== event.pointerId) return;
+      held = null;
+      move(event, true);
     });
     // The system took the pointer away: the sun stays where it was shown last.
-    canvas.addEventListener("pointercancel", () => {
-      if (held && this.sun) change(this.sun, true);
-      held = false;
+    canvas.addEventListener("pointercancel", (event) => {
+      if (held !== event.pointerId) return;
+      held = null;
+      if (this.sun) change(this.sun, true);
     });
     canvas.addEventListener("keydown", (event) => {
       const step = { ArrowLeft: [-5, 0], ArrowRight: [5, 0], ArrowUp: [0, 5], ArrowDown: [0, -5] }[event.key];
@@ -38,7 +41,7 @@ export class Dial {
       const sun = this.sun ?? { azimuth_deg: 0, elevation_deg: 45 };
       const azimuth = ((sun.azimuth_deg + step[0] + 540) % 360) - 180;
       const elevation = Math.max(0, Math.min(90, sun.elevation_deg + step[1]));
-      change({ azimuth_deg: azimuth, elevation_deg: elevation }, true);
+      change({ azimuth_deg: azimuth, elevation_deg: elevation }, true, "sun");
     });
   }
 

@@ -3,7 +3,7 @@
 const $ = (id) => document.getElementById(id);
 
 export const HELP = {
-  move: "Drag the object over the ground. Wheel: size. Shift and wheel, or R and drag: turn. Arrows, Q, E, + and - do the same.",
+  move: "Drag the object over the ground. Wheel: size. Shift and wheel, or R and drag: turn. Arrows, Q, E, + and - do the same; C copies, Delete removes, [ and ] choose.",
   lines: "Drag the ends of the lines.",
   measure: "Drag both ends of the line onto the ground.",
   mask: "Paint over what stands in front of the object.",
@@ -15,29 +15,44 @@ export function say(text, bad = false) {
   $("status").classList.toggle("bad", bad);
 }
 
-// A number field that reports finite numbers when they are entered.
+// A number field that reports finite numbers when they are entered. What `change` answers with false, and what is no
+// number, gives way to what was shown before.
 export function number(id, change) {
-  $(id).addEventListener("change", () => {
-    const value = $(id).valueAsNumber;
-    if (Number.isFinite(value)) change(value);
-  });
+  const field = $(id);
+  const enter = () => {
+    field.typing = false;
+    const value = field.valueAsNumber;
+    if (!Number.isFinite(value) || change(value) === false) field.value = field.shown;
+  };
+  field.addEventListener("input", () => (field.typing = true));
+  field.addEventListener("change", enter);
+  field.addEventListener("blur", () => field.typing && enter());
 }
 
 // Writes a value into a field that is not being typed in.
 export function put(id, value, digits = 2) {
-  if (document.activeElement === $(id)) return;
-  $(id).value = Number.isFinite(value) ? String(Number(value.toFixed(digits))) : "";
+  const field = $(id);
+  field.shown = Number.isFinite(value) ? String(Number(value.toFixed(digits))) : "";
+  if (!field.typing) field.value = field.shown;
 }
 
+let listed = null;
+
+// The list of objects. It is made anew only for other objects: a click or the keyboard may be at work in it.
 export function objects(names, edit, chosen, choose) {
-  const list = edit.objects.map((object, k) => {
-    const label = document.createElement("label");
-    const input = Object.assign(document.createElement("input"), { type: "radio", name: "object", checked: k === chosen });
-    input.addEventListener("change", () => choose(k));
-    label.append(input, `${k + 1} ${names[object.of]}`);
-    return label;
-  });
-  $("objects").replaceChildren(...list);
+  const said = edit.objects.map((object, k) => `${k + 1} ${names[object.of]}`);
+  if (said.join("\n") !== listed) {
+    listed = said.join("\n");
+    const list = said.map((text, k) => {
+      const label = document.createElement("label");
+      const input = Object.assign(document.createElement("input"), { type: "radio", name: "object" });
+      input.addEventListener("change", () => choose(k));
+      label.append(input, text);
+      return label;
+    });
+    $("objects").replaceChildren(...list);
+  }
+  $("objects").querySelectorAll("input")[chosen].checked = true;
 }
 
 export function showNumbers(view, chosen) {

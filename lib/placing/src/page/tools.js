@@ -33,13 +33,14 @@ class Ends {
     return this.held !== null;
   }
 
-  move([x, y]) {
-    if (this.held) [this.held[0], this.held[1]] = [x, y];
+  // Ends stay in the picture, where they can be taken again.
+  move(at, size) {
+    if (this.held) at.forEach((x, k) => (this.held[k] = Math.max(0, Math.min(size[k], x))));
   }
 }
 
 export class Tools {
-  // `page` offers: picture, history, view, chosen, choose, change, redraw, linesChanged, paint.
+  // `page` offers: picture, history, view, chosen, choose, pose, change, finish, copy, remove, redraw, linesChanged, paint.
   constructor(page, size) {
     this.page = page;
     this.name = "move";
@@ -86,8 +87,9 @@ export class Tools {
     page.picture.canvas.setPointerCapture(event.pointerId);
     const at = page.picture.at(event);
     this.pointers.set(event.pointerId, at);
-    // A further finger takes part in what the first one began.
+    // A further finger takes part in what the first one began: it sizes, or paints.
     if (this.pointers.size > 1) return;
+    this.first = event.pointerId;
     this.before = page.history.now;
     if (this.name === "mask") return page.paint(at, at, false);
     if (this.ends) {
@@ -95,9 +97,8 @@ export class Tools {
       return;
     }
     this.pick(at);
-    const object = page.history.now.edit.objects[page.chosen];
-    const shown = page.view.objects[page.chosen];
-    this.start = { at, contact: shown?.contact ?? at, yaw: shown?.yaw_deg ?? 0, size: object?.size ?? 1 };
+    const { contact, yaw } = page.pose();
+    this.start = { at, contact: contact ?? at, yaw: yaw ?? 0 };
     this.turns = this.keys.has("r") || event.altKey || event.button === 2;
   }
 
@@ -125,8 +126,9 @@ export class Tools {
     }
     this.pointers.set(event.pointerId, at);
     if (this.name === "mask") return page.paint(last, at, false);
+    if (event.pointerId !== this.first) return;
     if (this.ends) {
-      this.ends.move(at);
+      this.ends.move(at, page.picture.size);
       page.linesChanged();
       return page.redraw();
     }
@@ -160,20 +162,22 @@ export class Tools {
   wheel(event) {
     if (this.name !== "move") return;
     event.preventDefault();
-    const step = Math.sign(event.deltaY || event.deltaX);
+    // A notch of a wheel is about 100 pixels or 3 lines; touchpads report small parts of it, and two fingers that are
+    // spread report the logarithm of the factor, in percent: 1.04 ** 25 = e.
+    const unit = event.deltaMode === 1 ? 3 : event.ctrlKey ? 4 : 100;
+    const step = Math.max(-1, Math.min(1, (event.deltaY || event.deltaX) / unit));
     event.shiftKey ? this.turn(5 * step) : this.size(1.04 ** -step);
   }
 
+  // What is turned or sized in the midst of a drag is undone with it.
   turn(degrees) {
-    const { chosen, history, view } = this.page;
-    // What is shown may be older than the last turn.
-    const yaw = history.now.edit.objects[chosen]?.yaw_deg ?? view.objects[chosen]?.yaw_deg;
-    if (yaw !== undefined) this.page.change({ yaw_deg: yaw + degrees }, true);
+    const { yaw } = this.page.pose();
+    if (yaw !== undefined) this.page.change({ yaw_deg: yaw + degrees }, !this.pointers.size, "turn");
   }
 
   size(factor) {
     const object = this.page.history.now.edit.objects[this.page.chosen];
-    if (object) this.page.change({ size: (object.size ?? 1) * factor }, true);
+    if (object) this.page.change({ size: (object.size ?? 1) * factor }, !this.pointers.size, "size");
   }
 
   key(event) {
@@ -181,14 +185,15 @@ export class Tools {
     const { page } = this;
     const step = (event.shiftKey ? 10 : 2) / page.picture.scale;
     const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    const contact = page.history.now.edit.objects[page.chosen]?.at ?? page.view.objects[page.chosen]?.contact;
+    const { contact } = page.pose();
     const other = {
       q: () => this.turn(5), Q: () => this.turn(1), e: () => this.turn(-5), E: () => this.turn(-1),
       "+": () => this.size(1.04), "=": () => this.size(1.04), "-": () => this.size(1 / 1.04),
       "]": () => page.choose(page.chosen + 1), "[": () => page.choose(page.chosen - 1),
-      Delete: () => page.remove(), c: () => page.copy(),
+      Delete: () => event.repeat || page.remove(), c: () => event.repeat || page.copy(),
     }[event.key];
-    if (move && contact) page.change({ at: [contact[0] + move[0] * step, contact[1] + move[1] * step] }, true);
+    if (this.pointers.size) return;
+    if (move && contact) page.change({ at: contact.map((x, k) => x + move[k] * step) }, true, "move");
     else if (other) other();
     else return;
     event.preventDefault();
