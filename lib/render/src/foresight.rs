@@ -392,7 +392,7 @@ mod tests {
 
     #[test]
     fn effort_beside_the_jobs_is_paid_once() {
-        // Ten jobs of 8 samples, 80 rays beside them.
+        // Ten jobs of 8 samples, 80 rays beside them. Samples go up to the next multiple of four, half of 8: half of .5.
         let mut one = known(&[4.0; 10], 1.0);
         one.learn_of_effort(80);
         let cost = one.cost_of(0.2);
