@@ -17,6 +17,7 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::time::Instant;
 
+use dipir_imaging::raster::Raster;
 use dipir_light::environment::EnvironmentMap;
 use dipir_light::gaussian::SphericalGaussian;
 use dipir_light::rasterize::rasterize;
@@ -136,8 +137,8 @@ fn record_with(scene: &Scene, row: &Row, seed: u64, simulation: Simulation) -> T
 
 /// Pictures and the gradient of a fixed loss over both.
 struct Judged {
-    object: Vec<Vec3>,
-    shadow: Vec<Vec3>,
+    object: Raster<Vec3>,
+    shadow: Raster<Vec3>,
     gradient: Vec<Vec3>,
 }
 
@@ -160,8 +161,8 @@ fn judge_with(transport: &Transport, light: &EnvironmentMap, y: &[Vec3]) -> Judg
     let others = transport.shadow_vjp(light.texels(), &shadow, y);
     gradient.iter_mut().zip(others).for_each(|(g, o)| *g += o);
     Judged {
-        object: object.pixels().to_vec(),
-        shadow: shadow.pixels().to_vec(),
+        object,
+        shadow,
         gradient,
     }
 }
@@ -221,8 +222,8 @@ fn measure(row: &Row, timed: [u32; 2], reference: &Judged) -> Outcome {
     let noise = |a: &[Vec3], b: &[Vec3]| relative_error(a, b) / 2f64.sqrt();
     let regions = |gradient: &[Vec3]| coarser(gradient, row.environment, [16, 8]);
     let errors = [
-        relative_error(&found.object, &reference.object),
-        relative_error(&found.shadow, &reference.shadow),
+        relative_error(found.object.pixels(), reference.object.pixels()),
+        relative_error(found.shadow.pixels(), reference.shadow.pixels()),
         noise(&one, &other),
         noise(&regions(&one), &regions(&other)),
     ];

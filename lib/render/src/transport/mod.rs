@@ -208,7 +208,7 @@ impl Transport {
     pub fn foreground(&self, light: &[Vec3]) -> Raster<Vec3> {
         let light = self.checked(light);
         let base = self.base.pixels();
-        let lit = |p: usize, sum: Vec3| sum + base[p];
+        let lit = |p: usize, sum: Vec4| sum + padded(base[p]);
         let image = with_rows!(&self.weights, w => w.object.product(&light, &lit));
         self.raster(image)
     }
@@ -218,7 +218,7 @@ impl Transport {
     pub fn foreground_vjp(&self, gradient: &[Vec3]) -> Vec<Vec3> {
         self.check_pixels(gradient.len());
         let texels = self.texels();
-        with_rows!(&self.weights, w => w.object.product_vjp(texels, &|p| gradient[p]))
+        with_rows!(&self.weights, w => w.object.product_vjp(texels, &|p| padded(gradient[p])))
     }
 
     /// Ratio of the light that reaches the proxy with the object to that without it, per channel. It
@@ -298,7 +298,7 @@ impl Transport {
             width * height,
             "the transport was recorded for {width} x {height} texels"
         );
-        padded(light)
+        light.iter().copied().map(padded).collect()
     }
 
     fn check_pixels(&self, found: usize) {
@@ -317,7 +317,8 @@ const PIXELS_PER_SUM: usize = 1 << 13;
 impl<C: Entry> Sent<C> {
     /// Irradiance of every pixel under `light`.
     fn arriving(&self, light: &[Vec4]) -> Vec<Vec3> {
-        self.rows.product(light, &|p, sum| sum + self.base[p])
+        self.rows
+            .product(light, &|p, sum| sum + padded(self.base[p]))
     }
 }
 
@@ -346,15 +347,15 @@ impl<G: Entry> Shadow<G> {
 
     /// The ratios of all pixels; `sent` is the irradiance that the object sends to each.
     fn ratios(&self, light: &[Vec4], pixels: usize, sent: Option<Vec<Vec3>>) -> Vec<Vec3> {
-        let missing = |p: usize, blocked: Vec3| match &sent {
-            Some(sent) => blocked - sent[p],
+        let missing = |p: usize, blocked: Vec4| match &sent {
+            Some(sent) => blocked - padded(sent[p]),
             None => blocked,
         };
         match self {
             Shadow::None => vec![Vec3::ONE; pixels],
             Shadow::Plane { blocked, cosine } => {
                 let arriving = irradiance(cosine, light);
-                blocked.product(light, &|p, b| ratio3(missing(p, b), arriving, 1.0))
+                blocked.product(light, &|p, b| ratio(missing(p, b), arriving, 1.0))
             }
             Shadow::Mesh {
                 blocked,
@@ -362,7 +363,9 @@ impl<G: Entry> Shadow<G> {
                 share,
             } => {
                 let arriving = arriving.product(light, &|_, a| a);
-                blocked.product(light, &|p, b| ratio3(missing(p, b), arriving[p], share[p]))
+                blocked.product(light, &|p, b| {
+                    ratio(missing(p, b), padded(arriving[p]), share[p])
+                })
             }
         }
     }
@@ -375,7 +378,7 @@ impl<G: Entry> Shadow<G> {
         sent: Option<&Sent<C>>,
     ) -> Vec<Vec3> {
         // What is sent is missing less.
-        let add_sent = |sums: &mut [Vec3], missing: &(dyn Fn(usize) -> Vec3 + Sync)| {
+        let add_sent = |sums: &mut [Vec3], missing: &(dyn Fn(usize) -> Vec4 + Sync)| {
             if let Some(sent) = sent {
                 let more = sent.rows.product_vjp(light.len(), &|p| -missing(p));
                 sums.iter_mut().zip(more).for_each(|(sum, m)| *sum += m);
@@ -385,10 +388,11 @@ impl<G: Entry> Shadow<G> {
             Shadow::None => vec![Vec3::ZERO; light.len()],
             Shadow::Plane { blocked, cosine } => {
                 let arriving = irradiance(cosine, light);
-                let at = |p: usize| ratio3_vjp(ratios[p], arriving, 1.0, gradient[p]);
+                let at = |p| ratio_vjp(padded(ratios[p]), arriving, 1.0, padded(gradient[p]));
                 let mut sums = blocked.product_vjp(light.len(), &|p| at(p).0);
                 // The irradiance is one number for all pixels.
-                let sum = |pixels: Range<usize>| pixels.map(|p| at(p).1.as_dvec3()).sum::<DVec3>();
+                let at_arriving = |p| at(p).1.truncate().as_dvec3();
+                let sum = |pixels: Range<usize>| pixels.map(at_arriving).sum::<DVec3>();
                 let total = par_reduce(ratios.len(), PIXELS_PER_SUM, sum, |a, b| a + b);
                 let total = total.unwrap_or(DVec3::ZERO).as_vec3();
                 sums.iter_mut()
@@ -403,7 +407,10 @@ impl<G: Entry> Shadow<G> {
                 share,
             } => {
                 let light_there = arriving.product(light, &|_, a| a);
-                let at = |p: usize| ratio3_vjp(ratios[p], light_there[p], share[p], gradient[p]);
+                let at = |p: usize| {
+                    let [ratio, light, gradient] = [ratios[p], light_there[p], gradient[p]];
+                    ratio_vjp(padded(ratio), padded(light), share[p], padded(gradient))
+                };
                 let mut sums = blocked.product_vjp(light.len(), &|p| at(p).0);
                 let others = arriving.product_vjp(light.len(), &|p| at(p).1);
                 sums.iter_mut()
@@ -417,25 +424,10 @@ impl<G: Entry> Shadow<G> {
 }
 
 /// `E L` of a plane, summed in f64.
-fn irradiance(cosine: &[f32], light: &[Vec4]) -> Vec3 {
+fn irradiance(cosine: &[f32], light: &[Vec4]) -> Vec4 {
     let terms = cosine.iter().zip(light);
     let sum: DVec3 = terms
         .map(|(&e, l)| l.truncate().as_dvec3() * f64::from(e))
         .sum();
-    sum.as_vec3()
-}
-
-fn ratio3(blocked: Vec3, arriving: Vec3, share: f32) -> Vec3 {
-    Vec3::new(
-        ratio(blocked.x, arriving.x, share),
-        ratio(blocked.y, arriving.y, share),
-        ratio(blocked.z, arriving.z, share),
-    )
-}
-
-fn ratio3_vjp(ratio: Vec3, arriving: Vec3, share: f32, gradient: Vec3) -> (Vec3, Vec3) {
-    let x = ratio_vjp(ratio.x, arriving.x, share, gradient.x);
-    let y = ratio_vjp(ratio.y, arriving.y, share, gradient.y);
-    let z = ratio_vjp(ratio.z, arriving.z, share, gradient.z);
-    (Vec3::new(x.0, y.0, z.0), Vec3::new(x.1, y.1, z.1))
+    padded(sum.as_vec3())
 }

@@ -24,10 +24,11 @@ const SCATTER_PARTS: usize = 16;
 /// much as finding it.
 const ENTRIES_PER_TEXEL: usize = 4;
 
-/// Texels as the kernels read them: the fourth number is 0, so whatever an entry has there is
+/// A colour as the kernels read it: the fourth number is 0, so whatever an entry has there is
 /// harmless.
-pub fn padded(texels: &[Vec3]) -> Vec<Vec4> {
-    texels.iter().map(|t| t.extend(0.0)).collect()
+#[inline(always)]
+pub fn padded(colour: Vec3) -> Vec4 {
+    colour.extend(0.0)
 }
 
 impl<E: Entry> Rows<E> {
@@ -50,7 +51,7 @@ impl<E: Entry> Rows<E> {
     pub fn product(
         &self,
         light: &[Vec4],
-        finish: &(impl Fn(usize, Vec3) -> Vec3 + Sync),
+        finish: &(impl Fn(usize, Vec4) -> Vec4 + Sync),
     ) -> Vec<Vec3> {
         let (offsets, exponents, entries) = (&*self.offsets, &*self.exponents, &*self.entries);
         let mut pixels = vec![Vec3::ZERO; self.pixels()];
@@ -62,10 +63,15 @@ impl<E: Entry> Rows<E> {
             rest = others;
         }
         tasks.into_par_iter().for_each(|(first, pixels)| {
-            for (p, pixel) in (first..).zip(pixels) {
-                let (start, end) = (offsets[p] as usize, offsets[p + 1] as usize);
-                let scaled = row_sum(&entries[start..end], light).truncate();
-                *pixel = finish(p, scaled * inverse_scale(exponents[p]));
+            let (offsets, exponents) = (&offsets[first..], &exponents[first..]);
+            let rows = offsets.windows(2).zip(exponents).zip(pixels);
+            for (k, ((row, &exponent), pixel)) in rows.enumerate() {
+                let [start, end] = [row[0] as usize, row[1] as usize];
+                let sum = match start < end {
+                    true => row_sum(entries, start, end, light) * inverse_scale(exponent),
+                    false => Vec4::ZERO,
+                };
+                *pixel = finish(first + k, sum).truncate();
             }
         });
         pixels
@@ -76,7 +82,7 @@ impl<E: Entry> Rows<E> {
     pub fn product_vjp(
         &self,
         texels: usize,
-        gradient: &(impl Fn(usize) -> Vec3 + Sync),
+        gradient: &(impl Fn(usize) -> Vec4 + Sync),
     ) -> Vec<Vec3> {
         let (offsets, exponents, entries) = (&*self.offsets, &*self.exponents, &*self.entries);
         let parts = entries.len() / (ENTRIES_PER_TEXEL * texels.max(1));
@@ -91,9 +97,9 @@ impl<E: Entry> Rows<E> {
                         continue;
                     }
                     let gradient = gradient(p);
-                    if gradient != Vec3::ZERO {
+                    if gradient != Vec4::ZERO {
                         let scaled = gradient * inverse_scale(exponents[p]);
-                        row_scatter(&entries[start..end], scaled.extend(0.0), &mut sums);
+                        row_scatter(entries, start, end, scaled, &mut sums);
                     }
                 }
                 sums
@@ -138,61 +144,87 @@ fn inverse_scale(exponent: i8) -> f32 {
     power_of_two(-exponent)
 }
 
+/// Calls `each` with the weights and the entries of a row `[start, end)`, four at a time. The last
+/// may belong to other rows, or to none: their weights are 0, so that no row's length costs a branch.
+#[inline(always)]
+fn by_four<E: Entry>(
+    entries: &[E],
+    start: usize,
+    end: usize,
+    mut each: impl FnMut([Vec4; 4], &[E; 4]),
+) {
+    const KEPT: [[f32; 4]; 4] = [
+        [0.0; 4],
+        [1.0, 0.0, 0.0, 0.0],
+        [1.0, 1.0, 0.0, 0.0],
+        [1.0, 1.0, 1.0, 0.0],
+    ];
+    let (fours, rest) = entries[start..end].as_chunks::<4>();
+    for four in fours {
+        each(E::weights(four), four);
+    }
+    if !rest.is_empty() {
+        let mut copy = [E::zeroed(); 4];
+        let four = match entries[end - rest.len()..].first_chunk() {
+            Some(four) => four,
+            None => {
+                copy[..rest.len()].copy_from_slice(rest);
+                &copy
+            }
+        };
+        let mut weights = E::weights(four);
+        for (weight, kept) in weights.iter_mut().zip(KEPT[rest.len()]) {
+            *weight *= kept;
+        }
+        each(weights, four);
+    }
+}
+
 /// Sum of weight times texel over a row: four running sums hide the latency of additions.
 #[inline(always)]
-fn row_sum<E: Entry>(entries: &[E], light: &[Vec4]) -> Vec4 {
+fn row_sum<E: Entry>(entries: &[E], start: usize, end: usize, light: &[Vec4]) -> Vec4 {
     let mut sums = [Vec4::ZERO; 4];
-    let (fours, rest) = entries.as_chunks::<4>();
-    for four in fours {
-        let weights = E::weights(four);
+    by_four(entries, start, end, |weights, four| {
         for k in 0..4 {
             sums[k] = weights[k].mul_add(light[four[k].texel()], sums[k]);
         }
-    }
-    for (sum, entry) in sums.iter_mut().zip(rest) {
-        *sum = entry.weight().mul_add(light[entry.texel()], *sum);
-    }
+    });
     (sums[0] + sums[1]) + (sums[2] + sums[3])
 }
 
 /// Adds weight times `gradient` to every texel of a row.
 #[inline(always)]
-fn row_scatter<E: Entry>(entries: &[E], gradient: Vec4, sums: &mut [Vec4]) {
-    let (fours, rest) = entries.as_chunks::<4>();
-    for four in fours {
-        let weights = E::weights(four);
+fn row_scatter<E: Entry>(
+    entries: &[E],
+    start: usize,
+    end: usize,
+    gradient: Vec4,
+    sums: &mut [Vec4],
+) {
+    by_four(entries, start, end, |weights, four| {
         for k in 0..4 {
             let sum = &mut sums[four[k].texel()];
             *sum = weights[k].mul_add(gradient, *sum);
         }
-    }
-    for entry in rest {
-        let sum = &mut sums[entry.texel()];
-        *sum = entry.weight().mul_add(gradient, *sum);
-    }
+    });
 }
 
-/// The ratio `1 - share missing / arriving` of one channel, clamped at 0; 1 where nothing arrives.
+/// The ratio `1 - share missing / arriving` of each channel, clamped at 0; 1 where nothing arrives.
 /// Sampling noise alone can bring it below 0; above 1, where `missing` is negative, the object sends
 /// more than it blocks.
-#[inline]
-pub fn ratio(missing: f32, arriving: f32, share: f32) -> f32 {
-    if arriving > 0.0 {
-        let ratio = 1.0 - share * (missing / arriving);
-        if ratio < 0.0 { 0.0 } else { ratio }
-    } else {
-        1.0
-    }
+#[inline(always)]
+pub fn ratio(missing: Vec4, arriving: Vec4, share: f32) -> Vec4 {
+    let ratio = 1.0 - share * (missing / arriving);
+    let clamped = Vec4::select(ratio.cmplt(Vec4::ZERO), Vec4::ZERO, ratio);
+    Vec4::select(arriving.cmpgt(Vec4::ZERO), clamped, Vec4::ONE)
 }
 
 /// Adjoint of [`ratio`]: the gradients of `missing` and `arriving`, from the ratio and its
 /// gradient. 0 where it is clamped and where nothing arrives.
-#[inline]
-pub fn ratio_vjp(ratio: f32, arriving: f32, share: f32, gradient: f32) -> (f32, f32) {
-    if !(arriving > 0.0) || ratio <= 0.0 {
-        return (0.0, 0.0);
-    }
+#[inline(always)]
+pub fn ratio_vjp(ratio: Vec4, arriving: Vec4, share: f32, gradient: Vec4) -> (Vec4, Vec4) {
+    let moves = arriving.cmpgt(Vec4::ZERO) & !ratio.cmple(Vec4::ZERO);
     // d(1 - s m / a) = -s / a dm + s m / a^2 da, and s m / a is 1 - ratio.
-    let slope = gradient / arriving;
+    let slope = Vec4::select(moves, gradient / arriving, Vec4::ZERO);
     (-slope * share, slope * (1.0 - ratio))
 }

@@ -113,7 +113,7 @@ impl Entry for GreyHalf {
 
     #[inline(always)]
     fn weights(four: &[Self; 4]) -> [Vec4; 4] {
-        let w = widen(four.map(|entry| entry.0[0]));
+        let w = widen(first_halves(four));
         [w.xxxx(), w.yyyy(), w.zzzz(), w.wwww()]
     }
 }
@@ -135,6 +135,23 @@ impl Entry for GreySingle {
     fn weight(&self) -> Vec4 {
         Vec4::splat(f32::from_bits(self.0[0]))
     }
+}
+
+/// The weights of four entries.
+#[inline(always)]
+fn first_halves(four: &[GreyHalf; 4]) -> [u16; 4] {
+    #[cfg(all(target_arch = "x86_64", target_feature = "ssse3"))]
+    {
+        use std::arch::x86_64::{_mm_cvtsi128_si64, _mm_setr_epi8, _mm_shuffle_epi8};
+        // SAFETY: the instruction sets are enabled at compile time.
+        let packed = unsafe {
+            let bytes = _mm_setr_epi8(0, 1, 4, 5, 8, 9, 12, 13, -1, -1, -1, -1, -1, -1, -1, -1);
+            _mm_cvtsi128_si64(_mm_shuffle_epi8(bytemuck::cast(*four), bytes))
+        };
+        bytemuck::cast(packed)
+    }
+    #[cfg(not(all(target_arch = "x86_64", target_feature = "ssse3")))]
+    four.map(|entry| entry.0[0])
 }
 
 /// Four halves as floats. Exact, so both versions give the same bits.

@@ -114,10 +114,12 @@ fn reference_shadow(
 
 #[test]
 fn a_clamped_ratio_has_no_gradient() {
-    assert_eq!(ratio(2.0, 1.0, 1.0), 0.0);
-    assert_eq!(ratio_vjp(0.0, 1.0, 1.0, 5.0), (0.0, 0.0));
-    assert_eq!(ratio(0.0, 0.0, 1.0), 1.0);
-    assert_eq!(ratio_vjp(1.0, 0.0, 1.0, 5.0), (0.0, 0.0));
-    assert_eq!(ratio(1.0, 4.0, 0.5), 0.875);
-    assert_eq!(ratio_vjp(0.875, 4.0, 0.5, 8.0), (-1.0, 0.25));
+    // Clamped, dark, and in between; the fourth is none.
+    let missing = Vec4::new(2.0, 0.0, 1.0, 0.0);
+    let arriving = Vec4::new(1.0, 0.0, 4.0, 0.0);
+    let found = ratio(missing, arriving, 2.0);
+    assert_eq!(found.truncate(), Vec3::new(0.0, 1.0, 0.5));
+    let (on_missing, on_arriving) = ratio_vjp(found, arriving, 2.0, Vec4::splat(8.0));
+    assert_eq!(on_missing.truncate(), Vec3::new(0.0, 0.0, -4.0));
+    assert_eq!(on_arriving.truncate(), Vec3::new(0.0, 0.0, 1.0));
 }
