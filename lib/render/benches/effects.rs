@@ -1,4 +1,4 @@
-//! What planning saves: ten kinds of scene rendered to one error, once with everything that the scene can show and once
+//! What planning saves: eleven kinds of scene rendered to one error, once with everything that the scene can show and once
 //! with what shows, as a table in Markdown. Both are compared with one reference.
 //! `cargo bench -p dipir-render --bench effects -- [size=WIDTHxHEIGHT] [target=RMSE] [repeats=N] [NAME]`
 //! Times are processor seconds, the least of the repeats.
@@ -93,6 +93,7 @@ fn main() {
     );
     println!("|---|---|---|---|---|---|---|---|---|---|");
     let scenes = gallery::scenes(size[0]).into_iter();
+    let scenes = scenes.chain([gallery::black(size[0])]);
     let scenes = scenes.filter(|(n, _)| name.is_none_or(|name| n.contains(name.as_str())));
     for (name, mut scene) in scenes.take(if whole { usize::MAX } else { 1 }) {
         scene.camera.resolution[1] = size[1];

@@ -99,6 +99,12 @@ pub fn with_highlights(size: u32) -> Vec<(&'static str, Scene)> {
     ]
 }
 
+/// A scene whose light from fold to fold, and onto the ground, is there and does not show.
+#[allow(dead_code, reason = "not every bench renders it")]
+pub fn black(size: u32) -> (&'static str, Scene) {
+    ("black rubber", scene(size, knot(), matte(0.03), ground()))
+}
+
 /// Name and scene, ten kinds; square pictures of `size` pixels a side.
 pub fn scenes(size: u32) -> Vec<(&'static str, Scene)> {
     let scene = |mesh, material, proxy| scene(size, mesh, material, proxy);
