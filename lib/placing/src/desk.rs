@@ -20,7 +20,7 @@ use dipir_preview::small::{Props, SmallScene};
 use dipir_render::error::RenderError;
 use dipir_scene::camera::Camera;
 use dipir_scene::config::SceneConfig;
-use dipir_scene::pixels::ground_at;
+use dipir_scene::pixels::{ground_at, mesh_at};
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::LoadedScene;
 use dipir_stages::composite::table::CompositeTable;
@@ -32,12 +32,17 @@ use serde_json::{Value, json};
 use crate::document::Document;
 use crate::drafts::Drafts;
 use crate::edit::Edit;
+use crate::readings::Reading;
 use crate::relighting::Relighting;
 use crate::shown::{description, height_over, view};
+use crate::standing::{Grounds, keep_places};
 use crate::vanishing::{Lines, Solution, solve};
 
 /// Longest side of the photograph on the page, pixels.
 const LONGEST: u32 = 1280;
+/// What is said of the project's file then: this page does not know the new text, and must not lose it.
+const CHANGED: &str = "was changed by another program: undo that to save what is changed here, or start dipir place \
+                       anew to go on from it";
 /// The mask's file, beside the project's.
 const MASK_FILE: &str = "holdout.png";
 
@@ -47,6 +52,8 @@ pub struct Desk {
     /// What the command line sets; it holds whatever the page changes, and is not saved.
     overrides: Vec<String>,
     props: Arc<Props>,
+    /// The other files of the scene, but the mask that is painted here.
+    readings: Vec<Reading>,
     /// The photograph as a PNG, and its size.
     photo: Vec<u8>,
     size: [usize; 2],
@@ -111,6 +118,10 @@ impl Desk {
         for warning in &arrangement.warnings {
             session.warn(warning);
         }
+        let painted = path.with_file_name(MASK_FILE);
+        let inputs = small.loaded.inputs.iter().map(|i| &i.location);
+        let readings = inputs.filter(|i| **i != painted);
+        let readings = readings.map(|i| Reading::new(i)).collect();
         let photo = &small.loaded.photo;
         let picture = photo.transfer.encode(&photo.image);
         let size = [picture.0.width(), picture.0.height()];
@@ -119,6 +130,7 @@ impl Desk {
             path,
             overrides: session.config.overrides().to_vec(),
             props: small.props.clone(),
+            readings,
             photo: png::encode(size[0], size[1], &values)?,
             size,
             text: Mutex::new(text),
@@ -174,6 +186,10 @@ impl Desk {
         let mut document = Document::parse(&held(&self.text))?;
         document.order_objects(&edit.objects)?;
         document.apply_light(edit)?;
+        if (0..edit.objects.len()).any(|i| document.is_looked_for(i).unwrap_or(false)) {
+            let (_, before) = self.arranged(&held(&self.text))?;
+            keep_places(&mut document, edit, &before)?;
+        }
         for (i, object) in edit.objects.iter().enumerate() {
             document.shape(i, object)?;
         }
@@ -212,6 +228,7 @@ impl Desk {
 
     /// Turns the camera, then lifts it.
     fn move_camera(&self, document: &mut Document, edit: &Edit) -> anyhow::Result<()> {
+        document.refuse_ground_of_depths()?;
         // The camera alone: a turn may leave objects above the horizon that are put elsewhere.
         let camera_of = |document: &Document| -> anyhow::Result<(Camera, Plane)> {
             let (_, arranged) = self.arranged(&held(&self.text))?;
@@ -239,24 +256,39 @@ impl Desk {
         let config = self.config(&document.text())?;
         let scene: SceneConfig = config.table("scene")?;
         let camera = self.props.camera(&scene)?;
+        let objects = scene.validate()?.objects;
         let (_, before) = self.arranged(&held(&self.text))?;
-        let ground = match self.props.plane(&scene)? {
-            Some(plane) => plane,
-            None => before.ground(),
+        let after = match self.props.plane(&scene)? {
+            Some(plane) => Proxy::Plane(plane),
+            None => before.proxy.clone(),
+        };
+        let grounds = Grounds {
+            before: &before.proxy,
+            after: &after,
         };
         for (i, object) in edit.objects.iter().enumerate() {
             let Some(at) = object.at else { continue };
-            let is_by_position = document.is_by_position(i)?;
-            if !is_by_position && matches!(before.proxy, Proxy::Mesh(_)) {
-                document.put_at_pixel(i, at)?;
+            let pixel = DVec2::from_array(at);
+            let none = match after {
+                Proxy::Mesh(_) => "no ground is seen there",
+                _ => "no ground is seen there: it is above the horizon",
+            };
+            if document.is_by_position(i)? {
+                let (placed, rest) = (&before.objects[object.of], objects[i].placement.rest);
+                let point = grounds.point_at(&camera, placed, rest, pixel);
+                document.put_at(i, point.context(none)?)?;
                 continue;
             }
-            let seen = ground_at(&camera, &ground, DVec2::from_array(at));
-            let point = seen.context("no ground is seen there: it is above the horizon")?;
-            match is_by_position {
-                true => document.put_at(i, point)?,
-                false => document.put_at_pixel(i, at)?,
+            let is_seen = match &after {
+                Proxy::Mesh(mesh) => mesh_at(&camera, mesh, pixel).is_some(),
+                Proxy::Plane(plane) => ground_at(&camera, plane, pixel).is_some(),
+                // What the file lacks is said where it is read.
+                Proxy::None => true,
+            };
+            if !is_seen {
+                bail!(none);
             }
+            document.put_at_pixel(i, at)?;
         }
         Ok(())
     }
@@ -288,8 +320,28 @@ impl Desk {
             "names": arrangement.objects.iter().map(name).collect::<Vec<_>>(),
             "exposure_ev": exposure.exposure_ev,
             "edit": edit,
-            "view": view(&arrangement, true),
+            "view": self.shown(&arrangement, true),
         }))
+    }
+
+    fn shown(&self, arrangement: &Arrangement, grid: bool) -> Value {
+        let mut shown = view(arrangement, grid);
+        if let Some(warnings) = shown["warnings"].as_array_mut() {
+            warnings.extend(self.changes().into_iter().map(Value::from));
+        }
+        shown
+    }
+
+    /// What became of the files that were read, one sentence each.
+    fn changes(&self) -> Vec<String> {
+        let name = self.path.display();
+        let text = match dipir_files::read_to_string(&self.path) {
+            Ok(text) if text == *held(&self.text) => None,
+            Ok(_) => Some(format!("\"{name}\" {CHANGED}")),
+            Err(e) => Some(format!("cannot read \"{name}\": {}", plain_reason(&e))),
+        };
+        let others = self.readings.iter().filter_map(Reading::change);
+        text.into_iter().chain(others).collect()
     }
 
     /// Lines and numbers of an edit; with `grid`, the ground's, too.
@@ -298,7 +350,7 @@ impl Desk {
     /// If it cannot be.
     pub fn view(&self, edit: &Edit, grid: bool) -> anyhow::Result<Value> {
         let (_, _, arrangement) = self.edited(edit)?;
-        Ok(view(&arrangement, grid))
+        Ok(self.shown(&arrangement, grid))
     }
 
     /// The camera that sees `lines`.
@@ -444,8 +496,8 @@ impl Desk {
     /// Writes the file and, if one was painted, the mask; what was written, one line each.
     ///
     /// # Errors
-    /// If it cannot be, or the file was changed by another program or saved since it was read. Nothing
-    /// is written then.
+    /// If it cannot be, or the file was changed by another program or saved since it was read. The
+    /// file stays as it is then, and an earlier mask too.
     pub fn save(&self, edit: &Edit) -> anyhow::Result<Vec<String>> {
         let (text, _, arrangement) = self.edited(edit)?;
         let mut document = Document::parse(&text)?;
@@ -469,26 +521,32 @@ impl Desk {
         let found = dipir_files::read_to_string(&self.path)
             .with_context(|| format!("cannot read \"{}\"", self.path.display()))?;
         if found != *base {
-            bail!(
-                "the file was changed by another program; start dipir place anew to go on from it"
-            );
+            bail!("\"{}\" {CHANGED}", self.path.display());
         }
         // Every table is read once more, and the light found, as a run would.
         self.arrange(&mut rendered, edit, &arrangement, config)?;
         let graph = graph::graph(&rendered.session)?;
         graph::assess(&rendered.session, &graph, &graph.up_to(graph::LAST))?;
         let mut written = Vec::new();
+        let earlier = mask.as_ref().and_then(|path| dipir_files::read(path).ok());
         if let Some(path) = &mask {
             let [w, h] = arrangement.camera.resolution.map(|n| n as usize);
             let whole = resize(&self.raster(&painted), w, h, Filter::Tent);
             let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
             let values: Vec<u8> = whole.pixels().iter().map(byte).collect();
             png::write(path, &png::encode(w, h, &values)?).map_err(|e| unwritten(path, &e))?;
-            rendered.own_mask = Some(self.raster(&painted));
             written.push(path.display().to_string());
         }
-        dipir_files::rewrite(&self.path, base.as_bytes(), text.as_bytes())
-            .map_err(|e| unwritten(&self.path, &e))?;
+        if let Err(e) = dipir_files::rewrite(&self.path, base.as_bytes(), text.as_bytes()) {
+            // The file as it is goes with the mask as it was.
+            if let (Some(path), Some(earlier)) = (&mask, earlier) {
+                png::write(path, &earlier).map_err(|e| unwritten(path, &e))?;
+            }
+            return Err(unwritten(&self.path, &e));
+        }
+        if mask.is_some() {
+            rendered.own_mask = Some(self.raster(&painted));
+        }
         written.push(self.path.display().to_string());
         if text != *base {
             self.revision.fetch_add(1, Ordering::SeqCst);

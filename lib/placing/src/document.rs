@@ -1,4 +1,6 @@
 //! Changes of a `pipeline.toml` that keep its comments and its order.
+use std::path::Path;
+
 use anyhow::{Context, bail};
 use dipir_scene::camera::Camera;
 use glam::{DMat3, DVec3};
@@ -124,6 +126,23 @@ impl Document {
         Ok(())
     }
 
+    /// Refuses a ground through a depth map: it turns and rises with the camera, which is not shown here.
+    ///
+    /// # Errors
+    /// If the ground is one.
+    pub fn refuse_ground_of_depths(&mut self) -> anyhow::Result<()> {
+        let proxy = self.table("scene")?.get("proxy");
+        let points = proxy.and_then(|p| p.as_table_like()?.get("points")?.as_str());
+        let extension = points.and_then(|p| Path::new(p).extension());
+        if extension.is_some_and(|e| ["exr", "png"].iter().any(|d| e.eq_ignore_ascii_case(d))) {
+            bail!(
+                "the ground is that of a depth map, which moves with the camera; change [scene.camera] in \
+                 pipeline.toml and start dipir place anew"
+            );
+        }
+        Ok(())
+    }
+
     /// Says how high the camera stands over a ground that is told from the camera; `false` if the ground is told otherwise.
     ///
     /// # Errors
@@ -202,6 +221,14 @@ impl Document {
     /// If there is no such object.
     pub fn is_by_position(&mut self, index: usize) -> anyhow::Result<bool> {
         Ok(!self.object(index)?.contains_key("at_pixel"))
+    }
+
+    /// Whether a place is looked for where the object is free, seen and whole.
+    ///
+    /// # Errors
+    /// If there is no such object.
+    pub fn is_looked_for(&mut self, index: usize) -> anyhow::Result<bool> {
+        Ok(self.object(index)?.contains_key("place"))
     }
 
     /// Puts an object at a pixel.

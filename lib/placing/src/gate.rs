@@ -75,6 +75,9 @@ impl Gate {
         if head.host != Some(&self.authority) {
             return refuse(403, "this server answers to its own address alone");
         }
+        if !["GET", "POST"].contains(&head.method) {
+            return refuse(405, "this is asked for in another way");
+        }
         let own = format!("http://{}", self.authority);
         match head.origin {
             Some(origin) if origin != own => {
@@ -220,11 +223,10 @@ mod tests {
             }),
             403
         );
-        let put = Head {
-            method: "PUT",
-            ..POST
-        };
-        assert_eq!(status(put), 405);
+        for method in ["PUT", "HEAD", "OPTIONS", "TRACE", ""] {
+            assert_eq!(status(Head { method, ..GET }), 405, "{method}");
+            assert_eq!(status(Head { method, ..POST }), 405, "{method}");
+        }
         assert_eq!(
             status(Head {
                 method: "POST",

@@ -59,6 +59,8 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
 
 /// Most threads that compute an answer: one may render, others draw lines meanwhile.
 const THREADS: usize = 8;
+/// Most connections at once; a browser keeps six.
+const CONNECTIONS: usize = 128;
 /// How soon the server sees that it should end.
 const PAUSE: Duration = Duration::from_millis(200);
 /// Longest wait for the head of a request, and for its body.
@@ -123,6 +125,8 @@ impl Place {
         let listener = self.listener.try_clone()?;
         listener.set_nonblocking(true)?;
         let listener = tokio::net::TcpListener::from_std(listener)?;
+        // Each connection holds one.
+        let seats = Arc::new(());
         while !stop.load(Ordering::Relaxed) {
             let stream = match timeout(PAUSE, listener.accept()).await {
                 Err(_) => continue,
@@ -133,13 +137,21 @@ impl Place {
                     continue;
                 }
             };
+            // Files that are read and saved need descriptors, too.
+            let seat = seats.clone();
+            if Arc::strong_count(&seats) > CONNECTIONS + 1 {
+                continue;
+            }
             let site = self.site.clone();
             let service = service_fn(move |request| site.clone().answer(request));
             let mut http = http1::Builder::new();
             http.timer(TokioTimer::new()).header_read_timeout(PATIENCE);
             let connection = http.serve_connection(TokioIo::new(stream), service);
             // Who breaks a connection off does not wait for an answer.
-            tokio::spawn(async { drop(connection.await) });
+            tokio::spawn(async move {
+                drop(connection.await);
+                drop(seat);
+            });
         }
         Ok(())
     }

@@ -4,7 +4,7 @@ use dipir_preview::arrangement::{Arrangement, Placed};
 use dipir_preview::lines::{Kind, Piece};
 use dipir_preview::marks::{Grid, horizon, outline, stick};
 use dipir_scene::camera::Camera;
-use dipir_scene::proxy::Plane;
+use dipir_scene::proxy::{Plane, Proxy};
 use dipir_stages::light::at_hand::AtHand;
 use glam::DVec3;
 use serde_json::{Value, json};
@@ -48,7 +48,8 @@ pub(crate) fn view(arrangement: &Arrangement, grid: bool) -> Value {
         },
         "warnings": arrangement.warnings,
     });
-    if grid {
+    // On what is no plane the grid follows the first object.
+    if grid || !matches!(arrangement.proxy, Proxy::Plane(_)) {
         let found = Grid::new(camera, &ground, focus.map(|o| o.contact));
         view["grid"] = found.pieces.iter().map(line).collect();
         view["spacing_m"] = found.spacing_m.into();

@@ -3,6 +3,7 @@ use std::fs;
 
 use dipir_placing::desk::Desk;
 use dipir_placing::edit::Edit;
+use image::{ImageBuffer, Luma};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -13,12 +14,20 @@ const PLANE: &str = "plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0]
 
 /// The project on another ground, whose table says `proxy`.
 fn on_ground(proxy: &str) -> (TempDir, Desk) {
-    let folder = tempfile::tempdir().unwrap();
-    project(folder.path(), &[]);
-    let square = "v -9 0 9\nv 9 0 9\nv 9 0 -90\nv -9 0 -90\nf 1 2 3 4\n";
-    fs::write(folder.path().join("ground.obj"), square).unwrap();
     let text = TEXT.replace(PLANE, proxy);
     assert_ne!(text, TEXT);
+    opened(&text)
+}
+
+/// A project of this text, with a level mesh and a slope beside it.
+fn opened(text: &str) -> (TempDir, Desk) {
+    let folder = tempfile::tempdir().unwrap();
+    project(folder.path(), &[]);
+    for (name, near, far) in [("ground.obj", 0, 0), ("slope.obj", -1, 9)] {
+        let square =
+            format!("v -9 {near} 9\nv 9 {near} 9\nv 9 {far} -90\nv -9 {far} -90\nf 1 2 3 4\n");
+        fs::write(folder.path().join(name), square).unwrap();
+    }
     fs::write(folder.path().join("pipeline.toml"), text).unwrap();
     let desk = Desk::open(open(folder.path(), &[])).unwrap();
     (folder, desk)
@@ -57,6 +66,130 @@ fn an_object_at_a_pixel_of_a_mesh_is_moved_to_another_pixel() {
         text.contains("at_pixel = [190.0, 140.0] # at the kerb"),
         "{text}"
     );
+}
+
+/// The project on a ground, its object at a position and a second one at another.
+fn at_positions(proxy: &str, first: &str, second: &str) -> (TempDir, Desk) {
+    let one = TEXT.replace("at_pixel = [150.0, 150.0]", first);
+    let more = format!("[[scene.objects]]\npath = \"box.obj\"\n{second}\n\n[scene.camera]");
+    let proxy = match proxy {
+        "" => "",
+        proxy => &format!("[scene.proxy]\n{proxy}"),
+    };
+    let both = one.replace("[scene.camera]", &more);
+    opened(&both.replace(&format!("[scene.proxy]\n{PLANE}"), proxy))
+}
+
+#[test]
+fn objects_at_positions_follow_the_pointer_over_any_ground_and_keep_the_height_that_they_are_given()
+{
+    let at = "position = [0.0, 0.0, -4.0]";
+    let on_a_table = "position = [1.0, 0.8, -4.0]";
+    let fixed = "position = [1.0, 0.8, -4.0]\nrest = \"position\"";
+    let lamp = "position = [1.0, 2.4, -4.0]";
+    let slope = "mesh = \"slope.obj\"";
+    for (proxy, second, pixels, height) in [
+        (slope, at, [[120.0, 150.0], [190.0, 140.0]], None),
+        (slope, fixed, [[120.0, 150.0], [190.0, 125.0]], Some(0.8)),
+        (
+            PLANE,
+            on_a_table,
+            [[120.0, 150.0], [190.0, 125.0]],
+            Some(0.8),
+        ),
+        // Above the eyes, and above the horizon.
+        (PLANE, lamp, [[120.0, 150.0], [200.0, 20.0]], Some(2.4)),
+        ("", on_a_table, [[120.0, 150.0], [190.0, 125.0]], Some(0.8)),
+    ] {
+        let (folder, desk) = at_positions(proxy, at, second);
+        let moved =
+            edit(json!({"objects": [{"of": 0, "at": pixels[0]}, {"of": 1, "at": pixels[1]}]}));
+        for view in shown_and_saved(&folder, &desk, &moved) {
+            for (k, pixel) in pixels.iter().enumerate() {
+                let at = [0, 1].map(|c| number(&view, &format!("/objects/{k}/contact/{c}")));
+                // A position is written to a tenth of a millimetre, 0.02 pixels at 2 m.
+                let off = (at[0] - pixel[0]).hypot(at[1] - pixel[1]);
+                assert!(off < 0.05, "{proxy} {second}: {at:?} {pixel:?}");
+            }
+        }
+        let text = fs::read_to_string(folder.path().join("pipeline.toml")).unwrap();
+        let objects = text.split("[scene.camera]").next().unwrap();
+        let kept = height.is_none_or(|h: f64| objects.contains(&format!(", {h:?}, ")));
+        assert!(kept, "{text}");
+    }
+}
+
+#[test]
+fn an_object_whose_place_was_looked_for_is_turned_and_sized_there_and_outlives_another() {
+    let looked_for = "place = \"auto\"\nheight_m = 0.5";
+    let (folder, desk) = at_positions(PLANE, "position = [-1.5, 0.0, -6.0]", looked_for);
+    let before = desk.view(&Edit::none(2), false).unwrap();
+    let contact = |view: &Value, k: usize| {
+        ["0", "1"].map(|c| number(view, &format!("/objects/{k}/contact/{c}")))
+    };
+    let place = contact(&before, 1);
+    let near = |at: [f64; 2]| {
+        // A position is written to a tenth of a millimetre, 0.02 pixels at 2 m.
+        let off = (at[0] - place[0]).hypot(at[1] - place[1]);
+        assert!(off < 0.05, "{at:?} {place:?}");
+    };
+    let turned = desk.view(
+        &edit(json!({"objects": [{"of": 0}, {"of": 1, "yaw_deg": 30.0, "size": 1.2}]})),
+        false,
+    );
+    let turned = turned.unwrap();
+    near(contact(&turned, 1));
+    assert!(
+        (number(&turned, "/objects/1/size_m/1") - 0.6).abs() < 1e-5,
+        "{turned}"
+    );
+    assert_ne!(turned["objects"][1]["lines"], before["objects"][1]["lines"]);
+    let alone = edit(json!({"objects": [{"of": 1}]}));
+    for view in shown_and_saved(&folder, &desk, &alone) {
+        near(contact(&view, 0));
+        assert!(
+            (number(&view, "/objects/0/size_m/1") - 0.5).abs() < 1e-5,
+            "{view}"
+        );
+    }
+}
+
+/// Depths of the level ground 1.6 m below the project's camera, millimetres.
+fn depths() -> ImageBuffer<Luma<u16>, Vec<u16>> {
+    let (focal, pitch) = (100.0 / 25f64.to_radians().tan(), 10f64.to_radians());
+    ImageBuffer::from_fn(300, 200, |_, row| {
+        let rise = (100.0 - (f64::from(row) + 0.5)) / focal * pitch.cos() - pitch.sin();
+        let seen = Some(-1600.0 / rise).filter(|mm| (0.0..40_000.0).contains(mm));
+        Luma([seen.map_or(0, |mm| mm.round() as u16)])
+    })
+}
+
+#[test]
+fn an_object_follows_the_pointer_over_a_depth_map_whose_camera_is_not_moved() {
+    let ground = "points = \"depth.png\"";
+    for place in ["at_pixel = [150.0, 150.0]", "position = [0.0, 0.0, -4.0]"] {
+        let folder = tempfile::tempdir().unwrap();
+        project(folder.path(), &[]);
+        depths().save(folder.path().join("depth.png")).unwrap();
+        let text = TEXT.replace(PLANE, ground);
+        let text = text.replace("at_pixel = [150.0, 150.0]", place);
+        fs::write(folder.path().join("pipeline.toml"), text).unwrap();
+        let desk = Desk::open(open(folder.path(), &[])).unwrap();
+        let moved = edit(json!({"objects": [{"of": 0, "at": [190.0, 140.0]}]}));
+        for view in shown_and_saved(&folder, &desk, &moved) {
+            let at = ["/objects/0/contact/0", "/objects/0/contact/1"].map(|p| number(&view, p));
+            // A position is written to a tenth of a millimetre, 0.02 pixels at 2 m.
+            assert!((at[0] - 190.0).hypot(at[1] - 140.0) < 0.05, "{at:?}");
+        }
+        // A run finds the ground anew from where the camera is.
+        let turn = json!({"pitch_deg": -14.0, "roll_deg": 0.0, "fov_deg": 50.0});
+        for (key, value) in [("turn", turn), ("height_m", json!(2.5))] {
+            let mut change = json!({"objects": [{"of": 0}], "revision": 1});
+            change[key] = value;
+            let error = desk.view(&edit(change), false).unwrap_err().to_string();
+            assert!(error.contains("depth map"), "{error}");
+        }
+    }
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use dipir_cli::session::Session;
 use dipir_placing::desk::Desk;
@@ -229,6 +229,28 @@ fn a_body_of_100_megabytes_is_refused_before_it_is_sent() {
     assert_eq!(place.post_bytes("mask", &[0; 60_000]).status, 200);
     assert_eq!(place.post_bytes("mask", &[0; 60_001]).status, 413);
     assert_eq!(place.post_bytes("mask", &[0; 59_999]).status, 422);
+}
+
+#[test]
+fn more_connections_than_a_browser_needs_are_closed_until_others_end() {
+    let place = Running::new();
+    let silent: Vec<TcpStream> = (0..200).map(|_| place.connect()).collect();
+    // No byte was sent to it: it is closed without a word.
+    assert_eq!((&silent[199]).read(&mut [0]).unwrap(), 0);
+    drop(silent);
+    let (token, host) = (&place.token, &place.authority);
+    let head = format!("GET /{token}/mask.bin HTTP/1.1\r\nHost: {host}\r\n\r\n");
+    let begins = || {
+        let mut stream = place.connect();
+        let sent = stream.write_all(head.as_bytes());
+        let mut answer = [0; 12];
+        sent.and_then(|()| stream.read_exact(&mut answer))
+            .is_ok_and(|()| answer.ends_with(b"200"))
+    };
+    let begin = Instant::now();
+    while !begins() {
+        assert!(begin.elapsed() < PATIENCE);
+    }
 }
 
 #[test]

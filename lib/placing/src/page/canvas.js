@@ -21,7 +21,7 @@ export class Picture {
   fit() {
     const parent = this.canvas.parentElement.clientWidth;
     const [w, h] = this.size;
-    const tall = window.innerWidth <= 760 ? 0.5 : 0.78;
+    const tall = window.innerWidth <= 760 ? 0.5 : 0.74;
     const width = Math.max(120, Math.min(parent, (tall * window.innerHeight * w) / h));
     const ratio = window.devicePixelRatio || 1;
     this.canvas.style.width = `${width}px`;
@@ -68,11 +68,12 @@ export class Picture {
     }
   }
 
-  handle([x, y], color, chosen = false) {
+  // `radius` in pixels of the screen.
+  handle([x, y], color, radius = 7) {
     const { context, zoom } = this;
     const ratio = window.devicePixelRatio || 1;
     context.beginPath();
-    context.arc(x * zoom, y * zoom, (chosen ? 9 : 7) * ratio, 0, 7);
+    context.arc(x * zoom, y * zoom, radius * ratio, 0, 7);
     context.fillStyle = "rgba(0,0,0,.45)";
     context.fill();
     context.strokeStyle = color;

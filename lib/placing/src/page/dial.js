@@ -57,7 +57,7 @@ export class Dial {
     const style = getComputedStyle(document.documentElement);
     const half = side / 2;
     const rim = half - 10;
-    context.strokeStyle = style.getPropertyValue("--edge");
+    context.strokeStyle = style.getPropertyValue("--line");
     for (const share of [1, 2 / 3, 1 / 3]) {
       context.beginPath();
       context.arc(half, half, rim * share, 0, 7);
@@ -75,7 +75,7 @@ export class Dial {
     context.beginPath();
     context.arc(half + radius * Math.sin(angle), half - radius * Math.cos(angle), 7, 0, 7);
     context.lineWidth = 2.5;
-    context.strokeStyle = "#e69f00";
+    context.strokeStyle = style.getPropertyValue("--sun");
     context.fillStyle = "#ffc93c";
     if (said) context.fill();
     context.stroke();

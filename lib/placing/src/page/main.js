@@ -83,6 +83,9 @@ const page = {
     if (tools.name === "lines") solve();
   },
 
+  // Width of the brush, pixels of the screen.
+  brush: () => $("brush").valueAsNumber,
+
   // Draws a stroke into the mask; sends it when the stroke ends.
   paint(from, to, ends) {
     if (ends) return takeMask();
@@ -90,7 +93,7 @@ const page = {
     ink.globalCompositeOperation = $("erase").checked ? "destination-out" : "source-over";
     ink.strokeStyle = "#ff2f6d";
     ink.lineCap = "round";
-    ink.lineWidth = ($("brush").valueAsNumber / picture.scale) * scale;
+    ink.lineWidth = (page.brush() / picture.scale) * scale;
     ink.beginPath();
     ink.moveTo(from[0] * scale, from[1] * scale);
     ink.lineTo(to[0] * scale + 0.01, to[1] * scale);
@@ -181,7 +184,7 @@ const relight = api.latest(async (edit) => {
 
 let beforeSun = null; // while the sun is dragged: what undo leads to
 let beforeExposure = null;
-const dragged = () => tools.pointers.size > 0 || beforeSun || beforeExposure;
+const dragged = () => tools.pointers.size > 0 || tools.isDown || beforeSun || beforeExposure;
 
 // Shows another sun or exposure while it is dragged.
 function showLit(keys) {
@@ -353,6 +356,7 @@ $("show").addEventListener("change", () => page.redraw());
 $("direction").addEventListener("change", () => solve());
 $("second").addEventListener("change", (event) => {
   tools.second = event.target.checked;
+  [[tools.lines.chosen]] = tools.lines.lines;
   solve();
   page.redraw();
 });

@@ -2,12 +2,14 @@
 
 const $ = (id) => document.getElementById(id);
 
+const ENDS = "Arrows move an end, Enter takes the next one.";
+
 export const HELP = {
   move: "Drag the object over the ground. Wheel: size. Shift and wheel, or R and drag: turn. Arrows, Q, E, + and - do the same; C copies, Delete removes, [ and ] choose.",
-  lines: "Drag the ends of the lines.",
-  measure: "Drag both ends of the line onto the ground.",
-  mask: "Paint over what stands in front of the object.",
-  shadow: "Drag one end to the foot, the other to the tip of the shadow.",
+  lines: `Drag the ends of the lines. ${ENDS}`,
+  measure: `Drag both ends of the line onto the ground. ${ENDS}`,
+  mask: "Paint over what stands in front of the object. Arrows move the brush; Enter puts it down and lifts it.",
+  shadow: `Drag one end to the foot, the other to the tip of the shadow. ${ENDS}`,
 };
 
 export function say(text, bad = false) {
@@ -40,6 +42,7 @@ let listed = null;
 
 // The list of objects. It is made anew only for other objects: a click or the keyboard may be at work in it.
 export function objects(names, edit, chosen, choose) {
+  let stays = false; // the keyboard in the list
   const said = edit.objects.map((object, k) => `${k + 1} ${names[object.of]}`);
   if (said.join("\n") !== listed) {
     listed = said.join("\n");
@@ -50,9 +53,12 @@ export function objects(names, edit, chosen, choose) {
       label.append(input, text);
       return label;
     });
+    stays = $("objects").contains(document.activeElement);
     $("objects").replaceChildren(...list);
   }
-  $("objects").querySelectorAll("input")[chosen].checked = true;
+  const now = $("objects").querySelectorAll("input")[chosen];
+  now.checked = true;
+  if (stays) now.focus();
 }
 
 export function showNumbers(view, chosen) {
@@ -70,6 +76,9 @@ export function showNumbers(view, chosen) {
       `${width.toFixed(2)} × ${height.toFixed(2)} × ${depth.toFixed(2)} m (width, height, depth), ` +
       `${object.distance_m.toFixed(1)} m from the camera`;
   }
+  // What has been said already is not said again.
+  const said = [...$("warnings").children].map((item) => item.textContent);
+  if (said.join("\n") === view.warnings.join("\n")) return;
   const warnings = view.warnings.map((text) => Object.assign(document.createElement("li"), { textContent: text }));
   $("warnings").replaceChildren(...warnings);
 }

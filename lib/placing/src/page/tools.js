@@ -1,20 +1,29 @@
 // What the pointer and the keys do on the picture, tool by tool.
+import { say } from "./panel.js";
 
 const BLUE = "#5ab4ff";
 const GREEN = "#61d095";
 const YELLOW = "#ffd140";
 
+const within = (at, size) => at.map((x, k) => Math.max(0, Math.min(size[k], x)));
+
 // A list of lines whose ends are dragged.
 class Ends {
   constructor(lines, colors) {
     Object.assign(this, { lines, colors, held: null });
+    this.chosen = lines[0][0]; // the end that the keys move
   }
 
-  draw(picture, count = this.lines.length) {
+  draw(picture, keyed, count = this.lines.length) {
     this.lines.slice(0, count).forEach((line, k) => {
       picture.line(line, this.colors[k]);
-      line.forEach((end) => picture.handle(end, this.colors[k]));
+      line.forEach((end) => picture.handle(end, this.colors[k], keyed && end === this.chosen ? 12 : 7));
     });
+  }
+
+  next(count = this.lines.length) {
+    const ends = this.lines.slice(0, count).flat();
+    this.chosen = ends[(ends.indexOf(this.chosen) + 1) % ends.length];
   }
 
   // The end near a place, within 22 pixels of the screen.
@@ -30,17 +39,18 @@ class Ends {
         }
       }),
     );
+    this.chosen = this.held ?? this.chosen;
     return this.held !== null;
   }
 
   // Ends stay in the picture, where they can be taken again.
-  move(at, size) {
-    if (this.held) at.forEach((x, k) => (this.held[k] = Math.max(0, Math.min(size[k], x))));
+  move(end, at, size) {
+    within(at, size).forEach((x, k) => (end[k] = x));
   }
 }
 
 export class Tools {
-  // `page` offers: picture, history, view, chosen, choose, pose, change, finish, copy, remove, redraw, linesChanged, paint.
+  // `page` offers: picture, history, view, chosen, choose, pose, change, finish, copy, remove, redraw, linesChanged, paint, brush.
   constructor(page, size) {
     this.page = page;
     this.name = "move";
@@ -53,6 +63,8 @@ export class Tools {
     this.measure = new Ends([of([0.4, 0.8], [0.6, 0.8])], [YELLOW]);
     this.shadow = new Ends([of([0.4, 0.8], [0.55, 0.75])], [YELLOW]);
     this.second = false;
+    this.brush = [w / 2, h / 2]; // where the keys paint
+    this.isDown = false; // whether they do
     this.keys = new Set();
     this.pointers = new Map();
     const canvas = page.picture.canvas;
@@ -61,6 +73,11 @@ export class Tools {
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => this.up(event));
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     canvas.addEventListener("keydown", (event) => this.key(event));
+    canvas.addEventListener("focus", () => page.redraw());
+    canvas.addEventListener("blur", () => {
+      this.lift();
+      page.redraw();
+    });
     window.addEventListener("keydown", (event) => this.keys.add(event.key.toLowerCase()));
     window.addEventListener("keyup", (event) => this.keys.delete(event.key.toLowerCase()));
     window.addEventListener("blur", () => this.keys.clear());
@@ -76,9 +93,11 @@ export class Tools {
 
   draw() {
     const { picture, view, chosen } = this.page;
-    this.ends?.draw(picture, this.count);
+    const keyed = picture.canvas.matches(":focus-visible");
+    this.ends?.draw(picture, keyed, this.count);
+    if (this.name === "mask" && keyed) picture.handle(this.brush, this.isDown ? "#ff2f6d" : "#fff", this.page.brush() / 2);
     const contact = view.objects[chosen]?.contact;
-    if (this.name === "move" && contact) picture.handle(contact, "#ff801a", true);
+    if (this.name === "move" && contact) picture.handle(contact, "#ff801a", 9);
   }
 
   down(event) {
@@ -128,7 +147,7 @@ export class Tools {
     if (this.name === "mask") return page.paint(last, at, false);
     if (event.pointerId !== this.first) return;
     if (this.ends) {
-      this.ends.move(at, page.picture.size);
+      if (this.ends.held) this.ends.move(this.ends.held, at, page.picture.size);
       page.linesChanged();
       return page.redraw();
     }
@@ -180,11 +199,49 @@ export class Tools {
     if (object) this.page.change({ size: (object.size ?? 1) * factor }, !this.pointers.size, "size");
   }
 
+  // Ends a stroke that the keys began.
+  lift() {
+    if (!this.isDown) return;
+    this.isDown = false;
+    this.page.paint(null, null, true);
+  }
+
+  // Keys of the tools with ends, and of the brush; whether the key was one.
+  keyOfTool(key, by) {
+    const { page, ends, brush } = this;
+    if (by) {
+      const at = within((ends?.chosen ?? brush).map((x, k) => x + by[k]), page.picture.size);
+      if (ends) ends.move(ends.chosen, at, page.picture.size);
+      else if (this.isDown) page.paint(brush, at, false);
+      if (!ends) this.brush = at;
+      page.linesChanged();
+    } else if (key !== "Enter" && key !== " ") {
+      return false;
+    } else if (ends) {
+      ends.next(this.count);
+    } else if (this.isDown) {
+      this.lift();
+      say("The brush is lifted.");
+    } else {
+      this.isDown = true;
+      page.paint(brush, brush, false);
+      say("The brush is down.");
+    }
+    page.redraw();
+    return true;
+  }
+
   key(event) {
-    if (this.name !== "move" || event.ctrlKey || event.metaKey) return;
+    // Some keyboards have brackets on a second level, which systems report as Ctrl and Alt.
+    if ((event.ctrlKey && !event.getModifierState("AltGraph")) || event.metaKey) return;
     const { page } = this;
     const step = (event.shiftKey ? 10 : 2) / page.picture.scale;
     const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    if (this.name !== "move") {
+      if (this.pointers.size) return;
+      if (this.keyOfTool(event.key, move?.map((x) => x * step))) event.preventDefault();
+      return;
+    }
     const { contact } = page.pose();
     const other = {
       q: () => this.turn(5), Q: () => this.turn(1), e: () => this.turn(-5), E: () => this.turn(-1),

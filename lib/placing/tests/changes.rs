@@ -1,0 +1,99 @@
+//! Files that other programs change, and that cannot be written, while the page is open.
+use std::fs;
+
+use dipir_placing::desk::Desk;
+use dipir_placing::edit::Edit;
+use serde_json::json;
+
+mod project;
+use project::{TEXT, open, project};
+
+fn warnings(desk: &Desk) -> Vec<String> {
+    let shown = desk.view(&Edit::none(1), false).unwrap();
+    assert_eq!(shown["warnings"], desk.state().unwrap()["view"]["warnings"]);
+    serde_json::from_value(shown["warnings"].clone()).unwrap()
+}
+
+#[test]
+fn files_that_changed_since_they_were_read_are_told_and_the_page_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let desk = Desk::open(project(folder.path(), &[])).unwrap();
+    assert!(warnings(&desk).is_empty());
+    let at = |name: &str| folder.path().join(name);
+    for (file, damaged, told) in [
+        (
+            "pipeline.toml",
+            Some("[[["),
+            "was changed by another program",
+        ),
+        ("pipeline.toml", None, "cannot read"),
+        (
+            "photo.png",
+            Some("another"),
+            "was written since it was read",
+        ),
+        ("photo.png", None, "is missing now"),
+        ("box.obj", None, "is missing now"),
+    ] {
+        fs::rename(at(file), at("kept")).unwrap();
+        if let Some(text) = damaged {
+            fs::write(at(file), text).unwrap();
+        }
+        let [warning] = &warnings(&desk)[..] else {
+            panic!("{file}: {:?}", warnings(&desk));
+        };
+        assert!(
+            warning.contains(file) && warning.contains(told),
+            "{warning}"
+        );
+        fs::rename(at("kept"), at(file)).unwrap();
+        assert!(warnings(&desk).is_empty(), "{file}");
+    }
+    // What the page writes itself is no news.
+    desk.paint(vec![255; desk.mask_bytes()]).unwrap();
+    let painted = Edit {
+        mask: true,
+        ..Edit::none(1)
+    };
+    desk.save(&painted).unwrap();
+    let again = Desk::open(open(folder.path(), &[])).unwrap();
+    again.paint(vec![0; again.mask_bytes()]).unwrap();
+    again.save(&painted).unwrap();
+    assert!(warnings(&again).is_empty());
+}
+
+/// A file whose folder has so long a path that none of a longer name fits beside it: it cannot be replaced, by no user.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_save_that_fails_leaves_file_and_mask_as_they_were() {
+    let folder = tempfile::tempdir().unwrap();
+    drop(project(folder.path(), &[]));
+    let mut deep = folder.path().canonicalize().unwrap();
+    // A path has 4095 bytes at most, a name 255; beside "p" there is no room for ten letters more.
+    while deep.as_os_str().len() < 4090 {
+        let room = 4090 - deep.as_os_str().len();
+        let name = if room > 255 {
+            200
+        } else {
+            room.saturating_sub(1).max(1)
+        };
+        deep.push("d".repeat(name));
+    }
+    fs::create_dir_all(&deep).unwrap();
+    fs::rename(folder.path().join("pipeline.toml"), deep.join("p")).unwrap();
+    std::os::unix::fs::symlink(deep.join("p"), folder.path().join("pipeline.toml")).unwrap();
+    let desk = Desk::open(open(folder.path(), &[])).unwrap();
+    let mask = folder.path().join("holdout.png");
+    let earlier = dipir_preview::png::encode(300, 200, &[7; 60_000]).unwrap();
+    fs::write(&mask, &earlier).unwrap();
+    desk.paint(vec![255; desk.mask_bytes()]).unwrap();
+    let edit = serde_json::from_value(json!({"objects": [{"of": 0}], "mask": true})).unwrap();
+    let error = desk.save(&edit).unwrap_err().to_string();
+    assert!(
+        error.starts_with("cannot write \"") && error.contains("pipeline.toml"),
+        "{error}"
+    );
+    assert!(fs::read(&mask).unwrap() == earlier);
+    assert_eq!(fs::read_to_string(deep.join("p")).unwrap(), TEXT);
+    assert!(desk.own_mask().is_empty());
+}
