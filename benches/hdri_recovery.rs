@@ -20,11 +20,12 @@ use dipir_imaging::layers::Layers;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
+use dipir_light::exposure::automatic_exposure_ev;
 use dipir_light::fit::fit;
 use dipir_light::rasterize::rasterize;
 use dipir_render::shapes::torus_knot;
 use dipir_scene::export::to_obj;
-use dipir_stages::scene::background::{PanoramaView, automatic_exposure_ev};
+use dipir_stages::scene::background::PanoramaView;
 use glam::Vec3;
 use serde_json::Value;
 

@@ -11,8 +11,9 @@ use dipir_imaging::marked_png::write_display;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
+use dipir_light::exposure::automatic_exposure_ev;
 use dipir_stages::command_line::scene::{BackgroundArgs, Cli, Command};
-use dipir_stages::scene::background::{PanoramaView, automatic_exposure_ev};
+use dipir_stages::scene::background::PanoramaView;
 use serde_json::json;
 
 fn main() -> ExitCode {

@@ -10,11 +10,12 @@ use dipir_imaging::file::write_png;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
+use dipir_light::exposure::{MID_GREY, exposure_ev_to};
 use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_render::shapes::torus_knot;
 use dipir_scene::export::to_obj;
 use dipir_stages::composite::table::Tone;
-use dipir_stages::scene::background::{MID_GREY, PanoramaView, exposure_ev_to};
+use dipir_stages::scene::background::PanoramaView;
 use glam::Vec3;
 
 use crate::command_line::MakeArgs;

@@ -108,26 +108,20 @@ fn numbered(parent: &Path) -> Vec<PathBuf> {
     all.into_iter().map(|(_, path)| path).collect()
 }
 
-/// Reads the model in `folder`, binary files first. Points may be missing. `up` is the axis of the
-/// model's world that points up.
+/// The cameras of a model by the names of their images. `up` is the axis of the model's world that points up.
 ///
 /// # Errors
 /// If a file is missing, cut short, or of a camera model that is not known.
-pub fn read(folder: &Path, up: WorldUp) -> Result<Model, CameraError> {
-    let files = Files::in_folder(folder);
-    let points = match files.part("points3D").exists() {
-        true => files.bytes("points3D")?,
-        false => Vec::new(),
-    };
-    of_parts(&files, &points, up)
-}
-
-/// The cameras of a model by the names of their images. Errors as [`read`].
 pub fn read_cameras(files: &Files, up: WorldUp) -> Result<Vec<(String, Camera)>, CameraError> {
-    Ok(of_parts(files, &[], up)?.images)
+    let (cameras, images) = (files.bytes("cameras")?, files.bytes("images")?);
+    let model = match files.extension {
+        "bin" => read_binary(&cameras, &images, &[], up)?,
+        _ => read_text(text(&cameras)?, text(&images)?, "", up)?,
+    };
+    Ok(model.images)
 }
 
-/// The points of `points3D.txt` or, if `binary`, `points3D.bin`. Errors as [`read`].
+/// The points of `points3D.txt` or, if `binary`, `points3D.bin`. Errors as [`read_cameras`].
 pub fn read_points(points: &[u8], binary: bool, up: WorldUp) -> Result<Vec<DVec3>, CameraError> {
     const NONE: [u8; 8] = [0; 8];
     match binary {
@@ -137,19 +131,12 @@ pub fn read_points(points: &[u8], binary: bool, up: WorldUp) -> Result<Vec<DVec3
 }
 
 fn text(bytes: &[u8]) -> Result<&str, CameraError> {
+    dipir_files::refuse_utf16(bytes).map_err(|e| CameraError::new(FORMAT, e.to_string()))?;
     let bytes = dipir_files::without_byte_order_mark(bytes);
     std::str::from_utf8(bytes).map_err(|_| CameraError::new(FORMAT, "it is not UTF-8"))
 }
 
-fn of_parts(files: &Files, points: &[u8], up: WorldUp) -> Result<Model, CameraError> {
-    let (cameras, images) = (files.bytes("cameras")?, files.bytes("images")?);
-    match files.extension {
-        "bin" => read_binary(&cameras, &images, points, up),
-        _ => read_text(text(&cameras)?, text(&images)?, text(points)?, up),
-    }
-}
-
-/// Reads the contents of the text files; `points` may be empty. Errors as [`read`].
+/// Reads the contents of the text files; `points` may be empty. Errors as [`read_cameras`].
 pub fn read_text(
     cameras: &str,
     images: &str,
@@ -216,7 +203,7 @@ fn records(text: &str) -> impl Iterator<Item = &str> {
         .filter(|line| !line.starts_with('#'))
 }
 
-/// Reads the contents of the binary files; `points` may be empty. Errors as [`read`].
+/// Reads the contents of the binary files; `points` may be empty. Errors as [`read_cameras`].
 pub fn read_binary(
     cameras: &[u8],
     images: &[u8],

@@ -134,10 +134,13 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
             })?;
         return Ok(of(camera, "COLMAP", false));
     }
-    let bytes = dipir_files::read(path).map_err(|source| CameraError::Read {
+    let cannot_read = |source| CameraError::Read {
         path: path.into(),
         source,
-    })?;
+    };
+    let bytes = dipir_files::read(path).map_err(cannot_read)?;
+    // No binary file that is read here begins as text in UTF-16 does.
+    dipir_files::refuse_utf16(&bytes).map_err(cannot_read)?;
     let bytes = dipir_files::without_byte_order_mark(&bytes);
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     match extension.as_deref().unwrap_or_default() {

@@ -55,6 +55,11 @@ const ROWS: &[Row] = &[
     },
     Row {
         make: "canon",
+        models: &["powershot g1 x mark iii"],
+        size_mm: APS_C_CANON,
+    },
+    Row {
+        make: "canon",
         models: &["powershot g1 x"],
         size_mm: [18.7, 14.0],
     },
@@ -65,6 +70,7 @@ const ROWS: &[Row] = &[
             "powershot g5 x",
             "powershot g7 x",
             "powershot g9 x",
+            "powershot v10",
         ],
         size_mm: ONE_INCH,
     },
@@ -77,7 +83,7 @@ const ROWS: &[Row] = &[
         make: "nikon",
         models: &[
             "d3", "d4", "d5", "d6", "d600", "d610", "d700", "d750", "d780", "d800", "d810", "d850",
-            "df", "z 5", "z 6", "z 7", "z 8", "z 9", "z f",
+            "df", "z 5", "z 6", "z 7", "z 8", "z 9", "z f", "z5", "z6", "z7", "zr",
         ],
         size_mm: FULL_FRAME,
     },
@@ -85,6 +91,11 @@ const ROWS: &[Row] = &[
         make: "nikon",
         models: &["d", "z 30", "z 50", "z50"],
         size_mm: APS_C,
+    },
+    Row {
+        make: "nikon",
+        models: &["1 aw", "1 j", "1 s", "1 v"],
+        size_mm: ONE_INCH,
     },
     Row {
         make: "nikon",
@@ -102,17 +113,31 @@ const ROWS: &[Row] = &[
             "dslr-a850",
             "dslr-a900",
             "dsc-rx1",
+            "ilme-fx2",
+            "ilme-fx3",
+            "ilme-fx6",
+            "ilx-lr1",
+            "nex-vg900",
+            "zv-e1",
         ],
         size_mm: FULL_FRAME,
     },
     Row {
         make: "sony",
-        models: &["ilce-", "ilca-", "slt-", "dslr-", "nex-", "zv-e10"],
+        models: &[
+            "ilce-",
+            "ilca-",
+            "ilme-fx30",
+            "slt-",
+            "dslr-",
+            "nex-",
+            "zv-e10",
+        ],
         size_mm: APS_C,
     },
     Row {
         make: "sony",
-        models: &["dsc-rx10", "dsc-rx100", "zv-1"],
+        models: &["dsc-rx0", "dsc-rx10", "dsc-rx100", "zv-1"],
         size_mm: ONE_INCH,
     },
     Row {
@@ -122,33 +147,60 @@ const ROWS: &[Row] = &[
     },
     Row {
         make: "fujifilm",
-        models: &["x-s1"],
+        models: &["x-s1", "x10", "x20", "x30"],
         size_mm: [8.8, 6.6],
     },
     Row {
         make: "fujifilm",
-        models: &["x-", "x100", "x70"],
+        models: &["x-hf1"],
+        size_mm: ONE_INCH,
+    },
+    Row {
+        make: "fujifilm",
+        models: &["finepix x100", "x-", "x100", "x70", "xf10"],
         size_mm: APS_C,
     },
     Row {
         make: "olympus",
-        models: &["e-"],
+        models: &["e-10", "e-20"],
+        size_mm: [8.8, 6.6],
+    },
+    Row {
+        make: "olympus",
+        models: &["e-", "pen-f"],
         size_mm: FOUR_THIRDS,
     },
     Row {
         make: "om digital",
-        models: &["om-"],
+        models: &["e-", "om-"],
         size_mm: FOUR_THIRDS,
     },
     Row {
         make: "panasonic",
-        models: &["dc-s"],
+        models: &["dc-bs1", "dc-s"],
         size_mm: FULL_FRAME,
     },
     Row {
         make: "panasonic",
-        models: &["dmc-g", "dc-g"],
+        models: &["dc-bgh1", "dc-g", "dmc-g", "dmc-l1", "dmc-l10"],
         size_mm: FOUR_THIRDS,
+    },
+    Row {
+        make: "panasonic",
+        models: &[
+            "dc-fz1000",
+            "dc-tz200",
+            "dc-zs200",
+            "dmc-fz1000",
+            "dmc-fz2000",
+            "dmc-fz2500",
+            "dmc-lx10",
+            "dmc-lx15",
+            "dmc-lx9",
+            "dmc-tz100",
+            "dmc-zs100",
+        ],
+        size_mm: ONE_INCH,
     },
     Row {
         make: "leica",
@@ -161,14 +213,43 @@ const ROWS: &[Row] = &[
         size_mm: FULL_FRAME,
     },
     Row {
+        make: "leica",
+        models: &["s (typ", "s-e", "s2", "s3"],
+        size_mm: [45.0, 30.0],
+    },
+    Row {
+        make: "leica",
+        models: &[
+            "cl", "t (typ", "tl", "x (typ", "x vario", "x-e", "x-u", "x1", "x2",
+        ],
+        size_mm: APS_C,
+    },
+    Row {
+        make: "leica",
+        models: &["digilux 3"],
+        size_mm: FOUR_THIRDS,
+    },
+    Row {
         make: "pentax",
         models: &["k-1"],
         size_mm: FULL_FRAME,
     },
     Row {
         make: "pentax",
-        models: &["k-", "k10", "k20", "k100", "k200"],
+        models: &[
+            "*ist d", "k-", "k10", "k20", "k100", "k110", "k200", "k2000",
+        ],
         size_mm: APS_C,
+    },
+    Row {
+        make: "pentax",
+        models: &["645d"],
+        size_mm: [44.0, 33.0],
+    },
+    Row {
+        make: "ricoh",
+        models: &["pentax 645z"],
+        size_mm: [43.8, 32.8],
     },
     Row {
         make: "ricoh",
@@ -187,13 +268,28 @@ const ROWS: &[Row] = &[
     },
     Row {
         make: "sigma",
-        models: &["fp"],
+        models: &["bf", "fp"],
         size_mm: FULL_FRAME,
     },
     Row {
         make: "dji",
-        models: &["fc6310"],
+        models: &["fc3411", "fc6310", "fc6510"],
         size_mm: ONE_INCH,
+    },
+    Row {
+        make: "dji",
+        models: &["fc550", "fc6520"],
+        size_mm: FOUR_THIRDS,
+    },
+    Row {
+        make: "dji",
+        models: &["fc6540"],
+        size_mm: APS_C,
+    },
+    Row {
+        make: "dji",
+        models: &["zenmusep1"],
+        size_mm: FULL_FRAME,
     },
     Row {
         make: "hasselblad",
@@ -201,8 +297,20 @@ const ROWS: &[Row] = &[
         size_mm: ONE_INCH,
     },
     Row {
+        make: "hasselblad",
+        models: &["l2d"],
+        size_mm: FOUR_THIRDS,
+    },
+    Row {
+        make: "hasselblad",
+        models: &["907x", "x1d", "x2d"],
+        size_mm: [43.8, 32.9],
+    },
+    Row {
         make: "dji",
-        models: &["fc220", "fc330", "fc300"],
+        models: &[
+            "fc1102", "fc220", "fc2204", "fc300", "fc330", "fc350", "fc7203", "fc7303",
+        ],
         size_mm: [6.17, 4.55],
     },
 ];
@@ -275,6 +383,58 @@ mod tests {
             size("RICOH IMAGING COMPANY, LTD.", "RICOH GR III"),
             Some(APS_C)
         );
+    }
+
+    #[test]
+    fn newer_cameras_and_those_beside_them_in_a_family_have_their_sensors() {
+        let size = |make, model| size_mm(Some(make), Some(model));
+        for (make, model, want) in [
+            ("Canon", "Canon EOS R5m2", FULL_FRAME),
+            ("Canon", "Canon EOS R6 Mark II", FULL_FRAME),
+            ("Canon", "Canon EOS R50 V", APS_C_CANON),
+            ("Canon", "Canon PowerShot G1 X Mark II", [18.7, 14.0]),
+            ("Canon", "Canon PowerShot G1 X Mark III", APS_C_CANON),
+            ("NIKON CORPORATION", "NIKON Z 7_2", FULL_FRAME),
+            ("NIKON CORPORATION", "NIKON Z6_3", FULL_FRAME),
+            ("NIKON CORPORATION", "NIKON Z5_2", FULL_FRAME),
+            ("NIKON CORPORATION", "NIKON Z50_2", APS_C),
+            ("NIKON CORPORATION", "NIKON 1 J5", ONE_INCH),
+            ("SONY", "ILCE-7CM2", FULL_FRAME),
+            ("SONY", "ILME-FX3", FULL_FRAME),
+            ("SONY", "ILME-FX30", APS_C),
+            ("SONY", "ZV-E1", FULL_FRAME),
+            ("SONY", "ZV-E10M2", APS_C),
+            ("SONY", "ZV-1M2", ONE_INCH),
+            ("SONY", "NEX-VG900", FULL_FRAME),
+            ("SONY", "NEX-7", APS_C),
+            ("FUJIFILM", "GFX100S II", [43.8, 32.9]),
+            ("FUJIFILM", "X100VI", APS_C),
+            ("FUJIFILM", "X10", [8.8, 6.6]),
+            ("FUJIFILM", "X-HF1", ONE_INCH),
+            ("FUJIFILM", "X-H2S", APS_C),
+            ("OLYMPUS IMAGING CORP.", "E-20,E-20N,E-20P", [8.8, 6.6]),
+            ("OLYMPUS CORPORATION", "PEN-F", FOUR_THIRDS),
+            ("OM Digital Solutions", "OM-5", FOUR_THIRDS),
+            ("Panasonic", "DC-S5M2", FULL_FRAME),
+            ("Panasonic", "DC-GH7", FOUR_THIRDS),
+            ("Panasonic", "DMC-LX15", ONE_INCH),
+            ("Leica Camera AG", "LEICA Q3 43", FULL_FRAME),
+            ("Leica Camera AG", "LEICA SL3", FULL_FRAME),
+            ("LEICA CAMERA AG", "LEICA S3", [45.0, 30.0]),
+            ("LEICA CAMERA AG", "LEICA TL2", APS_C),
+            ("RICOH IMAGING COMPANY, LTD.", "PENTAX 645Z", [43.8, 32.8]),
+            ("RICOH IMAGING COMPANY, LTD.", "RICOH GR IIIx", APS_C),
+            ("SIGMA", "SIGMA BF", FULL_FRAME),
+            ("DJI", "FC3411", ONE_INCH),
+            ("DJI", "FC7303", [6.17, 4.55]),
+            ("Hasselblad", "L2D-20c", FOUR_THIRDS),
+            ("Hasselblad", "X2D 100C", [43.8, 32.9]),
+        ] {
+            assert_eq!(size(make, model), Some(want), "{make} {model}");
+        }
+        // Its lens is a fisheye, and telephones have several sensors: the equivalent focal length tells.
+        assert_eq!(size("GoPro", "HERO11 Black"), None);
+        assert_eq!(size("Panasonic", "DMC-LX100"), None);
     }
 
     #[test]

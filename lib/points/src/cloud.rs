@@ -16,14 +16,24 @@ pub struct Cloud {
 
 /// Most points that are kept of a file; of more, every second, third, … is.
 pub const MOST_POINTS: usize = 20_000_000;
+/// Farthest coordinate of a point, metres, as of what a configuration says: the largest northing of UTM. Beyond it are
+/// numbers that stand for no echo.
+const FARTHEST_M: f64 = 1e7;
 
 impl Cloud {
-    /// Scaled, then turned and shifted.
+    /// Without points that are too far away to be of a scene.
+    pub(crate) fn near(mut self) -> Self {
+        self.points.retain(|p| p.abs().max_element() < FARTHEST_M);
+        self
+    }
+
+    /// Scaled, then turned and shifted; without points that this brings beyond all numbers.
     pub(crate) fn moved(mut self, scale: f64, rotation: DMat3, position: DVec3) -> Self {
         let to_world = |p: DVec3| rotation * (scale * p) + position;
-        for p in &mut self.points {
+        self.points.retain_mut(|p| {
             *p = to_world(*p);
-        }
+            p.is_finite()
+        });
         self.viewpoint = self.viewpoint.map(to_world);
         self
     }
@@ -47,7 +57,7 @@ impl Collector {
 
     /// Points that are not finite are those that a sensor did not see.
     pub(crate) fn add(&mut self, point: DVec3) {
-        if self.seen.is_multiple_of(self.every) && point.is_finite() && point.length() < 1e7 {
+        if self.seen.is_multiple_of(self.every) && point.is_finite() {
             self.points.push(point);
         }
         self.seen += 1;

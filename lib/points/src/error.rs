@@ -39,6 +39,15 @@ pub enum PointsError {
         /// What to do.
         remedy: &'static str,
     },
+    /// The ground is to be a relief, and too few points are ground.
+    #[error(
+        "the ground through the points cannot be a relief: fewer than {fewest} of them are ground near the camera; \
+         leave points_shape out, or write points_shape = \"plane\""
+    )]
+    NoRelief {
+        /// Points that a relief takes.
+        fewest: usize,
+    },
 }
 
 impl PointsError {

@@ -57,7 +57,8 @@ pub fn read(source: &Source) -> Result<Cloud, PointsError> {
             "exr" => depth::read_exr(&path)?,
             _ => depth::read_png(&read_bytes(&path)?)?,
         };
-        return depth::points(&depth.map(|z| z * source.scale as f32), source.camera);
+        let cloud = depth::points(&depth.map(|z| z * source.scale as f32), source.camera)?;
+        return Ok(cloud.near());
     }
     let bytes = read_bytes(&path)?;
     let is_colmap = path.file_stem().is_some_and(|s| s == "points3D");
@@ -88,7 +89,8 @@ pub fn read(source: &Source) -> Result<Cloud, PointsError> {
         None => (source.up.unwrap_or(up).to_ours(), DVec3::ZERO),
         Some(pose) => sensor(pose, source.up)?,
     };
-    Ok(cloud.moved(source.scale, rotation, position))
+    // How far away a point is shows in metres.
+    Ok(cloud.moved(source.scale, rotation, position).near())
 }
 
 fn read_bytes(path: &Path) -> Result<Vec<u8>, PointsError> {
@@ -101,6 +103,10 @@ fn read_bytes(path: &Path) -> Result<Vec<u8>, PointsError> {
 /// The sensor's rotation and position in our world.
 fn sensor(path: &Path, up: Option<WorldUp>) -> Result<(DMat3, DVec3), PointsError> {
     let bytes = read_bytes(path)?;
+    dipir_files::refuse_utf16(&bytes).map_err(|source| PointsError::Read {
+        path: path.into(),
+        source,
+    })?;
     let bytes = dipir_files::without_byte_order_mark(&bytes);
     let is_json = path
         .extension()

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::cloud::Cloud;
 use crate::error::PointsError;
 use crate::plane::{ransac, refine};
-use crate::relief::{Relief, relief};
+use crate::relief::{self, Relief, relief};
 
 /// The ground of a scene, and how sure it is.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -30,7 +30,7 @@ pub struct Ground {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Shape {
     /// A relief where the points are off the plane by more than their noise, and by more than matters:
-    /// 5 cm at 10 m.
+    /// 5 cm at 10 m. Too few points for a relief give a plane.
     #[default]
     Auto,
     /// A plane.
@@ -67,7 +67,8 @@ const LEAST_SHARE: f64 = 0.05;
 /// Finds the ground below the camera.
 ///
 /// # Errors
-/// If the camera sees too few points below itself, or too few of them lie on a plane.
+/// If the camera sees too few points below itself, too few of them lie on a plane, or the shape is [`Shape::Relief`] and
+/// they are too few for one.
 pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     let camera = search.camera;
     let up = search.up.normalize();
@@ -125,11 +126,18 @@ pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     }
     if search.shape != Shape::Plane {
         let ahead = -camera.pose.rotation.z_axis;
-        if let Some((found, noise)) = relief(&points, &ground, ahead, sigma)
-            && (search.shape == Shape::Relief || !found.is_flat(threshold.max(3.0 * noise)))
-        {
-            ground.relief = Some(found);
-            ground.count(&points, 3.0 * noise);
+        match relief(&points, &ground, ahead, sigma) {
+            Some((found, noise))
+                if search.shape == Shape::Relief || !found.is_flat(threshold.max(3.0 * noise)) =>
+            {
+                ground.relief = Some(found);
+                ground.count(&points, 3.0 * noise);
+            }
+            None if search.shape == Shape::Relief => {
+                let fewest = relief::FEWEST;
+                return Err(PointsError::NoRelief { fewest });
+            }
+            _ => {}
         }
     }
     Ok(ground)
@@ -181,11 +189,6 @@ impl Ground {
     pub fn height(&self, point: DVec3) -> f64 {
         let over_plane = self.normal.dot(point - self.point);
         over_plane - self.relief.as_ref().map_or(0.0, |r| r.height(point))
-    }
-
-    /// The point of the ground below or above `point`, along the plane's normal.
-    pub fn below(&self, point: DVec3) -> DVec3 {
-        point - self.height(point) * self.normal
     }
 
     /// The first point of the ground on a ray from above it; the direction has any length.

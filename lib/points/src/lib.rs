@@ -2,6 +2,7 @@
 //! through them, and free places on it.
 //!
 //! Coordinates are those of dipir: right-handed, +y up, metres.
+mod cells;
 pub mod cloud;
 pub mod depth;
 pub mod error;

@@ -3,6 +3,7 @@ use dipir_cameras::Camera;
 use dipir_numerics::sampler::Sampler;
 use glam::{DVec2, DVec3};
 
+use crate::cells::{Cells, Chart, square};
 use crate::cloud::{Cloud, POINTS};
 use crate::ground::Ground;
 
@@ -47,6 +48,8 @@ const MARGIN: f64 = 0.01;
 const CLEARANCE_M: f64 = 0.25;
 /// What is lower, in the ground's residuals and metres, is ground.
 const LOW: (f64, f64) = (4.0, 0.1);
+/// Least width of a view of a body, near the eyes, of the body's.
+const NARROWEST: f64 = 0.2;
 
 impl Search<'_> {
     /// The foot of the body at the best place; `None` if there is none. In the picture it is beside other
@@ -160,28 +163,33 @@ fn overlap([a, b]: [DVec2; 2], [c, d]: [DVec2; 2]) -> bool {
     a.cmplt(d).all() && c.cmplt(b).all()
 }
 
+/// A point that stands on the ground, and its height over it, metres.
+type Standing = (DVec3, f64);
+
 /// The points of a scene, by whether they are ground.
 struct Surroundings {
-    ground: Vec<DVec3>,
-    /// Standing on it, with their heights.
-    standing: Vec<(DVec3, f64)>,
+    chart: Chart,
+    ground: Cells<DVec3>,
+    standing: Cells<Standing>,
     viewpoint: Option<DVec3>,
 }
 
 impl Surroundings {
     fn new(cloud: &Cloud, ground: &Ground) -> Self {
         let low = (LOW.0 * ground.residual_m).max(LOW.1);
+        let chart = Chart::new(ground.point, ground.normal);
         let (mut flat, mut standing) = (Vec::new(), Vec::new());
         for p in &cloud.points {
             match ground.height(*p) {
-                h if h > low => standing.push((*p, h)),
-                h if h > -low => flat.push(*p),
+                h if h > low => standing.push((chart.at(*p), (*p, h))),
+                h if h > -low => flat.push((chart.at(*p), *p)),
                 _ => {}
             }
         }
         Self {
-            ground: flat,
-            standing,
+            chart,
+            ground: Cells::new(flat.into_iter()),
+            standing: Cells::new(standing.into_iter()),
             viewpoint: cloud.viewpoint,
         }
     }
@@ -190,37 +198,22 @@ impl Surroundings {
     /// between the body and those who looked: what is behind it is not known to be free.
     fn is_free(&self, foot: DVec3, body: &Body, ground: &Ground, eye: DVec3) -> bool {
         let up = ground.normal;
-        let level = |v: DVec3| v - v.dot(up) * up;
         let wide = body.radius_m + CLEARANCE_M;
-        let touches = |(p, h): &(DVec3, f64)| {
-            *h < body.height_m + CLEARANCE_M && level(*p - foot).length() < wide
+        let touches = |(p, h): &Standing| {
+            *h < body.height_m + CLEARANCE_M && level(*p - foot, up).length() < wide
         };
-        if self.standing.iter().any(touches) || !self.is_known(foot, body, ground, eye) {
+        let around = square(self.chart.at(foot), wide);
+        if self.standing.any(&around, touches) || !self.is_known(foot, body, ground, eye) {
             return false;
         }
         let lookers = [Some(eye), self.viewpoint];
-        let blocked = |from: DVec3| {
-            let height = ground.height(from).max(0.0);
-            let way = level(foot - from);
-            let distance = way.length();
-            if distance < wide {
-                return true;
+        let blocked = |from: DVec3| match Sight::new(from, foot, body, ground) {
+            None => true,
+            Some(sight) => {
+                let corners = sight.corners(&self.chart);
+                let blocks = |(p, h): &Standing| sight.is_blocked_by(*p, *h);
+                self.standing.any(&corners, blocks)
             }
-            let ahead = way / distance;
-            let blocks = |(p, h): &(DVec3, f64)| {
-                let to = level(*p - from);
-                let along = to.dot(ahead);
-                if along <= 0.0 || along >= distance + wide {
-                    return false;
-                }
-                let share = along / distance;
-                let off = (to - along * ahead).length();
-                // It blocks the view if it reaches between the lines of sight to the body's foot and to its top.
-                let lower = height * (1.0 - along / (distance + wide));
-                let upper = height + (body.height_m - height) * share;
-                off < wide * share.max(0.2) && *h > lower - CLEARANCE_M && *h < upper + CLEARANCE_M
-            };
-            self.standing.iter().any(blocks)
         };
         !lookers.into_iter().flatten().any(blocked)
     }
@@ -236,14 +229,79 @@ impl Surroundings {
         let right = ahead.cross(up).normalize_or(up.any_orthonormal_vector());
         let ahead = up.cross(right);
         let mut sides = [false; 4];
-        for p in &self.ground {
+        self.ground.any(&square(self.chart.at(foot), reach), |p| {
             let from = *p - foot;
             if from.length() < reach {
                 let (x, y) = (right.dot(from), ahead.dot(from));
                 sides[usize::from(x > 0.0) + 2 * usize::from(y > 0.0)] = true;
             }
+            sides == [true; 4]
+        })
+    }
+}
+
+/// The part of a vector along the ground.
+fn level(v: DVec3, up: DVec3) -> DVec3 {
+    v - v.dot(up) * up
+}
+
+/// The view that somebody has of a body.
+struct Sight {
+    from: DVec3,
+    /// Height of the eyes over the ground, metres.
+    eyes_m: f64,
+    up: DVec3,
+    /// Along the ground to the body, a unit vector.
+    ahead: DVec3,
+    /// Along the ground to the body's middle, metres.
+    distance: f64,
+    /// Radius of the body and the air around it, metres.
+    wide: f64,
+    height_m: f64,
+}
+
+impl Sight {
+    /// `None` from within the body.
+    fn new(from: DVec3, foot: DVec3, body: &Body, ground: &Ground) -> Option<Self> {
+        let up = ground.normal;
+        let way = level(foot - from, up);
+        let (distance, wide) = (way.length(), body.radius_m + CLEARANCE_M);
+        (distance >= wide).then(|| Self {
+            from,
+            eyes_m: ground.height(from).max(0.0),
+            up,
+            ahead: way / distance,
+            distance,
+            wide,
+            height_m: body.height_m,
+        })
+    }
+
+    /// Whether a point of this height over the ground hides a part of the body.
+    fn is_blocked_by(&self, p: DVec3, height: f64) -> bool {
+        let to = level(p - self.from, self.up);
+        let along = to.dot(self.ahead);
+        if along <= 0.0 || along >= self.distance + self.wide {
+            return false;
         }
-        sides == [true; 4]
+        let share = along / self.distance;
+        let off = (to - along * self.ahead).length();
+        // It blocks the view if it reaches between the lines of sight to the body's foot and to its top.
+        let lower = self.eyes_m * (1.0 - along / (self.distance + self.wide));
+        let upper = self.eyes_m + (self.height_m - self.eyes_m) * share;
+        off < self.wide * share.max(NARROWEST)
+            && height > lower - CLEARANCE_M
+            && height < upper + CLEARANCE_M
+    }
+
+    /// The corners of a trapezoid on the ground with all points that can block the view.
+    fn corners(&self, chart: &Chart) -> [DVec2; 4] {
+        let end = self.distance + self.wide;
+        let [start, ahead, tip] =
+            [0.0, 1.0, end].map(|along| chart.at(self.from + along * self.ahead));
+        let side = (ahead - start).perp() * self.wide;
+        let (near, far) = (NARROWEST * side, end / self.distance * side);
+        [start + near, start - near, tip - far, tip + far]
     }
 }
 
@@ -360,5 +418,99 @@ mod tests {
                 assert!((high - low).y > LEAST_HEIGHT * 600.0);
             }
         }
+    }
+
+    /// As [`Surroundings::is_free`], by a walk through all points.
+    fn is_free_by_walk(
+        cloud: &Cloud,
+        foot: DVec3,
+        body: &Body,
+        ground: &Ground,
+        eye: DVec3,
+    ) -> bool {
+        let low = (LOW.0 * ground.residual_m).max(LOW.1);
+        let heights = cloud.points.iter().map(|p| (*p, ground.height(*p)));
+        let (standing, flat): (Vec<_>, Vec<_>) =
+            heights.filter(|s| s.1 > -low).partition(|s| s.1 > low);
+        let wide = body.radius_m + CLEARANCE_M;
+        let touches = |(p, h): &Standing| {
+            *h < body.height_m + CLEARANCE_M && level(*p - foot, ground.normal).length() < wide
+        };
+        let blocked = |from: DVec3| match Sight::new(from, foot, body, ground) {
+            None => true,
+            Some(sight) => standing.iter().any(|(p, h)| sight.is_blocked_by(*p, *h)),
+        };
+        let all = Surroundings {
+            // All are in one cell, that of the foot.
+            chart: Chart::new(foot, ground.normal),
+            ground: Cells::new(flat.iter().map(|(p, _)| (DVec2::ZERO, *p))),
+            standing: Cells::new(std::iter::empty()),
+            viewpoint: None,
+        };
+        let known = all.is_known(foot, body, ground, eye);
+        let lookers = [Some(eye), cloud.viewpoint];
+        !standing.iter().any(touches) && known && !lookers.into_iter().flatten().any(blocked)
+    }
+
+    #[test]
+    fn a_place_is_free_if_a_walk_through_all_points_finds_it_free() {
+        let mut found = [0; 2];
+        for scene in 0..12u32 {
+            let number = |index: u32, low: f64, high: f64| {
+                let seed = dipir_numerics::sampler::Stream::TEST;
+                let u = Sampler::new(u64::from(scene), seed, index, 0).next_1d();
+                low + (high - low) * f64::from(u)
+            };
+            // A slope with posts on it, far from the origin in some scenes.
+            let origin = DVec3::new(f64::from(scene) * 4e5, 0.0, f64::from(scene) * -9e5);
+            let normal = DVec3::new(number(0, -0.1, 0.1), 1.0, number(1, -0.1, 0.1)).normalize();
+            let ground = Ground {
+                point: origin,
+                normal,
+                ..ground()
+            };
+            let on = |x: f64, z: f64, h: f64| {
+                let level = DVec3::new(x, 0.0, z);
+                origin + level + (h - normal.dot(level) / normal.y) * DVec3::Y
+            };
+            let flat = (0..3000).map(|i| {
+                on(
+                    number(10 + 2 * i, -15.0, 15.0),
+                    number(11 + 2 * i, -30.0, 0.0),
+                    0.0,
+                )
+            });
+            let posts = (0..600).map(|i| {
+                let post = 9000 + 2 * (i / 40);
+                let [x, z] = [number(post, -9.0, 9.0), number(post + 1, -25.0, -2.0)];
+                on(x, z, 0.05 * f64::from(i % 40))
+            });
+            let cloud = Cloud {
+                points: flat.chain(posts).collect(),
+                viewpoint: Some(origin + DVec3::new(1.0, 1.9, 0.5)),
+            };
+            let eye = origin + DVec3::new(0.0, 1.6, 0.0);
+            let around = Surroundings::new(&cloud, &ground);
+            for i in 0..300 {
+                let body = Body {
+                    radius_m: number(20_000 + 4 * i, 0.05, 1.5),
+                    height_m: number(20_001 + 4 * i, 0.0, 2.5),
+                };
+                let [x, z] = [
+                    number(20_002 + 4 * i, -9.0, 9.0),
+                    number(20_003 + 4 * i, -28.0, 0.0),
+                ];
+                let foot = on(x, z, 0.0);
+                let got = around.is_free(foot, &body, &ground, eye);
+                assert_eq!(
+                    got,
+                    is_free_by_walk(&cloud, foot, &body, &ground, eye),
+                    "{scene} {i}"
+                );
+                found[usize::from(got)] += 1;
+            }
+        }
+        // Both answers are common, so that each is compared.
+        assert!(found.iter().all(|count| *count > 300), "{found:?}");
     }
 }

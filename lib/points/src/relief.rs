@@ -26,6 +26,8 @@ pub struct Relief {
 
 /// Cells along the longer side.
 const CELLS: f64 = 48.0;
+/// Fewest points of ground near the camera that show a relief.
+pub(crate) const FEWEST: usize = 100;
 /// Share of the nearest ground points that the grid covers.
 const COVERED: f64 = 0.9;
 /// Farthest cell, in heights of the camera over the ground: 40 m for a person.
@@ -50,7 +52,8 @@ pub(crate) fn relief(
     sigma: f64,
 ) -> Option<(Relief, f64)> {
     let up = ground.normal;
-    let right = view.cross(up).try_normalize()?;
+    // A camera that looks straight down has no direction along the ground.
+    let right = view.cross(up).normalize_or(up.any_orthonormal_vector());
     let ahead = up.cross(right);
     let eye = ground.point;
     let camera_m = REACH * reach_unit(points, eye);
@@ -64,7 +67,7 @@ pub(crate) fn relief(
             at.length() < camera_m && h.abs() < 3.0 * sigma + MOST_SLOPE * at.length()
         })
         .collect();
-    if near.len() < 100 {
+    if near.len() < FEWEST {
         return None;
     }
     near.sort_by(|a, b| a.0.length().total_cmp(&b.0.length()));

@@ -384,3 +384,36 @@ fn an_axis_beside_a_calibration_of_kitti_is_refused() {
     let error = of(Some(WorldUp::Y)).unwrap_err();
     assert!(error.contains("leave points_up out"), "{error}");
 }
+
+#[test]
+fn far_points_are_left_out_by_their_metres_and_not_by_the_unit_of_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scan.ply");
+    let camera = camera();
+    let of = |points: &str, scale: f64| {
+        let header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n";
+        std::fs::write(&path, format!("{header}end_header\n{points}")).unwrap();
+        let source = Source {
+            up: None,
+            scale,
+            ..source(&path, &camera)
+        };
+        file::read(&source).unwrap().points
+    };
+    // A house in UTM, in millimetres, and a pixel without an echo.
+    let house = "458000000 520000 5428000000\n1e30 1e30 1e30\n";
+    near(
+        &of(house, 1e-3),
+        &[DVec3::new(458_000.0, 520.0, 5_428_000.0)],
+        "UTM",
+    );
+    assert_eq!(of(house, 1.0), []);
+    // Just south of the equator, where northings count from ten million: its distance from the origin is more.
+    let south = "500000 0 9999000\n1e308 1e308 1e308\n";
+    near(
+        &of(south, 1.0),
+        &[DVec3::new(500_000.0, 0.0, 9_999_000.0)],
+        "south",
+    );
+    near(&of(south, 10.0), &[], "all are too far");
+}

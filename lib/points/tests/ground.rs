@@ -332,3 +332,70 @@ fn points_without_a_ground_are_explained() {
         "{error}"
     );
 }
+
+/// Ground of so many points with 2 cm of noise, before the camera.
+fn sparse(count: u32) -> Cloud {
+    let points = (0..count).map(|i| {
+        let mut n = Numbers::new(9, i);
+        let (x, z) = (n.between(-4.0, 4.0), n.between(-14.0, -5.0));
+        DVec3::new(x, NOISE_M * n.normal(), z)
+    });
+    Cloud {
+        points: points.collect(),
+        viewpoint: None,
+    }
+}
+
+#[test]
+fn a_relief_that_is_asked_of_too_few_points_is_refused() {
+    let camera = camera();
+    let of = |count, shape| {
+        let up = DVec3::Y;
+        let seed = 0;
+        let search = Search {
+            camera: &camera,
+            up,
+            shape,
+            seed,
+        };
+        ground(&sparse(count), &search).map_err(|e| e.to_string())
+    };
+    assert_eq!(of(60, Shape::Auto).unwrap().relief, None);
+    let error = of(60, Shape::Relief).unwrap_err();
+    let want = "cannot be a relief: fewer than 100 of them are ground near the camera; leave points_shape out";
+    assert!(error.contains(want), "{error}");
+    assert!(of(400, Shape::Relief).unwrap().relief.is_some());
+}
+
+#[test]
+fn a_camera_that_looks_straight_down_sees_a_relief() {
+    let mut camera = camera();
+    camera.pose.position = DVec3::new(0.0, 30.0, -9.0);
+    camera.pose.rotation = DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y);
+    // A plane without noise has a normal straight up.
+    let mut cloud = sparse(4000);
+    cloud.points.iter_mut().for_each(|p| p.y = 0.0);
+    let ground = found(&cloud, &camera, Shape::Relief);
+    assert!(ground.normal.abs_diff_eq(DVec3::Y, 1e-12) && ground.relief.is_some());
+}
+
+#[test]
+fn a_scan_in_utm_coordinates_has_the_same_ground() {
+    let here = camera();
+    let utm = DVec3::new(458_000.0, 520.0, -5_428_000.0);
+    let mut there = here;
+    there.pose.position += utm;
+    let cloud = Street::new(3, 20).scan(3, None);
+    let moved = Cloud {
+        points: cloud.points.iter().map(|p| *p + utm).collect(),
+        viewpoint: cloud.viewpoint.map(|p| p + utm),
+    };
+    let (near, far) = (
+        found(&cloud, &here, Shape::Auto),
+        found(&moved, &there, Shape::Auto),
+    );
+    // Coordinates of 5e6 m have steps of 1e-9 m, sums of 1e4 of them are off by 1e-5 at most, their mean by far less.
+    assert!(near.normal.abs_diff_eq(far.normal, 1e-6));
+    assert!((far.point - utm).abs_diff_eq(near.point, 1e-5));
+    assert!((near.residual_m - far.residual_m).abs() < 1e-5);
+}

@@ -1,6 +1,7 @@
 //! The camera of a photograph out of another program's file.
 use std::path::Path;
 
+use dipir_cameras::chan::Turns;
 use dipir_cameras::file::{self, Wanted, Which};
 use dipir_cameras::{CameraError, Lens, Pose, WorldUp};
 use glam::{DVec2, DVec3};
@@ -12,9 +13,13 @@ use crate::view::{Aim, CameraFile, CameraOptions, EYE_HEIGHT_M, View};
 const MOST_BENT_PX: f64 = 1.0;
 /// Least shift of the optical axis that is written down, pixels.
 const LEAST_SHIFT_PX: f64 = 0.5;
+/// Least change of an axis of the camera that the order of its rotations makes: half a pixel at a focal length of 5,000.
+const LEAST_TURN: f64 = 1e-4;
+/// Rounding of positions in the scene that matters, metres.
+const MOST_ROUNDED_M: f64 = 1e-3;
 
-/// The camera that the file or folder at `path` has for `photo`, of `size` pixels. `up` overrules
-/// which axis of its world points up.
+/// The camera that the file or folder at `path` has for `photo`, of `size` pixels, and what of it may be wrong, one
+/// sentence each. `up` overrules which axis of its world points up.
 ///
 /// # Errors
 /// On files that cannot be read, without a camera for the photograph, and of pictures of another
@@ -25,7 +30,7 @@ pub fn read(
     size: [u32; 2],
     up: Option<WorldUp>,
     asked: &CameraOptions,
-) -> Result<View, SetupError> {
+) -> Result<(View, Vec<String>), SetupError> {
     asked.check()?;
     let size = size.map(f64::from);
     let is_chan = path
@@ -77,13 +82,48 @@ pub fn read(
         path,
         asked,
     );
-    view.file = more_than_numbers(path, &found.lens).map(|why| CameraFile {
+    let is_ambiguous = is_chan && depends_on_order(path, &wanted, &pose);
+    let order = "it does not say in which order its rotations turn, and Nuke's is taken";
+    let why = more_than_numbers(path, &found.lens).or(is_ambiguous.then_some(order));
+    view.file = why.map(|why| CameraFile {
         path: path.into(),
         up,
         fov_deg: (!found.states_fov).then_some(view.fov_deg),
         why,
     });
-    Ok(view)
+    let mut warnings = Vec::new();
+    if is_ambiguous {
+        warnings.push(format!(
+            "\"{}\": {order}: if it is Blender's, write file_rotation_order = \"xyz\" into [scene.camera]",
+            path.display()
+        ));
+    }
+    warnings.extend(rounding(&pose).map(|what| format!("\"{}\": {what}", path.display())));
+    Ok((view, warnings))
+}
+
+/// Whether a `.chan` file has another camera if its rotations turn as in Blender's default.
+fn depends_on_order(path: &Path, wanted: &Wanted, pose: &Pose) -> bool {
+    let blender = Wanted {
+        turns: Turns::parse("xyz"),
+        ..*wanted
+    };
+    let other = file::read(path, &blender).ok().and_then(|found| found.pose);
+    other.is_some_and(|other| !other.rotation.abs_diff_eq(pose.rotation, LEAST_TURN))
+}
+
+/// What is wrong with a camera so far from the origin that single precision, which the scene has, moves it.
+fn rounding(pose: &Pose) -> Option<String> {
+    let farthest = pose.position.abs().max_element();
+    let step = f64::from((farthest as f32).next_up()) - f64::from(farthest as f32);
+    (step > MOST_ROUNDED_M).then(|| {
+        format!(
+            "the camera stands {:.0} km from the origin of its world, where lengths are rounded to {:.0} mm: subtract the \
+             same point from the cameras and points of the scene",
+            farthest / 1000.0,
+            step * 1000.0
+        )
+    })
 }
 
 /// What the file at `path` says that the numbers of a view do not, in words; `lens` is the photograph's.
@@ -180,6 +220,11 @@ mod tests {
     }"#;
 
     fn view_of(name: &str, text: &str, size: [u32; 2]) -> Result<View, String> {
+        told_of(name, text, size).map(|told| told.0)
+    }
+
+    /// The view and the warnings.
+    fn told_of(name: &str, text: &str, size: [u32; 2]) -> Result<(View, Vec<String>), String> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(name);
         std::fs::write(&path, text).unwrap();
@@ -268,6 +313,43 @@ mod tests {
         };
         let drop = 5.0 * 10f64.to_radians().sin();
         assert!((look_at.y - (1.7 - drop)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_chan_whose_camera_depends_on_the_order_of_rotations_is_named_and_told() {
+        // Tilted and turned: about z first or last, an angle of 0 turns nothing.
+        let (view, told) = told_of("a.chan", "1 0 1.7 4 -10 30 0 40\n", [600, 400]).unwrap();
+        assert!(view.file.is_none() && told.is_empty(), "{told:?}");
+        let rolled = "1 0 1.7 4 -10 30 5 40\n";
+        let (view, told) = told_of("a.chan", rolled, [600, 400]).unwrap();
+        assert!(
+            view.file
+                .unwrap()
+                .why
+                .contains("in which order its rotations turn")
+        );
+        let want = "if it is Blender's, write file_rotation_order = \"xyz\" into [scene.camera]";
+        assert!(told.len() == 1 && told[0].contains(want), "{told:?}");
+        let (text, got, want) = written("shot.chan", rolled, Request::default());
+        for line in ["file = \"shot.chan\"", "# file_rotation_order = \"xyz\""] {
+            assert!(text.contains(line), "{text}");
+        }
+        // Digits of the file, and single precision.
+        let apart = (got.rotation - want.rotation).to_cols_array();
+        assert!(apart.iter().all(|e| e.abs() < 1e-5));
+    }
+
+    #[test]
+    fn a_camera_where_the_scene_rounds_positions_is_told() {
+        let at = |x: f64| {
+            let text = format!("1 {x} 1.7 4 -10 0 0 40\n");
+            told_of("a.chan", &text, [600, 400]).unwrap().1
+        };
+        assert!(at(-8000.0).is_empty());
+        let told = at(-5_428_000.0);
+        let want =
+            "stands 5428 km from the origin of its world, where lengths are rounded to 500 mm";
+        assert!(told.len() == 1 && told[0].contains(want), "{told:?}");
     }
 
     /// What `dipir init` writes for `in/plate.0002.png` of 30 x 20 pixels and a camera's file with this name in the

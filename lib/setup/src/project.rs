@@ -1,12 +1,16 @@
 //! From files to the text that names them.
+use std::borrow::Cow;
 use std::fs::OpenOptions;
 use std::io::{ErrorKind, Write};
 use std::path::{Component, Path, PathBuf};
 
 use dipir_cameras::WorldUp;
-use dipir_imaging::file::read_photo;
+use dipir_imaging::file::{Photo, read_photo};
+use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
+use dipir_light::exposure::automatic_exposure_ev;
 use dipir_points::Ground;
+use dipir_points::file::is_depth;
 use dipir_points::ground::Shape;
 use dipir_scene::camera::Camera;
 use dipir_scene::ground::{self, PointsSettings};
@@ -19,6 +23,15 @@ use crate::model::Models;
 use crate::size::Kind;
 use crate::spots::{appears, spots};
 use crate::view::{CameraOptions, View};
+
+/// The photograph as a camera exposes it: the exposure of linear light, as EXR and HDR hold it, is arbitrary.
+fn exposed(photo: &Photo) -> Cow<'_, LinearImage> {
+    if photo.values.is_some() {
+        return Cow::Borrowed(&photo.image);
+    }
+    let gain = automatic_exposure_ev(&photo.image).exp2();
+    Cow::Owned(LinearImage(photo.image.0.map(|p| *p * gain)))
+}
 
 /// What a first configuration is made from.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -79,17 +92,21 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
     let sizes = sizes.collect::<Result<Vec<_>, _>>()?;
     let mut warnings = models.warnings;
     let photo = read_photo(&request.photo, Transfer::Srgb)?;
-    warnings.extend(photo.warnings);
+    warnings.extend(photo.warnings.iter().cloned());
     let view = match &request.camera {
-        Some(path) => camera_file::read(
-            path,
-            &request.photo,
-            photo.facts.size,
-            request.camera_up,
-            &request.asked,
-        )?,
+        Some(path) => {
+            let (view, doubts) = camera_file::read(
+                path,
+                &request.photo,
+                photo.facts.size,
+                request.camera_up,
+                &request.asked,
+            )?;
+            warnings.extend(doubts);
+            view
+        }
         None => {
-            let (view, no_ground) = View::of_photo(&photo.image, &photo.facts, &request.asked)?;
+            let (view, no_ground) = View::of_photo(&exposed(&photo), &photo.facts, &request.asked)?;
             warnings.extend(no_ground.filter(|_| request.points.is_none()));
             view
         }
@@ -161,9 +178,10 @@ fn points(
     let Some(path) = &request.points else {
         return Ok(None);
     };
+    let up = points_up(request, path);
     let settings = PointsSettings {
         path: path.clone(),
-        up: request.points_up,
+        up,
         scale: 1.0,
         pose: request.points_pose.clone(),
         shape: Shape::Auto,
@@ -173,16 +191,17 @@ fn points(
     let points = Points {
         path: beside(path, folder)?,
         pose: pose.map(|pose| beside(pose, folder)).transpose()?,
-        up: request.points_up.map(axis),
+        up: up.map(axis),
         words: ground.words(),
     };
     Ok(Some((points, ground)))
 }
 
-/// Whether the points are depths of the photograph itself.
-fn is_depth(path: &Path) -> bool {
-    let extension = path.extension();
-    extension.is_some_and(|e| e.eq_ignore_ascii_case("exr") || e.eq_ignore_ascii_case("png"))
+/// Which axis points up in the points: of COLMAP's as `dipir run` has it, that of the camera, which is in their world.
+fn points_up(request: &Request, path: &Path) -> Option<WorldUp> {
+    let is_colmap = path.extension().is_none() || path.file_stem().is_some_and(|s| s == "points3D");
+    let of_camera = request.camera_up.filter(|_| is_colmap);
+    request.points_up.or(of_camera)
 }
 
 impl Draft {
@@ -292,6 +311,8 @@ fn way(path: &Path, folder: &Path) -> Option<PathBuf> {
 
 #[cfg(test)]
 mod tests {
+    use dipir_imaging::layers::{Layers, Precision};
+
     use super::*;
 
     /// Exif data that say nothing but an orientation: a TIFF header and one tag [TIFF 6.0].
@@ -325,6 +346,37 @@ mod tests {
             .write_image_data(&pixels.collect::<Vec<u8>>())
             .unwrap();
         writer.finish().unwrap();
+    }
+
+    #[test]
+    fn linear_light_gives_the_same_camera_at_any_exposure() {
+        let folder = tempfile::tempdir().unwrap();
+        let model = folder.path().join("a.obj");
+        std::fs::write(
+            &model,
+            "v 0 0 0\nv 1 0 0\nv 0 0 1\nv 0 1 0\nf 1 2 3\nf 1 2 4\n",
+        )
+        .unwrap();
+        let pose = dipir_calibration::Pose::new(-8.0, 2.0, 60.0);
+        let room = dipir_calibration::generated::Built::Room;
+        let room = dipir_calibration::generated::picture(room, 1, &pose, [192, 128]);
+        // Powers of two, which floats multiply by exactly.
+        let texts = [1.0, 65536.0, 1.0 / 4096.0].map(|exposure| {
+            let photo = folder.path().join("photo.exr");
+            let mut layers = Layers::new(192, 128);
+            let colour = room.0.map(|p| *p * exposure);
+            layers.insert_rgb("", Precision::Full, &colour).unwrap();
+            layers.write_exr(&photo).unwrap();
+            let request = Request {
+                photo,
+                models: vec![model.clone()],
+                out: folder.path().join("pipeline.toml"),
+                ..Request::default()
+            };
+            draft(&request).unwrap().document.text()
+        });
+        assert_eq!(texts[0], texts[1]);
+        assert_eq!(texts[0], texts[2]);
     }
 
     #[test]
@@ -385,6 +437,41 @@ mod tests {
         for part in ["out = \"out-b\"", "which is small", "# pitch_deg = -90.0"] {
             assert!(text.contains(part), "{part}: {text}");
         }
+    }
+
+    #[test]
+    fn colmap_s_points_are_turned_as_its_camera_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        put_turned(&at("photo.png"), [30, 20], &|x, _| x as u8, 1);
+        std::fs::write(at("a.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+        // A level camera at the origin of a world with +y up, and the ground 2 m below it.
+        std::fs::create_dir(at("sparse")).unwrap();
+        std::fs::write(at("sparse/cameras.txt"), "1 PINHOLE 30 20 25 25 15 10\n").unwrap();
+        std::fs::write(at("sparse/images.txt"), "1 0 1 0 0 0 0 0 1 photo.png\n\n").unwrap();
+        let point = |i: u32| format!("{i} {} -2 {} 9 9 9 0\n", i % 9, -f64::from(i / 9 + 6));
+        let points: String = (0..90).map(point).collect();
+        std::fs::write(at("sparse/points3D.txt"), points).unwrap();
+        let of = |points_up| {
+            let request = Request {
+                photo: at("photo.png"),
+                models: vec![at("a.obj")],
+                out: at("pipeline.toml"),
+                camera: Some(at("sparse")),
+                camera_up: Some(WorldUp::Y),
+                points: Some(at("sparse")),
+                points_up,
+                ..Request::default()
+            };
+            draft(&request).map(|draft| draft.document.text())
+        };
+        let text = of(None).unwrap();
+        assert!(
+            text.contains("points = \"sparse\"\npoints_up = \"y\"\n"),
+            "{text}"
+        );
+        // Upside down the points are above the camera.
+        assert!(of(Some(WorldUp::MinusY)).is_err());
     }
 
     #[test]

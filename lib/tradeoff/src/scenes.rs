@@ -7,10 +7,11 @@ use anyhow::Context;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
+use dipir_light::exposure::automatic_exposure_ev;
 use dipir_render::shapes::{append, icosphere, torus_knot};
 use dipir_scene::export::to_obj;
 use dipir_scene::mesh::TriangleMesh;
-use dipir_stages::scene::background::{PanoramaView, automatic_exposure_ev};
+use dipir_stages::scene::background::PanoramaView;
 use glam::{Vec2, Vec3};
 
 use crate::lights::{hazy, indoors, outdoors};

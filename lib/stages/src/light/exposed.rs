@@ -4,9 +4,8 @@ use dipir_estimator::{BORDER_DEG, Estimator, LightEstimate, Visible};
 use dipir_imaging::file::Photo;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::tone::ToneCurves;
+use dipir_light::exposure::automatic_exposure_ev;
 use dipir_scene::camera::Camera;
-
-use crate::scene::background::automatic_exposure_ev;
 
 /// Whether a photograph, as it was read, is linear light without a white.
 pub(crate) fn is_linear(taken: &Photo) -> bool {
