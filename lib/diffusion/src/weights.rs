@@ -310,7 +310,8 @@ fn others(folder: &Path, stem: &str) -> Vec<String> {
 
 /// Writes tensors and header strings to `path`, through a temporary file
 /// beside it, so that a reader never sees half a file. Names are written in
-/// byte order: the same tensors give the same bytes.
+/// byte order: the same tensors give the same bytes. Where it fails, the
+/// temporary file is removed.
 pub fn write_safetensors(
     path: &Path,
     tensors: &BTreeMap<String, Tensor>,
@@ -318,8 +319,13 @@ pub fn write_safetensors(
 ) -> Result<()> {
     let bytes = serialize_safetensors(tensors, metadata)?;
     let temporary = path.with_extension("partial");
-    std::fs::write(&temporary, bytes).map_err(io("write", &temporary))?;
-    std::fs::rename(&temporary, path).map_err(io("write", path))
+    let written = std::fs::write(&temporary, bytes)
+        .map_err(io("write", &temporary))
+        .and_then(|()| std::fs::rename(&temporary, path).map_err(io("write", path)));
+    if written.is_err() {
+        let _ = std::fs::remove_file(&temporary);
+    }
+    written
 }
 
 /// The bytes that [`write_safetensors`] writes: header keys in sorted order.

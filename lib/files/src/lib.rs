@@ -52,12 +52,27 @@ pub fn read(path: impl AsRef<Path>) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The text of a regular file in UTF-8. Errors as [`open`].
+/// The text of a regular file in UTF-8. Errors as [`open`] and [`refuse_utf16`], and
+/// [`io::ErrorKind::InvalidData`] for other bytes that are not UTF-8.
 pub fn read_to_string(path: impl AsRef<Path>) -> io::Result<String> {
-    let mut file = open(path)?;
-    let mut text = String::new();
-    file.read_to_string(&mut text)?;
-    Ok(text)
+    let bytes = read(path)?;
+    refuse_utf16(&bytes)?;
+    String::from_utf8(bytes)
+        .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "it is not UTF-8 text"))
+}
+
+/// Refuses text that begins with the byte order mark of UTF-16, as editors on Windows save it.
+///
+/// # Errors
+/// [`io::ErrorKind::InvalidData`], with the way to save it.
+pub fn refuse_utf16(bytes: &[u8]) -> io::Result<()> {
+    match bytes {
+        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => Err(io::Error::new(
+            io::ErrorKind::InvalidData,
+            "it is UTF-16 text; save it as UTF-8, in Notepad by \"Save as\" with the encoding UTF-8",
+        )),
+        _ => Ok(()),
+    }
 }
 
 /// The bytes of a text without the byte order mark that editors on Windows put before it.
@@ -65,12 +80,34 @@ pub fn without_byte_order_mark(bytes: &[u8]) -> &[u8] {
     bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
 }
 
-#[cfg(all(test, unix))]
+#[cfg(test)]
 mod tests {
+    #[cfg(unix)]
     use rustix::fs::{CWD, FileType, Mode};
 
     use super::*;
 
+    #[test]
+    fn utf_16_text_is_refused_with_how_to_save_it_and_a_mark_of_utf_8_is_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("pipeline.toml");
+        for bytes in [&b"\xff\xfe[\0s\0"[..], b"\xfe\xff\0[\0s"] {
+            fs::write(&path, bytes).unwrap();
+            let error = read_to_string(&path).unwrap_err();
+            assert_eq!(
+                error.to_string(),
+                "it is UTF-16 text; save it as UTF-8, in Notepad by \"Save as\" with the encoding UTF-8"
+            );
+        }
+        fs::write(&path, b"caf\xe9").unwrap();
+        let error = read_to_string(&path).unwrap_err();
+        assert_eq!(error.to_string(), "it is not UTF-8 text");
+        fs::write(&path, b"\xef\xbb\xbf[s").unwrap();
+        let text = read_to_string(&path).unwrap();
+        assert_eq!(without_byte_order_mark(text.as_bytes()), b"[s");
+    }
+
+    #[cfg(unix)]
     #[test]
     fn a_pipe_is_refused_without_waiting_for_a_writer() {
         let folder = tempfile::tempdir().unwrap();
@@ -80,6 +117,7 @@ mod tests {
         assert_eq!(error.to_string(), "not a regular file");
     }
 
+    #[cfg(unix)]
     #[test]
     fn a_device_and_a_folder_are_refused_and_a_link_to_a_file_is_read() {
         assert_eq!(

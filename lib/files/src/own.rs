@@ -1,9 +1,10 @@
 //! Files that this program makes and replaces, recognised by how they begin.
 //!
 //! None of these functions follows a symbolic link at the name that it is given.
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use crate::check_regular;
 
@@ -29,7 +30,8 @@ pub fn begins_with(path: &Path, mark: &[u8]) -> io::Result<bool> {
 }
 
 /// Writes `content`, which begins with `mark`, beside `path`, flushes it and renames it to `path`:
-/// a reader of `path` finds the earlier content or this one, after a power cut, too.
+/// a reader of `path` finds the earlier content or this one, after a power cut, too. Of several processes that
+/// replace it at once, the last one to end wins.
 ///
 /// # Errors
 /// Those of the system, and [`io::ErrorKind::AlreadyExists`] if `path`, or `.NAME.partial` beside
@@ -39,19 +41,7 @@ pub fn replace(path: &Path, content: &[u8], mark: &[u8]) -> io::Result<()> {
     if beginning(path, mark.len())?.is_some_and(|found| found != mark) {
         return Err(not_ours(path));
     }
-    let partial = partial_of(path);
-    if let Some(left) = beginning(&partial, mark.len())? {
-        // A run that was killed may have written less than the mark.
-        if !mark.starts_with(&left) {
-            return Err(not_ours(&partial));
-        }
-        fs::remove_file(&partial)?;
-    }
-    // Made anew, so that a link that came to the name since is not followed.
-    let mut file = OpenOptions::new()
-        .write(true)
-        .create_new(true)
-        .open(&partial)?;
+    let (partial, mut file) = begin(path, mark)?;
     let written = file
         .write_all(content)
         .and_then(|()| file.sync_all())
@@ -60,19 +50,106 @@ pub fn replace(path: &Path, content: &[u8], mark: &[u8]) -> io::Result<()> {
         let _ = fs::remove_file(&partial);
     }
     written?;
-    match path.parent().filter(|p| !p.as_os_str().is_empty()) {
-        Some(parent) => sync_folder(parent),
-        None => sync_folder(Path::new(".")),
+    sync_folder(folder_of(path))
+}
+
+fn folder_of(path: &Path) -> &Path {
+    let parent = path.parent().filter(|p| !p.as_os_str().is_empty());
+    parent.unwrap_or(Path::new("."))
+}
+
+/// A new, locked file beside `path`: `.NAME.partial`, or a name of this process's own where another process is writing
+/// that. What a killed process left there is removed.
+fn begin(path: &Path, mark: &[u8]) -> io::Result<(PathBuf, File)> {
+    let partial = partial_of(path);
+    if let Some(left) = left_at(&partial, mark)? {
+        // Locked and at its name, so it is nobody else's meanwhile.
+        if is_at(&left, &partial) {
+            fs::remove_file(&partial)?;
+        }
+    }
+    if let Some(file) = create_locked(&partial)? {
+        return Ok((partial, file));
+    }
+    static COUNT: AtomicU32 = AtomicU32::new(0);
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    loop {
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let process = std::process::id();
+        let own = path.with_file_name(format!(".{name}.{process}-{count}.partial"));
+        if let Some(file) = create_locked(&own)? {
+            return Ok((own, file));
+        }
     }
 }
 
-/// What a killed [`replace`] of `path` left beside it: `.NAME.partial`, if it begins with `mark` or with a part of
-/// that.
+/// Makes the file anew, so that a link that came to the name since is not followed. The lock tells others that it is
+/// being written; a file system without locks does without. `None` if the name is, or has just been, another process's.
+fn create_locked(partial: &Path) -> io::Result<Option<File>> {
+    let mut options = OpenOptions::new();
+    let file = match options.write(true).create_new(true).open(partial) {
+        Err(e) if e.kind() == io::ErrorKind::AlreadyExists => return Ok(None),
+        opened => opened?,
+    };
+    let is_locked_by_other = matches!(file.try_lock(), Err(TryLockError::WouldBlock));
+    Ok((!is_locked_by_other && is_at(&file, partial)).then_some(file))
+}
+
+/// What a killed [`replace`] left at `partial`, locked; `None` if nothing is there or a running one writes it. What does
+/// not begin with `mark` or a part of it is an error.
+fn left_at(partial: &Path, mark: &[u8]) -> io::Result<Option<File>> {
+    let left = match open_regular(partial)? {
+        Some(left) => left,
+        None => return Ok(None),
+    };
+    if matches!(left.try_lock(), Err(TryLockError::WouldBlock)) {
+        return Ok(None);
+    }
+    let mut begins = Vec::with_capacity(mark.len());
+    (&left).take(mark.len() as u64).read_to_end(&mut begins)?;
+    match mark.starts_with(&begins) {
+        true => Ok(Some(left)),
+        false => Err(not_ours(partial)),
+    }
+}
+
+/// Whether the open file is the one at `path`.
+#[cfg(unix)]
+fn is_at(file: &File, path: &Path) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    let same = |a: fs::Metadata, b: fs::Metadata| (a.dev(), a.ino()) == (b.dev(), b.ino());
+    let (open, named) = (file.metadata(), fs::symlink_metadata(path));
+    open.ok().zip(named.ok()).is_some_and(|(a, b)| same(a, b))
+}
+
+#[cfg(not(unix))]
+fn is_at(_: &File, _: &Path) -> bool {
+    true
+}
+
+/// What a killed [`replace`] of `path` left beside it, if it begins with `mark` or with a part of that: `.NAME.partial`,
+/// else the first one that has the number of a process in its name.
 pub fn left_of_replacing(path: &Path, mark: &[u8]) -> Option<PathBuf> {
-    let partial = partial_of(path);
     // What is not a regular file is none of ours.
-    let left = beginning(&partial, mark.len()).ok()??;
-    mark.starts_with(&left).then_some(partial)
+    let is_left = |partial: &PathBuf| left_at(partial, mark).is_ok_and(|left| left.is_some());
+    let partial = partial_of(path);
+    if is_left(&partial) {
+        return Some(partial);
+    }
+    let head = format!(".{}.", path.file_name()?.to_string_lossy());
+    let is_own = |partial: &PathBuf| {
+        let name = partial.file_name().unwrap_or_default().to_string_lossy();
+        let numbers = name
+            .strip_prefix(&head)
+            .and_then(|n| n.strip_suffix(".partial"));
+        numbers.is_some_and(|n| n.bytes().all(|b| b.is_ascii_digit() || b == b'-'))
+    };
+    let entries = fs::read_dir(folder_of(path))
+        .into_iter()
+        .flatten()
+        .flatten();
+    let names = entries.map(|entry| partial.with_file_name(entry.file_name()));
+    names.filter(|name| is_own(name) && is_left(name)).min()
 }
 
 /// Flushes the content of a regular file, one that this program wrote, to the disk.
@@ -102,21 +179,31 @@ pub fn sync_folder(folder: &Path) -> io::Result<()> {
 /// The first `length` bytes of a regular file, fewer if it is shorter; `None` if nothing is there.
 /// What is not a regular file is an error.
 pub fn beginning(path: &Path, length: usize) -> io::Result<Option<Vec<u8>>> {
+    let Some(file) = open_regular(path)? else {
+        return Ok(None);
+    };
+    let mut found = Vec::with_capacity(length);
+    file.take(length as u64).read_to_end(&mut found)?;
+    Ok(Some(found))
+}
+
+/// Opens a regular file for reading; `None` if nothing is there.
+fn open_regular(path: &Path) -> io::Result<Option<File>> {
+    let is_missing = |e: &io::Error| e.kind() == io::ErrorKind::NotFound;
     match fs::symlink_metadata(path) {
         Ok(found) if !found.is_file() => return Err(not_ours(path)),
         Ok(_) => {}
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(e) if is_missing(&e) => return Ok(None),
         Err(e) => return Err(e),
     }
     let mut options = OpenOptions::new();
     options.read(true);
     do_not_follow(&mut options);
-    let mut found = Vec::with_capacity(length);
-    options
-        .open(path)?
-        .take(length as u64)
-        .read_to_end(&mut found)?;
-    Ok(Some(found))
+    match options.open(path) {
+        // Renamed since.
+        Err(e) if is_missing(&e) => Ok(None),
+        opened => opened.map(Some),
+    }
 }
 
 fn partial_of(path: &Path) -> PathBuf {
@@ -201,6 +288,57 @@ mod tests {
         assert_eq!(left_of_replacing(&path, MARK), None);
         assert_eq!(fs::read(&partial).unwrap(), b"mine");
         assert_eq!(fs::read(&path).unwrap(), content("x"));
+    }
+
+    #[test]
+    fn a_file_that_another_process_is_writing_is_left_alone_and_replaced_all_the_same() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("page");
+        let partial = folder.path().join(".page.partial");
+        fs::write(&partial, MARK).unwrap();
+        let other = File::open(&partial).unwrap();
+        other.lock().unwrap();
+        replace(&path, &content("x"), MARK).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), content("x"));
+        assert!(partial.exists());
+        assert_eq!(left_of_replacing(&path, MARK), None);
+        drop(other);
+        assert_eq!(left_of_replacing(&path, MARK), Some(partial.clone()));
+        replace(&path, &content("y"), MARK).unwrap();
+        assert!(!partial.exists());
+        // Of another that was killed at the same time.
+        let own = folder.path().join(".page.123-4.partial");
+        for name in [
+            ".page.old.partial",
+            ".page.123-4.partial",
+            ".pages.1-2.partial",
+        ] {
+            fs::write(folder.path().join(name), MARK).unwrap();
+        }
+        assert_eq!(left_of_replacing(&path, MARK), Some(own));
+    }
+
+    // Elsewhere nothing tells whether an open file is still at its name.
+    #[cfg(unix)]
+    #[test]
+    fn writers_at_once_do_not_disturb_each_other_and_readers_find_whole_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("page");
+        let of = |writer: usize| content(&writer.to_string().repeat(1 << 16));
+        replace(&path, &of(0), MARK).unwrap();
+        std::thread::scope(|scope| {
+            for writer in 0..4 {
+                let path = &path;
+                scope.spawn(move || {
+                    for _ in 0..50 {
+                        replace(path, &of(writer), MARK).unwrap();
+                        let found = fs::read(path).unwrap();
+                        assert!((0..4).any(|w| found == of(w)), "{} bytes", found.len());
+                    }
+                });
+            }
+        });
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 
     #[test]

@@ -180,7 +180,7 @@ impl CameraSettings {
                 }
                 if let FieldOfView::Vertical(angle_rad) = field_of_view {
                     let height_px = f64::from(resolution[1]);
-                    let focal_px = distorted_focal(distortion, *angle_rad, height_px);
+                    let focal_px = distorted_focal(distortion, *angle_rad, height_px)?;
                     camera.focal_px = focal_px.map_or(camera.focal_px, |f| Vec2::splat(f as f32));
                 }
                 let pose = Pose {
@@ -200,12 +200,28 @@ impl CameraSettings {
 }
 
 /// The focal length of a fisheye with this vertical field of view, pixels. `None` for other lenses, whose field of view
-/// counts without distortion.
-fn distorted_focal(distortion: &Distortion, angle_rad: f32, height_px: f64) -> Option<f64> {
+/// counts without distortion. An error if the fisheye does not see so far.
+fn distorted_focal(
+    distortion: &Distortion,
+    angle_rad: f32,
+    height_px: f64,
+) -> Result<Option<f64>, Error> {
+    if !distortion.is_fisheye() {
+        return Ok(None);
+    }
     let (sin, cos) = (0.5 * f64::from(angle_rad)).sin_cos();
     let image = distortion.image(DVec3::new(0.0, sin, cos));
-    let image = image.filter(|i| distortion.is_fisheye() && i.point.y > 0.0);
-    image.map(|i| 0.5 * height_px / i.point.y)
+    match image.filter(|i| i.point.y > 0.0) {
+        Some(image) => Ok(Some(0.5 * height_px / image.point.y)),
+        None => Err(Error::Config {
+            key: "scene.camera.fov_deg".into(),
+            value: format!("{:.1}", angle_rad.to_degrees()),
+            accepted:
+                "a field of view that the fisheye's distortion reaches before its curve turns \
+                       back; or the focal length, as in fx = 800"
+                    .into(),
+        }),
+    }
 }
 
 fn of_lens(pose: &Pose, lens: &Lens, resolution: [u32; 2]) -> (Camera, Option<Undistortion>) {
@@ -336,7 +352,7 @@ impl FileSettings {
             lens.distortion = distortion;
             if let Some(fov_deg) = self.fov_deg {
                 let height_px = lens.size[1];
-                let focal_px = distorted_focal(&distortion, fov_deg.to_radians(), height_px);
+                let focal_px = distorted_focal(&distortion, fov_deg.to_radians(), height_px)?;
                 lens.focal_px = focal_px.map_or(lens.focal_px, DVec2::splat);
             }
         }

@@ -72,6 +72,21 @@ fn an_output_that_is_not_finite_is_refused() -> Outcome {
 }
 
 #[test]
+fn a_file_that_cannot_be_written_leaves_nothing_beside_it() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let weights = BTreeMap::from([("a".to_string(), Tensor::zeros(4, DType::F32, &Device::Cpu)?)]);
+    // Nothing replaces a folder.
+    let path = folder.path().join("lora.safetensors");
+    std::fs::create_dir(&path)?;
+    assert!(write_safetensors(&path, &weights, &BTreeMap::new()).is_err());
+    assert_eq!(std::fs::read_dir(folder.path())?.count(), 1);
+    // Nor is there a way into one that is not there.
+    let path = folder.path().join("gone/lora.safetensors");
+    assert!(write_safetensors(&path, &weights, &BTreeMap::new()).is_err());
+    Ok(())
+}
+
+#[test]
 fn shards_give_the_same_prediction_as_one_file() -> Outcome {
     let tensors = unet_tensors()?;
     let folder = unet_folder(&tensors)?;

@@ -205,7 +205,7 @@ mod tests {
     /// The camera of `in/plate.1001.png`, of 600 x 400 pixels, with its lens if that bends lines. Of `lines` those of
     /// `[scene.camera]` but for the name of its file.
     fn resolved(
-        (name, text): (&str, &str),
+        (name, text): (&str, impl AsRef<[u8]>),
         lines: &str,
     ) -> Result<(crate::camera::Camera, Option<Lens>), String> {
         let folder = tempfile::tempdir().unwrap();
@@ -342,6 +342,22 @@ mod tests {
         let lens = resolved(file, fisheye).unwrap().1.unwrap();
         // 60 degrees are seen at 200 pixels, and the image's radius is the angle.
         assert!((lens.focal_px.y - 200.0 / 60f64.to_radians()).abs() < 1e-3);
+        // The radius a - a^3 / 2 grows no more from 47 degrees on, and is 0 at 81.
+        let turned_back = "fov_deg = 170.0\ndistortion = { fisheye = true, k1 = -0.5 }";
+        let error = resolved(file, turned_back).unwrap_err();
+        assert!(error.starts_with("scene.camera.fov_deg is 170"), "{error}");
+    }
+
+    #[test]
+    fn a_file_that_is_utf_16_is_refused_with_how_to_save_it() {
+        let text: Vec<u8> = "\u{feff}fx 800"
+            .encode_utf16()
+            .flat_map(u16::to_le_bytes)
+            .collect();
+        for name in ["shot.chan", "lens.yaml", "transforms.json", "calib.txt"] {
+            let error = resolved((name, &text), "").unwrap_err();
+            assert!(error.contains("UTF-16"), "{name}: {error}");
+        }
     }
 
     #[test]

@@ -89,7 +89,9 @@ impl<'a> Buffers<'a> {
         let views = &self.document.buffer_views;
         let view = get(views, index.value(), place, "buffer views")?;
         let at = format!("bufferViews[{index}]");
+        // Some exporters write 0 for "one behind the other".
         let stride = view.byte_stride.map(|stride| stride.0);
+        let stride = stride.filter(|bytes| *bytes != 0);
         let extension = match &view.extensions {
             Some(e) => raw_extension::<Compressed>(&e.others, MESHOPT, &at)?,
             None => None,

@@ -68,18 +68,17 @@ impl Folder {
                 format!("{scheme} addresses are not followed; download the file beside the object"),
             ));
         }
-        // Some exporters forget to encode: the name as it stands is the second guess.
+        // Some exporters forget to encode, and some write the separators of Windows: further guesses.
         let decoded = percent_decoded(uri);
+        let slashed = decoded.replace('\\', "/");
+        let guesses = [&decoded, uri, &slashed];
         let allow_outside = self.limits.allow_outside;
-        if !allow_outside && (leaves_folder(&decoded) || leaves_folder(uri)) {
+        if !allow_outside && guesses.iter().any(|guess| leaves_folder(guess)) {
             return Err(outside());
         }
-        let (decoded, literal) = (self.path.join(decoded), self.path.join(uri));
-        let found = if decoded.is_file() || !literal.is_file() {
-            decoded
-        } else {
-            literal
-        };
+        let paths = guesses.map(|guess| self.path.join(guess));
+        let found = paths.iter().find(|path| path.is_file());
+        let found = found.unwrap_or(&paths[0]).clone();
         if !allow_outside && !self.holds(&found)? {
             return Err(outside());
         }

@@ -179,20 +179,25 @@ fn check_header(document: &Document) -> Result<(), Error> {
         if ACCEPTED.contains(&name.as_str()) {
             continue;
         }
-        let remedy = match name.as_str() {
-            "KHR_draco_mesh_compression" => "convert the file: gltf-transform copy IN.glb OUT.glb",
-            name if name.contains("compression") => {
-                "convert the file: gltf-transform meshopt IN.glb OUT.glb"
-            }
-            name if IMAGE_EXTENSIONS.contains(&name) => image_remedy(name),
-            _ => "export the object without it",
-        };
-        return Err(Error::UnsupportedExtension {
-            extension: name.clone(),
-            remedy,
-        });
+        return Err(not_read(name));
     }
     Ok(())
+}
+
+/// The refusal of an extension, with the way out.
+pub(super) fn not_read(name: &str) -> Error {
+    let remedy = match name {
+        "KHR_draco_mesh_compression" => "convert the file: gltf-transform copy IN.glb OUT.glb",
+        name if name.contains("compression") => {
+            "convert the file: gltf-transform meshopt IN.glb OUT.glb"
+        }
+        name if IMAGE_EXTENSIONS.contains(&name) => image_remedy(name),
+        _ => "export the object without it",
+    };
+    Error::UnsupportedExtension {
+        extension: name.into(),
+        remedy,
+    }
 }
 
 fn buffer_data<'a>(

@@ -6,7 +6,7 @@ use gltf::json::{Accessor, Index};
 
 use super::accessor::{Buffers, get};
 use super::document::Document;
-use super::gltf::Group;
+use super::gltf::{Group, not_read};
 use super::tangents;
 use crate::error::Error;
 use crate::material::{Material, TextureRef};
@@ -78,32 +78,34 @@ impl<'a> MeshReader<'a> {
                 ));
             }
         };
-        let mut extensions = primitive.extensions.iter().flat_map(|e| e.others.keys());
-        if let Some(name) = extensions.find(|n| n.contains("compression")) {
-            // The uncompressed copy that an optional extension promises, if there is one.
-            self.warnings.push(format!(
-                "{at}: {name} is not read, its uncompressed copy is"
-            ));
-        }
         let Some(positions) = attribute(primitive, Semantic::Positions) else {
             self.warnings
                 .push(format!("{at} has no positions and is left out"));
             return Ok(None);
         };
+        let place = format!("{at}.attributes.POSITION");
+        let mut extensions = primitive.extensions.iter().flat_map(|e| e.others.keys());
+        if let Some(name) = extensions.find(|n| n.contains("compression")) {
+            let stored = self.buffers.accessor(positions, &place)?;
+            if stored.buffer_view.is_none() && stored.sparse.is_none() {
+                return Err(not_read(name));
+            }
+            // The uncompressed copy that an optional extension promises.
+            self.warnings.push(format!(
+                "{at}: {name} is not read, its uncompressed copy is"
+            ));
+        }
         let material = self.material(primitive, &at)?;
         let mut mesh = TriangleMesh {
-            positions: self.buffers.floats(
-                positions,
-                &format!("{at}.attributes.POSITION"),
-                false,
-                Vec3::from_array,
-            )?,
+            positions: self
+                .buffers
+                .floats(positions, &place, false, Vec3::from_array)?,
             ..TriangleMesh::default()
         };
         if let Some(bad) = mesh.first_non_finite() {
             let p = mesh.positions[bad];
             return Err(Error::NotFinite {
-                place: format!("{at}.attributes.POSITION"),
+                place,
                 element: bad as u64,
                 value: format!("{}, {}, {}", p.x, p.y, p.z),
             });
@@ -303,7 +305,9 @@ impl<'a> MeshReader<'a> {
                 "{at}: COLOR_{set} is not read; only COLOR_0 is part of the surface"
             ));
         }
-        if self.normal_map(material).is_some() && !mesh.normals.is_empty() {
+        let surface = self.materials.get(material);
+        let is_anisotropic = surface.is_some_and(|m| m.extensions.anisotropy.is_some());
+        if (is_anisotropic || self.normal_map(material).is_some()) && !mesh.normals.is_empty() {
             let unit = |[x, y, z, w]: [f32; 4]| {
                 let direction = DVec3::new(x.into(), y.into(), z.into());
                 let direction = direction.normalize_or_zero().as_vec3();
@@ -385,6 +389,7 @@ impl<'a> MeshReader<'a> {
         }
         self.warnings
             .push("skinned meshes are shown in their rest pose".to_owned());
+        let mut mirrored = vec![false; mesh.positions.len()];
         for v in 0..mesh.positions.len() {
             let mut pose = DMat4::ZERO;
             let mut total = 0.0;
@@ -409,6 +414,7 @@ impl<'a> MeshReader<'a> {
             }
             let pose = pose * (1.0 / total);
             let linear = DMat3::from_mat4(pose);
+            mirrored[v] = linear.determinant() < 0.0;
             mesh.positions[v] = pose
                 .transform_point3(mesh.positions[v].as_dvec3())
                 .as_vec3();
@@ -421,7 +427,14 @@ impl<'a> MeshReader<'a> {
             }
             if let Some(t) = mesh.tangents.get_mut(v) {
                 let direction = (linear * t.truncate().as_dvec3()).normalize_or_zero();
-                *t = direction.as_vec3().extend(t.w);
+                let sign = if mirrored[v] { -t.w } else { t.w };
+                *t = direction.as_vec3().extend(sign);
+            }
+        }
+        // Fronts stay fronts, as under a node that mirrors.
+        for triangle in &mut mesh.indices {
+            if triangle.iter().filter(|v| mirrored[**v as usize]).count() >= 2 {
+                triangle.swap(1, 2);
             }
         }
         if let Some(bad) = mesh.first_non_finite() {
@@ -473,7 +486,7 @@ impl<'a> MeshReader<'a> {
         if let Some(map) = normal_map
             && mesh.tangents.is_empty()
         {
-            tangents::generate(mesh, usize::from(map.uv_set), &map.transform);
+            tangents::generate(mesh, usize::from(map.uv_set), &|_| Some(map.transform));
         }
     }
 }

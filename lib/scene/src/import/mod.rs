@@ -105,7 +105,10 @@ pub fn load_object_within(path: &Path, limits: &Limits) -> Result<Imported, Erro
         "stl" => load_stl_bytes(&bytes, limits),
         _ => load_gltf_bytes(&bytes, &folder, limits),
     };
-    let mut imported = loaded.map_err(|e| e.in_file(path))?;
+    let mut imported = loaded.map_err(|e| match dipir_files::refuse_utf16(&bytes) {
+        Ok(()) => e.in_file(path),
+        Err(source) => unreadable(path, source),
+    })?;
     imported.dependencies = folder.into_used();
     for texture in &mut imported.textures {
         if let ImageSource::Bytes { name, .. } = &mut texture.image {
@@ -116,15 +119,18 @@ pub fn load_object_within(path: &Path, limits: &Limits) -> Result<Imported, Erro
 }
 
 fn read_whole(path: &Path, limits: &Limits) -> Result<Vec<u8>, Error> {
-    let unreadable = |source| Error::Read {
+    let file = dipir_files::open(path).map_err(|e| unreadable(path, e))?;
+    let length = file.metadata().map_err(|e| unreadable(path, e))?.len();
+    limits.check_bytes(length).map_err(|e| e.in_file(path))?;
+    dipir_files::read(path).map_err(|e| unreadable(path, e))
+}
+
+fn unreadable(path: &Path, source: std::io::Error) -> Error {
+    Error::Read {
         role: "the object".into(),
         path: path.into(),
         source,
-    };
-    let file = dipir_files::open(path).map_err(unreadable)?;
-    let length = file.metadata().map_err(unreadable)?.len();
-    limits.check_bytes(length).map_err(|e| e.in_file(path))?;
-    dipir_files::read(path).map_err(unreadable)
+    }
 }
 
 impl Imported {

@@ -78,6 +78,8 @@ struct Draft {
     alpha_file: Option<String>,
     /// Whether the file of `map_Ke` is missing.
     lacks_emission: bool,
+    /// Whether `d` was written.
+    has_opacity: bool,
 }
 
 /// An image statement: the file and its options.
@@ -156,8 +158,12 @@ impl Library {
             }
             "Pr" => draft.roughness = Some(unit(rest)?),
             "Pm" => material.metallic = unit(rest)?,
-            "d" => material.base_color.w = unit(rest)?,
-            "Tr" => material.base_color.w = 1.0 - unit(rest)?,
+            "d" => {
+                material.base_color.w = unit(rest)?;
+                draft.has_opacity = true;
+            }
+            // Some exporters write opacity here: beside d it does not count.
+            "Tr" if !draft.has_opacity => material.base_color.w = 1.0 - unit(rest)?,
             "map_Kd" => {
                 let map = Map::parse(rest);
                 // White, so that the texture is seen as it is where no Kd was meant.

@@ -227,6 +227,11 @@ impl Reader {
         match resolver.read(&name.replace('\\', "/")) {
             Ok(bytes) => {
                 let path = container::named(name);
+                dipir_files::refuse_utf16(&bytes).map_err(|source| Error::Read {
+                    role: "the material library".into(),
+                    path: path.clone(),
+                    source,
+                })?;
                 self.library
                     .read(&bytes, name, resolver)
                     .map_err(|e| Problem::from(e.in_file(path)))
@@ -277,7 +282,10 @@ impl Reader {
     fn gather(&mut self, materials: &[Material]) {
         let n = self.mesh.positions.len();
         let reads_uv = materials.iter().any(|m| m.texture_refs().next().is_some());
-        let normal_map = materials.iter().find_map(|m| m.normal_texture);
+        let normal_map = |material: u32| {
+            let map = materials.get(material as usize)?.normal_texture;
+            map.map(|(texture, _)| texture.transform)
+        };
         if reads_uv {
             if !self.has[0] {
                 self.warnings
@@ -311,12 +319,11 @@ impl Reader {
                 ));
             }
         }
-        if let Some((map, _)) = normal_map {
+        if materials.iter().any(|m| m.normal_texture.is_some()) {
             if self.mesh.normals.is_empty() {
                 self.mesh.split_flat();
             }
-            // Maps of several materials are mirrored alike, if at all.
-            tangents::generate(&mut self.mesh, 0, &map.transform);
+            tangents::generate(&mut self.mesh, 0, &normal_map);
         }
     }
 }

@@ -22,18 +22,24 @@ pub fn load_stl_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
         .get(80..HEADER)
         .map(|b| u64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]])));
     let needed = announced.map(|n| HEADER as u64 + n * RECORD as u64);
-    let is_text = bytes.trim_ascii_start().starts_with(b"solid");
     let mut mesh = Mesh::new(limits);
+    let mut warnings = Vec::new();
     match (announced, needed) {
-        // Some binary files start with "solid", too.
-        (Some(n), Some(needed)) if needed == bytes.len() as u64 || !is_text => {
-            if needed > bytes.len() as u64 {
+        _ if is_text(bytes) => read_text(bytes, &mut mesh)?,
+        (Some(n), Some(needed)) => {
+            let length = bytes.len() as u64;
+            if needed > length {
                 return Err(Error::malformed(
                     format!(
-                        "{n} triangles are announced, which take {needed} bytes, but the file has {}",
-                        bytes.len()
+                        "{n} triangles are announced, which take {needed} bytes, but the file has {length}"
                     ),
                     "export or copy the file again",
+                ));
+            }
+            if needed < length {
+                warnings.push(format!(
+                    "the {} bytes behind the {n} triangles that the file announces are not read",
+                    length - needed
                 ));
             }
             limits.check_mesh(0, n)?;
@@ -45,7 +51,6 @@ pub fn load_stl_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
                 mesh.push([corner(1), corner(2), corner(3)])?;
             }
         }
-        _ if is_text => read_text(bytes, &mut mesh)?,
         _ => {
             return Err(Error::malformed(
                 format!(
@@ -56,7 +61,21 @@ pub fn load_stl_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
             ));
         }
     }
-    mesh.finish()
+    Ok(Imported {
+        warnings,
+        ..mesh.finish()?
+    })
+}
+
+/// Whether the file is ASCII. Some binary files start with "solid", too, but their number of triangles is no text: a byte
+/// of it is a control character unless there are 150 million.
+fn is_text(bytes: &[u8]) -> bool {
+    let text = dipir_files::without_byte_order_mark(bytes).trim_ascii_start();
+    let begins = text
+        .get(..5)
+        .is_some_and(|b| b.eq_ignore_ascii_case(b"solid"));
+    let mut count = bytes.get(80..HEADER).unwrap_or_default().iter();
+    begins && count.all(|b| !b.is_ascii_control() || b.is_ascii_whitespace())
 }
 
 fn read_text(bytes: &[u8], mesh: &mut Mesh) -> Result<(), Error> {

@@ -9,28 +9,29 @@ use glam::{DVec2, DVec3, Mat3, Vec2, Vec4};
 
 use crate::mesh::TriangleMesh;
 
-/// Fills `mesh.tangents` from texture coordinate set `uv_set` after `transform`, the way the normal
-/// map is read. The mesh must have normals and that set. A vertex whose triangles all collapse in
-/// texture space gets the zero tangent.
-pub fn generate(mesh: &mut TriangleMesh, uv_set: usize, transform: &Mat3) {
-    let orientation = split_mirrored(mesh, uv_set, transform);
+/// Fills `mesh.tangents` from texture coordinate set `uv_set` after the transform that `map` gives for a triangle's
+/// material, the way its normal map is read; triangles without one are passed over. The mesh must have normals, that
+/// set and materials. A vertex whose triangles all collapse in texture space gets the zero tangent.
+pub fn generate(mesh: &mut TriangleMesh, uv_set: usize, map: &dyn Fn(u32) -> Option<Mat3>) {
+    let turns = split_turned(mesh, uv_set, map);
     let mut sums = vec![DVec3::ZERO; mesh.positions.len()];
     let mut signs = vec![1.0f32; mesh.positions.len()];
     for (t, corners) in mesh.indices.iter().enumerate() {
-        if orientation[t] == 0 {
+        let (Some(turn), Some(transform)) = (turns[t], map(mesh.materials[t])) else {
             continue;
-        }
-        let p = corners.map(|i| mesh.positions[i as usize].as_dvec3());
-        let [d1, d2] = uv_edges(mesh, t, uv_set, transform);
+        };
         // v points down and tangent space's y up: a positive area in (u, v) is a mirrored map.
-        let direction = ((p[1] - p[0]) * d2.y - (p[2] - p[0]) * d1.y) * f64::from(orientation[t]);
+        let orientation = if turn.is_mirrored { 1.0 } else { -1.0 };
+        let p = corners.map(|i| mesh.positions[i as usize].as_dvec3());
+        let [d1, d2] = uv_edges(mesh, t, uv_set, &transform);
+        let direction = ((p[1] - p[0]) * d2.y - (p[2] - p[0]) * d1.y) * orientation;
         let direction = direction.normalize_or_zero();
         for k in 0..3 {
             let (a, b) = (p[(k + 1) % 3] - p[k], p[(k + 2) % 3] - p[k]);
             let angle = a.cross(b).length().atan2(a.dot(b));
             let vertex = corners[k] as usize;
             sums[vertex] += direction * angle;
-            signs[vertex] = -f32::from(orientation[t]);
+            signs[vertex] = -orientation as f32;
         }
     }
     mesh.tangents = sums
@@ -55,27 +56,42 @@ fn uv_edges(mesh: &TriangleMesh, triangle: usize, uv_set: usize, transform: &Mat
     [b - a, c - a].map(|d: Vec2| transform.transform_vector2(d).as_dvec2())
 }
 
-/// Sign of each triangle's area in texture space; a vertex that triangles of both signs share is
-/// given a twin for the sign that comes later.
-fn split_mirrored(mesh: &mut TriangleMesh, uv_set: usize, transform: &Mat3) -> Vec<i8> {
-    let mut orientation = Vec::with_capacity(mesh.indices.len());
-    let mut vertex_sign = vec![0i8; mesh.positions.len()];
-    let mut twins: HashMap<u32, u32> = HashMap::new();
+/// How a normal map lies on a triangle. Triangles that differ in it share no tangent.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+struct Turn {
+    /// Whether the area in texture space is positive.
+    is_mirrored: bool,
+    /// Whether the transform of the map reverses u: of two materials on one surface, one can.
+    is_reversed: bool,
+}
+
+/// The turn of each triangle, `None` of those without a map or an area in texture space. A vertex that triangles of
+/// several turns share is given a twin for each that comes later.
+fn split_turned(
+    mesh: &mut TriangleMesh,
+    uv_set: usize,
+    map: &dyn Fn(u32) -> Option<Mat3>,
+) -> Vec<Option<Turn>> {
+    let mut turns = Vec::with_capacity(mesh.indices.len());
+    let mut first: Vec<Option<Turn>> = vec![None; mesh.positions.len()];
+    let mut twins: HashMap<(u32, Turn), u32> = HashMap::new();
     for t in 0..mesh.indices.len() {
-        let [d1, d2] = uv_edges(mesh, t, uv_set, transform);
-        let area = d1.perp_dot(d2);
-        let sign = (area > 0.0) as i8 - (area < 0.0) as i8;
-        orientation.push(sign);
-        if sign == 0 {
+        let turn = map(mesh.materials[t]).and_then(|transform| {
+            let [d1, d2] = uv_edges(mesh, t, uv_set, &transform);
+            let area = d1.perp_dot(d2);
+            (area.abs() > 0.0).then_some(Turn {
+                is_mirrored: area > 0.0,
+                is_reversed: transform.x_axis.x < 0.0,
+            })
+        });
+        turns.push(turn);
+        let Some(turn) = turn else {
             continue;
-        }
+        };
         for k in 0..3 {
             let vertex = mesh.indices[t][k];
-            let known = &mut vertex_sign[vertex as usize];
-            if *known == 0 {
-                *known = sign;
-            } else if *known != sign {
-                mesh.indices[t][k] = *twins.entry(vertex).or_insert_with(|| {
+            if *first[vertex as usize].get_or_insert(turn) != turn {
+                mesh.indices[t][k] = *twins.entry((vertex, turn)).or_insert_with(|| {
                     mesh_twin(
                         &mut mesh.positions,
                         &mut mesh.normals,
@@ -87,7 +103,7 @@ fn split_mirrored(mesh: &mut TriangleMesh, uv_set: usize, transform: &Mat3) -> V
             }
         }
     }
-    orientation
+    turns
 }
 
 /// Copies a vertex and returns the copy's index.

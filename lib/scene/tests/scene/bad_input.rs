@@ -551,3 +551,38 @@ fn pipes_and_devices_are_refused_at_once_wherever_a_file_is_named() {
         "material library \"pipe.mtl\" cannot be read (not a regular file); grey is used"
     );
 }
+
+#[test]
+fn utf_16_text_is_told_with_how_to_save_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        let units = text.encode_utf16().flat_map(u16::to_le_bytes);
+        let bytes: Vec<u8> = [0xff, 0xfe].into_iter().chain(units).collect();
+        std::fs::write(&path, bytes).unwrap();
+        path
+    };
+    let expected = |what: &str, path: &str| {
+        format!(
+            "cannot read {what} \"{path}\": it is UTF-16 text; save it as UTF-8, in Notepad by \"Save as\" with the encoding UTF-8"
+        )
+    };
+    let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+    let stl = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\nendloop\nendfacet\nendsolid\n";
+    for (name, text) in [
+        ("a.obj", obj),
+        ("a.gltf", "{ \"asset\": { \"version\": \"2.0\" } }"),
+        ("a.stl", stl),
+        ("a.ply", "ply\nformat ascii 1.0\nend_header\n"),
+    ] {
+        let path = write(name, text);
+        let message = load_object(&path).unwrap_err().to_string();
+        assert_eq!(message, expected("the object", &path.display().to_string()));
+    }
+    write("m.mtl", "newmtl a\nKd 1 0 0\n");
+    let path = folder.path().join("b.obj");
+    std::fs::write(&path, format!("mtllib m.mtl\n{obj}")).unwrap();
+    let message = load_object(&path).unwrap_err().to_string();
+    let inner = expected("the material library", "m.mtl");
+    assert_eq!(message, format!("\"{}\": {inner}", path.display()));
+}

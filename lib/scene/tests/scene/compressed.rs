@@ -121,3 +121,22 @@ fn webp_textures_are_decoded() {
         "{error}"
     );
 }
+
+#[test]
+fn compressed_geometry_without_an_uncompressed_copy_is_refused_though_it_is_not_required() {
+    let mut glb = Glb::triangle(json!({
+        "extensions": { "KHR_draco_mesh_compression": { "bufferView": 0, "attributes": {} } },
+    }));
+    assert_eq!(
+        glb.try_load().unwrap().warnings,
+        [
+            "meshes[0].primitives[0]: KHR_draco_mesh_compression is not read, its uncompressed copy is"
+        ]
+    );
+    let accessor = glb.json["accessors"][0].as_object_mut().unwrap();
+    accessor.remove("bufferView");
+    assert_eq!(
+        glb.try_load().unwrap_err().to_string(),
+        "the file requires the glTF extension KHR_draco_mesh_compression, which is not supported; convert the file: gltf-transform copy IN.glb OUT.glb"
+    );
+}

@@ -137,6 +137,13 @@ fn index_types_and_no_indices_mean_the_same_triangles() {
 }
 
 #[test]
+fn a_stride_of_zero_means_one_element_behind_the_other() {
+    let mut glb = Glb::triangle(json!({}));
+    glb.json["bufferViews"][0]["byteStride"] = json!(0);
+    assert_eq!(glb.load().mesh.positions[1], Vec3::X);
+}
+
+#[test]
 fn strips_and_fans_face_the_same_way_as_triangles() {
     // Corners of a square facing +z, in the order of a strip and of a fan.
     let strip = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0];
@@ -376,6 +383,43 @@ fn skins_are_shown_in_their_rest_pose() {
 }
 
 #[test]
+fn a_skin_that_mirrors_keeps_fronts_and_flips_the_tangents_sign() {
+    let mut glb = normal_mapped_square(&[0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
+    let joints = glb.accessor(&[0u8; 16], U8, "VEC4", 4);
+    let weights = glb.floats("VEC4", &[1.0, 0.0, 0.0, 0.0].repeat(4));
+    let tangent = glb.floats("VEC4", &[1.0, 0.0, 0.0, 1.0].repeat(4));
+    merge(
+        &mut glb.json["meshes"][0]["primitives"][0]["attributes"],
+        json!({ "JOINTS_0": joints, "WEIGHTS_0": weights, "TANGENT": tangent }),
+    );
+    glb.json["nodes"] = json!([{ "mesh": 0, "skin": 0 }, { "scale": [-1.0, 1.0, 1.0] }]);
+    glb.push("skins", json!({ "joints": [1] }));
+    let mesh = glb.load().mesh;
+    assert_eq!(mesh.positions[1], Vec3::NEG_X);
+    for t in 0..2 {
+        assert_eq!(normal_of(&mesh, t), Vec3::Z);
+    }
+    assert_eq!(mesh.normals, [Vec3::Z; 4]);
+    assert_eq!(mesh.tangents, [Vec4::new(-1.0, 0.0, 0.0, -1.0); 4]);
+}
+
+#[test]
+fn tangents_of_an_anisotropic_surface_arrive_without_a_normal_map() {
+    let mut glb = normal_mapped_square(&[0.0; 8]);
+    let tangent = glb.floats("VEC4", &[0.0, 1.0, 0.0, -1.0].repeat(4));
+    glb.json["meshes"][0]["primitives"][0]["attributes"]["TANGENT"] = json!(tangent);
+    glb.json["materials"][0] = json!({});
+    assert!(glb.load().mesh.tangents.is_empty());
+    glb.json["materials"][0] = json!({ "extensions": {
+        "KHR_materials_anisotropy": { "anisotropyStrength": 0.5 }
+    } });
+    assert_eq!(
+        glb.load().mesh.tangents,
+        [Vec4::new(0.0, 1.0, 0.0, -1.0); 4]
+    );
+}
+
+#[test]
 fn morph_targets_are_added_by_their_default_weights() {
     let mut glb = Glb::triangle(json!({}));
     let delta = glb.floats("VEC3", &[0.0, 0.0, 2.0].repeat(3));
@@ -399,6 +443,17 @@ fn data_uris_and_percent_encoded_files_are_found() {
     let imported = load_object(&path).unwrap();
     assert_eq!(imported.mesh.positions[1], Vec3::X);
     assert_eq!(imported.dependencies, [folder.path().join("a b.bin")]);
+
+    // Named as on Windows.
+    std::fs::create_dir(folder.path().join("data")).unwrap();
+    std::fs::rename(
+        folder.path().join("a b.bin"),
+        folder.path().join("data/b.bin"),
+    )
+    .unwrap();
+    glb.json["buffers"] = json!([{ "uri": "data\\b.bin", "byteLength": 36 }]);
+    std::fs::write(&path, glb.json.to_string()).unwrap();
+    assert_eq!(load_object(&path).unwrap().mesh.positions[1], Vec3::X);
 
     // Three zero vectors, 36 bytes.
     let uri = format!("data:application/octet-stream;base64,{}", "A".repeat(48));

@@ -379,3 +379,57 @@ fn tangents_go_along_the_normal_map_as_its_options_turn_it() {
         assert_eq!(imported.mesh.tangents, [want; 3], "{option}");
     }
 }
+
+#[test]
+fn materials_whose_normal_maps_are_mirrored_differently_share_no_tangents() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    std::fs::write(file("n.png"), one_texel_png([0.5, 0.5, 1.0])).unwrap();
+    // Two triangles of a square, which share two vertices.
+    std::fs::write(
+        file("m.obj"),
+        format!(
+            "mtllib m.mtl\n{SQUARE}vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\nusemtl b\nf 1/1 3/3 4/4\n"
+        ),
+    )
+    .unwrap();
+    let tangents = |options: [&str; 2]| {
+        let [a, b] = options.map(|option| format!("norm {option}n.png\n"));
+        std::fs::write(file("m.mtl"), format!("newmtl a\n{a}newmtl b\n{b}")).unwrap();
+        let mesh = load_object(&file("m.obj")).unwrap().mesh;
+        let of = |t: &[u32; 3]| t.map(|i| mesh.tangents[i as usize]);
+        mesh.indices.iter().map(of).collect::<Vec<_>>()
+    };
+    let plain = Vec3::X.extend(1.0);
+    // Mirrored in u, its u runs the other way; in v, it does not; in both, it is turned by half a turn.
+    for (option, want) in [
+        ("", plain),
+        ("-s 2 3 1 ", plain),
+        ("-s -1 1 1 ", Vec3::NEG_X.extend(-1.0)),
+        ("-s 1 -1 1 ", Vec3::X.extend(-1.0)),
+        ("-s -1 -1 1 ", Vec3::NEG_X.extend(1.0)),
+    ] {
+        assert_eq!(tangents(["", option]), [[plain; 3], [want; 3]], "{option}");
+        assert_eq!(tangents([option, ""]), [[want; 3], [plain; 3]], "{option}");
+    }
+}
+
+#[test]
+fn opacity_wins_over_what_some_exporters_write_as_transparency() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    std::fs::write(
+        file("m.obj"),
+        format!("mtllib m.mtl\n{SQUARE}usemtl a\nf 1 2 3\n"),
+    )
+    .unwrap();
+    for (statements, want) in [
+        ("d 1\nTr 1\n", 1.0),
+        ("Tr 1\nd 1\n", 1.0),
+        ("Tr 0.25\n", 0.75),
+    ] {
+        std::fs::write(file("m.mtl"), format!("newmtl a\n{statements}")).unwrap();
+        let imported = load_object(&file("m.obj")).unwrap();
+        assert_eq!(imported.materials[0].base_color.w, want, "{statements}");
+    }
+}

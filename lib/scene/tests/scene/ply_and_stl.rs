@@ -199,6 +199,34 @@ fn binary_and_ascii_stls_share_vertices() {
 }
 
 #[test]
+fn bytes_behind_the_triangles_of_a_binary_stl_are_left_out_with_a_warning() {
+    for header in [&b"made by hand"[..], b"solid binary"] {
+        let mut bytes = square_stl(header);
+        bytes.extend(*b"end");
+        let imported = stl(&bytes).unwrap();
+        assert_eq!(imported.mesh.indices, [[0, 1, 2], [0, 2, 3]]);
+        assert_eq!(
+            imported.warnings,
+            ["the 3 bytes behind the 2 triangles that the file announces are not read"]
+        );
+    }
+    // One that is cut short is not taken for text either.
+    assert_eq!(
+        stl(&square_stl(b"solid binary")[..150]).unwrap_err(),
+        "2 triangles are announced, which take 184 bytes, but the file has 150; export or copy the file again"
+    );
+}
+
+#[test]
+fn an_ascii_stl_may_begin_with_a_byte_order_mark_and_capitals() {
+    let facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\nendloop\nendfacet\n";
+    for start in ["\u{feff}solid a\n", "SOLID a\r\n", " solid \u{e9}\n"] {
+        let text = format!("{start}{facet}");
+        assert_eq!(stl(text.as_bytes()).unwrap().mesh.indices.len(), 1);
+    }
+}
+
+#[test]
 fn broken_stls_say_where() {
     let whole = square_stl(b"x");
     assert_eq!(
