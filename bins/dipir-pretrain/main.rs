@@ -10,9 +10,9 @@ use dipir_cli::interrupt::{self, Interrupted};
 use dipir_cli::output::{json_path, print_bytes};
 use dipir_cli::progress::Progress;
 use dipir_cli::session::duration;
+use dipir_places::Progress as Step;
 use dipir_places::figures::table;
 use dipir_places::place::Place;
-use dipir_places::{PlacesError, Progress as Step};
 use dipir_pretraining::command_line::{
     CheckArgs, Cli, Command, DataArgs, EncoderArgs, FoldsArgs, LightArgs, SheetArgs, TrainArgs,
 };
@@ -169,11 +169,7 @@ fn train_light(args: &LightArgs, output: &OutputArgs) -> anyhow::Result<()> {
 fn folds(args: &FoldsArgs) -> anyhow::Result<()> {
     let places = dipir_places::place::read_places(&args.panoramas)?;
     let count = usize::try_from(args.folds)?;
-    if places.len() < count {
-        let (path, found, folds) = (args.panoramas.clone(), places.len(), count);
-        return Err(PlacesError::TooFew { path, found, folds }.into());
-    }
-    let folds = dipir_places::place::folds(&places, count);
+    let folds = dipir_places::place::filled_folds(&args.panoramas, &places, count)?;
     let line = |(place, fold): (&Place, &usize)| format!("{}\t{fold}\n", place.name);
     let text: String = places.iter().zip(&folds).map(line).collect();
     print_bytes(text.as_bytes());

@@ -2,6 +2,7 @@
 //!
 //! A picture of any size becomes two feature maps, one of 112 channels at a sixteenth of its size and one of 192
 //! channels at a thirty-second. One thread computes them, so that the bytes never depend on threads.
+pub mod frame;
 mod layers;
 mod network;
 mod product;

@@ -1,6 +1,7 @@
 //! From a photograph to a distribution over cameras.
 use std::collections::HashMap;
 
+use dipir_backbone::frame;
 use dipir_imaging::raster::LinearImage;
 use rayon::prelude::*;
 use safetensors::tensor::SafeTensors;
@@ -45,25 +46,36 @@ pub struct Evidence {
     pub look: Look,
     /// The picture as a whole.
     pub whole: Whole,
+    /// Logarithm of the longer side that was looked at over that of the photograph: 0 without a frame.
+    within: f64,
 }
 
 impl Evidence {
-    /// Of a photograph of any size.
+    /// Of a photograph of any size, without the frame around it.
     pub fn new(image: &LinearImage) -> Self {
-        Self::blurred(image, BLUR)
+        let Some(inside) = frame::inside(image) else {
+            return Self::blurred(image, BLUR);
+        };
+        let longer = |w: usize, h: usize| w.max(h) as f64;
+        let [_, _, width, height] = inside;
+        Self {
+            within: (longer(width, height) / longer(image.0.width(), image.0.height())).ln(),
+            ..Self::blurred(&frame::cut(image, inside), BLUR)
+        }
     }
 
-    /// With another blur of the whole than photographs get.
+    /// With another blur of the whole than photographs get, and with its frame.
     pub fn blurred(image: &LinearImage, blur: usize) -> Self {
         let size = [image.0.width(), image.0.height()];
         Self {
             lines: Lines::new(&segments(image), size),
             look: Look::new(image),
             whole: Whole::new(image, blur),
+            within: 0.0,
         }
     }
 
-    /// What lines and look tell of a camera.
+    /// What lines and look tell of a camera, whose focal length is relative to the side that was looked at.
     pub fn features(&self, pose: &Pose) -> Vec<f32> {
         self.look.features(&self.lines, pose)
     }
@@ -141,7 +153,10 @@ impl CameraEstimator {
             roll_deg: posterior.interval(1),
             fov_deg: posterior.fov_deg(),
             lines: evidence.lines.count(),
-            agreeing: evidence.lines.agreement(&posterior.middle()),
+            agreeing: evidence.lines.agreement(&Pose {
+                log_focal: posterior.middle().log_focal - evidence.within,
+                ..posterior.middle()
+            }),
         }
     }
 
@@ -155,6 +170,11 @@ impl CameraEstimator {
                 self.members.iter().map(with_table).collect()
             }
         };
+        // Relative to the side that is looked at, until the end.
+        let known = known.map(|k| KnownFocal {
+            relative: k.relative / evidence.within.exp(),
+            ..k
+        });
         let mut scores = on_grid(&members, evidence, known, coarse(known));
         for _ in 0..ROUNDS {
             let mut fine = FINE;
@@ -167,6 +187,7 @@ impl CameraEstimator {
             });
             scores = on_grid(&members, evidence, known, axes);
         }
+        scores.axes[2].low += evidence.within;
         scores
     }
 }

@@ -9,7 +9,7 @@ use crate::pose::{Pose, fov_deg, log_focal};
 use crate::posterior::{Axis, Posterior};
 use crate::segments::Segment;
 use crate::whole::{FOCALS, PITCHES, WHOLE};
-use crate::{CameraEstimator, Evidence, KnownFocal};
+use crate::{CameraEstimator, Evidence, KnownFocal, SEARCHED};
 
 /// An estimator that knows nothing of pictures.
 fn ignorant() -> CameraEstimator {
@@ -283,4 +283,126 @@ fn weights_survive_their_file_and_others_are_refused_by_name() {
             .starts_with("the camera's weights are refused"),
         "{error}"
     );
+}
+
+/// A picture with bars of one shade beside and above it.
+fn framed(picture: &LinearImage, bars: [usize; 2], shade: f32) -> LinearImage {
+    let (w, h) = (
+        picture.0.width() + 2 * bars[0],
+        picture.0.height() + 2 * bars[1],
+    );
+    let pixel = |k: usize| match [(k % w).checked_sub(bars[0]), (k / w).checked_sub(bars[1])] {
+        [Some(x), Some(y)] if x < picture.0.width() && y < picture.0.height() => {
+            *picture.0.get(x, y)
+        }
+        _ => Vec3::splat(shade),
+    };
+    LinearImage(Raster::from_pixels(w, h, (0..w * h).map(pixel).collect()))
+}
+
+#[test]
+fn a_frame_does_not_pass_for_upright_and_level_things() {
+    let pose = Pose::new(-12.0, 4.0, 60.0);
+    let image = picture(Built::Street, 3, &pose, [320, 240]);
+    let estimator = CameraEstimator::embedded().unwrap();
+    let plain = estimator.estimate(&image, None);
+    for (bars, shade) in [
+        ([32, 24], 0.0),
+        ([2, 2], 1.0),
+        ([0, 90], 0.0),
+        ([100, 0], 0.0),
+    ] {
+        let photo = framed(&image, bars, shade);
+        let longer = photo.0.width().max(photo.0.height()) as f64;
+        // The same focal length of 320 pixels' sides, over another side.
+        let relative = pose.focal() * 320.0 / longer;
+        let wanted = fov_deg(relative.ln());
+        let found = estimator.estimate(&photo, None);
+        // Three pixels at each bar are cut off with it: a hundredth of the picture, which moves what is found by less
+        // than half of the interval.
+        for (found, plain) in [
+            (found.pitch_deg, plain.pitch_deg),
+            (found.roll_deg, plain.roll_deg),
+        ] {
+            assert!(
+                (found.middle - plain.middle).abs() < plain.half_width(),
+                "{bars:?}: {found:?} {plain:?}"
+            );
+        }
+        assert!(
+            found.roll_deg.holds(4.0) && found.pitch_deg.holds(-12.0),
+            "{bars:?}: {found:?}"
+        );
+        assert!(
+            found.fov_deg.holds(wanted),
+            "{bars:?}: {wanted} in {:?}",
+            found.fov_deg
+        );
+        let known = KnownFocal {
+            relative,
+            sigma: 0.02,
+        };
+        let known = estimator.estimate(&photo, Some(known));
+        assert!(
+            (known.fov_deg.middle - wanted).abs() < 0.5,
+            "{bars:?}: {:?}",
+            known.fov_deg
+        );
+        assert!(
+            (known.roll_deg.middle - 4.0).abs() < 1.0
+                && (known.pitch_deg.middle + 12.0).abs() < 1.0,
+            "{known:?}"
+        );
+        assert!(
+            known.agreeing.upright + known.agreeing.level > 0.5 * known.lines as f64,
+            "{known:?}"
+        );
+    }
+}
+
+#[test]
+fn photographs_of_any_shape_and_brightness_have_intervals_within_what_is_searched() {
+    let estimator = CameraEstimator::embedded().unwrap();
+    let of = |size: [usize; 2], value: &dyn Fn(usize, Vec3) -> Vec3| {
+        let plain = picture(Built::Street, 3, &Pose::new(-5.0, 1.0, 60.0), size);
+        let pixels = plain.0.pixels().iter().enumerate();
+        let pixels = pixels.map(|(k, p)| value(k, *p)).collect();
+        LinearImage(Raster::from_pixels(size[0], size[1], pixels))
+    };
+    for image in [
+        of([240, 80], &|_, p| p),
+        of([80, 240], &|_, p| p),
+        of([32, 24], &|_, p| p),
+        of([1, 1], &|_, p| p),
+        of([1, 90], &|_, p| p),
+        of([160, 120], &|_, p| 0.01 * p),
+        of([160, 120], &|_, p| (8.0 * p).min(Vec3::ONE)),
+        of([160, 120], &|_, p| 1e6 * p),
+        of([160, 120], &|k, p| if k % 61 == 0 { Vec3::NAN } else { p }),
+        of([160, 120], &|k, p| {
+            if k % 61 == 0 { Vec3::INFINITY } else { p }
+        }),
+    ] {
+        let found = estimator.estimate(&image, None);
+        let all = [found.pitch_deg, found.roll_deg, found.fov_deg];
+        for (interval, [low, high]) in all.into_iter().zip(SEARCHED) {
+            let inside = low - 5.0 < interval.low && interval.high < high + 5.0;
+            let ordered = interval.low < interval.middle && interval.middle < interval.high;
+            // The outermost points of a grid stand for half a step more: 3 degrees of 80 on 15 points.
+            assert!(inside && ordered, "{:?}: {found:?}", image.0.width());
+        }
+    }
+}
+
+#[test]
+fn the_sides_of_a_frame_are_no_lines() {
+    let pixel = |k: usize| Vec3::splat(0.3 + 0.001 * (k % 160) as f32);
+    let soft = LinearImage(Raster::from_pixels(
+        160,
+        120,
+        (0..160 * 120).map(pixel).collect(),
+    ));
+    let photo = framed(&soft, [16, 12], 0.0);
+    assert!(Evidence::blurred(&photo, 1).lines.count() >= 4);
+    assert_eq!(Evidence::new(&photo).lines.count(), 0);
 }

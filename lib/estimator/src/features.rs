@@ -4,7 +4,7 @@
 //! photographs of all kinds.
 use std::sync::Arc;
 
-use dipir_backbone::{Backbone, CHANNELS, Map, Tuned};
+use dipir_backbone::{Backbone, CHANNELS, Map, Tuned, frame};
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::resize::{Filter, resize};
 use dipir_imaging::transfer::Transfer;
@@ -63,8 +63,15 @@ pub struct SmallPhoto {
 }
 
 impl SmallPhoto {
-    /// The whole `photo`, resized. Pixels that are no numbers count as black.
+    /// The whole `photo` without the frame around it, resized. Pixels that are no numbers count as black.
     pub fn new(photo: &LinearImage, camera: &Camera) -> Self {
+        if let Some((photo, camera)) = unframed(photo, camera) {
+            return Self::whole(&photo, &camera);
+        }
+        Self::whole(photo, camera)
+    }
+
+    fn whole(photo: &LinearImage, camera: &Camera) -> Self {
         let photo = photo.0.map(|p| clean(*p));
         let small = resize(&photo, SIDE, SIDE, Filter::Area);
         let shown =
@@ -242,6 +249,24 @@ impl SmallPhoto {
             mean(6) - mean(1) * mean(7),
         ]
     }
+}
+
+/// The photograph inside its frame, and the camera of that part; `None` without a frame.
+pub(crate) fn unframed(photo: &LinearImage, camera: &Camera) -> Option<(LinearImage, Camera)> {
+    let inside = frame::inside(photo)?;
+    let [left, top, width, height] = inside;
+    let camera = Camera {
+        resolution: camera.resolution.map(|n| n.max(1)),
+        ..*camera
+    };
+    // The camera may belong to another size of the same picture.
+    let camera = camera.scaled([photo.0.width() as u32, photo.0.height() as u32]);
+    let camera = Camera {
+        principal_px: camera.principal_px - Vec2::new(left as f32, top as f32),
+        resolution: [width as u32, height as u32],
+        ..camera
+    };
+    Some((frame::cut(photo, inside), camera))
 }
 
 /// A pixel as linear light between black and white.

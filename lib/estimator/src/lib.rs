@@ -17,6 +17,8 @@ pub mod network;
 pub mod posterior;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod unusual_tests;
 mod visible;
 
 pub use candidates::Candidate;
@@ -29,4 +31,4 @@ pub use posterior::PeakPosterior;
 pub use visible::{BORDER_DEG, Visible, merged, overlaid};
 
 /// Raised whenever the same photograph and camera get another estimate.
-pub const VERSION: u32 = 6;
+pub const VERSION: u32 = 7;

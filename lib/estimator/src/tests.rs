@@ -17,7 +17,7 @@ fn direction_deg(azimuth: f64, elevation: f64) -> Vec3 {
     direction(azimuth.to_radians() as f32, elevation.to_radians() as f32)
 }
 
-fn estimator() -> Estimator {
+pub(crate) fn estimator() -> Estimator {
     brighter([0.0; 2])
 }
 
@@ -51,7 +51,7 @@ fn brighter(by: [f32; 2]) -> Estimator {
 }
 
 /// A picture that is not its own mirror image.
-fn photo(width: usize, height: usize) -> LinearImage {
+pub(crate) fn photo(width: usize, height: usize) -> LinearImage {
     let pixel = |k: usize| {
         let (x, y) = (
             (k % width) as f32 / width as f32,
@@ -76,7 +76,7 @@ fn mirrored(photo: &LinearImage) -> LinearImage {
 }
 
 /// A level camera at eye height that looks to an azimuth, degrees.
-fn camera(azimuth_deg: f32, width: u32, height: u32) -> Camera {
+pub(crate) fn camera(azimuth_deg: f32, width: u32, height: u32) -> Camera {
     let (sin, cos) = azimuth_deg.to_radians().sin_cos();
     let eye = Vec3::new(0.0, 1.6, 0.0);
     let ahead = eye + Vec3::new(sin, -0.2, -cos);
@@ -89,7 +89,7 @@ fn camera(azimuth_deg: f32, width: u32, height: u32) -> Camera {
     )
 }
 
-fn finite(e: &LightEstimate) -> bool {
+pub(crate) fn finite(e: &LightEstimate) -> bool {
     let map = e.map();
     let texels = map
         .texels()
@@ -150,34 +150,6 @@ fn the_same_photograph_has_the_same_estimate_to_the_bit() {
         estimator.estimate(&photo, &camera),
         estimator.estimate(&photo, &camera)
     );
-}
-
-#[test]
-fn extreme_photographs_and_cameras_stay_finite() {
-    let estimator = estimator();
-    let flat = |v: f32, w: usize, h: usize| LinearImage(Raster::filled(w, h, Vec3::splat(v)));
-    for photo in [
-        flat(0.0, 30, 20),
-        flat(1.0, 30, 20),
-        flat(0.4, 1, 1),
-        flat(f32::NAN, 3, 2),
-        flat(f32::INFINITY, 2, 2),
-    ] {
-        let size = [photo.0.width() as u32, photo.0.height() as u32];
-        assert!(finite(
-            &estimator.estimate(&photo, &camera(10.0, size[0], size[1]))
-        ));
-        for to in [Vec3::NEG_Y, Vec3::Y] {
-            let vertical = Camera::look_at(
-                Vec3::ZERO,
-                to,
-                Vec3::NEG_Z,
-                FieldOfView::Vertical(1.0),
-                size,
-            );
-            assert!(finite(&estimator.estimate(&photo, &vertical)));
-        }
-    }
 }
 
 #[test]

@@ -6,7 +6,7 @@ use dipir_light::luminance::luminance;
 use dipir_scene::camera::Camera;
 use glam::{Vec2, Vec3};
 
-use crate::features::CLIPPED;
+use crate::features::{CLIPPED, unframed};
 
 /// Width of the soft border of a photograph in a map, degrees.
 pub const BORDER_DEG: f32 = 6.0;
@@ -33,8 +33,8 @@ pub struct Visible {
 }
 
 impl Visible {
-    /// Places a decoded photograph into a map of `width` x `height` texels, fading over the outer `border_deg` degrees
-    /// of the picture. Every texel is the mean over its cell.
+    /// Places a decoded photograph without the frame around it into a map of `width` x `height` texels, fading over the
+    /// outer `border_deg` degrees of the picture. Every texel is the mean over its cell.
     pub fn new(
         photo: &LinearImage,
         camera: &Camera,
@@ -42,7 +42,10 @@ impl Visible {
         height: usize,
         border_deg: f32,
     ) -> Self {
-        let view = View::new(photo, camera, height, border_deg);
+        let view = match unframed(photo, camera) {
+            Some((photo, camera)) => View::new(&photo, &camera, height, border_deg),
+            None => View::new(photo, camera, height, border_deg),
+        };
         let (mut texels, mut alpha, mut clipped) = (Vec::new(), Vec::new(), Vec::new());
         for i in 0..height {
             for j in 0..width {

@@ -253,6 +253,8 @@ def main():
     steps = int(sys.argv[4]) if len(sys.argv) > 4 else 1500
     folds = [line.split("\t") for line in open(table).read().splitlines()]
     files = {re.sub(r"_[124]k$", "", f[:-4]): os.path.join(folder, f) for f in sorted(os.listdir(folder)) if f.endswith(".hdr")}
+    if missing := [name for name, _ in folds if name not in files]:
+        sys.exit(f"{folder} has no .hdr file of {', '.join(missing)}; other formats are not read here: save them as Radiance HDR")
     texels, lights = [], []
     for name, _ in folds:
         rgb = read_hdr(files[name])

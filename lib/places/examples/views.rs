@@ -3,6 +3,7 @@
 //! `.foldN` beside WEIGHTS. With `any` cameras and exposures are drawn.
 use std::path::PathBuf;
 
+use dipir_places::LeftOut;
 use dipir_places::several::{run, table};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -15,7 +16,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         Some("any") => true,
         Some(other) => return Err(format!("`{other}` is not `any`").into()),
     };
-    let rows = run(&PathBuf::from(panoramas), &PathBuf::from(weights), any)?;
-    println!("{}", table(&rows));
+    let left_out = LeftOut::read(&PathBuf::from(panoramas), &PathBuf::from(weights))?;
+    println!("{}", table(&run(&left_out, any)));
+    if let Some(note) = left_out.note() {
+        println!("{note}");
+    }
     Ok(())
 }

@@ -212,12 +212,14 @@ fn best_constant(cases: &[&Case], probes: &Probes) -> f32 {
 /// Figures for all photographs, those with a sun, and each kind of place.
 pub fn figures(cases: &[Case], probes: &Probes) -> Vec<Figures> {
     let folds = cases.iter().map(|c| c.fold).max().map_or(0, |f| f + 1);
+    // Places of one fold alone have no others.
+    let alone = cases.windows(2).all(|w| w[0].fold == w[1].fold);
     let constants: Vec<f32> = (0..folds)
         .map(|f| {
             best_constant(
                 &cases
                     .iter()
-                    .filter(|c| c.fold != f || folds == 1)
+                    .filter(|c| c.fold != f || alone)
                     .collect::<Vec<_>>(),
                 probes,
             )

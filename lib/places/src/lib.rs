@@ -6,6 +6,7 @@ pub mod cameras;
 pub mod error;
 pub mod examples;
 pub mod figures;
+pub mod left_out;
 mod loss;
 mod network;
 pub mod place;
@@ -19,4 +20,5 @@ pub mod trainer;
 pub mod view;
 
 pub use error::PlacesError;
+pub use left_out::LeftOut;
 pub use run::{Progress, Settings, run};

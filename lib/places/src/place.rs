@@ -129,7 +129,7 @@ impl Place {
 }
 
 /// Names that differ in their numbers and in a word for the sky alone are one place seen again.
-fn group_of(name: &str) -> String {
+pub(crate) fn group_of(name: &str) -> String {
     let parts: Vec<&str> = name
         .split('_')
         .filter(|p| *p != "puresky" && !p.chars().all(|c| c.is_ascii_digit()))
@@ -160,8 +160,7 @@ pub fn read_places(folder: &Path) -> Result<Vec<Place>, PlacesError> {
             .map(|s| s.to_string_lossy().into_owned())
             .unwrap_or_default();
         let of = |(name, kind): (&String, &String)| {
-            stem.starts_with(name.as_str())
-                .then(|| (name.len(), kind.clone()))
+            names(name, &stem).then(|| (name.len(), kind.clone()))
         };
         kinds
             .iter()
@@ -173,6 +172,16 @@ pub fn read_places(folder: &Path) -> Result<Vec<Place>, PlacesError> {
         .par_iter()
         .map(|path| Place::read(path, &kind(path)))
         .collect()
+}
+
+/// Whether a name in the table is that of a file without its extension and, where the name has none, its resolution
+/// (`_4k`).
+fn names(name: &str, stem: &str) -> bool {
+    stem.strip_prefix(name).is_some_and(|rest| {
+        let digits = rest.strip_prefix('_').and_then(|r| r.strip_suffix('k'));
+        rest.is_empty()
+            || digits.is_some_and(|d| !d.is_empty() && d.bytes().all(|b| b.is_ascii_digit()))
+    })
 }
 
 /// The first word of each kind; empty without a table.
@@ -202,7 +211,7 @@ fn kinds(table: &Path) -> BTreeMap<String, String> {
 ///
 /// # Errors
 /// If there are fewer places than folds.
-pub(crate) fn filled_folds(
+pub fn filled_folds(
     folder: &Path,
     places: &[Place],
     count: usize,
@@ -219,7 +228,7 @@ pub(crate) fn filled_folds(
 }
 
 /// The fold of each place, dealt out by kind and by the strongest source's share, groups together.
-pub fn folds(places: &[Place], count: usize) -> Vec<usize> {
+pub(crate) fn folds(places: &[Place], count: usize) -> Vec<usize> {
     let mut groups: BTreeMap<&str, (&str, f64)> = BTreeMap::new();
     for p in places {
         groups.entry(&p.group).or_insert((&p.kind, p.share));

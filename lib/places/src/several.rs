@@ -1,6 +1,5 @@
 //! The light from several photographs of a place, each of which looks another way.
 use std::f32::consts::TAU;
-use std::path::Path;
 
 use dipir_estimator::{
     BORDER_DEG, Estimator, LightEstimate, ViewEstimate, Visible, combine, overlaid,
@@ -12,10 +11,10 @@ use dipir_scene::camera::Camera;
 use glam::Mat3;
 use rayon::prelude::*;
 
-use crate::error::PlacesError;
 use crate::examples::{Example, Seen};
 use crate::figures::{Case, Figures, figures, picture_error};
-use crate::place::{Place, SMOOTH, filled_folds, read_places};
+use crate::left_out::LeftOut;
+use crate::place::{Place, SMOOTH};
 use crate::probes::Probes;
 use crate::view::View;
 
@@ -47,23 +46,19 @@ struct Shot {
     gain: f32,
 }
 
-/// Combines 1, 2, 4 and 8 photographs of each place that the networks beside `weights` (`.foldN`) were not trained on.
+/// Combines 1, 2, 4 and 8 photographs of each place, seen by networks that were not trained on it.
 /// `any` draws any camera and exposure, else photographs are as the evaluation takes them.
-pub fn run(panoramas: &Path, weights: &Path, any: bool) -> Result<Vec<Row>, PlacesError> {
-    let places = read_places(panoramas)?;
-    let file = |f: usize| weights.with_extension(format!("fold{f}"));
-    let files = (0..).map(file).take_while(|path| path.is_file());
-    let networks = files.map(Estimator::load).collect::<Result<Vec<_>, _>>()?;
-    if networks.is_empty() {
-        let path = file(0);
-        let text = format!("{} is missing; train with --keep-folds", path.display());
-        return Err(PlacesError::Setting(text));
-    }
-    let fold = filled_folds(panoramas, &places, networks.len())?;
+pub fn run(left_out: &LeftOut, any: bool) -> Vec<Row> {
+    let LeftOut {
+        places,
+        networks,
+        fold,
+        ..
+    } = left_out;
     let probes = Probes::seen(0.8, Some(0.3));
     let shots: Vec<Shot> = (0..places.len() * AROUND)
         .into_par_iter()
-        .map(|k| Shot::take(&places, k, any, &networks[fold[k / AROUND]], &probes))
+        .map(|k| Shot::take(places, k, any, &networks[fold[k / AROUND]], &probes))
         .collect();
     let sets = [
         (1, true),
@@ -96,7 +91,7 @@ pub fn run(panoramas: &Path, weights: &Path, any: bool) -> Result<Vec<Row>, Plac
             shown: median(&errors).unwrap_or(f64::NAN),
         }
     };
-    Ok(sets.into_iter().map(row).collect())
+    sets.into_iter().map(row).collect()
 }
 
 impl Shot {

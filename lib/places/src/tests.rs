@@ -14,7 +14,7 @@ use crate::place::{Place, SMOOTH, folds, read_places};
 use crate::probes::{PROBES, Probes};
 use crate::trainer::{Training, train};
 use crate::view::View;
-use crate::{PlacesError, Progress, Settings, run};
+use crate::{LeftOut, PlacesError, Progress, Settings, run};
 
 /// A sky over a ground, with a sun at azimuth 90 degrees, 40 high, and a wall of its own grey.
 fn panorama(grey: f32) -> EnvironmentMap {
@@ -485,4 +485,95 @@ fn no_fold_is_left_of_an_earlier_training_with_more_of_them() {
     };
     assert_eq!(trained(3), [true, true, true]);
     assert_eq!(trained(2), [true, true, false]);
+}
+
+/// A folder of four panoramas, and the weights of a training that kept its folds.
+fn kept() -> (tempfile::TempDir, Settings) {
+    let folder = tempfile::tempdir().unwrap();
+    write_panoramas(folder.path());
+    let asked = Settings {
+        keep: true,
+        ..settings(folder.path(), "out.safetensors")
+    };
+    run(&asked, &|_| true).unwrap();
+    (folder, asked)
+}
+
+#[test]
+fn places_stay_in_the_folds_of_their_training_when_panoramas_come_and_go() {
+    let (folder, asked) = kept();
+    let read = || LeftOut::read(folder.path(), &asked.out).unwrap();
+    let fold_of = |found: &LeftOut, name: &str| {
+        let at = found.places.iter().position(|p| p.name == name);
+        found.fold[at.unwrap()]
+    };
+    let before = read();
+    let names = ["field", "hall", "street", "yard"];
+    let trained = names.map(|n| fold_of(&before, n));
+    assert_eq!((before.note(), trained.iter().sum::<usize>()), (None, 2));
+    // Its sun has the least share of all light: dealt anew, it comes first and moves the others by one.
+    for name in ["alley", "yard_02"] {
+        panorama(0.9)
+            .write(folder.path().join(format!("{name}.exr")))
+            .unwrap();
+    }
+    let after = read();
+    assert_ne!(
+        folds(&after.places, 2)[1..5],
+        trained,
+        "or this shows nothing"
+    );
+    assert_eq!(names.map(|n| fold_of(&after, n)), trained);
+    assert_eq!(
+        fold_of(&after, "yard_02"),
+        trained[3],
+        "the yard seen again"
+    );
+    assert_eq!(after.added, ["alley"]);
+    assert!(after.note().unwrap().starts_with("1 of 6 panoramas"));
+    std::fs::remove_file(folder.path().join("field.exr")).unwrap();
+    assert_eq!(fold_of(&read(), "hall"), trained[1]);
+}
+
+#[test]
+fn networks_and_figures_of_other_trainings_are_refused() {
+    let (folder, asked) = kept();
+    let file = |extension: &str| asked.out.with_extension(extension);
+    let refused = || match LeftOut::read(folder.path(), &asked.out) {
+        Err(e) => e.to_string(),
+        Ok(_) => "accepted".into(),
+    };
+    assert_eq!(refused(), "accepted");
+    let figures = std::fs::read_to_string(file("json")).unwrap();
+    std::fs::remove_file(file("json")).unwrap();
+    assert!(refused().contains("out.json`, in which"), "{}", refused());
+    std::fs::write(file("json"), "{}").unwrap();
+    assert!(refused().contains("missing field"), "{}", refused());
+    std::fs::write(file("json"), figures).unwrap();
+    let one = std::fs::read(file("fold1")).unwrap();
+    std::fs::write(file("fold1"), std::fs::read(file("fold0")).unwrap()).unwrap();
+    assert!(refused().contains("not of one training"), "{}", refused());
+    std::fs::remove_file(file("fold1")).unwrap();
+    assert!(refused().contains("the 1 networks"), "{}", refused());
+    std::fs::write(file("fold1"), one).unwrap();
+    std::fs::remove_file(file("fold0")).unwrap();
+    assert!(refused().contains("--keep-folds"), "{}", refused());
+}
+
+#[test]
+fn a_kind_is_that_of_the_whole_name_whatever_the_resolution() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["street_1k", "street_8k", "street_lamp_1k", "streets"] {
+        panorama(0.2)
+            .write(folder.path().join(format!("{name}.exr")))
+            .unwrap();
+    }
+    std::fs::write(
+        folder.path().join("panoramas.tsv"),
+        "name\tkind\nstreet\toutdoor urban\n",
+    )
+    .unwrap();
+    let places = read_places(folder.path()).unwrap();
+    let kinds: Vec<&str> = places.iter().map(|p| p.kind.as_str()).collect();
+    assert_eq!(kinds, ["outdoor", "outdoor", "place", "place"]);
 }

@@ -15,8 +15,9 @@ use dipir_evaluation::results::{write, write_json};
 use dipir_evaluation::scores::{PictureScores, Touched, compare_pictures};
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::DisplayImage;
-use dipir_places::place::{Place, folds, read_places};
+use dipir_places::place::Place;
 use dipir_places::probes::Probes;
+use dipir_places::{LeftOut, PlacesError};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -98,11 +99,15 @@ impl Outcome {
 /// Renders and scores all scenes; `progress` is told the share that is done.
 ///
 /// # Errors
-/// If files cannot be read, or the weights have no networks for each fold.
+/// If files cannot be read, or the weights have no networks for each fold of their training.
 pub fn run(settings: &Settings, progress: &(dyn Fn(f64) + Sync)) -> anyhow::Result<Outcome> {
-    let places = read_places(&settings.panoramas)?;
-    let networks = networks(&settings.weights)?;
-    let fold = folds(&places, networks.len());
+    let left_out = left_out(settings)?;
+    let LeftOut {
+        places,
+        networks,
+        fold,
+        ..
+    } = &left_out;
     let objects = Objects::read(settings.models.as_deref())?;
     let probes = Probes::default();
     let done = AtomicUsize::new(0);
@@ -131,28 +136,21 @@ pub fn run(settings: &Settings, progress: &(dyn Fn(f64) + Sync)) -> anyhow::Resu
         .collect();
     tables::add_constants(&mut scenes, &factors);
     Ok(Outcome {
-        tables: tables::all(&scenes),
+        tables: match left_out.note() {
+            Some(note) => format!("{}\n{note}\n", tables::all(&scenes)),
+            None => tables::all(&scenes),
+        },
         sheet: tables::sheet(&scenes, settings.sheet),
         scenes,
     })
 }
 
-/// The networks that each fold was left out of.
-fn networks(weights: &Path) -> anyhow::Result<Vec<Estimator>> {
-    let file = |f: usize| weights.with_extension(format!("fold{f}"));
-    let all = (0..).map(file).take_while(|path| path.is_file());
-    let networks = all
-        .map(|path| Ok(Estimator::load(&path)?))
-        .collect::<anyhow::Result<Vec<_>>>()?;
-    if networks.len() < 2 {
-        let text = format!(
-            "{}: there is no {} beside it; train with --keep-folds to have it",
-            weights.display(),
-            file(0).display()
-        );
-        return Err(Usage(text).into());
-    }
-    Ok(networks)
+/// The places with networks that have not seen them.
+fn left_out(settings: &Settings) -> anyhow::Result<LeftOut> {
+    LeftOut::read(&settings.panoramas, &settings.weights).map_err(|error| match error {
+        PlacesError::Setting(text) => Usage(text).into(),
+        other => other.into(),
+    })
 }
 
 fn score(

@@ -6,6 +6,7 @@ use anyhow::Context;
 use dipir_imaging::raster::{DisplayImage, LinearImage};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
+use dipir_light::exposure::{MID_GREY, exposure_ev_to};
 use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_places::place::{Place, SMOOTH};
 use dipir_pretraining::shapes::Shape;
@@ -15,7 +16,7 @@ use dipir_scene::material::Material;
 use dipir_scene::placement::{Anchor, Placement, Rest, Size};
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::Scene;
-use dipir_stages::scene::background::{MID_GREY, PanoramaView, exposure_ev_to};
+use dipir_stages::scene::background::PanoramaView;
 use glam::{DVec3, Vec2, Vec3, Vec4};
 
 /// Columns and rows of photographs.

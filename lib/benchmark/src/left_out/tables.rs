@@ -40,11 +40,13 @@ impl Scored {
 /// best for each scene.
 pub fn add_constants(scenes: &mut [Scored], factors: &[f32]) {
     let folds = scenes.iter().map(|s| s.fold).max().map_or(0, |f| f + 1);
+    // Places of one fold alone have no others.
+    let alone = scenes.windows(2).all(|w| w[0].fold == w[1].fold);
     for (n, name) in ["neutral", "estimate"].into_iter().enumerate() {
         let best: Vec<usize> = (0..folds)
             .map(|f| {
                 let error = |k: usize| -> f64 {
-                    let others = scenes.iter().filter(|s| s.fold != f);
+                    let others = scenes.iter().filter(|s| s.fold != f || alone);
                     others.map(|s| s.exposed[n][k].rmse_touched).sum()
                 };
                 (0..factors.len())
@@ -249,5 +251,34 @@ mod tests {
             "\nMost worse than neutral light: c (+0.500), b (+0.250)\n"
         );
         assert_eq!(worst(&scenes[..1]), "\nWorse than neutral light: none\n");
+    }
+
+    #[test]
+    fn scenes_of_one_fold_alone_get_the_constant_that_is_best_for_them() {
+        let errors = |best: usize| -> Vec<PictureScores> {
+            let at = |k: usize| PictureScores {
+                rmse: 0.0,
+                ssim: 1.0,
+                si_rmse: 0.0,
+                rmse_touched: k.abs_diff(best) as f64,
+                si_rmse_object: 0.0,
+            };
+            (0..5).map(at).collect()
+        };
+        let scene = |fold: usize, best: usize| Scored {
+            name: "yard".into(),
+            kind: "place".into(),
+            fold,
+            sun: false,
+            scores: Vec::new(),
+            exposed: [errors(best), errors(best)],
+            pictures: Vec::new(),
+        };
+        let found = |mut scenes: Vec<Scored>| {
+            add_constants(&mut scenes, &[1.0; 5]);
+            scenes[0].touched("neutral x constant")
+        };
+        assert_eq!(found(vec![scene(2, 3), scene(2, 3)]), 0.0);
+        assert_eq!(found(vec![scene(2, 3), scene(0, 1)]), 2.0);
     }
 }
