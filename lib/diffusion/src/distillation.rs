@@ -68,13 +68,13 @@ pub struct InpaintCondition {
 }
 
 impl InpaintCondition {
-    /// From an image [1, 3, h, w] in [-1, 1] and a mask [1, 1, h, w], 1 where
-    /// the network may paint: what is masked becomes grey before it is
+    /// From images [batch, 3, h, w] in [-1, 1] and masks [batch, 1, h, w], 1
+    /// where the network may paint: what is masked becomes grey before it is
     /// encoded, the mask is read at the top left of each latent pixel.
     pub fn new(vae: &Vae, image: &Tensor, mask: &Tensor) -> Result<Self> {
-        let (_, _, height, width) = image.dims4()?;
+        let (batch, _, height, width) = image.dims4()?;
         let factor = vae.downscale();
-        if mask.dims() != [1, 1, height, width] || height % factor != 0 || width % factor != 0 {
+        if mask.dims() != [batch, 1, height, width] || height % factor != 0 || width % factor != 0 {
             return argument(format!(
                 "inpainting: image {:?} and mask {:?} must have one size, a multiple of {factor}",
                 image.dims(),

@@ -1,6 +1,9 @@
 //! Latent diffusion models at any size: model folders in the diffusers
 //! layout, layers whose gradients pass, samplers, LoRA and score distillation.
 
+#[cfg(test)]
+extern crate self as dipir_diffusion;
+
 mod added_tokens;
 pub mod check;
 pub mod concepts;
@@ -9,6 +12,9 @@ pub mod crop;
 #[cfg(feature = "cuda")]
 mod cuda;
 pub mod description;
+#[cfg(test)]
+#[path = "../tests/differences/mod.rs"]
+mod differences;
 pub mod distillation;
 pub mod error;
 pub mod extent;

@@ -101,14 +101,21 @@ impl Default for ScheduleConfig {
 const MAX_TIMESTEPS: usize = 100_000;
 
 /// How diffusers' schedulers begin that interpolate to noise, or scale it without bound.
-const FOREIGN_FAMILIES: [&str; 2] = ["FlowMatch", "EDM"];
-/// Others whose noise is not of a schedule of betas.
-const FOREIGN_SCHEDULERS: [&str; 8] = [
+const FOREIGN_FAMILIES: [&str; 4] = ["FlowMatch", "FlowMap", "EDM", "Helios"];
+/// Others whose noise is not of a schedule of betas, or not of it alone.
+const FOREIGN_SCHEDULERS: [&str; 15] = [
     "AmusedScheduler",
+    "CMStochasticIterativeScheduler",
+    "CogVideoXDDIMScheduler",
+    "CogVideoXDPMScheduler",
     "ConsistencyDecoderScheduler",
     "CosineDPMSolverMultistepScheduler",
     "DDPMWuerstchenScheduler",
+    "IPNDMScheduler",
     "KarrasVeScheduler",
+    "LTXEulerAncestralRFScheduler",
+    "PiflowScheduler",
+    "SCMScheduler",
     "ScoreSdeVeScheduler",
     "ScoreSdeVpScheduler",
     "VQDiffusionScheduler",

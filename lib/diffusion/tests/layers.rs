@@ -1,76 +1,29 @@
 //! Gradients of every layer against central differences, half precision
 //! against f32, extreme inputs, and the same bytes for any number of threads.
 
+mod differences;
+
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Device, Tensor, Var};
+use differences::{Outcome, assert_gradients_of, normal};
 use dipir_diffusion::layers::{
-    Activation, Attention, Causality, Conv2d, GroupNorm, LayerNorm, Linear, NormActivation,
-    Padding, activate, geglu, upsample_nearest,
+    Activation, Attention, Causality, Conv2d, Embedding, GroupNorm, LayerNorm, Linear,
+    NormActivation, Padding, activate, geglu, upsample_nearest,
 };
-use dipir_diffusion::noise::NoiseStream;
 use dipir_diffusion::parameters::Parameters;
-
-type Outcome = Result<(), Box<dyn std::error::Error>>;
-
-fn normal(stream: u64, shape: &[usize]) -> Tensor {
-    NoiseStream::new(11, stream)
-        .normal_tensor(shape, DType::F32, &Device::Cpu)
-        .expect("tensor")
-}
+use dipir_diffusion::vae::{pixel_shuffle, pixel_unshuffle};
 
 /// A layer as a function of all its tensors.
 type Layer<'a> = &'a dyn Fn(&[Tensor]) -> dipir_diffusion::Result<Tensor>;
 
-/// Compares the gradient of sum(layer * probe) with central differences at up
-/// to 12 elements of each input. The step is 1e-2: the differences of values
-/// of size 1 then carry rounding of 1e-7 / 1e-2 = 1e-5 and, with third
-/// derivatives of order 1, a truncation of 1e-4 / 6; sums over `probe` have
-/// size sqrt(n). 5e-3 of the largest gradient leaves room for both.
+/// Compares the gradients of a layer at all `inputs` with differences.
 fn assert_gradients(name: &str, inputs: &[Tensor], layer: Layer) -> Outcome {
-    let variables: Vec<Var> = inputs
-        .iter()
-        .map(Var::from_tensor)
-        .collect::<Result<_, _>>()?;
-    let tensors: Vec<Tensor> = variables.iter().map(|v| v.as_tensor().clone()).collect();
-    let y = layer(&tensors)?;
-    let probe = normal(99, y.dims());
-    let value = |tensors: &[Tensor]| -> Result<f64, Box<dyn std::error::Error>> {
-        let y = layer(tensors)?.to_dtype(DType::F64)?;
-        Ok((y * probe.to_dtype(DType::F64)?)?
-            .sum_all()?
-            .to_scalar::<f64>()?)
-    };
-    let gradients = (&y * &probe)?.sum_all()?.backward()?;
-    for (index, variable) in variables.iter().enumerate() {
-        let gradient = gradients
-            .get(variable)
-            .ok_or(format!("{name}: input {index} got no gradient"))?;
-        let gradient = gradient.flatten_all()?.to_vec1::<f32>()?;
-        let values = inputs[index].flatten_all()?.to_vec1::<f32>()?;
-        let largest = gradient.iter().fold(0f32, |m, g| m.max(g.abs()));
-        assert!(
-            largest.is_finite() && largest > 0.0,
-            "{name}: input {index}: gradient of size {largest}"
-        );
-        for element in (0..values.len()).step_by(values.len().div_ceil(12)) {
-            let at = |shift: f32| -> Result<f64, Box<dyn std::error::Error>> {
-                let mut moved = values.clone();
-                moved[element] += shift;
-                let mut all = inputs.to_vec();
-                all[index] = Tensor::from_vec(moved, inputs[index].dims(), &Device::Cpu)?;
-                value(&all)
-            };
-            let numerical = (at(1e-2)? - at(-1e-2)?) / 2e-2;
-            let error = (numerical - gradient[element] as f64).abs();
-            assert!(
-                error < 5e-3 * largest as f64,
-                "{name}: input {index}, element {element}: difference {numerical}, gradient {}",
-                gradient[element]
-            );
-        }
-    }
-    Ok(())
+    let variable = |(i, x): (usize, &Tensor)| Ok((format!("input {i}"), Var::from_tensor(x)?));
+    let variables = inputs.iter().enumerate().map(variable);
+    let variables = variables.collect::<Result<Vec<_>, candle_core::Error>>()?;
+    let tensors: Vec<Tensor> = variables.iter().map(|v| v.1.as_tensor().clone()).collect();
+    assert_gradients_of(name, &variables, &|| layer(&tensors))
 }
 
 #[test]
@@ -301,6 +254,22 @@ fn activations_and_enlargement_pass_gradients() -> Outcome {
     // A second consumer of the input must not lose its share.
     assert_gradients("two consumers", &[normal(22, &[1, 2, 3, 3])], &|t| {
         Ok((upsample_nearest(&t[0], 6, 6)? + upsample_nearest(&t[0].sqr()?, 6, 6)?)?)
+    })
+}
+
+#[test]
+fn tables_and_rearranged_pixels_pass_gradients() -> Outcome {
+    // Row 2 is taken twice, row 1 never.
+    let indices = Tensor::new(&[[2u32, 0], [3, 2]], &Device::Cpu)?;
+    assert_gradients("table", &[normal(43, &[4, 3])], &|t| {
+        let table = BTreeMap::from([("weight".to_owned(), t[0].clone())]);
+        Embedding::new(&Parameters::from_tensors(table), 4, 3)?.forward(&indices)
+    })?;
+    assert_gradients("pixels to channels", &[normal(44, &[2, 3, 4, 6])], &|t| {
+        pixel_unshuffle(&t[0], 2)
+    })?;
+    assert_gradients("channels to pixels", &[normal(45, &[2, 12, 2, 3])], &|t| {
+        pixel_shuffle(&t[0], 2)
     })
 }
 

@@ -22,7 +22,9 @@ pub struct MaterialState {
     pub adam: Adam,
     /// The mean of the parameters so far, over the steps that count.
     pub mean: Tensors,
-    /// Loss of every step's picture.
+    /// Steps that were not finite, one after the other up to now.
+    pub bad_in_a_row: usize,
+    /// Loss of every step's picture, where it is a number.
     pub losses: Vec<f64>,
 }
 
@@ -38,6 +40,8 @@ struct Header {
     settings: MaterialSettings,
     iteration: usize,
     steps: u64,
+    #[serde(default)]
+    bad_in_a_row: usize,
     losses: Vec<f64>,
 }
 
@@ -49,6 +53,7 @@ impl MaterialState {
             adam: Adam::new(&parameters),
             mean: parameters.zeros_like(),
             parameters,
+            bad_in_a_row: 0,
             losses: Vec::new(),
         }
     }
@@ -67,6 +72,7 @@ impl MaterialState {
             settings: *settings,
             iteration: self.iteration,
             steps: self.adam.steps,
+            bad_in_a_row: self.bad_in_a_row,
             losses: self.losses.clone(),
         };
         let mut snapshot = Snapshot::new(&header);
@@ -102,6 +108,7 @@ impl MaterialState {
                 steps: header.steps,
             },
             mean: file.set("mean", start)?,
+            bad_in_a_row: header.bad_in_a_row,
             losses: header.losses,
         }))
     }

@@ -34,6 +34,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::OptimizeError;
 use crate::guidance::{PHOTOMETRIC_SCALE, charbonnier};
 use crate::material_checkpoint::MaterialState;
+use crate::optimization::MOST_BAD_IN_A_ROW;
 use crate::tensors::{Group, Tensor, Tensors};
 
 /// Least base colour: at 0 a diffuse lobe is never sampled and could not come back.
@@ -136,7 +137,7 @@ pub struct MaterialOptimization<'a, L> {
 pub struct MaterialOutcome {
     /// In the order asked for.
     pub materials: Vec<RecoveredMaterial>,
-    /// Loss of every step's picture.
+    /// Loss of every step's picture, where it is a number.
     pub losses: Vec<f64>,
 }
 
@@ -157,41 +158,16 @@ impl<L: SceneLight> MaterialOptimization<'_, L> {
             None => None,
         }
         .unwrap_or_else(|| MaterialState::new(self.parameters(start)));
-        let first_averaged = ((1.0 - AVERAGED) * settings.iterations as f64) as usize;
         while state.iteration < settings.iterations {
-            let iteration = state.iteration;
-            let share = iteration as f64 / settings.iterations as f64;
+            let share = state.iteration as f64 / settings.iterations as f64;
             if progress(share).is_break() {
                 self.keep(&state)?;
                 return Err(OptimizeError::Interrupted);
             }
             self.apply(&state.parameters, start, &mut scene);
-            let (loss, gradients) = self.step(&scene, iteration)?;
+            let (loss, gradients) = self.step(&scene, state.iteration)?;
             let gradient = self.gradient(&scene, &gradients);
-            if !loss.is_finite() || gradient.first_not_finite().is_some() {
-                return Err(OptimizeError::NotFinite {
-                    tensor: gradient.first_not_finite().unwrap_or("loss").into(),
-                    iteration,
-                    in_a_row: 1,
-                });
-            }
-            state.losses.push(loss);
-            let cosine = 0.5 * (1.0 + (std::f64::consts::PI * share).cos());
-            let rate = settings.rate * (LAST_RATE + (1.0 - LAST_RATE) * cosine);
-            state
-                .adam
-                .step(&mut state.parameters, &gradient, |_| rate)?;
-            clamp(&mut state.parameters);
-            if iteration >= first_averaged {
-                let weight = 1.0 / (settings.iterations - first_averaged) as f64;
-                for (m, p) in state.mean.0.iter_mut().zip(&state.parameters.0) {
-                    m.values
-                        .iter_mut()
-                        .zip(&p.values)
-                        .for_each(|(m, p)| *m += weight * p);
-                }
-            }
-            state.iteration += 1;
+            self.take(&mut state, loss, &gradient)?;
             let every = settings.checkpoint_every;
             if every > 0 && state.iteration.is_multiple_of(every) {
                 self.keep(&state)?;
@@ -206,6 +182,54 @@ impl<L: SceneLight> MaterialOptimization<'_, L> {
             materials: self.recovered(found, start),
             losses: state.losses,
         })
+    }
+
+    /// Ends the iteration with a step against `gradient`, or without one where something is not finite: then the next
+    /// iteration draws other paths. An error after [`MOST_BAD_IN_A_ROW`] of these.
+    fn take(
+        &self,
+        state: &mut MaterialState,
+        loss: f64,
+        gradient: &Tensors,
+    ) -> Result<(), OptimizeError> {
+        let (iteration, iterations) = (state.iteration, self.settings.iterations);
+        let bad = match loss.is_finite() {
+            true => gradient.first_not_finite(),
+            false => Some("loss"),
+        };
+        if loss.is_finite() {
+            state.losses.push(loss);
+        }
+        if let Some(tensor) = bad {
+            state.bad_in_a_row += 1;
+            if state.bad_in_a_row >= MOST_BAD_IN_A_ROW {
+                return Err(OptimizeError::NotFinite {
+                    tensor: tensor.into(),
+                    iteration,
+                    in_a_row: state.bad_in_a_row,
+                });
+            }
+        } else {
+            state.bad_in_a_row = 0;
+            let share = iteration as f64 / iterations as f64;
+            let cosine = 0.5 * (1.0 + (std::f64::consts::PI * share).cos());
+            let rate = self.settings.rate * (LAST_RATE + (1.0 - LAST_RATE) * cosine);
+            let parameters = &mut state.parameters;
+            state.adam.step(parameters, gradient, |_| rate)?;
+            clamp(parameters);
+        }
+        let first_averaged = ((1.0 - AVERAGED) * iterations as f64) as usize;
+        if iteration >= first_averaged {
+            let weight = 1.0 / (iterations - first_averaged) as f64;
+            for (m, p) in state.mean.0.iter_mut().zip(&state.parameters.0) {
+                m.values
+                    .iter_mut()
+                    .zip(&p.values)
+                    .for_each(|(m, p)| *m += weight * p);
+            }
+        }
+        state.iteration += 1;
+        Ok(())
     }
 
     /// The state that a checkpoint holds; `None` if there is no file.

@@ -111,8 +111,18 @@ impl Case {
         checkpoint: Option<&Path>,
         progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
     ) -> Result<MaterialOutcome, OptimizeError> {
+        self.optimization(&Renderer::new(&self.start), settings, checkpoint)
+            .run(progress)
+    }
+
+    fn optimization<'a>(
+        &'a self,
+        renderer: &'a Renderer<'a>,
+        settings: MaterialSettings,
+        checkpoint: Option<&'a Path>,
+    ) -> MaterialOptimization<'a, EnvironmentSampler> {
         MaterialOptimization {
-            renderer: &Renderer::new(&self.start),
+            renderer,
             light: &self.light,
             simulation: simulation(),
             tone: Some(ToneCurves::identity()),
@@ -123,7 +133,6 @@ impl Case {
             settings,
             checkpoint,
         }
-        .run(progress)
     }
 }
 
@@ -208,6 +217,47 @@ fn without_a_step_the_material_is_that_of_the_start() {
         (start.metallic, start.roughness)
     );
     assert_eq!(found.emissive_strength, 1.0);
+}
+
+#[test]
+fn a_few_steps_that_are_not_finite_change_no_material_and_five_in_a_row_end_the_run() {
+    let case = Case::new(&material([0.9, 0.7, 0.4], 1.0, 0.35));
+    let renderer = Renderer::new(&case.start);
+    let run = case.optimization(&renderer, SETTINGS, None);
+    let start = run.parameters(&case.start);
+    let mut bad = start.zeros_like();
+    bad.0[1].values[0] = f64::NAN;
+    let mut state = MaterialState::new(start.clone());
+    for _ in 0..4 {
+        run.take(&mut state, 0.5, &bad).unwrap();
+    }
+    assert_eq!((&state.parameters, state.adam.steps), (&start, 0));
+    assert_eq!((state.iteration, state.losses.len()), (4, 4));
+    // The next one counts again, and so do later ones from there.
+    let good = Tensors(
+        start
+            .0
+            .iter()
+            .map(|t| Tensor {
+                values: vec![1.0; t.values.len()],
+                ..*t
+            })
+            .collect(),
+    );
+    run.take(&mut state, 0.5, &good).unwrap();
+    assert_ne!(state.parameters, start);
+    let moved = state.clone();
+    for _ in 0..4 {
+        run.take(&mut state, f64::INFINITY, &good).unwrap();
+    }
+    assert_eq!(state.parameters, moved.parameters);
+    assert_eq!(state.losses, moved.losses);
+    let error = run.take(&mut state, 0.5, &bad).unwrap_err().to_string();
+    assert!(
+        error
+            .starts_with("`materials.metallic` is not finite in iteration 9, and 5 steps in a row"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -23,7 +23,7 @@ use crate::transport::Recorder;
 
 /// Steps in a row that may be skipped because something was not finite. A guidance with noise
 /// may stumble; one that stumbles this often will not recover.
-const MOST_BAD_IN_A_ROW: usize = 5;
+pub(crate) const MOST_BAD_IN_A_ROW: usize = 5;
 /// Iterations between two checks of how well the record samples the light.
 const RECORD_EVERY: usize = 50;
 /// Transport is recorded anew when its effective sample size falls below this share of its samples. A record made for

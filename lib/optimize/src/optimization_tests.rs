@@ -406,6 +406,38 @@ fn nothing_to_light_and_no_light_at_all_stay_finite() {
     }
 }
 
+#[test]
+fn no_iteration_gives_the_light_of_the_start_and_a_single_one_moves_it() {
+    let none = Case::new(0).run().unwrap();
+    let start = Parameters::neutral(Case::new(0).settings.lobes, 0.5);
+    assert_eq!(none.parameters, start);
+    assert!(none.history.is_empty() && !none.stopped_early);
+    let one = Case::new(1).run().unwrap();
+    assert_eq!(one.history.len(), 1);
+    assert_ne!(one.parameters, start);
+    for outcome in [none, one] {
+        assert!(outcome.picture.0.pixels().iter().all(|p| p.is_finite()));
+        assert!(outcome.parameters.to_tensors().first_not_finite().is_none());
+    }
+}
+
+/// A step of 1e6 times the usual gradient early in the run is not a NaN that would be skipped.
+#[test]
+fn a_huge_gradient_in_an_early_step_does_not_stop_the_light() {
+    let case = Case::new(300);
+    let struck = run_spoiled(&case, &|k, g| {
+        if k == 4 {
+            g.gradient.pixels_mut().iter_mut().for_each(|p| *p *= -1e6);
+        }
+    })
+    .unwrap();
+    let off = degrees_between(struck.lighting.peak_direction().unwrap(), SUN);
+    let mask = touched(&objective(case.scene.clone(), WEIGHTS));
+    let error = rmse(&struck.picture, &case.truth(), &mask, None);
+    // As without the stroke.
+    assert!(off < 3.0 && error < 0.01, "{off} degrees, rmse {error}");
+}
+
 // ---- resuming --------------------------------------------------------------------------------
 
 /// The outcome without what differs from run to run.

@@ -1,6 +1,7 @@
 //! A batch of examples as tensors.
 
 use candle_core::Tensor;
+use dipir_diffusion::distillation::InpaintCondition;
 use dipir_prior::caption::Caption;
 use dipir_prior::picture::{Picture, inpainting_condition, latent_weights, latents_of};
 
@@ -15,8 +16,8 @@ pub struct Batch {
     pub noised: Tensor,
     /// Whether the two differ.
     pub relit: Vec<bool>,
-    /// Mask and masked latents, [batch, 1 + c, h, w].
-    pub condition: Tensor,
+    /// Masks and masked latents.
+    pub condition: InpaintCondition,
     /// Weights of latent values, [batch, c, h, w].
     pub weights: Tensor,
     /// Captions; `None` is the empty one.

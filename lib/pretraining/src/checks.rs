@@ -10,7 +10,7 @@ use dipir_diffusion::noise::NoiseStream;
 use dipir_prior::caption::{Caption, LightDescription};
 use dipir_prior::encoder::LightEncoder;
 use dipir_prior::energy::{Observation, TIMESTEP_SHARES, energies, prediction_difference};
-use dipir_prior::inversion::{angle_between, minimum_angle};
+use dipir_prior::inversion::{AZIMUTHS, angle_between, minimum_angle};
 use dipir_prior::picture::{dilate, latents_of};
 use dipir_prior::text_conditioning::{caption_states, guidance_states};
 use half::f16;
@@ -30,8 +30,6 @@ use crate::window::{CroppedScene, Window};
 
 /// Key of the scenes of the checks. Training has other keys.
 pub const HELD_OUT_SEED: u64 = 0x6a7e5;
-/// Azimuths of the search.
-const AZIMUTHS: usize = 16;
 /// Offsets of the recorded suns from the true azimuth, degrees. The mirrored sun follows them.
 const OFFSETS: [f32; 7] = [0.0, 25.0, 35.0, -25.0, -35.0, 45.0, -45.0];
 

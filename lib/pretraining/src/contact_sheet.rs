@@ -71,7 +71,7 @@ pub fn sample_lights(
     png: &Path,
     progress: &mut dyn FnMut(f64) -> ControlFlow<()>,
 ) -> Result<bool> {
-    let side = model.unet.config().sample_size * model.vae.downscale();
+    let side = model.native_size();
     let columns = OBJECTS.len() * REPEATS;
     let count = columns * LIGHTS.len();
     let mut pictures = vec![];

@@ -211,7 +211,7 @@ impl Denoiser {
             .map(|&i| timesteps[i as usize] as f64)
             .collect();
         let index = Tensor::new(example.as_slice(), &Device::Cpu)?;
-        let input = Tensor::cat(&[&noisy, &batch.condition], 1)?.index_select(&index, 0)?;
+        let input = batch.condition.join(&noisy)?.index_select(&index, 0)?;
         let context = EncodedCaptions::new(&self.tokenizer, &captions)?.states(&self.text)?;
         Ok(Rows {
             output: self.unet.forward(&input, &t, &context, &Pass::default())?,

@@ -1,7 +1,8 @@
 //! Pictures of the small model's size as planes of numbers, and their latents.
 
 use candle_core::{Device, Tensor};
-use dipir_diffusion::vae::pixel_unshuffle;
+use dipir_diffusion::distillation::InpaintCondition;
+use dipir_diffusion::vae::{Vae, pixel_unshuffle};
 
 use crate::error::Result;
 
@@ -43,12 +44,23 @@ pub fn dilate(mask: &[f32], radius: usize) -> Vec<f32> {
     pass(&pass(mask, 1, SIZE), SIZE, 1)
 }
 
-/// Scaled latents [pictures, LATENT_CHANNELS, h, w] of one or more pictures in [0, 1], one after the other.
-pub fn latents_of(pictures: Vec<f32>) -> Result<Tensor> {
+/// The step between pictures and latents, as model folders have it in `vae/`.
+const VAE: Vae = Vae::PixelUnshuffle {
+    factor: LATENT_FACTOR,
+    in_channels: 3,
+    scaling_factor: LATENT_SCALE,
+};
+
+/// Pictures in [0, 1], one after the other, as [pictures, 3, SIZE, SIZE] in [-1, 1].
+fn images(pictures: Vec<f32>) -> Result<Tensor> {
     let count = pictures.len() / (3 * PIXELS);
     let x = Tensor::from_vec(pictures, (count, 3, SIZE, SIZE), &Device::Cpu)?;
-    let x = x.affine(2.0, -1.0)?;
-    Ok((pixel_unshuffle(&x, LATENT_FACTOR)? * LATENT_SCALE)?)
+    Ok(x.affine(2.0, -1.0)?)
+}
+
+/// Scaled latents [pictures, LATENT_CHANNELS, h, w] of one or more pictures in [0, 1], one after the other.
+pub fn latents_of(pictures: Vec<f32>) -> Result<Tensor> {
+    Ok(VAE.encode(&images(pictures)?)?)
 }
 
 /// Weights of pixels, [SIZE, SIZE] of one or more pictures, as weights of latent values.
@@ -59,27 +71,11 @@ pub fn latent_weights(weights: Vec<f32>) -> Result<Tensor> {
     Ok(Tensor::cat(&[&weights, &weights, &weights], 1)?)
 }
 
-/// The inpainting condition [pictures, 1 + LATENT_CHANNELS, h, w]: mask and latents of `pictures` in [0, 1], grey where
-/// the mask, [SIZE, SIZE] for each picture, is at least 0.5.
-pub fn inpainting_condition(pictures: Vec<f32>, masks: &[Vec<f32>]) -> Result<Tensor> {
-    let mut visible = pictures;
-    for (i, v) in visible.iter_mut().enumerate() {
-        if masks[i / (3 * PIXELS)][i % PIXELS] >= 0.5 {
-            *v = 0.5;
-        }
-    }
-    let side = SIZE / LATENT_FACTOR;
-    // A latent pixel has the mask of its top left pixel.
-    let at = |mask: &Vec<f32>, i: usize| {
-        let (x, y) = (i % side * LATENT_FACTOR, i / side * LATENT_FACTOR);
-        f32::from(mask[y * SIZE + x] >= 0.5)
-    };
-    let small = masks
-        .iter()
-        .flat_map(|mask| (0..side * side).map(move |i| at(mask, i)));
-    let small: Vec<f32> = small.collect();
-    let mask = Tensor::from_vec(small, (masks.len(), 1, side, side), &Device::Cpu)?;
-    Ok(Tensor::cat(&[&mask, &latents_of(visible)?], 1)?)
+/// The inpainting condition of `pictures` in [0, 1], one after the other, and of `masks`, [SIZE, SIZE] for each picture.
+pub fn inpainting_condition(pictures: Vec<f32>, masks: &[Vec<f32>]) -> Result<InpaintCondition> {
+    let shape = (masks.len(), 1, SIZE, SIZE);
+    let masks = Tensor::from_vec(masks.concat(), shape, &Device::Cpu)?;
+    Ok(InpaintCondition::new(&VAE, &images(pictures)?, &masks)?)
 }
 
 #[cfg(test)]
@@ -108,14 +104,24 @@ mod tests {
     }
 
     #[test]
-    fn the_inpainting_condition_is_the_mask_then_what_is_visible() {
+    fn the_inpainting_condition_is_the_mask_and_what_is_visible() {
         let mut mask = vec![0.0; PIXELS];
         mask[0] = 1.0;
-        let condition = inpainting_condition(vec![1.0; 3 * PIXELS], &[mask]).unwrap();
-        assert_eq!(condition.dims(), [1, 1 + LATENT_CHANNELS, 16, 16]);
-        let values = condition.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        // The masked pixel is grey, 0 in [-1, 1]; white is 1, times the scale.
-        assert_eq!((values[0], values[1]), (1.0, 0.0));
-        assert_eq!((values[256], values[257]), (0.0, 2.0));
+        let masks = [vec![0.0; PIXELS], mask];
+        let condition = inpainting_condition(vec![1.0; 6 * PIXELS], &masks).unwrap();
+        assert_eq!(condition.mask.dims(), [2, 1, 16, 16]);
+        assert_eq!(
+            condition.masked_latents.dims(),
+            [2, LATENT_CHANNELS, 16, 16]
+        );
+        let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let (mask, latents) = (flat(&condition.mask), flat(&condition.masked_latents));
+        // The masked pixel of the second picture is grey, 0 in [-1, 1]; white is 1, times the scale.
+        assert_eq!((mask[0], mask[256], mask[257]), (0.0, 1.0, 0.0));
+        let second = LATENT_CHANNELS * 256;
+        assert_eq!(
+            (latents[0], latents[second], latents[second + 1]),
+            (2.0, 0.0, 2.0)
+        );
     }
 }

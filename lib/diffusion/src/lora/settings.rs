@@ -103,7 +103,8 @@ fn quoted(key: &str, value: &Value) -> String {
     format!("{key:?}: {cut}")
 }
 
-/// Whether a key is one that peft writes, on its own or for a UNet that is not part of a pipeline.
+/// Whether a key is one that peft writes, on its own or for a UNet that is not part of a pipeline. Keys that begin with
+/// `unet.` are of diffusers, which reads no configuration beside them: without metadata, alpha is the rank.
 fn is_of_peft(key: &str) -> bool {
     let is_matrix = key.ends_with(".lora_A.weight") || key.ends_with(".lora_B.weight");
     key.starts_with(OWN_PREFIX) || (is_matrix && !key.starts_with("unet."))

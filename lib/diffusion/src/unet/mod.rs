@@ -395,3 +395,6 @@ fn up_level(parameters: &Parameters, config: &UNetConfig, level: usize) -> Resul
         upsample: upsample.transpose()?,
     })
 }
+
+#[cfg(test)]
+mod gradient_tests;

@@ -299,3 +299,7 @@ impl Decoder {
         run(&self.units, z)
     }
 }
+
+#[cfg(test)]
+#[path = "gradient_tests.rs"]
+mod gradient_tests;

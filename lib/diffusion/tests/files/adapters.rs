@@ -257,10 +257,15 @@ fn adapters_that_peft_wrote_have_the_alpha_of_the_configuration_beside_them() ->
     }
     std::fs::remove_file(&config)?;
     assert_eq!(scale_of_ones(&path, 4)?, 1.0);
-    // Keys of others do not take a configuration that happens to be there.
-    std::fs::write(&config, r#"{"r": 4, "lora_alpha": 16}"#)?;
+    // Beside keys of diffusers the configuration counts for nothing, as in load_lora_weights of diffusers 0.42.1.
     write_safetensors(&path, &renamed("unet."), &header)?;
-    assert_eq!(scale_of_ones(&path, 4)?, 1.0);
+    for text in [
+        r#"{"r": 4, "lora_alpha": 16}"#,
+        r#"{"r": 8, "lora_alpha": 16, "rank_pattern": {"to_q": 2}, "alpha_pattern": {"to_q": 1}, "use_rslora": true}"#,
+    ] {
+        std::fs::write(&config, text)?;
+        assert_eq!(scale_of_ones(&path, 4)?, 1.0, "{text}");
+    }
     Ok(())
 }
 

@@ -134,6 +134,9 @@ fn schedulers_whose_noise_is_not_of_variances_are_refused_by_class() -> Outcome 
         "FlowMatchOfTomorrow",
         "EDMDPMSolverMultistepScheduler",
         "ScoreSdeVeScheduler",
+        "IPNDMScheduler",
+        "CMStochasticIterativeScheduler",
+        "CogVideoXDDIMScheduler",
     ] {
         let message = load(class).expect_err(class).to_string();
         assert!(

@@ -1,6 +1,7 @@
 //! Model folders: what is read, and hostile files, each refused with the tensor or key that is wrong.
 mod adapters;
 mod configurations;
+mod exports;
 mod pixels;
 mod text;
 mod weights;
