@@ -9,6 +9,7 @@ use dipir_cli::output::json_paths;
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::hashing::Hashes;
 use dipir_pipeline::lock::{FolderLock, WhenLocked};
+use dipir_pipeline::manifest::plain_reason;
 use dipir_pipeline::mark::{Kind, Owned};
 use dipir_pipeline::{resume, stage};
 use dipir_stages::names::CONCEPTS;
@@ -105,12 +106,21 @@ pub fn run(args: &CleanArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The message about a folder that is written, in the words of a command that has no `--wait`.
+/// The message about a folder that cannot be locked, in the words of a command that writes nothing.
 fn without_wait(error: StageError) -> anyhow::Error {
     match error {
         StageError::Locked { folder, holder } => anyhow!(
             "{} is being written by {holder}; wait for it to end, and nothing was removed",
             folder.display()
+        ),
+        StageError::Io {
+            action,
+            path,
+            source,
+        } => anyhow!(
+            "cannot {action} {}: {}; nothing was removed",
+            path.display(),
+            plain_reason(&source)
         ),
         other => other.into(),
     }

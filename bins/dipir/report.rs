@@ -5,9 +5,9 @@ use clap::Args;
 use dipir_cli::exit::{Usage, describe, printable};
 use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
-use dipir_pipeline::graph::{Graph, Node};
+use dipir_pipeline::graph::Graph;
 use dipir_stages::graph;
-use dipir_stages::report::Report;
+use dipir_stages::report::{self, Report};
 use dipir_stages::truth::{self, Truth};
 use serde_json::json;
 
@@ -21,12 +21,11 @@ pub struct ReportArgs {
 
 pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
     let (session, graph) = args.project.open()?;
-    if !session.out.is_dir() {
+    if !report::has_anything(&session) {
         let message = "no stage has run yet, so there is nothing to show; run dipir run first";
         return Err(Usage(message.into()).into());
     }
-    let needed = graph.up_to(graph::LAST);
-    let (path, truth) = write(&args.project, &session, &graph, &needed, &[])?;
+    let (path, truth) = write(&args.project, &session, &graph, &[])?;
     session.result(
         || printable(&in_words(&path, truth.as_ref())),
         || json!({"report": json_path(&path), "truth": truth}),
@@ -34,15 +33,15 @@ pub fn run(args: &ReportArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Writes the page, with the frames that `failed`; where it is, and the comparison with the true light, if that is known.
+/// Writes the page, with the state of all stages, whichever ran, and the frames that `failed`; where it is, and the
+/// comparison with the true light, if that is known.
 pub fn write(
     args: &ProjectArgs,
     session: &Session,
     graph: &Graph,
-    needed: &[&Node],
     failed: &[String],
 ) -> anyhow::Result<(PathBuf, Option<Truth>)> {
-    let status = graph::assess(session, graph, needed)?;
+    let status = graph::assess(session, graph, &graph.up_to(graph::LAST))?;
     let truth = truth::compare(session).unwrap_or_else(|e| {
         session.warn(&format!(
             "not compared with the true light: {}",

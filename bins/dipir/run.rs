@@ -262,7 +262,7 @@ pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String,
     }
     let report = match is_frame || dipir_stages::report::is_current(&session) {
         true => None,
-        false => page(project, &session, &graph, &nodes, &[]),
+        false => page(project, &session, &graph, &[]),
     };
     Ok(work.conclude(&nodes, report))
 }
@@ -273,10 +273,9 @@ pub fn page(
     project: &ProjectArgs,
     session: &Session,
     graph: &Graph,
-    nodes: &[&Node],
     failed: &[String],
 ) -> Option<Page> {
-    match report::write(project, session, graph, nodes, failed) {
+    match report::write(project, session, graph, failed) {
         Ok(page) => Some(page),
         Err(e) => {
             session.warn(&format!("there is no report: {}", exit::describe(&e)));

@@ -7,7 +7,7 @@ use dipir_cli::args::CommonArgs;
 use dipir_cli::exit::{Usage, printable};
 use dipir_cli::session::Session;
 use dipir_stages::names::{LIGHT, SCENE};
-use dipir_stages::{graph, report, shot};
+use dipir_stages::{report, shot};
 use serde_json::Value;
 
 use crate::plan;
@@ -76,8 +76,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
         if failed.is_empty() && report::is_current(&session) {
             return;
         }
-        let nodes = graph.up_to(graph::LAST);
-        let page = page(&base, &session, &graph, &nodes, failed);
+        let page = page(&base, &session, &graph, failed);
         if let Some((path, _)) = page.filter(|_| !common.output.json) {
             let words = || format!("wrote {}", printable(&path.display().to_string()));
             common.output.result(words, || Value::Null);

@@ -82,6 +82,13 @@ fn the_page_shows_whatever_there_is() {
         2,
         "error: no stage has run yet, so there is nothing to show; run dipir run first",
     );
+    // As a run leaves it that ended in its first stage.
+    std::fs::create_dir(project.path("out")).unwrap();
+    project.run(DIPIR, &["report"]).expect_error(
+        2,
+        "error: no stage has run yet, so there is nothing to show; run dipir run first",
+    );
+    assert!(project.names("out").is_empty());
     project
         .run(DIPIR, &["run", "-q", "--until", "scene"])
         .expect_success();
@@ -89,6 +96,10 @@ fn the_page_shows_whatever_there_is() {
     assert_well_formed(&first);
     assert!(first.contains("Effects") && !first.contains("class=\"compare\""));
     project.run(DIPIR, &["run", "-q"]).expect_success();
+    // A run of one stage says of those that it takes as they are what holds.
+    let last = ["run", "-q", "--from", "composite", "--force"];
+    project.run(DIPIR, &last).expect_success();
+    assert!(!page(&project).contains("nothing that is asked for reads it"));
     let mut bytes = project.read("out/composite/composite.exr");
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;

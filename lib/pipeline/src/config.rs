@@ -132,11 +132,11 @@ impl Config {
     /// Reads `path` and applies `overrides`, each `table.key=value`: a TOML value, or else a bare
     /// string. Later overrides win, and they take the place of keys of the file that exclude them.
     pub fn read(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text = dipir_files::read_to_string(path).map_err(|e| ConfigError::Read {
+        let bytes = dipir_files::read(path).map_err(|e| ConfigError::Read {
             path: path.into(),
             cause: plain(&e),
         })?;
-        Self::parse(path, &text, overrides)
+        Self::parse(path, tree::text(path, &bytes)?, overrides)
     }
 
     /// As [`read`](Self::read), with the file's text at hand.

@@ -283,12 +283,21 @@ pub(crate) fn plain(error: &io::Error) -> String {
     reason
 }
 
+/// On Windows: access is denied (5), or another program has a file open (32).
+const IN_USE: [i32; 2] = [5, 32];
+
 fn remedy(action: &str, error: &io::Error) -> &'static str {
+    let is_in_use = || error.raw_os_error().is_some_and(|e| IN_USE.contains(&e));
     match error.kind() {
         io::ErrorKind::PermissionDenied if action == "read" => {
             "; it is there, but you may not read it: allow it, as with chmod u+r"
         }
         _ if action == "read" => "",
+        // A folder is not renamed while a file in it is open.
+        _ if cfg!(windows) && is_in_use() => {
+            "; close the programs that show a file of it, or choose a folder that you may write with --out (earlier \
+             results are untouched)"
+        }
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
             "; free some space or choose another folder with --out (earlier results are untouched)"
         }

@@ -395,7 +395,11 @@ fn swap_in_two_steps(partial: &Path, target: &Path) -> Result<(), StageError> {
     let failed = |e| StageError::io("write", target, e);
     let previous = sibling(target, "previous");
     fs::rename(target, &previous).map_err(failed)?;
-    fs::rename(partial, target).map_err(failed)
+    fs::rename(partial, target).map_err(|e| {
+        // Where this fails, too, the next run does it.
+        let _ = fs::rename(&previous, target);
+        failed(e)
+    })
 }
 
 #[cfg(test)]

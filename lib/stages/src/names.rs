@@ -24,7 +24,7 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 13,
+    version: 14,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
@@ -42,7 +42,7 @@ pub const LORA: StageName = StageName {
 pub const LIGHT: StageName = StageName {
     name: "light",
     executable: "dipir-light",
-    version: 8,
+    version: 9,
 };
 /// Renders the picture and its layers.
 pub const COMPOSITE: StageName = StageName {

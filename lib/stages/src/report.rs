@@ -16,11 +16,12 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use dipir_cli::exit::describe;
 use dipir_cli::session::Session;
+use dipir_pipeline::config::TABLES;
 use dipir_pipeline::manifest::{FILE_NAME, Manifest};
 use dipir_pipeline::status::StageStatus;
 use dipir_scene::config::SceneConfig;
 
-use crate::names;
+use crate::names::{self, StageName};
 use crate::shot;
 use crate::truth::Truth;
 use html::Html;
@@ -178,11 +179,26 @@ pub fn is_current(session: &Session) -> bool {
     }
 }
 
-/// A hash of what the page is made of: every stage's manifest, which names its files by hash, that of
-/// every frame's picture, and what is compared with.
+/// Whether any stage has left something that a page can show.
+pub fn has_anything(session: &Session) -> bool {
+    // What cannot be looked at may be there: reading it says why not.
+    let is_there = |path: PathBuf| path.try_exists().unwrap_or(true);
+    let has_run = |stage: &&StageName| is_there(stage.folder(session).join(FILE_NAME));
+    names::ALL.iter().any(has_run) || shot::folders(&session.out).iter().any(|f| shot::is_made(f))
+}
+
+/// A hash of what the page is made of: the configuration, by which it says what is up to date; what amended that, which it
+/// repeats in commands; every stage's manifest, which names its files by hash; that of every frame's picture; and what is
+/// compared with.
 fn key(session: &Session) -> anyhow::Result<String> {
     let mut hasher = blake3::Hasher::new();
     hasher.update(format!("report {VERSION}").as_bytes());
+    for table in TABLES {
+        let content: serde_json::Value = session.config.table(table)?;
+        hasher.update(&serde_json::to_vec(&content)?);
+    }
+    let amended = (session.config.overrides(), session.pipeline.seed);
+    hasher.update(&serde_json::to_vec(&amended)?);
     for stage in names::ALL {
         let manifest = std::fs::read(stage.folder(session).join(FILE_NAME));
         hasher.update(&manifest.unwrap_or_default());
@@ -221,4 +237,67 @@ fn outputs((folder, manifest): &(PathBuf, Manifest), role: &str) -> Vec<(String,
     found
         .map(|a| (stem(&a.path), folder.join(&a.path)))
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::command_line::scene::Cli;
+
+    #[test]
+    fn a_page_is_current_only_for_the_settings_that_it_was_made_with() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("pipeline.toml");
+        std::fs::create_dir(folder.path().join("out")).unwrap();
+        let write = |class: &str| {
+            let text = format!("[scene]\nbackground = \"photo.png\"\nclass = \"{class}\"\n");
+            std::fs::write(&file, text).unwrap();
+        };
+        write("toy");
+        let path = file.display().to_string();
+        let session = |more: &[&str]| {
+            let args = [&["dipir-scene", "-q", "-p", path.as_str()], more].concat();
+            Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap()
+        };
+        // No manifest holds it.
+        let amended = ["--set", "scene.class=car"];
+        let page = |session: &Session| {
+            let report = Report {
+                session,
+                status: &[],
+                options: &[],
+                truth: None,
+                failed: &[],
+            };
+            report.write().unwrap();
+        };
+        page(&session(&amended));
+        assert!(is_current(&session(&amended)));
+        for other in [&[][..], &["--seed", "1"], &["--set", "scene.class=toy"]] {
+            assert!(!is_current(&session(other)), "{other:?}");
+        }
+        page(&session(&[]));
+        assert!(is_current(&session(&[])));
+        write("car");
+        assert!(!is_current(&session(&[])));
+    }
+
+    #[test]
+    fn there_is_nothing_to_show_until_a_stage_has_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("pipeline.toml");
+        std::fs::write(&file, "[scene]\nbackground = \"photo.png\"\n").unwrap();
+        let path = file.display().to_string();
+        let args = ["dipir-scene", "-q", "-p", path.as_str()];
+        let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+        assert!(!has_anything(&session));
+        // As a run leaves it that was killed in its first stage.
+        std::fs::create_dir_all(session.out.join(".scene.partial")).unwrap();
+        assert!(!has_anything(&session));
+        let plan = names::SCENE.plan(&session, serde_json::Value::Null);
+        session.begin(plan).unwrap().finish().unwrap();
+        assert!(has_anything(&session));
+    }
 }

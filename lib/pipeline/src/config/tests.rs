@@ -233,6 +233,76 @@ fn broken_toml_names_the_line() {
 }
 
 #[test]
+fn a_file_that_is_not_utf8_text_is_answered_with_how_to_save_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pipeline.toml");
+    let read = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        Config::read(&path, &[]).map_err(|e| {
+            let told = e.to_string();
+            told.replace(&path.display().to_string(), "p.toml")
+        })
+    };
+    let of_units = |units: &[u16], to_bytes: fn(u16) -> [u8; 2]| -> Vec<u8> {
+        units.iter().flat_map(|u| to_bytes(*u)).collect()
+    };
+    let units: Vec<u16> = TEXT.encode_utf16().collect();
+    let marked: Vec<u16> = std::iter::once(0xfeff).chain(units.clone()).collect();
+    for units in [&units, &marked] {
+        for to_bytes in [u16::to_le_bytes, u16::to_be_bytes] {
+            assert_eq!(
+                read(&of_units(units, to_bytes)).unwrap_err(),
+                "p.toml: not valid TOML: it is saved as UTF-16; save it as UTF-8 (Notepad: Save as, Encoding UTF-8; \
+                 PowerShell: Out-File -Encoding utf8)"
+            );
+        }
+    }
+    assert_eq!(
+        read(b"[scene]\nclass = \"B\xe4r\"\n").unwrap_err(),
+        "p.toml:2: not valid TOML: a character that is not UTF-8; save the file as UTF-8"
+    );
+    assert_eq!(
+        read(b"[scene]\n\n# a\0b\n").unwrap_err(),
+        "p.toml:3: not valid TOML: a NUL byte, which no text holds; remove it, or write the file anew"
+    );
+    for text in [
+        format!("\u{feff}{TEXT}"),
+        TEXT.replace('\n', "\r\n"),
+        format!("\u{feff}{}", TEXT.replace('\n', "\r\n")),
+    ] {
+        let config = read(text.as_bytes()).unwrap();
+        let scene: Scene = config.table("scene").unwrap();
+        assert_eq!(scene.background, Path::new("photo.png"));
+        let place = config.place("scene.background").unwrap().to_string();
+        assert!(place.ends_with(":6"), "{place}");
+    }
+}
+
+#[test]
+fn an_item_of_a_list_that_is_not_there_is_answered_with_how_to_add_it() {
+    for (text, set, list) in [
+        ("[scene]\n", "scene.objects.0.path=x", "scene.objects"),
+        ("", "scene.objects.0.path=x", "scene.objects"),
+        ("[light]\n", "light.environment.1=64", "light.environment"),
+    ] {
+        let item = set.split('.').nth(2).unwrap()[..1].to_string();
+        assert_eq!(
+            parse(text, &[set]).unwrap_err().to_string(),
+            format!(
+                "--set {set}: {list} is not in the file, so it has no item {item}; add it there, or set all of it, as in \
+                 --set {list}=[…]"
+            )
+        );
+    }
+    let set = [
+        "scene.objects=[{ path = \"a.glb\" }]",
+        "scene.objects.0.path=b.glb",
+    ];
+    let scene = scene("[scene]\nbackground = \"a.png\"\n", &set).unwrap();
+    assert_eq!(scene.objects[0].path, Path::new("b.glb"));
+}
+
+#[test]
 fn a_malformed_override_shows_the_form() {
     let tail = "; write --set table.key=value, as in --set scene.class=car";
     for (set, finding) in [

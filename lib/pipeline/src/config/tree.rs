@@ -86,6 +86,35 @@ impl Node {
     }
 }
 
+/// The text of a file in UTF-8, with a byte order mark or without.
+pub(super) fn text<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a str, ConfigError> {
+    let wrong = |at: Place, message: &str| ConfigError::Syntax {
+        at,
+        message: message.into(),
+    };
+    let line_of = |offset: usize| Place::Line {
+        file: path.into(),
+        line: 1 + bytes[..offset].iter().filter(|b| **b == b'\n').count(),
+    };
+    // The byte order mark, or half of the first letter.
+    if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] | [0, _, ..] | [_, 0, ..] = bytes {
+        let message = "it is saved as UTF-16; save it as UTF-8 (Notepad: Save as, Encoding UTF-8; \
+                       PowerShell: Out-File -Encoding utf8)";
+        return Err(wrong(Place::File { file: path.into() }, message));
+    }
+    let text = str::from_utf8(bytes).map_err(|e| {
+        let message = "a character that is not UTF-8; save the file as UTF-8";
+        wrong(line_of(e.valid_up_to()), message)
+    })?;
+    match text.find('\0') {
+        None => Ok(text),
+        Some(offset) => Err(wrong(
+            line_of(offset),
+            "a NUL byte, which no text holds; remove it, or write the file anew",
+        )),
+    }
+}
+
 /// Parses a whole file.
 pub(super) fn parse_file(path: &Path, text: &str) -> Result<Node, ConfigError> {
     let line_starts: Vec<usize> = std::iter::once(0)
@@ -192,7 +221,26 @@ pub(super) fn apply_override(root: &mut Node, text: &str) -> Result<(), ConfigEr
             place: place.clone(),
         },
     };
+    if let Some((list, index)) = absent_list(root, &steps) {
+        let message = format!(
+            "{list} is not in the file, so it has no item {index}; add it there, or set all of it, as in --set {list}=[…]"
+        );
+        return Err(ConfigError::Invalid {
+            at: place,
+            key: list,
+            message,
+        });
+    }
     insert(root, &steps, node, &place).map_err(wrong)
+}
+
+/// The dotted key of the list that is not there and that `steps` step into, and the index. No table has a number for a key.
+fn absent_list<'a>(root: &Node, steps: &[&'a str]) -> Option<(String, &'a str)> {
+    let is_index = |step: &&str| step.bytes().all(|b| b.is_ascii_digit());
+    let at = steps.iter().position(is_index).filter(|at| *at > 0)?;
+    let list = &steps[..at];
+    let there = list.iter().try_fold(root, |node, step| node.get(step));
+    there.is_none().then(|| (list.join("."), steps[at]))
 }
 
 /// A number as people write it on a command line and TOML does not: `.004`, `5.`.

@@ -287,6 +287,17 @@ fn swapping_in_two_steps_ends_as_an_exchange_does() {
 }
 
 #[test]
+fn a_folder_that_cannot_be_swapped_in_leaves_the_earlier_one_in_its_place() {
+    let out = tempfile::tempdir().unwrap();
+    let (absent, b) = (out.path().join("a"), out.path().join("b"));
+    fs::create_dir(&b).unwrap();
+    fs::write(b.join("old"), "").unwrap();
+    swap_in_two_steps(&absent, &b).unwrap_err();
+    assert_eq!(names(out.path()), ["b"]);
+    assert_eq!(names(&b), ["old"]);
+}
+
+#[test]
 fn a_folder_that_no_stage_wrote_is_left_alone() {
     let out = tempfile::tempdir().unwrap();
     let target = out.path().join("scene");

@@ -16,6 +16,7 @@ use crate::composite::table::{CompositeTable, Tone};
 use crate::light::estimate::{distribution, estimate};
 use crate::light::exposed;
 use crate::light::folder::{self, Recovered};
+use crate::light::method::{Method, starts_neutral};
 use crate::light::request::first_light;
 use crate::light::surroundings::surroundings;
 use crate::names::{LIGHT, SCENE};
@@ -69,8 +70,8 @@ pub struct AtHand {
 }
 
 /// The light of `loaded`, whose photograph and camera may be scaled: the map of `[composite]`, else
-/// what the light stage left if that is up to date, else the light of `[light] start`, by default the
-/// estimate of the photograph.
+/// what the light stage left if that is up to date, else the light of `[light] start`: by default the
+/// estimate of the photograph, with a reference neutral light.
 ///
 /// # Errors
 /// On tables and files that cannot be used.
@@ -131,7 +132,7 @@ fn start(
             let lobes = light.as_ref().map(Lighting::exposed_lobes);
             (lobes.unwrap_or_default(), None, Origin::File)
         }
-        Start::Neutral => {
+        start if starts_neutral(start, Method::of(session)?) => {
             let settings = transport::settings(session, &table)?;
             let ambient = ambient_of(&loaded.photo.image);
             let neutral = Parameters::neutral(settings.lobes, ambient);
@@ -166,4 +167,60 @@ fn estimated(
         Some(source) => (vec![source], estimate.base_map(), seen),
         None => (Vec::new(), estimate.map(), seen),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use dipir_imaging::file::write_png;
+    use dipir_imaging::raster::{DisplayImage, Raster};
+    use dipir_scene::scene::Scene;
+    use glam::Vec3;
+
+    use super::*;
+    use crate::command_line::light::Cli;
+    use crate::light::request::{First, Request};
+
+    #[test]
+    fn a_preview_starts_from_the_light_that_the_stage_starts_from() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let photo = DisplayImage(Raster::filled(36, 24, Vec3::splat(0.5)));
+        write_png(at("photo.png"), &photo).unwrap();
+        let object = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+        std::fs::write(at("object.obj"), object).unwrap();
+        let text = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"object.obj\"\nposition = [0.0, 0.0, 0.0]\n\
+                    [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 0.5, 0.0]\nfov_deg = 40.0\n\
+                    [scene.proxy]\nplane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }\n";
+        std::fs::write(at("pipeline.toml"), text).unwrap();
+        let path = at("pipeline.toml").display().to_string();
+        let reference = [
+            "-s",
+            "light.guidance=reference",
+            "-s",
+            "light.reference=photo.png",
+        ];
+        for (more, first, origin) in [
+            (&[][..], First::Estimated, Origin::Estimate),
+            (
+                &["-s", "light.start=neutral"],
+                First::Neutral,
+                Origin::Neutral,
+            ),
+            (&reference, First::Neutral, Origin::Neutral),
+            (
+                &[&reference[..], &["-s", "light.start=estimated"]].concat(),
+                First::Estimated,
+                Origin::Estimate,
+            ),
+        ] {
+            let args = [&["dipir-light", "-q", "-p", path.as_str()], more].concat();
+            let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+            let config = session.config.table("scene").unwrap();
+            let loaded = Scene::load(&config, folder.path()).unwrap();
+            assert!(Request::of(&session).unwrap().start == first, "{more:?}");
+            let found = at_hand(&session, &loaded).unwrap();
+            assert_eq!(found.origin, origin, "{more:?}");
+        }
+    }
 }

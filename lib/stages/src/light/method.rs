@@ -75,6 +75,15 @@ impl Method {
     }
 }
 
+/// Whether the light starts nearly uniform: as asked, or because a reference tells the rest.
+pub(crate) fn starts_neutral(start: &Start, method: Method) -> bool {
+    match start {
+        Start::Neutral => true,
+        Start::Auto => method == Method::Reference,
+        Start::Estimated | Start::Read | Start::Encoder | Start::File(_) => false,
+    }
+}
+
 /// Whether the start needs the model.
 fn asks_model(table: &LightTable) -> bool {
     matches!(table.start, Start::Read | Start::Encoder)

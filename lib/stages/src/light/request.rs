@@ -13,7 +13,7 @@ use dipir_scene::config::SceneConfig;
 use dipir_scene::views::ViewSettings;
 use serde_json::{Value, json};
 
-use crate::light::method::Method;
+use crate::light::method::{Method, starts_neutral};
 use crate::light::views;
 use crate::model::ModelTable;
 use crate::scene::folder::SceneFolder;
@@ -64,13 +64,18 @@ pub(crate) enum First {
 }
 
 impl First {
-    fn of(session: &Session, table: &LightTable, guide: &Guide) -> anyhow::Result<Self> {
+    fn of(
+        session: &Session,
+        table: &LightTable,
+        method: Method,
+        guide: &Guide,
+    ) -> anyhow::Result<Self> {
         let first = match (&table.start, guide) {
             (Start::File(path), _) => {
                 refuse_misspelt(session, path)?;
                 Self::File
             }
-            (Start::Neutral, _) | (Start::Auto, Guide::Reference { .. }) => Self::Neutral,
+            (start, _) if starts_neutral(start, method) => Self::Neutral,
             (
                 _,
                 Guide::Model {
@@ -82,7 +87,7 @@ impl First {
                                estimated, neutral, a lighting.json, or guidance = \"lds\" beside it";
                 return Err(session.config.invalid("light.start", message).into());
             }
-            (Start::Auto | Start::Estimated, _) => Self::Estimated,
+            (Start::Auto | Start::Estimated | Start::Neutral, _) => Self::Estimated,
         };
         Ok(first)
     }
@@ -118,7 +123,8 @@ impl Request {
     pub(crate) fn of(session: &Session) -> anyhow::Result<Self> {
         let table: LightTable = session.config.table("light")?;
         let mut settings = transport::settings(session, &table)?;
-        let guide = match Method::of(session)? {
+        let method = Method::of(session)?;
+        let guide = match method {
             Method::Reference => {
                 let (path, file) = reference_of(session, &table)?;
                 Guide::Reference { path, file }
@@ -126,7 +132,7 @@ impl Request {
             Method::Model { adapted } => model_guide(session, &table, adapted)?,
             Method::Start | Method::Materials | Method::Given | Method::Taken => Guide::None,
         };
-        let start = First::of(session, &table, &guide)?;
+        let start = First::of(session, &table, method, &guide)?;
         let views = views::settings(session)?;
         start.refuse_unused(session, &table, &views)?;
         if let Guide::Model {
