@@ -112,7 +112,7 @@ def regions(g):
 def main():
     with tempfile.TemporaryDirectory() as folder:
         dipir("export", folder)
-        ours = {s: json.loads(dipir("iteration", s)) for s in (64, 128, 256)}
+        ours = {s: json.loads(dipir("iteration", s)) for s in (54, 128, 256)}
         seconds, g = mitsuba(folder)
         again = {s: json.loads(dipir("iteration", s)) for s in ours}
     print("| | samples | one iteration, ms | 600 iterations and the record, s | noise per texel | per region |")
