@@ -2,14 +2,14 @@
 //!
 //! Tensors: `base` (H, W, 3) and `coverage` (H, W), f32; `environment.density` (rows, columns),
 //! f32, per steradian; and for each of the row sets `object`, `shadow.blocked` and
-//! `shadow.arriving` its `offsets` (H W + 1), u32, `exponents` (H W), i8, `entries` (n, numbers
-//! an entry), u16 or u32, and `merged` (n), u8. An entry is one weight per channel of the object, one
+//! `shadow.arriving` its `offsets` (H W + 1), u32, `order` (H W), u16, `exponents` (H W), i8, `entries`
+//! (n, numbers an entry), u16 or u32, and `merged` (n), u8. Rows are in the order that `rows` tells. An entry is one weight per channel of the object, one
 //! for all channels of the shadow, and a texel; weights are the bits of halves or floats. A plane
 //! has `shadow.cosine` (rows, columns), a proxy mesh `shadow.share` (H, W), both f32. Where the
 //! object sends light to the proxy there is a row set `sent` with entries like the object's, and
 //! `sent.base` (H, W, 3), f32. Metadata: one entry, [`FORMAT`], whose value is the [`Header`] as JSON.
 //!
-//! A file is checked when it is opened: shapes against the header, offsets monotone, texels in
+//! A file is checked when it is opened: shapes against the header, offsets monotone, each pixel once, texels in
 //! range, weights finite. After that it is trusted, and must not be changed while it is in use.
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -25,12 +25,12 @@ use memmap2::Mmap;
 use rayon::prelude::*;
 use safetensors::tensor::{Dtype, SafeTensors, View};
 
-use super::rows::{Entry, Rows, Store};
+use super::rows::{BAND, Entry, Rows, Store};
 use super::{Header, Precision, RowSet, Sent, Shadow, ShadowKind, Transport, Weights, with_rows};
 use crate::error::RenderError;
 
 /// The key of the header, and the version of everything in the file.
-const FORMAT: &str = "dipir_transport_2";
+const FORMAT: &str = "dipir_transport_3";
 
 /// Pictures and environments may have this many pixels or texels; more is a damaged header.
 const MOST_PIXELS: usize = 1 << 30;
@@ -157,6 +157,10 @@ fn push_rows<'a, E: Entry>(tensors: &mut Vec<(String, Tensor<'a>)>, name: &str, 
         Tensor::new(Dtype::U32, &[rows.offsets.len()], &rows.offsets),
     );
     push(
+        "order",
+        Tensor::new(Dtype::U16, &[rows.pixels()], &rows.order),
+    );
+    push(
         "exponents",
         Tensor::new(Dtype::I8, &[rows.pixels()], &rows.exponents),
     );
@@ -256,6 +260,10 @@ impl Source<'_> {
         if offsets[0] != 0 || offsets.windows(2).any(|o| o[0] > o[1]) {
             return Err(format!("has decreasing \"{name}.offsets\""));
         }
+        let order = self.store::<u16>(&format!("{name}.order"), Dtype::U16, &[pixels])?;
+        if !order.par_chunks(BAND).all(has_each_once) {
+            return Err(format!("has pixels twice in \"{name}.order\""));
+        }
         let n = offsets[pixels] as usize;
         let shape = [n, E::NUMBERS];
         let entries = self.store::<E>(&format!("{name}.entries"), entry_dtype::<E>(), &shape)?;
@@ -276,7 +284,7 @@ impl Source<'_> {
         // Beyond that the scale is no longer a normal number.
         if let Some(p) = exponents.iter().position(|e| !(-126..=126).contains(e)) {
             return Err(format!(
-                "has exponent {} for pixel {p} of \"{name}\"",
+                "has exponent {} for row {p} of \"{name}\"",
                 exponents[p]
             ));
         }
@@ -284,6 +292,7 @@ impl Source<'_> {
             exponents,
             merged: self.store(&format!("{name}.merged"), Dtype::U8, &[n])?,
             offsets,
+            order,
             entries,
         })
     }
@@ -325,6 +334,15 @@ impl Source<'_> {
             range: range_within(&self.file[..], bytes),
         })
     }
+}
+
+/// Whether the numbers are all of those below their count.
+fn has_each_once(order: &[u16]) -> bool {
+    let mut found = [false; BAND];
+    order.iter().all(|&k| {
+        let k = usize::from(k);
+        k < order.len() && !std::mem::replace(&mut found[k], true)
+    })
 }
 
 /// Where `part`, a slice of `whole`, lies in it.

@@ -14,13 +14,11 @@ use dipir_light::luminance::luminance;
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 
-use super::rows::{Entry, Rows, merged_count, power_of_two};
+use super::rows::{BAND, Entry, Rows, merged_count, power_of_two};
 
-/// Runs of pixels that are multiplied as one task: enough for many threads.
-const GATHER_PARTS: usize = 64;
-/// Most runs of pixels with a gradient of their own: each costs a pass over the environment.
+/// Most runs of rows with a gradient of their own: each costs a pass over the environment.
 const SCATTER_PARTS: usize = 16;
-/// A run of pixels must have this many entries per texel, or adding its gradient up costs as
+/// A run of rows must have this many entries per texel, or adding its gradient up costs as
 /// much as finding it.
 const ENTRIES_PER_TEXEL: usize = 4;
 
@@ -32,7 +30,7 @@ pub fn padded(colour: Vec3) -> Vec4 {
 }
 
 impl<E: Entry> Rows<E> {
-    /// At most `parts` runs of pixels with about the same number of entries; a function of the
+    /// At most `parts` runs of rows with about the same number of entries; a function of the
     /// record alone.
     fn runs(&self, parts: usize) -> Vec<Range<usize>> {
         let offsets = &*self.offsets;
@@ -55,23 +53,19 @@ impl<E: Entry> Rows<E> {
     ) -> Vec<Vec3> {
         let (offsets, exponents, entries) = (&*self.offsets, &*self.exponents, &*self.entries);
         let mut pixels = vec![Vec3::ZERO; self.pixels()];
-        let mut rest = &mut pixels[..];
-        let mut tasks = Vec::with_capacity(GATHER_PARTS);
-        for run in self.runs(GATHER_PARTS) {
-            let (own, others) = rest.split_at_mut(run.len());
-            tasks.push((run.start, own));
-            rest = others;
-        }
-        tasks.into_par_iter().for_each(|(first, pixels)| {
+        let bands = pixels.par_chunks_mut(BAND).zip(self.order.par_chunks(BAND));
+        bands.enumerate().for_each(|(band, (pixels, order))| {
+            let first = band * BAND;
             let (offsets, exponents) = (&offsets[first..], &exponents[first..]);
-            let rows = offsets.windows(2).zip(exponents).zip(pixels);
-            for (k, ((row, &exponent), pixel)) in rows.enumerate() {
+            let rows = offsets.windows(2).zip(exponents).zip(order);
+            for ((row, &exponent), &p) in rows {
                 let [start, end] = [row[0] as usize, row[1] as usize];
                 let sum = match start < end {
                     true => row_sum(entries, start, end, light) * inverse_scale(exponent),
                     false => Vec4::ZERO,
                 };
-                *pixel = finish(first + k, sum).truncate();
+                let p = usize::from(p);
+                pixels[p] = finish(first + p, sum).truncate();
             }
         });
         pixels
@@ -91,14 +85,14 @@ impl<E: Entry> Rows<E> {
             .into_par_iter()
             .map(|run| {
                 let mut sums = vec![Vec4::ZERO; texels];
-                for p in run {
-                    let (start, end) = (offsets[p] as usize, offsets[p + 1] as usize);
+                for row in run {
+                    let (start, end) = (offsets[row] as usize, offsets[row + 1] as usize);
                     if start == end {
                         continue;
                     }
-                    let gradient = gradient(p);
+                    let gradient = gradient(self.pixel(row));
                     if gradient != Vec4::ZERO {
-                        let scaled = gradient * inverse_scale(exponents[p]);
+                        let scaled = gradient * inverse_scale(exponents[row]);
                         row_scatter(entries, start, end, scaled, &mut sums);
                     }
                 }
@@ -117,24 +111,24 @@ impl<E: Entry> Rows<E> {
     /// recorded count; samples that reached several texels count once for each. 0 for pixels
     /// without light.
     pub fn effective_sample_size(&self, light: &[Vec4]) -> Vec<f32> {
-        (0..self.pixels())
-            .into_par_iter()
-            .with_min_len(256)
-            .map(|p| {
-                let row = self.offsets[p] as usize..self.offsets[p + 1] as usize;
+        let mut sizes = vec![0.0; self.pixels()];
+        let bands = sizes.par_chunks_mut(BAND).enumerate();
+        bands.for_each(|(band, sizes)| {
+            for row in band * BAND..band * BAND + sizes.len() {
+                let entries = self.offsets[row] as usize..self.offsets[row + 1] as usize;
                 let (mut sum, mut squares) = (0f32, 0f32);
-                for (entry, &count) in self.entries[row.clone()].iter().zip(&self.merged[row]) {
+                let merged = &self.merged[entries.clone()];
+                for (entry, &count) in self.entries[entries].iter().zip(merged) {
                     let y = luminance((entry.weight() * light[entry.texel()]).truncate());
                     sum += y;
                     squares += y * y / merged_count(count);
                 }
                 if squares > 0.0 {
-                    sum * sum / squares
-                } else {
-                    0.0
+                    sizes[usize::from(self.order[row])] = sum * sum / squares;
                 }
-            })
-            .collect()
+            }
+        });
+        sizes
     }
 }
 

@@ -1,7 +1,8 @@
 //! Sparse rows of weights: which texels of the environment a pixel sees, and how much of each.
 //!
-//! Compressed rows (CSR): `offsets[p]..offsets[p + 1]` are the entries of pixel `p`, by ascending
-//! texel. In half precision every row has its own power of two, so that its largest weight lies
+//! Compressed rows (CSR): `offsets[r]..offsets[r + 1]` are the entries of row `r`, by ascending
+//! texel. Every [`BAND`] pixels have their rows by ascending length, so that loops over rows end as the
+//! processor foresees; `order` says which pixel of the band a row belongs to. In half precision every row has its own power of two, so that its largest weight lies
 //! in `[2^14, 2^15)`: weights down to `2^-28` of the row's largest keep all eleven bits, and a
 //! weight's relative rounding error is at most `2^-11`.
 use std::fmt::Debug;
@@ -193,12 +194,17 @@ impl<T: Pod> Deref for Store<T> {
     }
 }
 
+/// Pixels whose rows are sorted together, at most 65536.
+pub const BAND: usize = 1024;
+
 /// The rows of all pixels.
 #[derive(Clone, Debug)]
 pub struct Rows<E> {
-    /// Where each pixel's entries begin, and the end: one more than there are pixels.
+    /// Where each row's entries begin, and the end: one more than there are pixels.
     pub offsets: Store<u32>,
-    /// Stored weights are `2^exponent` times the true ones.
+    /// The pixel of each row, counted from the first of its band.
+    pub order: Store<u16>,
+    /// Stored weights of a row are `2^exponent` times the true ones.
     pub exponents: Store<i8>,
     /// Texels and weights.
     pub entries: Store<E>,
@@ -226,34 +232,53 @@ impl<E: Entry> Rows<E> {
         self.exponents.len()
     }
 
-    /// Bytes that a product with these rows reads of them.
-    pub fn bytes(&self) -> usize {
-        size_of_val(&*self.offsets) + size_of_val(&*self.exponents) + size_of_val(&*self.entries)
+    /// The pixel of row `row`.
+    #[inline(always)]
+    pub fn pixel(&self, row: usize) -> usize {
+        row / BAND * BAND + usize::from(self.order[row])
     }
 
-    /// Puts rows in the order of their pixels; `None` if they exceed 2^32 - 1 entries.
+    /// Bytes that a product with these rows reads of them.
+    pub fn bytes(&self) -> usize {
+        size_of_val(&*self.offsets)
+            + size_of_val(&*self.order)
+            + size_of_val(&*self.exponents)
+            + size_of_val(&*self.entries)
+    }
+
+    /// Puts rows in their order; `None` if they exceed 2^32 - 1 entries.
     pub fn assemble(pixels: usize, parts: &[Part<E>]) -> Option<Self> {
-        let mut lengths = vec![0u64; pixels + 1];
-        let mut exponents = vec![0i8; pixels];
+        let mut lengths = vec![0; pixels];
         for row in parts.iter().flat_map(|p| &p.rows) {
-            lengths[row.pixel as usize + 1] = row.length as u64;
-            exponents[row.pixel as usize] = row.exponent;
+            lengths[row.pixel as usize] = row.length;
         }
-        let mut total = 0u64;
-        let mut offsets = Vec::with_capacity(pixels + 1);
-        for length in lengths {
-            total += length;
-            offsets.push(u32::try_from(total).ok()?);
+        let (mut order, mut row_of) = (Vec::with_capacity(pixels), vec![0; pixels]);
+        for (band, lengths) in lengths.chunks(BAND).enumerate() {
+            let mut sorted: Vec<usize> = (0..lengths.len()).collect();
+            sorted.sort_by_key(|&p| lengths[p]);
+            for (k, &p) in sorted.iter().enumerate() {
+                row_of[band * BAND + p] = band * BAND + k;
+                order.push(p as u16);
+            }
+        }
+        let mut exponents = vec![0i8; pixels];
+        let mut offsets = vec![0; pixels + 1];
+        for row in parts.iter().flat_map(|p| &p.rows) {
+            exponents[row_of[row.pixel as usize]] = row.exponent;
+            offsets[row_of[row.pixel as usize] + 1] = row.length as u32;
+        }
+        let mut total = 0u32;
+        for end in &mut offsets {
+            total = total.checked_add(*end)?;
+            *end = total;
         }
         let mut entries = vec![E::zeroed(); total as usize];
         let mut merged = vec![0u8; total as usize];
         for part in parts {
             let mut first = 0;
             for row in &part.rows {
-                let (from, to) = (
-                    first..first + row.length,
-                    offsets[row.pixel as usize] as usize,
-                );
+                let from = first..first + row.length;
+                let to = offsets[row_of[row.pixel as usize]] as usize;
                 entries[to..to + row.length].copy_from_slice(&part.entries[from.clone()]);
                 merged[to..to + row.length].copy_from_slice(&part.merged[from]);
                 first += row.length;
@@ -261,6 +286,7 @@ impl<E: Entry> Rows<E> {
         }
         Some(Self {
             offsets: Store::Owned(offsets),
+            order: Store::Owned(order),
             exponents: Store::Owned(exponents),
             entries: Store::Owned(entries),
             merged: Store::Owned(merged),
@@ -406,8 +432,9 @@ mod tests {
                 })
                 .collect();
             let rows = row::<ColourHalf>(&weights, scale);
-            assert_eq!(&*rows.offsets, [0, 0, 68, 68]);
-            let unit = 1.0 / f64::from(power_of_two(rows.exponents[1]));
+            assert_eq!(&*rows.offsets, [0, 0, 0, 68]);
+            assert_eq!([0, 1, 2].map(|row| rows.pixel(row)), [0, 2, 1]);
+            let unit = 1.0 / f64::from(power_of_two(rows.exponents[2]));
             for (entry, (texel, weight)) in rows.entries.iter().zip(&weights) {
                 assert_eq!(entry.texel(), *texel);
                 let found = entry.weight().truncate().as_dvec3() * unit;
@@ -455,6 +482,39 @@ mod tests {
             );
         }
         assert_eq!(merged_code(f32::NAN), 0);
+    }
+
+    #[test]
+    fn rows_ascend_in_length_within_a_band_and_every_pixel_keeps_its_own() {
+        let pixels = 2 * BAND + 77;
+        let length = |p: usize| p * 7919 % 23;
+        let mut builder = RowBuilder::new(32);
+        let mut part = Part::<GreySingle>::default();
+        // Tiles come in any order.
+        for p in (0..pixels).rev() {
+            for texel in 0..length(p) {
+                builder.add(texel, Vec3::splat(p as f32 + 1.0));
+            }
+            part.push(p as u32, &mut builder, 1.0);
+        }
+        let rows = Rows::assemble(pixels, &[part]).expect("small");
+        let lengths: Vec<u32> = rows.offsets.windows(2).map(|o| o[1] - o[0]).collect();
+        assert!(lengths.chunks(BAND).all(<[u32]>::is_sorted));
+        let one = [Vec4::ONE; 32];
+        let sums = rows.product(&one, &|p, sum| sum + Vec4::splat(p as f32));
+        for (p, sum) in sums.iter().enumerate() {
+            let expected = (length(p) * (p + 1) + p) as f32;
+            assert_eq!(*sum, Vec3::splat(expected), "{p}");
+        }
+        let ones = rows.product_vjp(32, &|p| Vec4::splat(1.0 / (p as f32 + 1.0)));
+        for (texel, sum) in ones.iter().enumerate() {
+            let expected = (0..pixels).filter(|&p| length(p) > texel).count();
+            // Each term is 1 to an ulp, and so is each of 2,125 sums.
+            assert!(
+                (sum.x - expected as f32).abs() <= 1e-3 * expected as f32,
+                "{texel}"
+            );
+        }
     }
 
     #[test]

@@ -73,16 +73,16 @@ fn reference_shadow(
         .map(|(l, d)| l.as_dvec3() + d.as_dvec3() * h)
         .collect();
     fn product<E: Entry>(rows: &Rows<E>, light: &[DVec3]) -> Vec<DVec3> {
-        (0..rows.pixels())
-            .map(|p| {
-                let row = rows.offsets[p] as usize..rows.offsets[p + 1] as usize;
-                let scale = 2f64.powi(-i32::from(rows.exponents[p]));
-                let terms = rows.entries[row].iter();
-                terms
-                    .map(|e| e.weight().truncate().as_dvec3() * light[e.texel()] * scale)
-                    .sum()
-            })
-            .collect()
+        let mut sums = vec![DVec3::ZERO; rows.pixels()];
+        for row in 0..rows.pixels() {
+            let entries = rows.offsets[row] as usize..rows.offsets[row + 1] as usize;
+            let scale = 2f64.powi(-i32::from(rows.exponents[row]));
+            let terms = rows.entries[entries].iter();
+            sums[rows.pixel(row)] = terms
+                .map(|e| e.weight().truncate().as_dvec3() * light[e.texel()] * scale)
+                .sum();
+        }
+        sums
     }
     let ratio = |b: DVec3, a: DVec3, s: f32| {
         let ratio = DVec3::ONE - f64::from(s) * b / a;

@@ -56,13 +56,13 @@ fn replace(bytes: &mut [u8], from: &str, to: &str) {
 fn damaged_files_are_refused_by_what_is_wrong() {
     assert!(damaged(|_| ()).is_ok());
     type Damage = fn(&mut Vec<u8>);
-    let cases: [(Damage, &str); 9] = [
+    let cases: [(Damage, &str); 10] = [
         (|b| b.clear(), "is not safetensors"),
         (|b| b.truncate(b.len() - 1), "is not safetensors"),
         (|b| b[..8].fill(0xff), "is not safetensors"),
         (
-            |b| replace(b, "dipir_transport_2", "dipir_transport_9"),
-            "has no metadata \"dipir_transport_2\"",
+            |b| replace(b, "dipir_transport_3", "dipir_transport_9"),
+            "has no metadata \"dipir_transport_3\"",
         ),
         (
             |b| replace(b, "\\\"size\\\":[12,12]", "\\\"size\\\":[12,99]"),
@@ -84,6 +84,13 @@ fn damaged_files_are_refused_by_what_is_wrong() {
                 b[at..at + 4].fill(0xff);
             },
             "has decreasing \"object.offsets\"",
+        ),
+        (
+            |b| {
+                let at = tensor_start(b, "object.order");
+                b.copy_within(at..at + 2, at + 2);
+            },
+            "has pixels twice in \"object.order\"",
         ),
         (
             |b| {
