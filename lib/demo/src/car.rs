@@ -166,12 +166,17 @@ fn wells(p: Vec3) -> f32 {
     well(FRONT_AXLE).min(well(REAR_AXLE))
 }
 
+/// Side windows, windscreen and rear screen.
+fn glazing(p: Vec3) -> f32 {
+    side_windows(p).min(windscreen(p)).min(rear_screen(p))
+}
+
 fn painted(p: Vec3) -> f32 {
     let shell = shell(p);
-    let glazing = side_windows(p).min(windscreen(p)).min(rear_screen(p));
-    let mut d = smooth_difference(shell, inlay(shell, glazing, 0.025), 0.008);
+    // Edges are as round as a cell of the mesh is wide: narrower ones would be beads.
+    let mut d = smooth_difference(shell, inlay(shell, glazing(p), 0.025), 0.02);
     let lamps = headlamps(p).min(tail_lamps(p)).min(plate_recess(p));
-    d = smooth_difference(d, inlay(shell, lamps, 0.025), 0.008);
+    d = smooth_difference(d, inlay(shell, lamps, 0.025), 0.02);
     d = smooth_difference(d, inlay(shell, grille(p), 0.06), 0.012);
     smooth_difference(d, wells(p), 0.012)
 }
@@ -179,8 +184,14 @@ fn painted(p: Vec3) -> f32 {
 /// What is seen through windows, grille and wells, and the sill under the doors.
 fn glazed(p: Vec3) -> f32 {
     let deep = shell(p) + 0.012;
-    let near = side_windows(p).min(windscreen(p)).min(rear_screen(p)) - 0.03;
+    let near = glazing(p) - 0.03;
     deep.max(near).max(-(shell(p) + 0.06))
+}
+
+/// Rubber seals along the edges of windows and lamps.
+fn seals(p: Vec3) -> f32 {
+    let tube = |edge: f32, radius: f32| Vec2::new(edge, shell(p) + 0.006).length() - radius;
+    tube(glazing(p), 0.011).min(tube(headlamps(p).min(tail_lamps(p)), 0.006))
 }
 
 fn trim(p: Vec3) -> f32 {
@@ -380,6 +391,7 @@ pub fn body(step: f32) -> Vec<Part> {
         half(CarMaterial::Paint, &fittings, 0.7 * step),
         half(CarMaterial::Glass, &glazed, 1.3 * step),
         half(CarMaterial::Trim, &trim, step),
+        half(CarMaterial::Trim, &seals, 0.4 * step),
         half(CarMaterial::Lamp, &lamps, step),
         half(CarMaterial::TailLamp, &tail, step),
         half(CarMaterial::Plate, &plate, step),
