@@ -57,11 +57,14 @@ impl Interface {
             }
             None => (f0, of_dielectric.max_element()),
         };
+        // At grazing incidence a film reflects all, however weak the dielectric's own reflection is.
+        let film_factor = film.as_ref().map_or(0.0, |film| film.factor);
+        let grazing = extension.specular + (1.0 - extension.specular) * film_factor;
         let mut interface = Self {
             f0,
             f90: Vec3::splat(extension.specular).lerp(Vec3::ONE, surface.metallic),
             f0_bound,
-            dielectric: (dielectric, extension.specular.max(dielectric)),
+            dielectric: (dielectric, grazing.max(dielectric)),
             film,
             roughness: surface.roughness,
             ..Self::PLAIN

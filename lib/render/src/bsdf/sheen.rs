@@ -56,7 +56,8 @@ impl Fibres {
         let l = |x: f32| a / (1.0 + b * x.powf(c)) + d * x + e;
         match cosine < 0.5 {
             true => l(cosine).exp(),
-            false => (2.0 * l(0.5) - l(1.0 - cosine)).exp(),
+            // The cosine of rounded unit vectors may exceed 1, and a negative number has no power.
+            false => (2.0 * l(0.5) - l((1.0 - cosine).max(0.0))).exp(),
         }
     }
 

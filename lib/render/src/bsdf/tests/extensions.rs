@@ -207,3 +207,23 @@ fn a_film_scatters_as_it_samples_and_adds_no_light() {
         }
     }
 }
+
+#[test]
+fn sheen_is_a_number_where_the_cosine_of_a_rounded_direction_exceeds_one() {
+    let surface = facing_z(extended(
+        0.5,
+        1.0,
+        ExtensionPoint {
+            sheen_color: Vec3::ONE,
+            sheen_roughness: 0.5,
+            ..ExtensionPoint::NONE
+        },
+    ));
+    // One rounding step above 1, as the length of a direction that was rotated may be.
+    let above = Vec3::new(0.0, 0.0, 1.0 + 2.0 * f32::EPSILON);
+    let slanted = direction(0.6, 0.4);
+    for (wo, wi) in [(above, slanted), (slanted, above)] {
+        let value = Bsdf::<{ ALL | EXTENSIONS }>::new(&surface, wo).eval(wi);
+        assert!(value.is_finite() && value.min_element() > 0.0, "{value}");
+    }
+}
