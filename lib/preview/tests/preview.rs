@@ -32,11 +32,15 @@ const BOX: &str = "v 3 5 7\nv 4 5 7\nv 4 7 7\nv 3 7 7\nv 3 5 10\nv 4 5 10\nv 4 7
     f 1 4 3 2\nf 5 6 7 8\nf 1 5 8 4\nf 2 3 7 6\nf 4 8 7 3\nf 1 2 6 5\n";
 
 fn project() -> (TempDir, Session) {
+    project_of(TEXT)
+}
+
+fn project_of(text: &str) -> (TempDir, Session) {
     let folder = tempfile::tempdir().unwrap();
     let grey = Raster::filled(300, 200, Vec3::splat(0.5));
     write_png(folder.path().join("photo.png"), &DisplayImage(grey)).unwrap();
     fs::write(folder.path().join("box.obj"), BOX).unwrap();
-    fs::write(folder.path().join("pipeline.toml"), TEXT).unwrap();
+    fs::write(folder.path().join("pipeline.toml"), text).unwrap();
     let session = Session::open(&CommonArgs {
         pipeline: folder.path().join("pipeline.toml"),
         set: Vec::new(),
@@ -80,6 +84,25 @@ fn a_photograph_stays_one_that_a_camera_exposed_at_any_size() {
         assert_eq!(values.pixels()[0], [128; 3]);
         // As a run does, a draft bends the light of the object.
         assert!(at_hand(&session, &small.loaded).unwrap().tone.is_some());
+    }
+}
+
+#[test]
+fn a_drawn_shadow_tells_the_same_sun_at_any_size() {
+    let shadow = "start = \"auto\"\nshadow = { foot = [150.0, 140.0], tip = [60.0, 170.0], height_m = 1.0 }\n";
+    for lens in ["", "distortion = { k1 = -0.1 }\n"] {
+        let text = TEXT.replace("start = \"neutral\"\n", shadow);
+        let text = text.replace("fov_deg = 50.0\n", &format!("fov_deg = 50.0\n{lens}"));
+        let (folder, session) = project_of(&text);
+        let suns = [300, 100].map(|longest| {
+            let (small, _) = SmallScene::load(&session, longest).unwrap();
+            let found = at_hand(&session, &small.loaded).unwrap();
+            let lobes = found.lobes.lobes().to_vec();
+            lobes[0].direction
+        });
+        // Directions are put on a grid of half degrees at the finest; a wrong scale moves the sun by tens of them.
+        assert!(suns[0].dot(suns[1]) > 0.9998, "{suns:?}");
+        drop(folder);
     }
 }
 

@@ -66,6 +66,11 @@ impl Undistortion {
         &self.lens
     }
 
+    /// Columns and rows of the working picture.
+    pub fn size(&self) -> [u32; 2] {
+        self.resolution
+    }
+
     /// The working picture's camera, at a place.
     pub fn camera(&self, pose: &Pose) -> Camera {
         Camera {

@@ -9,7 +9,7 @@ use dipir_scene::proxy::Proxy;
 use dipir_scene::scene::LoadedScene;
 use dipir_sun::shadow::{Angle, Ground, sun_of_shadow};
 use dipir_sun::table::Taken;
-use glam::Vec2;
+use glam::{DVec2, Vec2};
 use serde::Serialize;
 
 use super::views;
@@ -144,6 +144,16 @@ fn contradiction(what: &str, sun: Angle, shadow: Angle) -> Option<String> {
     })
 }
 
+/// What is wrong with ends of a shadow that are not pixels of a photograph of so many.
+fn outside(ends: [DVec2; 2], size: DVec2) -> Option<String> {
+    let is_inside = |end: DVec2| end.cmpge(DVec2::ZERO).all() && end.cmple(size).all();
+    let end = ends.into_iter().find(|end| !is_inside(*end))?;
+    Some(format!(
+        "has an end at [{:?}, {:?}]; accepted: pixels of the photograph, [0, 0] to [{:?}, {:?}]",
+        end.x, end.y, size.x, size.y
+    ))
+}
+
 /// What the configuration and the photograph's own data say of the sun, relative to the view.
 fn known_sun(
     session: &Session,
@@ -173,6 +183,10 @@ fn known_sun(
         let shadow = shadow
             .resolve("light.shadow")
             .map_err(|e| wrong("light.shadow", e.to_string()))?;
+        let size = DVec2::from_array(facts.size.map(f64::from));
+        if let Some(message) = outside([shadow.foot, shadow.tip], size) {
+            return Err(wrong("light.shadow", message).into());
+        }
         let ground = match (&loaded.scene.proxy, &loaded.description.proxy) {
             (Proxy::Plane(plane), _) => Ground {
                 point: plane.point.as_dvec3(),
@@ -187,8 +201,13 @@ fn known_sun(
                 return Err(wrong("light.shadow", message.into()).into());
             }
         };
-        let ray = |pixel: glam::DVec2| {
-            let pixel = loaded.undistorted_pixel(pixel);
+        // A preview's camera has fewer pixels than the photograph or its working picture.
+        let original = loaded.original.as_ref();
+        let working = original.map_or(facts.size, |o| o.undistortion.size());
+        let scale = DVec2::from_array(camera.resolution.map(f64::from))
+            / DVec2::from_array(working.map(f64::from));
+        let ray = |pixel: DVec2| {
+            let pixel = loaded.undistorted_pixel(pixel) * scale;
             let ray = camera.ray(Vec2::new(pixel.x as f32, pixel.y as f32));
             (ray.origin.as_dvec3(), ray.direction.as_dvec3())
         };
