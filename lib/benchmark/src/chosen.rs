@@ -65,6 +65,7 @@ pub fn choose(args: &RunArgs, note: &dyn Fn(&str)) -> anyhow::Result<Vec<Chosen>
         return Err(Usage(why).into());
     }
     refuse_set(&args.set, &chosen)?;
+    note_scenes(&args.set, note);
     Ok(chosen)
 }
 
@@ -191,6 +192,27 @@ fn refuse_set(set: &[String], chosen: &[Chosen]) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Notes what `--set` changes of the scenes: methods see it, the true pictures do not.
+fn note_scenes(set: &[String], note: &dyn Fn(&str)) {
+    let parts = [
+        "background",
+        "transfer",
+        "occluders",
+        "objects",
+        "camera",
+        "proxy",
+    ];
+    for pair in set.iter().filter(|s| s.contains('=')) {
+        let key = key_of(pair);
+        if parts.iter().any(|p| overlap(&key, &format!("scene.{p}"))) {
+            note(&format!(
+                "--set {pair}: the true pictures show the scenes as they were made, so that scores count the \
+                 difference; to change a scene, edit its pipeline.toml"
+            ));
+        }
+    }
+}
+
 /// Whether one of the dotted keys is the other, or a table around it.
 fn overlap(a: &str, b: &str) -> bool {
     let is_in = |a: &str, b: &str| {
@@ -281,6 +303,23 @@ pub(crate) mod tests {
             "light.adaptive=1",
         ])
         .unwrap();
+    }
+
+    #[test]
+    fn what_changes_the_scenes_is_noted_because_the_truth_does_not_change() {
+        let notes = |set: &str| chosen(&["--method", "neutral", "-s", set]).unwrap().1;
+        let said = notes("scene.objects.0.height_m=2");
+        assert_eq!(said.len(), 1);
+        assert!(
+            said[0].starts_with(
+                "--set scene.objects.0.height_m=2: the true pictures show the scenes as they were made"
+            ),
+            "{said:?}"
+        );
+        assert_eq!(notes("scene . camera = { fov_deg = 50 }").len(), 1);
+        for harmless in ["scene.class=car", "scene.effects.mode=all", "lora.steps=3"] {
+            assert!(notes(harmless).is_empty(), "{harmless}");
+        }
     }
 
     #[test]

@@ -127,8 +127,9 @@ pub struct RunArgs {
     #[arg(long, value_name = "FILE")]
     pub methods: Option<PathBuf>,
 
-    /// Maps that another estimator made, DIR/SCENE.exr or .hdr, on the photograph's scale: a method
-    /// called like the folder; may be repeated
+    /// Maps that another estimator made, DIR/SCENE.exr or .hdr, directions as in the true map of the scene and radiance on the
+    /// photograph's scale (the true map times 2^exposure_ev, both in its scene.json): a method called like the folder; may be
+    /// repeated
     #[arg(long, value_name = "DIR")]
     pub environment_from: Vec<PathBuf>,
 

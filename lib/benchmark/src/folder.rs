@@ -84,6 +84,22 @@ impl EvaluationFolder {
         self.run(method, scene).join("composite/composite.png")
     }
 
+    /// Hash of what a scene is: its `scene.json`, its files and its objects' files. A file that cannot be read counts
+    /// as an empty one.
+    pub fn digest(&self, scene: &SceneInfo) -> String {
+        let folder = self.scene(&scene.name);
+        let pipeline = folder.join("pipeline.toml");
+        let mut files = objects(&pipeline).unwrap_or_default();
+        files.extend([pipeline, folder.join("photo.png"), folder.join(&scene.map)]);
+        let mut hash = blake3::Hasher::new();
+        hash.update(&serde_json::to_vec(scene).unwrap_or_default());
+        for file in files {
+            let bytes = dipir_files::read(&file).unwrap_or_default();
+            hash.update(blake3::hash(&bytes).as_bytes());
+        }
+        hash.finalize().to_hex()[..16].to_owned()
+    }
+
     /// Where stages work.
     pub fn work(&self, scene: &str, key: &str) -> PathBuf {
         self.root.join("work").join(scene).join(key)
@@ -161,6 +177,22 @@ impl EvaluationFolder {
     pub fn methods(&self) -> anyhow::Result<Vec<String>> {
         folders(&self.root.join("runs"))
     }
+}
+
+/// The files of the objects that `pipeline` names.
+pub(crate) fn objects(pipeline: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let text = dipir_files::read_to_string(pipeline)
+        .with_context(|| format!("cannot read {}", pipeline.display()))?;
+    let table: toml::Table =
+        toml::from_str(&text).with_context(|| format!("cannot read {}", pipeline.display()))?;
+    let objects = table.get("scene").and_then(|s| s.get("objects"));
+    let paths = objects
+        .and_then(|o| o.as_array())
+        .into_iter()
+        .flatten()
+        .filter_map(|o| o.get("path")?.as_str());
+    let folder = pipeline.parent().unwrap_or(Path::new(""));
+    Ok(paths.map(|p| folder.join(p)).collect())
 }
 
 /// Names of the folders in `folder`, sorted; none if it is not there.

@@ -6,6 +6,7 @@
 //! with pictures and scores, `work/` where stages run, and the report.
 mod check;
 mod chosen;
+mod columns;
 pub mod command_line;
 pub mod definition;
 pub mod folder;

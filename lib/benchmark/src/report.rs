@@ -3,19 +3,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use anyhow::{Context, bail};
 use dipir_cli::exit::Usage;
 use dipir_evaluation::lpips::Lpips;
-use dipir_evaluation::results::{read_json, write, write_json};
+use dipir_evaluation::results::{write, write_json};
 use dipir_evaluation::scores::DisplayedComposite;
 use dipir_evaluation::summary::Summary;
 use dipir_imaging::raster::DisplayImage;
 use serde_json::{Value, json};
 
+use crate::columns::{Column, read};
 use crate::command_line::ReportArgs;
-use crate::definition::Definition;
 use crate::folder::{EvaluationFolder, SceneInfo, TRUTH};
-use crate::methods::{self, Source};
 use crate::metrics::{COMPARED, METRICS, Metric, SECONDS};
 use crate::score::Score;
 
@@ -37,12 +35,14 @@ pub struct Written {
 pub fn report(args: &ReportArgs) -> anyhow::Result<Written> {
     let evaluation = EvaluationFolder::new(&args.folder.out);
     let scenes = evaluation.chosen(&args.scene)?;
-    let mut columns = read(&evaluation, &scenes)?;
+    let mut earlier = Vec::new();
+    let mut columns = read(&evaluation, &scenes, &mut earlier)?;
     if let Some(file) = &args.lpips {
         add_lpips(&evaluation, &Lpips::load(file)?, &mut columns)?;
     }
     let baseline = baseline(args, &columns)?;
-    let report = Report::new(columns, baseline, &scenes);
+    let mut report = Report::new(columns, baseline, &scenes);
+    report.notes.extend(earlier);
     let files =
         ["json", "csv", "md", "html"].map(|e| evaluation.root().join(format!("report.{e}")));
     write_json(&files[0], &report.json())?;
@@ -51,79 +51,6 @@ pub fn report(args: &ReportArgs) -> anyhow::Result<Written> {
     write(&files[2], &tables)?;
     write(&files[3], report.html(&evaluation, &scenes)?)?;
     Ok(Written { files, tables })
-}
-
-/// A method's scores by scene.
-pub(crate) struct Column {
-    pub name: String,
-    pub title: String,
-    /// What all scores were made with.
-    pub definition: Definition,
-    pub scores: BTreeMap<String, Score>,
-}
-
-/// Scores of all methods: those of the table of methods in its order, then the others.
-fn read(evaluation: &EvaluationFolder, scenes: &[SceneInfo]) -> anyhow::Result<Vec<Column>> {
-    let mut columns = Vec::new();
-    for name in evaluation.methods()?.into_iter().filter(|n| n != TRUTH) {
-        let mut scores = BTreeMap::new();
-        for scene in scenes {
-            let file = evaluation.run(&name, &scene.name).join("score.json");
-            if file.is_file() {
-                let score: Score = read_json(&file).with_context(|| {
-                    format!(
-                        "a score cannot be used; delete {} and run dipir-evaluate run again",
-                        file.display()
-                    )
-                })?;
-                scores.insert(scene.name.clone(), score);
-            }
-        }
-        if let Some(first) = scores.values().next() {
-            refuse_mixture(&name, &scores)?;
-            columns.push(Column {
-                title: first.title.clone(),
-                definition: first.definition.clone(),
-                name,
-                scores,
-            });
-        }
-    }
-    if columns.is_empty() {
-        bail!(
-            "nothing has run in {}; run dipir-evaluate run first",
-            evaluation.root().display()
-        );
-    }
-    let order: Vec<String> = methods::read(None)?.into_iter().map(|m| m.name).collect();
-    let place = |c: &Column| {
-        order
-            .iter()
-            .position(|n| *n == c.name)
-            .unwrap_or(order.len())
-    };
-    columns.sort_by_key(place);
-    Ok(columns)
-}
-
-/// Refuses scores of one method that were not made alike.
-fn refuse_mixture(name: &str, scores: &BTreeMap<String, Score>) -> anyhow::Result<()> {
-    let mut all = scores.iter();
-    let Some((first, Score { definition, .. })) = all.next() else {
-        return Ok(());
-    };
-    let found = all.find_map(|(s, score)| Some((s, definition.unlike(&score.definition)?)));
-    let Some((other, [a, b])) = found else {
-        return Ok(());
-    };
-    let option = match definition.row.light {
-        Source::Imported => "--environment-from and the folder of its maps".to_owned(),
-        _ => format!("--method {name}"),
-    };
-    bail!(
-        "the scores of the method \"{name}\" were made in more than one way: {first} with {a}, {other} with {b}; run \
-         dipir-evaluate run with {option} and the same options for all scenes, or report on some scenes with --scene"
-    )
 }
 
 /// Adds LPIPS to the scores of pictures.
@@ -420,30 +347,9 @@ fn markdown_table(head: &[String], rows: &[Vec<String>]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::columns::tests::score;
+    use crate::definition::Definition;
     use crate::definition::tests::of;
-
-    #[test]
-    fn a_damaged_score_is_named_with_what_to_do() {
-        let folder = tempfile::tempdir().unwrap();
-        let evaluation = EvaluationFolder::new(folder.path());
-        let scene =
-            json!({"name": "a", "made_from": "", "map": "", "exposure_ev": 0.0, "tone": "none"});
-        let scene: SceneInfo = serde_json::from_value(scene).unwrap();
-        let file = evaluation.run("m", "a").join("score.json");
-        write(&file, "{").unwrap();
-        let error = read(&evaluation, &[scene]).map(|_| ()).unwrap_err();
-        let wanted = format!("delete {} and run dipir-evaluate run again", file.display());
-        assert!(format!("{error:#}").contains(&wanted), "{error:#}");
-    }
-
-    fn score(rmse_touched: f64, made: &Definition) -> Score {
-        let picture = json!({"rmse": 0.0, "ssim": 1.0, "si_rmse": 0.0, "rmse_touched": rmse_touched,
-            "si_rmse_object": 0.0});
-        serde_json::from_value(json!({"key": "", "method": "m", "title": "M", "scene": "",
-            "definition": made, "picture": picture, "light": null,
-            "seconds": [["dipir-light", 2.0], ["dipir-composite", 1.0]], "peak_rss_bytes": 0}))
-        .unwrap()
-    }
 
     fn column(name: &str, made: Definition) -> Column {
         Column {
@@ -452,54 +358,6 @@ mod tests {
             scores: [("a".to_owned(), score(0.1, &made))].into(),
             definition: made,
         }
-    }
-
-    #[test]
-    fn scores_of_one_method_that_were_not_made_alike_are_refused() {
-        let scores = |other: Definition| -> BTreeMap<String, Score> {
-            let first = of("ours", "embedded", &["lora.steps=200"]);
-            [("a", first), ("b", other)]
-                .map(|(n, d)| (n.to_owned(), score(0.1, &d)))
-                .into()
-        };
-        refuse_mixture("ours", &scores(of("ours", "embedded", &["lora.steps=200"]))).unwrap();
-        let message = |other| {
-            refuse_mixture("ours", &scores(other))
-                .unwrap_err()
-                .to_string()
-        };
-        assert_eq!(
-            message(of("ours", "embedded", &["lora.steps=500"])),
-            "the scores of the method \"ours\" were made in more than one way: a with --set lora.steps=200, b with \
-             --set lora.steps=500; run dipir-evaluate run with --method ours and the same options for all scenes, or \
-             report on some scenes with --scene"
-        );
-        let other = message(of("ours", "sd", &["lora.steps=200"]));
-        assert!(
-            other.contains("a with the embedded model (embedded), b with the model sd"),
-            "{other}"
-        );
-    }
-
-    #[test]
-    fn a_mixture_in_the_folder_is_refused_unless_the_scenes_that_are_chosen_are_alike() {
-        let folder = tempfile::tempdir().unwrap();
-        let evaluation = EvaluationFolder::new(folder.path());
-        let scenes = ["a", "b"].map(|name| -> SceneInfo {
-            serde_json::from_value(
-                json!({"name": name, "made_from": "", "map": "", "exposure_ev": 0.0,
-                "tone": "none"}),
-            )
-            .unwrap()
-        });
-        for (scene, set) in scenes.iter().zip(["lora.steps=1", "lora.steps=2"]) {
-            let made = of("ours", "embedded", &[set]);
-            let file = evaluation.run("ours", &scene.name).join("score.json");
-            write_json(&file, &score(0.1, &made)).unwrap();
-        }
-        assert!(read(&evaluation, &scenes).is_err());
-        let one = read(&evaluation, &scenes[..1]).unwrap();
-        assert_eq!(one[0].definition.set["lora.steps"], "1");
     }
 
     #[test]

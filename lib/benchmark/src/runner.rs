@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 use crate::chosen::Chosen;
 use crate::command_line::RunArgs;
 use crate::definition::{Definition, UsedModel};
-use crate::folder::{EvaluationFolder, SceneInfo, TRUTH};
+use crate::folder::{EvaluationFolder, SceneInfo, TRUTH, objects};
 use crate::lights;
 use crate::methods::{BEFORE_COMPOSITE, MODEL_PATH, Method, Source};
 use crate::parts::Parts;
@@ -95,6 +95,7 @@ impl Runner<'_> {
                 definition: self.definition(&Method::truth(), None),
                 title: "Truth".into(),
                 scene: scene.name.clone(),
+                scene_digest: Some(self.evaluation.digest(scene)),
                 picture: None,
                 lpips: None,
                 light: None,
@@ -157,6 +158,7 @@ impl Runner<'_> {
             definition: self.definition(method, chosen.model.as_ref().map(|m| m.used.clone())),
             title: method.title.clone(),
             scene: scene.name.clone(),
+            scene_digest: Some(self.evaluation.digest(scene)),
             picture: Some(compare_pictures(&found, &truth.picture, &truth.touched)),
             lpips: None,
             light: Some(compare_lights(&light, &truth.map)),
@@ -337,22 +339,6 @@ pub(crate) fn toml_string(path: &Path) -> anyhow::Result<String> {
         .replace('\\', "\\\\")
         .replace('"', "\\\"");
     Ok(format!("\"{text}\""))
-}
-
-/// The files of the objects that `pipeline` names.
-fn objects(pipeline: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let text = dipir_files::read_to_string(pipeline)
-        .with_context(|| format!("cannot read {}", pipeline.display()))?;
-    let table: toml::Table =
-        toml::from_str(&text).with_context(|| format!("cannot read {}", pipeline.display()))?;
-    let objects = table.get("scene").and_then(|s| s.get("objects"));
-    let paths = objects
-        .and_then(|o| o.as_array())
-        .into_iter()
-        .flatten()
-        .filter_map(|o| o.get("path")?.as_str());
-    let folder = pipeline.parent().unwrap_or(Path::new(""));
-    Ok(paths.map(|p| folder.join(p)).collect())
 }
 
 /// Stages that run in one folder with the same settings.

@@ -22,6 +22,10 @@ pub struct Score {
     pub title: String,
     /// The scene.
     pub scene: String,
+    /// [`EvaluationFolder::digest`](crate::folder::EvaluationFolder::digest) of the scene; absent in scores that were
+    /// written without it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scene_digest: Option<String>,
     /// Errors of the picture; absent for the truth.
     pub picture: Option<PictureScores>,
     /// LPIPS of the picture, if a report was asked for it.

@@ -38,7 +38,7 @@ impl LeftOut {
     pub fn read(panoramas: &Path, weights: &Path) -> Result<Self, PlacesError> {
         let networks = networks(weights)?;
         let trained = trained(weights)?;
-        let folds = trained.places.iter().map(|p| p.1 + 1).max();
+        let folds = trained.places.iter().map(|p| p.1.saturating_add(1)).max();
         let own: Vec<Estimator> = networks
             .iter()
             .map(|n| n.calibrated(trained.calibration))

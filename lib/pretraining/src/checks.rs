@@ -7,6 +7,7 @@ use std::ops::ControlFlow;
 
 use dipir_diffusion::model::Model;
 use dipir_diffusion::noise::NoiseStream;
+use dipir_numerics::stats::median;
 use dipir_prior::caption::{Caption, LightDescription};
 use dipir_prior::encoder::LightEncoder;
 use dipir_prior::energy::{Observation, TIMESTEP_SHARES, energies, prediction_difference};
@@ -311,13 +312,12 @@ fn summary(answers: &[&SceneResult]) -> QualityReport {
 }
 
 fn recognition(of: &[Preferences]) -> Recognition {
-    let mut errors: Vec<f64> = of.iter().map(|t| t.azimuth_error).collect();
-    errors.sort_by(f64::total_cmp);
+    let errors: Vec<f64> = of.iter().map(|t| t.azimuth_error).collect();
     Recognition {
         over_opposite: share(of.iter().map(|t| t.opposite)),
         over_mirror: share(of.iter().map(|t| t.mirror)),
         over_45: share(of.iter().flat_map(|t| t.beside)),
-        azimuth_median: errors.get(of.len() / 2).copied().unwrap_or(f64::NAN),
+        azimuth_median: median(&errors).unwrap_or(f64::NAN),
         within_30: share(errors.iter().map(|e| *e <= 30.0)),
     }
 }
@@ -397,6 +397,14 @@ mod tests {
         let across = preferences(-4.0, 10.0);
         assert!(!across.mirror && across.opposite && (across.azimuth_error - 14.0).abs() < 1e-4);
         assert!(!preferences(200.0, 30.0).opposite);
+    }
+
+    #[test]
+    fn the_median_of_two_errors_lies_between_them() {
+        // Answers 10 and 30 degrees off.
+        let found = [10f32, 30.0].map(|a| Preferences::by(a.to_radians(), 0.0));
+        assert!((recognition(&found).azimuth_median - 20.0).abs() < 1e-4);
+        assert!(recognition(&[]).azimuth_median.is_nan());
     }
 
     #[test]

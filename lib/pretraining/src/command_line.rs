@@ -26,8 +26,8 @@ Examples:
   dipir-pretrain check model --first 1000 --scenes 48  the same on other scenes, to tune on
   dipir-pretrain sheet model sheet.png                 pictures under captions of light
 
-An interrupted training goes on from CACHE/checkpoint.safetensors. data/prior/README.md says how
-that model was made.
+An interrupted `train` goes on from CACHE/checkpoint.safetensors; `light` keeps the folds that were
+finished; `encoder` begins its run anew. data/prior/README.md says how that model was made.
 Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted.";
 
 /// Train the small model and the light estimator, and measure them

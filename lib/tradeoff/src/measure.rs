@@ -353,8 +353,8 @@ fn key(set: &[(String, String)]) -> String {
     blake3::hash(text.join("\n").as_bytes()).to_hex()[..12].to_owned()
 }
 
-/// Where what belongs to a scene is kept. Projects of the user's may lie in folders of the same name: theirs has a hash of
-/// their place.
+/// Where what belongs to a scene is kept. Projects of the user's may lie in folders of the same name, and are edited: theirs
+/// has a hash of their place and one of their content.
 fn folder_name(scene: &MeasuredScene) -> String {
     let keep = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
     let plain = |name: &str| name.chars().map(keep).collect::<String>();
@@ -364,7 +364,8 @@ fn folder_name(scene: &MeasuredScene) -> String {
     let place = scene.lit.canonicalize();
     let place = place.unwrap_or_else(|_| scene.lit.clone());
     let hash = blake3::hash(place.as_os_str().as_encoded_bytes()).to_hex();
-    format!("{}-{}", plain(&folder_of(&scene.lit)), &hash[..8])
+    let (name, digest) = (plain(&folder_of(&scene.lit)), &scene.digest);
+    format!("{name}-{}-{digest}", &hash[..8])
 }
 
 /// Where the points of a track are kept: errors of renders are known beside one reference alone.
@@ -401,6 +402,26 @@ mod tests {
         assert_eq!(both[0].name, files[0].display().to_string());
         // What was measured of one alone is found again.
         assert_eq!(folder_name(&both[0]), folder_name(&first));
+    }
+
+    #[test]
+    fn a_project_that_was_edited_is_measured_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("pipeline.toml");
+        let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
+        let kept = || folder_name(&projects(std::slice::from_ref(&file))[0]);
+        write("car.obj", "v 0 0 0");
+        write("pipeline.toml", "objects = [{ path = \"car.obj\" }]");
+        let first = kept();
+        assert_eq!(kept(), first);
+        write("car.obj", "v 0 0 1");
+        let other_object = kept();
+        assert_ne!(other_object, first);
+        write(
+            "pipeline.toml",
+            "objects = [{ path = 'car.obj', yaw_deg = 3 }]",
+        );
+        assert!(![first, other_object].contains(&kept()));
     }
 
     #[test]

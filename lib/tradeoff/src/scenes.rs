@@ -25,6 +25,8 @@ pub struct MeasuredScene {
     pub lit: PathBuf,
     /// To recover the light from `truth.exr` beside it; built-in scenes alone.
     pub recover: Option<PathBuf>,
+    /// Hash of the file `lit` and of the files that it names; empty for built-in scenes, which nobody edits.
+    pub digest: String,
 }
 
 /// Names of the built-in scenes.
@@ -36,6 +38,7 @@ pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<M
         name: name.into(),
         lit: folder.join("pipeline.toml"),
         recover: Some(folder.join("recover.toml")),
+        digest: String::new(),
     };
     if scene.lit.is_file() {
         return Ok(scene);
@@ -111,8 +114,26 @@ pub fn projects(pipelines: &[PathBuf]) -> Vec<MeasuredScene> {
         },
         lit: pipeline.clone(),
         recover: None,
+        digest: digest(pipeline),
     };
     pipelines.iter().zip(&folders).map(named).collect()
+}
+
+/// Hash of a project's file and of the files whose paths it has in quotation marks. A file that cannot be read, which its
+/// stage says, counts as an empty one.
+fn digest(pipeline: &Path) -> String {
+    let folder = pipeline.parent().unwrap_or(Path::new(""));
+    let text = fs::read(pipeline).unwrap_or_default();
+    let mut hash = blake3::Hasher::new();
+    hash.update(&text);
+    for quoted in String::from_utf8_lossy(&text).split(['"', '\'', '\n']) {
+        let path = folder.join(quoted);
+        if !quoted.is_empty() && path.is_file() {
+            let bytes = fs::read(&path).unwrap_or_default();
+            hash.update(blake3::hash(&bytes).as_bytes());
+        }
+    }
+    hash.finalize().to_hex()[..8].to_owned()
 }
 
 /// The name of the folder that a file lies in.

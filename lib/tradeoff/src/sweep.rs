@@ -40,8 +40,8 @@ pub struct Outcome {
 /// it is measured.
 ///
 /// # Errors
-/// If the arguments name a scene or a series that does not exist, an executable fails, or the user
-/// interrupts.
+/// If the arguments name a scene or a series that does not exist, nothing is measured of what is to be reported, an
+/// executable fails, or the user interrupts.
 pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome> {
     if !(cli.reference_error > 0.0 && cli.reference_error < 1.0) || cli.repeats == 0 {
         let text = "--reference-error must lie above 0 and below 1, --repeats must be at least 1";
@@ -117,6 +117,15 @@ pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome>
                 .map(|samples| Point::new(&scene.name, variant, samples)),
         });
     }
+    if points.is_empty() {
+        // Tables of nothing would take the place of earlier ones.
+        let text = format!(
+            "--report-only: nothing of this is measured in {}; give --size, --pipeline, --track and --reference-error as they \
+             were for the measurement",
+            out.display()
+        );
+        return Err(Usage(text).into());
+    }
     let about = json!({
         "size": cli.size, "repeats": cli.repeats, "joint": cli.joint,
         "reference_error": cli.reference_error, "threads": cli.threads,
@@ -165,6 +174,34 @@ mod tests {
     use clap::Parser;
 
     use super::*;
+
+    #[test]
+    fn a_report_of_nothing_is_refused_and_leaves_earlier_tables() {
+        let folder = tempfile::tempdir().unwrap();
+        let earlier = folder.path().join("tradeoff.csv");
+        std::fs::write(&earlier, "earlier").unwrap();
+        let out = folder.path().to_str().unwrap();
+        let arguments = [
+            "dipir-tradeoff",
+            "--report-only",
+            "--track",
+            "light",
+            "--size",
+            "8x8",
+            "--out",
+            out,
+        ];
+        let refused = sweep(&Cli::parse_from(arguments), &mut |_| {});
+        let error = refused.err().expect("is refused");
+        assert!(error.is::<Usage>(), "{error:#}");
+        assert!(
+            error
+                .to_string()
+                .starts_with("--report-only: nothing of this is measured in "),
+            "{error:#}"
+        );
+        assert_eq!(std::fs::read_to_string(earlier).unwrap(), "earlier");
+    }
 
     #[test]
     fn a_series_that_does_not_exist_is_refused_beside_one_that_does() {

@@ -12,6 +12,7 @@ use dipir_light::environment::{EnvironmentMap, EnvironmentSampler};
 use dipir_render::adaptive::Stop;
 use dipir_render::effects::EffectsPlan;
 use dipir_render::render::{Renderer, Settings};
+use dipir_scene::texture::ImageSource;
 use dipir_stages::names;
 use glam::Vec3;
 
@@ -158,7 +159,25 @@ fn key(scene: &DrawnScene, light: &EnvironmentMap, target_error: f32) -> String 
             .flat_map(|p| p.to_array())
             .collect::<Vec<f32>>()
     };
-    floats(&mut hash, &flat(&scene.scene.mesh.positions));
+    let mesh = &scene.scene.mesh;
+    floats(&mut hash, &flat(&mesh.positions));
+    floats(&mut hash, &flat(&mesh.normals));
+    let parts = (
+        &mesh.indices,
+        &mesh.tangents,
+        &mesh.uvs,
+        &mesh.colors,
+        &mesh.materials,
+    );
+    hash.update(format!("{parts:?}").as_bytes());
+    for texture in &scene.scene.textures {
+        hash.update(format!("{:?}", (texture.encoding, texture.wrap, texture.filter)).as_bytes());
+        let pixels = match &texture.image {
+            ImageSource::File(path) => blake3::hash(&dipir_files::read(path).unwrap_or_default()),
+            ImageSource::Bytes { bytes, .. } => blake3::hash(bytes),
+        };
+        hash.update(pixels.as_bytes());
+    }
     floats(&mut hash, &flat(scene.photo.0.pixels()));
     floats(&mut hash, &flat(light.texels()));
     hash.finalize().to_hex()[..32].to_string()
@@ -171,6 +190,8 @@ mod tests {
     use dipir_scene::material::Material;
     use dipir_scene::proxy::Proxy;
     use dipir_scene::scene::Scene;
+    use dipir_scene::texture::{Encoding, Texture};
+    use glam::Vec2;
 
     use super::*;
 
@@ -206,5 +227,23 @@ mod tests {
         };
         assert_eq!(of(0.5), of(0.5));
         assert_ne!(of(0.5), of(0.25));
+        // So is another picture on the same surface, or the surface with other coordinates on it.
+        let textured = |pixels: &[u8], u: f32| {
+            let mut scene = scene(0.5);
+            scene.scene.textures.push(Texture {
+                image: ImageSource::Bytes {
+                    name: "paint".into(),
+                    bytes: pixels.into(),
+                },
+                encoding: Encoding::Srgb,
+                wrap: Default::default(),
+                filter: Default::default(),
+            });
+            scene.scene.mesh.uvs[0] = vec![Vec2::splat(u)];
+            key(&scene, &scene.truth, 0.01)
+        };
+        assert_eq!(textured(b"red", 0.0), textured(b"red", 0.0));
+        assert_ne!(textured(b"red", 0.0), textured(b"blue", 0.0));
+        assert_ne!(textured(b"red", 0.0), textured(b"red", 1.0));
     }
 }
