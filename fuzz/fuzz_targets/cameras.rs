@@ -43,6 +43,7 @@ fuzz_target!(|bytes: &[u8]| {
         is_whole(&camera);
     }
     let _ = kitti::read_scanner(&text);
+    let _ = nuscenes::sensor(bytes, WorldUp::Z);
     // Cameras and images of COLMAP, with a line or eight bytes of 255 between them.
     let mut parts = text.split("\n---\n");
     let (cameras, images) = (parts.next().unwrap_or(""), parts.next().unwrap_or(""));

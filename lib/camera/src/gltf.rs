@@ -13,6 +13,8 @@ use crate::camera::{Camera, Lens, Pose};
 use crate::error::CameraError;
 
 const FORMAT: &str = "glTF";
+/// Most nodes that a camera hangs from: rigs have tens. It bounds the time that each camera takes.
+const MOST_ABOVE: usize = 1000;
 
 #[derive(Deserialize)]
 struct Document {
@@ -201,10 +203,15 @@ fn lens(perspective: &Perspective, size: [f64; 2]) -> Result<Lens, CameraError> 
 fn above(parents: &[Option<usize>], i: usize) -> Result<Vec<usize>, CameraError> {
     let nodes = std::iter::successors(Some(i), |&i| parents[i]);
     // A path without a cycle visits no node twice.
-    let nodes: Vec<usize> = nodes.take(parents.len() + 1).collect();
-    match nodes.len() > parents.len() {
-        true => Err(CameraError::new(FORMAT, "its nodes form a cycle")),
-        false => Ok(nodes),
+    let most = parents.len().min(MOST_ABOVE + 1);
+    let nodes: Vec<usize> = nodes.take(most + 1).collect();
+    match nodes.len() {
+        n if n <= most => Ok(nodes),
+        n if n > parents.len() => Err(CameraError::new(FORMAT, "its nodes form a cycle")),
+        _ => Err(CameraError::new(
+            FORMAT,
+            format!("a camera hangs from more than {MOST_ABOVE} nodes"),
+        )),
     }
 }
 
@@ -264,6 +271,34 @@ mod tests {
         });
         let cameras = read_at_rest(document.to_string().as_bytes(), [600.0, 400.0]).unwrap();
         cameras.iter().map(|c| c.1.is_animated).collect()
+    }
+
+    /// Each of the 100,000 cameras of the chain hangs from all before it: without a limit, 5e9 products of matrices.
+    #[test]
+    fn a_chain_of_nodes_that_no_rig_has_is_refused_before_it_takes_long() {
+        let chain = |nodes: usize, last: usize| {
+            let node =
+                |i: usize| json!({ "camera": 0, "children": [if i == last { 0 } else { i + 1 }] });
+            let mut nodes: Vec<Value> = (0..nodes).map(node).collect();
+            if last >= nodes.len()
+                && let Some(node) = nodes.last_mut()
+            {
+                *node = json!({ "camera": 0 });
+            }
+            let cameras = json!([{ "perspective": { "yfov": 1.0 } }]);
+            let document = json!({ "nodes": nodes, "cameras": cameras }).to_string();
+            read(document.as_bytes(), [600.0, 400.0]).map(|cameras| cameras.len())
+        };
+        let own = MOST_ABOVE + 1;
+        assert_eq!(chain(own, own).unwrap(), own);
+        for (nodes, last, said) in [
+            (own + 1, own + 1, "a camera hangs from more than 1000 nodes"),
+            (100_000, 100_000, "a camera hangs from more than 1000 nodes"),
+            (3, 2, "its nodes form a cycle"),
+        ] {
+            let error = chain(nodes, last).unwrap_err().to_string();
+            assert!(error.contains(said), "{error}");
+        }
     }
 
     #[test]

@@ -6,7 +6,7 @@
 pub struct Extent {
     /// Number of tensors.
     pub tensors: usize,
-    /// Length of the longest axis of any tensor.
+    /// Length of the longest axis of any tensor that holds numbers.
     pub axis: usize,
 }
 

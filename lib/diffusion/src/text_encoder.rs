@@ -63,7 +63,7 @@ impl TextEncoderConfig {
     }
 
     /// Checks the sizes against the weights.
-    fn fits(&self, extent: &Extent) -> Result<(), String> {
+    pub(crate) fn fits(&self, extent: &Extent) -> Result<(), String> {
         extent.layers("num_hidden_layers", self.num_hidden_layers)?;
         for (key, value) in [
             ("vocab_size", self.vocab_size),

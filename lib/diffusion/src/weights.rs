@@ -225,7 +225,9 @@ impl Weights {
 
     /// How large a network these weights allow.
     pub fn extent(&self) -> Extent {
-        let axes = self.entries.values().flat_map(|entry| &entry.shape);
+        // A tensor without numbers may have an axis of any length.
+        let held = self.entries.values().filter(|e| !e.range.is_empty());
+        let axes = held.flat_map(|entry| &entry.shape);
         Extent {
             tensors: self.entries.len(),
             axis: axes.copied().max().unwrap_or(0),

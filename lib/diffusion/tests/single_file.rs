@@ -271,6 +271,39 @@ fn clip_s_names_may_lack_their_prefix() -> Outcome {
     Ok(())
 }
 
+/// An axis of 2^62 beside one of 0 takes no byte; products with it exceed all numbers.
+#[test]
+fn axes_of_tensors_without_numbers_are_no_sizes() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let mut tensors = export("sd15", Encoder::Clip)?;
+    let name = "cond_stage_model.transformer.text_model.embeddings.position_embedding.weight";
+    let empty = Tensor::zeros((1usize << 62, 0), DType::F32, &Device::Cpu)?;
+    assert!(tensors.insert(name.into(), empty).is_some());
+    let mut file = SingleFile::open(&write(folder.path(), &tensors)?, None)?;
+    (file.unet.norm_num_groups, file.vae.norm_num_groups) = (4, 4);
+    let error = file.networks(DType::F32, &Device::Cpu);
+    let message = error.expect_err("refused").to_string();
+    let said = "max_position_embeddings = 4611686018427387904 does not fit the weights";
+    assert!(message.contains(said), "{message}");
+    Ok(())
+}
+
+#[test]
+fn a_level_whose_number_is_the_largest_one_belongs_to_no_layer() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let mut tensors = export("sd15", Encoder::Clip)?;
+    let name = format!("decoder.up.{}.block.0.conv1.bias", usize::MAX);
+    let bias = Tensor::zeros(4, DType::F32, &Device::Cpu)?;
+    tensors.insert(format!("first_stage_model.{name}"), bias);
+    let mut file = SingleFile::open(&write(folder.path(), &tensors)?, None)?;
+    (file.unet.norm_num_groups, file.vae.norm_num_groups) = (4, 4);
+    let error = file.networks(DType::F32, &Device::Cpu);
+    let message = error.expect_err("refused").to_string();
+    let said = format!("tensor \"{name}\" belongs to no layer");
+    assert!(message.contains(&said), "{message}");
+    Ok(())
+}
+
 #[test]
 fn a_single_file_gives_the_same_bytes_as_the_folder_that_it_was_made_of() -> Outcome {
     for (name, encoder) in [

@@ -75,7 +75,10 @@ pub fn fetch(
             files: files.len(),
             ..Outcome::default()
         },
-        total: files.iter().filter_map(|f| f.size).sum(),
+        total: files
+            .iter()
+            .filter_map(|f| f.size)
+            .fold(0, u64::saturating_add),
     };
     for file in files {
         let url = hub.address(revision, &file.path);

@@ -66,6 +66,25 @@ struct Pattern {
     number: f64,
 }
 
+/// Most [`steps`] of all patterns of a setting. Compiled, a class of characters such as `\w` takes 67 kB.
+const MOST_STEPS: usize = 4000;
+
+/// Characters of a regular expression, repetitions written out; 0 of a plain name, which is compiled to little. Its dots
+/// may be escaped.
+fn steps(pattern: &str) -> usize {
+    let is_plain = |b: u8| b.is_ascii_alphanumeric() || b"_.^$".contains(&b);
+    if pattern.replace(r"\.", ".").bytes().all(is_plain) {
+        return 0;
+    }
+    let most = |repetition: &str| {
+        let inside = repetition.split('}').next().unwrap_or_default();
+        let numbers = inside.split(',').filter_map(|n| n.trim().parse().ok());
+        numbers.max().unwrap_or(1).max(1)
+    };
+    let repetitions = pattern.split('{').skip(1).map(most);
+    repetitions.fold(pattern.len(), usize::saturating_mul)
+}
+
 /// Whether a value is of the kind that a setting takes.
 type Accepts = fn(&Value) -> bool;
 
@@ -220,6 +239,14 @@ impl Settings {
             })?;
             Ok(Pattern { layers, number })
         };
+        let steps = entries.keys().map(|key| steps(key));
+        let steps = steps.fold(0, usize::saturating_add);
+        if steps > MOST_STEPS {
+            return Err(format!(
+                "{source}: the regular expressions of {name} have {steps} characters, repetitions written out (accepted: \
+                 {MOST_STEPS}); write the names of layers"
+            ));
+        }
         entries.iter().map(pattern).collect()
     }
 

@@ -126,6 +126,16 @@ impl SingleFile {
 
     /// The three networks.
     pub fn networks(&self, dtype: DType, device: &Device) -> Result<(UNet, Vae, TextEncoder)> {
+        // The axes of a tensor without numbers are sizes of nothing.
+        let extent = self.weights.extent();
+        let fits = [
+            self.unet.fits(&extent),
+            self.vae.fits(&extent),
+            self.text.fits(&extent),
+        ];
+        for part in fits {
+            part.map_err(|message| refused(&self.path, &message))?;
+        }
         let of = |weights| Parameters::from_weights(weights, dtype, device, false);
         let layers = self.unet.layers_per_block;
         let unet = self.weights.renamed(|name| match name.strip_prefix(UNET) {

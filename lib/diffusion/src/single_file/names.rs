@@ -132,7 +132,8 @@ fn vae_of(name: &str, levels: usize) -> Option<String> {
         }
         "up" => {
             let (level, rest) = inside.split_once('.')?;
-            let level = levels.checked_sub(1 + level.parse::<usize>().ok()?)?;
+            let level: usize = level.parse().ok()?;
+            let level = levels.checked_sub(level.checked_add(1)?)?;
             format!(
                 "up_blocks.{level}.{}",
                 vae_level(rest, "upsample", "upsamplers")?

@@ -85,7 +85,7 @@ impl AutoencoderConfig {
     }
 
     /// Checks the sizes against the weights.
-    pub(super) fn fits(&self, extent: &Extent) -> Result<(), String> {
+    pub(crate) fn fits(&self, extent: &Extent) -> Result<(), String> {
         extent.layers("layers_per_block", self.layers_per_block)?;
         for (level, &channels) in self.block_out_channels.iter().enumerate() {
             extent.width(&format!("block_out_channels[{level}]"), channels)?;

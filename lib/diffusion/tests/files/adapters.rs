@@ -325,6 +325,33 @@ fn patterns_are_regular_expressions_of_the_end_of_a_name() -> Outcome {
     Ok(())
 }
 
+/// A hundred patterns of 7 kB would be a gigabyte when compiled.
+#[test]
+fn patterns_that_are_much_when_compiled_are_refused_before() -> Outcome {
+    let repeated: Vec<String> = (0..30)
+        .map(|n| format!("{}a", "(x){5}".repeat(n % 3)))
+        .collect();
+    let name = "down_blocks.0.attentions.0.transformer_blocks.0.attn1.to_q";
+    let mut names: Vec<String> = (0..2000).map(|n| format!("{name}{n}")).collect();
+    names.extend((0..200).map(|n| format!("{name}{n}").replace('.', r"\.")));
+    let many: Vec<String> = (100..200).map(|n| format!("\\w{{{n}}}")).collect();
+    let nested = vec!["(((\\w{9}){9}){9}){9}".to_owned()];
+    for (patterns, is_taken) in [
+        (names, true),
+        (repeated, true),
+        (many, false),
+        (nested, false),
+    ] {
+        let entries: serde_json::Map<_, _> = patterns.into_iter().map(|p| (p, 2.into())).collect();
+        let metadata = serde_json::json!({ "alpha_pattern": entries }).to_string();
+        let message = scale_with_metadata(&metadata).map_err(|e| e.to_string());
+        let said = "the regular expressions of alpha_pattern have";
+        assert_eq!(message.is_ok(), is_taken, "{message:?}");
+        assert!(is_taken || message.is_err_and(|m| m.contains(said)));
+    }
+    Ok(())
+}
+
 #[test]
 fn settings_of_a_wrong_type_are_quoted() -> Outcome {
     for (metadata, part) in [

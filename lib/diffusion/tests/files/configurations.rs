@@ -236,6 +236,23 @@ fn what_was_read_of_a_model_is_described() -> Outcome {
     Ok(())
 }
 
+#[test]
+fn sizes_that_a_tensor_without_numbers_states_are_refused_by_key() -> Outcome {
+    let mut tensors = unet_tensors()?;
+    let empty = Tensor::zeros((0, 1usize << 62), DType::F32, &Device::Cpu)?;
+    tensors.insert("empty".into(), empty);
+    let folder = unet_folder(&tensors)?;
+    let path = folder.path().join("config.json");
+    let mut config: serde_json::Value = serde_json::from_slice(&std::fs::read(&path)?)?;
+    config["in_channels"] = (1u64 << 62).into();
+    std::fs::write(&path, config.to_string())?;
+    let error = load_unet(folder.path(), DType::F32, &Device::Cpu);
+    let message = error.expect_err("refused").to_string();
+    let said = "in_channels = 4611686018427387904 does not fit the weights";
+    assert!(message.contains(said), "{message}");
+    Ok(())
+}
+
 /// Were one of these read as it stands, the test would not end, or end for want of memory.
 #[test]
 fn sizes_that_the_weights_do_not_hold_are_refused_by_key() -> Outcome {
