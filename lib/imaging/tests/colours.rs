@@ -2,7 +2,8 @@
 use dipir_imaging::{
     encoding::Encoding,
     file::{Photo, read_linear, read_photo, write_picture},
-    raster::LinearImage,
+    layers::{Layers, Precision},
+    raster::{LinearImage, Raster},
     transfer::Transfer,
 };
 use exr::{
@@ -68,6 +69,40 @@ fn put_hdr(folder: &TempDir, lines: &str) -> PathBuf {
 
 fn first(image: &LinearImage) -> Vec3 {
     image.0.pixels()[0]
+}
+
+#[test]
+fn linear_light_that_a_display_shows_as_white_or_black_is_said() {
+    let folder = folder();
+    let said = |values: [f32; 4]| {
+        let path = folder.path().join("light.exr");
+        let mut layers = Layers::new(4, 1);
+        let grey = Raster::from_pixels(4, 1, values.map(Vec3::splat).to_vec());
+        layers.insert_rgb("", Precision::Full, &grey).unwrap();
+        layers.write_exr(&path).unwrap();
+        read_photo(&path, Transfer::Srgb).unwrap().warnings
+    };
+    // A factor of 2^-6 brings 11.52 to mid-grey, .18; and 2^10 brings .18 / 1024 there.
+    let [white] = &said([11.52, 11.52, 11.52, 11.52])[..] else {
+        panic!("one warning");
+    };
+    assert!(white.contains("100% of its pixels are above 1.0 and show white"));
+    assert!(
+        white.ends_with("multiply the photograph's values by 2^-6"),
+        "{white}"
+    );
+    let [black] = &said([0.18 / 1024.0; 4])[..] else {
+        panic!("one warning");
+    };
+    assert!(black.contains("100% of its pixels are below 0.01 and show nearly black"));
+    assert!(
+        black.ends_with("multiply the photograph's values by 2^10"),
+        "{black}"
+    );
+    // A sky that is white, a dark room with a window, and a picture without light say nothing.
+    for values in [[40.0, 40.0, 0.2, 0.3], [0.001, 0.001, 0.001, 3.0], [0.0; 4]] {
+        assert_eq!(said(values), Vec::<String>::new());
+    }
 }
 
 #[test]

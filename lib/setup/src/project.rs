@@ -21,8 +21,8 @@ use crate::document::{Document, Object, Points, axis};
 use crate::error::SetupError;
 use crate::model::Models;
 use crate::size::Kind;
-use crate::spots::{appears, spots};
-use crate::view::{CameraOptions, View};
+use crate::spots::{appears, crowded, spots};
+use crate::view::{self, CameraOptions, View};
 
 /// The photograph as a camera exposes it: the exposure of linear light, as EXR and HDR hold it, is arbitrary.
 fn exposed(photo: &Photo) -> Cow<'_, LinearImage> {
@@ -108,6 +108,7 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
         None => {
             let (view, no_ground) = View::of_photo(&exposed(&photo), &photo.facts, &request.asked)?;
             warnings.extend(no_ground.filter(|_| request.points.is_none()));
+            warnings.extend(view::strip(&photo.facts, &request.asked));
             view
         }
     };
@@ -135,6 +136,8 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
         ));
     }
     let spots = spots(&camera, &plane, &widths)?;
+    let crowded = crowded(&camera, &plane, &spots, &widths);
+    warnings.extend(crowded.filter(|_| !request.place_auto));
     let objects = request.models.iter().zip(sizes).zip(spots);
     let objects = objects.map(|((path, size), at_pixel)| {
         Ok(Object {
@@ -498,6 +501,30 @@ mod tests {
         let warnings = draft(&request).unwrap().warnings;
         let said = |w: &&String| w.starts_with("COLMAP's project has 2 models");
         assert_eq!(warnings.iter().filter(said).count(), 1, "{warnings:?}");
+    }
+
+    #[test]
+    fn a_panorama_and_objects_without_room_are_warnings() {
+        let folder = tempfile::tempdir().unwrap();
+        let (photo, model) = (folder.path().join("photo.png"), folder.path().join("a.obj"));
+        std::fs::write(&model, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+        put_turned(&photo, [90, 30], &|x, _| x as u8, 1);
+        let mut request = Request {
+            photo,
+            models: vec![model; 9],
+            out: folder.path().join("pipeline.toml"),
+            height_m: Some(4.0),
+            ..Request::default()
+        };
+        request.asked.pitch_deg = Some(-20.0);
+        let said = |request: &Request| draft(request).unwrap().warnings.join("\n");
+        let both = ["3.0 times as wide as high", "the 9 objects take 36.0 m"];
+        let text = said(&request);
+        assert!(both.iter().all(|part| text.contains(part)), "{text}");
+        request.place_auto = true;
+        request.asked.fov_deg = Some(60.0);
+        let text = said(&request);
+        assert!(!both.iter().any(|part| text.contains(part)), "{text}");
     }
 
     #[test]

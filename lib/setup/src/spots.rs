@@ -62,6 +62,35 @@ pub fn spots(
     Ok(found)
 }
 
+/// A warning if neighbours at `spots` are nearer to each other than they are wide: the ground that is seen there has no
+/// room for all.
+pub fn crowded(
+    camera: &Camera,
+    plane: &Plane,
+    spots: &[[f64; 2]],
+    widths_m: &[f64],
+) -> Option<String> {
+    let ground = |spot: [f64; 2]| ground_at(camera, plane, DVec2::from_array(spot));
+    let close = |(spots, widths): (&[[f64; 2]], &[f64])| match (ground(spots[0]), ground(spots[1]))
+    {
+        (Some(a), Some(b)) => a.distance(b) < 0.5 * (widths[0] + widths[1]),
+        _ => false,
+    };
+    if !spots.windows(2).zip(widths_m.windows(2)).any(close) {
+        return None;
+    }
+    let width = f64::from(camera.resolution[0]);
+    let row = spots[0][1];
+    let seen = ground([0.0, row]).zip(ground([width, row]));
+    let seen = seen.map_or_else(String::new, |(a, b)| format!(" of {:.1} m", a.distance(b)));
+    Some(format!(
+        "the {} objects take {:.1} m side by side{seen} that the picture shows at row {row:.0}, so they may stand in each \
+         other: make them smaller (--height-m), move them apart (dipir place), or let each look for free ground (--place auto)",
+        spots.len(),
+        widths_m.iter().sum::<f64>(),
+    ))
+}
+
 /// How wide and how high what stands at `spot` appears, pixels; `None` if it reaches behind the camera.
 pub fn appears(
     camera: &Camera,
@@ -142,6 +171,24 @@ mod tests {
         });
         // 0.5 + 0.3 + 0.2 m, to a tenth of a pixel.
         assert!((a.distance(b) - 1.0).abs() < 1e-3, "{}", a.distance(b));
+    }
+
+    #[test]
+    fn objects_that_the_picture_has_no_room_for_are_said_to_stand_in_each_other() {
+        // Level, a row 166.7 pixels below the horizon sees ground 1.6 m below the eye: 166.7 pixels are 1.6 m there.
+        let view = view(0.0, 0.0, 40.0);
+        let (camera, plane) = (view.camera([1500, 1000]), view.plane());
+        let said = |widths: &[f64]| {
+            let found = spots(&camera, &plane, widths).unwrap();
+            crowded(&camera, &plane, &found, widths)
+        };
+        for roomy in [&[3.0][..], &[20.0], &[1.0, 0.4], &[2.0, 2.0, 2.0]] {
+            assert_eq!(said(roomy), None, "{roomy:?}");
+        }
+        let text = said(&[4.0, 4.0, 4.0, 4.0]).unwrap();
+        let seen = 1500.0 * 1.6 / 166.7;
+        let part = format!("the 4 objects take 16.0 m side by side of {seen:.1} m");
+        assert!(text.contains(&part), "{text}");
     }
 
     #[test]

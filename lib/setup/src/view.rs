@@ -73,6 +73,11 @@ pub const EYE_HEIGHT_M: f64 = 1.6;
 pub const DEFAULT_FOV_DEG: f64 = 55.0;
 /// Half width of the 90% interval, relative, up to which the field of view that the picture shows is used.
 const MOST_FOV_HALF: f64 = 0.35;
+/// Longer over shorter side above which a picture is not a camera's own frame: the longest, of 65 x 24 mm, has 2.71.
+const MOST_ASPECT: f64 = 2.75;
+/// Standard deviation of a focal length that Exif data say of a longer picture, relative. A strip of 4:1, cut out of a
+/// frame of 4:3, has a diagonal that is 18% shorter than the frame's, by which the focal length for 35 mm counts.
+const STRIP_SIGMA: f64 = 0.2;
 
 impl Default for View {
     /// Level, at the height of the eyes, 40 degrees.
@@ -249,6 +254,13 @@ impl Lens {
             }
             FocalSource::Table => (0.05, "the focal length and a table of sensors"),
         };
+        let (sigma, sure) = match aspect(size) > MOST_ASPECT {
+            true => (
+                STRIP_SIGMA,
+                "which is wrong of a panorama or a strip; or --fov".into(),
+            ),
+            false => (sigma, format!("sure to about {:.0}%", 100.0 * sigma)),
+        };
         let millimetres = match facts.focal_mm {
             Some(mm) => format!(" (the lens has {mm} mm)"),
             None => String::new(),
@@ -256,10 +268,7 @@ impl Lens {
         Some(Self {
             focal_px,
             sigma,
-            why: format!(
-                "from {from} in the photograph's Exif data{millimetres}, sure to about {:.0}%",
-                100.0 * sigma
-            ),
+            why: format!("from {from} in the photograph's Exif data{millimetres}, {sure}"),
         })
     }
 
@@ -301,6 +310,25 @@ impl Lens {
             sigma: self.sigma,
         }
     }
+}
+
+/// Longer over shorter side.
+fn aspect([width, height]: [f64; 2]) -> f64 {
+    width.max(height) / width.min(height)
+}
+
+/// A warning if a picture is longer than a camera's own frame, and its field of view is not asked for.
+pub(crate) fn strip(facts: &Facts, asked: &CameraOptions) -> Option<String> {
+    let size = facts.size.map(f64::from);
+    let aspect = aspect(size);
+    (aspect > MOST_ASPECT && asked.fov_deg.is_none()).then(|| {
+        let sides = if size[0] > size[1] { "wide as high" } else { "high as wide" };
+        format!(
+            "the photograph is {aspect:.1} times as {sides}, as panoramas are: their Exif data say the field of view of one \
+             frame, and their lines are bent, which those of the objects will not be. Take the part around the objects \
+             alone, and its angle: --fov 60 for a third of a panorama of 180 degrees"
+        )
+    })
 }
 
 /// The focal length that sees this angle along the longer side.
@@ -362,6 +390,41 @@ mod tests {
             assert!((fov - DEFAULT_FOV_DEG).abs() < 0.02, "{fov}");
             assert!(view.fov_why.starts_with("a guess") && view.aim_why.starts_with("a guess"));
             assert_eq!(view.position, DVec3::new(0.0, 1.6, 0.0));
+        }
+    }
+
+    #[test]
+    fn a_picture_longer_than_a_frame_is_warned_of_and_its_focal_length_is_not_called_sure() {
+        let facts = |size: [u32; 2]| Facts {
+            focal_px: Some(800.0),
+            focal_source: Some(FocalSource::Equivalent35mm),
+            ..Facts::of_size(size)
+        };
+        let asked = CameraOptions::default();
+        let why = |[w, h]: [u32; 2]| {
+            let picture = grey(w as usize, h as usize);
+            View::of_photo(&picture, &facts([w, h]), &asked)
+                .unwrap()
+                .0
+                .fov_why
+        };
+        // Frames of 4:3, 21:9 and 65:24 are cameras' own.
+        for size in [[400, 300], [933, 400], [650, 240], [240, 650]] {
+            assert_eq!(strip(&facts(size), &asked), None, "{size:?}");
+            assert!(why(size).contains("sure to about 2%"));
+        }
+        for (size, sides) in [
+            ([900, 300], "3.0 times as wide as high"),
+            ([300, 1200], "4.0 times as high as wide"),
+        ] {
+            let said = strip(&facts(size), &asked).unwrap();
+            assert!(said.contains(sides) && said.contains("--fov"), "{said}");
+            assert!(why(size).contains("wrong of a panorama") && !why(size).contains("sure"));
+            let told = CameraOptions {
+                fov_deg: Some(60.0),
+                ..asked
+            };
+            assert_eq!(strip(&facts(size), &told), None);
         }
     }
 
