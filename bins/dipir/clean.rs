@@ -16,8 +16,8 @@ use dipir_stages::names::CONCEPTS;
 use dipir_stages::{report, shot};
 use serde_json::json;
 
+use crate::hashed::hashes_file;
 use crate::project::{ProjectArgs, Stage};
-use crate::run::hashes_file;
 
 #[derive(Args)]
 pub struct CleanArgs {

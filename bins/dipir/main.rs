@@ -1,5 +1,6 @@
 //! `dipir`: all stages with one command, each only if it has to run.
 mod clean;
+mod hashed;
 mod init;
 mod keys;
 mod made;

@@ -102,17 +102,22 @@ impl ProjectArgs {
     /// The options that repeat this on the command line of a stage's executable, for a shell.
     pub fn options(&self) -> Vec<String> {
         let mut words = Vec::new();
+        // One word where the value would be taken for another option.
+        let mut option = |name: &str, value: String| match value.starts_with('-') {
+            true => words.push(format!("{name}={value}")),
+            false => words.extend([name.to_string(), value]),
+        };
         if self.file() != Path::new("pipeline.toml") {
-            words.extend(["--pipeline".to_string(), self.file().display().to_string()]);
+            option("--pipeline", self.file().display().to_string());
         }
         for set in &self.set {
-            words.extend(["--set".to_string(), set.clone()]);
+            option("--set", set.clone());
         }
         if let Some(out) = &self.out {
-            words.extend(["--out".to_string(), out.display().to_string()]);
+            option("--out", out.display().to_string());
         }
         if let Some(seed) = self.seed {
-            words.extend(["--seed".to_string(), seed.to_string()]);
+            option("--seed", seed.to_string());
         }
         words.iter().map(|w| quoted(w)).collect()
     }

@@ -1,4 +1,5 @@
 //! `dipir run`: the stages' executables in order, those left out that have nothing to do.
+use std::ffi::{OsStr, OsString};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -24,6 +25,7 @@ use dipir_stages::graph;
 use dipir_stages::truth::Truth;
 use serde_json::{Map, Value, json};
 
+use crate::hashed::{Reads, hashes_file, remove_left};
 use crate::made::MadeFolders;
 use crate::plan;
 use crate::project::{ProjectArgs, Stage};
@@ -104,7 +106,9 @@ pub fn run(args: &RunArgs) -> anyhow::Result<()> {
     }
     check_several(&projects)?;
     let named = |project: ProjectArgs| (project.file().to_owned(), project);
-    run_each(args, projects.into_iter().map(named).collect(), |_| ())
+    run_each(args, projects.into_iter().map(named).collect(), |_| {
+        Map::new()
+    })
 }
 
 /// Refuses files that are not there, and two with one folder of artifacts: the later would replace what the earlier wrote.
@@ -142,11 +146,11 @@ fn in_full(path: &Path) -> PathBuf {
 }
 
 /// Runs projects, each with what it is called, one after the other. One that fails does not keep the others from running.
-/// `at_end` learns which failed.
+/// `at_end` learns which failed, and says what else the JSON tells.
 pub fn run_each(
     args: &RunArgs,
     projects: Vec<(PathBuf, ProjectArgs)>,
-    at_end: impl FnOnce(&[String]),
+    at_end: impl FnOnce(&[String]) -> Map<String, Value>,
 ) -> anyhow::Result<()> {
     let output = args.project.output;
     let (mut results, mut failed) = (Vec::new(), Vec::new());
@@ -190,9 +194,10 @@ pub fn run_each(
         }
     }
     let (codes, failed): (Vec<_>, Vec<_>) = failed.into_iter().unzip();
-    at_end(&failed);
+    let mut json = at_end(&failed);
     if output.json {
-        output.result(String::new, || json!({"runs": results}));
+        json.insert("runs".into(), results.into());
+        output.result(String::new, || Value::Object(json));
     }
     let Some(code) = codes.first() else {
         return Ok(());
@@ -240,6 +245,7 @@ impl RunArgs {
 
 /// Runs one project; what was done, for people and for programs.
 pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String, Value)> {
+    let reads = Reads::until_now();
     let (session, graph) = project.open()?;
     let nodes = selected(args, &graph)?;
     check_taken(&session, &nodes)?;
@@ -258,13 +264,14 @@ pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String,
             false => WhenLocked::Refuse,
         };
         let _lock = lock_when(&session, when_locked)?;
+        remove_left(&session.out);
         runner::run(&nodes, args.jobs, &mut work).map_err(stopped)?;
     }
     let report = match is_frame || dipir_stages::report::is_current(&session) {
         true => None,
         false => page(project, &session, &graph, &[]),
     };
-    Ok(work.conclude(&nodes, report))
+    Ok(work.conclude(&nodes, report, &reads))
 }
 
 /// The page that shows the run. What the stages wrote stands without it, so that it cannot be
@@ -342,11 +349,6 @@ fn lock_when(session: &Session, when_locked: WhenLocked) -> Result<FolderLock, S
     FolderLock::take_inside(&session.out, "run", when_locked)
 }
 
-/// The file in which hashes are handed to a stage and back; removed when it is done.
-pub fn hashes_file(out: &Path, stage: &str) -> PathBuf {
-    out.join(format!(".{stage}.hashes"))
-}
-
 /// What the runner asks.
 struct Pipeline<'a> {
     args: &'a RunArgs,
@@ -390,7 +392,7 @@ impl<'a> Pipeline<'a> {
     }
 
     /// How it went.
-    fn conclude(self, nodes: &[&Node], page: Option<Page>) -> (String, Value) {
+    fn conclude(self, nodes: &[&Node], page: Option<Page>, reads: &Reads) -> (String, Value) {
         let names: Vec<&str> = nodes.iter().map(|n| n.stage).collect();
         let done = match self.ran.is_empty() {
             true => format!("nothing to do: {} up to date", listed(&names)),
@@ -401,12 +403,9 @@ impl<'a> Pipeline<'a> {
             Some((path, truth)) => format!("{done}\n{}", report::in_words(path, truth.as_ref())),
         };
         let (path, truth) = page.unzip();
-        let reads = Hashes::of_this_process();
-        let read = |(path, n): (&PathBuf, &u32)| (path.to_string_lossy().into_owned(), json!(n));
-        let hashed: Map<String, Value> = reads.reads().iter().map(read).collect();
         let json = json!({
             "stages": names, "ran": self.ran, "results": self.results, "report": path.map(json_path),
-            "truth": truth.flatten(), "hashed": hashed,
+            "truth": truth.flatten(), "hashed": reads.since(),
         });
         (printable(&done), json)
     }
@@ -428,6 +427,13 @@ impl Drop for Pipeline<'_> {
             let _ = Hashes::remove(&hashes_file(&self.session.out, stage));
         }
     }
+}
+
+/// `--name=value` as one word: a value that begins with a dash would be another option.
+fn option(name: &str, value: impl AsRef<OsStr>) -> OsString {
+    let mut word = OsString::from(format!("--{name}="));
+    word.push(value);
+    word
 }
 
 fn listed(names: &[&str]) -> String {
@@ -461,18 +467,15 @@ impl Work for Pipeline<'_> {
         let name = format!("{}{}", node.executable, std::env::consts::EXE_SUFFIX);
         let mut command = Command::new(self.programs.join(name));
         let project = self.project;
-        command.arg("--pipeline").arg(project.file());
-        for set in &project.set {
-            command.arg("--set").arg(set);
-        }
-        if let Some(out) = &project.out {
-            command.arg("--out").arg(out);
-        }
-        if let Some(light) = &project.light {
-            command.arg("--light").arg(light);
-        }
-        if let Some(placed) = &project.placed {
-            command.arg("--placed").arg(placed);
+        command.arg(option("pipeline", project.file()));
+        command.args(project.set.iter().map(|set| option("set", set)));
+        let folders = [
+            ("out", &project.out),
+            ("light", &project.light),
+            ("placed", &project.placed),
+        ];
+        for (name, folder) in folders {
+            command.args(folder.iter().map(|folder| option(name, folder)));
         }
         if let Some(seed) = project.seed {
             command.args(["--seed", &seed.to_string()]);
@@ -485,7 +488,7 @@ impl Work for Pipeline<'_> {
         let hashes = hashes_file(&self.session.out, node.stage);
         // Without the file the stage hashes for itself.
         if Hashes::to_hand_over().write(&hashes).is_ok() {
-            command.arg("--hashes").arg(hashes);
+            command.arg(option("hashes", hashes));
             self.started.push(node.stage);
         }
         for (on, flag) in [

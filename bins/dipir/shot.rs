@@ -5,10 +5,11 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use dipir_cli::args::CommonArgs;
 use dipir_cli::exit::{Usage, printable};
+use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_stages::names::{LIGHT, SCENE};
 use dipir_stages::{report, shot};
-use serde_json::Value;
+use serde_json::{Map, Value, json};
 
 use crate::plan;
 use crate::project::{ProjectArgs, Stage};
@@ -66,21 +67,23 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
         common.output.result(|| words, || json);
         return Ok(());
     }
-    let done = run_one(&of_photo, &base)?;
+    let (done, photo) = run_one(&of_photo, &base)?;
     if !common.output.json {
-        common.output.result(|| done.0, || Value::Null);
+        common.output.result(|| done, || Value::Null);
     }
     let of_frames = RunArgs::needed(&common, None).forced(args.force);
     run_each(&of_frames, frames, |failed| {
         // The page of the photograph shows its frames.
-        if failed.is_empty() && report::is_current(&session) {
-            return;
-        }
-        let page = page(&base, &session, &graph, failed);
-        if let Some((path, _)) = page.filter(|_| !common.output.json) {
+        let page = match failed.is_empty() && report::is_current(&session) {
+            true => None,
+            false => page(&base, &session, &graph, failed).map(|(path, _)| path),
+        };
+        if let Some(path) = page.as_ref().filter(|_| !common.output.json) {
             let words = || format!("wrote {}", printable(&path.display().to_string()));
             common.output.result(words, || Value::Null);
         }
+        let report = json!(page.map(json_path));
+        Map::from_iter([("photo".into(), photo), ("report".into(), report)])
     })
 }
 

@@ -288,3 +288,18 @@ fn a_folder_that_cannot_be_written_is_one_message() {
         run.stderr
     );
 }
+
+/// A stage that ends just after `dipir` was killed has finished: it does not run again.
+#[test]
+fn hashes_that_a_killed_run_left_go_though_their_stage_does_not_run() {
+    let project = Project::new();
+    project.run(DIPIR, &["run", "-q"]).expect_success();
+    let hashes = "{\"dipir_hashes\":1,\"known\":[],\"read\":[]}";
+    project.write("out/.scene.hashes", hashes);
+    let text = "mine, and no hashes";
+    project.write("out/.light.hashes", text);
+    let other = ["run", "-q", "--set", "composite.exposure_ev=0.5"];
+    project.run(DIPIR, &other).expect_success();
+    assert!(!project.path("out/.scene.hashes").exists());
+    assert_eq!(project.read("out/.light.hashes"), text.as_bytes());
+}

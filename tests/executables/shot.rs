@@ -407,3 +407,22 @@ image = \"background.png\"";
         run.stderr
     );
 }
+
+#[test]
+fn the_json_of_a_shot_tells_each_file_once() {
+    let project = project();
+    for name in ["a_0001.png", "b_0002.png"] {
+        project.write(name, project.read("background.png"));
+    }
+    let run = project.run(DIPIR, &["shot", "--json", "a_0001.png", "b_0002.png"]);
+    run.expect_success();
+    let value: Value = serde_json::from_str(&run.stdout).unwrap();
+    // What was done of the photograph, and where the page is.
+    assert_eq!(value["photo"]["ran"], json!(["scene", "light"]));
+    assert_eq!(value["report"], json!("out/report.html"));
+    // A frame tells what was read for it, not for those before it.
+    let of_first = "out/frames/a_0001/scene/scene.json";
+    let hashed = |k: usize| value["runs"][k]["done"]["hashed"].as_object().unwrap();
+    assert!(hashed(0).contains_key(of_first), "{:?}", hashed(0));
+    assert!(!hashed(1).contains_key(of_first), "{:?}", hashed(1));
+}

@@ -400,3 +400,21 @@ fn a_limit_on_the_size_of_files_is_named_and_nothing_is_lost() {
     assert!(project.artifacts("out/scene") == before);
     assert_eq!(project.names("out"), ["scene"]);
 }
+
+#[test]
+fn names_may_begin_with_a_dash() {
+    let project = Project::new();
+    project.write("-p.toml", project.read("pipeline.toml"));
+    let run = project.run(DIPIR, &["run", "-q", "--out=-out", "--", "-p.toml"]);
+    run.expect_success();
+    assert!(project.path("-out/composite/composite.png").exists());
+    // The folders of a shot's frames are in it.
+    let set = "--set=pipeline.out=-shot";
+    let shot = project.run(DIPIR, &["shot", "-q", set, "--", "background.png"]);
+    shot.expect_success();
+    let frame = "-shot/frames/background/composite/composite.png";
+    assert!(project.path(frame).exists());
+    // The page names commands that can be typed.
+    let page = String::from_utf8(project.read("-out/report.html")).unwrap();
+    assert!(page.contains("--pipeline=-p.toml --out=-out"), "{page}");
+}
