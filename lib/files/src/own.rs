@@ -113,17 +113,18 @@ fn left_at(partial: &Path, mark: &[u8]) -> io::Result<Option<File>> {
     }
 }
 
-/// Whether the open file is the one at `path`.
+/// Whether the open file is the one at `path`. Only unix tells; elsewhere it is taken to be.
 #[cfg(unix)]
-fn is_at(file: &File, path: &Path) -> bool {
+pub fn is_at(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;
     let same = |a: fs::Metadata, b: fs::Metadata| (a.dev(), a.ino()) == (b.dev(), b.ino());
     let (open, named) = (file.metadata(), fs::symlink_metadata(path));
     open.ok().zip(named.ok()).is_some_and(|(a, b)| same(a, b))
 }
 
+/// Whether the open file is the one at `path`. Only unix tells; elsewhere it is taken to be.
 #[cfg(not(unix))]
-fn is_at(_: &File, _: &Path) -> bool {
+pub fn is_at(_: &File, _: &Path) -> bool {
     true
 }
 

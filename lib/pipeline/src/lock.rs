@@ -9,6 +9,8 @@ use std::io::ErrorKind::NotFound;
 use std::io::{self, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
+use dipir_files::is_at;
+
 use crate::error::StageError;
 
 /// How lock files begin; the number of the process follows.
@@ -119,20 +121,6 @@ fn sign(file: &mut File, path: &Path) -> Result<(), StageError> {
         .and_then(|()| file.rewind())
         .and_then(|()| writeln!(file, "{HEAD}{}", std::process::id()));
     Ok(())
-}
-
-/// Whether the open file is the one at `path`.
-#[cfg(unix)]
-fn is_at(file: &File, path: &Path) -> bool {
-    use std::os::unix::fs::MetadataExt;
-    let same = |a: fs::Metadata, b: fs::Metadata| (a.dev(), a.ino()) == (b.dev(), b.ino());
-    let (open, named) = (file.metadata(), fs::symlink_metadata(path));
-    open.ok().zip(named.ok()).is_some_and(|(a, b)| same(a, b))
-}
-
-#[cfg(not(unix))]
-fn is_at(_: &File, _: &Path) -> bool {
-    true
 }
 
 fn holder(file: &mut File) -> String {
