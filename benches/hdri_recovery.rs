@@ -15,12 +15,12 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use dipir_evaluation::scores::compare_lights;
+use dipir_imaging::exposure::automatic_exposure_ev;
 use dipir_imaging::file::write_png;
 use dipir_imaging::layers::Layers;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
-use dipir_light::exposure::automatic_exposure_ev;
 use dipir_light::fit::fit;
 use dipir_light::rasterize::rasterize;
 use dipir_render::shapes::torus_knot;

@@ -173,7 +173,7 @@ fn glazing(p: Vec3) -> f32 {
 
 fn painted(p: Vec3) -> f32 {
     let shell = shell(p);
-    // Edges are as round as a cell of the mesh is wide: narrower ones would be beads.
+    // Edges are rounder than a cell of the mesh is wide, .015 m: sharper ones become rows of beads.
     let mut d = smooth_difference(shell, inlay(shell, glazing(p), 0.025), 0.02);
     let lamps = headlamps(p).min(tail_lamps(p)).min(plate_recess(p));
     d = smooth_difference(d, inlay(shell, lamps, 0.025), 0.02);

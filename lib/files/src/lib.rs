@@ -61,16 +61,19 @@ pub fn read_to_string(path: impl AsRef<Path>) -> io::Result<String> {
         .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "it is not UTF-8 text"))
 }
 
+/// What is said of text in UTF-16.
+pub const UTF_16: &str = "it is UTF-16 text; save it as UTF-8 (Notepad: Save as, Encoding UTF-8; PowerShell: Out-File \
+                          -Encoding utf8)";
+
 /// Refuses text that begins with the byte order mark of UTF-16, as editors on Windows save it.
 ///
 /// # Errors
 /// [`io::ErrorKind::InvalidData`], with the way to save it.
 pub fn refuse_utf16(bytes: &[u8]) -> io::Result<()> {
     match bytes {
-        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => Err(io::Error::new(
-            io::ErrorKind::InvalidData,
-            "it is UTF-16 text; save it as UTF-8, in Notepad by \"Save as\" with the encoding UTF-8",
-        )),
+        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => {
+            Err(io::Error::new(io::ErrorKind::InvalidData, UTF_16))
+        }
         _ => Ok(()),
     }
 }
@@ -94,10 +97,7 @@ mod tests {
         for bytes in [&b"\xff\xfe[\0s\0"[..], b"\xfe\xff\0[\0s"] {
             fs::write(&path, bytes).unwrap();
             let error = read_to_string(&path).unwrap_err();
-            assert_eq!(
-                error.to_string(),
-                "it is UTF-16 text; save it as UTF-8, in Notepad by \"Save as\" with the encoding UTF-8"
-            );
+            assert_eq!(error.to_string(), UTF_16);
         }
         fs::write(&path, b"caf\xe9").unwrap();
         let error = read_to_string(&path).unwrap_err();

@@ -4,6 +4,7 @@ use crate::{
     decode::{Decoded, SizeLimit},
     encoding::Encoding,
     error::{ImagingError, MAX_PIXELS, listed},
+    exposure::automatic_exposure_ev,
     exr_file,
     facts::Facts,
     format::Format,
@@ -192,21 +193,16 @@ fn linear_photo(
 
 /// Luminance that shows nearly black: sRGB encodes it as 25 of 255.
 const DARK: f32 = 0.01;
-/// Luminance of a photograph that is well exposed, in the mean of logarithms.
-const MID_GREY: f64 = 0.18;
 
 /// A warning if a display shows most of this light as white, or nearly all as black: the exposure of linear files is
 /// arbitrary.
 fn unseen(image: &LinearImage, path: &Path) -> Option<String> {
     let pixels = image.0.pixels();
-    let (mut white, mut dark, mut lit, mut logs) = (0usize, 0usize, 0usize, 0.0f64);
+    let (mut white, mut dark, mut is_lit) = (0usize, 0usize, false);
     for luminance in pixels.iter().map(|p| p.dot(crate::metrics::LUMA)) {
         white += usize::from(luminance > 1.0);
         dark += usize::from(luminance < DARK);
-        if luminance > 0.0 {
-            lit += 1;
-            logs += f64::from(luminance).ln();
-        }
+        is_lit |= luminance > 0.0;
     }
     let count = pixels.len();
     let percent = |part: usize| 100 * part / count.max(1);
@@ -215,7 +211,7 @@ fn unseen(image: &LinearImage, path: &Path) -> Option<String> {
             "{}% of its pixels are above 1.0 and show white",
             percent(white)
         )
-    } else if lit > 0 && 100 * (count - dark) < count {
+    } else if is_lit && 100 * (count - dark) < count {
         format!(
             "{}% of its pixels are below {DARK} and show nearly black",
             percent(dark)
@@ -223,7 +219,7 @@ fn unseen(image: &LinearImage, path: &Path) -> Option<String> {
     } else {
         return None;
     };
-    let stops = (MID_GREY / (logs / lit as f64).exp()).log2();
+    let stops = automatic_exposure_ev(image);
     Some(format!(
         "`{}`: {what} in previews and in composite.png, which show its light as it is; composite.exr keeps all of it. \
          To see it, multiply the photograph's values by 2^{stops:.0}",

@@ -3,6 +3,7 @@ pub mod composite;
 mod decode;
 pub mod encoding;
 pub mod error;
+pub mod exposure;
 mod exr_file;
 pub mod facts;
 pub mod file;

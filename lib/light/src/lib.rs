@@ -4,7 +4,6 @@ pub mod cosine;
 pub mod environment;
 mod environment_sampler;
 pub mod error;
-pub mod exposure;
 pub mod fit;
 pub mod fusion;
 pub mod gaussian;

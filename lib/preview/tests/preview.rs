@@ -100,8 +100,8 @@ fn a_drawn_shadow_tells_the_same_sun_at_any_size() {
             let lobes = found.lobes.lobes().to_vec();
             lobes[0].direction
         });
-        // Directions are put on a grid of half degrees at the finest; a wrong scale moves the sun by tens of them.
-        assert!(suns[0].dot(suns[1]) > 0.9998, "{suns:?}");
+        // Pixels and directions are f32: some roundings of 6e-8.
+        assert!(suns[0].distance(suns[1]) < 1e-6, "{suns:?}");
         drop(folder);
     }
 }

@@ -5,10 +5,10 @@ use std::io::{ErrorKind, Write};
 use std::path::{Component, Path, PathBuf};
 
 use dipir_cameras::WorldUp;
+use dipir_imaging::exposure::automatic_exposure_ev;
 use dipir_imaging::file::{Photo, read_photo};
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
-use dipir_light::exposure::automatic_exposure_ev;
 use dipir_points::Ground;
 use dipir_points::file::is_depth;
 use dipir_points::ground::Shape;

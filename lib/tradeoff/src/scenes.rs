@@ -4,10 +4,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use dipir_imaging::exposure::automatic_exposure_ev;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
-use dipir_light::exposure::automatic_exposure_ev;
 use dipir_render::shapes::{append, icosphere, torus_knot};
 use dipir_scene::export::to_obj;
 use dipir_scene::mesh::TriangleMesh;

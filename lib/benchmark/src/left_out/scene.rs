@@ -3,10 +3,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context;
+use dipir_imaging::exposure::{MID_GREY, exposure_ev_to};
 use dipir_imaging::raster::{DisplayImage, LinearImage};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
-use dipir_light::exposure::{MID_GREY, exposure_ev_to};
 use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_places::place::{Place, SMOOTH};
 use dipir_pretraining::shapes::Shape;

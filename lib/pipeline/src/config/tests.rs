@@ -252,7 +252,7 @@ fn a_file_that_is_not_utf8_text_is_answered_with_how_to_save_it() {
         for to_bytes in [u16::to_le_bytes, u16::to_be_bytes] {
             assert_eq!(
                 read(&of_units(units, to_bytes)).unwrap_err(),
-                "p.toml: not valid TOML: it is saved as UTF-16; save it as UTF-8 (Notepad: Save as, Encoding UTF-8; \
+                "p.toml: not valid TOML: it is UTF-16 text; save it as UTF-8 (Notepad: Save as, Encoding UTF-8; \
                  PowerShell: Out-File -Encoding utf8)"
             );
         }

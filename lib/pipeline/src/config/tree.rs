@@ -98,9 +98,10 @@ pub(super) fn text<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a str, ConfigEr
     };
     // The byte order mark, or half of the first letter.
     if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] | [0, _, ..] | [_, 0, ..] = bytes {
-        let message = "it is saved as UTF-16; save it as UTF-8 (Notepad: Save as, Encoding UTF-8; \
-                       PowerShell: Out-File -Encoding utf8)";
-        return Err(wrong(Place::File { file: path.into() }, message));
+        return Err(wrong(
+            Place::File { file: path.into() },
+            dipir_files::UTF_16,
+        ));
     }
     let text = str::from_utf8(bytes).map_err(|e| {
         let message = "a character that is not UTF-8; save the file as UTF-8";

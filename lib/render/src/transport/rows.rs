@@ -1,8 +1,8 @@
 //! Sparse rows of weights: which texels of the environment a pixel sees, and how much of each.
 //!
 //! Compressed rows (CSR): `offsets[r]..offsets[r + 1]` are the entries of row `r`, by ascending
-//! texel. Every [`BAND`] pixels have their rows by ascending length, so that loops over rows end as the
-//! processor foresees; `order` says which pixel of the band a row belongs to. In half precision every row has its own power of two, so that its largest weight lies
+//! texel. Every [`BAND`] pixels have their rows by ascending length, so that the processor predicts where
+//! loops over rows end; `order` says which pixel of the band a row belongs to. In half precision every row has its own power of two, so that its largest weight lies
 //! in `[2^14, 2^15)`: weights down to `2^-28` of the row's largest keep all eleven bits, and a
 //! weight's relative rounding error is at most `2^-11`.
 use std::fmt::Debug;
@@ -509,9 +509,9 @@ mod tests {
         let ones = rows.product_vjp(32, &|p| Vec4::splat(1.0 / (p as f32 + 1.0)));
         for (texel, sum) in ones.iter().enumerate() {
             let expected = (0..pixels).filter(|&p| length(p) > texel).count();
-            // Each term is 1 to an ulp, and so is each of 2,125 sums.
+            // 2,125 terms near 1; each, and each sum, is rounded by at most 6e-8 of itself.
             assert!(
-                (sum.x - expected as f32).abs() <= 1e-3 * expected as f32,
+                (sum.x - expected as f32).abs() <= 3e-4 * expected as f32,
                 "{texel}"
             );
         }

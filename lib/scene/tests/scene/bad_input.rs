@@ -562,11 +562,8 @@ fn utf_16_text_is_told_with_how_to_save_it() {
         std::fs::write(&path, bytes).unwrap();
         path
     };
-    let expected = |what: &str, path: &str| {
-        format!(
-            "cannot read {what} \"{path}\": it is UTF-16 text; save it as UTF-8, in Notepad by \"Save as\" with the encoding UTF-8"
-        )
-    };
+    let expected =
+        |what: &str, path: &str| format!("cannot read {what} \"{path}\": {}", dipir_files::UTF_16);
     let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
     let stl = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\nendloop\nendfacet\nendsolid\n";
     for (name, text) in [

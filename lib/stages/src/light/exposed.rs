@@ -1,10 +1,10 @@
 //! Photographs of linear light, as OpenEXR and Radiance store it. Their exposure is arbitrary, no value is white, and
 //! nothing is clipped: they are looked at as a camera would expose them.
 use dipir_estimator::{BORDER_DEG, Estimator, LightEstimate, Visible};
+use dipir_imaging::exposure::automatic_exposure_ev;
 use dipir_imaging::file::Photo;
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::tone::ToneCurves;
-use dipir_light::exposure::automatic_exposure_ev;
 use dipir_scene::camera::Camera;
 
 /// Whether a photograph, as it was read, is linear light without a white.

@@ -1,7 +1,6 @@
 //! How a camera would expose linear light.
-use dipir_imaging::raster::LinearImage;
-
-use crate::luminance::luminance;
+use crate::metrics::LUMA;
+use crate::raster::LinearImage;
 
 /// Linear mid-grey.
 pub const MID_GREY: f64 = 0.18;
@@ -17,7 +16,7 @@ pub fn exposure_ev_to(image: &LinearImage, level: f64) -> f64 {
         .0
         .pixels()
         .iter()
-        .map(|&p| f64::from(luminance(p)))
+        .map(|p| f64::from(p.dot(LUMA)))
         .filter(|l| *l > 0.0)
         .map(f64::ln)
         .collect();
@@ -30,10 +29,10 @@ pub fn exposure_ev_to(image: &LinearImage, level: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use dipir_imaging::raster::Raster;
     use glam::Vec3;
 
     use super::*;
+    use crate::raster::Raster;
 
     #[test]
     fn automatic_exposure_brings_grey_to_mid_grey() {
