@@ -15,7 +15,7 @@ pub enum RayKind {
     Shadow,
     /// From the camera to a proxy mesh.
     Proxy,
-    /// From a proxy mesh towards the light, to find whether the mesh itself is in the way.
+    /// From a proxy mesh towards the light or the object, to find whether the mesh itself is in the way.
     ProxyOcclusion,
     /// From the proxy to the object, for light that the object sends there.
     LightOnProxy,

@@ -29,8 +29,8 @@ use crate::guide::PathGuide;
 use crate::light::PathLight;
 use crate::photo::ProxyPhoto;
 use crate::render::Simulation;
-use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
-use crate::world::{World, is_sheet};
+use crate::surface::{SurfacePoint, Surfaces};
+use crate::world::{Filling, World, is_sheet};
 
 /// Where paths begin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,6 +41,8 @@ pub enum PathStart {
     Proxy {
         /// Whether light counts that the object emits and sends straight to the proxy.
         emission: bool,
+        /// Whether a proxy mesh hides the object from itself.
+        hidden: bool,
     },
 }
 
@@ -309,9 +311,8 @@ impl<L: PathLight> PathContext<'_, L> {
         let mut sampled_pdf = f32::INFINITY; //      density of the segment's direction, infinite
         //                                           if the light could not have drawn it
         let mut leaves = false; //                   the segment is known to miss the object
-        let mut filling = Vec3::ZERO; //             attenuation per metre of the segment
+        let mut filling = Filling::NONE; //          what the segment runs through
         let mut least_roughness = self.min_roughness; // that the next surfaces count as having
-        let mut thickness = 0.0; //                  metres of it if the segment meets no inner side
         // The path has met sheets alone: the shadow ray counts the light behind them.
         let mut straight = has(F, TRANSMISSION) && self.start != PathStart::Camera;
         let first_dimension = sampler.dimension();
@@ -337,9 +338,13 @@ impl<L: PathLight> PathContext<'_, L> {
             };
 
             // ---- Escape: the light, as found by BSDF sampling -------------------------------
-            if has(F, EXTENSIONS) && filling != Vec3::ZERO {
-                let inside = hit.map_or(thickness, |hit| hit.t);
-                throughput *= ExtensionPoint::left_after(filling, inside);
+            if has(F, EXTENSIONS) {
+                throughput *= world.left_on_way(&mut filling, &ray, hit.as_ref());
+            }
+            if let (0, PathStart::Proxy { hidden: true, .. }, Some(hit)) = (depth, self.start, &hit)
+                && world.proxy_hides(&ray, hit.t, counts)
+            {
+                return 0.0;
             }
             let Some(hit) = hit else {
                 if depth == 0 {
@@ -380,7 +385,14 @@ impl<L: PathLight> PathContext<'_, L> {
                     }
                     break;
                 }
-                if depth > 0 || self.start != (PathStart::Proxy { emission: false }) {
+                let unseen = matches!(
+                    self.start,
+                    PathStart::Proxy {
+                        emission: false,
+                        ..
+                    }
+                );
+                if depth > 0 || !unseen {
                     gather.emitted::<F>(&vertex, throughput);
                 }
             }
@@ -414,13 +426,8 @@ impl<L: PathLight> PathContext<'_, L> {
                 if let Some(cones) = &cones {
                     bsdf_pdf = cones.mixed(light.direction, bsdf_pdf);
                 }
-                if has(F, EXTENSIONS) && surface.enters(light.direction) {
-                    let ExtensionPoint {
-                        attenuation,
-                        thickness,
-                        ..
-                    } = surface.extension;
-                    value *= ExtensionPoint::left_after(attenuation, thickness);
+                if has(F, EXTENSIONS) {
+                    value *= filling.left_by_sheet(&surface, light.direction);
                 }
                 // Both densities may underflow to 0: then there is no such sample.
                 let returns = value != Vec3::ZERO || G::DERIVATIVES;
@@ -475,10 +482,8 @@ impl<L: PathLight> PathContext<'_, L> {
                 None => sample.pdf,
             };
             if has(F, EXTENSIONS) && sample.transmitted {
-                let inside = surface.enters(sample.wi);
-                let ExtensionPoint { attenuation, .. } = surface.extension;
-                filling = attenuation * f32::from(inside);
-                thickness = surface.extension.thickness;
+                let material = world.surfaces.material_index(hit.triangle);
+                throughput *= filling.pass(&surface, material);
             }
             leaves = world.escapes && is_outward(&surface, sample.wi);
             ray = world.leave(&surface, sample.wi);

@@ -18,7 +18,7 @@ use dipir_numerics::sum::par_reduce;
 use glam::{DVec3, Vec2, Vec3};
 
 use crate::bsdf::slopes::{BsdfSlopes, MaterialSlopes};
-use crate::bsdf::{Bsdf, BsdfSample};
+use crate::bsdf::{Bsdf, BsdfSample, passing_coat};
 use crate::counters::RayCounts;
 use crate::error::RenderError;
 use crate::features::with_features;
@@ -143,7 +143,8 @@ impl Gather for Tape<'_> {
             self.sums[material].base_color += (arriving * factors.base_color).as_dvec3();
             return self.arrive(surface.base_color);
         }
-        self.sums[material].emissive += (arriving * factors.emission).as_dvec3();
+        let passing = passing_coat(&surface.coat, -vertex.direction);
+        self.sums[material].emissive += (arriving * factors.emission * passing).as_dvec3();
         self.arrive(surface.emission);
     }
 

@@ -328,6 +328,49 @@ fn the_gradient_is_unbiased_against_renders_that_sample_the_changed_material() {
 }
 
 #[test]
+fn the_gradient_of_emission_is_that_of_what_passes_the_coat() {
+    let mut s = pair(0.4);
+    s.materials[0].clearcoat = Some(dipir_scene::material::Clearcoat {
+        factor: 1.0,
+        factor_texture: None,
+        roughness: 0.3,
+        roughness_texture: None,
+        normal_texture: None,
+    });
+    let renderer = Renderer::new(&s);
+    let gradient = picture_gradient();
+    let settings = GradientSettings {
+        seed: 3,
+        samples: 16,
+        background: None,
+    };
+    let dark = crate::testing::sky(0.0);
+    let found = renderer
+        .material_gradient(&dark, &everything(1), &settings, &gradient)
+        .expect("has the camera's size");
+    // The picture is linear in the emission, and nothing else shines.
+    let world = renderer.world(ALL).expect("no textures");
+    let light = dark.on_object();
+    let path = PathContext::from_camera(&world, &light, &everything(1), None);
+    let mut sum = DVec3::ZERO;
+    for (k, weight) in gradient.pixels().iter().enumerate() {
+        let (x, y) = (k as u32 % 10, k as u32 / 10);
+        let base = sequence(settings.seed, Stream::FOREGROUND, 0, (x, y));
+        for sample in 0..settings.samples {
+            let corner = Vec2::new(x as f32, y as f32);
+            let mut counts = RayCounts::default();
+            let mut sampler = base.with_sample(sample);
+            let seen = path.camera_sample::<ALL>(corner, &mut sampler, &mut counts);
+            sum += (*weight * seen.radiance).as_dvec3() / f64::from(settings.samples);
+        }
+    }
+    let of_emission = found[0].emissive * s.materials[0].emissive.as_dvec3();
+    // Sums of 1600 numbers of single precision.
+    let error = (of_emission - sum).abs().max_element();
+    assert!(error < 1e-4 && sum.length() > 1.0, "{of_emission} {sum}");
+}
+
+#[test]
 fn the_gradient_has_the_same_bytes_for_any_number_of_threads() {
     let base = pair(0.4);
     let renderer = Renderer::new(&base);

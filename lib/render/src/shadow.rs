@@ -404,6 +404,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
             max_depth: if sent.bounce { self.path.max_depth } else { 0 },
             start: PathStart::Proxy {
                 emission: sent.emission,
+                hidden: self.proxy_occlusion,
             },
             photo: None,
             min_roughness: MIN_CAUSTIC_ROUGHNESS,

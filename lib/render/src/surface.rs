@@ -20,6 +20,7 @@ use crate::bsdf::features::{
     ALPHA, CLEARCOAT, EMISSION, EXTENSIONS, NORMAL_MAPPING, PLAIN_GGX, SPECULAR, TEXTURES,
     TRANSMISSION, has,
 };
+use crate::bsdf::passing_coat;
 
 pub use extensions::{ExtensionPoint, FilmPoint};
 
@@ -73,7 +74,7 @@ pub struct SurfacePoint {
     pub coat: CoatPoint,
     /// Extensions beside coat and transmission.
     pub extension: ExtensionPoint,
-    /// Emitted radiance towards the side that is seen, linear.
+    /// Emitted radiance towards the viewer, linear: what passes the coat.
     pub emission: Vec3,
     /// Shows `base_color` as radiance, whatever the light.
     pub unlit: bool,
@@ -88,17 +89,11 @@ pub struct FactorSlopes {
     pub metallic: f32,
     /// Of the roughness.
     pub roughness: f32,
-    /// Of the emission with respect to the emissive factor, a channel at a time.
+    /// Of the emission below the coat with respect to the emissive factor, a channel at a time.
     pub emission: Vec3,
 }
 
 impl SurfacePoint {
-    /// Whether `direction`, seen from the outside, leads into the object.
-    #[inline]
-    pub fn enters(&self, direction: Vec3) -> bool {
-        self.front_face && direction.dot(self.geometric_normal) < 0.0
-    }
-
     /// A flat, white, rough, opaque dielectric at the origin that faces `normal`.
     pub fn facing(normal: Vec3) -> Self {
         Self {
@@ -346,6 +341,17 @@ impl<'a> Surfaces<'a> {
                 emission *= self.lookup(t, &point).truncate();
             }
         }
+        let coat = match &m.clearcoat {
+            Some(c) if has(F, CLEARCOAT) => CoatPoint {
+                normal: facing(mapped(&c.normal_texture)),
+                own_normal: c.normal_texture.is_some() || m.normal_texture.is_some(),
+                ..self.coat_at::<F>(c, &point)
+            },
+            _ => CoatPoint::NONE,
+        };
+        if emission != Vec3::ZERO {
+            emission *= passing_coat(&coat, wo);
+        }
         SurfacePoint {
             position: interpolate(vertices, u, v).as_vec3(),
             geometric_normal: front * side,
@@ -359,14 +365,7 @@ impl<'a> Surfaces<'a> {
                 Some(t) if has(F, TRANSMISSION) => self.transmission_at::<F>(t, &point),
                 _ => 0.0,
             },
-            coat: match &m.clearcoat {
-                Some(c) if has(F, CLEARCOAT) => CoatPoint {
-                    normal: facing(mapped(&c.normal_texture)),
-                    own_normal: c.normal_texture.is_some() || m.normal_texture.is_some(),
-                    ..self.coat_at::<F>(c, &point)
-                },
-                _ => CoatPoint::NONE,
-            },
+            coat,
             extension: match has(F, EXTENSIONS) && !m.extensions.is_empty() {
                 true => self.extensions_at::<F>(&m.extensions, &point, vertices, smooth),
                 false => ExtensionPoint::NONE,

@@ -1,4 +1,5 @@
 //! What rays meet: the object, its surfaces, and the proxy.
+use std::cell::RefCell;
 use std::sync::Arc;
 
 use dipir_numerics::hashing::mix64;
@@ -13,6 +14,7 @@ use glam::Vec3;
 use crate::bsdf::Bsdf;
 use crate::bsdf::features::{ALPHA, EXTENSIONS, SPECULAR, TRANSMISSION, has};
 use crate::convexity::is_convex;
+use crate::counters::{RayCounts, RayKind};
 use crate::error::RenderError;
 use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
 
@@ -87,6 +89,66 @@ impl Geometry {
         // The corner of the bounding box that lies farthest along the normal.
         let top = Vec3::select(plane.normal.cmpgt(Vec3::ZERO), bounds.max, bounds.min);
         (top - plane.point).dot(plane.normal) <= 0.0
+    }
+}
+
+/// What a path runs through since it entered the object by a front face.
+#[derive(Clone, Copy)]
+pub(crate) struct Filling {
+    /// Per metre; 0 outside the object, and where it is clear.
+    attenuation: Vec3,
+    /// Metres, which count if there is no inner side.
+    thickness: f32,
+    /// Index into [`Scene::materials`].
+    material: u32,
+}
+
+impl Filling {
+    /// Outside the object.
+    pub const NONE: Self = Self {
+        attenuation: Vec3::ZERO,
+        thickness: 0.0,
+        material: 0,
+    };
+
+    /// What an open sheet at `surface` leaves of light from `direction` on its other side.
+    #[inline]
+    pub fn left_by_sheet(&self, surface: &SurfacePoint, direction: Vec3) -> Vec3 {
+        let ExtensionPoint {
+            attenuation,
+            thickness,
+            ..
+        } = surface.extension;
+        let behind = direction.dot(surface.geometric_normal) < 0.0;
+        match behind && (surface.front_face || self.attenuation == Vec3::ZERO) {
+            true => ExtensionPoint::left_after(attenuation, thickness),
+            false => Vec3::ONE,
+        }
+    }
+
+    /// The path passes `surface`, of `material`, to its other side. Returns what that leaves of its light where it
+    /// comes to a back face from outside: the back of an open sheet.
+    #[inline]
+    pub fn pass(&mut self, surface: &SurfacePoint, material: u32) -> Vec3 {
+        let ExtensionPoint {
+            attenuation,
+            thickness,
+            ..
+        } = surface.extension;
+        let was_outside = self.attenuation == Vec3::ZERO;
+        *self = Self::NONE;
+        if surface.front_face {
+            *self = Self {
+                attenuation,
+                thickness,
+                material,
+            };
+            return Vec3::ONE;
+        }
+        match was_outside {
+            true => ExtensionPoint::left_after(attenuation, thickness),
+            false => Vec3::ONE,
+        }
     }
 }
 
@@ -203,17 +265,16 @@ impl<'a> World<'a> {
     /// What the sheets that `ray` meets let pass.
     fn through_sheets<const F: u32>(&self, ray: &Ray, alpha_key: u64) -> Vec3 {
         let (mut ray, mut left) = (*ray, Vec3::ONE);
-        // Attenuation per metre of the segment, and metres of it if the segment meets no inner side.
-        let (mut filling, mut thickness) = (Vec3::ZERO, 0.0);
+        let mut filling = Filling::NONE;
         for _ in 0..MOST_SHEETS {
             let hit = self.geometry.bvh.closest(&ray, f32::INFINITY, |t, u, v| {
                 self.is_covered::<F>(t, u, v, alpha_key)
             });
+            if has(F, EXTENSIONS) {
+                left *= self.left_on_way(&mut filling, &ray, hit.as_ref());
+            }
             let Some(hit) = hit else {
-                return match has(F, EXTENSIONS) {
-                    true => left * ExtensionPoint::left_after(filling, thickness),
-                    false => left,
-                };
+                return left;
             };
             let Hit { triangle, u, v, .. } = hit;
             let surface = self.surfaces.interact::<F>(ray.direction, triangle, u, v);
@@ -222,10 +283,7 @@ impl<'a> World<'a> {
             }
             left *= Bsdf::<F>::new(&surface, -ray.direction).passing();
             if has(F, EXTENSIONS) {
-                left *= ExtensionPoint::left_after(filling, hit.t);
-                let inside = surface.enters(ray.direction);
-                filling = surface.extension.attenuation * f32::from(inside);
-                thickness = surface.extension.thickness;
+                left *= filling.pass(&surface, self.surfaces.material_index(triangle));
             }
             if left.max_element() < LEAST_PASSING {
                 break;
@@ -233,6 +291,48 @@ impl<'a> World<'a> {
             ray = self.leave(&surface, ray.direction);
         }
         Vec3::ZERO
+    }
+
+    /// What is left of the light on the segment `ray` up to `hit`. `filling` is emptied where the segment
+    /// turns out not to run inside: the sheet before it was open.
+    #[inline]
+    pub(crate) fn left_on_way(&self, filling: &mut Filling, ray: &Ray, hit: Option<&Hit>) -> Vec3 {
+        if filling.attenuation == Vec3::ZERO {
+            return Vec3::ONE;
+        }
+        let way = hit.filter(|hit| self.is_inside(filling, ray, hit));
+        let Filling {
+            attenuation,
+            thickness,
+            ..
+        } = *filling;
+        if way.is_none() {
+            *filling = Filling::NONE;
+        }
+        ExtensionPoint::left_after(attenuation, way.map_or(thickness, |hit| hit.t))
+    }
+
+    /// Whether the segment `ray`, which entered the object before, ends at an inner side, or at something inside: then
+    /// it goes out of the same material once more often than into it.
+    fn is_inside(&self, filling: &Filling, ray: &Ray, hit: &Hit) -> bool {
+        let surfaces = &self.surfaces;
+        let leads_out = |t| ray.direction.dot(surfaces.geometric_normal(t)) > 0.0;
+        if surfaces.transmits(hit.triangle) && leads_out(hit.triangle) {
+            return true;
+        }
+        let crossed = RefCell::new(Vec::new());
+        self.geometry.bvh.occluded(ray, f32::INFINITY, |t, _, _| {
+            if surfaces.material_index(t) == filling.material {
+                crossed.borrow_mut().push(t);
+            }
+            false
+        });
+        // Traversal may ask twice.
+        let mut crossed = crossed.into_inner();
+        crossed.sort_unstable();
+        crossed.dedup();
+        let out = crossed.iter().filter(|&&t| leads_out(t)).count();
+        2 * out > crossed.len()
     }
 
     #[inline(always)]
@@ -249,6 +349,16 @@ impl<'a> World<'a> {
         // A hash of the triangle, not a running number: traversal may ask twice, in any order.
         let chance = (mix64(key ^ u64::from(triangle)) >> 40) as f32 * (1.0 / 16_777_216.0);
         chance < self.surfaces.coverage::<F>(triangle, u, v)
+    }
+
+    /// Whether a proxy mesh lies on `ray` within `distance` metres.
+    #[inline]
+    pub(crate) fn proxy_hides(&self, ray: &Ray, distance: f32, counts: &mut RayCounts) -> bool {
+        let ProxyGeometry::Mesh { bvh, .. } = &self.geometry.proxy else {
+            return false;
+        };
+        counts.add(RayKind::ProxyOcclusion);
+        bvh.occluded(ray, distance, |_, _, _| true)
     }
 
     /// Where `ray`, from the camera, meets the side of the proxy that is seen.

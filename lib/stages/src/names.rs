@@ -24,7 +24,7 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 14,
+    version: 15,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
@@ -42,13 +42,13 @@ pub const LORA: StageName = StageName {
 pub const LIGHT: StageName = StageName {
     name: "light",
     executable: "dipir-light",
-    version: 9,
+    version: 10,
 };
 /// Renders the picture and its layers.
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 16,
+    version: 17,
 };
 
 /// All stages, each after those that it reads.

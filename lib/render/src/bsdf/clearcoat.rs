@@ -33,6 +33,25 @@ pub(super) const GAUSS: [(f32, f32); 6] = [
     (0.966_234_76, 0.085_662_25),
 ];
 
+/// Share of the light from below, emission for one, that passes the coat at `point` towards the unit
+/// vector `wo`, in world space: `1 - C(wo)`.
+pub(crate) fn passing_coat(point: &CoatPoint, wo: Vec3) -> f32 {
+    if point.factor <= 0.0 {
+        return 1.0;
+    }
+    let energy = LobeEnergy::new(point.roughness);
+    let cosine = point.normal.dot(wo).clamp(0.0, 1.0);
+    left_by(&energy, energy.further_fresnel(F0), point.factor, cosine)
+}
+
+/// `1 - C` at a cosine to the coat's normal.
+#[inline]
+fn left_by(energy: &LobeEnergy, further_fresnel: f32, factor: f32, cosine: f32) -> f32 {
+    let (loss, share) = (energy.loss(cosine), energy.share(cosine));
+    let fresnel = F0 + (1.0 - F0) * share;
+    1.0 - factor * (fresnel * (1.0 - loss) + further_fresnel * loss)
+}
+
 /// A coat for one `wo`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Coat {
@@ -120,9 +139,7 @@ impl Coat {
     /// `1 - C` at a cosine to the coat's normal.
     #[inline]
     pub fn passing(&self, cosine: f32) -> f32 {
-        let (loss, share) = (self.energy.loss(cosine), self.energy.share(cosine));
-        let fresnel = F0 + (1.0 - F0) * share;
-        1.0 - self.factor * (fresnel * (1.0 - loss) + self.further_fresnel * loss)
+        left_by(&self.energy, self.further_fresnel, self.factor, cosine)
     }
 
     /// What keeps a white diffuse base white below the coat: the base's mean passing light

@@ -88,6 +88,21 @@ impl Interface {
         }
     }
 
+    /// Whether there is a film.
+    #[inline]
+    pub fn has_film(&self) -> bool {
+        self.film.is_some()
+    }
+
+    /// The largest channel of [`fresnel`](Self::fresnel) where there is a film, else 0.
+    #[inline]
+    pub fn below_film(&self, weight: f32, cosine: f32) -> f32 {
+        match self.film {
+            Some(_) => self.fresnel(weight, cosine).max_element().min(1.0),
+            None => 0.0,
+        }
+    }
+
     /// A direction in the space in which the lobe is isotropic.
     #[inline]
     pub fn stretched(&self, w: Vec3) -> Vec3 {

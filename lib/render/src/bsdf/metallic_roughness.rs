@@ -29,6 +29,12 @@ use crate::surface::SurfacePoint;
 /// The least cosine of `wo`: where rounding puts it at or below the horizon, it grazes.
 const MIN_COSINE: f32 = 1e-7;
 
+/// The cosine whose Schlick weight is `share`, the mean one of facets.
+#[inline]
+fn mean_cosine(share: f32) -> f32 {
+    1.0 - share.max(0.0).powf(0.2)
+}
+
 /// The base for one `wo`, in the frame of the shading normal.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Base {
@@ -215,13 +221,13 @@ impl Base {
             diffuse: Vec3::ZERO,
             transmitted: Transmitted::default(),
             albedo: BaseAlbedo {
-                specular: interface.fresnel(share, wo.z) * (1.0 - loss),
+                specular: interface.fresnel(share, mean_cosine(share)) * (1.0 - loss),
                 further: further * loss,
                 ..BaseAlbedo::default()
             },
             interface,
         };
-        let left = 1.0 - base.dielectric_albedo(loss, share);
+        let left = base.left_by_dielectric::<F>(loss, share);
         base.albedo.diffuse = diffuse_color * left;
         base.diffuse = diffuse_color * (left * lambert::coupling(base.mean_dielectric_albedo()));
         if has(F, TRANSMISSION) {
@@ -231,6 +237,7 @@ impl Base {
                 color,
                 further: color * (below * broad),
             };
+            // Without the film, which may reflect all at the mean cosine and not at those around it.
             base.albedo.transmitted =
                 color * ((1.0 - base.dielectric_fresnel(share)) * (1.0 - loss));
             base.albedo.transmitted_further = color * (below * loss);
@@ -283,6 +290,27 @@ impl Base {
     #[inline]
     pub fn dielectric_fresnel(&self, weight: f32) -> f32 {
         self.f0_dielectric + (self.f90 - self.f0_dielectric) * weight
+    }
+
+    /// [`Self::dielectric_fresnel`] of a facet at `cosine`, or all that a film reflects there if that is more.
+    #[inline]
+    pub fn dielectric_fresnel_at<const F: u32>(&self, weight: f32, cosine: f32) -> f32 {
+        let bound = self.dielectric_fresnel(weight);
+        match has(F, EXTENSIONS) {
+            true => bound.max(self.interface.below_film(weight, cosine)),
+            false => bound,
+        }
+    }
+
+    /// What the dielectric's interface leaves to the diffuse lobe in a direction with these
+    /// [`LobeEnergy::loss`] and [`LobeEnergy::share`].
+    #[inline]
+    fn left_by_dielectric<const F: u32>(&self, loss: f32, share: f32) -> f32 {
+        if !(has(F, EXTENSIONS) && self.interface.has_film()) {
+            return 1.0 - self.dielectric_albedo(loss, share);
+        }
+        let fresnel = self.dielectric_fresnel_at::<F>(share, mean_cosine(share));
+        1.0 - (fresnel * (1.0 - loss) + self.further_dielectric * loss)
     }
 
     /// Cosine-weighted mean of [`Self::dielectric_albedo`].
@@ -429,7 +457,7 @@ impl Base {
         result.further_pdf = self.energy.further_pdf(wi.z);
         result.specular += self.further * (loss * wi.z);
         if self.diffuse != Vec3::ZERO {
-            let left = 1.0 - self.dielectric_albedo(loss, self.energy.share(wi.z));
+            let left = self.left_by_dielectric::<F>(loss, self.energy.share(wi.z));
             result.diffuse = self.diffuse * (left * wi.z);
         }
         result

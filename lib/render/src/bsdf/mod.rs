@@ -30,6 +30,7 @@ use dipir_numerics::warp::{Frame, square_to_cosine_hemisphere};
 use glam::{Vec2, Vec3};
 
 use self::clearcoat::Coat;
+pub(crate) use self::clearcoat::passing_coat;
 use self::features::{CLEARCOAT, EXTENSIONS, PLAIN_GGX, SPECULAR, TRANSMISSION, has};
 use self::fresnel::schlick_weight;
 use self::ggx::reflect;
@@ -432,7 +433,7 @@ impl<const F: u32> Bsdf<F> {
                 (self.frame.to_world(mirrored(base.wo)), f, self.chances[1])
             }
             Technique::Transmit => {
-                let passing = 1.0 - base.dielectric_fresnel(fresnel);
+                let passing = 1.0 - base.dielectric_fresnel_at::<F>(fresnel, base.wo.z);
                 let wi = self.frame.to_world(-base.wo);
                 (wi, base.transmitted.color * passing, self.chances[3])
             }

@@ -350,6 +350,53 @@ fn the_energy_table_is_what_quadrature_gives() {
     }
 }
 
+/// What a white surface with a roughness of `energy` returns towards the cosine `mu`, its single scattering by quadrature and
+/// the rest by the table; of index 1.5, and of metal.
+fn returned(energy: &super::energy::LobeEnergy, alpha: f64, mu: f64) -> [f64; 2] {
+    let (loss, e5) = super::energy_quadrature::directional_albedo(mu, alpha, 160);
+    // Cosine-weighted mean over the hemisphere, graded towards grazing angles.
+    let mean = |f: &dyn Fn(f32) -> f64| -> f64 {
+        let at = |k: u32| {
+            let t = (f64::from(k) + 0.5) / 512.0;
+            f(t.powi(4) as f32) * 2.0 * t.powi(4) * 4.0 * t.powi(3) / 512.0
+        };
+        (0..512).map(at).sum()
+    };
+    let returned = mean(&|mu| energy.loss(mu).into()) / f64::from(energy.mean_loss);
+    [0.04, 1.0].map(|f0| {
+        let further = f64::from(energy.further_fresnel(f0));
+        let interface =
+            f64::from(energy.mean_albedo(f0, 1.0)) + further * f64::from(energy.mean_loss);
+        let f0 = f64::from(f0);
+        let left = |mu: f32| {
+            let (loss, share) = (f64::from(energy.loss(mu)), f64::from(energy.share(mu)));
+            1.0 - (f0 + (1.0 - f0) * share) * (1.0 - loss) - further * loss
+        };
+        let lost = f64::from(energy.loss(mu as f32));
+        let specular = f0 * (1.0 - loss) + (1.0 - f0) * e5 + further * lost * returned;
+        match f0 < 1.0 {
+            true => specular + left(mu as f32) * mean(&left) / (1.0 - interface),
+            false => specular,
+        }
+    })
+}
+
+#[test]
+fn interpolation_of_the_energy_table_adds_less_than_four_thousandths_of_light() {
+    use super::energy::LobeEnergy;
+    // At the middle between rows, and many cosines; 160 steps are good to 2e-4. The largest found is 3.2e-3.
+    for row in 1..32 {
+        let r = (f64::from(row) + 0.5) / 32.0;
+        let energy = LobeEnergy::new(r as f32);
+        for k in 0..24 {
+            let mu = 0.05 + 0.95 * (f64::from(k) / 23.0).powi(2);
+            for all in returned(&energy, r * r, mu) {
+                assert!((0.996..1.004).contains(&all), "{r} {mu}: {all}");
+            }
+        }
+    }
+}
+
 #[test]
 fn a_surface_at_the_edge_of_smoothness_joins_the_mirror() {
     let wo = Vec3::new(0.8, 0.0, 0.6);

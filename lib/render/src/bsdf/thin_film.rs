@@ -110,7 +110,8 @@ impl Film {
     }
 
     /// The least reflectance at normal incidence with which Schlick's factor lies nowhere below the
-    /// film's, as far as a few angles tell, a channel at a time.
+    /// film's, as far as a few angles tell, a channel at a time. Grazing angles are left out: a bound for
+    /// them would darken all others.
     pub fn bound(&self) -> Vec3 {
         let at = |cosine: f32| {
             let weight = schlick_weight(cosine);

@@ -32,7 +32,8 @@ impl Base {
         if let Some(ggx) = self.ggx {
             let facet = self.facet::<F>(&ggx, mirrored, sum);
             let v = Ggx::visibility(self.wo.z, self.wo_length, mirrored.z, facet.wi_length);
-            let passing = 1.0 - self.dielectric_fresnel(schlick_weight(facet.cosine));
+            let weight = schlick_weight(facet.cosine);
+            let passing = 1.0 - self.dielectric_fresnel_at::<F>(weight, facet.cosine);
             value += self.transmitted.color * (passing * facet.d * v * mirrored.z);
             pdf = Ggx::reflection_pdf(facet.d, self.wo.z, self.wo_length);
         }

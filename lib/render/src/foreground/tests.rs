@@ -264,6 +264,24 @@ fn emission_and_unlit_colours_need_no_light() {
 }
 
 #[test]
+fn a_coat_dims_what_shines_below_it_by_what_it_reflects() {
+    let sheet = quad(Vec3::new(-9.0, -9.0, 0.0), Vec3::X * 18.0, Vec3::Y * 18.0);
+    let mut lamp = coated(0.0, 0.0);
+    lamp.emissive = Vec3::new(3.0, 2.0, 1.0);
+    for cosine in [1.0f32, 0.5, 0.2] {
+        let towards = Vec3::new((1.0 - cosine * cosine).sqrt(), 0.0, cosine);
+        let view = camera(towards * 4.0, Vec3::ZERO, 0.1, 2);
+        let s = scene(sheet.clone(), lamp.clone(), view, Proxy::None);
+        let r = render(&s, &sky(0.0), &everything(1), &settings(8, 3));
+        let passing = 0.96 * (1.0 - (1.0 - cosine).powi(5));
+        let found = *r.film.object.get(0, 0) / lamp.emissive;
+        // A picture of .1 degrees changes the cosine by 2e-3, and what passes by 5 times that at most.
+        let off = (found - passing).abs().max_element();
+        assert!(off < 0.01, "{cosine}: {found} instead of {passing}");
+    }
+}
+
+#[test]
 fn what_is_known_costs_no_rays() {
     let view = camera(Vec3::Z * 4.0, Vec3::ZERO, 30.0, 16);
     let rays = |mesh, simulation: &Simulation| {
@@ -348,11 +366,50 @@ fn a_volume_attenuates_by_the_length_of_the_way_through_it() {
     let through = passing(&cube, filled(color, 7.0));
     let exact = color.powf(0.5);
     assert!(through.abs_diff_eq(exact, 1e-4), "{through} {exact}");
-    // A sheet has no inner side: its thickness counts.
+    // A sheet has no inner side: its thickness counts, from either side.
     let sheet = quad(Vec3::new(-0.5, -0.5, 0.0), Vec3::X, Vec3::Y);
-    let through = passing(&sheet, filled(color, 3.0));
+    let back = quad(Vec3::new(-0.5, -0.5, 0.0), Vec3::Y, Vec3::X);
     let exact = color.powf(1.5);
-    assert!(through.abs_diff_eq(exact, 1e-4), "{through} {exact}");
+    for sheet in [&sheet, &back] {
+        let through = passing(sheet, filled(color, 3.0));
+        assert!(through.abs_diff_eq(exact, 1e-4), "{through} {exact}");
+    }
+    // The way to the next sheet leads through air.
+    for second in [&sheet, &cube] {
+        let mut both = sheet.clone();
+        let mut behind = second.clone();
+        behind.positions.iter_mut().for_each(|p| p.z -= 2.0);
+        crate::shapes::append(&mut both, behind, 0);
+        let through = passing(&both, filled(color, 3.0));
+        let metres = if second.indices.len() == 2 { 6.0 } else { 4.0 };
+        let exact = color.powf(metres / 2.0);
+        assert!(through.abs_diff_eq(exact, 1e-4), "{through} {exact}");
+    }
+}
+
+#[test]
+fn what_stands_inside_a_volume_is_seen_through_the_way_to_it() {
+    let color = Vec3::new(0.25, 0.5, 0.9);
+    let view = camera(Vec3::Z * 5.0, Vec3::ZERO, 0.5, 4);
+    let seen = |mesh: &dipir_scene::mesh::TriangleMesh, color| {
+        let mut mesh = mesh.clone();
+        let lamp = cuboid(Vec3::new(-0.1, -0.1, -0.3), Vec3::new(0.1, 0.1, -0.1));
+        crate::shapes::append(&mut mesh, lamp, 1);
+        let mut s = scene(mesh, filled(color, 2.0), view, Proxy::None);
+        let mut lamp = matte(Vec3::ZERO);
+        lamp.emissive = Vec3::ONE;
+        s.materials.push(lamp);
+        let r = render(&s, &sky(0.0), &everything(8), &settings(64, 1));
+        r.film.object.pixels()[5]
+    };
+    // .6 m of a cube, and a sheet that is said to be 2 m thick.
+    let cube = cuboid(Vec3::splat(-0.5), Vec3::splat(0.5));
+    let sheet = quad(Vec3::new(-0.5, -0.5, 0.5), Vec3::X, Vec3::Y);
+    for (mesh, metres) in [(cube, 0.6), (sheet, 2.0)] {
+        let through = seen(&mesh, color) / seen(&mesh, Vec3::ONE);
+        let exact = color.powf(metres / 2.0);
+        assert!(through.abs_diff_eq(exact, 1e-4), "{through} {exact}");
+    }
 }
 
 #[test]

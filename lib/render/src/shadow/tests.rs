@@ -371,6 +371,32 @@ fn light_that_the_object_emits_brightens_the_ground_by_its_form_factor() {
 }
 
 #[test]
+fn a_wall_of_the_proxy_hides_the_light_that_the_object_emits() {
+    let mut proxy = quad(Vec3::new(-9.0, 0.0, 9.0), Vec3::X * 18.0, Vec3::Z * -18.0);
+    let wall = quad(Vec3::new(1.0, 0.0, 9.0), Vec3::Y * 3.0, Vec3::Z * -18.0);
+    crate::shapes::append(&mut proxy, wall, 0);
+    let mut lamp = matte(Vec3::ZERO);
+    lamp.emissive = Vec3::splat(50.0);
+    let mesh = ball(Vec3::new(0.0, 1.0, 0.0), 0.3);
+    // The picture shows the ground behind the wall.
+    let view = camera(Vec3::new(2.0, 4.0, 0.1), Vec3::new(2.0, 0.0, 0.0), 20.0, 8);
+    let s = scene(mesh, lamp, view, Proxy::Mesh(proxy));
+    for hides in [true, false] {
+        let simulation = Simulation {
+            light_on_proxy: Some(LightOnProxy {
+                emission: true,
+                bounce: false,
+            }),
+            proxy_occlusion: hides,
+            ..everything(1)
+        };
+        let r = render(&s, &sky(1.0), &simulation, &settings(64, 7));
+        let brightest = r.film.shadow.pixels().iter().fold(0f32, |m, v| m.max(v.x));
+        assert_eq!(brightest <= 1.0, hides, "{brightest}");
+    }
+}
+
+#[test]
 fn a_white_furnace_with_bounces_to_the_proxy_has_no_shadow() {
     // A white sphere under a constant sky sends as much to the ground as it takes.
     let view = camera(Vec3::new(0.0, 7.0, 3.0), Vec3::ZERO, 30.0, 12);

@@ -48,8 +48,7 @@ fn surface(r: &mut Rng) -> SurfacePoint {
             tangent: Vec3::X,
             film: FilmPoint {
                 factor: half(r, film),
-                // Of the index of air, two interfaces that reflect nothing would both count at grazing incidence.
-                ior: 1.2 + 0.8 * share(r),
+                ior: 1.0 + share(r),
                 thickness_nm: 800.0 * share(r),
             },
             ..ExtensionPoint::NONE
@@ -133,8 +132,13 @@ fn no_combination_of_lobes_gains_light() {
         }
         let mean = sum / f64::from(n);
         let variance = (squares / f64::from(n) - mean * mean).max(DVec3::ZERO) / f64::from(n);
-        // 4500 means: 5 standard errors, and the interpolation of the energy table.
-        let most = 1.005 + 5.0 * variance.map(f64::sqrt);
+        // 4500 means: 5 standard errors. At these cosines the interpolation of the energy table adds less than 4e-3
+        // (`interpolation_of_the_energy_table_adds_less`), and the table of sheen is good to 3e-3.
+        let tables = match s.extension.sheen_color == Vec3::ZERO {
+            true => 4e-3,
+            false => 7e-3,
+        };
+        let most = 1.0 + tables + 5.0 * variance.map(f64::sqrt);
         assert!(mean.cmple(most).all(), "cosine {cosine} {s:?}: {mean}");
     }
 }

@@ -11,6 +11,7 @@ use dipir_render::bsdf::features::{ALL, EXTENSIONS};
 use dipir_render::foreground::MIN_CAUSTIC_ROUGHNESS;
 use dipir_render::render::{Renderer, Simulation};
 use dipir_render::world::{ProxyGeometry, World, is_sheet};
+use dipir_scene::bvh::Hit;
 use dipir_scene::camera::Ray;
 use glam::{DVec3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -164,13 +165,21 @@ impl<'a> Tracer<'a> {
         let (mut sum, mut throughput) = (Vec3::ZERO, Vec3::ONE);
         // Light behind sheets alone reaches the proxy along the shadow ray.
         let mut straight = start == Start::Proxy;
-        // Per metre inside the object, and metres if there is no inner side.
-        let (mut filling, mut thickness) = (Vec3::ZERO, 0.0);
+        // What was entered by a front face: attenuation per metre, metres if there is no inner side, material.
+        let mut inside: Option<(Vec3, f32, u32)> = None;
+        let left =
+            |attenuation: Vec3, way: f32| Vec3::from((attenuation * -way).to_array().map(f32::exp));
         for interactions in 0..=depth {
             let hit = world.closest::<F>(&ray, rng.bits());
-            if filling != Vec3::ZERO {
-                let way = hit.map_or(thickness, |hit| hit.t);
-                throughput *= Vec3::from((filling * -way).to_array().map(f32::exp));
+            if let Some((attenuation, thickness, material)) = inside {
+                let way = hit.filter(|hit| self.is_inside(&ray, hit, material));
+                throughput *= left(attenuation, way.map_or(thickness, |hit| hit.t));
+                inside = inside.filter(|_| way.is_some());
+            }
+            if let (0, Start::Proxy, Some(hit)) = (interactions, start, hit)
+                && self.is_behind_proxy(&ray, hit.t)
+            {
+                return None;
             }
             let Some(hit) = hit else {
                 if interactions == 0 {
@@ -219,14 +228,62 @@ impl<'a> Tracer<'a> {
             }
             let transmitted = wi.dot(surface.geometric_normal) < 0.0;
             straight &= transmitted;
-            filling = match transmitted && surface.enters(wi) {
-                true => surface.extension.attenuation,
-                false => Vec3::ZERO,
-            };
-            thickness = surface.extension.thickness;
+            if transmitted {
+                let (attenuation, thickness) =
+                    (surface.extension.attenuation, surface.extension.thickness);
+                if !surface.front_face && inside.is_none() {
+                    throughput *= left(attenuation, thickness);
+                }
+                let entered = (
+                    attenuation,
+                    thickness,
+                    surfaces.material_index(hit.triangle),
+                );
+                let fills = surface.front_face && attenuation != Vec3::ZERO;
+                inside = fills.then_some(entered);
+            }
             ray = world.leave(&surface, wi);
         }
         Some(sum)
+    }
+
+    /// Whether what `ray` meets after it entered `material` lies inside that: it leads out, or the ray goes out of the
+    /// same material more often than into it.
+    fn is_inside(&self, ray: &Ray, hit: &Hit, material: u32) -> bool {
+        let surfaces = &self.world.surfaces;
+        let leads_out = |t| surfaces.geometric_normal(t).dot(ray.direction) > 0.0;
+        if surfaces.transmits(hit.triangle) && leads_out(hit.triangle) {
+            return true;
+        }
+        let triangles = 0..self.world.scene.mesh.indices.len() as u32;
+        let of_same = triangles.filter(|&t| surfaces.material_index(t) == material);
+        let crossed = of_same.filter(|&t| {
+            let corners = self.world.scene.mesh.indices[t as usize];
+            let [a, b, c] = corners.map(|i| self.world.scene.mesh.positions[i as usize].as_dvec3());
+            let (origin, direction) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
+            // Cramer's rule for origin + direction t = a + (b - a) u + (c - a) v.
+            let (e1, e2) = (b - a, c - a);
+            let p = direction.cross(e2);
+            let (s, determinant) = (origin - a, e1.dot(p));
+            let u = s.dot(p) / determinant;
+            let q = s.cross(e1);
+            let (v, t_hit) = (direction.dot(q) / determinant, e2.dot(q) / determinant);
+            u >= 0.0 && v >= 0.0 && u + v <= 1.0 && t_hit > 0.0
+        });
+        crossed
+            .map(|t| if leads_out(t) { 1 } else { -1 })
+            .sum::<i32>()
+            > 0
+    }
+
+    /// Whether a proxy mesh lies on `ray` within `distance` metres.
+    fn is_behind_proxy(&self, ray: &Ray, distance: f32) -> bool {
+        match &self.world.geometry.proxy {
+            ProxyGeometry::Mesh { bvh, .. } if self.simulation.proxy_occlusion => {
+                bvh.occluded(ray, distance, |_, _, _| true)
+            }
+            _ => false,
+        }
     }
 
     /// What a ray that misses the object sees.

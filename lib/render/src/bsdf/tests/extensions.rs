@@ -189,18 +189,18 @@ fn the_anisotropic_lobe_equals_the_textbook_in_f64() {
 
 #[test]
 fn a_film_scatters_as_it_samples_and_adds_no_light() {
-    for thickness_nm in [250.0, 520.0] {
+    for (ior, thickness_nm) in [(1.6, 250.0), (1.6, 520.0), (1.0, 250.0), (1.2, 700.0)] {
         let extension = ExtensionPoint {
             film: FilmPoint {
                 factor: 1.0,
-                ior: 1.6,
+                ior,
                 thickness_nm,
             },
             ..ExtensionPoint::NONE
         };
         for metallic in [0.0, 1.0] {
             let surfaces = [0.0, 0.3].map(|r| SurfacePoint {
-                base_color: Vec3::splat(0.7),
+                base_color: Vec3::ONE,
                 ..extended(r, metallic, extension)
             });
             check::<{ ALL | EXTENSIONS }>("film", &surfaces, |_, _| ());
