@@ -122,10 +122,10 @@ const FIRST_ROUND_WITH_HIGHLIGHT: u32 = 1024;
 /// Draws samples until `stop`. `advance(job, n, round)` brings a job to `n` samples per pixel and
 /// replicate; the first round simulates `simulation`, and measures what may be left out from the next one on, if
 /// `leave_out` says what; `find_highlights(film, jobs)` says once, after the first round, which pixels of the object start
-/// again with another density of samples; with `auxiliary` pictures the layers are filtered after every round; `progress` may
-/// break off whenever it is called. A time budget counts from `start`; where it ends within the first round, the pixels that
-/// have no samples yet are taken from `coarse`, the same picture at a lower resolution. Without one, the first round is
-/// always finished.
+/// again with another density of samples; with `auxiliary` pictures the layers are filtered after every round if `denoise`
+/// says so, else once, to learn what that would save; `progress` may break off whenever it is called. A time budget counts
+/// from `start`; where it ends within the first round, the pixels that have no samples yet are taken from `coarse`, the same
+/// picture at a lower resolution. Without one, the first round is always finished.
 pub(crate) fn refine(
     size: (usize, usize),
     mut jobs: Vec<Job>,
@@ -138,6 +138,7 @@ pub(crate) fn refine(
     advance: &(impl Fn(&mut Job, u32, &Round) + Sync),
     find_highlights: &dyn Fn(&Film, &[Job]) -> Found,
     auxiliary: Option<&Auxiliary>,
+    denoise: bool,
     coarse: Option<&Film>,
     progress: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
 ) -> Result<Refined, RenderError> {
@@ -150,8 +151,8 @@ pub(crate) fn refine(
         _ => false,
     };
     let mut others = Effort::default();
-    let mut foresight = Foresight::new(limit, auxiliary.is_some());
-    let mut denoiser = auxiliary.map(Denoiser::new);
+    let mut foresight = Foresight::new(limit, denoise);
+    let mut denoiser = auxiliary.filter(|_| denoise).map(Denoiser::new);
     let mut report = Progress::default();
     let (mut simulation, mut stop, mut left_out) = (simulation, stop, None::<LeftOut>);
     loop {
@@ -229,6 +230,12 @@ pub(crate) fn refine(
         let error = total_error(&errors, &jobs, &film, viewing);
         let cost: f64 = jobs.iter().map(Job::cost).sum();
         foresight.learn(&jobs, &errors, &drawn, &error);
+        if let (1, false, Some(auxiliary)) = (round, denoise, auxiliary) {
+            let mut denoiser = Denoiser::new(auxiliary);
+            let (left, _) = errors_of(&mut film, &jobs, Some(&mut denoiser), viewing);
+            film.develop(&jobs);
+            foresight.learn_of_denoiser(&left);
+        }
         let growth = match stop {
             Stop::TimeBudget(budget) => {
                 let rate = seconds_of_round / cost_of_round.max(1.0);

@@ -2,7 +2,7 @@
 //!
 //! The rounds of [`crate::adaptive`] are played through on the jobs' squared errors and costs instead of their samples,
 //! with the same goals. A job's squared error is taken to fall with a power of its samples, the one that the jobs that
-//! grew have shown: 1 for independent samples, more where stratification helps.
+//! grew since the first round have shown: 1 for independent samples, more where stratification helps.
 use crate::adaptive::{EstimatedError, goal, unseen};
 use crate::job::Job;
 use crate::viewing::SquaredError;
@@ -16,8 +16,8 @@ const POWERS: [f64; 2] = [0.5, 3.0];
 const SHARE_TO_LEARN_FROM: f64 = 0.25;
 /// Rounds that are played through at most; each multiplies the samples by up to 4.
 const ROUNDS: usize = 32;
-/// Share of the samples' squared error that the denoiser is taken to leave, in pictures without it. Of .25 to 1 it foretells most
-/// scenes of `benches/forecasts.rs` best.
+/// Share of the samples' squared error that the denoiser is taken to leave where it has not been tried. Of .25 to 1 it foretells
+/// most scenes of `benches/forecasts.rs` best.
 const DENOISED: f64 = 0.4;
 /// Error of most pictures after the first round, from which the share of the first round is guessed while it is under way.
 const FIRST_ERROR: f64 = 0.027;
@@ -42,7 +42,7 @@ struct Point {
 pub enum Guess {
     /// How many highlights smaller than a pixel the samples have missed.
     Highlights,
-    /// How much noise the denoiser would remove: it did not run.
+    /// How much noise the denoiser would remove: it was not tried.
     Denoiser,
 }
 
@@ -55,13 +55,16 @@ pub struct Foresight {
     last: Vec<Point>,
     /// Squared error in units of what a target of 1 allows, and cost: after every round.
     rounds: Vec<(f64, f64)>,
+    /// The power from the first round to the last.
     power: f64,
-    /// The power of the first round in which jobs grew that tell it.
+    /// That of the first round in which jobs grew that tell it.
     early: Option<f64>,
     /// Cost that every target pays once, beside the jobs.
     once: f64,
     /// Whether noise is removed.
     denoises: bool,
+    /// Of every job the squared error that removing noise would have left after the first round, where that was tried.
+    denoised: Option<Vec<f64>>,
     /// Whether highlights smaller than a pixel were found.
     highlights: bool,
     /// Squared error allowed for a target of 1, summed over the pixels: less than their number, because it is the bound
@@ -79,6 +82,7 @@ impl Foresight {
             last: vec![],
             rounds: vec![],
             denoises,
+            denoised: None,
             highlights: false,
             power: POWER,
             early: None,
@@ -113,7 +117,7 @@ impl Foresight {
         let points: Vec<Point> = points.collect();
         if self.first.is_empty() {
             self.first.clone_from(&points);
-        } else if let Some(power) = power(&self.last, &points) {
+        } else if let Some(power) = power(&self.first, &points) {
             self.power = power;
             self.early.get_or_insert(power);
         }
@@ -138,6 +142,11 @@ impl Foresight {
         self.once + points.iter().map(|p| p.cost * p.samples).sum::<f64>()
     }
 
+    /// Adds what removing noise would have left of each job's squared error after the first round.
+    pub(crate) fn learn_of_denoiser(&mut self, left: &[SquaredError]) {
+        self.denoised = Some(left.iter().map(|e| e.sum).collect());
+    }
+
     /// Highlights smaller than a pixel were found.
     pub(crate) fn learn_of_highlights(&mut self) {
         self.highlights = true;
@@ -148,7 +157,7 @@ impl Foresight {
         let reached = self.rounds.last().is_some_and(|r| r.0 <= target * target);
         match () {
             () if self.highlights && !reached => Some(Guess::Highlights),
-            () if denoises && !self.denoises => Some(Guess::Denoiser),
+            () if denoises && !self.denoises && self.denoised.is_none() => Some(Guess::Denoiser),
             () => None,
         }
     }
@@ -161,21 +170,36 @@ impl Foresight {
 
     /// As [`cost_of`](Self::cost_of), where noise is removed or not, whatever was done.
     pub fn cost_with(&self, target: f64, denoises: bool) -> f64 {
-        let (share, power) = match (self.denoises, denoises) {
+        let (first, last, share, powers) = match (self.denoises, denoises) {
             (true, false) => {
                 let [first, last] = [&self.first, &self.last].map(|p| as_drawn(p));
                 let power = power(&first, &last).unwrap_or(POWER);
                 return self.played((&first, power), (&last, power), target);
             }
-            (false, true) => (DENOISED, POWER),
-            _ => (1.0, self.power),
+            (false, true) => {
+                let share = match &self.denoised {
+                    Some(left) => left.iter().sum::<f64>() / sum(&self.first),
+                    None => DENOISED,
+                };
+                let mut first = scaled(&self.first, share);
+                let left = self.denoised.iter().flatten();
+                first
+                    .iter_mut()
+                    .zip(left)
+                    .for_each(|(p, &left)| p.squared_error = left);
+                (first, scaled(&self.last, share), share, [POWER; 2])
+            }
+            _ => (
+                self.first.clone(),
+                self.last.clone(),
+                1.0,
+                [self.early.unwrap_or(self.power), self.power],
+            ),
         };
         // A round that reached the target has shown what is enough.
         let reached = self.rounds.iter().find(|r| r.0 * share <= target * target);
         let most = reached.map_or(f64::INFINITY, |r| r.1 / self.spent(&self.last));
-        let [first, last] = [&self.first, &self.last].map(|p| scaled(p, share));
-        let early = self.early.unwrap_or(power);
-        let cost = self.played((&first, early), (&last, power), target);
+        let cost = self.played((&first, powers[0]), (&last, powers[1]), target);
         cost.min(most)
     }
 
@@ -299,6 +323,7 @@ mod tests {
             last: points(errors, 8.0),
             rounds: vec![],
             denoises: true,
+            denoised: None,
             highlights: false,
             power,
             early: None,
@@ -388,6 +413,27 @@ mod tests {
         };
         assert_eq!(without.guess(0.1, true), Some(Guess::Denoiser));
         assert_eq!(without.guess(0.1, false), None);
+    }
+
+    #[test]
+    fn what_a_denoiser_that_was_tried_would_leave_is_no_guess() {
+        let mut one = Foresight {
+            denoises: false,
+            ..known(&[4.0; 10], 1.0)
+        };
+        let left = [SquaredError {
+            sum: 1.0,
+            variance: 0.0,
+        }; 10];
+        one.learn_of_denoiser(&left);
+        assert_eq!(one.guess(0.1, true), None);
+        // A quarter of the errors takes a quarter of the samples.
+        let cost = one.cost_with(0.2, true);
+        assert!((cost - 25.0).abs() < 1.0, "{cost}");
+        // A target that the samples have passed, to which the filter would have come with the first 8 of 800.
+        one.last = points(&[0.01; 10], 800.0);
+        let cost = one.cost_with(1.0, true);
+        assert!((cost - 0.01).abs() < 1e-9, "{cost}");
     }
 
     #[test]

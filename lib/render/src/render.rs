@@ -366,7 +366,9 @@ impl<'a> Renderer<'a> {
             };
             highlights::find(path, film, &viewing, &pixels, limit, settings.seed)
         };
-        let auxiliary = (settings.denoise).then(|| {
+        // Without the denoiser, what it would save is foreseen for a target.
+        let is_foreseen = matches!(settings.stop, Stop::TargetError(_));
+        let auxiliary = (settings.denoise || is_foreseen).then(|| {
             // Other samples than those that are filtered.
             gbuffer::auxiliary(path.world, &jobs, !settings.seed)
         });
@@ -382,6 +384,7 @@ impl<'a> Renderer<'a> {
             advance,
             &find_highlights,
             auxiliary.as_ref(),
+            settings.denoise,
             coarse,
             progress,
         )?;

@@ -177,7 +177,7 @@ impl Outlook {
         let because = |e: &Estimate| {
             let why = match e.guess? {
                 Guess::Highlights => "some highlights are smaller than a pixel",
-                Guess::Denoiser => "the denoiser, which it uses, was off",
+                Guess::Denoiser => "the denoiser, which it uses, was not tried",
             };
             Some(format!(
                 "; the time of {} is a guess: {why}",
@@ -400,7 +400,7 @@ mod tests {
         let end = "; the time of high is a guess: some highlights are smaller than a pixel";
         assert!(guessed.ends_with(end), "{guessed}");
         let guessed = around(targets[1]).with_guesses(|_| Some(Guess::Denoiser));
-        let one = "; the time of draft is a guess: the denoiser, which it uses, was off";
+        let one = "; the time of draft is a guess: the denoiser, which it uses, was not tried";
         assert!(guessed.text().contains(one), "{}", guessed.text());
     }
 
