@@ -175,23 +175,14 @@ pub struct Camera {
     pub lens: Lens,
 }
 
-/// Where a point is seen.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Projected {
-    /// Column and row, pixels.
-    pub pixel: DVec2,
-}
-
 impl Camera {
-    /// Where `point` is seen; `None` if it is not.
-    pub fn project(&self, point: DVec3) -> Option<Projected> {
+    /// Column and row where `point` is seen, pixels; `None` if it is not.
+    pub fn project(&self, point: DVec3) -> Option<DVec2> {
         let own = self.pose.rotation.transpose() * (point - self.pose.position);
         let lens = &self.lens;
         // Image axes: y down, z forward.
         let image = lens.distortion.image(DVec3::new(own.x, -own.y, -own.z))?;
-        Some(Projected {
-            pixel: lens.principal_px + lens.focal_px * image.point,
-        })
+        Some(lens.principal_px + lens.focal_px * image)
     }
 
     /// The unit direction of what is seen at `pixel`; `None` where the lens sees nothing.
@@ -230,11 +221,11 @@ mod tests {
             for j in -4..=4 {
                 let board = DVec3::new(0.5 * f64::from(i), 0.5 * f64::from(j), -6.0);
                 let point = camera.pose.position + camera.pose.rotation * board;
-                let Some(projected) = camera.project(point) else {
+                let Some(pixel) = camera.project(point) else {
                     continue;
                 };
                 // Undistorted, the corners are on a regular grid again.
-                let d = camera.pose.rotation.transpose() * camera.ray(projected.pixel).unwrap();
+                let d = camera.pose.rotation.transpose() * camera.ray(pixel).unwrap();
                 let straight = DVec2::new(d.x, -d.y) / -d.z * camera.lens.focal_px;
                 let want = DVec2::new(board.x, -board.y) / 6.0 * camera.lens.focal_px;
                 assert!(straight.abs_diff_eq(want, 1e-6), "{straight} {want}");

@@ -108,20 +108,26 @@ fn numbered(parent: &Path) -> Vec<PathBuf> {
     all.into_iter().map(|(_, path)| path).collect()
 }
 
-/// The cameras of a model by the names of their images. `up` is the axis of the model's world that points up.
+/// The camera of a model that `choose` takes by the names of all images, in the file's order. `up` is the axis of the
+/// model's world that points up.
 ///
 /// # Errors
-/// If a file is missing, cut short, or of a camera model that is not known.
-pub fn read_cameras(files: &Files, up: WorldUp) -> Result<Vec<(String, Camera)>, CameraError> {
+/// If a file is missing or cut short, `choose` takes none, or the camera is of a model that is not known.
+pub fn read_camera(
+    files: &Files,
+    up: WorldUp,
+    choose: impl FnOnce(&[&str]) -> Result<usize, CameraError>,
+) -> Result<Camera, CameraError> {
     let (cameras, images) = (files.bytes("cameras")?, files.bytes("images")?);
-    let model = match files.extension {
-        "bin" => read_binary(&cameras, &images, &[], up)?,
-        _ => read_text(text(&cameras)?, text(&images)?, "", up)?,
+    let file = match files.extension {
+        "bin" => Contents::binary(&cameras, &images, &[])?,
+        _ => Contents::text(text(&cameras)?, text(&images)?, "")?,
     };
-    Ok(model.images)
+    let names: Vec<&str> = file.images.iter().map(|i| i.name.as_str()).collect();
+    file.camera(&file.images[choose(&names)?], up)
 }
 
-/// The points of `points3D.txt` or, if `binary`, `points3D.bin`. Errors as [`read_cameras`].
+/// The points of `points3D.txt` or, if `binary`, `points3D.bin`. Errors as [`read_camera`].
 pub fn read_points(points: &[u8], binary: bool, up: WorldUp) -> Result<Vec<DVec3>, CameraError> {
     const NONE: [u8; 8] = [0; 8];
     match binary {
@@ -136,64 +142,195 @@ fn text(bytes: &[u8]) -> Result<&str, CameraError> {
     std::str::from_utf8(bytes).map_err(|_| CameraError::new(FORMAT, "it is not UTF-8"))
 }
 
-/// Reads the contents of the text files; `points` may be empty. Errors as [`read_cameras`].
+/// Reads the contents of the text files; `points` may be empty. Errors as [`read_camera`].
 pub fn read_text(
     cameras: &str,
     images: &str,
     points: &str,
     up: WorldUp,
 ) -> Result<Model, CameraError> {
-    let wrong = |what: &str, line: &str| {
-        let line: String = line.chars().take(60).collect();
-        CameraError::new(
-            FORMAT,
-            format!("{what} \"{}\" cannot be read", line.escape_debug()),
-        )
-    };
-    let mut lenses = BTreeMap::new();
-    for line in records(cameras).filter(|l| !l.is_empty()) {
-        let words: Vec<&str> = line.split_whitespace().collect();
-        let numbers: Option<Vec<f64>> = words.iter().skip(2).map(|w| w.parse().ok()).collect();
-        let id = words.first().and_then(|w| w.parse::<u32>().ok());
-        let (Some(id), Some(model), Some(numbers)) = (id, words.get(1), numbers) else {
-            return Err(wrong("the camera", line));
+    Contents::text(cameras, images, points)?.model(up)
+}
+
+/// Reads the contents of the binary files; `points` may be empty. Errors as [`read_camera`].
+pub fn read_binary(
+    cameras: &[u8],
+    images: &[u8],
+    points: &[u8],
+    up: WorldUp,
+) -> Result<Model, CameraError> {
+    Contents::binary(cameras, images, points)?.model(up)
+}
+
+/// What the files of a model say. Lenses and poses are unchecked, so that one that cannot be read keeps no other from
+/// being read.
+#[derive(Default)]
+struct Contents {
+    lenses: BTreeMap<u32, Parameters>,
+    images: Vec<Image>,
+    points: Vec<DVec3>,
+}
+
+/// Of a lens.
+struct Parameters {
+    model: String,
+    /// Of the image, pixels.
+    size: [f64; 2],
+    numbers: Vec<f64>,
+}
+
+struct Image {
+    name: String,
+    /// World to camera: quaternion w x y z, and translation.
+    turn: [f64; 4],
+    shift: DVec3,
+    lens: u32,
+}
+
+impl Contents {
+    fn text(cameras: &str, images: &str, points: &str) -> Result<Self, CameraError> {
+        let wrong = |what: &str, line: &str| {
+            let line: String = line.chars().take(60).collect();
+            CameraError::new(
+                FORMAT,
+                format!("{what} \"{}\" cannot be read", line.escape_debug()),
+            )
         };
-        let [w, h, parameters @ ..] = &numbers[..] else {
-            return Err(wrong("the camera", line));
-        };
-        lenses.insert(id, lens(model, [*w, *h], parameters)?);
+        let mut file = Self::default();
+        for line in records(cameras).filter(|l| !l.is_empty()) {
+            let words: Vec<&str> = line.split_whitespace().collect();
+            let numbers: Option<Vec<f64>> = words.iter().skip(2).map(|w| w.parse().ok()).collect();
+            let id = words.first().and_then(|w| w.parse::<u32>().ok());
+            let (Some(id), Some(model), Some(numbers)) = (id, words.get(1), numbers) else {
+                return Err(wrong("the camera", line));
+            };
+            let [w, h, parameters @ ..] = &numbers[..] else {
+                return Err(wrong("the camera", line));
+            };
+            let parameters = Parameters {
+                model: model.to_string(),
+                size: [*w, *h],
+                numbers: parameters.to_vec(),
+            };
+            file.lenses.insert(id, parameters);
+        }
+        // Each image is a line followed by one of its points, which may be empty; further empty lines mean nothing.
+        let mut lines = records(images);
+        while let Some(line) = lines.find(|l| !l.is_empty()) {
+            let words: Vec<&str> = line.splitn(10, char::is_whitespace).collect();
+            let numbers: Option<Vec<f64>> = words
+                .iter()
+                .skip(1)
+                .take(7)
+                .map(|w| w.parse().ok())
+                .collect();
+            let id = words.get(8).and_then(|w| w.parse::<u32>().ok());
+            let (Some(numbers), Some(id), Some(name)) = (numbers, id, words.get(9)) else {
+                return Err(wrong("the image", line));
+            };
+            let [q0, q1, q2, q3, x, y, z] = numbers[..] else {
+                return Err(wrong("the image", line));
+            };
+            file.images.push(Image {
+                name: name.trim().to_string(),
+                turn: [q0, q1, q2, q3],
+                shift: DVec3::new(x, y, z),
+                lens: id,
+            });
+            lines.next();
+        }
+        for line in records(points).filter(|l| !l.is_empty()) {
+            let numbers = line.split_whitespace().skip(1).take(3);
+            let numbers: Option<Vec<f64>> = numbers.map(|w| w.parse().ok()).collect();
+            let Some([x, y, z]) = numbers.as_deref() else {
+                return Err(wrong("the point", line));
+            };
+            file.points.push(DVec3::new(*x, *y, *z));
+        }
+        Ok(file)
     }
-    let mut model = Model::default();
-    // Each image is a line followed by one of its points, which may be empty; further empty lines mean nothing.
-    let mut lines = records(images);
-    while let Some(line) = lines.find(|l| !l.is_empty()) {
-        let words: Vec<&str> = line.splitn(10, char::is_whitespace).collect();
-        let numbers: Option<Vec<f64>> = words
-            .iter()
-            .skip(1)
-            .take(7)
-            .map(|w| w.parse().ok())
-            .collect();
-        let id = words.get(8).and_then(|w| w.parse::<u32>().ok());
-        let (Some(numbers), Some(id), Some(name)) = (numbers, id, words.get(9)) else {
-            return Err(wrong("the image", line));
-        };
-        let [q0, q1, q2, q3, x, y, z] = numbers[..] else {
-            return Err(wrong("the image", line));
-        };
-        let camera = image([q0, q1, q2, q3], DVec3::new(x, y, z), lenses.get(&id), up)?;
-        model.images.push((name.trim().to_string(), camera));
-        lines.next();
+
+    fn binary(cameras: &[u8], images: &[u8], points: &[u8]) -> Result<Self, CameraError> {
+        let mut file = Self::default();
+        let mut at = Bytes(cameras);
+        for _ in 0..at.u64()? {
+            let (id, kind) = (at.u32()?, at.u32()?);
+            let size = [at.u64()? as f64, at.u64()? as f64];
+            let mut models = MODELS.iter().chain(&UNREAD);
+            let Some(&(_, model, count)) = models.find(|m| m.0 == kind) else {
+                return Err(unknown(&kind.to_string()));
+            };
+            let numbers = (0..count).map(|_| at.f64()).collect::<Result<_, _>>()?;
+            let model = model.to_string();
+            let parameters = Parameters {
+                model,
+                size,
+                numbers,
+            };
+            file.lenses.insert(id, parameters);
+        }
+        let mut at = Bytes(images);
+        for _ in 0..at.u64()? {
+            at.u32()?;
+            let turn = [at.f64()?, at.f64()?, at.f64()?, at.f64()?];
+            let shift = DVec3::new(at.f64()?, at.f64()?, at.f64()?);
+            let lens = at.u32()?;
+            let name = at.text()?;
+            let seen = at.u64()?;
+            at.skip(seen, 24)?;
+            file.images.push(Image {
+                name,
+                turn,
+                shift,
+                lens,
+            });
+        }
+        if !points.is_empty() {
+            let mut at = Bytes(points);
+            for _ in 0..at.u64()? {
+                at.u64()?;
+                let point = DVec3::new(at.f64()?, at.f64()?, at.f64()?);
+                at.skip(1, 3 + 8)?;
+                let track = at.u64()?;
+                at.skip(track, 8)?;
+                file.points.push(point);
+            }
+        }
+        Ok(file)
     }
-    for line in records(points).filter(|l| !l.is_empty()) {
-        let numbers = line.split_whitespace().skip(1).take(3);
-        let numbers: Option<Vec<f64>> = numbers.map(|w| w.parse().ok()).collect();
-        let Some([x, y, z]) = numbers.as_deref() else {
-            return Err(wrong("the point", line));
-        };
-        model.points.push(up.to_ours() * DVec3::new(*x, *y, *z));
+
+    fn model(self, up: WorldUp) -> Result<Model, CameraError> {
+        let images = self.images.iter();
+        let images = images.map(|i| Ok((i.name.clone(), self.camera(i, up)?)));
+        let images = images.collect::<Result<_, CameraError>>()?;
+        let points = self.points.into_iter().map(|p| up.to_ours() * p);
+        Ok(Model {
+            images,
+            points: points.collect(),
+        })
     }
-    Ok(model)
+
+    fn camera(&self, image: &Image, up: WorldUp) -> Result<Camera, CameraError> {
+        let wrong = |what: &str| CameraError::new(FORMAT, what);
+        let parameters = self.lenses.get(&image.lens);
+        let Parameters {
+            model,
+            size,
+            numbers,
+        } = parameters.ok_or_else(|| wrong("an image names a camera that is not there"))?;
+        let [w, x, y, z] = image.turn;
+        let quaternion = DQuat::from_xyzw(x, y, z, w);
+        let length = quaternion.length();
+        let pose = match length > 1e-6 && length.is_finite() {
+            true => Pose::from_world_to_image(DMat3::from_quat(quaternion / length), image.shift),
+            false => None,
+        };
+        let pose = pose.ok_or_else(|| wrong("an image has no rotation"))?;
+        Ok(Camera {
+            pose: pose.in_our_world(up),
+            lens: lens(model, *size, numbers)?,
+        })
+    }
 }
 
 /// Lines that are no comments.
@@ -201,51 +338,6 @@ fn records(text: &str) -> impl Iterator<Item = &str> {
     text.lines()
         .map(str::trim)
         .filter(|line| !line.starts_with('#'))
-}
-
-/// Reads the contents of the binary files; `points` may be empty. Errors as [`read_cameras`].
-pub fn read_binary(
-    cameras: &[u8],
-    images: &[u8],
-    points: &[u8],
-    up: WorldUp,
-) -> Result<Model, CameraError> {
-    let mut lenses = BTreeMap::new();
-    let mut at = Bytes(cameras);
-    for _ in 0..at.u64()? {
-        let (id, kind) = (at.u32()?, at.u32()?);
-        let size = [at.u64()? as f64, at.u64()? as f64];
-        let Some((name, count)) = MODELS.iter().find(|m| m.0 == kind).map(|m| (m.1, m.2)) else {
-            return Err(unknown(&kind.to_string()));
-        };
-        let parameters: Vec<f64> = (0..count).map(|_| at.f64()).collect::<Result<_, _>>()?;
-        lenses.insert(id, lens(name, size, &parameters)?);
-    }
-    let mut model = Model::default();
-    let mut at = Bytes(images);
-    for _ in 0..at.u64()? {
-        at.u32()?;
-        let q = [at.f64()?, at.f64()?, at.f64()?, at.f64()?];
-        let t = DVec3::new(at.f64()?, at.f64()?, at.f64()?);
-        let id = at.u32()?;
-        let name = at.text()?;
-        let seen = at.u64()?;
-        at.skip(seen, 24)?;
-        let camera = image(q, t, lenses.get(&id), up)?;
-        model.images.push((name, camera));
-    }
-    if !points.is_empty() {
-        let mut at = Bytes(points);
-        for _ in 0..at.u64()? {
-            at.u64()?;
-            let point = DVec3::new(at.f64()?, at.f64()?, at.f64()?);
-            at.skip(1, 3 + 8)?;
-            let track = at.u64()?;
-            at.skip(track, 8)?;
-            model.points.push(up.to_ours() * point);
-        }
-    }
-    Ok(model)
 }
 
 /// Little-endian values from the front of a slice.
@@ -308,6 +400,13 @@ const MODELS: [(u32, &str, usize); 9] = [
     (9, "RADIAL_FISHEYE", 5),
 ];
 
+/// Those that are only passed over, of which the count tells where the next camera begins.
+const UNREAD: [(u32, &str, usize); 3] = [
+    (7, "FOV", 5),
+    (10, "THIN_PRISM_FISHEYE", 12),
+    (11, "RAD_TAN_THIN_PRISM_FISHEYE", 16),
+];
+
 fn unknown(model: &str) -> CameraError {
     let names: Vec<&str> = MODELS.iter().map(|m| m.1).collect();
     let detail = format!(
@@ -354,24 +453,4 @@ fn lens(model: &str, size: [f64; 2], p: &[f64]) -> Result<Lens, CameraError> {
     };
     lens.check(FORMAT)?;
     Ok(lens)
-}
-
-fn image(q: [f64; 4], t: DVec3, lens: Option<&Lens>, up: WorldUp) -> Result<Camera, CameraError> {
-    let Some(lens) = lens else {
-        return Err(CameraError::new(
-            FORMAT,
-            "an image names a camera that is not there",
-        ));
-    };
-    let quaternion = DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
-    let length = quaternion.length();
-    let pose = match length > 1e-6 && length.is_finite() {
-        true => Pose::from_world_to_image(DMat3::from_quat(quaternion / length), t),
-        false => None,
-    };
-    let pose = pose.ok_or_else(|| CameraError::new(FORMAT, "an image has no rotation"))?;
-    Ok(Camera {
-        pose: pose.in_our_world(up),
-        lens: *lens,
-    })
 }

@@ -54,13 +54,6 @@ impl From<Distortion> for Model {
     }
 }
 
-/// What a lens makes of a direction.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Imaged {
-    /// On the image plane at distance 1.
-    pub point: DVec2,
-}
-
 /// Newton's method doubles the digits a step; more are needed only where steps are shortened.
 const MOST_STEPS: usize = 60;
 /// Residual at which a point is found, in focal lengths: 1e-8 of a pixel at 1e4 pixels.
@@ -135,8 +128,9 @@ impl Distortion {
         matches!(self.model, Model::Fisheye { .. })
     }
 
-    /// Where light from `direction`, of any length, falls; `None` where the lens does not see.
-    pub fn image(&self, direction: DVec3) -> Option<Imaged> {
+    /// Where light from `direction`, of any length, falls on the image plane at distance 1; `None` where the lens does
+    /// not see.
+    pub fn image(&self, direction: DVec3) -> Option<DVec2> {
         if let Model::Fisheye { k } = self.model {
             return self.image_fisheye(&k, direction);
         }
@@ -145,7 +139,7 @@ impl Distortion {
         }
         let plane = direction.truncate() / direction.z;
         let (point, _) = self.distort(plane);
-        (plane.length() <= self.limit).then_some(Imaged { point })
+        (plane.length() <= self.limit).then_some(point)
     }
 
     /// The unit direction whose light falls on `point`; `None` where the lens sees nothing.
@@ -224,7 +218,7 @@ impl Distortion {
         None
     }
 
-    fn image_fisheye(&self, k: &[f64; 4], direction: DVec3) -> Option<Imaged> {
+    fn image_fisheye(&self, k: &[f64; 4], direction: DVec3) -> Option<DVec2> {
         let across = direction.truncate().length();
         let angle = across.atan2(direction.z);
         let length = direction.length();
@@ -238,9 +232,7 @@ impl Distortion {
             true => factor / direction.z,
             false => angle * factor / across,
         };
-        Some(Imaged {
-            point: scale * direction.truncate(),
-        })
+        Some(scale * direction.truncate())
     }
 
     /// The angle is found between 0 and the limit, by Newton's method with bisection for safety.
@@ -345,7 +337,7 @@ mod tests {
                         assert!(plane.length() > 0.9, "{lens:?} {plane}");
                         continue;
                     };
-                    let back = lens.direction(image.point).unwrap();
+                    let back = lens.direction(image).unwrap();
                     assert!(
                         back.abs_diff_eq(direction, 1e-10),
                         "{lens:?} {plane} {back}"
@@ -360,12 +352,8 @@ mod tests {
         let lens = Distortion::kannala_brandt([0.0; 4]).unwrap();
         let behind = DVec3::new(1.0, 0.0, -0.5).normalize();
         let image = lens.image(behind).unwrap();
-        assert!((image.point.x - (1.0f64).atan2(-0.5)).abs() < 1e-12);
-        assert!(
-            lens.direction(image.point)
-                .unwrap()
-                .abs_diff_eq(behind, 1e-10)
-        );
+        assert!((image.x - (1.0f64).atan2(-0.5)).abs() < 1e-12);
+        assert!(lens.direction(image).unwrap().abs_diff_eq(behind, 1e-10));
         assert_eq!(lens.direction(DVec2::new(3.2, 0.0)), None);
     }
 
@@ -422,7 +410,7 @@ mod tests {
                 if let Some(direction) = lens.direction(point) {
                     prop_assert!((direction.length() - 1.0).abs() < 1e-9);
                     if let Some(image) = lens.image(direction) {
-                        prop_assert!(image.point.abs_diff_eq(point, 1e-6), "{}", image.point);
+                        prop_assert!(image.abs_diff_eq(point, 1e-6), "{image}");
                     }
                 }
             }

@@ -118,10 +118,8 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
     };
     let z_up = wanted.up.unwrap_or(WorldUp::Z);
     if let Some(files) = colmap::Files::at(path) {
-        // COLMAP's world is that of a first camera, unless it was turned.
-        let cameras = colmap::read_cameras(&files, wanted.up.unwrap_or(WorldUp::MinusY))?;
-        let camera =
-            *chosen(&cameras, wanted, "COLMAP").map_err(|e| match (e, files.choice()) {
+        let choose = |names: &[&str]| {
+            chosen(names, wanted, "COLMAP").map_err(|e| match (e, files.choice()) {
                 (
                     CameraError::Malformed {
                         format,
@@ -131,7 +129,11 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
                     Some(choice),
                 ) => CameraError::with_remedy(format, format!("{detail}; {choice}"), remedy),
                 (e, _) => e,
-            })?;
+            })
+        };
+        // COLMAP's world is that of a first camera, unless it was turned.
+        let up = wanted.up.unwrap_or(WorldUp::MinusY);
+        let camera = colmap::read_camera(&files, up, choose)?;
         return Ok(of(camera, "COLMAP", false));
     }
     let cannot_read = |source| CameraError::Read {
@@ -162,11 +164,11 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
             Ok(of(fspy::read(bytes, z_up)?, "fSpy", true))
         }
         "gltf" | "glb" => {
-            let cameras = gltf::read_at_rest(bytes, wanted.size)?;
+            let cameras = gltf::read_named(bytes, wanted.size)?;
             let gltf::AtRest {
                 camera,
                 is_animated,
-            } = *chosen(&cameras, wanted, "glTF")?;
+            } = by_names(cameras, wanted, "glTF")??;
             if is_animated {
                 return Err(CameraError::with_remedy(
                     "glTF",
@@ -218,12 +220,15 @@ fn in_json(
     let record = json.get(0).unwrap_or(&json);
     let has = |key: &str| record.get(key).is_some();
     if has("frames") {
-        let frames = transforms::read(bytes, Some(wanted.size), z_up)?;
-        let camera = *chosen(&frames, wanted, "transforms.json")?;
-        return Ok(of(camera, "nerfstudio", false));
+        let mut frames = transforms::frames(bytes, Some(wanted.size), z_up)?;
+        let names: Vec<&str> = frames.iter().map(|f| f.0.as_str()).collect();
+        let chosen = chosen(&names, wanted, "transforms.json")?;
+        return Ok(of(frames.swap_remove(chosen).1?, "nerfstudio", false));
     }
     if has("camera_intrinsic") {
-        return Ok(of(of_nuscenes(bytes, wanted, z_up)?, "nuScenes", true));
+        let cameras = nuscenes::read_named(bytes, wanted.size, z_up)?;
+        let camera = by_names(cameras, wanted, "nuScenes")?;
+        return Ok(of(camera, "nuScenes", true));
     }
     if has("cameraTransform") || has("cameraParameters") {
         only(wanted, "fSpy")?;
@@ -232,18 +237,20 @@ fn in_json(
     lens_alone(&String::from_utf8_lossy(bytes), wanted)
 }
 
-/// The camera that is wanted by the first name of each record or, if none has it, by its others.
-fn of_nuscenes(bytes: &[u8], wanted: &Wanted, up: WorldUp) -> Result<Camera, CameraError> {
-    let all = nuscenes::read_named(bytes, wanted.size, up)?;
-    let by = |name: &dyn Fn(&nuscenes::Names) -> Option<String>| {
-        let named = all
-            .iter()
-            .map(|(names, c)| (name(names).unwrap_or_default(), *c));
-        let named: Vec<(String, Camera)> = named.collect();
-        chosen(&named, wanted, "nuScenes").copied()
+/// What is wanted by the first name of each or, if none has it, by their others.
+fn by_names<T, const N: usize>(
+    mut all: Vec<([Option<String>; N], T)>,
+    wanted: &Wanted,
+    format: &'static str,
+) -> Result<T, CameraError> {
+    let by = |name: &dyn Fn(&[Option<String>; N]) -> Option<&String>| {
+        let named = all.iter().map(|(names, _)| name(names));
+        let named: Vec<&str> = named.map(|n| n.map_or("", |n| n.as_str())).collect();
+        chosen(&named, wanted, format)
     };
-    let others = || (0..3).find_map(|k| by(&|names| names[k].clone()).ok());
-    by(&|names| names.iter().flatten().next().cloned()).or_else(|e| others().ok_or(e))
+    let others = || (0..N).find_map(|k| by(&|names| names[k].as_ref()).ok());
+    let chosen = by(&|names| names.iter().flatten().next()).or_else(|e| others().ok_or(e))?;
+    Ok(all.swap_remove(chosen).1)
 }
 
 fn lens_alone(text: &str, wanted: &Wanted) -> Result<Found, CameraError> {
@@ -273,12 +280,8 @@ fn only(wanted: &Wanted, format: &'static str) -> Result<(), CameraError> {
     }
 }
 
-/// What is wanted among cameras with names.
-fn chosen<'a, T>(
-    cameras: &'a [(String, T)],
-    wanted: &Wanted,
-    format: &'static str,
-) -> Result<&'a T, CameraError> {
+/// Which one is wanted among cameras with these names.
+fn chosen(cameras: &[&str], wanted: &Wanted, format: &'static str) -> Result<usize, CameraError> {
     let (found, what) = match wanted.which {
         Which::Number(n) => (
             Some(n as usize).filter(|n| *n < cameras.len()),
@@ -300,7 +303,7 @@ fn chosen<'a, T>(
         }
     };
     let cameras_are = cameras.len();
-    found.map(|i| &cameras[i].1).ok_or_else(|| {
+    found.ok_or_else(|| {
         CameraError::with_remedy(
             format,
             format!("it has {cameras_are} cameras, and {what}"),
@@ -310,15 +313,15 @@ fn chosen<'a, T>(
 }
 
 /// Which of `cameras` agrees best with what is called `name`. An error if two of them do.
-fn nearest<T, A: Ord>(
-    cameras: &[(String, T)],
+fn nearest<A: Ord>(
+    cameras: &[&str],
     format: &'static str,
     name: &str,
     agreement: impl Fn(&str) -> Option<A>,
 ) -> Result<Option<usize>, CameraError> {
     let all = cameras.iter().enumerate();
     let all: Vec<(A, usize)> = all
-        .filter_map(|(i, (own, _))| Some((agreement(own)?, i)))
+        .filter_map(|(i, own)| Some((agreement(own)?, i)))
         .collect();
     let Some(best) = all.iter().map(|(agreement, _)| agreement).max() else {
         return Ok(None);
@@ -328,7 +331,7 @@ fn nearest<T, A: Ord>(
     let Some((first, second)) = first.zip(second) else {
         return Ok(first);
     };
-    let names = [first, second].map(|i| &cameras[i].0);
+    let names = [first, second].map(|i| cameras[i]);
     let remedy = match names[0] == names[1] {
         true => format!("say which by its number, for instance frame = {second}"),
         false => format!("say which, for instance image = {:?}", names[1]),
@@ -410,11 +413,6 @@ mod tests {
 
     use super::*;
 
-    fn named(names: &[&str]) -> Vec<(String, usize)> {
-        let all = names.iter().enumerate();
-        all.map(|(i, name)| (name.to_string(), i)).collect()
-    }
-
     fn wanted(which: Which<'_>) -> Wanted<'_> {
         Wanted {
             size: [600.0, 400.0],
@@ -427,8 +425,7 @@ mod tests {
 
     /// Index of the one that is chosen, or what is wrong.
     fn choice_of(names: &[&str], which: Which) -> Result<usize, String> {
-        let found = chosen(&named(names), &wanted(which), "COLMAP").copied();
-        found.map_err(|e| e.to_string())
+        chosen(names, &wanted(which), "COLMAP").map_err(|e| e.to_string())
     }
 
     #[test]

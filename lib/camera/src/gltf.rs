@@ -103,12 +103,18 @@ impl Animated {
 
 /// A camera at rest.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct AtRest {
+pub(crate) struct AtRest {
     /// As the document has it, whatever animations say.
     pub camera: Camera,
     /// Whether an animation moves it, or what it hangs from, or zooms.
     pub is_animated: bool,
 }
+
+/// What a camera may be called by: its own name and its node's.
+pub(crate) type Names = [Option<String>; 2];
+
+/// A camera of the file by its names, or what is wrong with it.
+pub(crate) type Found = (Names, Result<AtRest, CameraError>);
 
 /// Reads all perspective cameras, in the order of their nodes. Their images have the height of `size`. Their width
 /// follows from the camera's aspect ratio; without one it is that of `size`. Their names are those of the cameras, else of
@@ -117,15 +123,17 @@ pub struct AtRest {
 /// # Errors
 /// On a document that is damaged or without perspective cameras, and on nodes that are sheared.
 pub fn read(bytes: &[u8], size: [f64; 2]) -> Result<Vec<(String, Camera)>, CameraError> {
-    let cameras = read_at_rest(bytes, size)?.into_iter();
-    Ok(cameras.map(|(name, own)| (name, own.camera)).collect())
+    let cameras = read_named(bytes, size)?.into_iter();
+    let first = |(names, own): Found| {
+        let name = names.into_iter().flatten().next();
+        Ok((name.unwrap_or_default(), own?.camera))
+    };
+    cameras.map(first).collect()
 }
 
-/// As [`read`], and which of them are animated. Animations themselves are not read.
-///
-/// # Errors
-/// As [`read`].
-pub fn read_at_rest(bytes: &[u8], size: [f64; 2]) -> Result<Vec<(String, AtRest)>, CameraError> {
+/// As [`read`], with all names, which of them are animated, and what is wrong with each. Animations themselves are not
+/// read.
+pub(crate) fn read_named(bytes: &[u8], size: [f64; 2]) -> Result<Vec<Found>, CameraError> {
     let document: Document = serde_json::from_slice(json(bytes)?)
         .map_err(|e| CameraError::new(FORMAT, e.to_string()))?;
     let mut parents = vec![None; document.nodes.len()];
@@ -145,19 +153,17 @@ pub fn read_at_rest(bytes: &[u8], size: [f64; 2]) -> Result<Vec<(String, AtRest)
         let Some(perspective) = &camera.perspective else {
             continue;
         };
-        let name = match camera.name.is_empty() {
-            true => &node.name,
-            false => &camera.name,
-        };
+        let names = [&camera.name, &node.name].map(|n| (!n.is_empty()).then(|| n.clone()));
         let nodes = above(&parents, i)?;
-        let pose = pose(&document.nodes, &nodes)?;
-        let lens = lens(perspective, size)?;
-        let own = AtRest {
-            camera: Camera { pose, lens },
-            is_animated: animated.cameras.contains(&index)
-                || nodes.iter().any(|node| animated.nodes.contains(node)),
-        };
-        cameras.push((name.clone(), own));
+        let own = pose(&document.nodes, &nodes).and_then(|pose| {
+            let lens = lens(perspective, size)?;
+            Ok(AtRest {
+                camera: Camera { pose, lens },
+                is_animated: animated.cameras.contains(&index)
+                    || nodes.iter().any(|node| animated.nodes.contains(node)),
+            })
+        });
+        cameras.push((names, own));
     }
     match cameras.is_empty() {
         true => Err(CameraError::with_remedy(
@@ -269,8 +275,9 @@ mod tests {
             "cameras": [{ "perspective": { "yfov": 1.0 } }, { "perspective": { "yfov": 1.0 } }],
             "animations": [{ "channels": channels, "samplers": [] }],
         });
-        let cameras = read_at_rest(document.to_string().as_bytes(), [600.0, 400.0]).unwrap();
-        cameras.iter().map(|c| c.1.is_animated).collect()
+        let cameras = read_named(document.to_string().as_bytes(), [600.0, 400.0]).unwrap();
+        let own = cameras.into_iter().map(|(_, own)| own.unwrap().is_animated);
+        own.collect()
     }
 
     /// Each of the 100,000 cameras of the chain hangs from all before it: without a limit, 5e9 products of matrices.

@@ -1,7 +1,8 @@
 //! KITTI's `calib` texts.
 //!
 //! `P2: …` (or `P_rect_02: …`) is a projection of twelve numbers by rows, from the rectified frame of
-//! the first camera, in image axes, to pixels, which count from the middle of the first one.
+//! the first camera, in image axes, to pixels, which count from the middle of the first one: the development kit adds 1 to
+//! what it projects before it draws it in MATLAB, where the middle of the first pixel is (1, 1).
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::camera::{Camera, FIRST_PIXEL, Lens, Pose, WorldUp};

@@ -2,8 +2,8 @@
 //!
 //! A sensor has `translation` (metres) and `rotation` (quaternion w x y z) into the vehicle, whose
 //! frame has +x forward, +y to the left, +z up and its origin on the ground; a camera has
-//! `camera_intrinsic`, three rows of three, in pixels from the middle of the first one. A record may
-//! bring the vehicle's own `ego_pose` along.
+//! `camera_intrinsic`, three rows of three, in pixels from the middle of the first one: the development kit takes the colour
+//! of a point from the pixel to whose number its projection rounds. A record may bring the vehicle's own `ego_pose` along.
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::Deserialize;
 

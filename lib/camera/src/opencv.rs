@@ -1,5 +1,5 @@
-//! Lenses that OpenCV and ROS calibrate: `camera_matrix`, `distortion_coefficients`, and the image's
-//! size, as YAML or JSON. Pixels count from the middle of the first one.
+//! Lenses that OpenCV, ROS and Kalibr calibrate: `camera_matrix` or `intrinsics`, `distortion_coefficients`, and the
+//! image's size, as YAML or JSON. Pixels count from the middle of the first one.
 use glam::DVec2;
 use serde_json::Value;
 
@@ -8,27 +8,47 @@ use crate::distortion::Distortion;
 use crate::error::CameraError;
 
 const FORMAT: &str = "OpenCV calibration";
-/// Names under which programs write them.
-const MATRIX: [&str; 4] = ["camera_matrix", "Camera_Matrix", "cameraMatrix", "K"];
-const COEFFICIENTS: [&str; 5] = [
-    "distortion_coefficients",
-    "Distortion_Coefficients",
-    "distCoeffs",
-    "dist_coeffs",
-    "D",
+/// Names under which programs write them, as [`plain`] makes them.
+const MATRIX: [&str; 2] = ["cameramatrix", "k"];
+/// Kalibr's: focal lengths and optical axis.
+const INTRINSICS: [&str; 1] = ["intrinsics"];
+const COEFFICIENTS: [&str; 8] = [
+    "distortioncoefficients",
+    "distortioncoeffs",
+    "distcoefficients",
+    "distcoeffs",
+    "distcoeff",
+    "distortion",
+    "dist",
+    "d",
 ];
-const WIDTH: [&str; 3] = ["image_width", "image_Width", "width"];
-const HEIGHT: [&str; 3] = ["image_height", "image_Height", "height"];
+const WIDTH: [&str; 2] = ["imagewidth", "width"];
+const HEIGHT: [&str; 2] = ["imageheight", "height"];
+/// Both of them, in Kalibr's files.
+const SIZE: [&str; 1] = ["resolution"];
 /// The first that is there counts: beside the model of the distortion, that of the camera says `pinhole`.
-const MODEL: [&str; 2] = ["distortion_model", "camera_model"];
+const MODEL: [&str; 2] = ["distortionmodel", "cameramodel"];
+/// Whether it is a fisheye, in the files of OpenCV's own calibration.
+const FISHEYE: [&str; 1] = ["fisheyemodel"];
+/// Models of the coefficients k1 k2 p1 p2 k3 …, and of a fisheye's.
+const BROWN: [&str; 6] = [
+    "plumb_bob",
+    "rational_polynomial",
+    "radtan",
+    "radial-tangential",
+    "pinhole",
+    "none",
+];
+const KANNALA: [&str; 2] = ["fisheye", "equidistant"];
 /// More numbers than any matrix of a calibration has.
 const MOST_NUMBERS: usize = 1 << 12;
 
 /// Reads the lens. Coefficients are k1 k2 p1 p2 and up to k3, k4 k5 k6, or k1 to k4 of a fisheye where
-/// the model is `fisheye` or `equidistant`. `size` is that of the image, where the file does not say it.
+/// the model is `fisheye` or `equidistant`, or `fisheye_model` is 1. `size` is that of the image, where the file does not say it.
 ///
 /// # Errors
-/// If the matrix or the size is missing, a list holds what is no number, or the coefficients are of another model.
+/// If the matrix or the size is missing, a list holds what is no number, the coefficients are of another model, or the
+/// file has several cameras.
 pub fn read(text: &str, size: Option<[f64; 2]>) -> Result<Lens, CameraError> {
     let found = match text.trim_start().starts_with('{') {
         true => Found::in_json(text)?,
@@ -36,7 +56,9 @@ pub fn read(text: &str, size: Option<[f64; 2]>) -> Result<Lens, CameraError> {
     };
     let wrong = |detail: &str| CameraError::new(FORMAT, detail);
     let [fx, skew, cx, _, fy, cy, _, _, _] = found.matrix[..] else {
-        return Err(wrong("it has no camera_matrix of nine numbers"));
+        return Err(wrong(
+            "it has neither a camera_matrix of nine numbers nor intrinsics of four",
+        ));
     };
     if skew.abs() > 1e-3 * fx.abs() {
         return Err(wrong("its pixels are skewed"));
@@ -65,7 +87,11 @@ impl Found {
     fn in_json(text: &str) -> Result<Self, CameraError> {
         let json: Value =
             serde_json::from_str(text).map_err(|e| CameraError::new(FORMAT, e.to_string()))?;
-        let get = |names: &[&str]| names.iter().find_map(|name| json.get(name));
+        let fields = json.as_object().into_iter().flatten();
+        let get = |names: &[&str]| {
+            let named = |name: &&str| fields.clone().find(|(own, _)| plain(own) == **name);
+            names.iter().find_map(named).map(|(_, value)| value)
+        };
         let numbers = |names: &[&str]| {
             let mut out = Vec::new();
             if let Some(value) = get(names) {
@@ -74,11 +100,16 @@ impl Found {
             Ok::<_, CameraError>(out)
         };
         let number = |names: &[&str]| get(names).and_then(Value::as_f64);
+        let is_fisheye = |v: &Value| v.as_bool().unwrap_or(v.as_f64().is_some_and(|v| v != 0.0));
+        let size = number(&WIDTH).zip(number(&HEIGHT)).map(|(w, h)| [w, h]);
         Ok(Self {
-            matrix: numbers(&MATRIX)?,
+            matrix: matrix(numbers(&MATRIX)?, || numbers(&INTRINSICS))?,
             coefficients: numbers(&COEFFICIENTS)?,
-            size: number(&WIDTH).zip(number(&HEIGHT)).map(|(w, h)| [w, h]),
-            model: get(&MODEL).and_then(Value::as_str).unwrap_or("").into(),
+            size: size.or_else(|| numbers(&SIZE).ok()?.try_into().ok()),
+            model: match get(&FISHEYE).is_some_and(is_fisheye) {
+                true => KANNALA[0].into(),
+                false => get(&MODEL).and_then(Value::as_str).unwrap_or("").into(),
+            },
         })
     }
 
@@ -89,26 +120,48 @@ impl Found {
             let mut lines = text.lines().map(without_comment);
             lines.find_map(|line| {
                 let (name, value) = line.split_once(':')?;
-                names.contains(&name.trim()).then(|| value.trim())
+                names.contains(&&*plain(name)).then(|| value.trim())
             })
         };
         let number = |names: &[&str]| value(names)?.parse().ok();
+        let size = number(&WIDTH).zip(number(&HEIGHT)).map(|(w, h)| [w, h]);
         let model = MODEL.iter().find_map(|name| value(&[name])).unwrap_or("");
+        let is_fisheye = |v: &str| v == "true" || v.parse().is_ok_and(|v: f64| v != 0.0);
+        let names = text.lines().filter_map(|line| line.split_once(':'));
+        let cameras = names.filter(|(name, _)| plain(name) == INTRINSICS[0]);
+        match cameras.count() {
+            0 | 1 => {}
+            n => {
+                return Err(CameraError::with_remedy(
+                    FORMAT,
+                    format!("it has {n} cameras"),
+                    "write that of the photograph into a file of its own",
+                ));
+            }
+        }
         Ok(Self {
-            matrix: yaml_list(text, &MATRIX)?,
+            matrix: matrix(yaml_list(text, &MATRIX)?, || yaml_list(text, &INTRINSICS))?,
             coefficients: yaml_list(text, &COEFFICIENTS)?,
-            size: number(&WIDTH).zip(number(&HEIGHT)).map(|(w, h)| [w, h]),
-            model: model.trim_matches(['"', '\'']).into(),
+            size: size.or_else(|| yaml_list(text, &SIZE).ok()?.try_into().ok()),
+            model: match value(&FISHEYE).is_some_and(is_fisheye) {
+                true => KANNALA[0].into(),
+                false => model.trim_matches(['"', '\'']).into(),
+            },
         })
     }
 
     fn distortion(&self) -> Result<Distortion, CameraError> {
         let c = &self.coefficients[..];
         let at = |i: usize| c.get(i).copied().unwrap_or(0.0);
-        let fisheye = ["fisheye", "equidistant"].contains(&self.model.as_str());
-        let known = ["", "plumb_bob", "rational_polynomial", "pinhole"];
-        if !fisheye && !known.contains(&self.model.as_str()) {
-            let detail = format!("its distortion model is \"{}\"", self.model.escape_debug());
+        let model = self.model.as_str();
+        let fisheye = KANNALA.contains(&model);
+        if !(fisheye || model.is_empty() || BROWN.contains(&model)) {
+            let detail = format!(
+                "its distortion model is \"{}\"; accepted: {}, {}",
+                model.escape_debug(),
+                BROWN.join(", "),
+                KANNALA.join(", ")
+            );
             return Err(CameraError::new(FORMAT, detail));
         }
         let rest = if fisheye { 4 } else { 8 };
@@ -126,6 +179,25 @@ impl Found {
         };
         lens.ok_or_else(|| CameraError::new(FORMAT, "its distortion is not finite"))
     }
+}
+
+/// A name as it is compared: programs write `distortion_coefficients`, `Distortion_Coefficients` and `distCoeffs`.
+fn plain(name: &str) -> String {
+    name.trim().to_lowercase().replace('_', "")
+}
+
+/// The matrix or, if a file has none, that of fx fy cx cy.
+fn matrix(
+    own: Vec<f64>,
+    intrinsics: impl FnOnce() -> Result<Vec<f64>, CameraError>,
+) -> Result<Vec<f64>, CameraError> {
+    if !own.is_empty() {
+        return Ok(own);
+    }
+    Ok(match intrinsics()?[..] {
+        [fx, fy, cx, cy] => vec![fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        _ => vec![],
+    })
 }
 
 /// All numbers of nested lists; `null` has none.
@@ -155,7 +227,9 @@ fn yaml_list(text: &str, names: &[&str]) -> Result<Vec<f64>, CameraError> {
     let mut lines = text.lines().map(without_comment);
     let found = lines.by_ref().find_map(|line| {
         let (name, value) = line.split_once(':')?;
-        names.contains(&name.trim()).then(|| (indent(line), value))
+        names
+            .contains(&&*plain(name))
+            .then(|| (indent(line), value))
     });
     let Some((level, own)) = found else {
         return Ok(vec![]);

@@ -69,22 +69,34 @@ intrinsics!(
 /// A frame: the name of its image, and its camera.
 pub type Named = (String, Camera);
 
+/// A frame's name and camera, or what is wrong with it.
+pub(crate) type Found = (String, Result<Camera, CameraError>);
+
 /// Reads all frames. `size` is that of the image, for files that do not say it.
 ///
 /// # Errors
 /// On matrices that do not rotate, lenses without a focal length, and camera models that are not
 /// known.
 pub fn read(json: &[u8], size: Option<[f64; 2]>, up: WorldUp) -> Result<Vec<Named>, CameraError> {
+    let frames = frames(json, size, up)?.into_iter();
+    frames.map(|(name, own)| Ok((name, own?))).collect()
+}
+
+/// As [`read`], with what is wrong with each frame.
+pub(crate) fn frames(
+    json: &[u8],
+    size: Option<[f64; 2]>,
+    up: WorldUp,
+) -> Result<Vec<Found>, CameraError> {
     let file: File =
         serde_json::from_slice(json).map_err(|e| CameraError::new(FORMAT, e.to_string()))?;
+    let camera = |frame: &Frame| {
+        let lens = lens(&frame.intrinsics.or(&file.intrinsics), size)?;
+        let pose = Pose::from_rows(&frame.transform_matrix, up, FORMAT)?;
+        Ok(Camera { pose, lens })
+    };
     let frames = file.frames.iter();
-    frames
-        .map(|frame| {
-            let lens = lens(&frame.intrinsics.or(&file.intrinsics), size)?;
-            let pose = Pose::from_rows(&frame.transform_matrix, up, FORMAT)?;
-            Ok((frame.file_path.clone(), Camera { pose, lens }))
-        })
-        .collect()
+    Ok(frames.map(|f| (f.file_path.clone(), camera(f))).collect())
 }
 
 fn lens(i: &Intrinsics, size: Option<[f64; 2]>) -> Result<Lens, CameraError> {

@@ -3,7 +3,7 @@ use std::path::Path;
 
 use dipir_cameras::file::{self, Wanted, Which};
 use dipir_cameras::{WorldUp, kitti, nuscenes, opencv};
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 use serde_json::{Value, json};
 
 /// A lens that cannot be read is not a lens without distortion.
@@ -35,6 +35,37 @@ fn the_middle_of_a_picture_is_half_a_pixel_beyond_its_last_index_over_two() {
     }
 }
 
+/// The development kits say which pixel a point lies in. That of nuScenes takes its colour from where the projection
+/// rounds to; that of KITTI adds 1 and draws it in MATLAB, where pixel n reaches from n - 1/2 to n + 1/2, from 1.
+#[test]
+fn a_point_lies_in_the_pixel_that_the_development_kits_give_it() {
+    let size = [640.0, 480.0];
+    let k = [500.0, 0.0, 311.2, 0.0, 505.0, 244.9, 0.0, 0.0, 1.0];
+    let p = format!("P2: {} 0 {} 0 0 {} {} 0 0 0 1 0\n", k[0], k[2], k[4], k[5]);
+    let mut own = record(json!({ "channel": "CAM" }), 0.0);
+    own["camera_intrinsic"] = json!([[k[0], 0, k[2]], [0, k[4], k[5]], [0, 0, 1]]);
+    let nuscenes = nuscenes::read(own.to_string().as_bytes(), size, WorldUp::Z).unwrap();
+    let kitti = kitti::read(&p, 2, size).unwrap();
+    for i in 0..100 {
+        // Image axes: in view, at positions within their pixels that differ.
+        let z = 5.0 + 0.01 * f64::from(i);
+        let seen = DVec3::new(
+            0.37 * z * (f64::from(i) / 99.0 - 0.5),
+            0.3 * z * (f64::from(i % 7) / 6.0 - 0.5),
+            z,
+        );
+        let projected = DVec2::new(k[0] * seen.x / z + k[2], k[4] * seen.y / z + k[5]);
+        for (camera, want) in [
+            (nuscenes[0].1, projected.round()),
+            (kitti, (projected + 1.0 + 0.5).floor() - 1.0),
+        ] {
+            let own = DVec3::new(seen.x, -seen.y, -seen.z);
+            let pixel = camera.project(camera.pose.position + camera.pose.rotation * own);
+            assert_eq!(pixel.unwrap().floor(), want, "{projected}");
+        }
+    }
+}
+
 #[test]
 fn the_model_of_the_distortion_counts_wherever_that_of_the_camera_is() {
     let matrix = "K: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nD: [0.1, 0, 0, 0]\n";
@@ -44,6 +75,76 @@ fn the_model_of_the_distortion_counts_wherever_that_of_the_camera_is() {
         let found = opencv::read(&text, Some([640.0, 480.0])).unwrap();
         assert!(found.distortion.is_fisheye(), "{text}");
     }
+}
+
+/// As the sample program of OpenCV writes them: without a name of the model.
+#[test]
+fn a_fisheye_of_opencv_s_own_calibration_is_none_of_brown_and_conrady_s() {
+    let read = |text: &str| opencv::read(text, Some([640.0, 480.0])).unwrap();
+    let matrix = "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 500., 0., 320., 0., 500., \
+        240., 0., 0., 1. ]\n";
+    let coefficients = "distortion_coefficients: !!opencv-matrix\n   rows: 4\n   cols: 1\n   dt: d\n   data: [ -0.02, \
+        0.003, 0.001, 0.002 ]\n";
+    let json =
+        json!({ "K": [500, 0, 320, 0, 500, 240, 0, 0, 1], "D": [-0.02, 0.003, 0.001, 0.002] });
+    for is_fisheye in [false, true] {
+        let kind = u8::from(is_fisheye);
+        let head = format!("%YAML:1.0\n---\nflags: 4\nfisheye_model: {kind}\n");
+        let mut json = json.clone();
+        json["fisheye_model"] = json!(kind);
+        for text in [format!("{head}{matrix}{coefficients}"), json.to_string()] {
+            assert_eq!(read(&text).distortion.is_fisheye(), is_fisheye, "{text}");
+        }
+    }
+}
+
+/// Programs shorten the names: a lens whose coefficients are not found would be one without distortion.
+#[test]
+fn coefficients_are_found_by_each_of_their_names() {
+    let matrix = "[500, 0, 320, 0, 500, 240, 0, 0, 1]";
+    let size = Some([640.0, 480.0]);
+    let want = opencv::read(&format!("K: {matrix}\nD: [-0.2, 0.03]\n"), size).unwrap();
+    assert!(!want.distortion.is_none());
+    for (k, d) in [
+        ("k", "d"),
+        ("camera_matrix", "dist_coeff"),
+        ("camera_matrix", "dist_coeffs"),
+        ("cameraMatrix", "distCoeffs"),
+        ("camera_matrix", "dist"),
+        ("camera_matrix", "distortion"),
+        ("Camera_Matrix", "Distortion_Coefficients"),
+    ] {
+        let yaml = format!("{k}: {matrix}\n{d}: [-0.2, 0.03]\n");
+        let json = format!("{{\"{k}\": {matrix}, \"{d}\": [[-0.2], [0.03]]}}");
+        for text in [yaml, json] {
+            assert_eq!(opencv::read(&text, size).unwrap(), want, "{text}");
+        }
+    }
+}
+
+#[test]
+fn a_camera_of_kalibr_s_is_that_of_opencv_s() {
+    let camera = |name: &str, model: &str| {
+        format!(
+            "{name}:\n  cam_overlaps: [1]\n  camera_model: pinhole\n  distortion_coeffs: [-0.02, 0.003, 0.001, 0.002]\n  \
+             distortion_model: {model}\n  intrinsics: [500.0, 501.0, 319.5, 239.5]\n  resolution: [640, 480]\n  \
+             rostopic: /cam0/image_raw\n"
+        )
+    };
+    let opencv = "image_width: 640\nimage_height: 480\nK: [500, 0, 319.5, 0, 501, 239.5, 0, 0, 1]\n\
+        D: [-0.02, 0.003, 0.001, 0.002]\n";
+    for (kalibr, own) in [("radtan", "plumb_bob"), ("equidistant", "fisheye")] {
+        let want = opencv::read(&format!("{opencv}distortion_model: {own}\n"), None);
+        let found = opencv::read(&camera("cam0", kalibr), None);
+        assert_eq!(found.unwrap(), want.unwrap());
+    }
+    let error = |text: &str| opencv::read(text, None).unwrap_err().to_string();
+    let two = camera("cam0", "radtan") + &camera("cam1", "radtan");
+    let want = "it has 2 cameras; write that of the photograph into a file of its own";
+    assert!(error(&two).ends_with(want), "{}", error(&two));
+    let unknown = error(&camera("cam0", "fov"));
+    let want = "its distortion model is \"fov\"; accepted: plumb_bob";
+    assert!(unknown.contains(want), "{unknown}");
 }
 
 #[test]

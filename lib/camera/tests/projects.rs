@@ -83,6 +83,52 @@ fn a_file_of_a_model_is_no_calibration_and_is_read_with_those_beside_it() {
     assert_eq!(error, want);
 }
 
+/// A rig may have a camera of a model that is not read.
+#[test]
+fn a_camera_of_an_unknown_model_keeps_no_other_of_the_model_from_being_read() {
+    let other = "2 THIN_PRISM_FISHEYE 640 480 500 500 320 240 1 2 3 4 5 6 7 8\n";
+    let images = "1 1 0 0 0 0 0 -3 1 a.jpg\n\n2 1 0 0 0 0 0 -4 2 b.jpg\n\n";
+    let text = tempfile::tempdir().unwrap();
+    std::fs::write(text.path().join("cameras.txt"), format!("{other}{CAMERA}")).unwrap();
+    std::fs::write(text.path().join("images.txt"), images).unwrap();
+    let binary = tempfile::tempdir().unwrap();
+    let mut cameras = 2u64.to_le_bytes().to_vec();
+    let mut camera = |id: u32, model: u32, parameters: &[f64]| {
+        cameras.extend([id.to_le_bytes(), model.to_le_bytes()].concat());
+        cameras.extend([640u64.to_le_bytes(), 480u64.to_le_bytes()].concat());
+        parameters
+            .iter()
+            .for_each(|p| cameras.extend(p.to_le_bytes()));
+    };
+    camera(
+        2,
+        10,
+        &[
+            500.0, 500.0, 320.0, 240.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0,
+        ],
+    );
+    camera(1, 1, &[500.0, 500.0, 320.0, 240.0]);
+    let mut images = 2u64.to_le_bytes().to_vec();
+    for (id, z, name) in [(1u32, -3.0, "a.jpg\0"), (2, -4.0, "b.jpg\0")] {
+        images.extend(id.to_le_bytes());
+        images.extend(
+            [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, z]
+                .map(f64::to_le_bytes)
+                .concat(),
+        );
+        images.extend(id.to_le_bytes());
+        images.extend([name.as_bytes(), &[0; 8]].concat());
+    }
+    std::fs::write(binary.path().join("cameras.bin"), cameras).unwrap();
+    std::fs::write(binary.path().join("images.bin"), images).unwrap();
+    for model in [text, binary] {
+        assert_eq!(position(model.path(), "a.jpg").unwrap().z, 3.0);
+        let error = position(model.path(), "b.jpg").unwrap_err();
+        let want = "its camera model is THIN_PRISM_FISHEYE; accepted: SIMPLE_PINHOLE";
+        assert!(error.contains(want), "{error}");
+    }
+}
+
 #[test]
 fn empty_lines_after_images_mean_nothing() {
     let folder = tempfile::tempdir().unwrap();

@@ -157,8 +157,9 @@ fn used(cloud: &Cloud, camera: &Camera, up: DVec3) -> Used {
     let below = cloud.points.iter().filter(|p| (**p - from).dot(up) < 0.0);
     let mut below: Vec<DVec3> = below.copied().collect();
     let is_seen = |p: &&DVec3| {
-        let pixel = camera.project(**p).map(|seen| seen.pixel);
-        pixel.is_some_and(|p| (0.0..=w).contains(&p.x) && (0.0..=h).contains(&p.y))
+        camera
+            .project(**p)
+            .is_some_and(|p| (0.0..=w).contains(&p.x) && (0.0..=h).contains(&p.y))
     };
     let mut seen: Vec<DVec3> = below.iter().filter(is_seen).copied().collect();
     for points in [&mut seen, &mut below] {

@@ -124,7 +124,7 @@ impl Search<'_> {
         if !inside {
             return None;
         }
-        let pixel = |point: DVec3| Some(self.camera.project(point)?.pixel);
+        let pixel = |point: DVec3| self.camera.project(point);
         let up = self.ground.normal;
         let (stands, top) = (pixel(foot)?, pixel(foot + body.height_m * up)?);
         let height = match body.height_m < FLAT * body.radius_m {
@@ -144,7 +144,7 @@ impl Search<'_> {
             let angle = f64::from(i) * std::f64::consts::FRAC_PI_4;
             let side = body.radius_m * (angle.cos() * right + angle.sin() * ahead);
             for point in [foot + side, foot + side + body.height_m * up] {
-                let pixel = self.camera.project(point)?.pixel;
+                let pixel = self.camera.project(point)?;
                 (low, high) = (low.min(pixel), high.max(pixel));
             }
         }

@@ -209,7 +209,7 @@ fn a_place_is_never_inside_an_obstacle_and_its_foot_is_on_the_ground() {
             let room = street.room(foot, body.radius_m);
             assert!(room > 0.0, "scene {scene}, draw {draw}: {foot} {room}");
             let truth = foot - street.normal.dot(foot) / street.normal.y * DVec3::Y;
-            let pixel = |p: DVec3| camera.project(p).unwrap().pixel;
+            let pixel = |p: DVec3| camera.project(p).unwrap();
             let off = pixel(foot).distance(pixel(truth));
             assert!(off < 2.0, "scene {scene}: {off} pixels at {foot}");
             // Nothing stands in the way.
@@ -249,12 +249,12 @@ fn without_points_the_place_is_in_the_lower_middle_and_whole() {
         draw,
     };
     let first = search(&[], 0).place(&body).unwrap();
-    let pixel = camera.project(first).unwrap().pixel;
+    let pixel = camera.project(first).unwrap();
     assert!(
         (pixel.x / 1242.0 - 0.5).abs() < 0.1 && pixel.y > 0.6 * 375.0,
         "{pixel}"
     );
-    assert!(camera.project(first + DVec3::Y).unwrap().pixel.y > 0.0);
+    assert!(camera.project(first + DVec3::Y).unwrap().y > 0.0);
     // A second one stands beside it.
     let taken = [(first, body)];
     let second = search(&taken, 0).place(&body).unwrap();

@@ -211,8 +211,8 @@ fn distorted_focal(
     }
     let (sin, cos) = (0.5 * f64::from(angle_rad)).sin_cos();
     let image = distortion.image(DVec3::new(0.0, sin, cos));
-    match image.filter(|i| i.point.y > 0.0) {
-        Some(image) => Ok(Some(0.5 * height_px / image.point.y)),
+    match image.filter(|at| at.y > 0.0) {
+        Some(at) => Ok(Some(0.5 * height_px / at.y)),
         None => Err(Error::Config {
             key: "scene.camera.fov_deg".into(),
             value: format!("{:.1}", angle_rad.to_degrees()),

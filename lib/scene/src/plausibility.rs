@@ -7,7 +7,7 @@ mod size;
 
 use dipir_cameras::Lens;
 use dipir_imaging::raster::Raster;
-use glam::{DVec2, Vec3};
+use glam::{DVec2, DVec3, Vec3};
 
 use crate::camera::Camera;
 use crate::description::{ObjectRecord, ProxyRecord};
@@ -28,6 +28,8 @@ const SMALLEST_PX: f32 = 3.0;
 const LEAST_FISHEYE_DEG: f64 = 80.0;
 /// Steps from the optical axis to a corner in which the end of a lens's picture is looked for.
 const STEPS: usize = 256;
+/// Rounding of positions in the scene that matters, metres.
+const MOST_ROUNDED_M: f64 = 1e-3;
 
 /// What is unlikely about a scene, one sentence each.
 pub fn implausible(loaded: &LoadedScene) -> Vec<String> {
@@ -57,6 +59,7 @@ pub fn implausible(loaded: &LoadedScene) -> Vec<String> {
 /// `lens` is the photograph's, if it bends lines.
 fn implausible_scene(scene: &Scene, objects: &[ObjectRecord], lens: Option<&Lens>) -> Vec<String> {
     let mut found = Vec::new();
+    found.extend(rounded(scene.camera.position.as_dvec3()));
     found.extend(lens.and_then(turns_back));
     // A fisheye's is not that of the picture without distortion, which shows the inner part of it.
     if !lens.is_some_and(|l| l.distortion.is_fisheye()) {
@@ -97,6 +100,20 @@ fn implausible_scene(scene: &Scene, objects: &[ObjectRecord], lens: Option<&Lens
         size_is_told,
     ));
     found
+}
+
+/// What is wrong with a camera at `position`, metres, so far from the origin that the scene's single precision moves it.
+pub fn rounded(position: DVec3) -> Option<String> {
+    let farthest = position.abs().max_element();
+    let step = f64::from((farthest as f32).next_up()) - f64::from(farthest as f32);
+    (step > MOST_ROUNDED_M).then(|| {
+        format!(
+            "the camera stands {:.0} km from the origin of its world, where lengths are rounded to {:.0} mm: subtract the \
+             same point from the cameras and points of the scene",
+            farthest / 1000.0,
+            step * 1000.0
+        )
+    })
 }
 
 fn field_of_view(camera: &Camera) -> Option<String> {
@@ -184,7 +201,7 @@ fn object_below(mesh: &TriangleMesh, plane: &Plane) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use dipir_cameras::Distortion;
-    use glam::{DMat4, DVec3, Vec2};
+    use glam::{DMat4, Vec2};
 
     use super::*;
     use crate::camera::FieldOfView;
@@ -230,6 +247,20 @@ mod tests {
     #[test]
     fn nothing_is_said_of_an_object_on_the_ground_before_the_camera() {
         assert_eq!(implausible_scene(&scene(), &[], None), Vec::<String>::new());
+    }
+
+    #[test]
+    fn a_camera_where_the_scene_rounds_positions_is_told() {
+        let at = |x: f32| {
+            let mut scene = scene();
+            scene.camera.position.x = x;
+            implausible_scene(&scene, &[], None)
+        };
+        let is_told = |x: f32| at(x).iter().any(|said| said.contains("are rounded to"));
+        // Floats are 0.98 mm apart below 2^14 metres, 1.95 mm above.
+        assert!(!is_told(16_000.0) && is_told(16_500.0));
+        let want = "stands 5428 km from the origin of its world, where lengths are rounded to 500 mm: subtract";
+        assert!(at(-5_428_000.0)[0].contains(want), "{:?}", at(-5_428_000.0));
     }
 
     #[test]

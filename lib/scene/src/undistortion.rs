@@ -99,7 +99,7 @@ impl Undistortion {
             pose: Pose::IDENTITY,
             lens: self.lens,
         };
-        camera.project(direction).map(|seen| seen.pixel)
+        camera.project(direction)
     }
 
     /// The working picture of something that has the photograph's pixels; beyond the photograph its
@@ -276,7 +276,7 @@ mod tests {
                 [0.9, 0.1, -1.0],
             ] {
                 let point = DVec3::from_array(corner);
-                let want = real.project(point).unwrap().pixel;
+                let want = real.project(point).unwrap();
                 let working = pinhole.project(point.as_vec3()).unwrap().as_dvec2();
                 let got = way.to_photo(working).unwrap();
                 // Single precision of the renderer's camera.

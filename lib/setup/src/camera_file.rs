@@ -4,6 +4,7 @@ use std::path::Path;
 use dipir_cameras::chan::Turns;
 use dipir_cameras::file::{self, Wanted, Which};
 use dipir_cameras::{CameraError, Lens, Pose, WorldUp};
+use dipir_scene::plausibility::rounded;
 use glam::{DVec2, DVec3};
 
 use crate::error::SetupError;
@@ -15,8 +16,6 @@ const MOST_BENT_PX: f64 = 1.0;
 const LEAST_SHIFT_PX: f64 = 0.5;
 /// Least change of an axis of the camera that the order of its rotations makes: half a pixel at a focal length of 5,000.
 const LEAST_TURN: f64 = 1e-4;
-/// Rounding of positions in the scene that matters, metres.
-const MOST_ROUNDED_M: f64 = 1e-3;
 
 /// The camera that the file or folder at `path` has for `photo`, of `size` pixels, and what of it may be wrong, one
 /// sentence each. `up` overrules which axis of its world points up.
@@ -98,7 +97,7 @@ pub fn read(
             path.display()
         ));
     }
-    warnings.extend(rounding(&pose).map(|what| format!("\"{}\": {what}", path.display())));
+    warnings.extend(rounded(pose.position).map(|what| format!("\"{}\": {what}", path.display())));
     Ok((view, warnings))
 }
 
@@ -110,20 +109,6 @@ fn depends_on_order(path: &Path, wanted: &Wanted, pose: &Pose) -> bool {
     };
     let other = file::read(path, &blender).ok().and_then(|found| found.pose);
     other.is_some_and(|other| !other.rotation.abs_diff_eq(pose.rotation, LEAST_TURN))
-}
-
-/// What is wrong with a camera so far from the origin that single precision, which the scene has, moves it.
-fn rounding(pose: &Pose) -> Option<String> {
-    let farthest = pose.position.abs().max_element();
-    let step = f64::from((farthest as f32).next_up()) - f64::from(farthest as f32);
-    (step > MOST_ROUNDED_M).then(|| {
-        format!(
-            "the camera stands {:.0} km from the origin of its world, where lengths are rounded to {:.0} mm: subtract the \
-             same point from the cameras and points of the scene",
-            farthest / 1000.0,
-            step * 1000.0
-        )
-    })
 }
 
 /// What the file at `path` says that the numbers of a view do not, in words; `lens` is the photograph's.
@@ -191,8 +176,8 @@ fn bent_px(lens: &Lens) -> f64 {
         let image = lens
             .distortion
             .image(DVec3::new(straight.x, straight.y, 1.0));
-        image.map_or(f64::INFINITY, |i| {
-            ((i.point - straight) * lens.focal_px).length()
+        image.map_or(f64::INFINITY, |at| {
+            ((at - straight) * lens.focal_px).length()
         })
     });
     bent.into_iter().fold(0.0, f64::max)

@@ -1,6 +1,7 @@
 //! How far estimated cameras are off, and how often their intervals hold.
 use dipir_calibration::Posterior;
 use dipir_calibration::pose::{Pose, fov_deg};
+use dipir_numerics::stats::median;
 
 /// A photograph, what was told of its camera, and its camera.
 #[derive(Clone, Debug)]
@@ -62,11 +63,14 @@ impl Row {
     /// Of the cases for which `belongs` holds.
     pub fn of(name: &str, cases: &[Case], belongs: impl Fn(&Case) -> bool) -> Self {
         let own: Vec<&Case> = cases.iter().filter(|c| belongs(c)).collect();
-        let at = |q: f64, value: &dyn Fn(&Case) -> f64| {
-            let mut all: Vec<f64> = own.iter().map(|c| value(c)).collect();
+        let all =
+            |value: &dyn Fn(&Case) -> f64| -> Vec<f64> { own.iter().map(|c| value(c)).collect() };
+        let middle = |value: &dyn Fn(&Case) -> f64| median(&all(value)).unwrap_or(f64::NAN);
+        let worst = |value: &dyn Fn(&Case) -> f64| {
+            let mut all = all(value);
             all.sort_by(f64::total_cmp);
             let last = all.len().saturating_sub(1) as f64;
-            all.get((q * last).round() as usize)
+            all.get((0.9 * last).round() as usize)
                 .copied()
                 .unwrap_or(f64::NAN)
         };
@@ -74,9 +78,9 @@ impl Row {
         Self {
             name: name.into(),
             count: own.len(),
-            median: [0, 1, 2].map(|k| at(0.5, &|c| c.off[k])),
-            worst: [0, 1, 2].map(|k| at(0.9, &|c| c.off[k])),
-            half: [0, 1, 2].map(|k| at(0.5, &|c| c.half[k])),
+            median: [0, 1, 2].map(|k| middle(&|c| c.off[k])),
+            worst: [0, 1, 2].map(|k| worst(&|c| c.off[k])),
+            half: [0, 1, 2].map(|k| middle(&|c| c.half[k])),
             held: [0, 1, 2].map(|k| held(k) / own.len() as f64),
         }
     }
@@ -102,4 +106,30 @@ pub fn table(rows: &[Row]) -> String {
         text.push('\n');
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_median_of_an_even_count_lies_between_the_middle_two() {
+        let case = |off: f64| Case {
+            group: "place".into(),
+            truth: Pose {
+                pitch_deg: 0.0,
+                roll_deg: 0.0,
+                log_focal: 0.0,
+            },
+            focal_known: true,
+            off: [off; 3],
+            half: [2.0 * off; 3],
+            held: [off < 2.5; 3],
+        };
+        let row = Row::of("all", &[4.0, 1.0, 3.0, 2.0].map(case), |_| true);
+        assert_eq!((row.median, row.half), ([2.5; 3], [5.0; 3]));
+        assert_eq!((row.worst, row.held), ([4.0; 3], [0.5; 3]));
+        let none = Row::of("none", &[], |_| true);
+        assert!(none.count == 0 && none.median[0].is_nan() && none.worst[0].is_nan());
+    }
 }

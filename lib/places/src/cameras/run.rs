@@ -9,6 +9,7 @@ use dipir_calibration::whole::MOST_BLUR;
 use dipir_calibration::{CameraEstimator, Evidence, KnownFocal, SEARCHED, Scores};
 use dipir_imaging::raster::LinearImage;
 use dipir_numerics::hashing::hash_u64s;
+use dipir_numerics::stats::median;
 use rayon::prelude::*;
 
 use crate::cameras::figures::{Case, Row};
@@ -489,7 +490,6 @@ fn blurred(
         middle(&again) / middle(&scores[1])
     };
     let judged = judged(&halved, settings);
-    let mut all: Vec<f64> = judged.par_iter().zip(scores).map(factor).collect();
-    all.sort_by(f64::total_cmp);
-    all.get(all.len() / 2).copied().unwrap_or(f64::NAN)
+    let all: Vec<f64> = judged.par_iter().zip(scores).map(factor).collect();
+    median(&all).unwrap_or(f64::NAN)
 }

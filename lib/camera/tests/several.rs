@@ -1,0 +1,67 @@
+//! Files of several cameras: which one is read, and what the others do.
+use std::path::Path;
+
+use dipir_cameras::file::{self, Wanted, Which};
+use serde_json::{Value, json};
+
+/// Where the camera stands that is found in a file of this name.
+fn found_x(name: &str, json: &Value, which: Which) -> Result<f64, String> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(name);
+    std::fs::write(&path, json.to_string()).unwrap();
+    let wanted = Wanted {
+        size: [600.0, 400.0],
+        which,
+        up: None,
+        fov_deg: None,
+        turns: None,
+    };
+    let found = file::read(&path, &wanted).map_err(|e| e.to_string())?;
+    Ok(found.pose.unwrap().position.x)
+}
+
+/// Blender names a camera's data, which several objects may share, and each object.
+#[test]
+fn a_gltf_s_camera_goes_by_its_node_s_name_too() {
+    let node = |name: &str, x: f64| json!({ "name": name, "camera": 0, "translation": [x, 0, 0] });
+    let text = json!({
+        "nodes": [node("left", -1.0), node("right", 1.0)],
+        "cameras": [{ "name": "lens", "perspective": { "yfov": 0.7 } }],
+    });
+    let x = |which| found_x("shot.gltf", &text, which);
+    assert_eq!(x(Which::Name("right")), Ok(1.0));
+    assert_eq!(x(Which::Photo(Path::new("plates/left.png"))), Ok(-1.0));
+    let error = x(Which::Name("lens")).unwrap_err();
+    let want = "match \"lens\" equally well; say which by its number, for instance frame = 1";
+    assert!(error.contains(want), "{error}");
+}
+
+/// A rig of which the others are of no use here.
+#[test]
+fn a_camera_that_cannot_be_read_keeps_no_other_from_being_read() {
+    let rows = |x: f64| json!([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
+    let frames = json!({ "fl_x": 500, "frames": [
+        { "file_path": "a.png", "transform_matrix": rows(1.0) },
+        { "file_path": "b.png", "transform_matrix": rows(2.0), "camera_model": "EQUIRECTANGULAR" },
+    ] });
+    // The parent's scale shears the turned camera alone.
+    let nodes = json!([
+        { "scale": [2, 1, 1], "children": [1, 2] },
+        { "name": "a", "camera": 0, "translation": [0.5, 0, 0] },
+        { "name": "b", "camera": 0, "rotation": [0, 0, 0.38268343, 0.92387953] },
+    ]);
+    let gltf = json!({ "nodes": nodes, "cameras": [{ "perspective": { "yfov": 0.7 } }] });
+    for (name, text, wrong) in [
+        (
+            "transforms.json",
+            frames,
+            "camera_model is \"EQUIRECTANGULAR\"",
+        ),
+        ("rig.gltf", gltf, "sheared, mirrored or scaled to nothing"),
+    ] {
+        let of = |photo: &str| found_x(name, &text, Which::Photo(Path::new(photo)));
+        assert_eq!(of("a.png"), Ok(1.0), "{name}");
+        let error = of("b.png").unwrap_err();
+        assert!(error.contains(wrong), "{error}");
+    }
+}
