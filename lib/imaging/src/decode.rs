@@ -2,6 +2,7 @@
 use crate::{
     encoding::Encoding,
     error::ImagingError,
+    facts::is_adobe_rgb,
     file::{PhotoLimits, check_size},
     format::Format,
     jpeg_header,
@@ -14,6 +15,7 @@ use image::{
     codecs::{jpeg::JpegDecoder, png::PngDecoder},
     metadata::Orientation,
 };
+use moxcms::ColorProfile;
 use rayon::prelude::*;
 use std::{io::Cursor, path::Path};
 
@@ -91,7 +93,14 @@ impl Decoded {
                 jpeg_header::check(bytes, path)?;
                 let decoder = JpegDecoder::new(Cursor::new(bytes)).map_err(failed)?;
                 let decoded = Self::with(decoder, path, limit, failed)?;
-                Ok(decoded.with_profile_of(bytes, b"ICC_PROFILE\0"))
+                let mut decoded = decoded.with_profile_of(bytes, b"ICC_PROFILE\0");
+                if decoded.icc.is_none()
+                    && decoded.colours() == 3
+                    && decoded.exif.as_deref().is_some_and(is_adobe_rgb)
+                {
+                    decoded.icc = ColorProfile::new_adobe_rgb().encode().ok();
+                }
+                Ok(decoded)
             }
             other => Err(other.refuse(path, expected)),
         }

@@ -86,10 +86,7 @@ impl Facts {
         if let Some(turn) = Orientation::from_exif_chunk(exif) {
             facts.orientation = turn.to_exif();
         }
-        let mut reader = exif::Reader::new();
-        let read = reader.continue_on_error(true).read_raw(exif.to_vec());
-        let read = read.or_else(|e| e.distill_partial_result(|_| {}));
-        if let Ok(exif) = read {
+        if let Some(exif) = parsed(exif) {
             let fields = Fields(&exif);
             facts.make = fields.text(Tag::Make);
             facts.model = fields.text(Tag::Model);
@@ -219,6 +216,24 @@ impl Facts {
         let focal = self.focal_px?;
         Some(self.size.map(|n| 2.0 * (0.5 * f64::from(n) / focal).atan()))
     }
+}
+
+/// Exif data, from their TIFF header on; of damaged ones what can be read.
+fn parsed(exif: &[u8]) -> Option<Exif> {
+    let mut reader = exif::Reader::new();
+    let read = reader.continue_on_error(true).read_raw(exif.to_vec());
+    read.or_else(|e| e.distill_partial_result(|_| {})).ok()
+}
+
+/// Whether Exif data say that the values are Adobe RGB: cameras say so by the interoperability index `R03`, and write no
+/// profile [DCF 2.0, 5.2.2].
+pub(crate) fn is_adobe_rgb(exif: &[u8]) -> bool {
+    const SRGB: u32 = 1;
+    parsed(exif).is_some_and(|exif| {
+        let fields = Fields(&exif);
+        fields.text(Tag::InteroperabilityIndex).as_deref() == Some("R03")
+            && fields.uint(Tag::ColorSpace) != Some(SRGB)
+    })
 }
 
 /// Exif fields by tag, of the picture itself.

@@ -485,6 +485,13 @@ fn linear_of_layers(
         let (xyz, white) = Primaries::of_xyz(layers.primaries);
         (layers.xyz("")?.map(|&v| v / white), Some(xyz))
     } else {
+        if layers.skipped().iter().any(|c| c == "RY" || c == "BY") {
+            return Err(ImagingError::Unsupported {
+                path: path.to_owned(),
+                what: "stores its colours as luminance and chroma (`Y`, `RY`, `BY`)".into(),
+                remedy: "save it with the channels `R`, `G`, `B`".into(),
+            });
+        }
         (layers.channel("Y")?.map(|&v| Vec3::splat(v)), None)
     };
     check_finite(path, &colour)?;

@@ -7,8 +7,8 @@ use std::path::Path;
 /// The brightness of 8 x 8 pixels takes a bit at least: a file that declares more is cut off or made to waste time.
 const MOST_PIXELS_A_BYTE: usize = 8 * 64;
 
-/// Errors on files that end before their end-of-image marker, on CMYK, on other than 8 bits, on more pixels
-/// than their bytes can hold, and on layouts that cannot be decoded.
+/// Errors on files that end before their end-of-image marker, on CMYK, on other than 8 bits, on codings of
+/// specialists, on more pixels than their bytes can hold, and on layouts that cannot be decoded.
 pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
     let damaged = |detail: &str| ImagingError::Damaged {
         path: path.to_owned(),
@@ -37,6 +37,13 @@ pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
         };
         // Start of frame, all codings; C4, C8 and CC are other tables.
         if matches!(marker, 0xc0..=0xcf) && !matches!(marker, 0xc4 | 0xc8 | 0xcc) {
+            if let Some(coding) = other_coding(marker) {
+                return Err(ImagingError::Unsupported {
+                    path: path.to_owned(),
+                    what: format!("is a JPEG with {coding}"),
+                    remedy: format::conversion("magick", "", path).into(),
+                });
+            }
             let (Some(&bits), Some(&components)) = (bytes.get(at + 4), bytes.get(at + 9)) else {
                 return Err(damaged("the frame header is cut off"));
             };
@@ -69,6 +76,17 @@ pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
             }
         }
         at += 2 + usize::from(u16::from_be_bytes([high, low])).max(2);
+    }
+}
+
+/// What the decoder cannot read of a frame with this marker: it reads sequential and progressive frames of Huffman codes
+/// [ITU-T T.81, table B.1].
+fn other_coding(marker: u8) -> Option<&'static str> {
+    match marker {
+        0xc0..=0xc2 => None,
+        0xc3 => Some("lossless coding"),
+        0xc5..=0xc7 => Some("hierarchical coding"),
+        _ => Some("arithmetic coding"),
     }
 }
 

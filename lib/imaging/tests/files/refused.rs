@@ -365,3 +365,42 @@ fn nan_and_infinity_in_imported_light_are_refused_with_the_pixel_named() {
         }
     }
 }
+
+#[test]
+fn a_jpeg_of_another_coding_is_not_called_damaged() {
+    let folder = folder();
+    let mut file = jpeg(&[90; 12], 2, 2, ExtendedColorType::Rgb8);
+    let frame = file.windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
+    for (marker, coding) in [
+        (0xc3, "lossless"),
+        (0xc6, "hierarchical"),
+        (0xc9, "arithmetic"),
+        (0xca, "arithmetic"),
+    ] {
+        file[frame + 1] = marker;
+        let path = put(&folder, "x.jpg", &file);
+        let error = words(read_photo(&path, Transfer::Srgb).unwrap_err());
+        let says = format!("is a JPEG with {coding} coding, which is not supported; convert it");
+        assert!(error.contains(&says), "{error}");
+    }
+}
+
+#[test]
+fn luminance_with_chroma_is_not_read_as_grey() {
+    let folder = folder();
+    let path = folder.path().join("x.exr");
+    let mut layers = Layers::new(2, 1);
+    for name in ["Y", "RY", "BY"] {
+        let samples = Raster::filled(2, 1, 0.5);
+        layers.insert(name, Precision::Half, samples).unwrap();
+    }
+    layers.write_exr(&path).unwrap();
+    for error in [
+        words(read_photo(&path, Transfer::Srgb).unwrap_err()),
+        words(read_linear(&path).unwrap_err()),
+    ] {
+        assert!(error.contains("luminance and chroma"), "{error}");
+    }
+    // A mask is the luminance.
+    assert_eq!(read_mask(&path).unwrap().pixels(), [0.5; 2]);
+}
