@@ -1,14 +1,12 @@
 //! A project while it is being arranged.
-use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use anyhow::{Context, anyhow, bail};
+use anyhow::{Context, bail};
 use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_imaging::raster::Raster;
-use dipir_imaging::resize::{Filter, resize};
 use dipir_optimize::settings::LightTable;
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::plain_reason;
@@ -26,12 +24,14 @@ use dipir_scene::scene::LoadedScene;
 use dipir_stages::composite::table::CompositeTable;
 use dipir_stages::graph;
 use dipir_stages::light::at_hand::{AtHand, at_hand};
+use dipir_stages::names::LIGHT;
 use glam::DVec2;
 use serde_json::{Value, json};
 
 use crate::document::Document;
 use crate::drafts::Drafts;
 use crate::edit::Edit;
+use crate::mask::{MASK_FILE, MaskFile, unwritten};
 use crate::readings::Reading;
 use crate::relighting::Relighting;
 use crate::shown::{description, height_over, view};
@@ -43,8 +43,6 @@ const LONGEST: u32 = 1280;
 /// What is said of the project's file then: this page does not know the new text, and must not lose it.
 const CHANGED: &str = "was changed by another program: undo that to save what is changed here, or start dipir place \
                        anew to go on from it";
-/// The mask's file, beside the project's.
-const MASK_FILE: &str = "holdout.png";
 
 /// The project, its photograph scaled, and what was painted.
 pub struct Desk {
@@ -304,6 +302,8 @@ impl Desk {
         };
         let (config, arrangement) = self.arranged(&text)?;
         let exposure = config.table::<CompositeTable>("composite")?;
+        // What is wrong with it, the picture says.
+        let light = config.table::<LightTable>("light");
         let models = &self.props.models;
         let name = |o: &Placed| {
             let name = models[o.model].path.file_stem().unwrap_or_default();
@@ -319,6 +319,7 @@ impl Desk {
             "shown": self.size,
             "names": arrangement.objects.iter().map(name).collect::<Vec<_>>(),
             "exposure_ev": exposure.exposure_ev,
+            "shadow": light.is_ok_and(|l| l.shadow.is_some()),
             "edit": edit,
             "view": self.shown(&arrangement, true),
         }))
@@ -429,6 +430,10 @@ impl Desk {
         to.small.arrange(arrangement);
         to.session.config = config;
         to.small.loaded.occluders = self.occluders(edit, to.own_mask.as_ref());
+        // A light that a run refuses is not shown first and refused when it is saved.
+        if edit.sun.is_some() || edit.shadow.is_some() {
+            assess(&to.session, LIGHT.name)?;
+        }
         to.light_up()
     }
 
@@ -502,11 +507,12 @@ impl Desk {
         let (text, _, arrangement) = self.edited(edit)?;
         let mut document = Document::parse(&text)?;
         let painted = held(&self.mask).clone();
-        let mask = (edit.mask && !painted.is_empty()).then(|| self.path.with_file_name(MASK_FILE));
-        if let Some(path) = &mask {
-            if !png::is_free(path)? {
-                bail!("{MASK_FILE} is there already and dipir did not make it; rename it");
-            }
+        let wanted = edit.mask && !painted.is_empty();
+        let mut mask = match wanted {
+            true => Some(MaskFile::beside(&self.path)?),
+            false => None,
+        };
+        if wanted {
             document.occluders(MASK_FILE)?;
         }
         let text = document.text();
@@ -525,22 +531,16 @@ impl Desk {
         }
         // Every table is read once more, and the light found, as a run would.
         self.arrange(&mut rendered, edit, &arrangement, config)?;
-        let graph = graph::graph(&rendered.session)?;
-        graph::assess(&rendered.session, &graph, &graph.up_to(graph::LAST))?;
+        assess(&rendered.session, graph::LAST)?;
         let mut written = Vec::new();
-        let earlier = mask.as_ref().and_then(|path| dipir_files::read(path).ok());
-        if let Some(path) = &mask {
-            let [w, h] = arrangement.camera.resolution.map(|n| n as usize);
-            let whole = resize(&self.raster(&painted), w, h, Filter::Tent);
-            let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
-            let values: Vec<u8> = whole.pixels().iter().map(byte).collect();
-            png::write(path, &png::encode(w, h, &values)?).map_err(|e| unwritten(path, &e))?;
-            written.push(path.display().to_string());
+        if let Some(mask) = &mut mask {
+            mask.write(&self.raster(&painted), arrangement.camera.resolution)?;
+            written.push(mask.path.display().to_string());
         }
         if let Err(e) = dipir_files::rewrite(&self.path, base.as_bytes(), text.as_bytes()) {
             // The file as it is goes with the mask as it was.
-            if let (Some(path), Some(earlier)) = (&mask, earlier) {
-                png::write(path, &earlier).map_err(|e| unwritten(path, &e))?;
+            if let Some(mask) = &mask {
+                mask.restore()?;
             }
             return Err(unwritten(&self.path, &e));
         }
@@ -574,8 +574,9 @@ impl Rendered {
     }
 }
 
-/// That the file cannot be written. The name of the one beside it, which becomes it, says nothing to anybody.
-fn unwritten(path: &Path, error: &io::Error) -> anyhow::Error {
-    let reason = plain_reason(error);
-    anyhow!("cannot write \"{}\": {reason}", path.display())
+/// Errors on what a run up to `stage` refuses.
+fn assess(session: &Session, stage: &str) -> anyhow::Result<()> {
+    let graph = graph::graph(session)?;
+    graph::assess(session, &graph, &graph.up_to(stage))?;
+    Ok(())
 }

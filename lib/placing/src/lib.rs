@@ -7,6 +7,8 @@ pub mod document;
 mod drafts;
 pub mod edit;
 pub mod gate;
+mod mask;
+mod patient;
 mod readings;
 pub mod relighting;
 pub mod server;

@@ -25,6 +25,7 @@ use tokio::time::timeout;
 use crate::desk::{Crop, Desk, Superseded};
 use crate::edit::Edit;
 use crate::gate::{Gate, Head, MASK, MOST_JSON, Refusal, Route, token};
+use crate::patient::Patient;
 use crate::vanishing::Lines;
 
 /// The page's files: name behind the token, type, text.
@@ -63,7 +64,7 @@ const THREADS: usize = 8;
 const CONNECTIONS: usize = 128;
 /// How soon the server sees that it should end.
 const PAUSE: Duration = Duration::from_millis(200);
-/// Longest wait for the head of a request, and for its body.
+/// Longest wait for the head of a request, for its body, and for a reader who takes nothing of the answer.
 const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A server that listens.
@@ -146,7 +147,8 @@ impl Place {
             let service = service_fn(move |request| site.clone().answer(request));
             let mut http = http1::Builder::new();
             http.timer(TokioTimer::new()).header_read_timeout(PATIENCE);
-            let connection = http.serve_connection(TokioIo::new(stream), service);
+            let stream = TokioIo::new(Patient::new(stream, PATIENCE));
+            let connection = http.serve_connection(stream, service);
             // Who breaks a connection off does not wait for an answer.
             tokio::spawn(async move {
                 drop(connection.await);

@@ -84,10 +84,12 @@ fn a_save_that_fails_leaves_file_and_mask_as_they_were() {
     std::os::unix::fs::symlink(deep.join("p"), folder.path().join("pipeline.toml")).unwrap();
     let desk = Desk::open(open(folder.path(), &[])).unwrap();
     let mask = folder.path().join("holdout.png");
+    let edit = serde_json::from_value(json!({"objects": [{"of": 0}], "mask": true})).unwrap();
+    desk.paint(vec![255; desk.mask_bytes()]).unwrap();
+    desk.save(&edit).unwrap_err();
+    assert!(!mask.exists(), "a first mask stayed");
     let earlier = dipir_preview::png::encode(300, 200, &[7; 60_000]).unwrap();
     fs::write(&mask, &earlier).unwrap();
-    desk.paint(vec![255; desk.mask_bytes()]).unwrap();
-    let edit = serde_json::from_value(json!({"objects": [{"of": 0}], "mask": true})).unwrap();
     let error = desk.save(&edit).unwrap_err().to_string();
     assert!(
         error.starts_with("cannot write \"") && error.contains("pipeline.toml"),

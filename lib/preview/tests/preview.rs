@@ -3,7 +3,6 @@ use std::fs;
 use std::ops::ControlFlow;
 use std::sync::Arc;
 
-use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::session::Session;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, Raster};
@@ -19,6 +18,9 @@ use dipir_render::error::RenderError;
 use dipir_stages::light::at_hand::{AtHand, Origin, at_hand};
 use glam::{DVec3, Vec3};
 use tempfile::TempDir;
+
+mod opened;
+use opened::open;
 
 /// A box that lies off its origin, twice, one of them turned in every way.
 const TEXT: &str = "[scene]\nbackground = \"photo.png\"\n\
@@ -41,20 +43,8 @@ fn project_of(text: &str) -> (TempDir, Session) {
     write_png(folder.path().join("photo.png"), &DisplayImage(grey)).unwrap();
     fs::write(folder.path().join("box.obj"), BOX).unwrap();
     fs::write(folder.path().join("pipeline.toml"), text).unwrap();
-    let session = Session::open(&CommonArgs {
-        pipeline: folder.path().join("pipeline.toml"),
-        set: Vec::new(),
-        out: None,
-        threads: None,
-        seed: None,
-        wait: false,
-        supervised: false,
-        light: None,
-        placed: None,
-        hashes: None,
-        output: OutputArgs::default(),
-    });
-    (folder, session.unwrap())
+    let session = open(folder.path(), &[]);
+    (folder, session)
 }
 
 #[test]

@@ -166,7 +166,7 @@ async function shoot(samples) {
 
 function showPicture(found, { shadow }) {
   draft = found;
-  if (found) light = { ...found.light, shadow };
+  if (found) light = { ...found.light, shadow: shadow ?? state.shadow };
   showLight();
   page.redraw();
 }
@@ -254,6 +254,7 @@ async function step(way) {
   if (saving || dragged()) return;
   const before = history.now.mask;
   if (!history[way]()) return;
+  say(""); // what was said of the change that is undone
   if (history.now.mask !== before) await setMask(history.now.mask ?? ownMask());
   refresh();
 }

@@ -2,11 +2,14 @@
 use std::fs;
 use std::path::Path;
 
-use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::session::Session;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use glam::Vec3;
+
+#[path = "../../../preview/tests/opened/mod.rs"]
+mod opened;
+pub use opened::open;
 
 /// A box of a metre on a grey photograph, seen from the height of the eyes, under neutral light.
 pub const TEXT: &str = "# The street.\n[scene]\nbackground = \"photo.png\" # mine\n\n\
@@ -25,25 +28,4 @@ pub fn project(folder: &Path, set: &[&str]) -> Session {
     fs::write(folder.join("box.obj"), BOX).unwrap();
     fs::write(folder.join("pipeline.toml"), TEXT).unwrap();
     open(folder, set)
-}
-
-pub fn open(folder: &Path, set: &[&str]) -> Session {
-    Session::open(&CommonArgs {
-        pipeline: folder.join("pipeline.toml"),
-        set: set.iter().map(|s| (*s).to_owned()).collect(),
-        out: None,
-        threads: None,
-        seed: None,
-        wait: false,
-        supervised: false,
-        light: None,
-        placed: None,
-        hashes: None,
-        output: OutputArgs {
-            json: false,
-            quiet: true,
-            verbose: false,
-        },
-    })
-    .unwrap()
 }

@@ -1,0 +1,53 @@
+//! The light on the page: what of it is shown, and what is refused.
+use std::fs;
+
+use dipir_placing::desk::Desk;
+use serde_json::json;
+
+mod project;
+use project::{TEXT, open, project};
+
+#[test]
+fn a_light_that_a_run_refuses_is_refused_when_it_is_drawn() {
+    let folder = tempfile::tempdir().unwrap();
+    // A run refuses a sun beside a neutral light.
+    let desk = Desk::open(project(folder.path(), &[])).unwrap();
+    let edit = |keys: serde_json::Value| {
+        let mut edit = json!({"objects": [{"of": 0}]});
+        edit.as_object_mut()
+            .unwrap()
+            .append(&mut keys.as_object().unwrap().clone());
+        serde_json::from_value(edit).unwrap()
+    };
+    let sun = edit(json!({"sun": {"azimuth_deg": 30.0, "elevation_deg": 40.0}}));
+    let shadow = edit(json!({"shadow": {"foot": [20.0, 170.0], "tip": [60.0, 150.0]}}));
+    for (edit, key) in [(sun, "light.sun"), (shadow, "light.shadow")] {
+        for error in [
+            desk.draft(&edit, 1, 0).err().expect("refused"),
+            desk.relight(&edit, 0).err().expect("refused"),
+            desk.save(&edit).unwrap_err(),
+        ] {
+            assert!(error.to_string().contains(key), "{error:#}");
+        }
+    }
+    let none = edit(json!({}));
+    assert!(desk.draft(&none, 1, 0).unwrap().is_ok());
+}
+
+#[test]
+fn a_shadow_that_the_file_tells_is_known_to_the_page() {
+    let folder = tempfile::tempdir().unwrap();
+    project(folder.path(), &[]);
+    for (light, is_told) in [
+        ("start = \"neutral\"", false),
+        (
+            "shadow = { foot = [20.0, 170.0], tip = [60.0, 150.0] }",
+            true,
+        ),
+    ] {
+        let text = TEXT.replace("start = \"neutral\"", light);
+        fs::write(folder.path().join("pipeline.toml"), text).unwrap();
+        let desk = Desk::open(open(folder.path(), &[])).unwrap();
+        assert_eq!(desk.state().unwrap()["shadow"], is_told);
+    }
+}
