@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use crate::error::{Error, Result, io};
 
@@ -51,6 +51,19 @@ impl ConfigFile {
     /// The value of `key`; null counts as absent.
     pub fn get(&self, key: &str) -> Option<&Value> {
         self.value.get(key).filter(|value| !value.is_null())
+    }
+
+    /// The same with `defaults` for the keys that are absent or null.
+    pub fn with_defaults(mut self, defaults: Map<String, Value>) -> Self {
+        if let Value::Object(map) = &mut self.value {
+            for (key, value) in defaults {
+                let present = map.entry(key).or_insert(Value::Null);
+                if present.is_null() {
+                    *present = value;
+                }
+            }
+        }
+        self
     }
 
     /// Converts to a typed configuration that takes the keys it knows.

@@ -1,6 +1,8 @@
 //! Noise schedules: how much signal and noise a timestep has, and what the
 //! network's output means.
 
+mod class;
+
 use std::path::Path;
 
 use candle_core::Tensor;
@@ -80,7 +82,7 @@ pub struct ScheduleConfig {
 }
 
 impl Default for ScheduleConfig {
-    /// diffusers' defaults.
+    /// diffusers' defaults, but for the betas of a few classes.
     fn default() -> Self {
         Self {
             num_train_timesteps: 1000,
@@ -99,51 +101,6 @@ impl Default for ScheduleConfig {
 
 /// Most timesteps of a training: a hundred times those of published models.
 const MAX_TIMESTEPS: usize = 100_000;
-
-/// How diffusers' schedulers begin that interpolate to noise, or scale it without bound.
-const FOREIGN_FAMILIES: [&str; 4] = ["FlowMatch", "FlowMap", "EDM", "Helios"];
-/// Others whose noise is not of a schedule of betas, or not of it alone.
-const FOREIGN_SCHEDULERS: [&str; 15] = [
-    "AmusedScheduler",
-    "CMStochasticIterativeScheduler",
-    "CogVideoXDDIMScheduler",
-    "CogVideoXDPMScheduler",
-    "ConsistencyDecoderScheduler",
-    "CosineDPMSolverMultistepScheduler",
-    "DDPMWuerstchenScheduler",
-    "IPNDMScheduler",
-    "KarrasVeScheduler",
-    "LTXEulerAncestralRFScheduler",
-    "PiflowScheduler",
-    "SCMScheduler",
-    "ScoreSdeVeScheduler",
-    "ScoreSdeVpScheduler",
-    "VQDiffusionScheduler",
-];
-
-/// Keys of samplers that change what is sampled.
-const SAMPLER_KEYS: [&str; 6] = [
-    "use_karras_sigmas",
-    "use_exponential_sigmas",
-    "use_beta_sigmas",
-    "use_flow_sigmas",
-    "use_lu_lambdas",
-    "thresholding",
-];
-/// Samplers of models that are made for a few steps of them.
-const FEW_STEPS: [&str; 2] = ["LCMScheduler", "TCDScheduler"];
-
-/// Settings of the file that other samplers than ours heed.
-fn unused(file: &ConfigFile, class: &str) -> Vec<String> {
-    let is_set = |key: &str| file.get(key).and_then(Value::as_bool) == Some(true);
-    let few_steps = FEW_STEPS.contains(&class).then(|| class.to_owned());
-    let keys = SAMPLER_KEYS.iter().filter(|key| is_set(key));
-    // Others carry the key and do not heed it.
-    let clips = class.starts_with("DDIM") || class.starts_with("DDPM");
-    let clips = (clips && is_set("clip_sample")).then(|| "clip_sample".to_owned());
-    let keys = keys.map(|key| (*key).to_owned());
-    few_steps.into_iter().chain(keys).chain(clips).collect()
-}
 
 /// Stands for "no signal" where a division by it follows, as diffusers has it.
 pub(crate) const ALMOST_NO_SIGNAL: f64 = 5.960_464_477_539_063e-8; // 2^-24
@@ -166,17 +123,14 @@ impl NoiseSchedule {
     pub fn load_as(folder: &Path, prediction: Option<Prediction>) -> Result<Self> {
         let file = ConfigFile::read(&folder.join("scheduler_config.json"))?;
         let class = file.get("_class_name").and_then(Value::as_str);
-        if let Some(class) = class
-            && (FOREIGN_FAMILIES
-                .iter()
-                .any(|start| class.starts_with(start))
-                || FOREIGN_SCHEDULERS.contains(&class))
-        {
+        let class = class.unwrap_or_default().to_owned();
+        if class::is_foreign(&class) {
             return Err(file.error(format!(
                 "_class_name = \"{class}\" is not supported: its noise is not that of a schedule of betas; use a model of \
                  the Stable Diffusion 1 or 2 family, or the scheduler that this one was trained with"
             )));
         }
+        let file = file.with_defaults(class::betas(&class));
         let mut config: ScheduleConfig = file.parse()?;
         config.prediction_type = prediction.unwrap_or(config.prediction_type);
         let schedule = Self::new(config).map_err(|e| match e {
@@ -184,7 +138,7 @@ impl NoiseSchedule {
             other => other,
         })?;
         Ok(Self {
-            unused: unused(&file, class.unwrap_or_default()),
+            unused: class::unused(&file, &class),
             ..schedule
         })
     }

@@ -155,6 +155,43 @@ fn schedulers_whose_noise_is_not_of_variances_are_refused_by_class() -> Outcome 
     Ok(())
 }
 
+/// The betas of diffusers 0.42.1, by the class's own defaults.
+#[test]
+fn betas_that_a_scheduler_s_file_leaves_out_are_its_class_s() -> Outcome {
+    use serde_json::json;
+    let folder = tempfile::tempdir()?;
+    let read = |text: String| -> Result<_, Box<dyn std::error::Error>> {
+        std::fs::write(folder.path().join("scheduler_config.json"), text)?;
+        let config = NoiseSchedule::load(folder.path())?.config().clone();
+        Ok((
+            config.beta_start,
+            config.beta_end,
+            json!(config.beta_schedule),
+        ))
+    };
+    for (class, start, end, curve) in [
+        ("DDIMScheduler", 1e-4, 0.02, "linear"),
+        ("PNDMScheduler", 1e-4, 0.02, "linear"),
+        ("EulerDiscreteScheduler", 1e-4, 0.02, "linear"),
+        ("LMSDiscreteScheduler", 1e-4, 0.02, "linear"),
+        ("LCMScheduler", 8.5e-4, 0.012, "scaled_linear"),
+        ("TCDScheduler", 8.5e-4, 0.012, "scaled_linear"),
+        ("HeunDiscreteScheduler", 8.5e-4, 0.012, "linear"),
+        ("KDPM2DiscreteScheduler", 8.5e-4, 0.012, "linear"),
+        ("KDPM2AncestralDiscreteScheduler", 8.5e-4, 0.012, "linear"),
+        ("DPMSolverSDEScheduler", 8.5e-4, 0.012, "linear"),
+        ("UnCLIPScheduler", 1e-4, 0.02, "squaredcos_cap_v2"),
+    ] {
+        let found = read(format!(
+            "{{\"_class_name\": \"{class}\", \"beta_end\": null}}"
+        ))?;
+        assert_eq!(found, (start, end, json!(curve)), "{class}");
+        let said = format!("{{\"_class_name\": \"{class}\", \"beta_start\": 0.001}}");
+        assert_eq!(read(said)?.0, 0.001, "{class}");
+    }
+    Ok(())
+}
+
 #[test]
 fn settings_of_samplers_that_nothing_heeds_are_told() -> Outcome {
     let folder = tempfile::tempdir()?;
