@@ -162,21 +162,22 @@ impl Object {
                  anchor = \"center\"               # the middle of the object stands there\n"
             ),
         };
-        let mut text = format!(
-            "[[scene.objects]]\npath = {}\n{place}\
-             yaw_deg = 0.0                   # turn, counter-clockwise from above; or to_pixel = [x, y], which it faces\n",
-            quoted(&self.path)
-        );
-        if self.may_lie {
-            text += "# pitch_deg = -90.0             # if it lies on its back\n";
-        }
+        let size = format!("# size: {}\n", self.size_why);
+        // A comment goes with the key below it when an object is removed or copied, so none stands behind the last key.
+        let mut text = "[[scene.objects]]\n".to_owned();
         if let Some(words) = self.appearance(picture) {
             text += &comment(&format!("at pixel {x}, {y} it {words}"));
         }
-        text += &format!("# size: {}\n", self.size_why);
+        if self.size_line.is_none() {
+            text += &size;
+        }
+        text += &format!("path = {}\n{place}", quoted(&self.path));
+        if self.may_lie {
+            text += "# pitch_deg = -90.0             # if it lies on its back\n";
+        }
+        text += "yaw_deg = 0.0                   # turn, counter-clockwise from above; or to_pixel = [x, y], which it faces\n";
         if let Some(line) = &self.size_line {
-            text += line;
-            text.push('\n');
+            text += &format!("{size}{line}\n");
         }
         text.push('\n');
         text
@@ -487,6 +488,19 @@ mod tests {
         );
         object.appears_px = None;
         assert_eq!(object.appearance([900, 600]), None);
+    }
+
+    #[test]
+    fn comments_of_an_object_stand_above_one_of_its_keys() {
+        let mut document = document(View::default());
+        document.objects[0].may_lie = true;
+        for size_line in [None, Some("height_m = 1.0".to_owned())] {
+            document.objects[0].size_line = size_line;
+            let text = document.objects[0].text([900, 600]);
+            let last = text.trim_end().lines().last().unwrap();
+            assert!(!last.starts_with('#'), "{text}");
+            assert!(text.contains("# size: "), "{text}");
+        }
     }
 
     #[test]
