@@ -118,6 +118,12 @@ fn write_report(args: &ReportArgs) -> anyhow::Result<()> {
 
 fn write_study(args: &StudyPageArgs) -> anyhow::Result<()> {
     let page = study::page(args)?;
+    if !page.changed.is_empty() {
+        args.folder.output.warn(&format!(
+            "left out, for they have changed since a method ran on them; run dipir-evaluate run again: {}",
+            page.changed.join(", ")
+        ));
+    }
     args.folder.output.result(
         || {
             format!(
@@ -127,7 +133,7 @@ fn write_study(args: &StudyPageArgs) -> anyhow::Result<()> {
                 page.pairs
             )
         },
-        || json!({"page": json_path(&page.file), "pairs": page.pairs}),
+        || json!({"page": json_path(&page.file), "pairs": page.pairs, "changed": page.changed}),
     );
     Ok(())
 }

@@ -3,6 +3,7 @@ mod clean;
 mod hashed;
 mod init;
 mod keys;
+mod lock;
 mod made;
 mod manual;
 mod place;

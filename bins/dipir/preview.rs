@@ -37,7 +37,7 @@ pub fn run(args: &PreviewArgs) -> anyhow::Result<()> {
         session.warn(warning);
     }
     preview.write(&path)?;
-    let light = preview.light.map(|l| l.words());
+    let light = preview.light.map(|l| l.words_of(&session)).transpose()?;
     let took = duration(preview.seconds);
     session.result(
         || {

@@ -15,10 +15,8 @@ use dipir_cli::interrupt::{self, Interrupted};
 use dipir_cli::output::{json_path, say};
 use dipir_cli::session::{Session, check_threads, duration};
 use dipir_cli::style::{bold, color_on_stderr};
-use dipir_pipeline::error::StageError;
 use dipir_pipeline::graph::{Graph, Node};
 use dipir_pipeline::hashing::Hashes;
-use dipir_pipeline::lock::{FolderLock, WhenLocked};
 use dipir_pipeline::runner::{self, Stopped, Work};
 use dipir_pipeline::status::{self, State};
 use dipir_stages::graph;
@@ -26,6 +24,7 @@ use dipir_stages::truth::Truth;
 use serde_json::{Map, Value, json};
 
 use crate::hashed::{Reads, hashes_file, remove_left};
+use crate::lock::lock_folder;
 use crate::made::MadeFolders;
 use crate::plan;
 use crate::project::{ProjectArgs, Stage};
@@ -158,6 +157,7 @@ pub fn run_each(
     // Seconds of those that ran something, and their number.
     let mut took = (0.0, 0);
     for (k, (name, project)) in projects.into_iter().enumerate() {
+        interrupt::check()?;
         let name = name.display().to_string();
         if !(output.quiet || output.json) {
             let left = (all - k) as f64 * took.0 / f64::from(took.1.max(1));
@@ -259,11 +259,7 @@ pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String,
     let all_fresh = all_fresh(&session, &graph, &nodes)?;
     if args.force || !all_fresh {
         interrupt::listen_patiently()?;
-        let when_locked = match args.wait {
-            true => WhenLocked::Wait,
-            false => WhenLocked::Refuse,
-        };
-        let _lock = lock_when(&session, when_locked)?;
+        let _lock = lock_folder(&session, args.wait, project.output.quiet)?;
         remove_left(&session.out);
         runner::run(&nodes, args.jobs, &mut work).map_err(stopped)?;
     }
@@ -342,11 +338,6 @@ pub fn all_fresh(session: &Session, graph: &Graph, nodes: &[&Node]) -> anyhow::R
         .iter()
         .filter(|s| nodes.iter().any(|n| n.stage == s.stage));
     Ok(asked.into_iter().all(|s| fresh(&s.state)))
-}
-
-/// One run at a time in a folder of artifacts.
-fn lock_when(session: &Session, when_locked: WhenLocked) -> Result<FolderLock, StageError> {
-    FolderLock::take_inside(&session.out, "run", when_locked)
 }
 
 /// What the runner asks.

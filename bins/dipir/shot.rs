@@ -5,15 +5,18 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use dipir_cli::args::CommonArgs;
 use dipir_cli::exit::{Usage, printable};
+use dipir_cli::interrupt;
 use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
+use dipir_pipeline::error::StageError;
 use dipir_stages::names::{LIGHT, SCENE};
 use dipir_stages::{report, shot};
 use serde_json::{Map, Value, json};
 
+use crate::lock::lock_folder;
 use crate::plan;
 use crate::project::{ProjectArgs, Stage};
-use crate::run::{RunArgs, page, run_each, run_one};
+use crate::run::{RunArgs, all_fresh, page, run_each, run_one};
 
 #[derive(Args)]
 pub struct ShotArgs {
@@ -67,7 +70,20 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
         common.output.result(|| words, || json);
         return Ok(());
     }
+    interrupt::listen_patiently()?;
     let (done, photo) = run_one(&of_photo, &base)?;
+    // Held while frames are made: another run would replace their light, another shot the frames.
+    let _lock = match lock_folder(&session, common.wait, common.output.quiet) {
+        // Where nothing can be written nobody replaces anything, and a frame that is not made yet says so.
+        Err(e) if matches!(e.downcast_ref(), Some(StageError::Io { .. })) => None,
+        lock => Some(lock?),
+    };
+    if !all_fresh(&session, &graph, &graph.up_to(last.name()))? {
+        anyhow::bail!(
+            "another run has just replaced what the frames share in {}; run again",
+            session.out.display()
+        );
+    }
     if !common.output.json {
         common.output.result(|| done, || Value::Null);
     }

@@ -2,8 +2,9 @@
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Child, Command, ExitStatus};
 use std::thread;
 use std::time::{Duration, SystemTime};
 
@@ -34,7 +35,8 @@ pub fn watch(project: &ProjectArgs) -> anyhow::Result<()> {
     loop {
         let before = stamps(project);
         let mut run = Command::new(&own);
-        let status = run.args(&args).status().context("cannot run dipir")?;
+        let child = run.args(&args).spawn().context("cannot run dipir")?;
+        let status = wait(child).context("cannot follow dipir")?;
         if interrupt::asked() || status.code() == Some(i32::from(INTERRUPTED)) {
             return Err(AlreadyReported(INTERRUPTED).into());
         }
@@ -44,6 +46,24 @@ pub fn watch(project: &ProjectArgs) -> anyhow::Result<()> {
         if !changed(project, before) {
             return Ok(());
         }
+    }
+}
+
+/// Waits for the end of a run. One that goes on well after this process was asked to stop was not asked itself, and is ended:
+/// its stages stop by themselves then.
+fn wait(mut child: Child) -> io::Result<ExitStatus> {
+    let mut patience = 40;
+    loop {
+        if let Some(status) = child.try_wait()? {
+            return Ok(status);
+        }
+        if interrupt::asked() {
+            if patience == 0 {
+                child.kill()?;
+            }
+            patience -= 1;
+        }
+        thread::sleep(PAUSE / 10);
     }
 }
 

@@ -1,5 +1,7 @@
 //! Runs that end early, and runs at the same time.
 use std::fs::File;
+#[cfg(unix)]
+use std::io::{BufRead, BufReader};
 use std::process::Child;
 #[cfg(unix)]
 use std::process::Command;
@@ -51,24 +53,89 @@ fn a_killed_run_leaves_earlier_results_and_the_next_one_ends_as_if_undisturbed()
 }
 
 #[cfg(unix)]
+fn send(signal: &str, to: &Child) {
+    let pid = to.id().to_string();
+    let sent = Command::new("kill").args([signal, &pid]).status();
+    assert!(sent.unwrap().success());
+}
+
+/// Signals that ask a process to end; not that of a closed terminal where these tests themselves were started to outlive theirs.
+#[cfg(unix)]
+fn ending() -> &'static [&'static str] {
+    let hangs_up = Command::new("sh").args(["-c", "kill -HUP $$"]).status();
+    match hangs_up.unwrap().success() {
+        true => &["-TERM"],
+        false => &["-TERM", "-HUP"],
+    }
+}
+
+#[cfg(unix)]
 #[test]
-fn control_c_ends_with_130_and_leaves_nothing_half_written() {
+fn a_signal_that_asks_to_end_ends_with_130_and_leaves_nothing_half_written() {
     let project = Project::new();
     project.run_both(&[]);
     let before = project.artifacts("out/composite");
-    let child = start_endless(&project);
-    let pid = child.id().to_string();
-    assert!(
-        Command::new("kill")
-            .args(["-INT", &pid])
-            .status()
-            .unwrap()
-            .success()
-    );
-    let run: Run = child.wait_with_output().unwrap().into();
-    run.expect_error(130, "interrupted; earlier results are as they were");
-    assert!(project.artifacts("out/composite") == before);
-    assert!(!project.path("out/.composite.partial").exists());
+    for signal in [&["-INT"], ending()].concat() {
+        let child = start_endless(&project);
+        send(signal, &child);
+        let run: Run = child.wait_with_output().unwrap().into();
+        run.expect_error(130, "interrupted; earlier results are as they were");
+        assert!(project.artifacts("out/composite") == before);
+        assert!(!project.path("out/.composite.partial").exists());
+    }
+    for signal in ending() {
+        let mut run = project.command(DIPIR, &[&["run"], &ENDLESS[..]].concat());
+        let mut child = run.spawn().unwrap();
+        wait_until_it_writes(&project, &mut child);
+        send(signal, &child);
+        assert_eq!(child.wait().unwrap().code(), Some(130));
+        for left in [".run.lock", ".composite.hashes", ".composite.partial"] {
+            assert!(!project.path("out").join(left).exists(), "{signal}: {left}");
+        }
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_terminal_that_is_closed_ends_no_run_that_was_started_to_outlive_it() {
+    let project = Project::new();
+    project.run(SCENE, &[]).expect_success();
+    // As nohup does.
+    let script = r#"trap '' HUP; exec "$@""#;
+    let args = [&["-c", script, "sh", COMPOSITE], &ENDLESS[..]].concat();
+    let mut child = project.command("sh", &args).spawn().unwrap();
+    wait_until_it_writes(&project, &mut child);
+    let status = std::fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap();
+    let mask = |name: &str| {
+        let mask = status.lines().find_map(|line| line.strip_prefix(name));
+        u64::from_str_radix(mask.unwrap().trim(), 16).unwrap()
+    };
+    let (ignored, caught) = (mask("SigIgn:"), mask("SigCgt:"));
+    let bit = |signal: u32| 1u64 << (signal - 1);
+    let (hangup, termination) = (bit(1), bit(15));
+    assert_eq!(ignored & hangup, hangup);
+    assert_eq!(caught & (hangup | termination), termination);
+    child.kill().unwrap();
+    child.wait().unwrap();
+}
+
+#[cfg(unix)]
+#[test]
+fn a_run_that_waits_for_another_says_so_and_ends_when_it_is_asked_to() {
+    let project = Project::new();
+    let mut first = project.command(DIPIR, &[&["run"], &ENDLESS[..]].concat());
+    let mut first = first.spawn().unwrap();
+    wait_until_it_writes(&project, &mut first);
+    let mut second = project.command(DIPIR, &["run", "--wait"]).spawn().unwrap();
+    let mut told = String::new();
+    let mut lines = BufReader::new(second.stderr.take().unwrap());
+    lines.read_line(&mut told).unwrap();
+    let wanted = format!("waiting for process {}, which writes out\n", first.id());
+    assert_eq!(told, wanted);
+    send("-INT", &second);
+    assert_eq!(second.wait().unwrap().code(), Some(130));
+    first.kill().unwrap();
+    first.wait().unwrap();
 }
 
 #[cfg(unix)]

@@ -426,3 +426,48 @@ fn the_json_of_a_shot_tells_each_file_once() {
     assert!(hashed(0).contains_key(of_first), "{:?}", hashed(0));
     assert!(!hashed(1).contains_key(of_first), "{:?}", hashed(1));
 }
+
+#[test]
+fn one_shot_at_a_time_makes_the_frames_of_a_folder() {
+    let project = project();
+    let names = ["a.png", "b.png", "c.png"];
+    for name in names {
+        project.write(name, project.read("background.png"));
+    }
+    project
+        .run(DIPIR, &["run", "--until", "light"])
+        .expect_success();
+    // Its frames are being made when it has begun the first.
+    let args = [
+        &["shot"],
+        &names[..],
+        &["--set", "composite.target_error=1e-9"],
+    ]
+    .concat();
+    let args = [&args[..], &["--set", "composite.max_samples=4000000000"]].concat();
+    let mut first = project.command(DIPIR, &args).spawn().unwrap();
+    while !project.path("out/frames/a/.composite.partial").exists() {
+        assert!(first.try_wait().unwrap().is_none(), "it did not start");
+        std::thread::yield_now();
+    }
+    let held = format!(
+        "out is being written by process {}; wait for it to end",
+        first.id()
+    );
+    for other in [
+        &["shot", "b.png"][..],
+        &["run", "--set", "light.candidate=1"],
+    ] {
+        let run = project.run(DIPIR, other);
+        assert_eq!(run.code, Some(1), "{other:?}");
+        assert!(run.stderr.contains(&held), "{other:?}: {}", run.stderr);
+    }
+    assert!(!project.path("out/frames/b").exists());
+    first.kill().unwrap();
+    first.wait().unwrap();
+    // Waits, if at all, for the stage of the one that was killed.
+    assert_eq!(
+        shot(&project, &["--wait", "a.png", "b.png", "c.png"]).len(),
+        3
+    );
+}

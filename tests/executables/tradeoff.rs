@@ -20,6 +20,8 @@ fn a_project_is_measured_once_and_shown_as_tables_and_plots() {
     ];
     let run = project.run(TRADEOFF, &arguments);
     run.expect_success();
+    let told = "points, each 1 times, into tradeoff: Ctrl-C ends it";
+    assert!(run.stderr.contains(told), "{}", run.stderr);
     for file in [
         "tradeoff.json",
         "tradeoff.csv",

@@ -19,7 +19,7 @@ pub struct UsedModel {
 
 impl UsedModel {
     fn in_words(&self) -> String {
-        let short = &self.digest[..self.digest.len().min(8)];
+        let short = self.digest.get(..8).unwrap_or(&self.digest);
         match &self.path {
             Some(path) => format!("the model {path} ({short})"),
             None => format!("the embedded model ({short})"),

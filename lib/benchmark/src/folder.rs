@@ -8,6 +8,8 @@ use dipir_evaluation::results::read_json;
 use dipir_stages::composite::table::Tone;
 use serde::{Deserialize, Serialize};
 
+use crate::score::Score;
+
 /// The folder.
 #[derive(Clone, Debug)]
 pub struct EvaluationFolder {
@@ -98,6 +100,13 @@ impl EvaluationFolder {
             hash.update(blake3::hash(&bytes).as_bytes());
         }
         hash.finalize().to_hex()[..16].to_owned()
+    }
+
+    /// Whether a method's score was made of a scene whose [`digest`](Self::digest) was another one; false where no score
+    /// tells.
+    pub fn is_earlier(&self, method: &str, scene: &str, digest: &str) -> bool {
+        let score = read_json::<Score>(&self.run(method, scene).join("score.json"));
+        score.is_ok_and(|s| s.scene_digest.is_some_and(|d| d != digest))
     }
 
     /// Where stages work.

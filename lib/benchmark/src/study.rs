@@ -32,6 +32,8 @@ pub struct StudyPage {
     pub file: PathBuf,
     /// Pairs that it shows.
     pub pairs: usize,
+    /// Scenes that it leaves out, for they have changed since a method ran on them.
+    pub changed: Vec<String>,
 }
 
 /// What was answered.
@@ -67,18 +69,32 @@ pub fn page(args: &StudyPageArgs) -> anyhow::Result<StudyPage> {
         }
     }
     // Only scenes that everybody has a picture of.
-    let mut scenes = Vec::new();
+    let (mut scenes, mut changed) = (Vec::new(), Vec::new());
     let mut pictures: BTreeMap<String, BTreeMap<&str, String>> = BTreeMap::new();
     for scene in evaluation.scenes()? {
         let methods = || others.iter().chain([&args.method]);
         let files: Vec<(&str, PathBuf)> = methods()
             .map(|m| (m.as_str(), evaluation.picture(m, &scene.name)))
             .collect();
-        if files.iter().all(|(_, f)| f.is_file()) {
+        let digest = evaluation.digest(&scene);
+        let is_earlier = |m: &String| evaluation.is_earlier(m, &scene.name, &digest);
+        if !files.iter().all(|(_, f)| f.is_file()) {
+            continue;
+        }
+        if methods().any(is_earlier) {
+            changed.push(scene.name);
+        } else {
             let shown = files.into_iter().map(|(m, f)| Ok((m, address(&f)?)));
             pictures.insert(scene.name.clone(), shown.collect::<anyhow::Result<_>>()?);
             scenes.push(scene.name);
         }
+    }
+    if scenes.is_empty() && !changed.is_empty() {
+        let text = format!(
+            "every scene has changed since a method ran on it; run dipir-evaluate run again: {}",
+            changed.join(", ")
+        );
+        return Err(Usage(text).into());
     }
     if scenes.is_empty() || others.is_empty() {
         let text = "no scene has a picture of both methods; run dipir-evaluate run first";
@@ -95,7 +111,11 @@ pub fn page(args: &StudyPageArgs) -> anyhow::Result<StudyPage> {
     page.push(&format!("<script>{SCRIPT}</script>"));
     let file = evaluation.root().join("study.html");
     write(&file, page.finish())?;
-    Ok(StudyPage { file, pairs: count })
+    Ok(StudyPage {
+        file,
+        pairs: count,
+        changed,
+    })
 }
 
 /// Counts answers.
@@ -145,4 +165,51 @@ pub fn table(found: &[Verdict]) -> String {
         );
     }
     text.trim_end().into()
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use dipir_evaluation::results::write_json;
+
+    use super::*;
+    use crate::columns::tests::score;
+    use crate::command_line::{Cli, Command, StudyCommand};
+    use crate::definition::tests::of;
+    use crate::folder::SceneInfo;
+    use crate::score::Score;
+
+    #[test]
+    fn pictures_of_a_scene_that_has_changed_since_are_not_shown() {
+        let folder = tempfile::tempdir().unwrap();
+        let evaluation = EvaluationFolder::new(folder.path());
+        for name in ["a", "b"] {
+            let info = json!({"name": name, "made_from": "", "map": "map.exr", "exposure_ev": 0.0, "tone": "none"});
+            write_json(&evaluation.scene(name).join("scene.json"), &info).unwrap();
+            let info: SceneInfo = serde_json::from_value(info).unwrap();
+            for method in ["ours", "neutral"] {
+                write(&evaluation.picture(method, name), "picture").unwrap();
+                let scored = Score {
+                    scene_digest: Some(evaluation.digest(&info)),
+                    ..score(0.1, &of(method, "", &[]))
+                };
+                let file = evaluation.run(method, name).join("score.json");
+                write_json(&file, &scored).unwrap();
+            }
+        }
+        let out = folder.path().to_str().unwrap();
+        let args = ["dipir-evaluate", "study", "page", "--out", out];
+        let Command::Study(StudyCommand::Page(args)) = Cli::parse_from(args).command else {
+            panic!("the command line is another's");
+        };
+        let shown = |page: anyhow::Result<StudyPage>| page.map(|p| (p.pairs, p.changed));
+        let both = shown(page(&args)).unwrap();
+        assert!(both.1.is_empty());
+        write(&evaluation.scene("b").join("photo.png"), "another").unwrap();
+        let one = shown(page(&args)).unwrap();
+        assert_eq!(one, (both.0 / 2, vec!["b".to_string()]));
+        write(&evaluation.scene("a").join("photo.png"), "another").unwrap();
+        let error = shown(page(&args)).unwrap_err().to_string();
+        assert!(error.starts_with("every scene has changed"), "{error}");
+    }
 }

@@ -1,5 +1,5 @@
-//! Ctrl-C: the work is asked to stop; if it does not within a moment, the process ends anyway,
-//! its unfinished folder removed.
+//! Ctrl-C, and the signals that ask a process to end (SIGTERM, SIGHUP): the work is asked to stop; if it does not within a
+//! moment, the process ends anyway, its unfinished folder removed.
 use std::fmt;
 use std::io::{Read, stdin};
 use std::path::{Path, PathBuf};
@@ -46,7 +46,48 @@ static UNFINISHED: Mutex<Option<PathBuf>> = Mutex::new(None);
 /// Starts to listen. Stages write beside their target and swap at the end, so that ending the
 /// process at any moment leaves earlier results whole.
 pub fn listen() -> anyhow::Result<()> {
-    ctrlc::set_handler(stop).context(NO_THREAD)
+    handle(stop)
+}
+
+/// Runs `act` on Ctrl-C and on the signals that ask to end. A closed terminal stays ignored where the process was started so,
+/// as by nohup.
+fn handle(act: impl FnMut() + Send + 'static) -> anyhow::Result<()> {
+    let outlives_terminal = hangup::is_ignored();
+    ctrlc::set_handler(act).context(NO_THREAD)?;
+    if outlives_terminal {
+        hangup::ignore();
+    }
+    Ok(())
+}
+
+#[cfg(unix)]
+mod hangup {
+    /// Whether the process ignores that its terminal is closed.
+    pub fn is_ignored() -> bool {
+        // SAFETY: all zeros are a valid action, and the call only writes the present one there.
+        unsafe {
+            let mut action: libc::sigaction = std::mem::zeroed();
+            libc::sigaction(libc::SIGHUP, std::ptr::null(), &mut action) == 0
+                && action.sa_sigaction == libc::SIG_IGN
+        }
+    }
+
+    /// Ignores it from now on.
+    pub fn ignore() {
+        // SAFETY: ignoring a signal runs no code of ours.
+        unsafe {
+            libc::signal(libc::SIGHUP, libc::SIG_IGN);
+        }
+    }
+}
+
+#[cfg(not(unix))]
+mod hangup {
+    pub fn is_ignored() -> bool {
+        false
+    }
+
+    pub fn ignore() {}
 }
 
 /// Starts to listen but never ends the process. For work that waits for its children to stop. Does
@@ -54,7 +95,7 @@ pub fn listen() -> anyhow::Result<()> {
 pub fn listen_patiently() -> anyhow::Result<()> {
     static LISTENS: AtomicBool = AtomicBool::new(false);
     if !LISTENS.swap(true, Ordering::SeqCst) {
-        ctrlc::set_handler(|| ASKED.store(true, Ordering::SeqCst)).context(NO_THREAD)?;
+        handle(|| ASKED.store(true, Ordering::SeqCst))?;
     }
     Ok(())
 }

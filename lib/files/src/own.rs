@@ -1,6 +1,7 @@
 //! Files that this program makes and replaces, recognised by how they begin.
 //!
 //! None of these functions follows a symbolic link at the name that it is given.
+use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -137,20 +138,26 @@ pub fn left_of_replacing(path: &Path, mark: &[u8]) -> Option<PathBuf> {
     if is_left(&partial) {
         return Some(partial);
     }
-    let head = format!(".{}.", path.file_name()?.to_string_lossy());
-    let is_own = |partial: &PathBuf| {
-        let name = partial.file_name().unwrap_or_default().to_string_lossy();
-        let numbers = name
-            .strip_prefix(&head)
-            .and_then(|n| n.strip_suffix(".partial"));
-        numbers.is_some_and(|n| n.bytes().all(|b| b.is_ascii_digit() || b == b'-'))
-    };
     let entries = fs::read_dir(folder_of(path))
         .into_iter()
         .flatten()
         .flatten();
-    let names = entries.map(|entry| partial.with_file_name(entry.file_name()));
-    names.filter(|name| is_own(name) && is_left(name)).min()
+    let names = entries.map(|entry| entry.file_name());
+    let names = names.filter(|name| is_partial_of(path, name));
+    let names = names.map(|name| partial.with_file_name(name));
+    names.filter(is_left).min()
+}
+
+/// Whether `name` is one under which [`replace`] writes `path`, with the number of a process in it or without.
+pub fn is_partial_of(path: &Path, name: &OsStr) -> bool {
+    let (of, name) = (path.file_name().unwrap_or_default(), name.to_string_lossy());
+    let rest = name.strip_prefix(&format!(".{}.", of.to_string_lossy()));
+    let numbers = rest.and_then(|rest| rest.strip_suffix("partial"));
+    numbers.is_some_and(|n| n.is_empty() || n.ends_with('.') && is_number(n.trim_end_matches('.')))
+}
+
+fn is_number(text: &str) -> bool {
+    text.bytes().all(|b| b.is_ascii_digit() || b == b'-')
 }
 
 /// Flushes the content of a regular file, one that this program wrote, to the disk.

@@ -85,8 +85,9 @@ impl Mark {
         if known.as_ref() == Some(self) {
             return Ok(());
         }
+        let is_known = known.as_ref().is_some_and(is_ours);
         let mut is_new = false;
-        if !known.as_ref().is_some_and(is_ours) {
+        if !is_known {
             match fs::symlink_metadata(folder) {
                 Err(e) if e.kind() == io::ErrorKind::NotFound => {
                     create_folder(folder)?;
@@ -94,17 +95,25 @@ impl Mark {
                 }
                 Err(e) => return Err(StageError::io("read", folder, e)),
                 Ok(_) if is_empty(folder)? => {
-                    // Of a run that was killed at this point: without content.
-                    let _ = fs::remove_file(folder.join(FILE_NAME));
+                    // Of runs that were killed at this point: a mark without content, and what was to become one.
+                    let mark = folder.join(FILE_NAME);
+                    let _ = fs::remove_file(&mark);
+                    while let Some(left) = dipir_files::left_of_replacing(&mark, HEAD)
+                        && fs::remove_file(left).is_ok()
+                    {}
                 }
                 Ok(_) => return Err(foreign(folder, Foreign::NoMark)),
             }
         }
-        self.write(folder).inspect_err(|_| {
-            if is_new {
-                let _ = fs::remove_dir(folder);
-            }
-        })
+        match self.write(folder) {
+            // A folder that is only read keeps the list that another version wrote.
+            Err(StageError::Io { source, .. }) if is_known && is_refused(&source) => Ok(()),
+            written => written.inspect_err(|_| {
+                if is_new {
+                    let _ = fs::remove_dir(folder);
+                }
+            }),
+        }
     }
 
     /// What in `folder` this mark calls ours.
@@ -253,6 +262,12 @@ impl Owned {
     }
 }
 
+/// Whether nothing may be written there.
+fn is_refused(error: &io::Error) -> bool {
+    use io::ErrorKind::{PermissionDenied, ReadOnlyFilesystem};
+    matches!(error.kind(), PermissionDenied | ReadOnlyFilesystem)
+}
+
 fn is_named(name: &Path, file: &str) -> bool {
     name == Path::new(file)
 }
@@ -312,7 +327,7 @@ pub(crate) fn is_empty(folder: &Path) -> Result<bool, StageError> {
             read.ok().flatten().unwrap_or_else(|| b"?".into())
         };
         let is_void = name == FILE_NAME && begins(1).is_empty();
-        let is_begun = name == format!(".{FILE_NAME}.partial").as_str()
+        let is_begun = dipir_files::is_partial_of(Path::new(FILE_NAME), &name)
             && HEAD.starts_with(&begins(HEAD.len()));
         if !(is_begun || is_void) {
             return Ok(false);
@@ -383,12 +398,15 @@ mod tests {
             ("..dipir.partial", b""),
             ("..dipir.partial", &whole[..9]),
             ("..dipir.partial", &whole),
+            // Beside one that another process was writing.
+            ("..dipir.4711-0.partial", &whole[..9]),
         ] {
             fs::create_dir(&folder).unwrap();
             fs::write(folder.join(name), content).unwrap();
             assert!(is_empty(&folder).unwrap(), "{name} {}", content.len());
             mark.make(&folder).unwrap();
             assert_eq!(Mark::read(&folder), Some(mark.clone()));
+            assert_eq!(fs::read_dir(&folder).unwrap().count(), 1, "{name}");
             fs::remove_dir_all(&folder).unwrap();
         }
         fs::create_dir(&folder).unwrap();

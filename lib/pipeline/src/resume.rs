@@ -19,7 +19,8 @@ pub struct Resume {
 
 impl Resume {
     /// Opens the folder of `fingerprint` in `root`, and makes it if it is not there. `files` are
-    /// the names that `stage` writes in it, `#` for any row of digits.
+    /// the names that `stage` writes in it, `#` for any row of digits; in a cache those of
+    /// [`put`](Self::put), too.
     pub fn open(
         root: &Path,
         kind: Kind,
@@ -28,7 +29,11 @@ impl Resume {
         files: &[&str],
     ) -> Result<Self, StageError> {
         let folder = root.join(fingerprint.short());
-        let files: Vec<String> = files.iter().map(|f| f.to_string()).collect();
+        let mut files: Vec<String> = files.iter().map(|f| f.to_string()).collect();
+        if kind == Kind::Cache {
+            let own: Vec<String> = files.iter().map(|f| own_name(f, "#")).collect();
+            files.extend(own);
+        }
         let mark = Mark::new(kind, stage, files.clone());
         mark.make(&folder)?;
         for file in &files {
@@ -52,6 +57,37 @@ impl Resume {
     /// Where the file `name`, one of those that were named when it was opened, lies.
     pub fn file(&self, name: impl AsRef<Path>) -> PathBuf {
         self.folder.join(name)
+    }
+
+    /// Lets `write` make the file `name` of a cache under a name of this process's own beside it, and renames that: several
+    /// processes that share the cache may make the file at once, and a kill leaves the earlier file or the new one.
+    ///
+    /// # Errors
+    /// Those of `write`, and if the file cannot be renamed.
+    pub fn put<E: From<StageError>>(
+        &self,
+        name: &str,
+        write: impl FnOnce(&Path) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.put_as(std::process::id(), name, write)
+    }
+
+    fn put_as<E: From<StageError>>(
+        &self,
+        process: u32,
+        name: &str,
+        write: impl FnOnce(&Path) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let path = self.file(name);
+        let own = self.file(own_name(name, &process.to_string()));
+        let written = write(&own).and_then(|()| {
+            let renamed = fs::rename(&own, &path);
+            Ok(renamed.map_err(|e| StageError::io("write", &path, e))?)
+        });
+        if written.is_err() {
+            let _ = fs::remove_file(&own);
+        }
+        written
     }
 
     /// Those of its files that lie in its folder `below`, by name, sorted.
@@ -86,6 +122,14 @@ impl Resume {
     }
 }
 
+/// `0001.4711.png` for `0001.png` and process 4711.
+fn own_name(name: &str, process: &str) -> String {
+    match name.rsplit_once('.') {
+        Some((stem, extension)) => format!("{stem}.{process}.{extension}"),
+        None => format!("{name}.{process}"),
+    }
+}
+
 /// The folders of `kind` that `stage` made in `root`, with what in them is its own.
 pub fn folders_in(
     root: &Path,
@@ -110,6 +154,36 @@ pub fn folders_in(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn processes_that_make_one_file_of_a_cache_at_once_do_not_disturb_each_other() {
+        let root = tempfile::tempdir().unwrap();
+        let of = Fingerprint::of("concepts").seed(1).finish();
+        let cache = Resume::open(root.path(), Kind::Cache, "concepts", &of, &["a/#.png"]).unwrap();
+        let write = |path: &Path, text: &str| {
+            fs::write(path, text).map_err(|e| StageError::io("write", path, e))
+        };
+        let whole = || fs::read_to_string(cache.file("a/1.png"));
+        let both = cache.put_as(1, "a/1.png", |one| {
+            write(one, "begun")?;
+            cache.put_as(2, "a/1.png", |two| write(two, "the second"))?;
+            assert_eq!(whole().unwrap(), "the second");
+            write(one, "the first")
+        });
+        both.unwrap();
+        assert_eq!(whole().unwrap(), "the first");
+        // What cannot be made leaves nothing, and what a killed process left is the cache's own.
+        let failed = cache.put("a/1.png", |own| {
+            write(own, "begun")?;
+            Err(StageError::io("write", own, std::io::Error::other("full")))
+        });
+        failed.unwrap_err();
+        fs::write(cache.file("a/1.4711.png"), "begun").unwrap();
+        let names = cache.files_in("a").unwrap();
+        assert_eq!(names, ["1.4711.png", "1.png"]);
+        cache.remove();
+        assert!(!root.path().exists());
+    }
 
     #[test]
     fn a_checkpoint_is_found_by_its_run_alone_and_goes_without_what_others_put_there() {

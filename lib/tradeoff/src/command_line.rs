@@ -7,8 +7,8 @@ use dipir_cli::args::OutputArgs;
 
 const EXAMPLES: &str = "\
 Examples:
-  dipir-tradeoff                           all scenes, both tracks, into ./tradeoff; takes an hour
-                                           or so on two cores; goes on where it was stopped
+  dipir-tradeoff                           all scenes, both tracks, into ./tradeoff; takes hours, and
+                                           says how many; goes on where it was stopped
   dipir-tradeoff --track render            only what compositing costs
   dipir-tradeoff -p photo/pipeline.toml    your own scene, lit by its [composite] environment
   dipir-tradeoff --size 48x32 --repeats 1  a quick look

@@ -26,6 +26,9 @@ pub struct Step<'a> {
     pub series: &'a str,
     /// What distinguishes it from others of the series.
     pub label: &'a str,
+    /// Seconds that the whole sweep is expected to take, those of processors; 0 if all is measured, and only known of the
+    /// built-in scenes.
+    pub expected_s: Option<f64>,
 }
 
 /// What was measured.
@@ -99,6 +102,12 @@ pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome>
         costs.push(cost);
     }
     let all = costs.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+    // Costs are those of pictures of 96 x 64 pixels; how large a user's are is not known here.
+    let larger = (width * height) as f64 / (96.0 * 64.0);
+    let expected_s = cli
+        .pipeline
+        .is_empty()
+        .then_some(costs.iter().sum::<f64>() * larger);
     let mut points: Vec<Point> = Vec::new();
     for (n, (scene, variant)) in work.iter().enumerate() {
         report(Step {
@@ -108,6 +117,7 @@ pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome>
             scene: &scene.name,
             series: &variant.series,
             label: &variant.label,
+            expected_s,
         });
         let measurement = measurement(scene);
         points.extend(match cli.report_only {

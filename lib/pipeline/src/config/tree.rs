@@ -169,7 +169,7 @@ fn node(
                     at,
                     key: key.into(),
                     found: format!("the integer {}", i.as_str()),
-                    accepted: "a whole number that fits 64 bits".into(),
+                    accepted: "a whole number from -2^63 to 2^63 - 1".into(),
                 });
             }
         },

@@ -4,7 +4,7 @@ pub mod table;
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context;
 use candle_core::{DType, Device, Tensor};
@@ -33,14 +33,8 @@ use crate::written;
 use folder::{ConceptEntry, ConceptList, read_latents};
 use table::ConceptsTable;
 
-/// The files of an image in the cache, and the names under which they are written.
-const CACHED: [&str; 5] = [
-    "#.png",
-    "#.safetensors",
-    "#.blake3",
-    "#.partial",
-    "#.partial.png",
-];
+/// The files of an image in the cache, and what tensors are called while they are written.
+const CACHED: [&str; 4] = ["#.png", "#.safetensors", "#.blake3", "#.partial"];
 
 /// What the stage did.
 pub struct Done {
@@ -98,12 +92,8 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         interrupt::check()?;
         let concept = concept(&list.class, index, session.pipeline.seed);
         let stem = format!("{index:04}");
-        let (png, tensor) = (
-            cache.file(format!("{stem}.png")),
-            cache.file(format!("{stem}.safetensors")),
-        );
-        let seal = cache.file(format!("{stem}.blake3"));
-        if !is_whole(&seal, &png, &tensor) {
+        let image = CachedImage::new(&cache, &stem);
+        if !image.is_whole() {
             let settings = GenerateSettings {
                 solver: Solver::DpmSolver2M,
                 steps: table.steps,
@@ -112,13 +102,13 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
                 seed: concept.seed,
             };
             let share = |part: f64| (index as f64 + part) / table.count as f64;
-            make(&model, &concept, &settings, &png, &tensor, |part| {
+            image.make(&model, &concept, &settings, |part| {
                 progress.set(share(part))
             })?;
-            write_seal(&seal, &png, &tensor)?;
             made += 1;
         }
-        latents.push(read_latents(&tensor)?);
+        let png = cache.file(&image.png);
+        latents.push(read_latents(&cache.file(&image.tensor))?);
         let name = PathBuf::from(format!("images/{stem}.png"));
         let target = writer.output("image", &name)?;
         std::fs::copy(&png, &target).with_context(|| format!("cannot copy {}", png.display()))?;
@@ -188,59 +178,75 @@ fn cache_folder(
     )?)
 }
 
-/// Whether both files of an image are there with the hashes that were noted when they were made.
-fn is_whole(seal: &Path, png: &Path, tensor: &Path) -> bool {
-    let noted = std::fs::read_to_string(seal).ok();
-    noted.is_some() && noted == hashes(png, tensor).ok()
+/// An image in the cache: the names of its files.
+struct CachedImage<'a> {
+    cache: &'a Resume,
+    png: String,
+    tensor: String,
+    /// The hashes of both.
+    seal: String,
 }
 
-/// Notes the hashes of both files of an image: written last, it says that they are whole.
-fn write_seal(seal: &Path, png: &Path, tensor: &Path) -> anyhow::Result<()> {
-    let text = hashes(png, tensor)?;
-    let partial = seal.with_extension("partial");
-    std::fs::write(&partial, text)
-        .and_then(|()| std::fs::rename(&partial, seal))
-        .with_context(|| format!("cannot write {}", seal.display()))
-}
+impl<'a> CachedImage<'a> {
+    fn new(cache: &'a Resume, stem: &str) -> Self {
+        Self {
+            cache,
+            png: format!("{stem}.png"),
+            tensor: format!("{stem}.safetensors"),
+            seal: format!("{stem}.blake3"),
+        }
+    }
 
-fn hashes(png: &Path, tensor: &Path) -> Result<String, StageError> {
-    Ok(format!("{}\n{}\n", hash_file(png)?.1, hash_file(tensor)?.1))
-}
+    /// Whether both files are there with the hashes that were noted when they were made.
+    fn is_whole(&self) -> bool {
+        let noted = std::fs::read_to_string(self.cache.file(&self.seal)).ok();
+        noted.is_some() && noted == self.hashes().ok()
+    }
 
-fn make(
-    model: &Model,
-    concept: &Concept,
-    settings: &GenerateSettings,
-    png: &Path,
-    tensor: &Path,
-    mut progress: impl FnMut(f64),
-) -> anyhow::Result<()> {
-    let outcome = generate(
-        model,
-        &concept.prompt,
-        settings,
-        &Pass::default(),
-        None,
-        |part| {
-            progress(part);
-            !interrupt::asked()
-        },
-    );
-    interrupt::check()?;
-    let generated = outcome?;
-    let partial = png.with_extension("partial.png");
-    write_png(&partial, &dipir_tensors::model_output(&generated.image)?)?;
-    std::fs::rename(&partial, png).with_context(|| format!("cannot write {}", png.display()))?;
-    let latents = generated
-        .latents
-        .to_device(&Device::Cpu)?
-        .to_dtype(DType::F32)?;
-    write_safetensors(
-        tensor,
-        &BTreeMap::from([("latents".to_owned(), latents)]),
-        &BTreeMap::new(),
-    )?;
-    Ok(())
+    fn hashes(&self) -> Result<String, StageError> {
+        let hash = |name: &String| hash_file(&self.cache.file(name)).map(|(_, hash)| hash);
+        Ok(format!("{}\n{}\n", hash(&self.png)?, hash(&self.tensor)?))
+    }
+
+    /// Makes both files, then notes their hashes, which say that they are whole.
+    fn make(
+        &self,
+        model: &Model,
+        concept: &Concept,
+        settings: &GenerateSettings,
+        mut progress: impl FnMut(f64),
+    ) -> anyhow::Result<()> {
+        let outcome = generate(
+            model,
+            &concept.prompt,
+            settings,
+            &Pass::default(),
+            None,
+            |part| {
+                progress(part);
+                !interrupt::asked()
+            },
+        );
+        interrupt::check()?;
+        let generated = outcome?;
+        self.cache.put(&self.png, |own| {
+            let picture = dipir_tensors::model_output(&generated.image)?;
+            Ok::<_, anyhow::Error>(write_png(own, &picture)?)
+        })?;
+        let latents = generated
+            .latents
+            .to_device(&Device::Cpu)?
+            .to_dtype(DType::F32)?;
+        let latents = BTreeMap::from([("latents".to_owned(), latents)]);
+        self.cache.put(&self.tensor, |own| {
+            Ok::<_, anyhow::Error>(write_safetensors(own, &latents, &BTreeMap::new())?)
+        })?;
+        let text = self.hashes()?;
+        let seal = self.cache.file(&self.seal);
+        self.cache.put(&self.seal, |own| {
+            std::fs::write(own, text).with_context(|| format!("cannot write {}", seal.display()))
+        })
+    }
 }
 
 impl Done {

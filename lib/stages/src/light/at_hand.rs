@@ -50,6 +50,26 @@ impl Origin {
         }
     }
 
+    /// In words, with what `[light]` of the session tells of the sun.
+    ///
+    /// # Errors
+    /// If `[light]` cannot be read.
+    pub fn words_of(self, session: &Session) -> anyhow::Result<&'static str> {
+        let table: LightTable = session.config.table("light")?;
+        Ok(match (self, table.sun.is_some(), table.shadow.is_some()) {
+            (Self::Estimate, true, true) => {
+                "estimated from the photograph, the sun as [light] sun and shadow tell"
+            }
+            (Self::Estimate, true, false) => {
+                "estimated from the photograph, the sun as [light] sun tells"
+            }
+            (Self::Estimate, false, true) => {
+                "estimated from the photograph, the sun as [light] shadow tells"
+            }
+            _ => self.words(),
+        })
+    }
+
     /// Whether what is said of the sun does not change it.
     pub fn is_fixed(self) -> bool {
         matches!(self, Self::Map | Self::File | Self::Neutral)
@@ -221,6 +241,12 @@ mod tests {
             assert!(Request::of(&session).unwrap().start == first, "{more:?}");
             let found = at_hand(&session, &loaded).unwrap();
             assert_eq!(found.origin, origin, "{more:?}");
+            assert_eq!(origin.words_of(&session).unwrap(), origin.words());
         }
+        let args = ["dipir-light", "-p", &path, "-s", "light.sun.azimuth_deg=30"];
+        let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+        let words = |origin: Origin| origin.words_of(&session).unwrap();
+        assert!(words(Origin::Estimate).ends_with("the sun as [light] sun tells"));
+        assert_eq!(words(Origin::Stage), Origin::Stage.words());
     }
 }

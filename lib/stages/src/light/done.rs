@@ -8,7 +8,7 @@ use dipir_optimize::history::Row;
 use serde_json::{Value, json};
 
 use super::Done;
-use super::words::{in_words, is_unplaced_sun};
+use super::words::{in_words, is_unplaced_sun, of_shadow};
 use crate::{shown, written};
 
 impl Done {
@@ -84,8 +84,9 @@ impl fmt::Display for Done {
             if estimated.chosen().is_none() && is_unplaced_sun(&estimated.estimate) {
                 write!(
                     f,
-                    "\n  the sun probably shines, but its direction is not known well enough for a sharp shadow: draw one \
-                     (light.shadow), say where the sun is (light.sun), or choose one of {} by its number (light.candidate)",
+                    "\n  the sun probably shines, but its direction is not known well enough for a sharp shadow: {}say where \
+                     the sun is (light.sun), or choose one of {} by its number (light.candidate)",
+                    of_shadow(estimated.shadow),
                     shown(&self.folder.join("candidates.png"))
                 )?;
             }

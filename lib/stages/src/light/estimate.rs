@@ -28,6 +28,28 @@ pub(super) struct CandidateEntry {
     words: String,
 }
 
+/// The shadow of `[light]`, which tells the sun's elevation only with a height.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum DrawnShadow {
+    /// None is drawn.
+    None,
+    /// The height of what casts it is not told.
+    WithoutHeight,
+    /// The height is told.
+    WithHeight,
+}
+
+impl DrawnShadow {
+    /// Of a shadow, by the height of what casts it, metres.
+    pub(super) fn of(shadow: Option<Option<f64>>) -> Self {
+        match shadow {
+            None => Self::None,
+            Some(None) => Self::WithoutHeight,
+            Some(Some(_)) => Self::WithHeight,
+        }
+    }
+}
+
 /// An estimated light.
 pub(super) struct Estimated {
     /// The distribution.
@@ -48,6 +70,8 @@ pub(super) struct Estimated {
     pub(super) seen: Vec<Visible>,
     /// How many photographs tell it.
     pub(super) photographs: usize,
+    /// The shadow that is drawn in the photograph.
+    pub(super) shadow: DrawnShadow,
 }
 
 impl Estimated {
@@ -113,6 +137,7 @@ pub(super) fn estimate(
         smooth,
         seen,
         photographs: 1 + views::settings(session)?.len(),
+        shadow: DrawnShadow::of(table.shadow.as_ref().map(|s| s.height_m)),
     })
 }
 

@@ -2,6 +2,8 @@
 use dipir_estimator::posterior::side;
 use dipir_estimator::{Interval, LightEstimate};
 
+use super::estimate::DrawnShadow;
+
 /// A quantity of the light, its middle and its 80% interval in numbers, and the interval in words.
 pub(crate) struct Quantity {
     /// What it is.
@@ -28,6 +30,17 @@ pub(super) fn in_words(estimate: &LightEstimate) -> String {
 /// Whether a sun is more probable than none, but its direction is not known well enough for a sharp shadow.
 pub(super) fn is_unplaced_sun(estimate: &LightEstimate) -> bool {
     estimate.sun_probability >= 0.5 && estimate.source.is_none()
+}
+
+/// What a shadow could still tell of the sun, as the first of several ways; empty if nothing.
+pub(super) fn of_shadow(drawn: DrawnShadow) -> &'static str {
+    match drawn {
+        DrawnShadow::None => "draw one (light.shadow), ",
+        DrawnShadow::WithoutHeight => {
+            "say how tall what casts the drawn one is (light.shadow.height_m), "
+        }
+        DrawnShadow::WithHeight => "",
+    }
 }
 
 /// Azimuth, elevation, exposure and share.
@@ -130,6 +143,14 @@ mod tests {
         let shown = [0.0, 0.004, 0.006, 0.5, 0.994, 0.996, 1.0].map(percent);
         let wanted = ["0%", "under 1%", "1%", "50%", "99%", "over 99%", "100%"];
         assert_eq!(shown, wanted);
+    }
+
+    #[test]
+    fn a_shadow_that_was_drawn_is_not_asked_for_again() {
+        assert!(of_shadow(DrawnShadow::None).starts_with("draw one"));
+        let known = |height_m| DrawnShadow::of(Some(height_m));
+        assert!(of_shadow(known(None)).contains("light.shadow.height_m"));
+        assert_eq!(of_shadow(known(Some(1.8))), "");
     }
 
     #[test]

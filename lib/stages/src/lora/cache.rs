@@ -14,27 +14,18 @@ use serde::{Deserialize, Serialize};
 
 use crate::names::LORA;
 
-/// The files that the cache holds, and the names under which they are written.
-const FILES: [&str; 16] = [
+/// The files that the cache holds.
+const FILES: [&str; 8] = [
     "lora.safetensors",
-    "lora.safetensors.partial",
     "lora_kohya.safetensors",
-    "lora_kohya.safetensors.partial",
     "word.safetensors",
-    "word.safetensors.partial",
     "training.json",
-    "training.json.partial",
     "training.csv",
-    "training.csv.partial",
     "sheet.png",
-    "sheet.png.partial",
     "samples/#.png",
-    "samples/#.png.partial",
     SEAL,
-    SEAL_PARTIAL,
 ];
 const SEAL: &str = "seal.json";
-const SEAL_PARTIAL: &str = "seal.json.partial";
 
 /// A file of a finished run.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -112,12 +103,10 @@ impl Cache {
         write: impl FnOnce(&Path) -> std::io::Result<()>,
     ) -> anyhow::Result<()> {
         let path = self.kept.file(name);
-        let mut partial = path.clone().into_os_string();
-        partial.push(".partial");
-        let partial = PathBuf::from(partial);
-        write(&partial)
-            .and_then(|()| fs::rename(&partial, &path))
-            .with_context(|| format!("cannot write {}", path.display()))
+        let name = name.to_str().context("a file's name is not UTF-8")?;
+        self.kept.put(name, |own| {
+            write(own).with_context(|| format!("cannot write {}", path.display()))
+        })
     }
 }
 

@@ -15,6 +15,7 @@ use std::time::Instant;
 
 use anyhow::Context;
 use candle_core::Tensor;
+use dipir_cli::exit::describe;
 use dipir_cli::interrupt;
 use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
@@ -168,7 +169,13 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     run.resume.remove();
     let folder = LORA.folder(session);
     if let Some(cache) = &cache {
-        cache.keep(&folder, &manifest)?;
+        // The stage's own result stands without it.
+        if let Err(e) = cache.keep(&folder, &manifest) {
+            session.warn(&format!(
+                "the adapter is not kept for other scenes: {}",
+                describe(&e)
+            ));
+        }
     }
     Ok(Done {
         folder,
