@@ -2,7 +2,7 @@
 //!
 //! The rounds of [`crate::adaptive`] are played through on the jobs' squared errors and costs instead of their samples,
 //! with the same goals. A job's squared error is taken to fall with a power of its samples, the one that the jobs that
-//! grew since the first round have shown: 1 for independent samples, more where stratification helps.
+//! grew have shown where they held most of the error: 1 for independent samples, more where stratification helps.
 use crate::adaptive::{EstimatedError, goal, unseen};
 use crate::job::Job;
 use crate::viewing::SquaredError;
@@ -13,7 +13,7 @@ const POWER: f64 = 1.0;
 /// [Owen 1997, "Scrambled net variance for integrals of smooth functions"].
 const POWERS: [f64; 2] = [0.5, 3.0];
 /// Jobs that grew tell the power if they held this share of the squared error.
-const SHARE_TO_LEARN_FROM: f64 = 0.25;
+const SHARE_TO_LEARN_FROM: f64 = 0.5;
 /// Rounds that are played through at most; each multiplies the samples by up to 4.
 const ROUNDS: usize = 32;
 /// Share of the samples' squared error that the denoiser is taken to leave where it has not been tried. Of .25 to 1 it foretells
@@ -55,9 +55,9 @@ pub struct Foresight {
     last: Vec<Point>,
     /// Squared error in units of what a target of 1 allows, and cost: after every round.
     rounds: Vec<(f64, f64)>,
-    /// The power from the first round to the last.
+    /// The power of the last round that tells it.
     power: f64,
-    /// That of the first round in which jobs grew that tell it.
+    /// That of the first one.
     early: Option<f64>,
     /// Cost that every target pays once, beside the jobs.
     once: f64,
@@ -117,7 +117,7 @@ impl Foresight {
         let points: Vec<Point> = points.collect();
         if self.first.is_empty() {
             self.first.clone_from(&points);
-        } else if let Some(power) = power(&self.first, &points) {
+        } else if let Some(power) = power(&self.last, &points) {
             self.power = power;
             self.early.get_or_insert(power);
         }
