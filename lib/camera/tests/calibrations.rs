@@ -1,10 +1,14 @@
 //! Calibrations: what their numbers mean, and which cannot be read.
+mod found;
+
 use std::path::Path;
 
-use dipir_cameras::file::{self, Wanted, Which};
+use dipir_cameras::file::{self, Which};
 use dipir_cameras::{WorldUp, kitti, nuscenes, opencv};
 use glam::{DVec2, DVec3};
 use serde_json::{Value, json};
+
+use crate::found::found_x;
 
 /// A lens that cannot be read is not a lens without distortion.
 #[test]
@@ -166,22 +170,6 @@ fn record(names: Value, x: f64) -> Value {
     let all = record.as_object_mut().unwrap();
     all.extend(names.as_object().unwrap().clone());
     record
-}
-
-/// Where the camera stands that is found in a file of this name.
-fn found_x(name: &str, text: &str, which: Which) -> Result<f64, String> {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join(name);
-    std::fs::write(&path, text).unwrap();
-    let wanted = Wanted {
-        size: [640.0, 480.0],
-        which,
-        up: None,
-        fov_deg: None,
-        turns: None,
-    };
-    let found = file::read(&path, &wanted).map_err(|e| e.to_string())?;
-    Ok(found.pose.unwrap().position.x)
 }
 
 #[test]

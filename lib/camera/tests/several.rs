@@ -1,24 +1,12 @@
 //! Files of several cameras: which one is read, and what the others do.
+mod found;
+
 use std::path::Path;
 
-use dipir_cameras::file::{self, Wanted, Which};
-use serde_json::{Value, json};
+use dipir_cameras::file::Which;
+use serde_json::json;
 
-/// Where the camera stands that is found in a file of this name.
-fn found_x(name: &str, json: &Value, which: Which) -> Result<f64, String> {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join(name);
-    std::fs::write(&path, json.to_string()).unwrap();
-    let wanted = Wanted {
-        size: [600.0, 400.0],
-        which,
-        up: None,
-        fov_deg: None,
-        turns: None,
-    };
-    let found = file::read(&path, &wanted).map_err(|e| e.to_string())?;
-    Ok(found.pose.unwrap().position.x)
-}
+use crate::found::found_x;
 
 /// Blender names a camera's data, which several objects may share, and each object.
 #[test]
@@ -28,7 +16,7 @@ fn a_gltf_s_camera_goes_by_its_node_s_name_too() {
         "nodes": [node("left", -1.0), node("right", 1.0)],
         "cameras": [{ "name": "lens", "perspective": { "yfov": 0.7 } }],
     });
-    let x = |which| found_x("shot.gltf", &text, which);
+    let x = |which| found_x("shot.gltf", &text.to_string(), which);
     assert_eq!(x(Which::Name("right")), Ok(1.0));
     assert_eq!(x(Which::Photo(Path::new("plates/left.png"))), Ok(-1.0));
     let error = x(Which::Name("lens")).unwrap_err();
@@ -59,7 +47,7 @@ fn a_camera_that_cannot_be_read_keeps_no_other_from_being_read() {
         ),
         ("rig.gltf", gltf, "sheared, mirrored or scaled to nothing"),
     ] {
-        let of = |photo: &str| found_x(name, &text, Which::Photo(Path::new(photo)));
+        let of = |photo: &str| found_x(name, &text.to_string(), Which::Photo(Path::new(photo)));
         assert_eq!(of("a.png"), Ok(1.0), "{name}");
         let error = of("b.png").unwrap_err();
         assert!(error.contains(wrong), "{error}");
