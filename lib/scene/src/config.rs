@@ -253,7 +253,7 @@ macro_rules! effects_config {
 
 effects_config! {
     shadow: "The object's shadow: light that it keeps from the proxy.",
-    proxy_occlusion: "The proxy's own shadow: light that its parts keep from each other.",
+    proxy_occlusion: "The proxy's own shadow: light, the object's too, that its parts keep from each other.",
     interreflection: "Light that bounces between parts of the object.",
     specular: "Mirror-like reflection at the surface.",
     textures: "Base colour, metalness and roughness that vary over the surface.",
