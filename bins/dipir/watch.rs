@@ -6,7 +6,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus};
 use std::thread;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::Context;
 use dipir_cli::exit::{AlreadyReported, INTERRUPTED};
@@ -19,6 +19,11 @@ use crate::project::ProjectArgs;
 
 /// How often files are looked at.
 const PAUSE: Duration = Duration::from_millis(500);
+
+/// How often a run is asked whether it has ended.
+const ASK_EVERY: Duration = Duration::from_millis(50);
+/// How long a run may go on once this process was asked to stop.
+const GRACE: Duration = Duration::from_secs(2);
 
 /// Time of change and length of files; `None` of one that is not there.
 type Stamps = BTreeMap<PathBuf, Option<(SystemTime, u64)>>;
@@ -49,21 +54,18 @@ pub fn watch(project: &ProjectArgs) -> anyhow::Result<()> {
     }
 }
 
-/// Waits for the end of a run. One that goes on well after this process was asked to stop was not asked itself, and is ended:
-/// its stages stop by themselves then.
+/// Waits for the end of a run. A run that goes on for [`GRACE`] after this process was asked to stop was not asked itself: it
+/// is killed, and its stages stop by themselves then.
 fn wait(mut child: Child) -> io::Result<ExitStatus> {
-    let mut patience = 40;
+    let mut asked = None;
     loop {
         if let Some(status) = child.try_wait()? {
             return Ok(status);
         }
-        if interrupt::asked() {
-            if patience == 0 {
-                child.kill()?;
-            }
-            patience -= 1;
+        if interrupt::asked() && asked.get_or_insert_with(Instant::now).elapsed() > GRACE {
+            child.kill()?;
         }
-        thread::sleep(PAUSE / 10);
+        thread::sleep(ASK_EVERY);
     }
 }
 
