@@ -87,6 +87,16 @@ pub fn run(args: &CleanArgs) -> anyhow::Result<()> {
         found.roots.extend(frames.iter().cloned());
         found.roots.push(out.join(shot::FOLDER));
     }
+    let exposures = shot::exposure::kept_in(out);
+    if args.stages.is_empty() {
+        found
+            .files
+            .extend(shot::exposure::left_of_writing(&exposures));
+        if shot::exposure::is_kept(&exposures) {
+            found.files.push(exposures);
+            found.roots.push(out.join(shot::FOLDER));
+        }
+    }
     let (removed, kept) = found.listed()?;
     let roots = std::mem::take(&mut found.roots);
     if !args.dry_run {

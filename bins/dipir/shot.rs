@@ -53,7 +53,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     refuse_pipeline(&args.frames)?;
     let base = ProjectArgs::of(&common);
     let (session, graph) = base.open()?;
-    let mut frames = frames(args, &session, &base)?;
+    let (mut frames, told) = frames(args, &session, &base)?;
     let is_recovered = graph.node(LIGHT.name).is_some_and(|n| n.unneeded.is_none());
     for (_, frame) in &mut frames {
         frame.placed = Some(SCENE.folder(&session));
@@ -65,6 +65,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     };
     let of_photo = RunArgs::needed(&common, Some(last));
     if args.plan {
+        expose(&session, &mut frames, &told, false)?;
         let photo = run_one(&of_photo.planned(), &base)?;
         let (words, json) = plan::frames(&session, photo, &frames, args.force)?;
         common.output.result(|| words, || json);
@@ -87,6 +88,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     if !common.output.json {
         common.output.result(|| done, || Value::Null);
     }
+    expose(&session, &mut frames, &told, true)?;
     let of_frames = RunArgs::needed(&common, None).forced(args.force);
     run_each(&of_frames, frames, |failed| {
         // The page of the photograph shows its frames.
@@ -116,29 +118,26 @@ fn refuse_pipeline(frames: &[PathBuf]) -> Result<(), Usage> {
     }
 }
 
-/// The frames, each with its project.
+/// A frame, and its project.
+type Frame = (PathBuf, ProjectArgs);
+
+/// The frames, and how much more than the photograph each is exposed, stops; nothing where only its picture can tell.
 fn frames(
     args: &ShotArgs,
     session: &Session,
     base: &ProjectArgs,
-) -> anyhow::Result<Vec<(PathBuf, ProjectArgs)>> {
-    let mut frames: Vec<(PathBuf, ProjectArgs)> = Vec::new();
+) -> anyhow::Result<(Vec<Frame>, Vec<Option<f64>>)> {
+    let (mut frames, mut told) = (Vec::<Frame>::new(), Vec::new());
     let stands_still = shot::camera_stands_still(session)?;
     for path in &args.frames {
         let name = name(path)?;
-        let stops = match args.same_exposure {
-            true => 0.0,
-            false => shot::exposure_stops(session, path)?.unwrap_or_default(),
-        };
+        told.push(match args.same_exposure {
+            true => Some(0.0),
+            false => shot::exposure_stops(session, path)?,
+        });
         let mut frame = base.clone();
-        frame
-            .set
-            .extend(shot::overrides(session, path, stops, stands_still)?);
-        if stops != 0.0 {
-            let than = if stops > 0.0 { "more" } else { "less" };
-            let stops = stops.abs();
-            session.remark(|| format!("{}: exposed by {stops:.2} stops {than}", path.display()));
-        }
+        let overrides = shot::overrides(session, path, stands_still)?;
+        frame.set.extend(overrides);
         frame.out = Some(session.out.join(shot::FOLDER).join(name));
         if frames.iter().any(|(_, other)| other.out == frame.out) {
             let message = format!("{}: another frame has the same name", path.display());
@@ -146,7 +145,48 @@ fn frames(
         }
         frames.push((path.clone(), frame));
     }
-    Ok(frames)
+    Ok((frames, told))
+}
+
+/// Gives each frame light of its exposure: what is `told`, else what the pictures tell, for which they are read if `look`.
+fn expose(
+    session: &Session,
+    frames: &mut [Frame],
+    told: &[Option<f64>],
+    look: bool,
+) -> anyhow::Result<()> {
+    let mut stops = told.to_vec();
+    let mut untold: Vec<usize> = (0..frames.len()).filter(|k| told[*k].is_none()).collect();
+    if !untold.is_empty() {
+        untold.sort_by_key(|k| shot::order(&frames[*k].0));
+        let open = |k: &usize| Ok((frames[*k].0.clone(), frames[*k].1.open()?.0));
+        let open: anyhow::Result<Vec<_>> = untold.iter().map(open).collect();
+        let (found, unknown) = shot::exposure::exposures(session, &open?, look)?;
+        untold
+            .into_iter()
+            .zip(found)
+            .for_each(|(k, found)| stops[k] = Some(found));
+        if let Some(first) = unknown.first() {
+            let who = match unknown.len() {
+                1 => format!("{} shows", first.display()),
+                n => format!("{n} frames, the first of them {}, show", first.display()),
+            };
+            session.warn(&format!(
+                "{who} too little of what the photograph or another frame shows to tell the exposure: taken to be exposed as \
+                 the frame before"
+            ));
+        }
+    }
+    for ((path, frame), stops) in frames.iter_mut().zip(stops) {
+        let stops = stops.unwrap_or_default();
+        frame.set.extend(shot::exposed(session, stops)?);
+        if stops != 0.0 {
+            let than = if stops > 0.0 { "more" } else { "less" };
+            let stops = stops.abs();
+            session.remark(|| format!("{}: exposed by {stops:.2} stops {than}", path.display()));
+        }
+    }
+    Ok(())
 }
 
 /// The name of a frame's folder: that of its file without the extension.

@@ -1,6 +1,7 @@
 //! Frames under one light.
 use dipir_imaging::file::write_png;
-use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
+use dipir_imaging::transfer::Transfer;
 use glam::Vec3;
 use serde_json::{Value, json};
 
@@ -215,11 +216,12 @@ fn a_frame_that_fails_leaves_no_folder() {
     shot(&project, &["b c.png"]);
     let link = "<a href=\"frames/b%20c/composite/composite.png\">b c</a>";
     assert!(page().contains(link) && page().contains("2 made. "));
-    assert_eq!(project.names("out/frames"), ["a", "b c"]);
+    let found = ["a", "b c", "exposures.json"];
+    assert_eq!(project.names("out/frames"), found);
     // A folder that was there is not ours.
     std::fs::create_dir(project.path("out/frames/cut")).unwrap();
     failed(&["cut.png"]);
-    assert_eq!(project.names("out/frames"), ["a", "b c", "cut"]);
+    assert_eq!(project.names("out/frames").len(), found.len() + 1);
     project.run(DIPIR, &["clean"]).expect_success();
     assert_eq!(project.names("out/frames"), ["cut"]);
 }
@@ -278,6 +280,71 @@ fn frames_are_exposed_as_their_exif_data_say() {
     assert_eq!(stops("longer"), 1.5);
     shot(&project, &["longer.jpg", "--same-exposure"]);
     assert_eq!(stops("longer"), 0.0);
+}
+
+#[test]
+fn frames_without_exif_data_are_exposed_as_their_pictures_tell() {
+    let project = project();
+    // Ground and sky of many shades, taken by a camera that exposes each frame by itself.
+    let shade = |n: usize| {
+        let (x, y) = (n % 96, n / 96);
+        0.08 + 0.2 * ((x / 6 * 37 + y / 6 * 101) % 17) as f32 / 17.0
+    };
+    let frame = |name: &str, stops: f32| {
+        let value = |n: usize| {
+            let light = shade(n) * stops.exp2();
+            Vec3::splat(light / (1.0 + light))
+        };
+        let pixels = (0..96 * 64).map(value).collect();
+        let image = LinearImage(Raster::from_pixels(96, 64, pixels));
+        write_png(project.path(name), &Transfer::Srgb.encode(&image)).unwrap();
+    };
+    let exposures = [0.0, 0.5, 0.9, 1.4, 0.02];
+    for (k, stops) in exposures.iter().enumerate() {
+        frame(&format!("f_{k}.png"), *stops);
+    }
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write("pipeline.toml", text.replace("background.png", "f_0.png"));
+    let stops = |k: usize| {
+        let manifest = format!("out/frames/f_{k}/composite/stage.json");
+        let value: Value = serde_json::from_slice(&project.read(&manifest)).unwrap();
+        value["params"]["light"]["exposure_ev"].as_f64().unwrap()
+    };
+    let all = ["f_3.png", "f_1.png", "f_2.png", "f_4.png"];
+    for done in shot(&project, &all) {
+        assert_eq!(done["done"]["ran"], json!(["scene", "composite"]));
+    }
+    for k in 1..5 {
+        // What is measured is uncertain by .05 stops, which are taken off; values of 8 bits are off by .01 of a stop.
+        let wanted = f64::from((exposures[k] - 0.05).max(0.0));
+        assert!((stops(k) - wanted).abs() < 0.02, "{k}: {}", stops(k));
+    }
+    // What was measured is kept, and shown before anything runs.
+    let kept = project.read("out/frames/exposures.json");
+    for again in shot(&project, &all) {
+        assert_eq!(again["done"]["ran"], json!([]));
+    }
+    let plan = project.run(DIPIR, &[&["shot", "--plan", "--json"], &all[..]].concat());
+    let plan: Value = serde_json::from_str(&plan.stdout).unwrap();
+    assert_eq!(plan["frames"]["run"], 0, "{plan}");
+    assert_eq!(project.read("out/frames/exposures.json"), kept);
+    // A picture of something else is as the frame before it, and a file of the user's with that name stays.
+    project.write("out/frames/exposures.json", "mine");
+    write_png(
+        project.path("f_5.png"),
+        &DisplayImage(Raster::filled(96, 64, Vec3::ONE)),
+    )
+    .unwrap();
+    let run = project.run(DIPIR, &["shot", "f_1.png", "f_2.png", "f_5.png"]);
+    run.expect_success();
+    let warning = "f_5.png shows too little";
+    assert!(run.stderr.contains(warning), "{}", run.stderr);
+    assert!((stops(5) - stops(2)).abs() < 1e-3);
+    assert_eq!(project.read("out/frames/exposures.json"), b"mine");
+    std::fs::remove_file(project.path("out/frames/exposures.json")).unwrap();
+    shot(&project, &all);
+    project.run(DIPIR, &["clean"]).expect_success();
+    assert!(!project.path("out/frames").exists());
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Several photographs of one place.
 use dipir_imaging::file::write_png;
-use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
 use glam::Vec3;
@@ -95,6 +95,27 @@ fn a_photograph_of_unknown_exposure_tells_directions_alone() {
     // Three stops more than the scene's photograph: an eighth of what it shows.
     let seen = behind(&project);
     assert!(seen.distance(shown() / 8.0) < ROUNDING / 8.0, "{seen}");
+}
+
+#[test]
+fn what_two_photographs_show_tells_how_they_are_exposed() {
+    let project = project(&format!(
+        "{VIEW}camera = {{ heading_deg = 0.0, pitch_deg = -11.31 }}\n"
+    ));
+    // Shades of one place; `behind.png` has a quarter of the light.
+    let photo = |name: &str, gain: f32| {
+        let shade =
+            |n: usize| 0.15 + 0.5 * ((n % 96 / 6 * 37 + n / 96 / 6 * 101) % 17) as f32 / 17.0;
+        let pixels = (0..96 * 64).map(|n| Vec3::splat(gain * shade(n))).collect();
+        let image = LinearImage(Raster::from_pixels(96, 64, pixels));
+        write_png(project.path(name), &Transfer::Srgb.encode(&image)).unwrap();
+    };
+    photo("background.png", 1.0);
+    photo("behind.png", 0.25);
+    let run = project.run(DIPIR, &["run", "--until", "light", "-v"]);
+    run.expect_success();
+    let told = "scene.views[0].background: exposed by -2.00 stops more than scene.background, as what both show tells";
+    assert!(run.stderr.contains(told), "{}", run.stderr);
 }
 
 #[test]

@@ -78,6 +78,20 @@ pub enum ProxyRecord {
     Ground(Box<Ground>),
 }
 
+impl ProxyRecord {
+    /// The plane, or that through the points; `None` for meshes.
+    pub fn plane(&self) -> Option<Plane> {
+        match self {
+            Self::Plane(plane) => Some(*plane),
+            Self::Ground(ground) => Some(Plane {
+                point: ground.point.as_vec3(),
+                normal: ground.normal.as_vec3().normalize(),
+            }),
+            Self::None | Self::Mesh(_) => None,
+        }
+    }
+}
+
 /// The content of `scene.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

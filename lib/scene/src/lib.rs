@@ -6,6 +6,7 @@ pub mod config;
 pub mod description;
 pub mod error;
 pub mod export;
+pub mod exposure;
 pub mod features;
 pub mod ground;
 pub mod import;

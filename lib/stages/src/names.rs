@@ -42,7 +42,7 @@ pub const LORA: StageName = StageName {
 pub const LIGHT: StageName = StageName {
     name: "light",
     executable: "dipir-light",
-    version: 10,
+    version: 11,
 };
 /// Renders the picture and its layers.
 pub const COMPOSITE: StageName = StageName {

@@ -11,6 +11,8 @@ use serde_json::json;
 use crate::composite::table::CompositeTable;
 use crate::names::COMPOSITE;
 
+pub mod exposure;
+
 /// Folder of the frames' artifacts in that of all.
 pub const FOLDER: &str = "frames";
 /// Exposures that differ by less are one, stops: cameras round times and f-numbers.
@@ -30,8 +32,8 @@ pub fn is_made(frame: &Path) -> bool {
     Owned::of_stage(&frame.join(COMPOSITE.name), COMPOSITE.name).is_some()
 }
 
-/// How much more the frame in `path` is exposed than the session's photograph, stops, if the Exif data of both tell and
-/// they are not exposed alike.
+/// How much more the frame in `path` is exposed than the session's photograph, stops, if the Exif data of both tell; 0 if they
+/// are exposed alike.
 ///
 /// # Errors
 /// If `[scene]` cannot be read.
@@ -43,7 +45,10 @@ pub fn exposure_stops(session: &Session, path: &Path) -> anyhow::Result<Option<f
         return Ok(None);
     };
     let stops = (frame - photo).clamp(-30.0, 30.0);
-    Ok((stops.abs() >= SAME_EXPOSURE).then_some(stops))
+    Ok(Some(match stops.abs() >= SAME_EXPOSURE {
+        true => stops,
+        false => 0.0,
+    }))
 }
 
 /// Whether all frames have one camera.
@@ -57,15 +62,24 @@ pub fn camera_stands_still(session: &Session) -> anyhow::Result<bool> {
     Ok(file.is_none_or(has_one))
 }
 
-/// What sets the frame in `path`, exposed by `stops` more, in place of the session's photograph, as `KEY=VALUE`. The camera
-/// is its own, unless it `stands_still`.
+/// What makes the light that of a frame which is exposed by `stops` more than the session's photograph, as `KEY=VALUE`.
+///
+/// # Errors
+/// If `[composite]` cannot be read.
+pub fn exposed(session: &Session, stops: f64) -> anyhow::Result<Option<String>> {
+    let composite: CompositeTable = session.config.table("composite")?;
+    let exposure_ev = f64::from(composite.exposure_ev) + stops;
+    Ok((stops != 0.0).then(|| format!("composite.exposure_ev={exposure_ev:.3}")))
+}
+
+/// What sets the frame in `path` in place of the session's photograph, as `KEY=VALUE`. The camera is its own, unless it
+/// `stands_still`.
 ///
 /// # Errors
 /// If there is no such file or mask, if it is of a format that is not read, or its camera cannot be told from the configuration.
 pub fn overrides(
     session: &Session,
     path: &Path,
-    stops: f64,
     stands_still: bool,
 ) -> anyhow::Result<Vec<String>> {
     let wrong = |why: &str| Usage(printable(&format!("{}: {why}", path.display())));
@@ -85,11 +99,6 @@ pub fn overrides(
         "scene.background={}",
         text(&std::path::absolute(path)?)?
     )];
-    if stops != 0.0 {
-        let composite: CompositeTable = session.config.table("composite")?;
-        let exposure_ev = f64::from(composite.exposure_ev) + stops;
-        set.push(format!("composite.exposure_ev={exposure_ev:.3}"));
-    }
     if let Some(mask) = mask_of(&scene, path) {
         if !session.config.base_dir().join(&mask).is_file() {
             let mask = mask.display();
@@ -160,6 +169,13 @@ fn stem(path: &Path) -> Option<&str> {
 /// A name, and the digits at its end.
 fn split(stem: &str) -> (&str, &str) {
     stem.split_at(stem.trim_end_matches(|c: char| c.is_ascii_digit()).len())
+}
+
+/// What sorts frames as they were taken: by the name before its number, and by that.
+pub fn order(path: &Path) -> (PathBuf, u64, PathBuf) {
+    let (head, digits) = split(stem(path).unwrap_or_default());
+    let number = digits.parse().unwrap_or(u64::MAX);
+    (path.with_file_name(head), number, path.into())
 }
 
 /// The number at the end of a file's name.

@@ -11,7 +11,7 @@ pub struct ViewConfig {
     pub background: Option<PathBuf>,
     /// How much more than the scene's photograph it is exposed, stops.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = -30, max = 30), extend("x-default" = "what the Exif data of both tell, 0 for EXR and HDR; else it tells no brightness"), example = 0.0)]
+    #[schemars(range(min = -30, max = 30), extend("x-default" = "what the Exif data of both tell, 0 for EXR and HDR; else what both pictures show"), example = 0.0)]
     pub exposure_stops: Option<f64>,
     /// Where it was taken from: the keys of `[scene.camera]`. Without `file` and direction it is a camera of the scene's
     /// `file`, by `image`, `frame` or the photograph's name. The position may be left out, and the field of view if
@@ -25,6 +25,34 @@ impl SceneConfig {
         let of =
             |(k, view): (usize, &ViewConfig)| view.validate(&format!("scene.views[{k}]"), self);
         self.views.iter().enumerate().map(of).collect()
+    }
+}
+
+impl SceneConfig {
+    /// The scene's own photograph, as one of several of the place.
+    ///
+    /// # Errors
+    /// If `scene.background` is missing, or a key of `[scene.camera]` or `scene.transfer` is wrong.
+    pub fn own_view(&self) -> Result<ViewSettings, Error> {
+        let key = "scene.background";
+        let background = self
+            .background
+            .clone()
+            .ok_or_else(|| missing(key, "name the photograph: background = \"photo.jpg\""))?;
+        let camera = self.camera.clone().unwrap_or_default();
+        Ok(ViewSettings {
+            key: key.into(),
+            camera: camera.validate(&background)?,
+            config: ViewConfig {
+                background: Some(background.clone()),
+                exposure_stops: None,
+                camera: Some(camera),
+            },
+            background,
+            exposure_stops: None,
+            transfer: self.transfer()?,
+            limits: self.limits,
+        })
     }
 }
 

@@ -1,10 +1,13 @@
 //! The other photographs of the place, `[[scene.views]]`.
+use std::cell::LazyCell;
+
 use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_estimator::{Estimator, LightEstimate, ViewEstimate, Visible, combine};
 use dipir_imaging::file::Photo;
 use dipir_pipeline::stage::StagePlan;
 use dipir_scene::config::SceneConfig;
+use dipir_scene::exposure::Cells;
 use dipir_scene::scene::LoadedScene;
 use dipir_scene::views::{View, ViewSettings};
 
@@ -61,24 +64,23 @@ pub(super) fn estimate(
         estimate: own,
         stops: Some(0.0),
     }];
+    let photo = &loaded.photo.image;
+    let cells = LazyCell::new(|| Cells::new(photo, *camera, false));
     let mut seen = Vec::new();
     for settings in settings(session)? {
         let view = read(session, loaded, &settings)?;
         let told = between(loaded.taken(), &view.taken);
-        let stops = settings.exposure_stops.or(told);
+        let shown = || {
+            let other = Cells::new(&view.image, view.camera, false);
+            cells.stops_to(&other, loaded.description.proxy.plane().as_ref())
+        };
+        let known = settings.exposure_stops.or(told);
+        let stops = known.or_else(shown);
         let by_exif = by_exif(loaded.taken(), &view.taken);
         if let Some(warning) = disagreement(&settings.key, settings.exposure_stops, by_exif) {
             session.warn(&warning);
         }
-        if stops.is_none() {
-            session.remark(|| {
-                format!(
-                    "{}: nothing tells how it is exposed, so that it tells where light comes from and not how bright it is; \
-                     write exposure_stops = 0.0 beside it if it is exposed as scene.background is",
-                    settings.key
-                )
-            });
-        }
+        session.remark(|| remark(&settings.key, known, stops));
         all.push(ViewEstimate {
             estimate: exposed::estimate(&estimator, &view.taken, &view.image, &view.camera),
             stops,
@@ -89,6 +91,23 @@ pub(super) fn estimate(
         }
     }
     Ok((combine(&all)?, seen))
+}
+
+/// What is said of an exposure, and of what the pictures show of it.
+fn remark(key: &str, known: Option<f64>, stops: Option<f64>) -> String {
+    match (known, stops) {
+        (Some(stops), _) => {
+            format!("{key}: exposed by {stops:.2} stops more than scene.background")
+        }
+        (None, Some(stops)) => format!(
+            "{key}: exposed by {stops:.2} stops more than scene.background, as what both show tells; exposure_stops beside it \
+             says otherwise"
+        ),
+        (None, None) => format!(
+            "{key}: nothing tells how it is exposed, so that it tells where light comes from and not how bright it is; write \
+             exposure_stops = 0.0 beside it if it is exposed as scene.background is"
+        ),
+    }
 }
 
 fn read(session: &Session, loaded: &LoadedScene, settings: &ViewSettings) -> anyhow::Result<View> {

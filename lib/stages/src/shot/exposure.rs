@@ -1,0 +1,241 @@
+//! How the frames of a shot are exposed, from what they show of one place.
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use dipir_cli::interrupt;
+use dipir_cli::session::Session;
+use dipir_pipeline::fingerprint::Fingerprint;
+use dipir_pipeline::manifest::Artifact;
+use dipir_scene::config::SceneConfig;
+use dipir_scene::description::SceneDescription;
+use dipir_scene::exposure::Cells;
+use dipir_scene::ground;
+use dipir_scene::proxy::Plane;
+use dipir_scene::views::ViewSettings;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+
+use crate::composite::table::{CompositeTable, Tone};
+use crate::light::exposed::is_linear;
+use crate::names::SCENE;
+use crate::scene::with_place;
+
+/// The file, in the folder of frames, in which exposures are kept.
+const FILE: &str = "exposures.json";
+/// How the file begins.
+const MARK: &[u8] = b"{\"made_by\":\"dipir\",\"exposures_of\":";
+/// Exposures that differ from the photograph's by less are as that: what is measured is this uncertain, stops.
+const UNCERTAIN: f64 = 0.05;
+/// Frames that are read at once.
+const AT_ONCE: usize = 16;
+
+/// What is kept.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Kept {
+    made_by: String,
+    /// Hash of all that decides the values.
+    exposures_of: String,
+    /// Of each frame, stops over the photograph; nothing for one that has nothing in common with the others.
+    stops: Vec<Option<f64>>,
+}
+
+/// How much more than the session's photograph each of `frames` is exposed, stops, as their pictures tell. `frames` are in the
+/// order in which they were taken, each with the session that makes it. What was found for the same frames earlier is
+/// not looked for again; with `look` unset nothing is.
+///
+/// Where a frame has nothing in common with the photograph it is compared with others; the second value are the frames that
+/// have nothing in common with any, and are taken to be exposed as the one before or after them.
+///
+/// # Errors
+/// If the photograph or what its scene stage wrote cannot be read.
+pub fn exposures(
+    session: &Session,
+    frames: &[(PathBuf, Session)],
+    look: bool,
+) -> anyhow::Result<(Vec<f64>, Vec<PathBuf>)> {
+    let views: Result<Vec<_>, _> = frames.iter().map(|(_, frame)| settings(frame)).collect();
+    let views = views?;
+    let file = kept_in(&session.out);
+    let found = match fingerprint(session, frames, &views) {
+        Ok(of) => match read(&file).filter(|kept| kept.exposures_of == of) {
+            Some(kept) if kept.stops.len() == frames.len() => Some(kept.stops),
+            _ if look => {
+                let stops = measured(session, &views)?;
+                let kept = Kept {
+                    made_by: "dipir".into(),
+                    exposures_of: of,
+                    stops,
+                };
+                // Without the file they are measured again.
+                let _ = write(&file, &kept);
+                Some(kept.stops)
+            }
+            _ => None,
+        },
+        // The scene stage has not run.
+        Err(_) if !look => None,
+        Err(e) => return Err(e),
+    };
+    let found = found.unwrap_or_else(|| vec![Some(0.0); frames.len()]);
+    let unknown = frames
+        .iter()
+        .zip(&found)
+        .filter(|(_, stops)| stops.is_none());
+    let unknown = unknown.map(|((path, _), _)| path.clone()).collect();
+    Ok((filled(&found), unknown))
+}
+
+/// Where the exposures of the shot in the folder of artifacts `out` are kept.
+pub fn kept_in(out: &Path) -> PathBuf {
+    out.join(super::FOLDER).join(FILE)
+}
+
+/// Whether `path` is a file that [`exposures`] wrote.
+pub fn is_kept(path: &Path) -> bool {
+    dipir_files::begins_with(path, MARK).unwrap_or(false)
+}
+
+/// What a killed writer of `path` left beside it.
+pub fn left_of_writing(path: &Path) -> Option<PathBuf> {
+    dipir_files::left_of_replacing(path, MARK)
+}
+
+fn read(path: &Path) -> Option<Kept> {
+    serde_json::from_slice(&dipir_files::read(path).ok()?).ok()
+}
+
+fn write(path: &Path, kept: &Kept) -> io::Result<()> {
+    if let Some(folder) = path.parent() {
+        fs::create_dir_all(folder)?;
+    }
+    dipir_files::replace(path, &serde_json::to_vec(kept)?, MARK)
+}
+
+/// The exposures without those that are within what is uncertain of the photograph's, and with those of neighbours where
+/// nothing is known.
+fn filled(found: &[Option<f64>]) -> Vec<f64> {
+    let known = |k: usize| found[k];
+    let near = |k: usize| (0..k).rev().chain(k..found.len()).find_map(known);
+    let stops = (0..found.len()).map(|k| found[k].or_else(|| near(k)).unwrap_or(0.0));
+    // Shrunk, not cut off: an exposure that drifts away from the photograph's does not jump.
+    let beyond = |stops: f64| stops.signum() * (stops.abs() - UNCERTAIN).max(0.0);
+    stops.map(beyond).collect()
+}
+
+/// The photograph of a frame and its camera.
+fn settings(session: &Session) -> anyhow::Result<ViewSettings> {
+    let scene: SceneConfig = session.config.table("scene")?;
+    scene.own_view().map_err(|e| with_place(e, &session.config))
+}
+
+/// Hash of all that decides exposures: the photograph and its scene, the frames and their cameras, the curve.
+fn fingerprint(
+    session: &Session,
+    frames: &[(PathBuf, Session)],
+    all: &[ViewSettings],
+) -> anyhow::Result<String> {
+    let scene = SCENE.manifest(session)?;
+    let mut inputs = scene.inputs;
+    // One that is not there is told at its turn.
+    inputs.extend(
+        frames
+            .iter()
+            .flat_map(|(path, _)| Artifact::of("frame", path, path)),
+    );
+    let cameras: Vec<_> = all.iter().map(|view| &view.config.camera).collect();
+    let params = json!({
+        "scene": scene.params,
+        "rolled_off": is_rolled_off(session)?,
+        "cameras": cameras,
+    });
+    let parts = Fingerprint::of("exposures").version(1).params(params);
+    Ok(parts.inputs(&inputs).finish().as_str().into())
+}
+
+/// Whether objects go through a curve.
+fn is_rolled_off(session: &Session) -> anyhow::Result<bool> {
+    let table: CompositeTable = session.config.table("composite")?;
+    Ok(match table.tone {
+        Some(tone) => tone == Tone::Reinhard,
+        None => table.environment.is_none(),
+    })
+}
+
+/// The exposures of the photographs `all` over the session's.
+fn measured(session: &Session, all: &[ViewSettings]) -> anyhow::Result<Vec<Option<f64>>> {
+    let folder = SCENE.folder(session);
+    let scene = SCENE.manifest(session)?.output(&folder, "scene")?;
+    let scene = SceneDescription::read(&scene)?;
+    let plane = scene.proxy.plane();
+    let lens = ground::view(&scene.camera, None).lens;
+    let (base_dir, rolled_off) = (session.config.base_dir(), is_rolled_off(session)?);
+    let cells = |view: &ViewSettings| {
+        let view = view.load(&base_dir, &lens)?;
+        // Linear light has one scale.
+        let display = !is_linear(&view.taken);
+        Ok(display.then(|| Cells::new(&view.image, view.camera, rolled_off)))
+    };
+    let own = settings(session)?;
+    let own = cells(&own).map_err(|e: dipir_scene::Error| with_place(e, &session.config))?;
+    let Some(own) = own else {
+        return Ok(vec![None; all.len()]);
+    };
+    let progress = session.progress("exposures");
+    let mut seen = Vec::with_capacity(all.len());
+    for some in all.chunks(AT_ONCE) {
+        interrupt::check()?;
+        // A frame that cannot be read is told at its turn.
+        seen.par_extend(some.par_iter().map(|view| cells(view).ok().flatten()));
+        progress.set(seen.len() as f64 / all.len() as f64);
+    }
+    progress.done();
+    Ok(followed(&own, &seen, plane.as_ref()))
+}
+
+/// The exposures of frames over the photograph. Each is compared with the photograph, else with the frame that the one
+/// before it was compared with, else with the one before it; what is left, in the same way with those after it.
+fn followed(photo: &Cells, frames: &[Option<Cells>], plane: Option<&Plane>) -> Vec<Option<f64>> {
+    let mut stops = vec![None; frames.len()];
+    let forward: Vec<usize> = (0..frames.len()).collect();
+    let backward: Vec<usize> = forward.iter().rev().copied().collect();
+    for order in [forward, backward] {
+        let (mut key, mut last): (Option<usize>, Option<usize>) = (None, None);
+        for k in order {
+            let Some(frame) = &frames[k] else {
+                continue;
+            };
+            if stops[k].is_none() {
+                let from = |other: Option<usize>| {
+                    let (cells, known) = (frames[other?].as_ref()?, stops[other?]?);
+                    Some(known + cells.stops_to(frame, plane)?)
+                };
+                let known = photo.stops_to(frame, plane).or_else(|| from(key));
+                let moved_on = known.is_none();
+                stops[k] = known.or_else(|| from(last));
+                if moved_on {
+                    key = last;
+                }
+            }
+            if stops[k].is_some() {
+                last = Some(k);
+            }
+        }
+    }
+    stops
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_differences_are_none_and_larger_ones_do_not_jump() {
+        let found = [None, Some(0.04), Some(-0.06), None, Some(1.05)];
+        let wanted = [0.0, 0.0, -0.01, -0.01, 1.0];
+        for (stops, wanted) in filled(&found).iter().zip(wanted) {
+            assert!((stops - wanted).abs() < 1e-12, "{stops} {wanted}");
+        }
+    }
+}
