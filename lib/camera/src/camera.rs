@@ -156,6 +156,18 @@ pub enum WorldUp {
 }
 
 impl WorldUp {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Y, Self::Z, Self::MinusY];
+
+    /// Its word in configurations.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Y => "y",
+            Self::Z => "z",
+            Self::MinusY => "-y",
+        }
+    }
+
     /// The rotation into our world.
     pub fn to_ours(self) -> DMat3 {
         match self {

@@ -118,13 +118,19 @@ pub fn read_camera(
     up: WorldUp,
     choose: impl FnOnce(&[&str]) -> Result<usize, CameraError>,
 ) -> Result<Camera, CameraError> {
-    let (cameras, images) = (files.bytes("cameras")?, files.bytes("images")?);
-    let file = match files.extension {
-        "bin" => Contents::binary(&cameras, &images, &[])?,
-        _ => Contents::text(text(&cameras)?, text(&images)?, "")?,
-    };
+    let file = Contents::of_cameras(files)?;
     let names: Vec<&str> = file.images.iter().map(|i| i.name.as_str()).collect();
     file.camera(&file.images[choose(&names)?], up)
+}
+
+/// The rotations of a model's cameras in its own world, without those that cannot be read. Errors as [`read_camera`].
+pub(crate) fn rotations(files: &Files) -> Result<Vec<DMat3>, CameraError> {
+    let file = Contents::of_cameras(files)?;
+    let cameras = file
+        .images
+        .iter()
+        .filter_map(|i| file.camera(i, WorldUp::Y).ok());
+    Ok(cameras.map(|camera| camera.pose.rotation).collect())
 }
 
 /// The points of `points3D.txt` or, if `binary`, `points3D.bin`. Errors as [`read_camera`].
@@ -188,6 +194,15 @@ struct Image {
 }
 
 impl Contents {
+    /// Without points.
+    fn of_cameras(files: &Files) -> Result<Self, CameraError> {
+        let (cameras, images) = (files.bytes("cameras")?, files.bytes("images")?);
+        match files.extension {
+            "bin" => Self::binary(&cameras, &images, &[]),
+            _ => Self::text(text(&cameras)?, text(&images)?, ""),
+        }
+    }
+
     fn text(cameras: &str, images: &str, points: &str) -> Result<Self, CameraError> {
         let wrong = |what: &str, line: &str| {
             let line: String = line.chars().take(60).collect();

@@ -7,7 +7,9 @@ use serde_json::Value;
 use crate::camera::{Camera, Lens, Pose, WorldUp};
 use crate::chan::Turns;
 use crate::error::CameraError;
-use crate::{chan, colmap, fspy, gltf, kitti, nuscenes, opencv, transforms};
+use crate::{chan, colmap, foreign, fspy, gltf, kitti, nuscenes, opencv, transforms};
+
+pub use crate::upright::doubt;
 
 /// Which of a file's cameras is meant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -200,12 +202,7 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
             let camera = kitti::read(&String::from_utf8_lossy(bytes), index, wanted.size)?;
             Ok(of(camera, "KITTI", false))
         }
-        _ => Err(CameraError::with_remedy(
-            "camera's",
-            "it is not a kind of file that is known",
-            "use .fspy, transforms.json, .chan, .glb, .gltf, COLMAP's folder or project, or a calibration \
-             of OpenCV (.yaml, .json), KITTI (.txt) or nuScenes (.json)",
-        )),
+        other => Err(foreign::of_extension(other, bytes)),
     }
 }
 
@@ -227,14 +224,17 @@ fn in_json(
     }
     if has("camera_intrinsic") {
         let cameras = nuscenes::read_named(bytes, wanted.size, z_up)?;
-        let camera = by_names(cameras, wanted, "nuScenes")?;
+        let camera = by_names(cameras, wanted, "nuScenes")??;
         return Ok(of(camera, "nuScenes", true));
     }
     if has("cameraTransform") || has("cameraParameters") {
         only(wanted, "fSpy")?;
         return Ok(of(fspy::read(bytes, z_up)?, "fSpy", true));
     }
-    lens_alone(&String::from_utf8_lossy(bytes), wanted)
+    match foreign::of_json(&json) {
+        Some(error) => Err(error),
+        None => lens_alone(&String::from_utf8_lossy(bytes), wanted),
+    }
 }
 
 /// What is wanted by the first name of each or, if none has it, by their others.

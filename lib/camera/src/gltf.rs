@@ -165,7 +165,13 @@ pub(crate) fn read_named(bytes: &[u8], size: [f64; 2]) -> Result<Vec<Found>, Cam
         });
         cameras.push((names, own));
     }
+    let is_flat = |camera: &GltfCamera| camera.perspective.is_none();
     match cameras.is_empty() {
+        true if document.cameras.iter().any(is_flat) => Err(CameraError::with_remedy(
+            FORMAT,
+            "its cameras are orthographic, and photographs are taken with perspective ones",
+            "make the camera perspective (in Blender: Camera, Lens, Type), and export it again",
+        )),
         true => Err(CameraError::with_remedy(
             FORMAT,
             "it has no perspective camera",

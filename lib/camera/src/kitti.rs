@@ -17,6 +17,14 @@ const FORMAT: &str = "KITTI calibration";
 /// If the file has no such camera, or its matrix is no projection.
 pub fn read(text: &str, index: u32, size: [f64; 2]) -> Result<Camera, CameraError> {
     let names = [format!("P{index}"), format!("P_rect_{index:02}")];
+    let is_projection = |line: &str| line.starts_with('P') && line.contains(':');
+    if !text.lines().any(is_projection) {
+        return Err(CameraError::with_remedy(
+            FORMAT,
+            "it has no line such as P2: …",
+            "of .txt KITTI's calib.txt is read, and cameras.txt, images.txt and points3D.txt of COLMAP's models",
+        ));
+    }
     let p: [f64; 12] = numbers(text, [&names[0], &names[1]])?;
     let wrong = |what: &str| CameraError::new(FORMAT, format!("{} {what}", names[0]));
     // K (I | t) with an upper triangular K that ends in 1.

@@ -9,12 +9,14 @@ pub mod colmap;
 pub mod distortion;
 pub mod error;
 pub mod file;
+mod foreign;
 pub mod fspy;
 pub mod gltf;
 pub mod kitti;
 pub mod nuscenes;
 pub mod opencv;
 pub mod transforms;
+mod upright;
 
 pub use camera::{Camera, Lens, Pose, WorldUp};
 pub use distortion::Distortion;

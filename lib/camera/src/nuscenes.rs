@@ -6,6 +6,7 @@
 //! of a point from the pixel to whose number its projection rounds. A record may bring the vehicle's own `ego_pose` along.
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::Deserialize;
+use serde_json::Value;
 
 use crate::camera::{Camera, FIRST_PIXEL, Lens, Pose, WorldUp};
 use crate::error::CameraError;
@@ -19,9 +20,6 @@ struct Record {
     #[serde(default)]
     camera_intrinsic: Vec<[f64; 3]>,
     ego_pose: Option<Stand>,
-    channel: Option<String>,
-    filename: Option<String>,
-    token: Option<String>,
     width: Option<f64>,
     height: Option<f64>,
 }
@@ -59,12 +57,16 @@ fn stand(record: &Record) -> Result<(DMat3, DVec3), CameraError> {
     }
 }
 
-fn records(json: &[u8]) -> Result<Vec<Record>, CameraError> {
-    let wrong = |e: serde_json::Error| CameraError::new(FORMAT, e.to_string());
-    match json.iter().find(|b| !b.is_ascii_whitespace()) {
-        Some(b'[') => serde_json::from_slice(json).map_err(wrong),
-        _ => Ok(vec![serde_json::from_slice(json).map_err(wrong)?]),
+/// Unchecked, so that one that cannot be read keeps no other from being read.
+fn records(json: &[u8]) -> Result<Vec<Value>, CameraError> {
+    match serde_json::from_slice(json).map_err(wrong)? {
+        Value::Array(records) => Ok(records),
+        one => Ok(vec![one]),
     }
+}
+
+fn wrong(error: serde_json::Error) -> CameraError {
+    CameraError::new(FORMAT, error.to_string())
 }
 
 /// Reads all cameras by the first of their names; records of other sensors are passed over. `size` is that of the image,
@@ -78,49 +80,62 @@ pub fn read(
     up: WorldUp,
 ) -> Result<Vec<(String, Camera)>, CameraError> {
     let cameras = read_named(json, size, up)?.into_iter();
-    let first = |(names, camera): (Names, Camera)| {
+    let first = |(names, own): Found| {
         let name = names.into_iter().flatten().next();
-        (name.unwrap_or_default(), camera)
+        Ok((name.unwrap_or_default(), own?))
     };
-    Ok(cameras.map(first).collect())
+    cameras.map(first).collect()
 }
 
 /// What a record may be called by: its channel, the file of its picture and its token.
 pub(crate) type Names = [Option<String>; 3];
 
-/// As [`read`], with all names.
+const NAMES: [&str; 3] = ["channel", "filename", "token"];
+
+/// A camera by its names, or what is wrong with it.
+pub(crate) type Found = (Names, Result<Camera, CameraError>);
+
+/// As [`read`], with all names and what is wrong with each record.
 pub(crate) fn read_named(
     json: &[u8],
     size: [f64; 2],
     up: WorldUp,
-) -> Result<Vec<(Names, Camera)>, CameraError> {
-    let mut cameras = Vec::new();
-    for record in records(json)? {
-        if record.camera_intrinsic.is_empty() {
-            continue;
-        }
-        let [[fx, skew, cx], [_, fy, cy], [_, _, one]] = record.camera_intrinsic[..] else {
-            return Err(CameraError::new(FORMAT, "camera_intrinsic is not 3 by 3"));
-        };
-        if !(skew.abs() < 1e-3 * fx.abs() && (one - 1.0).abs() < 1e-6) {
-            return Err(CameraError::new(FORMAT, "camera_intrinsic is no pinhole's"));
-        }
-        let own = record.width.zip(record.height).map(|(w, h)| [w, h]);
-        let lens = Lens {
-            principal_px: DVec2::new(cx, cy) + FIRST_PIXEL,
-            ..Lens::pinhole(own.unwrap_or(size), DVec2::new(fx, fy))
-        };
-        lens.check(FORMAT)?;
-        let (r, position) = stand(&record)?;
-        // From image axes: y down, z forward.
-        let axes = DMat3::from_cols(r.x_axis, -r.y_axis, -r.z_axis);
-        let pose = Pose::from_axes(axes, position)
-            .ok_or_else(|| CameraError::new(FORMAT, "a record does not rotate"))?;
-        let pose = pose.in_our_world(up);
-        let names = [record.channel, record.filename, record.token];
-        cameras.push((names, Camera { pose, lens }));
+) -> Result<Vec<Found>, CameraError> {
+    let records = records(json)?;
+    // Other sensors have an empty list.
+    let is_camera = |value: &&Value| {
+        let matrix = value.get("camera_intrinsic");
+        matrix.is_some_and(|m| m.as_array().is_none_or(|rows| !rows.is_empty()))
+    };
+    let cameras = records.iter().filter(is_camera);
+    let named = |value: &Value| {
+        let word = |key: &str| value[key].as_str().map(Into::into);
+        (NAMES.map(word), camera(value, size, up))
+    };
+    Ok(cameras.map(named).collect())
+}
+
+fn camera(value: &Value, size: [f64; 2], up: WorldUp) -> Result<Camera, CameraError> {
+    let record = Record::deserialize(value).map_err(wrong)?;
+    let [[fx, skew, cx], [_, fy, cy], [_, _, one]] = record.camera_intrinsic[..] else {
+        return Err(CameraError::new(FORMAT, "camera_intrinsic is not 3 by 3"));
+    };
+    if !(skew.abs() < 1e-3 * fx.abs() && (one - 1.0).abs() < 1e-6) {
+        return Err(CameraError::new(FORMAT, "camera_intrinsic is no pinhole's"));
     }
-    Ok(cameras)
+    let own = record.width.zip(record.height).map(|(w, h)| [w, h]);
+    let lens = Lens {
+        principal_px: DVec2::new(cx, cy) + FIRST_PIXEL,
+        ..Lens::pinhole(own.unwrap_or(size), DVec2::new(fx, fy))
+    };
+    lens.check(FORMAT)?;
+    let (r, position) = stand(&record)?;
+    // From image axes: y down, z forward.
+    let axes = DMat3::from_cols(r.x_axis, -r.y_axis, -r.z_axis);
+    let pose = Pose::from_axes(axes, position)
+        .ok_or_else(|| CameraError::new(FORMAT, "a record does not rotate"))?;
+    let pose = pose.in_our_world(up);
+    Ok(Camera { pose, lens })
 }
 
 /// Where the sensor of the only record stands: rotation and position into our world.
@@ -130,7 +145,8 @@ pub(crate) fn read_named(
 pub fn sensor(json: &[u8], up: WorldUp) -> Result<(DMat3, DVec3), CameraError> {
     match &records(json)?[..] {
         [record] => {
-            let (rotation, position) = stand(record)?;
+            let record = Record::deserialize(record).map_err(wrong)?;
+            let (rotation, position) = stand(&record)?;
             Ok((up.to_ours() * rotation, up.to_ours() * position))
         }
         more => Err(CameraError::with_remedy(

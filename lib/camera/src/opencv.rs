@@ -55,11 +55,20 @@ pub fn read(text: &str, size: Option<[f64; 2]>) -> Result<Lens, CameraError> {
         false => Found::in_yaml(text)?,
     };
     let wrong = |detail: &str| CameraError::new(FORMAT, detail);
-    let [fx, skew, cx, _, fy, cy, _, _, _] = found.matrix[..] else {
-        return Err(wrong(
-            "it has neither a camera_matrix of nine numbers nor intrinsics of four",
-        ));
+    let [fx, skew, cx, below, fy, cy, rest @ ..] = &found.matrix[..] else {
+        return Err(no_matrix());
     };
+    let (fx, skew, cx, fy, cy) = (*fx, *skew, *cx, *fy, *cy);
+    match rest[..] {
+        // Up to rounding.
+        [a, b, one] if [*below, a, b, one - 1.0].iter().all(|v| v.abs() < 1e-6) => {}
+        [_, _, _] => {
+            return Err(wrong(
+                "its matrix is not fx 0 cx, 0 fy cy, 0 0 1 by rows; others write it by columns",
+            ));
+        }
+        _ => return Err(no_matrix()),
+    }
     if skew.abs() > 1e-3 * fx.abs() {
         return Err(wrong("its pixels are skewed"));
     }
@@ -73,6 +82,14 @@ pub fn read(text: &str, size: Option<[f64; 2]>) -> Result<Lens, CameraError> {
     };
     lens.check(FORMAT)?;
     Ok(lens)
+}
+
+fn no_matrix() -> CameraError {
+    CameraError::with_remedy(
+        FORMAT,
+        "it has neither a camera_matrix of nine numbers nor intrinsics of four",
+        "export the lens again, or use a file that is read, as transforms.json or fSpy's",
+    )
 }
 
 #[derive(Default)]

@@ -4,6 +4,7 @@
 //! belong to the file or to a frame.
 use glam::DVec2;
 use serde::Deserialize;
+use serde_json::Value;
 
 use crate::camera::{Camera, Lens, Pose, WorldUp};
 use crate::distortion::Distortion;
@@ -15,14 +16,13 @@ const FORMAT: &str = "transforms.json";
 struct File {
     #[serde(flatten)]
     intrinsics: Intrinsics,
-    frames: Vec<Frame>,
+    /// Unchecked, so that one that cannot be read keeps no other from being read.
+    frames: Vec<Value>,
 }
 
 #[derive(Deserialize)]
 struct Frame {
-    #[serde(default)]
-    file_path: String,
-    transform_matrix: Vec<Vec<f64>>,
+    transform_matrix: Option<Vec<Vec<f64>>>,
     #[serde(flatten)]
     intrinsics: Intrinsics,
 }
@@ -90,13 +90,19 @@ pub(crate) fn frames(
 ) -> Result<Vec<Found>, CameraError> {
     let file: File =
         serde_json::from_slice(json).map_err(|e| CameraError::new(FORMAT, e.to_string()))?;
-    let camera = |frame: &Frame| {
+    let camera = |value: &Value| {
+        let wrong = |detail: &str| CameraError::new(FORMAT, format!("the frame {detail}"));
+        let frame =
+            Frame::deserialize(value).map_err(|e| wrong(&format!("cannot be read: {e}")))?;
         let lens = lens(&frame.intrinsics.or(&file.intrinsics), size)?;
-        let pose = Pose::from_rows(&frame.transform_matrix, up, FORMAT)?;
+        let rows = frame.transform_matrix;
+        let rows = rows.ok_or_else(|| wrong("has no transform_matrix"))?;
+        let pose = Pose::from_rows(&rows, up, FORMAT)?;
         Ok(Camera { pose, lens })
     };
+    let name = |value: &Value| value["file_path"].as_str().unwrap_or_default().to_string();
     let frames = file.frames.iter();
-    Ok(frames.map(|f| (f.file_path.clone(), camera(f))).collect())
+    Ok(frames.map(|f| (name(f), camera(f))).collect())
 }
 
 fn lens(i: &Intrinsics, size: Option<[f64; 2]>) -> Result<Lens, CameraError> {

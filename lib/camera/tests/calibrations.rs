@@ -28,6 +28,19 @@ fn what_is_no_number_in_a_calibration_is_quoted() {
 }
 
 #[test]
+fn a_matrix_by_columns_is_no_lens_with_its_axis_in_the_corner() {
+    let read = |k: &str| opencv::read(&format!("K: {k}\n"), Some([640.0, 480.0]));
+    assert!(read("[500, 0, 320, 0, 500, 240, 0, 0, 1]").is_ok());
+    let error = read("[500, 0, 0, 0, 500, 0, 320, 240, 1]")
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("by rows; others write it by columns"),
+        "{error}"
+    );
+}
+
+#[test]
 fn the_middle_of_a_picture_is_half_a_pixel_beyond_its_last_index_over_two() {
     let size = [640.0, 480.0];
     let opencv = opencv::read("K: [500, 0, 319.5, 0, 500, 239.5, 0, 0, 1]\n", Some(size));

@@ -31,7 +31,18 @@ fn a_camera_that_cannot_be_read_keeps_no_other_from_being_read() {
     let frames = json!({ "fl_x": 500, "frames": [
         { "file_path": "a.png", "transform_matrix": rows(1.0) },
         { "file_path": "b.png", "transform_matrix": rows(2.0), "camera_model": "EQUIRECTANGULAR" },
+        { "file_path": "c.png", "transform_matrix": null },
+        { "file_path": "d.png", "transform_matrix": [[1, 0, 0, null]] },
     ] });
+    let sensor = |x: f64, turn: serde_json::Value, file: &str| {
+        json!({ "translation": [x, 0, 0], "rotation": turn, "filename": file,
+            "camera_intrinsic": [[500, 0, 300], [0, 500, 200], [0, 0, 1]] })
+    };
+    let records = json!([
+        sensor(1.0, json!([1, 0, 0, 0]), "a.png"),
+        sensor(2.0, json!([0, 0, 0, 0]), "b.png"),
+        sensor(3.0, json!(null), "c.png"),
+    ]);
     // The parent's scale shears the turned camera alone.
     let nodes = json!([
         { "scale": [2, 1, 1], "children": [1, 2] },
@@ -39,17 +50,45 @@ fn a_camera_that_cannot_be_read_keeps_no_other_from_being_read() {
         { "name": "b", "camera": 0, "rotation": [0, 0, 0.38268343, 0.92387953] },
     ]);
     let gltf = json!({ "nodes": nodes, "cameras": [{ "perspective": { "yfov": 0.7 } }] });
-    for (name, text, wrong) in [
+    for (name, text, photo, wrong) in [
         (
             "transforms.json",
-            frames,
+            &frames,
+            "b.png",
             "camera_model is \"EQUIRECTANGULAR\"",
         ),
-        ("rig.gltf", gltf, "sheared, mirrored or scaled to nothing"),
+        (
+            "transforms.json",
+            &frames,
+            "c.png",
+            "the frame has no transform_matrix",
+        ),
+        (
+            "transforms.json",
+            &frames,
+            "d.png",
+            "the frame cannot be read: invalid type: null",
+        ),
+        ("sensors.json", &records, "b.png", "no rotation"),
+        ("sensors.json", &records, "c.png", "invalid type: null"),
+        (
+            "rig.gltf",
+            &gltf,
+            "b.png",
+            "sheared, mirrored or scaled to nothing",
+        ),
     ] {
         let of = |photo: &str| found_x(name, &text.to_string(), Which::Photo(Path::new(photo)));
         assert_eq!(of("a.png"), Ok(1.0), "{name}");
-        let error = of("b.png").unwrap_err();
+        let error = of(photo).unwrap_err();
         assert!(error.contains(wrong), "{error}");
     }
+}
+
+#[test]
+fn a_gltf_of_orthographic_cameras_says_that_they_are() {
+    let camera = json!({ "type": "orthographic", "orthographic": { "xmag": 1, "ymag": 1 } });
+    let text = json!({ "nodes": [{ "camera": 0 }], "cameras": [camera] }).to_string();
+    let error = found_x("shot.gltf", &text, Which::Number(0)).unwrap_err();
+    assert!(error.contains("its cameras are orthographic"), "{error}");
 }

@@ -1,4 +1,5 @@
 //! What can be wrong with points.
+use std::borrow::Cow;
 use std::path::PathBuf;
 
 use dipir_cameras::CameraError;
@@ -37,7 +38,7 @@ pub enum PointsError {
         /// Why not.
         detail: String,
         /// What to do.
-        remedy: &'static str,
+        remedy: Cow<'static, str>,
     },
     /// The ground is to be a relief, and too few points are ground.
     #[error(

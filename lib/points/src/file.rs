@@ -37,6 +37,22 @@ pub fn is_depth(path: &Path) -> bool {
     matches!(extension.as_deref(), Some("exr" | "png"))
 }
 
+/// Which axis of the file at `path` points up where nobody says it; `None` for depths, whose points the camera tells.
+pub fn up_of(path: &Path) -> Option<WorldUp> {
+    let path = part(path);
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    match extension.as_deref() {
+        _ if is_depth(&path) => None,
+        Some("ply") => Some(WorldUp::Y),
+        Some("txt" | "bin") if is_colmap(&path) => Some(WorldUp::MinusY),
+        _ => Some(WorldUp::Z),
+    }
+}
+
+fn is_colmap(path: &Path) -> bool {
+    path.file_stem().is_some_and(|s| s == "points3D")
+}
+
 /// Reads points.
 ///
 /// # Errors
@@ -61,21 +77,17 @@ pub fn read(source: &Source) -> Result<Cloud, PointsError> {
         return Ok(cloud.near());
     }
     let bytes = read_bytes(&path)?;
-    let is_colmap = path.file_stem().is_some_and(|s| s == "points3D");
-    let (cloud, up) = match extension {
-        "txt" | "bin" if is_colmap => {
+    let cloud = match extension {
+        "txt" | "bin" if is_colmap(&path) => {
             let points = colmap::read_points(&bytes, extension == "bin", WorldUp::Y)?;
-            (
-                Cloud {
-                    points: Collector::of(points),
-                    viewpoint: None,
-                },
-                WorldUp::MinusY,
-            )
+            Cloud {
+                points: Collector::of(points),
+                viewpoint: None,
+            }
         }
-        "ply" => (ply::read(&bytes)?, WorldUp::Y),
-        "pcd" => (pcd::read(&bytes)?, WorldUp::Z),
-        "bin" => (sweep(&bytes)?, WorldUp::Z),
+        "ply" => ply::read(&bytes)?,
+        "pcd" => pcd::read(&bytes)?,
+        "bin" => sweep(&bytes)?,
         _ => {
             return Err(PointsError::with_remedy(
                 "points'",
@@ -86,7 +98,10 @@ pub fn read(source: &Source) -> Result<Cloud, PointsError> {
         }
     };
     let (rotation, position) = match source.pose {
-        None => (source.up.unwrap_or(up).to_ours(), DVec3::ZERO),
+        None => {
+            let up = source.up.or(up_of(&path)).unwrap_or_default();
+            (up.to_ours(), DVec3::ZERO)
+        }
         Some(pose) => sensor(pose, source.up)?,
     };
     // How far away a point is shows in metres.

@@ -1,5 +1,5 @@
 //! The ground through the points that a camera sees.
-use dipir_cameras::Camera;
+use dipir_cameras::{Camera, WorldUp};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
@@ -79,7 +79,8 @@ pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     if points.len() < FEWEST {
         return Err(PointsError::NoGround {
             detail: format!("the camera sees {} of them below itself", points.len()),
-            remedy: "see whether points_up, points_scale and points_pose are right, or write plane",
+            remedy: "see whether points_up, points_scale and points_pose are right, or write plane"
+                .into(),
         });
     }
     let away = |p: &DVec3| p.distance(camera.pose.position);
@@ -102,10 +103,18 @@ pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     });
     let none = |detail: String| PointsError::NoGround {
         detail,
-        remedy: "see whether points_up is right, or write plane",
+        remedy: "see whether points_up is right, or write plane".into(),
     };
     let (plane, sigma) =
         found.ok_or_else(|| none("no three of them make a plane that lies flat".into()))?;
+    // Of a wall a level strip is drawn, which least squares turn upright.
+    let tilt = plane.normal.angle_between(up);
+    if tilt > most {
+        let tilt = tilt.to_degrees();
+        return Err(none(format!(
+            "they lie on a plane that is {tilt:.0} degrees from level, and ground is {MOST_TILT_DEG} at most"
+        )));
+    }
     let under = plane.height(camera.pose.position);
     let mut ground = Ground {
         point: camera.pose.position - under * plane.normal,
@@ -143,6 +152,55 @@ pub fn ground(cloud: &Cloud, search: &Search) -> Result<Ground, PointsError> {
     Ok(ground)
 }
 
+/// Points among which another axis is looked for.
+const JUDGED: usize = 50_000;
+/// Times as many points of the ground that are seen if another axis points up, from which on it is believed.
+const CLEARLY_MORE: usize = 3;
+
+/// The axis that points up instead of `up`, by which the file of `cloud` was turned into the camera's world, if then the
+/// camera sees clearly more ground.
+pub fn other_up(cloud: &Cloud, search: &Search, up: WorldUp) -> Option<WorldUp> {
+    let every = cloud.points.len().div_ceil(JUDGED).max(1);
+    let ground_seen = |axis: WorldUp| {
+        let turn = axis.to_ours() * up.to_ours().transpose();
+        let points = cloud.points.iter().step_by(every).map(|p| turn * *p);
+        let cloud = Cloud {
+            points: points.collect(),
+            viewpoint: None,
+        };
+        let flat = Search {
+            shape: Shape::Plane,
+            ..*search
+        };
+        let Ok(ground) = ground(&cloud, &flat) else {
+            return 0;
+        };
+        // Flat ground in a file of few digits has no residual.
+        let reach = (3.0 * ground.residual_m).max(1e-6);
+        let seen = cloud.points.iter().filter(|p| is_seen(search.camera, **p));
+        let (mut on, mut below) = (0usize, 0usize);
+        for height in seen.map(|p| ground.height(*p)) {
+            on += usize::from(height.abs() <= reach);
+            below += usize::from(height < -3.0 * reach);
+        }
+        // What stands on the ground is below it where it is upside down.
+        on.saturating_sub(below)
+    };
+    let least = FEWEST.max(CLEARLY_MORE * ground_seen(up));
+    let others = WorldUp::ALL.into_iter().filter(|axis| *axis != up);
+    let seen = others.map(|axis| (ground_seen(axis), axis));
+    let (most, axis) = seen.max_by_key(|s| s.0)?;
+    (most >= least).then_some(axis)
+}
+
+/// Whether the point is in the picture.
+fn is_seen(camera: &Camera, point: DVec3) -> bool {
+    let [w, h] = camera.lens.size;
+    camera
+        .project(point)
+        .is_some_and(|p| (0.0..=w).contains(&p.x) && (0.0..=h).contains(&p.y))
+}
+
 /// Points below the camera.
 struct Used {
     /// Those that the camera sees, the nearest ones; all of them, if it sees few.
@@ -152,16 +210,11 @@ struct Used {
 }
 
 fn used(cloud: &Cloud, camera: &Camera, up: DVec3) -> Used {
-    let [w, h] = camera.lens.size;
     let from = camera.pose.position;
     let below = cloud.points.iter().filter(|p| (**p - from).dot(up) < 0.0);
     let mut below: Vec<DVec3> = below.copied().collect();
-    let is_seen = |p: &&DVec3| {
-        camera
-            .project(**p)
-            .is_some_and(|p| (0.0..=w).contains(&p.x) && (0.0..=h).contains(&p.y))
-    };
-    let mut seen: Vec<DVec3> = below.iter().filter(is_seen).copied().collect();
+    let seen = below.iter().filter(|p| is_seen(camera, **p));
+    let mut seen: Vec<DVec3> = seen.copied().collect();
     for points in [&mut seen, &mut below] {
         if points.len() > MOST_USED {
             let away = |p: &DVec3| p.distance_squared(from);

@@ -1,7 +1,7 @@
 //! Generated scans of streets: the ground through them, and places on it.
-use dipir_cameras::{Camera, Lens, Pose};
+use dipir_cameras::{Camera, Lens, Pose, WorldUp};
 use dipir_numerics::sampler::{Sampler, Stream};
-use dipir_points::ground::{Search, Shape, ground};
+use dipir_points::ground::{Search, Shape, ground, other_up};
 use dipir_points::place::{self, Body};
 use dipir_points::{Cloud, Ground};
 use glam::{DMat3, DVec2, DVec3};
@@ -329,6 +329,61 @@ fn points_without_a_ground_are_explained() {
     let error = said(&wall);
     assert!(
         error.contains("no ground is found in the points"),
+        "{error}"
+    );
+}
+
+#[test]
+fn the_axis_that_points_up_is_the_one_by_which_the_camera_sees_ground() {
+    // The origin is at the camera: ground through the origin would be ground upside down, too.
+    let mut camera = camera();
+    let origin = std::mem::take(&mut camera.pose.position);
+    let search = Search {
+        camera: &camera,
+        up: DVec3::Y,
+        shape: Shape::Auto,
+        seed: 0,
+    };
+    for scene in 0..6 {
+        let mut cloud = Street::new(scene, 20).scan(scene, None);
+        cloud.points.iter_mut().for_each(|p| *p -= origin);
+        for written in WorldUp::ALL {
+            for taken in WorldUp::ALL {
+                let turn = taken.to_ours() * written.to_ours().transpose();
+                let points = cloud.points.iter().map(|p| turn * *p).collect();
+                let cloud = Cloud {
+                    points,
+                    viewpoint: None,
+                };
+                let found = other_up(&cloud, &search, taken);
+                let want = (taken != written).then_some(written);
+                assert_eq!(found, want, "{scene} {written:?} {taken:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_wall_is_no_ground_though_a_strip_of_it_is_level() {
+    let camera = camera();
+    let points = (0..4000).map(|i| {
+        let mut n = Numbers::new(11, i);
+        let (x, y) = (n.between(-4.0, 4.0), n.between(-2.0, 1.5));
+        DVec3::new(x, y, -6.0 + 0.01 * n.normal())
+    });
+    let wall = Cloud {
+        points: points.collect(),
+        viewpoint: None,
+    };
+    let search = Search {
+        camera: &camera,
+        up: DVec3::Y,
+        shape: Shape::Auto,
+        seed: 0,
+    };
+    let error = ground(&wall, &search).unwrap_err().to_string();
+    assert!(
+        error.contains("degrees from level, and ground is 20 at most"),
         "{error}"
     );
 }

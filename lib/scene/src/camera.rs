@@ -287,6 +287,12 @@ impl FileSettings {
         file::choice(&base_dir.join(&self.path))
     }
 
+    /// Whether another axis of the file's world seems to point up, as a warning, where nobody says which.
+    pub(crate) fn doubt(&self, base_dir: &Path) -> Option<String> {
+        let is_told = self.up.is_some();
+        (!is_told).then(|| file::doubt(&base_dir.join(&self.path)))?
+    }
+
     fn resolve(
         &self,
         resolution: [u32; 2],

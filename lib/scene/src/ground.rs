@@ -42,6 +42,31 @@ impl PointsSettings {
         dipir_cameras::file::choice(&base_dir.join(&self.path))
     }
 
+    /// Which axis of `cloud`, the points as they were read, seems to point up instead of the one that is taken where
+    /// nobody says it, as a sentence.
+    pub fn doubt(&self, base_dir: &Path, view: &LensCamera, cloud: &Cloud) -> Option<String> {
+        let own = dipir_points::file::up_of(&base_dir.join(&self.path))?;
+        // COLMAP's points are turned with its cameras.
+        if self.up.is_some() || self.pose.is_some() || own == WorldUp::MinusY {
+            return None;
+        }
+        let other = dipir_points::ground::other_up(cloud, &self.search(view), own)?;
+        let (own, other) = (own.word(), other.word());
+        Some(format!(
+            "the camera sees the ground of the points if {other} of their world points up, and {own} is taken: write \
+             points_up = {other:?} into [scene.proxy] (dipir init: --points-up), or points_up = {own:?} if that is right"
+        ))
+    }
+
+    fn search<'a>(&self, view: &'a LensCamera) -> Search<'a> {
+        Search {
+            camera: view,
+            up: DVec3::Y,
+            shape: self.shape,
+            seed: 0,
+        }
+    }
+
     /// Reads the points and finds the ground that `view` sees.
     ///
     /// # Errors
@@ -61,16 +86,26 @@ impl PointsSettings {
             other => Error::Points(other).in_file(&path),
         };
         let cloud = dipir_points::file::read(&source).map_err(wrong)?;
-        let search = Search {
-            camera: view,
-            up: DVec3::Y,
-            shape: self.shape,
-            seed: 0,
-        };
-        let ground = dipir_points::ground(&cloud, &search).map_err(wrong)?;
-        Ok((cloud, ground))
+        let ground = dipir_points::ground(&cloud, &self.search(view));
+        let ground = ground.map_err(|e| match e {
+            PointsError::NoGround { detail, remedy } => PointsError::NoGround {
+                detail,
+                remedy: match dipir_points::file::up_of(&path) {
+                    Some(WorldUp::MinusY) => LEVEL.into(),
+                    _ => self
+                        .doubt(base_dir, view, &cloud)
+                        .map_or(remedy, Into::into),
+                },
+            },
+            other => other,
+        });
+        Ok((cloud, ground.map_err(wrong)?))
     }
 }
+
+/// What to do about points of COLMAP's without a ground.
+const LEVEL: &str = "see whether file_up of the camera or points_up is right; a world that is tilted is levelled by \
+                     `colmap model_orientation_aligner`; or write plane";
 
 /// The files that `points` and `points_pose` stand for, as the configuration would name them.
 pub fn points_parts(path: &Path, pose: Option<&Path>, base_dir: &Path) -> Vec<PathBuf> {
@@ -154,6 +189,8 @@ pub(crate) struct Places<'a> {
     pub(crate) occluders: Option<&'a Raster<f32>>,
     pub(crate) undistortion: Option<&'a Undistortion>,
     pub(crate) taken: Vec<(DVec3, Body)>,
+    /// What may be wrong with the points.
+    pub(crate) doubt: Option<String>,
 }
 
 impl Places<'_> {
@@ -189,7 +226,10 @@ impl Places<'_> {
         let foot = search.place(&body).ok_or_else(|| Error::Config {
             key: format!("{key}.place"),
             value: "\"auto\", and no place is free, seen and whole in the picture".into(),
-            accepted: "a position or at_pixel instead, or a smaller object".into(),
+            accepted: match &self.doubt {
+                Some(doubt) => format!("points with their axes as the camera's: {doubt}"),
+                None => "a position or at_pixel instead, or a smaller object".into(),
+            },
         })?;
         self.taken.push((foot, body));
         Ok(foot)

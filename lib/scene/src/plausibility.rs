@@ -5,6 +5,8 @@ mod grey;
 mod in_picture;
 mod size;
 
+use std::path::Path;
+
 use dipir_cameras::Lens;
 use dipir_imaging::raster::Raster;
 use glam::{DVec2, DVec3, Vec3};
@@ -20,7 +22,7 @@ use size::{Part, parts, proxy_without_unit, too_wide};
 pub use size::likely_unit;
 
 /// Vertical fields of view of lenses that people have: an 800 mm lens has 1.7 degrees.
-const FIELD_OF_VIEW_DEG: [f32; 2] = [1.5, 140.0];
+const FIELD_OF_VIEW_DEG: [f64; 2] = [1.5, 140.0];
 /// An object smaller than this in the picture cannot be judged, pixels.
 const SMALLEST_PX: f32 = 3.0;
 
@@ -40,7 +42,10 @@ pub fn implausible(loaded: &LoadedScene) -> Vec<String> {
         camera,
         ..
     } = &loaded.scene;
-    let mut found = implausible_scene(&loaded.scene, &loaded.description.objects, lens);
+    let camera_file = loaded.inputs.iter().find(|i| i.role == "camera");
+    let camera_file = camera_file.map(|i| i.path.as_path());
+    let objects = &loaded.description.objects;
+    let mut found = implausible_scene(&loaded.scene, objects, lens, camera_file);
     if let ProxyRecord::Mesh(record) = &loaded.description.proxy {
         found.extend(proxy_without_unit(record, &loaded.scene.proxy));
     }
@@ -56,14 +61,21 @@ pub fn implausible(loaded: &LoadedScene) -> Vec<String> {
     found
 }
 
-/// `lens` is the photograph's, if it bends lines.
-fn implausible_scene(scene: &Scene, objects: &[ObjectRecord], lens: Option<&Lens>) -> Vec<String> {
+/// `lens` is the photograph's, if it bends lines; `camera_file` is the file that its camera is from.
+fn implausible_scene(
+    scene: &Scene,
+    objects: &[ObjectRecord],
+    lens: Option<&Lens>,
+    camera_file: Option<&Path>,
+) -> Vec<String> {
     let mut found = Vec::new();
     found.extend(rounded(scene.camera.position.as_dvec3()));
     found.extend(lens.and_then(turns_back));
     // A fisheye's is not that of the picture without distortion, which shows the inner part of it.
     if !lens.is_some_and(|l| l.distortion.is_fisheye()) {
-        found.extend(field_of_view(&scene.camera));
+        let half = 0.5 * scene.camera.resolution[1] as f32 / scene.camera.focal_px.y;
+        let degrees = f64::from((2.0 * half.atan()).to_degrees());
+        found.extend(field_of_view(degrees, camera_file));
     }
     let ground = match &scene.proxy {
         Proxy::Plane(plane) => Some(plane),
@@ -116,23 +128,41 @@ pub fn rounded(position: DVec3) -> Option<String> {
     })
 }
 
-fn field_of_view(camera: &Camera) -> Option<String> {
-    let half = 0.5 * camera.resolution[1] as f32 / camera.focal_px.y;
-    let degrees = (2.0 * half.atan()).to_degrees();
+/// What is wrong with a vertical field of view that no lens has, degrees, of the camera in `file` or, without one, in the
+/// configuration.
+pub fn field_of_view(degrees: f64, file: Option<&Path>) -> Option<String> {
     let [least, most] = FIELD_OF_VIEW_DEG;
     if (least..=most).contains(&degrees) {
         return None;
     }
+    let (at, may_be_radians) = match file {
+        None => ("[scene.camera] fov_deg, in degrees".to_string(), true),
+        Some(file)
+            if file
+                .extension()
+                .is_some_and(|e| e.eq_ignore_ascii_case("chan")) =>
+        {
+            (
+                format!(
+                    "the last number of its line in {file:?} or, where there is none, [scene.camera] fov_deg, in degrees"
+                ),
+                true,
+            )
+        }
+        Some(file) => (
+            format!("its field of view or focal length in {file:?}"),
+            false,
+        ),
+    };
     // 0.2 to 2.5 radians are fields of view that lenses have.
     let as_radians = degrees.to_degrees();
-    let meant = match (10.0..=150.0).contains(&as_radians) {
+    let meant = match may_be_radians && (10.0..=150.0).contains(&as_radians) {
         true => format!("; if {degrees:.3} was meant in radians, write {as_radians:.1}"),
         false => String::new(),
     };
     Some(format!(
-        "the camera's vertical field of view is {} degrees; lenses have {least} to {most}: \
-         see [scene.camera] fov_deg, in degrees{meant}",
-        short(degrees.into())
+        "the camera's vertical field of view is {} degrees; lenses have {least} to {most}: see {at}{meant}",
+        short(degrees)
     ))
 }
 
@@ -237,7 +267,7 @@ mod tests {
     }
 
     fn one(scene: &Scene, part: &str) {
-        let found = implausible_scene(scene, &[], None);
+        let found = implausible_scene(scene, &[], None, None);
         assert!(
             found.len() == 1 && found[0].contains(part),
             "{part:?}: {found:?}"
@@ -246,7 +276,10 @@ mod tests {
 
     #[test]
     fn nothing_is_said_of_an_object_on_the_ground_before_the_camera() {
-        assert_eq!(implausible_scene(&scene(), &[], None), Vec::<String>::new());
+        assert_eq!(
+            implausible_scene(&scene(), &[], None, None),
+            Vec::<String>::new()
+        );
     }
 
     #[test]
@@ -254,7 +287,7 @@ mod tests {
         let at = |x: f32| {
             let mut scene = scene();
             scene.camera.position.x = x;
-            implausible_scene(&scene, &[], None)
+            implausible_scene(&scene, &[], None, None)
         };
         let is_told = |x: f32| at(x).iter().any(|said| said.contains("are rounded to"));
         // Floats are 0.98 mm apart below 2^14 metres, 1.95 mm above.
@@ -278,6 +311,18 @@ mod tests {
     }
 
     #[test]
+    fn the_field_of_view_of_a_camera_s_file_is_mended_there() {
+        let of = |file: &str| field_of_view(0.7, Some(Path::new(file))).unwrap();
+        let chan = of("shot.chan");
+        let want = "see the last number of its line in \"shot.chan\" or, where there is none, [scene.camera] fov_deg, in \
+                    degrees; if 0.700 was meant in radians, write 40.1";
+        assert!(chan.ends_with(want), "{chan}");
+        let other = of("transforms.json");
+        let want = "see its field of view or focal length in \"transforms.json\"";
+        assert!(other.ends_with(want), "{other}");
+    }
+
+    #[test]
     fn a_camera_under_the_ground_and_a_ground_upside_down_are_told_apart() {
         let mut below = scene();
         below.proxy = Proxy::Plane(Plane {
@@ -285,7 +330,7 @@ mod tests {
             normal: Vec3::Y,
         });
         assert!(
-            implausible_scene(&below, &[], None)[0]
+            implausible_scene(&below, &[], None, None)[0]
                 .contains("the camera is 0.30 m below the ground")
         );
         let mut turned = scene();
@@ -293,8 +338,11 @@ mod tests {
             point: Vec3::ZERO,
             normal: Vec3::NEG_Y,
         });
-        assert!(implausible_scene(&turned, &[], None)[0].contains("points down"));
-        assert!(implausible_scene(&turned, &[], None)[0].contains("normal = [-0.00, 1.00, -0.00]"));
+        assert!(implausible_scene(&turned, &[], None, None)[0].contains("points down"));
+        assert!(
+            implausible_scene(&turned, &[], None, None)[0]
+                .contains("normal = [-0.00, 1.00, -0.00]")
+        );
     }
 
     /// The object of [`scene`], `scale` times as large as in its file.
@@ -318,7 +366,7 @@ mod tests {
             point: Vec3::new(0.0, 1.0004, 0.0),
             normal: Vec3::Y,
         });
-        let found = implausible_scene(&scene, &[], None);
+        let found = implausible_scene(&scene, &[], None, None);
         assert!(found[0].contains("lie 4.0e-4 m or more below"), "{found:?}");
     }
 
@@ -333,7 +381,7 @@ mod tests {
             let whole = scene.mesh.bounds().unwrap();
             let hidden = below_a_pixel(whole, &scene.camera).is_some();
             assert_eq!(hidden, warnings == 0, "{scale}");
-            let found = implausible_scene(&scene, &[record(scale.into())], None);
+            let found = implausible_scene(&scene, &[record(scale.into())], None, None);
             assert_eq!(found.len(), warnings, "{scale}: {found:?}");
         }
     }
@@ -352,7 +400,7 @@ mod tests {
             for p in &mut scene.mesh.positions {
                 *p += offset;
             }
-            let found = implausible_scene(&scene, &[], None);
+            let found = implausible_scene(&scene, &[], None, None);
             assert!(found.iter().any(|f| f.contains(part)), "{part}: {found:?}");
         }
     }
@@ -382,7 +430,7 @@ mod tests {
         assert!(found.contains(" 17% of the half diagonal"), "{found}");
         assert!(turns_back(&brown(1e300)).is_some());
         assert!(turns_back(&fisheye(-5.0)).is_some());
-        let found = implausible_scene(&scene(), &[], Some(&brown(-5.0)));
+        let found = implausible_scene(&scene(), &[], Some(&brown(-5.0)), None);
         assert!(found.len() == 1 && found[0].contains("17%"), "{found:?}");
         // The picture of half a sphere is a circle in a larger frame.
         let mut circular = fisheye(-0.05);
@@ -395,9 +443,9 @@ mod tests {
         let mut wide = scene();
         wide.camera.focal_px = Vec2::splat(10.0);
         let part = "vertical field of view is 145";
-        assert!(implausible_scene(&wide, &[], None)[0].contains(part));
+        assert!(implausible_scene(&wide, &[], None, None)[0].contains(part));
         let fisheye = lens(Distortion::kannala_brandt([0.0; 4]));
-        let found = implausible_scene(&wide, &[], Some(&fisheye));
+        let found = implausible_scene(&wide, &[], Some(&fisheye), None);
         assert!(!found.iter().any(|f| f.contains(part)), "{found:?}");
     }
 

@@ -188,7 +188,11 @@ impl Scene {
             for part in file.parts(base_dir) {
                 files.input("camera", &part);
             }
-            files.warn(file.choice(base_dir));
+            files.warn(
+                file.choice(base_dir)
+                    .into_iter()
+                    .chain(file.doubt(base_dir)),
+            );
         }
         let (camera, undistortion) =
             match of_shot.filter(|_| settings.camera.stands_still(base_dir)) {
@@ -207,6 +211,8 @@ impl Scene {
             Some(of_shot) => (files.recorded(&of_shot.proxy)?, of_shot.proxy.clone(), None),
             None => files.proxy(&settings.proxy, &view)?,
         };
+        let doubt = settings.proxy.doubt(base_dir, &view, cloud.as_ref());
+        files.warn(doubt.clone());
         let taken = match of_shot {
             Some(_) => Vec::new(),
             None => {
@@ -232,6 +238,7 @@ impl Scene {
             occluders: occluders.as_ref(),
             undistortion: undistortion.as_ref(),
             taken,
+            doubt,
         };
         let recorded = of_shot.map_or(&[][..], |of_shot| &of_shot.objects[..]);
         let to_place = match of_shot {

@@ -4,7 +4,7 @@ use std::path::Path;
 use dipir_cameras::chan::Turns;
 use dipir_cameras::file::{self, Wanted, Which};
 use dipir_cameras::{CameraError, Lens, Pose, WorldUp};
-use dipir_scene::plausibility::rounded;
+use dipir_scene::plausibility::{field_of_view, rounded};
 use glam::{DVec2, DVec3};
 
 use crate::error::SetupError;
@@ -97,6 +97,12 @@ pub fn read(
             path.display()
         ));
     }
+    let is_fisheye = found.lens.distortion.is_fisheye();
+    warnings.extend(
+        (!is_fisheye)
+            .then(|| field_of_view(view.fov_deg, Some(path)))
+            .flatten(),
+    );
     warnings.extend(rounded(pose.position).map(|what| format!("\"{}\": {what}", path.display())));
     Ok((view, warnings))
 }
@@ -282,7 +288,7 @@ mod tests {
     fn other_shapes_and_kinds_of_file_are_refused() {
         let error = view_of("room.json", FSPY, [800, 1200]).unwrap_err();
         assert!(error.contains("a picture of 600 x 400 pixels"), "{error}");
-        let error = view_of("room.fbx", FSPY, [600, 400]).unwrap_err();
+        let error = view_of("room.3dm", FSPY, [600, 400]).unwrap_err();
         assert!(
             error.contains("not a kind of file that is known"),
             "{error}"
@@ -298,6 +304,52 @@ mod tests {
         };
         let drop = 5.0 * 10f64.to_radians().sin();
         assert!((look_at.y - (1.7 - drop)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_file_whose_pictures_are_upright_by_another_axis_is_told_where_no_ground_is_seen() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let grey = DisplayImage(Raster::filled(30, 20, glam::Vec3::splat(0.5)));
+        dipir_imaging::file::write_png(at("b.png"), &grey).unwrap();
+        std::fs::write(at("a.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+        // +y up, looking a little down: taken as +z, they look straight down and are upside down.
+        let frame = |name: &str| {
+            format!(
+                r#"{{ "file_path": "{name}", "transform_matrix":
+                [[1,0,0,0],[0,0.98,0.199,1.5],[0,-0.199,0.98,0],[0,0,0,1]] }}"#
+            )
+        };
+        let frames = ["a", "b", "c", "d", "e"].map(frame).join(",");
+        let text = format!(r#"{{ "fl_x": 25, "frames": [{frames}] }}"#);
+        std::fs::write(at("transforms.json"), text).unwrap();
+        let of = |camera_up| {
+            let request = Request {
+                photo: at("b.png"),
+                models: vec![at("a.obj")],
+                out: at("pipeline.toml"),
+                camera: Some(at("transforms.json")),
+                camera_up,
+                ..Request::default()
+            };
+            draft(&request).map_err(|e| e.to_string())
+        };
+        let error = of(None).unwrap_err();
+        let want = "are upright if y of its world points up, and z is taken: write file_up = \"y\"";
+        assert!(error.contains(want), "{error}");
+        let error = of(Some(WorldUp::Z)).unwrap_err();
+        assert!(
+            error.ends_with("see whether --camera and --camera-up are right"),
+            "{error}"
+        );
+        assert!(of(Some(WorldUp::Y)).unwrap().warnings.is_empty());
+    }
+
+    #[test]
+    fn a_chan_in_radians_is_told_in_degrees() {
+        let (_, told) = told_of("a.chan", "1 0 1.7 4 -10 0 0 0.7\n", [600, 400]).unwrap();
+        let want = "if 0.700 was meant in radians, write 40.1";
+        assert!(told.len() == 1 && told[0].contains(want), "{told:?}");
     }
 
     #[test]

@@ -1,5 +1,4 @@
 //! The text of a first `pipeline.toml`.
-use dipir_cameras::WorldUp;
 use dipir_imaging::facts::Facts;
 use glam::DVec3;
 
@@ -201,15 +200,6 @@ impl Points {
     }
 }
 
-/// The word of an axis in the file.
-pub(crate) fn axis(up: WorldUp) -> &'static str {
-    match up {
-        WorldUp::Y => "y",
-        WorldUp::Z => "z",
-        WorldUp::MinusY => "-y",
-    }
-}
-
 fn camera_of_file(name: &str, file: &CameraFile, view: &View) -> String {
     let mut text = format!(
         "[scene.camera]\n# {}\n# {}\nfile = {}\n",
@@ -218,7 +208,7 @@ fn camera_of_file(name: &str, file: &CameraFile, view: &View) -> String {
         quoted(name)
     );
     if let Some(up) = file.up {
-        text += &format!("file_up = \"{}\"\n", axis(up));
+        text += &format!("file_up = \"{}\"\n", up.word());
     }
     if let Some(fov_deg) = file.fov_deg {
         let fov_deg = number(fov_deg, 5);
@@ -315,6 +305,7 @@ pub(crate) fn printable(text: &str) -> String {
 mod tests {
     use std::path::Path;
 
+    use dipir_cameras::WorldUp;
     use dipir_imaging::facts::Heading;
     use dipir_pipeline::config::Config;
     use dipir_scene::config::SceneConfig;
@@ -372,7 +363,7 @@ mod tests {
         document.points = Some(Points {
             path: "scan.bin".into(),
             pose: Some("calib.txt".into()),
-            up: Some(axis(WorldUp::Z)),
+            up: Some(WorldUp::Z.word()),
             words: "a plane".into(),
         });
         let config = scene(&document.text());

@@ -1,4 +1,5 @@
 //! What can keep a first configuration from being written.
+use std::borrow::Cow;
 use std::path::PathBuf;
 
 use dipir_cameras::CameraError;
@@ -64,12 +65,12 @@ pub enum SetupError {
     #[error(transparent)]
     Calibration(#[from] dipir_calibration::CalibrationError),
     /// The camera sees no ground to put anything on.
-    #[error(
-        "the camera sees no ground: {detail}; look further down with --pitch -10, or see whether --camera is right"
-    )]
+    #[error("the camera sees no ground: {detail}; {remedy}")]
     NoGround {
         /// Why not.
         detail: String,
+        /// What to do.
+        remedy: Cow<'static, str>,
     },
     /// The file to write is there already.
     #[error("\"{}\" is there already and stays as it is; name another file with --out", path.display())]
@@ -99,4 +100,21 @@ pub enum SetupError {
         /// Why not.
         source: std::io::Error,
     },
+}
+
+impl SetupError {
+    /// With what to do about a camera that sees no ground, if it is from a file or there are doubts about axes that point up.
+    pub(crate) fn of_camera(self, is_from_file: bool, doubts: &[String]) -> Self {
+        match self {
+            Self::NoGround { detail, remedy } => Self::NoGround {
+                detail,
+                remedy: match (doubts, is_from_file) {
+                    ([], false) => remedy,
+                    ([], true) => "see whether --camera and --camera-up are right".into(),
+                    _ => doubts.join("; ").into(),
+                },
+            },
+            other => other,
+        }
+    }
 }

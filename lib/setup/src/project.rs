@@ -4,7 +4,7 @@ use std::fs::OpenOptions;
 use std::io::{ErrorKind, Write};
 use std::path::{Component, Path, PathBuf};
 
-use dipir_cameras::WorldUp;
+use dipir_cameras::{WorldUp, file};
 use dipir_imaging::exposure::automatic_exposure_ev;
 use dipir_imaging::file::{Photo, read_photo};
 use dipir_imaging::raster::LinearImage;
@@ -17,7 +17,7 @@ use dipir_scene::ground::{self, PointsSettings};
 use dipir_scene::proxy::Plane;
 
 use crate::camera_file;
-use crate::document::{Document, Object, Points, axis};
+use crate::document::{Document, Object, Points};
 use crate::error::SetupError;
 use crate::model::Models;
 use crate::size::Kind;
@@ -112,12 +112,16 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
             view
         }
     };
+    let camera_file = request.camera.as_deref();
+    let doubted = camera_file.filter(|_| request.camera_up.is_none());
+    // Of axes that point up.
+    let mut doubts: Vec<String> = doubted.and_then(file::doubt).into_iter().collect();
     for path in [&request.camera, &request.points].into_iter().flatten() {
-        warnings.extend(dipir_cameras::file::choice(path).filter(|c| !warnings.contains(c)));
+        warnings.extend(file::choice(path).filter(|c| !warnings.contains(c)));
     }
     let widths: Vec<f64> = sizes.iter().map(|s| s.width_m).collect();
     let camera = view.camera(photo.facts.size);
-    let found = points(request, &camera, folder)?;
+    let found = points(request, &camera, folder, &mut doubts)?;
     let plane = match &found {
         Some((_, ground)) => Plane {
             point: ground.point.as_vec3(),
@@ -125,17 +129,19 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
         },
         None => view.plane(),
     };
-    if let Some(path) = request
+    let alone = request
         .points
         .as_ref()
-        .filter(|p| request.camera.is_none() && !is_depth(p))
-    {
-        warnings.push(format!(
+        .filter(|p| camera_file.is_none() && !is_depth(p));
+    warnings.extend(alone.map(|path| {
+        format!(
             "\"{}\": points belong to the photograph only with the camera of the same scene: name it with --camera",
             path.display()
-        ));
-    }
-    let spots = spots(&camera, &plane, &widths)?;
+        )
+    }));
+    let spots = spots(&camera, &plane, &widths);
+    let spots = spots.map_err(|e| e.of_camera(camera_file.is_some(), &doubts))?;
+    warnings.append(&mut doubts);
     let crowded = crowded(&camera, &plane, &spots, &widths);
     warnings.extend(crowded.filter(|_| !request.place_auto));
     let objects = request.models.iter().zip(sizes).zip(spots);
@@ -177,6 +183,7 @@ fn points(
     request: &Request,
     camera: &Camera,
     folder: &Path,
+    doubts: &mut Vec<String>,
 ) -> Result<Option<(Points, Ground)>, SetupError> {
     let Some(path) = &request.points else {
         return Ok(None);
@@ -189,12 +196,14 @@ fn points(
         pose: request.points_pose.clone(),
         shape: Shape::Auto,
     };
-    let (_, ground) = settings.read(Path::new(""), &ground::view(camera, None))?;
+    let (here, view) = (Path::new(""), ground::view(camera, None));
+    let (cloud, ground) = settings.read(here, &view)?;
+    doubts.extend(settings.doubt(here, &view, &cloud));
     let pose = request.points_pose.as_ref();
     let points = Points {
         path: beside(path, folder)?,
         pose: pose.map(|pose| beside(pose, folder)).transpose()?,
-        up: up.map(axis),
+        up: up.map(WorldUp::word),
         words: ground.words(),
     };
     Ok(Some((points, ground)))

@@ -28,7 +28,10 @@ pub fn spots(
     widths_m: &[f64],
 ) -> Result<Vec<[f64; 2]>, SetupError> {
     let [w, h] = camera.resolution.map(f64::from);
-    let none = |detail: String| SetupError::NoGround { detail };
+    let none = |detail: String| SetupError::NoGround {
+        detail,
+        remedy: "look further down with --pitch -10".into(),
+    };
     let horizon = [0.1, 0.5, 0.9]
         .map(|share| horizon_row(camera, plane, share * w))
         .into_iter()

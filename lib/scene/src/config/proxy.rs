@@ -1,4 +1,6 @@
 //! The `[scene.proxy]` table: what receives the shadow.
+use dipir_cameras::Camera as LensCamera;
+use dipir_points::Cloud;
 use dipir_points::ground::Shape;
 
 use super::lens::world_up;
@@ -91,6 +93,21 @@ pub enum ProxySettings {
     Points(PointsSettings),
     /// A plane by pixels and lengths.
     Pixels(PixelPlane),
+}
+
+impl ProxySettings {
+    /// What may be wrong with the points that were read, if there are any, as a sentence.
+    pub(crate) fn doubt(
+        &self,
+        base_dir: &Path,
+        view: &LensCamera,
+        cloud: Option<&Cloud>,
+    ) -> Option<String> {
+        match self {
+            Self::Points(points) => points.doubt(base_dir, view, cloud?),
+            _ => None,
+        }
+    }
 }
 
 impl ProxyConfig {

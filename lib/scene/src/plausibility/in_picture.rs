@@ -206,7 +206,7 @@ mod tests {
         let found = near(&around).unwrap();
         let said = "the camera stands inside scene.objects[0] (40 m large), within its bounds: is its size right?";
         assert!(found.starts_with(said), "{found}");
-        let all = implausible_scene(&around, &[record(1.0)], None);
+        let all = implausible_scene(&around, &[record(1.0)], None, None);
         assert!(all.contains(&found), "{all:?}");
         assert_eq!(near(&scene()), None);
         // Above a floor that reaches behind it.

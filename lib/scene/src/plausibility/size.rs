@@ -236,7 +236,7 @@ mod tests {
             record.file.path = path.into();
             let mut scene = scene();
             scene.mesh.positions.iter_mut().for_each(|p| *p *= metres);
-            let found = implausible_scene(&scene, &[record], None);
+            let found = implausible_scene(&scene, &[record], None, None);
             found.into_iter().find(|w| w.contains("STL"))
         };
         let found = told("part.STL", 1.0, 8.0).unwrap();
@@ -270,7 +270,7 @@ mod tests {
         scene.mesh.positions[3] = Vec3::new(0.0, 0.0, -9e4);
         assert_eq!(too_wide(scene.mesh.bounds().unwrap()), None);
         scene.mesh.positions[3].z = -3e6;
-        let found = implausible_scene(&scene, &[], None);
+        let found = implausible_scene(&scene, &[], None, None);
         let said = "the objects reach over 3.0e6 m, so rays are slow and details of less than 3.00 m are lost";
         assert!(found.iter().any(|f| f.starts_with(said)), "{found:?}");
     }

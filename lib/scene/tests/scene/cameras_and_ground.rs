@@ -282,6 +282,24 @@ fn the_ground_of_points_is_in_scene_json_and_objects_find_a_free_place_on_it() {
 }
 
 #[test]
+fn points_of_which_another_axis_points_up_are_told_with_the_key() {
+    let folder = folder();
+    scan(folder.path(), 0.0);
+    let of = |object: &str, proxy: &str| {
+        let proxy = format!("[proxy]\npoints = \"scan.ply\"\n{proxy}");
+        scene(folder.path(), object, STANDS, &proxy)
+    };
+    let want =
+        "if z of their world points up, and y is taken: write points_up = \"z\" into [scene.proxy]";
+    let error = of("place = \"auto\"\nheight_m = 0.5", "").unwrap_err();
+    assert!(error.contains(want), "{error}");
+    let right = of("", "points_up = \"z\"").unwrap();
+    assert!(!right.warnings.iter().any(|w| w.contains("points_up")));
+    let error = of("", "points_up = \"y\"").err().unwrap_or_default();
+    assert!(!error.contains(want), "{error}");
+}
+
+#[test]
 fn a_place_that_is_looked_for_is_apart_from_objects_that_have_one() {
     let folder = folder();
     let auto = "height_m = 0.4\nplace = \"auto\"";
