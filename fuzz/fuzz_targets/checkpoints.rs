@@ -4,18 +4,14 @@ use dipir_optimize::checkpoint::State;
 use dipir_optimize::material_checkpoint::MaterialState;
 use dipir_optimize::materials::MaterialSettings;
 use dipir_optimize::parameters::Parameters;
-use dipir_optimize::settings::{LightPreset, LightTable};
+use dipir_optimize::settings::LightTable;
 use dipir_render::transport::Transport;
 use glam::Vec3;
 use libfuzzer_sys::fuzz_target;
 
-const PRESET: LightPreset = LightPreset {
-    iterations: 4,
-    lobes: 4,
-    environment: [8, 4],
-    samples: 4,
-    size: 32,
-};
+mod preset;
+use preset::PRESET;
+
 /// Texels and pixels of records that are used: more take much time.
 const MOST: usize = 1 << 16;
 

@@ -1,18 +1,13 @@
 #![no_main]
 use std::path::Path;
 
-use dipir_optimize::settings::{LightPreset, LightTable};
+use dipir_optimize::settings::LightTable;
 use dipir_pipeline::config::Config;
 use dipir_scene::config::SceneConfig;
 use libfuzzer_sys::fuzz_target;
 
-const PRESET: LightPreset = LightPreset {
-    iterations: 4,
-    lobes: 4,
-    environment: [8, 4],
-    samples: 4,
-    size: 32,
-};
+mod preset;
+use preset::PRESET;
 
 fuzz_target!(|text: &str| {
     if let Ok(config) = Config::parse(Path::new("pipeline.toml"), text, &[]) {

@@ -392,6 +392,17 @@ fn hasty_hands_two_fingers_two_tabs_and_a_server_that_ends_lose_nothing() {
     browser.click("#undo");
     shows("yaw", 0.0);
 
+    // A number that cannot be gives way to the one before it, and it is said why.
+    browser.script(
+        "const f = document.getElementById('yaw'); f.value = 1e9; f.dispatchEvent(new Event('change'))",
+    );
+    says("status", "no usable number");
+    shows("yaw", 0.0);
+    browser.keys("q");
+    shows("yaw", 5.0);
+    browser.click("#undo");
+    shows("yaw", 0.0);
+
     // A copy is chosen by the keyboard, which stays in the list.
     browser.keys("c");
     browser.wait("document.querySelectorAll('#objects input').length === 2");

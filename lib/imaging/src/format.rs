@@ -39,7 +39,10 @@ impl Format {
             || bytes.get(4..11) == Some(b"ftypcrx")
         {
             Self::Other(RAW)
-        } else if starts(b"II*\0") || starts(b"MM\0*") {
+        } else if [b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"]
+            .iter()
+            .any(|m| starts(*m))
+        {
             Self::Other(TIFF)
         } else if starts(b"RIFF") && bytes.get(8..12) == Some(b"WEBP") {
             Self::Other(WEBP)
@@ -49,12 +52,20 @@ impl Format {
             Self::Other(MOVIE)
         } else if starts(b"\xff\x0a") || starts(b"\0\0\0\x0cJXL ") {
             Self::Other(JPEG_XL)
+        } else if starts(b"\0\0\0\x0cjP  ") || starts(b"\xff\x4f\xff\x51") {
+            Self::Other(JPEG_2000)
+        } else if is_netpbm(bytes) {
+            Self::Other(NETPBM)
+        } else if starts(b"8BPS") {
+            Self::Other(PHOTOSHOP)
+        } else if starts(b"qoif") {
+            Self::Other(QOI)
         } else if starts(b"\xabKTX") {
             Self::Other("a KTX texture")
         } else if starts(b"DDS ") {
-            Self::Other("a DDS texture")
+            Self::Other(DDS)
         } else {
-            Self::Other("not an image of a known format")
+            Self::Other(UNKNOWN)
         }
     }
 
@@ -86,6 +97,8 @@ impl Format {
         let raw = RAW_TIFFS.contains(&extension.to_ascii_lowercase().as_str());
         let found = match self {
             Self::Other(TIFF) if raw => RAW,
+            // Its first bytes say nothing.
+            Self::Other(UNKNOWN) if extension.eq_ignore_ascii_case("tga") => TARGA,
             other => other.described(),
         };
         ImagingError::WrongFormat {
@@ -106,6 +119,13 @@ const HEIF: &str = "a HEIF image";
 const AVIF: &str = "an AVIF image";
 const MOVIE: &str = "a movie";
 const JPEG_XL: &str = "a JPEG XL image";
+const JPEG_2000: &str = "a JPEG 2000 image";
+const NETPBM: &str = "a Netpbm image";
+const PHOTOSHOP: &str = "a Photoshop document";
+const QOI: &str = "a QOI image";
+const DDS: &str = "a DDS texture";
+const TARGA: &str = "a Targa image";
+const UNKNOWN: &str = "not an image of a known format";
 /// Extensions of raw files that begin as TIFF files do.
 const RAW_TIFFS: [&str; 7] = ["nef", "arw", "dng", "pef", "srw", "3fr", "nrw"];
 
@@ -128,6 +148,14 @@ fn is_movie(bytes: &[u8]) -> bool {
     boxes || avi || bytes.starts_with(b"\x1aE\xdf\xa3") || bytes.starts_with(b"\x06\x0e+4")
 }
 
+/// Whether a file begins as PBM, PGM, PPM or PAM: a P, a digit, and a space, a line's end or a comment.
+fn is_netpbm(bytes: &[u8]) -> bool {
+    matches!(
+        bytes,
+        [b'P', b'1'..=b'7', b' ' | b'\t' | b'\r' | b'\n' | b'#', ..]
+    )
+}
+
 /// How to convert, with the command of a usual converter.
 fn remedy(found: &str, path: &Path) -> String {
     let tool = match found {
@@ -135,7 +163,9 @@ fn remedy(found: &str, path: &Path) -> String {
         AVIF => "avifdec",
         JPEG_XL => "djxl",
         RAW => "darktable-cli",
-        GIF | BMP | WEBP | TIFF => "magick",
+        // The first of its pictures is all layers as one.
+        PHOTOSHOP => return conversion_of("magick", "[0]", "", path),
+        GIF | BMP | WEBP | TIFF | JPEG_2000 | NETPBM | QOI | DDS | TARGA => "magick",
         MOVIE => {
             return format!(
                 "write its frames, for instance with `mkdir frames && ffmpeg -i \"{}\" frames/%04d.png`, and give one of \
@@ -150,13 +180,18 @@ fn remedy(found: &str, path: &Path) -> String {
 
 /// How to make a PNG of the file with a command line, whose `options` stand between the two names.
 pub(crate) fn conversion(tool: &str, options: &str, path: &Path) -> String {
+    conversion_of(tool, "", options, path)
+}
+
+/// The same of a `part` of the file, as the converter writes it behind the name.
+fn conversion_of(tool: &str, part: &str, options: &str, path: &Path) -> String {
     let mut to = path.with_extension("png");
     // What is there stays.
     if to == path {
         to = path.with_extension("converted.png");
     }
     format!(
-        "convert it, for instance with `{tool} \"{}\" {options}\"{}\"`",
+        "convert it, for instance with `{tool} \"{}{part}\" {options}\"{}\"`",
         path.display(),
         to.display()
     )

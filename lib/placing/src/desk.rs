@@ -402,7 +402,7 @@ impl Desk {
         if go_on().is_break() {
             return Ok(Err(Superseded));
         }
-        let (loaded, light) = self.arrange(&mut rendered, edit, &arrangement, config)?;
+        let (loaded, light, words) = self.arrange(&mut rendered, edit, &arrangement, config)?;
         let draft = match Draft::render(loaded, light, samples, &mut || go_on()) {
             Err(RenderError::Interrupted) => return Ok(Err(Superseded)),
             other => other?,
@@ -415,18 +415,18 @@ impl Desk {
         Ok(Ok(Some(Crop {
             png: png::encode(x1 - x0, y1 - y0, &values)?,
             place,
-            light: description(light, &arrangement.camera),
+            light: description(light, words, &arrangement.camera),
         })))
     }
 
-    /// The objects as `edit` places them, and their light.
+    /// The objects as `edit` places them, their light and where it comes from.
     fn arrange<'a>(
         &self,
         to: &'a mut Rendered,
         edit: &Edit,
         arrangement: &Arrangement,
         config: Config,
-    ) -> anyhow::Result<(&'a LoadedScene, &'a AtHand)> {
+    ) -> anyhow::Result<(&'a LoadedScene, &'a AtHand, &'static str)> {
         to.small.arrange(arrangement);
         to.session.config = config;
         to.small.loaded.occluders = self.occluders(edit, to.own_mask.as_ref());
@@ -458,7 +458,7 @@ impl Desk {
             if go_on().is_break() {
                 return Ok(Err(Superseded));
             }
-            let (loaded, light) = self.arrange(&mut rendered, edit, &arrangement, config)?;
+            let (loaded, light, words) = self.arrange(&mut rendered, edit, &arrangement, config)?;
             if !relighting.is_recorded(&key) {
                 // Two records are never held at once.
                 relighting.keep(None);
@@ -470,9 +470,10 @@ impl Desk {
             }
             let text = held(&self.text).clone();
             let said: CompositeTable = self.config(&text)?.table("composite")?;
-            relighting.light_up(&key, edit, f64::from(said.exposure_ev), light);
+            let said_ev = f64::from(said.exposure_ev);
+            relighting.light_up(&key, edit, said_ev, (light, words));
         }
-        let Some((piece, light, camera)) = relighting.picture(edit)? else {
+        let Some((piece, light)) = relighting.picture(edit)? else {
             return Ok(Ok(None));
         };
         let place = piece.place;
@@ -481,7 +482,7 @@ impl Desk {
         Ok(Ok(Some(Crop {
             png: png::encode(w, h, &values)?,
             place,
-            light: description(&light, &camera),
+            light,
         })))
     }
 
@@ -557,8 +558,9 @@ impl Desk {
 }
 
 impl Rendered {
-    /// The objects and their light, which is found unless it is that of the same camera and keys as before.
-    fn light_up(&mut self) -> anyhow::Result<(&LoadedScene, &AtHand)> {
+    /// The objects, their light and where it comes from. It is found unless it is that of the same camera and keys as
+    /// before.
+    fn light_up(&mut self) -> anyhow::Result<(&LoadedScene, &AtHand, &'static str)> {
         let config = &self.session.config;
         let light: LightTable = config.table("light")?;
         let composite: CompositeTable = config.table("composite")?;
@@ -570,7 +572,8 @@ impl Rendered {
             None => at_hand(&self.session, &self.small.loaded)?,
         };
         let (_, light) = self.light.insert((key, light));
-        Ok((&self.small.loaded, light))
+        let words = light.origin.words_of(&self.session)?;
+        Ok((&self.small.loaded, light, words))
     }
 }
 

@@ -5,13 +5,17 @@ use anyhow::{Context, bail};
 use dipir_scene::camera::Camera;
 use glam::{DMat3, DVec3};
 use toml_edit::{
-    Array, ArrayOfTables, DocumentMut, InlineTable, Item, Table, TableLike, Value, value,
+    Array, ArrayOfTables, DocumentMut, InlineTable, Item, RawString, Table, TableLike, Value, value,
 };
 
 use crate::edit::{Edit, ObjectEdit, ShadowEdit, SunEdit, Turn};
 
 /// A file's text, to be changed.
-pub struct Document(DocumentMut);
+pub struct Document {
+    toml: DocumentMut,
+    /// Whether lines end as Windows writes them; the parser forgets it.
+    crlf: bool,
+}
 
 /// `x` with at most `digits` behind the point.
 fn rounded(x: f64, digits: i32) -> f64 {
@@ -39,23 +43,65 @@ fn set(table: &mut dyn TableLike, key: &str, new: impl Into<Value>) {
     }
 }
 
+/// Brings the values of `array` into an `order` of indices that it has. Comments go with their values: what stands behind
+/// a comma, up to the line's end, belongs to the value before it.
+fn reorder(array: &mut Array, order: &[usize]) {
+    let old = array.clone();
+    let text = |raw: Option<&RawString>| {
+        raw.and_then(RawString::as_str)
+            .unwrap_or_default()
+            .to_owned()
+    };
+    let before = old.iter().map(|v| text(v.decor().prefix()));
+    let gaps: Vec<String> = before.chain([text(Some(old.trailing()))]).collect();
+    // The line that gap `before` begins with, and the rest of gap `next`.
+    let joined = |before: usize, next: usize| {
+        let split = |gap: usize| gaps[gap].split_at(gaps[gap].find('\n').unwrap_or(0));
+        let (behind, rest) = (split(before).0, split(next).1);
+        // A comment ends with its line.
+        let end = if behind.contains('#') && !rest.starts_with('\n') {
+            "\n"
+        } else {
+            ""
+        };
+        format!("{behind}{end}{rest}")
+    };
+    array.clear();
+    let mut last = 0;
+    for &of in order {
+        let Some(value) = old.get(of) else { continue };
+        let mut value = value.clone();
+        value.decor_mut().set_prefix(joined(last, of));
+        array.push_formatted(value);
+        last = of + 1;
+    }
+    array.set_trailing(joined(last, old.len()));
+}
+
 impl Document {
     /// Parses `text`.
     ///
     /// # Errors
     /// If it is no TOML.
     pub fn parse(text: &str) -> anyhow::Result<Self> {
-        Ok(Self(text.parse().context("pipeline.toml is no TOML")?))
+        Ok(Self {
+            toml: text.parse().context("pipeline.toml is no TOML")?,
+            crlf: text.contains("\r\n"),
+        })
     }
 
     /// The text.
     pub fn text(&self) -> String {
-        self.0.to_string()
+        let text = self.toml.to_string();
+        match self.crlf {
+            true => text.replace("\r\n", "\n").replace('\n', "\r\n"),
+            false => text,
+        }
     }
 
     /// The table `[name]`, made if it is not there.
     fn table(&mut self, name: &str) -> anyhow::Result<&mut dyn TableLike> {
-        let item = self.0.entry(name).or_insert(Item::Table(Table::new()));
+        let item = self.toml.entry(name).or_insert(Item::Table(Table::new()));
         item.as_table_like_mut()
             .with_context(|| format!("[{name}] is no table"))
     }
@@ -191,11 +237,11 @@ impl Document {
                 if order.clone().eq(0..array.len()) {
                     return Ok(());
                 }
-                let mut new = Array::new();
-                for of in order {
-                    new.push_formatted(array.get(of).with_context(|| missing(of))?.clone());
+                let order: Vec<usize> = order.collect();
+                if let Some(none) = order.iter().find(|of| **of >= array.len()) {
+                    bail!(missing(*none));
                 }
-                *array = new;
+                reorder(array, &order);
             }
             _ => bail!("scene.objects is no list of tables"),
         }
@@ -406,6 +452,52 @@ mod tests {
             document.order_objects(&[of(none)]).unwrap_err();
         }
         document.order_objects(&[]).unwrap_err();
+    }
+
+    #[test]
+    fn comments_of_a_list_go_with_their_objects() {
+        let list = |lines: &str| {
+            format!("[scene]\nobjects = [ # all\n{lines}  # end\n] # done\nclass = \"b\"\n")
+        };
+        let [a, b] = [
+            "  # first\n  { path = \"a.glb\" }, # one\n",
+            "  # second\n  { path = \"b.glb\" }, # two\n",
+        ];
+        let ordered = |lines: &str, order: &[usize]| {
+            let mut document = Document::parse(&list(lines)).unwrap();
+            let of = |of: &usize| ObjectEdit {
+                of: *of,
+                ..ObjectEdit::default()
+            };
+            let order: Vec<_> = order.iter().map(of).collect();
+            document.order_objects(&order).map(|()| document.text())
+        };
+        for (order, expected) in [
+            (vec![1, 0], [b, a].concat()),
+            (vec![0], a.into()),
+            (vec![1], b.into()),
+            (vec![0, 0, 1], [a, a, b].concat()),
+        ] {
+            let text = ordered(&[a, b].concat(), &order).unwrap();
+            assert_eq!(text, list(&expected), "{order:?}");
+        }
+        // Two in a line: the comment of one does not swallow the next.
+        let text = ordered("  {}, # one\n  {}, { path = \"c.glb\" },\n", &[0, 2]).unwrap();
+        assert!(
+            text.parse::<DocumentMut>().is_ok() && text.contains("\n { path = \"c.glb\" }"),
+            "{text}"
+        );
+        ordered(a, &[0, 1]).unwrap_err();
+    }
+
+    #[test]
+    fn lines_end_as_they_did() {
+        let text = TEXT.replace('\n', "\r\n");
+        let mut document = Document::parse(&text).unwrap();
+        assert_eq!(document.text(), text);
+        document.exposure(0.5).unwrap();
+        let added = "\r\n[composite]\r\nexposure_ev = 0.5\r\n";
+        assert_eq!(document.text(), text + added);
     }
 
     #[test]

@@ -5,8 +5,10 @@ use dipir_render::error::RenderError;
 use dipir_scene::camera::Camera;
 use dipir_stages::light::at_hand::{AtHand, Origin};
 use glam::{Quat, Vec3};
+use serde_json::Value;
 
 use crate::edit::{Edit, SunEdit};
+use crate::shown::description;
 
 /// What was recorded last, and under which light it was looked at.
 #[derive(Default)]
@@ -26,6 +28,8 @@ struct Recorded {
 struct Known {
     key: String,
     light: AtHand,
+    /// Where the light comes from.
+    words: &'static str,
     sun: Option<SunEdit>,
     exposure_ev: f64,
     /// The exposure that the file says.
@@ -54,23 +58,30 @@ impl Relighting {
         })
     }
 
-    /// Takes the light of `edit`; `said_ev` is the exposure of the file.
-    pub fn light_up(&mut self, key: &str, edit: &Edit, said_ev: f64, light: &AtHand) {
+    /// Takes the light of `edit` and where it comes from; `said_ev` is the exposure of the file.
+    pub fn light_up(
+        &mut self,
+        key: &str,
+        edit: &Edit,
+        said_ev: f64,
+        (light, words): (&AtHand, &'static str),
+    ) {
         self.known = Some(Known {
             key: key.to_owned(),
             light: light.clone(),
+            words,
             sun: edit.sun,
             exposure_ev: edit.exposure_ev.unwrap_or(said_ev),
             said_ev,
         });
     }
 
-    /// The picture under the sun and exposure of `edit`, with its light and the camera. `None` if the
+    /// The picture under the sun and exposure of `edit`, and what the page says of its light. `None` if the
     /// objects change nothing, or nothing is recorded.
     ///
     /// # Errors
     /// If the record was lost.
-    pub fn picture(&self, edit: &Edit) -> Result<Option<(Piece, AtHand, Camera)>, RenderError> {
+    pub fn picture(&self, edit: &Edit) -> Result<Option<(Piece, Value)>, RenderError> {
         let (Some(record), Some(known)) = (&self.record, &self.known) else {
             return Ok(None);
         };
@@ -82,7 +93,8 @@ impl Relighting {
         };
         let stops = edit.exposure_ev.unwrap_or(known.said_ev) - known.exposure_ev;
         let piece = record.relit.under(&light, stops.exp2() as f32)?;
-        Ok(piece.map(|piece| (piece, light, record.camera)))
+        let said = description(&light, known.words, &record.camera);
+        Ok(piece.map(|piece| (piece, said)))
     }
 }
 

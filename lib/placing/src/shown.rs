@@ -80,8 +80,8 @@ fn line(piece: &Piece) -> Value {
     ])
 }
 
-/// A light in words and numbers.
-pub(crate) fn description(light: &AtHand, camera: &Camera) -> Value {
+/// A light in numbers and in `words`, which say where it comes from.
+pub(crate) fn description(light: &AtHand, words: &str, camera: &Camera) -> Value {
     let strongest = light.lobes.lobes().iter().max_by(|a, b| {
         let power = |l: &SphericalGaussian| l.integral().element_sum();
         power(a).total_cmp(&power(b))
@@ -94,5 +94,8 @@ pub(crate) fn description(light: &AtHand, camera: &Camera) -> Value {
         let azimuth_deg = (from_view + 180.0).rem_euclid(360.0) - 180.0;
         json!({"azimuth_deg": azimuth_deg, "elevation_deg": d.y.clamp(-1.0, 1.0).asin().to_degrees()})
     });
-    json!({"origin": light.origin.words(), "fixed": light.origin.is_fixed(), "sun": sun})
+    let (origin, fixed) = (words, light.origin.is_fixed());
+    // Whether the file or the page says where the sun is.
+    let told = words != light.origin.words();
+    json!({"origin": origin, "fixed": fixed, "sun": sun, "told": told})
 }

@@ -51,3 +51,38 @@ fn a_shadow_that_the_file_tells_is_known_to_the_page() {
         assert_eq!(desk.state().unwrap()["shadow"], is_told);
     }
 }
+
+#[test]
+fn what_is_told_of_the_sun_is_said_of_the_light() {
+    let folder = tempfile::tempdir().unwrap();
+    project(folder.path(), &[]);
+    let opened = |light: &str| {
+        let text = TEXT.replace("start = \"neutral\"", light);
+        fs::write(folder.path().join("pipeline.toml"), text).unwrap();
+        Desk::open(open(folder.path(), &[])).unwrap()
+    };
+    let edit = |keys: &str| {
+        let edit = format!("{{\"objects\": [{{\"of\": 0}}]{keys}}}");
+        serde_json::from_str(&edit).unwrap()
+    };
+    let seen = "estimated from the photograph";
+    let of_sun = format!("{seen}, the sun as [light] sun tells");
+    let of_shadow = format!("{seen}, the sun as [light] shadow tells");
+    let sun = "sun = { azimuth_deg = 30.0, elevation_deg = 40.0 }";
+    let dial = ", \"sun\": {\"azimuth_deg\": -20.0, \"elevation_deg\": 50.0}";
+    let line = ", \"shadow\": {\"foot\": [20.0, 170.0], \"tip\": [60.0, 150.0]}";
+    for (light, keys, expected) in [
+        ("", "", seen),
+        ("", dial, &of_sun),
+        ("", line, &of_shadow),
+        (sun, "", &of_sun),
+    ] {
+        let (desk, edit) = (opened(light), edit(keys));
+        let drawn = desk.draft(&edit, 1, 0).unwrap().ok().flatten();
+        let turned = desk.relight(&edit, 0).unwrap().ok().flatten();
+        for crop in [drawn, turned].map(|crop| crop.expect("an object is seen")) {
+            assert_eq!(crop.light["origin"], expected, "{light}{keys}");
+            assert_eq!(crop.light["told"], expected != seen, "{light}{keys}");
+        }
+    }
+}

@@ -111,6 +111,24 @@ fn files_that_a_converter_reads_are_refused_with_its_command() {
         ),
         ("x.jxl", b"\xff\x0a\0\0\0\0\0\0", "a JPEG XL image", "djxl"),
         (
+            "x.jp2",
+            b"\0\0\0\x0cjP  \r\n\x87\n",
+            "a JPEG 2000 image",
+            "magick",
+        ),
+        (
+            "x.j2k",
+            b"\xff\x4f\xff\x51\0\x2f",
+            "a JPEG 2000 image",
+            "magick",
+        ),
+        ("x.ppm", b"P6\n2 2\n255\n", "a Netpbm image", "magick"),
+        ("x.pgm", b"P5 2 2 255 ", "a Netpbm image", "magick"),
+        ("x.qoi", b"qoif\0\0\0\x02", "a QOI image", "magick"),
+        ("x.dds", b"DDS \x7c\0\0\0", "a DDS texture", "magick"),
+        ("x.TGA", b"\0\0\x02\0\0\0", "a Targa image", "magick"),
+        ("x.tif", b"II+\0\x08\0\0\0", "a TIFF image", "magick"),
+        (
             "x.CR2",
             b"II*\0\x10\0\0\0CR\x02\0",
             "a camera's raw file",
@@ -138,6 +156,14 @@ fn files_that_a_converter_reads_are_refused_with_its_command() {
         );
         assert_eq!(words(read_photo(&path, Transfer::Srgb).unwrap_err()), want);
     }
+    let layers = put(&folder, "x.psd", b"8BPS\0\x01\0\0");
+    let error = words(read_photo(&layers, Transfer::Srgb).unwrap_err());
+    let command = format!("`magick \"{}[0]\" \"", layers.display());
+    assert!(error.contains(&command), "{error}");
+    // A word that begins with P and a digit is no picture.
+    let text = put(&folder, "x.txt", b"P6x 2 2");
+    let error = words(read_photo(text, Transfer::Srgb).unwrap_err());
+    assert!(error.contains("not an image of a known format"), "{error}");
 }
 
 #[test]

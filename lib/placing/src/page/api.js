@@ -2,14 +2,14 @@
 
 async function failed(response) {
   const text = await response.text();
+  let message = text || `${response.status}`;
   try {
-    return new Error(JSON.parse(text).error);
-  } catch {
-    return new Error(text || `${response.status}`);
-  }
+    message = JSON.parse(text).error;
+  } catch {}
+  return Object.assign(new Error(message), { refused: true });
 }
 
-// An answer; one to a picture that a newer one broke off is 409.
+// An answer; an error is `refused` if the server gave it. One to a picture that a newer one broke off is 409.
 async function request(route, body) {
   let response;
   try {

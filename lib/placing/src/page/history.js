@@ -32,6 +32,14 @@ export class History {
     [this.kind, this.time] = [kind, time];
   }
 
+  // Takes the last change back for good; whether there was one.
+  drop() {
+    if (!this.past.length) return false;
+    this.kind = null;
+    this.now = this.past.pop();
+    return true;
+  }
+
   undo() {
     if (!this.past.length) return false;
     this.kind = null;

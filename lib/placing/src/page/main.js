@@ -120,6 +120,23 @@ function list(change) {
   edit({ objects: change(objects, chosen) }, true);
 }
 
+const typed = new WeakSet(); // edits that number fields made
+let kept = null; // the edit beside which a refusal stays
+
+// Makes an edit of a number that was typed.
+function enter(make) {
+  make();
+  typed.add(history.now.edit);
+}
+
+// Says why an edit cannot be. A number that was typed gives way to the one before it.
+function refuse(edit, error) {
+  say(error.message, true);
+  if (edit !== history.now.edit || !error.refused || !typed.has(edit) || !history.drop()) return;
+  kept = history.now.edit;
+  refresh();
+}
+
 const look = api.latest(async (edit) => {
   const key = JSON.stringify([edit.turn, edit.height_m]);
   try {
@@ -127,10 +144,10 @@ const look = api.latest(async (edit) => {
     if (view.objects.length !== history.now.edit.objects.length) return; // a newer one follows
     Object.assign(page, { view, viewOf: edit, refused: false });
     if (view.grid) [grid, gridOf] = [view.grid, key];
-    if ($("status").classList.contains("bad")) say("");
+    if ($("status").classList.contains("bad") && edit !== kept) say("");
   } catch (error) {
     page.refused = true;
-    return say(error.message, true);
+    return refuse(edit, error);
   }
   page.linesChanged();
   showNumbers(page.view, page.chosen);
@@ -160,7 +177,7 @@ async function shoot(samples) {
   } catch (error) {
     if (edit !== history.now.edit) return;
     aim = null;
-    say(error.message, true);
+    refuse(edit, error);
   }
 }
 
@@ -199,7 +216,7 @@ function showLit(keys) {
 function showLight() {
   const said = history.now.edit.sun;
   const sun = said ?? light?.sun ?? null;
-  dial.draw(sun, Boolean(said));
+  dial.draw(sun, Boolean(said ?? light?.told));
   put("azimuth", sun?.azimuth_deg, 0);
   put("elevation", sun?.elevation_deg, 0);
   const none = light?.shadow ? "; the shadow does not tell well enough where the sun is" : ", no sun";
@@ -326,14 +343,15 @@ const dial = new Dial($("dial"), (sun, done, kind) => {
   }
 });
 const sunNow = () => history.now.edit.sun ?? light?.sun ?? { azimuth_deg: 0, elevation_deg: 45 };
-number("azimuth", (v) => edit({ sun: { ...sunNow(), azimuth_deg: v }, shadow: null }, true));
-number("elevation", (v) => edit({ sun: { ...sunNow(), elevation_deg: v }, shadow: null }, true));
-number("yaw", (v) => page.change({ yaw_deg: v }, true));
+const sunAt = (keys) => enter(() => edit({ sun: { ...sunNow(), ...keys }, shadow: null }, true));
+number("azimuth", (v) => sunAt({ azimuth_deg: v }));
+number("elevation", (v) => sunAt({ elevation_deg: v }));
+number("yaw", (v) => enter(() => page.change({ yaw_deg: v }, true)));
 number("height", (v) => {
   const now = page.view.objects[page.chosen]?.size_m[1];
   const size = page.viewOf.objects[page.chosen]?.size ?? 1;
   if (!(v > 0 && now > 0)) return false;
-  page.change({ size: (size * v) / now }, true);
+  enter(() => page.change({ size: (size * v) / now }, true));
 });
 $("exposure").addEventListener("input", (event) => {
   beforeExposure ??= history.now;
