@@ -81,6 +81,9 @@ impl LightEstimate {
         }
         let weight = |k: usize| {
             let (azimuth, elevation) = angles_deg(bin_direction(k));
+            if sun.shines && elevation < SET_DEG {
+                return 0.0;
+            }
             let prior = f64::from(self.posterior.weights[k]) + DOUBT;
             let apart = |known: Option<KnownAngle>, turn: f64, at: f64| {
                 known.map_or(0.0, |a| {
@@ -197,7 +200,7 @@ fn angles_deg(towards: Vec3) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::grid::BASE_TEXELS;
+    use crate::grid::{AZIMUTHS, BASE_TEXELS};
 
     /// Grey light with a reddish source that may stand anywhere, seen by a camera that looks 70 degrees to the right.
     fn open() -> LightEstimate {
@@ -240,6 +243,26 @@ mod tests {
         assert!((lobe.sigma.to_degrees() - 0.135).abs() < 1e-3);
         let lobes = known.lobes(8);
         assert!(lobes[0] == lobe && lobes.len() <= 8);
+    }
+
+    #[test]
+    fn a_sun_that_casts_a_shadow_is_not_below_the_horizon() {
+        let sun = KnownSun {
+            azimuth: angle(20.0, 3.0),
+            shines: true,
+            ..KnownSun::default()
+        };
+        let known = open().knowing(&sun);
+        let low = &known.posterior.weights[..AZIMUTHS];
+        assert!(low.iter().all(|w| *w == 0.0), "{low:?}");
+        let all = known.candidates(8);
+        let mut suns = all.iter().filter_map(|c| c.direction);
+        assert!(suns.all(|d| d.y > 0.0));
+        let seen = KnownSun {
+            shines: false,
+            ..sun
+        };
+        assert!(open().knowing(&seen).posterior.weights[1] > 0.0);
     }
 
     #[test]
