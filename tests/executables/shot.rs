@@ -135,6 +135,9 @@ fn every_frame_has_the_camera_of_its_name() {
         run.expect_error(2, &format!("error: {message}"));
     };
     refused(&["a.png", "gone.png"], "gone.png: there is no such file");
+    project.write("empty.png", "");
+    let empty = "empty.png: it is empty: copy it again, or leave it out";
+    refused(&["a.png", "empty.png"], empty);
     std::fs::create_dir(project.path("all")).unwrap();
     refused(
         &["a.png", "all"],

@@ -90,6 +90,9 @@ pub fn overrides(
     if !path.is_file() {
         return Err(wrong("there is no such file").into());
     }
+    if path.metadata().is_ok_and(|found| found.len() == 0) {
+        return Err(wrong("it is empty: copy it again, or leave it out").into());
+    }
     dipir_imaging::file::check_format(path)?;
     let text = |path: &Path| match path.to_str() {
         Some(text) => Ok(json!(text).to_string()),
