@@ -207,7 +207,7 @@ impl Trial {
         Errors {
             azimuth: angle_between(azimuth, sun.azimuth).to_degrees().into(),
             elevation: (elevation - sun.elevation).abs().to_degrees().into(),
-            rmse: rmse(&picture, truth, &touched(objective), None),
+            rmse: rmse(&picture, truth, &touched(objective)),
         }
     }
 
@@ -318,7 +318,7 @@ fn measure(
     let projected = Errors {
         azimuth: f64::NAN,
         elevation: f64::NAN,
-        rmse: rmse(&picture, &truth, &touched(&objective), None),
+        rmse: rmse(&picture, &truth, &touched(&objective)),
     };
     errors.insert("2b photograph projected", projected);
     let sun = trial.place.sun();

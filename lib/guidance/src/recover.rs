@@ -190,7 +190,7 @@ pub fn recover_light(
     }
     .run(&mut |event| watch(Event::Optimization(event)))?;
     let rmse = match target {
-        Target::Reference(reference) => Some(rmse(&outcome.picture, reference, &mask, None)),
+        Target::Reference(reference) => Some(rmse(&outcome.picture, reference, &mask)),
         Target::Model(_) => None,
     };
     Ok(Recovery {

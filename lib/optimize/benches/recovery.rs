@@ -285,13 +285,13 @@ fn recover(object: &str, light: &str, knobs: &Knobs) -> Row {
     let everything = Raster::filled(mask.width(), mask.height(), 1.0);
     Row {
         degrees: degrees_from(&outcome.lighting, peak),
-        touched: rmse(&picture, &reference, &mask, None),
-        all: rmse(&picture, &reference, &everything, None),
+        touched: rmse(&picture, &reference, &mask),
+        all: rmse(&picture, &reference, &everything),
         iterations: outcome.history.len(),
         records: 1 + outcome.history.iter().filter(|r| r.recorded).count(),
         seconds: [recorded_s, seconds - recorded_s],
         residual: outcome.lighting.fusion_residual,
-        recorded: rmse(&outcome.picture, &reference, &mask, None),
+        recorded: rmse(&outcome.picture, &reference, &mask),
     }
 }
 

@@ -4,7 +4,6 @@
 //! should change: of a loss where there is a reference picture, by itself where a diffusion model
 //! guides.
 use dipir_imaging::raster::{DisplayImage, Raster};
-use dipir_imaging::resize::PixelBox;
 use dipir_numerics::sum::Neumaier;
 use glam::Vec3;
 
@@ -168,25 +167,11 @@ pub fn charbonnier(d: f64, scale: f64) -> (f64, f64) {
     (q * q / (root + 1.0), q / (scale * root))
 }
 
-/// The root mean square difference of two pictures over the pixels where `touched` is positive
-/// and inside `crop`; 0 if there are none.
-pub fn rmse(
-    a: &DisplayImage,
-    b: &DisplayImage,
-    touched: &Raster<f32>,
-    crop: Option<PixelBox>,
-) -> f64 {
-    let (width, height) = (touched.width(), touched.height());
-    let all = PixelBox {
-        x: 0,
-        y: 0,
-        width,
-        height,
-    };
-    let crop = crop.unwrap_or(all);
+/// The root mean square difference of two pictures over the pixels where `touched` is positive; 0 if there are none.
+pub fn rmse(a: &DisplayImage, b: &DisplayImage, touched: &Raster<f32>) -> f64 {
     let (mut squares, mut count) = (Neumaier::default(), 0usize);
-    for y in crop.y..crop.y + crop.height {
-        for x in crop.x..crop.x + crop.width {
+    for y in 0..touched.height() {
+        for x in 0..touched.width() {
             if *touched.get(x, y) > 0.0 {
                 let d = (*a.0.get(x, y) - *b.0.get(x, y)).as_dvec3();
                 squares.add(d.length_squared());

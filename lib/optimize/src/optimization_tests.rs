@@ -111,7 +111,7 @@ fn a_sun_and_a_sky_are_recovered_from_a_picture_and_a_neutral_start() {
     let outcome = case.run().unwrap();
     let peak = outcome.lighting.peak_direction().unwrap();
     let mask = touched(&objective(case.scene.clone(), WEIGHTS));
-    let error = rmse(&outcome.picture, &case.truth(), &mask, None);
+    let error = rmse(&outcome.picture, &case.truth(), &mask);
     let angle = degrees_between(peak, SUN);
     println!(
         "peak {angle:.2} degrees, rmse {error:.4}, residual {:.4}",
@@ -433,7 +433,7 @@ fn a_huge_gradient_in_an_early_step_does_not_stop_the_light() {
     .unwrap();
     let off = degrees_between(struck.lighting.peak_direction().unwrap(), SUN);
     let mask = touched(&objective(case.scene.clone(), WEIGHTS));
-    let error = rmse(&struck.picture, &case.truth(), &mask, None);
+    let error = rmse(&struck.picture, &case.truth(), &mask);
     // As without the stroke.
     assert!(off < 3.0 && error < 0.01, "{off} degrees, rmse {error}");
 }

@@ -121,7 +121,7 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
     let neutral = under_neutral(&objective, &frame, table.truth_tone)?;
     let mask = touched(&objective);
     let wanted = transfer.encode(&wanted);
-    let apart = |linear: &LinearImage| rmse(&transfer.encode(linear), &wanted, &mask, None);
+    let apart = |linear: &LinearImage| rmse(&transfer.encode(linear), &wanted, &mask);
     let sun_error = |d: Vec3| f64::from(d.angle_between(peak).to_degrees());
     Ok(Some(Truth {
         sun_error_deg: recovered.peak_direction().map(sun_error),
