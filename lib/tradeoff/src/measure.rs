@@ -93,6 +93,8 @@ pub struct SceneMeasurement<'a> {
     pub reference_error: f64,
 }
 
+/// The scene stage's list of effects, in the folder of artifacts.
+const EFFECTS: &str = "scene/effects.json";
 /// Seed of references, which no point has.
 const REFERENCE_SEED: u64 = 1_000_003;
 /// Error at which the pictures under recovered lights, and the truth that they are recovered from,
@@ -156,12 +158,25 @@ impl SceneMeasurement<'_> {
         self.stage(&COMPOSITE, lit, folder, REFERENCE_SEED, set)
     }
 
-    /// Names of the effects that the scene can show.
+    /// Where the scene stage says which effects the scene can show.
+    fn planned_folder(&self) -> PathBuf {
+        self.work().join("planned")
+    }
+
+    /// Names of the effects that the scene can show, asked of the scene stage unless they are known.
     pub fn effects_on(&self) -> anyhow::Result<Vec<String>> {
-        let folder = self.work().join("planned");
-        let path = folder.join("scene/effects.json");
-        if !path.is_file() {
+        let folder = self.planned_folder();
+        if !folder.join(EFFECTS).is_file() {
             self.stage(&SCENE, &self.scene.lit, &folder, 0, &[])?;
+        }
+        self.known_effects()
+    }
+
+    /// The same as far as they are known: none of a scene of which nothing is measured.
+    pub fn known_effects(&self) -> anyhow::Result<Vec<String>> {
+        let path = self.planned_folder().join(EFFECTS);
+        if !path.is_file() {
+            return Ok(Vec::new());
         }
         let plan: EffectsPlan = read_json(&path)?;
         let on = plan.effects.iter().filter(|e| e.enabled);
@@ -378,6 +393,9 @@ fn track_folder(part: Part, reference_error: f64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use dipir_imaging::file::write_png;
+    use dipir_imaging::raster::Raster;
+
     use super::*;
     use crate::scenes::projects;
 
@@ -422,6 +440,30 @@ mod tests {
             "objects = [{ path = 'car.obj', yaw_deg = 3 }]",
         );
         assert!(![first, other_object].contains(&kept()));
+    }
+
+    #[test]
+    fn a_project_whose_object_has_other_materials_or_textures_is_measured_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("pipeline.toml");
+        let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
+        let kept = || folder_name(&projects(std::slice::from_ref(&file))[0]);
+        let object = "mtllib car.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+        write("car.obj", object);
+        write("car.mtl", "newmtl m\nKd 0.5 0.5 0.5\nmap_Kd car.png\n");
+        let picture = |value: f32| {
+            let grey = DisplayImage(Raster::filled(2, 2, glam::Vec3::splat(value)));
+            write_png(folder.path().join("car.png"), &grey).unwrap();
+        };
+        picture(0.5);
+        write("pipeline.toml", "objects = [{ path = \"car.obj\" }]");
+        let first = kept();
+        assert_eq!(kept(), first);
+        picture(1.0);
+        let other_texture = kept();
+        assert_ne!(other_texture, first);
+        write("car.mtl", "newmtl m\nKd 0.9 0.5 0.5\nmap_Kd car.png\n");
+        assert!(![first, other_texture].contains(&kept()));
     }
 
     #[test]

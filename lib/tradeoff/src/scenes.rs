@@ -10,6 +10,7 @@ use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_render::shapes::{append, icosphere, torus_knot};
 use dipir_scene::export::to_obj;
+use dipir_scene::import::{EXTENSIONS, load_object};
 use dipir_scene::mesh::TriangleMesh;
 use dipir_stages::scene::background::PanoramaView;
 use glam::{Vec2, Vec3};
@@ -32,14 +33,19 @@ pub struct MeasuredScene {
 /// Names of the built-in scenes.
 pub const NAMES: [&str; 3] = ["matte outdoors", "glossy indoors", "concave"];
 
-/// Writes the built-in scene `name` into `folder`, unless it is there.
-pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<MeasuredScene> {
-    let scene = MeasuredScene {
+/// The built-in scene `name` in `folder`, there or not.
+pub fn kept(name: &str, folder: &Path) -> MeasuredScene {
+    MeasuredScene {
         name: name.into(),
         lit: folder.join("pipeline.toml"),
         recover: Some(folder.join("recover.toml")),
         digest: String::new(),
-    };
+    }
+}
+
+/// Writes the built-in scene `name` into `folder`, unless it is there.
+pub fn built_in(name: &str, folder: &Path, size: [usize; 2]) -> anyhow::Result<MeasuredScene> {
+    let scene = kept(name, folder);
     if scene.lit.is_file() {
         return Ok(scene);
     }
@@ -119,21 +125,34 @@ pub fn projects(pipelines: &[PathBuf]) -> Vec<MeasuredScene> {
     pipelines.iter().zip(&folders).map(named).collect()
 }
 
-/// Hash of a project's file and of the files whose paths it has in quotation marks. A file that cannot be read, which its
-/// stage says, counts as an empty one.
+/// Hash of a project's file, of the files whose paths it has in quotation marks, and of those that an object among them
+/// consists of. A file that cannot be read, which its stage says, counts as an empty one.
 fn digest(pipeline: &Path) -> String {
     let folder = pipeline.parent().unwrap_or(Path::new(""));
     let text = fs::read(pipeline).unwrap_or_default();
     let mut hash = blake3::Hasher::new();
     hash.update(&text);
+    let mut add = |path: &Path| {
+        let bytes = fs::read(path).unwrap_or_default();
+        hash.update(blake3::hash(&bytes).as_bytes());
+    };
     for quoted in String::from_utf8_lossy(&text).split(['"', '\'', '\n']) {
         let path = folder.join(quoted);
         if !quoted.is_empty() && path.is_file() {
-            let bytes = fs::read(&path).unwrap_or_default();
-            hash.update(blake3::hash(&bytes).as_bytes());
+            add(&path);
+            parts(&path).iter().for_each(|part| add(part));
         }
     }
     hash.finalize().to_hex()[..8].to_owned()
+}
+
+/// The further files that an object consists of: materials, buffers, textures. None of what is no object.
+fn parts(path: &Path) -> Vec<PathBuf> {
+    let extension = path.extension().unwrap_or_default().to_string_lossy();
+    if !EXTENSIONS.contains(&&*extension.to_lowercase()) {
+        return Vec::new();
+    }
+    load_object(path).map_or(Vec::new(), |object| object.dependencies)
 }
 
 /// The name of the folder that a file lies in.

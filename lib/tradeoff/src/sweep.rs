@@ -79,6 +79,7 @@ pub fn sweep(cli: &Cli, report: &mut dyn FnMut(Step)) -> anyhow::Result<Outcome>
     for &part in parts {
         for scene in &scenes {
             let effects = match part {
+                Part::Render if cli.report_only => measurement(scene).known_effects()?,
                 Part::Render => measurement(scene).effects_on()?,
                 Part::Light => Vec::new(),
             };
@@ -174,7 +175,11 @@ fn chosen_scenes(cli: &Cli) -> anyhow::Result<Vec<MeasuredScene>> {
             let text = format!("--scene \"{name}\": accepted: {}", scenes::NAMES.join(", "));
             return Err(Usage(text).into());
         }
-        scenes::built_in(name, &folder.join(name.replace(' ', "-")), cli.size)
+        let folder = folder.join(name.replace(' ', "-"));
+        match cli.report_only {
+            true => Ok(scenes::kept(name, &folder)),
+            false => scenes::built_in(name, &folder, cli.size),
+        }
     };
     names.into_iter().map(make).collect()
 }
@@ -186,21 +191,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_report_of_nothing_is_refused_and_leaves_earlier_tables() {
+    fn a_report_of_nothing_is_refused_leaves_earlier_tables_and_makes_no_file() {
         let folder = tempfile::tempdir().unwrap();
         let earlier = folder.path().join("tradeoff.csv");
         std::fs::write(&earlier, "earlier").unwrap();
         let out = folder.path().to_str().unwrap();
-        let arguments = [
-            "dipir-tradeoff",
-            "--report-only",
-            "--track",
-            "light",
-            "--size",
-            "8x8",
-            "--out",
-            out,
-        ];
+        let arguments = ["dipir-tradeoff", "--report-only", "--out", out];
         let refused = sweep(&Cli::parse_from(arguments), &mut |_| {});
         let error = refused.err().expect("is refused");
         assert!(error.is::<Usage>(), "{error:#}");
@@ -210,6 +206,7 @@ mod tests {
                 .starts_with("--report-only: nothing of this is measured in "),
             "{error:#}"
         );
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
         assert_eq!(std::fs::read_to_string(earlier).unwrap(), "earlier");
     }
 
