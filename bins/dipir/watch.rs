@@ -22,7 +22,7 @@ const PAUSE: Duration = Duration::from_millis(500);
 
 /// How often a run is asked whether it has ended.
 const ASK_EVERY: Duration = Duration::from_millis(50);
-/// How long a run may go on once this process was asked to stop.
+/// How long a run may go on once this process was asked to stop, where no signal can ask the run.
 const GRACE: Duration = Duration::from_secs(2);
 
 /// Time of change and length of files; `None` of one that is not there.
@@ -54,16 +54,22 @@ pub fn watch(project: &ProjectArgs) -> anyhow::Result<()> {
     }
 }
 
-/// Waits for the end of a run. A run that goes on for [`GRACE`] after this process was asked to stop was not asked itself: it
-/// is killed, and its stages stop by themselves then.
+/// Waits for the end of a run. If this process is asked to stop, the run is asked, too, and ends as on Ctrl-C. Where it cannot
+/// be asked, one that goes on for [`GRACE`] is killed, and its stages stop by themselves then.
 fn wait(mut child: Child) -> io::Result<ExitStatus> {
     let mut asked = None;
     loop {
         if let Some(status) = child.try_wait()? {
             return Ok(status);
         }
-        if interrupt::asked() && asked.get_or_insert_with(Instant::now).elapsed() > GRACE {
-            child.kill()?;
+        if interrupt::asked() {
+            let since = asked.get_or_insert_with(|| {
+                interrupt::pass_on(&child);
+                Instant::now()
+            });
+            if cfg!(not(unix)) && since.elapsed() > GRACE {
+                child.kill()?;
+            }
         }
         thread::sleep(ASK_EVERY);
     }

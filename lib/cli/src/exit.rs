@@ -142,7 +142,8 @@ pub fn code_of(error: &anyhow::Error) -> u8 {
 }
 
 /// The message, then its causes. A cause that its parent already quotes is not repeated. Numbers of
-/// operating-system errors are left out, because their text says the same.
+/// operating-system errors are left out, because their text says the same. Where no disk has room, the way out follows unless
+/// a message has said it.
 pub fn describe(error: &anyhow::Error) -> String {
     let mut text = String::new();
     let mut parent = String::new();
@@ -157,7 +158,23 @@ pub fn describe(error: &anyhow::Error) -> String {
         text.push_str(&message);
         parent = message;
     }
+    if is_of_full_disk(error, &text) && !text.contains(FREE_SPACE) {
+        text.push_str(&format!("; {FREE_SPACE} or write elsewhere"));
+    }
     text
+}
+
+/// How the remedy for a full disk begins, here and in the errors of stages.
+const FREE_SPACE: &str = "free some space";
+
+/// Whether the system said so. Libraries that write hand on its words, but not always its error.
+fn is_of_full_disk(error: &anyhow::Error, text: &str) -> bool {
+    use std::io::ErrorKind::{QuotaExceeded, StorageFull};
+    let cause = error.root_cause().downcast_ref::<std::io::Error>();
+    let text = text.to_lowercase();
+    cause.is_some_and(|e| matches!(e.kind(), StorageFull | QuotaExceeded))
+        || text.contains("no space left on device")
+        || text.contains("disk quota exceeded")
 }
 
 /// The text with what a terminal would obey, or what would turn the line around, written as an
@@ -211,6 +228,30 @@ mod tests {
             describe(&error),
             "the scene cannot be set up\n  caused by: cannot read a.png: disk on fire"
         );
+    }
+
+    #[test]
+    fn a_full_disk_has_one_remedy_whoever_writes() {
+        let full = || std::io::Error::from(std::io::ErrorKind::StorageFull);
+        let picture = anyhow::Error::new(full()).context("cannot write a.exr");
+        assert_eq!(
+            describe(&picture),
+            "cannot write a.exr\n  caused by: no storage space; free some space or write elsewhere"
+        );
+        let handed_on = describe(&anyhow::anyhow!(
+            "cannot write a.png: No space left on device (os error 28)"
+        ));
+        assert_eq!(
+            handed_on,
+            "cannot write a.png: No space left on device; free some space or write elsewhere"
+        );
+        let stage = dipir_pipeline::error::StageError::Io {
+            action: "write",
+            path: "stage.json".into(),
+            source: full(),
+        };
+        let text = describe(&stage.into());
+        assert_eq!(text.matches(FREE_SPACE).count(), 1, "{text}");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::io::{Read, stdin};
 use std::path::{Path, PathBuf};
-use std::process;
+use std::process::{self, Child};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
@@ -99,6 +99,19 @@ pub fn listen_patiently() -> anyhow::Result<()> {
     }
     Ok(())
 }
+
+/// Asks a child to end, as whoever asked this process would have had to ask it. Only Ctrl-C reaches children by itself.
+#[cfg(unix)]
+pub fn pass_on(child: &Child) {
+    // SAFETY: sending a signal touches no memory. The child has not been waited for, so the number is still its own.
+    unsafe {
+        libc::kill(child.id() as libc::pid_t, libc::SIGTERM);
+    }
+}
+
+/// Other systems have no such signal.
+#[cfg(not(unix))]
+pub fn pass_on(_: &Child) {}
 
 /// Takes the end of standard input for Ctrl-C. Whoever started this process holds the other end,
 /// so the work stops when that process does, however it ends.

@@ -183,7 +183,13 @@ impl StageWriter {
     }
 
     /// Writes `stage.json`, flushes everything and swaps the folder in.
-    pub fn finish(mut self) -> Result<Manifest, StageError> {
+    pub fn finish(self) -> Result<Manifest, StageError> {
+        self.finish_and(|| {})
+    }
+
+    /// As [`finish`](Self::finish), and then `tidy_up`, before another run may begin: that run would go on from what is being
+    /// removed.
+    pub fn finish_and(mut self, tidy_up: impl FnOnce()) -> Result<Manifest, StageError> {
         let mut outputs = Vec::with_capacity(self.outputs.len());
         for (role, name) in &self.outputs {
             let path = self.partial.join(name);
@@ -224,6 +230,7 @@ impl StageWriter {
         if let Some(parent) = self.target.parent().filter(|p| !p.as_os_str().is_empty()) {
             sync_folder(parent)?;
         }
+        tidy_up();
         Ok(manifest)
     }
 

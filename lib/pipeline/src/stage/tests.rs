@@ -209,6 +209,23 @@ fn leftovers_of_a_killed_run_are_cleared() {
 }
 
 #[test]
+fn what_a_result_makes_needless_goes_before_another_run_may_begin() {
+    let out = tempfile::tempdir().unwrap();
+    let target = out.path().join("scene");
+    let writer = StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap();
+    let mut tidied = false;
+    let tidy_up = || {
+        tidied = true;
+        assert!(target.join(FILE_NAME).is_file());
+        let other = StageWriter::begin(&target, plan(3), WhenLocked::Refuse);
+        assert!(matches!(other, Err(StageError::Locked { .. })));
+    };
+    writer.finish_and(tidy_up).unwrap();
+    assert!(tidied);
+    StageWriter::begin(&target, plan(3), WhenLocked::Refuse).unwrap();
+}
+
+#[test]
 fn a_kill_while_an_unfinished_folder_is_removed_blocks_no_later_run() {
     let out = tempfile::tempdir().unwrap();
     let (target, partial) = (out.path().join("scene"), out.path().join(".scene.partial"));

@@ -104,8 +104,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     };
     writer.write_json(ROLE, FILE, &outcome.materials)?;
     writer.write_json("history", "history.json", &outcome.losses)?;
-    let manifest = writer.finish()?;
-    resume.remove();
+    let manifest = writer.finish_and(|| resume.remove())?;
     Ok(Done {
         folder,
         manifest,

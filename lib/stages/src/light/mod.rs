@@ -167,10 +167,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         let sheet = candidates::sheet(loaded, &simulation, estimated, visible)?;
         write_png(writer.output("candidates_sheet", "candidates.png")?, &sheet)?;
     }
-    let manifest = writer.finish()?;
-    if let Some(resume) = resume {
-        resume.remove();
-    }
+    let manifest = writer.finish_and(|| resume.iter().for_each(Resume::remove))?;
     let budget = request.settings.time_budget_s;
     let outlook = match (resumed_at, &request.guide) {
         (0, Guide::Reference { .. } | Guide::Model { .. }) if budget.is_none() => {

@@ -165,8 +165,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         return from_cache(session, writer, table.steps);
     }
     let run = train(session, &table, &fingerprint, base_hash, &mut writer)?;
-    let manifest = writer.finish()?;
-    run.resume.remove();
+    let manifest = writer.finish_and(|| run.resume.remove())?;
     let folder = LORA.folder(session);
     if let Some(cache) = &cache {
         // The stage's own result stands without it.

@@ -228,9 +228,21 @@ pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
         hashes(&recorded, object) != hashes(&now.inputs, object)
     };
     match plan_with_parts(session, &there) {
-        Ok(now) if gone.iter().all(|part| is_of_another(part, &now)) => Ok(now),
+        Ok(now)
+            if gone
+                .iter()
+                .all(|p| is_dispensable(p) || is_of_another(p, &now)) =>
+        {
+            Ok(now)
+        }
         _ => whole,
     }
+}
+
+/// Whether an object is read, with a warning, though this part of it is gone: its materials and textures, but not the buffers
+/// of a glTF file.
+fn is_dispensable(part: &Artifact) -> bool {
+    part.path.extension().is_some_and(|e| e != "bin")
 }
 
 /// The plan with the files that the configuration names and these `parts` of objects.
@@ -433,20 +445,30 @@ mod tests {
     use crate::command_line::scene::Cli;
 
     #[test]
-    fn a_file_that_only_the_object_before_had_may_be_gone() {
+    fn a_part_that_is_gone_keeps_a_scene_from_running_only_where_the_object_needs_it() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         let photo = DisplayImage(Raster::filled(36, 24, Vec3::splat(0.5)));
         write_png(at("photo.png"), &photo).unwrap();
-        let object = |material: &str| {
-            let text = format!(
-                "mtllib {material}\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-            );
-            fs::write(at("object.obj"), text).unwrap();
+        // A triangle whose corners are in another file.
+        let object = |buffer: &str| {
+            let object = json!({
+                "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+                "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}],
+                "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3",
+                    "min": [0, 0, 0], "max": [1, 1, 0]}],
+                "bufferViews": [{"buffer": 0, "byteLength": 36}],
+                "buffers": [{"uri": buffer, "byteLength": 36}],
+                "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+                "textures": [{"source": 0}], "images": [{"uri": "grey.png"}],
+            });
+            fs::write(at("object.gltf"), object.to_string()).unwrap();
         };
-        object("a.mtl");
-        fs::write(at("a.mtl"), "newmtl m\nKd 0.5 0.5 0.5\n").unwrap();
-        let text = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"object.obj\"\nposition = [0.0, 0.0, 0.0]\n\
+        object("a.bin");
+        let corners = [0f32, 0., 0., 1., 0., 0., 0., 1., 0.].map(f32::to_le_bytes);
+        fs::write(at("a.bin"), corners.concat()).unwrap();
+        write_png(at("grey.png"), &photo).unwrap();
+        let text = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"object.gltf\"\nposition = [0.0, 0.0, 0.0]\n\
                     [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 0.5, 0.0]\nfov_deg = 40.0\n\
                     [scene.proxy]\nplane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }\n";
         fs::write(at("pipeline.toml"), text).unwrap();
@@ -460,13 +482,21 @@ mod tests {
             Ok::<_, String>(in_words(&reasons))
         };
         assert_eq!(told(), Ok(String::new()));
-        fs::rename(at("a.mtl"), at("b.mtl")).unwrap();
+        // The stage runs without a texture.
+        fs::remove_file(at("grey.png")).unwrap();
+        let lacks = "it no longer reads the part of object 2";
+        assert_eq!(told().unwrap(), lacks);
+        run(&session).unwrap();
+        assert_eq!(told(), Ok(String::new()));
+        fs::rename(at("a.bin"), at("b.bin")).unwrap();
         let missing = told().unwrap_err();
-        assert!(missing.contains("a.mtl"), "{missing}");
-        object("b.mtl");
+        assert!(missing.contains("a.bin"), "{missing}");
+        assert!(run(&session).is_err());
+        // Another object has other files.
+        object("b.bin");
         assert_eq!(
             told().unwrap(),
-            "the object object.obj has other content; it no longer reads the part of object"
+            "the object object.gltf has other content; it no longer reads the part of object"
         );
         run(&session).unwrap();
         assert_eq!(told(), Ok(String::new()));
