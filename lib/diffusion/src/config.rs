@@ -15,11 +15,36 @@ pub struct ConfigFile {
     value: Value,
 }
 
+/// Numbers that Python writes and JSON lacks, as diffusers does for `lambda_min_clipped` of its DPM-Solvers.
+const NOT_JSON: [&str; 3] = ["-Infinity", "Infinity", "NaN"];
+
+/// `json` with [`NOT_JSON`] as texts: a key that needs a number refuses them.
+fn with_quoted_numbers(json: &[u8]) -> Vec<u8> {
+    let (mut out, mut at, mut is_text) = (Vec::with_capacity(json.len()), 0, false);
+    while let Some(&byte) = json.get(at) {
+        let rest = &json[at..];
+        let mut words = NOT_JSON.iter().map(|word| word.as_bytes());
+        if !is_text && let Some(word) = words.find(|word| rest.starts_with(word)) {
+            out.extend([b"\"", word, b"\""].concat());
+            at += word.len();
+            continue;
+        }
+        // A quote after a backslash ends no text.
+        let length = if is_text && byte == b'\\' { 2 } else { 1 };
+        is_text ^= byte == b'"';
+        out.extend(rest.iter().take(length));
+        at += length;
+    }
+    out
+}
+
 impl ConfigFile {
-    /// Reads `path`.
+    /// Reads `path`. Python's `Infinity` and `NaN` are texts.
     pub fn read(path: &Path) -> Result<Self> {
         let bytes = dipir_files::read(path).map_err(io("read", path))?;
-        let value: Value = serde_json::from_slice(&bytes).map_err(|e| Error::Config {
+        let value = serde_json::from_slice(&bytes)
+            .or_else(|_| serde_json::from_slice(&with_quoted_numbers(&bytes)));
+        let value: Value = value.map_err(|e| Error::Config {
             path: path.to_owned(),
             message: format!("not JSON: {e}"),
         })?;

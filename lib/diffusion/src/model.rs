@@ -61,6 +61,7 @@ impl Model {
         device: &Device,
     ) -> Result<Self> {
         check_precision(dtype, device)?;
+        refuse_part_or_cache(folder)?;
         refuse_foreign(&ConfigFile::read(&folder.join("model_index.json"))?)?;
         // What is small comes first: its errors cost nothing.
         let schedule = NoiseSchedule::load_as(&folder.join("scheduler"), prediction)?;
@@ -181,6 +182,40 @@ impl Model {
             .map(|p| self.tokenizer.encode(p))
             .collect::<Result<Vec<_>>>()?;
         self.text_encoder.forward(&tokens, learned)
+    }
+}
+
+/// Refuses a folder below or above a model's: one of its parts, or the hub's cache of it.
+fn refuse_part_or_cache(folder: &Path) -> Result<()> {
+    if folder.join("model_index.json").exists() {
+        return Ok(());
+    }
+    let fail = |message: String| {
+        Err(Error::Config {
+            path: folder.to_owned(),
+            message: format!("no model_index.json is in it; {message}"),
+        })
+    };
+    let entries = std::fs::read_dir(folder.join("snapshots"));
+    let names = entries.into_iter().flatten().flatten();
+    let mut snapshots: Vec<String> = names
+        .map(|entry| format!("snapshots/{}", entry.file_name().to_string_lossy()))
+        .collect();
+    snapshots.sort();
+    if !snapshots.is_empty() {
+        return fail(format!(
+            "it is the hub's cache: name a folder in it, {}",
+            snapshots.join(" or ")
+        ));
+    }
+    let parts = [
+        "config.json",
+        "scheduler_config.json",
+        "tokenizer_config.json",
+    ];
+    match parts.iter().any(|name| folder.join(name).is_file()) {
+        true => fail("it is one part of a model: name the model's folder".into()),
+        false => Ok(()),
     }
 }
 

@@ -1,6 +1,6 @@
 //! Memory-mapped safetensors: one file or several shards behind one index.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -11,6 +11,9 @@ use serde::Deserialize;
 
 use crate::error::{Error, Result, io};
 use crate::extent::Extent;
+
+/// How the text begins that a clone without Git LFS holds instead of a large file.
+const GIT_LFS: &[u8] = b"version https://git-lfs.github.com/spec/";
 
 /// Where one tensor lies.
 #[derive(Debug, Clone)]
@@ -40,25 +43,66 @@ struct ShardIndex {
     weight_map: BTreeMap<String, String>,
 }
 
+impl ShardIndex {
+    fn read(index: &Path) -> Result<Self> {
+        let bytes = dipir_files::read(index).map_err(io("read", index))?;
+        serde_json::from_slice(&bytes).map_err(|e| Error::Config {
+            path: index.to_owned(),
+            message: format!("not a shard index: {e}"),
+        })
+    }
+}
+
+/// What stands for the weights in a folder.
+enum Chosen {
+    File(PathBuf),
+    Index(PathBuf),
+}
+
+/// The first that is there of `stem.safetensors`, its index, and both as a half-precision variant.
+fn chosen(folder: &Path, stem: &str) -> Option<Chosen> {
+    for variant in ["", ".fp16", ".bf16"] {
+        let single = folder.join(format!("{stem}{variant}.safetensors"));
+        if single.is_file() {
+            return Some(Chosen::File(single));
+        }
+        for index in [
+            format!("{stem}.safetensors.index{variant}.json"),
+            format!("{stem}{variant}.safetensors.index.json"),
+        ] {
+            let index = folder.join(index);
+            if index.is_file() {
+                return Some(Chosen::Index(index));
+            }
+        }
+    }
+    None
+}
+
+/// The names of the files in `folder` that [`Weights::open`] reads for `stem`: one, or an index and its shards; none
+/// where there are none. Of an index that is none the name alone: opening it says what is wrong.
+pub fn weight_files(folder: &Path, stem: &str) -> BTreeSet<String> {
+    let name = |path: &Path| path.file_name().map(|n| n.to_string_lossy().into_owned());
+    match chosen(folder, stem) {
+        None => BTreeSet::new(),
+        Some(Chosen::File(file)) => name(&file).into_iter().collect(),
+        Some(Chosen::Index(index)) => {
+            let shards = ShardIndex::read(&index).map(|parsed| parsed.weight_map);
+            let shards = shards.unwrap_or_default().into_values();
+            shards.chain(name(&index)).collect()
+        }
+    }
+}
+
 impl Weights {
     /// Opens the weights called `stem` in `folder`: `stem.safetensors`, the
     /// shards of `stem.safetensors.index.json`, or the half-precision variants
     /// `stem.fp16.safetensors` and `stem.bf16.safetensors`, in this order.
     pub fn open(folder: &Path, stem: &str) -> Result<Self> {
-        for variant in ["", ".fp16", ".bf16"] {
-            let single = folder.join(format!("{stem}{variant}.safetensors"));
-            if single.is_file() {
-                return Self::open_file(&single);
-            }
-            for index in [
-                format!("{stem}.safetensors.index{variant}.json"),
-                format!("{stem}{variant}.safetensors.index.json"),
-            ] {
-                let index = folder.join(index);
-                if index.is_file() {
-                    return Self::open_shards(&index);
-                }
-            }
+        match chosen(folder, stem) {
+            Some(Chosen::File(file)) => return Self::open_file(&file),
+            Some(Chosen::Index(index)) => return Self::open_shards(&index),
+            None => {}
         }
         let found = others(folder, stem);
         let is_pickled =
@@ -96,11 +140,7 @@ impl Weights {
     }
 
     fn open_shards(index: &Path) -> Result<Self> {
-        let bytes = dipir_files::read(index).map_err(io("read", index))?;
-        let parsed: ShardIndex = serde_json::from_slice(&bytes).map_err(|e| Error::Config {
-            path: index.to_owned(),
-            message: format!("not a shard index: {e}"),
-        })?;
+        let parsed = ShardIndex::read(index)?;
         let folder = index.parent().unwrap_or(Path::new("."));
         let mut shards: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
         for (name, file) in &parsed.weight_map {
@@ -136,6 +176,11 @@ impl Weights {
             path: path.to_owned(),
             message,
         };
+        if map.starts_with(GIT_LFS) {
+            return Err(damaged(
+                "it is what Git LFS leaves in its place (git lfs pull fetches it)".into(),
+            ));
+        }
         let (header_len, header) =
             SafeTensors::read_metadata(&map).map_err(|e| damaged(e.to_string()))?;
         let base = 8 + header_len;

@@ -114,10 +114,11 @@ impl Lora {
                 problems,
             })
         };
-        if let Some(key) = weights.names().find(|key| is_of_dora(key)) {
-            return refused(vec![format!(
-                "it is a DoRA, for it holds magnitudes ({key:?}); {ACCEPTED}"
-            )]);
+        if let Some((key, kind)) = weights
+            .names()
+            .find_map(|key| Some((key, other_kind(key)?)))
+        {
+            return refused(vec![format!("it is {kind} ({key:?}); {ACCEPTED}")]);
         }
         let mut problems = vec![];
         let parts = sort_keys(&weights, targets, &mut problems);
@@ -149,10 +150,45 @@ impl Lora {
     }
 }
 
-/// Whether a tensor is the magnitude of a weight-decomposed adapter [Liu et al. 2024].
-fn is_of_dora(key: &str) -> bool {
-    key.contains(".lora_magnitude_vector") || key.ends_with(".dora_scale")
+/// What is adapted by other means than two matrices whose product is added, by a part of its keys.
+const OTHER_KINDS: [(&str, &str); 10] = [
+    (".lora_magnitude_vector", "a DoRA, for it holds magnitudes"),
+    (".dora_scale", "a DoRA, for it holds magnitudes"),
+    (".hada_w", "a LoHa"),
+    (".lokr_w", "a LoKr"),
+    (".oft_", "an OFT"),
+    (".on_input", "an IA3"),
+    (".lora_mid.", "a LoCon with a third matrix for a layer"),
+    (".lora_B.bias", "a LoRA with biases (lora_bias)"),
+    (".base_layer.bias", "a LoRA with biases (bias)"),
+    (".diff", "made of whole differences of weights"),
+];
+
+/// What a file with this key is, if it is no plain LoRA.
+fn other_kind(key: &str) -> Option<&'static str> {
+    let is_of = |part: &str| match part {
+        // `diffusion_model.` begins the keys of some plain ones.
+        ".diff" => key.ends_with(part) || key.ends_with(".diff_b"),
+        _ => key.contains(part),
+    };
+    let found = OTHER_KINDS.iter().find(|(part, _)| is_of(part));
+    found.map(|(_, kind)| *kind)
 }
+
+/// Parts of the names of a UNet's layers outside its attentions.
+const OUTSIDE: [&str; 11] = [
+    "resnets",
+    "samplers",
+    "conv_in",
+    "conv_out",
+    "time_emb",
+    "in_layers",
+    "out_layers",
+    "emb_layers",
+    "skip_connection",
+    "_0_op",
+    "_conv",
+];
 
 /// The keys that belong to one layer.
 #[derive(Debug, Default)]
@@ -236,6 +272,9 @@ fn sort_keys<'a>(
             let of_text = ["lora_te", "text_encoder", "text_model"];
             let hint = if of_text.iter().any(|start| own.starts_with(start)) {
                 "adapts the text encoder, accepted are adapters of the UNet; train or export with the UNet only"
+            } else if OUTSIDE.iter().any(|part| own.contains(part)) {
+                "adapts a layer outside the attentions, as LoCon does, accepted are adapters of attention blocks; train it \
+                 without convolutions (no conv_dim) and time embeddings"
             } else {
                 "belongs to no layer of this UNet"
             };

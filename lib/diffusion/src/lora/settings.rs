@@ -279,5 +279,4 @@ impl Settings {
 }
 
 /// The remedy where a file is another kind of adapter.
-pub(super) const ACCEPTED: &str =
-    "accepted: a plain LoRA; train it again as one (use_dora = false)";
+pub(super) const ACCEPTED: &str = "accepted: a plain LoRA; train it again as one";

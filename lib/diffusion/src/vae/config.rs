@@ -57,7 +57,8 @@ impl AutoencoderConfig {
     pub fn from_file(file: &ConfigFile) -> Result<Self> {
         file.require("_class_name", &[json!("AutoencoderKL")])?;
         file.require("act_fn", &[json!("silu"), json!("swish")])?;
-        for key in ["shift_factor", "latents_mean", "latents_std"] {
+        file.require("shift_factor", &[json!(0), json!(0.0)])?;
+        for key in ["latents_mean", "latents_std"] {
             file.require(key, &[])?;
         }
         file.require_single("layers_per_block")?;

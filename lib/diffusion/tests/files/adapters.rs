@@ -34,6 +34,20 @@ fn foreign_lora_keys_are_named() -> Outcome {
             "\"unet.nowhere.lora_A.weight\" belongs to no layer",
         ),
         (
+            vec![(
+                "lora_unet_down_blocks_0_resnets_0_conv1.lora_down.weight",
+                matrix(4, 8)?,
+            )],
+            "conv1.lora_down.weight\" adapts a layer outside the attentions",
+        ),
+        (
+            vec![(
+                "base_model.model.down_blocks.0.resnets.0.time_emb_proj.lora_A.weight",
+                matrix(4, 8)?,
+            )],
+            "time_emb_proj.lora_A.weight\" adapts a layer outside the attentions",
+        ),
+        (
             vec![("unet.bias", matrix(4, 8)?)],
             "neither a down nor an up matrix",
         ),
@@ -535,10 +549,16 @@ fn what_is_no_lora_is_called_by_its_name() -> Outcome {
     let path = folder.path().join("lora.safetensors");
     let layer = "unet.down_blocks.0.attentions.0.transformer_blocks.0.attn1.to_q";
     let zeros = |a| Tensor::zeros((a, 16), DType::F32, &Device::Cpu);
-    for end in [
-        "lora_magnitude_vector",
-        "lora_magnitude_vector.weight",
-        "dora_scale",
+    for (end, kind) in [
+        ("lora_magnitude_vector", "it is a DoRA"),
+        ("lora_magnitude_vector.weight", "it is a DoRA"),
+        ("dora_scale", "it is a DoRA"),
+        ("hada_w1_a", "it is a LoHa"),
+        ("lokr_w1", "it is a LoKr"),
+        ("lora_mid.weight", "it is a LoCon with a third matrix"),
+        ("lora_B.bias", "it is a LoRA with biases"),
+        ("diff", "it is made of whole differences"),
+        ("diff_b", "it is made of whole differences"),
     ] {
         let tensors = BTreeMap::from([
             (format!("{layer}.{end}"), zeros(1)?),
@@ -546,7 +566,7 @@ fn what_is_no_lora_is_called_by_its_name() -> Outcome {
         ]);
         write_safetensors(&path, &tensors, &BTreeMap::new())?;
         let message = scale_of_ones(&path, 4).expect_err(end).to_string();
-        assert!(message.contains("it is a DoRA"), "{message}");
+        assert!(message.contains(kind), "{message}");
     }
     let pickled = folder.path().join("pytorch_lora_weights.bin");
     for (path, part) in [

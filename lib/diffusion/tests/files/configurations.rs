@@ -213,6 +213,59 @@ fn settings_of_samplers_that_nothing_heeds_are_told() -> Outcome {
     Ok(())
 }
 
+/// As diffusers 0.42.1 writes the configuration of every DPM-Solver.
+#[test]
+fn infinity_as_python_writes_it_hinders_no_key_that_does_not_need_it() -> Outcome {
+    let folder = tempfile::tempdir()?;
+    let read = |text: &str| {
+        std::fs::write(folder.path().join("scheduler_config.json"), text)?;
+        NoiseSchedule::load(folder.path())
+            .map_err(|e| Box::<dyn std::error::Error>::from(e.to_string()))
+    };
+    let schedule = read(
+        r#"{"_class_name": "DPMSolverMultistepScheduler", "lambda_min_clipped": -Infinity, "note": "a \\\" NaN, -Infinity",
+            "beta_start": 0.00085, "sample_max_value": Infinity, "other": [NaN, 1]}"#,
+    )?;
+    assert_eq!(schedule.config().beta_start, 0.00085);
+    assert_eq!(schedule.config().beta_end, 0.02);
+    for (text, part) in [
+        (
+            r#"{"beta_end": Infinity}"#,
+            "beta_end: invalid type: string \"Infinity\", expected f64",
+        ),
+        (
+            "{\"a\": -Infinity,\n\"b\": }",
+            "not JSON: expected value at line 2",
+        ),
+        (r#"{"a": "NaN\"#, "not JSON"),
+    ] {
+        let message = read(text).expect_err(part).to_string();
+        assert!(message.contains(part), "{message}");
+    }
+    Ok(())
+}
+
+#[test]
+fn a_part_of_a_model_and_the_hub_s_cache_are_told_from_a_model() -> Outcome {
+    let folder = model_folder()?;
+    let load = |path: &std::path::Path| {
+        let error = Model::load(path, DType::F32, &Device::Cpu).expect_err("no model");
+        error.to_string()
+    };
+    for part in ["unet", "scheduler", "text_encoder"] {
+        let message = load(&folder.path().join(part));
+        assert!(message.contains("name the model's folder"), "{message}");
+    }
+    let cache = tempfile::tempdir()?;
+    for commit in ["1a", "0b"] {
+        std::fs::create_dir_all(cache.path().join("snapshots").join(commit))?;
+    }
+    let message = load(cache.path());
+    let wanted = "name a folder in it, snapshots/0b or snapshots/1a";
+    assert!(message.contains(wanted), "{message}");
+    Ok(())
+}
+
 #[test]
 fn a_prediction_that_is_given_overrules_the_folder_s() -> Outcome {
     let folder = model_folder()?;

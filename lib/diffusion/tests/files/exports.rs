@@ -151,6 +151,8 @@ fn autoencoders_without_quantising_convolutions_and_of_other_scales_are_read() -
     })?;
     let without = run()?;
     assert_eq!(with, without);
+    configure(&part, "config.json", |c| c["shift_factor"] = json!(0.0))?;
+    assert_eq!(run()?, without);
     // A power of two times the factor: the latents are exactly that multiple, and come back.
     configure(&part, "config.json", |c| {
         c["scaling_factor"] = json!(4.0 * 0.18215)

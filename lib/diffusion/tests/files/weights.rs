@@ -287,5 +287,11 @@ fn hostile_headers_are_refused_without_a_panic() -> Outcome {
             other => panic!("{what}: {other:?}"),
         }
     }
+    let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 3438167540\n";
+    std::fs::write(&path, pointer)?;
+    let message = Weights::open_file(&path)
+        .expect_err("a pointer")
+        .to_string();
+    assert!(message.contains("git lfs pull"), "{message}");
     Ok(())
 }

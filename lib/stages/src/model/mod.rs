@@ -11,6 +11,7 @@ use dipir_cli::exit::Usage;
 use dipir_cli::session::Session;
 use dipir_diffusion::model::Model;
 use dipir_diffusion::schedule::Prediction;
+use dipir_diffusion::weights::weight_files;
 use dipir_pipeline::error::ConfigError;
 use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::stage::StagePlan;
@@ -277,7 +278,20 @@ fn files(path: &Path, folder: &Path, plan: &mut StagePlan) -> anyhow::Result<()>
         }
         return Ok(());
     }
-    for part in ["", "unet", "vae", "text_encoder", "tokenizer", "scheduler"] {
+    // What stands beside these is as large, and changes nothing: another precision, the model as one file.
+    let diffusers = "diffusion_pytorch_model";
+    for (part, stem) in [
+        ("", None),
+        ("unet", Some(diffusers)),
+        ("vae", Some(diffusers)),
+        ("text_encoder", Some("model")),
+        ("tokenizer", None),
+        ("scheduler", None),
+    ] {
+        let weights = match stem {
+            Some(stem) => weight_files(&folder.join(part), stem),
+            None => [encoder::FILE.to_owned()].into(),
+        };
         let mut names: Vec<PathBuf> = match std::fs::read_dir(folder.join(part)) {
             Ok(entries) => entries
                 .filter_map(|e| e.ok().map(|e| PathBuf::from(e.file_name())))
@@ -286,9 +300,8 @@ fn files(path: &Path, folder: &Path, plan: &mut StagePlan) -> anyhow::Result<()>
         };
         names.sort();
         for name in names {
-            let used = name
-                .extension()
-                .is_some_and(|e| e == "json" || e == "safetensors" || e == "txt");
+            let is_text = name.extension().is_some_and(|e| e == "json" || e == "txt");
+            let used = is_text || weights.contains(name.to_string_lossy().as_ref());
             let location = folder.join(part).join(&name);
             if used && location.is_file() {
                 plan.input("model", &path.join(part).join(&name), &location)?;
@@ -312,6 +325,49 @@ pub fn digest(folder: Option<&Path>) -> anyhow::Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn weights_that_are_not_read_change_no_stage() -> anyhow::Result<()> {
+        let folder = tempfile::tempdir()?;
+        let write = |name: &str, text: &str| -> anyhow::Result<()> {
+            let path = folder.path().join(name);
+            std::fs::create_dir_all(path.parent().context("a folder")?)?;
+            Ok(std::fs::write(path, text)?)
+        };
+        write("model_index.json", "{}")?;
+        write(
+            "unet/diffusion_pytorch_model.safetensors.index.json",
+            r#"{"weight_map": {"a": "1.safetensors", "b": "2.safetensors"}}"#,
+        )?;
+        write("unet/1.safetensors", "1")?;
+        write("unet/2.safetensors", "2")?;
+        write("vae/diffusion_pytorch_model.safetensors", "vae")?;
+        write("text_encoder/model.fp16.safetensors", "text")?;
+        let digest = || digest(Some(folder.path()));
+        let before = digest()?;
+        for name in [
+            "v1-5-pruned.safetensors",
+            "unet/diffusion_pytorch_model.fp16.safetensors",
+            "unet/diffusion_pytorch_model.non_ema.safetensors",
+            "text_encoder/pytorch_model.safetensors",
+        ] {
+            write(name, "another")?;
+            assert_eq!(digest()?, before, "{name}");
+        }
+        for name in [
+            encoder::FILE,
+            "unet/2.safetensors",
+            "vae/diffusion_pytorch_model.safetensors",
+            "text_encoder/model.fp16.safetensors",
+            // Is read before the variant.
+            "text_encoder/model.safetensors",
+        ] {
+            let before = digest()?;
+            write(name, name)?;
+            assert_ne!(digest()?, before, "{name}");
+        }
+        Ok(())
+    }
 
     #[test]
     fn a_scheduler_s_settings_that_nothing_heeds_are_warned_of() {
