@@ -120,6 +120,14 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn seconds_of_no_stage_are_zero_without_a_sign() {
+        let mut score = score(0.1, &of("ours", "", &[]));
+        score.seconds.clear();
+        let seconds = (crate::metrics::SECONDS.of)(&score).unwrap();
+        assert_eq!(format!("{seconds:.1}"), "0.0");
+    }
+
+    #[test]
     fn a_damaged_score_is_named_with_what_to_do() {
         let folder = tempfile::tempdir().unwrap();
         let evaluation = EvaluationFolder::new(folder.path());

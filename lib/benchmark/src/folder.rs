@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use dipir_cli::exit::Usage;
 use dipir_evaluation::results::read_json;
+use dipir_scene::import::load_object;
 use dipir_stages::composite::table::Tone;
 use serde::{Deserialize, Serialize};
 
@@ -86,12 +87,15 @@ impl EvaluationFolder {
         self.run(method, scene).join("composite/composite.png")
     }
 
-    /// Hash of what a scene is: its `scene.json`, its files and its objects' files. A file that cannot be read counts
-    /// as an empty one.
+    /// Hash of what a scene is: its `scene.json`, its files, its objects' files and those that these consist of: materials,
+    /// buffers, textures. A file that cannot be read counts as an empty one.
     pub fn digest(&self, scene: &SceneInfo) -> String {
         let folder = self.scene(&scene.name);
         let pipeline = folder.join("pipeline.toml");
         let mut files = objects(&pipeline).unwrap_or_default();
+        let parts = |object: &PathBuf| load_object(object).map_or(Vec::new(), |o| o.dependencies);
+        let parts: Vec<PathBuf> = files.iter().flat_map(parts).collect();
+        files.extend(parts);
         files.extend([pipeline, folder.join("photo.png"), folder.join(&scene.map)]);
         let mut hash = blake3::Hasher::new();
         hash.update(&serde_json::to_vec(scene).unwrap_or_default());
@@ -221,4 +225,35 @@ fn folders(folder: &Path) -> anyhow::Result<Vec<String>> {
     }
     names.sort();
     Ok(names)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn other_materials_make_another_scene() {
+        let folder = tempfile::tempdir().unwrap();
+        let evaluation = EvaluationFolder::new(folder.path());
+        let info: SceneInfo = serde_json::from_value(serde_json::json!({
+            "name": "a", "made_from": "", "map": "map.exr", "exposure_ev": 0.0, "tone": "none",
+        }))
+        .unwrap();
+        let at = |name: &str| evaluation.scene("a").join(name);
+        fs::create_dir_all(at("")).unwrap();
+        fs::write(at("pipeline.toml"), "[[scene.objects]]\npath = \"a.obj\"\n").unwrap();
+        let mesh = "mtllib a.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+        fs::write(at("a.obj"), mesh).unwrap();
+        let with = |materials: &str| {
+            fs::write(at("a.mtl"), format!("newmtl m\n{materials}\n")).unwrap();
+            evaluation.digest(&info)
+        };
+        let plain = with("Kd 1 0 0");
+        assert_ne!(plain, with("Kd 0 1 0"));
+        assert_eq!(plain, with("Kd 1 0 0"));
+        // A texture counts from when it is there.
+        let without = with("map_Kd a.png");
+        fs::write(at("a.png"), "pixels").unwrap();
+        assert_ne!(without, evaluation.digest(&info));
+    }
 }

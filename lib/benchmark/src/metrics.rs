@@ -67,7 +67,8 @@ pub static METRICS: [Metric; 9] = [
         name: "seconds",
         about: "of all stages of one scene; a stage that methods share counts in the one that ran first, so seconds do not compare methods",
         digits: 1,
-        of: |s| Some(s.seconds.iter().map(|(_, t)| t).sum()),
+        // The sum of no number is -0.
+        of: |s| Some(s.seconds.iter().map(|(_, t)| t).sum::<f64>() + 0.0),
     },
 ];
 

@@ -99,6 +99,7 @@ impl Objects {
             lights: Vec::new(),
             warnings: Vec::new(),
             dependencies: Vec::new(),
+            missing: Vec::new(),
         };
         (shape.word().into(), solid)
     }
