@@ -89,7 +89,7 @@ fn a_texture_that_cannot_be_read_is_told_as_the_scene_stage_tells_it() {
     );
     project.write("object.gltf", document.to_string());
     let message =
-        "error: `\"t.ktx2\"` is a KTX texture; expected a PNG or JPEG image: convert the file";
+        "error: `t.ktx2` is a KTX texture; expected a PNG or JPEG image: convert the file";
     let object = "scene.objects=[{path=\"object.gltf\"}]";
     project.run(SCENE, &["-s", object]).expect_error(1, message);
     project

@@ -1,6 +1,10 @@
 //! Which stages run again after which change: exactly those that depend on it.
 use std::fs;
 
+use dipir_imaging::file::write_png;
+use dipir_imaging::raster::{DisplayImage, Raster};
+use glam::Vec3;
+
 use crate::project::*;
 use crate::whole::{self, STAGES, run_all};
 
@@ -65,6 +69,55 @@ fn changed_bytes_of_an_input_run_the_stages_that_read_it() {
     let photo = project.read("background.png");
     fs::write(project.path("background.png"), &photo).unwrap();
     assert!(run_all(&project, &[]).is_empty());
+}
+
+#[test]
+fn a_texture_that_comes_late_runs_the_scene_again() {
+    let project = Project::new();
+    project.write("object.obj", format!("mtllib a.mtl\nusemtl m\n{OBJECT}"));
+    let status = || project.run(DIPIR, &["status"]).stdout;
+    let run = |done: &str| {
+        let run = project.run(DIPIR, &["run", "--until", "scene"]);
+        run.expect_success();
+        assert_eq!(run.stdout == UP_TO_DATE, done.is_empty(), "{}", run.stdout);
+        assert!(run.stderr.contains(done), "{done}: {}", run.stderr);
+    };
+    const UP_TO_DATE: &str = "nothing to do: scene is up to date\n";
+    run("material library \"a.mtl\" cannot be read (No such file or directory); grey is used");
+    run("");
+    project.write("a.mtl", "newmtl m\nmap_Kd paint.png\n");
+    let told = status();
+    assert!(
+        told.contains("the part of object a.mtl is there now"),
+        "{told}"
+    );
+    run("the texture \"paint.png\" cannot be read (No such file or directory);");
+    run("");
+    // Elsewhere nothing is there, too.
+    let moved = tempfile::tempdir().unwrap();
+    let names = ["pipeline.toml", "background.png", "object.obj", "a.mtl"];
+    for name in names {
+        std::fs::copy(project.path(name), moved.path().join(name)).unwrap();
+    }
+    let there = moved.path().join("out");
+    std::fs::rename(project.path("out"), &there).unwrap();
+    let file = moved.path().join("pipeline.toml");
+    let args = ["run", "--until", "scene", file.to_str().unwrap()];
+    assert_eq!(project.run(DIPIR, &args).stdout, UP_TO_DATE);
+    std::fs::rename(there, project.path("out")).unwrap();
+    write_png(
+        project.path("paint.png"),
+        &DisplayImage(Raster::filled(2, 2, Vec3::new(1.0, 0.0, 0.0))),
+    )
+    .unwrap();
+    let told = status();
+    assert!(
+        told.contains("the part of object paint.png is there now"),
+        "{told}"
+    );
+    run("the part of object paint.png is there now");
+    run("");
+    assert!(!status().contains("is there now"));
 }
 
 #[test]

@@ -17,7 +17,7 @@ use serde_json::Value;
 
 use crate::error::{Damage, StageError};
 use crate::manifest::{Artifact, Manifest};
-use crate::stage::StagePlan;
+use crate::stage::{MISSING, StagePlan};
 
 /// A hash of everything that decides a stage's outputs.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize)]
@@ -210,7 +210,11 @@ impl fmt::Display for StaleReason {
                 write!(f, "{key} changed from {} to {}", shown(was), shown(now))
             }
             Self::InputChanged { role, path } => {
-                write!(f, "the {role} {} has other content", path.display())
+                let path = path.display();
+                match role.strip_prefix(MISSING) {
+                    Some(role) => write!(f, "the {role} {path} is there now"),
+                    None => write!(f, "the {role} {path} has other content"),
+                }
             }
             Self::InputAdded { role } => write!(f, "it now reads the {role}"),
             Self::InputRemoved { role } => write!(f, "it no longer reads the {role}"),
@@ -251,14 +255,17 @@ impl StaleReason {
     /// What has happened to an input, and its role without its number.
     fn about_inputs(&self) -> Option<(&'static str, &str)> {
         let (verb, role) = match self {
-            Self::InputChanged { role, .. } => ("have other content", role),
-            Self::InputAdded { role } => ("are read now", role),
-            Self::InputRemoved { role } => ("are no longer read", role),
+            Self::InputChanged { role, .. } if role.starts_with(MISSING) => {
+                ("are there now", &role[MISSING.len()..])
+            }
+            Self::InputChanged { role, .. } => ("have other content", role.as_str()),
+            Self::InputAdded { role } => ("are read now", role.as_str()),
+            Self::InputRemoved { role } => ("are no longer read", role.as_str()),
             _ => return None,
         };
         let is_number = |n: &str| n.bytes().all(|b| b.is_ascii_digit());
         let base = role.rsplit_once(' ').filter(|(_, n)| is_number(n));
-        Some((verb, base.map_or(role.as_str(), |(base, _)| base)))
+        Some((verb, base.map_or(role, |(base, _)| base)))
     }
 }
 
@@ -511,6 +518,18 @@ mod tests {
             "the seed changed from 0 to 1; 3 files of the model have other content, \
              sd/unet/config.json the first; the photo a.png has other content"
         );
+    }
+
+    #[test]
+    fn files_that_were_missing_are_told_once_they_are_there() {
+        let came = |path: &str| StaleReason::InputChanged {
+            role: format!("{MISSING}part of object"),
+            path: path.into(),
+        };
+        let told = |paths: &[&str]| in_words(&paths.iter().map(|p| came(p)).collect::<Vec<_>>());
+        assert_eq!(told(&["a"]), "the part of object a is there now");
+        let both = "2 files of the part of object are there now, a the first";
+        assert_eq!(told(&["a", "b"]), both);
     }
 
     #[test]

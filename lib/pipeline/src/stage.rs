@@ -16,6 +16,10 @@ use crate::lock::{FolderLock, WhenLocked, create_folder, sibling};
 use crate::manifest::{Artifact, FILE_NAME, Manifest, SCHEMA, check_inside, peak_rss_bytes};
 use crate::mark::{self, Kind, Mark, Owned, foreign, is_empty, is_folder};
 
+/// What begins the role of a file that a run looked for in vain. Another content than that of [`StagePlan::missing`] means
+/// that it is there now.
+pub const MISSING: &str = "missing ";
+
 /// What identifies a run of a stage, before it has run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StagePlan {
@@ -52,6 +56,17 @@ impl StagePlan {
         let artifact = Artifact::of(&self.free_role(role), path, location)?;
         self.inputs.push(artifact);
         Ok(())
+    }
+
+    /// Adds a file that was looked for at `path` and could not be opened, by a role that begins with [`MISSING`].
+    pub fn missing(&mut self, role: &str, path: &Path) {
+        self.inputs.push(Artifact {
+            role: self.free_role(&format!("{MISSING}{role}")),
+            path: path.into(),
+            bytes: 0,
+            // Not that of an empty file, which may be there later.
+            blake3: blake3::hash(b"missing").to_hex().to_string(),
+        });
     }
 
     /// As [`StagePlan::input`], for what is no file: `content`, to be known as `path`.

@@ -1,5 +1,6 @@
 //! What stands in front of the camera: meshes, materials, textures, the camera,
 //! the proxy geometry that receives shadows, and the BVH that finds them.
+mod assembly;
 pub mod bvh;
 pub mod camera;
 pub mod config;

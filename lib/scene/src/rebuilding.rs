@@ -3,13 +3,14 @@ use std::path::Path;
 
 use dipir_cameras::Pose;
 
+use crate::assembly::Assembly;
 use crate::camera::{Camera, CameraSettings};
 use crate::config::EffectsConfig;
 use crate::description::{ObjectRecord, ProxyRecord, SceneDescription};
 use crate::error::Error;
 use crate::ground;
 use crate::proxy::Proxy;
-use crate::scene::{Assembly, Files, LoadedScene, undistort};
+use crate::scene::{Files, LoadedScene, undistort};
 use crate::undistortion::Undistortion;
 
 /// By how much the shapes of a shot's photograph and a frame may differ, relative.
@@ -50,6 +51,7 @@ impl SceneDescription {
             description: self.clone(),
             lights,
             inputs: files.inputs,
+            missing: files.missing,
             warnings: files.warnings,
         })
     }

@@ -9,6 +9,7 @@ use dipir_imaging::transfer::Transfer;
 use dipir_points::Cloud;
 use glam::{DMat4, DVec2};
 
+use crate::assembly::Assembly;
 use crate::camera::{Camera, CameraSettings};
 use crate::config::{ProxySettings, SceneConfig};
 use crate::description::{
@@ -28,7 +29,6 @@ use crate::proxy::Proxy;
 use crate::taken::taken;
 use crate::texture::Texture;
 use crate::undistortion::Undistortion;
-use crate::visibility;
 
 /// Objects to insert, the camera that took the photo, and the proxy that catches the shadow.
 #[derive(Clone, Debug)]
@@ -73,6 +73,8 @@ pub struct LoadedScene {
     pub lights: Vec<PunctualLight>,
     /// All files that were read.
     pub inputs: Vec<Input>,
+    /// Files of objects that could not be opened; the objects are as they are without them.
+    pub missing: Vec<Input>,
     /// One sentence each.
     pub warnings: Vec<String>,
 }
@@ -297,6 +299,7 @@ impl Scene {
             },
             lights,
             inputs: files.inputs,
+            missing: files.missing,
             warnings: files.warnings,
         })
     }
@@ -307,11 +310,23 @@ impl Scene {
     }
 }
 
+fn add_once(list: &mut Vec<Input>, role: &str, path: &Path, base_dir: &Path) {
+    let input = Input {
+        role: role.into(),
+        path: path.into(),
+        location: base_dir.join(path),
+    };
+    if !list.contains(&input) {
+        list.push(input);
+    }
+}
+
 /// Reads files relative to a folder and keeps the list.
 pub(crate) struct Files<'a> {
     base_dir: &'a Path,
-    limits: Limits,
+    pub(crate) limits: Limits,
     pub(crate) inputs: Vec<Input>,
+    pub(crate) missing: Vec<Input>,
     pub(crate) warnings: Vec<String>,
     hashes: HashMap<PathBuf, String>,
 }
@@ -322,13 +337,14 @@ impl<'a> Files<'a> {
             base_dir,
             limits,
             inputs: Vec::new(),
+            missing: Vec::new(),
             warnings: Vec::new(),
             hashes: HashMap::new(),
         }
     }
 
     /// Adds warnings, each once, with the names in them made printable.
-    fn warn(&mut self, warnings: impl IntoIterator<Item = String>) {
+    pub(crate) fn warn(&mut self, warnings: impl IntoIterator<Item = String>) {
         for warning in warnings.into_iter().map(printable) {
             if !self.warnings.contains(&warning) {
                 self.warnings.push(warning);
@@ -337,14 +353,7 @@ impl<'a> Files<'a> {
     }
 
     pub(crate) fn input(&mut self, role: &str, path: &Path) {
-        let input = Input {
-            role: role.into(),
-            path: path.into(),
-            location: self.base_dir.join(path),
-        };
-        if !self.inputs.contains(&input) {
-            self.inputs.push(input);
-        }
+        add_once(&mut self.inputs, role, path, self.base_dir);
     }
 
     /// Notes a file with its hash.
@@ -434,7 +443,11 @@ impl<'a> Files<'a> {
     }
 
     /// Imports an object and notes all files that it consists of.
-    fn import(&mut self, role: &str, path: &Path) -> Result<(Imported, ObjectRecord), Error> {
+    pub(crate) fn import(
+        &mut self,
+        role: &str,
+        path: &Path,
+    ) -> Result<(Imported, ObjectRecord), Error> {
         let imported = import::load_object_within(&self.base_dir.join(path), &self.limits)?;
         let shown = printable(path.display());
         self.warnings.extend(
@@ -445,9 +458,13 @@ impl<'a> Files<'a> {
         );
         let file = self.record(role, path)?;
         let mut dependencies = Vec::new();
+        let (part, base_dir) = (format!("part of {role}"), self.base_dir);
+        let relative = |path| Path::strip_prefix(path, base_dir).unwrap_or(path);
         for found in &imported.dependencies {
-            let relative = found.strip_prefix(self.base_dir).unwrap_or(found);
-            dependencies.push(self.record(&format!("part of {role}"), relative)?);
+            dependencies.push(self.record(&part, relative(found))?);
+        }
+        for missing in &imported.missing {
+            add_once(&mut self.missing, &part, relative(missing), base_dir);
         }
         let record = ObjectRecord {
             file,
@@ -499,102 +516,5 @@ impl<'a> Files<'a> {
             .mesh
             .transform(&DMat4::from_translation(imported.origin));
         Ok((imported.mesh, record))
-    }
-}
-
-/// Puts objects together into one mesh. A file that several objects use is read once, and they share
-/// its materials.
-pub(crate) struct Assembly {
-    camera: Camera,
-    mesh: TriangleMesh,
-    materials: Vec<Material>,
-    textures: Vec<Texture>,
-    lights: Vec<PunctualLight>,
-    /// How many objects of each file are still to come.
-    pending: HashMap<PathBuf, usize>,
-    kept: HashMap<PathBuf, (Imported, ObjectRecord, u32)>,
-}
-
-impl Assembly {
-    pub(crate) fn new(camera: Camera, paths: impl Iterator<Item = PathBuf>) -> Self {
-        let mut pending = HashMap::new();
-        for path in paths {
-            *pending.entry(path).or_insert(0) += 1;
-        }
-        Self {
-            camera,
-            mesh: TriangleMesh::default(),
-            materials: Vec::new(),
-            textures: Vec::new(),
-            lights: Vec::new(),
-            pending,
-            kept: HashMap::new(),
-        }
-    }
-
-    pub(crate) fn into_scene(self, proxy: Proxy) -> (Scene, Vec<PunctualLight>) {
-        let scene = Scene {
-            mesh: self.mesh,
-            materials: self.materials,
-            textures: self.textures,
-            camera: self.camera,
-            proxy,
-        };
-        (scene, self.lights)
-    }
-
-    /// Adds the object in `path`; `place` gives the map from its file's coordinates to the world.
-    pub(crate) fn add<W>(
-        &mut self,
-        files: &mut Files,
-        path: &Path,
-        place: impl FnOnce(&Imported) -> Result<(DMat4, W), Error>,
-    ) -> Result<(ObjectRecord, W), Error> {
-        let (mut imported, mut record, first_material) = match self.kept.remove(path) {
-            Some(kept) => kept,
-            None => {
-                let (mut imported, record) = files.import("object", path)?;
-                let first_material = self.materials.len() as u32;
-                let first_texture = self.textures.len() as u32;
-                for mut material in std::mem::take(&mut imported.materials) {
-                    material.shift_textures(first_texture);
-                    self.materials.push(material);
-                }
-                self.textures.append(&mut imported.textures);
-                (imported, record, first_material)
-            }
-        };
-        let (map, extra) = place(&imported)?;
-        let pending = self.pending.entry(path.into()).or_insert(1);
-        *pending -= 1;
-        self.lights
-            .extend(imported.lights.iter().map(|light| light.placed(&map)));
-        let origin = imported.origin;
-        let mut mesh = if *pending > 0 {
-            let mesh = imported.mesh.clone();
-            let kept = (imported, record.clone(), first_material);
-            self.kept.insert(path.into(), kept);
-            mesh
-        } else {
-            std::mem::take(&mut imported.mesh)
-        };
-        mesh.transform(&(map * DMat4::from_translation(origin)));
-        if let Some(bad) = mesh.first_non_finite() {
-            return Err(Error::NotFinite {
-                place: format!("\"{}\", as placed", path.display()),
-                element: bad as u64,
-                value: format!("{:?}", mesh.positions[bad].to_array()),
-            });
-        }
-        let materials = &self.materials[first_material as usize..];
-        let hidden = visibility::hidden(&mesh, materials, &self.camera).into_iter();
-        files.warn(hidden.map(|why| format!("\"{}\": {why}", path.display())));
-        record.transform = ObjectRecord::rows(&map);
-        let total = self.mesh.positions.len() as u64 + mesh.positions.len() as u64;
-        files
-            .limits
-            .check_mesh(total, (self.mesh.indices.len() + mesh.indices.len()) as u64)?;
-        self.mesh.append(mesh, first_material);
-        Ok((record, extra))
     }
 }

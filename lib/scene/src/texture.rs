@@ -102,7 +102,8 @@ impl ImageSource {
         match self {
             Self::File(path) => {
                 let bytes = dipir_files::read(path).map_err(|e| self.unreadable(e))?;
-                decode(&bytes, &self.name())
+                // The decoder puts it between quotation marks.
+                decode(&bytes, &printable(path.display()))
             }
             Self::Bytes { bytes, .. } => decode(bytes, &self.name()),
         }

@@ -37,12 +37,13 @@ impl Resolver for NoFiles {
     }
 }
 
-/// Finds files relative to a folder and remembers which ones were asked for.
+/// Finds files relative to a folder and remembers which ones were asked for, there or not.
 #[derive(Debug)]
 pub struct Folder {
     path: PathBuf,
     limits: Limits,
     used: RefCell<Vec<PathBuf>>,
+    missing: RefCell<Vec<PathBuf>>,
 }
 
 impl Folder {
@@ -53,12 +54,13 @@ impl Folder {
             path: path.into(),
             limits: *limits,
             used: RefCell::default(),
+            missing: RefCell::default(),
         }
     }
 
-    /// The files found so far, each once, in the order of first use.
-    pub fn into_used(self) -> Vec<PathBuf> {
-        self.used.into_inner()
+    /// The files found so far, and the paths at which none could be opened, each once, in the order of first use.
+    pub fn into_used_and_missing(self) -> (Vec<PathBuf>, Vec<PathBuf>) {
+        (self.used.into_inner(), self.missing.into_inner())
     }
 
     fn find(&self, uri: &str) -> io::Result<PathBuf> {
@@ -79,18 +81,19 @@ impl Folder {
         let paths = guesses.map(|guess| self.path.join(guess));
         let found = paths.iter().find(|path| path.is_file());
         let found = found.unwrap_or(&paths[0]).clone();
+        // Opened to refuse now what is no regular file, though it be read later.
+        let file = dipir_files::open(&found).inspect_err(|_| match found.is_file() {
+            true => note(&self.missing, &found),
+            false => paths.iter().for_each(|path| note(&self.missing, path)),
+        });
         if !allow_outside && !self.holds(&found)? {
             return Err(outside());
         }
-        // Opened to refuse now what is no regular file, though it be read later.
-        let bytes = dipir_files::open(&found)?.metadata()?.len();
+        let bytes = file?.metadata()?.len();
         self.limits
             .check_bytes(bytes)
             .map_err(|e| io::Error::new(io::ErrorKind::FileTooLarge, e.to_string()))?;
-        let mut used = self.used.borrow_mut();
-        if !used.contains(&found) {
-            used.push(found.clone());
-        }
+        note(&self.used, &found);
         Ok(found)
     }
 
@@ -101,6 +104,14 @@ impl Folder {
             false => &self.path,
         };
         Ok(file.canonicalize()?.starts_with(folder.canonicalize()?))
+    }
+}
+
+/// Adds a path once.
+fn note(list: &RefCell<Vec<PathBuf>>, path: &Path) {
+    let mut list = list.borrow_mut();
+    if !list.iter().any(|known| known == path) {
+        list.push(path.into());
     }
 }
 
@@ -130,8 +141,15 @@ impl Resolver for Folder {
         dipir_files::read(self.find(uri)?)
     }
 
+    /// Exporters name a texture by where it lay on their machine: beside the object it is looked for, too.
     fn image(&self, uri: &str) -> io::Result<ImageSource> {
-        self.find(uri).map(ImageSource::File)
+        let bare = uri.rsplit(['/', '\\']).next().unwrap_or_default();
+        let found = self.find(uri).or_else(|e| match e.kind() {
+            io::ErrorKind::FileTooLarge => Err(e),
+            _ if bare.is_empty() => Err(e),
+            _ => self.find(bare).map_err(|_| e),
+        });
+        found.map(ImageSource::File)
     }
 }
 
@@ -148,8 +166,9 @@ pub(super) fn image(
         Ok(image) => Ok(Some(image)),
         Err(e) if e.kind() == io::ErrorKind::NotFound || e.raw_os_error().is_some() => {
             warnings.push(format!(
-                "{what} \"{}\" cannot be read ({e}); the material's factors alone are used",
-                path.display()
+                "{what} \"{}\" cannot be read ({}); the material's factors alone are used",
+                path.display(),
+                plain_reason(&e)
             ));
             Ok(None)
         }
@@ -159,6 +178,12 @@ pub(super) fn image(
             source,
         }),
     }
+}
+
+/// An error without the number of the operating system, for messages.
+pub(super) fn plain_reason(error: &io::Error) -> String {
+    let text = error.to_string();
+    text.split(" (os error").next().unwrap_or_default().into()
 }
 
 /// Where a file that was asked for would have to lie, for messages.

@@ -122,6 +122,7 @@ pub fn load_gltf_bytes(
         lights,
         warnings,
         dependencies: Vec::new(),
+        missing: Vec::new(),
     }
     .checked(limits)
 }

@@ -263,12 +263,16 @@ impl<'a> MeshReader<'a> {
         at: &str,
         mesh: &mut TriangleMesh,
     ) -> Result<(), Error> {
+        let surface = self.materials.get(material);
+        let is_anisotropic = surface.is_some_and(|m| m.extensions.anisotropy.is_some());
         for set in 0..2 {
+            // Where there are no tangents, the first set says which way highlights are longer.
+            let name = Semantic::TexCoords(set);
+            let turns = set == 0 && is_anisotropic && attribute(primitive, name.clone()).is_some();
             let used = self.material_uses(material, |t| u32::from(t.uv_set) == set);
-            if !used {
+            if !used && !turns {
                 continue;
             }
-            let name = Semantic::TexCoords(set);
             let finite = |uv| {
                 let uv = Vec2::from_array(uv);
                 if uv.is_finite() { uv } else { Vec2::ZERO }
@@ -305,8 +309,6 @@ impl<'a> MeshReader<'a> {
                 "{at}: COLOR_{set} is not read; only COLOR_0 is part of the surface"
             ));
         }
-        let surface = self.materials.get(material);
-        let is_anisotropic = surface.is_some_and(|m| m.extensions.anisotropy.is_some());
         if (is_anisotropic || self.normal_map(material).is_some()) && !mesh.normals.is_empty() {
             let unit = |[x, y, z, w]: [f32; 4]| {
                 let direction = DVec3::new(x.into(), y.into(), z.into());

@@ -52,6 +52,8 @@ pub struct Imported {
     pub warnings: Vec<String>,
     /// Further files that the object consists of (buffers, images, material libraries).
     pub dependencies: Vec<PathBuf>,
+    /// Where files of it were looked for and could not be opened: it is as it is without them.
+    pub missing: Vec<PathBuf>,
 }
 
 /// Extensions of the kinds of file that are read.
@@ -109,7 +111,7 @@ pub fn load_object_within(path: &Path, limits: &Limits) -> Result<Imported, Erro
         Ok(()) => e.in_file(path),
         Err(source) => unreadable(path, source),
     })?;
-    imported.dependencies = folder.into_used();
+    (imported.dependencies, imported.missing) = folder.into_used_and_missing();
     for texture in &mut imported.textures {
         if let ImageSource::Bytes { name, .. } = &mut texture.image {
             *name = format!("{}: {name}", path.display());
@@ -144,6 +146,7 @@ impl Imported {
             lights: Vec::new(),
             warnings: Vec::new(),
             dependencies: Vec::new(),
+            missing: Vec::new(),
         }
     }
 

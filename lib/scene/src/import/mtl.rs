@@ -10,8 +10,14 @@ use glam::{Mat3, Vec2, Vec3, Vec4};
 
 use super::container::{self, Resolver};
 use crate::error::Error;
-use crate::material::{AlphaMode, Material, TextureRef};
+use crate::material::{AlphaMode, Clearcoat, Material, TextureRef};
 use crate::texture::{Encoding, Filter, Texture, Wrap};
+
+/// Statements that change what a surface looks like and are not read.
+const LEFT_OUT: [&str; 13] = [
+    "Ps", "aniso", "map_Ks", "map_Ns", "map_Ps", "map_Pc", "map_Pcr", "map_Tr", "map_refl",
+    "map_disp", "disp", "decal", "refl",
+];
 
 /// What a triangle without a material gets.
 pub(super) fn grey() -> Material {
@@ -63,6 +69,8 @@ pub(super) struct Library {
     pub materials: Vec<Material>,
     pub textures: Vec<Texture>,
     pub warnings: Vec<String>,
+    /// Materials with a `map_Bump`, which may be one of heights, and how that is written.
+    bumps: Vec<(usize, String)>,
     by_name: HashMap<String, u32>,
     by_file: HashMap<(String, Encoding, bool), u32>,
 }
@@ -76,6 +84,10 @@ struct Draft {
     roughness_file: Option<String>,
     metallic_file: Option<String>,
     alpha_file: Option<String>,
+    /// Weight and roughness of the coat.
+    coat: [f32; 2],
+    /// Statements that change the surface and are not read.
+    left_out: Vec<String>,
     /// Whether the file of `map_Ke` is missing.
     lacks_emission: bool,
     /// Whether `d` was written.
@@ -141,6 +153,13 @@ impl Library {
         draft: &mut Draft,
     ) -> Result<(), Error> {
         let unit = |rest| number(rest).map(|v| v.clamp(0.0, 1.0));
+        let is_map = word.starts_with("map_") || ["norm", "bump"].contains(&word);
+        if is_map && Map::parse(rest).file.is_empty() {
+            let name = &material.name;
+            self.warnings
+                .push(format!("material \"{name}\": {word} names no file"));
+            return Ok(());
+        }
         match word {
             "Kd" => {
                 let alpha = material.base_color.w;
@@ -158,6 +177,9 @@ impl Library {
             }
             "Pr" => draft.roughness = Some(unit(rest)?),
             "Pm" => material.metallic = unit(rest)?,
+            "Pc" => draft.coat[0] = unit(rest)?,
+            "Pcr" => draft.coat[1] = unit(rest)?,
+            "Ps" | "aniso" if number(rest)? == 0.0 => {}
             "d" => {
                 material.base_color.w = unit(rest)?;
                 draft.has_opacity = true;
@@ -194,16 +216,14 @@ impl Library {
             "map_Pm" => draft.metallic_file = Some(Map::parse(rest).file),
             "map_d" => draft.alpha_file = Some(Map::parse(rest).file),
             "norm" | "map_Bump" | "map_bump" | "bump" => {
-                if word != "norm" {
-                    self.warnings.push(format!(
-                        "material \"{}\": {word} is read as a normal map",
-                        material.name
-                    ));
-                }
                 let map = Map::parse(rest);
                 let texture = self.texture(&map, folder, resolver, Encoding::Linear)?;
                 material.normal_texture = texture.map(|texture| (texture, map.bump));
+                if word != "norm" {
+                    self.bumps.push((self.materials.len(), word.into()));
+                }
             }
+            word if LEFT_OUT.contains(&word) => draft.left_out.push(word.into()),
             _ => {}
         }
         Ok(())
@@ -249,6 +269,21 @@ impl Library {
                 "material \"{name}\": without map_Ke it does not emit light"
             ));
         }
+        if draft.coat[0] > 0.0 {
+            material.clearcoat = Some(Clearcoat {
+                factor: draft.coat[0],
+                factor_texture: None,
+                roughness: draft.coat[1],
+                roughness_texture: None,
+                normal_texture: None,
+            });
+        }
+        if !draft.left_out.is_empty() {
+            self.warnings.push(format!(
+                "material \"{name}\": {} not supported and left out",
+                draft.left_out.join(", ")
+            ));
+        }
         if material.base_color.w < 1.0 {
             material.alpha_mode = AlphaMode::Blend;
         }
@@ -257,6 +292,32 @@ impl Library {
         self.by_name.entry(short).or_insert(index);
         self.by_name.insert(name, index);
         self.materials.push(material);
+    }
+
+    /// Leaves out each `map_Bump` that is grey: it holds heights, and as normals these would tilt the whole surface.
+    pub fn drop_heights(&mut self) {
+        for (i, word) in &self.bumps {
+            let material = &mut self.materials[*i];
+            let Some((texture, _)) = material.normal_texture else {
+                continue;
+            };
+            let is_grey = |&[r, g, b, _]: &[u8; 4]| r == g && g == b;
+            // What cannot be decoded is told where it is looked up.
+            let decoded = self.textures[texture.texture as usize].decode();
+            let holds_heights =
+                decoded.is_ok_and(|image| image.texels().pixels().iter().all(is_grey));
+            if holds_heights {
+                material.normal_texture = None;
+            }
+            self.warnings.push(format!(
+                "material \"{}\": {word} is {}",
+                material.name,
+                match holds_heights {
+                    true => "grey, a map of heights, and left out; bake it into a normal map",
+                    false => "read as a normal map",
+                }
+            ));
+        }
     }
 
     /// `None`, with a warning, if the file is missing.
@@ -347,9 +408,15 @@ impl Map {
             Vec3::new(0.0, scale.y, 0.0),
             Vec3::new(offset.x, 1.0 - scale.y - offset.y, 1.0),
         );
-        map.file = rest.trim().replace('\\', "/");
+        map.file = unquoted(rest.trim()).replace('\\', "/");
         map
     }
+}
+
+/// A name without the quotation marks that some exporters put around one with blanks.
+pub(super) fn unquoted(name: &str) -> &str {
+    let inner = name.strip_prefix('"').and_then(|n| n.strip_suffix('"'));
+    inner.unwrap_or(name)
 }
 
 /// The first word and what follows it.

@@ -15,6 +15,7 @@ use super::{Imported, Limits, polygon};
 use crate::error::Error;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
+use crate::texture::check_sizes;
 
 const EXPORT: &str = "export the file again";
 
@@ -82,7 +83,8 @@ impl From<Error> for Problem {
 struct Reader {
     limits: Limits,
     positions: Vec<Vec3>,
-    colors: Vec<Vec4>,
+    /// Display-referred, of the vertices that have one.
+    colors: Vec<Option<Vec3>>,
     uvs: Vec<Vec2>,
     normals: Vec<Vec3>,
     mesh: TriangleMesh,
@@ -117,11 +119,15 @@ impl Reader {
             }
             "f" => self.face(rest)?,
             "usemtl" => self.use_material(rest),
-            "mtllib" => self.read_library(rest, resolver)?,
+            "mtllib" => self.read_library(mtl::unquoted(rest), resolver)?,
             "p" | "l" => self
                 .warnings
                 .push("points and lines are not drawn".to_owned()),
-            // Objects, groups and smoothing do not matter here; curves and surfaces are rare.
+            "curv" | "curv2" | "surf" => self.warnings.push(
+                "curves and free-form surfaces are not drawn: export the object as a mesh"
+                    .to_owned(),
+            ),
+            // Objects, groups and smoothing do not matter here.
             _ => {}
         }
         Ok(())
@@ -138,28 +144,14 @@ impl Reader {
             }
             .into());
         }
-        // Three more numbers are a display-referred colour; a single one is a weight.
+        // Three more numbers are a colour; a single one is a weight.
         if count >= 6 {
-            let linear = |x: f32| {
-                if x.is_finite() {
-                    Transfer::Srgb.decode_scalar(x.clamp(0.0, 1.0))
-                } else {
-                    1.0
-                }
-            };
-            self.colors.resize(self.positions.len(), Vec4::ONE);
-            let k = count - 3;
-            let k = if count == 7 { k - 1 } else { k };
-            self.colors.push(Vec4::new(
-                linear(v[k]),
-                linear(v[k + 1]),
-                linear(v[k + 2]),
-                1.0,
-            ));
+            self.colors.resize(self.positions.len(), None);
+            self.colors.push(Some(Vec3::new(v[3], v[4], v[5])));
         }
         self.positions.push(position);
         if !self.colors.is_empty() {
-            self.colors.resize(self.positions.len(), Vec4::ONE);
+            self.colors.resize(self.positions.len(), None);
         }
         Ok(())
     }
@@ -241,8 +233,9 @@ impl Reader {
                 .split_whitespace()
                 .try_for_each(|one| self.read_library(one, resolver)),
             Err(e) => {
+                let reason = container::plain_reason(&e);
                 self.warnings.push(format!(
-                    "material library \"{name}\" cannot be read ({e}); grey is used"
+                    "material library \"{name}\" cannot be read ({reason}); grey is used"
                 ));
                 Ok(())
             }
@@ -255,6 +248,8 @@ impl Reader {
                 remedy: "check that the file has faces (f)",
             });
         }
+        check_sizes(&self.library.textures, &self.limits)?;
+        self.library.drop_heights();
         let mut materials = std::mem::take(&mut self.library.materials);
         let default = materials.len() as u32;
         for m in &mut self.mesh.materials {
@@ -274,6 +269,7 @@ impl Reader {
             lights: Vec::new(),
             warnings,
             dependencies: Vec::new(),
+            missing: Vec::new(),
         }
         .checked(&self.limits)
     }
@@ -299,6 +295,12 @@ impl Reader {
         if !self.colors.is_empty() {
             self.mesh.colors = vec![Vec4::ONE; n];
         }
+        let finite = self.colors.iter().flatten().filter(|c| c.is_finite());
+        let white = match finite.map(|c| c.max_element()).fold(0.0, f32::max) {
+            // Some tools write bytes.
+            most if most >= 2.0 => 255.0,
+            _ => 1.0,
+        };
         for (&(v, vt, vn), &i) in &self.vertices {
             let i = i as usize;
             if let (Some(vt), Some(uv)) = (vt, self.mesh.uvs[0].get_mut(i)) {
@@ -308,7 +310,7 @@ impl Reader {
                 *normal = self.normals[vn as usize];
             }
             if let Some(color) = self.mesh.colors.get_mut(i) {
-                *color = self.colors[v as usize];
+                *color = linear(self.colors[v as usize], white);
             }
         }
         if self.has[1] {
@@ -326,6 +328,16 @@ impl Reader {
             tangents::generate(&mut self.mesh, 0, &normal_map);
         }
     }
+}
+
+/// A display-referred colour on a scale from 0 to `white`; white where there is none.
+fn linear(color: Option<Vec3>, white: f32) -> Vec4 {
+    let decode = |x: f32| match x.is_finite() {
+        true => Transfer::Srgb.decode_scalar((x / white).clamp(0.0, 1.0)),
+        false => 1.0,
+    };
+    let color = color.unwrap_or(Vec3::splat(white));
+    Vec3::from_array(color.to_array().map(decode)).extend(1.0)
 }
 
 /// Whether these are the names of several libraries.

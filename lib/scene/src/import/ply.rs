@@ -54,8 +54,22 @@ pub fn load_ply_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
             })?;
         }
     }
-    reader.finish()
+    let mut imported = reader.finish()?;
+    let properties = header.elements.iter().flat_map(|e| &e.properties);
+    if properties
+        .into_iter()
+        .any(|p| COORDINATES.contains(&p.name.as_str()))
+    {
+        imported.warnings.push(
+            "texture coordinates and textures are not read: convert it, for instance by MeshLab to a .obj or .glb file"
+                .into(),
+        );
+    }
+    Ok(imported)
 }
+
+/// Names of texture coordinates.
+const COORDINATES: [&str; 5] = ["texcoord", "s", "u", "texture_u", "s1"];
 
 /// What a property of a vertex is: position, normal and colour, three each.
 type Slots = Vec<Option<usize>>;

@@ -266,7 +266,7 @@ fn a_missing_texture_is_warned_of_and_the_factors_alone_are_used() {
     assert_eq!(
         imported.warnings,
         [
-            "the texture images[0] \"no paint.png\" cannot be read (No such file or directory (os error 2)); the material's factors alone are used",
+            "the texture images[0] \"no paint.png\" cannot be read (No such file or directory); the material's factors alone are used",
             "materials[0]: without emissiveTexture it does not emit light",
         ]
     );
@@ -275,6 +275,8 @@ fn a_missing_texture_is_warned_of_and_the_factors_alone_are_used() {
     assert!(material.base_color_texture.is_none() && material.normal_texture.is_none());
     assert_eq!(material.emissive.to_array(), [0.0; 3]);
     assert!(imported.textures.is_empty() && imported.dependencies.is_empty());
+    let looked_for = ["no paint.png", "no%20paint.png"].map(|name| folder.path().join(name));
+    assert_eq!(imported.missing, looked_for);
     // What a limit refuses is an error.
     glb.json["images"][0]["uri"] = json!("../paint.png");
     std::fs::write(&path, glb.bytes()).unwrap();

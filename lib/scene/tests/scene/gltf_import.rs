@@ -417,6 +417,10 @@ fn tangents_of_an_anisotropic_surface_arrive_without_a_normal_map() {
         glb.load().mesh.tangents,
         [Vec4::new(0.0, 1.0, 0.0, -1.0); 4]
     );
+    // Else the texture coordinates say where it points, though there is no texture.
+    let attributes = &mut glb.json["meshes"][0]["primitives"][0]["attributes"];
+    attributes.as_object_mut().unwrap().remove("TANGENT");
+    assert_eq!(glb.load().mesh.uvs[0].len(), 4);
 }
 
 #[test]

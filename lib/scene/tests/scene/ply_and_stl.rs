@@ -90,6 +90,25 @@ fn binary_plys_of_both_byte_orders_mean_the_same() {
 }
 
 #[test]
+fn texture_coordinates_of_a_ply_are_left_out_with_a_warning() {
+    let with = |properties: &str, values: &str| {
+        let vertices = ["0 0 0", "1 0 0", "0 1 0"].map(|v| format!("{v}{values}\n"));
+        let text = format!(
+            "ply\nformat ascii 1.0\ncomment TextureFile a.png\nelement vertex 3\nproperty float x\nproperty float y\n\
+             property float z\n{properties}element face 1\nproperty list uchar int vertex_indices\nend_header\n{}3 0 1 2\n",
+            vertices.concat()
+        );
+        ply(&text).unwrap().warnings
+    };
+    assert!(with("", "").is_empty());
+    let told = with("property float s\nproperty float t\n", " 0 1");
+    assert!(
+        told.len() == 1 && told[0].starts_with("texture coordinates and textures are not read"),
+        "{told:?}"
+    );
+}
+
+#[test]
 fn a_cloud_of_points_is_refused_with_what_to_do() {
     let cloud = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n\
         property float z\nend_header\n0 0 0\n1 1 1\n";

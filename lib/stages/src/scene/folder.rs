@@ -5,7 +5,7 @@ use dipir_cli::session::Session;
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::fingerprint::{StaleReason, parameter_changes};
 use dipir_pipeline::manifest::{Artifact, Manifest};
-use dipir_pipeline::stage::StagePlan;
+use dipir_pipeline::stage::{MISSING, StagePlan};
 use dipir_render::effects::EffectsPlan;
 use dipir_scene::description::SceneDescription;
 use dipir_scene::scene::LoadedScene;
@@ -33,6 +33,7 @@ impl SceneFolder {
         let folder = SCENE.folder(session);
         let manifest = manifest(session)?;
         warn_of_other_settings(session, &manifest)?;
+        refuse_new_parts(session, &manifest)?;
         let description = SceneDescription::read(&manifest.output(&folder, "scene")?)?;
         let effects: EffectsPlan = read_json(&manifest.output(&folder, "effects")?)?;
         let loaded = description.load(&session.config.base_dir())?;
@@ -56,9 +57,27 @@ pub fn add_inputs(plan: &mut StagePlan, scene: &Manifest, roles: &[&str]) -> any
     plan.outputs_of(scene, roles)?;
     // What camera and points tell is in scene.json, the light's has a role of its own.
     let told = ["camera", "points", "environment"];
-    let made_of = |a: &&Artifact| !told.contains(&unnumbered(&a.role));
+    let made_of =
+        |a: &&Artifact| !told.contains(&unnumbered(&a.role)) && !a.role.starts_with(MISSING);
     plan.inputs
         .extend(scene.inputs.iter().filter(made_of).cloned());
+    Ok(())
+}
+
+/// Refuses a scene that lacks a file which is there now: its object would be read otherwise than it was.
+fn refuse_new_parts(session: &Session, manifest: &Manifest) -> anyhow::Result<()> {
+    for part in &manifest.inputs {
+        if let Some(role) = part.role.strip_prefix(MISSING)
+            && dipir_files::open(session.resolve(&part.path)).is_ok()
+        {
+            anyhow::bail!(
+                "the {} \"{}\" is there now and was missing when the scene was set up; run {} again",
+                unnumbered(role),
+                part.path.display(),
+                SCENE.executable
+            );
+        }
+    }
     Ok(())
 }
 

@@ -14,7 +14,7 @@ use dipir_cli::session::{Session, duration, size};
 use dipir_optimize::settings::{LightTable, Settings as RecoverySettings};
 use dipir_pipeline::config::Config;
 use dipir_pipeline::manifest::{Artifact, Manifest};
-use dipir_pipeline::stage::StagePlan;
+use dipir_pipeline::stage::{MISSING, StagePlan};
 use dipir_points::Ground;
 use dipir_render::effects::EffectsPlan;
 use dipir_render::gbuffer::GBuffer;
@@ -87,10 +87,13 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     let recovery = transport::settings(session, &table)?;
     let recorded = Method::of(session)?.replays().then_some(&recovery);
     let read = loaded.inputs.iter();
-    let plan_of_this = plan_with(
+    let mut plan_of_this = plan_with(
         session,
         read.map(|i| (i.role.as_str(), i.path.as_path(), i.location.as_path())),
     )?;
+    for part in &loaded.missing {
+        plan_of_this.missing(&part.role, &part.path);
+    }
     let folder = SCENE.folder(session);
     let mut writer = begin(session, plan_of_this)?;
 
@@ -207,21 +210,21 @@ fn record(
 /// What begins the role of a file that an object consists of.
 const PART_OF: &str = "part of ";
 
-/// What a run would be. The files that an object consists of are known only once it has been read.
-/// They are taken from the manifest of the last run: the same object has the same files.
+/// What a run would be. The files that an object consists of, and those of them that are missing, are known only once it has
+/// been read. They are taken from the manifest of the last run: the same object has the same files.
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
     let recorded = match SCENE.manifest(session) {
         Ok(manifest) => manifest.inputs,
         Err(_) => Vec::new(),
     };
-    let parts = recorded.iter().filter(|a| a.role.starts_with(PART_OF));
-    let parts: Vec<&Artifact> = parts.collect();
+    let is_part = |a: &&Artifact| a.role.starts_with(PART_OF) || is_missing(a);
+    let parts: Vec<&Artifact> = recorded.iter().filter(is_part).collect();
     let whole = plan_with_parts(session, &parts);
     if whole.is_ok() {
         return whole;
     }
     // Another object has other files.
-    let is_there = |part: &&Artifact| session.resolve(&part.path).exists();
+    let is_there = |p: &&Artifact| is_missing(p) || session.resolve(&p.path).exists();
     let (there, gone): (Vec<_>, Vec<_>) = parts.into_iter().partition(is_there);
     let is_of_another = |part: &&Artifact, now: &StagePlan| {
         let object = unnumbered(&part.role).trim_start_matches(PART_OF);
@@ -245,10 +248,17 @@ fn is_dispensable(part: &Artifact) -> bool {
     part.path.extension().is_some_and(|e| e != "bin")
 }
 
-/// The plan with the files that the configuration names and these `parts` of objects.
+/// Whether the last run looked for this in vain.
+fn is_missing(part: &Artifact) -> bool {
+    part.role.starts_with(MISSING)
+}
+
+/// The plan with the files that the configuration names and these `parts` of objects, missing ones among them.
 fn plan_with_parts(session: &Session, parts: &[&Artifact]) -> anyhow::Result<StagePlan> {
     let config: SceneConfig = session.config.table("scene")?;
     let named = named_files(&config, &session.config.base_dir());
+    let (missing, parts): (Vec<&Artifact>, Vec<&Artifact>) =
+        parts.iter().partition(|p| is_missing(p));
     let parts = parts.iter();
     let files = named
         .iter()
@@ -257,12 +267,19 @@ fn plan_with_parts(session: &Session, parts: &[&Artifact]) -> anyhow::Result<Sta
     let files: Vec<_> = files
         .map(|(role, path)| (role, path, session.resolve(path)))
         .collect();
-    plan_with(
+    let mut plan = plan_with(
         session,
         files
             .iter()
             .map(|(role, path, at)| (*role, *path, at.as_path())),
-    )
+    )?;
+    for part in missing {
+        let (role, path) = (unnumbered(&part.role), &part.path);
+        if plan.input(role, path, &session.resolve(path)).is_err() {
+            plan.missing(&role[MISSING.len()..], path);
+        }
+    }
+    Ok(plan)
 }
 
 /// The keys of `[scene]` that decide what the stage writes. Left out are `class`, which only stages that ask a model use,
@@ -446,8 +463,8 @@ mod tests {
 
     #[test]
     fn a_part_that_is_gone_keeps_a_scene_from_running_only_where_the_object_needs_it() {
-        let folder = tempfile::tempdir().unwrap();
-        let at = |name: &str| folder.path().join(name);
+        let here = tempfile::tempdir().unwrap();
+        let at = |name: &str| here.path().join(name);
         let photo = DisplayImage(Raster::filled(36, 24, Vec3::splat(0.5)));
         write_png(at("photo.png"), &photo).unwrap();
         // A triangle whose corners are in another file.
@@ -487,6 +504,16 @@ mod tests {
         let lacks = "it no longer reads the part of object 2";
         assert_eq!(told().unwrap(), lacks);
         run(&session).unwrap();
+        assert_eq!(told(), Ok(String::new()));
+        // It is there again.
+        write_png(at("grey.png"), &photo).unwrap();
+        assert_eq!(told().unwrap(), "the part of object grey.png is there now");
+        let refused = folder::SceneFolder::read(&session).err().unwrap();
+        assert_eq!(
+            refused.to_string(),
+            "the part of object \"grey.png\" is there now and was missing when the scene was set up; run dipir-scene again"
+        );
+        fs::remove_file(at("grey.png")).unwrap();
         assert_eq!(told(), Ok(String::new()));
         fs::rename(at("a.bin"), at("b.bin")).unwrap();
         let missing = told().unwrap_err();
