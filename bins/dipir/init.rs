@@ -183,6 +183,10 @@ fn said(draft: &Draft) -> String {
     if let Some(points) = &document.points {
         text += &format!("  ground: {}\n", points.words);
     }
+    if !document.views.is_empty() {
+        let views = document.views.join(", ");
+        text += &format!("  light: told by {views}, too, which look elsewhere\n");
+    }
     for object in &document.objects {
         let [x, y] = object.at_pixel;
         let place = match object.auto {
@@ -215,6 +219,7 @@ fn json(draft: &Draft) -> Value {
             "direction_why": view.aim_why,
             "fov_deg": view.fov_deg, "fov_why": view.fov_why,
         },
+        "views": document.views,
         "objects": objects.map(|o| json!({
             "path": o.path, "at_pixel": o.at_pixel, "appears_px": o.appears_px,
             "size_why": o.size_why,

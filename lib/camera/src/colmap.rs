@@ -123,14 +123,11 @@ pub fn read_camera(
     file.camera(&file.images[choose(&names)?], up)
 }
 
-/// The rotations of a model's cameras in its own world, without those that cannot be read. Errors as [`read_camera`].
-pub(crate) fn rotations(files: &Files) -> Result<Vec<DMat3>, CameraError> {
+/// The cameras of a model's pictures, without those that cannot be read. Errors as [`read_camera`].
+pub(crate) fn pictures(files: &Files, up: WorldUp) -> Result<Vec<(String, Camera)>, CameraError> {
     let file = Contents::of_cameras(files)?;
-    let cameras = file
-        .images
-        .iter()
-        .filter_map(|i| file.camera(i, WorldUp::Y).ok());
-    Ok(cameras.map(|camera| camera.pose.rotation).collect())
+    let named = |i: &Image| Some((i.name.clone(), file.camera(i, up).ok()?));
+    Ok(file.images.iter().filter_map(named).collect())
 }
 
 /// The points of `points3D.txt` or, if `binary`, `points3D.bin`. Errors as [`read_camera`].

@@ -84,6 +84,26 @@ pub fn read(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
     Ok(found)
 }
 
+/// The pictures of `transforms.json` or of COLMAP's model at `path`, by the names in it, and their cameras: without those that
+/// cannot be read, and none of other files. A `transforms.json` may leave sizes to the pictures: its lenses are of no use.
+pub fn pictures(path: &Path, up: Option<WorldUp>) -> Vec<(String, Camera)> {
+    if let Some(files) = colmap::Files::at(path) {
+        return colmap::pictures(&files, up.unwrap_or(WorldUp::MinusY)).unwrap_or_default();
+    }
+    let is_json = path
+        .extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("json"));
+    let Some(bytes) = is_json.then(|| dipir_files::read(path).ok()).flatten() else {
+        return Vec::new();
+    };
+    let bytes = dipir_files::without_byte_order_mark(&bytes);
+    let frames = transforms::frames(bytes, Some([1e3, 1e3]), up.unwrap_or(WorldUp::Z));
+    let frames = frames.unwrap_or_default().into_iter();
+    frames
+        .filter_map(|(name, own)| Some((name, own.ok()?)))
+        .collect()
+}
+
 /// Whether the file in `path` has one camera, whatever a picture is called. A file that cannot be read has none.
 pub fn has_one(path: &Path) -> bool {
     let wanted = Wanted {

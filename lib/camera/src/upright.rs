@@ -4,7 +4,8 @@ use std::path::Path;
 use glam::{DMat3, DVec3};
 
 use crate::camera::WorldUp;
-use crate::{colmap, transforms};
+use crate::colmap;
+use crate::file::pictures;
 
 /// Fewest pictures whose mean is believed.
 const FEWEST: usize = 5;
@@ -19,10 +20,12 @@ const MEANT: f64 = 0.866;
 /// A warning if the pictures of the file at `path` are upright by another axis than the one that points up where nobody
 /// says which, of files whose programs differ in that: `transforms.json` and COLMAP's.
 pub fn doubt(path: &Path) -> Option<String> {
-    let (own, rotations) = match colmap::Files::at(path) {
-        Some(files) => (WorldUp::MinusY, colmap::rotations(&files).ok()?),
-        None => (WorldUp::Z, of_transforms(path)?),
+    let own = match colmap::Files::at(path) {
+        Some(_) => WorldUp::MinusY,
+        None => WorldUp::Z,
     };
+    let pictures = pictures(path, Some(WorldUp::Y));
+    let rotations: Vec<DMat3> = pictures.iter().map(|p| p.1.pose.rotation).collect();
     let meant = meant(&rotations, own)?.word();
     let name = path.file_name().unwrap_or(path.as_os_str());
     let own = own.word();
@@ -30,18 +33,6 @@ pub fn doubt(path: &Path) -> Option<String> {
         "the pictures of {name:?} are upright if {meant} of its world points up, and {own} is taken: write file_up = {meant:?} \
          (dipir init: --camera-up), or file_up = {own:?} if that is right"
     ))
-}
-
-fn of_transforms(path: &Path) -> Option<Vec<DMat3>> {
-    let is_json = path
-        .extension()
-        .is_some_and(|e| e.eq_ignore_ascii_case("json"));
-    let bytes = is_json.then(|| dipir_files::read(path).ok()).flatten()?;
-    let bytes = dipir_files::without_byte_order_mark(&bytes);
-    // Lenses of any picture do.
-    let frames = transforms::frames(bytes, Some([1e3, 1e3]), WorldUp::Y).ok()?;
-    let cameras = frames.into_iter().filter_map(|(_, camera)| camera.ok());
-    Some(cameras.map(|camera| camera.pose.rotation).collect())
 }
 
 /// The axis by which cameras with these rotations are upright, if they are not by `own`.

@@ -44,6 +44,8 @@ pub struct Document {
     pub view: View,
     /// Its file, as the configuration names it, where the view has one.
     pub camera_file: Option<String>,
+    /// Other photographs of the place with cameras in that file, as the configuration names them.
+    pub views: Vec<String>,
     /// Points that tell the ground.
     pub points: Option<Points>,
     /// Limits that the models exceed.
@@ -96,6 +98,10 @@ impl Document {
                 number(self.view.ground_y, 6)
             ),
         };
+        for (k, view) in self.views.iter().enumerate() {
+            text += if k == 0 { ELSEWHERE } else { "" };
+            text += &format!("[[scene.views]]\nbackground = {}\n\n", quoted(view));
+        }
         if !self.raised.is_empty() {
             text += "[scene.limits]\n";
             for raised in &self.raised {
@@ -123,6 +129,9 @@ impl Document {
     }
 }
 
+/// Stands before other photographs of the place.
+const ELSEWHERE: &str =
+    "# other pictures of the camera's file, which look elsewhere: they tell the light, too\n";
 /// What appears smaller shows little of itself, pixels.
 const SMALL_PX: f64 = 24.0;
 /// What is this many times as wide as high is told by its width.
@@ -342,6 +351,7 @@ mod tests {
             }],
             view,
             camera_file: None,
+            views: Vec::new(),
             points: None,
             raised: vec![],
         }

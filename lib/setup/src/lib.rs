@@ -6,9 +6,11 @@
 //! turned by pitch and roll.
 pub mod camera_file;
 pub mod document;
+mod elsewhere;
 pub mod error;
 mod light;
 pub mod model;
+mod naming;
 pub mod project;
 pub mod size;
 pub mod spots;

@@ -2,7 +2,7 @@
 use std::borrow::Cow;
 use std::fs::OpenOptions;
 use std::io::{ErrorKind, Write};
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
 use dipir_cameras::{WorldUp, file};
 use dipir_imaging::exposure::automatic_exposure_ev;
@@ -18,8 +18,10 @@ use dipir_scene::proxy::Plane;
 
 use crate::camera_file;
 use crate::document::{Document, Object, Points};
+use crate::elsewhere::looking_elsewhere;
 use crate::error::SetupError;
 use crate::model::Models;
+use crate::naming::beside;
 use crate::size::Kind;
 use crate::spots::{appears, crowded, spots};
 use crate::view::{self, CameraOptions, View};
@@ -156,6 +158,9 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
             size_why: size.why,
         })
     });
+    let elsewhere = view.file.as_ref().map_or(Vec::new(), |file| {
+        looking_elsewhere(&file.path, &request.photo, request.camera_up)
+    });
     let (class, class_why) = class(request);
     Ok(Draft {
         document: Document {
@@ -169,6 +174,10 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
                 Some(file) => Some(beside(&file.path, folder)?),
                 None => None,
             },
+            views: elsewhere
+                .iter()
+                .map(|picture| beside(picture, folder))
+                .collect::<Result<_, _>>()?,
             view,
             points: found.map(|f| f.0),
             raised: models.raised,
@@ -271,54 +280,6 @@ fn class(request: &Request) -> (String, &'static str) {
         true => ("object".into(), "any word; or --class"),
         false => (words.join(" "), "as the model's file; or --class"),
     }
-}
-
-/// A path relative to the current folder, as a file in `folder` names it.
-fn beside(path: &Path, folder: &Path) -> Result<String, SetupError> {
-    let [path, folder] = [path, folder].map(|p| p.strip_prefix(".").unwrap_or(p));
-    let named = match path.strip_prefix(folder) {
-        Ok(rest) if rest.is_relative() => rest.to_owned(),
-        _ => match way(path, folder) {
-            Some(way) => way,
-            None => std::path::absolute(path).map_err(|source| SetupError::Read {
-                path: path.into(),
-                source,
-            })?,
-        },
-    };
-    let is_portable = named.is_relative();
-    let text = named.into_os_string().into_string();
-    let text = text.map_err(|_| SetupError::NotUtf8 { path: path.into() })?;
-    Ok(match is_portable {
-        // So that the project is read on other systems, too.
-        true => text.replace(std::path::MAIN_SEPARATOR, "/"),
-        false => text,
-    })
-}
-
-/// The way from `folder` to `path` by `..`; `None` if they share no folder but the root.
-fn way(path: &Path, folder: &Path) -> Option<PathBuf> {
-    let here = |p: &Path| match p.as_os_str().is_empty() {
-        true => Path::new(".").canonicalize().ok(),
-        false => p.canonicalize().ok(),
-    };
-    // Links of folders are followed, for `..` leads out of what they point to; a link of the file stays.
-    let path = match (path.parent(), path.file_name()) {
-        (Some(parent), Some(name)) => here(parent)?.join(name),
-        _ => here(path)?,
-    };
-    let folder = here(folder)?;
-    let common = path.components().zip(folder.components());
-    let common = common.take_while(|(a, b)| a == b).count();
-    let is_folder = |c: Component| matches!(c, Component::Normal(_));
-    if !path.components().take(common).any(is_folder) {
-        return None;
-    }
-    let up = folder
-        .components()
-        .skip(common)
-        .map(|_| Component::ParentDir);
-    Some(up.chain(path.components().skip(common)).collect())
 }
 
 #[cfg(test)]
