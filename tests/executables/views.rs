@@ -3,7 +3,7 @@ use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
-use glam::Vec3;
+use glam::{Mat3, Vec2, Vec3};
 use serde_json::Value;
 
 use crate::project::*;
@@ -98,24 +98,51 @@ fn a_photograph_of_unknown_exposure_tells_directions_alone() {
 }
 
 #[test]
-fn what_two_photographs_show_tells_how_they_are_exposed() {
-    let project = project(&format!(
-        "{VIEW}camera = {{ heading_deg = 0.0, pitch_deg = -11.31 }}\n"
-    ));
-    // Shades of one place; `behind.png` has a quarter of the light.
-    let photo = |name: &str, gain: f32| {
-        let shade =
-            |n: usize| 0.15 + 0.5 * ((n % 96 / 6 * 37 + n / 96 / 6 * 101) % 17) as f32 / 17.0;
+fn what_photographs_show_tells_how_they_are_exposed() {
+    // The last shows nothing of the first: the one between them tells.
+    let turned = [
+        ("background.png", 0f32, 1f32),
+        ("behind.png", 30.0, 0.25),
+        ("far.png", 60.0, 0.5),
+    ];
+    let view = |(name, heading_deg, _): &(&str, f32, f32)| {
+        format!(
+            "\n[[scene.views]]\nbackground = \"{name}\"\ncamera = {{ heading_deg = {heading_deg:.1}, pitch_deg = -11.31 }}\n"
+        )
+    };
+    // In another order.
+    let project = project(&[view(&turned[2]), view(&turned[1])].concat());
+    for (name, heading_deg, gain) in turned {
+        let shade = |n: usize| {
+            // 40 degrees high: the camera of the project.
+            let at = Vec2::new((n % 96) as f32 + 0.5 - 48.0, 31.5 - (n / 96) as f32) / 32.0
+                * 20f32.to_radians().tan();
+            let turn = Mat3::from_rotation_y(-heading_deg.to_radians())
+                * Mat3::from_rotation_x(-11.31f32.to_radians());
+            let d = (turn * at.extend(-1.0)).normalize();
+            let cell = |angle: f32| (angle.to_degrees() / 4.0).floor() as i32;
+            let k = cell(d.x.atan2(-d.z)) * 37 + cell(d.y.asin()) * 101;
+            0.1 + 0.4 * k.rem_euclid(17) as f32 / 17.0
+        };
         let pixels = (0..96 * 64).map(|n| Vec3::splat(gain * shade(n))).collect();
         let image = LinearImage(Raster::from_pixels(96, 64, pixels));
         write_png(project.path(name), &Transfer::Srgb.encode(&image)).unwrap();
-    };
-    photo("background.png", 1.0);
-    photo("behind.png", 0.25);
+    }
     let run = project.run(DIPIR, &["run", "--until", "light", "-v"]);
     run.expect_success();
-    let told = "scene.views[0].background: exposed by -2.00 stops more than scene.background, as what both show tells";
-    assert!(run.stderr.contains(told), "{}", run.stderr);
+    for (view, stops) in [(0, -1.0f64), (1, -2.0)] {
+        let head = format!("scene.views[{view}].background: exposed by ");
+        let line = run.stderr.lines().find(|l| l.starts_with(&head));
+        let told = line.unwrap_or_else(|| panic!("{}", run.stderr));
+        let told: f64 = told[head.len()..]
+            .split(' ')
+            .next()
+            .unwrap()
+            .parse()
+            .unwrap();
+        // Cells at the borders of shades and values of 8 bits.
+        assert!((told - stops).abs() < 0.05, "{view}: {told}");
+    }
 }
 
 #[test]

@@ -8,14 +8,14 @@ use crate::proxy::Plane;
 
 /// Cells along the longer side of a photograph.
 const CELLS: usize = 192;
-/// A cell is used if its mean is above this, and all its channels stay below [`BRIGHTEST`]: cameras add noise to what is
-/// darker, and bend the curve of what is brighter.
+/// A cell is used if its mean is above this, and all its pixels stay below [`BRIGHTEST`]: cameras add noise to what is darker,
+/// and each has its own curve for what is brighter.
 const DARKEST: f32 = 0.01;
-const BRIGHTEST: f32 = 0.8;
+const BRIGHTEST: f32 = 0.6;
 /// Weights of red, green and blue: the luminance of Rec. 709.
 const LUMINANCE: Vec3 = Vec3::new(0.2126, 0.7152, 0.0722);
 /// The cells that both show have to be more than one in so many of either.
-const OVERLAP: usize = 8;
+const OVERLAP: usize = 5;
 /// Ratios that agree, stops.
 const ALIKE: f64 = 0.15;
 /// Share of the cells, by weight, that have to agree: photographs of a place that are turned by 6 degrees all reach it, 14%
@@ -83,7 +83,8 @@ impl Cells {
     /// How much more `other` is exposed than this photograph, stops; `None` if they have too little in common.
     ///
     /// What they have in common is looked for on `ground`, on walls that this camera faces, at [`AWAY`] times the way between
-    /// the cameras, and far away. That on which most agrees tells.
+    /// the cameras, and far away. That on which most agrees tells. Of a camera whose place is not known nothing near can be
+    /// met: it is to have the place of the other.
     pub fn stops_to(&self, other: &Self, ground: Option<&Plane>) -> Option<f64> {
         let [from, to] = [self, other].map(|cells| cells.camera.position);
         let ahead = -self.camera.rotation.z_axis;

@@ -23,6 +23,8 @@ pub struct ViewSettings {
     pub background: PathBuf,
     /// Its exposure over that of the scene's photograph, stops, if that is written.
     pub exposure_stops: Option<f64>,
+    /// Whether it is known where the camera stands, beside where it looks.
+    pub is_placed: bool,
     pub(crate) camera: CameraSettings,
     pub(crate) transfer: Transfer,
     pub(crate) limits: Limits,

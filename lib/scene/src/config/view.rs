@@ -50,6 +50,7 @@ impl SceneConfig {
             },
             background,
             exposure_stops: None,
+            is_placed: true,
             transfer: self.transfer()?,
             limits: self.limits,
         })
@@ -94,10 +95,17 @@ impl ViewConfig {
             },
             background,
             exposure_stops: self.exposure_stops,
+            is_placed: !self.lacks_position(),
             camera: settings,
             transfer: scene.transfer()?,
             limits: scene.limits,
         })
+    }
+
+    /// Whether only the direction of its camera is written.
+    fn lacks_position(&self) -> bool {
+        let own = self.camera.as_ref();
+        own.is_some_and(|own| own.is_turned() && own.file.is_none() && own.position.is_none())
     }
 
     /// Its camera with what it takes from the scene's.

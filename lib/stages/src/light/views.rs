@@ -1,11 +1,10 @@
 //! The other photographs of the place, `[[scene.views]]`.
-use std::cell::LazyCell;
-
 use anyhow::Context;
 use dipir_cli::session::Session;
 use dipir_estimator::{Estimator, LightEstimate, ViewEstimate, Visible, combine};
 use dipir_imaging::file::Photo;
 use dipir_pipeline::stage::StagePlan;
+use dipir_scene::camera::Camera;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::exposure::Cells;
 use dipir_scene::scene::LoadedScene;
@@ -60,37 +59,84 @@ pub(super) fn estimate(
     let estimator = Estimator::embedded().context("cannot read the embedded light estimator")?;
     let camera = &loaded.scene.camera;
     let own = exposed::estimate(&estimator, loaded.taken(), &loaded.photo.image, camera);
-    let mut all = vec![ViewEstimate {
-        estimate: own,
-        stops: Some(0.0),
-    }];
-    let photo = &loaded.photo.image;
-    let cells = LazyCell::new(|| Cells::new(photo, *camera, false));
-    let mut seen = Vec::new();
+    let mut others = Vec::new();
     for settings in settings(session)? {
         let view = read(session, loaded, &settings)?;
         let told = between(loaded.taken(), &view.taken);
-        let shown = || {
-            let other = Cells::new(&view.image, view.camera, false);
-            cells.stops_to(&other, loaded.description.proxy.plane().as_ref())
-        };
-        let known = settings.exposure_stops.or(told);
-        let stops = known.or_else(shown);
         let by_exif = by_exif(loaded.taken(), &view.taken);
         if let Some(warning) = disagreement(&settings.key, settings.exposure_stops, by_exif) {
             session.warn(&warning);
         }
-        session.remark(|| remark(&settings.key, known, stops));
-        all.push(ViewEstimate {
+        let position = match settings.is_placed {
+            true => view.camera.position,
+            // Far away it makes no difference.
+            false => camera.position,
+        };
+        let placed = Camera {
+            position,
+            ..view.camera
+        };
+        others.push(Other {
+            known: settings.exposure_stops.or(told),
+            key: settings.key,
+            cells: Cells::new(&view.image, placed, false),
             estimate: exposed::estimate(&estimator, &view.taken, &view.image, &view.camera),
+            visible: exposed::visible(&view.taken, &view.image, &view.camera, MAP),
+        });
+    }
+    let exposures = exposures(loaded, &others);
+    let mut all = vec![ViewEstimate {
+        estimate: own,
+        stops: Some(0.0),
+    }];
+    let mut seen = Vec::new();
+    for (other, stops) in others.into_iter().zip(exposures) {
+        session.remark(|| remark(&other.key, other.known, stops));
+        all.push(ViewEstimate {
+            estimate: other.estimate,
             stops,
         });
-        if let Some(stops) = stops {
-            let visible = exposed::visible(&view.taken, &view.image, &view.camera, MAP);
-            seen.push(visible.scaled((-stops).exp2() as f32));
-        }
+        seen.extend(stops.map(|stops| other.visible.scaled((-stops).exp2() as f32)));
     }
     Ok((combine(&all)?, seen))
+}
+
+/// Another photograph, and what is kept of it.
+struct Other {
+    key: String,
+    /// Its exposure over that of the scene's photograph, stops, where it is written or a file tells.
+    known: Option<f64>,
+    cells: Cells,
+    estimate: LightEstimate,
+    visible: Visible,
+}
+
+/// The exposures of the others over the scene's photograph: as is known, else as what they show beside the photograph or
+/// beside each other tells.
+fn exposures(loaded: &LoadedScene, others: &[Other]) -> Vec<Option<f64>> {
+    let mut stops: Vec<Option<f64>> = others.iter().map(|other| other.known).collect();
+    if stops.iter().all(Option::is_some) {
+        return stops;
+    }
+    let plane = loaded.description.proxy.plane();
+    let photo = Cells::new(&loaded.photo.image, loaded.scene.camera, false);
+    let mut from = vec![(&photo, 0.0)];
+    let told = others.iter().zip(&stops);
+    from.extend(told.filter_map(|(other, stops)| Some((&other.cells, (*stops)?))));
+    // Those that are found tell of the next.
+    let mut k = 0;
+    while let Some(&(cells, known)) = from.get(k) {
+        k += 1;
+        for (other, stops) in others.iter().zip(&mut stops) {
+            if stops.is_none()
+                && let Some(more) = cells.stops_to(&other.cells, plane.as_ref())
+            {
+                *stops = Some(known + more);
+                from.push((&other.cells, known + more));
+            }
+        }
+    }
+    stops
 }
 
 /// What is said of an exposure, and of what the pictures show of it.
