@@ -351,6 +351,20 @@ fn frames_without_exif_data_are_exposed_as_their_pictures_tell() {
 }
 
 #[test]
+fn frames_of_linear_light_are_exposed_alike() {
+    let project = project();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write("pipeline.toml", text.replace("background.png", "sky.exr"));
+    project.write("b.exr", project.read("sky.exr"));
+    let run = project.run(DIPIR, &["shot", "b.exr"]);
+    run.expect_success();
+    assert!(!run.stderr.contains("exposed"), "{}", run.stderr);
+    let manifest = project.read("out/frames/b/composite/stage.json");
+    let manifest: Value = serde_json::from_slice(&manifest).unwrap();
+    assert_eq!(manifest["params"]["light"]["exposure_ev"], 0.0);
+}
+
+#[test]
 fn a_shot_is_planned_before_it_runs() {
     let project = project();
     for name in ["a.png", "b.png"] {

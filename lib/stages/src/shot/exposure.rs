@@ -180,18 +180,24 @@ fn measured(session: &Session, all: &[ViewSettings]) -> anyhow::Result<Vec<Optio
     let own = settings(session)?;
     let own = cells(&own).map_err(|e: dipir_scene::Error| with_place(e, &session.config))?;
     let Some(own) = own else {
-        return Ok(vec![None; all.len()]);
+        return Ok(vec![Some(0.0); all.len()]);
     };
     let progress = session.progress("exposures");
     let mut seen = Vec::with_capacity(all.len());
     for some in all.chunks(AT_ONCE) {
         interrupt::check()?;
-        // A frame that cannot be read is told at its turn.
+        // A frame that cannot be read is told at its turn; until then it is exposed as the photograph.
         seen.par_extend(some.par_iter().map(|view| cells(view).ok().flatten()));
         progress.set(seen.len() as f64 / all.len() as f64);
     }
     progress.done();
-    Ok(followed(&own, &seen, plane.as_ref()))
+    let stops = followed(&own, &seen, plane.as_ref()).into_iter().zip(&seen);
+    Ok(stops
+        .map(|(stops, cells)| match cells {
+            Some(_) => stops,
+            None => Some(0.0),
+        })
+        .collect())
 }
 
 /// The exposures of frames over the photograph. Each is compared with the photograph, else with the frame that the one
