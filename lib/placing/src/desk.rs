@@ -117,7 +117,8 @@ impl Desk {
             session.warn(warning);
         }
         let painted = path.with_file_name(MASK_FILE);
-        let inputs = small.loaded.inputs.iter().map(|i| &i.location);
+        let read = small.loaded.inputs.iter().chain(&small.loaded.missing);
+        let inputs = read.map(|i| &i.location);
         let readings = inputs.filter(|i| **i != painted);
         let readings = readings.map(|i| Reading::new(i)).collect();
         let photo = &small.loaded.photo;

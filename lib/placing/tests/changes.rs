@@ -60,6 +60,14 @@ fn files_that_changed_since_they_were_read_are_told_and_the_page_goes_on() {
     again.paint(vec![0; again.mask_bytes()]).unwrap();
     again.save(&painted).unwrap();
     assert!(warnings(&again).is_empty());
+    // A file that was looked for in vain may come.
+    let object = fs::read_to_string(at("box.obj")).unwrap();
+    fs::write(at("box.obj"), format!("mtllib late.mtl\n{object}")).unwrap();
+    let without = Desk::open(open(folder.path(), &[])).unwrap();
+    let before = warnings(&without);
+    fs::write(at("late.mtl"), "newmtl m\n").unwrap();
+    let came = |w: &String| w.contains("late.mtl") && w.contains("was written since it was read");
+    assert!(!before.iter().any(came) && warnings(&without).iter().any(came));
 }
 
 /// A file whose folder has so long a path that none of a longer name fits beside it: it cannot be replaced, by no user.
