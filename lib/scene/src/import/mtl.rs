@@ -116,7 +116,8 @@ impl Library {
         let folder = name.rfind('/').map_or("", |i| &name[..=i]);
         let text = String::from_utf8_lossy(dipir_files::without_byte_order_mark(bytes));
         let mut current: Option<(Material, Draft)> = None;
-        for (i, line) in text.lines().enumerate() {
+        let end = char::from(line_end(bytes));
+        for (i, line) in text.split(end).enumerate() {
             let (word, rest) = statement(line);
             if word == "newmtl" {
                 if let Some(done) = current.take() {
@@ -410,6 +411,14 @@ impl Map {
         );
         map.file = unquoted(rest.trim()).replace('\\', "/");
         map
+    }
+}
+
+/// What ends a line of a text: old tools write a carriage return alone.
+pub(super) fn line_end(text: &[u8]) -> u8 {
+    match text.contains(&b'\n') {
+        true => b'\n',
+        false => b'\r',
     }
 }
 

@@ -47,7 +47,8 @@ pub fn load_obj_bytes(
 
 /// Lines by number, continuation lines joined. A comment ends with its line: one may end with the name of a folder, `C:\models\`.
 fn logical_lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
-    let mut lines = bytes.split(|b| *b == b'\n').enumerate();
+    let end = mtl::line_end(bytes);
+    let mut lines = bytes.split(move |b| *b == end).enumerate();
     std::iter::from_fn(move || {
         let (number, first) = lines.next()?;
         let mut text = String::from_utf8_lossy(first);

@@ -278,6 +278,26 @@ fn vertex_colours_in_bytes_mean_the_same() {
 }
 
 #[test]
+fn lines_that_end_with_a_carriage_return_alone_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let read = |end: &str| {
+        let write = |name: &str, text: &str| {
+            std::fs::write(folder.path().join(name), text.replace('\n', end)).unwrap();
+        };
+        write(
+            "a.obj",
+            &format!("mtllib a.mtl\nusemtl red\n{SQUARE}f 1 2 3 4\n"),
+        );
+        write("a.mtl", "newmtl red\nKd 1 0 0\n");
+        load_object(&folder.path().join("a.obj")).unwrap()
+    };
+    let (unix, old) = (read("\n"), read("\r"));
+    assert_eq!(old.mesh.positions, unix.mesh.positions);
+    assert_eq!(old.materials, unix.materials);
+    assert_eq!(old.materials[0].name, "red");
+}
+
+#[test]
 fn free_form_surfaces_are_left_out_with_a_warning() {
     let text = format!("{SQUARE}f 1 2 3\ncstype bspline\nsurf 0 1 0 1 1 2 3 4\nend\n");
     let told = load(&text).warnings;
