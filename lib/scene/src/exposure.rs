@@ -18,12 +18,11 @@ const LUMINANCE: Vec3 = Vec3::new(0.2126, 0.7152, 0.0722);
 const OVERLAP: usize = 5;
 /// Ratios that agree, stops.
 const ALIKE: f64 = 0.15;
-/// Share of the cells, by weight, that have to agree: photographs of a place that are turned by 6 degrees all reach it, 14%
-/// of photographs of different places do (`cargo run -p dipir-places --example exposures`).
-const SHARE: f64 = 0.35;
-/// Distances of walls over the way between two cameras: from one to the next what they show moves by as much as from the
-/// last to far away.
-const AWAY: [f32; 6] = [2.0, 2.5, 3.3, 5.0, 10.0, 20.0];
+/// Share of the cells, by weight, that have to agree. Less is had by chance where cameras moved far between photographs, half
+/// a stop off.
+const SHARE: f64 = 0.6;
+/// Distances of walls over the way between two cameras: nearer ones look otherwise from the other camera.
+const AWAY: [f32; 5] = [4.0, 5.5, 8.0, 14.0, 30.0];
 /// Width of a bin of ratios, stops.
 const BIN: f64 = 0.02;
 /// Largest ratio, stops.

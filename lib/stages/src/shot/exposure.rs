@@ -26,7 +26,7 @@ use crate::scene::with_place;
 const FILE: &str = "exposures.json";
 /// How the file begins.
 const MARK: &[u8] = b"{\"made_by\":\"dipir\",\"exposures_of\":";
-/// Exposures that differ from the photograph's by less are as that: what is measured is this uncertain, stops.
+/// Exposures that differ from the photograph's by less are as that, stops: neighbours agree to this.
 const UNCERTAIN: f64 = 0.05;
 /// Frames that are read at once.
 const AT_ONCE: usize = 16;
