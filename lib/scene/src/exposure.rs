@@ -1,4 +1,5 @@
 //! How two photographs of one place are exposed, from what both of them show.
+use dipir_imaging::metrics::LUMA;
 use dipir_imaging::raster::{LinearImage, Raster};
 use glam::{DVec2, Vec2, Vec3};
 
@@ -12,14 +13,12 @@ const CELLS: usize = 192;
 /// and each has its own curve for what is brighter.
 const DARKEST: f32 = 0.01;
 const BRIGHTEST: f32 = 0.6;
-/// Weights of red, green and blue: the luminance of Rec. 709.
-const LUMINANCE: Vec3 = Vec3::new(0.2126, 0.7152, 0.0722);
 /// The cells that both show have to be more than one in so many of either.
 const OVERLAP: usize = 5;
 /// Ratios that agree, stops.
 const ALIKE: f64 = 0.15;
-/// Share of the cells, by weight, that have to agree. Less is had by chance where cameras moved far between photographs, half
-/// a stop off.
+/// Share of the cells, by weight, that have to agree. Where cameras moved far between photographs, half of them agree by chance
+/// on a ratio that is wrong.
 const SHARE: f64 = 0.6;
 /// Distances of walls over the way between two cameras: nearer ones look otherwise from the other camera.
 const AWAY: [f32; 5] = [4.0, 5.5, 8.0, 14.0, 30.0];
@@ -62,7 +61,7 @@ impl Cells {
                     most = most.max(pixel.max_element());
                 }
             }
-            let mean = (sum / (side * side) as f32).dot(LUMINANCE);
+            let mean = (sum / (side * side) as f32).dot(LUMA);
             match mean > DARKEST && most < BRIGHTEST {
                 true => mean.log2(),
                 false => f32::NAN,

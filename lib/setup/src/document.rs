@@ -453,6 +453,18 @@ mod tests {
     }
 
     #[test]
+    fn other_photographs_are_tables_that_are_read() {
+        let mut document = document(View::default());
+        document.views = vec!["b \"1\".jpg".into(), "c.jpg".into()];
+        let views = scene(&document.text()).views;
+        let read: Vec<_> = views
+            .iter()
+            .map(|v| v.background.clone().unwrap())
+            .collect();
+        assert_eq!(read, [Path::new("b \"1\".jpg"), Path::new("c.jpg")]);
+    }
+
+    #[test]
     fn what_may_lie_on_its_back_gets_the_line_that_turns_it() {
         let mut document = document(View::default());
         assert!(!document.text().contains("on its back"));

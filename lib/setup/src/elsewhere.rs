@@ -5,7 +5,7 @@ use dipir_cameras::WorldUp;
 use dipir_cameras::file::pictures;
 use glam::DVec3;
 
-/// Most of them: eight photographs tell more of the light than four, and are read in two seconds.
+/// Most of them: the light is known better from eight photographs than from four (docs/views.md).
 const MOST: usize = 7;
 /// Least angle between the directions of two, degrees: less shows little that is new, more leaves little that both show,
 /// which tells their exposures.
