@@ -24,7 +24,7 @@ pub struct ShotArgs {
     #[arg(value_name = "FRAME", required = true)]
     frames: Vec<PathBuf>,
 
-    /// Take every frame to be exposed as the photograph is, whatever the Exif data say
+    /// Take every frame to be exposed and white-balanced as the photograph is, whatever Exif data and pictures say
     #[arg(long)]
     same_exposure: bool,
 
@@ -65,7 +65,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     };
     let of_photo = RunArgs::needed(&common, Some(last));
     if args.plan {
-        expose(&session, &mut frames, &told, false)?;
+        expose(args, &session, &mut frames, &told, false)?;
         let photo = run_one(&of_photo.planned(), &base)?;
         let (words, json) = plan::frames(&session, photo, &frames, args.force)?;
         common.output.result(|| words, || json);
@@ -88,7 +88,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     if !common.output.json {
         common.output.result(|| done, || Value::Null);
     }
-    expose(&session, &mut frames, &told, true)?;
+    expose(args, &session, &mut frames, &told, true)?;
     let of_frames = RunArgs::needed(&common, None).forced(args.force);
     run_each(&of_frames, frames, |failed| {
         // The page of the photograph shows its frames.
@@ -121,7 +121,7 @@ fn refuse_pipeline(frames: &[PathBuf]) -> Result<(), Usage> {
 /// A frame, and its project.
 type Frame = (PathBuf, ProjectArgs);
 
-/// The frames, and how much more than the photograph each is exposed, stops; nothing where only its picture can tell.
+/// The frames, and how much more than the photograph each is exposed by Exif data, stops; nothing where they do not tell.
 fn frames(
     args: &ShotArgs,
     session: &Session,
@@ -131,10 +131,7 @@ fn frames(
     let stands_still = shot::camera_stands_still(session)?;
     for path in &args.frames {
         let name = name(path)?;
-        told.push(match args.same_exposure {
-            true => Some(0.0),
-            false => shot::exposure_stops(session, path)?,
-        });
+        told.push(shot::exposure_stops(session, path)?);
         let mut frame = base.clone();
         let overrides = shot::overrides(session, path, stands_still)?;
         frame.set.extend(overrides);
@@ -148,42 +145,57 @@ fn frames(
     Ok((frames, told))
 }
 
-/// Gives each frame light of its exposure: what is `told`, else what the pictures tell, for which they are read if `look`.
+/// Gives each frame light of its exposure and white balance: the exposure is what is `told`, all else what the pictures tell,
+/// which are read if `look`.
 fn expose(
+    args: &ShotArgs,
     session: &Session,
     frames: &mut [Frame],
     told: &[Option<f64>],
     look: bool,
 ) -> anyhow::Result<()> {
-    let mut stops = told.to_vec();
-    let mut untold: Vec<usize> = (0..frames.len()).filter(|k| told[*k].is_none()).collect();
-    if !untold.is_empty() {
-        untold.sort_by_key(|k| shot::order(&frames[*k].0));
-        let open = |k: &usize| Ok((frames[*k].0.clone(), frames[*k].1.open()?.0));
-        let open: anyhow::Result<Vec<_>> = untold.iter().map(open).collect();
-        let (found, unknown) = shot::exposure::exposures(session, &open?, look)?;
-        untold
-            .into_iter()
-            .zip(found)
-            .for_each(|(k, found)| stops[k] = Some(found));
-        if let Some(first) = unknown.first() {
-            let who = match unknown.len() {
-                1 => format!("{} shows", first.display()),
-                n => format!("{n} frames, the first of them {}, show", first.display()),
-            };
-            session.warn(&format!(
-                "{who} too little of what the photograph or another frame shows to tell the exposure: taken to be exposed as \
-                 the frame before"
-            ));
-        }
+    if args.same_exposure {
+        return Ok(());
     }
-    for ((path, frame), stops) in frames.iter_mut().zip(stops) {
-        let stops = stops.unwrap_or_default();
-        frame.set.extend(shot::exposed(session, stops)?);
+    let mut order: Vec<usize> = (0..frames.len()).collect();
+    order.sort_by_key(|k| shot::order(&frames[*k].0));
+    let open = |k: &usize| Ok((frames[*k].0.clone(), frames[*k].1.open()?.0));
+    let open: anyhow::Result<Vec<_>> = order.iter().map(open).collect();
+    let (found, unknown) = shot::exposure::exposures(session, &open?, look)?;
+    let unknown = order.iter().zip(unknown);
+    let mut unknown = unknown.filter(|(k, unknown)| *unknown && told[**k].is_none());
+    if let Some((first, _)) = unknown.next() {
+        let first = frames[*first].0.display();
+        let who = match 1 + unknown.count() {
+            1 => format!("{first} shows"),
+            n => format!("{n} frames, the first of them {first}, show"),
+        };
+        session.warn(&format!(
+            "{who} too little of what the photograph or another frame shows to tell the exposure: taken to be exposed as the \
+             frame before"
+        ));
+    }
+    for (k, found) in order.into_iter().zip(found) {
+        let (path, frame) = &mut frames[k];
+        let (stops, tint) = (
+            told[k].unwrap_or(found.stops),
+            found.tint.unwrap_or_default(),
+        );
+        frame.set.extend(shot::exposed(session, stops, tint)?);
         if stops != 0.0 {
             let than = if stops > 0.0 { "more" } else { "less" };
             let stops = stops.abs();
             session.remark(|| format!("{}: exposed by {stops:.2} stops {than}", path.display()));
+        }
+        // Less is not seen in the figures.
+        if tint.iter().any(|stops| stops.abs() >= 0.005) {
+            let [r, g, b] = tint;
+            session.remark(|| {
+                format!(
+                    "{}: another white balance, red {r:+.2}, green {g:+.2}, blue {b:+.2} stops",
+                    path.display()
+                )
+            });
         }
     }
     Ok(())

@@ -27,4 +27,5 @@ mod staleness;
 mod tradeoff;
 mod usage;
 mod views;
+mod white_balance;
 mod whole;

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use crate::project::*;
 
 /// A project whose light is estimated.
-fn project() -> Project {
+pub(crate) fn project() -> Project {
     let project = Project::new();
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
     let text = text.replace("environment = \"sky.exr\"\n", "");
@@ -38,7 +38,7 @@ fn frame_at(name: &str, [x, y]: [f64; 2]) -> Value {
     json!({ "file_path": name, "transform_matrix": matrix })
 }
 
-fn shot(project: &Project, frames: &[&str]) -> Vec<Value> {
+pub(crate) fn shot(project: &Project, frames: &[&str]) -> Vec<Value> {
     let run = project.run(DIPIR, &[&["shot", "--json"], frames].concat());
     run.expect_success();
     // The last of what is printed: the frames'.

@@ -26,12 +26,40 @@ pub struct Light {
 /// `None` if the key is not set.
 pub fn known_params(table: &CompositeTable) -> Option<(Value, &Path)> {
     let path = table.environment.as_deref()?;
-    let params = json!({
+    let mut params = json!({
         "environment": path,
         "exposure_ev": table.exposure_ev,
         "rotation_deg": table.rotation_deg,
     });
+    add_tint(&mut params, table);
     Some((params, path))
+}
+
+/// Adds a tint to what decides a light, if there is one.
+pub(crate) fn add_tint(params: &mut Value, table: &CompositeTable) {
+    if let Some(tint) = table.tint {
+        params["tint"] = json!(tint);
+    }
+}
+
+/// `map` with another white balance.
+///
+/// # Errors
+/// If its radiance is beyond `f32`.
+pub(crate) fn tinted(
+    session: &Session,
+    table: &CompositeTable,
+    map: EnvironmentMap,
+) -> anyhow::Result<EnvironmentMap> {
+    let Some(tint) = table.tint else {
+        return Ok(map);
+    };
+    let gain = table.tint_gain();
+    let texels = map.texels().iter().map(|texel| *texel * gain).collect();
+    EnvironmentMap::new(map.width(), map.height(), texels).map_err(|e| {
+        let message = format!("{tint:?} stops make a light that cannot be used: {e}");
+        session.config.invalid("composite.tint", message).into()
+    })
 }
 
 /// The map of `[composite] environment`, exposed and turned; `None` if the key is not set.
@@ -42,6 +70,7 @@ pub fn known(session: &Session, table: &CompositeTable) -> anyhow::Result<Option
     let map = table
         .placement()
         .read(session, "composite.environment", path)?;
+    let map = tinted(session, table, map)?;
     Ok(Some(Light { map: Arc::new(map) }))
 }
 

@@ -72,6 +72,7 @@ fn named(stage: &str, key: String, was: Option<String>, now: Option<String>) -> 
         "tone" => "light.recover_tone".into(),
         // Of a map, while materials are recovered.
         "environment" | "exposure_ev" | "rotation_deg" => composite(k),
+        k if k == "tint" || k.starts_with("tint.") => composite(k),
         k => format!("light.{k}"),
     };
     let name = match (stage, key.as_str()) {

@@ -62,14 +62,24 @@ pub fn camera_stands_still(session: &Session) -> anyhow::Result<bool> {
     Ok(file.is_none_or(has_one))
 }
 
-/// What makes the light that of a frame which is exposed by `stops` more than the session's photograph, as `KEY=VALUE`.
+/// What makes the light that of a frame which is exposed by `stops` more than the session's photograph and has its white
+/// balance by `tint`, stops of each channel, as `KEY=VALUE`.
 ///
 /// # Errors
 /// If `[composite]` cannot be read.
-pub fn exposed(session: &Session, stops: f64) -> anyhow::Result<Option<String>> {
+pub fn exposed(session: &Session, stops: f64, tint: [f64; 3]) -> anyhow::Result<Vec<String>> {
     let composite: CompositeTable = session.config.table("composite")?;
-    let exposure_ev = f64::from(composite.exposure_ev) + stops;
-    Ok((stops != 0.0).then(|| format!("composite.exposure_ev={exposure_ev:.3}")))
+    let mut set = Vec::new();
+    if stops != 0.0 {
+        let exposure_ev = f64::from(composite.exposure_ev) + stops;
+        set.push(format!("composite.exposure_ev={exposure_ev:.3}"));
+    }
+    if tint != [0.0; 3] {
+        let own = composite.tint.unwrap_or_default();
+        let [r, g, b]: [f64; 3] = std::array::from_fn(|k| f64::from(own[k]) + tint[k]);
+        set.push(format!("composite.tint=[{r:.3}, {g:.3}, {b:.3}]"));
+    }
+    Ok(set)
 }
 
 /// What sets the frame in `path` in place of the session's photograph, as `KEY=VALUE`. The camera is its own, unless it

@@ -6,6 +6,7 @@ use dipir_imaging::tone::ToneCurves;
 use dipir_pipeline::config::{Config, Quality};
 use dipir_pipeline::error::ConfigError;
 use dipir_render::adaptive::Stop;
+use glam::Vec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -23,6 +24,9 @@ pub struct CompositeTable {
     /// or dimmer.
     #[schemars(range(min = -64.0, max = 64.0), example = -1.5)]
     pub exposure_ev: f32,
+    /// Stops of red, green and blue of the light beside that, for another white balance.
+    #[schemars(extend("x-default" = "none"), example = [0.1, 0.0, -0.15])]
+    pub tint: Option<[f32; 3]>,
     /// Turn of the light about the vertical, degrees, counter-clockwise from above.
     #[schemars(example = 90.0)]
     pub rotation_deg: f32,
@@ -87,6 +91,9 @@ pub(super) const MAX_SAMPLES: u32 = 1 << 14;
 const LEAST_BUDGET_S: f64 = 0.01;
 const MOST_BUDGET_S: f64 = 1e7;
 
+/// Most stops of a channel that a tint has: beyond, a light has one colour.
+const MOST_TINT: f32 = 8.0;
+
 impl CompositeTable {
     /// Refuses what no run can work with.
     ///
@@ -117,7 +124,19 @@ impl CompositeTable {
         if self.most_pixels == Some(0) {
             return Err(config.out_of_range("composite.most_pixels", 0, "1 or more"));
         }
+        if let Some(tint) = self.tint
+            && !tint.iter().all(|stops| stops.abs() <= MOST_TINT)
+        {
+            let found = format!("{tint:?}");
+            let accepted = "three numbers of stops from -8 to 8, as in [0.1, 0.0, -0.15]";
+            return Err(config.out_of_range("composite.tint", found, accepted));
+        }
         self.placement().check(config)
+    }
+
+    /// The factor of each channel that `tint` is.
+    pub fn tint_gain(&self) -> Vec3 {
+        Vec3::from(self.tint.unwrap_or_default()).exp2()
     }
 
     /// How the map of `environment` is used.

@@ -12,15 +12,18 @@ use glam::Quat;
 use serde_json::{Value, json};
 
 use crate::composite::table::CompositeTable;
+use crate::known_light::{add_tint, tinted};
 use crate::names::LIGHT;
 
 /// What decides the recovered light beside the light stage's files.
 pub fn recovered_params(table: &CompositeTable) -> Value {
-    json!({
+    let mut params = json!({
         "recovered": true,
         "exposure_ev": table.exposure_ev,
         "rotation_deg": table.rotation_deg,
-    })
+    });
+    add_tint(&mut params, table);
+    params
 }
 
 /// Role of the map of the surroundings among the stage's outputs.
@@ -90,8 +93,12 @@ pub(super) fn exposed(
     let turn = Quat::from_rotation_y(table.rotation_deg.to_radians());
     let lobes = lobes.into_iter().map(|lobe| SphericalGaussian {
         direction: turn * lobe.direction,
-        radiance: lobe.radiance * exposure,
+        radiance: lobe.radiance * exposure * table.tint_gain(),
         ..lobe
+    });
+    let surroundings = surroundings.map(|map| {
+        let angle = f64::from(table.rotation_deg).to_radians();
+        tinted(session, table, map.scaled(exposure).rotated_y(angle))
     });
     Ok(Recovered {
         lobes: SgMixture::new(lobes.collect()).map_err(|e| {
@@ -101,10 +108,7 @@ pub(super) fn exposed(
             );
             session.config.invalid("composite.exposure_ev", message)
         })?,
-        surroundings: surroundings.map(|map| {
-            let angle = f64::from(table.rotation_deg).to_radians();
-            map.scaled(exposure).rotated_y(angle)
-        }),
+        surroundings: surroundings.transpose()?,
         tone,
     })
 }

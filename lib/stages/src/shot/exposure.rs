@@ -1,4 +1,4 @@
-//! How the frames of a shot are exposed, from what they show of one place.
+//! How the frames of a shot are exposed and tinted, from what they show of one place.
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use dipir_pipeline::fingerprint::Fingerprint;
 use dipir_pipeline::manifest::Artifact;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::description::SceneDescription;
-use dipir_scene::exposure::Cells;
+use dipir_scene::exposure::{Cells, Exposure};
 use dipir_scene::ground;
 use dipir_scene::proxy::Plane;
 use dipir_scene::views::ViewSettings;
@@ -26,8 +26,6 @@ use crate::scene::with_place;
 const FILE: &str = "exposures.json";
 /// How the file begins.
 const MARK: &[u8] = b"{\"made_by\":\"dipir\",\"exposures_of\":";
-/// Exposures that differ from the photograph's by less are as that, stops: neighbours agree to this.
-const UNCERTAIN: f64 = 0.05;
 /// Frames that are read at once.
 const AT_ONCE: usize = 16;
 
@@ -37,16 +35,17 @@ struct Kept {
     made_by: String,
     /// Hash of all that decides the values.
     exposures_of: String,
-    /// Of each frame, stops over the photograph; nothing for one that has nothing in common with the others.
-    stops: Vec<Option<f64>>,
+    /// Of each frame, over the photograph; nothing for one that has nothing in common with the others.
+    exposures: Vec<Option<Exposure>>,
 }
 
-/// How much more than the session's photograph each of `frames` is exposed, stops, as their pictures tell. `frames` are in the
+/// How much more than the session's photograph each of `frames` is exposed, as their pictures tell. `frames` are in the
 /// order in which they were taken, each with the session that makes it. What was found for the same frames earlier is
 /// not looked for again; with `look` unset nothing is.
 ///
-/// Where a frame has nothing in common with the photograph it is compared with others; the second value are the frames that
-/// have nothing in common with any, and are taken to be exposed as the one before or after them.
+/// Where a frame has nothing in common with the photograph it is compared with others; the second value says of each whether
+/// it has nothing in common with any, and is taken to be exposed as the one before or after it. So is the tint of a frame
+/// of which nothing tells it.
 ///
 /// # Errors
 /// If the photograph or what its scene stage wrote cannot be read.
@@ -54,23 +53,22 @@ pub fn exposures(
     session: &Session,
     frames: &[(PathBuf, Session)],
     look: bool,
-) -> anyhow::Result<(Vec<f64>, Vec<PathBuf>)> {
+) -> anyhow::Result<(Vec<Exposure>, Vec<bool>)> {
     let views: Result<Vec<_>, _> = frames.iter().map(|(_, frame)| settings(frame)).collect();
     let views = views?;
     let file = kept_in(&session.out);
     let found = match fingerprint(session, frames, &views) {
         Ok(of) => match read(&file).filter(|kept| kept.exposures_of == of) {
-            Some(kept) if kept.stops.len() == frames.len() => Some(kept.stops),
+            Some(kept) if kept.exposures.len() == frames.len() => Some(kept.exposures),
             _ if look => {
-                let stops = measured(session, &views)?;
                 let kept = Kept {
                     made_by: "dipir".into(),
                     exposures_of: of,
-                    stops,
+                    exposures: measured(session, &views)?,
                 };
                 // Without the file they are measured again.
                 let _ = write(&file, &kept);
-                Some(kept.stops)
+                Some(kept.exposures)
             }
             _ => None,
         },
@@ -78,12 +76,8 @@ pub fn exposures(
         Err(_) if !look => None,
         Err(e) => return Err(e),
     };
-    let found = found.unwrap_or_else(|| vec![Some(0.0); frames.len()]);
-    let unknown = frames
-        .iter()
-        .zip(&found)
-        .filter(|(_, stops)| stops.is_none());
-    let unknown = unknown.map(|((path, _), _)| path.clone()).collect();
+    let found = found.unwrap_or_else(|| vec![Some(Exposure::SAME); frames.len()]);
+    let unknown = found.iter().map(Option::is_none).collect();
     Ok((filled(&found), unknown))
 }
 
@@ -113,15 +107,14 @@ fn write(path: &Path, kept: &Kept) -> io::Result<()> {
     dipir_files::replace(path, &serde_json::to_vec(kept)?, MARK)
 }
 
-/// The exposures without those that are within what is uncertain of the photograph's, and with those of neighbours where
-/// nothing is known.
-fn filled(found: &[Option<f64>]) -> Vec<f64> {
-    let known = |k: usize| found[k];
-    let near = |k: usize| (0..k).rev().chain(k..found.len()).find_map(known);
-    let stops = (0..found.len()).map(|k| found[k].or_else(|| near(k)).unwrap_or(0.0));
-    // Shrunk, not cut off: an exposure that drifts away from the photograph's does not jump.
-    let beyond = |stops: f64| stops.signum() * (stops.abs() - UNCERTAIN).max(0.0);
-    stops.map(beyond).collect()
+/// The exposures without what is uncertain of them, and with those of neighbours where nothing is known.
+fn filled(found: &[Option<Exposure>]) -> Vec<Exposure> {
+    let near = |k: usize| (0..=k).rev().chain(k..found.len());
+    let filled = |k| Exposure {
+        stops: near(k).find_map(|k| Some(found[k]?.stops)).unwrap_or(0.0),
+        tint: near(k).find_map(|k| found[k]?.tint).or(Exposure::SAME.tint),
+    };
+    (0..found.len()).map(|k| filled(k).certain()).collect()
 }
 
 /// The photograph of a frame and its camera.
@@ -150,7 +143,7 @@ fn fingerprint(
         "rolled_off": is_rolled_off(session)?,
         "cameras": cameras,
     });
-    let parts = Fingerprint::of("exposures").version(1).params(params);
+    let parts = Fingerprint::of("exposures").version(2).params(params);
     Ok(parts.inputs(&inputs).finish().as_str().into())
 }
 
@@ -164,7 +157,7 @@ fn is_rolled_off(session: &Session) -> anyhow::Result<bool> {
 }
 
 /// The exposures of the photographs `all` over the session's.
-fn measured(session: &Session, all: &[ViewSettings]) -> anyhow::Result<Vec<Option<f64>>> {
+fn measured(session: &Session, all: &[ViewSettings]) -> anyhow::Result<Vec<Option<Exposure>>> {
     let folder = SCENE.folder(session);
     let scene = SCENE.manifest(session)?.output(&folder, "scene")?;
     let scene = SceneDescription::read(&scene)?;
@@ -180,7 +173,7 @@ fn measured(session: &Session, all: &[ViewSettings]) -> anyhow::Result<Vec<Optio
     let own = settings(session)?;
     let own = cells(&own).map_err(|e: dipir_scene::Error| with_place(e, &session.config))?;
     let Some(own) = own else {
-        return Ok(vec![Some(0.0); all.len()]);
+        return Ok(vec![Some(Exposure::SAME); all.len()]);
     };
     let progress = session.progress("exposures");
     let mut seen = Vec::with_capacity(all.len());
@@ -191,19 +184,23 @@ fn measured(session: &Session, all: &[ViewSettings]) -> anyhow::Result<Vec<Optio
         progress.set(seen.len() as f64 / all.len() as f64);
     }
     progress.done();
-    let stops = followed(&own, &seen, plane.as_ref()).into_iter().zip(&seen);
-    Ok(stops
-        .map(|(stops, cells)| match cells {
-            Some(_) => stops,
-            None => Some(0.0),
+    let told = followed(&own, &seen, plane.as_ref()).into_iter().zip(&seen);
+    Ok(told
+        .map(|(told, cells)| match cells {
+            Some(_) => told,
+            None => Some(Exposure::SAME),
         })
         .collect())
 }
 
 /// The exposures of frames over the photograph. Each is compared with the photograph, else with the frame that the one
 /// before it was compared with, else with the one before it; what is left, in the same way with those after it.
-fn followed(photo: &Cells, frames: &[Option<Cells>], plane: Option<&Plane>) -> Vec<Option<f64>> {
-    let mut stops = vec![None; frames.len()];
+fn followed(
+    photo: &Cells,
+    frames: &[Option<Cells>],
+    plane: Option<&Plane>,
+) -> Vec<Option<Exposure>> {
+    let mut told: Vec<Option<Exposure>> = vec![None; frames.len()];
     let forward: Vec<usize> = (0..frames.len()).collect();
     let backward: Vec<usize> = forward.iter().rev().copied().collect();
     for order in [forward, backward] {
@@ -212,24 +209,24 @@ fn followed(photo: &Cells, frames: &[Option<Cells>], plane: Option<&Plane>) -> V
             let Some(frame) = &frames[k] else {
                 continue;
             };
-            if stops[k].is_none() {
+            if told[k].is_none() {
                 let from = |other: Option<usize>| {
-                    let (cells, known) = (frames[other?].as_ref()?, stops[other?]?);
-                    Some(known + cells.stops_to(frame, plane)?)
+                    let (cells, known) = (frames[other?].as_ref()?, told[other?]?);
+                    Some(known.and(cells.exposure_to(frame, plane)?))
                 };
-                let known = photo.stops_to(frame, plane).or_else(|| from(key));
+                let known = photo.exposure_to(frame, plane).or_else(|| from(key));
                 let moved_on = known.is_none();
-                stops[k] = known.or_else(|| from(last));
+                told[k] = known.or_else(|| from(last));
                 if moved_on {
                     key = last;
                 }
             }
-            if stops[k].is_some() {
+            if told[k].is_some() {
                 last = Some(k);
             }
         }
     }
-    stops
+    told
 }
 
 #[cfg(test)]
@@ -237,11 +234,50 @@ mod tests {
     use super::*;
 
     #[test]
-    fn small_differences_are_none_and_larger_ones_do_not_jump() {
-        let found = [None, Some(0.04), Some(-0.06), None, Some(1.05)];
-        let wanted = [0.0, 0.0, -0.01, -0.01, 1.0];
-        for (stops, wanted) in filled(&found).iter().zip(wanted) {
-            assert!((stops - wanted).abs() < 1e-12, "{stops} {wanted}");
+    fn what_is_not_told_is_as_the_neighbour() {
+        let of = |stops: f64, red: Option<f64>| {
+            let tint = red.map(|red| [red, 0.0, -red]);
+            Some(Exposure { stops, tint })
+        };
+        let found = [
+            None,
+            of(0.04, None),
+            of(-0.06, Some(0.1)),
+            None,
+            of(1.05, None),
+        ];
+        let wanted = [
+            (0.0, 0.075),
+            (0.0, 0.075),
+            (-0.01, 0.075),
+            (-0.01, 0.075),
+            (1.0, 0.075),
+        ];
+        for (found, (stops, red)) in filled(&found).iter().zip(wanted) {
+            assert!((found.stops - stops).abs() < 1e-12, "{found:?} {stops}");
+            assert!(
+                (found.tint.unwrap()[0] - red).abs() < 1e-12,
+                "{found:?} {red}"
+            );
         }
+        assert_eq!(filled(&[None]), [Exposure::SAME]);
+    }
+
+    #[test]
+    fn a_file_without_tints_is_measured_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(FILE);
+        let head = String::from_utf8(MARK.to_vec()).unwrap();
+        let stops = format!("{head}\"a\",\"stops\":[0.5,null]}}");
+        fs::write(&path, stops).unwrap();
+        assert_eq!(read(&path), None);
+        let kept = Kept {
+            made_by: "dipir".into(),
+            exposures_of: "a".into(),
+            exposures: vec![Some(Exposure::SAME), None],
+        };
+        write(&path, &kept).unwrap();
+        assert!(is_kept(&path));
+        assert_eq!(read(&path), Some(kept));
     }
 }
