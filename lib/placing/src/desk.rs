@@ -31,6 +31,7 @@ use serde_json::{Value, json};
 use crate::document::Document;
 use crate::drafts::Drafts;
 use crate::edit::Edit;
+use crate::lens::Lens;
 use crate::mask::{MASK_FILE, MaskFile, unwritten};
 use crate::readings::Reading;
 use crate::relighting::Relighting;
@@ -55,6 +56,7 @@ pub struct Desk {
     /// The photograph as a PNG, and its size.
     photo: Vec<u8>,
     size: [usize; 2],
+    lens: Lens,
     /// The file's text, as it was read or last saved.
     text: Mutex<String>,
     /// Counts texts that were saved; it changes while `text` is held.
@@ -107,12 +109,6 @@ impl Desk {
         let text = dipir_files::read_to_string(&path)
             .with_context(|| format!("cannot read \"{}\"", path.display()))?;
         let (small, arrangement) = SmallScene::load(&session, LONGEST)?;
-        if small.loaded.original.is_some() {
-            bail!(
-                "the page cannot show a photograph whose lens distorts it: pixels of [scene.camera.distortion] are \
-                 those of the photograph as it was taken; edit pipeline.toml and look at it with dipir preview"
-            );
-        }
         for warning in &arrangement.warnings {
             session.warn(warning);
         }
@@ -132,6 +128,7 @@ impl Desk {
             readings,
             photo: png::encode(size[0], size[1], &values)?,
             size,
+            lens: Lens(small.loaded.original.as_ref().map(|o| o.undistortion)),
             text: Mutex::new(text),
             revision: AtomicU64::new(0),
             mask: Mutex::default(),
@@ -184,7 +181,7 @@ impl Desk {
         self.check_revision(edit)?;
         let mut document = Document::parse(&held(&self.text))?;
         document.order_objects(&edit.objects)?;
-        document.apply_light(edit)?;
+        document.apply_light(&self.lens.light(edit)?)?;
         if (0..edit.objects.len()).any(|i| document.is_looked_for(i).unwrap_or(false)) {
             let (_, before) = self.arranged(&held(&self.text))?;
             keep_places(&mut document, edit, &before)?;
@@ -238,7 +235,7 @@ impl Desk {
         };
         if let Some(turn) = &edit.turn {
             let (camera, _) = camera_of(document)?;
-            document.turn(turn, &camera)?;
+            document.turn(turn, self.lens.fov_deg(turn, &camera)?, &camera)?;
         }
         if let Some(height) = edit.height_m
             && !document.height_over_ground(height)?
@@ -287,7 +284,7 @@ impl Desk {
             if !is_seen {
                 bail!(none);
             }
-            document.put_at_pixel(i, at)?;
+            document.put_at_pixel(i, self.lens.to_photo(at)?)?;
         }
         Ok(())
     }
@@ -318,6 +315,7 @@ impl Desk {
             "file": json_path(&self.path),
             "size": arrangement.camera.resolution,
             "shown": self.size,
+            "border": self.lens.border(&arrangement.camera),
             "names": arrangement.objects.iter().map(name).collect::<Vec<_>>(),
             "exposure_ev": exposure.exposure_ev,
             "shadow": light.is_ok_and(|l| l.shadow.is_some()),
@@ -328,6 +326,7 @@ impl Desk {
 
     fn shown(&self, arrangement: &Arrangement, grid: bool) -> Value {
         let mut shown = view(arrangement, grid);
+        shown["undistorted"] = self.lens.bends().into();
         if let Some(warnings) = shown["warnings"].as_array_mut() {
             warnings.extend(self.changes().into_iter().map(Value::from));
         }
@@ -361,7 +360,7 @@ impl Desk {
     /// If there is none.
     pub fn solve(&self, edit: &Edit, lines: &Lines) -> anyhow::Result<Solution> {
         let (_, _, arrangement) = self.edited(edit)?;
-        solve(lines, &arrangement.camera)
+        solve(lines, &arrangement.camera, self.lens.focal())
     }
 
     /// The height of the camera at which two pixels of the ground are `length_m` apart.
@@ -536,7 +535,8 @@ impl Desk {
         assess(&rendered.session, graph::LAST)?;
         let mut written = Vec::new();
         if let Some(mask) = &mut mask {
-            mask.write(&self.raster(&painted), arrangement.camera.resolution)?;
+            let size = arrangement.camera.resolution;
+            mask.write(&self.lens.mask(&self.raster(&painted), size))?;
             written.push(mask.path.display().to_string());
         }
         if let Err(e) = dipir_files::rewrite(&self.path, base.as_bytes(), text.as_bytes()) {

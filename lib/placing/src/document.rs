@@ -116,19 +116,29 @@ impl Document {
         Ok(camera)
     }
 
-    /// Turns the camera; `camera` is the one that the text says.
+    /// Turns the camera; `camera` is the one that the text says. The field of view becomes `fov_deg`; with `None` it stays
+    /// as it is told.
     ///
     /// # Errors
-    /// If another file holds the camera, or its lens.
-    pub fn turn(&mut self, turn: &Turn, camera: &Camera) -> anyhow::Result<()> {
+    /// If another file holds the camera, or a lens whose field of view is to change.
+    pub fn turn(
+        &mut self,
+        turn: &Turn,
+        fov_deg: Option<f64>,
+        camera: &Camera,
+    ) -> anyhow::Result<()> {
         let table = self.camera()?;
-        if table.contains_key("file") {
+        // Beside a file that tells a lens alone the direction is written here.
+        let is_here = fov_deg.is_none() && table.contains_key("position");
+        if table.contains_key("file") && !is_here {
             bail!("the camera comes from scene.camera.file and is not changed here");
         }
-        for key in ["focal_mm", "sensor_mm"] {
-            table.remove(key);
+        if let Some(fov_deg) = fov_deg {
+            for key in ["focal_mm", "sensor_mm"] {
+                table.remove(key);
+            }
+            set(table, "fov_deg", rounded(fov_deg, 3));
         }
-        set(table, "fov_deg", rounded(turn.fov_deg, 3));
         let (pitch, roll) = (turn.pitch_deg, turn.roll_deg);
         if !table.contains_key("look_at") {
             set(table, "pitch_deg", rounded(pitch, 3));
@@ -513,7 +523,7 @@ mod tests {
         let text = "[scene.camera]\nfile = \"track.chan\"\n";
         let mut document = Document::parse(text).unwrap();
         for error in [
-            document.turn(&turn, &camera).unwrap_err(),
+            document.turn(&turn, Some(40.0), &camera).unwrap_err(),
             document.shift_camera(&camera, DVec3::Y).unwrap_err(),
         ] {
             assert!(error.to_string().contains("scene.camera.file"), "{error}");
@@ -524,6 +534,13 @@ mod tests {
         let mut document = Document::parse(&lens).unwrap();
         document.shift_camera(&camera, DVec3::Y).unwrap();
         assert!(document.text().contains("position = [0.0, 2.6, 2.0]"));
+        document.turn(&turn, Some(40.0), &camera).unwrap_err();
+        document.turn(&turn, None, &camera).unwrap();
+        let text = document.text();
+        assert!(
+            text.contains("pitch_deg = -3.0") && !text.contains("fov_deg"),
+            "{text}"
+        );
     }
 
     #[test]

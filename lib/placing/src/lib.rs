@@ -7,6 +7,7 @@ pub mod document;
 mod drafts;
 pub mod edit;
 pub mod gate;
+mod lens;
 mod mask;
 mod patient;
 mod readings;

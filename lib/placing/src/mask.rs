@@ -4,7 +4,6 @@ use std::{fs, io};
 
 use anyhow::{Context, anyhow, bail};
 use dipir_imaging::raster::Raster;
-use dipir_imaging::resize::{Filter, resize};
 use dipir_pipeline::manifest::plain_reason;
 use dipir_preview::png;
 
@@ -32,11 +31,11 @@ impl MaskFile {
         Ok(Self { path, earlier })
     }
 
-    /// Writes `mask`, scaled to `size` pixels.
+    /// Writes `mask`, which has the photograph's pixels.
     ///
     /// # Errors
     /// If it cannot be; what was there stays.
-    pub(crate) fn write(&mut self, mask: &Raster<f32>, size: [u32; 2]) -> anyhow::Result<()> {
+    pub(crate) fn write(&mut self, mask: &Raster<f32>) -> anyhow::Result<()> {
         let path = &self.path;
         self.earlier = match path.exists() {
             true => Some(
@@ -45,10 +44,9 @@ impl MaskFile {
             ),
             false => None,
         };
-        let [w, h] = size.map(|n| n as usize);
-        let whole = resize(mask, w, h, Filter::Tent);
+        let [w, h] = [mask.width(), mask.height()];
         let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
-        let values: Vec<u8> = whole.pixels().iter().map(byte).collect();
+        let values: Vec<u8> = mask.pixels().iter().map(byte).collect();
         png::write(path, &png::encode(w, h, &values)?).map_err(|e| unwritten(path, &e))
     }
 

@@ -24,6 +24,15 @@ pub enum Second {
     Upright,
 }
 
+/// What is known of the focal length before lines are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Focal {
+    /// It stays as it is.
+    Known,
+    /// Two pairs of lines tell it.
+    Unsure,
+}
+
 /// Lines that a user drew.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -62,8 +71,8 @@ const NOTHING_DEG: f64 = 90.0;
 ///
 /// # Errors
 /// If the lines contradict each other.
-pub fn solve(lines: &Lines, camera: &Camera) -> anyhow::Result<Solution> {
-    let (turn, found_fov) = turn_of(lines, camera)?;
+pub fn solve(lines: &Lines, camera: &Camera, known: Focal) -> anyhow::Result<Solution> {
+    let (turn, found_fov) = turn_of(lines, camera, known)?;
     let mut squares = [0.0; 3];
     let pairs = 1 + usize::from(lines.second.is_some());
     for k in 0..pairs * 8 {
@@ -73,7 +82,7 @@ pub fn solve(lines: &Lines, camera: &Camera) -> anyhow::Result<Solution> {
             _ => &mut moved.first,
         };
         pair[k % 8 / 4][k % 4 / 2][k % 2] += CLICK_PX;
-        let Ok((other, _)) = turn_of(&moved, camera) else {
+        let Ok((other, _)) = turn_of(&moved, camera, known) else {
             // Lines that contradict each other when they are moved a little say nothing.
             squares = [NOTHING_DEG * NOTHING_DEG; 3];
             break;
@@ -98,7 +107,7 @@ pub fn solve(lines: &Lines, camera: &Camera) -> anyhow::Result<Solution> {
     })
 }
 
-fn turn_of(lines: &Lines, camera: &Camera) -> anyhow::Result<(Turn, bool)> {
+fn turn_of(lines: &Lines, camera: &Camera, known: Focal) -> anyhow::Result<(Turn, bool)> {
     let focal = camera.focal_px.as_dvec2();
     let [scale, height] = camera.resolution.map(f64::from);
     let fov = |focal: f64| 2.0 * (0.5 * height / focal).atan().to_degrees();
@@ -123,7 +132,8 @@ fn turn_of(lines: &Lines, camera: &Camera) -> anyhow::Result<(Turn, bool)> {
     let square = -first.truncate().dot(second.truncate()) / (first.z * second.z);
     // Both points must be near enough to tell: a few picture widths.
     const FAR: f64 = 1.0 / 8.0;
-    let tells = first.z.abs() > FAR * first.truncate().length()
+    let tells = known == Focal::Unsure
+        && first.z.abs() > FAR * first.truncate().length()
         && second.z.abs() > FAR * second.truncate().length();
     let found = square.sqrt() * scale;
     if tells && !(square > 0.0 && BELIEVED.contains(&fov(found))) {
@@ -250,7 +260,7 @@ mod tests {
                     focal_px: camera.focal_px * if direction == Second::Level { 1.7 } else { 1.0 },
                     ..camera
                 };
-                let found = solve(&lines, &guess).unwrap().turn;
+                let found = solve(&lines, &guess, Focal::Unsure).unwrap().turn;
                 // Pixels of single precision: 6e-5 px over lines of 100 px, extrapolated tenfold.
                 assert!((found.pitch_deg - pitch_deg).abs() < 0.02, "{found:?}");
                 assert!((found.roll_deg - roll_deg).abs() < 0.02, "{found:?}");
@@ -275,9 +285,29 @@ mod tests {
             pitch_deg: 0.0,
             ..truth
         };
-        let found = solve(&lines, &camera(&level)).unwrap();
+        let found = solve(&lines, &camera(&level), Focal::Unsure).unwrap();
         assert!((found.turn.pitch_deg + 9.0).abs() < 0.02, "{found:?}");
         assert!(!found.found_fov && found.uncertain_deg.pitch_deg > 0.0);
+    }
+
+    #[test]
+    fn pairs_at_any_angle_give_the_turn_of_a_known_lens() {
+        let truth = Turn {
+            pitch_deg: -12.0,
+            roll_deg: 2.0,
+            fov_deg: 45.0,
+        };
+        let camera = camera(&truth);
+        let lines = Lines {
+            first: pair(&camera, DVec3::new(0.5, 0.0, -1.0)),
+            second: Some(pair(&camera, DVec3::new(1.0, 0.0, -0.2))),
+            direction: Second::Level,
+        };
+        let found = solve(&lines, &camera, Focal::Known).unwrap();
+        // As above.
+        assert!((found.turn.pitch_deg + 12.0).abs() < 0.02, "{found:?}");
+        assert!((found.turn.roll_deg - 2.0).abs() < 0.02, "{found:?}");
+        assert!(!found.found_fov && (found.turn.fov_deg - 45.0).abs() < 1e-3);
     }
 
     #[test]
@@ -295,7 +325,9 @@ mod tests {
             second: None,
             direction: Second::Level,
         };
-        let error = solve(&lines, &camera(&level)).unwrap_err().to_string();
+        let error = solve(&lines, &camera(&level), Focal::Unsure)
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("along the horizon"), "{error}");
     }
 
@@ -314,6 +346,6 @@ mod tests {
             FieldOfView::Vertical(0.7),
             [1200, 800],
         )));
-        solve(&lines, &camera).unwrap_err();
+        solve(&lines, &camera, Focal::Unsure).unwrap_err();
     }
 }

@@ -299,14 +299,6 @@ fn saving_keeps_comments_and_order() {
 }
 
 #[test]
-fn a_photograph_that_its_lens_distorts_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let session = project(folder.path(), &["scene.camera.distortion={k1=-0.2}"]);
-    let error = Desk::open(session).err().expect("refused").to_string();
-    assert!(error.contains("[scene.camera.distortion]"), "{error}");
-}
-
-#[test]
 fn what_cannot_be_is_not_saved() {
     let place = Running::new();
     for edit in [

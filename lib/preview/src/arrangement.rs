@@ -5,10 +5,12 @@ use anyhow::Context;
 use dipir_imaging::facts::Facts;
 use dipir_scene::camera::Camera;
 use dipir_scene::config::{ProxySettings, SceneConfig};
+use dipir_scene::ground;
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::placement::{Anchor, Placement};
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::LoadedScene;
+use dipir_scene::undistortion::Undistortion;
 use glam::{DMat3, DMat4, DQuat, DVec3, Vec2, Vec3};
 
 /// An object's file, read.
@@ -120,10 +122,8 @@ impl Arrangement {
         // Of a lens that distorts, the camera of the undistorted picture, which is what is shown.
         let (camera, undistortion) = lens.resolve(facts.size, base_dir)?;
         let mut warnings = Vec::new();
-        let proxy = match &undistortion {
-            Some(_) if matches!(settings.proxy, ProxySettings::Pixels(_)) => loaded_proxy.clone(),
-            _ => plane_of(&settings.proxy, &camera)?.map_or(loaded_proxy.clone(), Proxy::Plane),
-        };
+        let plane = plane_of(&settings.proxy, &camera, undistortion.as_ref())?;
+        let proxy = plane.map_or(loaded_proxy.clone(), Proxy::Plane);
         let mut objects = Vec::new();
         for (i, object) in settings.objects.iter().enumerate() {
             let key = format!("scene.objects[{i}]");
@@ -171,14 +171,22 @@ impl Arrangement {
     }
 }
 
-/// The plane that is written, or that lies where `camera`, whose lens bends nothing, sees its pixels; `None` if the proxy
-/// is told otherwise.
-pub(crate) fn plane_of(proxy: &ProxySettings, camera: &Camera) -> anyhow::Result<Option<Plane>> {
+/// The plane that is written, or that lies where `camera` sees its pixels, which are those of the photograph as it was
+/// taken; `None` if the proxy is told otherwise.
+pub(crate) fn plane_of(
+    proxy: &ProxySettings,
+    camera: &Camera,
+    undistortion: Option<&Undistortion>,
+) -> anyhow::Result<Option<Plane>> {
     let pixels = match proxy {
         ProxySettings::Plane(plane) => return Ok(Some(*plane)),
         ProxySettings::Pixels(pixels) => pixels,
         _ => return Ok(None),
     };
+    if undistortion.is_some() {
+        let (plane, _) = ground::plane_of(pixels, &ground::view(camera, undistortion))?;
+        return Ok(Some(plane));
+    }
     let ray = |pixel: &Vec2| camera.ray(*pixel).direction.as_dvec3();
     let rays: Vec<DVec3> = pixels.pixels.iter().map(ray).collect();
     let found = pixels.found(&rays)?;

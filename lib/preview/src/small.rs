@@ -12,6 +12,7 @@ use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::plausibility::implausible;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::{LoadedScene, Scene};
+use dipir_scene::undistortion::Undistortion;
 use dipir_stages::scene::with_place;
 use glam::DMat4;
 
@@ -43,8 +44,12 @@ impl Props {
     /// # Errors
     /// On a configuration that cannot be used.
     pub fn camera(&self, config: &SceneConfig) -> anyhow::Result<Camera> {
+        Ok(self.resolved(config)?.0)
+    }
+
+    fn resolved(&self, config: &SceneConfig) -> anyhow::Result<(Camera, Option<Undistortion>)> {
         let settings = config.validate()?.camera.with_facts(&self.facts)?;
-        Ok(settings.resolve(self.facts.size, &self.base_dir)?.0)
+        Ok(settings.resolve(self.facts.size, &self.base_dir)?)
     }
 
     /// The plane of `config`'s proxy as its camera sees it, whatever its objects; `None` if the proxy is told otherwise.
@@ -52,7 +57,8 @@ impl Props {
     /// # Errors
     /// On a configuration that cannot be used.
     pub fn plane(&self, config: &SceneConfig) -> anyhow::Result<Option<Plane>> {
-        plane_of(&config.validate()?.proxy, &self.camera(config)?)
+        let (camera, undistortion) = self.resolved(config)?;
+        plane_of(&config.validate()?.proxy, &camera, undistortion.as_ref())
     }
 
     /// Where the objects of `config` stand; nothing is read but the camera's file.

@@ -150,10 +150,10 @@ pub(crate) fn proxy(ground: &Ground) -> Proxy {
 }
 
 /// The plane that pixels of the photograph lie on, and a warning if their lengths disagree.
-pub(crate) fn plane_of(
-    pixels: &PixelPlane,
-    view: &LensCamera,
-) -> Result<(Plane, Option<String>), Error> {
+///
+/// # Errors
+/// If the lens shows nothing at a pixel, or no plane below the camera goes through them.
+pub fn plane_of(pixels: &PixelPlane, view: &LensCamera) -> Result<(Plane, Option<String>), Error> {
     let mut rays = Vec::new();
     for pixel in &pixels.pixels {
         let ray = view.ray(pixel.as_dvec2());

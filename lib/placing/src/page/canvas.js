@@ -11,8 +11,8 @@ const PENS = [
 ];
 
 export class Picture {
-  constructor(canvas, photo, size, shown) {
-    Object.assign(this, { canvas, photo, size, shown });
+  constructor(canvas, photo, { size, shown, border }) {
+    Object.assign(this, { canvas, photo, size, shown, border });
     this.context = canvas.getContext("2d");
     this.fit();
   }
@@ -93,6 +93,17 @@ export class Picture {
     context.fillText(text, x * zoom, y * zoom);
   }
 
+  // Darkens what the photograph does not show.
+  dim() {
+    const { context, canvas, zoom, border } = this;
+    context.beginPath();
+    context.rect(0, 0, canvas.width, canvas.height);
+    border.forEach(([x, y], k) => context[k ? "lineTo" : "moveTo"](x * zoom, y * zoom));
+    context.closePath();
+    context.fillStyle = "rgba(0,0,0,.6)";
+    context.fill("evenodd");
+  }
+
   draw(view, { draft, grid, mask, chosen, showGrid, tool }) {
     const { context, canvas } = this;
     context.drawImage(this.photo, 0, 0, canvas.width, canvas.height);
@@ -101,6 +112,7 @@ export class Picture {
       const [x0, y0, x1, y1] = draft.place;
       context.drawImage(draft.image, x0 * part, y0 * part, (x1 - x0) * part, (y1 - y0) * part);
     }
+    if (this.border.length) this.dim();
     if (mask && tool === "mask") {
       context.globalAlpha = 0.5;
       context.drawImage(mask, 0, 0, canvas.width, canvas.height);

@@ -21,7 +21,7 @@ let [first, own] = await read().catch((error) => {
 
 let state = first; // what the file says
 const history = new History({ edit: first.edit, mask: null });
-const picture = new Picture($("canvas"), photo, first.size, first.shown);
+const picture = new Picture($("canvas"), photo, first);
 const layer = Object.assign(document.createElement("canvas"), { width: first.shown[0], height: first.shown[1] });
 const ink = layer.getContext("2d", { willReadFrequently: true });
 let grid = first.view.grid;

@@ -64,10 +64,11 @@ export function objects(names, edit, chosen, choose) {
 export function showNumbers(view, chosen) {
   const object = view.objects[chosen];
   const { pitch_deg, roll_deg, fov_deg, height_m } = view.camera;
+  const shown = view.undistorted ? ", of the picture as it is shown: without the distortion of the lens" : "";
   const way = pitch_deg < 0 ? "down" : "up";
   $("camera").textContent =
     `${height_m.toFixed(2)} m above the ground, looks ${Math.abs(pitch_deg).toFixed(1)}° ${way}, ` +
-    `roll ${roll_deg.toFixed(1)}°, field of view ${fov_deg.toFixed(1)}° (vertical)`;
+    `roll ${roll_deg.toFixed(1)}°, field of view ${fov_deg.toFixed(1)}° (vertical)${shown}`;
   if (object) {
     const [width, height, depth] = object.size_m;
     put("yaw", object.yaw_deg, 1);
