@@ -8,6 +8,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use crate::camera::{Camera, Lens, Pose};
 use crate::error::CameraError;
+use crate::file::{self, Wanted, Which};
 
 const FORMAT: &str = ".chan";
 
@@ -70,22 +71,88 @@ pub fn frames(
     fov_deg: Option<f64>,
     turns: Turns,
 ) -> Result<Vec<Frame>, CameraError> {
+    let lines = lines(text, size, fov_deg, turns).into_iter();
+    lines.map(|(_, frame)| frame).collect()
+}
+
+/// The frames of all lines by their numbers, where these can be read, and what is wrong with a line.
+pub(crate) fn lines(
+    text: &str,
+    size: [f64; 2],
+    fov_deg: Option<f64>,
+    turns: Turns,
+) -> Vec<(Option<i64>, Result<Frame, CameraError>)> {
     let lines = text.lines().enumerate();
     let lines = lines.filter(|(_, l)| !l.trim().is_empty() && !l.trim_start().starts_with('#'));
     let mut line_of = BTreeMap::new();
-    lines
-        .map(|(index, line)| {
-            let frame = frame(index + 1, line, size, fov_deg, turns)?;
-            match line_of.insert(frame.number, index + 1) {
-                None => Ok(frame),
-                Some(first) => {
-                    let (second, number) = (index + 1, frame.number);
-                    let detail = format!("lines {first} and {second} are both frame {number}");
-                    Err(CameraError::with_remedy(FORMAT, detail, "keep one of them"))
-                }
+    let read = |(index, line): (usize, &str)| {
+        let second = index + 1;
+        let number = number(line);
+        let first = number.and_then(|number| Some((number, line_of.insert(number, second)?)));
+        let frame = match first {
+            None => frame(second, line, size, fov_deg, turns),
+            Some((number, first)) => {
+                let detail = format!("lines {first} and {second} are both frame {number}");
+                Err(CameraError::with_remedy(FORMAT, detail, "keep one of them"))
             }
-        })
-        .collect()
+        };
+        (number, frame)
+    };
+    lines.map(read).collect()
+}
+
+/// The wanted frame of these lines. Lines of other frames may be wrong.
+pub(crate) fn wanted(
+    mut lines: Vec<(Option<i64>, Result<Frame, CameraError>)>,
+    wanted: &Wanted,
+) -> Result<Frame, CameraError> {
+    let (number, picture) = match wanted.which {
+        Which::Number(n) => (Some(i64::from(n)), None),
+        Which::Name(name) => (
+            name.parse().ok().or_else(|| file::number(name.as_ref())),
+            Some(name.as_ref()),
+        ),
+        Which::Photo(path) => (file::number(path), Some(path)),
+    };
+    if lines.len() == 1 && matches!(wanted.which, Which::Photo(_)) {
+        return lines.remove(0).1;
+    }
+    let count = lines.len();
+    let is_it = |own: &Option<i64>| own.is_some() && *own == number;
+    let (own, others): (Vec<_>, Vec<_>) = lines.into_iter().partition(|(own, _)| is_it(own));
+    // Of two lines of a frame the second is an error.
+    let own: Result<Vec<Frame>, _> = own.into_iter().map(|(_, frame)| frame).collect();
+    if let Some(frame) = own?.first() {
+        return Ok(*frame);
+    }
+    // It may be a line whose number cannot be read.
+    for (own, frame) in others {
+        if own.is_none() {
+            frame?;
+        }
+    }
+    let name = picture.map(|p| p.file_name().unwrap_or_default());
+    let which = match (number, name) {
+        (Some(number), Some(name)) => {
+            format!("none of number {number}, with which {name:?} ends")
+        }
+        (Some(number), None) => format!("none of number {number}"),
+        (None, name) => format!(
+            "{:?} does not end in the number of one",
+            name.unwrap_or_default()
+        ),
+    };
+    Err(CameraError::with_remedy(
+        FORMAT,
+        format!("it has {count} frames, and {which}"),
+        "say which by its number, the first in its line",
+    ))
+}
+
+/// The number of a line's frame, its first.
+fn number(line: &str) -> Option<i64> {
+    let first: f64 = line.split_whitespace().next()?.parse().ok()?;
+    first.is_finite().then_some(first as i64)
 }
 
 /// The frame of a line with this number.

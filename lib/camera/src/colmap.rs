@@ -172,6 +172,8 @@ struct Contents {
     lenses: BTreeMap<u32, Parameters>,
     images: Vec<Image>,
     points: Vec<DVec3>,
+    /// The model of a camera with an unknown number of parameters, behind which no further camera is found.
+    unknown_model: Option<u32>,
 }
 
 /// Of a lens.
@@ -270,7 +272,8 @@ impl Contents {
             let size = [at.u64()? as f64, at.u64()? as f64];
             let mut models = MODELS.iter().chain(&UNREAD);
             let Some(&(_, model, count)) = models.find(|m| m.0 == kind) else {
-                return Err(unknown(&kind.to_string()));
+                file.unknown_model = Some(kind);
+                break;
             };
             let numbers = (0..count).map(|_| at.f64()).collect::<Result<_, _>>()?;
             let model = model.to_string();
@@ -325,6 +328,9 @@ impl Contents {
     fn camera(&self, image: &Image, up: WorldUp) -> Result<Camera, CameraError> {
         let wrong = |what: &str| CameraError::new(FORMAT, what);
         let parameters = self.lenses.get(&image.lens);
+        if let (None, Some(kind)) = (parameters, self.unknown_model) {
+            return Err(unknown(&kind.to_string()));
+        }
         let Parameters {
             model,
             size,

@@ -171,10 +171,10 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
         "chan" => {
             let text = String::from_utf8_lossy(bytes);
             let turns = wanted.turns.unwrap_or(Turns::ZXY);
-            let frames = chan::frames(&text, wanted.size, wanted.fov_deg, turns)?;
+            let lines = chan::lines(&text, wanted.size, wanted.fov_deg, turns);
             let chan::Frame {
                 camera, states_fov, ..
-            } = *of_chan(&frames, wanted)?;
+            } = chan::wanted(lines, wanted)?;
             let pose = camera.pose.in_our_world(wanted.up.unwrap_or(WorldUp::Y));
             Ok(Found {
                 states_fov,
@@ -388,43 +388,10 @@ fn stem(path: &Path) -> Option<&OsStr> {
 }
 
 /// The digits at the end of a picture's name.
-fn number(picture: &Path) -> Option<i64> {
+pub(crate) fn number(picture: &Path) -> Option<i64> {
     let stem = stem(picture)?.to_str()?;
     let head = stem.trim_end_matches(|c: char| c.is_ascii_digit());
     stem[head.len()..].parse().ok()
-}
-
-fn of_chan<'a>(frames: &'a [chan::Frame], wanted: &Wanted) -> Result<&'a chan::Frame, CameraError> {
-    let (number, picture) = match wanted.which {
-        Which::Number(n) => (Some(i64::from(n)), None),
-        Which::Name(name) => (
-            name.parse().ok().or_else(|| number(name.as_ref())),
-            Some(name.as_ref()),
-        ),
-        Which::Photo(path) => (number(path), Some(path)),
-    };
-    let found = match (wanted.which, frames) {
-        (Which::Photo(_), [only]) => Some(only),
-        _ => frames.iter().find(|f| Some(f.number) == number),
-    };
-    found.ok_or_else(|| {
-        let name = picture.map(|p| p.file_name().unwrap_or_default());
-        let which = match (number, name) {
-            (Some(number), Some(name)) => {
-                format!("none of number {number}, with which {name:?} ends")
-            }
-            (Some(number), None) => format!("none of number {number}"),
-            (None, name) => format!(
-                "{:?} does not end in the number of one",
-                name.unwrap_or_default()
-            ),
-        };
-        CameraError::with_remedy(
-            ".chan",
-            format!("it has {} frames, and {which}", frames.len()),
-            "say which by its number, the first in its line",
-        )
-    })
 }
 
 #[cfg(test)]
@@ -521,6 +488,29 @@ mod tests {
         let one = "7 1 2 3 0 0 0 40";
         let of_one = wanted(Which::Photo(Path::new("plate.1003.png")));
         assert!(found_in("shot.chan", one, &of_one).is_ok());
+    }
+
+    #[test]
+    fn of_a_chan_only_the_line_of_the_frame_has_to_be_right() {
+        let chan = "1001 1 2 3 0 0 0 40\n1002 nan 5 6 0 0 0 40\n1003 1 2\n1004 1 2 7 0 0 0 40\n1004 0 0 0 0 0 0 40\n";
+        let z = |text: &str, n| {
+            found_in("shot.chan", text, &wanted(Which::Number(n)))
+                .map(|f| f.pose.unwrap().position.z)
+        };
+        assert_eq!(z(chan, 1001), Ok(3.0));
+        for (n, want) in [
+            (1002, "line 2: expected a frame, a position and a rotation"),
+            (1003, "line 3: expected a frame, a position and a rotation"),
+            (1004, "lines 4 and 5 are both frame 1004; keep one of them"),
+            (1005, "it has 5 frames, and none of number 1005"),
+        ] {
+            let error = z(chan, n).unwrap_err();
+            assert!(error.contains(want), "{error}");
+        }
+        let numberless = "1001 1 2 3 0 0 0 40\n1OO2 4 5 6 0 0 0 40\n";
+        assert_eq!(z(numberless, 1001), Ok(3.0));
+        let error = z(numberless, 1002).unwrap_err();
+        assert!(error.contains("line 2: expected a frame"), "{error}");
     }
 
     #[test]

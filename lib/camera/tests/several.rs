@@ -3,7 +3,7 @@ mod found;
 
 use std::path::Path;
 
-use dipir_cameras::file::Which;
+use dipir_cameras::file::{self, Wanted, Which};
 use serde_json::json;
 
 use crate::found::found_x;
@@ -91,4 +91,53 @@ fn a_gltf_of_orthographic_cameras_says_that_they_are() {
     let text = json!({ "nodes": [{ "camera": 0 }], "cameras": [camera] }).to_string();
     let error = found_x("shot.gltf", &text, Which::Number(0)).unwrap_err();
     assert!(error.contains("its cameras are orthographic"), "{error}");
+}
+
+/// Files of later versions of COLMAP.
+#[test]
+fn a_model_of_cameras_with_a_number_that_is_not_known_keeps_no_earlier_one_from_being_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let numbers =
+        |values: &[f64]| -> Vec<u8> { values.iter().flat_map(|v| v.to_le_bytes()).collect() };
+    let camera = |id: u32, kind: u32, parameters: &[f64]| {
+        let head = [id.to_le_bytes(), kind.to_le_bytes()].concat();
+        let size = [640u64.to_le_bytes(), 480u64.to_le_bytes()].concat();
+        [head, size, numbers(parameters)].concat()
+    };
+    let pinhole = [520.0, 520.0, 320.0, 240.0];
+    let cameras = [
+        3u64.to_le_bytes().to_vec(),
+        camera(1, 1, &pinhole),
+        camera(2, 99, &[520.0, 320.0]),
+        camera(3, 1, &pinhole),
+    ];
+    let image = |id: u32| {
+        let pose = numbers(&[1.0, 0.0, 0.0, 0.0, f64::from(id), 0.0, 0.0]);
+        let name = format!("{id}.png\0").into_bytes();
+        let ids = [id.to_le_bytes(), id.to_le_bytes()];
+        [ids[0].to_vec(), pose, ids[1].to_vec(), name, vec![0; 8]].concat()
+    };
+    let images = [3u64.to_le_bytes().to_vec(), image(1), image(2), image(3)];
+    std::fs::write(folder.path().join("cameras.bin"), cameras.concat()).unwrap();
+    std::fs::write(folder.path().join("images.bin"), images.concat()).unwrap();
+    let of = |name| {
+        let asked = Wanted {
+            size: [640.0, 480.0],
+            which: Which::Name(name),
+            up: None,
+            fov_deg: None,
+            turns: None,
+        };
+        file::read(folder.path(), &asked).map_err(|e| e.to_string())
+    };
+    assert_eq!(of("1.png").unwrap().pose.unwrap().position.x, -1.0);
+    for name in ["2.png", "3.png"] {
+        let error = of(name).unwrap_err();
+        assert!(
+            error.contains("its camera model is 99; accepted:"),
+            "{error}"
+        );
+    }
+    let known = file::pictures(folder.path(), None);
+    assert_eq!(known.len(), 1);
 }

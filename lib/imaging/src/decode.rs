@@ -8,6 +8,7 @@ use crate::{
     jpeg_header,
     png_colours::PngColours,
     raster::{LinearImage, Raster},
+    unheeded,
 };
 use glam::Vec3;
 use image::{
@@ -35,6 +36,10 @@ pub(crate) struct Decoded {
     pub png_colours: PngColours,
     /// Exif data from its TIFF header on.
     pub exif: Option<Vec<u8>>,
+    /// The turn that XMP names where Exif data name none, 2 to 8; it is not applied.
+    pub turn_in_xmp: Option<u8>,
+    /// What names densities of pixels across and down that differ, and these.
+    pub densities: Option<(&'static str, [u32; 2])>,
 }
 
 enum Samples {
@@ -87,6 +92,7 @@ impl Decoded {
                 let decoder = PngDecoder::with_limits(source, limits).map_err(failed)?;
                 let mut decoded = Self::with(decoder, path, limit, failed)?;
                 decoded.png_colours = PngColours::of(bytes);
+                decoded.densities = unheeded::densities(bytes, format);
                 Ok(decoded.with_profile_of(bytes, b"iCCP"))
             }
             Format::Jpeg => {
@@ -100,6 +106,7 @@ impl Decoded {
                 {
                     decoded.icc = ColorProfile::new_adobe_rgb().encode().ok();
                 }
+                decoded.densities = unheeded::densities(bytes, format);
                 Ok(decoded)
             }
             other => Err(other.refuse(path, expected)),
@@ -122,6 +129,8 @@ impl Decoded {
         let icc = decoder.icc_profile().ok().flatten();
         let exif = decoder.exif_metadata().ok().flatten();
         let orientation = exif.as_deref().and_then(Orientation::from_exif_chunk);
+        let xmp = decoder.xmp_metadata().ok().flatten();
+        let xmp = xmp.filter(|_| orientation.is_none());
         let count = width * height * channels;
         let samples = if wide {
             let mut samples = vec![0u16; count];
@@ -142,6 +151,8 @@ impl Decoded {
             icc,
             png_colours: PngColours::default(),
             exif,
+            turn_in_xmp: xmp.as_deref().and_then(unheeded::turn_in_xmp),
+            densities: None,
         })
     }
 

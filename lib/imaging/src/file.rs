@@ -13,6 +13,7 @@ use crate::{
     primaries::{self, Primaries},
     raster::{LinearImage, Raster},
     transfer::Transfer,
+    unheeded,
 };
 use glam::Vec3;
 use image::metadata::Orientation;
@@ -296,7 +297,11 @@ fn display_photo(mut decoded: Decoded, path: &Path, transfer: Transfer) -> Photo
     let unused = unused
         .iter()
         .map(|what| format!("`{name}`: its {what}: convert it to sRGB if its colours look wrong"));
-    let warnings = unused.chain(transparency(alpha.as_ref(), path)).collect();
+    let warnings = unused
+        .chain(transparency(alpha.as_ref(), path))
+        .chain(decoded.densities.map(|own| unheeded::not_square(own, path)))
+        .chain(decoded.turn_in_xmp.map(|turn| unheeded::turned(turn, path)))
+        .collect();
     let encoding = match (transfer, of_file) {
         (Transfer::Srgb, Some(of_file)) => of_file,
         (_, of_file) => Encoding::overruled(transfer, of_file),

@@ -23,6 +23,7 @@ mod sensors;
 pub mod spline;
 pub mod tone;
 pub mod transfer;
+mod unheeded;
 pub mod warp;
 
 pub use error::ImagingError;

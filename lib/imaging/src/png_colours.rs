@@ -90,7 +90,7 @@ impl PngColours {
 }
 
 /// The chunks before the pixels: name and contents.
-fn chunks(bytes: &[u8]) -> impl Iterator<Item = ([u8; 4], &[u8])> {
+pub(crate) fn chunks(bytes: &[u8]) -> impl Iterator<Item = ([u8; 4], &[u8])> {
     let mut rest = bytes.get(8..).unwrap_or_default();
     let next = move || {
         let (length, tail) = rest.split_first_chunk()?;

@@ -1,11 +1,11 @@
 //! Why nothing of an object can be seen.
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 
 use crate::camera::Camera;
 use crate::material::{AlphaMode, Material};
 use crate::mesh::TriangleMesh;
 
-/// Says why nothing of the placed `mesh` can be seen, or which of its `materials` cannot; one sentence
+/// Says why nothing of the placed `mesh` can be seen, which of its `materials` cannot, or that it is inside out; one sentence
 /// each. Whether the mesh lies in the picture is not checked.
 pub fn hidden(mesh: &TriangleMesh, materials: &[Material], camera: &Camera) -> Vec<String> {
     let nothing = |why: String| vec![format!("nothing of it can be seen: {why}")];
@@ -41,6 +41,11 @@ pub fn hidden(mesh: &TriangleMesh, materials: &[Material], camera: &Camera) -> V
                 .into(),
         );
     }
+    let inside_out = is_inside_out(mesh, &used, camera).then(|| {
+        "its triangles are single-sided and face inwards, so that its inner sides are seen, in the dark; turn them outwards \
+         (in Blender: Mesh, Normals, Recalculate Outside), or make them double-sided (doubleSided in glTF)"
+            .into()
+    });
     without
         .iter()
         .map(|m| {
@@ -49,7 +54,37 @@ pub fn hidden(mesh: &TriangleMesh, materials: &[Material], camera: &Camera) -> V
                 m.name
             )
         })
+        .chain(inside_out)
         .collect()
+}
+
+/// A mesh is closed if the sum of its triangles' area vectors is less than this share of their areas.
+const CLOSED: f64 = 1e-3;
+
+/// How much of what it encloses a mesh that is inside out has, at least, as a negative volume.
+const INWARDS: f64 = 0.1;
+
+/// Whether a closed mesh whose backs do not show turns its fronts inwards, seen from outside: from inside it may be a room.
+fn is_inside_out(mesh: &TriangleMesh, used: &[&Material], camera: &Camera) -> bool {
+    let has_backs = |m: &&Material| m.double_sided || m.transmission.is_some();
+    let Some((low, high)) = mesh.bounds() else {
+        return false;
+    };
+    let eye = camera.position;
+    if used.iter().any(has_backs) || (eye.cmpge(low).all() && eye.cmple(high).all()) {
+        return false;
+    }
+    let middle = (low.as_dvec3() + high.as_dvec3()) * 0.5;
+    let (mut vectors, mut areas, mut volume, mut all) = (DVec3::ZERO, 0.0, 0.0, 0.0f64);
+    for (t, corners) in mesh.indices.iter().enumerate() {
+        let vector = mesh.scaled_normal(t);
+        let part = vector.dot(mesh.positions[corners[0] as usize].as_dvec3() - middle);
+        vectors += vector;
+        areas += vector.length();
+        volume += part;
+        all += part.abs();
+    }
+    vectors.length() < CLOSED * areas && volume < -INWARDS * all
 }
 
 /// Whether the camera sees the back of every triangle, and no back shows.
@@ -73,6 +108,9 @@ fn is_transparent(material: &Material, most_alpha: f32) -> bool {
     }
 }
 
+/// From as far as this, metres, hardly an object is meant to be less than a pixel.
+const ON_A_MAP_M: f64 = 1e3;
+
 fn without_extent(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
     let (low, high) = mesh.bounds()?;
     let (low, high) = (low.as_dvec3(), high.as_dvec3());
@@ -84,6 +122,13 @@ fn without_extent(mesh: &TriangleMesh, camera: &Camera) -> Option<String> {
         return Some("none of its triangles has an area (is a scale zero along an axis?)".into());
     }
     let pixels = below_a_pixel(mesh.bounds()?, camera)?;
+    let distance = camera.position.as_dvec3().distance((low + high) * 0.5);
+    if distance > ON_A_MAP_M {
+        return Some(format!(
+            "it lies {} km away; if its file has the coordinates of a map, write anchor = \"center\", else raise its scale",
+            short(distance * 1e-3)
+        ));
+    }
     Some(format!(
         "it is {} m across, {} of a pixel; raise its scale, or write height_m",
         short(size),

@@ -1,6 +1,9 @@
 //! The GLB container, data URIs, and where files that a document names are found.
 use std::borrow::Cow;
 use std::cell::RefCell;
+use std::collections::{HashMap, HashSet};
+use std::ffi::{OsStr, OsString};
+use std::hash::Hash;
 use std::io;
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
@@ -44,7 +47,13 @@ pub struct Folder {
     limits: Limits,
     used: RefCell<Vec<PathBuf>>,
     missing: RefCell<Vec<PathBuf>>,
+    warnings: RefCell<Vec<String>>,
+    /// Of folders that were searched.
+    listings: RefCell<HashMap<PathBuf, Listing>>,
 }
+
+/// Entries of a folder by their names in small letters; `None` where several have the same.
+type Listing = HashMap<String, Option<OsString>>;
 
 impl Folder {
     /// Files are found relative to `path`; `limits` says how large they may be and whether they may
@@ -55,18 +64,32 @@ impl Folder {
             limits: *limits,
             used: RefCell::default(),
             missing: RefCell::default(),
+            warnings: RefCell::default(),
+            listings: RefCell::default(),
         }
     }
 
     /// The files found so far, and the paths at which none could be opened, each once, in the order of first use.
     pub fn into_used_and_missing(self) -> (Vec<PathBuf>, Vec<PathBuf>) {
-        (self.used.into_inner(), self.missing.into_inner())
+        (
+            once(self.used.into_inner()),
+            once(self.missing.into_inner()),
+        )
+    }
+
+    /// What was found under another name than asked for, one sentence each.
+    pub(super) fn take_warnings(&self) -> Vec<String> {
+        once(self.warnings.take())
     }
 
     fn find(&self, uri: &str) -> io::Result<PathBuf> {
+        let uri = without_file_scheme(uri);
+        if uri.trim().is_empty() {
+            return Err(io::Error::new(io::ErrorKind::NotFound, "no file is named"));
+        }
         if let Some((scheme, _)) = uri.split_once("://") {
             return Err(io::Error::new(
-                io::ErrorKind::Unsupported,
+                io::ErrorKind::NotFound,
                 format!("{scheme} addresses are not followed; download the file beside the object"),
             ));
         }
@@ -76,18 +99,33 @@ impl Folder {
         let guesses = [&decoded, uri, &slashed];
         let allow_outside = self.limits.allow_outside;
         if !allow_outside && guesses.iter().any(|guess| leaves_folder(guess)) {
-            return Err(outside());
+            // An absolute path is one of the machine that wrote it. Whether it is there is not looked up.
+            let is_absolute = guesses.iter().any(|guess| Path::new(guess).has_root());
+            return Err(outside(match is_absolute {
+                true => io::ErrorKind::NotFound,
+                false => io::ErrorKind::PermissionDenied,
+            }));
         }
         let paths = guesses.map(|guess| self.path.join(guess));
-        let found = paths.iter().find(|path| path.is_file());
-        let found = found.unwrap_or(&paths[0]).clone();
+        let found = paths.iter().find(|path| path.is_file()).cloned();
+        let found = found.or_else(|| {
+            let found = guesses.iter().find_map(|guess| self.but_for_case(guess))?;
+            // As soon as one of these is there, it is the one.
+            paths.iter().for_each(|path| note(&self.missing, path));
+            Some(found)
+        });
+        let found = found.unwrap_or_else(|| paths[0].clone());
         // Opened to refuse now what is no regular file, though it be read later.
         let file = dipir_files::open(&found).inspect_err(|_| match found.is_file() {
             true => note(&self.missing, &found),
             false => paths.iter().for_each(|path| note(&self.missing, path)),
         });
+        let file = file.map_err(|e| match found.is_dir() {
+            true => io::Error::new(io::ErrorKind::NotFound, e.to_string()),
+            false => e,
+        });
         if !allow_outside && !self.holds(&found)? {
-            return Err(outside());
+            return Err(outside(io::ErrorKind::PermissionDenied));
         }
         let bytes = file?.metadata()?.len();
         self.limits
@@ -97,27 +135,95 @@ impl Folder {
         Ok(found)
     }
 
+    /// The only file of a name that differs in nothing but the case of letters, with a warning. Systems differ in whether that
+    /// counts.
+    fn but_for_case(&self, guess: &str) -> Option<PathBuf> {
+        let mut found = self.path.clone();
+        for part in Path::new(guess).components() {
+            let exact = found.join(part);
+            found = match (exact.exists(), part) {
+                (true, _) => exact,
+                (false, Component::Normal(name)) => self.only_match(&found, name)?,
+                (false, _) => return None,
+            };
+        }
+        if !found.is_file() {
+            return None;
+        }
+        let own = found.strip_prefix(&self.path).unwrap_or(&found);
+        let warning = format!(
+            "there is no \"{guess}\"; \"{}\" is used, whose name differs in the case of letters",
+            own.display()
+        );
+        self.warnings.borrow_mut().push(printable(warning));
+        Some(found)
+    }
+
+    /// The only entry of a folder that is called `name` but for the case of letters.
+    fn only_match(&self, folder: &Path, name: &OsStr) -> Option<PathBuf> {
+        let mut listings = self.listings.borrow_mut();
+        // Listed once, for an object may name many files that are not there.
+        let listing = (listings.entry(folder.into())).or_insert_with(|| listing(folder));
+        let found = listing.get(&small_letters(name))?.as_ref()?;
+        Some(folder.join(found))
+    }
+
     /// Whether `file` lies in the folder once links are followed.
     fn holds(&self, file: &Path) -> io::Result<bool> {
-        let folder = match self.path.as_os_str().is_empty() {
-            true => Path::new("."),
-            false => &self.path,
-        };
+        let folder = or_here(&self.path);
         Ok(file.canonicalize()?.starts_with(folder.canonicalize()?))
     }
 }
 
-/// Adds a path once.
-fn note(list: &RefCell<Vec<PathBuf>>, path: &Path) {
-    let mut list = list.borrow_mut();
-    if !list.iter().any(|known| known == path) {
-        list.push(path.into());
+/// A path that lists: the empty one stands for the folder of the process.
+fn or_here(folder: &Path) -> &Path {
+    match folder.as_os_str().is_empty() {
+        true => Path::new("."),
+        false => folder,
     }
 }
 
-fn outside() -> io::Error {
+fn small_letters(name: &OsStr) -> String {
+    name.to_string_lossy().to_lowercase()
+}
+
+/// Of a folder that cannot be listed it is empty.
+fn listing(folder: &Path) -> Listing {
+    let mut all = Listing::new();
+    let entries = or_here(folder).read_dir().into_iter().flatten();
+    for name in entries.flatten().map(|entry| entry.file_name()) {
+        all.entry(small_letters(&name))
+            .and_modify(|only| *only = None)
+            .or_insert(Some(name));
+    }
+    all
+}
+
+fn note(list: &RefCell<Vec<PathBuf>>, path: &Path) {
+    list.borrow_mut().push(path.into());
+}
+
+/// Each value once, where it is first.
+fn once<T: Clone + Eq + Hash>(mut all: Vec<T>) -> Vec<T> {
+    let mut seen = HashSet::new();
+    all.retain(|value| seen.insert(value.clone()));
+    all
+}
+
+/// The path in an address of the `file` scheme [RFC 8089]; anything else as it is.
+fn without_file_scheme(uri: &str) -> &str {
+    let scheme = uri.get(..5);
+    if !scheme.is_some_and(|s| s.eq_ignore_ascii_case("file:")) {
+        return uri;
+    }
+    let rest = uri[5..].strip_prefix("//").unwrap_or(&uri[5..]);
+    let local = rest.strip_prefix("localhost");
+    local.filter(|path| path.starts_with('/')).unwrap_or(rest)
+}
+
+fn outside(kind: io::ErrorKind) -> io::Error {
     io::Error::new(
-        io::ErrorKind::PermissionDenied,
+        kind,
         "it lies outside of the object's folder; copy it into that, or set scene.limits.allow_outside = true",
     )
 }
@@ -147,7 +253,10 @@ impl Resolver for Folder {
         let found = self.find(uri).or_else(|e| match e.kind() {
             io::ErrorKind::FileTooLarge => Err(e),
             _ if bare.is_empty() => Err(e),
-            _ => self.find(bare).map_err(|_| e),
+            _ => self.find(bare).map_err(|of_bare| match of_bare.kind() {
+                io::ErrorKind::NotFound => e,
+                _ => of_bare,
+            }),
         });
         found.map(ImageSource::File)
     }
@@ -377,5 +486,41 @@ fn borrowed(part: Cow<'_, [u8]>) -> &[u8] {
     match part {
         Cow::Borrowed(slice) => slice,
         Cow::Owned(_) => &[],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_is_listed_once_however_many_files_are_not_there() {
+        let files = tempfile::tempdir().unwrap();
+        std::fs::write(files.path().join("Paint.PNG"), "").unwrap();
+        let folder = Folder::new(files.path(), &Limits::default());
+        assert!(folder.image("gone.png").is_err());
+        // Not in the listing.
+        std::fs::write(files.path().join("WOOD.png"), "").unwrap();
+        if files.path().join("wood.PNG").exists() {
+            return;
+        }
+        assert!(folder.image("wood.png").is_err());
+        assert!(folder.image("paint.png").is_ok());
+        assert_eq!(folder.listings.borrow().len(), 1);
+    }
+
+    #[test]
+    fn paths_are_taken_out_of_addresses_of_the_file_scheme() {
+        for (uri, path) in [
+            ("file:///a/b.png", "/a/b.png"),
+            ("file:/a/b.png", "/a/b.png"),
+            ("File://localhost/a.png", "/a.png"),
+            ("file://localhost.png", "localhost.png"),
+            ("files/a.png", "files/a.png"),
+            ("fil\u{e9}:a", "fil\u{e9}:a"),
+            ("file:", ""),
+        ] {
+            assert_eq!(without_file_scheme(uri), path);
+        }
     }
 }

@@ -14,7 +14,7 @@ use super::accessor::{Buffers, get};
 use super::container::{self, Resolver};
 use super::document::{self, Document, raw_extension};
 use crate::error::Error;
-use crate::material::{AlphaMode, Clearcoat, Material, TextureRef, Transmission};
+use crate::material::{AlphaMode, Clearcoat, Material, Specular, TextureRef, Transmission};
 
 pub(super) mod extensions;
 use crate::texture::{Encoding, Filter, ImageSource, Texture, Wrap};
@@ -43,6 +43,9 @@ pub(super) fn image_remedy(extension: &str) -> &'static str {
         _ => "export the textures as PNG or JPEG",
     }
 }
+
+/// An index of refraction that reflects all but 4e-4 of light.
+const MIRROR: f32 = 1e4;
 
 const CLEARCOAT: &str = "KHR_materials_clearcoat";
 
@@ -129,7 +132,9 @@ impl<'a> MaterialReader<'a> {
         if let Some(coat) = raw_extension(&extensions.others, CLEARCOAT, &at)? {
             material.clearcoat = self.clearcoat(&coat, &at)?;
         }
+        let of_old_model = material.extensions.specular;
         material.extensions = self.extensions(&extensions.others, &at)?;
+        material.extensions.specular = of_old_model.or(material.extensions.specular);
         if let Some(transmission) = &extensions.transmission {
             let factor = transmission.transmission_factor.0;
             let factor = self.factor(factor, 1.0, 0.0, &at, "transmissionFactor");
@@ -147,8 +152,8 @@ impl<'a> MaterialReader<'a> {
         }
         if let Some(ior) = extensions.ior.as_ref().map(|e| e.ior.0) {
             // 0 is the extension's name for "reflects like a mirror everywhere": large enough.
-            let ior = if ior == 0.0 { 1e4 } else { ior };
-            material.ior = self.factor(ior, 1e4, 1.5, &at, "ior").max(1.0);
+            let ior = if ior == 0.0 { MIRROR } else { ior };
+            material.ior = self.factor(ior, MIRROR, 1.5, &at, "ior").max(1.0);
         }
         Ok(material)
     }
@@ -162,14 +167,35 @@ impl<'a> MaterialReader<'a> {
             Vec4::from_array(c.map(|v| s.factor(v, 1.0, 1.0, at, "baseColorFactor")))
         };
         if let Some(old) = old.filter(|_| !self.document.has_metallic_roughness(index)) {
-            self.warnings.push(format!(
-                "{at}: KHR_materials_pbrSpecularGlossiness is read as a dielectric; its specular colour is left out"
-            ));
             material.base_color = color(self, old.diffuse_factor.0);
             material.metallic = 0.0;
             material.roughness = 1.0 - unit(self, old.glossiness_factor.0, "glossinessFactor");
             material.base_color_texture =
                 self.texture(&old.diffuse_texture, at, "diffuseTexture", Encoding::Srgb)?;
+            let name = "specularGlossinessTexture";
+            let reflectance = Vec3::from_array(old.specular_factor.0);
+            let reflectance = reflectance.clamp(Vec3::ZERO, Vec3::ONE);
+            let most = reflectance.max_element();
+            material.ior = ior_of(most);
+            let color = match most > 0.0 {
+                true => reflectance / most,
+                false => Vec3::ONE,
+            };
+            let color_texture =
+                self.texture(&old.specular_glossiness_texture, at, name, Encoding::Srgb)?;
+            if color != Vec3::ONE || color_texture.is_some() {
+                material.extensions.specular = Some(Specular {
+                    factor: 1.0,
+                    factor_texture: None,
+                    color,
+                    color_texture,
+                });
+            }
+            if old.specular_glossiness_texture.is_some() {
+                self.warnings.push(format!(
+                    "{at}: the glossiness in {name} is not read; glossinessFactor alone is used"
+                ));
+            }
             return Ok(());
         }
         let pbr = &source.pbr_metallic_roughness;
@@ -432,6 +458,12 @@ impl<'a> MaterialReader<'a> {
         self.images.insert(index, image.clone());
         Ok(image)
     }
+}
+
+/// The index of refraction of a surface that reflects so much at normal incidence.
+fn ior_of(reflectance: f32) -> f32 {
+    let root = reflectance.sqrt();
+    ((1.0 + root) / (1.0 - root)).min(MIRROR)
 }
 
 /// `KHR_texture_transform`: scale, then rotate counter-clockwise in the image, then offset.

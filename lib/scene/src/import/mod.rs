@@ -9,6 +9,7 @@ mod lights;
 mod meshopt;
 mod mtl;
 mod obj;
+mod opacity;
 mod ply;
 mod polygon;
 mod stl;
@@ -111,6 +112,7 @@ pub fn load_object_within(path: &Path, limits: &Limits) -> Result<Imported, Erro
         Ok(()) => e.in_file(path),
         Err(source) => unreadable(path, source),
     })?;
+    imported.warnings.extend(folder.take_warnings());
     (imported.dependencies, imported.missing) = folder.into_used_and_missing();
     for texture in &mut imported.textures {
         if let ImageSource::Bytes { name, .. } = &mut texture.image {

@@ -4,12 +4,15 @@
 //! follows from the Blinn-Phong exponent `Ns` by `alpha^2 = 2 / (Ns + 2)` [Walter et al. 2007,
 //! section 5.2]. A black `Ks` switches the dielectric reflection off. Surfaces are double-sided, for
 //! the format does not say which side is the front.
-use std::collections::HashMap;
+use std::borrow::Cow;
+use std::collections::{HashMap, HashSet};
 
 use glam::{Mat3, Vec2, Vec3, Vec4};
 
 use super::container::{self, Resolver};
+use super::opacity;
 use crate::error::Error;
+use crate::limits::Limits;
 use crate::material::{AlphaMode, Clearcoat, Material, TextureRef};
 use crate::texture::{Encoding, Filter, Texture, Wrap};
 
@@ -18,6 +21,19 @@ const LEFT_OUT: [&str; 13] = [
     "Ps", "aniso", "map_Ks", "map_Ns", "map_Ps", "map_Pc", "map_Pcr", "map_Tr", "map_refl",
     "map_disp", "disp", "decal", "refl",
 ];
+
+/// Statements that are read, as the format spells them: some exporters write them small.
+const READ: [&str; 22] = [
+    "newmtl", "Kd", "Ks", "Ke", "Ns", "Ni", "Tf", "Tr", "d", "illum", "Pr", "Pm", "Pc", "Pcr",
+    "map_Kd", "map_Ke", "map_Pr", "map_Pm", "map_d", "map_Bump", "norm", "bump",
+];
+
+/// Linear Rec.709 of CIE XYZ, by columns [IEC 61966-2-1].
+const REC709_OF_XYZ: Mat3 = Mat3::from_cols(
+    Vec3::new(3.2404542, -0.969266, 0.0556434),
+    Vec3::new(-1.5371385, 1.8760108, -0.2040259),
+    Vec3::new(-0.4985314, 0.041556, 1.0572252),
+);
 
 /// What a triangle without a material gets.
 pub(super) fn grey() -> Material {
@@ -71,6 +87,8 @@ pub(super) struct Library {
     pub warnings: Vec<String>,
     /// Materials with a `map_Bump`, which may be one of heights, and how that is written.
     bumps: Vec<(usize, String)>,
+    /// Materials with a `map_d` in a file of its own.
+    opacities: Vec<(usize, TextureRef)>,
     by_name: HashMap<String, u32>,
     by_file: HashMap<(String, Encoding, bool), u32>,
 }
@@ -78,18 +96,19 @@ pub(super) struct Library {
 /// A material while its statements are read.
 #[derive(Default)]
 struct Draft {
+    diffuse: Option<Vec3>,
     base_file: String,
     shininess: Option<f32>,
     roughness: Option<f32>,
     roughness_file: Option<String>,
     metallic_file: Option<String>,
-    alpha_file: Option<String>,
+    opacity: Option<Map>,
     /// Weight and roughness of the coat.
     coat: [f32; 2],
     /// Statements that change the surface and are not read.
     left_out: Vec<String>,
-    /// Whether the file of `map_Ke` is missing.
-    lacks_emission: bool,
+    /// Whether there is a `map_Ke`.
+    has_emission_map: bool,
     /// Whether `d` was written.
     has_opacity: bool,
 }
@@ -114,14 +133,20 @@ impl Library {
     pub fn read(&mut self, bytes: &[u8], name: &str, resolver: &dyn Resolver) -> Result<(), Error> {
         let name = name.replace('\\', "/");
         let folder = name.rfind('/').map_or("", |i| &name[..=i]);
-        let text = String::from_utf8_lossy(dipir_files::without_byte_order_mark(bytes));
+        let text = dipir_files::without_byte_order_mark(bytes);
         let mut current: Option<(Material, Draft)> = None;
-        let end = char::from(line_end(bytes));
-        for (i, line) in text.split(end).enumerate() {
-            let (word, rest) = statement(line);
+        let end = line_end(bytes);
+        for (i, line) in text.split(|b| *b == end).enumerate() {
+            let line = decoded(line);
+            let (word, rest) = statement(&line);
+            let mut known = READ.iter().chain(&LEFT_OUT);
+            let word = known
+                .find(|k| k.eq_ignore_ascii_case(word))
+                .copied()
+                .unwrap_or(word);
             if word == "newmtl" {
                 if let Some(done) = current.take() {
-                    self.finish(done);
+                    self.finish(done, folder, resolver)?;
                 }
                 let material = Material {
                     name: rest.to_owned(),
@@ -139,7 +164,7 @@ impl Library {
             }
         }
         if let Some(done) = current {
-            self.finish(done);
+            self.finish(done, folder, resolver)?;
         }
         Ok(())
     }
@@ -162,12 +187,20 @@ impl Library {
             return Ok(());
         }
         match word {
-            "Kd" => {
-                let alpha = material.base_color.w;
-                material.base_color = color(rest)?.min(Vec3::ONE).extend(alpha);
+            "Kd" | "Ks" | "Ke" | "Tf" if is_spectrum(rest) => {
+                draft.left_out.push(format!("{word} spectral"));
             }
+            "Kd" => draft.diffuse = Some(color(rest)?.min(Vec3::ONE)),
             "Ks" if color(rest)? == Vec3::ZERO => material.ior = 1.0,
             "Ke" => material.emissive = color(rest)?,
+            // Maya writes white for opaque, others for clear: black and white say nothing.
+            "Tf" if color(rest).is_ok_and(|c| c != Vec3::ZERO && c != Vec3::ONE) => {
+                draft.left_out.push("Tf".into());
+            }
+            // Maya writes 4 of all surfaces, and Blender 9 of those that `d` makes transparent.
+            "illum" if ["6", "7"].contains(&rest) => {
+                draft.left_out.push(format!("illum {rest} (refraction)"));
+            }
             "Ns" => draft.shininess = Some(number(rest)?.max(0.0)),
             "Ni" => {
                 let ior = number(rest)?;
@@ -189,21 +222,14 @@ impl Library {
             "Tr" if !draft.has_opacity => material.base_color.w = 1.0 - unit(rest)?,
             "map_Kd" => {
                 let map = Map::parse(rest);
-                // White, so that the texture is seen as it is where no Kd was meant.
-                if material.base_color.truncate() == Vec3::ZERO {
-                    material.base_color = Vec4::ONE.with_w(material.base_color.w);
-                }
                 material.base_color_texture =
                     self.texture(&map, folder, resolver, Encoding::Srgb)?;
                 draft.base_file = map.file;
             }
             "map_Ke" => {
                 let map = Map::parse(rest);
-                if material.emissive == Vec3::ZERO {
-                    material.emissive = Vec3::ONE;
-                }
                 material.emissive_texture = self.texture(&map, folder, resolver, Encoding::Srgb)?;
-                draft.lacks_emission = material.emissive_texture.is_none();
+                draft.has_emission_map = true;
             }
             "map_Pr" => {
                 let map = Map::parse(rest);
@@ -215,8 +241,8 @@ impl Library {
                     .then_some(map.file);
             }
             "map_Pm" => draft.metallic_file = Some(Map::parse(rest).file),
-            "map_d" => draft.alpha_file = Some(Map::parse(rest).file),
-            "norm" | "map_Bump" | "map_bump" | "bump" => {
+            "map_d" => draft.opacity = Some(Map::parse(rest)),
+            "norm" | "map_Bump" | "bump" => {
                 let map = Map::parse(rest);
                 let texture = self.texture(&map, folder, resolver, Encoding::Linear)?;
                 material.normal_texture = texture.map(|texture| (texture, map.bump));
@@ -230,8 +256,23 @@ impl Library {
         Ok(())
     }
 
-    fn finish(&mut self, (mut material, draft): (Material, Draft)) {
+    fn finish(
+        &mut self,
+        (mut material, draft): (Material, Draft),
+        folder: &str,
+        resolver: &dyn Resolver,
+    ) -> Result<(), Error> {
         let name = material.name.clone();
+        let has_map = !draft.base_file.is_empty();
+        let diffuse = match draft.diffuse {
+            // White, so that the texture is seen as it is where no Kd was meant.
+            Some(Vec3::ZERO) if has_map => Some(Vec3::ONE),
+            None if material.base_color_texture.is_some() => Some(Vec3::ONE),
+            own => own,
+        };
+        if let Some(diffuse) = diffuse {
+            material.base_color = diffuse.extend(material.base_color.w);
+        }
         material.roughness = match (draft.roughness, draft.shininess) {
             (Some(r), _) => r,
             (None, Some(ns)) => (2.0 / (ns + 2.0)).powf(0.25),
@@ -254,16 +295,23 @@ impl Library {
                 "material \"{name}\": metalness and roughness textures are read only from one common file; metalness is constant"
             )),
         }
-        if let Some(file) = &draft.alpha_file {
-            if *file == draft.base_file {
+        if let Some(map) = &draft.opacity {
+            let base = material.base_color_texture;
+            if map.file == draft.base_file {
                 material.alpha_mode = AlphaMode::Blend;
-            } else {
+            } else if base.is_some_and(|base| base.transform != map.transform) {
                 self.warnings.push(format!(
-                    "material \"{name}\": map_d is read only from the alpha of map_Kd's file"
+                    "material \"{name}\": map_d is read only with the options of map_Kd, and left out"
                 ));
+            } else if let Some(own) = self.texture(map, folder, resolver, Encoding::Linear)? {
+                self.opacities.push((self.materials.len(), own));
             }
         }
-        if draft.lacks_emission {
+        if draft.has_emission_map && material.emissive_texture.is_some() {
+            if material.emissive == Vec3::ZERO {
+                material.emissive = Vec3::ONE;
+            }
+        } else if draft.has_emission_map {
             // What glows only in places shall not glow all over.
             material.emissive = Vec3::ZERO;
             self.warnings.push(format!(
@@ -293,6 +341,40 @@ impl Library {
         self.by_name.entry(short).or_insert(index);
         self.by_name.insert(name, index);
         self.materials.push(material);
+        Ok(())
+    }
+
+    /// Makes textures whose alpha is each `map_d` in a file of its own. Their pixels count by themselves against the limit of
+    /// all. What cannot be decoded is left out with a warning, and the material stays opaque.
+    pub fn add_opacities(&mut self, limits: &Limits) -> Result<(), Error> {
+        let (mut known, mut unreadable, mut all) = (HashMap::new(), HashSet::new(), 0);
+        for (i, map) in &self.opacities {
+            let material = &mut self.materials[*i];
+            let key = (material.base_color_texture.map(|b| b.texture), map.texture);
+            let of = |index: u32| &self.textures[index as usize];
+            if !known.contains_key(&key) && !unreadable.contains(&map.texture) {
+                match of(map.texture).decode() {
+                    Ok(decoded) => {
+                        let base = key.0.map(of);
+                        let (texture, pixels) =
+                            opacity::combined(base, of(map.texture), decoded.texels())?;
+                        all += pixels;
+                        limits.check_pixels(pixels, all, &texture.image.name())?;
+                        self.textures.push(texture);
+                        known.insert(key, self.textures.len() as u32 - 1);
+                    }
+                    Err(e) => {
+                        unreadable.insert(map.texture);
+                        self.warnings.push(format!("map_d is left out: {e}"));
+                    }
+                }
+            }
+            if let Some(&texture) = known.get(&key) {
+                material.base_color_texture = Some(TextureRef { texture, ..*map });
+                material.alpha_mode = AlphaMode::Blend;
+            }
+        }
+        Ok(())
     }
 
     /// Leaves out each `map_Bump` that is grey: it holds heights, and as normals these would tilt the whole surface.
@@ -329,7 +411,11 @@ impl Library {
         resolver: &dyn Resolver,
         encoding: Encoding,
     ) -> Result<Option<TextureRef>, Error> {
-        let file = format!("{folder}{}", map.file);
+        let is_absolute = map.file.starts_with('/') || map.file.contains(":/");
+        let file = match is_absolute {
+            true => map.file.clone(),
+            false => format!("{folder}{}", map.file),
+        };
         let key = (file.clone(), encoding, map.clamp);
         let texture = match self.by_file.get(&key) {
             Some(&known) => known,
@@ -414,6 +500,14 @@ impl Map {
     }
 }
 
+/// A line of text. What is not UTF-8 is Latin-1, of which each byte is a character: names that differ stay different.
+pub(super) fn decoded(line: &[u8]) -> Cow<'_, str> {
+    match std::str::from_utf8(line) {
+        Ok(text) => text.into(),
+        Err(_) => line.iter().map(|b| char::from(*b)).collect(),
+    }
+}
+
 /// What ends a line of a text: old tools write a carriage return alone.
 pub(super) fn line_end(text: &[u8]) -> u8 {
     match text.contains(&b'\n') {
@@ -449,10 +543,20 @@ fn number(rest: &str) -> Result<f32, Error> {
     }
 }
 
-/// Three numbers, or one that stands for all three; at least 0.
+/// Whether a colour is a file of measurements.
+fn is_spectrum(rest: &str) -> bool {
+    word(rest).0 == "spectral"
+}
+
+/// Three numbers, or one that stands for all three, in linear Rec.709 or, behind the word `xyz`, in CIE XYZ; at least 0.
 fn color(rest: &str) -> Result<Vec3, Error> {
-    let mut words = rest.split_ascii_whitespace();
+    let (space, numbers) = match word(rest) {
+        ("xyz", numbers) => (REC709_OF_XYZ, numbers),
+        _ => (Mat3::IDENTITY, rest),
+    };
+    let mut words = numbers.split_ascii_whitespace();
     let first = number(words.next().unwrap_or(""))?;
     let mut next = || words.next().map_or(Ok(first), number);
-    Ok(Vec3::new(first, next()?, next()?).max(Vec3::ZERO))
+    let own = Vec3::new(first, next()?, next()?).max(Vec3::ZERO);
+    Ok((space * own).max(Vec3::ZERO))
 }

@@ -19,6 +19,15 @@ use crate::texture::check_sizes;
 
 const EXPORT: &str = "export the file again";
 
+/// Beyond this, in the file's unit, single precision loses detail: places are kept relative to the first vertex.
+pub(super) const FAR: f32 = 1e4;
+
+/// How some programs on Windows write what is no number, `-1.#IND` or `1.#QNAN`, where a comment seems to begin.
+const NOT_A_NUMBER: &str = ".#";
+
+/// Material of triangles without one; what follows it downwards are names that no library has defined yet.
+const NO_MATERIAL: u32 = u32::MAX;
+
 /// A corner of a face: indices of position, texture coordinate and normal, from 0.
 type Corner = (u32, Option<u32>, Option<u32>);
 
@@ -51,17 +60,18 @@ fn logical_lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
     let mut lines = bytes.split(move |b| *b == end).enumerate();
     std::iter::from_fn(move || {
         let (number, first) = lines.next()?;
-        let mut text = String::from_utf8_lossy(first);
-        while !text.contains('#')
-            && let Some(head) = text.trim_end().strip_suffix('\\')
-        {
-            let mut joined = head.to_owned();
+        let mut text = mtl::decoded(first);
+        // Where the last line begins, the only one that is looked at: a statement may have millions.
+        let mut last = 0;
+        while !text[last..].contains('#') && text[last..].trim_end().ends_with('\\') {
+            let joined = text.to_mut();
+            joined.truncate(joined.trim_end().len() - 1);
             let Some((_, next)) = lines.next() else {
-                return Some((number + 1, Cow::Owned(joined)));
+                break;
             };
             joined.push(' ');
-            joined += &String::from_utf8_lossy(next);
-            text = Cow::Owned(joined);
+            last = joined.len();
+            joined.push_str(&mtl::decoded(next));
         }
         Some((number + 1, text))
     })
@@ -95,15 +105,23 @@ struct Reader {
     /// Names of those read; naming one again adds nothing.
     libraries: HashSet<String>,
     material: Option<u32>,
+    /// Names of materials that were used before a library defined them.
+    undefined: Vec<String>,
+    /// Where the positions' (0, 0, 0) lies in the file.
+    origin: DVec3,
+    /// Whether some face is concave and too large to be cut as such.
+    has_huge_face: bool,
     /// Whether some corner names a texture coordinate, a normal.
     has: [bool; 2],
-    uses_default: bool,
     warnings: Vec<String>,
 }
 
 impl Reader {
     fn statement(&mut self, line: &str, resolver: &dyn Resolver) -> Result<(), Problem> {
-        let (word, rest) = mtl::statement(line);
+        let (word, mut rest) = mtl::statement(line);
+        if line.contains(NOT_A_NUMBER) && ["v", "vt", "vn"].contains(&word) {
+            rest = line.trim()[word.len()..].trim_start();
+        }
         match word {
             "v" => self.vertex(rest)?,
             "vt" => {
@@ -145,6 +163,13 @@ impl Reader {
             }
             .into());
         }
+        if self.positions.is_empty() && position.abs().max_element() > FAR {
+            self.origin = exact(rest);
+        }
+        let position = match self.origin == DVec3::ZERO {
+            true => position,
+            false => (exact(rest) - self.origin).as_vec3(),
+        };
         // Three more numbers are a colour; a single one is a weight.
         if count >= 6 {
             self.colors.resize(self.positions.len(), None);
@@ -168,19 +193,15 @@ impl Reader {
             }
             self.corners.push(index);
         }
-        let n = self.corners.len();
-        if n < 3 {
-            return Err(Problem::Here(format!(
-                "a face of {n} corners; accepted: 3 or more"
-            )));
+        if self.corners.len() < 3 {
+            let what = "faces of fewer than three corners are not drawn";
+            self.warnings.push(what.to_owned());
         }
-        let material = self.material.unwrap_or_else(|| {
-            self.uses_default = true;
-            u32::MAX
-        });
-        polygon::triangulate(&self.corners, |triangle| {
-            self.mesh.indices.push(triangle);
-            self.mesh.materials.push(material);
+        let material = self.material.unwrap_or(NO_MATERIAL);
+        let mesh = &mut self.mesh;
+        self.has_huge_face |= polygon::triangulate(&self.corners, &mesh.positions, |triangle| {
+            mesh.indices.push(triangle);
+            mesh.materials.push(material);
         });
         self.limits.check_mesh(
             self.mesh.positions.len() as u64,
@@ -206,11 +227,32 @@ impl Reader {
     }
 
     fn use_material(&mut self, name: &str) {
-        self.material = self.library.index_of(name);
-        if self.material.is_none() {
-            self.warnings
-                .push(format!("material \"{name}\" is not defined; grey is used"));
+        self.material = self.library.index_of(name).or_else(|| {
+            // The library may come later.
+            self.undefined.push(name.to_owned());
+            Some(NO_MATERIAL - self.undefined.len() as u32)
+        });
+    }
+
+    /// Gives each triangle its material. Returns whether some have none.
+    fn resolve_materials(&mut self) -> bool {
+        let default = self.library.materials.len() as u32;
+        let find = |name: &String| {
+            let found = self.library.index_of(name);
+            if found.is_none() {
+                let what = format!("material \"{name}\" is not defined; grey is used");
+                self.warnings.push(what);
+            }
+            found.unwrap_or(default)
+        };
+        let late: Vec<u32> = self.undefined.iter().map(find).collect();
+        for m in &mut self.mesh.materials {
+            if *m >= default {
+                let late = late.get((NO_MATERIAL - *m).wrapping_sub(1) as usize);
+                *m = late.copied().unwrap_or(default);
+            }
         }
+        self.mesh.materials.contains(&default)
     }
 
     fn read_library(&mut self, name: &str, resolver: &dyn Resolver) -> Result<(), Problem> {
@@ -251,20 +293,21 @@ impl Reader {
         }
         check_sizes(&self.library.textures, &self.limits)?;
         self.library.drop_heights();
+        self.library.add_opacities(&self.limits)?;
+        let lacks_material = self.resolve_materials();
         let mut materials = std::mem::take(&mut self.library.materials);
-        let default = materials.len() as u32;
-        for m in &mut self.mesh.materials {
-            *m = (*m).min(default);
-        }
-        if self.uses_default {
+        if lacks_material {
             materials.push(mtl::grey());
+        }
+        if self.has_huge_face {
+            self.warnings.push(polygon::TOO_LARGE.into());
         }
         self.gather(&materials);
         let mut warnings = self.warnings;
         warnings.append(&mut self.library.warnings);
         Imported {
             mesh: self.mesh,
-            origin: DVec3::ZERO,
+            origin: self.origin,
             materials,
             textures: self.library.textures,
             lights: Vec::new(),
@@ -296,12 +339,7 @@ impl Reader {
         if !self.colors.is_empty() {
             self.mesh.colors = vec![Vec4::ONE; n];
         }
-        let finite = self.colors.iter().flatten().filter(|c| c.is_finite());
-        let white = match finite.map(|c| c.max_element()).fold(0.0, f32::max) {
-            // Some tools write bytes.
-            most if most >= 2.0 => 255.0,
-            _ => 1.0,
-        };
+        let white = white_of(self.colors.iter().flatten());
         for (&(v, vt, vn), &i) in &self.vertices {
             let i = i as usize;
             if let (Some(vt), Some(uv)) = (vt, self.mesh.uvs[0].get_mut(i)) {
@@ -331,8 +369,17 @@ impl Reader {
     }
 }
 
+/// What white is of display-referred colours: 1, but some tools write bytes.
+pub(super) fn white_of<'a>(colors: impl Iterator<Item = &'a Vec3>) -> f32 {
+    let finite = colors.filter(|c| c.is_finite());
+    match finite.map(|c| c.max_element()).fold(0.0, f32::max) {
+        most if most >= 2.0 => 255.0,
+        _ => 1.0,
+    }
+}
+
 /// A display-referred colour on a scale from 0 to `white`; white where there is none.
-fn linear(color: Option<Vec3>, white: f32) -> Vec4 {
+pub(super) fn linear(color: Option<Vec3>, white: f32) -> Vec4 {
     let decode = |x: f32| match x.is_finite() {
         true => Transfer::Srgb.decode_scalar((x / white).clamp(0.0, 1.0)),
         false => 1.0,
@@ -347,6 +394,13 @@ fn are_libraries(names: &str) -> bool {
     names.contains(char::is_whitespace) && names.split_whitespace().all(is_one)
 }
 
+/// The first three numbers in double precision.
+fn exact(rest: &str) -> DVec3 {
+    let mut words = rest.split_ascii_whitespace();
+    let mut next = || words.next().and_then(|w| w.parse().ok()).unwrap_or(0.0);
+    DVec3::new(next(), next(), next())
+}
+
 /// Up to `N` numbers, at least `least`; the rest is zero. Returns how many there were.
 fn floats<const N: usize>(
     rest: &str,
@@ -356,8 +410,11 @@ fn floats<const N: usize>(
     let mut out = [0.0; N];
     let mut count = 0;
     for text in rest.split_ascii_whitespace().take(N) {
-        out[count] = text
-            .parse()
+        let number = match text.contains(NOT_A_NUMBER) {
+            true => Ok(f32::NAN),
+            false => text.parse(),
+        };
+        out[count] = number
             .map_err(|_| Problem::Here(format!("\"{text}\" is not a number; accepted: {form}")))?;
         count += 1;
     }

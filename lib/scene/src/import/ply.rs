@@ -1,9 +1,9 @@
-//! PLY files with faces.
-use dipir_imaging::transfer::Transfer;
+//! PLY files with faces or strips of triangles.
 use dipir_points::ply::{Element, Header, Input, Property};
-use glam::{Vec3, Vec4};
+use glam::{DVec3, Vec3, Vec4};
 
 use super::mtl::grey;
+use super::obj::{self, FAR};
 use super::{Imported, Limits, polygon};
 use crate::error::Error;
 use crate::mesh::TriangleMesh;
@@ -23,7 +23,8 @@ pub fn load_ply_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
             (one, _) => Ok(one.map_or(0, |e| e.count)),
         }
     };
-    let (vertices, faces) = (count("vertex")?, count("face")?);
+    let vertices = count("vertex")?;
+    let faces = count("face")?.saturating_add(count("tristrips")?);
     if faces == 0 && vertices > 0 {
         return Err(Error::malformed(
             format!("the file is a cloud of {vertices} points without faces"),
@@ -34,6 +35,10 @@ pub fn load_ply_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
     limits.check_mesh(vertices, faces)?;
     let mut reader = Reader {
         mesh: TriangleMesh::default(),
+        colors: Vec::new(),
+        origin: DVec3::ZERO,
+        has_huge_face: false,
+        is_translucent: false,
         limits,
     };
     for element in &header.elements {
@@ -42,6 +47,7 @@ pub fn load_ply_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
             let read = match &layout {
                 Layout::Vertex(slots) => reader.vertex(&element.properties, slots, &mut input),
                 Layout::Face(at) => reader.face(&element.properties, *at, &mut input),
+                Layout::Strips(at) => reader.strips(&element.properties, *at, &mut input),
                 Layout::Other => (element.properties.iter())
                     .try_for_each(|p| p.skip(&mut input).map_err(Problem::Here)),
             };
@@ -65,19 +71,32 @@ pub fn load_ply_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
                 .into(),
         );
     }
+    let is_colored = |e: &Element| e.properties.iter().any(|p| p.name == "red");
+    let mut faces = header.elements.iter().filter(|e| e.name == "face");
+    if faces.any(is_colored) {
+        imported.warnings.push(
+            "colours of faces are not read: transfer them to vertices, for instance by MeshLab"
+                .into(),
+        );
+    }
     Ok(imported)
 }
 
 /// Names of texture coordinates.
 const COORDINATES: [&str; 5] = ["texcoord", "s", "u", "texture_u", "s1"];
 
-/// What a property of a vertex is: position, normal and colour, three each.
+/// What a property of a vertex is: position, normal and colour, three each, and alpha.
 type Slots = Vec<Option<usize>>;
+
+/// Where the alpha of a vertex is put.
+const ALPHA: usize = 9;
 
 enum Layout {
     Vertex(Slots),
     /// Which property is the list of corners.
     Face(usize),
+    /// The same of strips of triangles.
+    Strips(usize),
     Other,
 }
 
@@ -93,6 +112,7 @@ impl Layout {
             "red" | "diffuse_red" => Some(6),
             "green" | "diffuse_green" => Some(7),
             "blue" | "diffuse_blue" => Some(8),
+            "alpha" | "diffuse_alpha" => Some(ALPHA),
             _ => None,
         };
         let missing = |what: &str| {
@@ -107,13 +127,16 @@ impl Layout {
                     false => Err(missing("x, y and z")),
                 }
             }
-            "face" => {
+            name @ ("face" | "tristrips") => {
                 let corners = ["vertex_indices", "vertex_index"];
                 let is_corners =
                     |p: &Property| p.length.is_some() && corners.contains(&p.name.as_str());
                 let at = element.properties.iter().position(is_corners);
-                at.map(Self::Face)
-                    .ok_or_else(|| missing("list vertex_indices"))
+                let at = at.ok_or_else(|| missing("list vertex_indices"))?;
+                Ok(match name {
+                    "face" => Self::Face(at),
+                    _ => Self::Strips(at),
+                })
             }
             _ => Ok(Self::Other),
         }
@@ -133,6 +156,14 @@ impl From<String> for Problem {
 
 struct Reader<'a> {
     mesh: TriangleMesh,
+    /// Display-referred, of all vertices or none.
+    colors: Vec<Vec3>,
+    /// Where the positions' (0, 0, 0) lies in the file.
+    origin: DVec3,
+    /// Whether some face is concave and too large to be cut as such.
+    has_huge_face: bool,
+    /// Whether a vertex has an alpha below 1.
+    is_translucent: bool,
     limits: &'a Limits,
 }
 
@@ -143,35 +174,40 @@ impl Reader<'_> {
         slots: &[Option<usize>],
         input: &mut Input,
     ) -> Result<(), Problem> {
-        let mut values = [0.0; 9];
+        let (mut values, mut exact) = ([0.0; ALPHA + 1], DVec3::ZERO);
         for (property, slot) in properties.iter().zip(slots) {
             match slot {
-                Some(k) if *k < 6 => values[*k] = input.number(property.kind)? as f32,
+                Some(k) if *k < 6 => {
+                    let number = input.number(property.kind)?;
+                    values[*k] = number as f32;
+                    if *k < 3 {
+                        exact[*k] = number;
+                    }
+                }
                 Some(k) => {
                     values[*k] = (input.number(property.kind)? / property.kind.full()) as f32;
                 }
                 None => property.skip(input)?,
             }
         }
-        let [x, y, z, nx, ny, nz, r, g, b] = values;
+        let [x, y, z, nx, ny, nz, r, g, b, alpha] = values;
         let position = Vec3::new(x, y, z);
         if !position.is_finite() {
             return Err(Problem::Here(format!(
                 "the position ({x}, {y}, {z}) is not finite"
             )));
         }
-        self.mesh.positions.push(position);
+        if self.mesh.positions.is_empty() && position.abs().max_element() > FAR {
+            self.origin = exact;
+        }
+        self.mesh.positions.push((exact - self.origin).as_vec3());
         if slots.contains(&Some(3)) {
             self.mesh.normals.push(Vec3::new(nx, ny, nz));
         }
         if slots.contains(&Some(6)) {
-            let linear = [r, g, b].map(|c| Transfer::Srgb.decode_scalar(c.clamp(0.0, 1.0)));
-            let color = Vec3::from_array(linear).extend(1.0);
-            self.mesh.colors.push(match color.is_finite() {
-                true => color,
-                false => Vec4::ONE,
-            });
+            self.colors.push(Vec3::new(r, g, b));
         }
+        self.is_translucent |= alpha < 1.0 && slots.contains(&Some(ALPHA));
         Ok(())
     }
 
@@ -188,21 +224,62 @@ impl Reader<'_> {
                 continue;
             }
             for _ in 0..property.length(input)? {
-                let index = input.number(property.kind)?;
-                let count = self.mesh.positions.len();
-                if !(index >= 0.0 && index.fract() == 0.0 && index < count as f64) {
-                    return Err(Problem::Here(format!(
-                        "corner {index}, but {count} vertices stand before the faces"
-                    )));
-                }
-                corners.push(index as u32);
+                corners.push(self.corner(input.number(property.kind)?)?);
             }
         }
         let more = corners.len().saturating_sub(2) + self.mesh.indices.len();
         self.limits
             .check_mesh(0, more as u64)
             .map_err(Problem::Limit)?;
-        polygon::triangulate(&corners, |t| self.mesh.indices.push(t));
+        let mesh = &mut self.mesh;
+        self.has_huge_face |=
+            polygon::triangulate(&corners, &mesh.positions, |t| mesh.indices.push(t));
+        Ok(())
+    }
+
+    fn corner(&self, index: f64) -> Result<u32, Problem> {
+        let count = self.mesh.positions.len();
+        match index >= 0.0 && index.fract() == 0.0 && index < count as f64 {
+            true => Ok(index as u32),
+            false => Err(Problem::Here(format!(
+                "corner {index}, but {count} vertices stand before the faces"
+            ))),
+        }
+    }
+
+    /// Strips of triangles, an index of -1 between them: each corner makes one with the two before it, and every other
+    /// triangle is turned around.
+    fn strips(
+        &mut self,
+        properties: &[Property],
+        corners_at: usize,
+        input: &mut Input,
+    ) -> Result<(), Problem> {
+        for (i, property) in properties.iter().enumerate() {
+            if i != corners_at {
+                property.skip(input)?;
+                continue;
+            }
+            let (mut before, mut is_turned) = ([None; 2], false);
+            for _ in 0..property.length(input)? {
+                let index = input.number(property.kind)?;
+                if index == -1.0 {
+                    (before, is_turned) = ([None; 2], false);
+                    continue;
+                }
+                let c = self.corner(index)?;
+                if let [Some(a), Some(b)] = before {
+                    if a != b && b != c && c != a {
+                        let triangle = if is_turned { [b, a, c] } else { [a, b, c] };
+                        self.mesh.indices.push(triangle);
+                    }
+                    is_turned = !is_turned;
+                }
+                before = [before[1], Some(c)];
+                let triangles = self.mesh.indices.len() as u64;
+                (self.limits.check_mesh(0, triangles)).map_err(Problem::Limit)?;
+            }
+        }
         Ok(())
     }
 
@@ -214,6 +291,12 @@ impl Reader<'_> {
         }
         self.mesh.materials = vec![0; self.mesh.indices.len()];
         let mut warnings = Vec::new();
+        if self.has_huge_face {
+            warnings.push(polygon::TOO_LARGE.into());
+        }
+        if self.is_translucent {
+            warnings.push("the alpha of vertices is not read: the object is opaque".into());
+        }
         if !self.mesh.normals.is_empty() {
             let repaired = self.mesh.repair_normals();
             if repaired > 0 {
@@ -222,6 +305,9 @@ impl Reader<'_> {
                 ));
             }
         }
+        let white = obj::white_of(self.colors.iter());
+        let linear = |color: &Vec3| obj::linear(Some(*color), white);
+        self.mesh.colors = self.colors.iter().map(linear).collect();
         let mut material = grey();
         if !self.mesh.colors.is_empty() {
             // The colours are those of the surface.
@@ -229,6 +315,7 @@ impl Reader<'_> {
         }
         Ok(Imported {
             warnings,
+            origin: self.origin,
             ..Imported::of(self.mesh, material)
         })
     }

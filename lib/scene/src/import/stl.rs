@@ -3,7 +3,7 @@ use std::collections::HashMap;
 
 use glam::Vec3;
 
-use super::mtl::grey;
+use super::mtl::{grey, line_end};
 use super::{Imported, Limits};
 use crate::error::Error;
 use crate::mesh::TriangleMesh;
@@ -21,9 +21,21 @@ pub fn load_stl_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
     let announced = bytes
         .get(80..HEADER)
         .map(|b| u64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]])));
+    let mut warnings = Vec::new();
+    // Writers that cannot go back leave the number 0.
+    let behind = bytes.len().saturating_sub(HEADER);
+    let there = (behind / RECORD) as u64;
+    let announced = match announced {
+        Some(0) if there > 0 && behind.is_multiple_of(RECORD) && !is_text(bytes) => {
+            warnings.push(format!(
+                "no triangles are announced, and the {there} for which the file has bytes are read"
+            ));
+            Some(there)
+        }
+        announced => announced,
+    };
     let needed = announced.map(|n| HEADER as u64 + n * RECORD as u64);
     let mut mesh = Mesh::new(limits);
-    let mut warnings = Vec::new();
     match (announced, needed) {
         _ if is_text(bytes) => read_text(bytes, &mut mesh)?,
         (Some(n), Some(needed)) => {
@@ -43,7 +55,14 @@ pub fn load_stl_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
                 ));
             }
             limits.check_mesh(0, n)?;
-            for record in bytes[HEADER..needed as usize].as_chunks::<RECORD>().0 {
+            let records = bytes[HEADER..needed as usize].as_chunks::<RECORD>().0;
+            if are_colored(&bytes[..HEADER], records) {
+                warnings.push(
+                    "colours of triangles are not read: convert it with them to a .ply or .glb file"
+                        .into(),
+                );
+            }
+            for record in records {
                 let float = |at: usize| {
                     f32::from_le_bytes([record[at], record[at + 1], record[at + 2], record[at + 3]])
                 };
@@ -67,6 +86,14 @@ pub fn load_stl_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
     })
 }
 
+/// Whether triangles have colours, as Magics writes them, which puts the one of the whole into the header, or VisCAM, which
+/// sets the highest bit of the two bytes without meaning.
+fn are_colored(header: &[u8], records: &[[u8; RECORD]]) -> bool {
+    const WHOLE: &[u8] = b"COLOR=";
+    header.windows(WHOLE.len()).any(|w| w == WHOLE)
+        || records.iter().any(|record| record[RECORD - 1] & 0x80 != 0)
+}
+
 /// Whether the file is ASCII. Some binary files start with "solid", too, but their number of triangles is no text: a byte
 /// of it is a control character unless there are 150 million.
 fn is_text(bytes: &[u8]) -> bool {
@@ -80,7 +107,8 @@ fn is_text(bytes: &[u8]) -> bool {
 
 fn read_text(bytes: &[u8], mesh: &mut Mesh) -> Result<(), Error> {
     let mut corners: Vec<Vec3> = Vec::new();
-    for (i, line) in bytes.split(|b| *b == b'\n').enumerate() {
+    let end = line_end(bytes);
+    for (i, line) in bytes.split(|b| *b == end).enumerate() {
         let line = String::from_utf8_lossy(line);
         let wrong = |what: String| Err(Error::malformed(format!("line {}: {what}", i + 1), EXPORT));
         let mut words = line.split_ascii_whitespace();

@@ -10,17 +10,30 @@ use crate::gltf_import::{ROUNDING, normal_mapped_square};
 #[test]
 fn specular_glossiness_stands_in_only_for_a_missing_model() {
     let old = json!({ "KHR_materials_pbrSpecularGlossiness": {
-        "diffuseFactor": [0.1, 0.2, 0.3, 1.0], "glossinessFactor": 0.75
+        "diffuseFactor": [0.1, 0.2, 0.3, 1.0], "glossinessFactor": 0.75, "specularFactor": [0.9, 0.7, 0.3],
     } });
     let mut glb = Glb::triangle(json!({ "material": 0 }));
     glb.push("materials", json!({ "extensions": old }));
-    let material = &glb.load().materials[0];
+    let imported = glb.load();
+    let material = &imported.materials[0];
     assert_eq!(material.base_color, Vec4::new(0.1, 0.2, 0.3, 1.0));
     assert_eq!((material.metallic, material.roughness), (0.0, 0.25));
+    // What a metal of this model reflects is its specular colour alone.
+    let specular = material.extensions.specular.unwrap();
+    let reflected = ((material.ior - 1.0) / (material.ior + 1.0)).powi(2) * specular.color;
+    let wrong = (reflected - Vec3::new(0.9, 0.7, 0.3)).abs();
+    // The index of a surface that reflects nearly all has some digits fewer.
+    assert!(wrong.max_element() < 1e-5, "{reflected}");
+    assert!(imported.warnings.is_empty(), "{:?}", imported.warnings);
+    let specular = "/materials/0/extensions/KHR_materials_pbrSpecularGlossiness/specularFactor";
+    *glb.json.pointer_mut(specular).unwrap() = json!([0.04, 0.04, 0.04]);
+    let plain = &glb.load().materials[0];
+    assert!((plain.ior - 1.5).abs() < 1e-5 && plain.extensions.specular.is_none());
     glb.json["materials"][0]["pbrMetallicRoughness"] = json!({});
     let material = &glb.load().materials[0];
     assert_eq!(material.base_color, Vec4::ONE);
     assert_eq!((material.metallic, material.roughness), (1.0, 1.0));
+    assert!(material.extensions.specular.is_none());
 }
 
 #[test]

@@ -3,6 +3,7 @@ mod bad_input;
 mod cameras_and_ground;
 mod compressed;
 mod config_table;
+mod exports;
 mod glb;
 mod gltf_import;
 mod gltf_materials;

@@ -86,7 +86,7 @@ fn malformed_lines_are_named() {
     );
     assert_eq!(
         message(&format!("{SQUARE}f 1 2\n")),
-        "line 5: a face of 2 corners; accepted: 3 or more; export the file again"
+        "the file holds no triangles; check that the file has faces (f)"
     );
     assert_eq!(
         message("v 0 nan 0\n"),

@@ -116,11 +116,25 @@ proptest! {
 
     #[test]
     fn triangles_and_normals_are_those_that_tobj_reads(
-        positions in proptest::collection::vec([number(), number(), number()], 3..12),
+        mut positions in proptest::collection::vec([number(), number(), number()], 3..12),
         normals in proptest::collection::vec(normal(), 1..6),
         mut faces in proptest::collection::vec(face(), 1..8),
         with_normals in any::<bool>(),
+        convex in any::<bool>(),
     ) {
+        // Beyond thousands places are kept relative to the first.
+        positions[0] = positions[0].map(|v| v.max(-100.0));
+        // `tobj` makes a fan of every face, of a concave one, too: these corners are in order on a parabola.
+        let count = positions.len();
+        for (i, position) in positions.iter_mut().enumerate().filter(|_| convex) {
+            *position = [i as f32, (i * i) as f32, 0.0];
+        }
+        for face in &mut faces {
+            match convex {
+                true => face.corners.sort_by_key(|(p, _)| p.index(count)),
+                false => face.corners.truncate(3),
+            }
+        }
         // In a file with normals `tobj` gives some to every corner.
         faces.iter_mut().for_each(|f| f.with_normals = with_normals);
         let normals = if with_normals { normals } else { Vec::new() };

@@ -285,3 +285,79 @@ fn broken_stls_say_where() {
         "triangles, element 0 is (inf, 0, 0.5), which is not finite; repair the mesh and export it again"
     );
 }
+
+#[test]
+fn strips_of_triangles_are_read_and_keep_their_orientation() {
+    let vertices = "0 0 0\n1 0 0\n0 1 0\n1 1 0\n0 2 0\n";
+    let file = |strips: &str| {
+        let count = strips.split(' ').count();
+        format!(
+            "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n\
+             element tristrips 1\nproperty list int int vertex_indices\nend_header\n{vertices}{count} {strips}\n"
+        )
+    };
+    let mesh = ply(&file("0 1 2 3 4 -1 2 3 4 -1 0 1 1 2 3")).unwrap().mesh;
+    let [a, b, c]: [[u32; 3]; 3] = [[0, 1, 2], [2, 1, 3], [2, 3, 4]];
+    // The last strip says corner 1 twice: two triangles of no area, by which the third is not turned.
+    assert_eq!(mesh.indices, [a, b, c, c, [1, 2, 3]]);
+    for (t, z) in [1.0, 1.0, 1.0, 1.0, -1.0].into_iter().enumerate() {
+        assert_eq!(mesh.scaled_normal(t).z, z);
+    }
+    assert_eq!(
+        ply(&file("0 1 2 -2")).unwrap_err(),
+        "element tristrips 0: corner -2, but 5 vertices stand before the faces; export or copy the file again"
+    );
+}
+
+#[test]
+fn the_alpha_of_vertices_is_told_where_it_says_something() {
+    for (alpha, count) in [("255", 0), ("128", 1)] {
+        let text = SQUARE.replacen("element face", "property uchar alpha\nelement face", 1);
+        let text = text.replace(" 188\n", &format!(" 188 {alpha}\n"));
+        let told = ply(&text).unwrap().warnings;
+        assert_eq!(
+            told,
+            vec!["the alpha of vertices is not read: the object is opaque"; count]
+        );
+    }
+}
+
+#[test]
+fn colours_of_a_binary_stl_are_told() {
+    let plain = square_stl(b"made by hand");
+    let mut viscam = plain.clone();
+    viscam[132..134].copy_from_slice(&0x8421u16.to_le_bytes());
+    let magics = square_stl(b"COLOR=\xff\x80\x00\xff");
+    for (bytes, count) in [(plain, 0), (viscam, 1), (magics, 1)] {
+        let told = stl(&bytes).unwrap().warnings;
+        assert!(
+            told.len() == count && told.iter().all(|w| w.starts_with("colours")),
+            "{told:?}"
+        );
+    }
+}
+
+#[test]
+fn triangles_that_a_binary_stl_does_not_announce_are_read() {
+    let mut bytes = square_stl(b"streamed");
+    bytes[80..84].fill(0);
+    let imported = stl(&bytes).unwrap();
+    assert_eq!(imported.mesh.indices, [[0, 1, 2], [0, 2, 3]]);
+    assert_eq!(
+        imported.warnings,
+        ["no triangles are announced, and the 2 for which the file has bytes are read"]
+    );
+    // Not whole ones.
+    bytes.pop();
+    assert!(
+        stl(&bytes)
+            .unwrap_err()
+            .starts_with("the file holds no triangles")
+    );
+}
+
+#[test]
+fn lines_of_an_stl_may_end_with_a_carriage_return_alone() {
+    let text = "solid a\rfacet normal 0 0 1\router loop\rvertex 0 0 0\rvertex 1 0 0\rvertex 1 1 0\rendloop\rendfacet\r";
+    assert_eq!(stl(text.as_bytes()).unwrap().mesh.indices.len(), 1);
+}

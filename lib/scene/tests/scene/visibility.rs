@@ -65,6 +65,12 @@ fn an_object_without_extent_says_why() {
             "\"o.glb\": nothing of it can be seen: it is 1.4e-6 m across, 1.0e-5 of a pixel; raise its scale, or write height_m"
         ]
     );
+    assert_eq!(
+        warnings("o.glb", &whole, "position = [0.0, 0.0, -5000.0]"),
+        [
+            "\"o.glb\": nothing of it can be seen: it lies 5.01 km away; if its file has the coordinates of a map, write anchor = \"center\", else raise its scale"
+        ]
+    );
 }
 
 #[test]
@@ -120,4 +126,38 @@ fn objects_at_the_same_place_are_said_to_be_drawn_once() {
         warnings("o.glb", &bytes, &format!("{again}{moved}")),
         ["scene.objects: 3 of them stand where the same file stands already, and are drawn once"]
     );
+}
+
+#[test]
+fn a_closed_object_that_is_inside_out_is_told() {
+    // A tetrahedron, its fronts outwards.
+    let mesh = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n";
+    let faces = [[1, 3, 2], [1, 2, 4], [1, 4, 3], [2, 3, 4]];
+    let with = |turned: bool, count: usize| {
+        let mut glb = Glb::triangle(json!({ "material": 0 }));
+        glb.push("materials", json!({}));
+        let position = |line: &str| -> Vec<f32> {
+            line.split(' ')
+                .skip(1)
+                .map(|w| w.parse().unwrap())
+                .collect()
+        };
+        let places: Vec<Vec<f32>> = mesh.lines().map(position).collect();
+        let corners = faces[..count].iter().flat_map(|[a, b, c]| match turned {
+            true => [*a, *c, *b],
+            false => [*a, *b, *c],
+        });
+        let soup: Vec<f32> = corners.flat_map(|k: usize| places[k - 1].clone()).collect();
+        let accessor = glb.floats("VEC3", &soup);
+        glb.json["meshes"][0]["primitives"] =
+            json!([{ "attributes": { "POSITION": accessor }, "material": 0 }]);
+        glb.bytes()
+    };
+    let told = warnings("o.glb", &with(true, 4), "");
+    let want = "\"o.glb\": its triangles are single-sided and face inwards";
+    assert!(told.len() == 1 && told[0].starts_with(want), "{told:?}");
+    // As it should be, and open.
+    for (turned, count) in [(false, 4), (true, 3)] {
+        assert_eq!(warnings("o.glb", &with(turned, count), ""), [""; 0]);
+    }
 }

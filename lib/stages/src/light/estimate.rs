@@ -179,6 +179,16 @@ fn outside(ends: [DVec2; 2], size: DVec2) -> Option<String> {
     ))
 }
 
+/// What is wrong with ends of a shadow that the picture without distortion does not show, as at the edge of a fisheye's.
+fn unseen(ends: [DVec2; 2], is_shown: impl Fn(DVec2) -> bool) -> Option<String> {
+    let end = ends.into_iter().find(|end| !is_shown(*end))?;
+    Some(format!(
+        "has an end at [{:?}, {:?}], which the picture without the lens's distortion does not show; accepted: pixels nearer \
+         to the middle of the photograph",
+        end.x, end.y
+    ))
+}
+
 /// What the configuration and the photograph's own data say of the sun, relative to the view.
 fn known_sun(
     session: &Session,
@@ -209,7 +219,11 @@ fn known_sun(
             .resolve("light.shadow")
             .map_err(|e| wrong("light.shadow", e.to_string()))?;
         let size = DVec2::from_array(facts.size.map(f64::from));
-        if let Some(message) = outside([shadow.foot, shadow.tip], size) {
+        let original = loaded.original.as_ref();
+        let ends = [shadow.foot, shadow.tip];
+        let is_shown =
+            |end: DVec2| original.is_none_or(|o| o.undistortion.to_working(end).is_some());
+        if let Some(message) = outside(ends, size).or_else(|| unseen(ends, is_shown)) {
             return Err(wrong("light.shadow", message).into());
         }
         let ground = match (&loaded.scene.proxy, &loaded.description.proxy) {
@@ -227,7 +241,6 @@ fn known_sun(
             }
         };
         // A preview's camera has fewer pixels than the photograph or its working picture.
-        let original = loaded.original.as_ref();
         let working = original.map_or(facts.size, |o| o.undistortion.size());
         let scale = DVec2::from_array(camera.resolution.map(f64::from))
             / DVec2::from_array(working.map(f64::from));
@@ -264,4 +277,31 @@ fn known_sun(
         share: known.share,
         shines: sun.azimuth_deg.is_some() || sun.elevation_deg.is_some() || table.shadow.is_some(),
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use dipir_cameras::{Distortion, Lens};
+    use dipir_scene::undistortion::Undistortion;
+
+    use super::*;
+
+    #[test]
+    fn a_shadow_ends_where_the_picture_without_distortion_shows_it() {
+        // A fisheye that sees 180 degrees along the diagonal.
+        let lens = Lens {
+            distortion: Distortion::kannala_brandt([0.0; 4]).unwrap(),
+            ..Lens::pinhole(
+                [400.0, 300.0],
+                DVec2::splat(250.0 / std::f64::consts::FRAC_PI_2),
+            )
+        };
+        let way = Undistortion::of(&lens).unwrap();
+        let is_shown = |end: DVec2| way.to_working(end).is_some();
+        let (middle, corner) = (DVec2::new(220.0, 160.0), DVec2::new(399.0, 2.5));
+        assert_eq!(unseen([middle, DVec2::new(260.0, 90.0)], is_shown), None);
+        let message = unseen([middle, corner], is_shown).unwrap();
+        let start = "has an end at [399.0, 2.5], which the picture without the lens's distortion does not show";
+        assert!(message.starts_with(start), "{message}");
+    }
 }
