@@ -132,9 +132,14 @@ impl Header {
     pub fn read(bytes: &[u8]) -> Result<(Self, Input<'_>), String> {
         let mut rest = bytes;
         let mut format = None;
+        // Old Macintosh programs end lines with a carriage return alone.
+        let ends = match bytes {
+            [_, _, _, b'\r', next, ..] if *next != b'\n' => b'\r',
+            _ => b'\n',
+        };
         let mut elements: Vec<Element> = Vec::new();
         for number in 1.. {
-            let Some(end) = rest.iter().position(|b| *b == b'\n') else {
+            let Some(end) = rest.iter().position(|b| *b == ends) else {
                 return Err("the header has no end_header".into());
             };
             let line = String::from_utf8_lossy(&rest[..end]).into_owned();
@@ -250,6 +255,16 @@ impl Input<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lines_may_end_with_a_carriage_return_alone() {
+        let text =
+            "ply\rformat ascii 1.0\relement vertex 2\rproperty float x\rend_header\r1.5\r2.5\r";
+        let (header, mut input) = Header::read(text.as_bytes()).unwrap();
+        assert_eq!(header.elements[0].count, 2);
+        let read = [(); 2].map(|()| input.number(Scalar::F32));
+        assert_eq!(read, [Ok(1.5), Ok(2.5)]);
+    }
 
     #[test]
     fn a_bad_line_or_word_is_quoted_in_one_short_line() {
