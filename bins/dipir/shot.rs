@@ -171,8 +171,8 @@ fn expose(
             n => format!("{n} frames, the first of them {first}, show"),
         };
         session.warn(&format!(
-            "{who} too little of what the photograph or another frame shows to tell the exposure: taken to be exposed as the \
-             frame before"
+            "{who} too little of what the photograph or another frame shows to tell the exposure: exposure and white balance \
+             are taken to be those of the frame before"
         ));
     }
     for (k, found) in order.into_iter().zip(found) {

@@ -117,13 +117,13 @@ impl LoadedScene {
         }
     }
 
-    /// The pixel of the undistorted photo that shows what the photo shows at `pixel`; `pixel` itself
-    /// where there is none.
-    pub fn undistorted_pixel(&self, pixel: DVec2) -> DVec2 {
-        let moved = self.original.as_ref();
-        moved
-            .and_then(|o| o.undistortion.to_working(pixel))
-            .unwrap_or(pixel)
+    /// The pixel of the undistorted photo that shows what the photo shows at `pixel`; `None` where there is none, as at the
+    /// edge of a fisheye's.
+    pub fn undistorted_pixel(&self, pixel: DVec2) -> Option<DVec2> {
+        match &self.original {
+            Some(original) => original.undistortion.to_working(pixel),
+            None => Some(pixel),
+        }
     }
 }
 

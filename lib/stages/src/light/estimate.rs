@@ -179,9 +179,9 @@ fn outside(ends: [DVec2; 2], size: DVec2) -> Option<String> {
     ))
 }
 
-/// What is wrong with ends of a shadow that the picture without distortion does not show, as at the edge of a fisheye's.
-fn unseen(ends: [DVec2; 2], is_shown: impl Fn(DVec2) -> bool) -> Option<String> {
-    let end = ends.into_iter().find(|end| !is_shown(*end))?;
+/// What is wrong with ends of a shadow of which `shown` gives no pixel of the picture without distortion.
+fn unseen(ends: [DVec2; 2], shown: impl Fn(DVec2) -> Option<DVec2>) -> Option<String> {
+    let end = ends.into_iter().find(|end| shown(*end).is_none())?;
     Some(format!(
         "has an end at [{:?}, {:?}], which the picture without the lens's distortion does not show; accepted: pixels nearer \
          to the middle of the photograph",
@@ -219,11 +219,9 @@ fn known_sun(
             .resolve("light.shadow")
             .map_err(|e| wrong("light.shadow", e.to_string()))?;
         let size = DVec2::from_array(facts.size.map(f64::from));
-        let original = loaded.original.as_ref();
         let ends = [shadow.foot, shadow.tip];
-        let is_shown =
-            |end: DVec2| original.is_none_or(|o| o.undistortion.to_working(end).is_some());
-        if let Some(message) = outside(ends, size).or_else(|| unseen(ends, is_shown)) {
+        let shown = |end: DVec2| loaded.undistorted_pixel(end);
+        if let Some(message) = outside(ends, size).or_else(|| unseen(ends, shown)) {
             return Err(wrong("light.shadow", message).into());
         }
         let ground = match (&loaded.scene.proxy, &loaded.description.proxy) {
@@ -241,11 +239,13 @@ fn known_sun(
             }
         };
         // A preview's camera has fewer pixels than the photograph or its working picture.
+        let original = loaded.original.as_ref();
         let working = original.map_or(facts.size, |o| o.undistortion.size());
         let scale = DVec2::from_array(camera.resolution.map(f64::from))
             / DVec2::from_array(working.map(f64::from));
         let ray = |pixel: DVec2| {
-            let pixel = loaded.undistorted_pixel(pixel) * scale;
+            // Both ends are shown.
+            let pixel = shown(pixel).unwrap_or(pixel) * scale;
             let ray = camera.ray(Vec2::new(pixel.x as f32, pixel.y as f32));
             (ray.origin.as_dvec3(), ray.direction.as_dvec3())
         };
@@ -297,10 +297,10 @@ mod tests {
             )
         };
         let way = Undistortion::of(&lens).unwrap();
-        let is_shown = |end: DVec2| way.to_working(end).is_some();
+        let shown = |end: DVec2| way.to_working(end);
         let (middle, corner) = (DVec2::new(220.0, 160.0), DVec2::new(399.0, 2.5));
-        assert_eq!(unseen([middle, DVec2::new(260.0, 90.0)], is_shown), None);
-        let message = unseen([middle, corner], is_shown).unwrap();
+        assert_eq!(unseen([middle, DVec2::new(260.0, 90.0)], shown), None);
+        let message = unseen([middle, corner], shown).unwrap();
         let start = "has an end at [399.0, 2.5], which the picture without the lens's distortion does not show";
         assert!(message.starts_with(start), "{message}");
     }
