@@ -252,8 +252,8 @@ fn frames_are_exposed_as_their_exif_data_say() {
         }
         bytes
     };
-    let jpeg = |name: &str, seconds| {
-        let picture = image::RgbImage::from_pixel(36, 24, image::Rgb([90, 100, 110]));
+    let jpeg = |name: &str, seconds, color| {
+        let picture = image::RgbImage::from_pixel(36, 24, image::Rgb(color));
         let mut encoded = std::io::Cursor::new(vec![]);
         picture
             .write_to(&mut encoded, image::ImageFormat::Jpeg)
@@ -264,9 +264,10 @@ fn frames_are_exposed_as_their_exif_data_say() {
         let all = [&encoded[..2], &[0xff, 0xe1], &length, &exif, &encoded[2..]];
         project.write(name, all.concat());
     };
-    jpeg("photo.jpg", [1, 100]);
-    jpeg("longer.jpg", [1, 50]);
-    jpeg("same.jpg", [1, 100]);
+    jpeg("photo.jpg", [1, 100], [90, 100, 110]);
+    jpeg("longer.jpg", [1, 50], [90, 100, 110]);
+    jpeg("same.jpg", [1, 100], [90, 100, 110]);
+    jpeg("warm.jpg", [1, 100], [110, 100, 90]);
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
     project.write("pipeline.toml", text.replace("background.png", "photo.jpg"));
     let stops = |name: &str| {
@@ -274,8 +275,14 @@ fn frames_are_exposed_as_their_exif_data_say() {
         let value: Value = serde_json::from_slice(&project.read(&manifest)).unwrap();
         value["params"]["light"]["exposure_ev"].as_f64().unwrap()
     };
-    shot(&project, &["longer.jpg", "same.jpg"]);
-    assert_eq!(["longer", "same"].map(stops), [1.0, 0.0]);
+    shot(&project, &["longer.jpg", "same.jpg", "warm.jpg"]);
+    assert_eq!(["longer", "same", "warm"].map(stops), [1.0, 0.0, 0.0]);
+    // The white balance is that of the pictures all the same: 110 is .61 stops over 90, and a level of 8 bits is .03.
+    let warm = project.read("out/frames/warm/composite/stage.json");
+    let warm: Value = serde_json::from_slice(&warm).unwrap();
+    let [red, green, blue]: [f64; 3] =
+        serde_json::from_value(warm["params"]["light"]["tint"].clone()).unwrap();
+    assert!(red > green && green > blue && red - blue > 1.0, "{warm}");
     shot(
         &project,
         &["longer.jpg", "--set", "composite.exposure_ev=0.5"],

@@ -63,7 +63,7 @@ pub(crate) fn not_square((name, [across, down]): (&str, [u32; 2]), path: &Path) 
 pub(crate) fn turned(turn: u8, path: &Path) -> String {
     format!(
         "`{}`: its XMP says that it is to be turned (tiff:Orientation {turn}), and its Exif data do not; it is read as it is \
-         stored, as most viewers show it: turn it and save it if it lies on its side",
+         stored: turn it and save it if it lies on its side",
         path.display()
     )
 }

@@ -47,10 +47,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         println!(
             "| {:.0} | {:.2} | {:.0}% | {:.3} | {:.2} | {:.0}% |",
             turn(*columns).to_degrees(),
-            at(&sorted(found.iter().map(|f| f.truth.stops.abs())), 0.5),
+            middle(&sorted(found.iter().map(|f| f.truth.stops.abs()))),
             percent(off.len(), found.len()),
-            at(&off, 0.5),
-            at(&off, 0.9),
+            middle(&off),
+            most(&off),
             percent(
                 found.iter().filter(|f| f.of_another.is_some()).count(),
                 found.len()
@@ -86,13 +86,13 @@ fn print_tints(columns: usize, name: &str, found: &[Found]) {
     println!(
         "| {:.0} | {name} | {:.3} | {:.3} | {:.0}% | {:.3} | {:.3} | {:.3} | {:.3} | {:.0}% |",
         turn(columns).to_degrees(),
-        at(&drawn, 0.5),
-        at(&drawn, 0.9),
+        middle(&drawn),
+        most(&drawn),
         percent(raw.len(), found.len()),
-        at(&raw, 0.5),
-        at(&raw, 0.9),
-        at(&off, 0.5),
-        at(&off, 0.9),
+        middle(&raw),
+        most(&raw),
+        middle(&off),
+        most(&off),
         percent(none, found.len())
     );
 }
@@ -141,15 +141,14 @@ fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
     values
 }
 
-/// The value below which a `share` of `sorted` is.
-fn at(sorted: &[f64], share: f64) -> f64 {
-    match share == 0.5 {
-        true => median(sorted).unwrap_or(f64::NAN),
-        false => {
-            let k = (sorted.len() as f64 * share) as usize;
-            sorted.get(k).copied().unwrap_or(f64::NAN)
-        }
-    }
+fn middle(values: &[f64]) -> f64 {
+    median(values).unwrap_or(f64::NAN)
+}
+
+/// The value below which nine of ten are.
+fn most(sorted: &[f64]) -> f64 {
+    let value = sorted.get(sorted.len() * 9 / 10);
+    value.copied().unwrap_or(f64::NAN)
 }
 
 fn percent(n: usize, of: usize) -> f64 {

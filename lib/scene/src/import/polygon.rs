@@ -12,8 +12,8 @@ const LARGEST_CONCAVE: usize = 1024;
 const FLAT: f64 = 1e-5;
 
 /// The warning about a concave face that is too large.
-pub(super) const TOO_LARGE: &str = "a face of more than 1024 corners is concave and may be drawn where it is not: cut its \
-                                    faces into triangles before it is exported";
+pub(super) const TOO_LARGE: &str = "a concave face of more than 1024 corners may be drawn where it is not: cut faces into \
+                                    triangles before the object is exported";
 
 /// Cuts a face into triangles of the same orientation; those that name a corner twice are left out. A convex face becomes
 /// a fan, a concave one loses one ear after another [Meisters 1975]. Returns whether the face is concave and too large for
