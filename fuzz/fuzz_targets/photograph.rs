@@ -12,6 +12,7 @@ fuzz_target!(|bytes: &[u8]| {
         if let Ok(photo) = read_photo_within(&path, Transfer::Srgb, limits) {
             let pixels = photo.image.0.pixels();
             assert!(pixels.iter().all(|p| p.is_finite()));
+            assert!(photo.radiance().0.pixels().iter().all(|p| p.is_finite()));
             let _ = photo.encoding.encode_8(&photo.image);
         }
         let _ = read_mask(&path);

@@ -42,6 +42,18 @@ impl Visible {
         height: usize,
         border_deg: f32,
     ) -> Self {
+        Self::up_to(1.0, photo, camera, [width, height], border_deg)
+    }
+
+    /// As [`new`](Self::new), of a photograph that is clipped at `most` in place of 1: one with a gain map, which knows what is
+    /// brighter than white.
+    pub fn up_to(
+        most: f32,
+        photo: &LinearImage,
+        camera: &Camera,
+        [width, height]: [usize; 2],
+        border_deg: f32,
+    ) -> Self {
         let view = match unframed(photo, camera) {
             Some((photo, camera)) => View::new(&photo, &camera, height, border_deg),
             None => View::new(photo, camera, height, border_deg),
@@ -61,7 +73,7 @@ impl Visible {
                     if let Some((value, seen)) = view.sample(towards) {
                         light += value * seen;
                         weight += seen;
-                        white += if value.max_element() >= CLIPPED {
+                        white += if value.max_element() >= CLIPPED * most {
                             seen
                         } else {
                             0.0
@@ -236,6 +248,20 @@ mod tests {
     use dipir_scene::camera::FieldOfView;
 
     use super::*;
+
+    #[test]
+    fn light_beyond_white_is_known_up_to_the_most_that_is_told() {
+        let photo = LinearImage(Raster::filled(30, 20, Vec3::splat(3.0)));
+        let view = FieldOfView::Vertical(0.9);
+        let camera = Camera::look_at(Vec3::ZERO, Vec3::NEG_Z, Vec3::Y, view, [30, 20]);
+        let dim = EnvironmentMap::constant(8, 4, Vec3::splat(7.0));
+        for (most, wanted) in [(8.0, 3.0), (3.0, 7.0), (1.0, 7.0)] {
+            let seen = Visible::up_to(most, &photo, &camera, [64, 32], 3.0);
+            let light = overlaid(&seen, &dim);
+            let (i, j) = light.texel_of(Vec3::NEG_Z);
+            assert!((light.texel(i, j).x - wanted).abs() < 1e-4, "{most}");
+        }
+    }
 
     #[test]
     fn what_is_seen_of_far_light_does_not_depend_on_where_the_camera_stands() {

@@ -210,12 +210,25 @@ impl Decoded {
     /// An upright raster of `f` of every stored pixel's index.
     fn upright<T: Send>(&self, f: impl Fn(usize) -> T + Sync) -> Raster<T> {
         let turn = self.orientation;
-        let (width, height) = upright_size(turn, self.width, self.height);
+        let (width, height) = self.upright_size();
         let pixels = (0..width * height).into_par_iter().map(|i| {
             let (x, y) = stored_at(turn, i % width, i / width, self.width, self.height);
             f(y * self.width + x)
         });
         Raster::from_pixels(width, height, pixels.collect())
+    }
+
+    /// The same, turned as another picture is.
+    pub fn turned_as(self, other: &Self) -> Self {
+        Self {
+            orientation: other.orientation,
+            ..self
+        }
+    }
+
+    /// Columns and rows when upright.
+    pub fn upright_size(&self) -> (usize, usize) {
+        upright_size(self.orientation, self.width, self.height)
     }
 
     /// Upright linear light.

@@ -8,6 +8,7 @@ use crate::{
     exr_file,
     facts::Facts,
     format::Format,
+    gain_map::{self, GainMap},
     hdr_file,
     layers::Layers,
     primaries::{self, Primaries},
@@ -42,6 +43,8 @@ pub struct Photo {
     pub facts: Facts,
     /// The file's Exif data from the TIFF header on, with no orientation left to be applied.
     pub exif: Option<Vec<u8>>,
+    /// How much brighter than the picture shows it the place was, if a JPEG tells: see [`radiance`](Self::radiance).
+    pub gain: Option<GainMap>,
     /// What of the file could not be used, one sentence each.
     pub warnings: Vec<String>,
 }
@@ -104,7 +107,7 @@ pub fn read_photo(path: impl AsRef<Path>, transfer: Transfer) -> Result<Photo, I
 ///
 /// PNG and JPEG are decoded with their ICC profile if they have one and `transfer` is
 /// [`Transfer::Srgb`]; another curve overrules the file. So it is with a PNG's `gAMA`, where there is
-/// no profile. OpenEXR and Radiance HDR are linear light, of Rec.709 unless they name other
+/// no profile. A gain map behind a JPEG is kept; one that cannot be used is a warning. OpenEXR and Radiance HDR are linear light, of Rec.709 unless they name other
 /// primaries, from which it is converted. Of OpenEXR the display window is read; pixels of the data window outside it
 /// are dropped, with a warning.
 ///
@@ -122,8 +125,14 @@ pub fn read_photo_within(
     match Format::of(&bytes) {
         Format::Png | Format::Jpeg => {
             let decoded = Decoded::of(&bytes, path, PHOTO_FORMATS, limit)?;
+            let gain = GainMap::of(&bytes, &decoded, limit).transpose();
             drop(bytes);
-            Ok(display_photo(decoded, path, transfer))
+            let mut photo = display_photo(decoded, path, transfer);
+            match gain {
+                Ok(gain) => photo.gain = gain,
+                Err(why) => photo.warnings.push(gain_map::unusable(&why, path)),
+            }
+            Ok(photo)
         }
         Format::Exr => {
             let layers = read_colour(&bytes, path, limit)?;
@@ -188,6 +197,7 @@ fn linear_photo(
         encoding: Encoding::named(transfer),
         values: None,
         exif: None,
+        gain: None,
         warnings,
     })
 }
@@ -324,6 +334,7 @@ fn display_photo(mut decoded: Decoded, path: &Path, transfer: Transfer) -> Photo
         values: Some(decoded.values_8()),
         facts,
         exif,
+        gain: None,
         warnings,
     }
 }

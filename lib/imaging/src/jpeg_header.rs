@@ -8,8 +8,9 @@ use std::path::Path;
 const MOST_PIXELS_A_BYTE: usize = 8 * 64;
 
 /// Errors on files that end before their end-of-image marker, on CMYK, on other than 8 bits, on codings of
-/// specialists, on more pixels than their bytes can hold, and on layouts that cannot be decoded.
-pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
+/// specialists, on more pixels than their bytes can hold, and on layouts that cannot be decoded. Returns where the picture
+/// ends in the file.
+pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<usize, ImagingError> {
     let damaged = |detail: &str| ImagingError::Damaged {
         path: path.to_owned(),
         format: "JPEG",
@@ -30,7 +31,7 @@ pub(crate) fn check(bytes: &[u8], path: &Path) -> Result<(), ImagingError> {
             return Err(damaged("no end-of-image marker"));
         };
         if marker == 0xd9 {
-            return Ok(());
+            return Ok(at + 2);
         }
         let Some(&[high, low]) = bytes.get(at + 2..at + 4).and_then(|s| s.first_chunk()) else {
             return Err(damaged("a segment has no length"));

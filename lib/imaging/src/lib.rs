@@ -8,6 +8,8 @@ mod exr_file;
 pub mod facts;
 pub mod file;
 mod format;
+pub mod gain_map;
+mod gain_metadata;
 mod hdr_file;
 mod jpeg_header;
 pub mod layer_rows;

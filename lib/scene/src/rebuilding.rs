@@ -50,8 +50,8 @@ impl SceneDescription {
             occluders,
             description: self.clone(),
             lights,
-            inputs: files.inputs,
-            missing: files.missing,
+            inputs: files.inputs.list,
+            missing: files.missing.list,
             warnings: files.warnings,
         })
     }

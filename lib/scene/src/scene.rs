@@ -1,5 +1,6 @@
 //! Everything of a scene that a renderer needs, except the light.
-use std::collections::HashMap;
+use std::borrow::Cow;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use dipir_cameras::{Camera as LensCamera, Lens};
@@ -117,6 +118,14 @@ impl LoadedScene {
         }
     }
 
+    /// The photo with its gain map, where it has one: light above white ([`Photo::radiance`]).
+    pub fn radiance(&self) -> Cow<'_, LinearImage> {
+        match self.taken().radiance() {
+            Cow::Owned(brighter) => Cow::Owned(self.undistorted(brighter)),
+            Cow::Borrowed(_) => Cow::Borrowed(&self.photo.image),
+        }
+    }
+
     /// The pixel of the undistorted photo that shows what the photo shows at `pixel`; `None` where there is none, as at the
     /// edge of a fisheye's.
     pub fn undistorted_pixel(&self, pixel: DVec2) -> Option<DVec2> {
@@ -144,6 +153,7 @@ pub(crate) fn undistort(
         values: None,
         facts: photo.facts.clone(),
         exif: photo.exif.clone(),
+        gain: None,
         warnings: Vec::new(),
     };
     let occluders = occluders.map(|mask| undistortion.undistort(&mask));
@@ -298,8 +308,8 @@ impl Scene {
                 limits: settings.limits,
             },
             lights,
-            inputs: files.inputs,
-            missing: files.missing,
+            inputs: files.inputs.list,
+            missing: files.missing.list,
             warnings: files.warnings,
         })
     }
@@ -310,14 +320,23 @@ impl Scene {
     }
 }
 
-fn add_once(list: &mut Vec<Input>, role: &str, path: &Path, base_dir: &Path) {
-    let input = Input {
-        role: role.into(),
-        path: path.into(),
-        location: base_dir.join(path),
-    };
-    if !list.contains(&input) {
-        list.push(input);
+/// Files, each once, in the order in which they were added.
+#[derive(Default)]
+pub(crate) struct Inputs {
+    pub(crate) list: Vec<Input>,
+    /// Role and path of each.
+    known: HashSet<(String, PathBuf)>,
+}
+
+impl Inputs {
+    fn add(&mut self, role: &str, path: &Path, base_dir: &Path) {
+        if self.known.insert((role.into(), path.into())) {
+            self.list.push(Input {
+                role: role.into(),
+                path: path.into(),
+                location: base_dir.join(path),
+            });
+        }
     }
 }
 
@@ -325,8 +344,8 @@ fn add_once(list: &mut Vec<Input>, role: &str, path: &Path, base_dir: &Path) {
 pub(crate) struct Files<'a> {
     base_dir: &'a Path,
     pub(crate) limits: Limits,
-    pub(crate) inputs: Vec<Input>,
-    pub(crate) missing: Vec<Input>,
+    pub(crate) inputs: Inputs,
+    pub(crate) missing: Inputs,
     pub(crate) warnings: Vec<String>,
     hashes: HashMap<PathBuf, String>,
 }
@@ -336,8 +355,8 @@ impl<'a> Files<'a> {
         Self {
             base_dir,
             limits,
-            inputs: Vec::new(),
-            missing: Vec::new(),
+            inputs: Inputs::default(),
+            missing: Inputs::default(),
             warnings: Vec::new(),
             hashes: HashMap::new(),
         }
@@ -353,7 +372,7 @@ impl<'a> Files<'a> {
     }
 
     pub(crate) fn input(&mut self, role: &str, path: &Path) {
-        add_once(&mut self.inputs, role, path, self.base_dir);
+        self.inputs.add(role, path, self.base_dir);
     }
 
     /// Notes a file with its hash.
@@ -464,7 +483,7 @@ impl<'a> Files<'a> {
             dependencies.push(self.record(&part, relative(found))?);
         }
         for missing in &imported.missing {
-            add_once(&mut self.missing, &part, relative(missing), base_dir);
+            self.missing.add(&part, relative(missing), base_dir);
         }
         let record = ObjectRecord {
             file,

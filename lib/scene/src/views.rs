@@ -1,4 +1,5 @@
 //! Other photographs of the scene's place.
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use dipir_cameras::Lens;
@@ -11,6 +12,7 @@ use crate::camera::{Camera, CameraSettings, FieldOfView};
 use crate::config::ViewConfig;
 use crate::error::Error;
 use crate::limits::Limits;
+use crate::undistortion::Undistortion;
 
 /// A checked `[[scene.views]]` table.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +41,20 @@ pub struct View {
     pub image: LinearImage,
     /// The camera of `image`.
     pub camera: Camera,
+    undistortion: Option<Undistortion>,
+}
+
+impl View {
+    /// `image` with the photograph's gain map, where it has one: light above white ([`Photo::radiance`]).
+    pub fn radiance(&self) -> Cow<'_, LinearImage> {
+        match (self.taken.radiance(), &self.undistortion) {
+            (Cow::Borrowed(_), _) => Cow::Borrowed(&self.image),
+            (Cow::Owned(brighter), None) => Cow::Owned(brighter),
+            (Cow::Owned(brighter), Some(way)) => {
+                Cow::Owned(LinearImage(way.undistort(&brighter.0)))
+            }
+        }
+    }
 }
 
 impl ViewSettings {
@@ -64,7 +80,7 @@ impl ViewSettings {
             .with_facts(&taken.facts)
             .and_then(|c| c.resolve(resolution, base_dir))
             .map_err(|e| e.moved("scene.camera", &self.key.replace("background", "camera")))?;
-        let image = match undistortion {
+        let image = match &undistortion {
             Some(undistortion) => LinearImage(undistortion.undistort(&taken.image.0)),
             None => taken.image.clone(),
         };
@@ -72,6 +88,7 @@ impl ViewSettings {
             taken,
             image,
             camera,
+            undistortion,
         })
     }
 

@@ -34,6 +34,8 @@ pub struct Document {
     pub photo: String,
     /// Of the photograph.
     pub facts: Facts,
+    /// Whether it has a gain map that can be used.
+    pub has_gain: bool,
     /// What the object is called.
     pub class: String,
     /// Where that comes from.
@@ -119,6 +121,10 @@ impl Document {
         let mut what = format!("{w} x {h} pixels");
         for name in [&self.facts.make, &self.facts.model].into_iter().flatten() {
             what += &format!(", {}", printable(name));
+        }
+        if self.has_gain {
+            what +=
+                ", with a gain map: how bright what it shows is beyond white is part of the light";
         }
         format!(
             "[scene]\nbackground = {}    # {what}\nclass = {}    # what the object is called: {}\n\n",
@@ -338,6 +344,7 @@ mod tests {
                 }),
                 ..Facts::of_size([900, 600])
             },
+            has_gain: false,
             class: "chair".into(),
             class_why: "as the model's file",
             objects: vec![Object {
@@ -369,6 +376,9 @@ mod tests {
             ..View::default()
         });
         document.camera_file = Some("rig.json".into());
+        assert!(!document.text().contains("with a gain map"));
+        document.has_gain = true;
+        assert!(document.text().contains(", with a gain map: how bright"));
         document.objects[0].auto = true;
         document.points = Some(Points {
             path: "scan.bin".into(),

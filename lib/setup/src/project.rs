@@ -166,6 +166,7 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
         document: Document {
             out: out_folder(&request.out),
             photo: beside(&request.photo, folder)?,
+            has_gain: photo.gain.is_some(),
             facts: photo.facts,
             class,
             class_why,

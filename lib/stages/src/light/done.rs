@@ -93,6 +93,12 @@ impl fmt::Display for Done {
             if estimated.photographs > 1 {
                 write!(f, "\n  from {} photographs", estimated.photographs)?;
             }
+            if estimated.has_gain {
+                write!(
+                    f,
+                    "\n  the photograph's gain map tells how bright what it shows is beyond white"
+                )?;
+            }
         }
         let skipped = self.found.skipped();
         if skipped > 0 {

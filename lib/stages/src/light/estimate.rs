@@ -70,6 +70,8 @@ pub(super) struct Estimated {
     pub(super) seen: Vec<Visible>,
     /// How many photographs tell it.
     pub(super) photographs: usize,
+    /// Whether a gain map tells how bright what the photograph shows is.
+    pub(super) has_gain: bool,
     /// The shadow that is drawn in the photograph.
     pub(super) shadow: DrawnShadow,
 }
@@ -136,6 +138,7 @@ pub(super) fn estimate(
         sources,
         smooth,
         seen,
+        has_gain: table.visible.unwrap_or(true) && loaded.taken().gain.is_some(),
         photographs: 1 + views::settings(session)?.len(),
         shadow: DrawnShadow::of(table.shadow.as_ref().map(|s| s.height_m)),
     })

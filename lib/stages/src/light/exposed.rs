@@ -37,14 +37,15 @@ pub(super) fn estimate(
     estimator.estimate(&exposed, camera).scaled(gain.recip())
 }
 
-/// What a photograph shows of the light, in `size` texels.
+/// What a photograph shows of the light, in `size` texels. `radiance` is the photograph with its gain map, where it has one.
 pub(super) fn visible(
     taken: &Photo,
-    image: &LinearImage,
+    radiance: &LinearImage,
     camera: &Camera,
     size: [usize; 2],
 ) -> Visible {
-    let seen = Visible::new(image, camera, size[0], size[1], BORDER_DEG);
+    let most = taken.gain.as_ref().map_or(1.0, |gain| gain.most());
+    let seen = Visible::up_to(most, radiance, camera, size, BORDER_DEG);
     match is_linear(taken) {
         true => seen.unclipped(),
         false => seen,

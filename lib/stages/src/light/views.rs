@@ -81,7 +81,7 @@ pub(super) fn estimate(
             key: settings.key,
             cells: Cells::new(&view.image, placed, false),
             estimate: exposed::estimate(&estimator, &view.taken, &view.image, &view.camera),
-            visible: exposed::visible(&view.taken, &view.image, &view.camera, MAP),
+            visible: exposed::visible(&view.taken, &view.radiance(), &view.camera, MAP),
         });
     }
     let exposures = exposures(loaded, &others);
