@@ -79,15 +79,17 @@ impl StagePlan {
         });
     }
 
+    /// The role itself, or it with the number behind that of the last file of this role. Looked for from the end: files of a
+    /// role mostly follow one another.
     fn free_role(&self, role: &str) -> String {
-        let taken = |name: &str| self.inputs.iter().any(|a| a.role == name);
-        let mut name = role.to_string();
-        let mut number = 2;
-        while taken(&name) {
-            name = format!("{role} {number}");
-            number += 1;
+        let number = |a: &Artifact| match a.role.strip_prefix(role)? {
+            "" => Some(1),
+            behind => behind.strip_prefix(' ')?.parse::<usize>().ok(),
+        };
+        match self.inputs.iter().rev().find_map(number) {
+            Some(last) => format!("{role} {}", last.saturating_add(1)),
+            None => role.to_string(),
         }
-        name
     }
 
     /// Adds outputs of an earlier stage by their roles, known by `STAGE/file`, with the hashes

@@ -28,7 +28,8 @@ pub struct Limits {
     /// Pixels of the photograph, millions. A pixel takes 18 bytes while it is read.
     #[schemars(example = 400)]
     pub photo_megapixels: u64,
-    /// Whether a file may name others outside of its folder, as `../wood.png` or `/models/wood.png`.
+    /// Whether a file may name any others outside of its folder, as `/models/wood.png`; an image or a buffer at a relative
+    /// path, as `../wood.png`, is read anyway.
     #[schemars(example = true)]
     pub allow_outside: bool,
 }

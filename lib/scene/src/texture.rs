@@ -64,7 +64,7 @@ pub enum Encoding {
 /// An image as a file holds it, encoded.
 #[derive(Clone, Debug)]
 pub enum ImageSource {
-    /// A PNG, JPEG or WebP file, read when it is decoded.
+    /// A PNG, JPEG, WebP, BMP or Targa file, read when it is decoded.
     File(PathBuf),
     /// The bytes of such a file that is embedded in another.
     Bytes {
@@ -103,20 +103,21 @@ impl ImageSource {
             Self::File(path) => {
                 let bytes = dipir_files::read(path).map_err(|e| self.unreadable(e))?;
                 // The decoder puts it between quotation marks.
-                decode(&bytes, &printable(path.display()))
+                let name = printable(path.display());
+                decode(&bytes, other_format(&bytes, is_targa(path)), &name)
             }
-            Self::Bytes { bytes, .. } => decode(bytes, &self.name()),
+            Self::Bytes { bytes, .. } => decode(bytes, other_format(bytes, false), &self.name()),
         }
     }
 
     /// The number of pixels by the header; `None` if it cannot be read. Decoding will say why.
-    fn pixels(&self) -> Result<Option<u64>, Error> {
+    pub(crate) fn pixels(&self) -> Result<Option<u64>, Error> {
         let size = match self {
             Self::File(path) => {
                 let file = dipir_files::open(path).map_err(|e| self.unreadable(e))?;
-                size_in_header(BufReader::new(file))
+                size_in_header(BufReader::new(file), is_targa(path))
             }
-            Self::Bytes { bytes, .. } => size_in_header(Cursor::new(bytes)),
+            Self::Bytes { bytes, .. } => size_in_header(Cursor::new(bytes), false),
         };
         Ok(size.map(|(width, height)| u64::from(width) * u64::from(height)))
     }
@@ -133,18 +134,36 @@ impl ImageSource {
     }
 }
 
-fn size_in_header(bytes: impl BufRead + Seek) -> Option<(u32, u32)> {
-    let reader = ImageReader::new(bytes).with_guessed_format().ok()?;
+/// Whether a file is a Targa image by its name: nothing at its beginning says so.
+fn is_targa(path: &Path) -> bool {
+    path.extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("tga"))
+}
+
+fn size_in_header(bytes: impl BufRead + Seek, is_targa: bool) -> Option<(u32, u32)> {
+    let mut reader = ImageReader::new(bytes).with_guessed_format().ok()?;
+    if reader.format().is_none() && is_targa {
+        reader.set_format(ImageFormat::Tga);
+    }
     reader.into_dimensions().ok()
 }
 
-fn decode(bytes: &[u8], name: &str) -> Result<Raster<[u8; 4]>, Error> {
-    if !(bytes.starts_with(b"RIFF") && bytes.get(8..12) == Some(b"WEBP")) {
-        return Ok(dipir_imaging::file::decode_texture(bytes, name)?);
+/// The format of a texture that photographs do not have.
+fn other_format(bytes: &[u8], is_targa: bool) -> Option<ImageFormat> {
+    match image::guess_format(bytes) {
+        Ok(format @ (ImageFormat::WebP | ImageFormat::Bmp)) => Some(format),
+        Err(_) if is_targa && !bytes.is_empty() => Some(ImageFormat::Tga),
+        _ => None,
     }
-    let decoded = image::load_from_memory_with_format(bytes, ImageFormat::WebP).map_err(|e| {
+}
+
+fn decode(bytes: &[u8], other: Option<ImageFormat>, name: &str) -> Result<Raster<[u8; 4]>, Error> {
+    let Some(format) = other else {
+        return Ok(dipir_imaging::file::decode_texture(bytes, name)?);
+    };
+    let decoded = image::load_from_memory_with_format(bytes, format).map_err(|e| {
         Error::malformed(
-            format!("the WebP image {name} cannot be decoded: {e}"),
+            format!("the {format:?} image {name} cannot be decoded: {e}"),
             "export it as PNG or JPEG",
         )
     })?;
@@ -183,7 +202,7 @@ pub struct Texture {
 }
 
 impl Texture {
-    /// Reads and decodes the image. Fails on anything but a readable PNG, JPEG or WebP.
+    /// Reads and decodes the image. Fails on anything but a readable PNG, JPEG, WebP, BMP or Targa image.
     pub fn decode(&self) -> Result<DecodedTexture, Error> {
         Ok(self.with_texels(Arc::new(self.image.decode()?)))
     }
@@ -315,6 +334,52 @@ mod tests {
 
     /// Bytes of order 255 after a few roundings.
     const ROUNDING: f32 = 255.0 * 4.0 * f32::EPSILON;
+
+    /// Red, green over blue, white.
+    const FOUR: [[u8; 4]; 4] = [
+        [255, 0, 0, 255],
+        [0, 255, 0, 255],
+        [0, 0, 255, 255],
+        [255, 255, 255, 255],
+    ];
+
+    /// Rows of blue, green, red from the bottom up, each filled up to a multiple of `align` bytes.
+    fn rows_from_the_bottom(align: usize) -> Vec<u8> {
+        let row = |texels: &[[u8; 4]]| {
+            let mut row: Vec<u8> = texels.iter().flat_map(|t| [t[2], t[1], t[0]]).collect();
+            row.resize(row.len().next_multiple_of(align), 0);
+            row
+        };
+        [row(&FOUR[2..]), row(&FOUR[..2])].concat()
+    }
+
+    #[test]
+    fn bmp_and_targa_textures_are_read_upright() {
+        let mut bmp =
+            b"BM\x46\0\0\0\0\0\0\0\x36\0\0\0\x28\0\0\0\x02\0\0\0\x02\0\0\0\x01\0\x18\0".to_vec();
+        bmp.resize(0x36, 0);
+        bmp.extend(rows_from_the_bottom(4));
+        let mut targa = vec![0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 2, 0, 24, 0];
+        targa.extend(rows_from_the_bottom(1));
+        let folder = tempfile::tempdir().unwrap();
+        for (name, bytes) in [("paint.bmp", bmp), ("PAINT.TGA", targa)] {
+            let path = folder.path().join(name);
+            std::fs::write(&path, bytes).unwrap();
+            let image = ImageSource::File(path);
+            assert_eq!(image.pixels().unwrap(), Some(4), "{name}");
+            assert_eq!(image.decode().unwrap().pixels(), FOUR, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_targa_texture_that_is_none_is_told_by_its_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("notes.tga");
+        std::fs::write(&path, "these are notes").unwrap();
+        let told = ImageSource::File(path).decode().unwrap_err().to_string();
+        assert!(told.contains("notes.tga"), "{told}");
+        assert!(told.contains("export it as PNG or JPEG"), "{told}");
+    }
 
     #[test]
     fn linear_filtering_meets_texel_centres_and_halves_between_them() {

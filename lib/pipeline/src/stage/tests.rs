@@ -417,9 +417,13 @@ fn inputs_of_one_role_are_told_apart() {
     let mut plan = plan(0);
     for _ in 0..3 {
         plan.input("object", Path::new("a"), &file).unwrap();
+        plan.input("object's part", Path::new("a"), &file).unwrap();
     }
+    plan.missing("object", Path::new("b"));
+    plan.input("object", Path::new("a"), &file).unwrap();
     let roles: Vec<_> = plan.inputs.iter().map(|a| a.role.as_str()).collect();
-    assert_eq!(roles, ["object", "object 2", "object 3"]);
+    let expected = "object, object's part, object 2, object's part 2, object 3, object's part 3, missing object, object 4";
+    assert_eq!(roles.join(", "), expected);
 }
 
 #[test]

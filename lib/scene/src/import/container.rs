@@ -18,6 +18,11 @@ pub trait Resolver {
     /// The contents of the file that the percent-encoded relative `uri` names.
     fn read(&self, uri: &str) -> io::Result<Vec<u8>>;
 
+    /// The bytes of geometry that `uri` names.
+    fn buffer(&self, uri: &str) -> io::Result<Vec<u8>> {
+        self.read(uri)
+    }
+
     /// The image that `uri` names, not decoded; it must exist.
     fn image(&self, uri: &str) -> io::Result<ImageSource> {
         Ok(ImageSource::Bytes {
@@ -52,6 +57,36 @@ pub struct Folder {
     listings: RefCell<HashMap<PathBuf, Listing>>,
 }
 
+/// What a file that a document names is read as.
+#[derive(Clone, Copy, PartialEq)]
+enum Kind {
+    Text,
+    Buffer,
+    Image,
+}
+
+/// Extensions of files that hold buffers.
+const OF_BUFFERS: [&str; 3] = ["bin", "glbin", "glbuf"];
+
+impl Kind {
+    /// Whether a file outside of the object's folder may be read as this, where the document climbs to it by `..`. A document
+    /// of strangers may name any file: one is read that can be nothing else, and only its pixels or numbers are used.
+    fn is_of(self, file: &Path) -> bool {
+        // Links are followed: the name is that of the file itself.
+        let found = file.canonicalize();
+        let extension = found.as_deref().ok().and_then(Path::extension);
+        match self {
+            Self::Text => false,
+            Self::Buffer => {
+                extension.is_some_and(|e| OF_BUFFERS.iter().any(|own| e.eq_ignore_ascii_case(own)))
+            }
+            Self::Image => ImageSource::File(file.into())
+                .pixels()
+                .is_ok_and(|size| size.is_some()),
+        }
+    }
+}
+
 /// Entries of a folder by their names in small letters; `None` where several have the same.
 type Listing = HashMap<String, Option<OsString>>;
 
@@ -82,7 +117,7 @@ impl Folder {
         once(self.warnings.take())
     }
 
-    fn find(&self, uri: &str) -> io::Result<PathBuf> {
+    fn find(&self, uri: &str, kind: Kind) -> io::Result<PathBuf> {
         let uri = without_file_scheme(uri);
         if uri.trim().is_empty() {
             return Err(io::Error::new(io::ErrorKind::NotFound, "no file is named"));
@@ -98,9 +133,10 @@ impl Folder {
         let slashed = decoded.replace('\\', "/");
         let guesses = [&decoded, uri, &slashed];
         let allow_outside = self.limits.allow_outside;
-        if !allow_outside && guesses.iter().any(|guess| leaves_folder(guess)) {
-            // An absolute path is one of the machine that wrote it. Whether it is there is not looked up.
-            let is_absolute = guesses.iter().any(|guess| Path::new(guess).has_root());
+        let climbs = guesses.iter().any(|guess| leaves_folder(guess));
+        // An absolute path is one of the machine that wrote it. Whether it is there is not looked up.
+        let is_absolute = guesses.iter().any(|guess| is_absolute(guess));
+        if !allow_outside && (is_absolute || climbs && kind == Kind::Text) {
             return Err(outside(match is_absolute {
                 true => io::ErrorKind::NotFound,
                 false => io::ErrorKind::PermissionDenied,
@@ -124,8 +160,15 @@ impl Folder {
             true => io::Error::new(io::ErrorKind::NotFound, e.to_string()),
             false => e,
         });
-        if !allow_outside && !self.holds(&found)? {
-            return Err(outside(io::ErrorKind::PermissionDenied));
+        let may_be_read = || climbs && file.is_ok() && kind.is_of(&found);
+        if !(allow_outside || self.holds(&found)? || may_be_read()) {
+            return Err(file.err().unwrap_or_else(|| match (climbs, kind) {
+                (true, Kind::Image) => io::Error::new(
+                    io::ErrorKind::NotFound,
+                    "it lies outside of the object's folder and is no PNG, JPEG, WebP, BMP or Targa image",
+                ),
+                _ => outside(io::ErrorKind::PermissionDenied),
+            }));
         }
         let bytes = file?.metadata()?.len();
         self.limits
@@ -228,35 +271,46 @@ fn outside(kind: io::ErrorKind) -> io::Error {
     )
 }
 
+/// Whether a path starts from no folder that it is joined to.
+fn is_absolute(path: &str) -> bool {
+    let first = Path::new(path).components().next();
+    matches!(first, Some(Component::Prefix(_) | Component::RootDir))
+}
+
 /// Whether a relative path climbs out of the folder that it starts from.
 fn leaves_folder(path: &str) -> bool {
     let mut depth = 0i64;
     Path::new(path).components().any(|part| {
-        match part {
-            Component::Prefix(_) | Component::RootDir => depth = i64::MIN,
-            Component::ParentDir => depth -= 1,
-            Component::Normal(_) => depth += 1,
-            Component::CurDir => {}
-        }
+        depth += match part {
+            Component::ParentDir => -1,
+            Component::Normal(_) => 1,
+            _ => 0,
+        };
         depth < 0
     })
 }
 
 impl Resolver for Folder {
     fn read(&self, uri: &str) -> io::Result<Vec<u8>> {
-        dipir_files::read(self.find(uri)?)
+        dipir_files::read(self.find(uri, Kind::Text)?)
+    }
+
+    fn buffer(&self, uri: &str) -> io::Result<Vec<u8>> {
+        dipir_files::read(self.find(uri, Kind::Buffer)?)
     }
 
     /// Exporters name a texture by where it lay on their machine: beside the object it is looked for, too.
     fn image(&self, uri: &str) -> io::Result<ImageSource> {
         let bare = uri.rsplit(['/', '\\']).next().unwrap_or_default();
-        let found = self.find(uri).or_else(|e| match e.kind() {
+        let found = self.find(uri, Kind::Image).or_else(|e| match e.kind() {
             io::ErrorKind::FileTooLarge => Err(e),
             _ if bare.is_empty() => Err(e),
-            _ => self.find(bare).map_err(|of_bare| match of_bare.kind() {
-                io::ErrorKind::NotFound => e,
-                _ => of_bare,
-            }),
+            _ => self
+                .find(bare, Kind::Image)
+                .map_err(|of_bare| match of_bare.kind() {
+                    io::ErrorKind::NotFound => e,
+                    _ => of_bare,
+                }),
         });
         found.map(ImageSource::File)
     }

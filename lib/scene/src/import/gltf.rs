@@ -213,7 +213,7 @@ fn buffer_data<'a>(
             None => binary.filter(|_| i == 0).map(Cow::Borrowed),
             Some(uri) => Some(Cow::Owned(match container::data_uri(uri, &at) {
                 Some(bytes) => bytes?,
-                None => resolver.read(uri).map_err(|source| Error::Read {
+                None => resolver.buffer(uri).map_err(|source| Error::Read {
                     role: at.clone(),
                     path: container::named(uri),
                     source,

@@ -4,6 +4,10 @@
 //! follows from the Blinn-Phong exponent `Ns` by `alpha^2 = 2 / (Ns + 2)` [Walter et al. 2007,
 //! section 5.2]. A black `Ks` switches the dielectric reflection off. Surfaces are double-sided, for
 //! the format does not say which side is the front.
+//!
+//! Glass is what refracts (`illum` 6 and 7) by an index (`Ni` above 1), is opaque by `d` and has no `map_Kd`, in the colour of
+//! `Tf`. With `d` below 1 the same numbers come from exporters that mean no more than `d`; some write 7 of every surface, but
+//! no index; and 4 and 9, glass by the format's name, are written of opaque surfaces.
 use std::borrow::Cow;
 use std::collections::{HashMap, HashSet};
 
@@ -13,7 +17,7 @@ use super::container::{self, Resolver};
 use super::opacity;
 use crate::error::Error;
 use crate::limits::Limits;
-use crate::material::{AlphaMode, Clearcoat, Material, TextureRef};
+use crate::material::{AlphaMode, Clearcoat, Material, TextureRef, Transmission};
 use crate::texture::{Encoding, Filter, Texture, Wrap};
 
 /// Statements that change what a surface looks like and are not read.
@@ -53,25 +57,24 @@ pub(super) fn statement(line: &str) -> (&str, &str) {
     let (word, rest) = line
         .split_once(char::is_whitespace)
         .map_or((line, ""), |(w, r)| (w, r.trim()));
-    let is_file = |word: &str| {
-        let names = ["mtllib", "norm", "bump"];
-        names.contains(&word) || word.starts_with("map_")
-    };
+    let is = |name: &&str| word.eq_ignore_ascii_case(name);
+    let is_map = (word.get(..4)).is_some_and(|start| start.eq_ignore_ascii_case("map_"));
     let blank = |at: usize| {
         rest[..at]
             .chars()
             .next_back()
             .is_none_or(char::is_whitespace)
     };
-    match word {
-        word if word.starts_with('#') => ("", ""),
-        "usemtl" | "newmtl" => (word, rest),
-        word if is_file(word) => {
-            let mut marks = rest.match_indices('#').map(|(at, _)| at);
-            let end = marks.find(|at| blank(*at)).unwrap_or(rest.len());
-            (word, rest[..end].trim())
-        }
-        word => (word, without_comment(rest)),
+    if word.starts_with('#') {
+        ("", "")
+    } else if ["usemtl", "newmtl"].iter().any(is) {
+        (word, rest)
+    } else if is_map || ["mtllib", "norm", "bump"].iter().any(is) {
+        let mut marks = rest.match_indices('#').map(|(at, _)| at);
+        let end = marks.find(|at| blank(*at)).unwrap_or(rest.len());
+        (word, rest[..end].trim())
+    } else {
+        (word, without_comment(rest))
     }
 }
 
@@ -111,6 +114,12 @@ struct Draft {
     has_emission_map: bool,
     /// Whether `d` was written.
     has_opacity: bool,
+    /// The `illum` of a surface that refracts.
+    refraction: Option<String>,
+    /// Whether `Ni` is above 1.
+    has_index: bool,
+    /// `Tf`, but for black and white.
+    filter: Option<Vec3>,
 }
 
 /// An image statement: the file and its options.
@@ -194,16 +203,19 @@ impl Library {
             "Ks" if color(rest)? == Vec3::ZERO => material.ior = 1.0,
             "Ke" => material.emissive = color(rest)?,
             // Maya writes white for opaque, others for clear: black and white say nothing.
-            "Tf" if color(rest).is_ok_and(|c| c != Vec3::ZERO && c != Vec3::ONE) => {
-                draft.left_out.push("Tf".into());
+            "Tf" => {
+                draft.filter = color(rest)
+                    .ok()
+                    .filter(|c| *c != Vec3::ZERO && *c != Vec3::ONE)
             }
-            // Maya writes 4 of all surfaces, and Blender 9 of those that `d` makes transparent.
-            "illum" if ["6", "7"].contains(&rest) => {
-                draft.left_out.push(format!("illum {rest} (refraction)"));
+            "illum" => {
+                draft.refraction =
+                    Some(rest.to_owned()).filter(|n| ["6", "7"].contains(&n.as_str()))
             }
             "Ns" => draft.shininess = Some(number(rest)?.max(0.0)),
             "Ni" => {
                 let ior = number(rest)?;
+                draft.has_index = ior > 1.0;
                 // Many exporters write 1 for "unknown". It would mean a surface without reflection, so it is ignored.
                 if ior > 1.0 && material.ior > 1.0 {
                     material.ior = ior.min(10.0);
@@ -258,7 +270,7 @@ impl Library {
 
     fn finish(
         &mut self,
-        (mut material, draft): (Material, Draft),
+        (mut material, mut draft): (Material, Draft),
         folder: &str,
         resolver: &dyn Resolver,
     ) -> Result<(), Error> {
@@ -281,6 +293,28 @@ impl Library {
         };
         if draft.roughness_file.is_some() && draft.roughness.is_none() {
             material.roughness = 1.0;
+        }
+        let is_opaque = material.base_color.w == 1.0 && draft.opacity.is_none();
+        let refraction = draft.refraction.filter(|_| is_opaque);
+        let is_glass = draft.has_index && !has_map;
+        if let Some(illum) = refraction.as_ref().filter(|_| is_glass) {
+            self.warnings.push(format!(
+                "material \"{name}\" is glass (illum {illum}) that light passes straight: its refraction is left out"
+            ));
+            material.transmission = Some(Transmission {
+                factor: 1.0,
+                texture: None,
+            });
+            let filter = draft.filter.unwrap_or(Vec3::ONE).min(Vec3::ONE);
+            material.base_color = filter.extend(1.0);
+            // Rays that are refracted are not blurred: Ns is the size of highlights.
+            if draft.roughness.is_none() && draft.roughness_file.is_none() {
+                material.roughness = 0.0;
+            }
+        } else {
+            let tf = draft.filter.map(|_| "Tf".into());
+            let refraction = refraction.map(|illum| format!("illum {illum} (refraction)"));
+            draft.left_out.extend(tf.into_iter().chain(refraction));
         }
         // One texture holds both, in green and blue: a grey roughness map would dim the metal.
         match (&draft.roughness_file, &draft.metallic_file) {

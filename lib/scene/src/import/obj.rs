@@ -25,6 +25,9 @@ pub(super) const FAR: f32 = 1e4;
 /// How some programs on Windows write what is no number, `-1.#IND` or `1.#QNAN`, where a comment seems to begin.
 const NOT_A_NUMBER: &str = ".#";
 
+/// A comment in which ZBrush writes colours of vertices.
+const POLYPAINT: &str = "#MRGB ";
+
 /// Material of triangles without one; what follows it downwards are names that no library has defined yet.
 const NO_MATERIAL: u32 = u32::MAX;
 
@@ -96,6 +99,8 @@ struct Reader {
     positions: Vec<Vec3>,
     /// Display-referred, of the vertices that have one.
     colors: Vec<Option<Vec3>>,
+    /// Likewise, of the vertices in their order, where it comes from comments.
+    paint: Vec<Option<Vec3>>,
     uvs: Vec<Vec2>,
     normals: Vec<Vec3>,
     mesh: TriangleMesh,
@@ -118,6 +123,9 @@ struct Reader {
 
 impl Reader {
     fn statement(&mut self, line: &str, resolver: &dyn Resolver) -> Result<(), Problem> {
+        if let Some(paint) = line.strip_prefix(POLYPAINT) {
+            self.polypaint(paint);
+        }
         let (word, mut rest) = mtl::statement(line);
         if line.contains(NOT_A_NUMBER) && ["v", "vt", "vn"].contains(&word) {
             rest = line.trim()[word.len()..].trim_start();
@@ -180,6 +188,17 @@ impl Reader {
             self.colors.resize(self.positions.len(), None);
         }
         Ok(())
+    }
+
+    /// Eight hexadecimal digits a vertex: a mask, red, green and blue.
+    fn polypaint(&mut self, digits: &str) {
+        for digits in digits.trim().as_bytes().chunks_exact(8) {
+            let number = std::str::from_utf8(digits).ok();
+            let number = number.and_then(|n| u32::from_str_radix(n, 16).ok());
+            let rgb =
+                |n: u32| Vec3::from_array([16, 8, 0].map(|at| (n >> at & 255) as f32 / 255.0));
+            self.paint.push(number.map(rgb));
+        }
     }
 
     fn face(&mut self, rest: &str) -> Result<(), Problem> {
@@ -259,8 +278,16 @@ impl Reader {
         if !self.libraries.insert(name.to_owned()) {
             return Ok(());
         }
-        match resolver.read(&name.replace('\\', "/")) {
-            Ok(bytes) => {
+        let own = name.replace('\\', "/");
+        // Some exporters name it by where it lay on their machine: beside the object it is looked for, too.
+        let bare = own.rsplit('/').next().unwrap_or_default();
+        let found = resolver.read(&own).map(|bytes| (&*own, bytes));
+        let found = found.or_else(|e| match bare == own || are_libraries(name) {
+            true => Err(e),
+            false => resolver.read(bare).map(|bytes| (bare, bytes)).or(Err(e)),
+        });
+        match found {
+            Ok((name, bytes)) => {
                 let path = container::named(name);
                 dipir_files::refuse_utf16(&bytes).map_err(|source| Error::Read {
                     role: "the material library".into(),
@@ -301,6 +328,10 @@ impl Reader {
         }
         if self.has_huge_face {
             self.warnings.push(polygon::TOO_LARGE.into());
+        }
+        if self.colors.is_empty() && !self.paint.is_empty() {
+            self.colors = std::mem::take(&mut self.paint);
+            self.colors.resize(self.positions.len(), None);
         }
         self.gather(&materials);
         let mut warnings = self.warnings;

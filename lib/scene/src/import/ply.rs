@@ -6,6 +6,7 @@ use super::mtl::grey;
 use super::obj::{self, FAR};
 use super::{Imported, Limits, polygon};
 use crate::error::Error;
+use crate::material::AlphaMode;
 use crate::mesh::TriangleMesh;
 
 const EXPORT: &str = "export the file again";
@@ -25,6 +26,13 @@ pub fn load_ply_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
     };
     let vertices = count("vertex")?;
     let faces = count("face")?.saturating_add(count("tristrips")?);
+    let mut properties = header.elements.iter().flat_map(|e| &e.properties);
+    if faces == 0 && properties.any(|p| p.name == "f_dc_0") {
+        return Err(Error::malformed(
+            format!("the file holds {vertices} Gaussian splats, not a mesh"),
+            "export a mesh (.glb or .obj) from the program that made it",
+        ));
+    }
     if faces == 0 && vertices > 0 {
         return Err(Error::malformed(
             format!("the file is a cloud of {vertices} points without faces"),
@@ -36,9 +44,9 @@ pub fn load_ply_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
     let mut reader = Reader {
         mesh: TriangleMesh::default(),
         colors: Vec::new(),
+        alphas: Vec::new(),
         origin: DVec3::ZERO,
         has_huge_face: false,
-        is_translucent: false,
         limits,
     };
     for element in &header.elements {
@@ -158,12 +166,12 @@ struct Reader<'a> {
     mesh: TriangleMesh,
     /// Display-referred, of all vertices or none.
     colors: Vec<Vec3>,
+    /// Likewise.
+    alphas: Vec<f32>,
     /// Where the positions' (0, 0, 0) lies in the file.
     origin: DVec3,
     /// Whether some face is concave and too large to be cut as such.
     has_huge_face: bool,
-    /// Whether a vertex has an alpha below 1.
-    is_translucent: bool,
     limits: &'a Limits,
 }
 
@@ -207,7 +215,9 @@ impl Reader<'_> {
         if slots.contains(&Some(6)) {
             self.colors.push(Vec3::new(r, g, b));
         }
-        self.is_translucent |= alpha < 1.0 && slots.contains(&Some(ALPHA));
+        if slots.contains(&Some(ALPHA)) {
+            self.alphas.push(alpha);
+        }
         Ok(())
     }
 
@@ -294,9 +304,6 @@ impl Reader<'_> {
         if self.has_huge_face {
             warnings.push(polygon::TOO_LARGE.into());
         }
-        if self.is_translucent {
-            warnings.push("the alpha of vertices is not read: the object is opaque".into());
-        }
         if !self.mesh.normals.is_empty() {
             let repaired = self.mesh.repair_normals();
             if repaired > 0 {
@@ -312,6 +319,18 @@ impl Reader<'_> {
         if !self.mesh.colors.is_empty() {
             // The colours are those of the surface.
             material.base_color = Vec4::ONE;
+        }
+        let most = self.alphas.iter().copied().fold(0.0, f32::max);
+        let full = if most >= 2.0 { 255.0 } else { 1.0 };
+        if !self.alphas.is_empty() && most <= 0.0 {
+            warnings
+                .push("the alpha of all vertices is 0 and not read: the object is opaque".into());
+        } else if self.alphas.iter().any(|alpha| *alpha < full) {
+            self.mesh.colors.resize(self.alphas.len(), Vec4::ONE);
+            for (color, alpha) in self.mesh.colors.iter_mut().zip(&self.alphas) {
+                color.w = (alpha.min(full) / full).max(0.0);
+            }
+            material.alpha_mode = AlphaMode::Blend;
         }
         Ok(Imported {
             warnings,

@@ -1,10 +1,10 @@
 //! STL files, binary and ASCII. That they have no unit is said where objects are placed, [`crate::plausibility`].
 use std::collections::HashMap;
 
-use glam::Vec3;
+use glam::{Vec3, Vec4};
 
 use super::mtl::{grey, line_end};
-use super::{Imported, Limits};
+use super::{Imported, Limits, obj};
 use crate::error::Error;
 use crate::mesh::TriangleMesh;
 
@@ -13,7 +13,7 @@ const EXPORT: &str = "export the file again";
 /// A header of 80 bytes and the number of triangles.
 const HEADER: usize = 84;
 
-/// A normal, three corners and two bytes without meaning.
+/// A normal, three corners and two bytes that may be a colour.
 const RECORD: usize = 50;
 
 /// Reads an STL file from memory. Stored normals are not used: they are those of the triangles.
@@ -56,18 +56,14 @@ pub fn load_stl_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
             }
             limits.check_mesh(0, n)?;
             let records = bytes[HEADER..needed as usize].as_chunks::<RECORD>().0;
-            if are_colored(&bytes[..HEADER], records) {
-                warnings.push(
-                    "colours of triangles are not read: convert it with them to a .ply or .glb file"
-                        .into(),
-                );
-            }
+            let colors = Colors::of(&bytes[..HEADER], records);
             for record in records {
                 let float = |at: usize| {
                     f32::from_le_bytes([record[at], record[at + 1], record[at + 2], record[at + 3]])
                 };
                 let corner = |k: usize| Vec3::from_array([0, 4, 8].map(|c| float(12 * k + c)));
-                mesh.push([corner(1), corner(2), corner(3)])?;
+                let color = colors.as_ref().map(|colors| colors.at(record));
+                mesh.push([corner(1), corner(2), corner(3)], color)?;
             }
         }
         _ => {
@@ -86,12 +82,56 @@ pub fn load_stl_bytes(bytes: &[u8], limits: &Limits) -> Result<Imported, Error> 
     })
 }
 
-/// Whether triangles have colours, as Magics writes them, which puts the one of the whole into the header, or VisCAM, which
-/// sets the highest bit of the two bytes without meaning.
-fn are_colored(header: &[u8], records: &[[u8; RECORD]]) -> bool {
-    const WHOLE: &[u8] = b"COLOR=";
-    header.windows(WHOLE.len()).any(|w| w == WHOLE)
-        || records.iter().any(|record| record[RECORD - 1] & 0x80 != 0)
+/// What the last two bytes of a record mean: three numbers of five bits each, display-referred, and a flag.
+enum Colors {
+    /// As VisCAM and SolidView write them, blue in the lowest bits: where the flag is set there is a colour.
+    OfTriangles,
+    /// As Magics writes them, red in the lowest bits: where the flag is set the colour is that of the whole, in the header.
+    OrOfWhole(Vec3),
+    /// Of the whole alone.
+    OfWhole(Vec3),
+}
+
+const FLAG: u16 = 0x8000;
+
+fn attribute(record: &[u8; RECORD]) -> u16 {
+    u16::from_le_bytes([record[RECORD - 2], record[RECORD - 1]])
+}
+
+impl Colors {
+    /// `None` if there are none.
+    fn of(header: &[u8], records: &[[u8; RECORD]]) -> Option<Self> {
+        const WHOLE: &[u8] = b"COLOR=";
+        let at = header.windows(WHOLE.len()).position(|w| w == WHOLE);
+        let rgb = at.and_then(|at| header[..80].get(at + WHOLE.len()..)?.first_chunk::<3>());
+        match rgb {
+            Some(rgb) => {
+                let whole = Vec3::from_array(rgb.map(|v| f32::from(v) / 255.0));
+                // Black triangles would be said so as well by who says nothing of them.
+                Some(match records.iter().all(|record| attribute(record) == 0) {
+                    true => Self::OfWhole(whole),
+                    false => Self::OrOfWhole(whole),
+                })
+            }
+            None => (records.iter())
+                .any(|record| attribute(record) & FLAG != 0)
+                .then_some(Self::OfTriangles),
+        }
+    }
+
+    /// The linear colour of a triangle.
+    fn at(&self, record: &[u8; RECORD]) -> Vec4 {
+        let bits = attribute(record);
+        let [low, middle, high] = [0, 5, 10].map(|at| f32::from(bits >> at & 31) / 31.0);
+        let is_flagged = bits & FLAG != 0;
+        let color = match self {
+            Self::OfTriangles if !is_flagged => return grey().base_color,
+            Self::OfTriangles => Vec3::new(high, middle, low),
+            Self::OrOfWhole(_) if !is_flagged => Vec3::new(low, middle, high),
+            Self::OrOfWhole(whole) | Self::OfWhole(whole) => *whole,
+        };
+        obj::linear(Some(color), 1.0)
+    }
 }
 
 /// Whether the file is ASCII. Some binary files start with "solid", too, but their number of triangles is no text: a byte
@@ -122,7 +162,7 @@ fn read_text(bytes: &[u8], mesh: &mut Mesh) -> Result<(), Error> {
             }
             Some("endfacet") => {
                 match corners[..] {
-                    [a, b, c] => mesh.push([a, b, c])?,
+                    [a, b, c] => mesh.push([a, b, c], None)?,
                     _ => {
                         return wrong(format!("a facet of {} corners; accepted: 3", corners.len()));
                     }
@@ -141,10 +181,10 @@ fn read_text(bytes: &[u8], mesh: &mut Mesh) -> Result<(), Error> {
     }
 }
 
-/// Collects triangles; corners at the same place become one vertex.
+/// Collects triangles; corners at the same place, of the same colour, become one vertex.
 struct Mesh<'a> {
     mesh: TriangleMesh,
-    known: HashMap<[u32; 3], u32>,
+    known: HashMap<([u32; 3], Option<[u32; 4]>), u32>,
     limits: &'a Limits,
 }
 
@@ -157,7 +197,8 @@ impl<'a> Mesh<'a> {
         }
     }
 
-    fn push(&mut self, corners: [Vec3; 3]) -> Result<(), Error> {
+    /// Every triangle or none has a colour, linear.
+    fn push(&mut self, corners: [Vec3; 3], color: Option<Vec4>) -> Result<(), Error> {
         let number = self.mesh.indices.len() as u64;
         if let Some(bad) = corners.iter().find(|p| !p.is_finite()) {
             return Err(Error::NotFinite {
@@ -168,10 +209,12 @@ impl<'a> Mesh<'a> {
         }
         let indices = corners.map(|p| {
             let next = self.mesh.positions.len() as u32;
-            let key = p.to_array().map(|v| (v + 0.0).to_bits());
+            let place = p.to_array().map(|v| (v + 0.0).to_bits());
+            let key = (place, color.map(|c| c.to_array().map(f32::to_bits)));
             let index = *self.known.entry(key).or_insert(next);
             if index == next {
                 self.mesh.positions.push(p);
+                self.mesh.colors.extend(color);
             }
             index
         });
@@ -189,6 +232,10 @@ impl<'a> Mesh<'a> {
             });
         }
         self.mesh.materials = vec![0; self.mesh.indices.len()];
-        Ok(Imported::of(self.mesh, grey()))
+        let mut material = grey();
+        if !self.mesh.colors.is_empty() {
+            material.base_color = Vec4::ONE;
+        }
+        Ok(Imported::of(self.mesh, material))
     }
 }

@@ -107,21 +107,120 @@ fn a_texture_is_seen_as_it_is_without_a_colour_before_or_behind_it() {
 }
 
 #[test]
-fn refraction_is_told_and_what_exporters_write_of_every_surface_is_not() {
-    // Maya's of an opaque surface, Blender's of one that `d` makes transparent.
+fn what_refracts_and_is_opaque_otherwise_is_glass_and_what_exporters_write_of_every_surface_is_not()
+{
+    // Maya's of an opaque surface, Blender's of those that `d` makes transparent, a map that does.
     for statements in [
         "illum 4\nTf 1.00 1.00 1.00\nNi 1\n",
         "illum 9\nd 0.5\n",
+        "illum 6\nd 0.5\n",
+        "Tr 0.5\nillum 7\nNi 1.5\n",
+        "illum 7\nmap_d paint.png\n",
         "illum 2\nTf 0 0 0\n",
     ] {
-        let told = Project::material(statements.as_bytes()).warnings;
-        assert!(told.is_empty(), "{told:?}");
+        let imported = Project::material(statements.as_bytes());
+        let told = imported
+            .warnings
+            .iter()
+            .filter(|w| !w.contains("coordinates"));
+        assert_eq!(told.count(), 0, "{:?}", imported.warnings);
+        assert_eq!(imported.materials[0].transmission, None, "{statements}");
     }
-    let glass = Project::material(b"illum 7\nTf 0.9 1 0.9\nNi 1.5\n");
-    assert_eq!(
-        glass.warnings,
-        ["material \"a\": illum 7 (refraction), Tf not supported and left out"]
-    );
+    let coloured = Project::material(b"Tf 0.3 0.3 0.3\nillum 4\n");
+    assert_eq!(coloured.materials[0].transmission, None);
+    let told = ["material \"a\": Tf not supported and left out"];
+    assert_eq!(coloured.warnings, told);
+    // Paint of which an exporter says 7, as of every surface.
+    for paint in ["Kd 0.8 0.1 0.1\nNi 1\n", "Ni 1.5\nmap_Kd paint.png\n"] {
+        let painted = Project::material(format!("{paint}illum 7\n").as_bytes());
+        assert_eq!(painted.materials[0].transmission, None, "{paint}");
+        let told = &painted.warnings.join("\n");
+        assert!(
+            told.contains("illum 7 (refraction) not supported"),
+            "{told}"
+        );
+    }
+    for (statements, color, ior, roughness) in [
+        (
+            "illum 7\nTf 0.9 1 0.8\nNi 1.33\nd 1\nKd 0 0 0\nNs 200\n",
+            Vec4::new(0.9, 1.0, 0.8, 1.0),
+            1.33,
+            0.0,
+        ),
+        (
+            "Kd 0.01 0.01 0.01\nillum 6\nNi 1.45\nTf 1 1 1\nPr 0.25\n",
+            Vec4::ONE,
+            1.45,
+            0.25,
+        ),
+    ] {
+        let imported = Project::material(statements.as_bytes());
+        let glass = &imported.materials[0];
+        assert_eq!(glass.transmission.unwrap().factor, 1.0);
+        assert_eq!(
+            (glass.base_color, glass.ior, glass.roughness),
+            (color, ior, roughness)
+        );
+        assert_eq!(glass.alpha_mode, AlphaMode::Opaque);
+        let [told] = &imported.warnings[..] else {
+            panic!("{:?}", imported.warnings);
+        };
+        assert!(told.ends_with("that light passes straight: its refraction is left out"));
+    }
+}
+
+#[test]
+fn names_with_a_hash_are_whole_whatever_the_case_of_the_statement() {
+    let mesh = format!("mtllib m.mtl\n{SQUARE}vt 0 0\nusemtl Material #25\nf 1/1 2/1 3/1\n");
+    let library = b"NEWMTL Material #25\nMAP_KD a#b.png # paint\nKD 1 1 1 # white\n";
+    let paint = one_texel_png([1.0, 0.0, 0.0]);
+    let files: [(&str, &[u8]); 3] = [
+        ("m.obj", mesh.as_bytes()),
+        ("m.mtl", library),
+        ("a#b.png", &paint),
+    ];
+    let imported = Project::with(&files).load("m.obj");
+    assert_eq!(imported.warnings, [""; 0]);
+    assert_eq!(imported.materials[0].name, "Material #25");
+    assert!(imported.materials[0].base_color_texture.is_some());
+}
+
+#[test]
+fn a_library_named_by_its_place_on_another_machine_is_found_beside_the_object() {
+    for named in [
+        "C:\\work\\my chair.mtl",
+        "/home/a/my chair.mtl",
+        "../lib/my chair.mtl",
+    ] {
+        let mesh = format!("mtllib {named}\n{SQUARE}vt 0 0\nusemtl a\nf 1/1 2/1 3/1\n");
+        let paint = one_texel_png([1.0, 0.0, 0.0]);
+        let files: [(&str, &[u8]); 3] = [
+            ("m.obj", mesh.as_bytes()),
+            ("my chair.mtl", b"newmtl a\nmap_Kd paint.png\n"),
+            ("paint.png", &paint),
+        ];
+        let imported = Project::with(&files).load("m.obj");
+        assert_eq!(imported.warnings, [""; 0], "{named}");
+        assert!(imported.materials[0].base_color_texture.is_some());
+    }
+}
+
+#[test]
+fn the_polypaint_of_zbrush_is_read_where_vertices_have_no_colours_of_their_own() {
+    let faces = "#MRGB ffff0000ff00ff00\n#MRGB ff0000ffgarbage!\nf -4 -3 -2\nf 1 3 4\n";
+    let project = Project::with(&[
+        ("m.obj", format!("{SQUARE}{faces}").as_bytes()),
+        (
+            "own.obj",
+            format!("{}{faces}", SQUARE.replace(" 0\n", " 0 0 0 0\n")).as_bytes(),
+        ),
+    ]);
+    let imported = project.load("m.obj");
+    let [red, green, blue] = [Vec3::X, Vec3::Y, Vec3::Z].map(|c| c.extend(1.0));
+    // What is no colour is white, as what has none.
+    assert_eq!(imported.mesh.colors, [red, green, blue, Vec4::ONE]);
+    let own = project.load("own.obj").mesh.colors;
+    assert_eq!(own, [Vec4::new(0.0, 0.0, 0.0, 1.0); 4]);
 }
 
 #[test]

@@ -12,6 +12,7 @@ mod left_out;
 mod limits;
 mod obj_import;
 mod obj_reference;
+mod outside;
 mod ply_and_stl;
 mod scene_load;
 mod views;

@@ -1,5 +1,6 @@
 //! PLY and STL files.
 use dipir_scene::import::{Imported, Limits, load_ply_bytes, load_stl_bytes};
+use dipir_scene::material::AlphaMode;
 use glam::{Vec3, Vec4};
 
 fn ply(text: &str) -> Result<Imported, String> {
@@ -310,31 +311,88 @@ fn strips_of_triangles_are_read_and_keep_their_orientation() {
 }
 
 #[test]
-fn the_alpha_of_vertices_is_told_where_it_says_something() {
-    for (alpha, count) in [("255", 0), ("128", 1)] {
-        let text = SQUARE.replacen("element face", "property uchar alpha\nelement face", 1);
-        let text = text.replace(" 188\n", &format!(" 188 {alpha}\n"));
-        let told = ply(&text).unwrap().warnings;
-        assert_eq!(
-            told,
-            vec!["the alpha of vertices is not read: the object is opaque"; count]
+fn the_alpha_of_vertices_is_read_where_it_says_something() {
+    let load = |kind: &str, alpha: &str| {
+        let text = SQUARE.replacen(
+            "element face",
+            &format!("property {kind} alpha\nelement face"),
+            1,
         );
+        ply(&text.replace(" 188\n", &format!(" 188 {alpha}\n"))).unwrap()
+    };
+    for (kind, alpha, read) in [
+        ("uchar", "255", None),
+        ("float", "1", None),
+        ("uchar", "51", Some(0.2)),
+        ("float", "0.25", Some(0.25)),
+        ("float", "51", Some(0.2)),
+        ("uchar", "0", None),
+    ] {
+        let imported = load(kind, alpha);
+        let expected = read.map_or(AlphaMode::Opaque, |_| AlphaMode::Blend);
+        assert_eq!(imported.materials[0].alpha_mode, expected);
+        for color in &imported.mesh.colors {
+            assert_eq!(
+                (color.x, color.w),
+                (1.0, read.unwrap_or(1.0)),
+                "{kind} {alpha}"
+            );
+        }
+        let told = ["the alpha of all vertices is 0 and not read: the object is opaque"];
+        assert_eq!(imported.warnings, told[..usize::from(alpha == "0")]);
     }
+    // Without colours grey shows through.
+    let colors = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
+    let grey = SQUARE
+        .replace(colors, "property float alpha\n")
+        .replace(" 255 0 188\n", " 0.5\n");
+    let grey = ply(&grey).unwrap();
+    assert_eq!(grey.mesh.colors, [Vec4::new(1.0, 1.0, 1.0, 0.5); 4]);
+    assert_eq!(grey.materials[0].base_color.x, 0.8);
 }
 
 #[test]
-fn colours_of_a_binary_stl_are_told() {
+fn colours_of_a_binary_stl_are_read_as_viscam_and_magics_write_them() {
     let plain = square_stl(b"made by hand");
-    let mut viscam = plain.clone();
-    viscam[132..134].copy_from_slice(&0x8421u16.to_le_bytes());
-    let magics = square_stl(b"COLOR=\xff\x80\x00\xff");
-    for (bytes, count) in [(plain, 0), (viscam, 1), (magics, 1)] {
-        let told = stl(&bytes).unwrap().warnings;
-        assert!(
-            told.len() == count && told.iter().all(|w| w.starts_with("colours")),
-            "{told:?}"
-        );
-    }
+    let colored = |header: &[u8], bits: [u16; 2]| {
+        let mut bytes = square_stl(header);
+        bytes[132..134].copy_from_slice(&bits[0].to_le_bytes());
+        bytes[182..184].copy_from_slice(&bits[1].to_le_bytes());
+        let imported = stl(&bytes).unwrap();
+        assert_eq!(imported.warnings, [""; 0]);
+        assert_eq!(imported.materials[0].base_color, Vec4::ONE);
+        let mesh = &imported.mesh;
+        let of = |t: usize| {
+            let colors = mesh.indices[t].map(|i| mesh.colors[i as usize]);
+            assert!(colors.iter().all(|c| *c == colors[0]));
+            colors[0]
+        };
+        [of(0), of(1)]
+    };
+    assert!(stl(&plain).unwrap().mesh.colors.is_empty());
+    let [red, blue] = [Vec4::new(1.0, 0.0, 0.0, 1.0), Vec4::new(0.0, 0.0, 1.0, 1.0)];
+    let grey = Vec4::new(0.8, 0.8, 0.8, 1.0);
+    // VisCAM: blue in the lowest bits, the highest says that there is a colour.
+    assert_eq!(colored(b"made by hand", [0xfc00, 0x7c00]), [red, grey]);
+    assert_eq!(colored(b"made by hand", [0x801f, 0xfc00]), [blue, red]);
+    // Magics: red in the lowest bits, the highest says that the colour is that of the whole.
+    let whole = b"by hand COLOR=\x00\x00\xff\xff";
+    assert_eq!(colored(whole, [0x001f, 0x8000]), [red, blue]);
+    assert_eq!(
+        colored(whole, [0, 0x001f])[0],
+        Vec4::new(0.0, 0.0, 0.0, 1.0)
+    );
+    assert_eq!(colored(whole, [0, 0]), [blue, blue]);
+}
+
+#[test]
+fn gaussian_splats_are_told_from_other_points() {
+    let text = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
+        property float f_dc_0\nend_header\n0 0 0 1\n";
+    assert_eq!(
+        ply(text).unwrap_err(),
+        "the file holds 1 Gaussian splats, not a mesh; export a mesh (.glb or .obj) from the program that made it"
+    );
 }
 
 #[test]
