@@ -5,6 +5,7 @@
 extern crate self as dipir_diffusion;
 
 mod added_tokens;
+pub mod backward;
 pub mod check;
 pub mod concepts;
 pub mod config;

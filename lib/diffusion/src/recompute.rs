@@ -8,10 +8,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use candle_core::backend::BackendStorage;
 use candle_core::backprop::GradStore;
 use candle_core::{
-    CpuStorage, CudaStorage, CustomOp2, CustomOp3, Layout, MetalStorage, Shape, Tensor, TensorId,
-    Var,
+    CpuStorage, CudaStorage, CustomOp3, Layout, MetalStorage, Shape, Tensor, TensorId, Var,
 };
 
+use crate::backward::{apply3, gradients};
 use crate::error::{Result, argument};
 
 /// Collects the gradients that recomputed segments find for `variables`.
@@ -62,7 +62,7 @@ impl Recompute {
             segment,
             owner: self.clone(),
         };
-        Ok(x.apply_op3(context, &y, op)?)
+        Ok(apply3(x, context, &y, op)?)
     }
 
     /// Adds the collected gradients to `gradients` and forgets them.
@@ -172,21 +172,15 @@ impl CustomOp3 for RecomputeOp {
         };
         let (x_leaf, context_leaf) = (leaf(x)?, leaf(context)?);
         let y = (self.segment)(&x_leaf, &context_leaf)?;
-        let mut gradients = backward_from(&y, g)?;
-        let (dx, dcontext) = (gradients.remove(&x_leaf), gradients.remove(&context_leaf));
-        self.owner.collect(&mut gradients)?;
+        let mut found = gradients(&y, g)?;
+        let (dx, dcontext) = (found.remove(&x_leaf), found.remove(&context_leaf));
+        self.owner.collect(&mut found)?;
         Ok((
             dx.filter(|_| x.track_op()),
             dcontext.filter(|_| context.track_op()),
             None,
         ))
     }
-}
-
-/// The gradients of everything that `y` depends on, where that at `y` is `g`.
-pub(crate) fn backward_from(y: &Tensor, g: &Tensor) -> candle_core::Result<GradStore> {
-    let nothing = Tensor::zeros((), y.dtype(), y.device())?;
-    y.apply_op2(&nothing, GradientOp(g.detach()))?.backward()
 }
 
 /// The gradient at x of a loss whose gradient at segment(x) is `g`: computes the segment again.
@@ -197,59 +191,9 @@ pub(crate) fn gradient_through(
 ) -> Result<Tensor> {
     let leaf = Var::from_tensor(&x)?;
     drop(x);
-    let mut gradients = backward_from(&segment(&leaf)?, g)?;
-    match gradients.remove(&leaf) {
+    let mut found = gradients(&segment(&leaf)?, g)?;
+    match found.remove(&leaf) {
         Some(gradient) => Ok(gradient),
         None => argument("the segment's value does not depend on its input"),
-    }
-}
-
-/// Has no value of its own; says what the gradient at the first argument is, without the products that a
-/// weighted sum would keep.
-struct GradientOp(Tensor);
-
-impl CustomOp2 for GradientOp {
-    fn name(&self) -> &'static str {
-        "gradient"
-    }
-
-    fn cpu_fwd(
-        &self,
-        _: &CpuStorage,
-        _: &Layout,
-        nothing: &CpuStorage,
-        layout: &Layout,
-    ) -> candle_core::Result<(CpuStorage, Shape)> {
-        Ok((nothing.try_clone(layout)?, layout.shape().clone()))
-    }
-
-    fn cuda_fwd(
-        &self,
-        _: &CudaStorage,
-        _: &Layout,
-        nothing: &CudaStorage,
-        layout: &Layout,
-    ) -> candle_core::Result<(CudaStorage, Shape)> {
-        Ok((nothing.try_clone(layout)?, layout.shape().clone()))
-    }
-
-    fn metal_fwd(
-        &self,
-        _: &MetalStorage,
-        _: &Layout,
-        nothing: &MetalStorage,
-        layout: &Layout,
-    ) -> candle_core::Result<(MetalStorage, Shape)> {
-        Ok((nothing.try_clone(layout)?, layout.shape().clone()))
-    }
-
-    fn bwd(
-        &self,
-        _: &Tensor,
-        _: &Tensor,
-        _: &Tensor,
-        _: &Tensor,
-    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
-        Ok((Some(self.0.clone()), None))
     }
 }

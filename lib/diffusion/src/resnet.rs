@@ -3,7 +3,7 @@
 use candle_core::Tensor;
 
 use crate::error::Result;
-use crate::layers::{Conv2d, GroupNorm, Linear, NormActivation, Padding};
+use crate::layers::{Conv2d, GroupNorm, Linear, NormActivation, Padding, add, add_to_channels};
 use crate::parameters::Parameters;
 
 /// Sizes of a [`ResnetBlock`].
@@ -81,8 +81,8 @@ impl ResnetBlock {
         let h = self.first_half(x, time)?;
         let h = self.conv2.forward(&self.norm2.forward(&h)?)?;
         Ok(match &self.shortcut {
-            Some(shortcut) => (shortcut.forward(x)? + h)?,
-            None => (x + h)?,
+            Some(shortcut) => add(&shortcut.forward(x)?, &h)?,
+            None => add(x, &h)?,
         })
     }
 
@@ -100,17 +100,15 @@ impl ResnetBlock {
             self.norm1.input_gradient(x, &normed)?
         };
         Ok(match &self.shortcut {
-            Some(shortcut) => (shortcut.input_gradient(x.shape(), g)? + through)?,
-            None => (g + through)?,
+            Some(shortcut) => add(&shortcut.input_gradient(x.shape(), g)?, &through)?,
+            None => add(g, &through)?,
         })
     }
 
     fn first_half(&self, x: &Tensor, time: Option<&Tensor>) -> Result<Tensor> {
         let mut h = self.conv1.forward(&self.norm1.forward(x)?)?;
         if let (Some(layer), Some(time)) = (&self.time, time) {
-            let shift = layer.forward(time)?;
-            let (batch, channels) = shift.dims2()?;
-            h = h.broadcast_add(&shift.reshape((batch, channels, 1, 1))?)?;
+            h = add_to_channels(&h, &layer.forward(time)?)?;
         }
         Ok(h)
     }

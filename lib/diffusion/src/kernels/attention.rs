@@ -2,6 +2,8 @@
 //! stay in the cache, nothing quadratic is stored, and the adjoint computes
 //! them again [Dao et al. 2022 for the idea, with whole rows of scores here].
 
+pub(crate) mod panels;
+
 use rayon::prelude::*;
 
 use super::matmul::{Columns, Engine, Matrix, Threads, product_by, product_columns};

@@ -6,6 +6,7 @@
 
 pub(crate) mod attention;
 pub(crate) mod conv;
+pub(crate) mod joining;
 mod lanes;
 pub(crate) mod matmul;
 pub(crate) mod norm;

@@ -13,7 +13,7 @@ use super::{SharedMut, with_scratch};
 /// Rows of the register tile: 14 x 2 registers of sums, 2 of B, of 32.
 const MR: usize = 14;
 /// Columns of the register tile, two registers.
-const NR: usize = 32;
+pub(super) const NR: usize = 32;
 /// Depth of a panel at most: a panel of B takes 40 KiB of L1, while A and the
 /// result stream by; 320, 640 and 1280 channels divide evenly.
 const KC: usize = 320;
@@ -255,6 +255,90 @@ unsafe fn one_pass(
     }
 }
 
+/// A left side that many products share: its rows in panels.
+pub(super) struct Left {
+    panels: Vec<f32>,
+    rows: usize,
+    depth: usize,
+}
+
+impl Left {
+    pub(super) fn new(a: Matrix, (rows, depth): (usize, usize)) -> Self {
+        a.check(rows, depth);
+        let mut panels = vec![0.0; rows.next_multiple_of(MR) * depth];
+        pack_rows(a, 0, rows, 0, depth, &mut panels);
+        Self {
+            panels,
+            rows,
+            depth,
+        }
+    }
+
+    /// `out = keep out + scale self b`, where b [depth, NR] and out [rows, NR] lie without gaps.
+    pub(super) fn times_panel(&self, b: &[f32], out: &mut [f32], keep: f32, scale: f32) {
+        assert!(available() && b.len() == self.depth * NR && out.len() == self.rows * NR);
+        let block = Block {
+            rows: self.rows,
+            columns: NR,
+            depth: self.depth,
+            onto: Onto::Kept(keep),
+            scale,
+            out_row: NR,
+        };
+        // SAFETY: all sizes were checked.
+        unsafe { block.run(Rows::Packed(&self.panels), b, out.as_mut_ptr()) };
+    }
+}
+
+/// A right side that many products share: its columns in panels, of a depth of NR at most.
+pub(super) struct Right {
+    panels: Vec<f32>,
+    columns: usize,
+    depth: usize,
+}
+
+impl Right {
+    pub(super) fn new(b: Matrix, (depth, columns): (usize, usize)) -> Self {
+        b.check(depth, columns);
+        assert!(depth <= NR, "deeper than a panel is wide");
+        let mut panels = vec![0.0; columns.next_multiple_of(NR) * depth];
+        pack_pass(b, (0, depth), (0, columns), &mut panels);
+        Self {
+            panels,
+            columns,
+            depth,
+        }
+    }
+
+    /// `out += scale a self`, where the first `depth` of NR columns of a [rows, NR] count.
+    ///
+    /// # Safety
+    /// `out` is valid for reads and writes of `rows` rows of `columns` elements, `out_row` apart, used by nobody else meanwhile.
+    pub(super) unsafe fn after_rows(
+        &self,
+        a: &[f32],
+        (rows, depth): (usize, usize),
+        out: *mut f32,
+        out_row: usize,
+        scale: f32,
+    ) {
+        assert!(available() && depth == self.depth && a.len() == rows * NR);
+        let block = Block {
+            rows,
+            columns: self.columns,
+            depth,
+            onto: Onto::Kept(1.0),
+            scale,
+            out_row,
+        };
+        with_scratch(rows.next_multiple_of(MR) * depth, |packed| {
+            pack_rows(Matrix::rows(a, NR), 0, rows, 0, depth, packed);
+            // SAFETY: by the caller's contract; the other sizes were checked.
+            unsafe { block.run(Rows::Packed(packed), &self.panels, out) };
+        });
+    }
+}
+
 /// Packs `count` columns of B, `depth` deep: depth rows of NR elements.
 fn pack_columns(
     b: Matrix,
@@ -407,11 +491,13 @@ unsafe fn tile<const HALVES: usize, const PACKED: bool>(
     // masked loads and stores touch `rows` x `columns` elements of `out` only.
     unsafe {
         let starts: [*const f32; MR] = std::array::from_fn(|i| a.add(i.min(rows - 1) * a_row));
-        // The lines that are written come from memory meanwhile.
-        for i in 0..rows {
-            let line = out.wrapping_add(i * block.out_row).cast();
-            _mm_prefetch::<_MM_HINT_T0>(line);
-            _mm_prefetch::<_MM_HINT_T0>(line.wrapping_add(64));
+        // The lines that are written come from memory meanwhile, those of a panel are near.
+        if block.out_row != NR {
+            for i in 0..rows {
+                let line = out.wrapping_add(i * block.out_row).cast();
+                _mm_prefetch::<_MM_HINT_T0>(line);
+                _mm_prefetch::<_MM_HINT_T0>(line.wrapping_add(64));
+            }
         }
         for p in 0..block.depth {
             let row = b.add(p * NR);

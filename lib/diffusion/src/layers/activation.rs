@@ -6,6 +6,7 @@ use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp1, D, Layout, Shape, Tensor};
 
 use super::backend::{has_kernels, has_kernels_anywhere};
+use crate::backward::apply1;
 #[cfg(feature = "cuda")]
 use crate::cuda::{self, View};
 use crate::error::{Result, argument};
@@ -47,7 +48,7 @@ impl Activation {
 pub fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
     let x = x.contiguous()?;
     if has_kernels(&x) {
-        return Ok(x.apply_op1(ActivationOp(f))?);
+        return Ok(apply1(&x, ActivationOp(f))?);
     }
     activate_composed(f, &x)
 }
@@ -74,7 +75,7 @@ pub fn geglu(x: &Tensor) -> Result<Tensor> {
         ));
     }
     if has_kernels_anywhere(&x, &[]) {
-        return Ok(x.apply_op1(GegluOp)?);
+        return Ok(apply1(&x, GegluOp)?);
     }
     geglu_composed(&x)
 }

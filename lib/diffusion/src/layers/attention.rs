@@ -2,14 +2,18 @@
 
 #[cfg(feature = "cuda")]
 use candle_core::CudaStorage;
+use std::sync::OnceLock;
+
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, D, DType, Device, Layout, Shape, Tensor};
 use half::bf16;
 
 use super::backend::has_kernels_anywhere;
+use crate::backward::apply3;
 #[cfg(feature = "cuda")]
 use crate::cuda::{self, View};
 use crate::error::{Result, argument};
+use crate::kernels::attention::panels::{self, Softmax};
 use crate::kernels::attention::{self, AttentionShape};
 use crate::kernels::matmul::Engine;
 use crate::kernels::tensor::{floats, from_floats, halves, read, store, with_halves};
@@ -43,7 +47,7 @@ impl Attention {
         let (q, k, v) = (q.contiguous()?, k.contiguous()?, v.contiguous()?);
         let shape = self.shape(q.shape(), k.shape(), v.shape())?;
         if has_kernels_anywhere(&q, &[]) {
-            return Ok(q.apply_op3(&k, &v, AttentionOp(*self))?);
+            return Ok(apply3(&q, &k, &v, AttentionOp::new(*self))?);
         }
         self.forward_composed(&q, &k, &v, shape)
     }
@@ -135,11 +139,24 @@ fn engine(dtype: DType) -> Engine {
     }
 }
 
-struct AttentionOp(Attention);
+struct AttentionOp {
+    attention: Attention,
+    /// Of the result, where the kernel for panels computed it.
+    softmax: OnceLock<Softmax>,
+}
 
 impl AttentionOp {
+    fn new(attention: Attention) -> Self {
+        Self {
+            attention,
+            softmax: OnceLock::new(),
+        }
+    }
+
     fn shape(&self, q: &Shape, k: &Shape) -> candle_core::Result<AttentionShape> {
-        self.0.shape(q, k, k).map_err(candle_core::Error::wrap)
+        self.attention
+            .shape(q, k, k)
+            .map_err(candle_core::Error::wrap)
     }
 }
 
@@ -162,8 +179,19 @@ impl CustomOp3 for AttentionOp {
             let out = tiles::attention(shape, halves(q, lq)?, halves(k, lk)?, halves(v, lv)?);
             return Ok((CpuStorage::BF16(out), lq.shape().clone()));
         }
-        let (engine, q_, k_) = (engine(q.dtype()), floats(q, lq)?, floats(k, lk)?);
-        let out = attention::attention(engine, shape, &q_, &k_, &floats(v, lv)?);
+        let (engine, q_, k_, v_) = (
+            engine(q.dtype()),
+            floats(q, lq)?,
+            floats(k, lk)?,
+            floats(v, lv)?,
+        );
+        let out = if engine == Engine::Panels && panels::suit(shape) {
+            let (out, softmax) = panels::attention(shape, &q_, &k_, &v_);
+            self.softmax.get_or_init(|| softmax);
+            out
+        } else {
+            attention::attention(engine, shape, &q_, &k_, &v_)
+        };
         Ok((store(out, q.dtype()), lq.shape().clone()))
     }
 
@@ -214,7 +242,12 @@ impl CustomOp3 for AttentionOp {
         }
         let (q_, k_, v_) = (read(q)?, read(k)?, read(v)?);
         let (engine, y, g) = (engine(q.dtype()), read(y)?, read(&g)?);
-        let (dq, dk, dv) = attention::attention_vjp(engine, shape, &q_, &k_, &v_, &y, &g);
+        let (dq, dk, dv) = match self.softmax.get() {
+            Some(softmax) if panels::suit_vjp(shape) => {
+                panels::attention_vjp(shape, softmax, [&q_, &k_, &v_], &y, &g)
+            }
+            _ => attention::attention_vjp(engine, shape, &q_, &k_, &v_, &y, &g),
+        };
         let wanted = |like: &Tensor, values: Vec<f32>| {
             like.track_op()
                 .then(|| from_floats(values, like.shape(), like.dtype()))

@@ -123,19 +123,23 @@ fn norms_agree() {
 
 #[test]
 fn attention_agrees() {
-    for (heads, queries, keys, causality) in [
-        (1, 9, 7, Causality::Full),
-        (4, 5, 40, Causality::Full),
-        (2, 6, 6, Causality::Causal),
+    // The last three have several blocks of keys, and panels of queries.
+    for (heads, width, queries, keys, causality) in [
+        (1, 8, 9, 7, Causality::Full),
+        (4, 8, 5, 40, Causality::Full),
+        (2, 8, 6, 6, Causality::Causal),
+        (2, 80, 140, 230, Causality::Full),
+        (2, 66, 150, 150, Causality::Causal),
+        (2, 16, 70, 230, Causality::Full),
     ] {
         let inputs = [
-            normal(13, &[2, queries, 8]),
-            normal(14, &[2, keys, 8]),
-            normal(15, &[2, keys, 8]),
+            normal(13, &[2, queries, width]),
+            normal(14, &[2, keys, width]),
+            normal(15, &[2, keys, width]),
         ];
         let attention = Attention { heads, causality };
         assert_agree(
-            &format!("attention {heads} {causality:?}"),
+            &format!("attention {heads} {width} {causality:?}"),
             &inputs,
             &|t| attention.forward(&t[0], &t[1], &t[2]),
             &|t| {
@@ -168,4 +172,30 @@ fn activations_and_enlargement_agree() {
         &|t| upsample_nearest(&t[0], 7, 10),
         &|t| upsample_composed(&t[0], 7, 10),
     );
+}
+
+#[test]
+fn what_joins_layers_agrees() {
+    // Pixels by jobs of 64, and not.
+    for (height, width) in [(8, 8), (3, 5)] {
+        let x = normal(19, &[2, 19, height, width]);
+        let y = normal(20, &[2, 19, height, width]);
+        let agree = |name, inputs: &[Tensor], layer: Layer| {
+            assert_agree(name, inputs, layer, &|t| composed(|| layer(t)));
+        };
+        agree("sum", &[x.clone(), y.clone()], &|t| add(&t[0], &t[1]));
+        let shift = normal(21, &[2, 19]);
+        agree("shift", &[x.clone(), shift], &|t| {
+            add_to_channels(&t[0], &t[1])
+        });
+        let narrow = normal(22, &[2, 4, height, width]);
+        agree("concatenation", &[x.clone(), narrow], &|t| {
+            concatenate_channels(&t[0], &t[1])
+        });
+        agree("tokens", std::slice::from_ref(&x), &|t| tokens_of(&t[0]));
+        let tokens = normal(23, &[2, height * width, 19]);
+        agree("image of tokens", &[x.clone(), tokens], &|t| {
+            add_tokens(&t[0], &t[1])
+        });
+    }
 }

@@ -6,6 +6,7 @@ use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, Layout, Shape, Tensor};
 
 use super::backend::has_kernels_anywhere;
+use crate::backward::apply3;
 #[cfg(feature = "cuda")]
 use crate::cuda::{self, View};
 use crate::error::{Result, argument};
@@ -86,7 +87,7 @@ impl Conv2d {
         let x = x.contiguous()?;
         let op = self.op();
         if has_kernels_anywhere(&x, &[&self.weight, &self.bias]) {
-            return Ok(x.apply_op3(&self.weight, &self.bias, op)?);
+            return Ok(apply3(&x, &self.weight, &self.bias, op)?);
         }
         self.forward_composed(&x, op.before, op.after)
     }

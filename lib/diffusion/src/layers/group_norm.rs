@@ -6,6 +6,7 @@ use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Shape, Tensor};
 
 use super::backend::has_kernels_anywhere;
+use crate::backward::apply3;
 #[cfg(feature = "cuda")]
 use crate::cuda::{self, View, norm::NormShape};
 use crate::error::{Result, argument};
@@ -64,7 +65,7 @@ impl GroupNorm {
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = x.contiguous()?;
         if has_kernels_anywhere(&x, &[&self.gamma, &self.beta]) {
-            return Ok(x.apply_op3(&self.gamma, &self.beta, self.op())?);
+            return Ok(apply3(&x, &self.gamma, &self.beta, self.op())?);
         }
         self.forward_composed(&x)
     }

@@ -5,6 +5,7 @@ use candle_core::CudaStorage;
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Shape, Tensor};
 
 use super::backend::has_kernels_anywhere;
+use crate::backward::{apply2, apply3};
 #[cfg(feature = "cuda")]
 use crate::cuda::{self, View};
 use crate::error::{Result, argument};
@@ -37,10 +38,10 @@ impl Linear {
         Ok(Self { weight, bias: None })
     }
 
-    /// From tensors; refuses a weight that is no matrix or a bias that does
-    /// not fit it.
+    /// From tensors; refuses a weight that is neither a matrix nor a 1x1 convolution's [outputs, inputs, 1, 1], or a bias
+    /// that does not fit it.
     pub fn from_tensors(weight: Tensor, bias: Option<Tensor>) -> Result<Self> {
-        let (outputs, _) = weight.dims2()?;
+        let (outputs, _) = matrix(weight.shape())?;
         if let Some(bias) = &bias
             && bias.dims() != [outputs]
         {
@@ -63,7 +64,7 @@ impl Linear {
         self.weight.dims()[0]
     }
 
-    /// The weight matrix [outputs, inputs].
+    /// The weight matrix [outputs, inputs], or [outputs, inputs, 1, 1].
     pub fn weight(&self) -> &Tensor {
         &self.weight
     }
@@ -75,8 +76,8 @@ impl Linear {
             return self.forward_composed(&x);
         }
         Ok(match &self.bias {
-            Some(bias) => x.apply_op3(&self.weight, bias, LinearOp)?,
-            None => x.apply_op2(&self.weight, LinearOp)?,
+            Some(bias) => apply3(&x, &self.weight, bias, LinearOp)?,
+            None => apply2(&x, &self.weight, LinearOp)?,
         })
     }
 
@@ -84,7 +85,8 @@ impl Linear {
     pub(super) fn forward_composed(&self, x: &Tensor) -> Result<Tensor> {
         let mut shape = x.dims().to_vec();
         let inputs = shape.pop().unwrap_or(1);
-        let y = x.reshape(((), inputs))?.matmul(&self.weight.t()?)?;
+        let weight = self.weight.reshape((self.outputs(), inputs))?;
+        let y = x.reshape(((), inputs))?.matmul(&weight.t()?)?;
         shape.push(self.outputs());
         let y = y.reshape(shape)?;
         Ok(match &self.bias {
@@ -94,12 +96,20 @@ impl Linear {
     }
 }
 
+/// Outputs and inputs of a weight. A 1x1 convolution's is taken as it is: reshaped, it would be another tensor of the graph.
+fn matrix(weight: &Shape) -> candle_core::Result<(usize, usize)> {
+    match *weight.dims() {
+        [outputs, inputs] | [outputs, inputs, 1, 1] => Ok((outputs, inputs)),
+        _ => candle_core::bail!("linear layer: the weight {weight:?} is no matrix"),
+    }
+}
+
 struct LinearOp;
 
 impl LinearOp {
     /// Of the product, and of its result.
     fn sizes(x: &Shape, w: &Shape) -> candle_core::Result<(LinearShape, Shape)> {
-        let (outputs, inputs) = w.dims2()?;
+        let (outputs, inputs) = matrix(w)?;
         let mut shape = x.dims().to_vec();
         if shape.pop() != Some(inputs) {
             candle_core::bail!("linear layer of {inputs} inputs got {x:?}");
@@ -146,7 +156,7 @@ impl LinearOp {
         w: &Tensor,
         g: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
-        let (outputs, inputs) = w.dims2()?;
+        let (outputs, inputs) = matrix(w.shape())?;
         let g = g.contiguous()?;
         let rows = g.elem_count() / outputs;
         let sizes = LinearShape {

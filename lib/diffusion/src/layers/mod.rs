@@ -15,6 +15,7 @@ mod composed;
 mod conv2d;
 mod embedding;
 mod group_norm;
+mod joining;
 mod layer_norm;
 mod linear;
 #[cfg(all(test, feature = "cuda"))]
@@ -27,6 +28,7 @@ pub use backend::composed;
 pub use conv2d::{Conv2d, Padding};
 pub use embedding::Embedding;
 pub use group_norm::{GroupNorm, NormActivation};
+pub(crate) use joining::{add, add_to_channels, add_tokens, concatenate_channels, tokens_of};
 pub use layer_norm::LayerNorm;
 pub use linear::Linear;
 pub use resample::upsample_nearest;

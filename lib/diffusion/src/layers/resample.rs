@@ -8,6 +8,7 @@ use candle_core::{CpuStorage, CustomOp1, Layout, Shape, Tensor};
 use rayon::prelude::*;
 
 use super::backend::has_kernels;
+use crate::backward::apply1;
 use crate::error::Result;
 use crate::kernels::tensor::{floats, from_floats, read, store};
 
@@ -16,7 +17,7 @@ use crate::kernels::tensor::{floats, from_floats, read, store};
 pub fn upsample_nearest(x: &Tensor, height: usize, width: usize) -> Result<Tensor> {
     let x = x.contiguous()?;
     if has_kernels(&x) {
-        return Ok(x.apply_op1(NearestOp { height, width })?);
+        return Ok(apply1(&x, NearestOp { height, width })?);
     }
     upsample_composed(&x, height, width)
 }

@@ -82,3 +82,18 @@ fn residual_blocks_and_transformers_pass_gradients() -> Outcome {
     }
     Ok(())
 }
+
+#[test]
+fn no_operation_of_the_network_is_candles_own() -> Outcome {
+    let parameters = Parameters::random(3, &Device::Cpu);
+    let config = UNetConfig {
+        addition_embed_type: None,
+        ..config()
+    };
+    let unet = UNet::new(config, parameters)?;
+    let (x, context) = (input(60, &[2, 4, 6, 6])?, normal(61, &[2, 5, 6]));
+    let y = unet.forward(&x, &[3.0], &context, &Pass::default())?;
+    // Weights and x lead to y: one addition of candle's would make all gradients go its slower way.
+    assert!(crate::backward::knows_the_way(&y));
+    Ok(())
+}

@@ -21,7 +21,9 @@ pub use timestep::sinusoids;
 use transformer::SpatialTransformer;
 
 use crate::error::{Result, argument};
-use crate::layers::{Conv2d, GroupNorm, NormActivation, Padding, upsample_nearest};
+use crate::layers::{
+    Conv2d, GroupNorm, NormActivation, Padding, concatenate_channels, upsample_nearest,
+};
 use crate::lora::AdapterTarget;
 use crate::parameters::Parameters;
 use crate::pass::Pass;
@@ -230,7 +232,13 @@ impl UNet {
                 let Some(skip) = skips.pop() else {
                     return argument("UNet: fewer skips than stages");
                 };
-                x = run(stage, &Tensor::cat(&[&x, &skip], 1)?, &time, context, pass)?;
+                x = run(
+                    stage,
+                    &concatenate_channels(&x, &skip)?,
+                    &time,
+                    context,
+                    pass,
+                )?;
             }
             if let (Some(upsample), Some(skip)) = (&level.upsample, skips.last()) {
                 let (_, _, height, width) = skip.dims4()?;

@@ -3,7 +3,7 @@
 use candle_core::Tensor;
 
 use crate::error::Result;
-use crate::layers::Linear;
+use crate::layers::{Linear, add};
 use crate::lora::AdapterTarget;
 use crate::parameters::{Init, Parameters};
 use crate::pass::Pass;
@@ -45,7 +45,7 @@ impl Projection {
     ) -> Result<Self> {
         let weight = parameters.get("weight", &[outputs, inputs, 1, 1], Init::FanIn(inputs))?;
         let bias = parameters.get("bias", &[outputs], Init::FanIn(inputs))?;
-        let linear = Linear::from_tensors(weight.reshape((outputs, inputs))?, Some(bias))?;
+        let linear = Linear::from_tensors(weight, Some(bias))?;
         Ok(Self::named(parameters, linear, true))
     }
 
@@ -81,7 +81,7 @@ impl Projection {
                     0,
                 )?)
             }
-            _ => Ok((y + adapter.forward(x)?)?),
+            _ => add(&y, &adapter.forward(x)?),
         }
     }
 }

@@ -6,7 +6,9 @@ use candle_core::Tensor;
 use super::config::UNetConfig;
 use super::projection::Projection;
 use crate::error::Result;
-use crate::layers::{Attention, Causality, GroupNorm, LayerNorm, NormActivation, geglu};
+use crate::layers::{
+    Attention, Causality, GroupNorm, LayerNorm, NormActivation, add, add_tokens, geglu, tokens_of,
+};
 use crate::lora::AdapterTarget;
 use crate::parameters::Parameters;
 use crate::pass::Pass;
@@ -75,13 +77,11 @@ impl TransformerBlock {
 
     fn forward(&self, x: &Tensor, context: &Tensor, pass: &Pass) -> Result<Tensor> {
         let normed = self.norm1.forward(x)?;
-        let x = (x + self.self_attention.forward(&normed, &normed, pass)?)?;
-        let x = (&x
-            + self
-                .cross_attention
-                .forward(&self.norm2.forward(&x)?, context, pass)?)?;
+        let x = add(x, &self.self_attention.forward(&normed, &normed, pass)?)?;
+        let normed = self.norm2.forward(&x)?;
+        let x = add(&x, &self.cross_attention.forward(&normed, context, pass)?)?;
         let hidden = geglu(&self.expand.forward(&self.norm3.forward(&x)?, pass)?)?;
-        Ok((&x + self.contract.forward(&hidden, pass)?)?)
+        add(&x, &self.contract.forward(&hidden, pass)?)
     }
 }
 
@@ -149,21 +149,12 @@ impl SpatialTransformer {
     }
 
     pub(super) fn forward(&self, x: &Tensor, context: &Tensor, pass: &Pass) -> Result<Tensor> {
-        let (batch, channels, height, width) = x.dims4()?;
-        let tokens = self
-            .norm
-            .forward(x)?
-            .reshape((batch, channels, height * width))?
-            .transpose(1, 2)?;
-        let mut tokens = self.proj_in.forward(&tokens, pass)?;
+        let mut tokens = self
+            .proj_in
+            .forward(&tokens_of(&self.norm.forward(x)?)?, pass)?;
         for block in &self.blocks {
             tokens = block.forward(&tokens, context, pass)?;
         }
-        let tokens = self.proj_out.forward(&tokens, pass)?;
-        let back = tokens
-            .transpose(1, 2)?
-            .contiguous()?
-            .reshape((batch, channels, height, width))?;
-        Ok((x + back)?)
+        add_tokens(x, &self.proj_out.forward(&tokens, pass)?)
     }
 }

@@ -5,7 +5,8 @@ use candle_core::Tensor;
 use super::config::AutoencoderConfig;
 use crate::error::Result;
 use crate::layers::{
-    Attention, Causality, Conv2d, GroupNorm, Linear, NormActivation, Padding, upsample_nearest,
+    Attention, Causality, Conv2d, GroupNorm, Linear, NormActivation, Padding, add_tokens,
+    tokens_of, upsample_nearest,
 };
 use crate::parameters::Parameters;
 use crate::recompute::gradient_through;
@@ -52,13 +53,7 @@ impl PixelAttention {
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let (batch, channels, height, width) = x.dims4()?;
-        let tokens = self
-            .norm
-            .forward(x)?
-            .reshape((batch, channels, height * width))?
-            .transpose(1, 2)?
-            .contiguous()?;
+        let tokens = tokens_of(&self.norm.forward(x)?)?;
         let (q, k, v) = (
             self.to_q.forward(&tokens)?,
             self.to_k.forward(&tokens)?,
@@ -68,12 +63,7 @@ impl PixelAttention {
             heads: 1,
             causality: Causality::Full,
         };
-        let out = self.to_out.forward(&attention.forward(&q, &k, &v)?)?;
-        let back = out
-            .transpose(1, 2)?
-            .contiguous()?
-            .reshape((batch, channels, height, width))?;
-        Ok((x + back)?)
+        add_tokens(x, &self.to_out.forward(&attention.forward(&q, &k, &v)?)?)
     }
 }
 
