@@ -24,25 +24,25 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 17,
+    version: 18,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
     name: "concepts",
     executable: "dipir-concepts",
-    version: 3,
+    version: 4,
 };
 /// Personalises the model to the photograph.
 pub const LORA: StageName = StageName {
     name: "lora",
     executable: "dipir-lora",
-    version: 5,
+    version: 6,
 };
 /// Recovers light and tone curves.
 pub const LIGHT: StageName = StageName {
     name: "light",
     executable: "dipir-light",
-    version: 11,
+    version: 12,
 };
 /// Renders the picture and its layers.
 pub const COMPOSITE: StageName = StageName {
