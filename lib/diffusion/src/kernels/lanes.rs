@@ -85,8 +85,8 @@ pub(super) fn gather(source: &[f32], stride: usize, rows: usize, target: &mut [L
     plain::gather(source, stride, rows, target);
 }
 
-/// As [`gather`], of `len` elements a row, into `len` groups of `width` numbers, one after the other; width is at most 16.
-/// False, and nothing is done, where the processor has no AVX-512.
+/// As [`gather`], of `len` elements a row, into `len` groups, `width` apart, of `width` numbers, but 16 at most; what lies
+/// between them stays. False, and nothing is done, where there are none or the processor has no AVX-512.
 #[cfg_attr(not(target_arch = "x86_64"), allow(unused_variables))]
 pub(super) fn gather_narrow(
     source: &[f32],
@@ -98,8 +98,12 @@ pub(super) fn gather_narrow(
 ) -> bool {
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx512f") {
-        assert!(width <= LANES && rows <= width && target.len() >= len * width);
-        assert!(rows == 0 || len == 0 || (rows - 1) * stride + len <= source.len());
+        if len == 0 || rows == 0 {
+            return false;
+        }
+        let group = width.min(LANES);
+        assert!(rows <= group && target.len() >= (len - 1) * width + group);
+        assert!((rows - 1) * stride + len <= source.len());
         // SAFETY: the processor was asked, and the sizes were checked.
         unsafe { avx512::columns(source, stride, rows, len, target.as_mut_ptr(), width) };
         return true;
@@ -254,11 +258,11 @@ mod avx512 {
         }))
     }
 
-    /// Element c of row r goes to `r + c width` of `target`; 0 where r is at least `rows`.
+    /// Element c of row r goes to `r + c width` of `target`; 0 where r is at least `rows`, up to 16 and below `width`.
     ///
     /// # Safety
-    /// `source` holds `rows` rows of `len` elements, `stride` apart; `target` is valid for writes of `len` times `width`
-    /// elements, and `width` is at most 16.
+    /// `source` holds `rows` rows of `len` elements, `stride` apart; `target` is valid for writes of `len` groups of `width`
+    /// elements, but 16 at most, `width` apart.
     #[target_feature(enable = "avx512f")]
     pub(super) unsafe fn columns(
         source: &[f32],
@@ -268,7 +272,7 @@ mod avx512 {
         target: *mut f32,
         width: usize,
     ) {
-        let end = len * width;
+        let end = (len - 1) * width + width.min(LANES);
         for left in (0..len).step_by(LANES) {
             let start = source.as_ptr().wrapping_add(left);
             // SAFETY: the rows hold `len - left` elements more.
@@ -331,6 +335,8 @@ mod tests {
             (3, 1, 5),
             (16, 33, 16),
             (1, 17, 1),
+            (16, 35, 32),
+            (7, 18, 20),
         ] {
             let mut lanes = vec![Lane::ZERO; columns];
             gather(&source, 50, rows, &mut lanes);
@@ -340,11 +346,12 @@ mod tests {
                 assert_eq!(target[0], -1.0);
                 continue;
             }
-            let wanted = lanes.iter().flat_map(|lane| &lane.0[..width]);
-            assert!(
-                target[..columns * width].iter().eq(wanted),
-                "{rows} x {columns} in {width}"
-            );
+            let group = width.min(LANES);
+            for (target, lane) in target.chunks_exact(width).zip(&lanes) {
+                let (own, between) = target.split_at(group);
+                assert_eq!(own, &lane.0[..group], "{rows} x {columns} in {width}");
+                assert!(between.iter().all(|v| *v == -1.0));
+            }
             assert_eq!(target[columns * width], -1.0);
         }
     }

@@ -6,7 +6,7 @@
 
 use rayon::prelude::*;
 
-use super::lanes::gather_narrow;
+use super::lanes::{LANES, gather_narrow};
 use super::matmul::{Matrix, Onto, Threads};
 use super::{SharedMut, with_scratch};
 
@@ -358,10 +358,17 @@ fn pack_columns(
         }
         return;
     }
-    for j in 0..count {
-        let start = (first + j) * b.column + first_depth * b.row;
-        for p in 0..depth {
-            target[p * NR + j] = b.data[start + p * b.row];
+    for left in (0..count).step_by(LANES) {
+        let columns = LANES.min(count - left);
+        let start = (first + left) * b.column + first_depth * b.row;
+        let (source, target) = (&b.data[start..], &mut target[left..]);
+        if b.row == 1 && gather_narrow(source, b.column, columns, depth, target, NR) {
+            continue;
+        }
+        for j in 0..columns {
+            for p in 0..depth {
+                target[p * NR + j] = source[j * b.column + p * b.row];
+            }
         }
     }
 }
