@@ -1,4 +1,5 @@
 //! `dipir shot`: the objects in every frame of a shot, under one light.
+use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
@@ -129,12 +130,22 @@ fn frames(
 ) -> anyhow::Result<(Vec<Frame>, Vec<Option<f64>>)> {
     let (mut frames, mut told) = (Vec::<Frame>::new(), Vec::new());
     let stands_still = shot::camera_stands_still(session)?;
+    let mut assumed = BTreeSet::new();
     for path in &args.frames {
         let name = name(path)?;
         told.push(shot::exposure_stops(session, path)?);
         let mut frame = base.clone();
-        let overrides = shot::overrides(session, path, stands_still)?;
-        frame.set.extend(overrides);
+        let overrides = shot::overrides(session, path, stands_still, |words, is_doubtful| {
+            // Of all frames it mostly is the same.
+            if !assumed.insert(words.clone()) {
+                return;
+            }
+            match is_doubtful {
+                true => session.warn(&words),
+                false => session.remark(|| words),
+            }
+        });
+        frame.set.extend(overrides?);
         frame.out = Some(session.out.join(shot::FOLDER).join(name));
         if frames.iter().any(|(_, other)| other.out == frame.out) {
             let message = format!("{}: another frame has the same name", path.display());

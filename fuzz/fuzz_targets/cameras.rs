@@ -1,6 +1,7 @@
 #![no_main]
+use dipir_cameras::file::{Wanted, Which};
 use dipir_cameras::{
-    Camera, Pose, WorldUp, chan, colmap, fspy, gltf, kitti, nuscenes, opencv, transforms,
+    Camera, Pose, WorldUp, chan, colmap, fspy, gltf, kitti, moving, nuscenes, opencv, transforms,
 };
 use glam::DVec2;
 use libfuzzer_sys::fuzz_target;
@@ -41,6 +42,17 @@ fuzz_target!(|bytes: &[u8]| {
     let all = named.chain(frames.map(|(_, camera)| camera));
     for camera in all.chain(single.into_iter().flatten()).chain(lens) {
         is_whole(&camera);
+    }
+    for frame in [0, 2] {
+        let wanted = Wanted {
+            size: SIZE,
+            which: Which::Number(frame),
+            up: None,
+            fov_deg: None,
+            turns: None,
+        };
+        let camera = moving::read(bytes, None, &wanted);
+        camera.iter().for_each(is_whole);
     }
     let _ = kitti::read_scanner(&text);
     let _ = nuscenes::sensor(bytes, WorldUp::Z);

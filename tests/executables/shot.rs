@@ -1,4 +1,6 @@
 //! Frames under one light.
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD_NO_PAD;
 use dipir_imaging::file::write_png;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
@@ -169,6 +171,38 @@ fn every_frame_has_the_camera_of_its_name() {
         &["a.png"],
         "a.png: its name does not end in the number of a frame of .chan",
     );
+    // So has a glTF camera that moves: x is .5, .25 and -.5 at 1/24, 2/24 and 3/24 s.
+    let keys: [f32; 12] = [1.0, 2.0, 3.0, 0.5, 1.5, 5.0, 0.25, 1.5, 5.0, -0.5, 1.5, 5.0];
+    let keys = keys.iter().enumerate();
+    let keys = keys.flat_map(|(i, k)| if i < 3 { k / 24.0 } else { *k }.to_le_bytes());
+    let keys = BASE64_STANDARD_NO_PAD.encode(keys.collect::<Vec<u8>>());
+    let accessor = |view: u32, kind: &str| json!({ "bufferView": view, "componentType": 5126, "type": kind, "count": 3 });
+    let channel = json!({ "sampler": 0, "target": { "node": 1, "path": "translation" } });
+    let moving = json!({
+        "nodes": [{ "name": "still", "camera": 0 }, { "name": "tracked", "camera": 0 }],
+        "cameras": [{ "perspective": { "yfov": 0.7 } }],
+        "buffers": [{ "uri": format!("data:;base64,{keys}") }],
+        "bufferViews": [{ "buffer": 0, "byteLength": 12 }, { "buffer": 0, "byteOffset": 12, "byteLength": 36 }],
+        "accessors": [accessor(0, "SCALAR"), accessor(1, "VEC3")],
+        "animations": [{ "samplers": [{ "input": 0, "output": 1 }], "channels": [channel] }],
+    });
+    project.write("shot.gltf", moving.to_string());
+    let plates = ["p.1001.png", "p.1003.png"];
+    plates.iter().for_each(|name| project.write(name, &photo));
+    with("file = \"shot.gltf\"\nimage = \"tracked\"\nframe = 2");
+    let run = project.run(DIPIR, &[&["shot"], &plates[..]].concat());
+    run.expect_success();
+    let told = "picture 1001 is taken to be frame 1; if it is not, write the frame";
+    assert_eq!(run.stderr.matches(told).count(), 1, "{}", run.stderr);
+    let places = ["frames/p.1001", "frames/p.1003", "."].map(place);
+    assert_eq!(places, [0.5, -0.5, 0.25]);
+    // Counted from the photograph, whose frame is written.
+    let own = "scene.background=p.1001.png";
+    let run = project.run(DIPIR, &[&["shot", "--set", own], &plates[..]].concat());
+    run.expect_success();
+    assert!(!run.stderr.contains("is taken to be"), "{}", run.stderr);
+    let places = ["frames/p.1001", "frames/p.1003"].map(place);
+    assert_eq!(places, [0.25, -0.5]);
     with("transforms = \"transforms.json\"\ntransforms_up = \"y\"");
     refused(
         &["a.png"],

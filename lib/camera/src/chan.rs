@@ -108,7 +108,7 @@ pub(crate) fn wanted(
 ) -> Result<Frame, CameraError> {
     let (number, picture) = match wanted.which {
         Which::Number(n) => (Some(i64::from(n)), None),
-        Which::Name(name) => (
+        Which::Name(name) | Which::Frame(name, _) => (
             name.parse().ok().or_else(|| file::number(name.as_ref())),
             Some(name.as_ref()),
         ),

@@ -7,20 +7,25 @@ use serde_json::Value;
 use crate::camera::{Camera, Lens, Pose, WorldUp};
 use crate::chan::Turns;
 use crate::error::CameraError;
-use crate::{chan, colmap, foreign, fspy, gltf, kitti, nuscenes, opencv, transforms};
+use crate::{buffers, chan, colmap, foreign, fspy, kitti, moving, nuscenes, opencv, transforms};
 
+pub use crate::moving::Shown;
 pub use crate::upright::doubt;
 
 /// Which of a file's cameras is meant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Which<'a> {
     /// The camera of the picture with this path, as far from its end as they agree, and in a `.chan` file the frame
-    /// with the number at the end of its name; if no picture has its name, the only camera.
+    /// with the number at the end of its name; if no picture has its name, the only camera. A glTF camera that moves
+    /// stands where [`shown`] says.
     Photo(&'a Path),
-    /// By number: counted from 0; the frame in a `.chan` file, n of `Pn` in KITTI's.
+    /// By number: counted from 0; the frame in a `.chan` file and of a glTF's only camera if that moves, n of `Pn` in
+    /// KITTI's.
     Number(u32),
     /// By the name of its picture, or of the camera itself.
     Name(&'a str),
+    /// By its name, at this frame: of a glTF camera that moves.
+    Frame(&'a str, u32),
 }
 
 /// What is asked of a file.
@@ -117,10 +122,37 @@ pub fn has_one(path: &Path) -> bool {
     found(path, &wanted).is_ok()
 }
 
-/// The files that [`read`] reads: `path` itself, or those of COLMAP's model.
+/// The frame that `photo` shows of a camera of the glTF file at `path` that moves: of the one with this `name` or, without
+/// one, of the one that [`Which::Photo`] means. `None` if it stands still, and of other files.
+///
+/// # Errors
+/// As [`read`].
+pub fn shown(path: &Path, name: Option<&str>, photo: &Path) -> Result<Option<Shown>, CameraError> {
+    if !is_gltf(path) {
+        return Ok(None);
+    }
+    let cannot_read = |source| CameraError::Read {
+        path: path.into(),
+        source,
+    };
+    let bytes = dipir_files::read(path).map_err(cannot_read)?;
+    moving::shown(&bytes, path.parent(), name, photo)
+}
+
+/// Whether this is the name of a glTF file, of which a camera may move.
+pub fn is_gltf(path: &Path) -> bool {
+    let is = |kind| {
+        path.extension()
+            .is_some_and(|e| e.eq_ignore_ascii_case(kind))
+    };
+    is("gltf") || is("glb")
+}
+
+/// The files that [`read`] reads: `path` itself, and those that have the keys of a glTF's cameras, or those of COLMAP's model.
 pub fn parts(path: &Path) -> Vec<PathBuf> {
     match colmap::Files::at(path) {
         Some(files) => ["cameras", "images"].map(|stem| files.part(stem)).into(),
+        None if is_gltf(path) => [vec![path.into()], buffers::files(path)].concat(),
         None => vec![path.into()],
     }
 }
@@ -186,18 +218,7 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
             Ok(of(fspy::read(bytes, z_up)?, "fSpy", true))
         }
         "gltf" | "glb" => {
-            let cameras = gltf::read_named(bytes, wanted.size)?;
-            let gltf::AtRest {
-                camera,
-                is_animated,
-            } = by_names(cameras, wanted, "glTF")??;
-            if is_animated {
-                return Err(CameraError::with_remedy(
-                    "glTF",
-                    "its camera is animated, which is not read",
-                    "export .chan or transforms.json, or the camera of one frame without animation",
-                ));
-            }
+            let camera = moving::read(bytes, path.parent(), wanted)?;
             let pose = camera.pose.in_our_world(wanted.up.unwrap_or(WorldUp::Y));
             Ok(of(Camera { pose, ..camera }, "glTF", true))
         }
@@ -207,7 +228,7 @@ fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
             let index = match wanted.which {
                 Which::Number(n) => n,
                 Which::Photo(_) => KITTI_LEFT,
-                Which::Name(name) => {
+                Which::Name(name) | Which::Frame(name, _) => {
                     return Err(CameraError::with_remedy(
                         "KITTI",
                         format!("its cameras have numbers, and none the name {name:?}"),
@@ -258,7 +279,7 @@ fn in_json(
 }
 
 /// What is wanted by the first name of each or, if none has it, by their others.
-fn by_names<T, const N: usize>(
+pub(crate) fn by_names<T, const N: usize>(
     mut all: Vec<([Option<String>; N], T)>,
     wanted: &Wanted,
     format: &'static str,
@@ -289,7 +310,7 @@ fn lens_alone(text: &str, wanted: &Wanted) -> Result<Found, CameraError> {
 }
 
 /// Errors if another camera than the first is wanted of a file that has one.
-fn only(wanted: &Wanted, format: &'static str) -> Result<(), CameraError> {
+pub(crate) fn only(wanted: &Wanted, format: &'static str) -> Result<(), CameraError> {
     match wanted.which {
         Which::Number(n @ 1..) => Err(CameraError::with_remedy(
             format,
@@ -307,7 +328,7 @@ fn chosen(cameras: &[&str], wanted: &Wanted, format: &'static str) -> Result<usi
             Some(n as usize).filter(|n| *n < cameras.len()),
             format!("no camera {n}"),
         ),
-        Which::Name(name) => {
+        Which::Name(name) | Which::Frame(name, _) => {
             let exact = nearest(cameras, format, name, |own| (own == name).then_some(()))?;
             let by_path = || nearest(cameras, format, name, |own| agreement(own, name.as_ref()));
             (
@@ -396,8 +417,6 @@ pub(crate) fn number(picture: &Path) -> Option<i64> {
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
-
     use super::*;
 
     fn wanted(which: Which<'_>) -> Wanted<'_> {
@@ -526,21 +545,6 @@ mod tests {
         let (own, asked) = (of("1 1 2 3 0 0 0 40"), of("1 1 2 3 0 0 0"));
         assert!(own.states_fov && !asked.states_fov);
         assert_eq!(own.pose.unwrap().position.to_array(), [1.0, 3.0, -2.0]);
-    }
-
-    #[test]
-    fn an_animated_camera_is_refused_where_it_is_asked_for() {
-        let target = json!({ "node": 0, "path": "translation" });
-        let text = json!({
-            "nodes": [{ "name": "moving", "camera": 0 }, { "name": "still", "camera": 0 }],
-            "cameras": [{ "perspective": { "yfov": 0.7 } }],
-            "animations": [{ "channels": [{ "sampler": 0, "target": target }] }],
-        });
-        let of = |name| found_in("shot.gltf", &text.to_string(), &wanted(Which::Name(name)));
-        assert!(of("still").is_ok());
-        let error = of("moving").unwrap_err();
-        let want = "its camera is animated, which is not read; export .chan or transforms.json";
-        assert!(error.contains(want), "{error}");
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! World and camera are those of dipir: right-handed, +y up, metres; a camera looks down its own -z
 //! with +y up in the picture; pixel (0, 0) is the top left corner. Lenses count in image axes: +x to
 //! the right, +y down, +z forward.
+mod buffers;
 pub mod camera;
 pub mod chan;
 pub mod colmap;
@@ -13,8 +14,10 @@ mod foreign;
 pub mod fspy;
 pub mod gltf;
 pub mod kitti;
+pub mod moving;
 pub mod nuscenes;
 pub mod opencv;
+mod track;
 pub mod transforms;
 mod upright;
 

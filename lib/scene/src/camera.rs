@@ -247,6 +247,8 @@ pub enum Which {
     Number(u32),
     /// By the name of its picture.
     Name(String),
+    /// By its name, at this frame: of a glTF camera that moves.
+    Frame(String, u32),
 }
 
 /// A camera in another program's file.
@@ -276,15 +278,28 @@ pub struct FileSettings {
     pub distortion: Option<Distortion>,
 }
 
+fn absolute(base_dir: &Path, path: &Path) -> PathBuf {
+    let path = base_dir.join(path);
+    std::path::absolute(&path).unwrap_or(path)
+}
+
 impl FileSettings {
     /// The files that are read, as the configuration would name them.
     pub fn parts(&self, base_dir: &Path) -> Vec<PathBuf> {
         parts(&self.path, base_dir)
     }
 
-    /// Which of several models is read, as a warning.
+    /// Which of several models is read, or at which frame a camera that moves stands, as a warning.
     pub(crate) fn choice(&self, base_dir: &Path) -> Option<String> {
-        file::choice(&base_dir.join(&self.path))
+        let path = base_dir.join(&self.path);
+        let Which::Photo(photo) = &self.which else {
+            return file::choice(&path);
+        };
+        // What is wrong with it is told where it is read.
+        let shown = file::shown(&path, None, &absolute(base_dir, photo));
+        let shown = shown.ok().flatten().filter(|shown| shown.is_doubtful);
+        let assumed = shown.map(|shown| format!("\"{}\": {}", path.display(), shown.assumed));
+        assumed.or_else(|| file::choice(&path))
     }
 
     /// Whether another axis of the file's world seems to point up, as a warning, where nobody says which.
@@ -301,16 +316,16 @@ impl FileSettings {
         let path = base_dir.join(&self.path);
         // Its folders tell pictures of the same name apart.
         let photo = match &self.which {
-            Which::Photo(path) => base_dir.join(path),
+            Which::Photo(path) => absolute(base_dir, path),
             _ => PathBuf::new(),
         };
-        let photo = std::path::absolute(&photo).unwrap_or(photo);
         let wanted = Wanted {
             size: resolution.map(f64::from),
             which: match &self.which {
                 Which::Photo(_) => file::Which::Photo(&photo),
                 Which::Number(n) => file::Which::Number(*n),
                 Which::Name(name) => file::Which::Name(name),
+                Which::Frame(name, n) => file::Which::Frame(name, *n),
             },
             up: self.up,
             fov_deg: self.fov_deg.map(f64::from),

@@ -182,8 +182,8 @@ pub struct CameraConfig {
     /// As `file`, a nerfstudio `transforms.json` whose frame is named by its number.
     #[schemars(extend("format" = "path"), example = &"transforms.json")]
     pub transforms: Option<PathBuf>,
-    /// Which camera of `transforms` or `file` is the photograph's, from 0; in a `.chan` file the number of
-    /// the frame, in KITTI's that of the camera.
+    /// Which camera of `transforms` or `file` is the photograph's, from 0; in a `.chan` file and of a glTF camera
+    /// that moves (with `image`, if there are several) the number of the frame, in KITTI's that of the camera.
     #[schemars(extend("x-default" = "`0` of `transforms`; of `file` as `image`"), example = 3)]
     pub frame: Option<u32>,
     /// Which axis of the world of `transforms` is up.

@@ -1,6 +1,8 @@
 //! A shot: frames that one light lights.
 use std::path::{Path, PathBuf};
 
+use dipir_cameras::CameraError;
+use dipir_cameras::file::{self, Shown};
 use dipir_cli::exit::{Usage, printable};
 use dipir_cli::session::Session;
 use dipir_imaging::facts::Facts;
@@ -58,7 +60,7 @@ pub fn exposure_stops(session: &Session, path: &Path) -> anyhow::Result<Option<f
 pub fn camera_stands_still(session: &Session) -> anyhow::Result<bool> {
     let scene: SceneConfig = session.config.table("scene")?;
     let file = scene.camera.and_then(|camera| camera.file);
-    let has_one = |file| dipir_cameras::file::has_one(&session.config.base_dir().join(file));
+    let has_one = |file| file::has_one(&session.config.base_dir().join(file));
     Ok(file.is_none_or(has_one))
 }
 
@@ -83,7 +85,7 @@ pub fn exposed(session: &Session, stops: f64, tint: [f64; 3]) -> anyhow::Result<
 }
 
 /// What sets the frame in `path` in place of the session's photograph, as `KEY=VALUE`. The camera is its own, unless it
-/// `stands_still`.
+/// `stands_still`. `tell` hears what is assumed of it, and whether that is a warning.
 ///
 /// # Errors
 /// If there is no such file or mask, if it is of a format that is not read, or its camera cannot be told from the configuration.
@@ -91,6 +93,7 @@ pub fn overrides(
     session: &Session,
     path: &Path,
     stands_still: bool,
+    tell: impl FnMut(String, bool),
 ) -> anyhow::Result<Vec<String>> {
     let wrong = |why: &str| Usage(printable(&format!("{}: {why}", path.display())));
     let scene: SceneConfig = session.config.table("scene")?;
@@ -125,6 +128,10 @@ pub fn overrides(
     if stands_still && camera.transforms.is_none() {
         return Ok(set);
     }
+    if let Some(number) = moved(session, &scene, camera, path, tell)? {
+        set.push(format!("scene.camera.frame={number}"));
+        return Ok(set);
+    }
     if let Some(key) = key_of_frame(camera)? {
         let value = match key {
             "frame" => number(path)
@@ -135,6 +142,39 @@ pub fn overrides(
         set.push(format!("scene.camera.{key}={value}"));
     }
     Ok(set)
+}
+
+/// At which frame of the file the camera stands in the picture in `path`, if it moves in a glTF. Where the photograph's
+/// frame is written, others are counted from it.
+fn moved(
+    session: &Session,
+    scene: &SceneConfig,
+    camera: &CameraConfig,
+    path: &Path,
+    mut tell: impl FnMut(String, bool),
+) -> anyhow::Result<Option<u32>> {
+    let Some(own) = &camera.file else {
+        return Ok(None);
+    };
+    let own = session.config.base_dir().join(own);
+    let named = |e: CameraError| Usage(printable(&format!("\"{}\": {e}", own.display())));
+    let shown = file::shown(&own, camera.image.as_deref(), &std::path::absolute(path)?);
+    let Some(Shown {
+        frame,
+        assumed,
+        is_doubtful,
+    }) = shown.map_err(named)?
+    else {
+        return Ok(None);
+    };
+    let photo = scene.background.as_deref().and_then(number);
+    let written = camera.frame.zip(photo).zip(number(path));
+    if let Some(((written, photo), number)) = written {
+        let frame = i64::from(written) + i64::from(number) - i64::from(photo);
+        return Ok(Some(u32::try_from(frame.max(0))?));
+    }
+    tell(format!("\"{}\": {assumed}", own.display()), is_doubtful);
+    Ok(Some(frame))
 }
 
 /// The key that chooses a frame's camera, if its picture's name does not.

@@ -1,6 +1,7 @@
 //! What `[scene.camera]` says of another program's file, and of a lens that bends lines.
 use dipir_cameras::Distortion;
 use dipir_cameras::chan::Turns;
+use dipir_cameras::file::is_gltf;
 
 use super::*;
 use crate::camera::{FileSettings, Which};
@@ -100,6 +101,7 @@ impl CameraConfig {
             ));
         }
         let which = match (&self.image, self.frame) {
+            (Some(name), Some(n)) if is_gltf(path) => Which::Frame(name.clone(), n),
             (Some(_), Some(_)) => {
                 return Err(conflict("scene.camera.image", "scene.camera.frame"));
             }
@@ -295,6 +297,46 @@ mod tests {
         assert!(error.starts_with(want), "{error}");
         let error = resolved(("shot.gltf", GLTF), "file_rotation_order = \"xyz\"").unwrap_err();
         assert!(error.contains("files other than .chan say"), "{error}");
+    }
+
+    #[test]
+    fn a_gltf_camera_that_moves_is_named_with_its_frame() {
+        // x is 0.5, 0.25 and -0.5 at 1/24, 2/24 and 3/24 s.
+        let moving = r#"{ "nodes": [{ "camera": 0, "name": "A" }, { "camera": 0, "name": "B" }],
+            "cameras": [{ "perspective": { "yfov": 0.7 } }],
+            "buffers": [{ "uri": "data:;base64,q6oqPauqqj0AAAA+AAAAPwAAAEAAAAAAAACAPgAAAEAAAAAAAAAAvwAAAEAAAAAA" }],
+            "bufferViews": [{ "buffer": 0, "byteLength": 12 },
+                { "buffer": 0, "byteOffset": 12, "byteLength": 36 }],
+            "accessors": [{ "bufferView": 0, "componentType": 5126, "type": "SCALAR", "count": 3 },
+                { "bufferView": 1, "componentType": 5126, "type": "VEC3", "count": 3 }],
+            "animations": [{ "samplers": [{ "input": 0, "output": 1 }],
+                "channels": [{ "sampler": 0, "target": { "node": 1, "path": "translation" } }] }] }"#;
+        let x = |keys: &str| resolved(("shot.gltf", moving), keys).map(|(c, _)| c.position.x);
+        assert_eq!(x("image = \"B\"\nframe = 3"), Ok(-0.5));
+        assert_eq!(x("image = \"B\"\nframe = 2"), Ok(0.25));
+        assert_eq!(x("image = \"A\""), Ok(0.0));
+        let error = x("image = \"B\"").unwrap_err();
+        let want = "the camera moves, with frames 1 to 3 at 24 a second; say which";
+        assert!(error.contains(want), "{error}");
+        let both = resolved(("shot.chan", CHAN), "image = \"B\"\nframe = 3").unwrap_err();
+        let want = "scene.camera.image and scene.camera.frame cannot both be given";
+        assert!(both.starts_with(want), "{both}");
+        // Counted from the first picture, which is told.
+        let one = moving.replace(r#"{ "camera": 0, "name": "A" }"#, "{}");
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("shot.gltf"), one).unwrap();
+        let config: CameraConfig = toml::from_str("file = \"shot.gltf\"").unwrap();
+        let settings = config.validate(Path::new("plate.1001.png")).unwrap();
+        let (camera, _) = settings.resolve([600, 400], folder.path()).unwrap();
+        assert_eq!(camera.position.x, 0.5);
+        let CameraSettings::File(file) = settings else {
+            panic!("a file")
+        };
+        let told = file.choice(folder.path()).unwrap();
+        assert!(
+            told.contains("picture 1001 is taken to be frame 1"),
+            "{told}"
+        );
     }
 
     #[test]
