@@ -129,6 +129,9 @@ pub fn overrides(
         return Ok(set);
     }
     if let Some(number) = moved(session, &scene, camera, path, tell)? {
+        // The number alone would take the place of the camera's name.
+        let name = camera.image.iter();
+        set.extend(name.map(|name| format!("scene.camera.image={}", json!(name))));
         set.push(format!("scene.camera.frame={number}"));
         return Ok(set);
     }
