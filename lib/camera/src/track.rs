@@ -104,7 +104,8 @@ impl Track {
             Course::CubicSpline => self.values.chunks(3).all(|k| flat(&k[0]) && flat(&k[2])),
             _ => true,
         };
-        is_flat && keys.all(|key| same(self.value(key)))
+        // Slopes of a single key lead nowhere.
+        self.times.len() == 1 || is_flat && keys.all(|key| same(self.value(key)))
     }
 
     /// The value at `time_s`; before the first key and after the last one it is theirs. Rotations have length 1, or, where
@@ -240,6 +241,8 @@ mod tests {
             is(&keys, Course::CubicSpline, false)
         };
         assert!(spline(0.0) && !spline(1.0));
+        let one = [1.0, 5.0, 1.0].map(vector);
+        assert!(track(&[0.5], &one, Course::CubicSpline, false).is_constant());
     }
 
     #[test]

@@ -107,8 +107,8 @@ pub fn read_photo(path: impl AsRef<Path>, transfer: Transfer) -> Result<Photo, I
 ///
 /// PNG and JPEG are decoded with their ICC profile if they have one and `transfer` is
 /// [`Transfer::Srgb`]; another curve overrules the file. So it is with a PNG's `gAMA`, where there is
-/// no profile. A gain map behind a JPEG is kept; one that cannot be used is a warning. OpenEXR and Radiance HDR are linear light, of Rec.709 unless they name other
-/// primaries, from which it is converted. Of OpenEXR the display window is read; pixels of the data window outside it
+/// no profile. A gain map behind a JPEG is kept; one that cannot be used is a warning. OpenEXR and
+/// Radiance HDR are linear light, of Rec.709 unless they name other primaries, from which it is converted. Of OpenEXR the display window is read; pixels of the data window outside it
 /// are dropped, with a warning.
 ///
 /// # Errors

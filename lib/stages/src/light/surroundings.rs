@@ -97,8 +97,9 @@ mod tests {
                 map.texel(i, j)
             };
             let (sky, ground) = (at(&brighter, 0.25).x, at(&brighter, -0.25));
-            assert!((sky - 8.1).abs() < 0.1, "{sky}");
-            assert!((at(&plain, 0.25).x - 1.0).abs() < 0.05);
+            // (1 + 1/64) 2^3 - 1/64. A texel is the mean of places, which JPEG leaves within a hundredth of white.
+            assert!((sky - 8.109).abs() < 0.08, "{sky}");
+            assert!((at(&plain, 0.25).x - 1.0).abs() < 0.01);
             assert_eq!(ground, at(&plain, -0.25));
         }
     }
