@@ -243,6 +243,7 @@ fn what_lies_beside_the_artifacts_is_there_after_the_next_run() {
             "composite.png",
             "composite.png.bak",
             "effects.json",
+            "look.json",
             "painted over.psd",
             "stage.json"
         ]

@@ -13,6 +13,7 @@ mod keys;
 mod kills;
 mod large;
 mod lens;
+mod look;
 mod manual;
 mod page;
 mod pipeline;

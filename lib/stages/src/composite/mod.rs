@@ -1,7 +1,9 @@
 //! The composite stage: the object at full quality, its shadow, and the layers of both.
 mod lens;
+mod look;
 pub mod table;
 
+use std::borrow::Cow;
 use std::fmt;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -37,6 +39,7 @@ use crate::names::{COMPOSITE, begin};
 use crate::presets::{CompositePreset, Outlook, Preset};
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::written;
+use look::{Look, Matched, Overlay};
 use table::{CompositeTable, MAX_SAMPLES, Tone};
 
 /// When to stop, from the command line.
@@ -58,6 +61,7 @@ pub struct Done {
     target: Stop,
     /// Object and shadow were rendered at one over this of the photograph's resolution.
     divisor: u32,
+    matched: Matched,
     /// From the start of the run to its end.
     seconds: f64,
     outlook: Outlook,
@@ -119,6 +123,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let folder = COMPOSITE.folder(session);
     let mut writer = begin(session, plan(session, &table)?)?;
     let curve = Curve::of(table.tone, &light, inputs.scene.loaded.taken());
+    let look = Look::of(inputs.scene.loaded.taken(), &table);
     let course = render(
         session,
         &table,
@@ -130,7 +135,8 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let Course { rendered, .. } = course;
     let effects = inputs.scene.effects.rendered(&rendered);
     writer.write_json("effects", "effects.json", &effects)?;
-    let layers = Composite::new(&inputs, rendered.film, &curve);
+    let layers = Composite::new(&inputs, rendered.film, rendered.divisor, &curve, &look);
+    writer.write_json("look", "look.json", &layers.matched)?;
     let picture = layers.picture()?;
     check_finite(&picture)?;
     let png = writer.output("picture", "composite.png")?;
@@ -187,6 +193,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         error,
         target: stop,
         divisor: rendered.divisor,
+        matched: layers.matched,
         seconds,
         outlook,
     })
@@ -247,6 +254,8 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
         "tone": table.tone,
         "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
         "denoise": table.denoise(session.pipeline.quality),
+        "match_blur": table.matches_blur(),
+        "match_grain": table.matches_grain(),
         "blur_caustics": table.blur_caustics(session.pipeline.quality),
         "most_pixels": table.most_pixels(session.pipeline.quality),
         "stop": match table.stop(session.pipeline.quality) {
@@ -354,10 +363,11 @@ struct Composite<'a> {
     shadow: LinearImage,
     /// How the object's and the shadow's colours are stored.
     precision: [Precision; 2],
+    matched: Matched,
 }
 
 impl<'a> Composite<'a> {
-    fn new(inputs: &'a Inputs, film: Film, curve: &Curve) -> Self {
+    fn new(inputs: &'a Inputs, film: Film, divisor: u32, curve: &Curve, look: &Look) -> Self {
         let loaded = &inputs.scene.loaded;
         let background = &loaded.taken().image;
         let film = match &loaded.original {
@@ -366,11 +376,29 @@ impl<'a> Composite<'a> {
         };
         let Film {
             object,
-            mut alpha,
+            alpha,
             shadow,
             ..
         } = film;
-        let (mut object, mut shadow) = curve.apply(object, &alpha, shadow);
+        let (object, shadow) = curve.apply(object, &alpha, shadow);
+        let mut layers = Overlay {
+            object,
+            alpha,
+            shadow,
+        };
+        let hidden = loaded
+            .occluders
+            .as_ref()
+            .map(|mask| match &loaded.original {
+                Some(original) => Cow::Owned(original.undistortion.distort(mask, 0.0)),
+                None => Cow::Borrowed(mask),
+            });
+        let matched = look.apply(&mut layers, background, hidden.as_deref(), divisor);
+        let Overlay {
+            mut object,
+            mut alpha,
+            mut shadow,
+        } = layers;
         // Rounded to what the file stores before they are put together, so that whoever does it
         // again from the file gets the same picture. Light beyond half precision is stored in full.
         let precision = [Precision::of_colour(&object), Precision::of_colour(&shadow)];
@@ -386,6 +414,7 @@ impl<'a> Composite<'a> {
             alpha,
             shadow: LinearImage(shadow),
             precision,
+            matched,
         }
     }
 
@@ -488,6 +517,7 @@ impl Done {
             "picture": json_path(self.folder.join("composite.png")),
             "layers": json_path(self.folder.join("composite.exr")),
             "estimated_error": self.error,
+            "matched": self.matched,
             "samples": self.samples,
             "rays": self.rays,
             "elapsed_s": self.manifest.elapsed_s,
@@ -521,6 +551,9 @@ impl fmt::Display for Done {
                  does not count",
                 self.divisor
             )?;
+        }
+        if let Some(matched) = self.matched.text() {
+            write!(f, "\n  {matched}")?;
         }
         if let Stop::TimeBudget(budget) = self.target {
             let (budget, share) = (budget.as_secs_f64(), self.seconds / budget.as_secs_f64());

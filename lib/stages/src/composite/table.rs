@@ -50,6 +50,12 @@ pub struct CompositeTable {
     /// it: fewer specks, in less time.
     #[schemars(extend("x-default" = "true; false for the preset `high`"), example = false)]
     pub blur_caustics: Option<bool>,
+    /// Whether object and shadow are blurred as the photograph's sharpest edges are, where these are softer than rendered ones.
+    #[schemars(extend("x-default" = "true"), example = false)]
+    pub match_blur: Option<bool>,
+    /// Whether the object gets the photograph's grain, where its even parts show some.
+    #[schemars(extend("x-default" = "true"), example = false)]
+    pub match_grain: Option<bool>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
     /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
     #[schemars(extend("x-default" = "the recovered curves with the recovered light, `none` with a map"), example = &"reinhard")]
@@ -150,6 +156,14 @@ impl CompositeTable {
     pub(super) fn denoise(&self, quality: Quality) -> bool {
         let by_preset = presets::of(quality).composite.denoise;
         self.denoise.unwrap_or(by_preset)
+    }
+
+    pub(super) fn matches_blur(&self) -> bool {
+        self.match_blur.unwrap_or(true)
+    }
+
+    pub(super) fn matches_grain(&self) -> bool {
+        self.match_grain.unwrap_or(true)
     }
 
     pub(super) fn blur_caustics(&self, quality: Quality) -> bool {

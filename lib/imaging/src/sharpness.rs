@@ -1,0 +1,317 @@
+//! Sharpness: how wide the sharpest edges of a photograph are, and the same blur for what is laid over it.
+use crate::metrics::LUMA;
+use crate::raster::{LinearImage, Raster};
+use crate::resize::{PixelBox, Sample};
+use crate::squares::squares;
+use rayon::prelude::*;
+
+/// Standard deviations of the two Gaussians whose gradients are compared, pixels. Half a pixel of the smaller is what pixels
+/// themselves blur; the larger reaches over few neighbours.
+const SCALES: [f32; 2] = [0.7, 1.4];
+/// Least gradient of an edge that is measured, linear light a pixel. Noise and faint detail have less.
+const LEAST_GRADIENT: f32 = 0.06;
+/// Least number of edges that tell anything, and the share of all that is listened to: those with the steepest gradients.
+const LEAST_EDGES: usize = 100;
+const STEEPEST: usize = 10;
+/// Of these, one in so many is sharper than what counts as the photograph's sharpness: thin lines look sharper than they are.
+const SHARPER: usize = 5;
+/// What is measured where there is no blur but that of square pixels.
+pub const OF_PIXELS: f32 = 0.4;
+/// Further than this from an edge's middle its gradient is not looked at, standard deviations.
+const REACH: f32 = 4.0;
+
+/// Blur of the sharpest edges of `image`, pixels: the standard deviation of the Gaussian that a sharp edge was blurred by,
+/// and a half where it was not. `None` where too few edges tell.
+///
+/// A step blurred by `s` has after another Gaussian of `t` a gradient in proportion to `1 / sqrt(s^2 + t^2)`: the ratio of
+/// the gradients at two `t` gives `s` [Zhuo and Sim 2011].
+pub fn edge_blur_px(image: &LinearImage) -> Option<f32> {
+    let squares = squares(image.0.width(), image.0.height());
+    let edges = squares.par_iter().map(|b| edges_of(image, *b));
+    let mut edges: Vec<Edge> = edges.collect::<Vec<_>>().into_iter().flatten().collect();
+    if edges.len() < LEAST_EDGES {
+        return None;
+    }
+    edges.sort_by(|a, b| b.gradient.total_cmp(&a.gradient));
+    edges.truncate((edges.len() / STEEPEST).max(LEAST_EDGES));
+    edges.sort_by(|a, b| a.blur_px.total_cmp(&b.blur_px));
+    Some(edges[edges.len() / SHARPER].blur_px)
+}
+
+struct Edge {
+    gradient: f32,
+    blur_px: f32,
+}
+
+/// Columns and rows of a square's border in which no edge is looked for: the filters reach beyond.
+const BORDER: usize = 6;
+
+fn edges_of(image: &LinearImage, square: PixelBox) -> Vec<Edge> {
+    let rows = square.y..square.y + square.height;
+    let columns = square.x..square.x + square.width;
+    let luma = rows
+        .flat_map(|y| image.0.row(y)[columns.clone()].iter().map(|v| v.dot(LUMA)))
+        .collect();
+    let luma = Raster::from_pixels(square.width, square.height, luma);
+    let whole = PixelBox {
+        x: 0,
+        y: 0,
+        ..square
+    };
+    let [fine, wide] = SCALES.map(|s| {
+        let (smooth, slope) = (gaussian(s), slope(s));
+        [
+            filtered(&luma, whole, &slope, &smooth),
+            filtered(&luma, whole, &smooth, &slope),
+        ]
+    });
+    let inside = |length: usize| BORDER..length.saturating_sub(BORDER);
+    let mut edges = Vec::new();
+    for y in inside(square.height) {
+        for x in inside(square.width) {
+            let of = |g: &[Raster<f32>; 2], x: usize, y: usize| [*g[0].get(x, y), *g[1].get(x, y)];
+            let g = of(&fine, x, y);
+            let gradient = g[0].hypot(g[1]);
+            if gradient < LEAST_GRADIENT {
+                continue;
+            }
+            let along = g.map(|c| c / gradient);
+            let beside = |sign: f32| {
+                let to = |at: usize, by: f32| (at as f32 + sign * by).round() as usize;
+                let [a, b] = of(&fine, to(x, along[0]), to(y, along[1]));
+                a.hypot(b)
+            };
+            if gradient < beside(1.0) || gradient < beside(-1.0) {
+                continue;
+            }
+            let w = of(&wide, x, y);
+            let ratio = gradient / (w[0] * along[0] + w[1] * along[1]).abs();
+            edges.push(Edge {
+                gradient,
+                blur_px: blur_of(ratio),
+            });
+        }
+    }
+    edges
+}
+
+/// The blur of a step whose gradient is `ratio` times as steep behind the smaller Gaussian as behind the larger.
+fn blur_of(ratio: f32) -> f32 {
+    let [s, t] = SCALES;
+    let ratio = ratio.powi(2);
+    if ratio <= 1.0 {
+        return f32::INFINITY;
+    }
+    ((t * t - ratio * s * s) / (ratio - 1.0)).max(0.0).sqrt()
+}
+
+/// Weights of a Gaussian, from its middle to both sides.
+fn gaussian(deviation: f32) -> Vec<f32> {
+    let reach = (REACH * deviation).ceil() as i32;
+    let at = |i: i32| (-0.5 * (i as f32 / deviation).powi(2)).exp();
+    let total: f32 = (-reach..=reach).map(at).sum();
+    (-reach..=reach).map(|i| at(i) / total).collect()
+}
+
+/// Weights of its derivative: a ramp that rises by 1 a pixel gives 1.
+fn slope(deviation: f32) -> Vec<f32> {
+    let smooth = gaussian(deviation);
+    let offset = |i: usize| i as f32 - (smooth.len() / 2) as f32;
+    let weight = |i: usize| offset(i) * smooth[i];
+    let total: f32 = (0..smooth.len()).map(|i| offset(i) * weight(i)).sum();
+    (0..smooth.len()).map(|i| weight(i) / total).collect()
+}
+
+/// `part` of `image`, weighed along rows, then along columns. Beyond its border the image goes on as it ends.
+fn filtered<T: Sample>(
+    image: &Raster<T>,
+    part: PixelBox,
+    across: &[f32],
+    down: &[f32],
+) -> Raster<T> {
+    let beside = |at: usize, k: usize, taps: &[f32], length: usize| {
+        (at + k).saturating_sub(taps.len() / 2).min(length - 1)
+    };
+    let (width, height) = (image.width(), image.height());
+    let reach = down.len() / 2;
+    let first = part.y.saturating_sub(reach);
+    let last = (part.y + part.height + reach).min(height);
+    let mut wide = Raster::filled(part.width, last - first, T::default());
+    let rows = wide.pixels_mut().par_chunks_mut(part.width.max(1));
+    rows.enumerate().for_each(|(j, row)| {
+        let source = image.row(first + j);
+        for (i, pixel) in row.iter_mut().enumerate() {
+            for (k, &w) in across.iter().enumerate() {
+                *pixel += source[beside(part.x + i, k, across, width)] * w;
+            }
+        }
+    });
+    let mut out = Raster::filled(part.width, part.height, T::default());
+    let rows = out.pixels_mut().par_chunks_mut(part.width.max(1));
+    rows.enumerate().for_each(|(j, row)| {
+        for (k, &w) in down.iter().enumerate() {
+            let source = wide.row(beside(part.y + j, k, down, height) - first);
+            for (pixel, &value) in row.iter_mut().zip(source) {
+                *pixel += value * w;
+            }
+        }
+    });
+    out
+}
+
+/// Blurs `part` of `image` by a Gaussian of `deviation` pixels. `seen` is how much of each pixel counts, as of a thing that
+/// something hides: what is hidden does not leak, and hides as much as before.
+pub fn blur<T: Sample>(
+    image: &mut Raster<T>,
+    seen: Option<&Raster<f32>>,
+    part: PixelBox,
+    deviation: f32,
+) {
+    let taps = gaussian(deviation);
+    let blurred = filtered(image, part, &taps, &taps);
+    let counted = seen.map(|seen| filtered(seen, part, &taps, &taps));
+    let width = image.width();
+    for y in 0..part.height {
+        let start = (part.y + y) * width + part.x;
+        let row = &mut image.pixels_mut()[start..start + part.width];
+        for (x, pixel) in row.iter_mut().enumerate() {
+            let factor = match (seen, &counted) {
+                (Some(seen), Some(counted)) => {
+                    // What was hidden stays hidden: of all that counts here, as much as is seen.
+                    seen.get(part.x + x, part.y + y) / counted.get(x, y).max(1e-3)
+                }
+                _ => 1.0,
+            };
+            *pixel = *blurred.get(x, y) * factor;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+    use statrs::function::erf::erf;
+
+    const SIZE: usize = 256;
+
+    /// Bars at an angle whose edges are blurred by `blur_px`, each pixel the mean over its area.
+    fn bars(blur_px: f64) -> LinearImage {
+        const FINE: usize = 4;
+        let (sin, cos) = 0.4f64.sin_cos();
+        let cover = |x: f64, y: f64| {
+            let along = x * cos + y * sin;
+            let from_edge = (along / 32.0).rem_euclid(2.0) - 1.0;
+            // A rising edge in the middle of the period, a falling one where it ends.
+            let to_middle = 32.0 * from_edge;
+            let to_end = 32.0 - to_middle.abs();
+            let step = |d: f64| match blur_px > 0.0 {
+                true => 0.5 * (1.0 + erf(d / (blur_px * 2f64.sqrt()))),
+                false => f64::from(u8::from(d > 0.0)),
+            };
+            match to_middle.abs() < to_end {
+                true => step(to_middle),
+                false => step(to_middle.signum() * to_end),
+            }
+        };
+        let pixel = |i: usize| {
+            let fine = (0..FINE * FINE).map(|k| {
+                let [u, v] = [k % FINE, k / FINE].map(|c| (c as f64 + 0.5) / FINE as f64);
+                cover((i % SIZE) as f64 + u, (i / SIZE) as f64 + v)
+            });
+            let mean = fine.sum::<f64>() / (FINE * FINE) as f64;
+            Vec3::splat((0.1 + 0.7 * mean) as f32)
+        };
+        LinearImage(Raster::from_pixels(
+            SIZE,
+            SIZE,
+            (0..SIZE * SIZE).map(pixel).collect(),
+        ))
+    }
+
+    #[test]
+    fn the_blur_of_edges_is_found() {
+        // The area of a pixel blurs by sqrt(1 / 12). Where nothing else does, what is found depends on how the edge crosses
+        // the pixels (.4 to .6); from one pixel on it hardly does.
+        let sharp = edge_blur_px(&bars(0.0)).unwrap();
+        assert!((sharp - OF_PIXELS).abs() < 0.08, "{sharp}");
+        for blur_px in [1.0, 1.5, 2.0] {
+            let found = f64::from(edge_blur_px(&bars(blur_px)).unwrap());
+            let expected = blur_px.hypot((1.0f64 / 12.0).sqrt());
+            assert!((found / expected - 1.0).abs() < 0.08, "{found} {expected}");
+        }
+        let even = LinearImage(Raster::filled(SIZE, SIZE, Vec3::splat(0.4)));
+        assert_eq!(edge_blur_px(&even), None);
+        let tiny = LinearImage(Raster::filled(3, 2, Vec3::splat(0.4)));
+        assert_eq!(edge_blur_px(&tiny), None);
+    }
+
+    #[test]
+    fn a_blurred_layer_has_the_blur_that_was_asked_for() {
+        let mut layer = bars(0.0).0;
+        let part = PixelBox {
+            x: 0,
+            y: 0,
+            width: SIZE,
+            height: SIZE,
+        };
+        blur(&mut layer, None, part, 1.2);
+        let found = edge_blur_px(&LinearImage(layer)).unwrap();
+        let expected = 1.2f32.hypot((1.0f32 / 12.0).sqrt());
+        assert!((found / expected - 1.0).abs() < 0.08, "{found} {expected}");
+    }
+
+    #[test]
+    fn only_the_part_is_blurred_and_what_is_hidden_does_not_leak() {
+        let original = Raster::from_pixels(40, 30, (0..1200).map(|i| (i % 7) as f32).collect());
+        let part = PixelBox {
+            x: 5,
+            y: 6,
+            width: 20,
+            height: 11,
+        };
+        let (mut whole, mut within) = (original.clone(), original.clone());
+        blur(
+            &mut whole,
+            None,
+            PixelBox {
+                x: 0,
+                y: 0,
+                width: 40,
+                height: 30,
+            },
+            0.9,
+        );
+        blur(&mut within, None, part, 0.9);
+        for y in 0..30 {
+            for x in 0..40 {
+                let is_inside = (5..25).contains(&x) && (6..17).contains(&y);
+                let expected = if is_inside { &whole } else { &original };
+                assert_eq!(within.get(x, y), expected.get(x, y), "{x} {y}");
+            }
+        }
+        // An even object, hidden from column 20 on: it stays even, and ends where it ended.
+        let seen = Raster::from_pixels(
+            40,
+            30,
+            (0..1200)
+                .map(|i| f32::from(u8::from(i % 40 < 20)))
+                .collect(),
+        );
+        let mut object = seen.map(|s| 0.6 * s);
+        blur(
+            &mut object,
+            Some(&seen),
+            PixelBox {
+                x: 0,
+                y: 0,
+                width: 40,
+                height: 30,
+            },
+            1.5,
+        );
+        for (value, seen) in object.pixels().iter().zip(seen.pixels()) {
+            assert!((value - 0.6 * seen).abs() < 1e-5, "{value} {seen}");
+        }
+    }
+}

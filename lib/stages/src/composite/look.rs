@@ -1,0 +1,201 @@
+//! What the photograph's camera did to the photograph, done to object and shadow, too: blur and grain.
+use dipir_imaging::composite::composite_pixel;
+use dipir_imaging::file::Photo;
+use dipir_imaging::grain::Grain;
+use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_imaging::resize::PixelBox;
+use dipir_imaging::sharpness::{self, edge_blur_px};
+use dipir_imaging::transfer::Transfer;
+use glam::Vec3;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::table::CompositeTable;
+use crate::light::exposed;
+
+/// Less blur than this is not added, pixels: nobody sees it.
+const LEAST_BLUR_PX: f32 = 0.5;
+/// Most blur, pixels. Wider edges belong to things out of focus.
+const MOST_BLUR_PX: f32 = 3.0;
+
+/// How the photograph looks beside a rendered picture.
+pub(super) struct Look {
+    edge_blur_px: Option<f32>,
+    grain: Option<Grain>,
+    shown: Shown,
+}
+
+/// What was done, the content of `look.json`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Matched {
+    /// Standard deviation of the blur of the photograph's sharpest edges, pixels, .4 where there is none; absent where it was
+    /// not looked for, and where nothing tells it.
+    pub edge_blur_px: Option<f32>,
+    /// Standard deviation of the blur of object and shadow, pixels; absent if they were not blurred.
+    pub blur_px: Option<f32>,
+    /// Standard deviation of the grain on the object where it is mid-grey, of each channel, display values; absent if it got none.
+    pub grain: Option<[f32; 3]>,
+}
+
+/// From light to display values and back.
+#[derive(Clone, Copy)]
+struct Shown {
+    transfer: Transfer,
+    gain: f32,
+}
+
+impl Shown {
+    fn display(self, light: Vec3) -> Vec3 {
+        let values = (light * self.gain).to_array();
+        Vec3::from_array(values.map(|v| self.transfer.encode_scalar(v)))
+    }
+
+    /// `light` with `grain` added to its display values. Light that shows black or white stays.
+    fn with_grain(self, light: Vec3, display: Vec3, grain: Vec3) -> Vec3 {
+        Vec3::from_array(
+            [0, 1, 2].map(|c| match display[c] > 0.0 && display[c] < 1.0 {
+                true => self.transfer.decode_scalar(display[c] + grain[c]) / self.gain,
+                false => light[c],
+            }),
+        )
+    }
+}
+
+/// The layers that are laid over the photograph, of its size.
+pub(super) struct Overlay {
+    pub object: Raster<Vec3>,
+    pub alpha: Raster<f32>,
+    pub shadow: Raster<Vec3>,
+}
+
+impl Look {
+    /// Looks at the photograph as it was taken; `table` says for what.
+    pub fn of(taken: &Photo, table: &CompositeTable) -> Self {
+        let shown = Shown {
+            transfer: taken.transfer,
+            gain: exposed::gain(taken, &taken.image),
+        };
+        let grain = || Grain::of(&taken.image, |light| shown.display(light));
+        Self {
+            edge_blur_px: table
+                .matches_blur()
+                .then(|| edge_blur_px(&taken.image))
+                .flatten(),
+            grain: table.matches_grain().then(grain).flatten(),
+            shown,
+        }
+    }
+
+    /// Blurs the layers, and puts grain on the object. `hidden` is the mask of what stands in front of it; the layers were
+    /// rendered at one over `divisor` of the photograph's resolution.
+    pub fn apply(
+        &self,
+        layers: &mut Overlay,
+        background: &LinearImage,
+        hidden: Option<&Raster<f32>>,
+        divisor: u32,
+    ) -> Matched {
+        let blur_px = self.blur_px(divisor);
+        if let Some(blur_px) = blur_px {
+            layers.blur(hidden, blur_px, self.shown.gain.recip());
+        }
+        if let Some(grain) = &self.grain {
+            self.roughen(layers, background, grain);
+        }
+        let grain = self.grain.as_ref();
+        Matched {
+            edge_blur_px: self.edge_blur_px,
+            blur_px,
+            grain: grain.map(|g| g.deviation(Vec3::splat(0.5)).to_array()),
+        }
+    }
+
+    /// Blur that layers of pixels of `divisor` times the photograph's lack.
+    fn blur_px(&self, divisor: u32) -> Option<f32> {
+        let own = sharpness::OF_PIXELS * divisor as f32;
+        let wanted = self.edge_blur_px?.min(MOST_BLUR_PX);
+        let lacks = (wanted * wanted - own * own).max(0.0).sqrt();
+        (lacks >= LEAST_BLUR_PX).then_some(lacks)
+    }
+
+    fn roughen(&self, layers: &mut Overlay, background: &LinearImage, grain: &Grain) {
+        let width = layers.alpha.width();
+        let (alpha, shadow) = (layers.alpha.pixels(), layers.shadow.pixels());
+        let background = background.0.pixels();
+        let object = layers.object.pixels_mut().par_iter_mut().enumerate();
+        object.for_each(|(i, object)| {
+            if alpha[i] == 0.0 {
+                return;
+            }
+            let light = composite_pixel(background[i], *object, alpha[i], shadow[i]);
+            let display = self.shown.display(light);
+            let grain = grain.at(i % width, i / width, display) * alpha[i];
+            *object += self.shown.with_grain(light, display, grain) - light;
+        });
+    }
+}
+
+impl Overlay {
+    /// Blurs all layers where they change the photograph. Light above `white` stays where it is: a glint of a pixel would
+    /// become a disc, and so would its noise, which nobody sees beyond white.
+    fn blur(&mut self, hidden: Option<&Raster<f32>>, blur_px: f32, white: f32) {
+        let Some(part) = self.touched(2 + (3.0 * blur_px) as usize) else {
+            return;
+        };
+        let seen = hidden.map(|mask| mask.map(|m| 1.0 - m.clamp(0.0, 1.0)));
+        let seen = seen.as_ref();
+        let white = Vec3::splat(white);
+        let mut shown = self.object.map(|light| light.min(white));
+        sharpness::blur(&mut shown, seen, part, blur_px);
+        let object = self.object.pixels_mut().iter_mut();
+        for (light, shown) in object.zip(shown.pixels()) {
+            *light = (*light - white).max(Vec3::ZERO) + *shown;
+        }
+        sharpness::blur(&mut self.alpha, seen, part, blur_px);
+        // What is taken of the light, which is nothing where there is no shadow.
+        let mut taken = self.shadow.map(|s| *s - Vec3::ONE);
+        sharpness::blur(&mut taken, seen, part, blur_px);
+        self.shadow = taken.map(|t| Vec3::ONE + *t);
+    }
+
+    /// The pixels with something in them, and `margin` more to all sides.
+    fn touched(&self, margin: usize) -> Option<PixelBox> {
+        let (width, height) = (self.alpha.width(), self.alpha.height());
+        let is_touched =
+            |i: usize| self.alpha.pixels()[i] > 0.0 || self.shadow.pixels()[i] != Vec3::ONE;
+        let (mut left, mut right, mut top, mut bottom) = (width, 0, height, 0);
+        for i in (0..width * height).filter(|&i| is_touched(i)) {
+            let (x, y) = (i % width, i / width);
+            (left, right) = (left.min(x), right.max(x + 1));
+            (top, bottom) = (top.min(y), bottom.max(y + 1));
+        }
+        if left >= right {
+            return None;
+        }
+        let (x, y) = (left.saturating_sub(margin), top.saturating_sub(margin));
+        Some(PixelBox {
+            x,
+            y,
+            width: (right + margin).min(width) - x,
+            height: (bottom + margin).min(height) - y,
+        })
+    }
+}
+
+impl Matched {
+    /// One line on what was done, for people; none if nothing was.
+    pub fn text(&self) -> Option<String> {
+        let blur = self.blur_px.map(|px| format!("blurred by {px:.1} pixels"));
+        let grain = self.grain.map(|g| {
+            let percent = 100.0 * g.iter().sum::<f32>() / 3.0;
+            format!("grainy by {percent:.1}% of white")
+        });
+        let done = [blur, grain].into_iter().flatten().collect::<Vec<_>>();
+        (!done.is_empty()).then(|| {
+            format!(
+                "{} as the photograph is (composite.match_blur, composite.match_grain)",
+                done.join(" and ")
+            )
+        })
+    }
+}
