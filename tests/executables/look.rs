@@ -108,11 +108,22 @@ fn the_object_gets_the_photographs_blur_and_grain() {
 }
 
 #[test]
-fn a_soft_photograph_without_noise_blurs_the_object_alone() {
+fn a_soft_photograph_without_noise_blurs_the_object_alone_and_takes_fewer_pixels() {
     let project = Project::new();
     write_photograph(&project, 1.5, 0.0);
-    project.run_both(&[]);
-    let found = look(&project);
+    project.run(SCENE, &[]).expect_success();
+    let error = "composite.target_error=0.004";
+    let picture = |args: &[&str]| {
+        let run = project.run(COMPOSITE, &[&["-s", error], args].concat());
+        run.expect_success();
+        let picture = read_photo(project.path("out/composite/composite.png"), Transfer::Srgb);
+        (picture.unwrap().values.unwrap(), run.stdout, look(&project))
+    };
+    let (half, said, found) = picture(&[]);
+    assert!(
+        said.contains("1/2 of the photograph's resolution, enlarged: no softer"),
+        "{said}"
+    );
     // With the area of a pixel; the logistic curve is not quite the integral of a Gaussian.
     let expected = 1.5f64.hypot((1.0f64 / 12.0).sqrt());
     assert!(
@@ -120,9 +131,29 @@ fn a_soft_photograph_without_noise_blurs_the_object_alone() {
         "{found}"
     );
     assert!(
-        number(&found["blur_px"]) > 1.3 && found["grain"].is_null(),
+        number(&found["blur_px"]) > 1.0 && found["grain"].is_null(),
         "{found}"
     );
+    let (whole, said, found) = picture(&["-s", "composite.most_pixels=1000000"]);
+    assert!(
+        !said.contains("resolution") && number(&found["blur_px"]) > 1.3,
+        "{said}"
+    );
+    let (high, said, _) = picture(&["-s", "pipeline.quality=high"]);
+    assert!(!said.contains("resolution"), "{said}");
+    // Each has noise of .004 and is rounded by .001, which makes .006; and the same blur in another shape at edges.
+    for other in [&whole, &high] {
+        let pairs = half.pixels().iter().zip(other.pixels());
+        let (mut squares, mut touched) = (0.0, 0);
+        for (a, b) in pairs.filter(|(a, b)| a != b) {
+            squares += (0..3)
+                .map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2))
+                .sum::<f64>();
+            touched += 3;
+        }
+        let off = (squares / f64::from(touched)).sqrt() / 255.0;
+        assert!(off < 0.012, "{off}");
+    }
 }
 
 #[test]

@@ -58,6 +58,8 @@ pub struct CompositePreset {
     pub denoise: bool,
     /// Whether caustics on the object are blurred.
     pub blur_caustics: bool,
+    /// Whether object and shadow are rendered at no more pixels than the photograph's sharpness needs.
+    pub follow_sharpness: bool,
     /// Most pixels at which object and shadow are rendered.
     pub most_pixels: Option<u64>,
 }

@@ -1,4 +1,6 @@
 //! What the photograph's camera did to the photograph, done to object and shadow, too: blur and grain.
+use std::ops::Range;
+
 use dipir_imaging::composite::composite_pixel;
 use dipir_imaging::file::Photo;
 use dipir_imaging::grain::Grain;
@@ -8,7 +10,7 @@ use dipir_imaging::sharpness::{self, edge_blur_px};
 use dipir_imaging::transfer::Transfer;
 use glam::Vec3;
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::table::CompositeTable;
 use crate::light::exposed;
@@ -26,7 +28,8 @@ pub(super) struct Look {
 }
 
 /// What was done, the content of `look.json`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Matched {
     /// Standard deviation of the blur of the photograph's sharpest edges, pixels, .4 where there is none; absent where it was
     /// not looked for, and where nothing tells it.
@@ -66,6 +69,15 @@ pub(super) struct Overlay {
     pub object: Raster<Vec3>,
     pub alpha: Raster<f32>,
     pub shadow: Raster<Vec3>,
+}
+
+/// Blur of edges that are rendered at one over `divisor` of the resolution, pixels. Enlarged, an edge is blurred by a box of
+/// `divisor` pixels and a tent of twice that: their standard deviation is half of `divisor`.
+fn own_blur_px(divisor: u32) -> f32 {
+    match divisor {
+        1 => sharpness::OF_PIXELS,
+        _ => 0.5 * divisor as f32,
+    }
 }
 
 impl Look {
@@ -110,9 +122,18 @@ impl Look {
         }
     }
 
-    /// Blur that layers of pixels of `divisor` times the photograph's lack.
+    /// Pixels of a picture of `resolution` that are as sharp as the photograph: those of the whole one, a quarter of them, and
+    /// so on. `None` where it is not known how sharp it is.
+    pub fn enough_pixels(&self, resolution: [u32; 2]) -> Option<u64> {
+        let blur_px = self.edge_blur_px?.min(MOST_BLUR_PX);
+        let divisor = [4, 2].into_iter().find(|&d| own_blur_px(d) <= blur_px);
+        let [width, height] = resolution.map(|n| u64::from(n.div_ceil(divisor.unwrap_or(1))));
+        Some(width * height)
+    }
+
+    /// Blur that layers which were rendered at one over `divisor` of the resolution lack.
     fn blur_px(&self, divisor: u32) -> Option<f32> {
-        let own = sharpness::OF_PIXELS * divisor as f32;
+        let own = own_blur_px(divisor);
         let wanted = self.edge_blur_px?.min(MOST_BLUR_PX);
         let lacks = (wanted * wanted - own * own).max(0.0).sqrt();
         (lacks >= LEAST_BLUR_PX).then_some(lacks)
@@ -145,17 +166,26 @@ impl Overlay {
         let seen = hidden.map(|mask| mask.map(|m| 1.0 - m.clamp(0.0, 1.0)));
         let seen = seen.as_ref();
         let white = Vec3::splat(white);
-        let mut shown = self.object.map(|light| light.min(white));
-        sharpness::blur(&mut shown, seen, part, blur_px);
-        let object = self.object.pixels_mut().iter_mut();
-        for (light, shown) in object.zip(shown.pixels()) {
-            *light = (*light - white).max(Vec3::ZERO) + *shown;
+        let width = self.alpha.width();
+        let rows = (part.y..part.y + part.height).map(|y| y * width + part.x);
+        let inside: Vec<Range<usize>> = rows.map(|start| start..start + part.width).collect();
+        let mut beyond_white = Vec::with_capacity(part.width * part.height);
+        for row in &inside {
+            for light in &mut self.object.pixels_mut()[row.clone()] {
+                beyond_white.push((*light - white).max(Vec3::ZERO));
+                *light = light.min(white);
+            }
+        }
+        sharpness::blur(&mut self.object, seen, part, blur_px);
+        let object = self.object.pixels_mut();
+        for (i, beyond) in inside.into_iter().flatten().zip(beyond_white) {
+            object[i] += beyond;
         }
         sharpness::blur(&mut self.alpha, seen, part, blur_px);
-        // What is taken of the light, which is nothing where there is no shadow.
-        let mut taken = self.shadow.map(|s| *s - Vec3::ONE);
-        sharpness::blur(&mut taken, seen, part, blur_px);
-        self.shadow = taken.map(|t| Vec3::ONE + *t);
+        // Where there is no shadow, nothing of the light is missing.
+        self.shadow.pixels_mut().iter_mut().for_each(|s| *s -= 1.0);
+        sharpness::blur(&mut self.shadow, seen, part, blur_px);
+        self.shadow.pixels_mut().iter_mut().for_each(|s| *s += 1.0);
     }
 
     /// The pixels with something in them, and `margin` more to all sides.
@@ -183,19 +213,14 @@ impl Overlay {
 }
 
 impl Matched {
-    /// One line on what was done, for people; none if nothing was.
+    /// What was done, for people: a clause of which object and shadow are the subject; `None` if nothing was.
     pub fn text(&self) -> Option<String> {
         let blur = self.blur_px.map(|px| format!("blurred by {px:.1} pixels"));
         let grain = self.grain.map(|g| {
             let percent = 100.0 * g.iter().sum::<f32>() / 3.0;
             format!("grainy by {percent:.1}% of white")
         });
-        let done = [blur, grain].into_iter().flatten().collect::<Vec<_>>();
-        (!done.is_empty()).then(|| {
-            format!(
-                "{} as the photograph is (composite.match_blur, composite.match_grain)",
-                done.join(" and ")
-            )
-        })
+        let done: Vec<String> = [blur, grain].into_iter().flatten().collect();
+        (!done.is_empty()).then(|| format!("{} as the photograph is", done.join(" and ")))
     }
 }

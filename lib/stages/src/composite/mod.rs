@@ -1,4 +1,5 @@
 //! The composite stage: the object at full quality, its shadow, and the layers of both.
+mod curve;
 mod lens;
 mod look;
 pub mod table;
@@ -13,7 +14,7 @@ use anyhow::bail;
 use dipir_cli::output::json_path;
 use dipir_cli::session::{Session, duration};
 use dipir_imaging::composite::{composite, composite_pixel};
-use dipir_imaging::file::{Photo, write_picture};
+use dipir_imaging::file::write_picture;
 use dipir_imaging::layer_rows::{LayerRows, Packing};
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::{LinearImage, Raster};
@@ -27,7 +28,6 @@ use dipir_render::coarse::divisor_for;
 use dipir_render::film::Film;
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings};
-use glam::Vec3;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
@@ -36,11 +36,13 @@ use crate::known_light::{self, Light};
 use crate::light::folder::{self as light_folder, Recovered};
 use crate::light::{exposed, materials};
 use crate::names::{COMPOSITE, begin};
-use crate::presets::{CompositePreset, Outlook, Preset};
+use crate::presets::{self, CompositePreset, Outlook, Preset};
 use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::written;
-use look::{Look, Matched, Overlay};
-use table::{CompositeTable, MAX_SAMPLES, Tone};
+use curve::Curve;
+pub use look::Matched;
+use look::{Look, Overlay};
+use table::{CompositeTable, MAX_SAMPLES};
 
 /// When to stop, from the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -61,6 +63,8 @@ pub struct Done {
     target: Stop,
     /// Object and shadow were rendered at one over this of the photograph's resolution.
     divisor: u32,
+    /// That is as sharp as the photograph.
+    is_sharp_enough: bool,
     matched: Matched,
     /// From the start of the run to its end.
     seconds: f64,
@@ -124,9 +128,13 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let mut writer = begin(session, plan(session, &table)?)?;
     let curve = Curve::of(table.tone, &light, inputs.scene.loaded.taken());
     let look = Look::of(inputs.scene.loaded.taken(), &table);
+    let resolution = inputs.scene.loaded.scene.camera.resolution;
+    let enough = look.enough_pixels(resolution);
+    let preset = &presets::of(session.pipeline.quality).composite;
     let course = render(
         session,
         &table,
+        table.most_pixels(preset, enough),
         within(stop, clock, &inputs),
         &inputs,
         &light,
@@ -162,14 +170,13 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let error = rendered.error.upper_95;
     // What is not spent on samples stays.
     let foresight = &rendered.foresight;
-    let resolution = inputs.scene.loaded.scene.camera.resolution;
     let pixels_of = |most: Option<u64>| f64::from(divisor_for(resolution, most)).powi(-2);
     let here = f64::from(rendered.divisor).powi(-2);
     let denoises = |preset: &CompositePreset| table.denoise.unwrap_or(preset.denoise);
     // The same error takes as many samples a pixel at any resolution.
     let with_preset = |preset: &Preset| {
         let preset = &preset.composite;
-        let pixels = pixels_of(table.most_pixels.or(preset.most_pixels)) / here;
+        let pixels = pixels_of(table.most_pixels(preset, enough)) / here;
         let cost = foresight.cost_with(preset.target_error.into(), denoises(preset));
         seconds + course.seconds * (pixels * cost - 1.0)
     };
@@ -193,6 +200,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         error,
         target: stop,
         divisor: rendered.divisor,
+        is_sharp_enough: divisor_for(resolution, enough) >= rendered.divisor,
         matched: layers.matched,
         seconds,
         outlook,
@@ -257,7 +265,7 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
         "match_blur": table.matches_blur(),
         "match_grain": table.matches_grain(),
         "blur_caustics": table.blur_caustics(session.pipeline.quality),
-        "most_pixels": table.most_pixels(session.pipeline.quality),
+        "most_pixels": table.most_pixels(&presets::of(session.pipeline.quality).composite, None),
         "stop": match table.stop(session.pipeline.quality) {
             Stop::Samples(n) => json!({"samples": n}),
             Stop::TargetError(e) => json!({"target_error": e}),
@@ -277,6 +285,7 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
 fn render(
     session: &Session,
     table: &CompositeTable,
+    most_pixels: Option<u64>,
     stop: Stop,
     inputs: &Inputs,
     light: &Source,
@@ -285,15 +294,23 @@ fn render(
     match light {
         Source::Map(light) => {
             let map = EnvironmentSampler::new(light.map.clone());
-            render_under(session, table, stop, inputs, &map, tone)
+            render_under(session, table, most_pixels, stop, inputs, &map, tone)
         }
         Source::Recovered(light) => match &light.surroundings {
             Some(map) => {
                 let map = EnvironmentSampler::new(Arc::new(map.clone()));
                 let light = MapWithLobes::new(map, light.lobes.clone());
-                render_under(session, table, stop, inputs, &light, tone)
+                render_under(session, table, most_pixels, stop, inputs, &light, tone)
             }
-            None => render_under(session, table, stop, inputs, &light.lobes, tone),
+            None => render_under(
+                session,
+                table,
+                most_pixels,
+                stop,
+                inputs,
+                &light.lobes,
+                tone,
+            ),
         },
     }
 }
@@ -301,6 +318,7 @@ fn render(
 fn render_under<L: SceneLight>(
     session: &Session,
     table: &CompositeTable,
+    most_pixels: Option<u64>,
     stop: Stop,
     inputs: &Inputs,
     light: &L,
@@ -316,7 +334,7 @@ fn render_under<L: SceneLight>(
         max_samples: table.max_samples.unwrap_or(MAX_SAMPLES),
         denoise: table.denoise(session.pipeline.quality),
         blur_caustics: table.blur_caustics(session.pipeline.quality),
-        most_pixels: table.most_pixels(session.pipeline.quality),
+        most_pixels,
         leave_out: effects.leave_out(loaded.description.effects()),
         tone,
         gain: exposed::gain(loaded.taken(), &loaded.photo.image),
@@ -457,58 +475,6 @@ impl<'a> Composite<'a> {
     }
 }
 
-/// What is done to the light of the object and to the shadow before they are laid over the
-/// photograph.
-enum Curve {
-    None,
-    /// On the object's own colour, which is `rgb / alpha`.
-    Object(Box<ToneCurves>),
-    /// Reinhard and a spline on the object, a spline per channel on the shadow.
-    Recovered(Box<ToneCurves>),
-}
-
-impl Curve {
-    /// The table's, else the one that was recovered with the light, else none.
-    fn of(tone: Option<Tone>, light: &Source, taken: &Photo) -> Self {
-        match (tone, light) {
-            (Some(tone), _) => match tone.curves() {
-                Some(curves) => Self::Object(Box::new(curves)),
-                None => Self::None,
-            },
-            (None, Source::Map(_)) => Self::None,
-            (None, Source::Recovered(light)) => match exposed::tone(taken, light.tone) {
-                Some(tone) => Self::Recovered(Box::new(tone)),
-                None => Self::None,
-            },
-        }
-    }
-
-    /// The curves, if there are any.
-    fn curves(&self) -> Option<&ToneCurves> {
-        match self {
-            Self::None => None,
-            Self::Object(curves) | Self::Recovered(curves) => Some(curves),
-        }
-    }
-
-    fn apply(
-        &self,
-        object: Raster<Vec3>,
-        alpha: &Raster<f32>,
-        shadow: Raster<Vec3>,
-    ) -> (Raster<Vec3>, Raster<Vec3>) {
-        let object = LinearImage(object);
-        match self {
-            Self::None => (object.0, shadow),
-            Self::Object(curves) => (curves.apply_object(&object, alpha).0, shadow),
-            Self::Recovered(curves) => (
-                curves.apply_object(&object, alpha).0,
-                curves.apply_shadow(&LinearImage(shadow)).0,
-            ),
-        }
-    }
-}
-
 impl Done {
     /// For programs.
     pub fn to_json(&self) -> Value {
@@ -545,15 +511,21 @@ impl fmt::Display for Done {
             self.rays as f64 * 1e-6
         )?;
         if self.divisor > 1 {
+            let edges = match self.is_sharp_enough {
+                true => "no softer than the photograph is",
+                false => "edges are soft, which the error does not count",
+            };
             write!(
                 f,
-                "\n  object and shadow at 1/{} of the photograph's resolution, enlarged: edges are soft, which the error \
-                 does not count",
+                "\n  object and shadow at 1/{} of the photograph's resolution, enlarged: {edges}",
                 self.divisor
             )?;
         }
         if let Some(matched) = self.matched.text() {
-            write!(f, "\n  {matched}")?;
+            write!(
+                f,
+                "\n  {matched} (composite.match_blur, composite.match_grain)"
+            )?;
         }
         if let Stop::TimeBudget(budget) = self.target {
             let (budget, share) = (budget.as_secs_f64(), self.seconds / budget.as_secs_f64());

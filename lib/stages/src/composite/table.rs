@@ -11,7 +11,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::known_light::Placement;
-use crate::presets;
+use crate::presets::{self, CompositePreset};
 
 /// The `[composite]` table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -41,7 +41,7 @@ pub struct CompositeTable {
     pub max_samples: Option<u32>,
     /// Most pixels at which object and shadow are rendered: in a larger photograph they are rendered at a half, a quarter
     /// and so on of its resolution, and enlarged. A time budget chooses the resolution itself.
-    #[schemars(range(min = 1), extend("x-default" = "none; 1048576 for the preset `draft`"), example = 4000000)]
+    #[schemars(range(min = 1), extend("x-default" = "as many as the photograph is sharp for; 1048576 for the preset `draft`; none for `high`"), example = 4000000)]
     pub most_pixels: Option<u64>,
     /// Whether noise is removed from object and shadow. What that does to the error is measured and stated.
     #[schemars(extend("x-default" = "true; false for the preset `high`"), example = false)]
@@ -171,14 +171,12 @@ impl CompositeTable {
         self.blur_caustics.unwrap_or(by_preset)
     }
 
-    /// Most pixels at which object and shadow are rendered; a time budget chooses the resolution itself.
-    pub(super) fn most_pixels(&self, quality: Quality) -> Option<u64> {
-        match self.time_budget_s {
-            Some(_) => None,
-            None => self
-                .most_pixels
-                .or(presets::of(quality).composite.most_pixels),
-        }
+    /// Most pixels at which object and shadow are rendered with `preset`, where the photograph is as sharp as `enough`
+    /// pixels would be. A time budget chooses the resolution itself.
+    pub(super) fn most_pixels(&self, preset: &CompositePreset, enough: Option<u64>) -> Option<u64> {
+        let enough = enough.filter(|_| preset.follow_sharpness);
+        let by_preset = [preset.most_pixels, enough].into_iter().flatten().min();
+        self.most_pixels.or(by_preset)
     }
 
     pub(super) fn stop(&self, quality: Quality) -> Stop {

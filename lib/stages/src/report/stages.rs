@@ -7,6 +7,7 @@ use dipir_render::effects::EffectsPlan;
 
 use super::html::{self, Html};
 use super::{Report, Section, json};
+use crate::composite::Matched;
 use crate::names::{COMPOSITE, LIGHT, SCENE};
 
 /// Every stage with its state, error, time and memory.
@@ -111,10 +112,18 @@ pub fn effects(report: &Report) -> Section {
         optional(plan.left_out_upper_95),
         rays.join(", ")
     );
-    Ok(Some(Html::all([
-        html::table(&heads, rows.collect()),
-        Html::element("p", &[("class", "soft")], [Html::text(note)]),
-    ])))
+    let look = match run.1.output(&run.0, "look").is_ok() {
+        true => json::<Matched>(&run, "look")?.text(),
+        false => None,
+    };
+    let look = look.map(|look| format!("The object is {look} (look.json)."));
+    let notes = [note].into_iter().chain(look);
+    let notes = notes.map(|note| Html::element("p", &[("class", "soft")], [Html::text(note)]));
+    Ok(Some(Html::all(
+        [html::table(&heads, rows.collect())]
+            .into_iter()
+            .chain(notes),
+    )))
 }
 
 /// A command for every stage.
