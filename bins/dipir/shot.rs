@@ -131,21 +131,21 @@ fn frames(
     let (mut frames, mut told) = (Vec::<Frame>::new(), Vec::new());
     let stands_still = shot::camera_stands_still(session)?;
     let mut assumed = BTreeSet::new();
-    for path in &args.frames {
+    let overrides = shot::overrides(session, &args.frames, stands_still, |words, is_doubtful| {
+        // Of all frames it mostly is the same.
+        if !assumed.insert(words.clone()) {
+            return;
+        }
+        match is_doubtful {
+            true => session.warn(&words),
+            false => session.remark(|| words),
+        }
+    });
+    for (path, overrides) in args.frames.iter().zip(overrides?) {
         let name = name(path)?;
         told.push(shot::exposure_stops(session, path)?);
         let mut frame = base.clone();
-        let overrides = shot::overrides(session, path, stands_still, |words, is_doubtful| {
-            // Of all frames it mostly is the same.
-            if !assumed.insert(words.clone()) {
-                return;
-            }
-            match is_doubtful {
-                true => session.warn(&words),
-                false => session.remark(|| words),
-            }
-        });
-        frame.set.extend(overrides?);
+        frame.set.extend(overrides);
         frame.out = Some(session.out.join(shot::FOLDER).join(name));
         if frames.iter().any(|(_, other)| other.out == frame.out) {
             let message = format!("{}: another frame has the same name", path.display());

@@ -1,12 +1,13 @@
 //! Numbers in the buffers of a glTF file.
 use std::borrow::Cow;
 use std::cell::OnceCell;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
 use base64::Engine;
 use base64::alphabet::STANDARD;
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use glam::DVec4;
+use percent_encoding::percent_decode_str;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -181,23 +182,32 @@ pub(crate) fn files(path: &Path) -> Vec<PathBuf> {
     files.filter(|path| path.is_file()).collect()
 }
 
-/// The file that a relative address names in `folder` itself.
+/// The file that a relative address names, if a document in `folder` may name it: one there or below, or by `..` a buffer.
 fn beside(folder: &Path, uri: &str) -> Option<PathBuf> {
-    let mut bytes = Vec::new();
-    let mut rest = uri.as_bytes();
-    while let [first, after @ ..] = rest {
-        let code = after.get(..2).and_then(|hex| std::str::from_utf8(hex).ok());
-        let code = code.and_then(|hex| u8::from_str_radix(hex, 16).ok());
-        let escaped = code.filter(|_| *first == b'%');
-        bytes.push(escaped.unwrap_or(*first));
-        rest = &after[if escaped.is_some() { 2 } else { 0 }..];
+    let path = percent_decode_str(uri).decode_utf8().ok()?;
+    let path = Path::new(&*path);
+    let found = folder.join(path);
+    // A path with a root is one of the machine that wrote it.
+    if path.has_root() || path.file_name().is_none() {
+        return None;
     }
-    let path = PathBuf::from(String::from_utf8(bytes).ok()?);
-    let mut names = path.components().filter(|c| *c != Component::CurDir);
-    match (names.next(), names.next()) {
-        (Some(Component::Normal(name)), None) => Some(folder.join(name)),
-        _ => None,
-    }
+    let whole = [&found, &folder.join(".")].map(|path| path.canonicalize().ok());
+    let is_outside = matches!(&whole, [Some(file), Some(folder)] if !file.starts_with(folder));
+    // One that is missing is told where it is read.
+    (!is_outside || is_buffer(&found)).then_some(found)
+}
+
+/// Whether a file is called as a glTF's buffers are, links followed. It may lie anywhere that a relative path leads to: it can
+/// be nothing else, and only its numbers are used.
+pub fn is_buffer(file: &Path) -> bool {
+    // The name is that of the file itself.
+    let found = file.canonicalize();
+    let extension = found.as_deref().ok().and_then(Path::extension);
+    extension.is_some_and(|e| {
+        ["bin", "glbin", "glbuf"]
+            .iter()
+            .any(|own| e.eq_ignore_ascii_case(own))
+    })
 }
 
 /// Entry `index` of a list of the document.
@@ -251,12 +261,46 @@ mod tests {
     }
 
     #[test]
-    fn buffers_are_files_of_the_same_folder() {
-        let of = |uri| beside(Path::new("a"), uri);
-        assert_eq!(of("my%20scene.bin"), Some("a/my scene.bin".into()));
-        assert_eq!(of("./100%.bin"), Some("a/100%.bin".into()));
-        for outside in ["../b.bin", "/b.bin", "b/c.bin", "%2e%2e/b.bin", "%ff", ""] {
+    fn buffers_lie_in_the_folder_or_below_or_are_called_so_elsewhere() {
+        let all = tempfile::tempdir().unwrap();
+        let folder = all.path().join("a");
+        std::fs::create_dir_all(folder.join("b")).unwrap();
+        for name in ["keys.bin", "secret", "a/b/keys"] {
+            std::fs::write(all.path().join(name), "").unwrap();
+        }
+        let of = |uri| beside(&folder, uri);
+        for (uri, file) in [
+            ("my%20scene.bin", "my scene.bin"),
+            ("./100%.bin", "100%.bin"),
+            ("b/keys", "b/keys"),
+            ("gone/keys.bin", "gone/keys.bin"),
+            ("%2e%2e/keys.bin", "../keys.bin"),
+            ("../a/b/keys", "../a/b/keys"),
+        ] {
+            assert_eq!(of(uri), Some(folder.join(file)), "{uri}");
+        }
+        let absolute = folder.join("b/keys");
+        for outside in [
+            "../secret",
+            "b/../../secret",
+            absolute.to_str().unwrap(),
+            "%ff",
+            "..",
+            "",
+        ] {
             assert_eq!(of(outside), None, "{outside}");
         }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn the_name_of_a_buffer_is_that_of_the_file_and_not_of_a_link() {
+        let all = tempfile::tempdir().unwrap();
+        let folder = all.path().join("a");
+        std::fs::create_dir(&folder).unwrap();
+        std::fs::write(all.path().join("secret"), "").unwrap();
+        std::os::unix::fs::symlink("../secret", folder.join("keys.bin")).unwrap();
+        assert_eq!(beside(&folder, "keys.bin"), None);
+        assert_eq!(beside(&folder, "../a/keys.bin"), None);
     }
 }

@@ -9,6 +9,7 @@ use crate::chan::Turns;
 use crate::error::CameraError;
 use crate::{buffers, chan, colmap, foreign, fspy, kitti, moving, nuscenes, opencv, transforms};
 
+pub use crate::buffers::is_buffer;
 pub use crate::moving::Shown;
 pub use crate::upright::doubt;
 
@@ -122,21 +123,33 @@ pub fn has_one(path: &Path) -> bool {
     found(path, &wanted).is_ok()
 }
 
-/// The frame that `photo` shows of a camera of the glTF file at `path` that moves: of the one with this `name` or, without
-/// one, of the one that [`Which::Photo`] means. `None` if it stands still, and of other files.
+/// The frame that each of `photos` shows of a camera of the glTF file at `path` that moves: of the one with this `name` or,
+/// without one, of the one that [`Which::Photo`] means. `None` if it stands still, and of other files.
 ///
 /// # Errors
 /// As [`read`].
-pub fn shown(path: &Path, name: Option<&str>, photo: &Path) -> Result<Option<Shown>, CameraError> {
+pub fn all_shown(
+    path: &Path,
+    name: Option<&str>,
+    photos: &[PathBuf],
+) -> Result<Vec<Option<Shown>>, CameraError> {
     if !is_gltf(path) {
-        return Ok(None);
+        return Ok(vec![None; photos.len()]);
     }
     let cannot_read = |source| CameraError::Read {
         path: path.into(),
         source,
     };
     let bytes = dipir_files::read(path).map_err(cannot_read)?;
-    moving::shown(&bytes, path.parent(), name, photo)
+    moving::shown(&bytes, path.parent(), name, photos)
+}
+
+/// As [`all_shown`], of one photo.
+///
+/// # Errors
+/// As [`read`].
+pub fn shown(path: &Path, name: Option<&str>, photo: &Path) -> Result<Option<Shown>, CameraError> {
+    Ok(all_shown(path, name, &[photo.into()])?.pop().flatten())
 }
 
 /// Whether this is the name of a glTF file, of which a camera may move.

@@ -3,8 +3,9 @@
 //! An animation has keys at times, in seconds. Exporters that write a key for each frame, as Blender does unless it is told
 //! otherwise, write the number of the frame over the rate, `k / fps`, or count from the first frame. So the rate is that of
 //! the keys, and the numbers in the names of pictures are those of the keys, or both begin together.
-use std::collections::BTreeMap;
-use std::path::Path;
+use std::collections::btree_map::{BTreeMap, Entry};
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
 
 use glam::{DMat4, DQuat, DVec4};
 use serde::Deserialize;
@@ -106,7 +107,7 @@ pub fn read(bytes: &[u8], folder: Option<&Path>, wanted: &Wanted) -> Result<Came
     let number = match wanted.which {
         Which::Frame(_, n) => n,
         Which::Number(n) if is_one => n,
-        Which::Photo(path) => frames.shown(path)?.frame,
+        Which::Photo(path) => frames.shown(path, &mut Numbers::new())?.frame,
         Which::Number(_) | Which::Name(_) => {
             let detail = format!("the camera moves, with {}", frames.words());
             let remedy = "say which by its name and the number of the frame, for instance image = \"Camera\" with frame = 1";
@@ -116,26 +117,34 @@ pub fn read(bytes: &[u8], folder: Option<&Path>, wanted: &Wanted) -> Result<Came
     motion.camera(frames.time_s(i64::from(number)))
 }
 
-/// The frame that `photo` shows of the camera with this `name` or, without one, of the one that [`Which::Photo`] means;
-/// `None` if it stands still.
+/// The frame that each of `photos` shows of the camera with this `name` or, without one, of the one that [`Which::Photo`]
+/// means; `None` if it stands still.
 pub(crate) fn shown(
     bytes: &[u8],
     folder: Option<&Path>,
     name: Option<&str>,
-    photo: &Path,
-) -> Result<Option<Shown>, CameraError> {
-    let wanted = Wanted {
-        // Of any picture, as its frame does not depend on it.
-        size: [1e3, 1e3],
-        which: name.map_or(Which::Photo(photo), Which::Name),
-        up: None,
-        fov_deg: None,
-        turns: None,
-    };
+    photos: &[PathBuf],
+) -> Result<Vec<Option<Shown>>, CameraError> {
     let file = File::parse(bytes)?;
-    let seat = file::by_names(file.cameras(wanted.size)?, &wanted, FORMAT)??;
-    let frames = Motion::of(&file, &seat, folder)?.frames()?;
-    frames.map(|frames| frames.shown(photo)).transpose()
+    let (mut known, mut numbers) = (BTreeMap::new(), Numbers::new());
+    let mut of = |photo: &PathBuf| {
+        let wanted = Wanted {
+            // Of any picture, as its frame does not depend on it.
+            size: [1e3, 1e3],
+            which: name.map_or(Which::Photo(photo), Which::Name),
+            up: None,
+            fov_deg: None,
+            turns: None,
+        };
+        let seat = file::by_names(file.cameras(wanted.size)?, &wanted, FORMAT)??;
+        let frames: &Option<Frames> = match known.entry(seat.node) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(new) => new.insert(Motion::of(&file, &seat, folder)?.frames()?),
+        };
+        let shown = |frames: &Frames| frames.shown(photo, &mut numbers);
+        frames.as_ref().map(shown).transpose()
+    };
+    photos.iter().map(&mut of).collect()
 }
 
 impl Motion {
@@ -350,8 +359,8 @@ impl Frames {
         format!("frames {} to {} at {rate} a second", self.first, self.last)
     }
 
-    /// The frame that `photo` shows, which other pictures of its folder tell, too.
-    fn shown(&self, photo: &Path) -> Result<Shown, CameraError> {
+    /// The frame that `photo` shows, which other pictures of its folder tell, too; `known` are those of earlier photos.
+    fn shown(&self, photo: &Path, known: &mut Numbers) -> Result<Shown, CameraError> {
         let name = photo.file_name().unwrap_or_default();
         let Some(number) = file::number(photo) else {
             let detail = format!(
@@ -362,7 +371,7 @@ impl Frames {
                 "name the picture by it (plate.1001.png), or say which, for instance frame = 1";
             return Err(CameraError::with_remedy(FORMAT, detail, remedy));
         };
-        let [low, high] = numbers_beside(photo, number);
+        let [low, high] = numbers_beside(photo, number, known);
         // Either has all of the other: they are counted alike.
         let holds = |a: [i64; 2], b: [i64; 2]| a[0] <= b[0] && b[1] <= a[1];
         let (own, all) = ([self.first, self.last], [low, high]);
@@ -398,20 +407,28 @@ impl Frames {
     }
 }
 
+/// The lowest and the highest number of the pictures in a folder whose names are alike but for them, by both.
+type Numbers = BTreeMap<(PathBuf, Option<(String, OsString)>), [i64; 2]>;
+
 /// The lowest and the highest number of the pictures in the folder of `photo`, of that `number`, whose names are as its own.
-fn numbers_beside(photo: &Path, number: i64) -> [i64; 2] {
+fn numbers_beside(photo: &Path, number: i64, known: &mut Numbers) -> [i64; 2] {
     let head = |path: &Path| {
         let stem = path.file_stem()?.to_str()?.to_owned();
         let head = stem.trim_end_matches(|c: char| c.is_ascii_digit());
         Some((head.to_owned(), path.extension()?.to_owned()))
     };
-    let own = head(photo);
-    let folder = photo.parent().map(Path::read_dir);
-    let beside = folder.into_iter().flatten().flatten().flatten();
-    let beside = beside.map(|entry| entry.path());
-    let numbers = beside.filter(|path| head(path) == own);
-    let numbers = numbers.filter_map(|path| file::number(&path));
-    numbers.fold([number; 2], |[low, high], n| [low.min(n), high.max(n)])
+    let (own, folder) = (head(photo), photo.parent().unwrap_or(Path::new("")));
+    let widen = |[low, high]: [i64; 2], n: i64| [low.min(n), high.max(n)];
+    let all = known
+        .entry((folder.into(), own.clone()))
+        .or_insert_with(|| {
+            let beside = folder.read_dir().into_iter().flatten().flatten();
+            let beside = beside.map(|entry| entry.path());
+            let numbers = beside.filter(|path| head(path) == own);
+            let numbers = numbers.filter_map(|path| file::number(&path));
+            numbers.fold([number; 2], widen)
+        });
+    widen(*all, number)
 }
 
 /// The rate that is meant by one of keys from `start` to `end` that are rounded to single precision: a whole number, or

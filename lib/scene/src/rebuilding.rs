@@ -9,6 +9,7 @@ use crate::config::EffectsConfig;
 use crate::description::{ObjectRecord, ProxyRecord, SceneDescription};
 use crate::error::Error;
 use crate::ground;
+use crate::import::once;
 use crate::proxy::Proxy;
 use crate::scene::{Files, LoadedScene, undistort};
 use crate::undistortion::Undistortion;
@@ -52,7 +53,7 @@ impl SceneDescription {
             lights,
             inputs: files.inputs.list,
             missing: files.missing.list,
-            warnings: files.warnings,
+            warnings: once(files.warnings),
         })
     }
 

@@ -19,7 +19,7 @@ use crate::description::{
 use crate::error::Error;
 use crate::features::SceneFeatures;
 use crate::ground::{self, Places};
-use crate::import::{self, Imported};
+use crate::import::{self, Imported, once};
 use crate::light::PunctualLight;
 use crate::limits::Limits;
 use crate::material::Material;
@@ -310,7 +310,7 @@ impl Scene {
             lights,
             inputs: files.inputs.list,
             missing: files.missing.list,
-            warnings: files.warnings,
+            warnings: once(files.warnings),
         })
     }
 
@@ -362,13 +362,9 @@ impl<'a> Files<'a> {
         }
     }
 
-    /// Adds warnings, each once, with the names in them made printable.
+    /// Adds warnings, with the names in them made printable.
     pub(crate) fn warn(&mut self, warnings: impl IntoIterator<Item = String>) {
-        for warning in warnings.into_iter().map(printable) {
-            if !self.warnings.contains(&warning) {
-                self.warnings.push(warning);
-            }
-        }
+        self.warnings.extend(warnings.into_iter().map(printable));
     }
 
     pub(crate) fn input(&mut self, role: &str, path: &Path) {

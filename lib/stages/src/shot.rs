@@ -84,19 +84,64 @@ pub fn exposed(session: &Session, stops: f64, tint: [f64; 3]) -> anyhow::Result<
     Ok(set)
 }
 
-/// What sets the frame in `path` in place of the session's photograph, as `KEY=VALUE`. The camera is its own, unless it
+/// What sets each of `frames` in place of the session's photograph, as `KEY=VALUE`. The camera is its own, unless it
 /// `stands_still`. `tell` hears what is assumed of it, and whether that is a warning.
 ///
 /// # Errors
 /// If there is no such file or mask, if it is of a format that is not read, or its camera cannot be told from the configuration.
 pub fn overrides(
     session: &Session,
-    path: &Path,
+    frames: &[PathBuf],
     stands_still: bool,
     tell: impl FnMut(String, bool),
-) -> anyhow::Result<Vec<String>> {
-    let wrong = |why: &str| Usage(printable(&format!("{}: {why}", path.display())));
+) -> anyhow::Result<Vec<Vec<String>>> {
     let scene: SceneConfig = session.config.table("scene")?;
+    let sets = frames.iter().map(|path| picture(session, &scene, path));
+    let mut sets: Vec<Vec<String>> = sets.collect::<anyhow::Result<_>>()?;
+    let Some(camera) = &scene.camera else {
+        return Ok(sets);
+    };
+    if stands_still && camera.transforms.is_none() {
+        return Ok(sets);
+    }
+    let moved = moved(session, &scene, camera, frames, tell)?;
+    for ((set, path), moved) in sets.iter_mut().zip(frames).zip(moved) {
+        if let Some(number) = moved {
+            // The number alone would take the place of the camera's name.
+            let name = camera.image.iter();
+            set.extend(name.map(|name| format!("scene.camera.image={}", json!(name))));
+            set.push(format!("scene.camera.frame={number}"));
+        } else if let Some(key) = key_of_frame(camera)? {
+            let value = match key {
+                "frame" => number(path)
+                    .ok_or_else(|| {
+                        wrong(
+                            path,
+                            "its name does not end in the number of a frame of .chan",
+                        )
+                    })?
+                    .to_string(),
+                _ => text(path, &std::path::absolute(path)?)?,
+            };
+            set.push(format!("scene.camera.{key}={value}"));
+        }
+    }
+    Ok(sets)
+}
+
+fn wrong(frame: &Path, why: &str) -> Usage {
+    Usage(printable(&format!("{}: {why}", frame.display())))
+}
+
+/// A path of a frame as TOML has it.
+fn text(frame: &Path, path: &Path) -> Result<String, Usage> {
+    let text = path.to_str().map(|text| json!(text).to_string());
+    text.ok_or_else(|| wrong(frame, "its path is not UTF-8"))
+}
+
+/// What sets the picture and the mask of the frame in `path`.
+fn picture(session: &Session, scene: &SceneConfig, path: &Path) -> anyhow::Result<Vec<String>> {
+    let wrong = |why: &str| wrong(path, why);
     if path.is_dir() {
         return Err(wrong("it is a folder: name the pictures in it").into());
     }
@@ -107,77 +152,51 @@ pub fn overrides(
         return Err(wrong("it is empty: copy it again, or leave it out").into());
     }
     dipir_imaging::file::check_format(path)?;
-    let text = |path: &Path| match path.to_str() {
-        Some(text) => Ok(json!(text).to_string()),
-        None => Err(wrong("its path is not UTF-8")),
-    };
     let mut set = vec![format!(
         "scene.background={}",
-        text(&std::path::absolute(path)?)?
+        text(path, &std::path::absolute(path)?)?
     )];
-    if let Some(mask) = mask_of(&scene, path) {
+    if let Some(mask) = mask_of(scene, path) {
         if !session.config.base_dir().join(&mask).is_file() {
             let mask = mask.display();
             return Err(wrong(&format!("its mask {mask} is missing")).into());
         }
-        set.push(format!("scene.occluders={}", text(&mask)?));
-    }
-    let Some(camera) = &scene.camera else {
-        return Ok(set);
-    };
-    if stands_still && camera.transforms.is_none() {
-        return Ok(set);
-    }
-    if let Some(number) = moved(session, &scene, camera, path, tell)? {
-        // The number alone would take the place of the camera's name.
-        let name = camera.image.iter();
-        set.extend(name.map(|name| format!("scene.camera.image={}", json!(name))));
-        set.push(format!("scene.camera.frame={number}"));
-        return Ok(set);
-    }
-    if let Some(key) = key_of_frame(camera)? {
-        let value = match key {
-            "frame" => number(path)
-                .ok_or_else(|| wrong("its name does not end in the number of a frame of .chan"))?
-                .to_string(),
-            _ => text(&std::path::absolute(path)?)?,
-        };
-        set.push(format!("scene.camera.{key}={value}"));
+        set.push(format!("scene.occluders={}", text(path, &mask)?));
     }
     Ok(set)
 }
 
-/// At which frame of the file the camera stands in the picture in `path`, if it moves in a glTF. Where the photograph's
+/// At which frame of the file the camera stands in each of the pictures, if it moves in a glTF. Where the photograph's
 /// frame is written, others are counted from it.
 fn moved(
     session: &Session,
     scene: &SceneConfig,
     camera: &CameraConfig,
-    path: &Path,
+    frames: &[PathBuf],
     mut tell: impl FnMut(String, bool),
-) -> anyhow::Result<Option<u32>> {
+) -> anyhow::Result<Vec<Option<u32>>> {
     let Some(own) = &camera.file else {
-        return Ok(None);
+        return Ok(vec![None; frames.len()]);
     };
     let own = session.config.base_dir().join(own);
     let named = |e: CameraError| Usage(printable(&format!("\"{}\": {e}", own.display())));
-    let shown = file::shown(&own, camera.image.as_deref(), &std::path::absolute(path)?);
-    let Some(Shown {
-        frame,
-        assumed,
-        is_doubtful,
-    }) = shown.map_err(named)?
-    else {
-        return Ok(None);
-    };
+    let photos = frames.iter().map(std::path::absolute);
+    let photos: Vec<PathBuf> = photos.collect::<std::io::Result<_>>()?;
+    let shown = file::all_shown(&own, camera.image.as_deref(), &photos).map_err(named)?;
     let photo = scene.background.as_deref().and_then(number);
-    let written = camera.frame.zip(photo).zip(number(path));
-    if let Some(((written, photo), number)) = written {
-        let frame = i64::from(written) + i64::from(number) - i64::from(photo);
-        return Ok(Some(u32::try_from(frame.max(0))?));
-    }
-    tell(format!("\"{}\": {assumed}", own.display()), is_doubtful);
-    Ok(Some(frame))
+    let mut frame_of = |path: &Path, shown: Shown| {
+        let written = camera.frame.zip(photo).zip(number(path));
+        if let Some(((written, photo), number)) = written {
+            let frame = i64::from(written) + i64::from(number) - i64::from(photo);
+            return Ok(u32::try_from(frame.max(0))?);
+        }
+        let assumed = format!("\"{}\": {}", own.display(), shown.assumed);
+        tell(assumed, shown.is_doubtful);
+        Ok(shown.frame)
+    };
+    let all = frames.iter().zip(shown);
+    all.map(|(path, shown)| shown.map(|shown| frame_of(path, shown)).transpose())
+        .collect()
 }
 
 /// The key that chooses a frame's camera, if its picture's name does not.

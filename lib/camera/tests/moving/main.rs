@@ -2,7 +2,7 @@
 mod files;
 mod wrong;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use dipir_cameras::file::{self, Found, Wanted, Which};
 use dipir_cameras::{Pose, gltf};
@@ -114,9 +114,13 @@ fn an_exported_rig_stands_as_in_chan_and_transforms_json() {
     put("shot.glb", &scene.glb());
     put(
         "shot.gltf",
-        scene.document(Some("my%20keys.bin")).to_string().as_bytes(),
+        scene
+            .document(Some("keys/my%20keys.bin"))
+            .to_string()
+            .as_bytes(),
     );
-    put("my keys.bin", scene.buffer());
+    std::fs::create_dir(at("keys")).unwrap();
+    put("keys/my keys.bin", scene.buffer());
     use base64::Engine;
     let text = base64::engine::general_purpose::STANDARD.encode(scene.buffer());
     let uri = format!("data:application/octet-stream;base64,{text}");
@@ -170,10 +174,10 @@ fn an_exported_rig_stands_as_in_chan_and_transforms_json() {
             );
         }
     }
-    let beside = [at("shot.gltf"), at("my keys.bin")];
+    let beside = [at("shot.gltf"), at("keys/my keys.bin")];
     assert_eq!(file::parts(&at("shot.gltf")), beside);
     assert_eq!(file::parts(&at("one.gltf")), [at("one.gltf")]);
-    std::fs::remove_file(at("my keys.bin")).unwrap();
+    std::fs::remove_file(at("keys/my keys.bin")).unwrap();
     let error = read(&at("shot.gltf"), Which::Number(FIRST)).unwrap_err();
     assert!(error.contains("my keys.bin"), "{error}");
 }
@@ -383,6 +387,53 @@ fn of_several_cameras_one_is_named_and_its_frame_with_it() {
     let shown = |name| file::shown(&path, Some(name), Path::new("plate.0003.png")).unwrap();
     assert_eq!(shown("Camera").unwrap().frame, 3);
     assert_eq!(shown("still"), None);
+}
+
+#[test]
+fn photos_of_several_folders_and_cameras_are_told_together_as_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let mut scene = numbered(1, 10, 24.0);
+    scene.nodes = ["plate.1", "plate.101"]
+        .map(|name| json!({ "name": name, "camera": 0 }))
+        .into();
+    let times: Vec<f32> = (5..8).map(|frame| frame as f32 / 24.0).collect();
+    let target = json!({ "node": 1, "path": "translation" });
+    scene.keys(
+        target,
+        &times,
+        &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0],
+        "LINEAR",
+    );
+    let path = at("shot.glb");
+    std::fs::write(&path, scene.glb()).unwrap();
+    let mut photos = Vec::new();
+    for (name, numbers) in [
+        ("a/plate.", 1..=12),
+        ("b/plate.", 101..=104),
+        ("a/mask.", 41..=42),
+    ] {
+        std::fs::create_dir_all(at(name).parent().unwrap()).unwrap();
+        let own = numbers.map(|n| at(&format!("{name}{n}.png")));
+        photos.extend(own.inspect(|photo| std::fs::write(photo, "").unwrap()));
+    }
+    let frames = |name, photos: &[PathBuf]| -> Vec<u32> {
+        let all = file::all_shown(&path, name, photos).unwrap();
+        for (photo, shown) in photos.iter().zip(&all) {
+            assert_eq!(*shown, file::shown(&path, name, photo).unwrap());
+        }
+        all.into_iter().map(|shown| shown.unwrap().frame).collect()
+    };
+    let plates = 1..=12;
+    let first: Vec<u32> = plates.clone().chain(1..=4).chain([1, 2]).collect();
+    assert_eq!(frames(Some("plate.1"), &photos), first);
+    let other: Vec<u32> = plates.chain(5..=8).chain([5, 6]).collect();
+    assert_eq!(frames(Some("plate.101"), &photos), other);
+    // Without a name each has the camera of its own.
+    assert_eq!(
+        frames(None, &[photos[0].clone(), photos[12].clone()]),
+        [1, 5]
+    );
 }
 
 #[test]

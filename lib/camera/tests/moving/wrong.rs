@@ -96,8 +96,8 @@ fn what_is_wrong_with_keys_is_told() {
         ),
         (
             "/buffers/0/uri",
-            json!("../keys.bin"),
-            "its buffer 0 is in a file of another folder: \"../keys.bin\"",
+            json!("/keys.bin"),
+            "its buffer 0 is in a file of another folder: \"/keys.bin\"",
         ),
         (
             "/buffers/0/uri",

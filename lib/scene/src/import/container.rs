@@ -8,6 +8,9 @@ use std::io;
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
+use dipir_cameras::file::is_buffer;
+use percent_encoding::percent_decode_str;
+
 use crate::error::Error;
 use crate::limits::Limits;
 use crate::printable::printable;
@@ -65,21 +68,13 @@ enum Kind {
     Image,
 }
 
-/// Extensions of files that hold buffers.
-const OF_BUFFERS: [&str; 3] = ["bin", "glbin", "glbuf"];
-
 impl Kind {
     /// Whether a file outside of the object's folder may be read as this, where the document climbs to it by `..`. A document
     /// of strangers may name any file: one is read that can be nothing else, and only its pixels or numbers are used.
     fn is_of(self, file: &Path) -> bool {
-        // Links are followed: the name is that of the file itself.
-        let found = file.canonicalize();
-        let extension = found.as_deref().ok().and_then(Path::extension);
         match self {
             Self::Text => false,
-            Self::Buffer => {
-                extension.is_some_and(|e| OF_BUFFERS.iter().any(|own| e.eq_ignore_ascii_case(own)))
-            }
+            Self::Buffer => is_buffer(file),
             Self::Image => ImageSource::File(file.into())
                 .pixels()
                 .is_ok_and(|size| size.is_some()),
@@ -131,7 +126,7 @@ impl Folder {
         // Some exporters forget to encode, and some write the separators of Windows: further guesses.
         let decoded = percent_decoded(uri);
         let slashed = decoded.replace('\\', "/");
-        let guesses = [&decoded, uri, &slashed];
+        let guesses = [&*decoded, uri, &slashed];
         let allow_outside = self.limits.allow_outside;
         let climbs = guesses.iter().any(|guess| leaves_folder(guess));
         // An absolute path is one of the machine that wrote it. Whether it is there is not looked up.
@@ -247,7 +242,7 @@ fn note(list: &RefCell<Vec<PathBuf>>, path: &Path) {
 }
 
 /// Each value once, where it is first.
-fn once<T: Clone + Eq + Hash>(mut all: Vec<T>) -> Vec<T> {
+pub(crate) fn once<T: Clone + Eq + Hash>(mut all: Vec<T>) -> Vec<T> {
     let mut seen = HashSet::new();
     all.retain(|value| seen.insert(value.clone()));
     all
@@ -351,37 +346,14 @@ pub(super) fn plain_reason(error: &io::Error) -> String {
 
 /// Where a file that was asked for would have to lie, for messages.
 pub(super) fn named(uri: &str) -> PathBuf {
-    Path::new(&percent_decoded(uri)).into()
+    Path::new(&*percent_decoded(uri)).into()
 }
 
 /// `%20` and the like replaced by what they stand for; what is no valid escape stays.
-fn percent_decoded(uri: &str) -> String {
-    String::from_utf8(percent_decoded_bytes(uri)).unwrap_or_else(|_| uri.to_owned())
-}
-
-fn percent_decoded_bytes(uri: &str) -> Vec<u8> {
-    let bytes = uri.as_bytes();
-    let mut out = Vec::with_capacity(bytes.len());
-    let mut i = 0;
-    while i < bytes.len() {
-        let hex = |k: usize| {
-            bytes
-                .get(i + k)
-                .and_then(|b| (*b as char).to_digit(16))
-                .map(|d| d as u8)
-        };
-        match (bytes[i], hex(1), hex(2)) {
-            (b'%', Some(high), Some(low)) => {
-                out.push(high * 16 + low);
-                i += 3;
-            }
-            (byte, ..) => {
-                out.push(byte);
-                i += 1;
-            }
-        }
-    }
-    out
+fn percent_decoded(uri: &str) -> Cow<'_, str> {
+    percent_decode_str(uri)
+        .decode_utf8()
+        .unwrap_or(Cow::Borrowed(uri))
 }
 
 /// The payload of a `data:` URI, or `None` if `uri` is not one.
@@ -401,7 +373,7 @@ pub(super) fn data_uri(uri: &str, place: &str) -> Option<Result<Vec<u8>, Error>>
             )
         })
     } else {
-        Ok(percent_decoded_bytes(payload))
+        Ok(percent_decode_str(payload).collect())
     })
 }
 

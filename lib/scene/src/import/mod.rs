@@ -5,6 +5,7 @@ mod document;
 mod gltf;
 mod gltf_material;
 mod gltf_mesh;
+mod held;
 mod lights;
 mod meshopt;
 mod mtl;
@@ -15,12 +16,12 @@ mod polygon;
 mod stl;
 pub mod tangents;
 
-use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 
 pub use self::gltf::load_gltf_bytes;
+pub(crate) use container::once;
 pub use container::{Folder, NoFiles, Resolver};
 pub use obj::load_obj_bytes;
 pub use ply::load_ply_bytes;
@@ -155,9 +156,10 @@ impl Imported {
     /// The object with its textures' sizes checked, and each warning once, the names in it printable.
     fn checked(mut self, limits: &Limits) -> Result<Self, Error> {
         check_sizes(&self.textures, limits)?;
-        let mut seen = HashSet::new();
-        self.warnings.retain(|w| seen.insert(w.clone()));
-        self.warnings.iter_mut().for_each(|w| *w = printable(&*w));
+        self.textures
+            .iter()
+            .try_for_each(|texture| held::check(&texture.image))?;
+        self.warnings = once(self.warnings).iter().map(printable).collect();
         Ok(self)
     }
 }
