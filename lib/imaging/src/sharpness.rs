@@ -5,8 +5,8 @@ use crate::resize::{PixelBox, Sample};
 use crate::squares::squares;
 use rayon::prelude::*;
 
-/// Standard deviations of the two Gaussians whose gradients are compared, pixels. Half a pixel of the smaller is what pixels
-/// themselves blur; the larger reaches over few neighbours.
+/// Standard deviations of the two Gaussians whose gradients are compared, pixels: about the least of which pixels can be
+/// samples, and one that reaches over few neighbours.
 const SCALES: [f32; 2] = [0.7, 1.4];
 /// Least gradient of an edge that is measured, linear light a pixel. Noise and faint detail have less.
 const LEAST_GRADIENT: f32 = 0.06;
@@ -15,13 +15,13 @@ const LEAST_EDGES: usize = 100;
 const STEEPEST: usize = 10;
 /// Of these, one in so many is sharper than what counts as the photograph's sharpness: thin lines look sharper than they are.
 const SHARPER: usize = 5;
-/// What is measured where there is no blur but that of square pixels.
+/// What is measured where there is no blur but that of square pixels, .29: a sampled Gaussian of .7 adds to it.
 pub const OF_PIXELS: f32 = 0.4;
 /// Further than this from an edge's middle its gradient is not looked at, standard deviations.
 const REACH: f32 = 4.0;
 
-/// Blur of the sharpest edges of `image`, pixels: the standard deviation of the Gaussian that a sharp edge was blurred by,
-/// and a half where it was not. `None` where too few edges tell.
+/// Blur of the sharpest edges of `image`, pixels: the standard deviation of the Gaussian that a step was blurred by, and
+/// [`OF_PIXELS`] or less where there is none but that of pixels. `None` where too few edges tell.
 ///
 /// A step blurred by `s` has after another Gaussian of `t` a gradient in proportion to `1 / sqrt(s^2 + t^2)`: the ratio of
 /// the gradients at two `t` gives `s` [Zhuo and Sim 2011].
