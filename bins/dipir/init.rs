@@ -185,7 +185,7 @@ fn said(draft: &Draft) -> String {
     }
     if !document.views.is_empty() {
         let views = document.views.join(", ");
-        text += &format!("  light: told by {views}, too, which look elsewhere\n");
+        text += &format!("  light: pictures of other directions tell it, too: {views}\n");
     }
     for object in &document.objects {
         let [x, y] = object.at_pixel;

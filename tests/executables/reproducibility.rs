@@ -16,8 +16,8 @@ fn a_rerun_writes_the_same_bytes() {
     );
     assert!(first == second);
     assert_eq!(first.0.len(), 3);
-    // The picture, its layers, and what was simulated.
-    assert_eq!(first.1.len(), 3);
+    // The picture, its layers, what was simulated, and how the photograph looks.
+    assert_eq!(first.1.len(), 4);
 }
 
 #[test]

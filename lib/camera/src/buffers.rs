@@ -147,12 +147,8 @@ impl<'a> Buffers<'a> {
         };
         if let Some(data) = uri.strip_prefix("data:") {
             let text = data.split_once(";base64,").map_or("", |split| split.1);
-            let lenient = GeneralPurposeConfig::new()
-                .with_decode_padding_mode(DecodePaddingMode::Indifferent);
-            let bytes = GeneralPurpose::new(&STANDARD, lenient).decode(text);
-            return bytes
-                .map(Cow::Owned)
-                .map_err(|_| wrong("is no valid base64"));
+            let bytes = from_base64(text).map(Cow::Owned);
+            return bytes.ok_or_else(|| wrong("is no valid base64"));
         }
         let path = self.folder.and_then(|folder| beside(folder, uri));
         let path = path.ok_or_else(|| {
@@ -195,6 +191,16 @@ fn beside(folder: &Path, uri: &str) -> Option<PathBuf> {
     let is_outside = matches!(&whole, [Some(file), Some(folder)] if !file.starts_with(folder));
     // One that is missing is told where it is read.
     (!is_outside || is_buffer(&found)).then_some(found)
+}
+
+/// The bytes of base64, of either alphabet, padded or not; `None` of anything else.
+pub fn from_base64(text: &str) -> Option<Vec<u8>> {
+    let lenient = GeneralPurposeConfig::new()
+        .with_decode_padding_mode(DecodePaddingMode::Indifferent)
+        .with_decode_allow_trailing_bits(true);
+    let text = text.trim_end_matches('=');
+    let text = text.replace('-', "+").replace('_', "/");
+    GeneralPurpose::new(&STANDARD, lenient).decode(text).ok()
 }
 
 /// Whether a file is called as a glTF's buffers are, links followed. It may lie anywhere that a relative path leads to: it can
@@ -289,6 +295,27 @@ mod tests {
             "",
         ] {
             assert_eq!(of(outside), None, "{outside}");
+        }
+    }
+
+    #[test]
+    fn base64_of_either_alphabet_is_decoded_with_padding_or_without() {
+        // RFC 4648, 10; the bits behind the last byte may be anything.
+        let whole: [(&str, &[u8]); 8] = [
+            ("", b""),
+            ("Zg==", b"f"),
+            ("Zg", b"f"),
+            ("Zh", b"f"),
+            ("Zm8=", b"fo"),
+            ("Zm9vYmFy", b"foobar"),
+            ("+/8=", b"\xfb\xff"),
+            ("-_8", b"\xfb\xff"),
+        ];
+        for (text, bytes) in whole {
+            assert_eq!(from_base64(text).as_deref(), Some(bytes), "{text}");
+        }
+        for text in ["Z", "Zm9v!", "Zm 9v", "Zg==Zg=="] {
+            assert_eq!(from_base64(text), None, "{text}");
         }
     }
 

@@ -9,7 +9,7 @@ use crate::chan::Turns;
 use crate::error::CameraError;
 use crate::{buffers, chan, colmap, foreign, fspy, kitti, moving, nuscenes, opencv, transforms};
 
-pub use crate::buffers::is_buffer;
+pub use crate::buffers::{from_base64, is_buffer};
 pub use crate::moving::Shown;
 pub use crate::upright::doubt;
 

@@ -8,7 +8,7 @@ use std::io;
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
-use dipir_cameras::file::is_buffer;
+use dipir_cameras::file::{from_base64, is_buffer};
 use percent_encoding::percent_decode_str;
 
 use crate::error::Error;
@@ -366,7 +366,7 @@ pub(super) fn data_uri(uri: &str, place: &str) -> Option<Result<Vec<u8>, Error>>
         )));
     };
     Some(if header.ends_with(";base64") {
-        base64_decoded(payload).ok_or_else(|| {
+        from_base64(payload).ok_or_else(|| {
             Error::malformed(
                 format!("{place} is a data URI that is not valid base64"),
                 "export the file again",
@@ -375,33 +375,6 @@ pub(super) fn data_uri(uri: &str, place: &str) -> Option<Result<Vec<u8>, Error>>
     } else {
         Ok(percent_decode_str(payload).collect())
     })
-}
-
-/// RFC 4648, both alphabets, padding optional; `None` on any other character.
-fn base64_decoded(text: &str) -> Option<Vec<u8>> {
-    let text = text.trim_end_matches('=').as_bytes();
-    if text.len() % 4 == 1 {
-        return None;
-    }
-    let mut out = Vec::with_capacity(text.len() / 4 * 3 + 2);
-    let (mut bits, mut held) = (0u32, 0);
-    for &c in text {
-        let digit = match c {
-            b'A'..=b'Z' => c - b'A',
-            b'a'..=b'z' => c - b'a' + 26,
-            b'0'..=b'9' => c - b'0' + 52,
-            b'+' | b'-' => 62,
-            b'/' | b'_' => 63,
-            _ => return None,
-        };
-        bits = (bits << 6) | u32::from(digit);
-        held += 6;
-        if held >= 8 {
-            held -= 8;
-            out.push((bits >> held) as u8);
-        }
-    }
-    Some(out)
 }
 
 const COPY: &str = "export or copy the file again";
