@@ -63,6 +63,8 @@ fn the_object_gets_the_photographs_blur_and_grain() {
         photo.values.unwrap()
     };
     let plain = values("out/composite/composite.png");
+    project.run(COMPOSITE, &NEITHER[..2]).expect_success();
+    let grainy = values("out/composite/composite.png");
     project.run(COMPOSITE, &[]).expect_success();
     let (photo, matched) = (
         values("background.png"),
@@ -73,8 +75,9 @@ fn the_object_gets_the_photographs_blur_and_grain() {
     let edges = number(&found["edge_blur_px"]);
     assert!(edges > 0.8 && edges < 1.6, "{found}");
     for c in 0..3 {
+        // The median of white noise in some hundred patches, each known to 3%.
         let grain = number(&found["grain"][c]);
-        assert!((grain / 0.03 - 1.0).abs() < 0.2, "{found}");
+        assert!((grain / 0.03 - 1.0).abs() < 0.1, "{found}");
     }
     let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
     let alpha = layers.channel("object.A").unwrap();
@@ -96,15 +99,15 @@ fn the_object_gets_the_photographs_blur_and_grain() {
             kept += 1;
         }
         if a == 1.0 {
-            let off = f64::from(matched.pixels()[n][1]) - f64::from(plain.pixels()[n][1]);
+            let off = f64::from(grainy.pixels()[n][1]) - f64::from(plain.pixels()[n][1]);
             squares += off * off / 255.0 / 255.0;
             covered += 1;
         }
     }
     assert!(kept > 10_000 && covered > 1_000, "{kept} {covered}");
-    // Inside of the object blur changes little; grain is as measured to a tenth.
+    // As measured to a tenth, of a field of as little as 1,000 pixels, known to 2%; rounding adds a thousandth.
     let deviation = (squares / f64::from(covered)).sqrt();
-    assert!((deviation / 0.03 - 1.0).abs() < 0.3, "{deviation}");
+    assert!((deviation / 0.03 - 1.0).abs() < 0.15, "{deviation}");
 }
 
 #[test]

@@ -1,8 +1,8 @@
-//! Grain: the noise of a photograph, as its even parts show it, and more of the same for what is laid over it.
+//! Grain: the noise of a photograph, as its flat areas show it, and more of the same for what is laid over it.
 //!
-//! A patch of 16 x 16 pixels without its plane of best fit is *residual*. Where the photograph shows a thing without detail
-//! the residual is noise. Such patches are told from those with faint detail by three properties of noise: it is equally strong
-//! in all four quarters of a patch, few of its values lie far out, and neighbours differ.
+//! The *residual* of a patch of 16 x 16 pixels is what is left without its plane of best fit. In a flat area, one without
+//! detail, the residual is noise. Three properties tell noise from faint detail: it is equally strong in all four quarters of
+//! a patch, few of its values lie far out, and neighbours differ.
 use crate::raster::LinearImage;
 use crate::resize::PixelBox;
 use crate::squares::squares;
@@ -18,12 +18,12 @@ const PIXELS: usize = SIDE * SIDE;
 const STEP: usize = SIDE / 2;
 /// Ranges of brightness in which noise is measured apart.
 const LEVELS: usize = 8;
-/// Patches of a level that must be even for it to tell the noise.
+/// Least number of flat patches from which the noise of a level is taken.
 const LEAST_PATCHES: usize = 16;
-/// Of the patches of a level this share, those with the weakest residual, may show nothing but noise.
+/// Share of a level's patches, those with the weakest residual, whose strongest is the measure of a flat one.
 const WEAKEST: f32 = 0.02;
-/// A patch with this many times the variance of the weakest ones counts as even, too.
-const EVEN: f32 = 2.0;
+/// A patch counts as flat up to this many times that one's variance.
+const FLAT: f32 = 2.0;
 /// Most spread of the variances of a patch's quarters, over their mean: .10 for white noise, .19 to .28 for noise behind a JPEG,
 /// .31 and more for foliage, water, and what the encoder of a video leaves (eight photographs, with and without noise).
 const MOST_SPREAD: f32 = 0.29;
@@ -36,7 +36,7 @@ const LEAST_ROUGHNESS: f32 = 0.2;
 const CLIPPED: f32 = 2e-3;
 /// Least standard deviation of grain that is worth adding, display values: two steps of 8 bits. What a picture of 8 bits is
 /// rounded by has a third of a step.
-pub const LEAST_DEVIATION: f32 = 2.0 / 255.0;
+const LEAST_DEVIATION: f32 = 2.0 / 255.0;
 /// Most patches that are kept.
 const MOST_KEPT: usize = 512;
 /// Residuals further out than this many standard deviations are cut.
@@ -47,7 +47,7 @@ const FAR_OUT: f32 = 4.0;
 pub struct Grain {
     /// Standard deviation of each channel's display values, at the middle of each level of brightness.
     deviations: [Vec3; LEVELS],
-    /// Residuals of even patches, each channel divided by its standard deviation.
+    /// Residuals of flat patches, each channel divided by its standard deviation.
     patches: Vec<[Vec3; PIXELS]>,
 }
 
@@ -66,7 +66,7 @@ struct Patch {
 }
 
 impl Grain {
-    /// The noise of `image`, if its even parts show some that is worth adding. `display` leads to display values, in
+    /// The noise of `image`, if its flat areas show some that is worth adding. `display` leads to display values, in
     /// `[0, 1]`.
     pub fn of(image: &LinearImage, display: impl Fn(Vec3) -> Vec3 + Sync) -> Option<Self> {
         let squares = squares(image.0.width(), image.0.height());
@@ -75,8 +75,8 @@ impl Grain {
         for patch in patches.collect::<Vec<_>>().into_iter().flatten() {
             levels[level_of(patch.brightness)].push(patch);
         }
-        let told = levels.map(even);
-        let deviations = told.each_ref().map(|even| deviation(even));
+        let told = levels.map(flat);
+        let deviations = told.each_ref().map(|flat| deviation(flat));
         let nearest = |k: usize| {
             let known = (0..LEVELS).filter_map(|j| Some((j.abs_diff(k), deviations[j]?)));
             known.min_by_key(|(far, _)| *far).map(|(_, d)| d)
@@ -92,7 +92,7 @@ impl Grain {
         let unit = |i: usize| {
             let patch = all[i * all.len() / kept];
             let deviation = filled[level_of(patch.brightness)].max(Vec3::splat(f32::EPSILON));
-            let values = values_at(image, patch.corner, &display);
+            let values = values_at(patch.corner, |x, y| display(*image.0.get(x, y)));
             let most = Vec3::splat(FAR_OUT);
             without_plane(&values)
                 .1
@@ -147,13 +147,13 @@ fn level_of(brightness: f32) -> usize {
 }
 
 /// The patches of one level that show nothing but noise; none if too few do.
-fn even(mut patches: Vec<Patch>) -> Vec<Patch> {
+fn flat(mut patches: Vec<Patch>) -> Vec<Patch> {
     if patches.len() < LEAST_PATCHES {
         return Vec::new();
     }
     patches.sort_by(|a, b| brightness(a.variance).total_cmp(&brightness(b.variance)));
     let weakest = ((WEAKEST * patches.len() as f32) as usize).max(LEAST_PATCHES / 2);
-    let most = EVEN * brightness(patches[weakest].variance);
+    let most = FLAT * brightness(patches[weakest].variance);
     patches.truncate(patches.partition_point(|p| brightness(p.variance) <= most));
     let mid = |of: fn(&Patch) -> f32| middle(patches.iter().map(of).collect());
     let is_noise = mid(|p| p.spread) <= MOST_SPREAD
@@ -166,9 +166,9 @@ fn even(mut patches: Vec<Patch>) -> Vec<Patch> {
 }
 
 /// Of each channel; `None` for no patches.
-fn deviation(even: &[Patch]) -> Option<Vec3> {
-    let of = |c: usize| middle(even.iter().map(|p| p.variance[c]).collect()).sqrt();
-    (!even.is_empty()).then(|| Vec3::new(of(0), of(1), of(2)))
+fn deviation(flat: &[Patch]) -> Option<Vec3> {
+    let of = |c: usize| middle(flat.iter().map(|p| p.variance[c]).collect()).sqrt();
+    (!flat.is_empty()).then(|| Vec3::new(of(0), of(1), of(2)))
 }
 
 /// The upper median; 0 for no values.
@@ -183,23 +183,27 @@ fn patches_of(
     square: PixelBox,
     display: &(impl Fn(Vec3) -> Vec3 + Sync),
 ) -> Vec<Patch> {
-    let starts = |from: usize, length: usize| {
-        let inside = 0..(length + 1).saturating_sub(SIDE);
-        inside.step_by(STEP).map(move |i| from + i)
+    let columns = square.x..square.x + square.width;
+    let shown: Vec<Vec<Vec3>> = (square.y..square.y + square.height)
+        .map(|y| {
+            image.0.row(y)[columns.clone()]
+                .iter()
+                .map(|v| display(*v))
+                .collect()
+        })
+        .collect();
+    let starts = |length: usize| (0..(length + 1).saturating_sub(SIDE)).step_by(STEP);
+    let corners = starts(square.height).flat_map(|y| starts(square.width).map(move |x| [x, y]));
+    let patch = |[x, y]: [usize; 2]| {
+        let values = values_at([x, y], |x, y| shown[y][x]);
+        Patch::of([square.x + x, square.y + y], values)
     };
-    let corners = starts(square.y, square.height)
-        .flat_map(|y| starts(square.x, square.width).map(move |x| [x, y]));
-    let patch = |corner| Patch::of(corner, values_at(image, corner, display));
     corners.filter_map(patch).collect()
 }
 
 /// Display values of the patch whose leftmost column and topmost row are `corner`.
-fn values_at(
-    image: &LinearImage,
-    [x, y]: [usize; 2],
-    display: &(impl Fn(Vec3) -> Vec3 + Sync),
-) -> [Vec3; PIXELS] {
-    std::array::from_fn(|i| display(*image.0.get(x + i % SIDE, y + i / SIDE)))
+fn values_at([x, y]: [usize; 2], at: impl Fn(usize, usize) -> Vec3) -> [Vec3; PIXELS] {
+    std::array::from_fn(|i| at(x + i % SIDE, y + i / SIDE))
 }
 
 impl Patch {
@@ -302,18 +306,20 @@ mod tests {
             let sigma = 0.03;
             let photo = noisy(sigma, smooth);
             let grain = Grain::of(&photo, |v| v).unwrap();
-            // A patch's variance has a relative deviation of sqrt(2 / 253) = .09, with smooth noise three times that, and the
-            // weakest patches are what is compared with: the median of those that count lies up to a deviation below.
+            // White noise: all patches count, and the median is that of some 2,000. Smooth noise has nine times its mean
+            // power at the lowest frequencies, so that a plane, 3 of 256 of them, takes a tenth of the variance; and its
+            // strongest patches count no more (2%): 7% of the deviation together.
             let found = grain.deviation(Vec3::splat(0.5));
             for c in 0..3 {
-                assert!((found[c] / sigma - 1.0).abs() < 0.15, "{found} {smooth}");
+                assert!((found[c] / sigma - 1.0).abs() < 0.1, "{found} {smooth}");
             }
             let field = (0..256 * 256).map(|i| grain.at(i % 256, i / 256, Vec3::splat(0.5)));
             let field = Raster::from_pixels(256, 256, field.collect());
             let variance = covariance(&field, 0);
             let made = variance.sqrt() / brightness(found);
+            // The mean variance of the patches that were kept, of which the deviation is the median.
             assert!((made - 1.0).abs() < 0.1, "{made} {smooth}");
-            // Of 3 x 3 neighbours two columns of three are the same; the planes that patches lose take some of it.
+            // Means over 3 x 3 of neighbours have two columns of three in common; the planes take a tenth of that.
             let beside = covariance(&field, 1) / variance;
             let expected = if smooth { 2.0 / 3.0 } else { 0.0 };
             assert!((beside - expected).abs() < 0.1, "{beside} {smooth}");
@@ -323,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photograph_without_noise_or_without_even_parts_has_no_grain() {
+    fn a_photograph_without_noise_or_without_flat_areas_has_no_grain() {
         let display = |v: Vec3| v;
         assert!(Grain::of(&noisy(0.0, false), display).is_none());
         // Half a step of 8 bits.

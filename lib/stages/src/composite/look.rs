@@ -15,9 +15,9 @@ use serde::{Deserialize, Serialize};
 use super::table::CompositeTable;
 use crate::light::exposed;
 
-/// Less blur than this is not added, pixels: nobody sees it.
+/// Less blur than this is not added, pixels: an edge differs by more with where it crosses the pixels.
 const LEAST_BLUR_PX: f32 = 0.5;
-/// Most blur, pixels. Wider edges belong to things out of focus.
+/// Most blur, pixels: a photograph whose sharpest edges are softer is out of focus as a whole.
 const MOST_BLUR_PX: f32 = 3.0;
 
 /// How the photograph looks beside a rendered picture.
@@ -28,11 +28,11 @@ pub(super) struct Look {
 }
 
 /// What was done, the content of `look.json`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Matched {
-    /// Standard deviation of the blur of the photograph's sharpest edges, pixels, .4 where there is none; absent where it was
-    /// not looked for, and where nothing tells it.
+    /// Standard deviation of the blur of the photograph's sharpest edges, pixels: .4 or less where there is none, 3 at most;
+    /// absent where it was not looked for, and where nothing tells it.
     pub edge_blur_px: Option<f32>,
     /// Standard deviation of the blur of object and shadow, pixels; absent if they were not blurred.
     pub blur_px: Option<f32>,
@@ -92,7 +92,8 @@ impl Look {
             edge_blur_px: table
                 .matches_blur()
                 .then(|| edge_blur_px(&taken.image))
-                .flatten(),
+                .flatten()
+                .map(|px| px.min(MOST_BLUR_PX)),
             grain: table.matches_grain().then(grain).flatten(),
             shown,
         }
@@ -112,7 +113,7 @@ impl Look {
             layers.blur(hidden, blur_px, self.shown.gain.recip());
         }
         if let Some(grain) = &self.grain {
-            self.roughen(layers, background, grain);
+            self.add_grain(layers, background, grain);
         }
         let grain = self.grain.as_ref();
         Matched {
@@ -125,7 +126,7 @@ impl Look {
     /// Pixels of a picture of `resolution` that are as sharp as the photograph: those of the whole one, a quarter of them, and
     /// so on. `None` where it is not known how sharp it is.
     pub fn enough_pixels(&self, resolution: [u32; 2]) -> Option<u64> {
-        let blur_px = self.edge_blur_px?.min(MOST_BLUR_PX);
+        let blur_px = self.edge_blur_px?;
         let divisor = [4, 2].into_iter().find(|&d| own_blur_px(d) <= blur_px);
         let [width, height] = resolution.map(|n| u64::from(n.div_ceil(divisor.unwrap_or(1))));
         Some(width * height)
@@ -134,12 +135,12 @@ impl Look {
     /// Blur that layers which were rendered at one over `divisor` of the resolution lack.
     fn blur_px(&self, divisor: u32) -> Option<f32> {
         let own = own_blur_px(divisor);
-        let wanted = self.edge_blur_px?.min(MOST_BLUR_PX);
+        let wanted = self.edge_blur_px?;
         let lacks = (wanted * wanted - own * own).max(0.0).sqrt();
         (lacks >= LEAST_BLUR_PX).then_some(lacks)
     }
 
-    fn roughen(&self, layers: &mut Overlay, background: &LinearImage, grain: &Grain) {
+    fn add_grain(&self, layers: &mut Overlay, background: &LinearImage, grain: &Grain) {
         let width = layers.alpha.width();
         let (alpha, shadow) = (layers.alpha.pixels(), layers.shadow.pixels());
         let background = background.0.pixels();
@@ -213,7 +214,7 @@ impl Overlay {
 }
 
 impl Matched {
-    /// What was done, for people: a clause of which object and shadow are the subject; `None` if nothing was.
+    /// What was done, as the end of a sentence on the object; `None` if nothing was.
     pub fn text(&self) -> Option<String> {
         let blur = self.blur_px.map(|px| format!("blurred by {px:.1} pixels"));
         let grain = self.grain.map(|g| {
@@ -222,5 +223,61 @@ impl Matched {
         });
         let done: Vec<String> = [blur, grain].into_iter().flatten().collect();
         (!done.is_empty()).then(|| format!("{} as the photograph is", done.join(" and ")))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An object of `light` in the left half of 40 x 20 pixels, and no shadow.
+    fn half(light: f32) -> Overlay {
+        let alpha = Raster::from_pixels(
+            40,
+            20,
+            (0..800).map(|i| f32::from(u8::from(i % 40 < 20))).collect(),
+        );
+        Overlay {
+            object: alpha.map(|a| Vec3::splat(light * a)),
+            alpha,
+            shadow: Raster::filled(40, 20, Vec3::ONE),
+        }
+    }
+
+    #[test]
+    fn a_glint_stays_a_pixel_and_what_is_far_from_edges_stays() {
+        let mut layers = half(0.5);
+        *layers.object.get_mut(8, 10) = Vec3::splat(1e6);
+        layers.blur(None, 1.0, 1.0);
+        // White spreads by at most the middle weight of a Gaussian of one pixel in two directions, .16.
+        let beside = layers.object.get(9, 10).x;
+        assert!(beside > 0.5 && beside < 0.66, "{beside}");
+        assert!(layers.object.get(8, 10).x > 0.99e6);
+        assert_eq!(*layers.shadow.get(20, 10), Vec3::ONE);
+        // Beyond the reach of the edge and of the glint, four deviations; weights sum to 1 but for rounding.
+        let far = layers.object.get(14, 10).x;
+        assert!((far - 0.5).abs() < 1e-6, "{far}");
+        // The edge lies between two pixels, so they share what it loses.
+        let [inner, outer] = [19, 20].map(|x| layers.alpha.get(x, 10));
+        assert!(
+            (inner + outer - 1.0).abs() < 1e-6 && *outer > 0.2,
+            "{inner} {outer}"
+        );
+    }
+
+    #[test]
+    fn light_that_is_infinite_is_still_found_after_blur() {
+        let mut layers = half(0.5);
+        *layers.object.get_mut(8, 10) = Vec3::INFINITY;
+        layers.blur(None, 1.0, 1.0);
+        assert!(!layers.object.get(8, 10).is_finite());
+        assert!(layers.object.get(9, 10).is_finite());
+    }
+
+    #[test]
+    fn layers_that_show_nothing_stay() {
+        let mut layers = half(0.5);
+        layers.alpha = Raster::filled(40, 20, 0.0);
+        assert_eq!(layers.touched(3), None);
     }
 }

@@ -63,7 +63,7 @@ pub struct Done {
     target: Stop,
     /// Object and shadow were rendered at one over this of the photograph's resolution.
     divisor: u32,
-    /// That is as sharp as the photograph.
+    /// Edges at that resolution are no softer than the photograph's.
     is_sharp_enough: bool,
     matched: Matched,
     /// From the start of the run to its end.

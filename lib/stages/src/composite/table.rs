@@ -53,7 +53,7 @@ pub struct CompositeTable {
     /// Whether object and shadow are blurred as the photograph's sharpest edges are, where these are softer than rendered ones.
     #[schemars(extend("x-default" = "true"), example = false)]
     pub match_blur: Option<bool>,
-    /// Whether the object gets the photograph's grain, where its even parts show some.
+    /// Whether the object gets the photograph's grain, where its flat areas show some.
     #[schemars(extend("x-default" = "true"), example = false)]
     pub match_grain: Option<bool>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
