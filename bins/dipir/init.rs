@@ -79,6 +79,11 @@ pub struct InitArgs {
     #[arg(long, value_name = "AXIS", requires = "points")]
     points_up: Option<Axis>,
 
+    /// Depths of the photograph at any scale, as a depth network or a scanner gives them, .exr or .png in shades of
+    /// grey: what is nearer than an object stands in front of it
+    #[arg(long, value_name = "FILE")]
+    depth: Option<PathBuf>,
+
     /// Where the objects stand: side by side in the middle, or wherever the ground is free and seen
     #[arg(long, value_name = "HOW", default_value = "middle")]
     place: Place,
@@ -135,6 +140,7 @@ pub fn run(args: &InitArgs) -> anyhow::Result<()> {
         points: args.points.clone(),
         points_pose: args.points_pose.clone(),
         points_up: args.points_up.map(Into::into),
+        depth: args.depth.clone(),
         place_auto: args.place == Place::Auto,
     };
     let draft = draft(&request).map_err(classified)?;

@@ -1,7 +1,7 @@
 #![no_main]
 use dipir_cameras::{Camera, Lens, Pose, WorldUp, colmap};
 use dipir_points::ground::{Search, Shape};
-use dipir_points::{Cloud, file, ground};
+use dipir_points::{Cloud, depth, file, ground};
 use glam::{DVec2, DVec3};
 use libfuzzer_sys::fuzz_target;
 
@@ -34,4 +34,5 @@ fuzz_target!(|bytes: &[u8]| {
     let _ = colmap::read_points(bytes, true, WorldUp::MinusY);
     let _ = colmap::read_points(bytes, false, WorldUp::MinusY);
     let _ = file::depth_png(bytes);
+    let _ = depth::png(bytes);
 });

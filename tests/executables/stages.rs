@@ -1,6 +1,7 @@
 //! What the stages write, and how they hand over to each other.
 use dipir_imaging::layers::Layers;
 use dipir_pipeline::manifest::Manifest;
+use glam::DVec3;
 use serde_json::Value;
 
 use crate::project::*;
@@ -192,6 +193,70 @@ fn a_mask_of_the_photos_foreground_hides_the_object() {
     project.run_both(&["--set", "scene.occluders=mask.png"]);
     let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
     assert_eq!(layers.rgb("").unwrap(), layers.rgb("background").unwrap());
+}
+
+/// Depths that the project's camera sees, as a network gives them: brightest where it is nearest, in shades. A fence
+/// stands in the left half, 2 m away, before the object.
+fn shades(fence_m: f64) -> image::GrayImage {
+    let (eye, to) = (DVec3::new(0.0, 1.2, 4.0), DVec3::new(0.0, 0.4, 0.0));
+    let ahead = (to - eye).normalize();
+    let right = ahead.cross(DVec3::Y).normalize();
+    let up = right.cross(ahead);
+    let pixel_m = 20f64.to_radians().tan() / 12.0;
+    image::GrayImage::from_fn(36, 24, |x, y| {
+        let at = |i: u32, n: f64| (f64::from(i) + 0.5 - 0.5 * n) * pixel_m;
+        let direction = ahead + right * at(x, 36.0) - up * at(y, 24.0);
+        // One over the depth of the ground; above the horizon nothing is near.
+        let ground = (-direction.y / eye.y).max(0.0);
+        let fence = if x < 18 { 1.0 / fence_m } else { 0.0 };
+        image::Luma([(400.0 * ground.max(fence) + 20.0).round() as u8])
+    })
+}
+
+#[test]
+fn what_is_nearer_by_the_depths_hides_object_and_shadow() {
+    let project = Project::new();
+    let depth = project.path("depth.png");
+    shades(2.0).save(&depth).unwrap();
+    let set = ["--set", "scene.depth=depth.png"];
+    let scene = project.run(SCENE, &set);
+    scene.expect_success();
+    let said = "  depth: disparities; ";
+    assert!(scene.stdout.contains(said), "{}", scene.stdout);
+    project.run(COMPOSITE, &set).expect_success();
+    // Where the two halves meet, the mask is soft.
+    let differs = |columns: std::ops::Range<usize>| {
+        let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
+        let [made, photo] = ["", "background"].map(|name| layers.rgb(name).unwrap());
+        let pixels = (0..24).flat_map(|y| columns.clone().map(move |x| (x, y)));
+        pixels
+            .filter(|&(x, y)| made.get(x, y) != photo.get(x, y))
+            .count()
+    };
+    assert_eq!(differs(0..14), 0);
+    let seen = differs(22..36);
+    assert!(seen > 20, "{seen}");
+    // A fence behind the object hides only what is of the ground beyond it.
+    shades(5.5).save(&depth).unwrap();
+    project
+        .run(DIPIR, &[&["run"][..], &set].concat())
+        .expect_success();
+    assert!(differs(0..18) > 20, "{}", differs(0..18));
+    assert!(differs(22..36) >= seen);
+    // Of another picture: refused, with what was made before untouched.
+    let before = project.artifacts("out/scene");
+    let noise = image::GrayImage::from_fn(36, 24, |x, y| image::Luma([(x * 97 + y * 57) as u8]));
+    noise.save(&depth).unwrap();
+    let refused = project.run(SCENE, &set);
+    assert_eq!(refused.code, Some(1), "{}", refused.stderr);
+    for part in [
+        "depth.png",
+        "of its values follow the ground",
+        "depth_scale",
+    ] {
+        assert!(refused.stderr.contains(part), "{}", refused.stderr);
+    }
+    assert_eq!(project.artifacts("out/scene"), before);
 }
 
 #[test]

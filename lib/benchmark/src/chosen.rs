@@ -198,6 +198,7 @@ fn note_scenes(set: &[String], note: &dyn Fn(&str)) {
         "background",
         "transfer",
         "occluders",
+        "depth",
         "objects",
         "camera",
         "proxy",

@@ -11,6 +11,7 @@ mod format;
 pub mod gain_map;
 mod gain_metadata;
 pub mod grain;
+pub mod guided;
 mod hdr_file;
 mod jpeg_header;
 pub mod layer_rows;

@@ -134,7 +134,7 @@ impl Desk {
             mask: Mutex::default(),
             rendered: Mutex::new(Rendered {
                 session,
-                own_mask: small.loaded.occluders.clone(),
+                own_mask: small.loaded.masked.clone(),
                 small,
                 light: None,
             }),
@@ -429,7 +429,8 @@ impl Desk {
     ) -> anyhow::Result<(&'a LoadedScene, &'a AtHand, &'static str)> {
         to.small.arrange(arrangement);
         to.session.config = config;
-        to.small.loaded.occluders = self.occluders(edit, to.own_mask.as_ref());
+        let mask = self.occluders(edit, to.own_mask.as_ref());
+        to.small.loaded.hide(mask)?;
         // A light that a run refuses is not shown first and refused when it is saved.
         if edit.sun.is_some() || edit.shadow.is_some() {
             assess(&to.session, LIGHT.name)?;

@@ -108,7 +108,7 @@ pub fn read(source: &Source) -> Result<Cloud, PointsError> {
     Ok(cloud.moved(source.scale, rotation, position).near())
 }
 
-fn read_bytes(path: &Path) -> Result<Vec<u8>, PointsError> {
+pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>, PointsError> {
     dipir_files::read(path).map_err(|source| PointsError::Read {
         path: path.into(),
         source,

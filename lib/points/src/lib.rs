@@ -13,6 +13,7 @@ pub mod place;
 mod plane;
 pub mod ply;
 pub mod relief;
+pub mod scale;
 
 pub use cloud::Cloud;
 pub use error::PointsError;

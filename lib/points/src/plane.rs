@@ -26,7 +26,7 @@ const JUDGES: usize = 4000;
 /// is nothing under the ground, but much on it.
 const BELOW: f64 = 2.0;
 /// Tukey's constant: 95% efficient where errors are normal.
-const TUKEY: f64 = 4.685;
+pub(crate) const TUKEY: f64 = 4.685;
 /// Standard deviations in a median absolute deviation of normal errors.
 pub(crate) const MAD: f64 = 1.4826;
 

@@ -98,9 +98,9 @@ impl SmallScene {
         loaded.photo.alpha = None;
         if full.resolution != [width, height] {
             loaded.photo.image = LinearImage(resize(&loaded.photo.image.0, w, h, Filter::Area));
-            loaded.occluders = loaded
-                .occluders
-                .map(|mask| resize(&mask, w, h, Filter::Area));
+            let mask = loaded.masked.take();
+            let mask = mask.map(|mask| resize(&mask, w, h, Filter::Area));
+            loaded.hide(mask)?;
             // A photograph without values is taken for linear light, which has another exposure and no curve.
             if loaded.photo.values.is_some() {
                 let shown = loaded.photo.transfer.encode(&loaded.photo.image).0;

@@ -7,12 +7,13 @@ use glam::DMat4;
 use crate::camera::Camera;
 use crate::description::ObjectRecord;
 use crate::error::Error;
+use crate::files::Files;
 use crate::import::Imported;
 use crate::light::PunctualLight;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
 use crate::proxy::Proxy;
-use crate::scene::{Files, Scene};
+use crate::scene::Scene;
 use crate::texture::Texture;
 use crate::visibility;
 

@@ -4,6 +4,8 @@
 //! optional that has a default; [`SceneConfig::validate`] turns it into [`SceneSettings`], in which
 //! nothing contradicts anything else. Unknown keys are refused while parsing.
 mod camera;
+mod effects;
+mod foreground;
 mod lens;
 mod proxy;
 mod view;
@@ -17,10 +19,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::{CameraSettings, FARTHEST_M, FieldOfView, WorldUp};
 use crate::error::Error;
+use crate::foreground::DepthSettings;
 use crate::limits::Limits;
 use crate::pixels::Pixels;
 use crate::placement::{Anchor, Placement, Rest, Size};
 
+pub use effects::{EffectSwitch, EffectsConfig, EffectsMode};
 pub use lens::DistortionConfig;
 pub use proxy::{PlaneConfig, ProxyConfig, ProxySettings};
 pub use view::ViewConfig;
@@ -42,6 +46,20 @@ pub struct SceneConfig {
     /// size: white hides the object, black shows it.
     #[schemars(extend("format" = "path"), example = &"foreground.png")]
     pub occluders: Option<PathBuf>,
+    /// Depths of the photograph, which tell what stands in front of an object: EXR, or PNG in shades of grey, of the
+    /// photograph's shape, as a scanner or a depth network gives them. Their scale is found on the ground.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("format" = "path"), example = &"depth.png")]
+    pub depth: Option<PathBuf>,
+    /// What the values of `depth` grow with: the depth along the optical axis, or one over it, as in most maps in which
+    /// what is near is bright.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("enum" = ["auto", "depth", "disparity"]), extend("default" = "auto"), example = &"disparity")]
+    pub depth_kind: Option<String>,
+    /// Metres of a unit of `depth`; in a PNG of 16 bits a unit is 1,000 steps.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "found on the ground"), example = 1.0)]
+    pub depth_scale: Option<f32>,
     /// The objects that are put into the photograph; at least one.
     #[serde(default)]
     pub objects: Vec<ObjectConfig>,
@@ -191,101 +209,6 @@ pub struct CameraConfig {
     pub transforms_up: Option<String>,
 }
 
-/// Whether planning decides what is simulated.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum EffectsMode {
-    /// Only what the scene calls for.
-    #[default]
-    Planned,
-    /// Everything.
-    All,
-}
-
-/// What the user says about one effect.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum EffectSwitch {
-    /// Simulated, whatever it contributes.
-    On,
-    /// Left out, whatever it contributes.
-    Off,
-    /// Planning decides.
-    Auto,
-}
-
-macro_rules! effects_config {
-    ($($name:ident: $what:literal),* $(,)?) => {
-        /// The `[scene.effects]` table.
-        #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-        #[serde(deny_unknown_fields)]
-        pub struct EffectsConfig {
-            /// Whether planning decides what is simulated: `planned` simulates what the picture
-            /// shows, `all` everything.
-            #[schemars(extend("default" = "planned"), example = &"all")]
-            #[serde(skip_serializing_if = "Option::is_none")]
-            pub mode: Option<EffectsMode>,
-            /// Error that planning may leave, display-referred RMSE with white at 1; never more than a quarter of `composite.target_error`.
-            #[schemars(range(min = 0.0, max = 1.0), extend("default" = EffectsConfig::DEFAULT_TOLERANCE), example = 0.002)]
-            #[serde(skip_serializing_if = "Option::is_none")]
-            pub tolerance: Option<f64>,
-            /// Most interactions of a path with the object.
-            #[schemars(range(min = 1, max = EffectsConfig::MOST_DEPTH), extend("x-default" = "as few as `tolerance` allows"), example = 3)]
-            #[serde(skip_serializing_if = "Option::is_none")]
-            pub max_depth: Option<u32>,
-            $(
-                #[doc = $what]
-                #[schemars(extend("default" = "auto"), example = &"off")]
-                #[serde(skip_serializing_if = "Option::is_none")]
-                pub $name: Option<EffectSwitch>,
-            )*
-        }
-
-        impl EffectsConfig {
-            /// Every effect by the name that the table and `effects.json` use, with what the user
-            /// says about it.
-            pub fn switches(&self) -> Vec<(&'static str, EffectSwitch)> {
-                vec![$((stringify!($name), self.$name.unwrap_or(EffectSwitch::Auto))),*]
-            }
-        }
-    };
-}
-
-effects_config! {
-    shadow: "The object's shadow: light that it keeps from the proxy.",
-    proxy_occlusion: "The proxy's own shadow: light, the object's too, that its parts keep from each other.",
-    interreflection: "Light that bounces between parts of the object.",
-    specular: "Mirror-like reflection at the surface.",
-    textures: "Base colour, metalness and roughness that vary over the surface.",
-    normal_mapping: "Shading normals from textures.",
-    alpha_mask: "Coverage from base-colour alpha, masked or blended.",
-    emission: "Light that the object emits.",
-    emission_on_proxy: "Light that the object emits onto the proxy.",
-    clearcoat: "A coat over the base.",
-    transmission: "Light that passes through the surface.",
-    bounce_to_proxy: "Light that the object reflects onto the proxy.",
-    bounce_from_proxy: "Light that the proxy reflects onto the object.",
-    occluders: "The photo's own foreground in front of the object.",
-}
-
-impl EffectsConfig {
-    /// Default of [`tolerance`](Self::tolerance): half an 8-bit step.
-    pub const DEFAULT_TOLERANCE: f64 = 0.002;
-    /// Most interactions of a path that are ever simulated; an albedo of 0.8 leaves 17% of the
-    /// light after eight.
-    pub const MOST_DEPTH: u32 = 8;
-
-    /// Whether planning decides what is simulated.
-    pub fn mode(&self) -> EffectsMode {
-        self.mode.unwrap_or_default()
-    }
-
-    /// Display-referred RMSE that may be left out.
-    pub fn tolerance(&self) -> f64 {
-        self.tolerance.unwrap_or(Self::DEFAULT_TOLERANCE)
-    }
-}
-
 /// The checked `[scene]` table; paths are still as written.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneSettings {
@@ -297,6 +220,8 @@ pub struct SceneSettings {
     pub class: String,
     /// Mask of the photo's own foreground.
     pub occluders: Option<PathBuf>,
+    /// Depths that tell of it.
+    pub depth: Option<DepthSettings>,
     /// At least one.
     pub objects: Vec<ObjectSettings>,
     /// Where the photo was taken from.
@@ -354,9 +279,7 @@ impl SceneConfig {
                 "a word for the object, for instance class = \"car\"",
             ));
         }
-        if let Some(mask) = &self.occluders {
-            named("scene.occluders", mask)?;
-        }
+        let foreground = self.foreground()?;
         if self.objects.is_empty() {
             return Err(missing(
                 "scene.objects",
@@ -403,19 +326,14 @@ impl SceneConfig {
             background,
             transfer,
             class: class.into(),
-            occluders: self.used_occluders().cloned(),
+            occluders: foreground.0,
+            depth: foreground.1,
             objects,
             camera,
             proxy,
             effects: self.effects,
             limits: self.limits,
         })
-    }
-
-    /// The mask, unless the effect is switched off.
-    fn used_occluders(&self) -> Option<&PathBuf> {
-        let is_off = self.effects.occluders == Some(EffectSwitch::Off);
-        self.occluders.as_ref().filter(|_| !is_off)
     }
 }
 

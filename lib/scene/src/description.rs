@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use dipir_cameras::Lens;
 use dipir_imaging::transfer::Transfer;
 use dipir_points::Ground;
+use dipir_points::scale::Measure;
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
 
@@ -64,6 +65,18 @@ impl ObjectRecord {
     }
 }
 
+/// Depths of the photo, as they were read.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DepthRecord {
+    /// Their file.
+    pub file: FileRecord,
+    /// What its values grow with, if that was said.
+    pub measure: Option<Measure>,
+    /// Metres of a unit, if that was said.
+    pub scale: Option<f32>,
+}
+
 /// What receives the shadow.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -104,6 +117,9 @@ pub struct SceneDescription {
     pub background: PhotoRecord,
     /// Mask of the photo's own foreground.
     pub occluders: Option<FileRecord>,
+    /// Depths that tell of it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth: Option<DepthRecord>,
     /// In the order of the configuration.
     pub objects: Vec<ObjectRecord>,
     /// The photo's camera; of the undistorted photo, if there is a `lens`.

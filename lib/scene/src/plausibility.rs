@@ -49,9 +49,11 @@ pub fn implausible(loaded: &LoadedScene) -> Vec<String> {
     if let ProxyRecord::Mesh(record) = &loaded.description.proxy {
         found.extend(proxy_without_unit(record, &loaded.scene.proxy));
     }
-    if let Some(mask) = &loaded.occluders {
+    if let Some(mask) = &loaded.masked {
         found.extend(hides_nothing(mask));
         found.extend(in_picture::hides_all(mask, mesh, camera));
+    } else if let Some(mask) = &loaded.occluders {
+        found.extend(in_picture::is_behind_all(mask, mesh, camera));
     }
     found.extend(grey::coloured_in_grey(
         &loaded.taken().image,

@@ -6,12 +6,14 @@ use dipir_cameras::Pose;
 use crate::assembly::Assembly;
 use crate::camera::{Camera, CameraSettings};
 use crate::config::EffectsConfig;
-use crate::description::{ObjectRecord, ProxyRecord, SceneDescription};
+use crate::description::{DepthRecord, ObjectRecord, ProxyRecord, SceneDescription};
 use crate::error::Error;
+use crate::files::Files;
+use crate::foreground::DepthSettings;
 use crate::ground;
 use crate::import::once;
 use crate::proxy::Proxy;
-use crate::scene::{Files, LoadedScene, undistort};
+use crate::scene::{LoadedScene, undistort};
 use crate::undistortion::Undistortion;
 
 /// By how much the shapes of a shot's photograph and a frame may differ, relative.
@@ -34,7 +36,14 @@ impl SceneDescription {
             }
         };
         let undistortion = self.lens.as_ref().and_then(Undistortion::of);
-        let (photo, occluders, original) = undistort(photo, occluders, undistortion);
+        let (photo, masked, original) = undistort(photo, occluders, undistortion);
+        let depth = self.depth.as_ref().map(DepthRecord::settings);
+        if let Some(record) = &self.depth {
+            files.check("the depths", &record.file)?;
+        }
+        let depths = files
+            .depths(depth.as_ref(), resolution, undistortion.as_ref())?
+            .0;
         let proxy = files.recorded(&self.proxy)?;
         let mut assembly = Assembly::new(
             self.camera,
@@ -44,17 +53,22 @@ impl SceneDescription {
             assembly.again(&mut files, object)?;
         }
         let (scene, lights) = assembly.into_scene(proxy);
-        Ok(LoadedScene {
+        let mut loaded = LoadedScene {
             scene,
             photo,
             original,
-            occluders,
+            occluders: None,
+            masked: None,
+            depths,
+            depth_fit: None,
             description: self.clone(),
             lights,
             inputs: files.inputs.list,
             missing: files.missing.list,
             warnings: once(files.warnings),
-        })
+        };
+        loaded.hide(masked)?;
+        Ok(loaded)
     }
 
     /// What the user says about effects.
@@ -100,6 +114,16 @@ impl CameraSettings {
         match self {
             Self::LookAt { .. } => true,
             Self::File(file) => dipir_cameras::file::has_one(&base_dir.join(&file.path)),
+        }
+    }
+}
+
+impl DepthRecord {
+    fn settings(&self) -> DepthSettings {
+        DepthSettings {
+            path: self.file.path.clone(),
+            measure: self.measure,
+            scale: self.scale,
         }
     }
 }

@@ -1,31 +1,26 @@
 //! Everything of a scene that a renderer needs, except the light.
 use std::borrow::Cow;
-use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-use dipir_cameras::{Camera as LensCamera, Lens};
-use dipir_imaging::file::{self, Photo};
+use dipir_cameras::Lens;
+use dipir_imaging::file::Photo;
 use dipir_imaging::raster::{LinearImage, Raster};
-use dipir_imaging::transfer::Transfer;
-use dipir_points::Cloud;
 use glam::{DMat4, DVec2};
 
 use crate::assembly::Assembly;
 use crate::camera::{Camera, CameraSettings};
-use crate::config::{ProxySettings, SceneConfig};
-use crate::description::{
-    FileRecord, ObjectRecord, PhotoRecord, ProxyRecord, SceneDescription, repeated,
-};
+use crate::config::SceneConfig;
+use crate::description::{ProxyRecord, SceneDescription, repeated};
 use crate::error::Error;
 use crate::features::SceneFeatures;
+use crate::files::Files;
+use crate::foreground::{DepthFit, Depths, Foreground};
 use crate::ground::{self, Places};
-use crate::import::{self, Imported, once};
+use crate::import::once;
 use crate::light::PunctualLight;
-use crate::limits::Limits;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
 use crate::placement::Anchor;
-use crate::printable::printable;
 use crate::proxy::Proxy;
 use crate::taken::taken;
 use crate::texture::Texture;
@@ -66,8 +61,15 @@ pub struct LoadedScene {
     pub photo: Photo,
     /// The photo as it was taken, if its lens bends lines.
     pub original: Option<Box<Original>>,
-    /// The photo's own foreground, 1 in front of the object; of the photo's size.
+    /// The photo's own foreground, 1 in front of the object; of the photo's size. [`LoadedScene::hide`] makes it of the
+    /// mask that the configuration names and of the depths.
     pub occluders: Option<Raster<f32>>,
+    /// That mask.
+    pub masked: Option<Raster<f32>>,
+    /// Depths that tell what stands in front of the objects.
+    pub depths: Option<Depths>,
+    /// What these were taken for.
+    pub depth_fit: Option<DepthFit>,
     /// From which the same scene can be rebuilt.
     pub description: SceneDescription,
     /// Lights that the objects' files bring along, as placed. They are not rendered.
@@ -126,6 +128,29 @@ impl LoadedScene {
         }
     }
 
+    /// Takes `mask` for the configuration's own and finds anew what stands in front of the objects where they stand.
+    ///
+    /// # Errors
+    /// If the depths do not agree with the ground.
+    pub fn hide(&mut self, mask: Option<Raster<f32>>) -> Result<(), Error> {
+        self.masked = mask;
+        let found = match &self.depths {
+            None => None,
+            Some(depths) => {
+                let Scene {
+                    mesh,
+                    camera,
+                    proxy,
+                    ..
+                } = &self.scene;
+                Some(depths.foreground(Some(mesh), proxy, camera, &self.photo.image)?)
+            }
+        };
+        self.depth_fit = found.as_ref().map(|f| f.fit);
+        self.occluders = joined(self.masked.as_ref(), found.as_ref());
+        Ok(())
+    }
+
     /// The pixel of the undistorted photo that shows what the photo shows at `pixel`; `None` where there is none, as at the
     /// edge of a fisheye's.
     pub fn undistorted_pixel(&self, pixel: DVec2) -> Option<DVec2> {
@@ -164,6 +189,22 @@ pub(crate) fn undistort(
     (working, occluders, Some(Box::new(original)))
 }
 
+/// What a mask or depths say is in front.
+fn joined(mask: Option<&Raster<f32>>, found: Option<&Foreground>) -> Option<Raster<f32>> {
+    let Some(found) = found else {
+        return mask.cloned();
+    };
+    let mut both = found.mask.clone();
+    for (b, m) in both
+        .pixels_mut()
+        .iter_mut()
+        .zip(mask.map_or(&[][..], |m| m.pixels()))
+    {
+        *b = b.max(*m);
+    }
+    Some(both)
+}
+
 impl Scene {
     /// Reads all files that `config` names, relative to `base_dir`, and places the objects.
     pub fn load(config: &SceneConfig, base_dir: &Path) -> Result<LoadedScene, Error> {
@@ -188,6 +229,10 @@ impl Scene {
         let settings = config.validate()?;
         let mut files = Files::new(base_dir, settings.limits);
         let (photo, background) = files.photo(&settings.background, settings.transfer)?;
+        let of_depth = |e: Error| match &settings.depth {
+            Some(depth) => e.in_file(base_dir.join(&depth.path)),
+            None => e,
+        };
         let resolution = [background.width, background.height];
         let occluders = match &settings.occluders {
             None => None,
@@ -217,7 +262,9 @@ impl Scene {
                     .resolve(resolution, base_dir)?,
             };
         let (occluders, occluders_record) = occluders.unzip();
-        let (photo, occluders, original) = undistort(photo, occluders, undistortion);
+        let (photo, masked, original) = undistort(photo, occluders, undistortion);
+        let (depths, depth) =
+            files.depths(settings.depth.as_ref(), resolution, undistortion.as_ref())?;
         let view = ground::view(&camera, undistortion.as_ref());
         let (proxy, proxy_record, cloud) = match of_shot {
             Some(of_shot) => (files.recorded(&of_shot.proxy)?, of_shot.proxy.clone(), None),
@@ -239,6 +286,14 @@ impl Scene {
                 )?
             }
         };
+        let is_looked_for = settings.objects.iter().any(|o| o.auto.is_some());
+        let hidden = match &depths {
+            Some(depths) if is_looked_for && of_shot.is_none() => {
+                let found = depths.foreground(None, &proxy, &camera, &photo.image);
+                joined(masked.as_ref(), Some(&found.map_err(of_depth)?))
+            }
+            _ => masked.clone(),
+        };
         let mut places = Places {
             view,
             ground: match (&proxy_record, &proxy) {
@@ -247,7 +302,7 @@ impl Scene {
                 _ => None,
             },
             cloud,
-            occluders: occluders.as_ref(),
+            occluders: hidden.as_ref(),
             undistortion: undistortion.as_ref(),
             taken,
             doubt,
@@ -290,16 +345,20 @@ impl Scene {
             files.warnings.extend(repeated(&objects));
         }
         let (scene, lights) = assembly.into_scene(proxy);
-        Ok(LoadedScene {
+        let mut loaded = LoadedScene {
             scene,
             photo,
             original,
-            occluders,
+            occluders: None,
+            masked: None,
+            depths,
+            depth_fit: None,
             description: SceneDescription {
                 schema: SceneDescription::SCHEMA.into(),
                 seed: 0,
                 background,
                 occluders: occluders_record,
+                depth,
                 objects,
                 camera,
                 lens: undistortion.map(|u| *u.lens()),
@@ -311,225 +370,13 @@ impl Scene {
             inputs: files.inputs.list,
             missing: files.missing.list,
             warnings: once(files.warnings),
-        })
+        };
+        loaded.hide(masked).map_err(of_depth)?;
+        Ok(loaded)
     }
 
     /// Which kinds of surface the triangles have.
     pub fn features(&self) -> SceneFeatures {
         SceneFeatures::of(self)
-    }
-}
-
-/// Files, each once, in the order in which they were added.
-#[derive(Default)]
-pub(crate) struct Inputs {
-    pub(crate) list: Vec<Input>,
-    /// Role and path of each.
-    known: HashSet<(String, PathBuf)>,
-}
-
-impl Inputs {
-    fn add(&mut self, role: &str, path: &Path, base_dir: &Path) {
-        if self.known.insert((role.into(), path.into())) {
-            self.list.push(Input {
-                role: role.into(),
-                path: path.into(),
-                location: base_dir.join(path),
-            });
-        }
-    }
-}
-
-/// Reads files relative to a folder and keeps the list.
-pub(crate) struct Files<'a> {
-    base_dir: &'a Path,
-    pub(crate) limits: Limits,
-    pub(crate) inputs: Inputs,
-    pub(crate) missing: Inputs,
-    pub(crate) warnings: Vec<String>,
-    hashes: HashMap<PathBuf, String>,
-}
-
-impl<'a> Files<'a> {
-    pub(crate) fn new(base_dir: &'a Path, limits: Limits) -> Self {
-        Self {
-            base_dir,
-            limits,
-            inputs: Inputs::default(),
-            missing: Inputs::default(),
-            warnings: Vec::new(),
-            hashes: HashMap::new(),
-        }
-    }
-
-    /// Adds warnings, with the names in them made printable.
-    pub(crate) fn warn(&mut self, warnings: impl IntoIterator<Item = String>) {
-        self.warnings.extend(warnings.into_iter().map(printable));
-    }
-
-    pub(crate) fn input(&mut self, role: &str, path: &Path) {
-        self.inputs.add(role, path, self.base_dir);
-    }
-
-    /// Notes a file with its hash.
-    fn record(&mut self, role: &str, path: &Path) -> Result<FileRecord, Error> {
-        self.input(role, path);
-        Ok(FileRecord {
-            path: path.into(),
-            blake3: self.hash(role, path)?,
-        })
-    }
-
-    fn hash(&mut self, role: &str, path: &Path) -> Result<String, Error> {
-        let location = self.base_dir.join(path);
-        if let Some(known) = self.hashes.get(&location) {
-            return Ok(known.clone());
-        }
-        let mut hasher = blake3::Hasher::new();
-        dipir_files::open(&location)
-            .and_then(|file| hasher.update_reader(file).map(|_| ()))
-            .map_err(|source| Error::Read {
-                role: role.into(),
-                path: location.clone(),
-                source,
-            })?;
-        let hash = hasher.finalize().to_hex().to_string();
-        self.hashes.insert(location, hash.clone());
-        Ok(hash)
-    }
-
-    pub(crate) fn check(&mut self, role: &str, record: &FileRecord) -> Result<(), Error> {
-        let found = self.hash(role, &record.path)?;
-        if found == record.blake3 {
-            return Ok(());
-        }
-        Err(Error::Changed {
-            role: role.into(),
-            path: record.path.clone(),
-            found,
-            expected: record.blake3.clone(),
-        })
-    }
-
-    pub(crate) fn check_object(&mut self, role: &str, record: &ObjectRecord) -> Result<(), Error> {
-        self.check(role, &record.file)?;
-        for dependency in &record.dependencies {
-            self.check(&format!("a part of {role}"), dependency)?;
-        }
-        Ok(())
-    }
-
-    pub(crate) fn photo(
-        &mut self,
-        path: &Path,
-        transfer: Transfer,
-    ) -> Result<(Photo, PhotoRecord), Error> {
-        let photo =
-            file::read_photo_within(self.base_dir.join(path), transfer, self.limits.photo())?;
-        self.warnings.extend(photo.warnings.iter().cloned());
-        let record = PhotoRecord {
-            file: self.record("background", path)?,
-            width: photo.image.0.width() as u32,
-            height: photo.image.0.height() as u32,
-            transfer,
-        };
-        Ok((photo, record))
-    }
-
-    pub(crate) fn mask(
-        &self,
-        path: &Path,
-        [width, height]: [u32; 2],
-    ) -> Result<Raster<f32>, Error> {
-        let mask = file::read_mask(self.base_dir.join(path))?;
-        if (mask.width(), mask.height()) == (width as usize, height as usize) {
-            return Ok(mask);
-        }
-        Err(Error::Config {
-            key: "scene.occluders".into(),
-            value: format!(
-                "an image of {} x {} pixels (\"{}\")",
-                mask.width(),
-                mask.height(),
-                path.display()
-            ),
-            accepted: format!("one of the background's size, {width} x {height}"),
-        })
-    }
-
-    /// Imports an object and notes all files that it consists of.
-    pub(crate) fn import(
-        &mut self,
-        role: &str,
-        path: &Path,
-    ) -> Result<(Imported, ObjectRecord), Error> {
-        let imported = import::load_object_within(&self.base_dir.join(path), &self.limits)?;
-        let shown = printable(path.display());
-        self.warnings.extend(
-            imported
-                .warnings
-                .iter()
-                .map(|w| format!("\"{shown}\": {w}")),
-        );
-        let file = self.record(role, path)?;
-        let mut dependencies = Vec::new();
-        let (part, base_dir) = (format!("part of {role}"), self.base_dir);
-        let relative = |path| Path::strip_prefix(path, base_dir).unwrap_or(path);
-        for found in &imported.dependencies {
-            dependencies.push(self.record(&part, relative(found))?);
-        }
-        for missing in &imported.missing {
-            self.missing.add(&part, relative(missing), base_dir);
-        }
-        let record = ObjectRecord {
-            file,
-            dependencies,
-            transform: ObjectRecord::rows(&DMat4::IDENTITY),
-            vertices: imported.mesh.positions.len() as u64,
-            triangles: imported.mesh.indices.len() as u64,
-        };
-        Ok((imported, record))
-    }
-
-    /// The proxy, its record, and the points that it was made from.
-    fn proxy(
-        &mut self,
-        settings: &ProxySettings,
-        view: &LensCamera,
-    ) -> Result<(Proxy, ProxyRecord, Option<Cloud>), Error> {
-        let of_plane = |plane| (Proxy::Plane(plane), ProxyRecord::Plane(plane), None);
-        Ok(match settings {
-            ProxySettings::None => (Proxy::None, ProxyRecord::None, None),
-            ProxySettings::Plane(plane) => of_plane(*plane),
-            ProxySettings::Mesh(path) => {
-                let (mesh, record) = self.proxy_mesh(path)?;
-                (Proxy::Mesh(mesh), ProxyRecord::Mesh(record), None)
-            }
-            ProxySettings::Pixels(pixels) => {
-                let (plane, warning) = ground::plane_of(pixels, view)?;
-                self.warnings.extend(warning);
-                of_plane(plane)
-            }
-            ProxySettings::Points(points) => {
-                for part in points.parts(self.base_dir) {
-                    self.input("points", &part);
-                }
-                self.warn(points.choice(self.base_dir));
-                let (cloud, ground) = points.read(self.base_dir, view)?;
-                let proxy = ground::proxy(&ground);
-                (proxy, ProxyRecord::Ground(Box::new(ground)), Some(cloud))
-            }
-        })
-    }
-
-    pub(crate) fn proxy_mesh(
-        &mut self,
-        path: &Path,
-    ) -> Result<(TriangleMesh, ObjectRecord), Error> {
-        let (mut imported, record) = self.import("proxy", path)?;
-        imported
-            .mesh
-            .transform(&DMat4::from_translation(imported.origin));
-        Ok((imported.mesh, record))
     }
 }

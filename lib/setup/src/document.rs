@@ -50,6 +50,8 @@ pub struct Document {
     pub views: Vec<String>,
     /// Points that tell the ground.
     pub points: Option<Points>,
+    /// Depths that tell what stands in front, as the file names them.
+    pub depth: Option<String>,
     /// Limits that the models exceed.
     pub raised: Vec<Raised>,
 }
@@ -126,12 +128,19 @@ impl Document {
             what +=
                 ", with a gain map: how bright what it shows is beyond white is part of the light";
         }
-        format!(
-            "[scene]\nbackground = {}    # {what}\nclass = {}    # what the object is called: {}\n\n",
+        let mut text = format!(
+            "[scene]\nbackground = {}    # {what}\nclass = {}    # what the object is called: {}\n",
             quoted(&self.photo),
             quoted(&self.class),
             self.class_why
-        )
+        );
+        if let Some(depth) = &self.depth {
+            let depth = quoted(depth);
+            text += &format!(
+                "depth = {depth}    # what is nearer than an object stands in front of it\n"
+            );
+        }
+        text + "\n"
     }
 }
 
@@ -360,6 +369,7 @@ mod tests {
             camera_file: None,
             views: Vec::new(),
             points: None,
+            depth: None,
             raised: vec![],
         }
     }

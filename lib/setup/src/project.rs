@@ -13,6 +13,7 @@ use dipir_points::Ground;
 use dipir_points::file::is_depth;
 use dipir_points::ground::Shape;
 use dipir_scene::camera::Camera;
+use dipir_scene::foreground::{DepthSettings, Depths};
 use dipir_scene::ground::{self, PointsSettings};
 use dipir_scene::proxy::Plane;
 
@@ -60,6 +61,8 @@ pub struct Request {
     pub points_pose: Option<PathBuf>,
     /// Which axis of them points up.
     pub points_up: Option<WorldUp>,
+    /// Depths of the photograph that tell what stands in front.
+    pub depth: Option<PathBuf>,
     /// Whether objects look for a free place.
     pub place_auto: bool,
 }
@@ -161,6 +164,15 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
     let elsewhere = view.file.as_ref().map_or(Vec::new(), |file| {
         looking_elsewhere(&file.path, &request.photo, request.camera_up)
     });
+    let depth = request.depth.as_deref();
+    if let Some(path) = depth {
+        let settings = DepthSettings {
+            path: path.into(),
+            measure: None,
+            scale: None,
+        };
+        Depths::read(&settings, Path::new(""), photo.facts.size, None)?;
+    }
     let (class, class_why) = class(request);
     Ok(Draft {
         document: Document {
@@ -181,6 +193,7 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
                 .collect::<Result<_, _>>()?,
             view,
             points: found.map(|f| f.0),
+            depth: depth.map(|path| beside(path, folder)).transpose()?,
             raised: models.raised,
         },
         path: request.out.clone(),

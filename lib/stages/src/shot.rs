@@ -156,12 +156,19 @@ fn picture(session: &Session, scene: &SceneConfig, path: &Path) -> anyhow::Resul
         "scene.background={}",
         text(path, &std::path::absolute(path)?)?
     )];
-    if let Some(mask) = mask_of(scene, path) {
-        if !session.config.base_dir().join(&mask).is_file() {
-            let mask = mask.display();
-            return Err(wrong(&format!("its mask {mask} is missing")).into());
+    let own = |given: &Option<PathBuf>| beside(given.as_ref()?, scene, path);
+    for (key, what, own) in [
+        ("occluders", "its mask", own(&scene.occluders)),
+        ("depth", "the file of its depths", own(&scene.depth)),
+    ] {
+        let Some(file) = own else {
+            continue;
+        };
+        if !session.config.base_dir().join(&file).is_file() {
+            let file = file.display();
+            return Err(wrong(&format!("{what} {file} is missing")).into());
         }
-        set.push(format!("scene.occluders={}", text(path, &mask)?));
+        set.push(format!("scene.{key}={}", text(path, &file)?));
     }
     Ok(set)
 }
@@ -217,24 +224,23 @@ fn key_of_frame(camera: &CameraConfig) -> anyhow::Result<Option<&'static str>> {
     })
 }
 
-/// The mask of a frame, beside that of the photograph. If the photograph's mask has the photograph's name, the frame's mask
-/// has the frame's; if it ends in the photograph's number, the frame's ends in the frame's, with as many digits. Otherwise
-/// `None`: all frames have the photograph's.
-fn mask_of(scene: &SceneConfig, frame: &Path) -> Option<PathBuf> {
-    let mask = scene.occluders.as_ref()?;
-    let (of_mask, of_photo) = (stem(mask)?, stem(scene.background.as_ref()?)?);
+/// What a frame has in place of `given`, a mask or depths of the photograph, and beside it. If that has the photograph's
+/// name, the frame's has the frame's; if it ends in the photograph's number, the frame's ends in the frame's, with as many
+/// digits. Otherwise `None`: all frames have the photograph's.
+fn beside(given: &Path, scene: &SceneConfig, frame: &Path) -> Option<PathBuf> {
+    let (of_given, of_photo) = (stem(given)?, stem(scene.background.as_ref()?)?);
     let of_frame = stem(frame)?;
-    let [(head, n), (_, photo), (_, number)] = [of_mask, of_photo, of_frame].map(split);
+    let [(head, n), (_, photo), (_, number)] = [of_given, of_photo, of_frame].map(split);
     let value = |digits: &str| digits.parse::<u64>().ok();
-    let name = match of_mask == of_photo {
+    let name = match of_given == of_photo {
         true => of_frame.to_string(),
         false if value(n)? == value(photo)? => {
             format!("{head}{:0width$}", value(number)?, width = n.len())
         }
         false => return None,
     };
-    let extension = mask.extension()?.to_str()?;
-    Some(mask.with_file_name(format!("{name}.{extension}")))
+    let extension = given.extension()?.to_str()?;
+    Some(given.with_file_name(format!("{name}.{extension}")))
 }
 
 fn stem(path: &Path) -> Option<&str> {
@@ -290,14 +296,13 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_has_the_mask_of_its_number() {
+    fn a_frame_has_the_mask_and_the_depths_of_its_number() {
         let mask = |photo: &str, mask: &str, frame: &str| {
             let scene = SceneConfig {
                 background: Some(photo.into()),
-                occluders: Some(mask.into()),
                 ..SceneConfig::default()
             };
-            let found = mask_of(&scene, Path::new(frame))?;
+            let found = beside(Path::new(mask), &scene, Path::new(frame))?;
             Some(found.to_str().unwrap().to_string())
         };
         for (photo, given, frame, wanted) in [

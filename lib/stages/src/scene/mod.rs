@@ -23,6 +23,7 @@ use dipir_render::transport::Transport;
 use dipir_scene::camera::parts;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::description::{ProxyRecord, SceneDescription};
+use dipir_scene::foreground::DepthFit;
 use dipir_scene::ground::points_parts;
 use dipir_scene::plausibility::implausible;
 use dipir_scene::scene::{LoadedScene, Scene};
@@ -46,6 +47,8 @@ pub struct Done {
     resolution: [u32; 2],
     /// Of the ground, where it was found in points.
     ground: Option<Ground>,
+    /// Of the depths that tell what is in front.
+    depth_fit: Option<DepthFit>,
     /// Absent where the light is given.
     record: Option<Record>,
     /// Other qualities differ in the record alone.
@@ -139,6 +142,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
             ProxyRecord::Ground(ground) => Some(*ground),
             _ => None,
         },
+        depth_fit: loaded.depth_fit,
         record,
         outlook: outlook.unwrap_or_default(),
     })
@@ -300,6 +304,7 @@ fn named_files(config: &SceneConfig, base_dir: &Path) -> Vec<(&'static str, Path
     let single = [
         ("background", config.background.clone()),
         ("occluders", config.occluders.clone()),
+        ("depth", config.depth.clone()),
         ("proxy", proxy),
     ];
     let camera = camera.into_iter().map(|path| ("camera", Some(path)));
@@ -383,6 +388,11 @@ impl Done {
                 "point": g.point, "normal": g.normal, "points": g.points, "inliers": g.inliers,
                 "residual_m": g.residual_m, "relief": g.relief.is_some(),
             })),
+            "depth": self.depth_fit.map(|d| json!({
+                "kind": d.fitted.map(|f| f.scale.measure), "factor": d.fitted.map(|f| f.scale.factor),
+                "shift": d.fitted.map(|f| f.scale.shift), "agreeing": d.fitted.map(|f| f.agreeing),
+                "deviation": d.fitted.map(|f| f.deviation), "margin": d.margin,
+            })),
             "effects": self.effects.effects,
             "max_depth": self.effects.max_depth,
             "transport": self.record.as_ref().map(|r| json!({
@@ -415,6 +425,9 @@ impl fmt::Display for Done {
         )?;
         if let Some(ground) = &self.ground {
             writeln!(f, "  ground: {}", ground.words())?;
+        }
+        if let Some(fit) = &self.depth_fit {
+            writeln!(f, "  depth: {}", fit.words())?;
         }
         write!(
             f,
