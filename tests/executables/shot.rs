@@ -465,6 +465,25 @@ fn objects_and_ground_are_as_in_the_photograph() {
     let run = project.run(DIPIR, &[&["shot", "f.1.png"][..], &at_pixel].concat());
     run.expect_error(2, "error: f.1.png: its mask roto.1.png is missing");
     write_png(project.path("roto.1.png"), &black).unwrap();
+    // Each frame of a camera that moves has depths of its own.
+    for (depth, why) in [
+        (
+            "depth.png",
+            "error: f.1.png: the camera moves, and scene.depth has no file for it",
+        ),
+        (
+            "depth.0.png",
+            "error: f.1.png: the file of its depths depth.1.png is missing",
+        ),
+    ] {
+        let depth = format!("scene.depth={depth}");
+        let run = project.run(
+            DIPIR,
+            &[&["shot", "f.1.png", "--set", &depth][..], &at_pixel].concat(),
+        );
+        assert_eq!(run.code, Some(2), "{}", run.stderr);
+        assert!(run.stderr.contains(why), "{}", run.stderr);
+    }
     shot(&project, &[&["f.1.png"][..], &at_pixel].concat());
     let of = |folder: &str| -> Value {
         let path = format!("{folder}/scene/scene.json");

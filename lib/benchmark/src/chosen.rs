@@ -199,6 +199,8 @@ fn note_scenes(set: &[String], note: &dyn Fn(&str)) {
         "transfer",
         "occluders",
         "depth",
+        "depth_kind",
+        "depth_scale",
         "objects",
         "camera",
         "proxy",

@@ -4,8 +4,10 @@ use rayon::prelude::*;
 
 use crate::raster::Raster;
 
-/// Rows that are filtered at once.
-const BAND: usize = 64;
+/// Side of the squares that are filtered each by itself, pixels.
+const TILE: usize = 128;
+/// Tiles of a batch.
+const TILES_AT_ONCE: usize = 1024;
 
 /// `mask` with the edges of `guide`: in every square of `2 radius + 1` pixels a side the mask is taken to be a linear
 /// function of the guide's colours, by least squares with a penalty of `softness`, a variance of colours, on its slope.
@@ -25,29 +27,44 @@ pub fn guided(
         (guide.width(), guide.height()),
         "mask and guide have the same size"
     );
+    let columns = width.div_ceil(TILE);
+    let tiles: Vec<usize> = (0..columns * height.div_ceil(TILE)).collect();
     let mut filtered = mask.clone();
-    let bands = filtered
-        .pixels_mut()
-        .par_chunks_mut(BAND * width.max(1))
-        .enumerate();
-    bands.for_each(|(band, out)| {
-        let first = band * BAND;
-        let last = first + out.len() / width;
-        // The filter averages twice.
-        let from = first.saturating_sub(2 * radius);
-        let to = (last + 2 * radius).min(height);
-        let values = &mask.pixels()[from * width..to * width];
-        if values.iter().all(|v| *v == values[0]) {
-            return;
+    // A batch at a time, so that what tiles take is small beside the picture.
+    for batch in tiles.chunks(TILES_AT_ONCE) {
+        let tile = |&tile: &usize| {
+            let (x, y) = (tile % columns * TILE, tile / columns * TILE);
+            let (inner, outer) = ([x, y], [x, y].map(|at| at.saturating_sub(2 * radius)));
+            // The filter averages twice.
+            let end = |at: usize, reach: usize, size: usize| (at + TILE + reach).min(size);
+            let outer_end = [end(x, 2 * radius, width), end(y, 2 * radius, height)];
+            let rows = outer[1]..outer_end[1];
+            let part = rows.flat_map(|v| v * width + outer[0]..v * width + outer_end[0]);
+            let values: Vec<f32> = part.clone().map(|i| mask.pixels()[i]).collect();
+            if values.iter().all(|v| *v == values[0]) {
+                return None;
+            }
+            let colours: Vec<Vec3> = part.map(|i| guide.pixels()[i]).collect();
+            let across = outer_end[0] - outer[0];
+            let lines = lines(&values, &colours, across, radius, softness);
+            let inside = |at: [usize; 2]| (at[1] - outer[1]) * across + at[0] - outer[0];
+            let pixels =
+                (y..end(y, 0, height)).flat_map(|v| (x..end(x, 0, width)).map(move |u| [u, v]));
+            let pixels = pixels.map(|at| {
+                let [x, y, z, offset] = lines[inside(at)];
+                (colours[inside(at)].dot(Vec3::new(x, y, z)) + offset).clamp(0.0, 1.0)
+            });
+            Some((inner, pixels.collect::<Vec<f32>>()))
+        };
+        let done: Vec<_> = batch.par_iter().filter_map(tile).collect();
+        for ([x, y], pixels) in done {
+            let across = (x + TILE).min(width) - x;
+            for (v, row) in pixels.chunks(across).enumerate() {
+                let start = (y + v) * width + x;
+                filtered.pixels_mut()[start..start + across].copy_from_slice(row);
+            }
         }
-        let colours = &guide.pixels()[from * width..to * width];
-        let lines = lines(values, colours, width, radius, softness);
-        for (i, out) in out.iter_mut().enumerate() {
-            let i = i + (first - from) * width;
-            let [x, y, z, offset] = lines[i];
-            *out = (colours[i].dot(Vec3::new(x, y, z)) + offset).clamp(0.0, 1.0);
-        }
-    });
+    }
     filtered
 }
 
@@ -179,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn squares_of_one_value_stay_and_bands_do_not_show() {
+    fn squares_of_one_value_stay_and_tiles_do_not_show() {
         let (guide, truth) = two_colours(150);
         let filtered = guided(&truth, &guide, 4, 1e-4);
         for (i, (a, b)) in filtered.pixels().iter().zip(truth.pixels()).enumerate() {

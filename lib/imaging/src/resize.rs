@@ -77,8 +77,9 @@ impl CropResize {
         );
         // Only the rows that the box touches are filtered along x; the rest are never read.
         let touched = self.rows.touched();
+        let first = touched.start;
         let wide = filter_rows(image, &self.columns, touched);
-        filter_columns(&wide, &self.rows)
+        filter_columns(&wide, &self.rows, first)
     }
 
     /// The transpose of [`apply`](Self::apply): from the gradient with respect to the output to
@@ -89,7 +90,7 @@ impl CropResize {
             self.output,
             "the output's size"
         );
-        let tall = filter_columns(gradient, &self.rows_transposed);
+        let tall = filter_columns(gradient, &self.rows_transposed, 0);
         filter_rows(&tall, &self.columns_transposed, 0..self.source.1)
     }
 }
@@ -116,30 +117,38 @@ pub fn resize<T: Sample>(
     .apply(image)
 }
 
-fn filter_rows<T: Sample>(image: &Raster<T>, taps: &Taps<f32>, rows: Range<usize>) -> Raster<T> {
-    let (width, height) = (taps.outputs(), image.height());
-    let mut output = Raster::filled(width, height, T::default());
-    let lines = output.pixels_mut().par_chunks_mut(width).enumerate();
-    lines
-        .filter(|(y, _)| rows.contains(y))
-        .for_each(|(y, line)| {
-            let input = image.row(y);
-            for (x, pixel) in line.iter_mut().enumerate() {
-                for &(i, weight) in taps.of(x) {
-                    *pixel += input[i] * weight;
-                }
+/// Those of `rows`, filtered along x.
+pub(crate) fn filter_rows<T: Sample>(
+    image: &Raster<T>,
+    taps: &Taps<f32>,
+    rows: Range<usize>,
+) -> Raster<T> {
+    let width = taps.outputs();
+    let mut output = Raster::filled(width, rows.len(), T::default());
+    let lines = output.pixels_mut().par_chunks_mut(width.max(1));
+    lines.zip(rows).for_each(|(line, y)| {
+        let input = image.row(y);
+        for (x, pixel) in line.iter_mut().enumerate() {
+            for &(i, weight) in taps.of(x) {
+                *pixel += input[i] * weight;
             }
-        });
+        }
+    });
     output
 }
 
-fn filter_columns<T: Sample>(image: &Raster<T>, taps: &Taps<f32>) -> Raster<T> {
+/// All rows, filtered along y, of an image whose row 0 is the row `first` of the taps.
+pub(crate) fn filter_columns<T: Sample>(
+    image: &Raster<T>,
+    taps: &Taps<f32>,
+    first: usize,
+) -> Raster<T> {
     let (width, height) = (image.width(), taps.outputs());
     let mut output = Raster::filled(width, height, T::default());
-    let lines = output.pixels_mut().par_chunks_mut(width).enumerate();
+    let lines = output.pixels_mut().par_chunks_mut(width.max(1)).enumerate();
     lines.for_each(|(y, line)| {
         for &(i, weight) in taps.of(y) {
-            for (pixel, &value) in line.iter_mut().zip(image.row(i)) {
+            for (pixel, &value) in line.iter_mut().zip(image.row(i - first)) {
                 *pixel += value * weight;
             }
         }

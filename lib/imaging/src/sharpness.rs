@@ -1,8 +1,9 @@
 //! Sharpness: how wide the sharpest edges of a photograph are, and the same blur for what is laid over it.
 use crate::metrics::LUMA;
 use crate::raster::{LinearImage, Raster};
-use crate::resize::{PixelBox, Sample};
+use crate::resize::{PixelBox, Sample, filter_columns, filter_rows};
 use crate::squares::squares;
+use dipir_numerics::resample::Taps;
 use rayon::prelude::*;
 
 /// Standard deviations of the two Gaussians whose gradients are compared, pixels: about the least of which pixels can be
@@ -129,34 +130,11 @@ fn filtered<T: Sample>(
     across: &[f32],
     down: &[f32],
 ) -> Raster<T> {
-    let beside = |at: usize, k: usize, taps: &[f32], length: usize| {
-        (at + k).saturating_sub(taps.len() / 2).min(length - 1)
-    };
-    let (width, height) = (image.width(), image.height());
-    let reach = down.len() / 2;
-    let first = part.y.saturating_sub(reach);
-    let last = (part.y + part.height + reach).min(height);
-    let mut wide = Raster::filled(part.width, last - first, T::default());
-    let rows = wide.pixels_mut().par_chunks_mut(part.width.max(1));
-    rows.enumerate().for_each(|(j, row)| {
-        let source = image.row(first + j);
-        for (i, pixel) in row.iter_mut().enumerate() {
-            for (k, &w) in across.iter().enumerate() {
-                *pixel += source[beside(part.x + i, k, across, width)] * w;
-            }
-        }
-    });
-    let mut out = Raster::filled(part.width, part.height, T::default());
-    let rows = out.pixels_mut().par_chunks_mut(part.width.max(1));
-    rows.enumerate().for_each(|(j, row)| {
-        for (k, &w) in down.iter().enumerate() {
-            let source = wide.row(beside(part.y + j, k, down, height) - first);
-            for (pixel, &value) in row.iter_mut().zip(source) {
-                *pixel += value * w;
-            }
-        }
-    });
-    out
+    let columns = Taps::of_kernel(across, part.x..part.x + part.width, image.width());
+    let rows = Taps::of_kernel(down, part.y..part.y + part.height, image.height());
+    let touched = rows.touched();
+    let first = touched.start;
+    filter_columns(&filter_rows(image, &columns, touched), &rows, first)
 }
 
 /// Blurs `part` of `image` by a Gaussian of `deviation` pixels. `seen` is how much of each pixel counts, as of a thing that

@@ -1,6 +1,7 @@
 //! Changing the number of samples of a line: a sparse matrix, and its transpose for gradients.
 //!
 //! Sample `i` covers `[i, i + 1]`, its centre is at `i + 1/2`.
+use std::ops::Range;
 
 /// How an output sample weighs the input samples around it. Weights are positive and sum to 1, so
 /// constants stay and nothing rings.
@@ -74,6 +75,24 @@ impl Taps {
     }
 }
 
+impl Taps<f32> {
+    /// `kernel`, of an odd length, around each of `samples` of a line of `inputs` samples. Beyond its ends the line goes on as
+    /// it ends.
+    pub fn of_kernel(kernel: &[f32], samples: Range<usize>, inputs: usize) -> Self {
+        let mut taps = Self {
+            starts: vec![0],
+            entries: Vec::with_capacity(kernel.len() * samples.len()),
+        };
+        for o in samples {
+            let at = |k: usize| (o + k).saturating_sub(kernel.len() / 2).min(inputs - 1);
+            let weights = kernel.iter().enumerate();
+            taps.entries.extend(weights.map(|(k, &w)| (at(k), w)));
+            taps.starts.push(taps.entries.len());
+        }
+        taps
+    }
+}
+
 /// First sample and weights of a mean over `[low, high]`.
 fn area(low: f64, high: f64, inputs: usize) -> (usize, Vec<f64>) {
     let first = (low.floor().max(0.0) as usize).min(inputs - 1);
@@ -136,6 +155,16 @@ impl<W: Copy> Taps<W> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_kernel_s_line_goes_on_as_it_ends() {
+        let taps = Taps::of_kernel(&[0.25, 0.5, 0.25], 0..3, 3);
+        assert_eq!(taps.of(0), [(0, 0.25), (0, 0.5), (1, 0.25)]);
+        assert_eq!(taps.of(1), [(0, 0.25), (1, 0.5), (2, 0.25)]);
+        assert_eq!(taps.of(2), [(1, 0.25), (2, 0.5), (2, 0.25)]);
+        let part = Taps::of_kernel(&[1.0; 5], 4..5, 9);
+        assert_eq!(part.touched(), 2..7);
+    }
 
     const FILTERS: [Filter; 2] = [Filter::Area, Filter::Tent];
 

@@ -78,6 +78,8 @@ struct Rendered {
     own_mask: Option<Raster<f32>>,
     /// The light of a configuration and a camera.
     light: Option<(String, AtHand)>,
+    /// Why depths hide nothing, where they should.
+    left_out: Option<String>,
 }
 
 /// A draft that was broken off by a newer one.
@@ -134,9 +136,10 @@ impl Desk {
             mask: Mutex::default(),
             rendered: Mutex::new(Rendered {
                 session,
-                own_mask: small.loaded.masked.clone(),
+                own_mask: small.loaded.mask().cloned(),
                 small,
                 light: None,
+                left_out: None,
             }),
             drafts: Drafts::default(),
             masks: AtomicU64::new(0),
@@ -407,6 +410,10 @@ impl Desk {
             Err(RenderError::Interrupted) => return Ok(Err(Superseded)),
             other => other?,
         };
+        let mut light = description(light, words, &arrangement.camera);
+        if let Some(why) = &rendered.left_out {
+            light["origin"] = format!("{words}. {why}").into();
+        }
         let Some(place) = draft.touched else {
             return Ok(Ok(None));
         };
@@ -415,7 +422,7 @@ impl Desk {
         Ok(Ok(Some(Crop {
             png: png::encode(x1 - x0, y1 - y0, &values)?,
             place,
-            light: description(light, words, &arrangement.camera),
+            light,
         })))
     }
 
@@ -427,10 +434,11 @@ impl Desk {
         arrangement: &Arrangement,
         config: Config,
     ) -> anyhow::Result<(&'a LoadedScene, &'a AtHand, &'static str)> {
+        to.left_out = None;
         to.small.arrange(arrangement);
         to.session.config = config;
         let mask = self.occluders(edit, to.own_mask.as_ref());
-        to.small.loaded.hide(mask)?;
+        to.left_out = to.small.loaded.hide_if_known(mask);
         // A light that a run refuses is not shown first and refused when it is saved.
         if edit.sun.is_some() || edit.shadow.is_some() {
             assess(&to.session, LIGHT.name)?;
@@ -533,6 +541,9 @@ impl Desk {
         }
         // Every table is read once more, and the light found, as a run would.
         self.arrange(&mut rendered, edit, &arrangement, config)?;
+        if let Some(why) = &rendered.left_out {
+            bail!("{why}");
+        }
         assess(&rendered.session, graph::LAST)?;
         let mut written = Vec::new();
         if let Some(mask) = &mut mask {

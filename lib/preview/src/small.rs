@@ -86,8 +86,8 @@ impl SmallScene {
     pub fn load(session: &Session, longest: u32) -> anyhow::Result<(Self, Arrangement)> {
         let config: SceneConfig = session.config.table("scene")?;
         let base_dir = session.config.base_dir();
-        let mut loaded =
-            Scene::load(&config, &base_dir).map_err(|e| with_place(e, &session.config))?;
+        let mut loaded = Scene::load_for_a_look(&config, &base_dir)
+            .map_err(|e| with_place(e, &session.config))?;
         let mut warnings = std::mem::take(&mut loaded.warnings);
         warnings.extend(implausible(&loaded));
         let models = Model::all(&loaded);
@@ -98,9 +98,10 @@ impl SmallScene {
         loaded.photo.alpha = None;
         if full.resolution != [width, height] {
             loaded.photo.image = LinearImage(resize(&loaded.photo.image.0, w, h, Filter::Area));
-            let mask = loaded.masked.take();
+            let mask = loaded.take_mask();
             let mask = mask.map(|mask| resize(&mask, w, h, Filter::Area));
-            loaded.hide(mask)?;
+            loaded.depths = loaded.depths.map(|depths| depths.within([width, height]));
+            warnings.extend(loaded.hide_if_known(mask).filter(|w| !warnings.contains(w)));
             // A photograph without values is taken for linear light, which has another exposure and no curve.
             if loaded.photo.values.is_some() {
                 let shown = loaded.photo.transfer.encode(&loaded.photo.image).0;

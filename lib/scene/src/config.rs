@@ -51,7 +51,7 @@ pub struct SceneConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("format" = "path"), example = &"depth.png")]
     pub depth: Option<PathBuf>,
-    /// What the values of `depth` grow with: the depth along the optical axis, or one over it, as in most maps in which
+    /// What the values of `depth` are linear in: the depth along the optical axis, or one over it, as in most maps in which
     /// what is near is bright.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("enum" = ["auto", "depth", "disparity"]), extend("default" = "auto"), example = &"disparity")]

@@ -71,7 +71,7 @@ impl ObjectRecord {
 pub struct DepthRecord {
     /// Their file.
     pub file: FileRecord,
-    /// What its values grow with, if that was said.
+    /// What its values are linear in, if that was said.
     pub measure: Option<Measure>,
     /// Metres of a unit, if that was said.
     pub scale: Option<f32>,

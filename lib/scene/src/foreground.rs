@@ -6,13 +6,14 @@ use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_imaging::warp::pick;
 use dipir_points::scale::{Fitted, Measure, Sample, Scale, fitted};
-use dipir_points::{PointsError, depth};
+use dipir_points::{Cloud, PointsError, depth};
 use glam::DVec2;
 use rayon::prelude::*;
 
 use crate::camera::Camera;
 use crate::depth_buffer::{direction, least, nearest};
 use crate::error::Error;
+use crate::ground;
 use crate::mesh::TriangleMesh;
 use crate::proxy::{Plane, Proxy};
 use crate::undistortion::Undistortion;
@@ -22,7 +23,7 @@ use crate::undistortion::Undistortion;
 pub struct DepthSettings {
     /// Their file.
     pub path: PathBuf,
-    /// What its values grow with, if that is said.
+    /// What its values are linear in, if that is said.
     pub measure: Option<Measure>,
     /// Metres of a unit, if that is said.
     pub scale: Option<f32>,
@@ -50,19 +51,29 @@ pub struct Foreground {
 pub struct DepthFit {
     /// Their scale, if it was found on the ground.
     pub fitted: Option<Fitted>,
-    /// How much nearer than a surface the photograph's own has to be to hide it, as a share of the surface's depth.
+    /// How much nearer than the object the photograph's own has to be to hide it, as a share of the object's depth.
     pub margin: f64,
+    /// The same for the ground and a shadow on it.
+    pub ground_margin: f64,
+    /// Whether the photograph's own hides all that would be seen of the objects.
+    pub hides_objects: bool,
 }
 
-/// As many standard deviations of the depths of the ground the foreground is nearer than what it hides.
+/// The margin, by how much what hides is nearer, in standard deviations of the ground's depths.
 const DEVIATIONS: f64 = 3.0;
-/// Least and most of that, as a share of the depth.
-const MARGINS: [f64; 2] = [0.02, 0.15];
-/// That share where the scale is said, and so nothing is known of deviations.
+/// Least and greatest margin, as a share of the depth.
+const MARGINS: [f64; 2] = [0.03, 0.15];
+/// Least margin before the ground: real ground is no plane, and over a bump of that share of the camera's height the shadow
+/// goes on.
+const GROUND_MARGIN: f64 = 0.08;
+/// The margin where the scale is said, and so nothing is known of deviations.
 const MARGIN: f64 = 0.05;
 /// From the margin on a mask becomes white over this share of it.
 const RAMP: f64 = 0.5;
-/// Depth networks see about so many pixels along the longer side; what is finer in their maps is interpolated.
+/// From this value on a mask hides.
+const HIDDEN: f32 = 0.99;
+/// Depth networks are taken to see so many pixels along the longer side (Depth Anything: 518); what is finer in their maps is
+/// interpolated.
 const NETWORK_PX: f64 = 512.0;
 /// Radii of the filter that brings the mask's edges onto the photograph's, pixels: least and most.
 const RADII: [f64; 2] = [2.0, 24.0];
@@ -70,6 +81,15 @@ const RADII: [f64; 2] = [2.0, 24.0];
 const SOFTNESS: f32 = 4e-4;
 /// Where a coarse mask is off, the filter leaves so much of it: this becomes 0, and one minus this 1.
 const CLEAR: f32 = 0.2;
+/// Texels to each side within which a blurred edge of a map is made sharp, and within which holes are filled.
+const AROUND: usize = 2;
+/// An edge changes the disparity over the ground's within [`AROUND`] by at least this share of the largest there, or by so many
+/// standard deviations.
+const EDGE: (f64, f64) = (0.08, 6.0);
+/// By how much the shapes of map and photograph may differ, relative: networks work on multiples of 14 to 32 pixels.
+const SAME_SHAPE: f64 = 0.05;
+/// From this deviation on there is a doubt: it is at most the 5% within which depths agree with the ground.
+const DOUBTFUL: f64 = 0.0495;
 /// Places on the ground along the longer side at which depths are compared with it.
 const COMPARED: usize = 128;
 
@@ -87,7 +107,7 @@ impl Depths {
         let path = base_dir.join(&settings.path);
         let photo = resolution.map(f64::from);
         let values = depth::read(&path);
-        let values = values.and_then(|v| depth::check_shape(&v, photo).map(|()| v));
+        let values = values.and_then(|v| depth::check_shape(&v, photo, SAME_SHAPE).map(|()| v));
         let values = values.map_err(|e| match e {
             PointsError::Read { path, source } => Error::Read {
                 role: "the depths".into(),
@@ -99,13 +119,16 @@ impl Depths {
         let values = match undistortion {
             None => values,
             Some(way) => {
+                // At its own resolution.
                 let own = DVec2::new(values.width() as f64, values.height() as f64);
                 let scale = own / DVec2::from_array(photo);
+                let working = DVec2::from_array(way.size().map(f64::from));
+                let size = (working * scale).round().max(DVec2::ONE);
                 let map = |p| {
-                    let pixel = way.to_photo(DVec2::from_array(p))?;
+                    let pixel = way.to_photo(DVec2::from_array(p) / size * working)?;
                     Some((pixel * scale).to_array())
                 };
-                pick(&values, way.size().map(|n| n as usize), f32::NAN, map)
+                pick(&values, size.to_array().map(|n| n as usize), f32::NAN, map)
             }
         };
         Ok(Self {
@@ -127,25 +150,16 @@ impl Depths {
         photo: &LinearImage,
     ) -> Result<Foreground, Error> {
         let ground = Ground::of(proxy, camera);
-        let (fitted, scale, margin) = match self.scale {
-            Some(factor) => {
-                let scale = Scale {
-                    measure: Measure::Depth,
-                    factor: f64::from(factor),
-                    shift: 0.0,
-                };
-                (None, scale, MARGIN)
-            }
-            None => {
-                let fitted = self.fitted(&ground, camera)?;
-                let margin = (DEVIATIONS * fitted.deviation).clamp(MARGINS[0], MARGINS[1]);
-                (Some(fitted), fitted.scale, margin)
-            }
-        };
+        let (scale, mut fit) = self.fit(&ground, camera)?;
+        let disparities = self.disparities(&scale, &fit, &ground, camera);
         let [width, height] = camera.resolution.map(|n| n as usize);
-        let hidden = |i: usize, surface_m: f64| {
-            let (x, y) = (i % width, i / width);
-            let nearer = 1.0 - scale.metres(self.at(x, y, camera)) / surface_m;
+        let hidden = |i: usize, surface_m: f64, margin: f64| {
+            let disparity = between(&disparities, i % width, i / width, camera);
+            // What is unknown or infinitely far hides nothing.
+            if !(disparity > 0.0) {
+                return 0.0;
+            }
+            let nearer = 1.0 - 1.0 / (f64::from(disparity) * surface_m);
             ((nearer - margin) / (RAMP * margin)).clamp(0.0, 1.0) as f32
         };
         let radius = self.radius(camera);
@@ -159,7 +173,7 @@ impl Depths {
             mask
         };
         let of_ground = |i: usize| match ground.metres(i % width, i / width, camera) {
-            Some(m) => hidden(i, m),
+            Some(m) => hidden(i, m, fit.ground_margin),
             None => 0.0,
         };
         let pixels = (0..width * height).into_par_iter();
@@ -171,63 +185,157 @@ impl Depths {
             let around = least(&nearest, 2 * radius + 1);
             let pixels = around.pixels().par_iter().enumerate();
             let of_objects = |(i, m): (usize, &f32)| match m.is_finite() {
-                true => hidden(i, f64::from(*m)),
+                true => hidden(i, f64::from(*m), fit.margin),
                 false => 0.0,
             };
             let before_objects = filtered(pixels.map(of_objects).collect());
             let covered = least(&nearest, 1);
             let of_objects = covered.pixels().iter().zip(before_objects.pixels());
+            let (mut seen, mut hidden) = (0usize, 0usize);
             for (m, (depth, before)) in mask.pixels_mut().iter_mut().zip(of_objects) {
                 if depth.is_finite() {
                     *m = *before;
+                    seen += 1;
+                    hidden += usize::from(*before >= HIDDEN);
                 }
             }
+            fit.hides_objects = seen > 0 && hidden == seen;
         }
-        Ok(Foreground {
-            mask,
-            fit: DepthFit { fitted, margin },
-        })
+        Ok(Foreground { mask, fit })
     }
 
-    /// The value at a pixel, between those of the map's, unless one of them is 0 or unknown: then the nearest.
-    fn at(&self, x: usize, y: usize, camera: &Camera) -> f32 {
-        let size = [self.values.width(), self.values.height()];
-        let [(left, right, u), (above, below, v)] = [(0, x), (1, y)].map(|(k, i)| {
-            let at = (i as f64 + 0.5) * size[k] as f64 / f64::from(camera.resolution[k]) - 0.5;
-            let at = at.clamp(0.0, (size[k] - 1) as f64);
-            let first = at as usize;
-            let share = (at - first as f64) as f32;
-            (first, (first + 1).min(size[k] - 1), share)
-        });
-        let of = |column, row| *self.values.get(column, row);
-        let around = [
-            of(left, above),
-            of(right, above),
-            of(left, below),
-            of(right, below),
-        ];
-        if around.iter().any(|v| !v.is_finite() || *v == 0.0) {
-            let nearest = |a, b, share| if share < 0.5 { a } else { b };
-            return of(nearest(left, right, u), nearest(above, below, v));
-        }
-        let across = |a: f32, b: f32| a + (b - a) * u;
-        let [above, below] = [across(around[0], around[1]), across(around[2], around[3])];
-        above + (below - above) * v
+    fn fit(&self, ground: &Ground, camera: &Camera) -> Result<(Scale, DepthFit), Error> {
+        let (scale, fitted, margin) = match self.scale {
+            Some(factor) => {
+                let scale = Scale {
+                    measure: Measure::Depth,
+                    factor: f64::from(factor),
+                    shift: 0.0,
+                };
+                (scale, None, MARGIN)
+            }
+            None => {
+                let fitted = self.fitted(ground, camera)?;
+                let margin = (DEVIATIONS * fitted.deviation).clamp(MARGINS[0], MARGINS[1]);
+                (fitted.scale, Some(fitted), margin)
+            }
+        };
+        let fit = DepthFit {
+            fitted,
+            margin,
+            ground_margin: margin.max(GROUND_MARGIN),
+            hides_objects: false,
+        };
+        Ok((scale, fit))
     }
 
     fn fitted(&self, ground: &Ground, camera: &Camera) -> Result<Fitted, Error> {
-        let [w, h] = camera.resolution.map(|n| n as usize);
-        let step = w.max(h).div_ceil(COMPARED);
+        if matches!(ground, Ground::None) {
+            return Err(Error::Missing {
+                key: "scene.proxy".into(),
+                remedy: "the scale of scene.depth is found on the ground: write one, or depth_scale, metres of a unit".into(),
+            });
+        }
+        let (width, height) = (self.values.width(), self.values.height());
+        let step = width.max(height).div_ceil(COMPARED);
         let mut samples = Vec::new();
-        for y in (step / 2..h).step_by(step) {
-            for x in (step / 2..w).step_by(step) {
-                let value = f64::from(self.at(x, y, camera));
-                if let Some(ground_m) = ground.metres(x, y, camera) {
+        for y in (step / 2..height).step_by(step) {
+            for x in (step / 2..width).step_by(step) {
+                let value = f64::from(*self.values.get(x, y));
+                if let Some(ground_m) = self.ground_m(x, y, ground, camera) {
                     samples.push(Sample { value, ground_m });
                 }
             }
         }
         fitted(&samples, self.measure).map_err(Error::Points)
+    }
+
+    /// Depth of the ground at a texel, metres.
+    fn ground_m(&self, x: usize, y: usize, ground: &Ground, camera: &Camera) -> Option<f64> {
+        let [w, h] = camera.resolution.map(|n| n as usize);
+        let column = (2 * x + 1) * w / (2 * self.values.width());
+        let row = (2 * y + 1) * h / (2 * self.values.height());
+        ground.metres(column, row, camera)
+    }
+
+    /// Without texels that a picture of at most `size` pixels does not show, but for twice as many along a side.
+    pub fn within(&self, size: [u32; 2]) -> Self {
+        let own = [self.values.width(), self.values.height()];
+        let to = [0, 1].map(|k| own[k].min(2 * size[k] as usize));
+        let map = |p: [f64; 2]| Some([0, 1].map(|k| p[k] * own[k] as f64 / to[k] as f64));
+        Self {
+            values: pick(&self.values, to, f32::NAN, map),
+            ..*self
+        }
+    }
+
+    /// One over the depths, 1/metre, with sharp edges and small holes filled; NaN where nothing is known. What a blurred edge
+    /// mixes is given to its nearer or its farther side: of the disparity over the ground's, so that ground has no edges.
+    fn disparities(
+        &self,
+        scale: &Scale,
+        fit: &DepthFit,
+        ground: &Ground,
+        camera: &Camera,
+    ) -> Raster<f32> {
+        let (width, height) = (self.values.width(), self.values.height());
+        let of_ground = |i: usize| {
+            let metres = self.ground_m(i % width, i / width, ground, camera);
+            metres.map_or(0.0, f64::recip)
+        };
+        let values = self.values.pixels().par_iter().enumerate();
+        let over = values.map(|(i, &value)| {
+            let disparity = scale.disparity(value)?;
+            Some([disparity, disparity - of_ground(i)].map(|v| v as f32))
+        });
+        let over: Vec<Option<[f32; 2]>> = over.collect();
+        let deviation = fit.fitted.map_or(0.0, |f| f.deviation);
+        let edge = EDGE.0.max(EDGE.1 * deviation) as f32;
+        let sharp = |i: usize| {
+            let (x, y) = (i % width, i / width);
+            let columns = x.saturating_sub(AROUND)..(x + AROUND + 1).min(width);
+            let rows = y.saturating_sub(AROUND)..(y + AROUND + 1).min(height);
+            let around = rows.flat_map(|y| columns.clone().map(move |x| y * width + x));
+            let (mut low, mut high, mut most) = (f32::INFINITY, f32::NEG_INFINITY, 0.0f32);
+            let (mut sum, mut count) = (0.0, 0.0);
+            for [disparity, over] in around.filter_map(|i| over[i]) {
+                (low, high, most) = (low.min(over), high.max(over), most.max(disparity));
+                (sum, count) = (sum + over, count + 1.0);
+            }
+            if count == 0.0 {
+                return f32::NAN;
+            }
+            let own = over[i].map_or(sum / count, |[_, over]| over);
+            let own = match high - low > edge * most {
+                true if own - low < high - own => low,
+                true => high,
+                false => own,
+            };
+            (own + of_ground(i) as f32).max(0.0)
+        };
+        let pixels = (0..width * height).into_par_iter().map(sharp);
+        Raster::from_pixels(width, height, pixels.collect())
+    }
+
+    /// Points that the depths show, metres, and the standard deviation of the ground's heights among them.
+    ///
+    /// # Errors
+    /// As [`Self::foreground`].
+    pub(crate) fn cloud(&self, proxy: &Proxy, camera: &Camera) -> Result<(Cloud, f64), Error> {
+        let ground = Ground::of(proxy, camera);
+        let (scale, fit) = self.fit(&ground, camera)?;
+        let disparities = self.disparities(&scale, &fit, &ground, camera);
+        let metres = disparities.map(|d| match *d > 0.0 {
+            true => d.recip(),
+            false => f32::NAN,
+        });
+        let cloud = depth::seen_points(&metres, &ground::view(camera, None));
+        let height_m = match proxy {
+            Proxy::Plane(plane) => (camera.position - plane.point).dot(plane.normal),
+            _ => 0.0,
+        };
+        let deviation = fit.fitted.map_or(0.0, |f| f.deviation);
+        Ok((cloud, deviation * f64::from(height_m)))
     }
 
     fn radius(&self, camera: &Camera) -> usize {
@@ -239,11 +347,24 @@ impl Depths {
 }
 
 impl DepthFit {
-    /// `disparities; 83% of the ground's agree with it to 1.2%; what is 4% nearer than object or ground hides it`.
+    /// What may be wrong with the depths, a sentence.
+    pub fn doubt(&self) -> Option<String> {
+        let fitted = self.fitted.filter(|f| f.deviation >= DOUBTFUL)?;
+        Some(format!(
+            "scene.depth: {:.0}% of the depths follow the ground, and these only roughly, so that only what is {:.0}% nearer \
+             hides an object: are pitch and roll of the camera right, and are they depths along the optical axis, not distances?",
+            100.0 * fitted.agreeing,
+            100.0 * self.margin
+        ))
+    }
+
+    /// `disparities; 83% of the ground's agree with it to 1.2%; what is 4% nearer than the object hides it, 8% than the ground
+    /// its shadow`.
     pub fn words(&self) -> String {
         let hides = format!(
-            "what is {:.0}% nearer than object or ground hides it",
-            100.0 * self.margin
+            "what is {:.0}% nearer than the object hides it, {:.0}% than the ground its shadow",
+            100.0 * self.margin,
+            100.0 * self.ground_margin
         );
         match &self.fitted {
             None => hides,
@@ -260,6 +381,27 @@ impl DepthFit {
             }
         }
     }
+}
+
+/// The value at a pixel of the camera, between those of the map's; the nearest where one of these is not finite.
+fn between(map: &Raster<f32>, x: usize, y: usize, camera: &Camera) -> f32 {
+    let size = [map.width(), map.height()];
+    let [(left, right, u), (above, below, v)] = [(0, x), (1, y)].map(|(k, i)| {
+        let at = (i as f64 + 0.5) * size[k] as f64 / f64::from(camera.resolution[k]) - 0.5;
+        let at = at.clamp(0.0, (size[k] - 1) as f64);
+        let first = at as usize;
+        let share = (at - first as f64) as f32;
+        (first, (first + 1).min(size[k] - 1), share)
+    });
+    let around = [(left, above), (right, above), (left, below), (right, below)];
+    let around = around.map(|(column, row)| *map.get(column, row));
+    if around.iter().any(|v| !v.is_finite()) {
+        let nearest = |a, b, share| if share < 0.5 { a } else { b };
+        return *map.get(nearest(left, right, u), nearest(above, below, v));
+    }
+    let across = |a: f32, b: f32| a + (b - a) * u;
+    let [above, below] = [across(around[0], around[1]), across(around[2], around[3])];
+    above + (below - above) * v
 }
 
 /// Depths of the ground.

@@ -49,11 +49,16 @@ pub fn implausible(loaded: &LoadedScene) -> Vec<String> {
     if let ProxyRecord::Mesh(record) = &loaded.description.proxy {
         found.extend(proxy_without_unit(record, &loaded.scene.proxy));
     }
-    if let Some(mask) = &loaded.masked {
+    if let Some(mask) = loaded.mask() {
         found.extend(hides_nothing(mask));
         found.extend(in_picture::hides_all(mask, mesh, camera));
-    } else if let Some(mask) = &loaded.occluders {
-        found.extend(in_picture::is_behind_all(mask, mesh, camera));
+    }
+    if loaded.depth_fit.is_some_and(|fit| fit.hides_objects) {
+        found.push(
+            "by scene.depth the objects are behind what the photograph shows: bring them nearer, or see whether camera and \
+             ground are right"
+                .into(),
+        );
     }
     found.extend(grey::coloured_in_grey(
         &loaded.taken().image,

@@ -53,7 +53,7 @@ impl SceneDescription {
             assembly.again(&mut files, object)?;
         }
         let (scene, lights) = assembly.into_scene(proxy);
-        let mut loaded = LoadedScene {
+        let loaded = LoadedScene {
             scene,
             photo,
             original,
@@ -67,8 +67,7 @@ impl SceneDescription {
             missing: files.missing.list,
             warnings: once(files.warnings),
         };
-        loaded.hide(masked)?;
-        Ok(loaded)
+        loaded.hidden(masked, base_dir)
     }
 
     /// What the user says about effects.

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use dipir_cameras::Lens;
 use dipir_imaging::file::Photo;
 use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_points::Ground;
 use glam::{DMat4, DVec2};
 
 use crate::assembly::Assembly;
@@ -64,8 +65,8 @@ pub struct LoadedScene {
     /// The photo's own foreground, 1 in front of the object; of the photo's size. [`LoadedScene::hide`] makes it of the
     /// mask that the configuration names and of the depths.
     pub occluders: Option<Raster<f32>>,
-    /// That mask.
-    pub masked: Option<Raster<f32>>,
+    /// That mask, where there are depths, too.
+    pub(crate) masked: Option<Raster<f32>>,
     /// Depths that tell what stands in front of the objects.
     pub depths: Option<Depths>,
     /// What these were taken for.
@@ -133,22 +134,62 @@ impl LoadedScene {
     /// # Errors
     /// If the depths do not agree with the ground.
     pub fn hide(&mut self, mask: Option<Raster<f32>>) -> Result<(), Error> {
-        self.masked = mask;
-        let found = match &self.depths {
-            None => None,
-            Some(depths) => {
-                let Scene {
-                    mesh,
-                    camera,
-                    proxy,
-                    ..
-                } = &self.scene;
-                Some(depths.foreground(Some(mesh), proxy, camera, &self.photo.image)?)
-            }
+        let Some(depths) = &self.depths else {
+            self.occluders = mask;
+            return Ok(());
         };
-        self.depth_fit = found.as_ref().map(|f| f.fit);
-        self.occluders = joined(self.masked.as_ref(), found.as_ref());
+        self.masked = mask;
+        let Scene {
+            mesh,
+            camera,
+            proxy,
+            ..
+        } = &self.scene;
+        let found = depths.foreground(Some(mesh), proxy, camera, &self.photo.image)?;
+        self.depth_fit = Some(found.fit);
+        self.occluders = Some(joined(self.masked.as_ref(), found));
         Ok(())
+    }
+
+    /// The mask that the configuration names.
+    pub fn mask(&self) -> Option<&Raster<f32>> {
+        match &self.depths {
+            None => self.occluders.as_ref(),
+            Some(_) => self.masked.as_ref(),
+        }
+    }
+
+    /// Takes that mask away.
+    pub fn take_mask(&mut self) -> Option<Raster<f32>> {
+        match &self.depths {
+            None => self.occluders.take(),
+            Some(_) => self.masked.take(),
+        }
+    }
+
+    /// With what the configuration's mask and the depths hide.
+    pub(crate) fn hidden(
+        mut self,
+        mask: Option<Raster<f32>>,
+        base_dir: &Path,
+    ) -> Result<Self, Error> {
+        let hidden = self.hide(mask);
+        hidden.map_err(|e| match (&self.description.depth, e) {
+            (Some(depth), e @ Error::Points(_)) => e.in_file(base_dir.join(&depth.file.path)),
+            (_, e) => e,
+        })?;
+        let doubt = self.depth_fit.and_then(|fit| fit.doubt());
+        self.warnings.extend(doubt);
+        Ok(self)
+    }
+
+    /// As [`LoadedScene::hide`], by the mask alone while depths do not agree with the ground; why they do not, as a sentence.
+    #[must_use]
+    pub fn hide_if_known(&mut self, mask: Option<Raster<f32>>) -> Option<String> {
+        let error = self.hide(mask).err()?;
+        self.depth_fit = None;
+        self.occluders.clone_from(&self.masked);
+        Some(format!("scene.depth is left out: {error}"))
     }
 
     /// The pixel of the undistorted photo that shows what the photo shows at `pixel`; `None` where there is none, as at the
@@ -190,25 +231,30 @@ pub(crate) fn undistort(
 }
 
 /// What a mask or depths say is in front.
-fn joined(mask: Option<&Raster<f32>>, found: Option<&Foreground>) -> Option<Raster<f32>> {
-    let Some(found) = found else {
-        return mask.cloned();
-    };
-    let mut both = found.mask.clone();
-    for (b, m) in both
-        .pixels_mut()
-        .iter_mut()
-        .zip(mask.map_or(&[][..], |m| m.pixels()))
-    {
-        *b = b.max(*m);
+fn joined(mask: Option<&Raster<f32>>, found: Foreground) -> Raster<f32> {
+    let mut both = found.mask;
+    if let Some(mask) = mask {
+        for (b, m) in both.pixels_mut().iter_mut().zip(mask.pixels()) {
+            *b = b.max(*m);
+        }
     }
-    Some(both)
+    both
 }
 
 impl Scene {
     /// Reads all files that `config` names, relative to `base_dir`, and places the objects.
     pub fn load(config: &SceneConfig, base_dir: &Path) -> Result<LoadedScene, Error> {
-        Self::load_in(config, base_dir, None)
+        let (loaded, mask) = Self::load_in(config, base_dir, None)?;
+        loaded.hidden(mask, base_dir)
+    }
+
+    /// As [`Scene::load`], for a look: depths that do not agree with the ground are left out, with a warning.
+    pub fn load_for_a_look(config: &SceneConfig, base_dir: &Path) -> Result<LoadedScene, Error> {
+        let (mut loaded, mask) = Self::load_in(config, base_dir, None)?;
+        let left_out = loaded.hide_if_known(mask);
+        let doubt = loaded.depth_fit.and_then(|fit| fit.doubt());
+        loaded.warnings.extend(left_out.into_iter().chain(doubt));
+        Ok(loaded)
     }
 
     /// As [`Scene::load`], of a frame of a shot: objects and proxy are as in its `photo`, and so is a camera that stands
@@ -218,21 +264,19 @@ impl Scene {
         base_dir: &Path,
         photo: &SceneDescription,
     ) -> Result<LoadedScene, Error> {
-        Self::load_in(config, base_dir, Some(photo))
+        let (loaded, mask) = Self::load_in(config, base_dir, Some(photo))?;
+        loaded.hidden(mask, base_dir)
     }
 
+    /// The scene, and the mask that is still to be applied.
     fn load_in(
         config: &SceneConfig,
         base_dir: &Path,
         of_shot: Option<&SceneDescription>,
-    ) -> Result<LoadedScene, Error> {
+    ) -> Result<(LoadedScene, Option<Raster<f32>>), Error> {
         let settings = config.validate()?;
         let mut files = Files::new(base_dir, settings.limits);
         let (photo, background) = files.photo(&settings.background, settings.transfer)?;
-        let of_depth = |e: Error| match &settings.depth {
-            Some(depth) => e.in_file(base_dir.join(&depth.path)),
-            None => e,
-        };
         let resolution = [background.width, background.height];
         let occluders = match &settings.occluders {
             None => None,
@@ -289,20 +333,35 @@ impl Scene {
         let is_looked_for = settings.objects.iter().any(|o| o.auto.is_some());
         let hidden = match &depths {
             Some(depths) if is_looked_for && of_shot.is_none() => {
+                // Depths that do not agree with the ground are refused afterwards.
                 let found = depths.foreground(None, &proxy, &camera, &photo.image);
-                joined(masked.as_ref(), Some(&found.map_err(of_depth)?))
+                found.ok().map(|found| joined(masked.as_ref(), found))
             }
-            _ => masked.clone(),
+            _ => None,
+        };
+        // Without points of another kind the depths tell what stands around.
+        let around = match (&depths, &cloud) {
+            (Some(depths), None) if is_looked_for && of_shot.is_none() => {
+                depths.cloud(&proxy, &camera).ok()
+            }
+            _ => None,
+        };
+        let (cloud, off_m) = match around {
+            Some((cloud, off_m)) => (Some(cloud), off_m),
+            None => (cloud, 0.0),
         };
         let mut places = Places {
             view,
             ground: match (&proxy_record, &proxy) {
                 (ProxyRecord::Ground(ground), _) => Some(ground.as_ref().clone()),
-                (_, Proxy::Plane(plane)) => Some(ground::of_plane(plane)),
+                (_, Proxy::Plane(plane)) => Some(Ground {
+                    residual_m: off_m,
+                    ..ground::of_plane(plane)
+                }),
                 _ => None,
             },
             cloud,
-            occluders: hidden.as_ref(),
+            occluders: hidden.as_ref().or(masked.as_ref()),
             undistortion: undistortion.as_ref(),
             taken,
             doubt,
@@ -345,7 +404,7 @@ impl Scene {
             files.warnings.extend(repeated(&objects));
         }
         let (scene, lights) = assembly.into_scene(proxy);
-        let mut loaded = LoadedScene {
+        let loaded = LoadedScene {
             scene,
             photo,
             original,
@@ -371,8 +430,7 @@ impl Scene {
             missing: files.missing.list,
             warnings: once(files.warnings),
         };
-        loaded.hide(masked).map_err(of_depth)?;
-        Ok(loaded)
+        Ok((loaded, masked))
     }
 
     /// Which kinds of surface the triangles have.

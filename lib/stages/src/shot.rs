@@ -104,6 +104,14 @@ pub fn overrides(
     if stands_still && camera.transforms.is_none() {
         return Ok(sets);
     }
+    if let Some(depth) = &scene.depth {
+        let without = |path: &&PathBuf| beside(depth, &scene, path).is_none();
+        if let Some(frame) = frames.iter().find(without) {
+            let why = "the camera moves, and scene.depth has no file for it: name those of the frames as their pictures, or \
+                       with the same numbers at their ends";
+            return Err(wrong(frame, why).into());
+        }
+    }
     let moved = moved(session, &scene, camera, frames, tell)?;
     for ((set, path), moved) in sets.iter_mut().zip(frames).zip(moved) {
         if let Some(number) = moved {

@@ -45,7 +45,7 @@ impl SceneConfig {
                 ("depth_scale", self.depth_scale.is_some()),
             ] {
                 if is_given {
-                    let remedy = format!("scene.{name} is about it");
+                    let remedy = format!("name the file of depths, or remove scene.{name}");
                     return Err(missing("scene.depth", &remedy));
                 }
             }

@@ -16,7 +16,7 @@ pub struct ProxyConfig {
     /// An infinite plane.
     pub plane: Option<PlaneConfig>,
     /// A mesh in the coordinates of the scene, metres, in a format of objects. It replaces `plane`.
-    /// It catches shadows and hides nothing: what stands in front of an object belongs into `scene.occluders`.
+    /// It catches shadows and hides nothing: what stands in front of an object belongs into `scene.occluders` or `scene.depth`.
     #[schemars(extend("format" = "path"), example = &"room.glb")]
     pub mesh: Option<PathBuf>,
     /// Points of the scene; the ground through them replaces `plane`: `.ply`, `.pcd`, `.bin` of KITTI and

@@ -87,7 +87,12 @@ fn wrong(mask: &Raster<f32>, object: &TriangleMesh, seen: &[usize]) -> [f64; 2] 
         let (x, y) = (i % SIZE[0] as usize, i / SIZE[0] as usize);
         let is_object = on.get(x, y).is_finite();
         // The wall stands behind the object, and before the ground beyond it.
-        let is_ground = ground.metres(x, y, &camera).is_some();
+        let ground_m = ground.metres(x, y, &camera);
+        let is_ground = ground_m.is_some();
+        // At its foot the wall is hardly before the ground.
+        if seen[i] == WALL && ground_m.is_some_and(|m| m < 9.0 / 0.87) {
+            continue;
+        }
         let hides = match seen[i] {
             POST => is_object || is_ground,
             WALL => !is_object && is_ground,
@@ -121,9 +126,14 @@ fn what_is_nearer_hides_the_object_and_what_is_farther_does_not() {
             .foreground(Some(&object), &ground(), &camera(), &photo)
             .unwrap();
         let [of_object, others] = wrong(&found.mask, &object, &seen);
-        // The masks' edges are within half a pixel: of the object 20, of others 700 pixels in 38,400.
+        // Outlines are 700 of 38,400 pixels long: .9% are within half a pixel, 3.6% within half a texel of four.
+        let most = if what.contains("quarter") {
+            0.036
+        } else {
+            0.01
+        };
         assert!(
-            of_object < 0.01 && others < 0.01,
+            of_object < 0.01 && others < most,
             "{what}: {of_object} {others}"
         );
         assert!(found.fit.margin < 0.05, "{what}: {}", found.fit.margin);
@@ -205,7 +215,7 @@ fn depths_of_a_lens_that_bends_lines_are_undistorted() {
     };
     let way = Undistortion::of(&lens).unwrap();
     let folder = tempfile::tempdir().unwrap();
-    // Halves of the photograph's pixels, whose values are their columns, in steps of 1/65,535.
+    // Halves of the photograph's pixels, whose values are their columns, in thousandths.
     let map = image::ImageBuffer::from_fn(160, 120, |x, _| image::Luma([x as u16 + 1]));
     image::DynamicImage::from(map)
         .save(folder.path().join("depth.png"))
@@ -217,13 +227,125 @@ fn depths_of_a_lens_that_bends_lines_are_undistorted() {
     };
     let found = Depths::read(&settings, folder.path(), [320, 240], Some(&way)).unwrap();
     let [w, h] = way.size().map(|n| n as usize);
-    assert_eq!((found.values.width(), found.values.height()), (w, h));
+    let size = [found.values.width(), found.values.height()];
+    assert_eq!(size, [w / 2, h / 2]);
     for (x, y) in [(w / 2, h / 2), (w / 4, h / 3), (w - 30, h / 2)] {
-        let pixel = way.to_photo(DVec2::new(x as f64, y as f64) + 0.5).unwrap();
+        let texel = (DVec2::new((x / 2) as f64, (y / 2) as f64) + 0.5) * 2.0;
+        let pixel = way.to_photo(texel).unwrap();
         let wanted = ((pixel.x / 2.0).floor() + 1.0) * 1e-3;
-        let value = f64::from(*found.values.get(x, y));
+        let value = f64::from(*found.values.get(x / 2, y / 2));
         assert!((value - wanted).abs() < 1e-6, "{value} {wanted}");
     }
     let other = Depths::read(&settings, folder.path(), [320, 200], None).unwrap_err();
     assert!(other.to_string().contains("160 x 120"), "{other}");
+}
+
+/// The share of the post's pixels before the object that hide it, and of the ground's pixels that hide the shadow.
+fn hides(found: &Depths) -> [f64; 2] {
+    let (photo, seen) = photo();
+    let object = square(0.0, 0.8, 5.0, 0.8);
+    let found = found.foreground(Some(&object), &ground(), &camera(), &photo);
+    let mask = found.unwrap().mask;
+    let on = nearest(&object, &camera());
+    let share = |kind: usize, of_object: bool| {
+        let pixels =
+            (0..seen.len()).filter(|&i| seen[i] == kind && on.pixels()[i].is_finite() == of_object);
+        let (hidden, all) = pixels.fold((0.0, 0.0), |(hidden, all), i| {
+            (hidden + f64::from(mask.pixels()[i]), all + 1.0)
+        });
+        hidden / all
+    };
+    [share(POST, true), share(0, false)]
+}
+
+#[test]
+fn a_blurred_edge_goes_to_the_nearer_or_the_farther_side() {
+    let mut blurred = depths(SIZE.map(|n| n / 2), |z| 1.0 / z);
+    let sharp = hides(&blurred);
+    for _ in 0..3 {
+        let before = blurred.values.clone();
+        let (w, h) = (before.width(), before.height());
+        for y in 1..h - 1 {
+            for x in 1..w - 1 {
+                let around = (y - 1..y + 2).flat_map(|v| (x - 1..x + 2).map(move |u| (u, v)));
+                let sum: f32 = around.map(|(u, v)| *before.get(u, v)).sum();
+                *blurred.values.get_mut(x, y) = sum / 9.0;
+            }
+        }
+    }
+    let [post, ground] = hides(&blurred);
+    assert!(post > sharp[0] - 0.03, "{post} {sharp:?}");
+    assert!(ground < sharp[1] + 0.01, "{ground} {sharp:?}");
+}
+
+#[test]
+fn holes_hide_nothing_and_small_ones_are_filled() {
+    let mut holes = depths(SIZE, |z| z);
+    let whole = hides(&holes);
+    let w = SIZE[0] as usize;
+    for (i, value) in holes.values.pixels_mut().iter_mut().enumerate() {
+        if i % 7 == 0 || (i / w > 60 && i % w > 200) {
+            *value = if i % 2 == 0 { 0.0 } else { f32::NAN };
+        }
+    }
+    // A camera that looks a little too far down gets depths a shift.
+    let [post, of_ground] = hides(&holes);
+    assert!(
+        (post - whole[0]).abs() < 0.01 && (of_ground - whole[1]).abs() < 0.01,
+        "{post} {of_ground} {whole:?}"
+    );
+    let tilted = Camera {
+        rotation: camera().rotation * glam::Mat3::from_rotation_x(-0.03),
+        ..camera()
+    };
+    let (photo, _) = photo();
+    let object = square(0.6, 0.9, 5.0, 0.6);
+    let found = holes.foreground(Some(&object), &ground(), &tilted, &photo);
+    let found = found.unwrap();
+    assert!(found.fit.fitted.unwrap().scale.shift != 0.0);
+    let on = nearest(&object, &tilted);
+    for (i, depth) in on.pixels().iter().enumerate() {
+        if depth.is_finite() && i / w > 64 && i % w > 204 {
+            assert_eq!(found.mask.pixels()[i], 0.0);
+        }
+    }
+}
+
+#[test]
+fn a_shadow_goes_on_over_a_bump() {
+    let (photo, _) = photo();
+    let mut bumped = depths(SIZE, |z| z);
+    let camera = camera();
+    let flat = Ground::of(&ground(), &camera);
+    // 6 cm high, a twenty-fifth of the camera's height, in the lower right.
+    for (i, value) in bumped.values.pixels_mut().iter_mut().enumerate() {
+        let (x, y) = (i % SIZE[0] as usize, i / SIZE[0] as usize);
+        let from = ((x as f32 - 180.0) / 25.0).powi(2) + ((y as f32 - 130.0) / 12.0).powi(2);
+        if let Some(metres) = flat.metres(x, y, &camera)
+            && (f64::from(*value) - metres).abs() < 1e-3 * metres
+        {
+            *value *= 1.0 - 0.04 * (-0.5 * from).exp();
+        }
+    }
+    let found = bumped.foreground(None, &ground(), &camera, &photo);
+    assert_eq!(*found.unwrap().mask.get(180, 130), 0.0);
+}
+
+#[test]
+fn depths_that_hardly_follow_the_ground_are_doubted() {
+    let (photo, _) = photo();
+    let noisy = |i: usize| 1.0 + 0.25 * (((i * 7919 + 13) % 1009) as f32 / 1009.0 - 0.5);
+    let mut found = depths(SIZE, |z| z);
+    let fit = |depths: &Depths| {
+        depths
+            .foreground(None, &ground(), &camera(), &photo)
+            .unwrap()
+            .fit
+    };
+    assert_eq!(fit(&found).doubt(), None);
+    for (i, value) in found.values.pixels_mut().iter_mut().enumerate() {
+        *value *= noisy(i);
+    }
+    let doubt = fit(&found).doubt().unwrap();
+    assert!(doubt.contains("scene.depth"), "{doubt}");
 }

@@ -129,35 +129,17 @@ pub(super) fn hides_all(
     mesh: &TriangleMesh,
     camera: &Camera,
 ) -> Option<String> {
-    shows_nothing(mask, mesh, camera).then(|| {
+    let [low, high] = seen(mesh, &mesh.indices, camera)?;
+    let columns = pixels(low.x, high.x, mask.width());
+    let mut rows = pixels(low.y, high.y, mask.height());
+    let shows_nothing = !columns.is_empty()
+        && !rows.is_empty()
+        && rows.all(|y| mask.row(y)[columns.clone()].iter().all(|v| *v >= HIDDEN));
+    shows_nothing.then(|| {
         "the mask of scene.occluders is white wherever the objects would be seen, so it hides them: white hides the object, \
          black shows it; is the mask inverted?"
             .into()
     })
-}
-
-/// A sentence about depths by which the photograph's own stands before all of the objects.
-pub(super) fn is_behind_all(
-    mask: &Raster<f32>,
-    mesh: &TriangleMesh,
-    camera: &Camera,
-) -> Option<String> {
-    shows_nothing(mask, mesh, camera).then(|| {
-        "by scene.depth all of the objects are behind what the photograph shows: bring them nearer, or see whether camera \
-         and ground are right"
-            .into()
-    })
-}
-
-fn shows_nothing(mask: &Raster<f32>, mesh: &TriangleMesh, camera: &Camera) -> bool {
-    let Some([low, high]) = seen(mesh, &mesh.indices, camera) else {
-        return false;
-    };
-    let columns = pixels(low.x, high.x, mask.width());
-    let mut rows = pixels(low.y, high.y, mask.height());
-    !columns.is_empty()
-        && !rows.is_empty()
-        && rows.all(|y| mask.row(y)[columns.clone()].iter().all(|v| *v >= HIDDEN))
 }
 
 /// The pixels of a row or column of `size` that lie between two places in it.

@@ -145,6 +145,7 @@ fn an_empty_path_is_refused_by_its_key() {
         (table("", "[proxy]\nmesh = \"\""), "scene.proxy.mesh"),
         (table("", "[proxy]\npoints = \" \""), "scene.proxy.points"),
         (table("occluders = \"\"", ""), "scene.occluders"),
+        (table("depth = \"\"", ""), "scene.depth"),
         (
             format!("background = \"\"\n{OBJECT}{CAMERA}"),
             "scene.background",
@@ -237,6 +238,42 @@ fn wrong_cameras_are_explained() {
         message(&camera(&format!("{stands}fov_deg = 40\nframe = 1"))),
         "scene.camera.file is missing; name the camera's file that scene.camera.frame is about"
     );
+}
+
+#[test]
+fn keys_of_depths_are_checked_and_switched_off_with_the_effect() {
+    for (lines, said) in [
+        (
+            "depth_kind = \"depth\"",
+            "scene.depth is missing; name the file of depths, or remove scene.depth_kind",
+        ),
+        (
+            "depth_scale = 1.0",
+            "scene.depth is missing; name the file of depths, or remove scene.depth_scale",
+        ),
+        (
+            "depth = \"d.png\"\ndepth_scale = 0.0",
+            "scene.depth_scale is 0",
+        ),
+        (
+            "depth = \"d.png\"\ndepth_kind = \"disprity\"",
+            "did you mean \"disparity\"?",
+        ),
+        (
+            "depth = \"d.png\"\ndepth_kind = \"disparity\"\ndepth_scale = 1.0",
+            "cannot both be given",
+        ),
+    ] {
+        let found = message(&table(lines, ""));
+        assert!(found.contains(said), "{found}");
+    }
+    let both =
+        "depth = \"d.png\"\ndepth_kind = \"depth\"\ndepth_scale = 0.5\noccluders = \"m.png\"";
+    let settings = parse(&table(both, "")).validate().unwrap();
+    assert_eq!(settings.depth.unwrap().scale, Some(0.5));
+    let off = parse(&table(both, "[effects]\noccluders = \"off\""));
+    let settings = off.validate().unwrap();
+    assert!(settings.depth.is_none() && settings.occluders.is_none());
 }
 
 #[test]

@@ -391,7 +391,7 @@ impl Done {
             "depth": self.depth_fit.map(|d| json!({
                 "kind": d.fitted.map(|f| f.scale.measure), "factor": d.fitted.map(|f| f.scale.factor),
                 "shift": d.fitted.map(|f| f.scale.shift), "agreeing": d.fitted.map(|f| f.agreeing),
-                "deviation": d.fitted.map(|f| f.deviation), "margin": d.margin,
+                "deviation": d.fitted.map(|f| f.deviation), "margin": d.margin, "ground_margin": d.ground_margin,
             })),
             "effects": self.effects.effects,
             "max_depth": self.effects.max_depth,
