@@ -223,6 +223,8 @@ fn what_is_nearer_by_the_depths_hides_object_and_shadow() {
     scene.expect_success();
     let said = "  depth: disparities; ";
     assert!(scene.stdout.contains(said), "{}", scene.stdout);
+    let found = &json(&project, "out/scene/scene.json")["depth"]["found"];
+    assert_eq!(found["measure"], "disparity");
     project.run(COMPOSITE, &set).expect_success();
     // Where the two halves meet, the mask is soft.
     let differs = |columns: std::ops::Range<usize>| {

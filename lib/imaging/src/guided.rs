@@ -9,24 +9,16 @@ const TILE: usize = 128;
 /// Tiles of a batch.
 const TILES_AT_ONCE: usize = 1024;
 
-/// `mask` with the edges of `guide`: in every square of `2 radius + 1` pixels a side the mask is taken to be a linear
-/// function of the guide's colours, by least squares with a penalty of `softness`, a variance of colours, on its slope.
+/// `mask` with the edges of a picture: `guide` gives the colour of each of its pixels, row by row. In every square of `2 radius + 1` pixels a side the mask is taken to be a linear
+/// function of the colours, by least squares with a penalty of `softness`, a variance of colours, on its slope.
 /// Where a square's mask has one value, it stays as it is. In `[0, 1]`, if the mask is.
-///
-/// # Panics
-/// Unless both have the same size.
 pub fn guided(
     mask: &Raster<f32>,
-    guide: &Raster<Vec3>,
+    guide: impl Fn(usize) -> Vec3 + Sync,
     radius: usize,
     softness: f32,
 ) -> Raster<f32> {
     let (width, height) = (mask.width(), mask.height());
-    assert_eq!(
-        (width, height),
-        (guide.width(), guide.height()),
-        "mask and guide have the same size"
-    );
     let columns = width.div_ceil(TILE);
     let tiles: Vec<usize> = (0..columns * height.div_ceil(TILE)).collect();
     let mut filtered = mask.clone();
@@ -44,7 +36,7 @@ pub fn guided(
             if values.iter().all(|v| *v == values[0]) {
                 return None;
             }
-            let colours: Vec<Vec3> = part.map(|i| guide.pixels()[i]).collect();
+            let colours: Vec<Vec3> = part.map(&guide).collect();
             let across = outer_end[0] - outer[0];
             let lines = lines(&values, &colours, across, radius, softness);
             let inside = |at: [usize; 2]| (at[1] - outer[1]) * across + at[0] - outer[0];
@@ -190,7 +182,7 @@ mod tests {
             truth.get(x.min(149), y.min(149)).round()
         };
         let coarse = Raster::from_pixels(150, 150, (0..150 * 150).map(coarse).collect());
-        let fine = guided(&coarse, &guide, 9, 1e-4);
+        let fine = guided(&coarse, |i| guide.pixels()[i], 9, 1e-4);
         let (before, after) = (wrong(&coarse, &truth), wrong(&fine, &truth));
         assert!(5 * after < before, "{before} {after}");
     }
@@ -198,7 +190,7 @@ mod tests {
     #[test]
     fn squares_of_one_value_stay_and_tiles_do_not_show() {
         let (guide, truth) = two_colours(150);
-        let filtered = guided(&truth, &guide, 4, 1e-4);
+        let filtered = guided(&truth, |i| guide.pixels()[i], 4, 1e-4);
         for (i, (a, b)) in filtered.pixels().iter().zip(truth.pixels()).enumerate() {
             let (x, y) = ((i % 150) as f32, (i / 150) as f32);
             // Nine pixels from the border in each direction.
@@ -208,13 +200,8 @@ mod tests {
         }
         // The same as of a picture in which rows 60 to 70 are the first ones.
         let part = |r: &Raster<f32>| Raster::from_pixels(150, 90, r.pixels()[150 * 60..].to_vec());
-        let colours = guide.pixels()[150 * 60..].to_vec();
-        let of_part = guided(
-            &part(&truth),
-            &Raster::from_pixels(150, 90, colours),
-            4,
-            1e-4,
-        );
+        let colours = &guide.pixels()[150 * 60..];
+        let of_part = guided(&part(&truth), |i| colours[i], 4, 1e-4);
         for y in 20..90 {
             for x in 0..150 {
                 let (a, b) = (of_part.get(x, y), filtered.get(x, y + 60));

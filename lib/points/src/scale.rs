@@ -17,7 +17,8 @@ pub enum Measure {
 }
 
 /// How values of a map become metres: depth or disparity is `factor * value + shift`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Scale {
     /// What the values are linear in.
     pub measure: Measure,
@@ -97,11 +98,15 @@ impl Scale {
 }
 
 /// The scale by which most values of `samples` lie on the ground (RANSAC, judged as MSAC, then least squares weighted by
-/// Tukey's function). `measure` is what the values are, if that is known.
+/// Tukey's function). `measure` is what the values are, and `has_shift` whether there is a shift, if that is known.
 ///
 /// # Errors
 /// If there is too little ground, or the values do not agree with it.
-pub fn fitted(samples: &[Sample], measure: Option<Measure>) -> Result<Fitted, PointsError> {
+pub fn fitted(
+    samples: &[Sample],
+    measure: Option<Measure>,
+    has_shift: Option<bool>,
+) -> Result<Fitted, PointsError> {
     let usable = |s: &&Sample| s.value.is_finite() && s.value != 0.0 && s.ground_m > 0.0;
     let mut depths: Vec<f64> = (samples.iter().filter(usable))
         .map(|s| s.ground_m)
@@ -132,9 +137,12 @@ pub fn fitted(samples: &[Sample], measure: Option<Measure>) -> Result<Fitted, Po
         let scale = refined(&near, scale, has_shift).0;
         Some((cost_of(&near, &scale), scale))
     };
-    let shifted = measures.iter().filter_map(|m| least_cost(*m, true));
+    // Disparities without a shift are among those with one.
+    let may_shift = |m: &&Measure| has_shift != Some(false) || **m == Measure::Disparity;
+    let shifted = measures.iter().filter(may_shift);
+    let shifted = shifted.filter_map(|m| least_cost(*m, true));
     let shifted = shifted.min_by(|a, b| a.0.total_cmp(&b.0));
-    let plain = match measures.contains(&Measure::Depth) {
+    let plain = match measures.contains(&Measure::Depth) && has_shift != Some(true) {
         true => least_cost(Measure::Depth, false),
         false => None,
     };
@@ -321,7 +329,7 @@ mod tests {
                 (true, true) => (10.0 - 1.0 / z) * factor,
             };
             let map = samples(covered, noise, value);
-            let fitted = fitted(&map, None).unwrap();
+            let fitted = fitted(&map, None, None).unwrap();
             let wanted = if disparity { Measure::Disparity } else { Measure::Depth };
             prop_assert_eq!(fitted.scale.measure, wanted);
             // Of 400 values or more with a uniform error of standard deviation `noise`.
@@ -342,15 +350,34 @@ mod tests {
         for s in &mut map {
             s.value = f64::from(numbers.next_1d());
         }
-        let error = fitted(&map, None).unwrap_err().to_string();
+        let error = fitted(&map, None, None).unwrap_err().to_string();
         assert!(error.contains("depth_scale"), "{error}");
         // A wall before all of the ground.
         for s in &mut map {
             s.value = 1.5;
         }
-        assert!(fitted(&map, None).is_err());
-        let error = fitted(&map[..50], None).unwrap_err().to_string();
+        assert!(fitted(&map, None, None).is_err());
+        let error = fitted(&map[..50], None, None).unwrap_err().to_string();
         assert!(error.contains("only 50"), "{error}");
+    }
+
+    #[test]
+    fn a_kind_that_is_known_is_kept() {
+        // Off by a half percent at most: too little for a shift of its own.
+        let map = samples(0.3, 0.005, |z| z + 0.01);
+        let found = |has_shift| fitted(&map, Some(Measure::Depth), has_shift).unwrap().scale;
+        assert_eq!(found(None).shift, 0.0);
+        assert_eq!(found(Some(false)), found(None));
+        assert!(
+            (found(Some(true)).shift + 0.01).abs() < 0.02,
+            "{:?}",
+            found(Some(true))
+        );
+        let disparities = samples(0.3, 0.005, |z| 1.0 / z);
+        for has_shift in [None, Some(false), Some(true)] {
+            let measure = fitted(&disparities, None, has_shift).unwrap().scale.measure;
+            assert_eq!(measure, Measure::Disparity, "{has_shift:?}");
+        }
     }
 
     #[test]
@@ -365,7 +392,7 @@ mod tests {
                 }
             })
             .collect();
-        let fitted = fitted(&steep, None).unwrap();
+        let fitted = fitted(&steep, None, None).unwrap();
         assert_eq!(fitted.scale.measure, Measure::Disparity);
         let found = fitted.scale.disparity(map(1.2) as f32).unwrap();
         assert!((found * 1.2 - 1.0).abs() < 1e-3, "{found}");

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use dipir_cameras::Lens;
 use dipir_imaging::transfer::Transfer;
 use dipir_points::Ground;
-use dipir_points::scale::Measure;
+use dipir_points::scale::{Measure, Scale};
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
 
@@ -75,6 +75,8 @@ pub struct DepthRecord {
     pub measure: Option<Measure>,
     /// Metres of a unit, if that was said.
     pub scale: Option<f32>,
+    /// The scale that was found on the ground, if it was.
+    pub found: Option<Scale>,
 }
 
 /// What receives the shadow.

@@ -174,6 +174,7 @@ impl<'a> Files<'a> {
             file: self.record("depth", &settings.path)?,
             measure: settings.measure,
             scale: settings.scale,
+            found: None,
         };
         Ok((Some(depths), Some(record)))
     }

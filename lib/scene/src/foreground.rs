@@ -7,7 +7,7 @@ use dipir_imaging::transfer::Transfer;
 use dipir_imaging::warp::pick;
 use dipir_points::scale::{Fitted, Measure, Sample, Scale, fitted};
 use dipir_points::{Cloud, PointsError, depth};
-use glam::DVec2;
+use glam::{DVec2, Vec3};
 use rayon::prelude::*;
 
 use crate::camera::Camera;
@@ -35,6 +35,8 @@ pub struct Depths {
     values: Raster<f32>,
     measure: Option<Measure>,
     scale: Option<f32>,
+    /// Whether the value 0 is another depth or disparity than 0, if that is known.
+    has_shift: Option<bool>,
 }
 
 /// What stands in front.
@@ -135,7 +137,15 @@ impl Depths {
             values,
             measure: settings.measure,
             scale: settings.scale,
+            has_shift: None,
         })
+    }
+
+    /// Of the kind that was found before, in the same map or in that of the same shot.
+    pub(crate) fn like(mut self, found: Option<Scale>) -> Self {
+        self.measure = self.measure.or(found.map(|f| f.measure));
+        self.has_shift = found.map(|f| f.shift != 0.0);
+        self
     }
 
     /// What stands before `objects` and `proxy` in `photo`.
@@ -163,10 +173,11 @@ impl Depths {
             ((nearer - margin) / (RAMP * margin)).clamp(0.0, 1.0) as f32
         };
         let radius = self.radius(camera);
-        let guide = Transfer::Srgb.encode(photo).0;
+        let encoded = |v| Transfer::Srgb.encode_scalar(v);
+        let guide = |i: usize| Vec3::from(photo.0.pixels()[i].to_array().map(encoded));
         let filtered = |mask: Vec<f32>| {
             let mask = Raster::from_pixels(width, height, mask);
-            let mut mask = guided(&mask, &guide, radius, SOFTNESS);
+            let mut mask = guided(&mask, guide, radius, SOFTNESS);
             for m in mask.pixels_mut() {
                 *m = ((*m - CLEAR) / (1.0 - 2.0 * CLEAR)).clamp(0.0, 1.0);
             }
@@ -247,7 +258,7 @@ impl Depths {
                 }
             }
         }
-        fitted(&samples, self.measure).map_err(Error::Points)
+        fitted(&samples, self.measure, self.has_shift).map_err(Error::Points)
     }
 
     /// Depth of the ground at a texel, metres.

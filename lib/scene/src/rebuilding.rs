@@ -44,6 +44,8 @@ impl SceneDescription {
         let depths = files
             .depths(depth.as_ref(), resolution, undistortion.as_ref())?
             .0;
+        let found = self.depth.as_ref().and_then(|depth| depth.found);
+        let depths = depths.map(|depths| depths.like(found));
         let proxy = files.recorded(&self.proxy)?;
         let mut assembly = Assembly::new(
             self.camera,

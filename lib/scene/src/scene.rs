@@ -180,6 +180,9 @@ impl LoadedScene {
         })?;
         let doubt = self.depth_fit.and_then(|fit| fit.doubt());
         self.warnings.extend(doubt);
+        if let Some(record) = &mut self.description.depth {
+            record.found = self.depth_fit.and_then(|fit| Some(fit.fitted?.scale));
+        }
         Ok(self)
     }
 
@@ -309,6 +312,9 @@ impl Scene {
         let (photo, masked, original) = undistort(photo, occluders, undistortion);
         let (depths, depth) =
             files.depths(settings.depth.as_ref(), resolution, undistortion.as_ref())?;
+        // The depths of a shot are of one kind.
+        let of_photo = of_shot.and_then(|photo| photo.depth.as_ref()?.found);
+        let depths = depths.map(|depths| depths.like(of_photo));
         let view = ground::view(&camera, undistortion.as_ref());
         let (proxy, proxy_record, cloud) = match of_shot {
             Some(of_shot) => (files.recorded(&of_shot.proxy)?, of_shot.proxy.clone(), None),

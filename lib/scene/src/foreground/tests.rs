@@ -74,6 +74,7 @@ fn depths(size: [u32; 2], value: impl Fn(f64) -> f64) -> Depths {
         values: Raster::from_pixels(w, h, values),
         measure: None,
         scale: None,
+        has_shift: None,
     }
 }
 
