@@ -23,6 +23,7 @@ mod project;
 mod recovery;
 mod reproducibility;
 mod shot;
+mod shot_cameras;
 mod stages;
 mod staleness;
 mod tradeoff;

@@ -9,9 +9,11 @@ const TILE: usize = 128;
 /// Tiles of a batch.
 const TILES_AT_ONCE: usize = 1024;
 
-/// `mask` with the edges of a picture: `guide` gives the colour of each of its pixels, row by row. In every square of `2 radius + 1` pixels a side the mask is taken to be a linear
-/// function of the colours, by least squares with a penalty of `softness`, a variance of colours, on its slope.
-/// Where a square's mask has one value, it stays as it is. In `[0, 1]`, if the mask is.
+/// `mask` with the edges of a picture: `guide` gives the colour of each of its pixels, counted row by row.
+///
+/// In every square of `2 radius + 1` pixels a side the mask is taken to be a linear function of the colours, by least squares.
+/// `softness`, a variance of colours, is a penalty on its slope. Where the mask has one value, it keeps it. The result is in
+/// `[0, 1]`.
 pub fn guided(
     mask: &Raster<f32>,
     guide: impl Fn(usize) -> Vec3 + Sync,

@@ -332,14 +332,15 @@ mod tests {
             let fitted = fitted(&map, None, None).unwrap();
             let wanted = if disparity { Measure::Disparity } else { Measure::Depth };
             prop_assert_eq!(fitted.scale.measure, wanted);
-            // Of 400 values or more with a uniform error of standard deviation `noise`.
+            // A shift is left out if it lowers the cost of all values by less than .01 each. At most 60% of them are covered:
+            // of the others by .025 at most, which is an error of .16 x 5% = .8% in the mean, and twice that at the ends. The
+            // median of uniform errors says 1.28 times their deviation.
             for z in [2.0, 5.0, 12.0] {
                 let found = fitted.scale.disparity(value(z) as f32).unwrap();
-                // A shift that is off by a tenth of 5% in the mean is left out; at the ends of the range that is six times as much.
-                prop_assert!((found * z - 1.0).abs() < 0.03 + noise, "{} for {}", found, z);
+                prop_assert!((found * z - 1.0).abs() < 0.016 + noise, "{} for {}", found, z);
             }
             prop_assert!(fitted.agreeing > 0.95 * (1.0 - covered));
-            prop_assert!(fitted.deviation < 0.01 + 1.6 * noise, "{}", fitted.deviation);
+            prop_assert!(fitted.deviation < 0.008 + 1.6 * noise, "{}", fitted.deviation);
         }
     }
 

@@ -10,7 +10,7 @@ use crate::mesh::TriangleMesh;
 const NEAREST_M: f64 = 1e-3;
 
 /// Through the middle of a pixel, in the camera's axes, one metre ahead.
-pub(crate) fn direction(x: usize, y: usize, camera: &Camera) -> DVec3 {
+fn direction(x: usize, y: usize, camera: &Camera) -> DVec3 {
     let pixel = DVec2::new(x as f64, y as f64) + 0.5;
     let d = (pixel - camera.principal_px.as_dvec2()) / camera.focal_px.as_dvec2();
     DVec3::new(d.x, -d.y, -1.0)

@@ -11,10 +11,11 @@ use glam::{DVec2, Vec3};
 use rayon::prelude::*;
 
 use crate::camera::Camera;
-use crate::depth_buffer::{direction, least, nearest};
+use crate::depth_buffer::{least, nearest};
 use crate::error::Error;
 use crate::ground;
 use crate::mesh::TriangleMesh;
+use crate::pixels::ground_at;
 use crate::proxy::{Plane, Proxy};
 use crate::undistortion::Undistortion;
 
@@ -81,12 +82,13 @@ const NETWORK_PX: f64 = 512.0;
 const RADII: [f64; 2] = [2.0, 24.0];
 /// Variance of colours, of 1 at white, that the filter takes for noise.
 const SOFTNESS: f32 = 4e-4;
-/// Where a coarse mask is off, the filter leaves so much of it: this becomes 0, and one minus this 1.
+/// Where a coarse mask is wrong, the filter leaves about so much of the error: masks up to this become 0, those from one minus
+/// this on 1.
 const CLEAR: f32 = 0.2;
 /// Texels to each side within which a blurred edge of a map is made sharp, and within which holes are filled.
 const AROUND: usize = 2;
-/// An edge changes the disparity over the ground's within [`AROUND`] by at least this share of the largest there, or by so many
-/// standard deviations.
+/// At an edge the disparity above the ground's changes within [`AROUND`] texels by at least this share of the largest disparity
+/// there, and by at least so many standard deviations of the ground's depths.
 const EDGE: (f64, f64) = (0.08, 6.0);
 /// By how much the shapes of map and photograph may differ, relative: networks work on multiples of 14 to 32 pixels.
 const SAME_SHAPE: f64 = 0.05;
@@ -269,7 +271,7 @@ impl Depths {
         ground.metres(column, row, camera)
     }
 
-    /// Without texels that a picture of at most `size` pixels does not show, but for twice as many along a side.
+    /// The same at no more than twice as many texels along a side as a picture of `size` pixels has.
     pub fn within(&self, size: [u32; 2]) -> Self {
         let own = [self.values.width(), self.values.height()];
         let to = [0, 1].map(|k| own[k].min(2 * size[k] as usize));
@@ -280,8 +282,9 @@ impl Depths {
         }
     }
 
-    /// One over the depths, 1/metre, with sharp edges and small holes filled; NaN where nothing is known. What a blurred edge
-    /// mixes is given to its nearer or its farther side: of the disparity over the ground's, so that ground has no edges.
+    /// One over the depths, 1/metre; NaN where nothing is known. Small holes are filled. A value on a blurred edge becomes that
+    /// of the nearer or the farther side. Edges are looked for in what the disparity is above the ground's: bare ground has
+    /// none.
     fn disparities(
         &self,
         scale: &Scale,
@@ -440,11 +443,9 @@ impl Ground {
                 depth.is_finite().then_some(f64::from(depth))
             }
             Self::Plane(plane) => {
-                let direction = camera.rotation.as_dmat3() * direction(x, y, camera);
-                let normal = plane.normal.as_dvec3();
-                let away = normal.dot(plane.point.as_dvec3() - camera.position.as_dvec3());
-                let depth = away / normal.dot(direction);
-                (depth.is_finite() && depth > 0.0).then_some(depth)
+                let point = ground_at(camera, plane, DVec2::new(x as f64, y as f64) + 0.5)?;
+                let ahead = -camera.rotation.z_axis.as_dvec3();
+                Some((point - camera.position.as_dvec3()).dot(ahead))
             }
         }
     }

@@ -337,21 +337,16 @@ impl Scene {
             }
         };
         let is_looked_for = settings.objects.iter().any(|o| o.auto.is_some());
-        let hidden = match &depths {
-            Some(depths) if is_looked_for && of_shot.is_none() => {
-                // Depths that do not agree with the ground are refused afterwards.
-                let found = depths.foreground(None, &proxy, &camera, &photo.image);
-                found.ok().map(|found| joined(masked.as_ref(), found))
-            }
-            _ => None,
-        };
+        // Depths that do not agree with the ground are refused afterwards.
+        let around = depths.as_ref();
+        let around = around.filter(|_| is_looked_for && of_shot.is_none());
+        let hidden = around.and_then(|depths| {
+            let found = depths.foreground(None, &proxy, &camera, &photo.image);
+            Some(joined(masked.as_ref(), found.ok()?))
+        });
         // Without points of another kind the depths tell what stands around.
-        let around = match (&depths, &cloud) {
-            (Some(depths), None) if is_looked_for && of_shot.is_none() => {
-                depths.cloud(&proxy, &camera).ok()
-            }
-            _ => None,
-        };
+        let around = around.filter(|_| cloud.is_none());
+        let around = around.and_then(|depths| depths.cloud(&proxy, &camera).ok());
         let (cloud, off_m) = match around {
             Some((cloud, off_m)) => (Some(cloud), off_m),
             None => (cloud, 0.0),

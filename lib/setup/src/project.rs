@@ -427,6 +427,30 @@ mod tests {
     }
 
     #[test]
+    fn depths_are_read_before_their_key_is_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        put_turned(&at("photo.png"), [192, 128], &|_, y| y as u8, 1);
+        put_turned(&at("depth.png"), [48, 32], &|_, y| y as u8, 1);
+        put_turned(&at("other.png"), [48, 48], &|_, y| y as u8, 1);
+        std::fs::write(at("a.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+        let of = |depth: &str| {
+            let request = Request {
+                photo: at("photo.png"),
+                models: vec![at("a.obj")],
+                out: at("pipeline.toml"),
+                depth: Some(at(depth)),
+                ..Request::default()
+            };
+            draft(&request).map(|draft| draft.document.text())
+        };
+        let text = of("depth.png").unwrap();
+        assert!(text.contains("\ndepth = \"depth.png\"    # "), "{text}");
+        let error = of("other.png").unwrap_err().to_string();
+        assert!(error.contains("48 x 48"), "{error}");
+    }
+
+    #[test]
     fn colmap_s_points_are_turned_as_its_camera_is() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);

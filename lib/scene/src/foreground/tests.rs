@@ -275,6 +275,8 @@ fn a_blurred_edge_goes_to_the_nearer_or_the_farther_side() {
         }
     }
     let [post, ground] = hides(&blurred);
+    // The post is 31 pixels wide: 3% are a quarter of a texel, of two pixels, on either side. 1% of the ground is about a pixel
+    // along both sides of the post.
     assert!(post > sharp[0] - 0.03, "{post} {sharp:?}");
     assert!(ground < sharp[1] + 0.01, "{ground} {sharp:?}");
 }
@@ -349,4 +351,42 @@ fn depths_that_hardly_follow_the_ground_are_doubted() {
     }
     let doubt = fit(&found).doubt().unwrap();
     assert!(doubt.contains("scene.depth"), "{doubt}");
+}
+
+#[test]
+fn maps_of_one_texel_and_of_extreme_values_give_a_finite_mask_or_are_refused() {
+    let (photo, _) = photo();
+    let object = square(0.0, 0.8, 5.0, 0.8);
+    for value in [0.0, f32::NAN, f32::INFINITY, -1.0, f32::MAX, 1e-40] {
+        for size in [[1, 1], SIZE] {
+            let mut found = depths(size, |_| f64::from(value));
+            found.values.pixels_mut().fill(value);
+            let error = found.foreground(Some(&object), &ground(), &camera(), &photo);
+            assert!(error.is_err(), "{value}");
+            for scale in [f32::MIN_POSITIVE, 1.0, f32::MAX] {
+                found.scale = Some(scale);
+                let found = found.foreground(Some(&object), &ground(), &camera(), &photo);
+                let mask = found.unwrap().mask;
+                let inside = |m: &f32| (0.0..=1.0).contains(m);
+                assert!(mask.pixels().iter().all(inside), "{value} {scale}");
+            }
+        }
+    }
+    // Nothing of an empty mesh can be hidden.
+    let nothing = TriangleMesh::default();
+    let whole = depths(SIZE, |z| z);
+    let found = whole.foreground(Some(&nothing), &ground(), &camera(), &photo);
+    assert!(!found.unwrap().fit.hides_objects);
+}
+
+#[test]
+fn objects_behind_a_wall_are_told() {
+    let (photo, _) = photo();
+    let told = |depth: f32| {
+        let object = square(1.5, 1.0, depth, 0.4);
+        let found = depths(SIZE, |z| z).foreground(Some(&object), &ground(), &camera(), &photo);
+        found.unwrap().fit.hides_objects
+    };
+    assert!(!told(5.0));
+    assert!(told(12.0));
 }

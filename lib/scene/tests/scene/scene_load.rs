@@ -264,3 +264,88 @@ fn a_mask_of_another_size_is_refused() {
         "scene.occluders is an image of 10 x 10 pixels (\"mask.png\"); accepted: one of the background's size, 64 x 32"
     );
 }
+
+/// Shades of a depth map of 64 x 32 pixels, by what is seen there: its depth, where the ground's is `ground`, metres.
+fn put_depths(folder: &Path, seen: impl Fn(u32, u32, f64) -> f64) {
+    let camera = load(folder, "", "").scene.camera;
+    let shades = image::ImageBuffer::from_fn(64, 32, |x, y| {
+        let ray = camera.ray(Vec2::new(x as f32, y as f32) + 0.5);
+        let ahead = -ray.direction.dot(camera.rotation.z_axis);
+        let ground = match ray.direction.y < 0.0 {
+            true => f64::from(1.6 / -ray.direction.y * ahead),
+            false => 1e3,
+        };
+        image::Luma([(1e4 / seen(x, y, ground)) as u16])
+    });
+    let path = folder.join("depth.png");
+    image::DynamicImage::from(shades).save(path).unwrap();
+}
+
+const GROUND: &str = "[proxy]\nplane = { point = [0, 0, 0], normal = [0, 1, 0] }";
+
+fn with_depth(folder: &Path, object: &str, more: &str) -> SceneConfig {
+    let mut config = config(object, GROUND);
+    config.depth = Some("depth.png".into());
+    if !more.is_empty() {
+        let mask =
+            image::GrayImage::from_fn(64, 32, |_, y| image::Luma([if y < 3 { 255 } else { 0 }]));
+        mask.save(folder.join(more)).unwrap();
+        config.occluders = Some(more.into());
+    }
+    config
+}
+
+#[test]
+fn a_mask_and_depths_hide_together_and_a_look_does_without_what_cannot_be_used() {
+    let folder = folder();
+    let folder = folder.path();
+    // A fence in the left third.
+    put_depths(
+        folder,
+        |x, _, ground| if x < 21 { ground.min(2.0) } else { ground },
+    );
+    let loaded = Scene::load(&with_depth(folder, "", "mask.png"), folder).unwrap();
+    let hidden = loaded.occluders.as_ref().unwrap();
+    assert_eq!(*hidden.get(40, 1), 1.0);
+    assert_eq!(*hidden.get(8, 16), 1.0);
+    assert_eq!(*hidden.get(40, 16), 0.0);
+    assert_eq!(*loaded.mask().unwrap().get(8, 16), 0.0);
+    // What is written down makes the same scene.
+    let again = loaded.description.load(folder).unwrap();
+    assert_eq!(again.occluders, loaded.occluders);
+    assert_eq!(again.description, loaded.description);
+    // Of another picture.
+    put_depths(folder, |x, y, _| 1.0 + f64::from((x * 97 + y * 57) % 101));
+    let config = with_depth(folder, "", "mask.png");
+    let refused = Scene::load(&config, folder).unwrap_err().to_string();
+    assert!(refused.contains("depth.png"), "{refused}");
+    let look = Scene::load_for_a_look(&config, folder).unwrap();
+    assert_eq!(look.occluders.as_ref(), look.mask());
+    let told = |w: &String| w.starts_with("scene.depth is left out: ");
+    assert!(look.warnings.iter().any(told), "{:?}", look.warnings);
+}
+
+#[test]
+fn a_place_is_looked_for_beside_what_depths_show() {
+    let folder = folder();
+    let folder = folder.path();
+    let x_of = |seen: &dyn Fn(u32, u32, f64) -> f64| {
+        put_depths(folder, seen);
+        let object = "place = \"auto\"\nscale = 0.3";
+        let loaded = Scene::load(&with_depth(folder, object, ""), folder).unwrap();
+        let (low, high) = loaded.scene.mesh.bounds().unwrap();
+        let middle = loaded.scene.camera.project(0.5 * (low + high)).unwrap();
+        middle.x
+    };
+    let free = x_of(&|_, _, ground| ground);
+    assert!((26.0..38.0).contains(&free), "{free}");
+    // A wall across the middle, near the camera.
+    let beside = x_of(&|x, _, ground| {
+        if (22..42).contains(&x) {
+            ground.min(3.0)
+        } else {
+            ground
+        }
+    });
+    assert!(!(22.0..42.0).contains(&beside), "{beside}");
+}
