@@ -22,8 +22,8 @@ fn a_misspelt_key_is_named_with_its_line() {
     project.run(SCENE, &[]).expect_error(
         2,
         "error: pipeline.toml:2: unknown key \"scene.backgruond\" (did you mean \"background\"?); \
-         [scene] accepts: background, transfer, class, occluders, depth, depth_kind, depth_scale, objects, \
-         camera, proxy, views, effects, limits",
+         [scene] accepts: background, transfer, class, occluders, depth, depth_kind, depth_scale, \
+         depth_surfaces, objects, camera, proxy, views, effects, limits",
     );
 }
 

@@ -201,6 +201,7 @@ fn note_scenes(set: &[String], note: &dyn Fn(&str)) {
         "depth",
         "depth_kind",
         "depth_scale",
+        "depth_surfaces",
         "objects",
         "camera",
         "proxy",

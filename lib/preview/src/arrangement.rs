@@ -10,6 +10,7 @@ use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::placement::{Anchor, Placement};
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::LoadedScene;
+use dipir_scene::surfaces::Surfaces;
 use dipir_scene::undistortion::Undistortion;
 use glam::{DMat3, DMat4, DQuat, DVec3, Vec2, Vec3};
 
@@ -106,7 +107,7 @@ fn part(mesh: &TriangleMesh, triangles: std::ops::Range<usize>) -> TriangleMesh 
 }
 
 impl Arrangement {
-    /// Places the objects of `config`. Photograph and models are those that were read; a plane
+    /// Places the objects of `config`. Photograph, models and surfaces are those that were read; a plane
     /// may be another one, also because the camera is that sees its pixels. An object with `place = "auto"` stays where `loaded_maps`, from its file to
     /// the world, have it.
     pub fn new(
@@ -115,6 +116,7 @@ impl Arrangement {
         facts: &Facts,
         models: &[Model],
         loaded_proxy: &Proxy,
+        surfaces: Option<&Surfaces>,
         loaded_maps: &[DMat4],
     ) -> anyhow::Result<Self> {
         let settings = config.validate()?;
@@ -131,7 +133,7 @@ impl Arrangement {
                 Some(way) => object.pixels.undistorted(way, &key)?,
                 None => object.pixels,
             };
-            let placement = pixels.place(&object.placement, &camera, &proxy, &key)?;
+            let placement = pixels.place(&object.placement, &camera, &proxy, surfaces, &key)?;
             let found = models.iter().position(|m| m.path == object.path);
             let model = found.with_context(|| {
                 format!("{key}.path: \"{}\" was not read", object.path.display())

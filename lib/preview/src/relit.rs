@@ -94,7 +94,8 @@ impl Relit {
         let [w, h] = size.map(|n| n as usize);
         small.scene.camera = small.scene.camera.scaled(size);
         small.photo.image = LinearImage(resize(&small.photo.image.0, w, h, Filter::Area));
-        small.depths = None;
+        // What is recorded leaves shadows on surfaces out.
+        (small.depths, small.surfaces) = (None, None);
         let mask = small.occluders.take();
         small.occluders = mask.map(|m| resize(&m, w, h, Filter::Area));
         let first = Lit::of(light, 1.0);

@@ -12,6 +12,7 @@ use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::plausibility::implausible;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::{LoadedScene, Scene};
+use dipir_scene::surfaces::Surfaces;
 use dipir_scene::undistortion::Undistortion;
 use dipir_stages::scene::with_place;
 use glam::DMat4;
@@ -32,6 +33,8 @@ pub struct Props {
     pub models: Vec<Model>,
     facts: Facts,
     proxy: Proxy,
+    /// What depths show beside it.
+    surfaces: Option<Surfaces>,
     /// From each object's file to the world, as it was read.
     maps: Vec<DMat4>,
     /// The folder that paths of the configuration start from.
@@ -72,6 +75,7 @@ impl Props {
             &self.facts,
             &self.models,
             &self.proxy,
+            self.surfaces.as_ref(),
             &self.maps,
         )
     }
@@ -113,6 +117,7 @@ impl SmallScene {
             models,
             facts: loaded.taken().facts.clone(),
             proxy: loaded.scene.proxy.clone(),
+            surfaces: loaded.surfaces.clone(),
             maps: (loaded.description.objects.iter())
                 .map(|o| o.transform())
                 .collect(),

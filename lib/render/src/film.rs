@@ -47,20 +47,24 @@ impl Film {
         self.shadow_variance.get(x, y)
     }
 
-    /// Removes object and shadow where `mask` is 1, and so much of them where it is between.
-    pub fn hide_behind(&mut self, mask: &Raster<f32>) {
+    /// Removes the object where `mask` is 1, the shadow where `of_shadow` is, and so much of them where these are between.
+    pub fn hide_behind(&mut self, mask: &Raster<f32>, of_shadow: &Raster<f32>) {
         let n = mask.pixels().len();
         for i in 0..n {
-            let seen = 1.0 - mask.pixels()[i].clamp(0.0, 1.0);
+            let [seen, lit] = [mask, of_shadow].map(|m| 1.0 - m.pixels()[i].clamp(0.0, 1.0));
             self.object.pixels_mut()[i] *= seen;
             self.alpha.pixels_mut()[i] *= seen;
             let shadow = &mut self.shadow.pixels_mut()[i];
-            *shadow = Vec3::ONE + (*shadow - Vec3::ONE) * seen;
+            *shadow = Vec3::ONE + (*shadow - Vec3::ONE) * lit;
             let (x, y) = (i % mask.width(), i / mask.width());
-            for variance in [&mut self.object_variance, &mut self.shadow_variance] {
+            let variances = [
+                (&mut self.object_variance, seen),
+                (&mut self.shadow_variance, lit),
+            ];
+            for (variance, left) in variances {
                 let before = variance.get(x, y);
                 if before != Vec3::ZERO {
-                    variance.set(x, y, before * (seen * seen));
+                    variance.set(x, y, before * (left * left));
                 }
             }
         }

@@ -11,6 +11,7 @@ use dipir_light::luminance::luminance_f64;
 use dipir_light::plane::PlaneLight;
 use dipir_scene::camera::Camera;
 use dipir_scene::scene::{LoadedScene, Scene};
+use dipir_scene::surfaces::Surfaces;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
@@ -31,7 +32,7 @@ use crate::guide::PathGuide;
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet};
 use crate::light::{PathLight, PreparedLight, SceneLight};
-use crate::shadow::{Block, LightOnProxy, ShadowContext};
+use crate::shadow::{Block, LightDirections, LightOnProxy, ShadowContext};
 use crate::viewing::Viewing;
 use crate::world::{Geometry, ProxyGeometry, World};
 
@@ -72,6 +73,8 @@ pub struct Settings<'a> {
     /// 1 where the photograph's own foreground hides the object, 0 where it does not; of the
     /// camera's size.
     pub occluders: Option<&'a Raster<f32>>,
+    /// What of the photograph beside the proxy catches shadows; its share is of the camera's size.
+    pub surfaces: Option<&'a Surfaces>,
     /// Share of a plane's light that may be blocked without being sampled.
     pub shadow_tolerance: f32,
     /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
@@ -106,7 +109,10 @@ impl<'a> Settings<'a> {
     /// For the photograph of `loaded`, at its full size.
     pub fn of_scene(loaded: &'a LoadedScene) -> Self {
         let photo = &loaded.photo;
-        Self::of(&photo.image, photo.transfer, loaded.occluders.as_ref())
+        Self {
+            surfaces: loaded.catching(),
+            ..Self::of(&photo.image, photo.transfer, loaded.occluders.as_ref())
+        }
     }
 }
 
@@ -121,6 +127,7 @@ impl Default for Settings<'_> {
             transfer: Transfer::Srgb,
             gain: 1.0,
             occluders: None,
+            surfaces: None,
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
             highlights: true,
@@ -244,6 +251,7 @@ impl<'a> Renderer<'a> {
     ) -> Result<Rendered, RenderError> {
         let start = Instant::now();
         self.check_images(settings.background, settings.occluders)?;
+        self.check_images(None, settings.surfaces.map(Surfaces::share))?;
         let light: &PreparedLight<L> = &PreparedLight {
             on_object: light.on_object(),
             on_plane: match &self.geometry.proxy {
@@ -261,7 +269,9 @@ impl<'a> Renderer<'a> {
             }
         }?;
         if let Some(mask) = settings.occluders {
-            rendered.film.hide_behind(mask);
+            let of_shadow = settings.surfaces.map(|surfaces| surfaces.shadow_mask(mask));
+            let of_shadow = of_shadow.as_ref().unwrap_or(mask);
+            rendered.film.hide_behind(mask, of_shadow);
         }
         Ok(rendered)
     }
@@ -311,6 +321,7 @@ impl<'a> Renderer<'a> {
                 blocker,
                 plane,
                 irradiance: luminance_f64(irradiance),
+                surfaces: settings.surfaces,
                 proxy_occlusion: simulation.proxy_occlusion,
                 light_on_proxy: simulation.light_on_proxy,
                 tolerance: settings.shadow_tolerance,
@@ -470,19 +481,39 @@ impl<'a> Renderer<'a> {
             ProxyGeometry::Mesh { .. } => Layer::MeshShadow,
         };
         let blocks: Vec<Block> = self.blocks().collect();
+        let directions = shadow
+            .surfaces
+            .map(|_| LightDirections::new(shadow.path.light));
         let shaded = |blocks: &[Block]| {
             let mut cones: Vec<P::Cone<'_>> = shadow.plane.iter().map(PlaneLight::cone).collect();
-            let shaded = blocks.iter().filter(|&&block| {
-                layer == Layer::MeshShadow || shadow.may_shade(block, &mut cones)
-            });
-            shaded.copied().collect::<Vec<_>>()
+            let layer = |block: Block| {
+                let of_surfaces = match &directions {
+                    Some(directions) => shadow.may_shade_surfaces(block, directions),
+                    None => false,
+                };
+                let shades = of_surfaces
+                    || layer == Layer::MeshShadow
+                    || shadow.may_shade(block, &mut cones);
+                let layer = match of_surfaces {
+                    true => Layer::MeshShadow,
+                    false => layer,
+                };
+                shades.then_some((layer, block))
+            };
+            blocks.iter().copied().filter_map(layer).collect::<Vec<_>>()
         };
-        let shaded: Vec<Vec<Block>> = blocks.par_chunks(BLOCKS_AT_ONCE).map(shaded).collect();
+        let shaded: Vec<Vec<_>> = blocks.par_chunks(BLOCKS_AT_ONCE).map(shaded).collect();
+        let seen = |layer, x, y| {
+            layer == Layer::MeshShadow && settings.surfaces.is_some() || is_visible(settings, x, y)
+        };
         shaded
             .into_iter()
             .flatten()
-            .filter(|&block| pixels_of(block).any(|(x, y)| is_visible(settings, x, y)))
-            .map(|block| Job::new(layer, block, PixelSet::new(block, |_| true), arriving))
+            .filter(|&(layer, block)| pixels_of(block).any(|(x, y)| seen(layer, x, y)))
+            .map(|(layer, block)| {
+                let arriving = arriving.filter(|_| layer == Layer::PlaneShadow);
+                Job::new(layer, block, PixelSet::new(block, |_| true), arriving)
+            })
             .collect()
     }
 }

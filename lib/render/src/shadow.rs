@@ -17,6 +17,7 @@ use dipir_numerics::warp::{
     Frame, balance_heuristic, cone_pdf, cosine_hemisphere_pdf, square_to_cone,
     square_to_cosine_hemisphere,
 };
+use dipir_scene::surfaces::Surfaces;
 use glam::{Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
@@ -27,6 +28,10 @@ use crate::features::{ALPHA, TRANSMISSION, has};
 use crate::foreground::{Gather, MIN_CAUSTIC_ROUGHNESS, PathContext, PathStart};
 use crate::light::PathLight;
 use crate::world::{ProxyGeometry, ProxyPoint};
+
+mod surfaces;
+
+pub use self::surfaces::LightDirections;
 
 /// Which light of the object counts on the proxy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,6 +53,8 @@ pub struct ShadowContext<'a, L, P> {
     pub plane: &'a [P],
     /// Luminance of the plane's irradiance without the object.
     pub irradiance: f64,
+    /// What of the photograph beside the proxy catches shadows.
+    pub surfaces: Option<&'a Surfaces>,
     /// Whether a proxy mesh shadows itself.
     pub proxy_occlusion: bool,
     /// Light of the object on the proxy, if it counts.
@@ -256,8 +263,11 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
         let mut gather = G::default();
         for index in samples.first..samples.first + samples.count {
             let mut sampler = base.with_sample(index);
-            let view = world.camera().ray(corner + sampler.next_2d());
-            let Some(point) = world.proxy_point(&view) else {
+            let pixel = corner + sampler.next_2d();
+            if self.surface_at(pixel, &mut sampler).is_some() {
+                continue;
+            }
+            let Some(point) = world.proxy_point(&world.camera().ray(pixel)) else {
                 continue;
             };
             let own;
@@ -287,7 +297,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
         gather
     }
 
-    /// Gathers `samples` samples of the pixel `(x, y)` on a proxy mesh.
+    /// Gathers `samples` samples of the pixel `(x, y)` on a proxy mesh, or on surfaces beside the proxy.
     ///
     /// Half of the directions come from the light, half from the cosine; both ratio parts use all
     /// of them with the balance heuristic's weights.
@@ -300,16 +310,21 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
     ) -> G {
         let world = self.path.world;
         let mut gather = G::default();
-        let ProxyGeometry::Mesh { bvh, .. } = &world.geometry.proxy else {
-            return gather;
-        };
         let corner = Vec2::new(x as f32, y as f32);
         for index in samples.first..samples.first + samples.count {
             let mut sampler = base.with_sample(index);
-            let view = world.camera().ray(corner + sampler.next_2d());
+            let pixel = corner + sampler.next_2d();
             let (light_numbers, cosine_numbers) = (sampler.next_2d(), sampler.next_2d());
             counts.add(RayKind::Proxy);
-            let Some(point) = world.proxy_point(&view) else {
+            let surface = self.surface_at(pixel, &mut sampler);
+            let hiding = match &world.geometry.proxy {
+                ProxyGeometry::Mesh { bvh, .. } if self.proxy_occlusion && surface.is_none() => {
+                    Some(bvh)
+                }
+                _ => None,
+            };
+            let of_proxy = || world.proxy_point(&world.camera().ray(pixel));
+            let Some(point) = surface.or_else(of_proxy) else {
                 continue;
             };
             gather.hit();
@@ -322,7 +337,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                     continue;
                 }
                 let ray = point.ray(direction);
-                if self.proxy_occlusion {
+                if let Some(bvh) = hiding {
                     counts.add(RayKind::ProxyOcclusion);
                     if bvh.occluded(&ray, f32::INFINITY, |_, _, _| true) {
                         continue;

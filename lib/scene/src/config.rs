@@ -60,6 +60,10 @@ pub struct SceneConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "found on the ground"), example = 1.0)]
     pub depth_scale: Option<f32>,
+    /// Whether what `depth` shows beside the proxy, as walls and furniture, catches the objects' shadows.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(extend("default" = true), example = false)]
+    pub depth_surfaces: Option<bool>,
     /// The objects that are put into the photograph; at least one.
     #[serde(default)]
     pub objects: Vec<ObjectConfig>,
@@ -122,8 +126,9 @@ pub struct ObjectConfig {
     #[schemars(extend("exclusiveMinimum" = 0), example = 1.4)]
     pub height_m: Option<f32>,
     /// What carries the object. `proxy`: it is dropped onto the proxy at the x and z of `position`.
-    /// `position`: its lowest point gets the y of `position`, whatever the proxy.
-    #[schemars(extend("enum" = ["proxy", "position"]), extend("x-default" = "`position` where the proxy is a horizontal plane or absent, else `proxy`"), example = &"proxy")]
+    /// `position`: its lowest point gets the y of `position`, whatever the proxy. `surface`: it stands on what
+    /// `scene.depth` shows at `at_pixel`, as a table's top.
+    #[schemars(extend("enum" = ["proxy", "position", "surface"]), extend("x-default" = "`position` where the proxy is a horizontal plane or absent, else `proxy`"), example = &"proxy")]
     pub rest: Option<String>,
     /// Which point of the object comes to lie at the x and z of `position`: the origin of its file,
     /// or the center of its bounding box.
@@ -291,7 +296,12 @@ impl SceneConfig {
             .iter()
             .enumerate()
             .map(|(i, object)| object.validate(&format!("scene.objects[{i}]")))
-            .collect::<Result<_, _>>()?;
+            .collect::<Result<Vec<_>, _>>()?;
+        let on_surface = |o: &ObjectSettings| o.placement.rest == Some(Rest::Surface);
+        if foreground.1.is_none() && objects.iter().any(on_surface) {
+            let remedy = "rest = \"surface\" stands an object on what these depths show, unless scene.effects.occluders is off";
+            return Err(missing("scene.depth", remedy));
+        }
         let camera = self.camera.as_ref().ok_or_else(|| {
             missing(
                 "scene.camera",
@@ -414,8 +424,14 @@ impl ObjectConfig {
                     None => None,
                     Some("proxy") => Some(Rest::Proxy),
                     Some("position") => Some(Rest::Position),
+                    Some("surface") if self.at_pixel.is_some() => Some(Rest::Surface),
+                    Some("surface") => {
+                        let remedy = "rest = \"surface\" stands the object on what is seen at it";
+                        return Err(missing(&key("at_pixel"), remedy));
+                    }
                     Some(other) => {
-                        return Err(wrong_word(&key("rest"), other, &["proxy", "position"]));
+                        let words = ["proxy", "position", "surface"];
+                        return Err(wrong_word(&key("rest"), other, &words));
                     }
                 },
                 anchor: match self.anchor.as_deref() {

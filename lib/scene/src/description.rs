@@ -77,6 +77,9 @@ pub struct DepthRecord {
     pub scale: Option<f32>,
     /// The scale that was found on the ground, if it was.
     pub found: Option<Scale>,
+    /// Whether what they show beside the proxy catches shadows.
+    #[serde(default)]
+    pub surfaces: bool,
 }
 
 /// What receives the shadow.

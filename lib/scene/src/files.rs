@@ -175,6 +175,7 @@ impl<'a> Files<'a> {
             measure: settings.measure,
             scale: settings.scale,
             found: None,
+            surfaces: settings.surfaces,
         };
         Ok((Some(depths), Some(record)))
     }

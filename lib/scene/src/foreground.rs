@@ -17,6 +17,7 @@ use crate::ground;
 use crate::mesh::TriangleMesh;
 use crate::pixels::ground_at;
 use crate::proxy::{Plane, Proxy};
+use crate::surfaces::{Map, Surfaces};
 use crate::undistortion::Undistortion;
 
 /// Where depths come from.
@@ -28,6 +29,8 @@ pub struct DepthSettings {
     pub measure: Option<Measure>,
     /// Metres of a unit, if that is said.
     pub scale: Option<f32>,
+    /// Whether what they show beside the proxy catches shadows.
+    pub surfaces: bool,
 }
 
 /// Depths of the undistorted photograph, at any resolution.
@@ -45,6 +48,8 @@ pub struct Depths {
 pub struct Foreground {
     /// 1 where the photograph's own stands before the objects or, where there are none, before the ground.
     pub mask: Raster<f32>,
+    /// What they show beside the proxy, if there is one.
+    pub surfaces: Option<Surfaces>,
     /// What depths were taken for.
     pub fit: DepthFit,
 }
@@ -191,6 +196,30 @@ impl Depths {
         };
         let pixels = (0..width * height).into_par_iter();
         let mut mask = filtered(pixels.map(of_ground).collect());
+        let surfaces = match ground {
+            // Nothing catches shadows.
+            Ground::None => None,
+            _ => {
+                let before_ground = |i: usize| {
+                    let metres = ground.metres(i % width, i / width, camera);
+                    // Above the horizon all that is known is before the ground.
+                    hidden(i, metres.unwrap_or(f64::INFINITY), fit.margin)
+                };
+                let pixels = (0..width * height).into_par_iter();
+                let share = filtered(pixels.map(before_ground).collect());
+                let behind = |x: usize, y: usize| {
+                    let metres = ground.metres(x, y, camera);
+                    metres.map_or(0.0, f64::recip)
+                };
+                let map = Map {
+                    disparities: &disparities,
+                    deviation: fit.fitted.map_or(0.0, |f| f.deviation),
+                    margin: fit.margin,
+                    camera,
+                };
+                Some(Surfaces::of_map(share, &map, behind))
+            }
+        };
         if let Some(objects) = objects {
             // The filter sees twice as far as its radius: there the objects' depth goes on, so that their outlines, which
             // the photograph does not show, are no edges of the mask.
@@ -214,7 +243,11 @@ impl Depths {
             }
             fit.hides_objects = seen > 0 && hidden == seen;
         }
-        Ok(Foreground { mask, fit })
+        Ok(Foreground {
+            mask,
+            surfaces,
+            fit,
+        })
     }
 
     fn fit(&self, ground: &Ground, camera: &Camera) -> Result<(Scale, DepthFit), Error> {
@@ -372,13 +405,19 @@ impl DepthFit {
         ))
     }
 
-    /// `disparities; 83% of the ground's agree with it to 1.2%; what is 4% nearer than the object hides it, 8% than the ground
-    /// its shadow`.
-    pub fn words(&self) -> String {
+    /// `disparities; 83% of the ground's agree with it to 1.2%; what is 4% nearer than the object hides it, than the ground
+    /// catches its shadow`. Where nothing `catches` shadows, `8% than the ground its shadow`.
+    pub fn words(&self, catches: bool) -> String {
+        let of_shadow = match catches {
+            true => "than the ground catches its shadow".into(),
+            false => format!(
+                "{:.0}% than the ground its shadow",
+                100.0 * self.ground_margin
+            ),
+        };
         let hides = format!(
-            "what is {:.0}% nearer than the object hides it, {:.0}% than the ground its shadow",
-            100.0 * self.margin,
-            100.0 * self.ground_margin
+            "what is {:.0}% nearer than the object hides it, {of_shadow}",
+            100.0 * self.margin
         );
         match &self.fitted {
             None => hides,

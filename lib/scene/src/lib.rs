@@ -27,6 +27,7 @@ pub mod proxy;
 pub mod ray_offset;
 mod rebuilding;
 pub mod scene;
+pub mod surfaces;
 mod taken;
 pub mod texture;
 pub mod triangle;

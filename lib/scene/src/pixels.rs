@@ -1,11 +1,12 @@
 //! Pixels of the photograph as points of the ground.
-use glam::{DQuat, DVec2, DVec3, Vec2};
+use glam::{DQuat, DVec2, DVec3, Vec2, Vec3};
 
 use crate::camera::Camera;
 use crate::error::Error;
 use crate::mesh::TriangleMesh;
-use crate::placement::Placement;
+use crate::placement::{Placement, Rest};
 use crate::proxy::{Plane, Proxy};
+use crate::surfaces::{Seen, Surfaces};
 use crate::undistortion::Undistortion;
 
 /// Pixels of the upright photograph that say where an object goes.
@@ -94,32 +95,41 @@ impl Pixels {
         })
     }
 
-    /// `placement` with the position and the yaw that the pixels say; `key` names the object's
-    /// table in messages.
+    /// `placement` with the position and the yaw that the pixels say, on the proxy or, if it rests on what is seen, on
+    /// `surfaces`; `key` names the object's table in messages.
     pub fn place(
         &self,
         placement: &Placement,
         camera: &Camera,
         proxy: &Proxy,
+        surfaces: Option<&Surfaces>,
         key: &str,
     ) -> Result<Placement, Error> {
         let mut placed = *placement;
         let size = Vec2::from(camera.resolution.map(|n| n as f32));
+        let surfaces = surfaces.filter(|_| placement.rest == Some(Rest::Surface));
+        let surface = |pixel: Vec2| surfaces.and_then(|s| s.point_at(camera, pixel));
+        let up = match proxy {
+            Proxy::Plane(plane) => plane.normal.as_dvec3().normalize(),
+            _ => DVec3::Y,
+        };
         if let Some(at) = self.at {
             let key = format!("{key}.at_pixel");
             within(at, size, &key)?;
-            placed.position = seen(camera, proxy, at, &key)?.as_vec3();
+            placed.position = match surface(at) {
+                Some(found) => level(&found, up, at, &key)?,
+                None => seen(camera, proxy, at, &key)?.as_vec3(),
+            };
         }
         if let Some(to) = self.to {
             let key = format!("{key}.to_pixel");
             within(to, size, &key)?;
-            let target = seen(camera, proxy, to, &key)?;
-            let up = match proxy {
-                Proxy::Plane(plane) => plane.normal.as_dvec3(),
-                _ => DVec3::Y,
+            let target = match surface(to) {
+                Some(found) => found.position.as_dvec3(),
+                None => seen(camera, proxy, to, &key)?,
             };
             // In the frame in which the object stands upright.
-            let upright = DQuat::from_rotation_arc(DVec3::Y, up.normalize());
+            let upright = DQuat::from_rotation_arc(DVec3::Y, up);
             let ahead = upright.inverse() * (target - placed.position.as_dvec3());
             if ahead.x.hypot(ahead.z) < 1e-6 {
                 return Err(Error::Config {
@@ -131,6 +141,27 @@ impl Pixels {
             placed.yaw_rad = ahead.x.atan2(ahead.z) as f32;
         }
         Ok(placed)
+    }
+}
+
+/// A surface that leans more than this carries nothing, degrees.
+const MOST_LEAN_DEG: f64 = 30.0;
+
+/// Where an object stands on a surface that is seen at `pixel`.
+fn level(found: &Seen, up: DVec3, pixel: Vec2, key: &str) -> Result<Vec3, Error> {
+    let lean = up.dot(found.normal.as_dvec3()).clamp(-1.0, 1.0).acos();
+    match lean.to_degrees() {
+        lean if lean <= MOST_LEAN_DEG => Ok(found.position),
+        lean => Err(Error::Config {
+            key: key.into(),
+            value: format!(
+                "{}, where by scene.depth something is seen that leans {lean:.0} degrees",
+                shown(pixel)
+            ),
+            accepted: "a pixel of something level, as a table's top; without rest = \"surface\" the object stands on the \
+                       ground"
+                .into(),
+        }),
     }
 }
 
@@ -195,8 +226,9 @@ fn seen(camera: &Camera, proxy: &Proxy, pixel: Vec2, key: &str) -> Result<DVec3,
 
 #[cfg(test)]
 mod tests {
-    use glam::Vec3;
     use proptest::prelude::*;
+
+    use dipir_imaging::raster::Raster;
 
     use super::*;
     use crate::camera::FieldOfView;
@@ -226,7 +258,7 @@ mod tests {
     }
 
     fn place(camera: &Camera, proxy: &Proxy, pixels: Pixels) -> Result<Placement, String> {
-        let placed = pixels.place(&placement(), camera, proxy, "scene.objects[0]");
+        let placed = pixels.place(&placement(), camera, proxy, None, "scene.objects[0]");
         placed.map_err(|e| e.to_string())
     }
 
@@ -234,6 +266,61 @@ mod tests {
         Pixels {
             at: Some(Vec2::new(x, y)),
             to: None,
+        }
+    }
+
+    #[test]
+    fn an_object_rests_on_the_level_surface_that_its_pixel_shows() {
+        let camera = camera(Vec3::new(0.3, 0.4, -1.0));
+        let [width, height] = [4000, 3000];
+        // A plane in the camera's axes, right, up and ahead, over its distance.
+        let through = |point: Vec3, normal: Vec3| {
+            let n = camera.rotation.transpose() * normal;
+            Vec3::new(n.x, n.y, -n.z) / normal.dot(point - camera.position)
+        };
+        let everywhere = |plane: Vec3| {
+            Surfaces::new(
+                Raster::filled(width, height, 1.0),
+                Raster::filled(4, 3, plane),
+            )
+        };
+        let resting = Placement {
+            rest: Some(Rest::Surface),
+            ..placement()
+        };
+        let proxy = Proxy::Plane(GROUND);
+        let pixels = at(2000.0, 1800.0);
+        let place = |surfaces: Option<&Surfaces>| {
+            let placed = pixels.place(&resting, &camera, &proxy, surfaces, "scene.objects[0]");
+            placed.map(|p| p.position).map_err(|e| e.to_string())
+        };
+        let top = everywhere(through(Vec3::Y * 0.7, Vec3::Y));
+        let on_top = place(Some(&top)).unwrap();
+        assert!((on_top.y - 0.7).abs() < 1e-5, "{on_top}");
+        let seen = camera.project(on_top).unwrap();
+        assert!(seen.distance(Vec2::new(2000.0, 1800.0)) < 0.01, "{seen}");
+        // What is not known is the ground, and so is what rests on anything else.
+        let unknown = everywhere(Vec3::NAN);
+        let on_ground = place(None).unwrap();
+        assert!(on_ground.y.abs() < 1e-5);
+        assert_eq!(place(Some(&unknown)).unwrap(), on_ground);
+        let other = pixels
+            .place(&placement(), &camera, &proxy, Some(&top), "")
+            .unwrap();
+        assert_eq!(other.position, on_ground);
+        for (lean_deg, stands) in [(25f32, true), (35.0, false), (90.0, false)] {
+            let (sin, cos) = lean_deg.to_radians().sin_cos();
+            let leaning = everywhere(through(Vec3::Y * 0.5, Vec3::new(0.0, cos, sin)));
+            match place(Some(&leaning)) {
+                Ok(_) => assert!(stands, "{lean_deg}"),
+                Err(said) => {
+                    assert!(
+                        !stands && said.contains(&format!("leans {lean_deg} degrees")),
+                        "{said}"
+                    );
+                    assert!(said.contains("scene.objects[0].at_pixel"), "{said}");
+                }
+            }
         }
     }
 

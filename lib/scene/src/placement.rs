@@ -34,6 +34,8 @@ pub enum Rest {
     Proxy,
     /// The placement's position.
     Position,
+    /// What the photograph shows at the pixel where the object is put.
+    Surface,
 }
 
 /// Which point of the object comes to lie at the placement's position, seen from above.
@@ -146,6 +148,7 @@ impl Placement {
             _ => Rest::Proxy,
         });
         match (proxy, rest) {
+            (_, Rest::Surface) => Ok((position, None)),
             (Proxy::Plane(plane), _) => {
                 let n = plane.normal.as_dvec3();
                 let height = n.dot(position - plane.point.as_dvec3());

@@ -60,6 +60,7 @@ impl SceneDescription {
             photo,
             original,
             occluders: None,
+            surfaces: None,
             masked: None,
             depths,
             depth_fit: None,
@@ -125,6 +126,7 @@ impl DepthRecord {
             path: self.file.path.clone(),
             measure: self.measure,
             scale: self.scale,
+            surfaces: self.surfaces,
         }
     }
 }

@@ -10,19 +10,20 @@ use glam::{DMat4, DVec2};
 
 use crate::assembly::Assembly;
 use crate::camera::{Camera, CameraSettings};
-use crate::config::SceneConfig;
+use crate::config::{ObjectSettings, SceneConfig};
 use crate::description::{ProxyRecord, SceneDescription, repeated};
 use crate::error::Error;
 use crate::features::SceneFeatures;
 use crate::files::Files;
-use crate::foreground::{DepthFit, Depths, Foreground};
+use crate::foreground::{DepthFit, Depths};
 use crate::ground::{self, Places};
 use crate::import::once;
 use crate::light::PunctualLight;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
-use crate::placement::Anchor;
+use crate::placement::{Anchor, Rest};
 use crate::proxy::Proxy;
+use crate::surfaces::Surfaces;
 use crate::taken::taken;
 use crate::texture::Texture;
 use crate::undistortion::Undistortion;
@@ -65,6 +66,8 @@ pub struct LoadedScene {
     /// The photo's own foreground, 1 in front of the object; of the photo's size. [`LoadedScene::hide`] makes it of the
     /// mask that the configuration names and of the depths.
     pub occluders: Option<Raster<f32>>,
+    /// What the depths show beside the proxy.
+    pub surfaces: Option<Surfaces>,
     /// That mask, where there are depths, too.
     pub(crate) masked: Option<Raster<f32>>,
     /// Depths that tell what stands in front of the objects.
@@ -147,8 +150,18 @@ impl LoadedScene {
         } = &self.scene;
         let found = depths.foreground(Some(mesh), proxy, camera, &self.photo.image)?;
         self.depth_fit = Some(found.fit);
-        self.occluders = Some(joined(self.masked.as_ref(), found));
+        self.surfaces = found.surfaces;
+        if let (Some(surfaces), Some(mask)) = (&mut self.surfaces, &self.masked) {
+            surfaces.hide(mask);
+        }
+        self.occluders = Some(joined(self.masked.as_ref(), found.mask));
         Ok(())
+    }
+
+    /// What of the photo beside the proxy catches shadows.
+    pub fn catching(&self) -> Option<&Surfaces> {
+        let depth = self.description.depth.as_ref()?;
+        self.surfaces.as_ref().filter(|_| depth.surfaces)
     }
 
     /// The mask that the configuration names.
@@ -191,6 +204,7 @@ impl LoadedScene {
     pub fn hide_if_known(&mut self, mask: Option<Raster<f32>>) -> Option<String> {
         let error = self.hide(mask).err()?;
         self.depth_fit = None;
+        self.surfaces = None;
         self.occluders.clone_from(&self.masked);
         Some(format!("scene.depth is left out: {error}"))
     }
@@ -234,8 +248,8 @@ pub(crate) fn undistort(
 }
 
 /// What a mask or depths say is in front.
-fn joined(mask: Option<&Raster<f32>>, found: Foreground) -> Raster<f32> {
-    let mut both = found.mask;
+fn joined(mask: Option<&Raster<f32>>, found: Raster<f32>) -> Raster<f32> {
+    let mut both = found;
     if let Some(mask) = mask {
         for (b, m) in both.pixels_mut().iter_mut().zip(mask.pixels()) {
             *b = b.max(*m);
@@ -322,6 +336,18 @@ impl Scene {
         };
         let doubt = settings.proxy.doubt(base_dir, &view, cloud.as_ref());
         files.warn(doubt.clone());
+        let is_looked_for = settings.objects.iter().any(|o| o.auto.is_some());
+        let rests = |o: &ObjectSettings| o.placement.rest == Some(Rest::Surface);
+        let counts = is_looked_for || settings.objects.iter().any(rests);
+        // Depths that do not agree with the ground are refused afterwards.
+        let around = depths.as_ref().filter(|_| counts && of_shot.is_none());
+        let found = around.and_then(|depths| {
+            let found = depths.foreground(None, &proxy, &camera, &photo.image);
+            found.ok()
+        });
+        let (hidden, surfaces) = found.map(|f| (f.mask, f.surfaces)).unzip();
+        let surfaces = surfaces.flatten();
+        let hidden = hidden.map(|found| joined(masked.as_ref(), found));
         let taken = match of_shot {
             Some(_) => Vec::new(),
             None => {
@@ -332,18 +358,12 @@ impl Scene {
                     limits,
                     &camera,
                     &proxy,
+                    surfaces.as_ref(),
                     undistortion.as_ref(),
                 )?
             }
         };
-        let is_looked_for = settings.objects.iter().any(|o| o.auto.is_some());
-        // Depths that do not agree with the ground are refused afterwards.
-        let around = depths.as_ref();
-        let around = around.filter(|_| is_looked_for && of_shot.is_none());
-        let hidden = around.and_then(|depths| {
-            let found = depths.foreground(None, &proxy, &camera, &photo.image);
-            Some(joined(masked.as_ref(), found.ok()?))
-        });
+        let around = around.filter(|_| is_looked_for);
         // Without points of another kind the depths tell what stands around.
         let around = around.filter(|_| cloud.is_none());
         let around = around.and_then(|depths| depths.cloud(&proxy, &camera).ok());
@@ -392,7 +412,8 @@ impl Scene {
                     placement.position = places.find(body, draw, &key)?.as_vec3();
                     placement.anchor = Anchor::Center;
                 }
-                let placement = pixels.place(&placement, &camera, &proxy, &key)?;
+                let placement =
+                    pixels.place(&placement, &camera, &proxy, surfaces.as_ref(), &key)?;
                 let (map, warning) =
                     placement.resolve(&imported.mesh, imported.origin, &proxy, &key)?;
                 // The record's map starts from the file's coordinates.
@@ -410,6 +431,7 @@ impl Scene {
             photo,
             original,
             occluders: None,
+            surfaces: None,
             masked: None,
             depths,
             depth_fit: None,

@@ -10,6 +10,7 @@ use crate::error::Error;
 use crate::import;
 use crate::limits::Limits;
 use crate::proxy::Proxy;
+use crate::surfaces::Surfaces;
 use crate::undistortion::Undistortion;
 
 /// Foot and size of every object with a place of its own; nothing if no object looks for one.
@@ -19,6 +20,7 @@ pub(crate) fn taken(
     limits: &Limits,
     camera: &Camera,
     proxy: &Proxy,
+    surfaces: Option<&Surfaces>,
     undistortion: Option<&Undistortion>,
 ) -> Result<Vec<(DVec3, Body)>, Error> {
     let mut taken = Vec::new();
@@ -35,7 +37,7 @@ pub(crate) fn taken(
             Some(way) => object.pixels.undistorted(way, &key)?,
             None => object.pixels,
         };
-        let placement = pixels.place(&object.placement, camera, proxy, &key)?;
+        let placement = pixels.place(&object.placement, camera, proxy, surfaces, &key)?;
         let (map, _) = placement.resolve(&imported.mesh, imported.origin, proxy, &key)?;
         let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
         for corner in &imported.mesh.positions {

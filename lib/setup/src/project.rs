@@ -170,6 +170,7 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
             path: path.into(),
             measure: None,
             scale: None,
+            surfaces: false,
         };
         Depths::read(&settings, Path::new(""), photo.facts.size, None)?;
     }

@@ -43,6 +43,7 @@ impl SceneConfig {
             for (name, is_given) in [
                 ("depth_kind", self.depth_kind.is_some()),
                 ("depth_scale", self.depth_scale.is_some()),
+                ("depth_surfaces", self.depth_surfaces.is_some()),
             ] {
                 if is_given {
                     let remedy = format!("name the file of depths, or remove scene.{name}");
@@ -56,6 +57,7 @@ impl SceneConfig {
             path: path.clone(),
             measure,
             scale: self.depth_scale,
+            surfaces: self.depth_surfaces.unwrap_or(true),
         }))
     }
 }

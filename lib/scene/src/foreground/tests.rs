@@ -225,6 +225,7 @@ fn depths_of_a_lens_that_bends_lines_are_undistorted() {
         path: "depth.png".into(),
         measure: None,
         scale: None,
+        surfaces: false,
     };
     let found = Depths::read(&settings, folder.path(), [320, 240], Some(&way)).unwrap();
     let [w, h] = way.size().map(|n| n as usize);

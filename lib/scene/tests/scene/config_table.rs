@@ -123,7 +123,15 @@ fn wrong_values_are_quoted_with_the_accepted_form() {
     );
     assert_eq!(
         message(&object("rest = \"floor\"")),
-        "scene.objects[0].rest is \"floor\"; accepted: \"proxy\" or \"position\""
+        "scene.objects[0].rest is \"floor\"; accepted: \"proxy\", \"position\" or \"surface\""
+    );
+    assert_eq!(
+        message(&object("rest = \"surface\"")),
+        "scene.objects[0].at_pixel is missing; rest = \"surface\" stands the object on what is seen at it"
+    );
+    assert_eq!(
+        message(&object("at_pixel = [3, 4]\nrest = \"surface\"")),
+        "scene.depth is missing; rest = \"surface\" stands an object on what these depths show, unless scene.effects.occluders is off"
     );
     assert_eq!(
         message(&table("", "[proxy]\nplane = { normal = [0, 0, 0] }")),
@@ -250,6 +258,10 @@ fn keys_of_depths_are_checked_and_switched_off_with_the_effect() {
         (
             "depth_scale = 1.0",
             "scene.depth is missing; name the file of depths, or remove scene.depth_scale",
+        ),
+        (
+            "depth_surfaces = false",
+            "scene.depth is missing; name the file of depths, or remove scene.depth_surfaces",
         ),
         (
             "depth = \"d.png\"\ndepth_scale = 0.0",

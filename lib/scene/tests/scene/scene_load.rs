@@ -267,8 +267,13 @@ fn a_mask_of_another_size_is_refused() {
 
 /// Shades of a depth map of 64 x 32 pixels, by what is seen there: its depth, where the ground's is `ground`, metres.
 fn put_depths(folder: &Path, seen: impl Fn(u32, u32, f64) -> f64) {
-    let camera = load(folder, "", "").scene.camera;
-    let shades = image::ImageBuffer::from_fn(64, 32, |x, y| {
+    put_depths_of(folder, [64, 32], seen);
+}
+
+/// The same of any size.
+fn put_depths_of(folder: &Path, [width, height]: [u32; 2], seen: impl Fn(u32, u32, f64) -> f64) {
+    let camera = load(folder, "", "").scene.camera.scaled([width, height]);
+    let shades = image::ImageBuffer::from_fn(width, height, |x, y| {
         let ray = camera.ray(Vec2::new(x as f32, y as f32) + 0.5);
         let ahead = -ray.direction.dot(camera.rotation.z_axis);
         let ground = match ray.direction.y < 0.0 {
@@ -348,4 +353,54 @@ fn a_place_is_looked_for_beside_what_depths_show() {
         }
     });
     assert!(!(22.0..42.0).contains(&beside), "{beside}");
+}
+
+#[test]
+fn an_object_stands_on_the_table_that_depths_show() {
+    let folder = folder();
+    let folder = folder.path();
+    let camera = load(folder, "", "").scene.camera;
+    // Half as high as the camera, in the right half, up to where a wall begins 6 m ahead.
+    let top_m = 0.8;
+    let seen = |x: u32, _: u32, ground: f64| match x >= 256 {
+        true => (ground * (1.6 - top_m) / 1.6).min(6.0),
+        false => ground.min(6.0),
+    };
+    put_depths_of(folder, [512, 256], seen);
+    let put = |pixel: [f32; 2], rest: &str| {
+        let object = format!("at_pixel = {pixel:?}\nscale = 0.3\nrest = {rest:?}");
+        let loaded = Scene::load(&with_depth(folder, &object, ""), folder)?;
+        let (low, _) = loaded.scene.mesh.bounds().unwrap();
+        let again = loaded.description.load(folder).unwrap();
+        let [found, known] = [&loaded, &again].map(|l| l.catching().unwrap());
+        assert!(found.share() == known.share());
+        let at = Vec2::new(48.0, 20.0);
+        assert_eq!(found.point_at(&camera, at), known.point_at(&camera, at));
+        assert_eq!(again.scene.mesh.bounds(), loaded.scene.mesh.bounds());
+        Ok::<f64, dipir_scene::Error>(low.y.into())
+    };
+    // A row of the ground, 3 m away, and so of the table, 1.5 m away.
+    let row = camera
+        .project(Vec3::new(0.0, 0.0, camera.position.z - 3.0))
+        .unwrap()
+        .y;
+    let on_table = put([48.0, row], "surface").unwrap();
+    // The scale is that of the ground at the photograph's 64 x 32 pixels: half a pixel of its rows is 2% of what is seen there.
+    assert!((on_table - top_m).abs() < 0.02 * 1.6, "{on_table}");
+    assert!(put([48.0, row], "proxy").unwrap().abs() < 1e-5);
+    assert!(put([16.0, row], "surface").unwrap().abs() < 1e-5);
+    let refused = put([48.0, 2.0], "surface").unwrap_err().to_string();
+    assert!(refused.contains("leans 80 degrees"), "{refused}");
+    let mut without = with_depth(folder, "", "");
+    without.depth_surfaces = Some(false);
+    let without = Scene::load(&without, folder).unwrap();
+    assert!(without.catching().is_none());
+    assert!(
+        without
+            .description
+            .load(folder)
+            .unwrap()
+            .catching()
+            .is_none()
+    );
 }

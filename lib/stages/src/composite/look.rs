@@ -1,4 +1,5 @@
 //! What the photograph's camera did to the photograph, done to object and shadow, too: blur and grain.
+use std::borrow::Cow;
 use std::ops::Range;
 
 use dipir_imaging::composite::composite_pixel;
@@ -99,13 +100,13 @@ impl Look {
         }
     }
 
-    /// Blurs the layers, and puts grain on the object. `hidden` is the mask of what stands in front of it; the layers were
+    /// Blurs the layers, and puts grain on the object. `hidden` is what stands in front; the layers were
     /// rendered at one over `divisor` of the photograph's resolution.
     pub fn apply(
         &self,
         layers: &mut Overlay,
         background: &LinearImage,
-        hidden: Option<&Raster<f32>>,
+        hidden: Option<&Hidden>,
         divisor: u32,
     ) -> Matched {
         let blur_px = self.blur_px(divisor);
@@ -157,15 +158,23 @@ impl Look {
     }
 }
 
+/// Masks of what stands in front of the layers, of their size.
+pub struct Hidden<'a> {
+    /// Hides the object.
+    pub object: Cow<'a, Raster<f32>>,
+    /// Hides the shadow.
+    pub shadow: Cow<'a, Raster<f32>>,
+}
+
 impl Overlay {
     /// Blurs all layers where they change the photograph. Light above `white` stays where it is: a glint of a pixel would
     /// become a disc, and so would its noise, which nobody sees beyond white.
-    fn blur(&mut self, hidden: Option<&Raster<f32>>, blur_px: f32, white: f32) {
+    fn blur(&mut self, hidden: Option<&Hidden>, blur_px: f32, white: f32) {
         let Some(part) = self.touched(2 + (3.0 * blur_px) as usize) else {
             return;
         };
-        let seen = hidden.map(|mask| mask.map(|m| 1.0 - m.clamp(0.0, 1.0)));
-        let seen = seen.as_ref();
+        let seen = |mask: &Raster<f32>| mask.map(|m| 1.0 - m.clamp(0.0, 1.0));
+        let of_object = hidden.map(|hidden| seen(&hidden.object));
         let white = Vec3::splat(white);
         let width = self.alpha.width();
         let rows = (part.y..part.y + part.height).map(|y| y * width + part.x);
@@ -177,15 +186,17 @@ impl Overlay {
                 *light = light.min(white);
             }
         }
-        sharpness::blur(&mut self.object, seen, part, blur_px);
+        sharpness::blur(&mut self.object, of_object.as_ref(), part, blur_px);
         let object = self.object.pixels_mut();
         for (i, beyond) in inside.into_iter().flatten().zip(beyond_white) {
             object[i] += beyond;
         }
-        sharpness::blur(&mut self.alpha, seen, part, blur_px);
+        sharpness::blur(&mut self.alpha, of_object.as_ref(), part, blur_px);
+        drop(of_object);
+        let of_shadow = hidden.map(|hidden| seen(&hidden.shadow));
         // Where there is no shadow, nothing of the light is missing.
         self.shadow.pixels_mut().iter_mut().for_each(|s| *s -= 1.0);
-        sharpness::blur(&mut self.shadow, seen, part, blur_px);
+        sharpness::blur(&mut self.shadow, of_shadow.as_ref(), part, blur_px);
         self.shadow.pixels_mut().iter_mut().for_each(|s| *s += 1.0);
     }
 

@@ -41,7 +41,7 @@ use crate::scene::folder::{self as scene_folder, SceneFolder};
 use crate::written;
 use curve::Curve;
 pub use look::Matched;
-use look::{Look, Overlay};
+use look::{Hidden, Look, Overlay};
 use table::{CompositeTable, MAX_SAMPLES};
 
 /// When to stop, from the command line.
@@ -404,14 +404,18 @@ impl<'a> Composite<'a> {
             alpha,
             shadow,
         };
-        let hidden = loaded
-            .occluders
-            .as_ref()
-            .map(|mask| match &loaded.original {
-                Some(original) => Cow::Owned(original.undistortion.distort(mask, 0.0)),
-                None => Cow::Borrowed(mask),
-            });
-        let matched = look.apply(&mut layers, background, hidden.as_deref(), divisor);
+        let hidden = loaded.occluders.as_ref();
+        let of_shadow = hidden.zip(loaded.catching());
+        let of_shadow = of_shadow.map(|(mask, surfaces)| surfaces.shadow_mask(mask));
+        let bent = |mask| match &loaded.original {
+            Some(original) => Cow::Owned(original.undistortion.distort(mask, 0.0)),
+            None => Cow::Borrowed(mask),
+        };
+        let hidden = hidden.map(|mask| Hidden {
+            object: bent(mask),
+            shadow: bent(of_shadow.as_ref().unwrap_or(mask)),
+        });
+        let matched = look.apply(&mut layers, background, hidden.as_ref(), divisor);
         let Overlay {
             mut object,
             mut alpha,

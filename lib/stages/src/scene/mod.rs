@@ -49,6 +49,8 @@ pub struct Done {
     ground: Option<Ground>,
     /// Of the depths that tell what is in front.
     depth_fit: Option<DepthFit>,
+    /// Whether what they show beside the proxy catches shadows.
+    catches: bool,
     /// Absent where the light is given.
     record: Option<Record>,
     /// Other qualities differ in the record alone.
@@ -138,6 +140,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         triangles: loaded.scene.mesh.indices.len(),
         materials: loaded.scene.materials.len(),
         resolution,
+        catches: loaded.catching().is_some(),
         ground: match loaded.description.proxy {
             ProxyRecord::Ground(ground) => Some(*ground),
             _ => None,
@@ -392,6 +395,7 @@ impl Done {
                 "kind": d.fitted.map(|f| f.scale.measure), "factor": d.fitted.map(|f| f.scale.factor),
                 "shift": d.fitted.map(|f| f.scale.shift), "agreeing": d.fitted.map(|f| f.agreeing),
                 "deviation": d.fitted.map(|f| f.deviation), "margin": d.margin, "ground_margin": d.ground_margin,
+                "surfaces": self.catches,
             })),
             "effects": self.effects.effects,
             "max_depth": self.effects.max_depth,
@@ -427,7 +431,7 @@ impl fmt::Display for Done {
             writeln!(f, "  ground: {}", ground.words())?;
         }
         if let Some(fit) = &self.depth_fit {
-            writeln!(f, "  depth: {}", fit.words())?;
+            writeln!(f, "  depth: {}", fit.words(self.catches))?;
         }
         write!(
             f,

@@ -1,0 +1,335 @@
+//! Surfaces that the photograph shows beside the proxy: they catch the objects' shadows, too.
+use dipir_imaging::raster::Raster;
+use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
+use rayon::prelude::*;
+
+use crate::camera::Camera;
+
+/// What the photograph shows before the proxy, by its depths. Light passes through it: how it is lit is part of the light.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Surfaces {
+    /// Share of each pixel of the photograph in which they are seen, from 0 to 1.
+    share: Raster<f32>,
+    /// Planes through the surfaces, at any resolution: one over the depth is `p . (u, v, 1)` where the camera looks `u` to the
+    /// right and `v` upwards, per metre ahead. NaN where nothing is known.
+    planes: Raster<Vec3>,
+}
+
+/// A point of a surface as the camera sees it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Seen {
+    /// World space, metres.
+    pub position: Vec3,
+    /// Unit normal on the side of the camera.
+    pub normal: Vec3,
+    /// Along the optical axis, metres.
+    pub depth: f32,
+}
+
+/// Planes along the longer side, at most.
+const MOST: usize = 768;
+/// Half the side of the window that a plane is fitted in, as a share of the longer side.
+const WINDOW: f64 = 1.0 / 80.0;
+/// Values of a window, from its middle to a side, at most.
+const STEPS: usize = 4;
+/// Texels from the middle of a window to a side, at least.
+const LEAST: usize = 2;
+/// What is within this share of the middle's disparity starts the fit.
+const NEAR: f64 = 0.1;
+/// From this deviation from the plane on, as a share of the disparity, a value does not count: at least this, and so many
+/// standard deviations of the ground's depths.
+const CUT: (f64, f64) = (0.02, 4.0);
+/// Fits, each with the weights of the one before.
+const ROUNDS: usize = 3;
+/// Penalty on slopes, in squares of a step: far below what a window weighs, for windows of one row.
+const PENALTY: f64 = 1e-3;
+
+/// From this nearness on, in margins, the shares of pixels are those of the mask.
+const CLEAR: f64 = 2.0;
+
+/// Disparities of a photograph.
+pub(crate) struct Map<'a> {
+    /// One over depths, 1/metre; NaN where nothing is known.
+    pub disparities: &'a Raster<f32>,
+    /// Their standard deviation, relative.
+    pub deviation: f64,
+    /// What is nearer than the ground by this share of its depth is none of it.
+    pub margin: f64,
+    /// The photograph's.
+    pub camera: &'a Camera,
+}
+
+impl Surfaces {
+    /// Planes at any resolution, as `p . (u, v, 1)` is one over their depth (1/metre) where the camera looks `u` to the right
+    /// and `v` upwards, per metre ahead; NaN where nothing is known. They are seen in `share` of each pixel of the photograph.
+    pub fn new(share: Raster<f32>, planes: Raster<Vec3>) -> Self {
+        Self { share, planes }
+    }
+
+    /// Those of `map` that are seen in `share` of each pixel. `ground` is the proxy's disparity at a pixel, 0 where there
+    /// is none.
+    ///
+    /// Planes are fitted to what is nearer than the ground by a margin. Where they meet the ground, less than that is left
+    /// between the two: downwards from there the plane goes on as long as it is before the ground and the map agrees.
+    pub(crate) fn of_map(
+        share: Raster<f32>,
+        map: &Map,
+        ground: impl Fn(usize, usize) -> f64 + Sync,
+    ) -> Self {
+        let disparities = map.disparities;
+        let own = [disparities.width(), disparities.height()];
+        // The pixel at the middle of a texel.
+        let pixel_of = |at: [usize; 2]| {
+            let side =
+                |k: usize| (2 * at[k] + 1) * map.camera.resolution[k] as usize / (2 * own[k]);
+            [side(0), side(1)]
+        };
+        let is_before = |i: usize| {
+            let disparity = f64::from(disparities.pixels()[i]);
+            let [x, y] = pixel_of([i % own[0], i / own[0]]);
+            disparity > 0.0 && 1.0 - ground(x, y) / disparity > map.margin
+        };
+        let before = (0..own[0] * own[1]).into_par_iter().map(is_before);
+        let window = Window {
+            map,
+            before: Raster::from_pixels(own[0], own[1], before.collect()),
+        };
+        let every = own[0].max(own[1]).div_ceil(MOST);
+        let size = own.map(|n| n.div_ceil(every));
+        let middle = |x: usize, y: usize| {
+            let side = |k: usize, i: usize| (i * every + every / 2).min(own[k] - 1);
+            [side(0, x), side(1, y)]
+        };
+        let plane = |i: usize| window.plane(middle(i % size[0], i / size[0]));
+        let planes = (0..size[0] * size[1]).into_par_iter().map(plane);
+        let mut planes = Raster::from_pixels(size[0], size[1], planes.collect::<Vec<_>>());
+        for y in 1..size[1] {
+            for x in 0..size[0] {
+                let above = *planes.get(x, y - 1);
+                if above.is_nan() || !planes.get(x, y).is_nan() {
+                    continue;
+                }
+                let at = middle(x, y);
+                let way = window.way(at[0], at[1]).extend(1.0);
+                let (goes_on, found) = (above.as_dvec3().dot(way), *disparities.get(at[0], at[1]));
+                let [u, v] = pixel_of(at);
+                let agrees = (f64::from(found) / goes_on - 1.0).abs() < map.margin;
+                if goes_on > ground(u, v) && agrees {
+                    *planes.get_mut(x, y) = above;
+                }
+            }
+        }
+        let mut surfaces = Self { share, planes };
+        surfaces.meet(map, ground);
+        surfaces
+    }
+
+    /// Near to the ground what is seen is the nearer of it and the surfaces.
+    fn meet(&mut self, map: &Map, ground: impl Fn(usize, usize) -> f64 + Sync) {
+        let camera = map.camera;
+        let width = self.share.width();
+        let seen = |i: usize| {
+            let (x, y) = (i % width, i / width);
+            let behind = ground(x, y);
+            let own = *self.share.get(x, y);
+            if behind == 0.0 {
+                return own;
+            }
+            let pixel = Vec2::new(x as f32, y as f32) + 0.5;
+            let found = self.point_at(camera, pixel).map(|s| f64::from(s.depth));
+            match found {
+                Some(depth) if 1.0 - depth * behind < CLEAR * map.margin => {
+                    f32::from(u8::from(depth * behind < 1.0))
+                }
+                _ => own,
+            }
+        };
+        let shares = (0..self.share.pixels().len()).into_par_iter().map(seen);
+        self.share = Raster::from_pixels(width, self.share.height(), shares.collect());
+    }
+
+    /// Takes away what `mask`, of the photograph's size, is in front of.
+    pub(crate) fn hide(&mut self, mask: &Raster<f32>) {
+        for (share, mask) in self.share.pixels_mut().iter_mut().zip(mask.pixels()) {
+            *share = share.min(1.0 - mask.clamp(0.0, 1.0));
+        }
+    }
+
+    /// Share of each pixel of the photograph in which they are seen, from 0 to 1.
+    pub fn share(&self) -> &Raster<f32> {
+        &self.share
+    }
+
+    /// What `mask`, of the photograph's size, hides of shadows: all but these surfaces, which it stands for, too.
+    pub fn shadow_mask(&self, mask: &Raster<f32>) -> Raster<f32> {
+        let both = mask.pixels().par_iter().zip(self.share.pixels());
+        let hides = both.map(|(mask, share)| (mask - share).max(0.0));
+        Raster::from_pixels(mask.width(), mask.height(), hides.collect())
+    }
+
+    /// Whether they are seen in the rectangle, in shares of the picture's width and height from its upper left corner.
+    pub fn are_seen(&self, columns: [f64; 2], rows: [f64; 2]) -> bool {
+        shares(&self.share, columns, rows).any(|s| s > 0.0)
+    }
+
+    /// The share in which they are seen at `pixel` of `camera`, the photograph's at any resolution.
+    #[inline]
+    pub fn share_at(&self, camera: &Camera, pixel: Vec2) -> f32 {
+        let index = |k: usize, size: usize| {
+            let at = pixel[k] / camera.resolution[k] as f32 * size as f32;
+            (at as usize).min(size - 1)
+        };
+        let (x, y) = (index(0, self.share.width()), index(1, self.share.height()));
+        *self.share.get(x, y)
+    }
+
+    /// The point of them at `pixel`, whether it is seen there or the proxy; `None` where nothing is known.
+    pub fn point_at(&self, camera: &Camera, pixel: Vec2) -> Option<Seen> {
+        let plane = self.plane_at(pixel, camera.resolution)?;
+        let d = (pixel - camera.principal_px) / camera.focal_px;
+        let way = Vec3::new(d.x, -d.y, 1.0);
+        let depth = plane.dot(way).recip();
+        // Behind the camera, or farther than a float tells apart.
+        if !(depth > 0.0 && depth < FARTHEST_M) {
+            return None;
+        }
+        let to_world = |v: Vec3| camera.rotation * Vec3::new(v.x, v.y, -v.z);
+        Some(Seen {
+            position: camera.position + to_world(way * depth),
+            normal: -to_world(plane).normalize(),
+            depth,
+        })
+    }
+
+    /// Between those of the four texels around a pixel of a picture of `resolution` pixels that are known.
+    fn plane_at(&self, pixel: Vec2, resolution: [u32; 2]) -> Option<Vec3> {
+        let size = [self.planes.width(), self.planes.height()];
+        let axis = |k: usize| {
+            let at = pixel[k] * size[k] as f32 / resolution[k] as f32 - 0.5;
+            let at = at.clamp(0.0, (size[k] - 1) as f32);
+            let first = at as usize;
+            let share = at - first as f32;
+            [(first, 1.0 - share), ((first + 1).min(size[k] - 1), share)]
+        };
+        let (columns, rows) = (axis(0), axis(1));
+        let (mut sum, mut weights) = (Vec3::ZERO, 0.0);
+        for (y, v) in rows {
+            for (x, u) in columns {
+                let plane = *self.planes.get(x, y);
+                if !plane.is_nan() {
+                    sum += plane * (u * v);
+                    weights += u * v;
+                }
+            }
+        }
+        (weights > 0.0).then(|| sum / weights)
+    }
+}
+
+/// What is farther is no surface, metres.
+const FARTHEST_M: f32 = 1e6;
+
+/// The shares of the pixels in a rectangle, which is given in shares of the picture's sides.
+fn shares(
+    share: &Raster<f32>,
+    columns: [f64; 2],
+    rows: [f64; 2],
+) -> impl Iterator<Item = f32> + use<'_> {
+    let range = |[from, to]: [f64; 2], size: usize| {
+        let size_f = size as f64;
+        (from * size_f).floor().max(0.0) as usize
+            ..((to * size_f).ceil().max(0.0) as usize).min(size)
+    };
+    let columns = range(columns, share.width());
+    let rows = range(rows, share.height());
+    rows.flat_map(move |y| {
+        let row = share.row(y);
+        row.get(columns.clone()).unwrap_or(&[]).iter().copied()
+    })
+}
+
+/// Fits planes to disparities around texels. A plane's disparity is linear in the picture.
+struct Window<'a> {
+    map: &'a Map<'a>,
+    /// Where the map is before the ground.
+    before: Raster<bool>,
+}
+
+impl Window<'_> {
+    /// The plane through a texel; NaN where it is not before the ground.
+    fn plane(&self, [x, y]: [usize; 2]) -> Vec3 {
+        let map = self.map.disparities;
+        let size = [map.width(), map.height()];
+        if !*self.before.get(x, y) {
+            return Vec3::NAN;
+        }
+        let middle = f64::from(*map.get(x, y));
+        let cut = CUT.0.max(CUT.1 * self.map.deviation);
+        let longest = size[0].max(size[1]) as f64;
+        let reach = ((WINDOW * longest).ceil() as usize).max(LEAST);
+        let step = reach.div_ceil(STEPS);
+        let offsets = -(reach.div_ceil(step) as isize)..=reach.div_ceil(step) as isize;
+        let at = |i: usize, offset: isize, size: usize| {
+            i.checked_add_signed(offset * step as isize)
+                .filter(|i| *i < size)
+        };
+        let here = self.way(x, y);
+        // Relative to the middle, so that the sums are well conditioned.
+        let mut around = Vec::new();
+        for v in offsets.clone().filter_map(|o| at(y, o, size[1])) {
+            for u in offsets.clone().filter_map(|o| at(x, o, size[0])) {
+                if *self.before.get(u, v) {
+                    let way = self.way(u, v) - here;
+                    let value = f64::from(*map.get(u, v)) / middle - 1.0;
+                    around.push((DVec3::new(way.x, way.y, 1.0), value));
+                }
+            }
+        }
+        let penalty = PENALTY * self.extent(step).powf(2.0);
+        // The first fit is to what is near in depth.
+        let mut plane = fitted(&around, |_, value| value / NEAR, penalty);
+        for _ in 1..ROUNDS {
+            plane = fitted(&around, |p, value| (value - plane.dot(p)) / cut, penalty);
+        }
+        if !(plane.is_finite() && plane.z.abs() < NEAR) {
+            plane = DVec3::ZERO;
+        }
+        let offset = 1.0 + plane.z - plane.x * here.x - plane.y * here.y;
+        (middle * DVec3::new(plane.x, plane.y, offset)).as_vec3()
+    }
+
+    /// Where the camera looks at the middle of a texel: to the right and upwards, per metre ahead.
+    fn way(&self, x: usize, y: usize) -> DVec2 {
+        let own = self.map.disparities;
+        let size = DVec2::new(own.width() as f64, own.height() as f64);
+        let camera = self.map.camera;
+        let [w, h] = camera.resolution.map(f64::from);
+        let pixel = (DVec2::new(x as f64, y as f64) + 0.5) / size * DVec2::new(w, h);
+        let d = (pixel - camera.principal_px.as_dvec2()) / camera.focal_px.as_dvec2();
+        DVec2::new(d.x, -d.y)
+    }
+
+    /// What `step` texels are of that.
+    fn extent(&self, step: usize) -> DVec2 {
+        self.way(step, 0) - self.way(0, step)
+    }
+}
+
+/// The slopes and the offset that fit `samples` best. Tukey's weights are 0 from where `off` is 1 or more.
+fn fitted(samples: &[(DVec3, f64)], off: impl Fn(DVec3, f64) -> f64, penalty: DVec2) -> DVec3 {
+    let mut squares = DMat3::from_diagonal(penalty.extend(1e-9));
+    let mut products = DVec3::ZERO;
+    for (p, value) in samples {
+        let off = off(*p, *value);
+        let left = 1.0 - off * off;
+        if left > 0.0 {
+            let weighted = *p * (left * left);
+            squares += DMat3::from_cols(weighted * p.x, weighted * p.y, weighted * p.z);
+            products += weighted * *value;
+        }
+    }
+    squares.inverse() * products
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,198 @@
+use super::*;
+use crate::camera::FieldOfView;
+
+const SIZE: [u32; 2] = [240, 160];
+/// Height of the camera, metres.
+const EYE: f32 = 1.5;
+
+fn camera() -> Camera {
+    let (eye, to) = (Vec3::new(0.0, EYE, 0.0), Vec3::new(0.0, 0.8, -5.0));
+    Camera::look_at(eye, to, Vec3::Y, FieldOfView::Vertical(0.8), SIZE)
+}
+
+/// Depth of the ground, infinite above the horizon.
+fn ground_m(camera: &Camera, pixel: Vec2) -> f64 {
+    let ray = camera.ray(pixel);
+    let ahead = -ray.direction.dot(camera.rotation.z_axis);
+    match ray.direction.y < 0.0 {
+        true => f64::from(EYE / -ray.direction.y * ahead),
+        false => f64::INFINITY,
+    }
+}
+
+/// Depth of the plane through `point` across `normal`.
+fn plane_m(camera: &Camera, pixel: Vec2, point: Vec3, normal: Vec3) -> f64 {
+    let ray = camera.ray(pixel);
+    let ahead = -ray.direction.dot(camera.rotation.z_axis);
+    let t = normal.dot(point - ray.origin) / normal.dot(ray.direction);
+    f64::from(if t > 0.0 { t * ahead } else { f32::INFINITY })
+}
+
+/// A wall that turns away to the right, 6 m ahead.
+const WALL: (Vec3, Vec3) = (Vec3::new(0.0, 0.0, -6.0), Vec3::new(-0.6, 0.0, 0.8));
+/// A table's top, .7 m high, to the left, from 2 to 4.5 m ahead.
+const TOP: (Vec3, Vec3) = (Vec3::new(0.0, 0.7, 0.0), Vec3::Y);
+
+fn middle(x: usize, y: usize) -> Vec2 {
+    Vec2::new(x as f32, y as f32) + 0.5
+}
+
+/// What is seen at a pixel: the ground (0), the wall (1) or the table's top (2), and its depth.
+fn seen(camera: &Camera, pixel: Vec2) -> (usize, f64) {
+    let [wall, top] = [WALL, TOP].map(|(p, n)| plane_m(camera, pixel, p, n));
+    let point = camera.ray(pixel);
+    let ahead = f64::from(-point.direction.dot(camera.rotation.z_axis));
+    let on_top = point.origin + point.direction * (top / ahead) as f32;
+    let is_table = on_top.x > -3.0 && on_top.x < -0.3 && on_top.z > -4.5 && on_top.z < -2.0;
+    let all = [
+        (0, ground_m(camera, pixel)),
+        (1, wall),
+        (2, if is_table { top } else { f64::INFINITY }),
+    ];
+    all.into_iter().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap()
+}
+
+/// The surfaces of a map of `size` texels whose disparities are `noise(column, row)` times what they ought to be.
+fn found(size: [usize; 2], deviation: f64, noise: impl Fn(usize, usize) -> f64) -> Surfaces {
+    let camera = camera();
+    let own = camera.scaled(size.map(|n| n as u32));
+    let at = |i: usize| (i % size[0], i / size[0]);
+    let disparity = |i: usize| {
+        let (x, y) = at(i);
+        (noise(x, y) / seen(&own, middle(x, y)).1) as f32
+    };
+    let values = (0..size[0] * size[1]).map(disparity).collect();
+    let disparities = Raster::from_pixels(size[0], size[1], values);
+    let [w, h] = SIZE.map(|n| n as usize);
+    let share = |i: usize| {
+        let pixel = middle(i % w, i / w);
+        let nearer = 1.0 - seen(&camera, pixel).1 / ground_m(&camera, pixel);
+        ((nearer - 0.03) / 0.015).clamp(0.0, 1.0) as f32
+    };
+    let share = Raster::from_pixels(w, h, (0..w * h).map(share).collect());
+    let map = Map {
+        disparities: &disparities,
+        deviation,
+        margin: 0.03,
+        camera: &camera,
+    };
+    Surfaces::of_map(share, &map, |x, y| ground_m(&camera, middle(x, y)).recip())
+}
+
+/// Pixels of the camera at least `margin` pixels from where something else is seen.
+fn inner(margin: usize) -> Vec<(usize, usize, usize, f64)> {
+    let camera = camera();
+    let [w, h] = SIZE.map(|n| n as usize);
+    let pixels = (margin..h - margin).flat_map(|y| (margin..w - margin).map(move |x| (x, y)));
+    let kept = pixels.filter_map(|(x, y)| {
+        let (what, depth) = seen(&camera, middle(x, y));
+        let around =
+            (y - margin..=y + margin).flat_map(|v| (x - margin..=x + margin).map(move |u| (u, v)));
+        let alone = around
+            .into_iter()
+            .all(|(u, v)| seen(&camera, middle(u, v)).0 == what);
+        alone.then_some((x, y, what, depth))
+    });
+    kept.collect()
+}
+
+/// The point of a surface that is seen in most of a pixel.
+fn at(surfaces: &Surfaces, x: usize, y: usize) -> Option<Seen> {
+    let is_seen = surfaces.share_at(&camera(), middle(x, y)) > 0.5;
+    surfaces
+        .point_at(&camera(), middle(x, y))
+        .filter(|_| is_seen)
+}
+
+#[test]
+fn flat_surfaces_come_back_at_any_resolution_of_the_map() {
+    let camera = camera();
+    for size in [SIZE.map(|n| n as usize), [120, 80], [500, 333]] {
+        let surfaces = found(size, 0.0, |_, _| 1.0);
+        let mut counts = [0; 3];
+        for (x, y, what, depth) in inner(8) {
+            let found = at(&surfaces, x, y);
+            let Some((_, normal)) = [None, Some(WALL), Some(TOP)][what] else {
+                assert!(found.is_none(), "{size:?} {x} {y}");
+                continue;
+            };
+            let found = found.unwrap_or_else(|| panic!("{size:?} {x} {y} {what}"));
+            counts[what] += 1;
+            // 32-bit disparities are exact to 1e-7 of their value, of which the slopes of a window are about a tenth.
+            assert!(
+                (f64::from(found.depth) / depth - 1.0).abs() < 1e-4,
+                "{size:?} {x} {y}"
+            );
+            assert!(
+                found.normal.dot(normal) > 0.9995,
+                "{size:?} {x} {y} {}",
+                found.normal
+            );
+            let seen = camera.project(found.position).unwrap();
+            assert!(seen.distance(middle(x, y)) < 0.01);
+        }
+        assert!(counts[1] > 5000 && counts[2] > 400, "{size:?} {counts:?}");
+    }
+}
+
+#[test]
+fn noise_of_a_percent_leaves_depths_and_normals() {
+    // Waves, as maps of networks have them.
+    let surfaces = found([240, 160], 0.007, |x, y| {
+        1.0 + 0.01 * ((x as f64 / 9.0).sin() * (y as f64 / 7.0).cos())
+    });
+    let (mut turned, mut count) = (0.0, 0.0);
+    for (x, y, what, depth) in inner(8).into_iter().filter(|p| p.2 > 0) {
+        let at = at(&surfaces, x, y).unwrap();
+        assert!((f64::from(at.depth) / depth - 1.0).abs() < 0.02);
+        let normal = [WALL, TOP][what - 1].1;
+        turned += at.normal.dot(normal).min(1.0).acos().to_degrees();
+        count += 1.0;
+    }
+    // A wave's slope is .01 / 9 a texel of .0053 radians across the view: .21 of the depth, 12 degrees at most for a wall that
+    // is looked at squarely. The mean of |cos| |cos| is (2 / pi)^2, and the window of 7 texels smooths waves of 57.
+    assert!(turned / count < 12.0, "{}", turned / count);
+}
+
+#[test]
+fn at_its_foot_a_wall_meets_the_ground() {
+    let camera = camera();
+    let surfaces = found([240, 160], 0.0, |_, _| 1.0);
+    let [w, h] = SIZE.map(|n| n as usize);
+    let mut wrong = 0;
+    for x in 120..w {
+        for y in 0..h {
+            let is_wall = seen(&camera, middle(x, y)).0 == 1;
+            wrong += usize::from((*surfaces.share().get(x, y) > 0.5) != is_wall);
+        }
+    }
+    // The foot passes through each column once: a pixel there may go to either side.
+    assert!(wrong <= w - 120, "{wrong}");
+}
+
+#[test]
+fn what_stands_before_the_camera_s_ground_alone_is_a_surface() {
+    let surfaces = found([240, 160], 0.0, |_, _| 1.0);
+    let camera = camera();
+    let [w, h] = SIZE.map(|n| n as usize);
+    let bottom = middle(w - 1, h - 1);
+    assert_eq!(seen(&camera, bottom).0, 0);
+    assert!(at(&surfaces, w - 1, h - 1).is_none());
+    assert!(!surfaces.are_seen([0.9, 1.0], [0.95, 1.0]));
+    assert!(surfaces.are_seen([0.4, 0.6], [0.0, 0.1]));
+    let mut half = surfaces.clone();
+    half.hide(&Raster::filled(w, h, 0.25));
+    assert_eq!(half.share_at(&camera, middle(120, 10)), 0.75);
+    assert_eq!(half.share_at(&camera.scaled([24, 16]), middle(12, 1)), 0.75);
+    // What hides them hides their shadow, they do not.
+    let mask = half.shadow_mask(&Raster::filled(w, h, 1.0));
+    assert_eq!(*mask.get(120, 10), 0.25);
+    assert_eq!(*mask.get(w - 1, h - 1), 1.0);
+}
+
+#[test]
+fn unknown_depths_are_no_surface() {
+    let surfaces = found([240, 160], 0.0, |x, _| if x < 120 { f64::NAN } else { 1.0 });
+    assert!(at(&surfaces, 60, 10).is_none());
+    assert!(at(&surfaces, 200, 10).is_some());
+}
