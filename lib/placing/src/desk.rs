@@ -19,6 +19,7 @@ use dipir_render::error::RenderError;
 use dipir_scene::camera::Camera;
 use dipir_scene::config::SceneConfig;
 use dipir_scene::pixels::{ground_at, mesh_at};
+use dipir_scene::placement::Rest;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::LoadedScene;
 use dipir_stages::composite::table::CompositeTable;
@@ -284,7 +285,8 @@ impl Desk {
                 // What the file lacks is said where it is read.
                 Proxy::None => true,
             };
-            if !is_seen {
+            let rests = objects[i].placement.rest == Some(Rest::Surface);
+            if !(is_seen || rests && self.props.shows_surface(&camera, pixel)) {
                 bail!(none);
             }
             document.put_at_pixel(i, self.lens.to_photo(at)?)?;

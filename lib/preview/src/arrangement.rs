@@ -10,7 +10,7 @@ use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::placement::{Anchor, Placement};
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::LoadedScene;
-use dipir_scene::surfaces::Surfaces;
+use dipir_scene::surfaces::SeenSurfaces;
 use dipir_scene::undistortion::Undistortion;
 use glam::{DMat3, DMat4, DQuat, DVec3, Vec2, Vec3};
 
@@ -116,7 +116,7 @@ impl Arrangement {
         facts: &Facts,
         models: &[Model],
         loaded_proxy: &Proxy,
-        surfaces: Option<&Surfaces>,
+        surfaces: Option<&SeenSurfaces>,
         loaded_maps: &[DMat4],
     ) -> anyhow::Result<Self> {
         let settings = config.validate()?;

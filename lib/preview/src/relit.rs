@@ -95,7 +95,7 @@ impl Relit {
         small.scene.camera = small.scene.camera.scaled(size);
         small.photo.image = LinearImage(resize(&small.photo.image.0, w, h, Filter::Area));
         // What is recorded leaves shadows on surfaces out.
-        (small.depths, small.surfaces) = (None, None);
+        (small.depths, small.surfaces, small.shadow_mask) = (None, None, None);
         let mask = small.occluders.take();
         small.occluders = mask.map(|m| resize(&m, w, h, Filter::Area));
         let first = Lit::of(light, 1.0);

@@ -12,10 +12,10 @@ use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::plausibility::implausible;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::{LoadedScene, Scene};
-use dipir_scene::surfaces::Surfaces;
+use dipir_scene::surfaces::SeenSurfaces;
 use dipir_scene::undistortion::Undistortion;
 use dipir_stages::scene::with_place;
-use glam::DMat4;
+use glam::{DMat4, DVec2};
 
 use crate::arrangement::{Arrangement, Model, plane_of};
 
@@ -34,7 +34,7 @@ pub struct Props {
     facts: Facts,
     proxy: Proxy,
     /// What depths show beside it.
-    surfaces: Option<Surfaces>,
+    surfaces: Option<SeenSurfaces>,
     /// From each object's file to the world, as it was read.
     maps: Vec<DMat4>,
     /// The folder that paths of the configuration start from.
@@ -62,6 +62,12 @@ impl Props {
     pub fn plane(&self, config: &SceneConfig) -> anyhow::Result<Option<Plane>> {
         let (camera, undistortion) = self.resolved(config)?;
         plane_of(&config.validate()?.proxy, &camera, undistortion.as_ref())
+    }
+
+    /// Whether `camera` sees a surface before the proxy at `pixel`.
+    pub fn shows_surface(&self, camera: &Camera, pixel: DVec2) -> bool {
+        let seen = |s: &SeenSurfaces| s.seen_at(camera, pixel.as_vec2()).is_some();
+        self.surfaces.as_ref().is_some_and(seen)
     }
 
     /// Where the objects of `config` stand; nothing is read but the camera's file.

@@ -119,6 +119,7 @@ impl Renderer<'_> {
             background: background.as_ref().or(settings.background),
             // A mask has edges, which are applied at full resolution.
             occluders: settings.occluders.filter(|_| divisor == 1),
+            shadow_mask: settings.shadow_mask.filter(|_| divisor == 1),
             ..*settings
         };
         let smaller = self.with_camera(at_resolution(camera, resolution));

@@ -11,7 +11,7 @@ use dipir_light::luminance::luminance_f64;
 use dipir_light::plane::PlaneLight;
 use dipir_scene::camera::Camera;
 use dipir_scene::scene::{LoadedScene, Scene};
-use dipir_scene::surfaces::Surfaces;
+use dipir_scene::surfaces::SeenSurfaces;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
@@ -74,7 +74,9 @@ pub struct Settings<'a> {
     /// camera's size.
     pub occluders: Option<&'a Raster<f32>>,
     /// What of the photograph beside the proxy catches shadows; its share is of the camera's size.
-    pub surfaces: Option<&'a Surfaces>,
+    pub seen_surfaces: Option<&'a SeenSurfaces>,
+    /// What hides the shadow, where that is not `occluders`; of the camera's size.
+    pub shadow_mask: Option<&'a Raster<f32>>,
     /// Share of a plane's light that may be blocked without being sampled.
     pub shadow_tolerance: f32,
     /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
@@ -110,7 +112,8 @@ impl<'a> Settings<'a> {
     pub fn of_scene(loaded: &'a LoadedScene) -> Self {
         let photo = &loaded.photo;
         Self {
-            surfaces: loaded.catching(),
+            seen_surfaces: loaded.catching(),
+            shadow_mask: loaded.shadow_mask.as_ref(),
             ..Self::of(&photo.image, photo.transfer, loaded.occluders.as_ref())
         }
     }
@@ -127,7 +130,8 @@ impl Default for Settings<'_> {
             transfer: Transfer::Srgb,
             gain: 1.0,
             occluders: None,
-            surfaces: None,
+            seen_surfaces: None,
+            shadow_mask: None,
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
             highlights: true,
@@ -251,7 +255,15 @@ impl<'a> Renderer<'a> {
     ) -> Result<Rendered, RenderError> {
         let start = Instant::now();
         self.check_images(settings.background, settings.occluders)?;
-        self.check_images(None, settings.surfaces.map(Surfaces::share))?;
+        let share = settings.seen_surfaces.map(SeenSurfaces::share);
+        for (what, image) in [
+            ("share of surfaces", share),
+            ("shadow mask", settings.shadow_mask),
+        ] {
+            if let Some(image) = image {
+                self.check_size(what, image.width(), image.height())?;
+            }
+        }
         let light: &PreparedLight<L> = &PreparedLight {
             on_object: light.on_object(),
             on_plane: match &self.geometry.proxy {
@@ -269,8 +281,7 @@ impl<'a> Renderer<'a> {
             }
         }?;
         if let Some(mask) = settings.occluders {
-            let of_shadow = settings.surfaces.map(|surfaces| surfaces.shadow_mask(mask));
-            let of_shadow = of_shadow.as_ref().unwrap_or(mask);
+            let of_shadow = settings.shadow_mask.unwrap_or(mask);
             rendered.film.hide_behind(mask, of_shadow);
         }
         Ok(rendered)
@@ -321,7 +332,7 @@ impl<'a> Renderer<'a> {
                 blocker,
                 plane,
                 irradiance: luminance_f64(irradiance),
-                surfaces: settings.surfaces,
+                seen_surfaces: settings.seen_surfaces,
                 proxy_occlusion: simulation.proxy_occlusion,
                 light_on_proxy: simulation.light_on_proxy,
                 tolerance: settings.shadow_tolerance,
@@ -417,26 +428,32 @@ impl<'a> Renderer<'a> {
         background: Option<&LinearImage>,
         occluders: Option<&Raster<f32>>,
     ) -> Result<(), RenderError> {
-        let [camera_width, camera_height] = self.camera.resolution.map(|n| n as usize);
-        let check = |what, width, height| {
-            if (width, height) == (camera_width, camera_height) {
-                return Ok(());
-            }
-            Err(RenderError::SizeMismatch {
-                what,
-                width,
-                height,
-                camera_width,
-                camera_height,
-            })
-        };
         if let Some(image) = background {
-            check("background", image.0.width(), image.0.height())?;
+            self.check_size("background", image.0.width(), image.0.height())?;
         }
         if let Some(mask) = occluders {
-            check("occluder mask", mask.width(), mask.height())?;
+            self.check_size("occluder mask", mask.width(), mask.height())?;
         }
         Ok(())
+    }
+
+    fn check_size(
+        &self,
+        what: &'static str,
+        width: usize,
+        height: usize,
+    ) -> Result<(), RenderError> {
+        let [camera_width, camera_height] = self.camera.resolution.map(|n| n as usize);
+        if (width, height) == (camera_width, camera_height) {
+            return Ok(());
+        }
+        Err(RenderError::SizeMismatch {
+            what,
+            width,
+            height,
+            camera_width,
+            camera_height,
+        })
     }
 
     pub(crate) fn blocks(&self) -> impl Iterator<Item = Block> {
@@ -461,7 +478,7 @@ impl<'a> Renderer<'a> {
             .filter(|b| footprint.overlaps(b.x, b.y, b.width, b.height))
             .filter_map(|block| {
                 let pixels = PixelSet::new(block, |(x, y)| {
-                    footprint.holds(x, y) && is_visible(settings, x, y)
+                    footprint.holds(x, y) && leaves(settings.occluders, x, y)
                 });
                 (!pixels.is_empty()).then(|| Job::new(Layer::Object, block, pixels, None))
             })
@@ -482,7 +499,7 @@ impl<'a> Renderer<'a> {
         };
         let blocks: Vec<Block> = self.blocks().collect();
         let directions = shadow
-            .surfaces
+            .seen_surfaces
             .map(|_| LightDirections::new(shadow.path.light));
         let shaded = |blocks: &[Block]| {
             let mut cones: Vec<P::Cone<'_>> = shadow.plane.iter().map(PlaneLight::cone).collect();
@@ -503,13 +520,12 @@ impl<'a> Renderer<'a> {
             blocks.iter().copied().filter_map(layer).collect::<Vec<_>>()
         };
         let shaded: Vec<Vec<_>> = blocks.par_chunks(BLOCKS_AT_ONCE).map(shaded).collect();
-        let seen = |layer, x, y| {
-            layer == Layer::MeshShadow && settings.surfaces.is_some() || is_visible(settings, x, y)
-        };
+        let mask = settings.shadow_mask.or(settings.occluders);
+        let shows = |block: &Block| pixels_of(*block).any(|(x, y)| leaves(mask, x, y));
         shaded
             .into_iter()
             .flatten()
-            .filter(|&(layer, block)| pixels_of(block).any(|(x, y)| seen(layer, x, y)))
+            .filter(|(_, block)| shows(block))
             .map(|(layer, block)| {
                 let arriving = arriving.filter(|_| layer == Layer::PlaneShadow);
                 Job::new(layer, block, PixelSet::new(block, |_| true), arriving)
@@ -521,10 +537,8 @@ impl<'a> Renderer<'a> {
 /// Blocks that are looked at with the same samplers of cones.
 const BLOCKS_AT_ONCE: usize = 1024;
 
-fn is_visible(settings: &Settings, x: u32, y: u32) -> bool {
-    settings
-        .occluders
-        .is_none_or(|mask| *mask.get(x as usize, y as usize) < 1.0)
+fn leaves(mask: Option<&Raster<f32>>, x: u32, y: u32) -> bool {
+    mask.is_none_or(|mask| *mask.get(x as usize, y as usize) < 1.0)
 }
 
 #[cfg(test)]

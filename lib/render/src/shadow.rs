@@ -17,7 +17,7 @@ use dipir_numerics::warp::{
     Frame, balance_heuristic, cone_pdf, cosine_hemisphere_pdf, square_to_cone,
     square_to_cosine_hemisphere,
 };
-use dipir_scene::surfaces::Surfaces;
+use dipir_scene::surfaces::SeenSurfaces;
 use glam::{Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
@@ -54,7 +54,7 @@ pub struct ShadowContext<'a, L, P> {
     /// Luminance of the plane's irradiance without the object.
     pub irradiance: f64,
     /// What of the photograph beside the proxy catches shadows.
-    pub surfaces: Option<&'a Surfaces>,
+    pub seen_surfaces: Option<&'a SeenSurfaces>,
     /// Whether a proxy mesh shadows itself.
     pub proxy_occlusion: bool,
     /// Light of the object on the proxy, if it counts.
@@ -291,7 +291,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                 }
             }
             if self.light_on_proxy.is_some() {
-                self.light_sent::<F, G>(&point, cone, &mut sampler, counts, &mut gather);
+                self.light_sent::<F, G>(&point, cone, false, &mut sampler, counts, &mut gather);
             }
         }
         gather
@@ -354,7 +354,8 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
                 }
             }
             if self.light_on_proxy.is_some() {
-                self.light_sent::<F, G>(&point, &cone, &mut sampler, counts, &mut gather);
+                let hidden = hiding.is_some();
+                self.light_sent::<F, G>(&point, &cone, hidden, &mut sampler, counts, &mut gather);
             }
         }
         gather
@@ -392,11 +393,12 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
     }
 
     /// Gathers the light that the object sends to `point`: one path through a uniform direction of
-    /// the cone; far from the object only with some chance, and a larger weight.
+    /// the cone; far from the object only with some chance, and a larger weight. With `hidden` a proxy mesh may be in between.
     fn light_sent<const F: u32, G: ShadowGather>(
         &self,
         point: &ProxyPoint,
         cone: &Cone,
+        hidden: bool,
         sampler: &mut Sampler,
         counts: &mut RayCounts,
         gather: &mut G,
@@ -419,7 +421,7 @@ impl<'p, L: PathLight, P: PlaneLight> ShadowContext<'p, L, P> {
             max_depth: if sent.bounce { self.path.max_depth } else { 0 },
             start: PathStart::Proxy {
                 emission: sent.emission,
-                hidden: self.proxy_occlusion,
+                hidden,
             },
             photo: None,
             min_roughness: MIN_CAUSTIC_ROUGHNESS,

@@ -299,8 +299,15 @@ impl SceneConfig {
             .collect::<Result<Vec<_>, _>>()?;
         let on_surface = |o: &ObjectSettings| o.placement.rest == Some(Rest::Surface);
         if foreground.1.is_none() && objects.iter().any(on_surface) {
-            let remedy = "rest = \"surface\" stands an object on what these depths show, unless scene.effects.occluders is off";
-            return Err(missing("scene.depth", remedy));
+            let remedy = "rest = \"surface\" stands an object on what these depths show";
+            return Err(match self.depth {
+                None => missing("scene.depth", remedy),
+                Some(_) => wrong(
+                    "scene.effects.occluders",
+                    "\"off\"",
+                    &format!("\"auto\", for {remedy}"),
+                ),
+            });
         }
         let camera = self.camera.as_ref().ok_or_else(|| {
             missing(

@@ -79,7 +79,7 @@ pub struct DepthRecord {
     pub found: Option<Scale>,
     /// Whether what they show beside the proxy catches shadows.
     #[serde(default)]
-    pub surfaces: bool,
+    pub catches: bool,
 }
 
 /// What receives the shadow.

@@ -175,7 +175,7 @@ impl<'a> Files<'a> {
             measure: settings.measure,
             scale: settings.scale,
             found: None,
-            surfaces: settings.surfaces,
+            catches: settings.catches,
         };
         Ok((Some(depths), Some(record)))
     }

@@ -17,7 +17,7 @@ use crate::ground;
 use crate::mesh::TriangleMesh;
 use crate::pixels::ground_at;
 use crate::proxy::{Plane, Proxy};
-use crate::surfaces::{Map, Surfaces};
+use crate::surfaces::{Map, SeenSurfaces};
 use crate::undistortion::Undistortion;
 
 /// Where depths come from.
@@ -30,7 +30,7 @@ pub struct DepthSettings {
     /// Metres of a unit, if that is said.
     pub scale: Option<f32>,
     /// Whether what they show beside the proxy catches shadows.
-    pub surfaces: bool,
+    pub catches: bool,
 }
 
 /// Depths of the undistorted photograph, at any resolution.
@@ -41,6 +41,7 @@ pub struct Depths {
     scale: Option<f32>,
     /// Whether the value 0 is another depth or disparity than 0, if that is known.
     has_shift: Option<bool>,
+    wants_surfaces: bool,
 }
 
 /// What stands in front.
@@ -48,8 +49,8 @@ pub struct Depths {
 pub struct Foreground {
     /// 1 where the photograph's own stands before the objects or, where there are none, before the ground.
     pub mask: Raster<f32>,
-    /// What they show beside the proxy, if there is one.
-    pub surfaces: Option<Surfaces>,
+    /// What they show beside the proxy, if that catches shadows or carries objects.
+    pub surfaces: Option<SeenSurfaces>,
     /// What depths were taken for.
     pub fit: DepthFit,
 }
@@ -145,6 +146,7 @@ impl Depths {
             measure: settings.measure,
             scale: settings.scale,
             has_shift: None,
+            wants_surfaces: settings.catches,
         })
     }
 
@@ -152,6 +154,12 @@ impl Depths {
     pub(crate) fn like(mut self, found: Option<Scale>) -> Self {
         self.measure = self.measure.or(found.map(|f| f.measure));
         self.has_shift = found.map(|f| f.shift != 0.0);
+        self
+    }
+
+    /// For objects that rest on surfaces, too.
+    pub(crate) fn with_surfaces(mut self, rests: bool) -> Self {
+        self.wants_surfaces |= rests;
         self
     }
 
@@ -196,10 +204,9 @@ impl Depths {
         };
         let pixels = (0..width * height).into_par_iter();
         let mut mask = filtered(pixels.map(of_ground).collect());
-        let surfaces = match ground {
-            // Nothing catches shadows.
-            Ground::None => None,
-            _ => {
+        let surfaces = match self.wants_surfaces {
+            false => None,
+            true => {
                 let before_ground = |i: usize| {
                     let metres = ground.metres(i % width, i / width, camera);
                     // Above the horizon all that is known is before the ground.
@@ -217,7 +224,7 @@ impl Depths {
                     margin: fit.margin,
                     camera,
                 };
-                Some(Surfaces::of_map(share, &map, behind))
+                Some(SeenSurfaces::of_map(share, &map, behind))
             }
         };
         if let Some(objects) = objects {
@@ -405,19 +412,18 @@ impl DepthFit {
         ))
     }
 
-    /// `disparities; 83% of the ground's agree with it to 1.2%; what is 4% nearer than the object hides it, than the ground
-    /// catches its shadow`. Where nothing `catches` shadows, `8% than the ground its shadow`.
+    /// `disparities; 83% of the ground's agree with it to 1.2%; what is 4% nearer than the object hides it, and what is 4%
+    /// nearer than the ground catches its shadow`. Where nothing `catches` shadows, `what is 8% nearer than the ground hides`
+    /// them.
     pub fn words(&self, catches: bool) -> String {
-        let of_shadow = match catches {
-            true => "than the ground catches its shadow".into(),
-            false => format!(
-                "{:.0}% than the ground its shadow",
-                100.0 * self.ground_margin
-            ),
+        let (of_shadow, does) = match catches {
+            true => (self.margin, "catches"),
+            false => (self.ground_margin, "hides"),
         };
         let hides = format!(
-            "what is {:.0}% nearer than the object hides it, {of_shadow}",
-            100.0 * self.margin
+            "what is {:.0}% nearer than the object hides it, and what is {:.0}% nearer than the ground {does} its shadow",
+            100.0 * self.margin,
+            100.0 * of_shadow
         );
         match &self.fitted {
             None => hides,

@@ -6,7 +6,7 @@ use crate::error::Error;
 use crate::mesh::TriangleMesh;
 use crate::placement::{Placement, Rest};
 use crate::proxy::{Plane, Proxy};
-use crate::surfaces::{Seen, Surfaces};
+use crate::surfaces::{Seen, SeenSurfaces};
 use crate::undistortion::Undistortion;
 
 /// Pixels of the upright photograph that say where an object goes.
@@ -102,13 +102,13 @@ impl Pixels {
         placement: &Placement,
         camera: &Camera,
         proxy: &Proxy,
-        surfaces: Option<&Surfaces>,
+        surfaces: Option<&SeenSurfaces>,
         key: &str,
     ) -> Result<Placement, Error> {
         let mut placed = *placement;
         let size = Vec2::from(camera.resolution.map(|n| n as f32));
         let surfaces = surfaces.filter(|_| placement.rest == Some(Rest::Surface));
-        let surface = |pixel: Vec2| surfaces.and_then(|s| s.point_at(camera, pixel));
+        let surface = |pixel: Vec2| surfaces.and_then(|s| s.seen_at(camera, pixel));
         let up = match proxy {
             Proxy::Plane(plane) => plane.normal.as_dvec3().normalize(),
             _ => DVec3::Y,
@@ -279,7 +279,7 @@ mod tests {
             Vec3::new(n.x, n.y, -n.z) / normal.dot(point - camera.position)
         };
         let everywhere = |plane: Vec3| {
-            Surfaces::new(
+            SeenSurfaces::new(
                 Raster::filled(width, height, 1.0),
                 Raster::filled(4, 3, plane),
             )
@@ -290,7 +290,7 @@ mod tests {
         };
         let proxy = Proxy::Plane(GROUND);
         let pixels = at(2000.0, 1800.0);
-        let place = |surfaces: Option<&Surfaces>| {
+        let place = |surfaces: Option<&SeenSurfaces>| {
             let placed = pixels.place(&resting, &camera, &proxy, surfaces, "scene.objects[0]");
             placed.map(|p| p.position).map_err(|e| e.to_string())
         };

@@ -61,6 +61,7 @@ impl SceneDescription {
             original,
             occluders: None,
             surfaces: None,
+            shadow_mask: None,
             masked: None,
             depths,
             depth_fit: None,
@@ -126,7 +127,7 @@ impl DepthRecord {
             path: self.file.path.clone(),
             measure: self.measure,
             scale: self.scale,
-            surfaces: self.surfaces,
+            catches: self.catches,
         }
     }
 }

@@ -23,7 +23,7 @@ use crate::material::Material;
 use crate::mesh::TriangleMesh;
 use crate::placement::{Anchor, Rest};
 use crate::proxy::Proxy;
-use crate::surfaces::Surfaces;
+use crate::surfaces::SeenSurfaces;
 use crate::taken::taken;
 use crate::texture::Texture;
 use crate::undistortion::Undistortion;
@@ -66,8 +66,10 @@ pub struct LoadedScene {
     /// The photo's own foreground, 1 in front of the object; of the photo's size. [`LoadedScene::hide`] makes it of the
     /// mask that the configuration names and of the depths.
     pub occluders: Option<Raster<f32>>,
-    /// What the depths show beside the proxy.
-    pub surfaces: Option<Surfaces>,
+    /// What the depths show beside the proxy, if it catches shadows or carries objects.
+    pub surfaces: Option<SeenSurfaces>,
+    /// What hides the objects' shadow, if that is not `occluders`.
+    pub shadow_mask: Option<Raster<f32>>,
     /// That mask, where there are depths, too.
     pub(crate) masked: Option<Raster<f32>>,
     /// Depths that tell what stands in front of the objects.
@@ -151,17 +153,16 @@ impl LoadedScene {
         let found = depths.foreground(Some(mesh), proxy, camera, &self.photo.image)?;
         self.depth_fit = Some(found.fit);
         self.surfaces = found.surfaces;
-        if let (Some(surfaces), Some(mask)) = (&mut self.surfaces, &self.masked) {
-            surfaces.hide(mask);
-        }
+        let of_shadow = self.catching().map(|s| s.shadow_mask(&found.mask));
+        self.shadow_mask = of_shadow.map(|found| joined(self.masked.as_ref(), found));
         self.occluders = Some(joined(self.masked.as_ref(), found.mask));
         Ok(())
     }
 
     /// What of the photo beside the proxy catches shadows.
-    pub fn catching(&self) -> Option<&Surfaces> {
+    pub fn catching(&self) -> Option<&SeenSurfaces> {
         let depth = self.description.depth.as_ref()?;
-        self.surfaces.as_ref().filter(|_| depth.surfaces)
+        self.surfaces.as_ref().filter(|_| depth.catches)
     }
 
     /// The mask that the configuration names.
@@ -204,7 +205,7 @@ impl LoadedScene {
     pub fn hide_if_known(&mut self, mask: Option<Raster<f32>>) -> Option<String> {
         let error = self.hide(mask).err()?;
         self.depth_fit = None;
-        self.surfaces = None;
+        (self.surfaces, self.shadow_mask) = (None, None);
         self.occluders.clone_from(&self.masked);
         Some(format!("scene.depth is left out: {error}"))
     }
@@ -261,13 +262,13 @@ fn joined(mask: Option<&Raster<f32>>, found: Raster<f32>) -> Raster<f32> {
 impl Scene {
     /// Reads all files that `config` names, relative to `base_dir`, and places the objects.
     pub fn load(config: &SceneConfig, base_dir: &Path) -> Result<LoadedScene, Error> {
-        let (loaded, mask) = Self::load_in(config, base_dir, None)?;
+        let (loaded, mask) = Self::load_in(config, base_dir, None, false)?;
         loaded.hidden(mask, base_dir)
     }
 
     /// As [`Scene::load`], for a look: depths that do not agree with the ground are left out, with a warning.
     pub fn load_for_a_look(config: &SceneConfig, base_dir: &Path) -> Result<LoadedScene, Error> {
-        let (mut loaded, mask) = Self::load_in(config, base_dir, None)?;
+        let (mut loaded, mask) = Self::load_in(config, base_dir, None, true)?;
         let left_out = loaded.hide_if_known(mask);
         let doubt = loaded.depth_fit.and_then(|fit| fit.doubt());
         loaded.warnings.extend(left_out.into_iter().chain(doubt));
@@ -281,15 +282,16 @@ impl Scene {
         base_dir: &Path,
         photo: &SceneDescription,
     ) -> Result<LoadedScene, Error> {
-        let (loaded, mask) = Self::load_in(config, base_dir, Some(photo))?;
+        let (loaded, mask) = Self::load_in(config, base_dir, Some(photo), false)?;
         loaded.hidden(mask, base_dir)
     }
 
-    /// The scene, and the mask that is still to be applied.
+    /// The scene, and the mask that is still to be applied. For a `look`, depths need not agree with the ground.
     fn load_in(
         config: &SceneConfig,
         base_dir: &Path,
         of_shot: Option<&SceneDescription>,
+        look: bool,
     ) -> Result<(LoadedScene, Option<Raster<f32>>), Error> {
         let settings = config.validate()?;
         let mut files = Files::new(base_dir, settings.limits);
@@ -328,7 +330,9 @@ impl Scene {
             files.depths(settings.depth.as_ref(), resolution, undistortion.as_ref())?;
         // The depths of a shot are of one kind.
         let of_photo = of_shot.and_then(|photo| photo.depth.as_ref()?.found);
-        let depths = depths.map(|depths| depths.like(of_photo));
+        let rests = |o: &ObjectSettings| o.placement.rest == Some(Rest::Surface);
+        let rests = of_shot.is_none() && settings.objects.iter().any(rests);
+        let depths = depths.map(|depths| depths.like(of_photo).with_surfaces(rests));
         let view = ground::view(&camera, undistortion.as_ref());
         let (proxy, proxy_record, cloud) = match of_shot {
             Some(of_shot) => (files.recorded(&of_shot.proxy)?, of_shot.proxy.clone(), None),
@@ -337,14 +341,18 @@ impl Scene {
         let doubt = settings.proxy.doubt(base_dir, &view, cloud.as_ref());
         files.warn(doubt.clone());
         let is_looked_for = settings.objects.iter().any(|o| o.auto.is_some());
-        let rests = |o: &ObjectSettings| o.placement.rest == Some(Rest::Surface);
-        let counts = is_looked_for || settings.objects.iter().any(rests);
-        // Depths that do not agree with the ground are refused afterwards.
-        let around = depths.as_ref().filter(|_| counts && of_shot.is_none());
-        let found = around.and_then(|depths| {
-            let found = depths.foreground(None, &proxy, &camera, &photo.image);
-            found.ok()
-        });
+        let around = depths.as_ref().filter(|_| of_shot.is_none());
+        let around = around.filter(|_| is_looked_for || rests);
+        let found = around.map(|d| d.foreground(None, &proxy, &camera, &photo.image));
+        let found = match found.transpose() {
+            Ok(found) => found,
+            Err(e) if rests && !look => {
+                let depth = settings.depth.map(|d| d.path).unwrap_or_default();
+                return Err(e.in_file(base_dir.join(depth)));
+            }
+            // Refused afterwards.
+            Err(_) => None,
+        };
         let (hidden, surfaces) = found.map(|f| (f.mask, f.surfaces)).unzip();
         let surfaces = surfaces.flatten();
         let hidden = hidden.map(|found| joined(masked.as_ref(), found));
@@ -432,6 +440,7 @@ impl Scene {
             original,
             occluders: None,
             surfaces: None,
+            shadow_mask: None,
             masked: None,
             depths,
             depth_fit: None,

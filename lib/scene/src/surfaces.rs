@@ -1,4 +1,4 @@
-//! Surfaces that the photograph shows beside the proxy: they catch the objects' shadows, too.
+//! SeenSurfaces that the photograph shows beside the proxy: they catch the objects' shadows, too.
 use dipir_imaging::raster::Raster;
 use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -7,7 +7,7 @@ use crate::camera::Camera;
 
 /// What the photograph shows before the proxy, by its depths. Light passes through it: how it is lit is part of the light.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Surfaces {
+pub struct SeenSurfaces {
     /// Share of each pixel of the photograph in which they are seen, from 0 to 1.
     share: Raster<f32>,
     /// Planes through the surfaces, at any resolution: one over the depth is `p . (u, v, 1)` where the camera looks `u` to the
@@ -44,8 +44,10 @@ const ROUNDS: usize = 3;
 /// Penalty on slopes, in squares of a step: far below what a window weighs, for windows of one row.
 const PENALTY: f64 = 1e-3;
 
-/// From this nearness on, in margins, the shares of pixels are those of the mask.
-const CLEAR: f64 = 2.0;
+/// Texels by which planes go on beyond what they were fitted to: the mask follows the photograph so far.
+const BEYOND: usize = 2;
+/// What is nearer than the ground by so many margins is told apart from it by the mask.
+const APART: f64 = 2.0;
 
 /// Disparities of a photograph.
 pub(crate) struct Map<'a> {
@@ -59,7 +61,7 @@ pub(crate) struct Map<'a> {
     pub camera: &'a Camera,
 }
 
-impl Surfaces {
+impl SeenSurfaces {
     /// Planes at any resolution, as `p . (u, v, 1)` is one over their depth (1/metre) where the camera looks `u` to the right
     /// and `v` upwards, per metre ahead; NaN where nothing is known. They are seen in `share` of each pixel of the photograph.
     pub fn new(share: Raster<f32>, planes: Raster<Vec3>) -> Self {
@@ -119,12 +121,15 @@ impl Surfaces {
                 }
             }
         }
-        let mut surfaces = Self { share, planes };
+        let mut surfaces = Self {
+            share,
+            planes: (0..BEYOND).fold(planes, |planes, _| grown(&planes)),
+        };
         surfaces.meet(map, ground);
         surfaces
     }
 
-    /// Near to the ground what is seen is the nearer of it and the surfaces.
+    /// Near to the ground what is seen is the nearer of it and the surfaces; where no plane is known it is not these.
     fn meet(&mut self, map: &Map, ground: impl Fn(usize, usize) -> f64 + Sync) {
         let camera = map.camera;
         let width = self.share.width();
@@ -132,27 +137,22 @@ impl Surfaces {
             let (x, y) = (i % width, i / width);
             let behind = ground(x, y);
             let own = *self.share.get(x, y);
-            if behind == 0.0 {
-                return own;
+            if own == 0.0 && behind == 0.0 {
+                return 0.0;
             }
             let pixel = Vec2::new(x as f32, y as f32) + 0.5;
-            let found = self.point_at(camera, pixel).map(|s| f64::from(s.depth));
+            let found = self.point_at(camera, pixel);
+            let found = found.map(|s| f64::from(s.depth));
             match found {
-                Some(depth) if 1.0 - depth * behind < CLEAR * map.margin => {
+                Some(depth) if behind > 0.0 && 1.0 - depth * behind < APART * map.margin => {
                     f32::from(u8::from(depth * behind < 1.0))
                 }
-                _ => own,
+                Some(_) => own,
+                None => 0.0,
             }
         };
         let shares = (0..self.share.pixels().len()).into_par_iter().map(seen);
         self.share = Raster::from_pixels(width, self.share.height(), shares.collect());
-    }
-
-    /// Takes away what `mask`, of the photograph's size, is in front of.
-    pub(crate) fn hide(&mut self, mask: &Raster<f32>) {
-        for (share, mask) in self.share.pixels_mut().iter_mut().zip(mask.pixels()) {
-            *share = share.min(1.0 - mask.clamp(0.0, 1.0));
-        }
     }
 
     /// Share of each pixel of the photograph in which they are seen, from 0 to 1.
@@ -160,16 +160,22 @@ impl Surfaces {
         &self.share
     }
 
-    /// What `mask`, of the photograph's size, hides of shadows: all but these surfaces, which it stands for, too.
-    pub fn shadow_mask(&self, mask: &Raster<f32>) -> Raster<f32> {
+    /// What hides shadows where `mask`, of the photograph's size, hides what is behind these surfaces.
+    pub(crate) fn shadow_mask(&self, mask: &Raster<f32>) -> Raster<f32> {
         let both = mask.pixels().par_iter().zip(self.share.pixels());
         let hides = both.map(|(mask, share)| (mask - share).max(0.0));
         Raster::from_pixels(mask.width(), mask.height(), hides.collect())
     }
 
-    /// Whether they are seen in the rectangle, in shares of the picture's width and height from its upper left corner.
-    pub fn are_seen(&self, columns: [f64; 2], rows: [f64; 2]) -> bool {
-        shares(&self.share, columns, rows).any(|s| s > 0.0)
+    /// Whether they are seen between the pixels `first` and `end` (not in these) of a picture of `resolution` pixels.
+    pub fn are_seen(&self, first: [u32; 2], end: [u32; 2], resolution: [u32; 2]) -> bool {
+        let size = [self.share.width(), self.share.height()];
+        let [columns, rows] = [0, 1].map(|k| {
+            let own = |at: u32, up: usize| (at as usize * size[k] + up) / resolution[k] as usize;
+            own(first[k], 0)..own(end[k], resolution[k] as usize - 1).min(size[k])
+        });
+        let mut rows = rows.map(|y| &self.share.row(y)[columns.clone()]);
+        rows.any(|row| row.iter().any(|s| *s > 0.0))
     }
 
     /// The share in which they are seen at `pixel` of `camera`, the photograph's at any resolution.
@@ -185,9 +191,9 @@ impl Surfaces {
 
     /// The point of them at `pixel`, whether it is seen there or the proxy; `None` where nothing is known.
     pub fn point_at(&self, camera: &Camera, pixel: Vec2) -> Option<Seen> {
-        let plane = self.plane_at(pixel, camera.resolution)?;
         let d = (pixel - camera.principal_px) / camera.focal_px;
         let way = Vec3::new(d.x, -d.y, 1.0);
+        let plane = self.plane_at(pixel, camera.resolution, way)?;
         let depth = plane.dot(way).recip();
         // Behind the camera, or farther than a float tells apart.
         if !(depth > 0.0 && depth < FARTHEST_M) {
@@ -201,8 +207,17 @@ impl Surfaces {
         })
     }
 
-    /// Between those of the four texels around a pixel of a picture of `resolution` pixels that are known.
-    fn plane_at(&self, pixel: Vec2, resolution: [u32; 2]) -> Option<Vec3> {
+    /// The point of them at `pixel`, if they are most of what is seen there.
+    pub fn seen_at(&self, camera: &Camera, pixel: Vec2) -> Option<Seen> {
+        match self.share_at(camera, pixel) > 0.5 {
+            true => self.point_at(camera, pixel),
+            false => None,
+        }
+    }
+
+    /// That of the nearest of the four texels around a pixel of a picture of `resolution` pixels, mixed with those that are as
+    /// far away along `way`: beyond an edge there is another surface.
+    fn plane_at(&self, pixel: Vec2, resolution: [u32; 2], way: Vec3) -> Option<Vec3> {
         let size = [self.planes.width(), self.planes.height()];
         let axis = |k: usize| {
             let at = pixel[k] * size[k] as f32 / resolution[k] as f32 - 0.5;
@@ -212,40 +227,45 @@ impl Surfaces {
             [(first, 1.0 - share), ((first + 1).min(size[k] - 1), share)]
         };
         let (columns, rows) = (axis(0), axis(1));
+        let texel = |k: usize| {
+            let ((x, u), (y, v)) = (columns[k % 2], rows[k / 2]);
+            (*self.planes.get(x, y), u * v)
+        };
+        let texels = [0, 1, 2, 3].map(texel);
+        let known = || texels.iter().filter(|(plane, _)| !plane.is_nan());
+        let (nearest, _) = known().max_by(|a, b| a.1.total_cmp(&b.1))?;
+        let disparity = nearest.dot(way);
         let (mut sum, mut weights) = (Vec3::ZERO, 0.0);
-        for (y, v) in rows {
-            for (x, u) in columns {
-                let plane = *self.planes.get(x, y);
-                if !plane.is_nan() {
-                    sum += plane * (u * v);
-                    weights += u * v;
-                }
+        for (plane, weight) in known() {
+            if (plane.dot(way) - disparity).abs() <= NEAR as f32 * disparity.abs() {
+                sum += *plane * *weight;
+                weights += weight;
             }
         }
-        (weights > 0.0).then(|| sum / weights)
+        Some(sum / weights)
     }
 }
 
 /// What is farther is no surface, metres.
 const FARTHEST_M: f32 = 1e6;
 
-/// The shares of the pixels in a rectangle, which is given in shares of the picture's sides.
-fn shares(
-    share: &Raster<f32>,
-    columns: [f64; 2],
-    rows: [f64; 2],
-) -> impl Iterator<Item = f32> + use<'_> {
-    let range = |[from, to]: [f64; 2], size: usize| {
-        let size_f = size as f64;
-        (from * size_f).floor().max(0.0) as usize
-            ..((to * size_f).ceil().max(0.0) as usize).min(size)
+/// With what is not known taken over from a neighbour, the nearest thing first.
+fn grown(planes: &Raster<Vec3>) -> Raster<Vec3> {
+    let (width, height) = (planes.width(), planes.height());
+    let plane = |i: usize| {
+        let (x, y) = (i % width, i / width);
+        if !planes.get(x, y).is_nan() {
+            return *planes.get(x, y);
+        }
+        let rows = y.saturating_sub(1)..(y + 2).min(height);
+        let around = rows.flat_map(|v| &planes.row(v)[x.saturating_sub(1)..(x + 2).min(width)]);
+        let known = around.filter(|p| !p.is_nan());
+        *known
+            .max_by(|a, b| a.z.total_cmp(&b.z))
+            .unwrap_or(&Vec3::NAN)
     };
-    let columns = range(columns, share.width());
-    let rows = range(rows, share.height());
-    rows.flat_map(move |y| {
-        let row = share.row(y);
-        row.get(columns.clone()).unwrap_or(&[]).iter().copied()
-    })
+    let all = (0..width * height).into_par_iter().map(plane);
+    Raster::from_pixels(width, height, all.collect())
 }
 
 /// Fits planes to disparities around texels. A plane's disparity is linear in the picture.

@@ -10,7 +10,7 @@ use crate::error::Error;
 use crate::import;
 use crate::limits::Limits;
 use crate::proxy::Proxy;
-use crate::surfaces::Surfaces;
+use crate::surfaces::SeenSurfaces;
 use crate::undistortion::Undistortion;
 
 /// Foot and size of every object with a place of its own; nothing if no object looks for one.
@@ -20,7 +20,7 @@ pub(crate) fn taken(
     limits: &Limits,
     camera: &Camera,
     proxy: &Proxy,
-    surfaces: Option<&Surfaces>,
+    surfaces: Option<&SeenSurfaces>,
     undistortion: Option<&Undistortion>,
 ) -> Result<Vec<(DVec3, Body)>, Error> {
     let mut taken = Vec::new();

@@ -170,7 +170,7 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
             path: path.into(),
             measure: None,
             scale: None,
-            surfaces: false,
+            catches: false,
         };
         Depths::read(&settings, Path::new(""), photo.facts.size, None)?;
     }

@@ -1,4 +1,6 @@
 //! Shadows on surfaces that the photograph shows beside the proxy.
+use std::f32::consts::PI;
+
 use dipir_light::luminance::luminance;
 use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_numerics::warp::{balance_heuristic, square_to_sphere};
@@ -13,11 +15,13 @@ pub struct LightDirections(Vec<(Vec3, f32)>);
 
 /// Directions drawn from the light, and as many from the whole sphere.
 const DIRECTIONS: u32 = 1024;
+/// From one of these to the next it is about so far, radians.
+const BETWEEN: f32 = 0.07;
 
 impl LightDirections {
     /// Draws directions from `light`, with what each stands for of its luminance.
     pub fn new(light: &impl PathLight) -> Self {
-        const UNIFORM: f32 = 1.0 / (4.0 * std::f32::consts::PI);
+        const UNIFORM: f32 = 1.0 / (4.0 * PI);
         let mut directions = Vec::new();
         for index in 0..DIRECTIONS {
             let mut sampler = Sampler::new(0, Stream::SHADOW, 0, index);
@@ -39,7 +43,7 @@ impl<L: PathLight, P> ShadowContext<'_, L, P> {
     /// The surface that a sample at `pixel` sees before the proxy.
     #[inline]
     pub(super) fn surface_at(&self, pixel: Vec2, sampler: &mut Sampler) -> Option<ProxyPoint> {
-        let surfaces = self.surfaces?;
+        let surfaces = self.seen_surfaces?;
         let camera = self.path.world.camera();
         let share = surfaces.share_at(camera, pixel);
         // Whole pixels need no number: samples of the proxy are what they are without surfaces.
@@ -57,16 +61,15 @@ impl<L: PathLight, P> ShadowContext<'_, L, P> {
 
     /// Whether surfaces are seen in `block` that could be shadowed noticeably, or receive light of the object.
     pub fn may_shade_surfaces(&self, block: Block, light: &LightDirections) -> bool {
-        let Some(surfaces) = self.surfaces else {
+        let Some(surfaces) = self.seen_surfaces else {
             return false;
         };
         let camera = self.path.world.camera();
-        let range = |first: u32, count: u32, all: u32| {
-            [first, first + count].map(|at| f64::from(at) / f64::from(all))
-        };
-        let columns = range(block.x, block.width, camera.resolution[0]);
-        let rows = range(block.y, block.height, camera.resolution[1]);
-        if !surfaces.are_seen(columns, rows) {
+        let (first, end) = (
+            [block.x, block.y],
+            [block.x + block.width, block.y + block.height],
+        );
+        if !surfaces.are_seen(first, end, camera.resolution) {
             return false;
         }
         let pixels = (block.y..block.y + block.height).flat_map(|y| {
@@ -77,8 +80,8 @@ impl<L: PathLight, P> ShadowContext<'_, L, P> {
             .filter_map(|pixel| surfaces.point_at(camera, pixel))
             .collect();
         if seen.is_empty() {
-            // Less than a pixel of them: what is unknown is looked at.
-            return true;
+            // Less than a pixel of them.
+            return false;
         }
         let center = seen.iter().map(|s| s.position).sum::<Vec3>() / seen.len() as f32;
         let reach = seen
@@ -90,11 +93,15 @@ impl<L: PathLight, P> ShadowContext<'_, L, P> {
         {
             return true;
         }
-        let in_cone = light
-            .0
-            .iter()
-            .filter(|(d, _)| d.dot(cone.axis) >= cone.cos_half_angle);
+        // Between the directions of the list, too.
+        let least_cosine = (cone.cos_half_angle.clamp(-1.0, 1.0).acos() + BETWEEN)
+            .min(PI)
+            .cos();
+        let in_cone = (light.0.iter()).filter(|(d, _)| d.dot(cone.axis) >= least_cosine);
         let blocked: f32 = in_cone.map(|(_, weight)| weight).sum();
+        if blocked == 0.0 {
+            return false;
+        }
         let arriving = |normal: Vec3| -> f32 {
             (light.0.iter())
                 .map(|(d, weight)| weight * d.dot(normal).max(0.0))

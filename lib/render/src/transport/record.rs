@@ -217,7 +217,7 @@ impl Transport {
                 plane: &plane,
                 irradiance: std::f64::consts::PI,
                 // A mask hides the shadow where they are.
-                surfaces: None,
+                seen_surfaces: None,
                 proxy_occlusion: simulation.proxy_occlusion,
                 light_on_proxy: simulation.light_on_proxy,
                 tolerance: 0.0,

@@ -57,7 +57,7 @@ impl SceneConfig {
             path: path.clone(),
             measure,
             scale: self.depth_scale,
-            surfaces: self.depth_surfaces.unwrap_or(true),
+            catches: self.depth_surfaces.unwrap_or(true),
         }))
     }
 }

@@ -75,6 +75,7 @@ fn depths(size: [u32; 2], value: impl Fn(f64) -> f64) -> Depths {
         measure: None,
         scale: None,
         has_shift: None,
+        wants_surfaces: true,
     }
 }
 
@@ -225,7 +226,7 @@ fn depths_of_a_lens_that_bends_lines_are_undistorted() {
         path: "depth.png".into(),
         measure: None,
         scale: None,
-        surfaces: false,
+        catches: false,
     };
     let found = Depths::read(&settings, folder.path(), [320, 240], Some(&way)).unwrap();
     let [w, h] = way.size().map(|n| n as usize);

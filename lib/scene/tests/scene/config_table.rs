@@ -131,7 +131,7 @@ fn wrong_values_are_quoted_with_the_accepted_form() {
     );
     assert_eq!(
         message(&object("at_pixel = [3, 4]\nrest = \"surface\"")),
-        "scene.depth is missing; rest = \"surface\" stands an object on what these depths show, unless scene.effects.occluders is off"
+        "scene.depth is missing; rest = \"surface\" stands an object on what these depths show"
     );
     assert_eq!(
         message(&table("", "[proxy]\nplane = { normal = [0, 0, 0] }")),

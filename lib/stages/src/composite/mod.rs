@@ -405,15 +405,13 @@ impl<'a> Composite<'a> {
             shadow,
         };
         let hidden = loaded.occluders.as_ref();
-        let of_shadow = hidden.zip(loaded.catching());
-        let of_shadow = of_shadow.map(|(mask, surfaces)| surfaces.shadow_mask(mask));
         let bent = |mask| match &loaded.original {
             Some(original) => Cow::Owned(original.undistortion.distort(mask, 0.0)),
             None => Cow::Borrowed(mask),
         };
         let hidden = hidden.map(|mask| Hidden {
             object: bent(mask),
-            shadow: bent(of_shadow.as_ref().unwrap_or(mask)),
+            shadow: bent(loaded.shadow_mask.as_ref().unwrap_or(mask)),
         });
         let matched = look.apply(&mut layers, background, hidden.as_ref(), divisor);
         let Overlay {
