@@ -100,6 +100,8 @@ const EDGE: (f64, f64) = (0.08, 6.0);
 const SAME_SHAPE: f64 = 0.05;
 /// From this deviation on there is a doubt: it is at most the 5% within which depths agree with the ground.
 const DOUBTFUL: f64 = 0.0495;
+/// A map of fewer texels along the longer side, and than the photograph has pixels, shows no surfaces.
+const COARSE: usize = 128;
 /// Places on the ground along the longer side at which depths are compared with it.
 const COMPARED: usize = 128;
 
@@ -204,7 +206,7 @@ impl Depths {
         };
         let pixels = (0..width * height).into_par_iter();
         let mut mask = filtered(pixels.map(of_ground).collect());
-        let surfaces = match self.wants_surfaces {
+        let surfaces = match self.wants_surfaces && self.is_fine(camera) {
             false => None,
             true => {
                 let before_ground = |i: usize| {
@@ -392,6 +394,25 @@ impl Depths {
         Ok((cloud, deviation * f64::from(height_m)))
     }
 
+    /// Where an object is to rest on surfaces that are not shown.
+    pub(crate) fn too_coarse(&self) -> Error {
+        Error::Config {
+            key: "scene.depth".into(),
+            value: format!(
+                "a map of {} x {} texels",
+                self.values.width(),
+                self.values.height()
+            ),
+            accepted: format!("at least {COARSE} along the longer side, for rest = \"surface\""),
+        }
+    }
+
+    /// Whether a window shows one thing rather than several.
+    fn is_fine(&self, camera: &Camera) -> bool {
+        let longest = camera.resolution[0].max(camera.resolution[1]) as usize;
+        self.values.width().max(self.values.height()) >= COARSE.min(longest)
+    }
+
     fn radius(&self, camera: &Camera) -> usize {
         let longest = f64::from(camera.resolution[0].max(camera.resolution[1]));
         let own = self.values.width().max(self.values.height()) as f64;
@@ -401,12 +422,17 @@ impl Depths {
 }
 
 impl DepthFit {
+    /// Whether the depths follow the ground only roughly: then nothing catches shadows.
+    pub fn is_doubted(&self) -> bool {
+        self.fitted.is_some_and(|f| f.deviation >= DOUBTFUL)
+    }
+
     /// What may be wrong with the depths, a sentence.
     pub fn doubt(&self) -> Option<String> {
-        let fitted = self.fitted.filter(|f| f.deviation >= DOUBTFUL)?;
+        let fitted = self.fitted.filter(|_| self.is_doubted())?;
         Some(format!(
             "scene.depth: {:.0}% of the depths follow the ground, and these only roughly, so that only what is {:.0}% nearer \
-             hides an object: are pitch and roll of the camera right, and are they depths along the optical axis, not distances?",
+             hides an object, and nothing catches its shadow: are pitch and roll of the camera right, and are they depths along the optical axis, not distances?",
             100.0 * fitted.agreeing,
             100.0 * self.margin
         ))

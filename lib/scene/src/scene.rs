@@ -162,7 +162,10 @@ impl LoadedScene {
     /// What of the photo beside the proxy catches shadows.
     pub fn catching(&self) -> Option<&SeenSurfaces> {
         let depth = self.description.depth.as_ref()?;
-        self.surfaces.as_ref().filter(|_| depth.catches)
+        let is_doubted = self.depth_fit.is_some_and(|fit| fit.is_doubted());
+        let has_proxy = !matches!(self.scene.proxy, Proxy::None);
+        let catches = depth.catches && has_proxy && !is_doubted;
+        self.surfaces.as_ref().filter(|_| catches)
     }
 
     /// The mask that the configuration names.
@@ -355,6 +358,9 @@ impl Scene {
         };
         let (hidden, surfaces) = found.map(|f| (f.mask, f.surfaces)).unzip();
         let surfaces = surfaces.flatten();
+        if let (Some(depths), true, None) = (around, rests && !look, &surfaces) {
+            return Err(depths.too_coarse());
+        }
         let hidden = hidden.map(|found| joined(masked.as_ref(), found));
         let taken = match of_shot {
             Some(_) => Vec::new(),

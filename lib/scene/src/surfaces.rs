@@ -44,6 +44,12 @@ const ROUNDS: usize = 3;
 /// Penalty on slopes, in squares of a step: far below what a window weighs, for windows of one row.
 const PENALTY: f64 = 1e-3;
 
+/// Rounds in which planes are compared with those beside them.
+const SETTLED: usize = 2;
+/// A plane is kept if the disparities around it are off by less than this share of what does not count, squared, in the mean.
+const FITS: f64 = 0.1;
+/// Another is better if they are off by less than this share of that.
+const BETTER: f64 = 0.5;
 /// Texels by which planes go on beyond what they were fitted to: the mask follows the photograph so far.
 const BEYOND: usize = 2;
 /// What is nearer than the ground by so many margins is told apart from it by the mask.
@@ -104,7 +110,8 @@ impl SeenSurfaces {
         };
         let plane = |i: usize| window.plane(middle(i % size[0], i / size[0]));
         let planes = (0..size[0] * size[1]).into_par_iter().map(plane);
-        let mut planes = Raster::from_pixels(size[0], size[1], planes.collect::<Vec<_>>());
+        let planes = Raster::from_pixels(size[0], size[1], planes.collect::<Vec<_>>());
+        let mut planes = (0..SETTLED).fold(planes, |planes, _| window.settled(&planes, middle));
         for y in 1..size[1] {
             for x in 0..size[0] {
                 let above = *planes.get(x, y - 1);
@@ -316,6 +323,58 @@ impl Window<'_> {
         }
         let offset = 1.0 + plane.z - plane.x * here.x - plane.y * here.y;
         (middle * DVec3::new(plane.x, plane.y, offset)).as_vec3()
+    }
+
+    /// With planes that do not fit what is around them replaced by one beside them that does: at an edge between two sides of
+    /// a thing a window shows both. `middle` is the map's texel of a plane.
+    fn settled(
+        &self,
+        planes: &Raster<Vec3>,
+        middle: impl Fn(usize, usize) -> [usize; 2] + Sync,
+    ) -> Raster<Vec3> {
+        let size = [planes.width(), planes.height()];
+        let cut = CUT.0.max(CUT.1 * self.map.deviation);
+        let near = |[x, y]: [usize; 2], step: usize, size: [usize; 2]| {
+            let side = move |at: usize, size: usize| {
+                let offsets = [-2isize, -1, 0, 1, 2].map(|o| o * step as isize);
+                let places = offsets.map(|o| at.checked_add_signed(o).filter(|i| *i < size));
+                places.into_iter().flatten()
+            };
+            side(y, size[1]).flat_map(move |v| side(x, size[0]).map(move |u| [u, v]))
+        };
+        let map = self.map.disparities;
+        let own = [map.width(), map.height()];
+        let settled = |i: usize| {
+            let at = [i % size[0], i / size[0]];
+            let plane = *planes.get(at[0], at[1]);
+            if plane.is_nan() {
+                return plane;
+            }
+            let around =
+                near(middle(at[0], at[1]), 1, own).filter(|[u, v]| *self.before.get(*u, *v));
+            let around: Vec<(DVec3, f64)> = around
+                .map(|[u, v]| (self.way(u, v).extend(1.0), f64::from(*map.get(u, v))))
+                .collect();
+            let off = |plane: Vec3| -> f64 {
+                let each = around.iter().map(|(way, disparity)| {
+                    let off = (plane.as_dvec3().dot(*way) / disparity - 1.0) / cut;
+                    (off * off).min(1.0)
+                });
+                each.sum::<f64>() / around.len() as f64
+            };
+            let kept = off(plane);
+            if kept < FITS {
+                return plane;
+            }
+            let beside = near(at, 2, size).map(|[u, v]| *planes.get(u, v));
+            let beside = beside.filter(|p| !p.is_nan()).map(|p| (off(p), p));
+            match beside.min_by(|a, b| a.0.total_cmp(&b.0)) {
+                Some((off, better)) if off < BETTER * kept => better,
+                _ => plane,
+            }
+        };
+        let all = (0..size[0] * size[1]).into_par_iter().map(settled);
+        Raster::from_pixels(size[0], size[1], all.collect())
     }
 
     /// Where the camera looks at the middle of a texel: to the right and upwards, per metre ahead.

@@ -75,7 +75,7 @@ effects_config! {
     transmission: "Light that passes through the surface.",
     bounce_to_proxy: "Light that the object reflects onto the proxy.",
     bounce_from_proxy: "Light that the proxy reflects onto the object.",
-    occluders: "The photo's own foreground in front of the object, by mask or depths.",
+    occluders: "The photo's own foreground in front of the object, by mask or depths, and what depths show that catches shadows.",
 }
 
 impl EffectsConfig {

@@ -352,7 +352,7 @@ fn depths_that_hardly_follow_the_ground_are_doubted() {
         *value *= noisy(i);
     }
     let doubt = fit(&found).doubt().unwrap();
-    assert!(doubt.contains("scene.depth"), "{doubt}");
+    assert!(doubt.contains("nothing catches its shadow"), "{doubt}");
 }
 
 #[test]

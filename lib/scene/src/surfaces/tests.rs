@@ -83,14 +83,16 @@ fn found(size: [usize; 2], deviation: f64, noise: impl Fn(usize, usize) -> f64) 
 fn inner(margin: usize) -> Vec<(usize, usize, usize, f64)> {
     let camera = camera();
     let [w, h] = SIZE.map(|n| n as usize);
+    let all = (0..w * h).map(|i| seen(&camera, middle(i % w, i / w)));
+    let all: Vec<(usize, f64)> = all.collect();
     let pixels = (margin..h - margin).flat_map(|y| (margin..w - margin).map(move |x| (x, y)));
     let kept = pixels.filter_map(|(x, y)| {
-        let (what, depth) = seen(&camera, middle(x, y));
-        let around =
-            (y - margin..=y + margin).flat_map(|v| (x - margin..=x + margin).map(move |u| (u, v)));
-        let alone = around
-            .into_iter()
-            .all(|(u, v)| seen(&camera, middle(u, v)).0 == what);
+        let (what, depth) = all[y * w + x];
+        let mut rows = y - margin..=y + margin;
+        let alone = rows.all(|v| {
+            let row = &all[v * w + x - margin..=v * w + x + margin];
+            row.iter().all(|other| other.0 == what)
+        });
         alone.then_some((x, y, what, depth))
     });
     kept.collect()

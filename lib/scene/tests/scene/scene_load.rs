@@ -403,4 +403,17 @@ fn an_object_stands_on_the_table_that_depths_show() {
             .catching()
             .is_none()
     );
+    // A coarse map of a larger photograph.
+    let large = DisplayImage(Raster::filled(256, 128, Vec3::splat(0.5)));
+    dipir_imaging::file::write_png(folder.join("photo.png"), &large).unwrap();
+    put_depths(folder, |x, y, ground| seen(8 * x, y, ground));
+    let object = "at_pixel = [200, 120]\nrest = \"surface\"";
+    let coarse = Scene::load(&with_depth(folder, object, ""), folder);
+    let refused = coarse.unwrap_err().to_string();
+    assert!(
+        refused.contains("a map of 64 x 32 texels; accepted: at least 128"),
+        "{refused}"
+    );
+    let coarse = Scene::load(&with_depth(folder, "", ""), folder).unwrap();
+    assert!(coarse.occluders.is_some() && coarse.catching().is_none());
 }
