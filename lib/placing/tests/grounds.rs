@@ -3,6 +3,7 @@ use std::fs;
 
 use dipir_placing::desk::Desk;
 use dipir_placing::edit::Edit;
+use dipir_scene::scene::Scene;
 use image::{ImageBuffer, Luma};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -190,6 +191,38 @@ fn an_object_follows_the_pointer_over_a_depth_map_whose_camera_is_not_moved() {
             assert!(error.contains("depth map"), "{error}");
         }
     }
+}
+
+#[test]
+fn an_object_on_what_depths_show_is_dragged_over_floor_and_table() {
+    let folder = tempfile::tempdir().unwrap();
+    project(folder.path(), &[]);
+    // A table in the right half, half as high as the camera.
+    let floor = depths();
+    let seen = ImageBuffer::from_fn(300, 200, |x, y| {
+        let Luma([mm]) = *floor.get_pixel(x, y);
+        Luma([if x < 150 { mm } else { mm / 2 }])
+    });
+    seen.save(folder.path().join("depth.png")).unwrap();
+    let text = TEXT.replace("[scene]\n", "[scene]\ndepth = \"depth.png\"\n");
+    let rests = "at_pixel = [100.0, 150.0]\nrest = \"surface\"";
+    let text = text.replace("at_pixel = [150.0, 150.0]", rests);
+    fs::write(folder.path().join("pipeline.toml"), text).unwrap();
+    let desk = Desk::open(open(folder.path(), &[])).unwrap();
+    let stands_at = || {
+        let session = open(folder.path(), &[]);
+        let scene = session.config.table("scene").unwrap();
+        let loaded = Scene::load(&scene, folder.path()).unwrap();
+        loaded.scene.mesh.bounds().unwrap().0.y
+    };
+    assert!(stands_at().abs() < 1e-3);
+    let moved = edit(json!({"objects": [{"of": 0, "at": [220.0, 150.0]}]}));
+    for view in shown_and_saved(&folder, &desk, &moved) {
+        let at = ["/objects/0/contact/0", "/objects/0/contact/1"].map(|p| number(&view, p));
+        assert!((at[0] - 220.0).hypot(at[1] - 150.0) < 0.05, "{at:?}");
+    }
+    // Depths in whole millimetres of 1 to 40 m.
+    assert!((stands_at() - 0.8).abs() < 0.01, "{}", stands_at());
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! SeenSurfaces that the photograph shows beside the proxy: they catch the objects' shadows, too.
+//! Surfaces that the photograph shows beside the proxy: they catch the objects' shadows, too.
 use dipir_imaging::raster::Raster;
 use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;

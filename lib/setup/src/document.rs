@@ -137,7 +137,7 @@ impl Document {
         if let Some(depth) = &self.depth {
             let depth = quoted(depth);
             text += &format!(
-                "depth = {depth}    # what is nearer than an object stands in front of it\n"
+                "depth = {depth}    # what is nearer than an object is in front of it, what is beside the ground catches its shadow\n"
             );
         }
         text + "\n"
