@@ -159,7 +159,7 @@ impl Depths {
         self
     }
 
-    /// For objects that rest on surfaces, too.
+    /// Looks for surfaces also where they catch no shadows, if an object `rests` on them.
     pub(crate) fn with_surfaces(mut self, rests: bool) -> Self {
         self.wants_surfaces |= rests;
         self
@@ -394,7 +394,7 @@ impl Depths {
         Ok((cloud, deviation * f64::from(height_m)))
     }
 
-    /// Where an object is to rest on surfaces that are not shown.
+    /// The error if an object is to rest on surfaces and the map has too few texels for these.
     pub(crate) fn too_coarse(&self) -> Error {
         Error::Config {
             key: "scene.depth".into(),
@@ -407,7 +407,7 @@ impl Depths {
         }
     }
 
-    /// Whether a window shows one thing rather than several.
+    /// Whether the map has enough texels for surfaces.
     fn is_fine(&self, camera: &Camera) -> bool {
         let longest = camera.resolution[0].max(camera.resolution[1]) as usize;
         self.values.width().max(self.values.height()) >= COARSE.min(longest)

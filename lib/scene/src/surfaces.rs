@@ -34,25 +34,26 @@ const WINDOW: f64 = 1.0 / 80.0;
 const STEPS: usize = 4;
 /// Texels from the middle of a window to a side, at least.
 const LEAST: usize = 2;
-/// What is within this share of the middle's disparity starts the fit.
+/// The first fit takes values whose disparity differs from the middle's by less than this share of it.
 const NEAR: f64 = 0.1;
-/// From this deviation from the plane on, as a share of the disparity, a value does not count: at least this, and so many
-/// standard deviations of the ground's depths.
+/// Later fits leave out values whose disparity is off the plane by this share or more: the larger of the first number, and
+/// the second times the standard deviation of the ground's depths.
 const CUT: (f64, f64) = (0.02, 4.0);
 /// Fits, each with the weights of the one before.
 const ROUNDS: usize = 3;
 /// Penalty on slopes, in squares of a step: far below what a window weighs, for windows of one row.
 const PENALTY: f64 = 1e-3;
 
-/// Rounds in which planes are compared with those beside them.
+/// Times that each plane is compared with its neighbours.
 const SETTLED: usize = 2;
-/// A plane is kept if the disparities around it are off by less than this share of what does not count, squared, in the mean.
+/// A plane is kept if the mean square of what the disparities around it are off, in units of [`CUT`], is less than this.
 const FITS: f64 = 0.1;
-/// Another is better if they are off by less than this share of that.
+/// A neighbour replaces it if its mean square is less than this share of that.
 const BETTER: f64 = 0.5;
-/// Texels by which planes go on beyond what they were fitted to: the mask follows the photograph so far.
+/// Texels by which planes are extended at their edges, because the mask, which follows the photograph, may reach so far.
 const BEYOND: usize = 2;
-/// What is nearer than the ground by so many margins is told apart from it by the mask.
+/// Where a surface is nearer than the ground by less than so many margins, the two planes decide which is seen; elsewhere the
+/// mask does.
 const APART: f64 = 2.0;
 
 /// Disparities of a photograph.
@@ -74,11 +75,11 @@ impl SeenSurfaces {
         Self { share, planes }
     }
 
-    /// Those of `map` that are seen in `share` of each pixel. `ground` is the proxy's disparity at a pixel, 0 where there
-    /// is none.
+    /// The surfaces of `map`, which are seen in `share` of each pixel. `ground` is the proxy's disparity at a pixel, 0 where
+    /// there is none.
     ///
-    /// Planes are fitted to what is nearer than the ground by a margin. Where they meet the ground, less than that is left
-    /// between the two: downwards from there the plane goes on as long as it is before the ground and the map agrees.
+    /// Planes are fitted to what is nearer than the ground by the margin. At the foot of a wall the distance is smaller. There
+    /// the plane above is extended downwards while it is nearer than the ground and the map agrees with it.
     pub(crate) fn of_map(
         share: Raster<f32>,
         map: &Map,
@@ -136,7 +137,8 @@ impl SeenSurfaces {
         surfaces
     }
 
-    /// Near to the ground what is seen is the nearer of it and the surfaces; where no plane is known it is not these.
+    /// Sets the share to 0 or 1 where ground and surface are close to each other: the nearer one is seen. Where no plane is
+    /// known, no surface is seen.
     fn meet(&mut self, map: &Map, ground: impl Fn(usize, usize) -> f64 + Sync) {
         let camera = map.camera;
         let width = self.share.width();
@@ -167,14 +169,14 @@ impl SeenSurfaces {
         &self.share
     }
 
-    /// What hides shadows where `mask`, of the photograph's size, hides what is behind these surfaces.
+    /// `mask`, of the photograph's size, without the surfaces: it hides shadows on what is behind them, not on themselves.
     pub(crate) fn shadow_mask(&self, mask: &Raster<f32>) -> Raster<f32> {
         let both = mask.pixels().par_iter().zip(self.share.pixels());
         let hides = both.map(|(mask, share)| (mask - share).max(0.0));
         Raster::from_pixels(mask.width(), mask.height(), hides.collect())
     }
 
-    /// Whether they are seen between the pixels `first` and `end` (not in these) of a picture of `resolution` pixels.
+    /// Whether they are seen in any of the pixels from `first` up to, not including, `end` of a picture of `resolution` pixels.
     pub fn are_seen(&self, first: [u32; 2], end: [u32; 2], resolution: [u32; 2]) -> bool {
         let size = [self.share.width(), self.share.height()];
         let [columns, rows] = [0, 1].map(|k| {
@@ -185,7 +187,7 @@ impl SeenSurfaces {
         rows.any(|row| row.iter().any(|s| *s > 0.0))
     }
 
-    /// The share in which they are seen at `pixel` of `camera`, the photograph's at any resolution.
+    /// The share of a pixel in which they are seen. `camera` is the photograph's, at any resolution.
     #[inline]
     pub fn share_at(&self, camera: &Camera, pixel: Vec2) -> f32 {
         let index = |k: usize, size: usize| {
@@ -196,7 +198,7 @@ impl SeenSurfaces {
         *self.share.get(x, y)
     }
 
-    /// The point of them at `pixel`, whether it is seen there or the proxy; `None` where nothing is known.
+    /// The surface point at `pixel`, also where the proxy hides it; `None` where no surface is known.
     pub fn point_at(&self, camera: &Camera, pixel: Vec2) -> Option<Seen> {
         let d = (pixel - camera.principal_px) / camera.focal_px;
         let way = Vec3::new(d.x, -d.y, 1.0);
@@ -214,7 +216,7 @@ impl SeenSurfaces {
         })
     }
 
-    /// The point of them at `pixel`, if they are most of what is seen there.
+    /// The surface point at `pixel`, if surfaces are seen in more than half of the pixel.
     pub fn seen_at(&self, camera: &Camera, pixel: Vec2) -> Option<Seen> {
         match self.share_at(camera, pixel) > 0.5 {
             true => self.point_at(camera, pixel),
@@ -222,8 +224,8 @@ impl SeenSurfaces {
         }
     }
 
-    /// That of the nearest of the four texels around a pixel of a picture of `resolution` pixels, mixed with those that are as
-    /// far away along `way`: beyond an edge there is another surface.
+    /// Interpolates the planes of the four texels around a pixel of a picture of `resolution` pixels. Texels whose disparity
+    /// along `way` differs from the nearest texel's are left out: they belong to another surface.
     fn plane_at(&self, pixel: Vec2, resolution: [u32; 2], way: Vec3) -> Option<Vec3> {
         let size = [self.planes.width(), self.planes.height()];
         let axis = |k: usize| {
@@ -256,7 +258,7 @@ impl SeenSurfaces {
 /// What is farther is no surface, metres.
 const FARTHEST_M: f32 = 1e6;
 
-/// With what is not known taken over from a neighbour, the nearest thing first.
+/// Fills unknown texels beside known ones with a neighbour's plane; of several, with that of the smallest depth.
 fn grown(planes: &Raster<Vec3>) -> Raster<Vec3> {
     let (width, height) = (planes.width(), planes.height());
     let plane = |i: usize| {
@@ -325,8 +327,8 @@ impl Window<'_> {
         (middle * DVec3::new(plane.x, plane.y, offset)).as_vec3()
     }
 
-    /// With planes that do not fit what is around them replaced by one beside them that does: at an edge between two sides of
-    /// a thing a window shows both. `middle` is the map's texel of a plane.
+    /// Replaces planes that do not fit the disparities around them by a neighbour's that does. At an edge a window sees two
+    /// sides of a thing, and the fitted plane is neither. `middle` gives the map's texel of a plane.
     fn settled(
         &self,
         planes: &Raster<Vec3>,
@@ -388,13 +390,13 @@ impl Window<'_> {
         DVec2::new(d.x, -d.y)
     }
 
-    /// What `step` texels are of that.
+    /// The same for an offset of `step` texels.
     fn extent(&self, step: usize) -> DVec2 {
         self.way(step, 0) - self.way(0, step)
     }
 }
 
-/// The slopes and the offset that fit `samples` best. Tukey's weights are 0 from where `off` is 1 or more.
+/// Slopes and offset of the plane through `samples` by weighted least squares, with Tukey's weights: 0 where `off` is 1 or more.
 fn fitted(samples: &[(DVec3, f64)], off: impl Fn(DVec3, f64) -> f64, penalty: DVec2) -> DVec3 {
     let mut squares = DMat3::from_diagonal(penalty.extend(1e-9));
     let mut products = DVec3::ZERO;

@@ -10,16 +10,16 @@ use super::{Block, ShadowContext};
 use crate::light::PathLight;
 use crate::world::ProxyPoint;
 
-/// Light as a list of directions: what comes from a cone of them is a sum.
+/// The light as a list of directions with weights: the light from a cone is the sum of the weights in it.
 pub struct LightDirections(Vec<(Vec3, f32)>);
 
 /// Directions drawn from the light, and as many from the whole sphere.
 const DIRECTIONS: u32 = 1024;
-/// From one of these to the next it is about so far, radians.
+/// About the angle between neighbouring directions of the sphere, radians.
 const BETWEEN: f32 = 0.07;
 
 impl LightDirections {
-    /// Draws directions from `light`, with what each stands for of its luminance.
+    /// Draws directions from `light`; a weight is the luminance that its direction stands for.
     pub fn new(light: &impl PathLight) -> Self {
         const UNIFORM: f32 = 1.0 / (4.0 * PI);
         let mut directions = Vec::new();
@@ -46,7 +46,7 @@ impl<L: PathLight, P> ShadowContext<'_, L, P> {
         let surfaces = self.seen_surfaces?;
         let camera = self.path.world.camera();
         let share = surfaces.share_at(camera, pixel);
-        // Whole pixels need no number: samples of the proxy are what they are without surfaces.
+        // Whole pixels draw no number: where no surface is seen, samples are the same as without surfaces.
         if share <= 0.0 || share < 1.0 && sampler.next_1d() >= share {
             return None;
         }
@@ -59,7 +59,7 @@ impl<L: PathLight, P> ShadowContext<'_, L, P> {
         })
     }
 
-    /// Whether surfaces are seen in `block` that could be shadowed noticeably, or receive light of the object.
+    /// Whether `block` sees surfaces that the object could shadow noticeably or send light to.
     pub fn may_shade_surfaces(&self, block: Block, light: &LightDirections) -> bool {
         let Some(surfaces) = self.seen_surfaces else {
             return false;
