@@ -307,9 +307,8 @@ impl Depths {
 
     /// Depth of the ground at a texel, metres.
     fn ground_m(&self, x: usize, y: usize, ground: &Ground, camera: &Camera) -> Option<f64> {
-        let [w, h] = camera.resolution.map(|n| n as usize);
-        let column = (2 * x + 1) * w / (2 * self.values.width());
-        let row = (2 * y + 1) * h / (2 * self.values.height());
+        let size = [self.values.width(), self.values.height()];
+        let [column, row] = pixel_of([x, y], size, camera);
         ground.metres(column, row, camera)
     }
 
@@ -468,16 +467,23 @@ impl DepthFit {
     }
 }
 
+/// The pixel at the middle of a texel of a map of `size` texels.
+pub(crate) fn pixel_of(texel: [usize; 2], size: [usize; 2], camera: &Camera) -> [usize; 2] {
+    [0, 1].map(|k| (2 * texel[k] + 1) * camera.resolution[k] as usize / (2 * size[k]))
+}
+
+/// The two of `size` texels around a place, a share of the map's side from 0 to 1, and the weight of the second.
+pub(crate) fn texels_at(place: f64, size: usize) -> (usize, usize, f32) {
+    let at = (place * size as f64 - 0.5).clamp(0.0, (size - 1) as f64);
+    let first = at as usize;
+    (first, (first + 1).min(size - 1), (at - first as f64) as f32)
+}
+
 /// The value at a pixel of the camera, between those of the map's; the nearest where one of these is not finite.
 fn between(map: &Raster<f32>, x: usize, y: usize, camera: &Camera) -> f32 {
     let size = [map.width(), map.height()];
-    let [(left, right, u), (above, below, v)] = [(0, x), (1, y)].map(|(k, i)| {
-        let at = (i as f64 + 0.5) * size[k] as f64 / f64::from(camera.resolution[k]) - 0.5;
-        let at = at.clamp(0.0, (size[k] - 1) as f64);
-        let first = at as usize;
-        let share = (at - first as f64) as f32;
-        (first, (first + 1).min(size[k] - 1), share)
-    });
+    let [(left, right, u), (above, below, v)] = [(0, x), (1, y)]
+        .map(|(k, i)| texels_at((i as f64 + 0.5) / f64::from(camera.resolution[k]), size[k]));
     let around = [(left, above), (right, above), (left, below), (right, below)];
     let around = around.map(|(column, row)| *map.get(column, row));
     if around.iter().any(|v| !v.is_finite()) {

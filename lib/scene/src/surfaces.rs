@@ -4,6 +4,7 @@ use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
 use crate::camera::Camera;
+use crate::foreground::{pixel_of, texels_at};
 
 /// What the photograph shows before the proxy, by its depths. Light passes through it: how it is lit is part of the light.
 #[derive(Clone, Debug, PartialEq)]
@@ -87,15 +88,9 @@ impl SeenSurfaces {
     ) -> Self {
         let disparities = map.disparities;
         let own = [disparities.width(), disparities.height()];
-        // The pixel at the middle of a texel.
-        let pixel_of = |at: [usize; 2]| {
-            let side =
-                |k: usize| (2 * at[k] + 1) * map.camera.resolution[k] as usize / (2 * own[k]);
-            [side(0), side(1)]
-        };
         let is_before = |i: usize| {
             let disparity = f64::from(disparities.pixels()[i]);
-            let [x, y] = pixel_of([i % own[0], i / own[0]]);
+            let [x, y] = pixel_of([i % own[0], i / own[0]], own, map.camera);
             disparity > 0.0 && 1.0 - ground(x, y) / disparity > map.margin
         };
         let before = (0..own[0] * own[1]).into_par_iter().map(is_before);
@@ -122,7 +117,7 @@ impl SeenSurfaces {
                 let at = middle(x, y);
                 let way = window.way(at[0], at[1]).extend(1.0);
                 let (goes_on, found) = (above.as_dvec3().dot(way), *disparities.get(at[0], at[1]));
-                let [u, v] = pixel_of(at);
+                let [u, v] = pixel_of(at, own, map.camera);
                 let agrees = (f64::from(found) / goes_on - 1.0).abs() < map.margin;
                 if goes_on > ground(u, v) && agrees {
                     *planes.get_mut(x, y) = above;
@@ -228,14 +223,11 @@ impl SeenSurfaces {
     /// along `way` differs from the nearest texel's are left out: they belong to another surface.
     fn plane_at(&self, pixel: Vec2, resolution: [u32; 2], way: Vec3) -> Option<Vec3> {
         let size = [self.planes.width(), self.planes.height()];
-        let axis = |k: usize| {
-            let at = pixel[k] * size[k] as f32 / resolution[k] as f32 - 0.5;
-            let at = at.clamp(0.0, (size[k] - 1) as f32);
-            let first = at as usize;
-            let share = at - first as f32;
-            [(first, 1.0 - share), ((first + 1).min(size[k] - 1), share)]
-        };
-        let (columns, rows) = (axis(0), axis(1));
+        let [columns, rows] = [0, 1].map(|k| {
+            let place = f64::from(pixel[k]) / f64::from(resolution[k]);
+            let (first, second, share) = texels_at(place, size[k]);
+            [(first, 1.0 - share), (second, share)]
+        });
         let texel = |k: usize| {
             let ((x, u), (y, v)) = (columns[k % 2], rows[k / 2]);
             (*self.planes.get(x, y), u * v)

@@ -283,6 +283,14 @@ fn keys_of_depths_are_checked_and_switched_off_with_the_effect() {
         "depth = \"d.png\"\ndepth_kind = \"depth\"\ndepth_scale = 0.5\noccluders = \"m.png\"";
     let settings = parse(&table(both, "")).validate().unwrap();
     assert_eq!(settings.depth.unwrap().scale, Some(0.5));
+    let rests = format!(
+        "background = \"photo.jpg\"\ndepth = \"d.png\"\n{OBJECT}at_pixel = [3, 4]\nrest = \"surface\"\n{CAMERA}"
+    );
+    parse(&rests).validate().unwrap();
+    assert_eq!(
+        message(&format!("{rests}\n[effects]\noccluders = \"off\"")),
+        "scene.effects.occluders is \"off\"; accepted: \"auto\", for rest = \"surface\" stands an object on what these depths show"
+    );
     let off = parse(&table(both, "[effects]\noccluders = \"off\""));
     let settings = off.validate().unwrap();
     assert!(settings.depth.is_none() && settings.occluders.is_none());
