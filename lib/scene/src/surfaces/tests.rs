@@ -146,7 +146,7 @@ fn noise_of_a_percent_leaves_depths_and_normals() {
     };
     let surfaces = found([240, 160], 0.0058, noise);
     let (mut turned, mut count) = (0.0, 0.0);
-    for (x, y, what, depth) in inner(8).into_iter().filter(|p| p.2 == 1) {
+    for (x, y, _, depth) in inner(8).into_iter().filter(|p| p.2 == 1) {
         let found = at(&surfaces, x, y).unwrap();
         assert!((f64::from(found.depth) / depth - 1.0).abs() < 0.01);
         turned += found.normal.dot(WALL.1).min(1.0).acos().to_degrees();
