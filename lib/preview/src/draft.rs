@@ -10,6 +10,7 @@ use dipir_light::map_with_lobes::MapWithLobes;
 use dipir_render::adaptive::Stop;
 use dipir_render::effects::EffectsPlan;
 use dipir_render::error::RenderError;
+use dipir_render::gloss::{self, Gloss};
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings, Simulation};
 use dipir_scene::config::EffectSwitch;
@@ -56,10 +57,10 @@ impl Draft {
                     false => map.clone(),
                 };
                 let map = EnvironmentSampler::new(map);
-                let light = MapWithLobes::new(map, light.lobes.clone());
-                render(loaded, &light, tone, samples, go_on)
+                let lit = MapWithLobes::new(map, light.lobes.clone());
+                render(loaded, &lit, (tone, light.gloss), samples, go_on)
             }
-            None => render(loaded, &light.lobes, tone, samples, go_on),
+            None => render(loaded, &light.lobes, (tone, light.gloss), samples, go_on),
         }?;
         let film = rendered.film;
         let (object, shadow) = match tone {
@@ -69,6 +70,10 @@ impl Draft {
             ),
             None => (LinearImage(film.object), LinearImage(film.shadow)),
         };
+        let mut object = object;
+        if let Some(mirrored) = film.mirrored {
+            gloss::add(&mut object.0, mirrored, tone);
+        }
         let photo = &loaded.photo;
         let picture = composite(&photo.image, &object, &film.alpha, &shadow)
             .unwrap_or_else(|_| photo.image.clone());
@@ -85,12 +90,13 @@ impl Draft {
 fn render<L: SceneLight>(
     loaded: &LoadedScene,
     light: &L,
-    tone: Option<&ToneCurves>,
+    (tone, gloss): (Option<&ToneCurves>, Option<Gloss>),
     samples: u32,
     go_on: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Result<Rendered, RenderError> {
     let settings = Settings {
         tone,
+        gloss,
         ..settings(loaded, samples)
     };
     let simulation = simulation(loaded, &settings);

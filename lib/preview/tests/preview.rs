@@ -186,6 +186,7 @@ fn sunny(direction: Vec3) -> AtHand {
             EnvironmentMap::new(32, 16, texels.collect()).unwrap(),
         )),
         tone: None,
+        gloss: None,
         origin: Origin::Estimate,
     }
 }

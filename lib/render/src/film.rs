@@ -18,6 +18,8 @@ pub struct Film {
     pub alpha: Raster<f32>,
     /// Shadow ratio; 1 where nothing is shadowed.
     pub shadow: Raster<Vec3>,
+    /// Light of the object by way of polished ground, linear, which is added to the photograph; if there is such ground.
+    pub mirrored: Option<Raster<Vec3>>,
     object_variance: Tiles<Vec3>,
     shadow_variance: Tiles<Vec3>,
 }
@@ -32,6 +34,7 @@ impl Film {
             object: Raster::filled(width, height, Vec3::ZERO),
             alpha: Raster::filled(width, height, 0.0),
             shadow: Raster::filled(width, height, Vec3::ONE),
+            mirrored: None,
             object_variance: Tiles::new(width, height),
             shadow_variance: Tiles::new(width, height),
         }
@@ -56,6 +59,9 @@ impl Film {
             self.alpha.pixels_mut()[i] *= seen;
             let shadow = &mut self.shadow.pixels_mut()[i];
             *shadow = Vec3::ONE + (*shadow - Vec3::ONE) * lit;
+            if let Some(mirrored) = &mut self.mirrored {
+                mirrored.pixels_mut()[i] *= lit;
+            }
             let (x, y) = (i % mask.width(), i / mask.width());
             let variances = [
                 (&mut self.object_variance, seen),

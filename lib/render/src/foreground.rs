@@ -249,6 +249,7 @@ impl<L: PathLight> PathContext<'_, L> {
     ) -> f32 {
         let point = corner + sampler.next_2d();
         self.trace_from_image::<F, G>(point, sampler, counts, gather)
+            .0
     }
 
     /// One path through `point` of the image plane, in pixels; draws from the sampler's current
@@ -261,13 +262,14 @@ impl<L: PathLight> PathContext<'_, L> {
         counts: &mut RayCounts,
     ) -> PathSample {
         let mut found = Carried::default();
-        let coverage = self.trace_from_image::<F, _>(point, sampler, counts, &mut found);
+        let (coverage, _) = self.trace_from_image::<F, _>(point, sampler, counts, &mut found);
         PathSample {
             radiance: found.sum,
             coverage,
         }
     }
 
+    /// Coverage, and the share of the light that gets from there to the camera: 1, but by way of polished ground.
     #[inline]
     pub(crate) fn trace_from_image<const F: u32, G: Gather>(
         &self,
@@ -275,11 +277,19 @@ impl<L: PathLight> PathContext<'_, L> {
         sampler: &mut Sampler,
         counts: &mut RayCounts,
         gather: &mut G,
-    ) -> f32 {
-        let ray = self.world.camera().ray(point);
+    ) -> (f32, f32) {
+        let mut ray = self.world.camera().ray(point);
+        let mut share = 1.0;
+        if let Some(gloss) = &self.world.gloss {
+            let Some(mirrored) = gloss.ray(self.world, &ray, sampler.next_2d()) else {
+                return (0.0, 0.0);
+            };
+            (ray, share) = mirrored;
+        }
         let alpha_key = sampler.next_u64();
         counts.add(RayKind::Camera);
-        self.trace::<F, G>(&ray, alpha_key, sampler, counts, gather)
+        let seen = self.trace_share::<F, G>(&ray, share, alpha_key, sampler, counts, gather);
+        (seen, share)
     }
 
     /// Radiance along `ray` from the object. Draws from the sampler's current dimension on.
@@ -304,10 +314,24 @@ impl<L: PathLight> PathContext<'_, L> {
         counts: &mut RayCounts,
         gather: &mut G,
     ) -> f32 {
+        self.trace_share::<F, G>(ray, 1.0, alpha_key, sampler, counts, gather)
+    }
+
+    /// [`trace`](Self::trace), with this share of the light.
+    #[inline(always)]
+    fn trace_share<const F: u32, G: Gather>(
+        &self,
+        ray: &Ray,
+        share: f32,
+        alpha_key: u64,
+        sampler: &mut Sampler,
+        counts: &mut RayCounts,
+        gather: &mut G,
+    ) -> f32 {
         let world = self.world;
         // Loop state.
         let mut ray = *ray; //                       the segment that is traced next
-        let mut throughput = Vec3::ONE; //           product of BSDF weights so far
+        let mut throughput = Vec3::splat(share); //  product of BSDF weights so far
         let mut sampled_pdf = f32::INFINITY; //      density of the segment's direction, infinite
         //                                           if the light could not have drawn it
         let mut leaves = false; //                   the segment is known to miss the object

@@ -12,6 +12,7 @@ use crate::denoise::auxiliary::{self, Auxiliary};
 use crate::error::RenderError;
 use crate::features::{EVERYTHING, with_features};
 use crate::footprint::Footprint;
+use crate::gloss::Gloss;
 use crate::job::{Job, Layer};
 use crate::render::Renderer;
 use crate::world::World;
@@ -253,8 +254,15 @@ impl<'a> View<'a> {
         (ray, sampler)
     }
 
+    /// That of the camera; by way of polished ground as a mirror sends it on.
     fn ray(&self, at: Vec2) -> Ray {
-        self.world.camera().ray(at)
+        let ray = self.world.camera().ray(at);
+        match self.world.gloss {
+            Some(_) => Gloss::MIRROR
+                .ray(self.world, &ray, Vec2::ZERO)
+                .map_or(ray, |r| r.0),
+            None => ray,
+        }
     }
 
     fn depth(&self, position: Vec3) -> f32 {

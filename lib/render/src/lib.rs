@@ -15,6 +15,7 @@ pub mod footprint;
 pub mod foreground;
 pub mod foresight;
 pub mod gbuffer;
+pub mod gloss;
 pub mod guide;
 pub mod highlights;
 pub mod job;

@@ -28,6 +28,7 @@ use crate::footprint::Footprint;
 use crate::foreground::PathContext;
 use crate::foresight::Foresight;
 use crate::gbuffer;
+use crate::gloss::{self, Gloss};
 use crate::guide::PathGuide;
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet};
@@ -79,6 +80,8 @@ pub struct Settings<'a> {
     pub shadow_mask: Option<&'a Raster<f32>>,
     /// Share of a plane's light that may be blocked without being sampled.
     pub shadow_tolerance: f32,
+    /// How polished the ground is, if it is a plane; `None` for matt ground.
+    pub gloss: Option<Gloss>,
     /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
     pub highlights: bool,
     /// Whether noise is [removed](crate::denoise) from object and shadow.
@@ -134,6 +137,7 @@ impl Default for Settings<'_> {
             shadow_mask: None,
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
+            gloss: None,
             highlights: true,
             denoise: false,
             blur_caustics: false,
@@ -271,6 +275,13 @@ impl<'a> Renderer<'a> {
                 _ => Vec::new(),
             },
         };
+        let mirrored = self.render_mirrored(light, world, simulation, settings, start, progress)?;
+        let settings = &Settings {
+            stop: gloss::stop_after(settings.stop, mirrored.as_ref()),
+            ..*settings
+        };
+        let mut share = gloss::progress_after(mirrored.is_some(), progress);
+        let progress: &mut Watch = &mut share;
         let mut rendered = match settings.stop {
             Stop::TimeBudget(budget) => {
                 self.render_within(light, world, simulation, settings, budget, start, progress)
@@ -280,6 +291,9 @@ impl<'a> Renderer<'a> {
                 self.render_at_most(most, light, world, simulation, settings, start, progress)
             }
         }?;
+        if let Some(mirrored) = mirrored {
+            self.lay_mirrored(&mut rendered, mirrored, &light.on_object, settings);
+        }
         if let Some(mask) = settings.occluders {
             let of_shadow = settings.shadow_mask.unwrap_or(mask);
             rendered.film.hide_behind(mask, of_shadow);
@@ -307,7 +321,10 @@ impl<'a> Renderer<'a> {
             .bvh
             .bounding_sphere()
             .map(|whole| Blocker::new(whole, self.geometry.bvh.clusters()));
-        let mut jobs = self.object_jobs(settings);
+        let mut jobs = match (&world.gloss, &blocker) {
+            (Some(gloss), Some(blocker)) => self.mirror_jobs(gloss, blocker, settings.shadow_mask),
+            _ => self.object_jobs(settings),
+        };
         let mut guide_rays = RayCounts::default();
         let guide = match simulation.max_depth {
             0 | 1 => None,
@@ -375,6 +392,7 @@ impl<'a> Renderer<'a> {
             tone: settings.tone.map(ToneCurves::mapper),
             transfer: settings.transfer,
             gain: settings.gain,
+            adds: path.world.gloss.is_some(),
         };
         let find_highlights = |film: &Film, jobs: &[Job]| {
             if !settings.highlights || matches!(settings.stop, Stop::Samples(_)) {

@@ -19,6 +19,8 @@ pub struct Viewing<'a> {
     pub transfer: Transfer,
     /// How much brighter the picture is shown than it is.
     pub gain: f32,
+    /// The object is seen by way of the ground: its light is added to the photograph, and hides nothing of it.
+    pub adds: bool,
 }
 
 /// Sums over pixels, of one job, of the squared display-referred error.
@@ -43,18 +45,23 @@ impl SquaredError {
 impl Viewing<'_> {
     /// The photograph at a pixel, linear.
     pub fn background(&self, x: usize, y: usize) -> Vec3 {
-        self.background
-            .map_or(Vec3::splat(0.18), |image| *image.0.get(x, y))
+        background(self.background, x, y)
     }
 
     /// The picture at a pixel, linear, where the layers have these values.
     fn laid_over(&self, (x, y): (usize, usize), object: Vec3, alpha: f32, shadow: Vec3) -> Vec3 {
+        let alpha = match self.adds {
+            true if object == Vec3::ZERO => 0.0,
+            true => 1.0,
+            false => alpha,
+        };
         let (object, shadow) = match &self.tone {
             // Most of the ground is in no shadow.
             Some(tone) if shadow == Vec3::ONE => (tone.object_pixel(object, alpha), shadow),
             Some(tone) => (tone.object_pixel(object, alpha), tone.shadow_pixel(shadow)),
             None => (object, shadow),
         };
+        let alpha = if self.adds { 0.0 } else { alpha };
         composite_pixel(self.background(x, y), object, alpha, shadow)
     }
 
@@ -160,6 +167,12 @@ impl Viewing<'_> {
     /// than noise would: counted as touched, unshadowed pixels would make the mean error look smaller
     /// than it is.
     pub fn is_touched(&self, film: &Film, x: usize, y: usize) -> bool {
+        let object = *film.object.get(x, y);
+        if self.adds {
+            let change =
+                self.shown((x, y), object, 0.0, Vec3::ONE) - self.encoded(self.background(x, y));
+            return change.abs().max_element() > 0.5 / 255.0;
+        }
         if *film.alpha.get(x, y) > 0.0 {
             return true;
         }
@@ -173,6 +186,11 @@ impl Viewing<'_> {
         let sure = (shadow - Vec3::ONE).abs() - 2.0 * film.shadow_noise(x, y);
         (0..3).any(|c| seen[c] > 0.5 / 255.0 && sure[c] > 0.0)
     }
+}
+
+/// The photograph at a pixel, linear; mid-grey (0.18) if there is none.
+pub(crate) fn background(photo: Option<&LinearImage>, x: usize, y: usize) -> Vec3 {
+    photo.map_or(Vec3::splat(0.18), |image| *image.0.get(x, y))
 }
 
 /// Half of the step over which slopes are taken.
@@ -193,6 +211,7 @@ mod tests {
             tone: Some(ToneCurves::identity().mapper()),
             transfer: Transfer::Linear,
             gain: 1.0,
+            adds: false,
         };
         let mut film = Film::new(1, 1);
         for (radiance, alpha) in [(0.1, 1.0), (1.5, 1.0), (0.4, 0.5), (2.0, 0.9)] {
@@ -219,6 +238,7 @@ mod tests {
             tone: None,
             transfer: Transfer::Srgb,
             gain: 1.0,
+            adds: false,
         };
         let mut film = Film::new(4, 4);
         // Two 8-bit steps darker, once with less noise than that, once with more.

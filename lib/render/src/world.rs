@@ -16,6 +16,7 @@ use crate::bsdf::features::{ALPHA, EXTENSIONS, SPECULAR, TRANSMISSION, has};
 use crate::convexity::is_convex;
 use crate::counters::{RayCounts, RayKind};
 use crate::error::RenderError;
+use crate::gloss::Gloss;
 use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
 
 /// The proxy, ready for rays.
@@ -164,6 +165,8 @@ pub struct World<'a> {
     pub surfaces: Surfaces<'a>,
     /// The effects that `surfaces` was prepared for ([`crate::features`]).
     pub mask: u32,
+    /// Rays from the camera go on from ground of this kind.
+    pub(crate) gloss: Option<Gloss>,
     /// No ray that leaves the object outwards meets it again, and none passes through.
     pub escapes: bool,
 }
@@ -203,6 +206,7 @@ impl<'a> World<'a> {
             geometry,
             surfaces,
             mask,
+            gloss: None,
         })
     }
 
@@ -400,7 +404,7 @@ const LEAST_PASSING: f32 = 1e-4;
 /// Where `ray` meets the front of `plane`; `None` for rays that run along it, away from it or
 /// come from behind.
 #[inline]
-fn plane_point(plane: &Plane, ray: &Ray) -> Option<ProxyPoint> {
+pub(crate) fn plane_point(plane: &Plane, ray: &Ray) -> Option<ProxyPoint> {
     let towards = -ray.direction.dot(plane.normal);
     let height = (ray.origin - plane.point).dot(plane.normal);
     if !(towards > 0.0 && height > 0.0) {

@@ -62,6 +62,7 @@ const VIEWING: Viewing = Viewing {
     tone: None,
     transfer: Transfer::Linear,
     gain: 1.0,
+    adds: false,
 };
 
 /// Squared error of `film` against `surface`, over the pixels that are wholly covered and for which `holds` is true.

@@ -75,12 +75,12 @@ fn advance_object_with<L: PathLight, const F: u32>(
                 };
                 let mut light = Carried::default();
                 let point = corner + place;
-                let seen =
+                let (seen, share) =
                     path.trace_from_image::<F, _>(point, &mut sampler, &mut counts, &mut light);
                 radiance += light.sum * weight;
                 squares += light.sum * light.sum * (weight * weight);
-                coverage += seen * weight;
-                weights += weight;
+                coverage += seen * weight * share;
+                weights += weight * share;
                 if measured.is_some() {
                     found[replicate].add(&light, weight);
                 }

@@ -10,6 +10,7 @@ pub(super) fn film(mut film: Film, way: &Undistortion) -> Film {
     film.object = way.distort(&film.object, Vec3::ZERO);
     film.alpha = way.distort(&film.alpha, 0.0);
     film.shadow = way.distort(&film.shadow, Vec3::ONE);
+    film.mirrored = film.mirrored.map(|added| way.distort(&added, Vec3::ZERO));
     film
 }
 

@@ -26,6 +26,7 @@ use dipir_pipeline::stage::StagePlan;
 use dipir_render::adaptive::Stop;
 use dipir_render::coarse::divisor_for;
 use dipir_render::film::Film;
+use dipir_render::gloss;
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings};
 use rayon::prelude::*;
@@ -257,7 +258,7 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
     table.check(&session.config)?;
     let scene = scene_folder::manifest(session)?;
     let known = known_light::known_params(table);
-    let params = json!({
+    let mut params = json!({
         "light": known.as_ref().map_or_else(|| light_folder::recovered_params(table), |k| k.0.clone()),
         "tone": table.tone,
         "max_samples": table.max_samples.unwrap_or(MAX_SAMPLES),
@@ -272,6 +273,9 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
             Stop::TimeBudget(t) => json!({"time_budget_s": t.as_secs_f64()}),
         },
     });
+    if let Some(gloss) = table.gloss() {
+        params["ground"] = json!([gloss.roughness, gloss.reflectance]);
+    }
     let mut plan = COMPOSITE.plan(session, params);
     scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
     match known {
@@ -337,6 +341,7 @@ fn render_under<L: SceneLight>(
         most_pixels,
         leave_out: effects.leave_out(loaded.description.effects()),
         tone,
+        gloss: table.gloss(),
         gain: exposed::gain(loaded.taken(), &loaded.photo.image),
         ..Settings::of_scene(loaded)
     };
@@ -396,9 +401,13 @@ impl<'a> Composite<'a> {
             object,
             alpha,
             shadow,
+            mirrored,
             ..
         } = film;
-        let (object, shadow) = curve.apply(object, &alpha, shadow);
+        let (mut object, shadow) = curve.apply(object, &alpha, shadow);
+        if let Some(mirrored) = mirrored {
+            gloss::add(&mut object, mirrored, curve.curves());
+        }
         let mut layers = Overlay {
             object,
             alpha,

@@ -6,6 +6,7 @@ use dipir_imaging::tone::ToneCurves;
 use dipir_pipeline::config::{Config, Quality};
 use dipir_pipeline::error::ConfigError;
 use dipir_render::adaptive::Stop;
+use dipir_render::gloss::Gloss;
 use glam::Vec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -56,6 +57,13 @@ pub struct CompositeTable {
     /// Whether the object gets the photograph's grain, where its flat areas show some.
     #[schemars(extend("x-default" = "true"), example = false)]
     pub match_grain: Option<bool>,
+    /// How rough polished ground is, from 0, a mirror, to 1: it then shows the object's mirror image. The ground has to be a plane.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-default" = "none: matt ground"), example = 0.15)]
+    pub ground_roughness: Option<f32>,
+    /// Share of the light that polished ground reflects where it is looked at from above: 0.02 for water, 0.04 for stone,
+    /// tiles and varnish, up to 1 for metal.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1.0), extend("default" = GROUND_REFLECTANCE), example = 0.02)]
+    pub ground_reflectance: Option<f32>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
     /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
     #[schemars(extend("x-default" = "the recovered curves with the recovered light, `none` with a map"), example = &"reinhard")]
@@ -97,6 +105,9 @@ pub(super) const MAX_SAMPLES: u32 = 1 << 14;
 const LEAST_BUDGET_S: f64 = 0.01;
 const MOST_BUDGET_S: f64 = 1e7;
 
+/// That of a surface whose index of refraction is 1.5.
+const GROUND_REFLECTANCE: f32 = 0.04;
+
 /// Most stops of a channel that a tint has: beyond, a light has one colour.
 const MOST_TINT: f32 = 8.0;
 
@@ -124,6 +135,7 @@ impl CompositeTable {
             let message = "excludes target_error; keep one of the two";
             return Err(config.invalid("composite.time_budget_s", message));
         }
+        self.check_ground(config)?;
         if self.max_samples == Some(0) {
             return Err(config.out_of_range("composite.max_samples", 0, "1 or more"));
         }
@@ -138,6 +150,35 @@ impl CompositeTable {
             return Err(config.out_of_range("composite.tint", found, accepted));
         }
         self.placement().check(config)
+    }
+
+    fn check_ground(&self, config: &Config) -> Result<(), ConfigError> {
+        if let Some(r) = self.ground_roughness
+            && !(0.0..=1.0).contains(&r)
+        {
+            let accepted = "0, a mirror, to 1, as in 0.15";
+            return Err(config.out_of_range("composite.ground_roughness", r, accepted));
+        }
+        if let Some(r) = self.ground_reflectance
+            && !(r > 0.0 && r <= 1.0)
+        {
+            let accepted = "a share above 0, at most 1, as in 0.04";
+            return Err(config.out_of_range("composite.ground_reflectance", r, accepted));
+        }
+        if self.ground_reflectance.is_some() && self.ground_roughness.is_none() {
+            let message =
+                "is about polished ground; say how rough it is, too: ground_roughness = 0.15";
+            return Err(config.invalid("composite.ground_reflectance", message));
+        }
+        Ok(())
+    }
+
+    /// The ground, if it is polished.
+    pub fn gloss(&self) -> Option<Gloss> {
+        Some(Gloss {
+            roughness: self.ground_roughness?,
+            reflectance: self.ground_reflectance.unwrap_or(GROUND_REFLECTANCE),
+        })
     }
 
     /// The factor of each channel that `tint` is.

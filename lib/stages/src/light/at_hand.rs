@@ -10,6 +10,7 @@ use dipir_optimize::lighting::Lighting;
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::settings::{LightTable, Start};
 use dipir_pipeline::status::State;
+use dipir_render::gloss::Gloss;
 use dipir_scene::scene::LoadedScene;
 
 use crate::composite::table::{CompositeTable, Tone};
@@ -85,6 +86,8 @@ pub struct AtHand {
     pub map: Option<Arc<EnvironmentMap>>,
     /// The curves of object and shadow, if there are any.
     pub tone: Option<ToneCurves>,
+    /// The ground that it shines on, if that is polished.
+    pub gloss: Option<Gloss>,
     /// Where it comes from.
     pub origin: Origin,
 }
@@ -103,6 +106,7 @@ pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand
             lobes: SgMixture::new(Vec::new())?,
             map: Some(light.map),
             tone: composite.tone.and_then(Tone::curves),
+            gloss: composite.gloss(),
             origin: Origin::Map,
         });
     }
@@ -123,6 +127,7 @@ pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand
             Some(tone) => tone.curves(),
             None => exposed::tone(loaded.taken(), light.tone),
         },
+        gloss: composite.gloss(),
         origin,
     })
 }
