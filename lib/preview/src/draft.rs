@@ -71,7 +71,7 @@ impl Draft {
             None => (LinearImage(film.object), LinearImage(film.shadow)),
         };
         let mut object = object;
-        if let Some(mirrored) = film.mirrored {
+        if let Some(mirrored) = &film.mirrored {
             gloss::add(&mut object.0, mirrored, tone);
         }
         let photo = &loaded.photo;

@@ -280,8 +280,8 @@ impl<L: PathLight> PathContext<'_, L> {
     ) -> (f32, f32) {
         let mut ray = self.world.camera().ray(point);
         let mut share = 1.0;
-        if let Some(gloss) = &self.world.gloss {
-            let Some(mirrored) = gloss.ray(self.world, &ray, sampler.next_2d()) else {
+        if let Some(ground) = &self.world.polished {
+            let Some(mirrored) = ground.gloss.ray(self.world, &ray, sampler.next_2d()) else {
                 return (0.0, 0.0);
             };
             (ray, share) = mirrored;

@@ -257,7 +257,7 @@ impl<'a> View<'a> {
     /// That of the camera; by way of polished ground as a mirror sends it on.
     fn ray(&self, at: Vec2) -> Ray {
         let ray = self.world.camera().ray(at);
-        match self.world.gloss {
+        match self.world.polished {
             Some(_) => Gloss::MIRROR
                 .ray(self.world, &ray, Vec2::ZERO)
                 .map_or(ray, |r| r.0),

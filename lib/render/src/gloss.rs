@@ -1,17 +1,20 @@
 //! Polished ground, which shows the object's mirror image.
 //!
 //! The ground is a matt surface under a coat with microfacets (GGX, height-correlated masking, Schlick's Fresnel factor). Of
-//! what the photograph shows, the coat's share `s` follows from the light: the radiance that its lobe gathers over that of
-//! the photograph, 1 at most. The object casts a shadow of ratio `r` on the matt surface and hides the share `c` of the lobe,
-//! so that the shadow's ratio becomes `(1 - s) r + s (1 - c)`. What the object sends by way of the coat is added.
+//! what the photograph shows, `P`, the coat's part `S` follows from the light: the radiance that its lobe gathers, `P` at
+//! most. With the object the shadow ratio `r` holds for the rest of `P`, and of `S` the object hides the share `c` of the
+//! lobe that it fills, and sends `m` instead:
 //!
-//! `c` and that light come from a picture of their own, of the object by way of the ground: one path a sample, whose first
-//! direction is drawn from the normals that are visible from the camera.
+//! `(P - S) r + S + (m - S c)`
+//!
+//! What is in brackets comes from a picture of its own, of the object by way of the ground: one path a sample, whose first
+//! direction is drawn from the normals that are visible from the camera. Where it adds light it is a layer, else part of the
+//! shadow ratio.
 use std::ops::ControlFlow;
 use std::time::Instant;
 
-use dipir_imaging::raster::Raster;
-use dipir_imaging::tone::ToneCurves;
+use dipir_imaging::raster::{LinearImage, Raster};
+use dipir_imaging::tone::{ToneCurves, ToneMapper};
 use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::{Sampler, Stream};
 use dipir_numerics::warp::{Frame, balance_heuristic};
@@ -47,8 +50,9 @@ const LEANING: f32 = 0.99;
 /// Share of a target error, and of a time budget, that is spent on the mirror image.
 const SHARE: f64 = 0.5;
 const SHARE_OF_TIME: f64 = 0.25;
-/// Pixels between the places where the coat's part is known.
-const STEP: usize = 4;
+/// Pixels between the places where the coat's part is known, at least, and most such places.
+const LEAST_STEP: f32 = 4.0;
+const MOST_PLACES: f32 = 65536.0;
 /// Directions from the lobe, and as many from the light, for the coat's part.
 const DIRECTIONS: u32 = 32;
 
@@ -107,21 +111,28 @@ impl Gloss {
         Some((point.ray(frame.to_world(drawn.wi)), drawn.weight))
     }
 
-    /// Radiance that the coat sends to the camera along the other way of `ray`.
-    fn radiance(&self, plane: &Plane, light: &impl PathLight, ray: &Ray, pixel: u32) -> Vec3 {
+    /// Radiance that the coat sends to the camera along the other way of `ray`, and the share of light that it reflects.
+    fn radiance(
+        &self,
+        plane: &Plane,
+        light: &impl PathLight,
+        ray: &Ray,
+        place: u32,
+    ) -> (Vec3, f32) {
         if plane_point(plane, ray).is_none() {
-            return Vec3::ZERO;
+            return (Vec3::ZERO, 0.0);
         }
         let frame = Frame::from_normal(plane.normal);
         let wo = frame.to_local(-ray.direction);
         let is_mirror = Ggx::new(self.roughness).is_none();
         let directions = if is_mirror { 1 } else { DIRECTIONS };
-        let mut sum = Vec3::ZERO;
+        let (mut sum, mut share) = (Vec3::ZERO, 0.0);
         for index in 0..directions {
-            let mut sampler = Sampler::new(0, Stream::SHADOW, pixel, index);
+            let mut sampler = Sampler::new(0, Stream::SHADOW, place, index);
             if let Some(drawn) = self.sample(wo, sampler.next_2d()) {
                 let (radiance, light_pdf) = light.eval_with_pdf(frame.to_world(drawn.wi));
                 let own = self.eval(wo, drawn.wi).map_or(f32::INFINITY, |e| e.1);
+                share += drawn.weight;
                 sum += radiance * (drawn.weight * balance_heuristic(own, light_pdf));
             }
             let drawn = light.sample(sampler.next_2d());
@@ -131,7 +142,8 @@ impl Gloss {
                 sum += drawn.radiance * (value * weight);
             }
         }
-        sum / directions as f32
+        let n = directions as f32;
+        (sum / n, share / n)
     }
 
     /// The most that a direction is off the mirrored one, radians.
@@ -141,17 +153,23 @@ impl Gloss {
     }
 }
 
+/// Light that is added to the photograph behind a curve, or, below 0, taken from it.
+pub(crate) fn toned(tone: Option<&ToneMapper>, light: Vec3) -> Vec3 {
+    match tone {
+        Some(tone) if light != Vec3::ZERO => {
+            tone.object_pixel(light.max(Vec3::ZERO), 1.0) + light.min(Vec3::ZERO)
+        }
+        _ => light,
+    }
+}
+
 /// Adds light that ground mirrors to an object that has gone through its tone curve, if there is one.
-pub fn add(object: &mut Raster<Vec3>, mirrored: Raster<Vec3>, tone: Option<&ToneCurves>) {
+pub fn add(object: &mut Raster<Vec3>, mirrored: &Raster<Vec3>, tone: Option<&ToneCurves>) {
     let mapper = tone.map(ToneCurves::mapper);
     let pixels = object.pixels_mut().par_iter_mut();
-    pixels.zip(mirrored.pixels()).for_each(|(object, &light)| {
-        if light != Vec3::ZERO {
-            *object += mapper
-                .as_ref()
-                .map_or(light, |m| m.object_pixel(light, 1.0));
-        }
-    });
+    pixels
+        .zip(mirrored.pixels())
+        .for_each(|(object, &light)| *object += toned(mapper.as_ref(), light));
 }
 
 /// When the picture stops, whose mirror image is known: its error and that of the picture together are as wanted.
@@ -246,8 +264,7 @@ impl Renderer<'_> {
         blocks.into_par_iter().filter_map(job).collect()
     }
 
-    /// The object by way of the ground, if that is polished and the scene has such ground: its light, and as its coverage the
-    /// share of the lobe that it hides.
+    /// What the object changes of the light that the ground mirrors, if that is polished and the scene has such ground.
     pub(crate) fn render_mirrored<L: SceneLight>(
         &self,
         light: &PreparedLight<L>,
@@ -256,12 +273,12 @@ impl Renderer<'_> {
         settings: &Settings,
         start: Instant,
         progress: &mut Watch,
-    ) -> Result<Option<Rendered>, RenderError> {
-        let is_level = match &self.geometry().proxy {
-            ProxyGeometry::Plane(plane) => !self.geometry().is_below(plane),
-            _ => false,
+    ) -> Result<Option<Mirrored>, RenderError> {
+        let plane = match &self.geometry().proxy {
+            ProxyGeometry::Plane(plane) if !self.geometry().is_below(plane) => plane,
+            _ => return Ok(None),
         };
-        let Some(gloss) = settings.gloss.filter(|_| is_level && simulation.shadow) else {
+        let Some(gloss) = settings.gloss.filter(|_| simulation.shadow) else {
             return Ok(None);
         };
         let stop = match settings.stop {
@@ -293,7 +310,14 @@ impl Renderer<'_> {
                 ..*seen
             })
         };
-        world.gloss = Some(gloss);
+        let coat = Coat::new(
+            gloss,
+            plane,
+            self.camera(),
+            &light.on_object,
+            settings.background,
+        );
+        world.polished = Some(Polished { gloss, coat });
         let rendered = match stop {
             Stop::TimeBudget(budget) => self.render_within(
                 light,
@@ -317,109 +341,161 @@ impl Renderer<'_> {
                 )
             }
         };
-        world.gloss = None;
-        rendered.map(Some)
+        let polished = world.polished.take();
+        let coat = polished.expect("as set above").coat;
+        Ok(Some(Mirrored {
+            rendered: rendered?,
+            coat,
+        }))
     }
+}
 
-    /// Adds the `mirrored` object to the picture, whose errors add up.
-    pub(crate) fn lay_mirrored(
-        &self,
-        rendered: &mut Rendered,
-        mirrored: Rendered,
-        light: &impl PathLight,
-        settings: &Settings,
-    ) {
-        rendered.error.rmse = rendered.error.rmse.hypot(mirrored.error.rmse);
-        rendered.error.upper_95 = rendered.error.upper_95.hypot(mirrored.error.upper_95);
-        rendered.error.touched_pixels =
-            (rendered.error.touched_pixels).max(mirrored.error.touched_pixels);
-        rendered.samples += mirrored.samples;
-        rendered.counts.merge(&mirrored.counts);
-        rendered
-            .foresight
-            .learn_of_effort(mirrored.counts.total() + mirrored.samples);
-        let (Some(gloss), ProxyGeometry::Plane(plane)) = (settings.gloss, &self.geometry().proxy)
-        else {
-            return;
-        };
-        let film = &mut rendered.film;
+/// Ground that camera rays go on from.
+pub(crate) struct Polished {
+    pub(crate) gloss: Gloss,
+    coat: Coat,
+}
+
+impl Polished {
+    /// Radiance that is missing at the place `at` in the picture where the object fills the lobe.
+    #[inline]
+    pub(crate) fn hidden(&self, world: &World, at: Vec2) -> Vec3 {
+        let [width, height] = world.camera().resolution.map(|n| n as f32);
+        self.coat.at(at / Vec2::new(width, height)).from_everywhere
+    }
+}
+
+/// The picture of the object by way of the ground.
+pub(crate) struct Mirrored {
+    pub(crate) rendered: Rendered,
+    coat: Coat,
+}
+
+impl Mirrored {
+    /// Adds it to the picture, whose errors add up.
+    pub(crate) fn lay(self, picture: &mut Rendered, camera: &Camera, settings: &Settings) {
+        let Self { rendered, coat } = self;
+        let error = &mut picture.error;
+        error.rmse = error.rmse.hypot(rendered.error.rmse);
+        error.upper_95 = error.upper_95.hypot(rendered.error.upper_95);
+        error.touched_pixels = error.touched_pixels.max(rendered.error.touched_pixels);
+        picture.samples += rendered.samples;
+        picture.counts.merge(&rendered.counts);
+        let effort = rendered.counts.total() + rendered.samples;
+        picture.foresight.learn_of_effort(effort);
         let Film {
-            object,
-            alpha: covered,
+            shadow,
+            alpha,
+            mirrored,
             ..
-        } = mirrored.film;
-        let is_touched =
-            |x: usize, y: usize| *covered.get(x, y) > 0.0 || *film.shadow.get(x, y) != Vec3::ONE;
-        let coat = Coat::new(self.camera(), &is_touched, |ray, pixel| {
-            gloss.radiance(plane, light, ray, pixel)
-        });
-        let mut added = object;
-        let width = added.width();
-        let shadows = film.shadow.pixels_mut().par_chunks_mut(width);
+        } = &mut picture.film;
+        let mut added = rendered.film.object;
+        let [width, height] = [added.width(), added.height()];
+        let size = Vec2::new(width as f32, height as f32);
+        let shadows = shadow.pixels_mut().par_chunks_mut(width);
         let rows = shadows.zip(added.pixels_mut().par_chunks_mut(width));
-        let alpha = &film.alpha;
         rows.enumerate().for_each(|(y, (shadows, added))| {
             for (x, (shadow, added)) in shadows.iter_mut().zip(added).enumerate() {
-                let covered = *covered.get(x, y);
-                if covered == 0.0 && *shadow == Vec3::ONE {
+                if *added == Vec3::ZERO && *shadow == Vec3::ONE {
                     continue;
                 }
                 let pixel = Vec2::new(x as f32, y as f32) + 0.5;
                 let surfaces = settings.seen_surfaces;
-                let seen = surfaces.map_or(1.0, |s| 1.0 - s.share_at(self.camera(), pixel));
-                let share = coat.share(x, y, background(settings.background, x, y)) * seen;
-                *shadow += share * (Vec3::splat(1.0 - covered) - *shadow);
-                *added *= seen * (1.0 - alpha.get(x, y).clamp(0.0, 1.0));
+                let seen = surfaces.map_or(1.0, |s| 1.0 - s.share_at(camera, pixel));
+                let photo = background(settings.background, x, y);
+                let coat = coat.at(pixel / size).sent.min(photo);
+                let of_photo = |light: Vec3| {
+                    let share = |c: usize| {
+                        if photo[c] > 0.0 {
+                            light[c] / photo[c]
+                        } else {
+                            0.0
+                        }
+                    };
+                    Vec3::new(share(0), share(1), share(2))
+                };
+                let lightened = of_photo(coat) * (Vec3::ONE - *shadow);
+                let darkened = of_photo(added.min(Vec3::ZERO));
+                *shadow = (*shadow + (lightened + darkened) * seen).max(Vec3::ZERO);
+                let uncovered = 1.0 - alpha.get(x, y).clamp(0.0, 1.0);
+                *added = added.max(Vec3::ZERO) * (seen * uncovered);
             }
         });
-        film.mirrored = Some(added);
+        *mirrored = Some(added);
     }
 }
 
-/// What the coat sends to the camera without the object, at places [`STEP`] pixels apart.
-struct Coat(Raster<Vec3>);
+/// The coat without the object, on a grid over the picture.
+struct Coat(Raster<CoatPoint>);
+
+#[derive(Clone, Copy, Debug, Default)]
+struct CoatPoint {
+    /// Radiance that it sends to the camera, that of the photograph around at most.
+    sent: Vec3,
+    /// That over the share of light that the coat reflects: the mean radiance in its lobe.
+    from_everywhere: Vec3,
+}
+
+impl CoatPoint {
+    fn mix(self, other: Self, along: f32) -> Self {
+        Self {
+            sent: self.sent.lerp(other.sent, along),
+            from_everywhere: self.from_everywhere.lerp(other.from_everywhere, along),
+        }
+    }
+}
 
 impl Coat {
-    /// Where pixels are touched; `radiance(ray, number)` is that along a camera's ray.
     fn new(
+        gloss: Gloss,
+        plane: &Plane,
         camera: &Camera,
-        is_touched: &(impl Fn(usize, usize) -> bool + Sync),
-        radiance: impl Fn(&Ray, u32) -> Vec3 + Sync,
+        light: &impl PathLight,
+        photo: Option<&LinearImage>,
     ) -> Self {
         let size = camera.resolution.map(|n| n as usize);
-        let [columns, rows] = size.map(|n| n / STEP + 2);
-        let near =
-            |at: usize, end: usize| (STEP * at).saturating_sub(STEP)..(STEP * (at + 1)).min(end);
+        let step = LEAST_STEP.max(((size[0] * size[1]) as f32 / MOST_PLACES).sqrt());
+        let [columns, rows] = size.map(|n| (n as f32 / step).ceil() as usize + 1);
         let at = |i: usize| {
-            let (column, row) = (i % columns, i / columns);
-            let mut pixels =
-                near(row, size[1]).flat_map(|y| near(column, size[0]).map(move |x| (x, y)));
-            if !pixels.any(|(x, y)| is_touched(x, y)) {
-                return Vec3::ZERO;
+            let place =
+                |n: usize, all: usize, k: usize| n as f32 / (all - 1) as f32 * size[k] as f32;
+            let at = Vec2::new(place(i % columns, columns, 0), place(i / columns, rows, 1));
+            let (sent, share) = gloss.radiance(plane, light, &camera.ray(at), i as u32);
+            let around = |k: usize| {
+                let end = (at[k] + 0.5 * step).ceil() as usize;
+                ((at[k] - 0.5 * step).max(0.0) as usize).min(size[k] - 1)..end.min(size[k])
+            };
+            let (mut sum, mut count) = (Vec3::ZERO, 0.0);
+            for y in around(1) {
+                for x in around(0) {
+                    sum += background(photo, x, y);
+                    count += 1.0;
+                }
             }
-            let place = Vec2::new(column as f32, row as f32) * STEP as f32;
-            radiance(&camera.ray(place), i as u32)
+            let sent = sent.min(sum / count);
+            CoatPoint {
+                sent,
+                from_everywhere: if share > 0.0 {
+                    sent / share
+                } else {
+                    Vec3::ZERO
+                },
+            }
         };
-        let values = (0..columns * rows).into_par_iter().map(at).collect();
-        Self(Raster::from_pixels(columns, rows, values))
+        let points = (0..columns * rows).into_par_iter().map(at).collect();
+        Self(Raster::from_pixels(columns, rows, points))
     }
 
-    /// Its share of `photo`, which a pixel shows.
-    fn share(&self, x: usize, y: usize, photo: Vec3) -> Vec3 {
-        let place = (Vec2::new(x as f32, y as f32) + 0.5) / STEP as f32;
-        let first = place.floor();
-        let along = place - first;
-        let row = |y: usize| {
-            let x = first.x as usize;
-            self.0.get(x, y).lerp(*self.0.get(x + 1, y), along.x)
-        };
-        let y = first.y as usize;
-        let sent = row(y).lerp(row(y + 1), along.y);
-        let share = |c: usize| match photo[c] > 0.0 {
-            true => (sent[c] / photo[c]).min(1.0),
-            false => 0.0,
-        };
-        Vec3::new(share(0), share(1), share(2))
+    /// At a place in the picture, a share of its sides.
+    fn at(&self, place: Vec2) -> CoatPoint {
+        let size = [self.0.width(), self.0.height()];
+        let [(x, u), (y, v)] = [0, 1].map(|k| {
+            let at = place[k].clamp(0.0, 1.0) * (size[k] - 1) as f32;
+            let first = (at as usize).min(size[k] - 2);
+            (first, at - first as f32)
+        });
+        let row = |y: usize| self.0.get(x, y).mix(*self.0.get(x + 1, y), u);
+        row(y).mix(row(y + 1), v)
     }
 }
 

@@ -226,7 +226,7 @@ impl Job {
         let blocked = Vec3::new(a, b, c);
         match self.layer {
             // Covered pixels are covered whatever the weights of their samples.
-            Layer::Object if samples > 0.0 && e > 0.0 => (blocked / samples, d / e),
+            Layer::Object if samples > 0.0 => (blocked / samples, d / e),
             Layer::Object => (Vec3::ZERO, 0.0),
             Layer::PlaneShadow | Layer::MeshShadow => {
                 let sums = ShadowSums {

@@ -277,7 +277,7 @@ impl<'a> Renderer<'a> {
         };
         let mirrored = self.render_mirrored(light, world, simulation, settings, start, progress)?;
         let settings = &Settings {
-            stop: gloss::stop_after(settings.stop, mirrored.as_ref()),
+            stop: gloss::stop_after(settings.stop, mirrored.as_ref().map(|m| &m.rendered)),
             ..*settings
         };
         let mut share = gloss::progress_after(mirrored.is_some(), progress);
@@ -292,7 +292,7 @@ impl<'a> Renderer<'a> {
             }
         }?;
         if let Some(mirrored) = mirrored {
-            self.lay_mirrored(&mut rendered, mirrored, &light.on_object, settings);
+            mirrored.lay(&mut rendered, self.camera(), settings);
         }
         if let Some(mask) = settings.occluders {
             let of_shadow = settings.shadow_mask.unwrap_or(mask);
@@ -321,8 +321,10 @@ impl<'a> Renderer<'a> {
             .bvh
             .bounding_sphere()
             .map(|whole| Blocker::new(whole, self.geometry.bvh.clusters()));
-        let mut jobs = match (&world.gloss, &blocker) {
-            (Some(gloss), Some(blocker)) => self.mirror_jobs(gloss, blocker, settings.shadow_mask),
+        let mut jobs = match (&world.polished, &blocker) {
+            (Some(ground), Some(blocker)) => {
+                self.mirror_jobs(&ground.gloss, blocker, settings.shadow_mask)
+            }
             _ => self.object_jobs(settings),
         };
         let mut guide_rays = RayCounts::default();
@@ -392,7 +394,7 @@ impl<'a> Renderer<'a> {
             tone: settings.tone.map(ToneCurves::mapper),
             transfer: settings.transfer,
             gain: settings.gain,
-            adds: path.world.gloss.is_some(),
+            adds: path.world.polished.is_some(),
         };
         let find_highlights = |film: &Film, jobs: &[Job]| {
             if !settings.highlights || matches!(settings.stop, Stop::Samples(_)) {

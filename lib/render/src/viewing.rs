@@ -6,6 +6,7 @@ use dipir_imaging::transfer::Transfer;
 use glam::Vec3;
 
 use crate::film::Film;
+use crate::gloss;
 use crate::job::{Job, Layer, REPLICATES};
 
 /// The picture that the layers go into: decides which errors are seen.
@@ -50,18 +51,15 @@ impl Viewing<'_> {
 
     /// The picture at a pixel, linear, where the layers have these values.
     fn laid_over(&self, (x, y): (usize, usize), object: Vec3, alpha: f32, shadow: Vec3) -> Vec3 {
-        let alpha = match self.adds {
-            true if object == Vec3::ZERO => 0.0,
-            true => 1.0,
-            false => alpha,
-        };
+        if self.adds {
+            return self.background(x, y) + gloss::toned(self.tone.as_ref(), object);
+        }
         let (object, shadow) = match &self.tone {
             // Most of the ground is in no shadow.
             Some(tone) if shadow == Vec3::ONE => (tone.object_pixel(object, alpha), shadow),
             Some(tone) => (tone.object_pixel(object, alpha), tone.shadow_pixel(shadow)),
             None => (object, shadow),
         };
-        let alpha = if self.adds { 0.0 } else { alpha };
         composite_pixel(self.background(x, y), object, alpha, shadow)
     }
 

@@ -16,7 +16,7 @@ use crate::bsdf::features::{ALPHA, EXTENSIONS, SPECULAR, TRANSMISSION, has};
 use crate::convexity::is_convex;
 use crate::counters::{RayCounts, RayKind};
 use crate::error::RenderError;
-use crate::gloss::Gloss;
+use crate::gloss::Polished;
 use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
 
 /// The proxy, ready for rays.
@@ -165,8 +165,8 @@ pub struct World<'a> {
     pub surfaces: Surfaces<'a>,
     /// The effects that `surfaces` was prepared for ([`crate::features`]).
     pub mask: u32,
-    /// Rays from the camera go on from ground of this kind.
-    pub(crate) gloss: Option<Gloss>,
+    /// Rays from the camera go on from this ground.
+    pub(crate) polished: Option<Polished>,
     /// No ray that leaves the object outwards meets it again, and none passes through.
     pub escapes: bool,
 }
@@ -206,7 +206,7 @@ impl<'a> World<'a> {
             geometry,
             surfaces,
             mask,
-            gloss: None,
+            polished: None,
         })
     }
 

@@ -69,6 +69,8 @@ pub(crate) struct Error {
 enum Kind {
     Object,
     Shadow,
+    /// Light of the object by way of the ground, which has no edges.
+    Mirrored,
 }
 
 impl Kind {
@@ -77,11 +79,12 @@ impl Kind {
         match self {
             Kind::Object => job.layer == Layer::Object && job.density.is_none(),
             Kind::Shadow => job.layer != Layer::Object,
+            Kind::Mirrored => true,
         }
     }
 }
 
-/// Shadow ratios are compared by luminance.
+/// Shadow ratios and mirrored light are compared by luminance.
 const SHADOW: Comparison<1, 2> = Comparison {
     with_own: true,
     channels: |ratio| [luminance(ratio)],
@@ -134,7 +137,7 @@ impl<'a> Tiles<'a> {
     fn halves(&self, x: usize, y: usize) -> Halves {
         let mut halves = Halves {
             values: [Vec3::ZERO; REPLICATES],
-            is_inside: self.kind == Kind::Shadow,
+            is_inside: self.kind != Kind::Object,
             seen: self.auxiliary.get(x, y),
         };
         let Some(job) = self.job(x / BLOCK, y / BLOCK) else {
@@ -151,13 +154,14 @@ impl<'a> Tiles<'a> {
                 halves.is_inside = estimates.iter().all(|e| e.1 >= 1.0);
             }
             Kind::Shadow => halves.values = estimates.map(|e| Vec3::ONE - e.0),
+            Kind::Mirrored => halves.values = estimates.map(|e| e.0),
         }
         halves
     }
 
     /// Whether the filter changes a pixel of its jobs.
     fn is_filtered(&self, (x, y): (u32, u32)) -> bool {
-        self.kind == Kind::Shadow || self.halves(x as usize, y as usize).is_inside
+        self.kind != Kind::Object || self.halves(x as usize, y as usize).is_inside
     }
 
     /// The jobs of the tiles up to `reach` away from that of `job`.
@@ -234,7 +238,7 @@ fn filter<const CHANNELS: usize, const PATCH: usize>(
             },
         });
         let value = match tiles.kind {
-            Kind::Object => (fa + fb) * 0.5,
+            Kind::Object | Kind::Mirrored => (fa + fb) * 0.5,
             Kind::Shadow => Vec3::ONE - (fa + fb) * 0.5,
         };
         (pixel, (value, residual))
@@ -290,7 +294,11 @@ impl<'a> Denoiser<'a> {
     ) -> Vec<Option<Error>> {
         self.known.resize(jobs.len(), Known::default());
         let mut errors = vec![None; jobs.len()];
-        for kind in [Kind::Object, Kind::Shadow] {
+        let kinds: &[Kind] = match viewing.adds {
+            true => &[Kind::Mirrored],
+            false => &[Kind::Object, Kind::Shadow],
+        };
+        for &kind in kinds {
             let of_kind = || jobs.iter().filter(|job| kind.holds(job));
             if of_kind().all(|job| job.samples > 0) {
                 let tiles = Tiles::new(kind, jobs, self.auxiliary, film);
@@ -359,7 +367,7 @@ fn filter_where(
     for indices in wanted.chunks(AT_ONCE) {
         let filter = |&index: &usize| match tiles.kind {
             Kind::Object => filter(OBJECT, tiles, &tiles.jobs[index], film, viewing),
-            Kind::Shadow => filter(SHADOW, tiles, &tiles.jobs[index], film, viewing),
+            _ => filter(SHADOW, tiles, &tiles.jobs[index], film, viewing),
         };
         let filtered: Vec<_> = indices.par_iter().map(filter).collect();
         for (&index, filtered) in indices.iter().zip(filtered) {

@@ -77,10 +77,13 @@ fn advance_object_with<L: PathLight, const F: u32>(
                 let point = corner + place;
                 let (seen, share) =
                     path.trace_from_image::<F, _>(point, &mut sampler, &mut counts, &mut light);
+                if let Some(ground) = &path.world.polished {
+                    light.sum -= ground.hidden(path.world, point) * (seen * share);
+                }
                 radiance += light.sum * weight;
                 squares += light.sum * light.sum * (weight * weight);
-                coverage += seen * weight * share;
-                weights += weight * share;
+                coverage += seen * weight;
+                weights += weight;
                 if measured.is_some() {
                     found[replicate].add(&light, weight);
                 }

@@ -406,7 +406,7 @@ impl<'a> Composite<'a> {
         } = film;
         let (mut object, shadow) = curve.apply(object, &alpha, shadow);
         if let Some(mirrored) = mirrored {
-            gloss::add(&mut object, mirrored, curve.curves());
+            gloss::add(&mut object, &mirrored, curve.curves());
         }
         let mut layers = Overlay {
             object,
