@@ -17,6 +17,7 @@ mod look;
 mod manual;
 mod page;
 mod pipeline;
+mod polished_ground;
 mod pretraining;
 mod printing;
 mod project;

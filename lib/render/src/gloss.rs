@@ -10,6 +10,7 @@
 //! What is in brackets comes from a picture of its own, of the object by way of the ground: one path a sample, whose first
 //! direction is drawn from the normals that are visible from the camera. Where it adds light it is a layer, else part of the
 //! shadow ratio.
+use std::borrow::Cow;
 use std::ops::ControlFlow;
 use std::time::Instant;
 
@@ -23,10 +24,11 @@ use dipir_scene::proxy::Plane;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::adaptive::{Progress, Stop, Watch};
+use crate::adaptive::{EstimatedError, Progress, Stop, Watch};
 use crate::blocker::Blocker;
 use crate::bsdf::fresnel::schlick_weight;
 use crate::bsdf::ggx::{Ggx, reflect};
+use crate::coarse::shrink;
 use crate::error::RenderError;
 use crate::film::Film;
 use crate::job::{Job, Layer, PixelSet};
@@ -47,9 +49,12 @@ pub struct Gloss {
 
 /// Share of a lobe's microfacets that lean less than what is looked at.
 const LEANING: f32 = 0.99;
-/// Share of a target error, and of a time budget, that is spent on the mirror image.
-const SHARE: f64 = 0.5;
-const SHARE_OF_TIME: f64 = 0.25;
+/// Share of a target error, and of a time budget, that is spent on the picture without its mirror image.
+const SHARE: f64 = 0.9;
+const SHARE_OF_TIME: f64 = 0.75;
+/// The coat's part of what the photograph shows at most, unless it reflects more from above: light that the map has where
+/// the mirrored ray goes may not be what is mirrored there, for the map is of one place.
+const MOST_OF_COAT: f32 = 0.75;
 /// Pixels between the places where the coat's part is known, at least, and most such places.
 const LEAST_STEP: f32 = 4.0;
 const MOST_PLACES: f32 = 65536.0;
@@ -172,26 +177,37 @@ pub fn add(object: &mut Raster<Vec3>, mirrored: &Raster<Vec3>, tone: Option<&Ton
         .for_each(|(object, &light)| *object += toned(mapper.as_ref(), light));
 }
 
-/// When the picture stops, whose mirror image is known: its error and that of the picture together are as wanted.
-pub(crate) fn stop_after(stop: Stop, mirrored: Option<&Rendered>) -> Stop {
-    match (stop, mirrored) {
-        (Stop::TargetError(target), Some(mirrored)) => {
-            let all = f64::from(target).powi(2);
-            let left = all - mirrored.error.upper_95.powi(2);
-            Stop::TargetError(left.max(all * (1.0 - SHARE * SHARE)).sqrt() as f32)
+/// The settings of the picture without its mirror image, if that is to follow.
+pub(crate) fn before<'a>(follows: bool, settings: &Settings<'a>) -> Settings<'a> {
+    let stop = match settings.stop {
+        Stop::TargetError(e) if follows => Stop::TargetError((f64::from(e) * SHARE) as f32),
+        Stop::TimeBudget(t) if follows => Stop::TimeBudget(t.mul_f64(SHARE_OF_TIME)),
+        stop => stop,
+    };
+    Settings { stop, ..*settings }
+}
+
+/// When the mirror image of a picture with such an `error` stops: both together have the error that is wanted.
+fn after(stop: Stop, error: &EstimatedError) -> Stop {
+    match stop {
+        Stop::TargetError(e) => {
+            let all = f64::from(e).powi(2);
+            let left = all - error.upper_95.powi(2);
+            let left = left.max(all * (1.0 - SHARE * SHARE) * 0.5);
+            Stop::TargetError(left.sqrt() as f32)
         }
-        _ => stop,
+        stop => stop,
     }
 }
 
-/// Progress of the picture, which follows its mirror image if it `is_second`.
-pub(crate) fn progress_after<'a>(
-    is_second: bool,
-    progress: &'a mut Watch,
-) -> impl FnMut(&Progress) -> ControlFlow<()> + 'a {
-    let before = if is_second { SHARE_OF_TIME } else { 0.0 };
+/// Progress of the picture without its mirror image, if that follows.
+pub(crate) fn first<'a, 'w>(
+    follows: bool,
+    progress: &'a mut Watch<'w>,
+) -> impl FnMut(&Progress) -> ControlFlow<()> + use<'a, 'w> {
+    let share = if follows { SHARE_OF_TIME } else { 1.0 };
     move |seen| {
-        let fraction = before + (1.0 - before) * seen.fraction;
+        let fraction = share * seen.fraction;
         progress(&Progress { fraction, ..*seen })
     }
 }
@@ -204,12 +220,7 @@ fn sides(block: Block) -> [f32; 4] {
 
 impl Renderer<'_> {
     /// The jobs that show the object by way of the ground.
-    pub(crate) fn mirror_jobs(
-        &self,
-        gloss: &Gloss,
-        blocker: &Blocker,
-        hidden: Option<&Raster<f32>>,
-    ) -> Vec<Job> {
+    pub(crate) fn mirror_jobs(&self, ground: &Polished, blocker: &Blocker) -> Vec<Job> {
         let ProxyGeometry::Plane(plane) = &self.geometry().proxy else {
             return vec![];
         };
@@ -220,7 +231,8 @@ impl Renderer<'_> {
             let mirrored = along - 2.0 * along.dot(plane.normal) * plane.normal;
             Some((plane_point(plane, &ray)?, mirrored))
         };
-        let spread = gloss.spread();
+        let spread = ground.gloss.spread();
+        let seen = ground.seen_at(camera.resolution);
         // Whether the object may be in the lobe of any point of a rectangle; for one that is cut by the horizon it may.
         let may_show = |[left, top, right, bottom]: [f32; 4]| {
             let corners = [(left, top), (right, top), (left, bottom), (right, bottom)];
@@ -255,7 +267,7 @@ impl Renderer<'_> {
                     width: 1,
                     height: 1,
                 };
-                let is_hidden = hidden.is_some_and(|m| *m.get(x as usize, y as usize) >= 1.0);
+                let is_hidden = seen.is_some_and(|s| *s.get(x as usize, y as usize) == 0.0);
                 !is_hidden && may_show(sides(pixel))
             });
             (!pixels.is_empty()).then(|| Job::new(Layer::Object, block, pixels, None))
@@ -264,51 +276,29 @@ impl Renderer<'_> {
         blocks.into_par_iter().filter_map(job).collect()
     }
 
-    /// What the object changes of the light that the ground mirrors, if that is polished and the scene has such ground.
-    pub(crate) fn render_mirrored<L: SceneLight>(
+    /// How the ground is polished, if it is a plane that mirrors something.
+    pub(crate) fn gloss_of(&self, settings: &Settings, simulation: &Simulation) -> Option<Gloss> {
+        let mirrors = match &self.geometry().proxy {
+            ProxyGeometry::Plane(plane) => simulation.shadow && !self.geometry().is_below(plane),
+            _ => false,
+        };
+        settings.gloss.filter(|_| mirrors)
+    }
+
+    /// Adds what the object changes of the light that the ground mirrors. Errors add up.
+    pub(crate) fn add_mirrored<L: SceneLight>(
         &self,
+        picture: &mut Rendered,
+        gloss: Gloss,
         light: &PreparedLight<L>,
         world: &mut World,
         simulation: &Simulation,
         settings: &Settings,
         start: Instant,
         progress: &mut Watch,
-    ) -> Result<Option<Mirrored>, RenderError> {
-        let plane = match &self.geometry().proxy {
-            ProxyGeometry::Plane(plane) if !self.geometry().is_below(plane) => plane,
-            _ => return Ok(None),
-        };
-        let Some(gloss) = settings.gloss.filter(|_| simulation.shadow) else {
-            return Ok(None);
-        };
-        let stop = match settings.stop {
-            Stop::Samples(n) => Stop::Samples(n),
-            Stop::TargetError(e) => Stop::TargetError((f64::from(e) * SHARE) as f32),
-            Stop::TimeBudget(budget) => {
-                let left = budget.saturating_sub(start.elapsed());
-                Stop::TimeBudget(start.elapsed() + left.mul_f64(SHARE_OF_TIME))
-            }
-        };
-        let settings = Settings {
-            seed: hash_u64s(&[settings.seed, 1]),
-            stop,
-            highlights: false,
-            leave_out: None,
-            occluders: None,
-            ..*settings
-        };
-        let simulation = Simulation {
-            shadow: false,
-            light_on_proxy: None,
-            ..*simulation
-        };
-        let mut progress = |seen: &Progress| {
-            let fraction = SHARE_OF_TIME * seen.fraction;
-            progress(&Progress {
-                round: 0,
-                fraction,
-                ..*seen
-            })
+    ) -> Result<(), RenderError> {
+        let ProxyGeometry::Plane(plane) = &self.geometry().proxy else {
+            return Ok(());
         };
         let coat = Coat::new(
             gloss,
@@ -317,36 +307,46 @@ impl Renderer<'_> {
             &light.on_object,
             settings.background,
         );
-        world.polished = Some(Polished { gloss, coat });
-        let rendered = match stop {
-            Stop::TimeBudget(budget) => self.render_within(
-                light,
-                world,
-                &simulation,
-                &settings,
-                budget,
-                start,
-                &mut progress,
-            ),
-            _ => {
-                let most = settings.most_pixels;
-                self.render_at_most(
-                    most,
-                    light,
-                    world,
-                    &simulation,
-                    &settings,
-                    start,
-                    &mut progress,
-                )
-            }
+        let ground = Polished::new(gloss, coat, &mut picture.film, self.camera(), settings);
+        let settings = Settings {
+            seed: hash_u64s(&[settings.seed, 1]),
+            stop: after(settings.stop, &picture.error),
+            highlights: false,
+            leave_out: None,
+            ..*settings
         };
-        let polished = world.polished.take();
-        let coat = polished.expect("as set above").coat;
-        Ok(Some(Mirrored {
-            rendered: rendered?,
-            coat,
-        }))
+        let simulation = Simulation {
+            shadow: false,
+            light_on_proxy: None,
+            ..*simulation
+        };
+        let known = picture.error;
+        let mut progress = |seen: &Progress| {
+            let fraction = SHARE_OF_TIME + (1.0 - SHARE_OF_TIME) * seen.fraction;
+            progress(&Progress {
+                round: picture.rounds,
+                error: known,
+                fraction,
+                ..*seen
+            })
+        };
+        world.polished = Some(ground);
+        let mirrored =
+            self.render_layers(light, world, &simulation, &settings, start, &mut progress);
+        let ground = world.polished.take();
+        let mirrored = mirrored?;
+        let error = &mut picture.error;
+        error.rmse = error.rmse.hypot(mirrored.error.rmse);
+        error.upper_95 = error.upper_95.hypot(mirrored.error.upper_95);
+        error.touched_pixels = error.touched_pixels.max(mirrored.error.touched_pixels);
+        picture.samples += mirrored.samples;
+        picture.counts.merge(&mirrored.counts);
+        let effort = mirrored.counts.total() + mirrored.samples;
+        picture.foresight.learn_of_effort(effort);
+        if let Some(ground) = ground {
+            ground.lay(mirrored.film.object, &mut picture.film, settings.background);
+        }
+        Ok(())
     }
 }
 
@@ -354,75 +354,111 @@ impl Renderer<'_> {
 pub(crate) struct Polished {
     pub(crate) gloss: Gloss,
     coat: Coat,
+    /// What is seen of it in each pixel of the picture, beside the object.
+    seen: Raster<f32>,
+    /// The picture without what the object changes of the light that it mirrors.
+    laid: LinearImage,
 }
 
 impl Polished {
+    /// Lightens the shadow of `film` by what the coat sends.
+    fn new(
+        gloss: Gloss,
+        coat: Coat,
+        film: &mut Film,
+        camera: &Camera,
+        settings: &Settings,
+    ) -> Self {
+        let [width, height] = [film.alpha.width(), film.alpha.height()];
+        let size = Vec2::new(width as f32, height as f32);
+        let mask = settings.shadow_mask.or(settings.occluders);
+        let mut laid = Raster::filled(width, height, Vec3::ZERO);
+        let mut seen = Raster::filled(width, height, 0.0);
+        let rows = laid.pixels_mut().par_chunks_mut(width);
+        let rows = rows.zip(seen.pixels_mut().par_chunks_mut(width));
+        let rows = rows.zip(film.shadow.pixels_mut().par_chunks_mut(width));
+        let (alpha, surfaces) = (&film.alpha, settings.seen_surfaces);
+        rows.enumerate().for_each(|(y, ((laid, seen), shadows))| {
+            for x in 0..width {
+                let pixel = Vec2::new(x as f32, y as f32) + 0.5;
+                let beside = surfaces.map_or(1.0, |s| 1.0 - s.share_at(camera, pixel));
+                let photo = background(settings.background, x, y);
+                let shadow = &mut shadows[x];
+                if *shadow != Vec3::ONE {
+                    let sent = coat.at(pixel / size).sent.min(photo);
+                    *shadow += over(sent, photo) * (Vec3::ONE - *shadow) * beside;
+                }
+                let is_hidden =
+                    *alpha.get(x, y) >= 1.0 || mask.is_some_and(|m| *m.get(x, y) >= 1.0);
+                seen[x] = if is_hidden { 0.0 } else { beside };
+                laid[x] = photo * *shadow;
+            }
+        });
+        Self {
+            gloss,
+            coat,
+            seen,
+            laid: LinearImage(laid),
+        }
+    }
+
     /// Radiance that is missing at the place `at` in the picture where the object fills the lobe.
     #[inline]
     pub(crate) fn hidden(&self, world: &World, at: Vec2) -> Vec3 {
         let [width, height] = world.camera().resolution.map(|n| n as f32);
         self.coat.at(at / Vec2::new(width, height)).from_everywhere
     }
-}
 
-/// The picture of the object by way of the ground.
-pub(crate) struct Mirrored {
-    pub(crate) rendered: Rendered,
-    coat: Coat,
-}
+    /// How much of it is seen, if that is known at this resolution.
+    fn seen_at(&self, resolution: [u32; 2]) -> Option<&Raster<f32>> {
+        let size = [self.seen.width(), self.seen.height()];
+        (size == resolution.map(|n| n as usize)).then_some(&self.seen)
+    }
 
-impl Mirrored {
-    /// Adds it to the picture, whose errors add up.
-    pub(crate) fn lay(self, picture: &mut Rendered, camera: &Camera, settings: &Settings) {
-        let Self { rendered, coat } = self;
-        let error = &mut picture.error;
-        error.rmse = error.rmse.hypot(rendered.error.rmse);
-        error.upper_95 = error.upper_95.hypot(rendered.error.upper_95);
-        error.touched_pixels = error.touched_pixels.max(rendered.error.touched_pixels);
-        picture.samples += rendered.samples;
-        picture.counts.merge(&rendered.counts);
-        let effort = rendered.counts.total() + rendered.samples;
-        picture.foresight.learn_of_effort(effort);
-        let Film {
-            shadow,
-            alpha,
-            mirrored,
-            ..
-        } = &mut picture.film;
-        let mut added = rendered.film.object;
-        let [width, height] = [added.width(), added.height()];
-        let size = Vec2::new(width as f32, height as f32);
-        let shadows = shadow.pixels_mut().par_chunks_mut(width);
-        let rows = shadows.zip(added.pixels_mut().par_chunks_mut(width));
-        rows.enumerate().for_each(|(y, (shadows, added))| {
-            for (x, (shadow, added)) in shadows.iter_mut().zip(added).enumerate() {
-                if *added == Vec3::ZERO && *shadow == Vec3::ONE {
-                    continue;
+    /// The picture, at a resolution no finer than its own.
+    pub(crate) fn laid_at(&self, resolution: [u32; 2]) -> Cow<'_, LinearImage> {
+        match self.seen_at(resolution) {
+            Some(_) => Cow::Borrowed(&self.laid),
+            None => {
+                let size = resolution.map(|n| n as usize);
+                Cow::Owned(LinearImage(shrink(&self.laid.0, size)))
+            }
+        }
+    }
+
+    /// Adds to the picture what the object `changes`.
+    fn lay(self, changes: Raster<Vec3>, film: &mut Film, photo: Option<&LinearImage>) {
+        let mut changes = changes;
+        let width = changes.width();
+        let alpha = &film.alpha;
+        let shadows = film.shadow.pixels_mut().par_chunks_mut(width);
+        let rows = shadows.zip(changes.pixels_mut().par_chunks_mut(width));
+        rows.enumerate().for_each(|(y, (shadows, changes))| {
+            for (x, (shadow, change)) in shadows.iter_mut().zip(changes).enumerate() {
+                if *change != Vec3::ZERO {
+                    let seen = *self.seen.get(x, y);
+                    let photo = background(photo, x, y);
+                    let taken = over(change.min(Vec3::ZERO), photo);
+                    *shadow = (*shadow + taken * seen).max(Vec3::ZERO);
+                    let uncovered = 1.0 - alpha.get(x, y).clamp(0.0, 1.0);
+                    *change = change.max(Vec3::ZERO) * (seen * uncovered);
                 }
-                let pixel = Vec2::new(x as f32, y as f32) + 0.5;
-                let surfaces = settings.seen_surfaces;
-                let seen = surfaces.map_or(1.0, |s| 1.0 - s.share_at(camera, pixel));
-                let photo = background(settings.background, x, y);
-                let coat = coat.at(pixel / size).sent.min(photo);
-                let of_photo = |light: Vec3| {
-                    let share = |c: usize| {
-                        if photo[c] > 0.0 {
-                            light[c] / photo[c]
-                        } else {
-                            0.0
-                        }
-                    };
-                    Vec3::new(share(0), share(1), share(2))
-                };
-                let lightened = of_photo(coat) * (Vec3::ONE - *shadow);
-                let darkened = of_photo(added.min(Vec3::ZERO));
-                *shadow = (*shadow + (lightened + darkened) * seen).max(Vec3::ZERO);
-                let uncovered = 1.0 - alpha.get(x, y).clamp(0.0, 1.0);
-                *added = added.max(Vec3::ZERO) * (seen * uncovered);
             }
         });
-        *mirrored = Some(added);
+        film.mirrored = Some(changes);
     }
+}
+
+/// `light` over what the photograph shows, 0 where that is black.
+fn over(light: Vec3, photo: Vec3) -> Vec3 {
+    let share = |c: usize| {
+        if photo[c] > 0.0 {
+            light[c] / photo[c]
+        } else {
+            0.0
+        }
+    };
+    Vec3::new(share(0), share(1), share(2))
 }
 
 /// The coat without the object, on a grid over the picture.
@@ -472,7 +508,8 @@ impl Coat {
                     count += 1.0;
                 }
             }
-            let sent = sent.min(sum / count);
+            let most = MOST_OF_COAT.max(gloss.reflectance);
+            let sent = sent.min(sum * (most / count));
             CoatPoint {
                 sent,
                 from_everywhere: if share > 0.0 {

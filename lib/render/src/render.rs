@@ -275,14 +275,42 @@ impl<'a> Renderer<'a> {
                 _ => Vec::new(),
             },
         };
-        let mirrored = self.render_mirrored(light, world, simulation, settings, start, progress)?;
-        let settings = &Settings {
-            stop: gloss::stop_after(settings.stop, mirrored.as_ref().map(|m| &m.rendered)),
-            ..*settings
-        };
-        let mut share = gloss::progress_after(mirrored.is_some(), progress);
-        let progress: &mut Watch = &mut share;
-        let mut rendered = match settings.stop {
+        let gloss = self.gloss_of(settings, simulation);
+        let plain = &gloss::before(gloss.is_some(), settings);
+        let mut first = gloss::first(gloss.is_some(), progress);
+        let mut rendered =
+            self.render_layers(light, world, simulation, plain, start, &mut first)?;
+        drop(first);
+        if let Some(gloss) = gloss {
+            self.add_mirrored(
+                &mut rendered,
+                gloss,
+                light,
+                world,
+                simulation,
+                settings,
+                start,
+                progress,
+            )?;
+        }
+        if let Some(mask) = settings.occluders {
+            let of_shadow = settings.shadow_mask.unwrap_or(mask);
+            rendered.film.hide_behind(mask, of_shadow);
+        }
+        Ok(rendered)
+    }
+
+    /// Renders the layers at the resolution that the settings ask for, occluders left aside.
+    pub(crate) fn render_layers<L: SceneLight>(
+        &self,
+        light: &PreparedLight<L>,
+        world: &mut World,
+        simulation: &Simulation,
+        settings: &Settings,
+        start: Instant,
+        progress: &mut Watch,
+    ) -> Result<Rendered, RenderError> {
+        match settings.stop {
             Stop::TimeBudget(budget) => {
                 self.render_within(light, world, simulation, settings, budget, start, progress)
             }
@@ -290,15 +318,7 @@ impl<'a> Renderer<'a> {
                 let most = settings.most_pixels;
                 self.render_at_most(most, light, world, simulation, settings, start, progress)
             }
-        }?;
-        if let Some(mirrored) = mirrored {
-            mirrored.lay(&mut rendered, self.camera(), settings);
         }
-        if let Some(mask) = settings.occluders {
-            let of_shadow = settings.shadow_mask.unwrap_or(mask);
-            rendered.film.hide_behind(mask, of_shadow);
-        }
-        Ok(rendered)
     }
 
     /// Renders the layers of `world`, occluders left aside; `coarse` is the same picture at a lower
@@ -322,9 +342,7 @@ impl<'a> Renderer<'a> {
             .bounding_sphere()
             .map(|whole| Blocker::new(whole, self.geometry.bvh.clusters()));
         let mut jobs = match (&world.polished, &blocker) {
-            (Some(ground), Some(blocker)) => {
-                self.mirror_jobs(&ground.gloss, blocker, settings.shadow_mask)
-            }
+            (Some(ground), Some(blocker)) => self.mirror_jobs(ground, blocker),
             _ => self.object_jobs(settings),
         };
         let mut guide_rays = RayCounts::default();
@@ -389,8 +407,10 @@ impl<'a> Renderer<'a> {
         progress: &mut Watch,
     ) -> Result<Rendered, RenderError> {
         let [width, height] = self.camera.resolution.map(|n| n as usize);
+        let laid = path.world.polished.as_ref();
+        let laid = laid.map(|ground| ground.laid_at(self.camera.resolution));
         let viewing = Viewing {
-            background: settings.background,
+            background: laid.as_deref().or(settings.background),
             tone: settings.tone.map(ToneCurves::mapper),
             transfer: settings.transfer,
             gain: settings.gain,

@@ -224,7 +224,7 @@ fn what_the_object_hides_of_the_coat_and_what_it_leaves_are_weighed_by_the_coats
             continue;
         };
         let coat = 0.2 + 0.8 * (1.0 - cosine).powi(5);
-        let share = (coat / Vec3::new(0.1, 0.3, 0.6)).min(Vec3::ONE);
+        let share = (coat / Vec3::new(0.1, 0.3, 0.6)).min(Vec3::splat(MOST_OF_COAT));
         let (r, found) = (*before.shadow.get(x, y), *after.shadow.get(x, y));
         let left = match passes(from, way) {
             p if p < 0.5 => {
@@ -314,7 +314,10 @@ fn every_pixel_whose_lobe_meets_the_object_is_looked_at() {
             roughness,
             reflectance: 1.0,
         };
-        let jobs = renderer.mirror_jobs(&gloss, &blocker, None);
+        let coat = Coat(Raster::filled(2, 2, CoatPoint::default()));
+        let mut film = Film::new(SIDE as usize, SIDE as usize);
+        let ground = Polished::new(gloss, coat, &mut film, &scene.camera, &settings(1, 0));
+        let jobs = renderer.mirror_jobs(&ground, &blocker);
         let of = |x: usize, y: usize| {
             jobs.iter()
                 .any(|job| job.pixels.index_of(x as u32, y as u32).is_some())

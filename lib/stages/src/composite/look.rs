@@ -203,8 +203,12 @@ impl Overlay {
     /// The pixels with something in them, and `margin` more to all sides.
     fn touched(&self, margin: usize) -> Option<PixelBox> {
         let (width, height) = (self.alpha.width(), self.alpha.height());
-        let is_touched =
-            |i: usize| self.alpha.pixels()[i] > 0.0 || self.shadow.pixels()[i] != Vec3::ONE;
+        // Polished ground adds light where the object covers nothing.
+        let is_touched = |i: usize| {
+            self.alpha.pixels()[i] > 0.0
+                || self.shadow.pixels()[i] != Vec3::ONE
+                || self.object.pixels()[i] != Vec3::ZERO
+        };
         let (mut left, mut right, mut top, mut bottom) = (width, 0, height, 0);
         for i in (0..width * height).filter(|&i| is_touched(i)) {
             let (x, y) = (i % width, i / width);
@@ -289,6 +293,8 @@ mod tests {
     fn layers_that_show_nothing_stay() {
         let mut layers = half(0.5);
         layers.alpha = Raster::filled(40, 20, 0.0);
+        assert!(layers.touched(3).is_some(), "added light");
+        layers.object = Raster::filled(40, 20, Vec3::ZERO);
         assert_eq!(layers.touched(3), None);
     }
 }

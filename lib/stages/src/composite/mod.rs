@@ -29,6 +29,7 @@ use dipir_render::film::Film;
 use dipir_render::gloss;
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings};
+use dipir_scene::proxy::Proxy;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
@@ -113,6 +114,10 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     table.check(&session.config)?;
     let mut inputs = read(session)?;
     materials::use_recovered(session, &mut inputs.scene)?;
+    let proxy = &inputs.scene.loaded.scene.proxy;
+    if table.gloss().is_some() && !matches!(proxy, Proxy::Plane(_)) {
+        session.warn("composite.ground_roughness: only a plane mirrors the objects, and [scene.proxy] is none");
+    }
     let light = match known_light::known(session, &table)? {
         Some(light) => {
             known_light::warn_of_unused(session)?;
