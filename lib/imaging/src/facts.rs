@@ -317,6 +317,8 @@ impl Fields<'_> {
             .filter(|o| is_offset(o));
         let universal = || {
             let day = iso_day(&self.text(Tag::GPSDateStamp)?)?;
+            // Devices that do not know the time write hours of 0/0.
+            self.number(Tag::GPSTimeStamp)?;
             let parts = self.rationals(Tag::GPSTimeStamp)?;
             let [h, m, s] = [0, 1, 2].map(|i| parts.get(i).copied().unwrap_or(60.0) as u32);
             Some(format!(

@@ -497,6 +497,9 @@ fn without_an_offset_the_satellites_time_is_taken_and_nonsense_is_left_out() {
     assert_eq!(facts.time.as_deref(), Some("2024-06-21T10:34:55Z"));
     let facts = with_exif(&exif(vec![], vec![local()], vec![]), (2, 2)).facts;
     assert_eq!(facts.time.as_deref(), Some("2024-06-21T12:34:56"));
+    let unknown = vec![text(0x1d, "2024:06:21"), rationals(7, &[(0, 0); 3])];
+    let facts = with_exif(&exif(vec![], vec![local()], unknown), (2, 2)).facts;
+    assert_eq!(facts.time.as_deref(), Some("2024-06-21T12:34:56"));
     let nonsense = exif(
         vec![],
         vec![
