@@ -21,7 +21,7 @@ use dipir_render::gbuffer::GBuffer;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
 use dipir_scene::camera::parts;
-use dipir_scene::config::SceneConfig;
+use dipir_scene::config::{EffectSwitch, SceneConfig};
 use dipir_scene::description::{ProxyRecord, SceneDescription};
 use dipir_scene::foreground::DepthFit;
 use dipir_scene::ground::points_parts;
@@ -304,10 +304,13 @@ fn named_files(config: &SceneConfig, base_dir: &Path) -> Vec<(&'static str, Path
     let camera = camera.and_then(|c| c.transforms.as_ref().or(c.file.as_ref()));
     let camera = camera.map_or(Vec::new(), |path| parts(path, base_dir));
     let proxy = config.proxy.as_ref().and_then(|p| p.mesh.clone());
+    // Switched off, mask and depths are not read.
+    let is_read = config.effects.occluders != Some(EffectSwitch::Off);
+    let read = |path: &Option<PathBuf>| path.clone().filter(|_| is_read);
     let single = [
         ("background", config.background.clone()),
-        ("occluders", config.occluders.clone()),
-        ("depth", config.depth.clone()),
+        ("occluders", read(&config.occluders)),
+        ("depth", read(&config.depth)),
         ("proxy", proxy),
     ];
     let camera = camera.into_iter().map(|path| ("camera", Some(path)));
@@ -466,83 +469,4 @@ impl fmt::Display for Done {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::fs;
-
-    use clap::Parser;
-    use dipir_imaging::file::write_png;
-    use dipir_imaging::raster::{DisplayImage, Raster};
-    use dipir_pipeline::fingerprint::{in_words, stale_reasons};
-    use glam::Vec3;
-
-    use super::*;
-    use crate::command_line::scene::Cli;
-
-    #[test]
-    fn a_part_that_is_gone_keeps_a_scene_from_running_only_where_the_object_needs_it() {
-        let here = tempfile::tempdir().unwrap();
-        let at = |name: &str| here.path().join(name);
-        let photo = DisplayImage(Raster::filled(36, 24, Vec3::splat(0.5)));
-        write_png(at("photo.png"), &photo).unwrap();
-        // A triangle whose corners are in another file.
-        let object = |buffer: &str| {
-            let object = json!({
-                "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
-                "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}],
-                "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3",
-                    "min": [0, 0, 0], "max": [1, 1, 0]}],
-                "bufferViews": [{"buffer": 0, "byteLength": 36}],
-                "buffers": [{"uri": buffer, "byteLength": 36}],
-                "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-                "textures": [{"source": 0}], "images": [{"uri": "grey.png"}],
-            });
-            fs::write(at("object.gltf"), object.to_string()).unwrap();
-        };
-        object("a.bin");
-        let corners = [0f32, 0., 0., 1., 0., 0., 0., 1., 0.].map(f32::to_le_bytes);
-        fs::write(at("a.bin"), corners.concat()).unwrap();
-        write_png(at("grey.png"), &photo).unwrap();
-        let text = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"object.gltf\"\nposition = [0.0, 0.0, 0.0]\n\
-                    [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 0.5, 0.0]\nfov_deg = 40.0\n\
-                    [scene.proxy]\nplane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }\n";
-        fs::write(at("pipeline.toml"), text).unwrap();
-        let file = at("pipeline.toml").display().to_string();
-        let args = ["dipir-scene", "-q", "-p", file.as_str()];
-        let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
-        run(&session).unwrap();
-        let told = || {
-            let plan = plan(&session).map_err(|e| dipir_cli::exit::describe(&e))?;
-            let reasons = stale_reasons(&plan, &SCENE.folder(&session)).unwrap();
-            Ok::<_, String>(in_words(&reasons))
-        };
-        assert_eq!(told(), Ok(String::new()));
-        // The stage runs without a texture.
-        fs::remove_file(at("grey.png")).unwrap();
-        let lacks = "it no longer reads the part of object 2";
-        assert_eq!(told().unwrap(), lacks);
-        run(&session).unwrap();
-        assert_eq!(told(), Ok(String::new()));
-        // It is there again.
-        write_png(at("grey.png"), &photo).unwrap();
-        assert_eq!(told().unwrap(), "the part of object grey.png is there now");
-        let refused = folder::SceneFolder::read(&session).err().unwrap();
-        assert_eq!(
-            refused.to_string(),
-            "the part of object \"grey.png\" is there now and was missing when the scene was set up; run dipir-scene again"
-        );
-        fs::remove_file(at("grey.png")).unwrap();
-        assert_eq!(told(), Ok(String::new()));
-        fs::rename(at("a.bin"), at("b.bin")).unwrap();
-        let missing = told().unwrap_err();
-        assert!(missing.contains("a.bin"), "{missing}");
-        assert!(run(&session).is_err());
-        // Another object has other files.
-        object("b.bin");
-        assert_eq!(
-            told().unwrap(),
-            "the object object.gltf has other content; it no longer reads the part of object"
-        );
-        run(&session).unwrap();
-        assert_eq!(told(), Ok(String::new()));
-    }
-}
+mod tests;

@@ -1,0 +1,121 @@
+//! What a run of the stage would read, against what it read.
+use std::fs;
+
+use clap::Parser;
+use dipir_imaging::file::write_png;
+use dipir_imaging::raster::{DisplayImage, Raster};
+use dipir_pipeline::fingerprint::{in_words, stale_reasons};
+use glam::Vec3;
+
+use super::*;
+use crate::command_line::scene::Cli;
+
+#[test]
+fn a_part_that_is_gone_keeps_a_scene_from_running_only_where_the_object_needs_it() {
+    let here = tempfile::tempdir().unwrap();
+    let at = |name: &str| here.path().join(name);
+    let photo = DisplayImage(Raster::filled(36, 24, Vec3::splat(0.5)));
+    write_png(at("photo.png"), &photo).unwrap();
+    // A triangle whose corners are in another file.
+    let object = |buffer: &str| {
+        let object = json!({
+            "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}],
+            "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3",
+                "min": [0, 0, 0], "max": [1, 1, 0]}],
+            "bufferViews": [{"buffer": 0, "byteLength": 36}],
+            "buffers": [{"uri": buffer, "byteLength": 36}],
+            "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+            "textures": [{"source": 0}], "images": [{"uri": "grey.png"}],
+        });
+        fs::write(at("object.gltf"), object.to_string()).unwrap();
+    };
+    object("a.bin");
+    let corners = [0f32, 0., 0., 1., 0., 0., 0., 1., 0.].map(f32::to_le_bytes);
+    fs::write(at("a.bin"), corners.concat()).unwrap();
+    write_png(at("grey.png"), &photo).unwrap();
+    let text = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"object.gltf\"\nposition = [0.0, 0.0, 0.0]\n\
+                [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 0.5, 0.0]\nfov_deg = 40.0\n\
+                [scene.proxy]\nplane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }\n";
+    fs::write(at("pipeline.toml"), text).unwrap();
+    let file = at("pipeline.toml").display().to_string();
+    let args = ["dipir-scene", "-q", "-p", file.as_str()];
+    let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+    run(&session).unwrap();
+    let told = || {
+        let plan = plan(&session).map_err(|e| dipir_cli::exit::describe(&e))?;
+        let reasons = stale_reasons(&plan, &SCENE.folder(&session)).unwrap();
+        Ok::<_, String>(in_words(&reasons))
+    };
+    assert_eq!(told(), Ok(String::new()));
+    // The stage runs without a texture.
+    fs::remove_file(at("grey.png")).unwrap();
+    let lacks = "it no longer reads the part of object 2";
+    assert_eq!(told().unwrap(), lacks);
+    run(&session).unwrap();
+    assert_eq!(told(), Ok(String::new()));
+    // It is there again.
+    write_png(at("grey.png"), &photo).unwrap();
+    assert_eq!(told().unwrap(), "the part of object grey.png is there now");
+    let refused = folder::SceneFolder::read(&session).err().unwrap();
+    assert_eq!(
+        refused.to_string(),
+        "the part of object \"grey.png\" is there now and was missing when the scene was set up; run dipir-scene again"
+    );
+    fs::remove_file(at("grey.png")).unwrap();
+    assert_eq!(told(), Ok(String::new()));
+    fs::rename(at("a.bin"), at("b.bin")).unwrap();
+    let missing = told().unwrap_err();
+    assert!(missing.contains("a.bin"), "{missing}");
+    assert!(run(&session).is_err());
+    // Another object has other files.
+    object("b.bin");
+    assert_eq!(
+        told().unwrap(),
+        "the object object.gltf has other content; it no longer reads the part of object"
+    );
+    run(&session).unwrap();
+    assert_eq!(told(), Ok(String::new()));
+}
+
+/// A tetrahedron on a grey photograph, on the ground that `proxy` tells; `more` are further keys of `[scene]`.
+fn project(folder: &Path, more: &str, proxy: &str) -> String {
+    let photo = DisplayImage(Raster::filled(36, 24, Vec3::splat(0.5)));
+    write_png(folder.join("photo.png"), &photo).unwrap();
+    let object = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+    fs::write(folder.join("object.obj"), object).unwrap();
+    let text = format!(
+        "[scene]\nbackground = \"photo.png\"\n{more}\n[[scene.objects]]\npath = \"object.obj\"\nposition = [0.0, 0.0, 0.0]\n\
+         [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 0.5, 0.0]\nfov_deg = 40.0\n\
+         [scene.proxy]\n{proxy}\n"
+    );
+    fs::write(folder.join("pipeline.toml"), text).unwrap();
+    folder.join("pipeline.toml").display().to_string()
+}
+
+fn opened(file: &str) -> Session {
+    let args = ["dipir-scene", "-q", "-p", file];
+    Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap()
+}
+
+/// Why the stage would run, in words.
+fn stale(session: &Session) -> String {
+    let plan = plan(session).unwrap();
+    in_words(&stale_reasons(&plan, &SCENE.folder(session)).unwrap())
+}
+
+#[test]
+fn mask_and_depths_of_an_effect_that_is_off_are_no_inputs() {
+    let here = tempfile::tempdir().unwrap();
+    let plane = "plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }";
+    let named =
+        "occluders = \"mask.png\"\ndepth = \"depth.png\"\neffects = { occluders = \"off\" }";
+    let session = opened(&project(here.path(), named, plane));
+    // Not even made.
+    run(&session).unwrap();
+    assert_eq!(stale(&session), "");
+    for name in ["mask.png", "depth.png"] {
+        fs::write(here.path().join(name), "made later").unwrap();
+    }
+    assert_eq!(stale(&session), "");
+}
