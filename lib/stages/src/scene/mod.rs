@@ -263,7 +263,11 @@ fn is_missing(part: &Artifact) -> bool {
 /// The plan with the files that the configuration names and these `parts` of objects, missing ones among them.
 fn plan_with_parts(session: &Session, parts: &[&Artifact]) -> anyhow::Result<StagePlan> {
     let config: SceneConfig = session.config.table("scene")?;
-    let named = named_files(&config, &session.config.base_dir());
+    let mut named = named_files(&config, &session.config.base_dir());
+    if session.placed.is_some() {
+        // A frame has the ground that its shot's scene.json tells.
+        named.retain(|(role, _)| *role != "points");
+    }
     let (missing, parts): (Vec<&Artifact>, Vec<&Artifact>) =
         parts.iter().partition(|p| is_missing(p));
     let parts = parts.iter();

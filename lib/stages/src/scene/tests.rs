@@ -93,8 +93,8 @@ fn project(folder: &Path, more: &str, proxy: &str) -> String {
     folder.join("pipeline.toml").display().to_string()
 }
 
-fn opened(file: &str) -> Session {
-    let args = ["dipir-scene", "-q", "-p", file];
+fn opened(file: &str, more: &[&str]) -> Session {
+    let args = [&["dipir-scene", "-q", "-p", file], more].concat();
     Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap()
 }
 
@@ -110,7 +110,7 @@ fn mask_and_depths_of_an_effect_that_is_off_are_no_inputs() {
     let plane = "plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }";
     let named =
         "occluders = \"mask.png\"\ndepth = \"depth.png\"\neffects = { occluders = \"off\" }";
-    let session = opened(&project(here.path(), named, plane));
+    let session = opened(&project(here.path(), named, plane), &[]);
     // Not even made.
     run(&session).unwrap();
     assert_eq!(stale(&session), "");
@@ -118,4 +118,30 @@ fn mask_and_depths_of_an_effect_that_is_off_are_no_inputs() {
         fs::write(here.path().join(name), "made later").unwrap();
     }
     assert_eq!(stale(&session), "");
+}
+
+#[test]
+fn a_frame_of_a_shot_on_points_is_made_once() {
+    let here = tempfile::tempdir().unwrap();
+    let points = (0..3600).map(|k| {
+        let (x, z) = (f64::from(k % 60) * 0.1 - 3.0, f64::from(k / 60) * 0.1 - 3.0);
+        format!("{x} 0 {z}\n")
+    });
+    let header = "ply\nformat ascii 1.0\nelement vertex 3600\nproperty float x\nproperty float y\nproperty float z\nend_header\n";
+    let points = header.to_owned() + &points.collect::<String>();
+    fs::write(here.path().join("scan.ply"), points).unwrap();
+    let proxy = "points = \"scan.ply\"\npoints_up = \"y\"";
+    let file = project(here.path(), "", proxy);
+    let photo = opened(&file, &[]);
+    run(&photo).unwrap();
+    assert_eq!(stale(&photo), "");
+    let out = photo.out.join("frames/a").display().to_string();
+    let mut frame = opened(&file, &["--out", &out]);
+    frame.placed = Some(SCENE.folder(&photo));
+    run(&frame).unwrap();
+    assert_eq!(stale(&frame), "");
+    // The photograph reads the points, the frame what became of them.
+    fs::write(here.path().join("scan.ply"), "another").unwrap();
+    assert_ne!(stale(&photo), "");
+    assert_eq!(stale(&frame), "");
 }
