@@ -131,11 +131,10 @@ fn fingerprint(
 ) -> anyhow::Result<String> {
     let scene = SCENE.manifest(session)?;
     let mut inputs = scene.inputs;
-    // One that is not there is told at its turn.
+    // One that is not there is told at its turn. Exposures go by the order of frames, and so do their roles.
+    let numbered = frames.iter().enumerate();
     inputs.extend(
-        frames
-            .iter()
-            .flat_map(|(path, _)| Artifact::of("frame", path, path)),
+        numbered.flat_map(|(k, (path, _))| Artifact::of(&format!("frame {k}"), path, path)),
     );
     let cameras: Vec<_> = all.iter().map(|view| &view.config.camera).collect();
     let params = json!({
@@ -231,7 +230,10 @@ fn followed(
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+
     use super::*;
+    use crate::command_line::scene::Cli;
 
     #[test]
     fn what_is_not_told_is_as_the_neighbour() {
@@ -261,6 +263,34 @@ mod tests {
             );
         }
         assert_eq!(filled(&[None]), [Exposure::SAME]);
+    }
+
+    #[test]
+    fn frames_that_change_places_are_measured_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let text = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"object.obj\"\nposition = [0.0, 0.0, 0.0]\n\
+                    [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 0.5, 0.0]\nfov_deg = 40.0\n";
+        fs::write(at("pipeline.toml"), text).unwrap();
+        let file = at("pipeline.toml").display().to_string();
+        let open = || {
+            let args = ["dipir-scene", "-q", "-p", file.as_str()];
+            Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap()
+        };
+        let session = open();
+        let plan = SCENE.plan(&session, json!({}));
+        session.begin(plan).unwrap().finish().unwrap();
+        let frames = ["a.png", "b.png"].map(|name| (at(name), open()));
+        let views = [settings(&session).unwrap(), settings(&session).unwrap()];
+        let of = |contents: [&str; 2]| {
+            for ((path, _), content) in frames.iter().zip(contents) {
+                fs::write(path, content).unwrap();
+            }
+            fingerprint(&session, &frames, &views).unwrap()
+        };
+        let first = of(["dark", "bright"]);
+        assert_ne!(of(["bright", "dark"]), first);
+        assert_eq!(of(["dark", "bright"]), first);
     }
 
     #[test]
