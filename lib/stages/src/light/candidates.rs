@@ -59,7 +59,7 @@ pub(super) fn sheet(
         ..frame.render_settings()
     };
     let (photo, taken) = (&loaded.photo.image, loaded.taken());
-    let seen = exposed::visible(taken, photo, &loaded.scene.camera, MAP);
+    let seen = exposed::visible(taken, &loaded.radiance(), &loaded.scene.camera, MAP);
     let tone = exposed::tone(taken, ToneCurves::identity());
     let gain = exposed::gain(taken, photo);
     let picture = |c: &Candidate| -> anyhow::Result<Raster<Vec3>> {
@@ -143,7 +143,54 @@ fn number(sheet: &mut Raster<Vec3>, n: usize, [left, top]: [usize; 2]) {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+    use dipir_cli::session::Session;
+    use dipir_optimize::settings::LightTable;
+    use dipir_render::effects::EffectsPlan;
+    use dipir_scene::scene::Scene;
+
     use super::*;
+    use crate::command_line::light::Cli;
+    use crate::light::estimate::estimate;
+
+    /// White above, grey below; a gain map of 3 stops on the white.
+    const PHOTO: &[u8] = include_bytes!("../../../../fuzz/seeds/photograph/gain_map.jpg");
+
+    #[test]
+    fn objects_are_lit_by_what_a_gain_map_tells_of_the_sky() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::write(at("photo.jpg"), PHOTO).unwrap();
+        // A plate that lies beneath the sky in the picture.
+        let object = "v -1 0 -1\nv 1 0 -1\nv 1 0 1\nv -1 0 1\nf 1 4 3 2\n";
+        std::fs::write(at("object.obj"), object).unwrap();
+        let text = "[scene]\nbackground = \"photo.jpg\"\n[[scene.objects]]\npath = \"object.obj\"\nposition = [0.0, 1.0, 2.0]\n\
+                    [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 1.6, 0.0]\nfov_deg = 50.0\n";
+        std::fs::write(at("pipeline.toml"), text).unwrap();
+        let args = [
+            "dipir-light",
+            "-q",
+            "-p",
+            &at("pipeline.toml").display().to_string(),
+        ];
+        let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+        let mut loaded =
+            Scene::load(&session.config.table("scene").unwrap(), folder.path()).unwrap();
+        let estimated = estimate(&session, &LightTable::default(), &loaded, 1).unwrap();
+        let renderer = Renderer::new(&loaded.scene);
+        let settings = Settings::of_scene(&loaded);
+        let plan = EffectsPlan::new(&renderer, loaded.description.effects(), &settings);
+        let simulation = plan.simulation();
+        let brightness = |loaded: &LoadedScene| {
+            let sheet = sheet(loaded, &simulation, &estimated, true).unwrap().0;
+            sheet.pixels().iter().map(|p| p.x).sum::<f32>()
+        };
+        let with_gain = brightness(&loaded);
+        loaded.photo.gain = None;
+        let without = brightness(&loaded);
+        // Most of the sheet is photograph.
+        assert!(with_gain > 1.001 * without, "{with_gain} {without}");
+    }
 
     #[test]
     fn every_picture_has_its_number() {
