@@ -111,15 +111,15 @@ impl Desk {
         let path = session.config.path().to_owned();
         let text = dipir_files::read_to_string(&path)
             .with_context(|| format!("cannot read \"{}\"", path.display()))?;
+        Document::parse(&text)?.refuse_other_objects(&session.config.table("scene")?)?;
         let (small, arrangement) = SmallScene::load(&session, LONGEST)?;
         for warning in &arrangement.warnings {
             session.warn(warning);
         }
         let painted = path.with_file_name(MASK_FILE);
         let read = small.loaded.inputs.iter().chain(&small.loaded.missing);
-        let inputs = read.map(|i| &i.location);
-        let readings = inputs.filter(|i| **i != painted);
-        let readings = readings.map(|i| Reading::new(i)).collect();
+        let others = read.map(|i| &i.location).filter(|i| **i != painted);
+        let readings = others.map(|i| Reading::new(i)).collect();
         let photo = &small.loaded.photo;
         let picture = photo.transfer.encode(&photo.image);
         let size = [picture.0.width(), picture.0.height()];

@@ -1,8 +1,9 @@
 //! Changes of a `pipeline.toml` that keep its comments and its order.
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use dipir_scene::camera::Camera;
+use dipir_scene::config::SceneConfig;
 use glam::{DMat3, DVec3};
 use toml_edit::{
     Array, ArrayOfTables, DocumentMut, InlineTable, Item, RawString, Table, TableLike, Value, value,
@@ -254,6 +255,31 @@ impl Document {
                 reorder(array, &order);
             }
             _ => bail!("scene.objects is no list of tables"),
+        }
+        Ok(())
+    }
+
+    /// Refuses a `scene` of other objects than the text has: the text's own would be replaced by what is arranged.
+    ///
+    /// # Errors
+    /// If their number or their files differ.
+    pub fn refuse_other_objects(&mut self, scene: &SceneConfig) -> anyhow::Result<()> {
+        let mut own = Vec::new();
+        while let Ok(object) = self.object(own.len()) {
+            let path = object.get("path").and_then(Item::as_str);
+            own.push(path.map(PathBuf::from));
+        }
+        let set: Vec<Option<PathBuf>> = scene.objects.iter().map(|o| o.path.clone()).collect();
+        if set != own {
+            let listed = |paths: &[Option<PathBuf>]| {
+                let paths: Vec<&PathBuf> = paths.iter().flatten().collect();
+                format!("{paths:?}")
+            };
+            let (set, own) = (listed(&set), listed(&own));
+            bail!(
+                "--set gives the scene the objects {set}, and the file has {own}: what is arranged here is saved to the file, so \
+                 write scene.objects there and leave it out of --set"
+            );
         }
         Ok(())
     }

@@ -70,6 +70,38 @@ fn files_that_changed_since_they_were_read_are_told_and_the_page_goes_on() {
     assert!(!before.iter().any(came) && warnings(&without).iter().any(came));
 }
 
+#[test]
+fn objects_that_the_command_line_sets_are_not_saved_over_those_of_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let two = |first: &str, second: &str| {
+        let object = |path: &str| format!("{{path=\"{path}\",at_pixel=[150.0,150.0]}}");
+        format!("scene.objects=[{},{}]", object(first), object(second))
+    };
+    fs::write(folder.path().join("other.obj"), "").unwrap();
+    let refused = Desk::open(project(folder.path(), &[&two("box.obj", "box.obj")])).err();
+    let words = refused.expect("refused").to_string();
+    assert_eq!(
+        words,
+        "--set gives the scene the objects [\"box.obj\", \"box.obj\"], and the file has [\"box.obj\"]: what is arranged here \
+         is saved to the file, so write scene.objects there and leave it out of --set"
+    );
+    let other = "scene.objects=[{path=\"other.obj\",at_pixel=[150.0,150.0]}]";
+    assert!(Desk::open(open(folder.path(), &[other])).is_err());
+    let same = "scene.objects=[{path=\"box.obj\",at_pixel=[150.0,150.0]}]";
+    Desk::open(open(folder.path(), &[same])).unwrap();
+    // A list in one line is a list, too.
+    let inline = TEXT.replace(
+        "[[scene.objects]]\npath = \"box.obj\"\nat_pixel = [150.0, 150.0] # at the kerb\n",
+        "",
+    );
+    let inline = inline.replace(
+        "# mine\n",
+        "\nobjects = [{ path = \"box.obj\", at_pixel = [150.0, 150.0] }, { path = \"box.obj\", at_pixel = [90.0, 150.0] }]\n",
+    );
+    fs::write(folder.path().join("pipeline.toml"), inline).unwrap();
+    Desk::open(open(folder.path(), &[])).unwrap();
+}
+
 /// A file whose folder has so long a path that none of a longer name fits beside it: it cannot be replaced, by no user.
 #[cfg(target_os = "linux")]
 #[test]
