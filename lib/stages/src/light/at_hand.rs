@@ -19,7 +19,7 @@ use crate::light::exposed;
 use crate::light::folder::{self, Recovered};
 use crate::light::method::{Method, starts_neutral};
 use crate::light::request::first_light;
-use crate::light::surroundings::surroundings;
+use crate::light::surroundings::{map_of, narrow_first, surroundings};
 use crate::names::{LIGHT, SCENE};
 use crate::scene::{folder as scene_folder, transport};
 use crate::{graph, known_light};
@@ -155,13 +155,15 @@ fn start(
         Start::File(_) => {
             let light = first_light(session, &table)?;
             let lobes = light.as_ref().map(Lighting::exposed_lobes);
-            (lobes.unwrap_or_default(), None, Origin::File)
+            let (lobes, map) = with_visible(&table, loaded, lobes.unwrap_or_default());
+            (lobes, map, Origin::File)
         }
         start if starts_neutral(start, Method::of(session)?) => {
             let settings = transport::settings(session, &table)?;
             let ambient = ambient_of(&loaded.photo.image);
             let neutral = Parameters::neutral(settings.lobes, ambient);
-            (neutral.foreground_lobes(), None, Origin::Neutral)
+            let (lobes, map) = with_visible(&table, loaded, neutral.foreground_lobes());
+            (lobes, map, Origin::Neutral)
         }
         _ => {
             let (lobes, smooth, seen) = estimated(session, &table, loaded)?;
@@ -173,6 +175,22 @@ fn start(
     let tone = ToneCurves::identity();
     let light = folder::exposed(session, composite, lobes, map, tone)?;
     Ok((light, origin))
+}
+
+/// The sources of a light that is not estimated, and the rest of it with what the photograph shows, if that is asked for;
+/// else all of it as lobes.
+fn with_visible(
+    table: &LightTable,
+    loaded: &LoadedScene,
+    lobes: Vec<SphericalGaussian>,
+) -> (Vec<SphericalGaussian>, Option<EnvironmentMap>) {
+    if table.visible != Some(true) {
+        return (lobes, None);
+    }
+    let (mut lobes, sources) = narrow_first(&lobes);
+    let map = surroundings(loaded, &[], &map_of(&lobes[sources..]), true);
+    lobes.truncate(sources);
+    (lobes, Some(map))
 }
 
 /// The sources of the estimated light, the rest of it, and what other photographs show of it. No lobes are fitted to
@@ -248,6 +266,19 @@ mod tests {
             assert_eq!(found.origin, origin, "{more:?}");
             assert_eq!(origin.words_of(&session).unwrap(), origin.words());
         }
+        // Whatever the start, what the photograph shows belongs to the light where that is asked for.
+        let visible = ["-s", "light.start=neutral", "-s", "light.visible=true"];
+        let args = [&["dipir-light", "-q", "-p", path.as_str()], &visible[..]].concat();
+        let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+        let loaded = Scene::load(&session.config.table("scene").unwrap(), folder.path()).unwrap();
+        let found = at_hand(&session, &loaded).unwrap();
+        assert_eq!(found.origin, Origin::Neutral);
+        let (map, lobes) = (found.map.expect("a map"), found.lobes.lobes());
+        assert!(lobes.is_empty(), "{lobes:?}");
+        let ahead = -loaded.scene.camera.rotation.z_axis;
+        let (i, j) = map.texel_of(ahead);
+        let shown = loaded.photo.image.0.get(18, 12).x;
+        assert!((map.texel(i, j).x - shown).abs() < 1e-3 * shown);
         let args = ["dipir-light", "-p", &path, "-s", "light.sun.azimuth_deg=30"];
         let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
         let words = |origin: Origin| origin.words_of(&session).unwrap();
