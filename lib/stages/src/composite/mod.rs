@@ -2,6 +2,7 @@
 mod curve;
 mod lens;
 mod look;
+mod sharpness;
 pub mod table;
 
 use std::borrow::Cow;
@@ -44,6 +45,7 @@ use crate::written;
 use curve::Curve;
 pub use look::Matched;
 use look::{Hidden, Look, Overlay};
+use sharpness::odd_sharpness;
 use table::{CompositeTable, MAX_SAMPLES};
 
 /// When to stop, from the command line.
@@ -280,6 +282,8 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
     });
     if let Some(gloss) = table.gloss() {
         params["ground"] = json!([gloss.roughness, gloss.reflectance]);
+    if let Some(follows) = odd_sharpness(table, session.pipeline.quality) {
+        params["follow_sharpness"] = follows.into();
     }
     let mut plan = COMPOSITE.plan(session, params);
     scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
