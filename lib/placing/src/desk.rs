@@ -77,7 +77,7 @@ struct Rendered {
     small: SmallScene,
     /// The mask of the file.
     own_mask: Option<Raster<f32>>,
-    /// The light of a configuration and a camera.
+    /// The light of a configuration, a camera and a ground, onto which a shadow may tell the sun.
     light: Option<(String, AtHand)>,
     /// Why depths hide nothing, where they should.
     left_out: Option<String>,
@@ -573,14 +573,14 @@ impl Desk {
 }
 
 impl Rendered {
-    /// The objects, their light and where it comes from. It is found unless it is that of the same camera and keys as
-    /// before.
+    /// The objects, their light and where it comes from. It is found unless it is that of the same camera, ground and keys
+    /// as before.
     fn light_up(&mut self) -> anyhow::Result<(&LoadedScene, &AtHand, &'static str)> {
         let config = &self.session.config;
         let light: LightTable = config.table("light")?;
         let composite: CompositeTable = config.table("composite")?;
-        let camera = self.small.loaded.scene.camera;
-        let key = format!("{light:?} {composite:?} {camera:?}");
+        let (camera, plane) = (self.small.loaded.scene.camera, self.small.plane());
+        let key = format!("{light:?} {composite:?} {camera:?} {plane:?}");
         let known = self.light.take().filter(|(known, _)| *known == key);
         let light = match known {
             Some((_, light)) => light,

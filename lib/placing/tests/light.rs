@@ -86,3 +86,24 @@ fn what_is_told_of_the_sun_is_said_of_the_light() {
         }
     }
 }
+
+#[test]
+fn a_sun_of_a_shadow_follows_the_camera_s_height() {
+    let folder = tempfile::tempdir().unwrap();
+    project(folder.path(), &[]);
+    let plane = "plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }";
+    let shadow = "shadow = { foot = [20.0, 190.0], tip = [90.0, 150.0], height_m = 1.0 }";
+    let text = TEXT.replace("start = \"neutral\"", shadow);
+    let text = text.replace(plane, "camera_height_m = 1.6");
+    fs::write(folder.path().join("pipeline.toml"), text).unwrap();
+    let opened = || Desk::open(open(folder.path(), &[])).unwrap();
+    let picture = |desk: &Desk, keys: &str| {
+        let edit = format!("{{\"objects\": [{{\"of\": 0}}]{keys}}}");
+        let crop = desk.draft(&serde_json::from_str(&edit).unwrap(), 4, 0);
+        crop.unwrap().ok().flatten().expect("an object is seen").png
+    };
+    let higher = ", \"height_m\": 3.2";
+    let desk = opened();
+    picture(&desk, "");
+    assert!(picture(&desk, higher) == picture(&opened(), higher));
+}

@@ -135,6 +135,14 @@ impl SmallScene {
         Ok((Self { loaded, props }, arrangement))
     }
 
+    /// The plane of the proxy, if it is one.
+    pub fn plane(&self) -> Option<Plane> {
+        match &self.loaded.scene.proxy {
+            Proxy::Plane(plane) => Some(*plane),
+            Proxy::None | Proxy::Mesh(_) => None,
+        }
+    }
+
     /// Puts camera and objects where `arrangement` has them.
     pub fn arrange(&mut self, arrangement: &Arrangement) {
         let scene = &mut self.loaded.scene;
