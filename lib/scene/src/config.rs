@@ -333,6 +333,14 @@ impl SceneConfig {
                 "interactions from 1 to 8, for instance max_depth = 3",
             ));
         }
+        let megapixels = self.limits.photo_megapixels;
+        if megapixels > Limits::MOST_PHOTO_MEGAPIXELS {
+            return Err(wrong(
+                "scene.limits.photo_megapixels",
+                megapixels,
+                "millions of pixels up to 268, of which the result's files have no more, for instance photo_megapixels = 250",
+            ));
+        }
         self.views()?;
         let proxy = match &self.proxy {
             None => ProxySettings::None,

@@ -1,4 +1,5 @@
 //! How much a file may ask for before it is refused.
+use dipir_imaging::error::MAX_PIXELS;
 use dipir_imaging::file::PhotoLimits;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -26,7 +27,7 @@ pub struct Limits {
     #[schemars(example = 8_u64 << 30)]
     pub file_bytes: u64,
     /// Pixels of the photograph, millions. A pixel takes 18 bytes while it is read.
-    #[schemars(example = 400)]
+    #[schemars(range(min = 0, max = Limits::MOST_PHOTO_MEGAPIXELS), example = 250)]
     pub photo_megapixels: u64,
     /// Whether a file may name any others outside of its folder, as `/models/wood.png`; an image or a buffer at a relative
     /// path, as `../wood.png`, is read anyway.
@@ -50,6 +51,9 @@ impl Default for Limits {
 }
 
 impl Limits {
+    /// Most millions of pixels of a photograph: those of a picture's file.
+    pub const MOST_PHOTO_MEGAPIXELS: u64 = MAX_PIXELS as u64 / 1_000_000;
+
     /// Most vertices: as many as triangles without a common one have.
     pub fn vertices(&self) -> u64 {
         self.triangles.saturating_mul(3)

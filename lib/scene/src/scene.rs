@@ -327,6 +327,12 @@ impl Scene {
                     .with_facts(&photo.facts)?
                     .resolve(resolution, base_dir)?,
             };
+        if let Some(way) = &undistortion {
+            way.check_size().map_err(|e| match &settings.camera {
+                CameraSettings::File(file) => e.in_file(base_dir.join(&file.path)),
+                CameraSettings::LookAt { .. } => e,
+            })?;
+        }
         let (occluders, occluders_record) = occluders.unzip();
         let (photo, masked, original) = undistort(photo, occluders, undistortion);
         let (depths, depth) =

@@ -5,12 +5,14 @@
 //! middle, and shows all that the photograph shows, up to [`MOST_LARGER`] times its size.
 use dipir_cameras::{Camera as LensCamera, Lens, Pose};
 use dipir_imaging::ImagingError;
+use dipir_imaging::error::MAX_PIXELS;
 use dipir_imaging::layers::{Layers, Precision};
 use dipir_imaging::raster::Raster;
 use dipir_imaging::warp::{Ordered, Outside, pick, warp};
 use glam::{DVec2, DVec3};
 
 use crate::camera::Camera;
+use crate::error::Error;
 
 /// A photograph's lens and the working picture.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -69,6 +71,26 @@ impl Undistortion {
     /// Columns and rows of the working picture.
     pub fn size(&self) -> [u32; 2] {
         self.resolution
+    }
+
+    /// Refuses a working picture of more pixels than a picture's file has.
+    ///
+    /// # Errors
+    /// On one that is too large.
+    pub(crate) fn check_size(&self) -> Result<(), Error> {
+        let [width, height] = self.resolution;
+        if u64::from(width) * u64::from(height) <= MAX_PIXELS as u64 {
+            return Ok(());
+        }
+        let [w, h] = self.lens.size;
+        let detail = format!(
+            "without the distortion of its lens the photograph of {w} x {h} pixels is a picture of {width} x {height}, and \
+             {MAX_PIXELS} pixels in all are the most"
+        );
+        Err(Error::malformed(
+            detail,
+            "scale the photograph down, or check the lens in [scene.camera]",
+        ))
     }
 
     /// The working picture's camera, at a place.
@@ -341,6 +363,23 @@ mod tests {
         let [s, t] = read(&undistort, 100, 90);
         let want = way.to_photo(DVec2::new(100.5, 90.5)).unwrap();
         assert!((s * 320.0 - want.x).abs() < 1e-3 && ((1.0 - t) * 240.0 - want.y).abs() < 1e-3);
+    }
+
+    #[test]
+    fn a_lens_that_makes_too_large_a_picture_is_named() {
+        let fisheye = |size: [f64; 2]| {
+            let lens = Lens {
+                distortion: Distortion::kannala_brandt([0.0; 4]).unwrap(),
+                ..Lens::pinhole(size, DVec2::splat(size[1] / std::f64::consts::PI))
+            };
+            Undistortion::of(&lens).unwrap().check_size()
+        };
+        fisheye([6000.0, 4000.0]).unwrap();
+        assert_eq!(
+            fisheye([12000.0, 8000.0]).unwrap_err().to_string(),
+            "without the distortion of its lens the photograph of 12000 x 8000 pixels is a picture of 24004 x 16004, and \
+             268435456 pixels in all are the most; scale the photograph down, or check the lens in [scene.camera]"
+        );
     }
 
     #[test]

@@ -145,6 +145,13 @@ fn wrong_values_are_quoted_with_the_accepted_form() {
         message(&table("", "[effects]\nmax_depth = 9")),
         "scene.effects.max_depth is 9; accepted: interactions from 1 to 8, for instance max_depth = 3"
     );
+    assert_eq!(
+        message(&table("", "[limits]\nphoto_megapixels = 269")),
+        "scene.limits.photo_megapixels is 269; accepted: millions of pixels up to 268, of which the result's files have no \
+         more, for instance photo_megapixels = 250"
+    );
+    let most = table("", "[limits]\nphoto_megapixels = 268");
+    parse(&most).validate().unwrap();
 }
 
 #[test]
