@@ -112,6 +112,18 @@ impl Placement {
         self.check(&session.config)?;
         let map = EnvironmentMap::read(session.resolve(path))
             .with_context(|| format!("cannot use {file_key} = \"{}\"", path.display()))?;
+        self.place(session, &map)
+    }
+
+    /// `map`, exposed and turned.
+    ///
+    /// # Errors
+    /// On radiance beyond `f32`.
+    pub(crate) fn place(
+        &self,
+        session: &Session,
+        map: &EnvironmentMap,
+    ) -> anyhow::Result<EnvironmentMap> {
         let most = |m: f32, t: &Vec3| m.max(t.max_element());
         let largest = map.texels().iter().fold(0.0, most);
         let (key, stops) = self.exposure_ev;

@@ -96,10 +96,9 @@ pub(super) fn exposed(
         radiance: lobe.radiance * exposure * table.tint_gain(),
         ..lobe
     });
-    let surroundings = surroundings.map(|map| {
-        let angle = f64::from(table.rotation_deg).to_radians();
-        tinted(session, table, map.scaled(exposure).rotated_y(angle))
-    });
+    let surroundings = surroundings
+        .map(|map| tinted(session, table, table.placement().place(session, &map)?))
+        .transpose()?;
     Ok(Recovered {
         lobes: SgMixture::new(lobes.collect()).map_err(|e| {
             let message = format!(
@@ -108,7 +107,7 @@ pub(super) fn exposed(
             );
             session.config.invalid("composite.exposure_ev", message)
         })?,
-        surroundings: surroundings.transpose()?,
+        surroundings,
         tone,
     })
 }
@@ -146,4 +145,37 @@ pub fn missing(recovered: &Path) -> anyhow::Error {
          in --set composite.environment=sky.hdr, or run dipir-light first",
         recovered.display()
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use glam::Vec3;
+
+    use super::*;
+    use crate::command_line::light::Cli;
+
+    #[test]
+    fn an_exposure_beyond_all_numbers_is_refused_by_its_key() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("pipeline.toml");
+        std::fs::write(&file, "").unwrap();
+        let args = ["dipir-light", "-q", "-p", &file.display().to_string()];
+        let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+        let table = CompositeTable {
+            exposure_ev: 64.0,
+            ..CompositeTable::default()
+        };
+        let light = |radiance: f32| {
+            let map = EnvironmentMap::constant(4, 2, Vec3::splat(radiance));
+            exposed(&session, &table, vec![], Some(map), ToneCurves::identity())
+        };
+        assert!(light(1.0).is_ok());
+        let message = format!("{:#}", light(1e20).err().expect("refused"));
+        assert!(
+            message.contains("composite.exposure_ev")
+                && message.contains("64 stops take the map's"),
+            "{message}"
+        );
+    }
 }
