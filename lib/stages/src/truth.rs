@@ -19,7 +19,7 @@ use dipir_pipeline::manifest::{FILE_NAME, hash_file};
 use dipir_render::adaptive::Stop;
 use dipir_render::render::{Renderer, Settings};
 use dipir_render::transport::Transport;
-use glam::Vec3;
+use glam::{Quat, Vec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -67,7 +67,8 @@ impl ReportTable {
 /// What was measured.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Truth {
-    /// Between the directions of most light, recovered and true; absent if nothing was recovered.
+    /// Between the directions of most light, recovered (and turned by `composite.rotation_deg`) and true; absent if nothing
+    /// was recovered.
     pub sun_error_deg: Option<f64>,
     /// Display-referred RMSE of the composite stage's picture, over what the object or its shadow
     /// touches.
@@ -122,13 +123,19 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
     let mask = touched(&objective);
     let wanted = transfer.encode(&wanted);
     let apart = |linear: &LinearImage| rmse(&transfer.encode(linear), &wanted, &mask);
-    let sun_error = |d: Vec3| f64::from(d.angle_between(peak).to_degrees());
+    let sun_error = |d: Vec3| apart_deg(d, lit.rotation_deg, peak);
     Ok(Some(Truth {
         sun_error_deg: recovered.peak_direction().map(sun_error),
         rmse_recovered: apart(&found),
         rmse_neutral: apart(&neutral),
         peak: Some(peak),
     }))
+}
+
+/// Degrees between the direction of a recovered light, turned as the picture has it, and the true one.
+fn apart_deg(recovered: Vec3, rotation_deg: f32, truth: Vec3) -> f64 {
+    let turned = Quat::from_rotation_y(rotation_deg.to_radians()) * recovered;
+    f64::from(turned.angle_between(truth).to_degrees())
 }
 
 /// The scene stage's record, else one of its own, and the size at which it is compared.
@@ -250,6 +257,16 @@ impl Truth {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_turn_of_the_picture_s_light_counts_in_its_error() {
+        let sun = Vec3::new(0.0, 0.6, 0.8);
+        // By a quarter turn light from +z comes from +x.
+        let quarter = Vec3::new(0.8, 0.6, 0.0);
+        assert!(apart_deg(sun, 90.0, quarter) < 0.1);
+        assert!(apart_deg(sun, 0.0, sun) < 0.1);
+        assert!(apart_deg(sun, 90.0, sun) > 60.0);
+    }
 
     #[test]
     fn an_error_is_told_beside_that_of_neutral_light() {
