@@ -2,7 +2,6 @@
 use dipir_estimator::LightEstimate;
 use dipir_estimator::grid::{direction, heading, relative};
 use dipir_estimator::posterior::words;
-use dipir_imaging::transfer::Transfer;
 use dipir_scene::camera::Camera;
 use dipir_scene::description::SceneDescription;
 use glam::{Quat, Vec2, Vec3};
@@ -67,7 +66,7 @@ pub fn figure(
     let [width, height] = ground.camera.resolution;
     let frame = format!("0 0 {width} {height}");
     let overlay = [("viewBox", frame.as_str()), ("aria-hidden", "true")];
-    let photo = Transfer::Srgb.encode(&loaded.photo.image);
+    let photo = loaded.photo.transfer.encode(&loaded.photo.image);
     let parts = [
         image(&photo, SHOWN, &caption)?,
         Html::element("svg", &overlay, drawn),
@@ -177,9 +176,14 @@ fn points(corners: &[Vec2]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+    use dipir_cli::session::Session;
+    use dipir_imaging::file::write_png;
+    use dipir_imaging::raster::{DisplayImage, Raster};
     use glam::Mat3;
 
     use super::*;
+    use crate::command_line::scene::Cli;
 
     /// A camera 1.6 m above the ground that looks along -z, at a thing 4 m away.
     fn ground() -> Ground {
@@ -193,6 +197,46 @@ mod tests {
             },
             foot: Vec3::new(0.0, 0.0, -4.0),
             radius: 0.5,
+        }
+    }
+
+    #[test]
+    fn the_photograph_is_shown_as_it_is_encoded() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let photo = DisplayImage(Raster::filled(36, 24, Vec3::splat(0.2)));
+        write_png(at("photo.png"), &photo).unwrap();
+        let object = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+        std::fs::write(at("object.obj"), object).unwrap();
+        let shown = |transfer: &str| {
+            let text = format!(
+                "[scene]\nbackground = \"photo.png\"\ntransfer = \"{transfer}\"\n\
+                 [[scene.objects]]\npath = \"object.obj\"\nposition = [0.0, 0.0, 0.0]\n\
+                 [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 0.5, 0.0]\nfov_deg = 40.0\n"
+            );
+            std::fs::write(at("pipeline.toml"), text).unwrap();
+            let args = [
+                "dipir-scene",
+                "-q",
+                "-p",
+                &at("pipeline.toml").display().to_string(),
+            ];
+            let session = Session::open(&Cli::try_parse_from(args).unwrap().common).unwrap();
+            crate::scene::run(&session).unwrap();
+            let report = Report {
+                session: &session,
+                status: &[],
+                options: &[],
+                truth: None,
+                failed: &[],
+            };
+            let html = figure(&report, Vec3::X, None, None).unwrap();
+            html.expect("a figure").into_string()
+        };
+        let srgb = shown("srgb");
+        assert!(srgb.contains("data:image/"), "{srgb}");
+        for transfer in ["gamma22", "linear"] {
+            assert!(shown(transfer) == srgb, "{transfer}");
         }
     }
 
