@@ -282,6 +282,7 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
     });
     if let Some(gloss) = table.gloss() {
         params["ground"] = json!([gloss.roughness, gloss.reflectance]);
+    }
     if let Some(follows) = odd_sharpness(table, session.pipeline.quality) {
         params["follow_sharpness"] = follows.into();
     }
