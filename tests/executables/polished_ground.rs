@@ -58,11 +58,11 @@ fn what_is_no_polished_plane_is_refused_or_told() {
     for (set, message) in [
         (
             "composite.ground_roughness=1.5",
-            "composite.ground_roughness is 1.5, accepted: 0, a mirror, to 1, as in 0.15",
+            "error: --set composite.ground_roughness=1.5: composite.ground_roughness: 1.5 is out of range; accepted: 0, a mirror, to 1, as in 0.15",
         ),
         (
             "composite.ground_reflectance=0.02",
-            "composite.ground_reflectance: is about polished ground; say how rough it is, too: ground_roughness = 0.15",
+            "error: --set composite.ground_reflectance=0.02: composite.ground_reflectance: is about polished ground; say how rough it is, too: ground_roughness = 0.15",
         ),
     ] {
         let run = project.run(DIPIR, &["run", "--set", set]);
@@ -75,8 +75,7 @@ fn what_is_no_polished_plane_is_refused_or_told() {
         "--set",
         "composite.ground_reflectance=0",
     ];
-    let accepted =
-        "composite.ground_reflectance is 0, accepted: a share above 0, at most 1, as in 0.04";
+    let accepted = "error: --set composite.ground_reflectance=0: composite.ground_reflectance: 0 is out of range; accepted: a share above 0, at most 1, as in 0.04";
     project.run(DIPIR, &both).expect_error(2, accepted);
     project.write("floor.obj", "v -9 0 9\nv 9 0 9\nv 0 0 -9\nf 1 2 3\n");
     let pipeline = String::from_utf8(project.read("pipeline.toml")).unwrap();

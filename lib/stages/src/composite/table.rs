@@ -62,7 +62,7 @@ pub struct CompositeTable {
     pub ground_roughness: Option<f32>,
     /// Share of the light that polished ground reflects where it is looked at from above: 0.02 for water, 0.04 for stone,
     /// tiles and varnish, up to 1 for metal.
-    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1.0), extend("default" = GROUND_REFLECTANCE), example = 0.02)]
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1.0), extend("x-default" = "0.04"), example = 0.02)]
     pub ground_reflectance: Option<f32>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
     /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
