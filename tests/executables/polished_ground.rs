@@ -27,8 +27,7 @@ fn the_mirror_image_is_in_the_layers_and_takes_the_composite_alone() {
     let file = project.read("out/composite/composite.exr");
     let all = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
     let alpha = all.channel("object.A").unwrap();
-    let [object, shadow, background, picture] =
-        ["object", "shadow", "background", ""].map(|name| layers(name));
+    let [object, shadow, background, picture] = ["object", "shadow", "background", ""].map(layers);
     let (mut added, mut changed) = (0, 0);
     for i in 0..36 * 24 {
         let a = alpha.pixels()[i];
