@@ -220,6 +220,10 @@ const PART_OF: &str = "part of ";
 /// What a run would be. The files that an object consists of, and those of them that are missing, are known only once it has
 /// been read. They are taken from the manifest of the last run: the same object has the same files.
 pub fn plan(session: &Session) -> anyhow::Result<StagePlan> {
+    let config: SceneConfig = session.config.table("scene")?;
+    config
+        .validate()
+        .map_err(|e| with_place(e, &session.config))?;
     let recorded = match SCENE.manifest(session) {
         Ok(manifest) => manifest.inputs,
         Err(_) => Vec::new(),

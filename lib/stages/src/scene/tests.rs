@@ -105,6 +105,29 @@ fn stale(session: &Session) -> String {
 }
 
 #[test]
+fn a_plan_refuses_what_a_run_refuses() {
+    let here = tempfile::tempdir().unwrap();
+    let plane = "plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }";
+    let file = project(here.path(), "", plane);
+    for wrong in [
+        "scene.objects.0.scale=nan",
+        "scene.objects.0.yaw_deg=nan",
+        "scene.objects.0.rest=nan",
+        "scene.transfer=nan",
+        "scene.camera.position=[0.0, 0.5, 0.0]",
+    ] {
+        let session = opened(&file, &["--set", wrong]);
+        let planned = plan(&session).err().unwrap();
+        let ran = run(&session).err().unwrap();
+        let told = planned.to_string();
+        assert_eq!(told, ran.to_string());
+        assert!(told.contains("scene."), "{told}");
+        let codes = [&planned, &ran].map(dipir_cli::exit::code_of);
+        assert_eq!(codes, [dipir_cli::exit::USAGE; 2], "{told}");
+    }
+}
+
+#[test]
 fn mask_and_depths_of_an_effect_that_is_off_are_no_inputs() {
     let here = tempfile::tempdir().unwrap();
     let plane = "plane = { point = [0.0, 0.0, 0.0], normal = [0.0, 1.0, 0.0] }";
