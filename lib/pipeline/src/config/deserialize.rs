@@ -51,6 +51,9 @@ pub(super) struct ReadError {
     place: Option<Place>,
 }
 
+/// The keys that a single pair of brackets makes a table by mistake.
+const LISTS_OF_TABLES: [&str; 2] = ["scene.objects", "scene.views"];
+
 impl ReadError {
     fn new(finding: Finding) -> Self {
         Self {
@@ -98,9 +101,12 @@ impl ReadError {
             },
             Finding::Wrong { found, accepted } => ConfigError::WrongType {
                 at,
+                accepted: match LISTS_OF_TABLES.contains(&key.as_str()) && found == "a table" {
+                    true => format!("{accepted}, each table of which begins with [[{key}]]"),
+                    false => accepted,
+                },
                 key,
                 found,
-                accepted,
             },
             Finding::Custom(message) => ConfigError::Invalid { at, key, message },
         }

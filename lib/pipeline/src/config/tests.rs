@@ -233,6 +233,36 @@ fn broken_toml_names_the_line() {
 }
 
 #[test]
+fn a_path_of_windows_in_double_quotes_is_answered_with_how_to_write_it() {
+    for path in [r"C:\Users\me\p.png", r"C:\me\p.png", r"D:\x\p.png"] {
+        let text = format!("[scene]\nbackground = \"{path}\"\n");
+        let told = parse(&text, &[]).unwrap_err().to_string();
+        assert!(
+            told.starts_with("pipeline.toml:2: not valid TOML: ")
+                && told.ends_with("write a path in single quotes, or with / for each \\"),
+            "{told}"
+        );
+    }
+    let other = parse("[scene]\nbackground = \n", &[]).unwrap_err();
+    assert!(!other.to_string().contains("single quotes"), "{other}");
+}
+
+#[test]
+fn a_table_in_place_of_a_list_of_tables_is_answered_with_its_brackets() {
+    #[derive(Debug, serde::Deserialize)]
+    struct Listing {
+        #[serde(rename = "objects")]
+        _objects: Vec<std::collections::BTreeMap<String, String>>,
+    }
+    let config = parse("[scene.objects]\npath = \"a.glb\"\n", &[]).unwrap();
+    let told = config.table::<Listing>("scene").unwrap_err().to_string();
+    assert!(
+        told.ends_with("a list, each table of which begins with [[scene.objects]]"),
+        "{told}"
+    );
+}
+
+#[test]
 fn a_file_that_is_not_utf8_text_is_answered_with_how_to_save_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("pipeline.toml");

@@ -127,13 +127,24 @@ pub(super) fn parse_file(path: &Path, text: &str) -> Result<Node, ConfigError> {
     };
     let table = DeTable::parse(text).map_err(|e| ConfigError::Syntax {
         at: place(e.span().map_or(0, |s| s.start)),
-        message: one_line(e.message()),
+        message: with_remedy(one_line(e.message())),
     })?;
     let table_place = Place::File { file: path.into() };
     Ok(Node {
         value: Value::Table(entries(table.get_ref(), &place)?),
         place: table_place,
     })
+}
+
+/// Says what to do where a path of Windows reads as escapes.
+fn with_remedy(message: String) -> String {
+    let is_escape = ["unicode value", "escape"];
+    match is_escape.iter().any(|word| message.contains(word)) {
+        true => format!(
+            "{message}; in double quotes a backslash begins an escape: write a path in single quotes, or with / for each \\"
+        ),
+        false => message,
+    }
 }
 
 fn one_line(message: &str) -> String {
