@@ -104,7 +104,8 @@ mod tests {
     fn said(typed: &[&str]) -> anyhow::Result<()> {
         let folder = tempfile::tempdir()?;
         let evaluation = EvaluationFolder::new(folder.path());
-        let pipeline = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"a.obj\"\n";
+        let pipeline = "[scene]\nbackground = \"photo.png\"\n[[scene.objects]]\npath = \"a.obj\"\nposition = [0.0, 0.0, 0.0]\n\
+                        [scene.camera]\nposition = [0.0, 1.6, 5.0]\nlook_at = [0.0, 0.5, 0.0]\nfov_deg = 40.0\n";
         write(&evaluation.scene("a").join("pipeline.toml"), pipeline)?;
         let scene: SceneInfo = serde_json::from_value(json!({"name": "a", "made_from": "",
             "map": "map.exr", "exposure_ev": 0.0, "tone": "none"}))?;
