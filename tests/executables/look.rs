@@ -171,3 +171,26 @@ fn a_sharp_photograph_without_noise_changes_nothing() {
     });
     assert_eq!(own, neither);
 }
+
+#[test]
+fn a_very_soft_photograph_is_matched_and_one_that_tells_nothing_is_named() {
+    let project = Project::new();
+    write_photograph(&project, 4.0, 0.0);
+    project.run_both(&[]);
+    let found = look(&project);
+    assert!(
+        (number(&found["edge_blur_px"]) / 4.0 - 1.0).abs() < 0.15,
+        "{found}"
+    );
+    assert!(number(&found["blur_px"]) > 2.0, "{found}");
+    write_photograph(&project, 100.0, 0.0);
+    project.run(SCENE, &[]).expect_success();
+    let run = project.run(COMPOSITE, &[]);
+    run.expect_success();
+    let unknown = "too few clear edges to tell how soft it is";
+    assert!(run.stdout.contains(unknown), "{}", run.stdout);
+    assert!(look(&project)["edge_blur_px"].is_null());
+    let run = project.run(COMPOSITE, &NEITHER[..2]);
+    run.expect_success();
+    assert!(!run.stdout.contains(unknown), "{}", run.stdout);
+}

@@ -1,7 +1,7 @@
 //! Sharpness: how wide the sharpest edges of a photograph are, and the same blur for what is laid over it.
 use crate::metrics::LUMA;
 use crate::raster::{LinearImage, Raster};
-use crate::resize::{PixelBox, Sample, filter_columns, filter_rows};
+use crate::resize::{Filter, PixelBox, Sample, filter_columns, filter_rows, resize};
 use crate::squares::squares;
 use dipir_numerics::resample::Taps;
 use rayon::prelude::*;
@@ -9,8 +9,12 @@ use rayon::prelude::*;
 /// Standard deviations of the two Gaussians whose gradients are compared, pixels: about the least of which pixels can be
 /// samples, and one that reaches over few neighbours.
 const SCALES: [f32; 2] = [0.7, 1.4];
-/// Least gradient of an edge that is measured, linear light a pixel. Noise and faint detail have less.
+/// Least gradient of an edge that is measured, in a pixel, as a share of white. Noise and faint detail have less.
 const LEAST_GRADIENT: f32 = 0.06;
+/// The photograph is looked at at one over these of its resolution, until enough edges are steep enough.
+const DIVISORS: [usize; 3] = [1, 2, 4];
+/// Least blur that is believed below the photograph's resolution, pixels there: what is sharper there was faint, not soft.
+const LEAST_BELOW: f32 = 0.7;
 /// Least number of edges that tell anything, and the share of all that is listened to: those with the steepest gradients.
 const LEAST_EDGES: usize = 100;
 const STEEPEST: usize = 10;
@@ -22,13 +26,36 @@ pub const OF_PIXELS: f32 = 0.4;
 const REACH: f32 = 4.0;
 
 /// Blur of the sharpest edges of `image`, pixels: the standard deviation of the Gaussian that a step was blurred by, and
-/// [`OF_PIXELS`] or less where there is none but that of pixels. `None` where too few edges tell.
+/// [`OF_PIXELS`] or less where there is none but that of pixels. `white` is the light that shows white. `None` where too few
+/// edges tell.
 ///
 /// A step blurred by `s` has after another Gaussian of `t` a gradient in proportion to `1 / sqrt(s^2 + t^2)`: the ratio of
-/// the gradients at two `t` gives `s` [Zhuo and Sim 2011].
-pub fn edge_blur_px(image: &LinearImage) -> Option<f32> {
-    let squares = squares(image.0.width(), image.0.height());
-    let edges = squares.par_iter().map(|b| edges_of(image, *b));
+/// the gradients at two `t` gives `s` [Zhuo and Sim 2011]. From two pixels on the ratio tells little, and edges are hardly
+/// steep enough: then they are measured at a lower resolution.
+pub fn edge_blur_px(image: &LinearImage, white: f32) -> Option<f32> {
+    DIVISORS.into_iter().find_map(|divisor| {
+        let found = blur_at(image, white, divisor)?;
+        // Pixels there are boxes of `divisor` pixels: their blur is not the photograph's, but that of its own pixels is.
+        let of_box = |width: f32| width * width / 12.0;
+        let own = of_box(1.0) - of_box(1.0 / divisor as f32);
+        match divisor {
+            1 => Some(found),
+            _ => (found >= LEAST_BELOW).then(|| divisor as f32 * (found * found - own).sqrt()),
+        }
+    })
+}
+
+/// Blur of the sharpest edges at one over `divisor` of the resolution, pixels there.
+fn blur_at(image: &LinearImage, white: f32, divisor: usize) -> Option<f32> {
+    let [width, height] = [image.0.width(), image.0.height()].map(|n| n / divisor);
+    if width.min(height) <= 2 * BORDER {
+        return None;
+    }
+    let squares = squares(width, height);
+    let edges = squares.par_iter().map(|b| {
+        let luma = luma_of(image, *b, divisor);
+        edges_of(&luma, LEAST_GRADIENT * white)
+    });
     let mut edges: Vec<Edge> = edges.collect::<Vec<_>>().into_iter().flatten().collect();
     if edges.len() < LEAST_EDGES {
         return None;
@@ -39,6 +66,25 @@ pub fn edge_blur_px(image: &LinearImage) -> Option<f32> {
     Some(edges[edges.len() / SHARPER].blur_px)
 }
 
+/// Luminance of a square of the image at one over `divisor` of its resolution.
+fn luma_of(image: &LinearImage, square: PixelBox, divisor: usize) -> Raster<f32> {
+    let PixelBox {
+        x,
+        y,
+        width,
+        height,
+    } = square;
+    let [first, rows, start, columns] = [y, height, x, width].map(|n| n * divisor);
+    let luma = (first..first + rows)
+        .flat_map(|y| &image.0.row(y)[start..start + columns])
+        .map(|v| v.dot(LUMA));
+    let luma = Raster::from_pixels(columns, rows, luma.collect());
+    match divisor {
+        1 => luma,
+        _ => resize(&luma, width, height, Filter::Area),
+    }
+}
+
 struct Edge {
     gradient: f32,
     blur_px: f32,
@@ -47,33 +93,28 @@ struct Edge {
 /// Columns and rows of a square's border in which no edge is looked for: the filters reach beyond.
 const BORDER: usize = 6;
 
-fn edges_of(image: &LinearImage, square: PixelBox) -> Vec<Edge> {
-    let rows = square.y..square.y + square.height;
-    let columns = square.x..square.x + square.width;
-    let luma = rows
-        .flat_map(|y| image.0.row(y)[columns.clone()].iter().map(|v| v.dot(LUMA)))
-        .collect();
-    let luma = Raster::from_pixels(square.width, square.height, luma);
+fn edges_of(luma: &Raster<f32>, least_gradient: f32) -> Vec<Edge> {
     let whole = PixelBox {
         x: 0,
         y: 0,
-        ..square
+        width: luma.width(),
+        height: luma.height(),
     };
     let [fine, wide] = SCALES.map(|s| {
         let (smooth, slope) = (gaussian(s), slope(s));
         [
-            filtered(&luma, whole, &slope, &smooth),
-            filtered(&luma, whole, &smooth, &slope),
+            filtered(luma, whole, &slope, &smooth),
+            filtered(luma, whole, &smooth, &slope),
         ]
     });
     let inside = |length: usize| BORDER..length.saturating_sub(BORDER);
     let mut edges = Vec::new();
-    for y in inside(square.height) {
-        for x in inside(square.width) {
+    for y in inside(whole.height) {
+        for x in inside(whole.width) {
             let of = |g: &[Raster<f32>; 2], x: usize, y: usize| [*g[0].get(x, y), *g[1].get(x, y)];
             let g = of(&fine, x, y);
             let gradient = g[0].hypot(g[1]);
-            if gradient < LEAST_GRADIENT {
+            if gradient < least_gradient {
                 continue;
             }
             let along = g.map(|c| c / gradient);
@@ -175,6 +216,11 @@ mod tests {
 
     /// Bars at an angle whose edges are blurred by `blur_px`, each pixel the mean over its area.
     fn bars(blur_px: f64) -> LinearImage {
+        steps(blur_px, 0.7)
+    }
+
+    /// The same with edges of this height.
+    fn steps(blur_px: f64, height: f64) -> LinearImage {
         const FINE: usize = 4;
         let (sin, cos) = 0.4f64.sin_cos();
         let cover = |x: f64, y: f64| {
@@ -198,7 +244,7 @@ mod tests {
                 cover((i % SIZE) as f64 + u, (i / SIZE) as f64 + v)
             });
             let mean = fine.sum::<f64>() / (FINE * FINE) as f64;
-            Vec3::splat((0.1 + 0.7 * mean) as f32)
+            Vec3::splat((0.1 + height * mean) as f32)
         };
         LinearImage(Raster::from_pixels(
             SIZE,
@@ -211,17 +257,41 @@ mod tests {
     fn the_blur_of_edges_is_found() {
         // The area of a pixel blurs by sqrt(1 / 12). Where nothing else does, what is found depends on how the edge crosses
         // the pixels (.4 to .6); from one pixel on it hardly does.
-        let sharp = edge_blur_px(&bars(0.0)).unwrap();
+        let sharp = edge_blur_px(&bars(0.0), 1.0).unwrap();
         assert!((sharp - OF_PIXELS).abs() < 0.08, "{sharp}");
-        for blur_px in [1.0, 1.5, 2.0] {
-            let found = f64::from(edge_blur_px(&bars(blur_px)).unwrap());
+        for blur_px in [1.0, 1.5, 2.0, 3.0, 4.5, 6.0] {
+            let found = f64::from(edge_blur_px(&bars(blur_px), 1.0).unwrap());
             let expected = blur_px.hypot((1.0f64 / 12.0).sqrt());
             assert!((found / expected - 1.0).abs() < 0.08, "{found} {expected}");
         }
         let even = LinearImage(Raster::filled(SIZE, SIZE, Vec3::splat(0.4)));
-        assert_eq!(edge_blur_px(&even), None);
+        assert_eq!(edge_blur_px(&even, 1.0), None);
         let tiny = LinearImage(Raster::filled(3, 2, Vec3::splat(0.4)));
-        assert_eq!(edge_blur_px(&tiny), None);
+        assert_eq!(edge_blur_px(&tiny, 1.0), None);
+    }
+
+    #[test]
+    fn soft_edges_that_are_faint_are_measured_at_a_lower_resolution_and_sharp_ones_never() {
+        for (blur_px, divisor) in [(2.0, 2), (4.0, 4)] {
+            let image = steps(blur_px, 0.2);
+            assert_eq!(blur_at(&image, 1.0, divisor / 2), None);
+            let found = f64::from(edge_blur_px(&image, 1.0).unwrap());
+            // That of the blur alone: the area of a pixel adds 1% to two pixels. Between steps of coarse pixels it varies.
+            assert!((found / blur_px - 1.0).abs() < 0.1, "{found} {blur_px}");
+        }
+        // Steps too faint to be seen at the photograph's resolution are as steep at any other.
+        assert_eq!(edge_blur_px(&steps(0.0, 0.08), 1.0), None);
+        // A little steeper at a lower resolution, and found there: sharp.
+        let between = steps(0.5, 0.13);
+        assert!(blur_at(&between, 1.0, 4).unwrap() < LEAST_BELOW);
+        assert_eq!(edge_blur_px(&between, 1.0), None);
+    }
+
+    #[test]
+    fn the_scale_of_light_does_not_matter() {
+        let image = steps(1.5, 0.5);
+        let bright = LinearImage(image.0.map(|p| *p * 1024.0));
+        assert_eq!(edge_blur_px(&bright, 1024.0), edge_blur_px(&image, 1.0));
     }
 
     #[test]
@@ -234,7 +304,7 @@ mod tests {
             height: SIZE,
         };
         blur(&mut layer, None, part, 1.2);
-        let found = edge_blur_px(&LinearImage(layer)).unwrap();
+        let found = edge_blur_px(&LinearImage(layer), 1.0).unwrap();
         let expected = 1.2f32.hypot((1.0f32 / 12.0).sqrt());
         assert!((found / expected - 1.0).abs() < 0.08, "{found} {expected}");
     }

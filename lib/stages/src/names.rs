@@ -48,7 +48,7 @@ pub const LIGHT: StageName = StageName {
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 19,
+    version: 20,
 };
 
 /// All stages, each after those that it reads.

@@ -19,10 +19,11 @@ use crate::light::exposed;
 /// Less blur than this is not added, pixels: an edge differs by more with where it crosses the pixels.
 const LEAST_BLUR_PX: f32 = 0.5;
 /// Most blur, pixels: a photograph whose sharpest edges are softer is out of focus as a whole.
-const MOST_BLUR_PX: f32 = 3.0;
+const MOST_BLUR_PX: f32 = 6.0;
 
 /// How the photograph looks beside a rendered picture.
 pub(super) struct Look {
+    looks_for_blur: bool,
     edge_blur_px: Option<f32>,
     grain: Option<Grain>,
     shown: Shown,
@@ -32,7 +33,7 @@ pub(super) struct Look {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Matched {
-    /// Standard deviation of the blur of the photograph's sharpest edges, pixels: .4 or less where there is none, 3 at most;
+    /// Standard deviation of the blur of the photograph's sharpest edges, pixels: .4 or less where there is none, 6 at most;
     /// absent where it was not looked for, and where nothing tells it.
     pub edge_blur_px: Option<f32>,
     /// Standard deviation of the blur of object and shadow, pixels; absent if they were not blurred.
@@ -89,10 +90,11 @@ impl Look {
             gain: exposed::gain(taken, &taken.image),
         };
         let grain = || Grain::of(&taken.image, |light| shown.display(light));
+        let looks_for_blur = table.matches_blur();
         Self {
-            edge_blur_px: table
-                .matches_blur()
-                .then(|| edge_blur_px(&taken.image))
+            looks_for_blur,
+            edge_blur_px: looks_for_blur
+                .then(|| edge_blur_px(&taken.image, shown.gain.recip()))
                 .flatten()
                 .map(|px| px.min(MOST_BLUR_PX)),
             grain: table.matches_grain().then(grain).flatten(),
@@ -131,6 +133,11 @@ impl Look {
         let divisor = [4, 2].into_iter().find(|&d| own_blur_px(d) <= blur_px);
         let [width, height] = resolution.map(|n| u64::from(n.div_ceil(divisor.unwrap_or(1))));
         Some(width * height)
+    }
+
+    /// Whether the photograph's blur was looked for and nothing tells it.
+    pub fn is_blur_unknown(&self) -> bool {
+        self.looks_for_blur && self.edge_blur_px.is_none()
     }
 
     /// Blur that layers which were rendered at one over `divisor` of the resolution lack.

@@ -70,6 +70,8 @@ pub struct Done {
     /// Edges at that resolution are no softer than the photograph's.
     is_sharp_enough: bool,
     matched: Matched,
+    /// Nothing tells how soft the photograph is.
+    is_blur_unknown: bool,
     /// From the start of the run to its end.
     seconds: f64,
     outlook: Outlook,
@@ -210,6 +212,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
         divisor: rendered.divisor,
         is_sharp_enough: divisor_for(resolution, enough) >= rendered.divisor,
         matched: layers.matched,
+        is_blur_unknown: look.is_blur_unknown(),
         seconds,
         outlook,
     })
@@ -547,6 +550,9 @@ impl fmt::Display for Done {
                 f,
                 "\n  {matched} (composite.match_blur, composite.match_grain)"
             )?;
+        }
+        if self.is_blur_unknown {
+            f.write_str("\n  the photograph has too few clear edges to tell how soft it is: the object is sharp")?;
         }
         if let Stop::TimeBudget(budget) = self.target {
             let (budget, share) = (budget.as_secs_f64(), self.seconds / budget.as_secs_f64());
