@@ -1,6 +1,7 @@
 //! The executables as a user runs them: on files, by exit code and by what they print.
 mod bad_input;
 mod browser;
+mod depth_of_field;
 mod disk;
 mod documents;
 mod estimate;

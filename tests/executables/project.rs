@@ -28,6 +28,15 @@ pub const PRETRAIN: &str = env!("CARGO_BIN_EXE_dipir-pretrain");
 /// `dipir-inspect`.
 pub const INSPECT: &str = env!("CARGO_BIN_EXE_dipir-inspect");
 
+/// Exif tags of fractions: seconds, the lens's f-number, its focal length in millimetres.
+pub const EXPOSURE_TIME: u16 = 0x829a;
+/// See there.
+pub const F_NUMBER: u16 = 0x829d;
+/// See there.
+pub const FOCAL_LENGTH: u16 = 0x920a;
+/// Exif tag of a whole number.
+const ISO_SPEED: u16 = 0x8827;
+
 /// A tetrahedron that stands on y = 0.
 pub const OBJECT: &str = "v -0.6 0 0.5\nv 0.6 0 0.5\nv 0 0 -0.6\nv 0 1.1 0\n\
                           f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n";
@@ -101,6 +110,42 @@ impl Project {
     /// Writes a file.
     pub fn write(&self, name: &str, content: impl AsRef<[u8]>) {
         fs::write(self.path(name), content).unwrap();
+    }
+
+    /// Writes a photograph of one colour whose Exif data are these fractions, and an ISO speed of 100. Tags rise.
+    pub fn write_jpeg(&self, name: &str, color: [u8; 3], exif: &[(u16, [u32; 2])]) {
+        let picture = image::RgbImage::from_pixel(36, 24, image::Rgb(color));
+        let mut encoded = std::io::Cursor::new(vec![]);
+        picture
+            .write_to(&mut encoded, image::ImageFormat::Jpeg)
+            .unwrap();
+        let encoded = encoded.into_inner();
+        // A TIFF header, a directory that names another, and that.
+        let mut bytes =
+            b"Exif\0\0II*\0\x08\0\0\0\x01\0\x69\x87\x04\0\x01\0\0\0\x1a\0\0\0\0\0\0\0".to_vec();
+        let entries = exif.len() as u16 + 1;
+        bytes.extend(entries.to_le_bytes());
+        let mut entry = |tag: u16, kind: u16, value: u32| {
+            bytes.extend([tag.to_le_bytes(), kind.to_le_bytes()].concat());
+            bytes.extend([1u32.to_le_bytes(), value.to_le_bytes()].concat());
+        };
+        let values = 0x1a + 2 + 12 * u32::from(entries) + 4;
+        let mut all: Vec<_> = (exif.iter().enumerate())
+            .map(|(i, (tag, _))| (*tag, 5, values + 8 * i as u32))
+            .collect();
+        all.push((ISO_SPEED, 3, 100));
+        all.sort();
+        for (tag, kind, value) in all {
+            entry(tag, kind, value);
+        }
+        bytes.extend([0; 4]);
+        bytes.extend(
+            exif.iter()
+                .flat_map(|(_, n)| n.map(u32::to_le_bytes).concat()),
+        );
+        let length = u16::try_from(bytes.len() + 2).unwrap().to_be_bytes();
+        let all = [&encoded[..2], &[0xff, 0xe1], &length, &bytes, &encoded[2..]];
+        self.write(name, all.concat());
     }
 
     /// Reads a file.

@@ -132,37 +132,9 @@ fn a_frame_that_fails_leaves_no_folder() {
 #[test]
 fn frames_are_exposed_as_their_exif_data_say() {
     let project = project();
-    // Exposure time, f-number and ISO of a TIFF header with one directory.
-    let exif = |seconds: [u32; 2]| {
-        let mut bytes =
-            b"Exif\0\0II*\0\x08\0\0\0\x01\0\x69\x87\x04\0\x01\0\0\0\x1a\0\0\0\0\0\0\0".to_vec();
-        let entry = |tag: u16, kind: u16, value: u32| {
-            let mut e = [tag.to_le_bytes(), kind.to_le_bytes()].concat();
-            e.extend([1, 0, 0, 0]);
-            e.extend(value.to_le_bytes());
-            e
-        };
-        bytes.extend([3, 0]);
-        bytes.extend(entry(0x829a, 5, 68));
-        bytes.extend(entry(0x829d, 5, 76));
-        bytes.extend(entry(0x8827, 3, 100));
-        bytes.extend([0; 4]);
-        for number in [seconds[0], seconds[1], 2, 1] {
-            bytes.extend(number.to_le_bytes());
-        }
-        bytes
-    };
     let jpeg = |name: &str, seconds, color| {
-        let picture = image::RgbImage::from_pixel(36, 24, image::Rgb(color));
-        let mut encoded = std::io::Cursor::new(vec![]);
-        picture
-            .write_to(&mut encoded, image::ImageFormat::Jpeg)
-            .unwrap();
-        let encoded = encoded.into_inner();
-        let exif = exif(seconds);
-        let length = u16::try_from(exif.len() + 2).unwrap().to_be_bytes();
-        let all = [&encoded[..2], &[0xff, 0xe1], &length, &exif, &encoded[2..]];
-        project.write(name, all.concat());
+        let exif = [(EXPOSURE_TIME, seconds), (F_NUMBER, [2, 1])];
+        project.write_jpeg(name, color, &exif);
     };
     jpeg("photo.jpg", [1, 100], [90, 100, 110]);
     jpeg("longer.jpg", [1, 50], [90, 100, 110]);

@@ -27,6 +27,9 @@ pub struct Facts {
     pub focal_source: Option<FocalSource>,
     /// Focal length over pixel pitch, pixels.
     pub focal_px: Option<f64>,
+    /// f-number of the lens.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub f_number: Option<f64>,
     /// When it was taken, ISO 8601: `2026-06-21T12:34:56+02:00`. Without an offset at its end it is
     /// the local time of an unknown zone.
     pub time: Option<String>,
@@ -118,6 +121,7 @@ impl Facts {
         let [w, h] = self.size.map(f64::from);
         let diagonal_px = w.hypot(h);
         self.focal_mm = fields.positive(Tag::FocalLength);
+        self.f_number = fields.positive(Tag::FNumber);
         // A digital zoom crops the sensor; the equivalent focal length includes it.
         let zoom = fields
             .positive(Tag::DigitalZoomRatio)

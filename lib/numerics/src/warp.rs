@@ -53,7 +53,7 @@ impl Frame {
 /// Uniform on the unit disk, by the concentric map [Shirley and Chiu 1997], which keeps
 /// strata compact.
 #[inline]
-fn square_to_disk(u: Vec2) -> Vec2 {
+pub fn square_to_disk(u: Vec2) -> Vec2 {
     let p = 2.0 * u - Vec2::ONE;
     if p == Vec2::ZERO {
         return Vec2::ZERO;

@@ -4,13 +4,12 @@ use std::sync::Arc;
 
 use dipir_imaging::composite::composite;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
-use dipir_imaging::tone::ToneCurves;
 use dipir_light::environment::EnvironmentSampler;
 use dipir_light::map_with_lobes::MapWithLobes;
 use dipir_render::adaptive::Stop;
 use dipir_render::effects::EffectsPlan;
 use dipir_render::error::RenderError;
-use dipir_render::gloss::{self, Gloss};
+use dipir_render::gloss;
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings, Simulation};
 use dipir_scene::config::EffectSwitch;
@@ -58,9 +57,9 @@ impl Draft {
                 };
                 let map = EnvironmentSampler::new(map);
                 let lit = MapWithLobes::new(map, light.lobes.clone());
-                render(loaded, &lit, (tone, light.gloss), samples, go_on)
+                render(loaded, &lit, light, samples, go_on)
             }
-            None => render(loaded, &light.lobes, (tone, light.gloss), samples, go_on),
+            None => render(loaded, &light.lobes, light, samples, go_on),
         }?;
         let film = rendered.film;
         let (object, shadow) = match tone {
@@ -90,13 +89,14 @@ impl Draft {
 fn render<L: SceneLight>(
     loaded: &LoadedScene,
     light: &L,
-    (tone, gloss): (Option<&ToneCurves>, Option<Gloss>),
+    at_hand: &AtHand,
     samples: u32,
     go_on: &mut dyn FnMut() -> ControlFlow<()>,
 ) -> Result<Rendered, RenderError> {
     let settings = Settings {
-        tone,
-        gloss,
+        tone: at_hand.tone.as_ref(),
+        gloss: at_hand.gloss,
+        lens: at_hand.lens,
         ..settings(loaded, samples)
     };
     let simulation = simulation(loaded, &settings);

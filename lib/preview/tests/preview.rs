@@ -187,6 +187,7 @@ fn sunny(direction: Vec3) -> AtHand {
         )),
         tone: None,
         gloss: None,
+        lens: None,
         origin: Origin::Estimate,
     }
 }

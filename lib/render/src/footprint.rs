@@ -3,6 +3,8 @@ use dipir_scene::bvh::{Bounds, Sphere};
 use dipir_scene::camera::Camera;
 use glam::{Vec2, Vec3};
 
+use crate::lens::ThinLens;
+
 /// Rectangles of pixels that together hold the object's image.
 #[derive(Clone, Debug, Default)]
 pub struct Footprint {
@@ -21,8 +23,13 @@ struct Rectangle {
 const NEAR: f32 = 1e-3;
 
 impl Footprint {
-    /// Of an object inside `bounds`, and inside the balls `parts`.
-    pub fn new(camera: &Camera, bounds: Option<Bounds>, parts: &[Sphere]) -> Self {
+    /// Of an object inside `bounds`, and inside the balls `parts`, seen through `lens` if there is one.
+    pub fn new(
+        camera: &Camera,
+        lens: Option<ThinLens>,
+        bounds: Option<Bounds>,
+        parts: &[Sphere],
+    ) -> Self {
         let Some(bounds) = bounds else {
             return Self::default();
         };
@@ -36,7 +43,7 @@ impl Footprint {
             })
         };
         Self {
-            whole: Some(rectangle(camera, &corners(bounds))),
+            whole: Some(rectangle(camera, lens, &corners(bounds))),
             parts: parts
                 .iter()
                 .map(|ball| {
@@ -45,7 +52,7 @@ impl Footprint {
                         min: (ball.center - r).max(bounds.min),
                         max: (ball.center + r).min(bounds.max),
                     };
-                    rectangle(camera, &corners(around))
+                    rectangle(camera, lens, &corners(around))
                 })
                 .collect(),
         }
@@ -67,11 +74,13 @@ impl Footprint {
 }
 
 /// The image of the convex hull of `corners`; everything if it reaches behind the camera.
-fn rectangle(camera: &Camera, corners: &[Vec3; 8]) -> Rectangle {
+fn rectangle(camera: &Camera, lens: Option<ThinLens>, corners: &[Vec3; 8]) -> Rectangle {
     let mut r = Rectangle {
         min: Vec2::INFINITY,
         max: Vec2::NEG_INFINITY,
     };
+    // Of all depths between those of the corners, one of these is blurred most.
+    let mut most_blur = Vec2::ZERO;
     let forward = -camera.rotation.z_axis;
     for corner in corners {
         let offset = *corner - camera.position;
@@ -79,6 +88,8 @@ fn rectangle(camera: &Camera, corners: &[Vec3; 8]) -> Rectangle {
         match camera.project(*corner).filter(|_| in_front) {
             // A thousandth of a pixel covers the rounding of the projection.
             Some(p) => {
+                let blur = lens.map_or(Vec2::ZERO, |l| l.blur_px(camera, offset.dot(forward)));
+                most_blur = most_blur.max(blur);
                 r.min = r.min.min(p - 1e-3 * (1.0 + p.abs()));
                 r.max = r.max.max(p + 1e-3 * (1.0 + p.abs()));
             }
@@ -90,6 +101,8 @@ fn rectangle(camera: &Camera, corners: &[Vec3; 8]) -> Rectangle {
             }
         }
     }
+    r.min -= most_blur * (1.0 + 1e-3);
+    r.max += most_blur * (1.0 + 1e-3);
     r
 }
 
@@ -114,7 +127,7 @@ mod tests {
             min: Vec3::new(-1.0, -0.5, -1.0),
             max: Vec3::new(0.5, 1.0, 1.0),
         };
-        let f = Footprint::new(&camera(), Some(bounds), &[]);
+        let f = Footprint::new(&camera(), None, Some(bounds), &[]);
         for i in 0..1000 {
             let h = |k: u64| dipir_numerics::hashing::hash_u64s(&[i, k]) as f32 / u64::MAX as f32;
             let p = bounds.min + (bounds.max - bounds.min) * Vec3::new(h(0), h(1), h(2));
@@ -131,12 +144,12 @@ mod tests {
             min: Vec3::splat(-9.0),
             max: Vec3::splat(9.0),
         };
-        let f = Footprint::new(&camera(), Some(bounds), &[]);
+        let f = Footprint::new(&camera(), None, Some(bounds), &[]);
         assert!(f.holds(0, 0) && f.holds(99, 50));
     }
 
     #[test]
     fn nothing_is_seen_nowhere() {
-        assert!(!Footprint::new(&camera(), None, &[]).holds(3, 3));
+        assert!(!Footprint::new(&camera(), None, None, &[]).holds(3, 3));
     }
 }

@@ -278,7 +278,7 @@ impl<L: PathLight> PathContext<'_, L> {
         counts: &mut RayCounts,
         gather: &mut G,
     ) -> (f32, f32) {
-        let mut ray = self.world.camera().ray(point);
+        let mut ray = self.world.view_ray(point, sampler);
         let mut share = 1.0;
         if let Some(ground) = &self.world.polished {
             let Some(mirrored) = ground.gloss.ray(self.world, &ray, sampler.next_2d()) else {

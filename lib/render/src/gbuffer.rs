@@ -159,7 +159,7 @@ impl<'a> View<'a> {
         let bvh = &world.geometry.bvh;
         Self {
             world,
-            footprint: Footprint::new(world.camera(), bvh.bounds(), bvh.clusters()),
+            footprint: Footprint::new(world.camera(), world.lens, bvh.bounds(), bvh.clusters()),
             seed,
         }
     }
@@ -200,7 +200,8 @@ impl<'a> View<'a> {
 
     /// The proxy at the upper corners of the pixels of row `y`, and at the last one's right.
     fn corners(&self, y: usize, width: usize) -> Vec<Option<Seen>> {
-        let corner = |x: usize| self.proxy_at(&self.ray(Vec2::new(x as f32, y as f32)));
+        let corner =
+            |x: usize| self.proxy_at(&self.world.camera().ray(Vec2::new(x as f32, y as f32)));
         (0..=width).map(corner).collect()
     }
 
@@ -250,13 +251,13 @@ impl<'a> View<'a> {
     fn sample(&self, (x, y): (usize, usize), i: u32) -> (Ray, Sampler) {
         let pixel = (y as u32) << 16 | (x as u32 & 0xffff);
         let mut sampler = Sampler::new(self.seed, Stream::FOREGROUND, pixel, i);
-        let ray = self.ray(Vec2::new(x as f32, y as f32) + sampler.next_2d());
-        (ray, sampler)
+        let place = Vec2::new(x as f32, y as f32) + sampler.next_2d();
+        let ray = self.world.view_ray(place, &mut sampler);
+        (self.sent_on(ray), sampler)
     }
 
-    /// That of the camera; by way of polished ground as a mirror sends it on.
-    fn ray(&self, at: Vec2) -> Ray {
-        let ray = self.world.camera().ray(at);
+    /// `ray` of the camera; by way of polished ground as a mirror sends it on.
+    fn sent_on(&self, ray: Ray) -> Ray {
         match self.world.polished {
             Some(_) => Gloss::MIRROR
                 .ray(self.world, &ray, Vec2::ZERO)
@@ -265,14 +266,9 @@ impl<'a> View<'a> {
         }
     }
 
-    fn depth(&self, position: Vec3) -> f32 {
-        let camera = self.world.camera();
-        (position - camera.position).dot(-camera.rotation.z_axis)
-    }
-
     fn proxy_at(&self, ray: &Ray) -> Option<Seen> {
         self.world.proxy_point(ray).map(|point| Seen {
-            depth: self.depth(point.position),
+            depth: self.world.camera().depth(point.position),
             normal: point.normal,
             albedo: Vec3::ZERO,
         })
@@ -283,7 +279,7 @@ impl<'a> View<'a> {
         let surfaces = &self.world.surfaces;
         let surface = surfaces.interact::<F>(ray.direction, hit.triangle, hit.u, hit.v);
         Some(Seen {
-            depth: self.depth(surface.position),
+            depth: self.world.camera().depth(surface.position),
             normal: surface.normal,
             albedo: surface.base_color,
         })

@@ -32,6 +32,7 @@ use crate::coarse::shrink;
 use crate::error::RenderError;
 use crate::film::Film;
 use crate::job::{Job, Layer, PixelSet};
+use crate::lens::ThinLens;
 use crate::light::{PathLight, PreparedLight, SceneLight};
 use crate::render::{Rendered, Renderer, Settings, Simulation};
 use crate::shadow::Block;
@@ -220,7 +221,12 @@ fn sides(block: Block) -> [f32; 4] {
 
 impl Renderer<'_> {
     /// The jobs that show the object by way of the ground.
-    pub(crate) fn mirror_jobs(&self, ground: &Polished, blocker: &Blocker) -> Vec<Job> {
+    pub(crate) fn mirror_jobs(
+        &self,
+        ground: &Polished,
+        lens: Option<ThinLens>,
+        blocker: &Blocker,
+    ) -> Vec<Job> {
         let ProxyGeometry::Plane(plane) = &self.geometry().proxy else {
             return vec![];
         };
@@ -256,6 +262,19 @@ impl Renderer<'_> {
             // Angles come from cosines: a thousandth covers their rounding.
             middle.angle_between(cone.axis) <= half + turn + spread + 1e-3
         };
+        // Through a lens, the ground around a pixel: as far as it is blurred, and mirrored things behind it, infinitely far at most.
+        let widened = |[left, top, right, bottom]: [f32; 4]| {
+            let Some(lens) = lens else {
+                return [left, top, right, bottom];
+            };
+            let depths = [(left, top), (right, top), (left, bottom), (right, bottom)]
+                .map(|(x, y)| at(x, y).map_or(f32::INFINITY, |(p, _)| camera.depth(p.position)));
+            let blur = (depths.into_iter().chain([f32::INFINITY]))
+                .map(|depth| lens.blur_px(camera, depth))
+                .fold(Vec2::ZERO, Vec2::max);
+            [left - blur.x, top - blur.y, right + blur.x, bottom + blur.y]
+        };
+        let may_show = |sides: [f32; 4]| may_show(widened(sides));
         let job = |block: Block| {
             if !may_show(sides(block)) {
                 return None;

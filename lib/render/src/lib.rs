@@ -19,6 +19,7 @@ pub mod gloss;
 pub mod guide;
 pub mod highlights;
 pub mod job;
+pub mod lens;
 pub mod light;
 pub mod material_gradient;
 pub mod photo;

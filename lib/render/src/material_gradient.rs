@@ -216,7 +216,7 @@ impl Renderer<'_> {
         let on_object = light.on_object();
         let path = PathContext::from_camera(&world, &on_object, simulation, settings.background);
         let bvh = &self.geometry().bvh;
-        let footprint = Footprint::new(self.camera(), bvh.bounds(), bvh.clusters());
+        let footprint = Footprint::new(self.camera(), None, bvh.bounds(), bvh.clusters());
         let pixels: Vec<(u32, u32)> = self
             .blocks()
             .filter(|b| footprint.overlaps(b.x, b.y, b.width, b.height))

@@ -32,6 +32,7 @@ use crate::gloss::{self, Gloss};
 use crate::guide::PathGuide;
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet};
+use crate::lens::ThinLens;
 use crate::light::{PathLight, PreparedLight, SceneLight};
 use crate::shadow::{Block, LightDirections, LightOnProxy, ShadowContext};
 use crate::viewing::Viewing;
@@ -82,6 +83,8 @@ pub struct Settings<'a> {
     pub shadow_tolerance: f32,
     /// How polished the ground is, if it is a plane; `None` for matt ground.
     pub gloss: Option<Gloss>,
+    /// What the camera looks through; `None` for a pinhole, to which everything is sharp.
+    pub lens: Option<ThinLens>,
     /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
     pub highlights: bool,
     /// Whether noise is [removed](crate::denoise) from object and shadow.
@@ -138,6 +141,7 @@ impl Default for Settings<'_> {
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
             gloss: None,
+            lens: None,
             highlights: true,
             denoise: false,
             blur_caustics: false,
@@ -275,12 +279,14 @@ impl<'a> Renderer<'a> {
                 _ => Vec::new(),
             },
         };
+        world.lens = settings.lens;
         let gloss = self.gloss_of(settings, simulation);
         let plain = &gloss::before(gloss.is_some(), settings);
         let mut first = gloss::first(gloss.is_some(), progress);
         let mut rendered =
             self.render_layers(light, world, simulation, plain, start, &mut first)?;
         drop(first);
+        self.defocus(&mut rendered.film.shadow, world, settings);
         if let Some(gloss) = gloss {
             self.add_mirrored(
                 &mut rendered,
@@ -342,7 +348,7 @@ impl<'a> Renderer<'a> {
             .bounding_sphere()
             .map(|whole| Blocker::new(whole, self.geometry.bvh.clusters()));
         let mut jobs = match (&world.polished, &blocker) {
-            (Some(ground), Some(blocker)) => self.mirror_jobs(ground, blocker),
+            (Some(ground), Some(blocker)) => self.mirror_jobs(ground, world.lens, blocker),
             _ => self.object_jobs(settings),
         };
         let mut guide_rays = RayCounts::default();
@@ -417,7 +423,9 @@ impl<'a> Renderer<'a> {
             adds: path.world.polished.is_some(),
         };
         let find_highlights = |film: &Film, jobs: &[Job]| {
-            if !settings.highlights || matches!(settings.stop, Stop::Samples(_)) {
+            // A place in the image says where a glint is only to a pinhole.
+            let is_given = matches!(settings.stop, Stop::Samples(_));
+            if !settings.highlights || is_given || settings.lens.is_some() {
                 return Found::default();
             }
             let objects = jobs.iter().filter(|job| job.layer == Layer::Object);
@@ -513,7 +521,7 @@ impl<'a> Renderer<'a> {
 
     fn object_jobs(&self, settings: &Settings) -> Vec<Job> {
         let bvh = &self.geometry.bvh;
-        let footprint = Footprint::new(&self.camera, bvh.bounds(), bvh.clusters());
+        let footprint = Footprint::new(&self.camera, settings.lens, bvh.bounds(), bvh.clusters());
         self.blocks()
             .filter(|b| footprint.overlaps(b.x, b.y, b.width, b.height))
             .filter_map(|block| {

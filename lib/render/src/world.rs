@@ -3,13 +3,14 @@ use std::cell::RefCell;
 use std::sync::Arc;
 
 use dipir_numerics::hashing::mix64;
+use dipir_numerics::sampler::Sampler;
 use dipir_scene::bvh::{Bvh, Hit, Sphere};
 use dipir_scene::camera::{Camera, Ray};
 use dipir_scene::mesh::TriangleMesh;
 use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::ray_offset::spawn_origin;
 use dipir_scene::scene::Scene;
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 
 use crate::bsdf::Bsdf;
 use crate::bsdf::features::{ALPHA, EXTENSIONS, SPECULAR, TRANSMISSION, has};
@@ -17,6 +18,7 @@ use crate::convexity::is_convex;
 use crate::counters::{RayCounts, RayKind};
 use crate::error::RenderError;
 use crate::gloss::Polished;
+use crate::lens::ThinLens;
 use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
 
 /// The proxy, ready for rays.
@@ -165,6 +167,8 @@ pub struct World<'a> {
     pub surfaces: Surfaces<'a>,
     /// The effects that `surfaces` was prepared for ([`crate::features`]).
     pub mask: u32,
+    /// What the camera looks through; `None` for a pinhole.
+    pub(crate) lens: Option<ThinLens>,
     /// Rays from the camera go on from this ground.
     pub(crate) polished: Option<Polished>,
     /// No ray that leaves the object outwards meets it again, and none passes through.
@@ -206,6 +210,7 @@ impl<'a> World<'a> {
             geometry,
             surfaces,
             mask,
+            lens: None,
             polished: None,
         })
     }
@@ -214,6 +219,15 @@ impl<'a> World<'a> {
     #[inline]
     pub fn camera(&self) -> &Camera {
         &self.camera
+    }
+
+    /// The ray from the camera through the image position `pixel`; a lens draws two numbers.
+    #[inline]
+    pub(crate) fn view_ray(&self, pixel: Vec2, sampler: &mut Sampler) -> Ray {
+        match &self.lens {
+            Some(lens) => lens.ray(&self.camera, pixel, sampler.next_2d()),
+            None => self.camera.ray(pixel),
+        }
     }
 
     /// The ray that leaves the object at `surface` towards `direction`.

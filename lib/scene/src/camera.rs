@@ -55,6 +55,11 @@ impl Camera {
 }
 
 impl Camera {
+    /// Distance of `point` along the optical axis, metres; negative behind the camera.
+    pub fn depth(&self, point: Vec3) -> f32 {
+        (point - self.position).dot(-self.rotation.z_axis)
+    }
+
     /// The same view with `resolution` pixels, which need not have the same shape: the whole image
     /// is stretched.
     pub fn scaled(&self, resolution: [u32; 2]) -> Self {

@@ -185,7 +185,7 @@ fn shown(pixel: Vec2) -> String {
 }
 
 /// The point of the proxy that is seen at `pixel`.
-fn seen(camera: &Camera, proxy: &Proxy, pixel: Vec2, key: &str) -> Result<DVec3, Error> {
+pub(crate) fn seen(camera: &Camera, proxy: &Proxy, pixel: Vec2, key: &str) -> Result<DVec3, Error> {
     if let Proxy::Mesh(mesh) = proxy {
         return mesh_at(camera, mesh, pixel.as_dvec2()).ok_or_else(|| Error::Config {
             key: key.into(),

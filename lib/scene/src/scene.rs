@@ -6,7 +6,7 @@ use dipir_cameras::Lens;
 use dipir_imaging::file::Photo;
 use dipir_imaging::raster::{LinearImage, Raster};
 use dipir_points::Ground;
-use glam::{DMat4, DVec2};
+use glam::{DMat4, DVec2, Vec2, Vec3};
 
 use crate::assembly::Assembly;
 use crate::camera::{Camera, CameraSettings};
@@ -21,6 +21,7 @@ use crate::import::once;
 use crate::light::PunctualLight;
 use crate::material::Material;
 use crate::mesh::TriangleMesh;
+use crate::pixels;
 use crate::placement::{Anchor, Rest};
 use crate::proxy::Proxy;
 use crate::surfaces::SeenSurfaces;
@@ -219,6 +220,45 @@ impl LoadedScene {
         match &self.original {
             Some(original) => original.undistortion.to_working(pixel),
             None => Some(pixel),
+        }
+    }
+
+    /// The point of the ground, or of what the depths show, that the photograph shows at `pixel`, of its own size whatever the
+    /// size of this; `key` names the pixel in messages.
+    ///
+    /// # Errors
+    /// For a pixel that is none of the photograph's, and where no ground is seen.
+    pub fn seen_at(&self, pixel: Vec2, key: &str) -> Result<Vec3, Error> {
+        let size = Vec2::from(self.photo.facts.size.map(|n| n as f32));
+        let is_inside = pixel.cmpge(Vec2::ZERO).all() && pixel.cmple(size).all();
+        let working = self
+            .undistorted_pixel(pixel.as_dvec2())
+            .filter(|_| is_inside);
+        let Some(working) = working else {
+            return Err(Error::Config {
+                key: key.into(),
+                value: format!("[{:?}, {:?}]", pixel.x, pixel.y),
+                accepted: format!(
+                    "a pixel of the photograph, [0, 0] to [{:?}, {:?}]",
+                    size.x, size.y
+                ),
+            });
+        };
+        let camera = &self.scene.camera;
+        let of = self
+            .original
+            .as_ref()
+            .map_or(self.photo.facts.size, |o| o.undistortion.size());
+        let scale =
+            Vec2::from(camera.resolution.map(|n| n as f32)) / Vec2::from(of.map(|n| n as f32));
+        let pixel = working.as_vec2() * scale;
+        let surface = self
+            .surfaces
+            .as_ref()
+            .and_then(|s| s.seen_at(camera, pixel));
+        match surface {
+            Some(found) => Ok(found.position),
+            None => Ok(pixels::seen(camera, &self.scene.proxy, pixel, key)?.as_vec3()),
         }
     }
 }

@@ -15,6 +15,8 @@ const ALTERNATIVES: &[(&str, &[&str])] = &[
     (PROXY, &["lengths_m", "camera_height_m"]),
     ("light.sun", &["time", "azimuth_deg elevation_deg"]),
     ("composite", &["target_error", "time_budget_s"]),
+    ("composite", &["focus_m", "focus_at_pixel"]),
+    ("composite", &["f_number", "aperture_mm"]),
 ];
 
 /// Tables, a key, and keys that it replaces and that do not replace it.

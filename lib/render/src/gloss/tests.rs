@@ -308,8 +308,14 @@ fn every_pixel_whose_lobe_meets_the_object_is_looked_at() {
     let renderer = Renderer::new(&scene);
     let bvh = &renderer.geometry().bvh;
     let blocker = Blocker::new(bvh.bounding_sphere().unwrap(), bvh.clusters());
-    let world = renderer.world(0).unwrap();
-    for roughness in [0.0, 0.1, 0.3] {
+    let mut world = renderer.world(0).unwrap();
+    let lens = ThinLens {
+        radius: 0.08,
+        focus: 3.0,
+    };
+    let lenses = [None, None, None, Some(lens), Some(lens)];
+    for (roughness, lens) in [0.0, 0.1, 0.3, 0.0, 0.3].into_iter().zip(lenses) {
+        world.lens = lens;
         let gloss = Gloss {
             roughness,
             reflectance: 1.0,
@@ -317,7 +323,7 @@ fn every_pixel_whose_lobe_meets_the_object_is_looked_at() {
         let coat = Coat(Raster::filled(2, 2, CoatPoint::default()));
         let mut film = Film::new(SIDE as usize, SIDE as usize);
         let ground = Polished::new(gloss, coat, &mut film, &scene.camera, &settings(1, 0));
-        let jobs = renderer.mirror_jobs(&ground, &blocker);
+        let jobs = renderer.mirror_jobs(&ground, lens, &blocker);
         let of = |x: usize, y: usize| {
             jobs.iter()
                 .any(|job| job.pixels.index_of(x as u32, y as u32).is_some())
@@ -327,7 +333,8 @@ fn every_pixel_whose_lobe_meets_the_object_is_looked_at() {
             for index in 0..64 {
                 let mut sampler = Sampler::new(0, Stream::TEST, (y * 64 + x) as u32, index);
                 let place = Vec2::new(x as f32, y as f32) + sampler.next_2d();
-                let drawn = gloss.ray(&world, &scene.camera.ray(place), sampler.next_2d());
+                let ray = world.view_ray(place, &mut sampler);
+                let drawn = gloss.ray(&world, &ray, sampler.next_2d());
                 if drawn.is_some_and(|(ray, _)| world.closest::<0>(&ray, 0).is_some()) {
                     hits += 1;
                     missed += usize::from(!of(x, y));
@@ -341,6 +348,7 @@ fn every_pixel_whose_lobe_meets_the_object_is_looked_at() {
         );
         assert!(
             roughness > 0.0
+                || missed == 0 && lens.is_some()
                 || missed == 0 && jobs.iter().map(|j| j.pixels.len()).sum::<usize>() < 2000
         );
     }

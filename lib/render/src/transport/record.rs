@@ -225,6 +225,7 @@ impl Transport {
         let recorder = Recorder {
             footprint: Footprint::new(
                 world.camera(),
+                None,
                 geometry.bvh.bounds(),
                 geometry.bvh.clusters(),
             ),

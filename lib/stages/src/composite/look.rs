@@ -24,6 +24,7 @@ const MOST_BLUR_PX: f32 = 6.0;
 /// How the photograph looks beside a rendered picture.
 pub(super) struct Look {
     looks_for_blur: bool,
+    out_of_focus_px: Option<[f32; 2]>,
     edge_blur_px: Option<f32>,
     grain: Option<Grain>,
     shown: Shown,
@@ -40,6 +41,10 @@ pub struct Matched {
     pub blur_px: Option<f32>,
     /// Standard deviation of the grain on the object where it is mid-grey, of each channel, display values; absent if it got none.
     pub grain: Option<[f32; 3]>,
+    /// Least and greatest radius of the discs that points of the objects are seen as, pixels; absent if it is not known what is
+    /// in focus.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub out_of_focus_px: Option<[f32; 2]>,
 }
 
 /// From light to display values and back.
@@ -83,8 +88,9 @@ fn own_blur_px(divisor: u32) -> f32 {
 }
 
 impl Look {
-    /// Looks at the photograph as it was taken; `table` says for what.
-    pub fn of(taken: &Photo, table: &CompositeTable) -> Self {
+    /// Looks at the photograph as it was taken; `table` says for what. `out_of_focus_px` are radii of the discs that points of
+    /// the objects are seen as.
+    pub fn of(taken: &Photo, out_of_focus_px: Option<[f32; 2]>, table: &CompositeTable) -> Self {
         let shown = Shown {
             transfer: taken.transfer,
             gain: exposed::gain(taken, &taken.image),
@@ -93,6 +99,7 @@ impl Look {
         let looks_for_blur = table.matches_blur();
         Self {
             looks_for_blur,
+            out_of_focus_px,
             edge_blur_px: looks_for_blur
                 .then(|| edge_blur_px(&taken.image, shown.gain.recip()))
                 .flatten()
@@ -123,6 +130,7 @@ impl Look {
             edge_blur_px: self.edge_blur_px,
             blur_px,
             grain: grain.map(|g| g.deviation(Vec3::splat(0.5)).to_array()),
+            out_of_focus_px: self.out_of_focus_px,
         }
     }
 
@@ -245,6 +253,19 @@ impl Matched {
         });
         let done: Vec<String> = [blur, grain].into_iter().flatten().collect();
         (!done.is_empty()).then(|| format!("{} as the photograph is", done.join(" and ")))
+    }
+}
+
+impl Matched {
+    /// How far the objects are out of focus, as a sentence; `None` if nothing says what is in focus.
+    pub fn focus_text(&self) -> Option<String> {
+        let [least, most] = self.out_of_focus_px?.map(|radius| 2.0 * radius);
+        Some(match most < 1.0 {
+            true => "the objects are in focus".into(),
+            false => format!(
+                "out of focus, points of the objects are discs of {least:.0} to {most:.0} pixels"
+            ),
+        })
     }
 }
 

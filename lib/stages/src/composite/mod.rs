@@ -1,5 +1,6 @@
 //! The composite stage: the object at full quality, its shadow, and the layers of both.
 mod curve;
+pub mod focus;
 mod lens;
 mod look;
 mod sharpness;
@@ -137,7 +138,9 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let folder = COMPOSITE.folder(session);
     let mut writer = begin(session, plan(session, &table)?)?;
     let curve = Curve::of(table.tone, &light, inputs.scene.loaded.taken());
-    let look = Look::of(inputs.scene.loaded.taken(), &table);
+    let lens = table.lens(&session.config, &inputs.scene.loaded)?;
+    let out_of_focus = lens.map(|lens| focus::blur_px(&lens, &inputs.scene.loaded));
+    let look = Look::of(inputs.scene.loaded.taken(), out_of_focus, &table);
     let resolution = inputs.scene.loaded.scene.camera.resolution;
     let enough = look.enough_pixels(resolution);
     let preset = &presets::of(session.pipeline.quality).composite;
@@ -286,6 +289,9 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
     if let Some(gloss) = table.gloss() {
         params["ground"] = json!([gloss.roughness, gloss.reflectance]);
     }
+    if let Some(focus) = table.focus_params() {
+        params["focus"] = focus;
+    }
     if let Some(follows) = odd_sharpness(table, session.pipeline.quality) {
         params["follow_sharpness"] = follows.into();
     }
@@ -355,6 +361,7 @@ fn render_under<L: SceneLight>(
         leave_out: effects.leave_out(loaded.description.effects()),
         tone,
         gloss: table.gloss(),
+        lens: focus::that_blurs(table.lens(&session.config, loaded)?, loaded),
         gain: exposed::gain(loaded.taken(), &loaded.photo.image),
         ..Settings::of_scene(loaded)
     };
@@ -549,6 +556,12 @@ impl fmt::Display for Done {
             write!(
                 f,
                 "\n  {matched} (composite.match_blur, composite.match_grain)"
+            )?;
+        }
+        if let Some(text) = self.matched.focus_text() {
+            write!(
+                f,
+                "\n  {text} (composite.focus_m, composite.focus_at_pixel)"
             )?;
         }
         if self.is_blur_unknown {

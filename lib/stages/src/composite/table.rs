@@ -64,6 +64,19 @@ pub struct CompositeTable {
     /// tiles and varnish, up to 1 for metal.
     #[schemars(extend("exclusiveMinimum" = 0), range(max = 1.0), extend("x-default" = "0.04"), example = 0.02)]
     pub ground_reflectance: Option<f32>,
+    /// Distance of what is in focus in the photograph, along the optical axis, metres. What is nearer or farther is then blurred as
+    /// by the photograph's lens. Excludes `focus_at_pixel`.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1e5), extend("x-default" = "none: everything is sharp"), example = 2.5)]
+    pub focus_m: Option<f32>,
+    /// Pixel of the photograph where the ground, or what `scene.depth` shows, is in focus: column and row. Excludes `focus_m`.
+    #[schemars(extend("x-default" = "none"), example = [1200.0, 1810.0])]
+    pub focus_at_pixel: Option<[f32; 2]>,
+    /// f-number of the photograph's lens.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1e3), extend("x-default" = "the photograph's"), example = 1.8)]
+    pub f_number: Option<f32>,
+    /// Diameter of the opening of the photograph's lens, millimetres: its true focal length over its f-number. Excludes `f_number`.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 1e3), extend("x-default" = "focal length over `f_number`"), example = 28.0)]
+    pub aperture_mm: Option<f32>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
     /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
     #[schemars(extend("x-default" = "the recovered curves with the recovered light, `none` with a map"), example = &"reinhard")]
@@ -136,6 +149,7 @@ impl CompositeTable {
             return Err(config.invalid("composite.time_budget_s", message));
         }
         self.check_ground(config)?;
+        self.check_focus(config)?;
         if self.max_samples == Some(0) {
             return Err(config.out_of_range("composite.max_samples", 0, "1 or more"));
         }

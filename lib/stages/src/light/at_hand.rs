@@ -11,8 +11,10 @@ use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::settings::{LightTable, Start};
 use dipir_pipeline::status::State;
 use dipir_render::gloss::Gloss;
+use dipir_render::lens::ThinLens;
 use dipir_scene::scene::LoadedScene;
 
+use crate::composite::focus;
 use crate::composite::table::{CompositeTable, Tone};
 use crate::light::estimate::{distribution, estimate};
 use crate::light::exposed;
@@ -88,6 +90,8 @@ pub struct AtHand {
     pub tone: Option<ToneCurves>,
     /// The ground that it shines on, if that is polished.
     pub gloss: Option<Gloss>,
+    /// What the photograph was taken through, if it is known where it is sharp.
+    pub lens: Option<ThinLens>,
     /// Where it comes from.
     pub origin: Origin,
 }
@@ -101,12 +105,15 @@ pub struct AtHand {
 pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand> {
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
+    let lens = composite.lens(&session.config, loaded)?;
+    let lens = focus::that_blurs(lens, loaded);
     if let Some(light) = known_light::known(session, &composite)? {
         return Ok(AtHand {
             lobes: SgMixture::new(Vec::new())?,
             map: Some(light.map),
             tone: composite.tone.and_then(Tone::curves),
             gloss: composite.gloss(),
+            lens,
             origin: Origin::Map,
         });
     }
@@ -128,6 +135,7 @@ pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand
             None => exposed::tone(loaded.taken(), light.tone),
         },
         gloss: composite.gloss(),
+        lens,
         origin,
     })
 }

@@ -113,11 +113,14 @@ pub fn effects(report: &Report) -> Section {
         rays.join(", ")
     );
     let look = match run.1.output(&run.0, "look").is_ok() {
-        true => json::<Matched>(&run, "look")?.text(),
+        true => Some(json::<Matched>(&run, "look")?),
         false => None,
     };
-    let look = look.map(|look| format!("The object is {look} (look.json)."));
-    let notes = [note].into_iter().chain(look);
+    let blur = look.and_then(|look| look.text());
+    let blur = blur.map(|text| format!("The object is {text} (look.json)."));
+    let focus = look.and_then(|look| look.focus_text());
+    let focus = focus.map(|text| format!("Depth of field: {text} (look.json)."));
+    let notes = [note].into_iter().chain(blur).chain(focus);
     let notes = notes.map(|note| Html::element("p", &[("class", "soft")], [Html::text(note)]));
     Ok(Some(Html::all(
         [html::table(&heads, rows.collect())]

@@ -1,0 +1,151 @@
+//! Depth of field: what is nearer or farther than the lens is focused on is blurred.
+//!
+//! The object is seen by rays through all of a thin lens, so what it hides of itself and of the photograph behind it blurs
+//! as it does in a camera. The photograph was blurred when it was taken; only the shadow on it is new. The ratio of a pixel
+//! is averaged over the disc that its lens would have seen on a surface facing the camera, at the depth that the pixel shows.
+use dipir_imaging::raster::Raster;
+use dipir_numerics::warp::square_to_disk;
+use dipir_scene::camera::{Camera, Ray};
+use glam::{DVec3, Vec2, Vec3};
+use rayon::prelude::*;
+
+use crate::render::{Renderer, Settings};
+use crate::world::World;
+
+/// A lens without thickness or errors, focused on a plane that faces the camera.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ThinLens {
+    /// Half of the diameter of the opening that light enters by, metres.
+    pub radius: f32,
+    /// Distance along the optical axis of what is sharp, metres.
+    pub focus: f32,
+}
+
+/// Rows that are blurred at a time, side by side.
+const BAND: usize = 32;
+/// Blur below this radius is none, pixels: that of a pixel's own area.
+const LEAST_PX: f32 = 0.5;
+
+impl ThinLens {
+    /// From the point of the lens that `u` in the unit square stands for, to what is sharp at the image position `pixel`.
+    pub fn ray(&self, camera: &Camera, pixel: Vec2, u: Vec2) -> Ray {
+        let d = (pixel - camera.principal_px) / camera.focal_px;
+        let sharp = Vec3::new(d.x, -d.y, -1.0) * self.focus;
+        let on_lens = (square_to_disk(u) * self.radius).extend(0.0);
+        Ray {
+            origin: camera.position + camera.rotation * on_lens,
+            direction: (camera.rotation * (sharp - on_lens)).normalize(),
+        }
+    }
+
+    /// Horizontal and vertical radius of the disc that a point at this distance along the optical axis is seen as, pixels.
+    pub fn blur_px(&self, camera: &Camera, depth: f32) -> Vec2 {
+        camera.focal_px * (self.radius * (1.0 / depth - 1.0 / self.focus).abs())
+    }
+
+    /// Shadow ratios as they are seen through the lens; `depth` is the distance along the optical axis of what the pixel
+    /// in a column and row shows of the ground, if it shows any.
+    pub(crate) fn blurred(
+        &self,
+        camera: &Camera,
+        shadow: &Raster<Vec3>,
+        depth: impl Fn(usize, usize) -> Option<f32> + Sync,
+    ) -> Raster<Vec3> {
+        let (width, height) = (shadow.width(), shadow.height());
+        let mut output = shadow.clone();
+        let shades = |y: usize| shadow.row(y).iter().any(|s| *s != Vec3::ONE);
+        let shaded: Vec<bool> = (0..height).map(shades).collect();
+        let bands = output.pixels_mut().par_chunks_mut(BAND * width);
+        bands.enumerate().for_each(|(band, output)| {
+            let rows = output.len() / width;
+            let radius = |i: usize| -> Option<Vec2> {
+                let radius = self.blur_px(camera, depth(i % width, band * BAND + i / width)?);
+                (radius.max_element() >= LEAST_PX).then_some(radius)
+            };
+            let radii: Vec<_> = (0..output.len()).map(radius).collect();
+            let reach = radii.iter().flatten().map(|r| r.y).fold(0f32, f32::max) as usize + 1;
+            let first = (band * BAND).saturating_sub(reach);
+            let end = (band * BAND + rows + reach).min(height);
+            if !shaded[first..end].contains(&true) {
+                return;
+            }
+            let missing = Missing::new(shadow, first, end);
+            for (i, (pixel, radius)) in output.iter_mut().zip(&radii).enumerate() {
+                if let Some(radius) = radius {
+                    let center = [i % width, band * BAND + i / width];
+                    *pixel = Vec3::ONE - missing.mean(center, *radius, height);
+                }
+            }
+        });
+        output
+    }
+}
+
+impl Renderer<'_> {
+    /// Blurs shadow ratios as the lens of `settings` does, if there is one.
+    pub(crate) fn defocus(&self, shadow: &mut Raster<Vec3>, world: &World, settings: &Settings) {
+        let Some(lens) = settings.lens else { return };
+        let camera = self.camera();
+        let depth = |x: usize, y: usize| {
+            let pixel = Vec2::new(x as f32, y as f32) + 0.5;
+            let surfaces = settings.seen_surfaces;
+            if let Some(seen) = surfaces.and_then(|s| s.seen_at(camera, pixel)) {
+                return Some(seen.depth);
+            }
+            let point = world.proxy_point(&camera.ray(pixel))?;
+            Some(camera.depth(point.position))
+        };
+        *shadow = lens.blurred(camera, shadow, depth);
+    }
+}
+
+/// What shadow ratios lack of 1, summed along rows.
+struct Missing {
+    first: usize,
+    width: usize,
+    /// Of each row from `first` on, the sums up to each pixel's left side, and the whole.
+    sums: Vec<DVec3>,
+}
+
+impl Missing {
+    fn new(shadow: &Raster<Vec3>, first: usize, end: usize) -> Self {
+        let width = shadow.width();
+        let mut sums = Vec::with_capacity((end - first) * (width + 1));
+        for y in first..end {
+            let mut sum = DVec3::ZERO;
+            sums.push(sum);
+            sums.extend(shadow.row(y).iter().map(|s| {
+                sum += (Vec3::ONE - *s).as_dvec3();
+                sum
+            }));
+        }
+        Self { first, width, sums }
+    }
+
+    /// Of row `y` up to the position `x`.
+    fn up_to(&self, y: usize, x: f64) -> DVec3 {
+        let row = &self.sums[(y - self.first) * (self.width + 1)..][..self.width + 1];
+        let at = x.clamp(0.0, self.width as f64);
+        let left = (at as usize).min(self.width - 1);
+        row[left].lerp(row[left + 1], at - left as f64)
+    }
+
+    /// The mean over the part of an ellipse that lies in the picture.
+    fn mean(&self, [x, y]: [usize; 2], radius: Vec2, height: usize) -> Vec3 {
+        let radius = radius.as_dvec2().max(glam::DVec2::splat(0.5));
+        let middle = x as f64 + 0.5;
+        let reach = radius.y as usize;
+        let (mut sum, mut area) = (DVec3::ZERO, 0.0);
+        for row in y.saturating_sub(reach)..(y + reach + 1).min(height) {
+            let off = (row as f64 - y as f64) / radius.y;
+            let half = radius.x * (1.0 - off * off).max(0.0).sqrt();
+            let ends = [middle - half, middle + half].map(|x| x.clamp(0.0, self.width as f64));
+            sum += self.up_to(row, ends[1]) - self.up_to(row, ends[0]);
+            area += ends[1] - ends[0];
+        }
+        (sum / area).as_vec3()
+    }
+}
+
+#[cfg(test)]
+mod tests;

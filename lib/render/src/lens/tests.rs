@@ -1,0 +1,323 @@
+use std::f32::consts::PI;
+
+use dipir_imaging::raster::LinearImage;
+use dipir_imaging::transfer::Transfer;
+use dipir_light::environment::EnvironmentSampler;
+use dipir_numerics::sampler::{Sampler, Stream};
+use dipir_scene::material::Material;
+use dipir_scene::proxy::Proxy;
+use dipir_scene::scene::Scene;
+
+use super::*;
+use crate::adaptive::Stop;
+use crate::gloss::Gloss;
+use crate::job::REPLICATES;
+use crate::render::Rendered;
+use crate::shapes::{icosphere, quad};
+use crate::testing::{
+    camera, carry_on, everything, ground, lambertian, matte, render, scene, settings, sky, sun,
+};
+
+const SIDE: u32 = 64;
+/// Paths a pixel and replicate.
+const PATHS: u32 = 256;
+
+fn numbers(n: u32) -> impl Iterator<Item = (Vec2, Vec2)> {
+    (0..n).map(|i| {
+        let mut sampler = Sampler::new(7, Stream::TEST, 0, i);
+        (sampler.next_2d(), sampler.next_2d())
+    })
+}
+
+/// Down a street, four metres before a thing on it.
+fn view() -> Camera {
+    camera(
+        Vec3::new(0.0, 1.0, 4.0),
+        Vec3::new(0.0, 0.4, 0.0),
+        40.0,
+        SIDE,
+    )
+}
+
+fn glowing() -> Material {
+    Material {
+        emissive: Vec3::ONE,
+        ..matte(Vec3::ZERO)
+    }
+}
+
+fn rendered(scene: &Scene, light: &EnvironmentSampler, lens: Option<ThinLens>) -> Rendered {
+    let settings = Settings {
+        lens,
+        ..settings(PATHS, 5)
+    };
+    render(scene, light, &lambertian(1), &settings)
+}
+
+#[test]
+fn rays_meet_where_it_is_sharp_and_lie_within_the_disc_elsewhere() {
+    let camera = Camera {
+        rotation: glam::Mat3::from_euler(glam::EulerRot::YXZ, 0.4, -0.3, 0.1),
+        focal_px: Vec2::new(120.0, 110.0),
+        ..view()
+    };
+    let lens = ThinLens {
+        radius: 0.05,
+        focus: 2.5,
+    };
+    for (place, u) in numbers(200) {
+        let pixel = place * 64.0;
+        let ray = lens.ray(&camera, pixel, u);
+        let offset = ray.origin - camera.position;
+        // Rounding of a position of some metres.
+        assert!(camera.depth(ray.origin).abs() < 1e-5 && offset.length() < 0.05 + 1e-5);
+        let seen_at = |depth: f32| {
+            let along = ray.direction.dot(-camera.rotation.z_axis);
+            camera.project(ray.origin + ray.direction * (depth / along))
+        };
+        assert!(seen_at(2.5).unwrap().distance(pixel) < 1e-2);
+        for depth in [0.5, 1.5, 10.0, 1e4] {
+            // The image of the place on the lens, from there: its share of the radius is that of the blur.
+            let share = (camera.rotation.transpose() * offset).truncate() / lens.radius;
+            let blur = lens.blur_px(&camera, depth);
+            let sign = (depth - lens.focus).signum();
+            let expected = pixel + sign * blur * share * Vec2::new(-1.0, 1.0);
+            let found = seen_at(depth).unwrap();
+            assert!(found.distance(expected) < 0.02, "{found} {expected}");
+        }
+    }
+}
+
+#[test]
+fn a_small_thing_is_seen_as_a_disc_of_the_blurs_radius() {
+    let (near, far) = (Vec3::new(0.1, 0.8, 2.0), Vec3::new(-0.1, 0.5, -4.0));
+    for (center, focus) in [(near, 6.0), (far, 2.0)] {
+        let ball = icosphere(center, 0.02 * view().depth(center), 3);
+        let scene = scene(ball, glowing(), view(), Proxy::None);
+        let lens = ThinLens {
+            radius: 0.12,
+            focus,
+        };
+        let [sharp, soft] = [None, Some(lens)].map(|lens| rendered(&scene, &sky(0.0), lens).film);
+        let moments = |alpha: &Raster<f32>| {
+            let middle = view().project(center).unwrap();
+            let pixels = alpha.pixels().iter().enumerate();
+            pixels.fold((0.0, 0.0), |(sum, square), (i, a)| {
+                let at = Vec2::new((i as u32 % SIDE) as f32, (i as u32 / SIDE) as f32) + 0.5;
+                (sum + a, square + a * at.distance_squared(middle))
+            })
+        };
+        let [(area, spread), (blurred_area, blurred_spread)] =
+            [&sharp, &soft].map(|film| moments(&film.alpha));
+        // Four deviations of the number of paths that meet the ball.
+        let hits = area * (PATHS * REPLICATES as u32) as f32;
+        assert!(
+            (blurred_area / area - 1.0).abs() < 4.0 / hits.sqrt(),
+            "{area} {blurred_area}"
+        );
+        // The mean squared radius of a disc is half of its squared radius, and that of both adds up.
+        let found = blurred_spread / blurred_area - spread / area;
+        let radius = lens.blur_px(&view(), view().depth(center)).x;
+        assert!(
+            radius > 3.0 && (found / (0.5 * radius * radius) - 1.0).abs() < 0.05,
+            "{found} {radius}"
+        );
+        // Light is spread as coverage is.
+        let off = |(o, a): (&Vec3, &f32)| (o.x - a).abs();
+        let pairs = soft.object.pixels().iter().zip(soft.alpha.pixels());
+        assert!(pairs.map(off).fold(0f32, f32::max) < 1e-5);
+        // In the middle of the disc, the share of it that the ball fills.
+        let [x, y] = view()
+            .project(center)
+            .unwrap()
+            .to_array()
+            .map(|v| v as usize);
+        let expected = area / (PI * radius * radius);
+        let found = soft.alpha.get(x, y);
+        let paths = (PATHS * REPLICATES as u32) as f32;
+        let tolerance = 4.0 * (expected / paths).sqrt();
+        assert!((found - expected).abs() < tolerance, "{found} {expected}");
+    }
+}
+
+#[test]
+fn what_is_in_focus_is_as_sharp_as_through_a_pinhole() {
+    let camera = camera(Vec3::new(0.0, 0.0, 3.0), Vec3::ZERO, 40.0, SIDE);
+    let square = quad(
+        Vec3::new(-0.5, -0.4, 0.0),
+        Vec3::X * 0.9,
+        Vec3::new(0.1, 0.8, 0.0),
+    );
+    let scene = scene(square, glowing(), camera, Proxy::None);
+    let lens = ThinLens {
+        radius: 0.1,
+        focus: 3.0,
+    };
+    let [sharp, soft] = [None, Some(lens)].map(|lens| rendered(&scene, &sky(0.0), lens).film);
+    for (a, b) in sharp.alpha.pixels().iter().zip(soft.alpha.pixels()) {
+        // The same places in the pixel, but for rounding at the edge.
+        assert!((a - b).abs() < 0.02, "{a} {b}");
+    }
+}
+
+#[test]
+fn shadows_are_averaged_over_the_discs_of_the_ground() {
+    let ball = icosphere(Vec3::new(0.0, 0.5, 0.0), 0.35, 4);
+    let light = sun(Vec3::new(0.5, 1.0, 0.3).normalize(), 4e3, 0.3, 128);
+    let scene = scene(ball, matte(Vec3::splat(0.5)), view(), ground());
+    let light = EnvironmentSampler::new(light);
+    let lens = ThinLens {
+        radius: 0.06,
+        focus: 1.2,
+    };
+    let sharp = rendered(&scene, &light, None).film.shadow;
+    let soft = rendered(&scene, &light, Some(lens)).film.shadow;
+    let ratio_at = |p: Vec2| {
+        let last = Vec2::splat(SIDE as f32 - 1.0);
+        let [x, y] = p.floor().clamp(Vec2::ZERO, last).to_array();
+        sharp.get(x as usize, y as usize).x
+    };
+    let (mut most, mut changed) = (0f32, 0f32);
+    for i in 0..(SIDE * SIDE) as usize {
+        let (x, y) = (i % SIDE as usize, i / SIDE as usize);
+        let corner = Vec2::new(x as f32, y as f32);
+        // What rays of the lens see of the ground, looked up where the pinhole sees it.
+        let mut sum = 0.0;
+        let mut is_whole = true;
+        for (place, u) in numbers(512) {
+            let ray = lens.ray(&view(), corner + place, u);
+            let ahead = -ray.origin.y / ray.direction.y;
+            match view().project(ray.origin + ray.direction * ahead) {
+                Some(p) if ahead > 0.0 => {
+                    is_whole &= p.min_element() >= 0.0 && p.max_element() <= SIDE as f32;
+                    sum += ratio_at(p) / 512.0;
+                }
+                _ => is_whole = false,
+            }
+        }
+        // Beside the picture nothing is known.
+        if is_whole {
+            most = most.max((sum - soft.get(x, y).x).abs());
+            changed = changed.max((sharp.get(x, y).x - soft.get(x, y).x).abs());
+        }
+    }
+    // Of a lens of .06 of the camera's height, discs grow by as much of a pixel a row: a fifth of a pixel over their radius of
+    // three, across which an edge of the shadow by .8 changes by .2 a pixel.
+    assert!(most < 0.04 && changed > 0.2, "{most} {changed}");
+}
+
+#[test]
+fn a_straight_edge_of_a_shadow_is_that_of_a_disc() {
+    let lens = ThinLens {
+        radius: 0.1,
+        focus: 4.0,
+    };
+    let edge = 48;
+    let values = (0..96 * 64).map(|i| Vec3::splat(if i % 96 < edge { 0.25 } else { 1.0 }));
+    let shadow = Raster::from_pixels(96, 64, values.collect());
+    let camera = Camera {
+        resolution: [96, 64],
+        ..view()
+    };
+    let blurred = lens.blurred(&camera, &shadow, |_, y| (y < 60).then_some(2.0));
+    let radius = lens.blur_px(&camera, 2.0).x;
+    assert!(radius > 2.0);
+    for x in 0..96 {
+        let t = ((x as f32 + 0.5 - edge as f32) / radius).clamp(-1.0, 1.0);
+        let lit = 0.5 + (t.asin() + t * (1.0 - t * t).sqrt()) / PI;
+        let found = blurred.get(x, 32).x;
+        // Rows of a disc of so few pixels.
+        assert!((found - (0.25 + 0.75 * lit)).abs() < 0.02, "{x}: {found}");
+        assert_eq!(blurred.get(x, 62), shadow.get(x, 62));
+    }
+}
+
+#[test]
+fn the_stated_error_holds_at_edges_that_are_out_of_focus() {
+    let ball = icosphere(Vec3::new(0.0, 0.5, 0.0), 0.5, 4);
+    let scene = scene(ball, matte(Vec3::splat(0.7)), view(), ground());
+    let photo = LinearImage(Raster::filled(
+        SIDE as usize,
+        SIDE as usize,
+        Vec3::splat(0.5),
+    ));
+    let lens = Some(ThinLens {
+        radius: 0.1,
+        focus: 1.5,
+    });
+    let light = sky(0.4);
+    let with = |stop, seed, denoise| {
+        let settings = Settings {
+            seed,
+            stop,
+            denoise,
+            lens,
+            background: Some(&photo),
+            transfer: Transfer::Srgb,
+            ..Settings::default()
+        };
+        let simulation = everything(2);
+        let renderer = Renderer::new(&scene);
+        renderer
+            .render(&light, &simulation, &settings, &mut carry_on)
+            .expect("renders")
+    };
+    let shown = |film: &crate::film::Film| -> Vec<f32> {
+        let pixels = photo.0.pixels().iter().enumerate();
+        let shown = pixels.map(|(i, b)| {
+            let (o, a, s) = (
+                film.object.pixels()[i],
+                film.alpha.pixels()[i],
+                film.shadow.pixels()[i],
+            );
+            Transfer::Srgb.encode_scalar((*b * s * (1.0 - a) + o).y)
+        });
+        shown.collect()
+    };
+    let truth = shown(&with(Stop::Samples(2048), 1, false).film);
+    for denoise in [false, true] {
+        let rendered = with(Stop::TargetError(0.008), 2, denoise);
+        let found = shown(&rendered.film);
+        let touched = (0..truth.len()).filter(|&i| {
+            rendered.film.alpha.pixels()[i] > 0.0
+                || (rendered.film.shadow.pixels()[i].y - 1.0).abs() > 0.01
+        });
+        let (mut sum, mut count) = (0.0, 0.0);
+        for i in touched {
+            sum += (found[i] - truth[i]).powi(2);
+            count += 1.0;
+        }
+        let error = (sum / count).sqrt();
+        // Some thousand pixels know the error to a few per cent; the bound is one of 95%.
+        assert!(
+            f64::from(error) < 1.1 * rendered.error.upper_95,
+            "{denoise}: {error} {:?}",
+            rendered.error
+        );
+    }
+}
+
+#[test]
+fn polished_ground_mirrors_as_much_light_through_a_lens() {
+    let ball = icosphere(Vec3::new(0.0, 0.9, 0.0), 0.15, 4);
+    let scene = scene(ball, glowing(), view(), ground());
+    let sum = |lens| {
+        let settings = Settings {
+            lens,
+            gloss: Some(Gloss {
+                roughness: 0.0,
+                reflectance: 0.5,
+            }),
+            ..settings(32, 3)
+        };
+        let rendered = render(&scene, &sky(0.0), &everything(1), &settings);
+        let mirrored = rendered.film.mirrored.expect("is polished");
+        mirrored.pixels().iter().map(|v| v.x).sum::<f32>()
+    };
+    let lens = ThinLens {
+        radius: 0.06,
+        focus: 2.0,
+    };
+    let [sharp, soft] = [None, Some(lens)].map(sum);
+    assert!((soft / sharp - 1.0).abs() < 0.03, "{sharp} {soft}");
+}
