@@ -114,7 +114,13 @@ pub(crate) fn auxiliary(world: &World, jobs: &[Job], seed: u64) -> Auxiliary {
         if view.object(&mut pixel, at, FIRST_SAMPLES) == First::Uneven {
             view.object(&mut pixel, at, SAMPLES);
         }
-        auxiliary::Seen::new(pixel.normal, pixel.albedo)
+        match world.lens {
+            // What is blurred more than that hardly differs between neighbours, and a few rays do not tell it.
+            Some(lens) if lens.blur_px(world.camera(), pixel.depth).max_element() > 1.0 => {
+                auxiliary::Seen::default()
+            }
+            _ => auxiliary::Seen::new(pixel.normal, pixel.albedo),
+        }
     });
     let seen: Vec<_> = seen.collect();
     let [width, height] = world.camera().resolution.map(|n| n as usize);

@@ -421,6 +421,7 @@ impl<'a> Renderer<'a> {
             transfer: settings.transfer,
             gain: settings.gain,
             adds: path.world.polished.is_some(),
+            unfocused: path.world.lens.is_some(),
         };
         let find_highlights = |film: &Film, jobs: &[Job]| {
             // A place in the image says where a glint is only to a pinhole.

@@ -2,7 +2,7 @@
 //!
 //! A shadow ratio has no texture: pixels whose surroundings look alike have nearly the same value. On the object, normals
 //! and base colours ([`auxiliary`]) also tell which pixels may differ; its edges, and pixels with highlights of their own,
-//! are left as they are. Each half of the samples is filtered with weights that the other half gives, so that weights do not
+//! are left as they are. Out of focus, edges are wide and their coverage is as noisy as light: both are filtered. Each half of the samples is filtered with weights that the other half gives, so that weights do not
 //! follow the noise that they average [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering"]. What is
 //! left of the error is measured, bias included: a filtered half differs from the other half as drawn by the error of the
 //! one and the noise of the other, and the noise is known. Where the filter does not help, the samples stay as they are.
@@ -10,7 +10,7 @@ pub(crate) mod auxiliary;
 mod window;
 
 use dipir_light::luminance::luminance;
-use glam::Vec3;
+use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 
 use self::auxiliary::Auxiliary;
@@ -68,6 +68,8 @@ pub(crate) struct Error {
 #[derive(Clone, Copy, PartialEq)]
 enum Kind {
     Object,
+    /// The object out of focus: coverage is as noisy as light, and filtered with it.
+    Unfocused,
     Shadow,
     /// Light of the object by way of the ground, which has no edges.
     Mirrored,
@@ -77,7 +79,7 @@ impl Kind {
     /// Pixels with a density of samples hold a highlight, and what their neighbours do not.
     fn holds(self, job: &Job) -> bool {
         match self {
-            Kind::Object => job.layer == Layer::Object && job.density.is_none(),
+            Kind::Object | Kind::Unfocused => job.layer == Layer::Object && job.density.is_none(),
             Kind::Shadow => job.layer != Layer::Object,
             Kind::Mirrored => true,
         }
@@ -87,12 +89,17 @@ impl Kind {
 /// Shadow ratios and mirrored light are compared by luminance.
 const SHADOW: Comparison<1, 2> = Comparison {
     with_own: true,
-    channels: |ratio| [luminance(ratio)],
+    channels: |ratio| [luminance(ratio.truncate())],
 };
 /// Radiance by all channels: what differs in colour alone stays apart.
 const OBJECT: Comparison<3, 1> = Comparison {
     with_own: false,
-    channels: |radiance| radiance.to_array(),
+    channels: |radiance| radiance.truncate().to_array(),
+};
+/// By coverage, too.
+const UNFOCUSED: Comparison<4, 1> = Comparison {
+    with_own: false,
+    channels: |value| value.to_array(),
 };
 
 /// The jobs of a kind by the tile of the frame that they cover.
@@ -136,7 +143,7 @@ impl<'a> Tiles<'a> {
     /// is missing on the ground.
     fn halves(&self, x: usize, y: usize) -> Halves {
         let mut halves = Halves {
-            values: [Vec3::ZERO; REPLICATES],
+            values: [Vec4::ZERO; REPLICATES],
             is_inside: self.kind != Kind::Object,
             seen: self.auxiliary.get(x, y),
         };
@@ -150,11 +157,12 @@ impl<'a> Tiles<'a> {
         let estimates: [_; REPLICATES] = std::array::from_fn(|k| job.estimate(index, Some(k)));
         match self.kind {
             Kind::Object => {
-                halves.values = estimates.map(|e| e.0);
+                halves.values = estimates.map(|e| e.0.extend(0.0));
                 halves.is_inside = estimates.iter().all(|e| e.1 >= 1.0);
             }
-            Kind::Shadow => halves.values = estimates.map(|e| Vec3::ONE - e.0),
-            Kind::Mirrored => halves.values = estimates.map(|e| e.0),
+            Kind::Unfocused => halves.values = estimates.map(|e| e.0.extend(e.1)),
+            Kind::Shadow => halves.values = estimates.map(|e| (Vec3::ONE - e.0).extend(0.0)),
+            Kind::Mirrored => halves.values = estimates.map(|e| e.0.extend(0.0)),
         }
         halves
     }
@@ -187,6 +195,8 @@ impl<'a> Tiles<'a> {
 /// A job's pixels, filtered, with the variance of each, and what its halves differ by.
 struct Filtered {
     pixels: Vec<((u32, u32), (Vec3, Vec3))>,
+    /// Coverage of the pixels, where it is filtered.
+    coverage: Vec<f32>,
     sums: Sums,
 }
 
@@ -209,10 +219,21 @@ fn filter<const CHANNELS: usize, const PATCH: usize>(
     }
     let filtered = window.filtered();
     let mut sums = Sums::default();
+    let mut coverage = vec![];
     let pixels = job.pixels.iter().filter(is_inside).map(|pixel| {
         let (i, j) = place(pixel);
-        let [a, b] = window.drawn(i, j);
-        let [fa, fb] = [0, 1].map(|k| filtered[k][j * BLOCK + i]);
+        // What is covered hides what is behind it: how far it is seen follows from both.
+        let behind = match tiles.kind {
+            Kind::Unfocused => {
+                let (x, y) = (pixel.0 as usize, pixel.1 as usize);
+                viewing.background(x, y) * *film.shadow.get(x, y)
+            }
+            _ => Vec3::ZERO,
+        };
+        let laid = |v: Vec4| v.truncate() - behind * v.w;
+        let [a, b] = window.drawn(i, j).map(laid);
+        let both = [0, 1].map(|k| filtered[k][j * BLOCK + i]);
+        let [fa, fb] = both.map(laid);
         let square = |v: Vec3| v * v;
         let half_noise = square(a - b) * 0.5;
         let residual = square(fa - fb) * 0.25;
@@ -237,14 +258,21 @@ fn filter<const CHANNELS: usize, const PATCH: usize>(
                 ..Sums::default()
             },
         });
+        let value = ((both[0] + both[1]) * 0.5).truncate();
         let value = match tiles.kind {
-            Kind::Object | Kind::Mirrored => (fa + fb) * 0.5,
-            Kind::Shadow => Vec3::ONE - (fa + fb) * 0.5,
+            Kind::Object | Kind::Mirrored => value,
+            Kind::Unfocused => {
+                coverage.push((both[0].w + both[1].w) * 0.5);
+                value
+            }
+            Kind::Shadow => Vec3::ONE - value,
         };
         (pixel, (value, residual))
     });
+    let pixels = pixels.collect();
     Some(Filtered {
-        pixels: pixels.collect(),
+        pixels,
+        coverage,
         sums,
     })
 }
@@ -294,9 +322,10 @@ impl<'a> Denoiser<'a> {
     ) -> Vec<Option<Error>> {
         self.known.resize(jobs.len(), Known::default());
         let mut errors = vec![None; jobs.len()];
-        let kinds: &[Kind] = match viewing.adds {
-            true => &[Kind::Mirrored],
-            false => &[Kind::Object, Kind::Shadow],
+        let kinds: &[Kind] = match (viewing.adds, viewing.unfocused) {
+            (true, _) => &[Kind::Mirrored],
+            (false, true) => &[Kind::Unfocused, Kind::Shadow],
+            (false, false) => &[Kind::Object, Kind::Shadow],
         };
         for &kind in kinds {
             let of_kind = || jobs.iter().filter(|job| kind.holds(job));
@@ -367,6 +396,7 @@ fn filter_where(
     for indices in wanted.chunks(AT_ONCE) {
         let filter = |&index: &usize| match tiles.kind {
             Kind::Object => filter(OBJECT, tiles, &tiles.jobs[index], film, viewing),
+            Kind::Unfocused => filter(UNFOCUSED, tiles, &tiles.jobs[index], film, viewing),
             _ => filter(SHADOW, tiles, &tiles.jobs[index], film, viewing),
         };
         let filtered: Vec<_> = indices.par_iter().map(filter).collect();
@@ -378,6 +408,9 @@ fn filter_where(
                 is_shown: filtered.is_some(),
             };
             if let Some(filtered) = filtered {
+                for (((x, y), _), coverage) in filtered.pixels.iter().zip(&filtered.coverage) {
+                    *film.alpha.get_mut(*x as usize, *y as usize) = *coverage;
+                }
                 film.replace(job.layer, filtered.pixels.into_iter());
             }
         }

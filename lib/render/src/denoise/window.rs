@@ -1,5 +1,5 @@
 //! Non-local means in a block of pixels.
-use glam::Vec3;
+use glam::{Vec3, Vec4};
 
 use super::auxiliary::Seen;
 use crate::job::REPLICATES;
@@ -32,7 +32,8 @@ const COMPARED: usize = BLOCK + 2 * MOST_COMPARED;
 /// What the halves of the samples say of a pixel.
 #[derive(Clone, Copy)]
 pub(super) struct Halves {
-    pub(super) values: [Vec3; REPLICATES],
+    /// A colour, and how much of the pixel the object covers where that differs.
+    pub(super) values: [Vec4; REPLICATES],
     /// Whether it may be averaged with others.
     pub(super) is_inside: bool,
     /// The surface there.
@@ -46,14 +47,14 @@ pub(super) struct Comparison<const CHANNELS: usize, const PATCH: usize> {
     /// Whether the two pixels themselves are compared, beside those around them. Weights that leave them out do not depend
     /// on the noise of a pixel, so that the error that the halves measure is true.
     pub(super) with_own: bool,
-    /// What of a colour is compared.
-    pub(super) channels: fn(Vec3) -> [f32; CHANNELS],
+    /// What of the values is compared.
+    pub(super) channels: fn(Vec4) -> [f32; CHANNELS],
 }
 
 /// A block with its margin.
 pub(super) struct Window<const CHANNELS: usize, const PATCH: usize> {
     comparison: Comparison<CHANNELS, PATCH>,
-    halves: [[Vec3; SIDE * SIDE]; REPLICATES],
+    halves: [[Vec4; SIDE * SIDE]; REPLICATES],
     inside: [bool; SIDE * SIDE],
     seen: [(Vec3, Vec3); SIDE * SIDE],
     /// What is compared.
@@ -73,7 +74,7 @@ impl<const CHANNELS: usize, const PATCH: usize> Window<CHANNELS, PATCH> {
     ) -> Option<Self> {
         let mut window = Self {
             comparison,
-            halves: [[Vec3::ZERO; SIDE * SIDE]; REPLICATES],
+            halves: [[Vec4::ZERO; SIDE * SIDE]; REPLICATES],
             inside: [false; SIDE * SIDE],
             seen: [(Vec3::ZERO, Vec3::ZERO); SIDE * SIDE],
             guides: [[[0.0; SIDE * SIDE]; CHANNELS]; REPLICATES],
@@ -89,7 +90,7 @@ impl<const CHANNELS: usize, const PATCH: usize> Window<CHANNELS, PATCH> {
                 window.inside[at] = pixel.is_inside;
                 window.seen[at] = pixel.seen.decoded();
                 for (k, half) in pixel.values.into_iter().enumerate() {
-                    is_empty &= half == Vec3::ZERO;
+                    is_empty &= half == Vec4::ZERO;
                     window.halves[k][at] = half;
                     for (c, guide) in (comparison.channels)(half).into_iter().enumerate() {
                         window.guides[k][c][at] = guide;
@@ -125,7 +126,7 @@ impl<const CHANNELS: usize, const PATCH: usize> Window<CHANNELS, PATCH> {
     }
 
     /// The halves of the pixel in column `i` and row `j` of the block, as drawn.
-    pub(super) fn drawn(&self, i: usize, j: usize) -> [Vec3; REPLICATES] {
+    pub(super) fn drawn(&self, i: usize, j: usize) -> [Vec4; REPLICATES] {
         let at = (j + MARGIN) * SIDE + i + MARGIN;
         [self.halves[0][at], self.halves[1][at]]
     }
@@ -136,8 +137,8 @@ impl<const CHANNELS: usize, const PATCH: usize> Window<CHANNELS, PATCH> {
     }
 
     /// Both halves of the block, filtered.
-    pub(super) fn filtered(&self) -> [[Vec3; BLOCK * BLOCK]; REPLICATES] {
-        let mut sums = [[Vec3::ZERO; BLOCK * BLOCK]; REPLICATES];
+    pub(super) fn filtered(&self) -> [[Vec4; BLOCK * BLOCK]; REPLICATES] {
+        let mut sums = [[Vec4::ZERO; BLOCK * BLOCK]; REPLICATES];
         let mut weights = [[0f32; BLOCK * BLOCK]; REPLICATES];
         for dy in 0..=2 * REACH {
             for dx in 0..=2 * REACH {

@@ -15,7 +15,7 @@ use crate::job::REPLICATES;
 use crate::render::Rendered;
 use crate::shapes::{icosphere, quad};
 use crate::testing::{
-    camera, carry_on, everything, ground, lambertian, matte, render, scene, settings, sky, sun,
+    camera, carry_on, everything, ground, matte, render, scene, settings, sky, sun,
 };
 
 const SIDE: u32 = 64;
@@ -51,7 +51,7 @@ fn rendered(scene: &Scene, light: &EnvironmentSampler, lens: Option<ThinLens>) -
         lens,
         ..settings(PATHS, 5)
     };
-    render(scene, light, &lambertian(1), &settings)
+    render(scene, light, &everything(1), &settings)
 }
 
 #[test]
@@ -275,26 +275,31 @@ fn the_stated_error_holds_at_edges_that_are_out_of_focus() {
         shown.collect()
     };
     let truth = shown(&with(Stop::Samples(2048), 1, false).film);
-    for denoise in [false, true] {
-        let rendered = with(Stop::TargetError(0.008), 2, denoise);
+    let error = |rendered: &Rendered| {
         let found = shown(&rendered.film);
         let touched = (0..truth.len()).filter(|&i| {
             rendered.film.alpha.pixels()[i] > 0.0
                 || (rendered.film.shadow.pixels()[i].y - 1.0).abs() > 0.01
         });
-        let (mut sum, mut count) = (0.0, 0.0);
-        for i in touched {
-            sum += (found[i] - truth[i]).powi(2);
-            count += 1.0;
-        }
-        let error = (sum / count).sqrt();
+        let squares: Vec<f32> = touched.map(|i| (found[i] - truth[i]).powi(2)).collect();
+        f64::from(squares.iter().sum::<f32>() / squares.len() as f32).sqrt()
+    };
+    for denoise in [false, true] {
+        let rendered = with(Stop::TargetError(0.008), 2, denoise);
         // Some thousand pixels know the error to a few per cent; the bound is one of 95%.
+        let error = error(&rendered);
         assert!(
-            f64::from(error) < 1.1 * rendered.error.upper_95,
+            error < 1.1 * rendered.error.upper_95,
             "{denoise}: {error} {:?}",
             rendered.error
         );
     }
+    // Edges, a third of what is seen of the ball, are filtered as well.
+    let [drawn, filtered] = [false, true].map(|denoise| {
+        let rendered = with(Stop::Samples(8), 3, denoise);
+        error(&rendered)
+    });
+    assert!(filtered < 0.6 * drawn, "{filtered} {drawn}");
 }
 
 #[test]
