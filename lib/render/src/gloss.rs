@@ -296,9 +296,9 @@ impl Renderer<'_> {
     }
 
     /// How the ground is polished, if it is a plane that mirrors something.
-    pub(crate) fn gloss_of(&self, settings: &Settings, simulation: &Simulation) -> Option<Gloss> {
+    pub(crate) fn gloss_of(&self, settings: &Settings) -> Option<Gloss> {
         let mirrors = match &self.geometry().proxy {
-            ProxyGeometry::Plane(plane) => simulation.shadow && !self.geometry().is_below(plane),
+            ProxyGeometry::Plane(plane) => !self.geometry().is_below(plane),
             _ => false,
         };
         settings.gloss.filter(|_| mirrors)

@@ -280,7 +280,7 @@ impl<'a> Renderer<'a> {
             },
         };
         world.lens = settings.lens;
-        let gloss = self.gloss_of(settings, simulation);
+        let gloss = self.gloss_of(settings);
         let plain = &gloss::before(gloss.is_some(), settings);
         let mut first = gloss::first(gloss.is_some(), progress);
         let mut rendered =

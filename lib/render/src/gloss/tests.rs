@@ -418,6 +418,20 @@ fn without_a_polished_plane_that_is_seen_there_is_no_mirror_image() {
 }
 
 #[test]
+fn the_mirror_image_does_not_need_the_shadow() {
+    let scene = scene(ball(), glowing(1.0), view(), ground());
+    let [with, without] = [true, false].map(|shadow| {
+        let simulation = Simulation {
+            shadow,
+            ..everything(2)
+        };
+        let film = render(&scene, &sky(1.0), &simulation, &polished(MIRROR)).film;
+        film.mirrored.expect("is polished")
+    });
+    assert_eq!(with, without);
+}
+
+#[test]
 fn every_way_to_stop_keeps_its_word() {
     let photo = LinearImage(Raster::filled(
         SIDE as usize,

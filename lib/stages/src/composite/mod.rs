@@ -121,7 +121,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     materials::use_recovered(session, &mut inputs.scene)?;
     let proxy = &inputs.scene.loaded.scene.proxy;
     if table.gloss().is_some() && !matches!(proxy, Proxy::Plane(_)) {
-        session.warn("composite.ground_roughness: only a plane mirrors the objects, and [scene.proxy] is none");
+        session.warn("composite.ground_roughness: only a plane mirrors the objects, and [scene.proxy] is not one");
     }
     let light = match known_light::known(session, &table)? {
         Some(light) => {
