@@ -58,6 +58,40 @@ fn a_changed_key_runs_the_stages_that_depend_on_it_and_no_other() {
 }
 
 #[test]
+fn defaults_that_are_written_down_and_limits_that_only_refuse_run_nothing() {
+    let project = Project::new();
+    let run = || {
+        let run = project.run(DIPIR, &["run"]);
+        run.expect_success();
+        run.stdout
+    };
+    assert!(run().contains("ran scene, composite\n"));
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let written = text
+        .replace(
+            "class = \"toy\"",
+            "transfer = \"srgb\"\nlimits = { triangles = 30000000 }\neffects = { shadow = \"auto\", tolerance = 0.002 }",
+        )
+        .replace(
+            "object.obj\"",
+            "object.obj\"\nposition = [0.0, 0.0, 0.0]\nyaw_deg = 0.0\nanchor = \"origin\"",
+        )
+        .replace("look_at", "up = [0.0, 1.0, 0.0]\nlook_at");
+    project.write("pipeline.toml", &written);
+    let stdout = run();
+    let nothing = "nothing to do: scene, composite are up to date\n";
+    assert!(stdout.starts_with(nothing), "{stdout}");
+    // What is no default is told with the default that it was.
+    project.write(
+        "pipeline.toml",
+        written.replace("[0.0, 0.0, 0.0]\nyaw", "[0.5, 0.0, 0.0]\nyaw"),
+    );
+    let status = project.run(DIPIR, &["status"]).stdout;
+    let told = "scene      stale: scene.objects.0.position.0 changed from 0.0 to 0.5\n";
+    assert!(status.starts_with(told), "{status}");
+}
+
+#[test]
 fn changed_bytes_of_an_input_run_the_stages_that_read_it() {
     let project = whole::project();
     run_all(&project, &[]);

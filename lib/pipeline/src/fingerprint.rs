@@ -206,9 +206,12 @@ impl fmt::Display for StaleReason {
                 write!(f, "its code changed from version {was} to {now}")
             }
             Self::Seed { was, now } => write!(f, "the seed changed from {was} to {now}"),
-            Self::Parameter { key, was, now } => {
-                write!(f, "{key} changed from {} to {}", shown(was), shown(now))
-            }
+            Self::Parameter { key, was, now } => match [shown(was), shown(now)] {
+                [was, now] if was == "a file" && now == was => {
+                    write!(f, "{key} names another file")
+                }
+                [was, now] => write!(f, "{key} changed from {was} to {now}"),
+            },
             Self::InputChanged { role, path } => {
                 let path = path.display();
                 match role.strip_prefix(MISSING) {
@@ -293,7 +296,10 @@ pub fn stale_reasons(plan: &StagePlan, folder: &Path) -> Result<Vec<StaleReason>
         });
     }
     reasons.extend(changes(
-        &flat(&manifest.params, &manifest.inputs),
+        &flat(
+            &(plan.comparable)(manifest.params.clone()),
+            &manifest.inputs,
+        ),
         &flat(&plan.params, &plan.inputs),
     ));
     reasons.extend(input_changes(&manifest.inputs, &plan.inputs));

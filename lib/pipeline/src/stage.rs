@@ -21,7 +21,7 @@ use crate::mark::{self, Kind, Mark, Owned, foreign, is_empty, is_folder};
 pub const MISSING: &str = "missing ";
 
 /// What identifies a run of a stage, before it has run.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct StagePlan {
     /// Name of the stage, as in `scene`.
     pub stage: String,
@@ -29,6 +29,8 @@ pub struct StagePlan {
     pub version: u32,
     /// Settings, defaults filled in.
     pub params: serde_json::Value,
+    /// Makes settings that were recorded, by an earlier version, too, such as are compared with these.
+    pub comparable: fn(serde_json::Value) -> serde_json::Value,
     /// Seed of every random number.
     pub seed: u64,
     /// What computes it, as in `cpu`.
@@ -44,6 +46,7 @@ impl StagePlan {
             stage: stage.into(),
             version,
             params,
+            comparable: |params| params,
             seed,
             device: "cpu".into(),
             inputs: Vec::new(),

@@ -1,5 +1,6 @@
 //! Every key of `pipeline.toml`: what it accepts, its default, what it is, an example. All of it is
 //! read off the types that read the file, as a JSON schema, so that nothing can be missing.
+pub(crate) mod defaults;
 mod markdown;
 mod value;
 

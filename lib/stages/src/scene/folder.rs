@@ -7,6 +7,7 @@ use dipir_pipeline::fingerprint::{StaleReason, parameter_changes};
 use dipir_pipeline::manifest::{Artifact, Manifest};
 use dipir_pipeline::stage::{MISSING, StagePlan};
 use dipir_render::effects::EffectsPlan;
+use dipir_scene::config::SceneConfig;
 use dipir_scene::description::SceneDescription;
 use dipir_scene::scene::LoadedScene;
 use serde::Deserialize;
@@ -83,9 +84,9 @@ fn refuse_new_parts(session: &Session, manifest: &Manifest) -> anyhow::Result<()
 
 /// Warns if the scene's folder was made before the last edit of `[scene]`.
 fn warn_of_other_settings(session: &Session, manifest: &Manifest) -> anyhow::Result<()> {
-    let config = scene::settings(session)?;
-    let was = json!({"scene": manifest.params["scene"]});
-    let now = json!({"scene": serde_json::to_value(config)?});
+    let config: SceneConfig = session.config.table("scene")?;
+    let was = scene::deciding(json!({"scene": manifest.params["scene"]}));
+    let now = scene::deciding(json!({"scene": config}));
     let changes: Vec<String> = parameter_changes(&was, &now)
         .iter()
         .map(StaleReason::to_string)

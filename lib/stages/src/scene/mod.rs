@@ -30,6 +30,7 @@ use dipir_scene::scene::{LoadedScene, Scene};
 use serde_json::{Value, json};
 
 use crate::composite::table::CompositeTable;
+use crate::keys::defaults;
 use crate::light::method::Method;
 use crate::names::{SCENE, begin};
 use crate::presets::Outlook;
@@ -299,13 +300,20 @@ fn plan_with_parts(session: &Session, parts: &[&Artifact]) -> anyhow::Result<Sta
     Ok(plan)
 }
 
-/// The keys of `[scene]` that decide what the stage writes. Left out are `class`, which only stages that ask a model use,
-/// and `views`, which only the light's estimate uses.
-pub fn settings(session: &Session) -> anyhow::Result<SceneConfig> {
-    let mut config: SceneConfig = session.config.table("scene")?;
-    config.class = None;
-    config.views.clear();
-    Ok(config)
+/// Parameters of the stage with the keys of `[scene]` that decide what it writes, defaults filled in. Left out are `class`,
+/// which only stages that ask a model use, `views`, which only the light's estimate uses, and limits that only refuse.
+pub(crate) fn deciding(mut params: Value) -> Value {
+    if let Some(scene) = params.get_mut("scene") {
+        defaults::fill("scene", scene);
+    }
+    if let Some(keys) = params.get_mut("scene").and_then(Value::as_object_mut) {
+        keys.retain(|key, _| key != "class" && key != "views");
+        if let Some(limits) = keys.get_mut("limits") {
+            let outside = limits["allow_outside"].as_bool();
+            *limits = json!({"allow_outside": outside.unwrap_or_default()});
+        }
+    }
+    params
 }
 
 /// The files that the configuration itself names, every one once.
@@ -357,7 +365,7 @@ fn plan_with<'a>(
     session: &Session,
     files: impl Iterator<Item = (&'a str, &'a Path, &'a Path)>,
 ) -> anyhow::Result<StagePlan> {
-    let config = settings(session)?;
+    let config: SceneConfig = session.config.table("scene")?;
     let table: LightTable = session.config.table("light")?;
     let recovery = transport::settings(session, &table)?;
     // Where nothing is optimised, nothing reads the record.
@@ -368,8 +376,9 @@ fn plan_with<'a>(
             "seed": recovery.seed,
         })
     });
-    let params = json!({"scene": serde_json::to_value(&config)?, "transport": transport});
+    let params = deciding(json!({"scene": config, "transport": transport}));
     let mut plan = SCENE.plan(session, params);
+    plan.comparable = deciding;
     for (role, path, location) in files {
         plan.input(role, path, location)?;
     }

@@ -168,3 +168,28 @@ fn a_frame_of_a_shot_on_points_is_made_once() {
     assert_ne!(stale(&photo), "");
     assert_eq!(stale(&frame), "");
 }
+
+#[test]
+fn what_earlier_versions_recorded_is_compared_with_defaults_filled_in() {
+    // As they were written: keys that were left out are null or absent, limits all or none.
+    let left_out = json!({"scene": {
+        "background": "a.png", "transfer": null, "class": null, "proxy": null, "effects": {},
+        "objects": [{"path": "a.obj", "position": null, "yaw_deg": null}],
+    }, "transport": null});
+    let written = json!({"scene": {
+        "background": "a.png", "transfer": "srgb", "class": "car", "effects": {"shadow": "auto"},
+        "objects": [{"path": "a.obj", "position": [0.0, 0.0, 0.0], "yaw_deg": 0.0, "place_draw": 0}],
+        "limits": {"triangles": 7, "allow_outside": false},
+    }, "transport": null});
+    assert_eq!(deciding(left_out), deciding(written.clone()));
+    for (key, value) in [
+        ("/scene/transfer", json!("linear")),
+        ("/scene/objects/0/yaw_deg", json!(1.0)),
+        ("/scene/effects/shadow", json!("off")),
+        ("/scene/limits/allow_outside", json!(true)),
+    ] {
+        let mut other = written.clone();
+        *other.pointer_mut(key).unwrap() = value;
+        assert_ne!(deciding(other), deciding(written.clone()), "{key}");
+    }
+}
