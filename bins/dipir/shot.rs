@@ -153,6 +153,11 @@ fn frames(
         }
         frames.push((path.clone(), frame));
     }
+    if !stands_still {
+        let open = |(path, frame): &Frame| Ok((path.clone(), frame.open()?.0));
+        let opened: anyhow::Result<Vec<_>> = frames.iter().map(open).collect();
+        shot::check_cameras(&opened?)?;
+    }
     Ok((frames, told))
 }
 

@@ -68,6 +68,8 @@ fn every_frame_has_the_camera_of_its_name() {
         run.expect_error(2, &format!("error: {message}"));
     };
     refused(&["a.png", "gone.png"], "gone.png: there is no such file");
+    let two = "2 frames cannot be used, the first of them: gone.png: there is no such file";
+    refused(&["gone.png", "a.png", "lost.png"], two);
     project.write("empty.png", "");
     let empty = "empty.png: it is empty: copy it again, or leave it out";
     refused(&["a.png", "empty.png"], empty);
@@ -89,6 +91,15 @@ fn every_frame_has_the_camera_of_its_name() {
         &["a.png", "./a.png"],
         "./a.png: another frame has the same name",
     );
+    for name in ["c.png", "d.png"] {
+        project.write(name, &photo);
+    }
+    let stranger = ["shot", "a.png", "c.png", "d.png"];
+    let run = project.run(DIPIR, &stranger);
+    assert_eq!(run.code, Some(1), "{}", run.stderr);
+    let told = "error: 2 frames cannot be used, the first of them: c.png: ";
+    assert!(run.stderr.starts_with(told), "{}", run.stderr);
+    assert!(!project.path("out").exists());
     // Frames of .chan have numbers.
     let numbered = ["f_1.png", "f_02.png"];
     numbered.iter().for_each(|name| project.write(name, &photo));

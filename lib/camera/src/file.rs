@@ -175,7 +175,8 @@ pub fn choice(path: &Path) -> Option<String> {
     colmap::Files::at(path)?.choice()
 }
 
-fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
+/// As [`read`], of a picture of any shape.
+pub fn found(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
     let of = |camera: Camera, program, ground_at_origin| Found {
         lens: camera.lens,
         pose: Some(camera.pose),

@@ -313,11 +313,27 @@ impl FileSettings {
         (!is_told).then(|| file::doubt(&base_dir.join(&self.path)))?
     }
 
+    /// Errors if the file has no camera for the photograph, whatever the shape of that.
+    pub(crate) fn check(&self, base_dir: &Path) -> Result<(), Error> {
+        self.found([1000, 1000], base_dir, file::found).map(|_| ())
+    }
+
     fn resolve(
         &self,
         resolution: [u32; 2],
         base_dir: &Path,
     ) -> Result<(Camera, Option<Undistortion>), Error> {
+        let found = self.found(resolution, base_dir, file::read)?;
+        let pose = self.pose(found.pose, resolution)?;
+        Ok(of_lens(&pose, &self.lens(&found)?, resolution))
+    }
+
+    fn found(
+        &self,
+        resolution: [u32; 2],
+        base_dir: &Path,
+        read: fn(&Path, &Wanted) -> Result<Found, CameraError>,
+    ) -> Result<Found, Error> {
         let path = base_dir.join(&self.path);
         // Its folders tell pictures of the same name apart.
         let photo = match &self.which {
@@ -336,16 +352,14 @@ impl FileSettings {
             fov_deg: self.fov_deg.map(f64::from),
             turns: self.turns,
         };
-        let found = file::read(&path, &wanted).map_err(|e| match e {
+        read(&path, &wanted).map_err(|e| match e {
             CameraError::Read { path, source } => Error::Read {
                 role: "the camera file".into(),
                 path,
                 source,
             },
             other => Error::Camera(other).in_file(&path),
-        })?;
-        let pose = self.pose(found.pose, resolution)?;
-        Ok(of_lens(&pose, &self.lens(&found)?, resolution))
+        })
     }
 
     /// An error about a key of the camera that the file, as far as `what` of it goes, excludes.

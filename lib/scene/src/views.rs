@@ -66,6 +66,17 @@ impl ViewSettings {
         }
     }
 
+    /// Looks for its camera without reading the photograph, relative to `base_dir`.
+    ///
+    /// # Errors
+    /// If the camera's file has none for the photograph.
+    pub fn check_camera(&self, base_dir: &Path) -> Result<(), Error> {
+        match &self.camera {
+            CameraSettings::File(file) => file.check(base_dir),
+            CameraSettings::LookAt { .. } => Ok(()),
+        }
+    }
+
     /// Reads the photograph and its camera, relative to `base_dir`. `scene_lens` is that of the scene's
     /// photograph as it was taken.
     ///

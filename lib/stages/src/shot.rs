@@ -1,6 +1,7 @@
 //! A shot: frames that one light lights.
 use std::path::{Path, PathBuf};
 
+use anyhow::Context;
 use dipir_cameras::CameraError;
 use dipir_cameras::file::{self, Shown};
 use dipir_cli::exit::{Usage, printable};
@@ -8,10 +9,12 @@ use dipir_cli::session::Session;
 use dipir_imaging::facts::Facts;
 use dipir_pipeline::mark::Owned;
 use dipir_scene::config::{CameraConfig, SceneConfig};
+use rayon::prelude::*;
 use serde_json::json;
 
 use crate::composite::table::CompositeTable;
 use crate::names::COMPOSITE;
+use crate::scene::with_place;
 
 pub mod exposure;
 
@@ -97,7 +100,7 @@ pub fn overrides(
 ) -> anyhow::Result<Vec<Vec<String>>> {
     let scene: SceneConfig = session.config.table("scene")?;
     let sets = frames.iter().map(|path| picture(session, &scene, path));
-    let mut sets: Vec<Vec<String>> = sets.collect::<anyhow::Result<_>>()?;
+    let mut sets = all_or_first(sets)?;
     let Some(camera) = &scene.camera else {
         return Ok(sets);
     };
@@ -135,6 +138,40 @@ pub fn overrides(
         }
     }
     Ok(sets)
+}
+
+/// Refuses frames without a camera, each with the session that makes it, before anything runs.
+///
+/// # Errors
+/// Where the camera's file has none for a frame.
+pub fn check_cameras(frames: &[(PathBuf, Session)]) -> anyhow::Result<()> {
+    let check = |(path, session): &(PathBuf, Session)| {
+        let view = exposure::settings(session)?;
+        let checked = view.check_camera(&session.config.base_dir());
+        let placed = checked.map_err(|e| with_place(e, &session.config));
+        placed.with_context(|| path.display().to_string())
+    };
+    let checked: Vec<_> = frames.par_iter().map(check).collect();
+    all_or_first(checked).map(|_| ())
+}
+
+/// The values, or the first error with the number of all.
+fn all_or_first<T>(results: impl IntoIterator<Item = anyhow::Result<T>>) -> anyhow::Result<Vec<T>> {
+    let (mut all, mut wrong) = (Vec::new(), Vec::new());
+    for result in results {
+        match result {
+            Ok(value) => all.push(value),
+            Err(e) => wrong.push(e),
+        }
+    }
+    let count = wrong.len();
+    match wrong.into_iter().next() {
+        None => Ok(all),
+        Some(first) if count == 1 => Err(first),
+        Some(first) => {
+            Err(first.context(format!("{count} frames cannot be used, the first of them")))
+        }
+    }
 }
 
 fn wrong(frame: &Path, why: &str) -> Usage {

@@ -118,7 +118,7 @@ fn filled(found: &[Option<Exposure>]) -> Vec<Exposure> {
 }
 
 /// The photograph of a frame and its camera.
-fn settings(session: &Session) -> anyhow::Result<ViewSettings> {
+pub(super) fn settings(session: &Session) -> anyhow::Result<ViewSettings> {
     let scene: SceneConfig = session.config.table("scene")?;
     scene.own_view().map_err(|e| with_place(e, &session.config))
 }
