@@ -68,7 +68,7 @@ fn every_frame_has_the_camera_of_its_name() {
         run.expect_error(2, &format!("error: {message}"));
     };
     refused(&["a.png", "gone.png"], "gone.png: there is no such file");
-    let two = "2 frames cannot be used, the first of them: gone.png: there is no such file";
+    let two = "2 frames cannot be used, the first as follows\n  caused by: gone.png: there is no such file";
     refused(&["gone.png", "a.png", "lost.png"], two);
     project.write("empty.png", "");
     let empty = "empty.png: it is empty: copy it again, or leave it out";
@@ -97,9 +97,10 @@ fn every_frame_has_the_camera_of_its_name() {
     let stranger = ["shot", "a.png", "c.png", "d.png"];
     let run = project.run(DIPIR, &stranger);
     assert_eq!(run.code, Some(1), "{}", run.stderr);
-    let told = "error: 2 frames cannot be used, the first of them: c.png: ";
+    let told =
+        "error: 2 frames cannot be used, the first as follows\n  caused by: c.png\n  caused by: ";
     assert!(run.stderr.starts_with(told), "{}", run.stderr);
-    assert!(!project.path("out").exists());
+    assert!(!project.path("out/scene").exists());
     // Frames of .chan have numbers.
     let numbered = ["f_1.png", "f_02.png"];
     numbered.iter().for_each(|name| project.write(name, &photo));

@@ -169,7 +169,7 @@ fn all_or_first<T>(results: impl IntoIterator<Item = anyhow::Result<T>>) -> anyh
         None => Ok(all),
         Some(first) if count == 1 => Err(first),
         Some(first) => {
-            Err(first.context(format!("{count} frames cannot be used, the first of them")))
+            Err(first.context(format!("{count} frames cannot be used, the first as follows")))
         }
     }
 }
