@@ -9,7 +9,7 @@ use dipir_benchmark::folder::EvaluationFolder;
 use dipir_benchmark::methods::{self, Method};
 use dipir_benchmark::run::Step;
 use dipir_benchmark::{left_out, make, report, run, spheres, study};
-use dipir_cli::exit::{self, describe};
+use dipir_cli::exit::{self, check_png, describe};
 use dipir_cli::output::{json_path, json_paths};
 use dipir_cli::progress::Progress;
 use serde_json::json;
@@ -164,6 +164,9 @@ fn list_methods(args: &MethodsArgs) -> anyhow::Result<()> {
 }
 
 fn compare_spheres(args: &SpheresArgs) -> anyhow::Result<()> {
+    if let Some(png) = &args.png {
+        check_png(png, "the comparison", "spheres.png")?;
+    }
     let scores = spheres::compare_files(&args.truth, &args.estimate, args.png.as_deref())?;
     args.output
         .result(|| spheres::table(&scores), || json!({"spheres": scores}));

@@ -1,10 +1,9 @@
 //! `dipir-scene`: sets the scene up for all later stages.
-use std::ffi::OsStr;
 use std::process::ExitCode;
 
 use anyhow::Context;
 use dipir_cli::args::CommonArgs;
-use dipir_cli::exit::{self, Usage, printable};
+use dipir_cli::exit::{self, Usage, check_png};
 use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_imaging::exposure::automatic_exposure_ev;
@@ -52,16 +51,7 @@ fn check(args: &BackgroundArgs) -> Result<(), Usage> {
             return Err(Usage(message));
         }
     }
-    let is_png = |e: &OsStr| e.eq_ignore_ascii_case("png");
-    match args.png.extension().is_some_and(is_png) {
-        true => Ok(()),
-        false => {
-            let path = args.png.display();
-            let message =
-                format!("{path}: the photograph is written as a PNG: name it so, as in photo.png");
-            Err(Usage(printable(&message)))
-        }
-    }
+    check_png(&args.png, "the photograph", "photo.png")
 }
 
 fn background(args: &BackgroundArgs) -> anyhow::Result<()> {

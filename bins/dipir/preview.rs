@@ -3,7 +3,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use dipir_cli::exit::{Usage, printable};
+use dipir_cli::exit::{Usage, check_png, printable};
 use dipir_cli::output::json_path;
 use dipir_cli::session::{Session, duration};
 use dipir_preview::picture::Preview;
@@ -28,6 +28,9 @@ pub struct PreviewArgs {
 
 /// Draws what is configured, without running a stage.
 pub fn run(args: &PreviewArgs) -> anyhow::Result<()> {
+    if let Some(path) = &args.out {
+        check_png(path, "the preview", "preview.png")?;
+    }
     let session = args.project.start()?;
     let path = args.out.clone();
     let path = path.unwrap_or_else(|| session.config.base_dir().join("preview.png"));

@@ -164,6 +164,15 @@ fn what_gives_no_photograph_is_refused_by_option() {
         run.expect_error(2, &message);
         assert!(!project.path(name).exists());
     }
+    for (executable, args, what) in [
+        (DIPIR, &["preview", "--wire", "-o", "o.jpg"][..], "preview"),
+        (INSPECT, &["background.png", "--png", "o.jpg"], "picture"),
+    ] {
+        let message =
+            format!("error: o.jpg: the {what} is written as a PNG: name it so, as in {what}.png");
+        project.run(executable, args).expect_error(2, &message);
+        assert!(!project.path("o.jpg").exists());
+    }
     let args = ["background.png", "--png", "o.png", "--exposure-ev", "nan"];
     let message = "error: --exposure-ev NaN: accepted: -64 to 64";
     project.run(INSPECT, &args).expect_error(2, message);

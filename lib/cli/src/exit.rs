@@ -1,6 +1,7 @@
 //! From an error to a message and an exit code.
 use std::fmt;
 use std::io::{Write, stdout};
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -20,6 +21,22 @@ pub const FAILED: u8 = 1;
 pub const USAGE: u8 = 2;
 /// Interrupted: 128 + SIGINT, as shells count.
 pub const INTERRUPTED: u8 = 130;
+
+/// Refuses a name of a PNG that says otherwise. `what` is written, as in `example`.
+///
+/// # Errors
+/// If the extension is not `png`.
+pub fn check_png(path: &Path, what: &str, example: &str) -> Result<(), Usage> {
+    if path
+        .extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("png"))
+    {
+        return Ok(());
+    }
+    let path = path.display();
+    let message = format!("{path}: {what} is written as a PNG: name it so, as in {example}");
+    Err(Usage(printable(&message)))
+}
 
 /// Marks an error as the fault of the command line or the configuration.
 #[derive(Debug)]

@@ -3,7 +3,7 @@ use std::fs;
 use std::path::Path;
 
 use anyhow::Context;
-use dipir_cli::exit::{Usage, printable};
+use dipir_cli::exit::{Usage, check_png, printable};
 use dipir_imaging::layers::Layers;
 use dipir_imaging::marked_png::write_display;
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
@@ -23,12 +23,16 @@ impl ViewArgs {
         }
     }
 
-    /// Refuses an exposure that no picture has, and a picture in place of the file `path` that it shows.
+    /// Refuses an exposure that no picture has, and a picture that is named as another format or in place of the file `path`
+    /// that it shows.
     pub fn check(&self, path: &Path) -> Result<(), Usage> {
         if let Some(stops) = self.exposure_ev
             && !(-64.0..=64.0).contains(&stops)
         {
             return Err(Usage(format!("--exposure-ev {stops}: accepted: -64 to 64")));
+        }
+        if let Some(png) = &self.png {
+            check_png(png, "the picture", "picture.png")?;
         }
         let in_full = |path: &Path| fs::canonicalize(path).ok();
         match &self.png {
