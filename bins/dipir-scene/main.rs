@@ -7,7 +7,7 @@ use dipir_cli::exit::{self, Usage, check_png};
 use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_imaging::exposure::automatic_exposure_ev;
-use dipir_imaging::marked_png::write_display;
+use dipir_imaging::marked_png::{Kind, write_display};
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
@@ -72,8 +72,12 @@ fn background(args: &BackgroundArgs) -> anyhow::Result<()> {
         .unwrap_or_else(|| automatic_exposure_ev(&image));
     let gain = exposure_ev.exp2();
     let exposed = LinearImage(image.0.map(|p| *p * gain));
-    write_display(&args.png, &Transfer::Srgb.encode(&exposed))
-        .with_context(|| format!("cannot write {}", args.png.display()))?;
+    write_display(
+        &args.png,
+        &Transfer::Srgb.encode(&exposed),
+        Kind::Photograph,
+    )
+    .with_context(|| format!("cannot write {}", args.png.display()))?;
     let rotation = view.rotation();
     args.output.result(
         || {

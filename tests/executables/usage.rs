@@ -202,6 +202,11 @@ fn no_picture_replaces_what_it_is_made_from() {
         "error: ./bg.png is what scene.background names, and the preview would replace it: name another \
          file with --out",
     );
+    let run = project.run(DIPIR, &["preview", "--wire", "-o", "bg.png"]);
+    run.expect_error(
+        1,
+        "error: cannot write \"bg.png\"\n  caused by: is there already, a photograph that dipir made; name another file",
+    );
     let run = project.run(INSPECT, &["bg.png", "--png", "./bg.png"]);
     run.expect_error(
         2,

@@ -11,7 +11,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::Context;
-use dipir_imaging::marked_png::write_display;
+use dipir_imaging::marked_png::{Kind, write_display};
 use dipir_imaging::metrics::{rmse, si_rmse};
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
@@ -97,7 +97,7 @@ pub fn compare_files(
         EnvironmentMap::read(estimate)?,
     );
     if let Some(png) = png {
-        write_display(png, &sheet(&truth, &estimate))
+        write_display(png, &sheet(&truth, &estimate), Kind::Comparison)
             .with_context(|| format!("cannot write {}", png.display()))?;
     }
     Ok(compare(&truth, &estimate))

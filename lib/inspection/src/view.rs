@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::Context;
 use dipir_cli::exit::{Usage, check_png, printable};
 use dipir_imaging::layers::Layers;
-use dipir_imaging::marked_png::write_display;
+use dipir_imaging::marked_png::{Kind, write_display};
 use dipir_imaging::raster::{DisplayImage, LinearImage, Raster};
 use dipir_imaging::transfer::Transfer;
 use dipir_light::environment::EnvironmentMap;
@@ -73,7 +73,8 @@ pub fn write(
             .unwrap_or_else(|| channel(name, "R"));
         preview::stretched(layers.channel(&single)?)
     };
-    write_display(png, &picture).with_context(|| format!("cannot write {}", png.display()))
+    write_display(png, &picture, Kind::View)
+        .with_context(|| format!("cannot write {}", png.display()))
 }
 
 fn channel(layer: &str, suffix: &str) -> String {

@@ -129,7 +129,7 @@ impl Desk {
             overrides: session.config.overrides().to_vec(),
             props: small.props.clone(),
             readings,
-            photo: png::encode(size[0], size[1], &values)?,
+            photo: png::encode(png::Kind::Preview, size[0], size[1], &values)?,
             size,
             lens: Lens(small.loaded.original.as_ref().map(|o| o.undistortion)),
             text: Mutex::new(text),
@@ -422,7 +422,7 @@ impl Desk {
         let [x0, y0, x1, y1] = place;
         let values = png::values(&draft.picture, place);
         Ok(Ok(Some(Crop {
-            png: png::encode(x1 - x0, y1 - y0, &values)?,
+            png: png::encode(png::Kind::Preview, x1 - x0, y1 - y0, &values)?,
             place,
             light,
         })))
@@ -491,7 +491,7 @@ impl Desk {
         let [w, h] = [place[2] - place[0], place[3] - place[1]];
         let values = png::values(&piece.picture, [0, 0, w, h]);
         Ok(Ok(Some(Crop {
-            png: png::encode(w, h, &values)?,
+            png: png::encode(png::Kind::Preview, w, h, &values)?,
             place,
             light,
         })))

@@ -24,7 +24,7 @@ impl MaskFile {
     /// If another program's file is there.
     pub(crate) fn beside(project: &Path) -> anyhow::Result<Self> {
         let path = project.with_file_name(MASK_FILE);
-        if !png::is_free(&path)? {
+        if !png::is_free(&path, png::Kind::Mask)? {
             bail!("{MASK_FILE} is there already and dipir did not make it; rename it");
         }
         let earlier = None;
@@ -47,7 +47,8 @@ impl MaskFile {
         let [w, h] = [mask.width(), mask.height()];
         let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
         let values: Vec<u8> = mask.pixels().iter().map(byte).collect();
-        png::write(path, &png::encode(w, h, &values)?).map_err(|e| unwritten(path, &e))
+        let kind = png::Kind::Mask;
+        png::write(path, &png::encode(kind, w, h, &values)?, kind).map_err(|e| unwritten(path, &e))
     }
 
     /// Brings back what was there before it was written, or nothing.
@@ -56,7 +57,7 @@ impl MaskFile {
     /// If it cannot be.
     pub(crate) fn restore(&self) -> anyhow::Result<()> {
         let restored = match &self.earlier {
-            Some(earlier) => png::write(&self.path, earlier),
+            Some(earlier) => png::write(&self.path, earlier, png::Kind::Mask),
             None => fs::remove_file(&self.path),
         };
         restored.map_err(|e| unwritten(&self.path, &e))

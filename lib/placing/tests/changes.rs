@@ -3,6 +3,7 @@ use std::fs;
 
 use dipir_placing::desk::Desk;
 use dipir_placing::edit::Edit;
+use dipir_preview::png::{Kind, encode};
 use serde_json::json;
 
 mod project;
@@ -128,7 +129,7 @@ fn a_save_that_fails_leaves_file_and_mask_as_they_were() {
     desk.paint(vec![255; desk.mask_bytes()]).unwrap();
     desk.save(&edit).unwrap_err();
     assert!(!mask.exists(), "a first mask stayed");
-    let earlier = dipir_preview::png::encode(300, 200, &[7; 60_000]).unwrap();
+    let earlier = encode(Kind::Mask, 300, 200, &[7; 60_000]).unwrap();
     fs::write(&mask, &earlier).unwrap();
     let error = desk.save(&edit).unwrap_err().to_string();
     assert!(

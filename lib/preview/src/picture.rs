@@ -81,7 +81,8 @@ impl Preview {
     pub fn write(&self, path: &Path) -> anyhow::Result<()> {
         let (width, height) = (self.picture.0.width(), self.picture.0.height());
         let values = png::values(&self.picture, [0, 0, width, height]);
-        let write = || png::write(path, &png::encode(width, height, &values)?);
+        let kind = png::Kind::Preview;
+        let write = || png::write(path, &png::encode(kind, width, height, &values)?, kind);
         write().with_context(|| format!("cannot write \"{}\"", path.display()))
     }
 }
