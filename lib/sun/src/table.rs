@@ -13,7 +13,8 @@ use crate::time::Time;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SunTable {
-    /// When the photograph was taken, ISO 8601 with the offset of its zone.
+    /// When the photograph was taken, ISO 8601 with the offset of its zone. Without an offset that of the longitude, in
+    /// whole hours, is taken, which may be an hour off.
     #[schemars(extend("x-default" = "the photograph's own"), example = &"2026-06-21T12:34:56+02:00")]
     pub time: Option<String>,
     /// Latitude of the place, degrees north. It belongs to `longitude`.
@@ -281,6 +282,19 @@ impl SunTable {
         })
     }
 
+    /// The offset that `time` is taken to have, if it is written without one and tells of the sun: `+02:00`.
+    pub fn assumed_offset(&self, taken: &Taken) -> Option<String> {
+        let time = Time::parse(self.time.as_deref()?)?;
+        let longitude = self.longitude.or(taken.longitude_deg)?;
+        self.by_time(taken).filter(|_| !time.zone_known)?;
+        let hours = (time.unix_s - time.at_longitude(longitude)) / 3600.0;
+        Some(format!(
+            "{}{:02}:00",
+            if hours < 0.0 { '-' } else { '+' },
+            hours.abs()
+        ))
+    }
+
     fn heading(&self, taken: &Taken) -> Option<Angle> {
         let deg = self
             .heading_deg
@@ -399,6 +413,21 @@ mod tests {
 
     /// A noon in June at 48 degrees north, in which the sun stands in the south.
     const NOON: &str = "time = \"2026-06-21T12:02:00Z\"\nlatitude = 48.0\nlongitude = 0.0\n";
+
+    #[test]
+    fn an_offset_that_is_assumed_is_told() {
+        let assumed = |time: &str, longitude: f64| {
+            let text = format!("time = \"{time}\"\nlatitude = 40.0\nlongitude = {longitude:?}");
+            sun(&text).assumed_offset(&Taken::default())
+        };
+        let clock = "2026-06-21T12:34:56";
+        assert_eq!(assumed(clock, 11.6).as_deref(), Some("+01:00"));
+        assert_eq!(assumed(clock, 286.0).as_deref(), Some("-05:00"));
+        assert_eq!(assumed(clock, 0.0).as_deref(), Some("+00:00"));
+        assert_eq!(assumed("2026-06-21T12:34:56+02:00", 11.6), None);
+        let without_place = sun("time = \"2026-06-21T12:34:56\"");
+        assert_eq!(without_place.assumed_offset(&Taken::default()), None);
+    }
 
     #[test]
     fn what_says_nothing_is_told() {

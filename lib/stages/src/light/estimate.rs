@@ -217,6 +217,13 @@ fn known_sun(
     if let Some(missing) = table.sun.as_ref().and_then(|sun| sun.idle(&taken)) {
         session.warn(&format!("light.sun: {missing}"));
     }
+    if let Some((time, offset)) = sun.time.as_deref().zip(sun.assumed_offset(&taken)) {
+        session.warn(&format!(
+            "light.sun.time has no offset of its zone, and {offset} is assumed by the longitude, which may be an hour off, \
+             as with summer time: write it, as in \"{}{offset}\"",
+            time.trim()
+        ));
+    }
     if let Some(shadow) = &table.shadow {
         let shadow = shadow
             .resolve("light.shadow")
