@@ -209,11 +209,17 @@ const DARK: f32 = 0.01;
 /// arbitrary.
 fn unseen(image: &LinearImage, path: &Path) -> Option<String> {
     let pixels = image.0.pixels();
-    let (mut white, mut dark, mut is_lit) = (0usize, 0usize, false);
+    if !pixels.is_empty() && pixels.iter().all(|p| p.max_element() <= 0.0) {
+        return Some(format!(
+            "`{}`: it holds no light, for none of its values is above 0: it is black in previews and in composite.png; \
+             is it the right file?",
+            path.display()
+        ));
+    }
+    let (mut white, mut dark) = (0usize, 0usize);
     for luminance in pixels.iter().map(|p| p.dot(crate::metrics::LUMA)) {
         white += usize::from(luminance > 1.0);
         dark += usize::from(luminance < DARK);
-        is_lit |= luminance > 0.0;
     }
     let count = pixels.len();
     let percent = |part: usize| 100 * part / count.max(1);
@@ -222,7 +228,7 @@ fn unseen(image: &LinearImage, path: &Path) -> Option<String> {
             "{}% of its pixels are above 1.0 and show white",
             percent(white)
         )
-    } else if is_lit && 100 * (count - dark) < count {
+    } else if 100 * (count - dark) < count {
         format!(
             "{}% of its pixels are below {DARK} and show nearly black",
             percent(dark)
