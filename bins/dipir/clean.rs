@@ -17,9 +17,10 @@ use dipir_stages::{report, shot};
 use serde_json::json;
 
 use crate::hashed::hashes_file;
-use crate::project::{ProjectArgs, Stage};
+use crate::project::{ProjectArgs, Stage, one_file};
 
 #[derive(Args)]
+#[command(mut_arg("files", one_file))]
 pub struct CleanArgs {
     #[command(flatten)]
     project: ProjectArgs,

@@ -1,7 +1,7 @@
 //! What all subcommands start from: a configuration, its graph, and names of stages.
 use std::path::{Path, PathBuf};
 
-use clap::{Args, ValueEnum};
+use clap::{Arg, ArgAction, Args, ValueEnum};
 use dipir_cli::args::{CommonArgs, OutputArgs};
 use dipir_cli::exit::{Usage, printable};
 use dipir_cli::interrupt;
@@ -137,18 +137,16 @@ impl ProjectArgs {
 
     /// Reads the configuration and draws the graph.
     pub fn open(&self) -> anyhow::Result<(Session, Graph)> {
-        if let [_, second, ..] = &self.files[..] {
-            let message = format!(
-                "{}: this takes one file; dipir run takes several",
-                second.display()
-            );
-            return Err(Usage(message).into());
-        }
         self.check_there()?;
         let session = Session::open(&self.common())?;
         let graph = graph::graph(&session)?;
         Ok((session, graph))
     }
+}
+
+/// The files of [`ProjectArgs`], for commands that take one.
+pub fn one_file(files: Arg) -> Arg {
+    files.num_args(0..=1).action(ArgAction::Set)
 }
 
 /// One project, for commands whose results are no artifacts.

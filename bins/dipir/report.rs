@@ -11,9 +11,10 @@ use dipir_stages::report::{self, Report};
 use dipir_stages::truth::{self, Truth};
 use serde_json::json;
 
-use crate::project::ProjectArgs;
+use crate::project::{ProjectArgs, one_file};
 
 #[derive(Args)]
+#[command(mut_arg("files", one_file))]
 pub struct ReportArgs {
     #[command(flatten)]
     project: ProjectArgs,

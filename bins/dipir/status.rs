@@ -6,9 +6,10 @@ use dipir_pipeline::status::{StageStatus, State};
 use dipir_stages::{graph, shot};
 use serde_json::json;
 
-use crate::project::{ProjectArgs, Stage};
+use crate::project::{ProjectArgs, Stage, one_file};
 
 #[derive(Args)]
+#[command(mut_arg("files", one_file))]
 pub struct StatusArgs {
     #[command(flatten)]
     project: ProjectArgs,
@@ -19,6 +20,7 @@ pub struct StatusArgs {
 }
 
 #[derive(Args)]
+#[command(mut_arg("files", one_file))]
 pub struct GraphArgs {
     #[command(flatten)]
     project: ProjectArgs,

@@ -34,6 +34,12 @@ fn meant(error: &clap::Error) -> Option<String> {
                 .or_else(|| executable(name))
                 .or_else(|| command(name))
         }
+        ErrorKind::TooManyValues if said(ContextKind::InvalidArg)? == "[FILE]" => {
+            let name = said(ContextKind::InvalidValue)?;
+            Some(format!(
+                "{name}: this takes one file; dipir run takes several"
+            ))
+        }
         ErrorKind::InvalidValue => {
             let value = said(ContextKind::InvalidValue)?;
             let option = said(ContextKind::InvalidArg)?;
