@@ -157,6 +157,7 @@ impl Config {
         Ok(config)
     }
 
+    /// Refuses tables that nothing reads. Those of `[scene]` are known by their names.
     fn check_tables(&self) -> Result<(), ConfigError> {
         let Value::Table(entries) = &self.root.value else {
             unreachable!("a TOML file is a table");
@@ -167,7 +168,13 @@ impl Config {
                     at: entry.place.clone(),
                     key: entry.name.clone(),
                     table: String::new(),
-                    nearest: nearest(&entry.name, TABLES),
+                    nearest: match entry.name.as_str() {
+                        name
+                        @ ("objects" | "camera" | "proxy" | "views" | "effects" | "limits") => {
+                            Some(format!("scene.{name}"))
+                        }
+                        name => nearest(name, TABLES),
+                    },
                     accepted: TABLES.map(String::from).into(),
                 });
             }

@@ -142,6 +142,22 @@ fn an_unknown_table_is_an_error() {
 }
 
 #[test]
+fn a_table_of_the_scene_at_the_top_is_answered_with_where_it_belongs() {
+    let told = parse("[[objects]]\npath = \"a.obj\"\n", &[]).unwrap_err();
+    let begins = "pipeline.toml:1: unknown key \"objects\" (did you mean \"scene.objects\"?); ";
+    assert!(told.to_string().starts_with(begins), "{told}");
+}
+
+#[test]
+fn a_key_that_is_written_twice_is_named() {
+    let told = parse("[scene]\nclass = \"a\"\nclass = \"b\"\n", &[]).unwrap_err();
+    assert_eq!(
+        told.to_string(),
+        "pipeline.toml:3: not valid TOML: class is written twice: keep one of them"
+    );
+}
+
+#[test]
 fn a_wrong_type_says_what_was_found_and_what_is_accepted() {
     let text = "[scene]\nbackground = \"a\"\nsamples = \"many\"\n";
     assert_eq!(

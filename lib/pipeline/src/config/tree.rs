@@ -127,7 +127,12 @@ pub(super) fn parse_file(path: &Path, text: &str) -> Result<Node, ConfigError> {
     };
     let table = DeTable::parse(text).map_err(|e| ConfigError::Syntax {
         at: place(e.span().map_or(0, |s| s.start)),
-        message: with_remedy(one_line(e.message())),
+        message: match e.span().and_then(|span| text.get(span)) {
+            Some(key) if e.message() == "duplicate key" => {
+                format!("{} is written twice: keep one of them", one_line(key))
+            }
+            _ => with_remedy(one_line(e.message())),
+        },
     })?;
     let table_place = Place::File { file: path.into() };
     Ok(Node {
