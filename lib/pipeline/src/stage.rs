@@ -9,7 +9,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crate::error::{Foreign, StageError};
 use crate::lock::{FolderLock, WhenLocked, create_folder, sibling};
@@ -197,7 +197,12 @@ impl StageWriter {
         self.timings_s.insert(name.into(), seconds);
     }
 
-    /// Seconds since [`begin`](Self::begin).
+    /// Counts what went before [`begin`](Self::begin), too: reading what the stage reads.
+    pub fn add_time(&mut self, before: Duration) {
+        self.started = self.started.checked_sub(before).unwrap_or(self.started);
+    }
+
+    /// Seconds since [`begin`](Self::begin), and those of [`add_time`](Self::add_time).
     pub fn elapsed_s(&self) -> f64 {
         self.started.elapsed().as_secs_f64()
     }

@@ -453,3 +453,12 @@ fn a_folder_that_vanishes_meanwhile_is_not_made_again_without_its_mark() {
     drop(writer);
     assert_eq!(names(&parent.path().join("out")), ["scene"]);
 }
+
+#[test]
+fn time_before_the_folder_was_opened_counts() {
+    let dir = tempfile::tempdir().unwrap();
+    let target = dir.path().join("scene");
+    let mut writer = StageWriter::begin(&target, plan(0), WhenLocked::Refuse).unwrap();
+    writer.add_time(Duration::from_millis(500));
+    assert!(writer.finish().unwrap().elapsed_s >= 0.5);
+}

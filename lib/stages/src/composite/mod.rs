@@ -136,7 +136,9 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     };
     let stop = table.stop(session.pipeline.quality);
     let folder = COMPOSITE.folder(session);
+    let reading = clock.elapsed();
     let mut writer = begin(session, plan(session, &table)?)?;
+    writer.add_time(reading);
     let curve = Curve::of(table.tone, &light, inputs.scene.loaded.taken());
     let lens = table.lens(&session.config, &inputs.scene.loaded)?;
     let out_of_focus = lens.map(|lens| focus::blur_px(&lens, &inputs.scene.loaded));

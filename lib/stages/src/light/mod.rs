@@ -136,11 +136,14 @@ impl Model {
 
 /// Runs the stage.
 pub fn run(session: &Session) -> anyhow::Result<Done> {
+    let clock = Instant::now();
     let request = Request::of(session)?;
     let inputs = Inputs::read(session, &request)?;
     let plan = plan(session)?;
     let fingerprint = fingerprint(&plan, &request.settings)?;
+    let reading = clock.elapsed();
     let mut writer = begin(session, plan)?;
+    writer.add_time(reading);
     let clock = Instant::now();
     let estimated = match request.start {
         First::Estimated => {

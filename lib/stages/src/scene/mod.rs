@@ -82,6 +82,7 @@ impl Record {
 
 /// Runs the stage.
 pub fn run(session: &Session) -> anyhow::Result<Done> {
+    let clock = Instant::now();
     let config: SceneConfig = session.config.table("scene")?;
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
@@ -103,7 +104,9 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
         plan_of_this.missing(&part.role, &part.path);
     }
     let folder = SCENE.folder(session);
+    let reading = clock.elapsed();
     let mut writer = begin(session, plan_of_this)?;
+    writer.add_time(reading);
 
     let settings = Settings {
         seed: session.pipeline.seed,
