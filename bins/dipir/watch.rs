@@ -49,7 +49,7 @@ pub fn watch(project: &ProjectArgs) -> anyhow::Result<()> {
             say("waiting for a change of the files that were read; Ctrl-C ends this");
         }
         if !changed(project, before) {
-            return Ok(());
+            return Err(AlreadyReported(INTERRUPTED).into());
         }
     }
 }

@@ -98,6 +98,21 @@ fn a_signal_that_asks_to_end_ends_with_130_and_leaves_nothing_half_written() {
     }
 }
 
+#[cfg(unix)]
+#[test]
+fn a_watch_that_waits_ends_with_130() {
+    use std::io::{BufRead, BufReader};
+
+    let project = Project::new();
+    let watch = ["run", "--watch", "--until", "scene"];
+    let mut child = project.command(DIPIR, &watch).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    let waits = |line: std::io::Result<String>| line.unwrap().starts_with("waiting for a change");
+    assert!(lines.any(waits));
+    send("-INT", &child);
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+}
+
 #[cfg(target_os = "linux")]
 #[test]
 fn a_terminal_that_is_closed_ends_no_run_that_was_started_to_outlive_it() {

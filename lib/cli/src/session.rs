@@ -81,6 +81,12 @@ impl Session {
                 Usage("the folder of artifacts is empty: name one with --out".into()).into(),
             );
         }
+        if out.exists() && !out.is_dir() {
+            let out = out.display();
+            anyhow::bail!(
+                "cannot create {out}: file exists; move it away or choose another folder with --out"
+            );
+        }
         if let Some(path) = &args.hashes {
             Hashes::read(path).adopt();
         }
