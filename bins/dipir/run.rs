@@ -19,8 +19,8 @@ use dipir_pipeline::graph::{Graph, Node};
 use dipir_pipeline::hashing::Hashes;
 use dipir_pipeline::runner::{self, Stopped, Work};
 use dipir_pipeline::status::{self, State};
-use dipir_stages::graph;
 use dipir_stages::truth::Truth;
+use dipir_stages::{graph, needed_files};
 use serde_json::{Map, Value, json};
 
 use crate::hashed::{Reads, hashes_file, remove_left};
@@ -248,13 +248,14 @@ pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String,
     let reads = Reads::until_now();
     let (session, graph) = project.open()?;
     let nodes = selected(args, &graph)?;
+    let is_frame = project.placed.is_some();
+    needed_files::check(&session, &nodes)?;
     check_taken(&session, &nodes)?;
     if args.plan {
         return plan::plan(&session, &graph, &nodes, args.force);
     }
-    let is_frame = project.placed.is_some();
-    // Dropped after all that is written there: a frame that fails leaves no empty folder.
-    let _made = is_frame.then(|| MadeFolders::make(&session.out));
+    // Dropped after all that is written there: a run that fails leaves no empty folder.
+    let _made = MadeFolders::make(&session.out);
     let mut work = Pipeline::new(args, project, &session)?;
     let all_fresh = all_fresh(&session, &graph, &nodes)?;
     if args.force || !all_fresh {

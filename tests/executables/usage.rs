@@ -432,3 +432,81 @@ fn names_may_begin_with_a_dash() {
     let page = String::from_utf8(project.read("-out/report.html")).unwrap();
     assert!(page.contains("--pipeline=-p.toml --out=-out"), "{page}");
 }
+
+#[test]
+fn a_command_that_takes_one_file_says_so() {
+    let project = Project::new();
+    for command in ["status", "graph", "report", "clean"] {
+        let help = project.run(DIPIR, &[command, "--help"]).stdout;
+        let usage = format!("Usage: dipir {command} [OPTIONS] [FILE]\n");
+        assert!(help.contains(&usage), "{help}");
+    }
+    let help = project.run(DIPIR, &["run", "--help"]).stdout;
+    assert!(help.contains("[FILE]...\n"), "{help}");
+}
+
+#[test]
+fn a_folder_of_artifacts_that_is_a_file_is_refused_by_name() {
+    let project = Project::new();
+    project.write("out", "mine");
+    let message =
+        "error: cannot create out: file exists; move it away or choose another folder with --out";
+    for command in [&["run"][..], &["status"]] {
+        project.run(DIPIR, command).expect_error(1, message);
+    }
+    assert_eq!(project.read("out"), b"mine");
+    // A run that fails leaves no folder that it made.
+    let run = project.run(DIPIR, &["run", "--from", "composite", "-o", "new/folder"]);
+    assert_eq!(run.code, Some(1));
+    assert!(!project.path("new").exists());
+}
+
+#[test]
+fn what_later_stages_read_is_looked_for_before_any_runs() {
+    let project = Project::new();
+    let gone = |set: &[&str], key: &str, file: &str| {
+        let run = project.run(DIPIR, &[&["run"], set].concat());
+        let cause = format!("  caused by: `{file}` does not exist; check the path\n");
+        let message = format!("error: cannot use {key} = \"{file}\"\n{cause}");
+        assert_eq!((run.code, &*run.stderr), (Some(1), &*message));
+        assert!(!project.path("out").exists());
+    };
+    gone(
+        &["--set", "composite.environment=gone.hdr"],
+        "composite.environment",
+        "gone.hdr",
+    );
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write(
+        "pipeline.toml",
+        text.replace("environment = \"sky.exr\"\n", ""),
+    );
+    let reference = "light.reference=gone.exr";
+    let guided = ["--set", "light.guidance=reference", "--set", reference];
+    gone(&guided, "light.reference", "gone.exr");
+    gone(
+        &["--set", "light.start=gone.json"],
+        "light.start",
+        "gone.json",
+    );
+    gone(&["--set", "model.path=gone"], "model.path", "gone");
+    // Of stages that do not run nothing is asked.
+    let until = ["run", "--until", "scene", "--set", "light.start=gone.json"];
+    project.run(DIPIR, &until).expect_success();
+    for (key, why) in [
+        (
+            "composite.environment",
+            "is empty; name a file, or remove the key",
+        ),
+        (
+            "light.start",
+            "\"\" is neither a file nor one of these words",
+        ),
+    ] {
+        let set = format!("{key}=\"\"");
+        let run = project.run(DIPIR, &["run", "--set", &set]);
+        let told = format!("error: --set {set}: {key}: {why}");
+        assert_eq!(run.code, Some(2));
+        assert!(run.stderr.starts_with(&told), "{}", run.stderr);
+    }
+}

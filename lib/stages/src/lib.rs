@@ -9,6 +9,7 @@ pub mod light;
 pub mod lora;
 pub mod model;
 pub mod names;
+pub mod needed_files;
 pub mod presets;
 pub mod preview;
 mod reasons;

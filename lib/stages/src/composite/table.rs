@@ -130,6 +130,11 @@ impl CompositeTable {
     /// # Errors
     /// The first such value, by key.
     pub fn check(&self, config: &Config) -> Result<(), ConfigError> {
+        let environment = self.environment.as_ref();
+        if environment.is_some_and(|path| path.as_os_str().is_empty()) {
+            let message = "is empty; name a file, or remove the key";
+            return Err(config.invalid("composite.environment", message));
+        }
         if let Some(e) = self.target_error
             && !(e > 0.0 && e <= 1.0)
         {

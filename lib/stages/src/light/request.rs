@@ -272,7 +272,7 @@ fn model_guide(session: &Session, table: &LightTable, adapted: bool) -> anyhow::
 
 /// Refuses a start that was meant as one of the words: a name without extension, and no such file. A file with an extension
 /// that is not there is refused where it is read.
-fn refuse_misspelt(session: &Session, path: &Path) -> anyhow::Result<()> {
+pub(crate) fn refuse_misspelt(session: &Session, path: &Path) -> anyhow::Result<()> {
     if path.extension().is_some() || (path.file_name().is_some() && session.resolve(path).exists())
     {
         return Ok(());
