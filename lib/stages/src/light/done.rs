@@ -72,6 +72,9 @@ impl fmt::Display for Done {
                     write!(f, "\n  {chosen}")?;
                 }
             }
+            None if self.is_neutral => {
+                write!(f, "\n  it is neutral, nearly alike from all sides")?;
+            }
             None => {
                 if let Some(peak) = self.found.lighting.peak_direction() {
                     let seen = words(relative(peak, &self.camera));

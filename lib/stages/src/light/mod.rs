@@ -63,6 +63,8 @@ pub struct Done {
     folder: PathBuf,
     manifest: Manifest,
     found: Found,
+    /// Whether it is the light of a neutral start.
+    is_neutral: bool,
     /// The iterations that were asked for, where a time budget decided how many were run.
     wanted: Option<usize>,
     /// The camera of the picture that the light was recovered on.
@@ -183,6 +185,9 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     Ok(Done {
         folder: LIGHT.folder(session),
         manifest,
+        is_neutral: request.start == First::Neutral
+            && found.history.is_empty()
+            && found.surroundings.is_none(),
         found,
         wanted: budget.map(|_| request.settings.iterations),
         camera: inputs.frame.camera,
