@@ -19,6 +19,7 @@ use dipir_pipeline::graph::{Graph, Node};
 use dipir_pipeline::hashing::Hashes;
 use dipir_pipeline::runner::{self, Stopped, Work};
 use dipir_pipeline::status::{self, State};
+use dipir_stages::light::idle_guidance;
 use dipir_stages::truth::Truth;
 use dipir_stages::{graph, needed_files};
 use serde_json::{Map, Value, json};
@@ -249,6 +250,9 @@ pub fn run_one(args: &RunArgs, project: &ProjectArgs) -> anyhow::Result<(String,
     let (session, graph) = project.open()?;
     let nodes = selected(args, &graph)?;
     let is_frame = project.placed.is_some();
+    if let Some(warning) = idle_guidance(&session)?.filter(|_| !is_frame) {
+        session.warn(&warning);
+    }
     needed_files::check(&session, &nodes)?;
     check_taken(&session, &nodes)?;
     if args.plan {

@@ -305,3 +305,59 @@ fn a_plate_of_linear_light_is_lit_at_its_own_exposure() {
         assert!(off < 0.01 * bright.max_element() + 1e-3, "{dim} {bright}");
     }
 }
+
+#[test]
+fn keys_of_guidance_that_is_off_are_named_once() {
+    let project = project();
+    let warning = "warning: light.reference, light.iterations change nothing, for nothing guides the light: \
+                   light.guidance = \"reference\" switches guidance on\n";
+    let set = [
+        "--set",
+        "light.reference=a.exr",
+        "--set",
+        "light.iterations=9",
+    ];
+    for _ in 0..2 {
+        let run = project.run(DIPIR, &[&["run"], &set[..]].concat());
+        run.expect_success();
+        assert_eq!(run.stderr.matches(warning).count(), 1, "{}", run.stderr);
+    }
+    let run = project.run(OPTIMIZE, &["--set", "light.prompt=noon"]);
+    let warning = "warning: light.prompt changes nothing, for nothing guides the light: light.guidance = \"lds\" switches";
+    assert!(run.stderr.contains(warning), "{}", run.stderr);
+    for silent in [
+        &["--set", "light.iterations=0"][..],
+        &["--set", "light.start=neutral"],
+    ] {
+        let run = project.run(DIPIR, &[&["run"], silent].concat());
+        run.expect_success();
+        assert!(!run.stderr.contains("warning"), "{}", run.stderr);
+    }
+    // Neutral light comes from no side.
+    let run = project.run(OPTIMIZE, &["--set", "light.start=neutral"]);
+    assert!(
+        run.stdout
+            .contains("\n  it is neutral, nearly alike from all sides\n"),
+        "{}",
+        run.stdout
+    );
+}
+
+#[test]
+fn a_time_without_its_offset_says_which_is_assumed() {
+    let project = project();
+    project.run(SCENE, &[]).expect_success();
+    let told = |time: &str| {
+        let sun =
+            format!("light.sun={{time=\"{time}\",latitude=48.1,longitude=11.6,heading_deg=0.0}}");
+        let run = project.run(OPTIMIZE, &["--set", &sun]);
+        run.expect_success();
+        run.stderr
+    };
+    let warning = told("2026-06-21T12:34:56");
+    let said = "light.sun.time has no offset of its zone, and +01:00 is assumed by the longitude, which may be an hour off, \
+                as with summer time: write it, as in \"2026-06-21T12:34:56+01:00\"";
+    assert!(warning.contains(said), "{warning}");
+    let with_offset = told("2026-06-21T12:34:56+02:00");
+    assert!(!with_offset.contains("offset"), "{with_offset}");
+}

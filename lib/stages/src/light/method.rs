@@ -1,6 +1,7 @@
 //! How the configuration gets its light, decided from its tables alone, before any file is read.
 use dipir_cli::session::Session;
 use dipir_optimize::settings::{GuidanceKind, LightTable, Start};
+use dipir_pipeline::config::Place;
 
 use crate::composite::table::CompositeTable;
 use crate::model::ModelTable;
@@ -82,6 +83,62 @@ pub(crate) fn starts_neutral(start: &Start, method: Method) -> bool {
         Start::Auto => method == Method::Reference,
         Start::Estimated | Start::Read | Start::Encoder | Start::File(_) => false,
     }
+}
+
+/// Keys of `[light]` that only guidance uses.
+const OF_GUIDANCE: [&str; 15] = [
+    "reference",
+    "iterations",
+    "time_budget_s",
+    "timesteps",
+    "prompt",
+    "draws",
+    "crop",
+    "guidance_scale",
+    "learning_rates",
+    "consistency",
+    "regularizer",
+    "fused_after",
+    "crops",
+    "samples",
+    "patience",
+];
+
+/// A warning that names the keys of guidance that are written though nothing guides.
+///
+/// # Errors
+/// If `[light]`, `[composite]` or `[model]` cannot be read.
+pub fn idle_guidance(session: &Session) -> anyhow::Result<Option<String>> {
+    let table: LightTable = session.config.table("light")?;
+    let model: ModelTable = session.config.table("model")?;
+    let is_off = table.guidance.resolved(model.path.is_some()) == GuidanceKind::None;
+    if Method::of(session)? != Method::Start || !is_off {
+        return Ok(None);
+    }
+    // Those of a method that is named stand in no file of the user's.
+    let is_written = |place: Place| match place {
+        Place::Line { file, .. } => file == session.config.path(),
+        _ => true,
+    };
+    let written = |key: &&&str| {
+        let place = session.config.place(&format!("light.{key}"));
+        place.is_some_and(is_written) && !(**key == "iterations" && table.iterations == Some(0))
+    };
+    let keys: Vec<String> = OF_GUIDANCE
+        .iter()
+        .filter(written)
+        .map(|key| format!("light.{key}"))
+        .collect();
+    let guidance = match &keys[..] {
+        [] => return Ok(None),
+        _ if table.reference.is_some() => "reference",
+        _ => "lds",
+    };
+    let change = if keys.len() == 1 { "changes" } else { "change" };
+    Ok(Some(format!(
+        "{} {change} nothing, for nothing guides the light: light.guidance = \"{guidance}\" switches guidance on",
+        keys.join(", ")
+    )))
 }
 
 /// Whether the start needs the model.

@@ -15,6 +15,8 @@ mod surroundings;
 mod views;
 mod words;
 
+pub use method::idle_guidance;
+
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
