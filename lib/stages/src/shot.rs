@@ -168,9 +168,9 @@ fn all_or_first<T>(results: impl IntoIterator<Item = anyhow::Result<T>>) -> anyh
     match wrong.into_iter().next() {
         None => Ok(all),
         Some(first) if count == 1 => Err(first),
-        Some(first) => {
-            Err(first.context(format!("{count} frames cannot be used, the first as follows")))
-        }
+        Some(first) => Err(first.context(format!(
+            "{count} frames cannot be used, the first as follows"
+        ))),
     }
 }
 
