@@ -85,7 +85,6 @@ fn what_is_no_polished_plane_is_refused_or_told() {
     );
     let run = project.run(DIPIR, &[&["run"], &POLISHED[..]].concat());
     run.expect_success();
-    let told =
-        "composite.ground_roughness: only a plane mirrors the objects, and [scene.proxy] is not one";
+    let told = "composite.ground_roughness: only a plane mirrors the objects, and [scene.proxy] is not one";
     assert!(run.stderr.contains(told), "{}", run.stderr);
 }
