@@ -140,13 +140,13 @@ pub fn read_photo_within(
             check_square(&layers, path)?;
             let alpha = layers.channel("A").ok().cloned();
             let light = linear_of_layers(&layers, path)?;
-            let mut photo = linear_photo(light, alpha, path, transfer)?;
+            let mut photo = linear_photo(light, alpha, path)?;
             photo.warnings.extend(overscan(&layers, path));
             Ok(photo)
         }
         Format::Hdr => {
             let light = hdr_file::decode(&bytes, path, limit)?;
-            linear_photo(light, None, path, transfer)
+            linear_photo(light, None, path)
         }
         other => Err(other.refuse(path, PHOTO_FORMATS)),
     }
@@ -174,8 +174,9 @@ fn linear_photo(
     (mut image, primaries): (LinearImage, Option<Primaries>),
     alpha: Option<Raster<f32>>,
     path: &Path,
-    transfer: Transfer,
 ) -> Result<Photo, ImagingError> {
+    // Results are shown as display values, whatever the key says of files that hold such.
+    let transfer = Transfer::Srgb;
     let mut warnings: Vec<String> = transparency(alpha.as_ref(), path).into_iter().collect();
     match primaries.map_or(Ok(None), Primaries::to_rec709) {
         Ok(None) => {}

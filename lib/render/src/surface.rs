@@ -335,7 +335,9 @@ impl<'a> Surfaces<'a> {
             if let Some(t) = &m.metallic_roughness_texture {
                 let value = self.lookup(t, &point);
                 roughness *= value.y;
-                metallic *= value.z;
+                if m.metallic_is_textured {
+                    metallic *= value.z;
+                }
             }
             if let Some(t) = &m.emissive_texture {
                 emission *= self.lookup(t, &point).truncate();
@@ -397,7 +399,9 @@ impl<'a> Surfaces<'a> {
             if let Some(t) = &m.metallic_roughness_texture {
                 let value = self.lookup(t, &point);
                 slopes.roughness *= value.y;
-                slopes.metallic *= value.z;
+                if m.metallic_is_textured {
+                    slopes.metallic *= value.z;
+                }
             }
             if let Some(t) = &m.emissive_texture {
                 slopes.emission *= self.lookup(t, &point).truncate();

@@ -139,7 +139,7 @@ impl CameraSettings {
                 let Some(sensor_mm) = facts.sensor_width_mm() else {
                     return Err(Error::Missing {
                         key: "scene.camera.sensor_mm".into(),
-                        remedy: "the photograph does not say which sensor took it: write the sensor's width, for instance sensor_mm = 36.0".into(),
+                        remedy: "the photograph does not say which sensor took it: write how wide the upright picture is on the sensor, for instance sensor_mm = 36.0, or 24.0 for a portrait".into(),
                     });
                 };
                 *field_of_view = FieldOfView::Lens {

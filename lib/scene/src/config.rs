@@ -143,7 +143,7 @@ pub struct CameraConfig {
     /// Centre of projection, metres: x, y and z of the scene.
     #[schemars(extend("x-default" = "none; required without `file`"), extend("examples" = [[0.0, 1.5, 4.0]]))]
     pub position: Option<[f32; 3]>,
-    /// The point that the centre of the image shows, metres.
+    /// The point that is seen on the optical axis, which is the middle of the image unless `principal_px` is given, metres.
     #[schemars(extend("x-default" = "none; required without `file`"), extend("examples" = [[0.0, 0.5, 0.0]]))]
     pub look_at: Option<[f32; 3]>,
     /// The direction that is up in the image, of any length.
@@ -172,7 +172,7 @@ pub struct CameraConfig {
     /// Focal length, millimetres. It replaces `fov_deg`.
     #[schemars(extend("exclusiveMinimum" = 0), example = 35.0)]
     pub focal_mm: Option<f32>,
-    /// Width of the sensor, millimetres; 36 is full frame. It belongs to `focal_mm`.
+    /// Width of the upright picture on the sensor, millimetres: of full frame 36, or 24 for a portrait. It belongs to `focal_mm`.
     #[schemars(extend("exclusiveMinimum" = 0), extend("x-default" = "the photograph's own, from its Exif data"), example = 36.0)]
     pub sensor_mm: Option<f32>,
     /// How the lens bends lines. The photograph is undistorted for everything that is computed, and the

@@ -182,6 +182,8 @@ pub struct Material {
     pub roughness: f32,
     /// Linear texture: green multiplies roughness, blue multiplies metallic.
     pub metallic_roughness_texture: Option<TextureRef>,
+    /// Whether blue does; it holds roughness, too, where roughness has a texture of its own.
+    pub metallic_is_textured: bool,
     /// Tangent-space normal map and its scale.
     pub normal_texture: Option<(TextureRef, f32)>,
     /// Emitted radiance, linear, strength (`KHR_materials_emissive_strength`) multiplied in.
@@ -222,6 +224,7 @@ impl Default for Material {
             metallic: 1.0,
             roughness: 1.0,
             metallic_roughness_texture: None,
+            metallic_is_textured: true,
             normal_texture: None,
             emissive: Vec3::ZERO,
             emissive_texture: None,

@@ -24,7 +24,7 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 19,
+    version: 20,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {

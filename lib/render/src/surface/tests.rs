@@ -107,6 +107,11 @@ fn factors_textures_and_vertex_colours_multiply_in_linear_light() {
     assert!(p.base_color.abs_diff_eq(expected, 1e-5), "{}", p.base_color);
     // Green is roughness and blue metalness.
     assert!((p.roughness - 0.1).abs() < 1e-6 && (p.metallic - 0.3).abs() < 1e-6);
+    let mut grey = scene.clone();
+    grey.materials[0].metallic_is_textured = false;
+    let grey = Surfaces::new(&grey, ALL).unwrap();
+    let p = grey.interact::<ALL>(-Vec3::Z, 1, 0.1, 0.1);
+    assert!((p.roughness - 0.1).abs() < 1e-6 && p.metallic == 0.5);
     // What the plan leaves out is not there, even for a kernel that could show it.
     let plain = Surfaces::new(&scene, SPECULAR).unwrap();
     assert!(plain.textures.iter().all(Option::is_none));

@@ -316,15 +316,15 @@ impl Library {
             let refraction = refraction.map(|illum| format!("illum {illum} (refraction)"));
             draft.left_out.extend(tf.into_iter().chain(refraction));
         }
-        // One texture holds both, in green and blue: a grey roughness map would dim the metal.
+        // One texture holds both, in green and blue: a grey map of roughness alone shall not dim the metal.
+        material.metallic_is_textured = draft.roughness_file == draft.metallic_file;
         match (&draft.roughness_file, &draft.metallic_file) {
             (Some(r), Some(m)) if r == m => {
                 if material.metallic == 0.0 {
                     material.metallic = 1.0;
                 }
             }
-            (None, None) | (Some(_), None) if material.metallic == 0.0 => {}
-            (None, None) => {}
+            (_, None) => {}
             _ => self.warnings.push(format!(
                 "material \"{name}\": metalness and roughness textures are read only from one common file; metalness is constant"
             )),

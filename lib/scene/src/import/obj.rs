@@ -324,7 +324,15 @@ impl Reader {
         let lacks_material = self.resolve_materials();
         let mut materials = std::mem::take(&mut self.library.materials);
         if lacks_material {
-            materials.push(mtl::grey());
+            let is_painted = !self.colors.is_empty() || !self.paint.is_empty();
+            materials.push(match is_painted {
+                // The colours are those of the surface.
+                true => Material {
+                    base_color: Vec4::ONE,
+                    ..mtl::grey()
+                },
+                false => mtl::grey(),
+            });
         }
         if self.has_huge_face {
             self.warnings.push(polygon::TOO_LARGE.into());

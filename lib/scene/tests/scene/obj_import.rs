@@ -352,6 +352,37 @@ fn normals_and_display_referred_vertex_colours_arrive() {
     // sRGB 0.5 is ((0.5 + 0.055) / 1.055)^2.4 in linear light.
     let linear = (0.555f32 / 1.055).powf(2.4);
     assert!((imported.mesh.colors[0].y - linear).abs() < 4.0 * f32::EPSILON);
+    // They are the surface's own, which without a material nothing darkens.
+    assert_eq!(imported.materials[0].base_color, Vec4::ONE);
+    let plain = load(&format!("{SQUARE}f 1 2 3\n"));
+    assert!(plain.materials[0].base_color.x < 1.0);
+}
+
+#[test]
+fn a_grey_map_of_roughness_does_not_dim_metal() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    for name in ["rough.png", "both.png"] {
+        std::fs::write(file(name), one_texel_png([0.2; 3])).unwrap();
+    }
+    std::fs::write(
+        file("m.obj"),
+        format!("mtllib m.mtl\nusemtl a\n{SQUARE}f 1 2 3\n"),
+    )
+    .unwrap();
+    for (maps, is_textured, warnings) in [
+        ("map_Pr rough.png", false, 0),
+        ("map_Pr rough.png\nmap_Pm metal.png", false, 1),
+        ("map_Pr both.png\nmap_Pm both.png", true, 0),
+    ] {
+        std::fs::write(file("m.mtl"), format!("newmtl a\nPm 1\nPr 1\n{maps}\n")).unwrap();
+        let imported = load_object(&file("m.obj")).unwrap();
+        let material = &imported.materials[0];
+        assert!(material.metallic_roughness_texture.is_some(), "{maps}");
+        assert_eq!(material.metallic_is_textured, is_textured, "{maps}");
+        let told = imported.warnings.iter().filter(|w| w.contains("metalness"));
+        assert_eq!(told.count(), warnings, "{maps}");
+    }
 }
 
 #[test]
