@@ -11,40 +11,40 @@ use crate::scene::with_place;
 
 /// Farthest distance of what is sharp, metres.
 const FARTHEST_M: f32 = 1e5;
-/// Widest opening, millimetres.
+/// Widest opening, millimetres, and most f-number.
 const WIDEST_MM: f32 = 1e3;
 /// Discs of a smaller radius are not seen, pixels.
 const LEAST_PX: f32 = 0.25;
 
 impl CompositeTable {
     pub(super) fn check_focus(&self, config: &Config) -> Result<(), ConfigError> {
-        let refuse = |key: &str, found: String, accepted: &str| {
-            Err(config.out_of_range(&format!("composite.{key}"), found, accepted))
-        };
-        let positive = |v: Option<f32>, most: f32| v.is_none_or(|v| v > 0.0 && v <= most);
-        if !positive(self.focus_m, FARTHEST_M) {
-            let accepted = "metres above 0, at most 100000, as in 2.5";
-            return refuse(
+        let positive = [
+            (
                 "focus_m",
-                format!("{:?}", self.focus_m.unwrap_or_default()),
-                accepted,
-            );
-        }
-        if !positive(self.f_number, WIDEST_MM) {
-            let accepted = "a number above 0, at most 1000, as in 1.8";
-            return refuse(
+                self.focus_m,
+                FARTHEST_M,
+                "metres above 0, at most 100000, as in 2.5",
+            ),
+            (
                 "f_number",
-                format!("{:?}", self.f_number.unwrap_or_default()),
-                accepted,
-            );
-        }
-        if !positive(self.aperture_mm, WIDEST_MM) {
-            let accepted = "millimetres above 0, at most 1000, as in 28.0";
-            return refuse(
+                self.f_number,
+                WIDEST_MM,
+                "a number above 0, at most 1000, as in 1.8",
+            ),
+            (
                 "aperture_mm",
-                format!("{:?}", self.aperture_mm.unwrap_or_default()),
-                accepted,
-            );
+                self.aperture_mm,
+                WIDEST_MM,
+                "millimetres above 0, at most 1000, as in 28.0",
+            ),
+        ];
+        for (key, value, most, accepted) in positive {
+            if let Some(v) = value
+                && !(v > 0.0 && v <= most)
+            {
+                let key = format!("composite.{key}");
+                return Err(config.out_of_range(&key, format!("{v:?}"), accepted));
+            }
         }
         let excluded = [
             (
