@@ -1,6 +1,7 @@
 //! Image files in and out: every kind that is read.
 use dipir_imaging::{
     ImagingError,
+    encoding::Encoding,
     file::{
         PhotoLimits, check_format, decode_texture, read_linear, read_mask, read_photo,
         read_photo_within, write_png, write_png_16, write_png_mask,
@@ -272,7 +273,9 @@ fn an_exr_photograph_keeps_its_light_and_alpha() {
     layers.write_exr(&path).unwrap();
     let photo = read_photo(&path, Transfer::Gamma22).unwrap();
     assert_eq!((photo.image.0, photo.alpha), (colour, Some(alpha)));
-    assert_eq!(photo.transfer, Transfer::Gamma22);
+    // What is said of display values is none of its.
+    assert_eq!(photo.transfer, Transfer::Srgb);
+    assert_eq!(photo.encoding, Encoding::named(Transfer::Srgb));
 }
 
 #[test]
