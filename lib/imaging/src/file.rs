@@ -175,7 +175,7 @@ fn linear_photo(
     alpha: Option<Raster<f32>>,
     path: &Path,
 ) -> Result<Photo, ImagingError> {
-    // Results are shown as display values, whatever the key says of files that hold such.
+    // `scene.transfer` is about files of display values. Results for linear light are encoded as sRGB.
     let transfer = Transfer::Srgb;
     let mut warnings: Vec<String> = transparency(alpha.as_ref(), path).into_iter().collect();
     match primaries.map_or(Ok(None), Primaries::to_rec709) {

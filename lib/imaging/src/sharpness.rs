@@ -13,7 +13,7 @@ const SCALES: [f32; 2] = [0.7, 1.4];
 const LEAST_GRADIENT: f32 = 0.06;
 /// The photograph is looked at at one over these of its resolution, until enough edges are steep enough.
 const DIVISORS: [usize; 3] = [1, 2, 4];
-/// Least blur that is believed below the photograph's resolution, pixels there: what is sharper there was faint, not soft.
+/// Least blur that is believed at a lower resolution, pixels there: sharper edges were missed because they are faint, not soft.
 const LEAST_BELOW: f32 = 0.7;
 /// Least number of edges that tell anything, and the share of all that is listened to: those with the steepest gradients.
 const LEAST_EDGES: usize = 100;

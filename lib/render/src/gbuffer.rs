@@ -115,7 +115,7 @@ pub(crate) fn auxiliary(world: &World, jobs: &[Job], seed: u64) -> Auxiliary {
             view.object(&mut pixel, at, SAMPLES);
         }
         match world.lens {
-            // What is blurred more than that hardly differs between neighbours, and a few rays do not tell it.
+            // Out of focus, neighbours hardly differ, and a few rays through the lens tell only noise.
             Some(lens) if lens.blur_px(world.camera(), pixel.depth).max_element() > 1.0 => {
                 auxiliary::Seen::default()
             }

@@ -23,7 +23,7 @@ pub struct ThinLens {
 
 /// Rows that are blurred at a time, side by side.
 const BAND: usize = 32;
-/// Blur below this radius is none, pixels: that of a pixel's own area.
+/// Discs of a smaller radius leave a shadow as it is, pixels: a pixel is as wide.
 const LEAST_PX: f32 = 0.5;
 
 impl ThinLens {

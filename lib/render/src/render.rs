@@ -424,7 +424,7 @@ impl<'a> Renderer<'a> {
             unfocused: path.world.lens.is_some(),
         };
         let find_highlights = |film: &Film, jobs: &[Job]| {
-            // A place in the image says where a glint is only to a pinhole.
+            // Through a lens, a point of the image does not tell where a glint is.
             let is_given = matches!(settings.stop, Stop::Samples(_));
             if !settings.highlights || is_given || settings.lens.is_some() {
                 return Found::default();

@@ -83,7 +83,7 @@ pub enum FieldOfView {
     Lens {
         /// Focal length.
         focal_mm: f32,
-        /// Width of the sensor.
+        /// Width of the upright picture on the sensor.
         sensor_mm: f32,
     },
     /// A lens before the sensor that the photograph's own data tell of, millimetres; without such

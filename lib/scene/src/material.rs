@@ -182,7 +182,7 @@ pub struct Material {
     pub roughness: f32,
     /// Linear texture: green multiplies roughness, blue multiplies metallic.
     pub metallic_roughness_texture: Option<TextureRef>,
-    /// Whether blue does; it holds roughness, too, where roughness has a texture of its own.
+    /// Whether blue multiplies metallic: a grey map of roughness alone leaves it.
     pub metallic_is_textured: bool,
     /// Tangent-space normal map and its scale.
     pub normal_texture: Option<(TextureRef, f32)>,

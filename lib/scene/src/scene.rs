@@ -223,40 +223,36 @@ impl LoadedScene {
         }
     }
 
-    /// The point of the ground, or of what the depths show, that the photograph shows at `pixel`, of its own size whatever the
-    /// size of this; `key` names the pixel in messages.
+    /// The pixel of the camera's picture that shows what the photograph shows at `pixel`; `None` where there is none. A preview's
+    /// camera has fewer pixels than the photograph, and an undistorted photograph others.
+    pub fn camera_pixel(&self, pixel: DVec2) -> Option<DVec2> {
+        let original = self.original.as_ref();
+        let working = original.map_or(self.photo.facts.size, |o| o.undistortion.size());
+        let scale = DVec2::from_array(self.scene.camera.resolution.map(f64::from))
+            / DVec2::from_array(working.map(f64::from));
+        self.undistorted_pixel(pixel).map(|p| p * scale)
+    }
+
+    /// The point of the ground, or of what the depths show, that is seen at `pixel` of the photograph; `key` names the pixel in
+    /// messages.
     ///
     /// # Errors
-    /// For a pixel that is none of the photograph's, and where no ground is seen.
+    /// If the photograph has no such pixel, and where no ground is seen.
     pub fn seen_at(&self, pixel: Vec2, key: &str) -> Result<Vec3, Error> {
         let size = Vec2::from(self.photo.facts.size.map(|n| n as f32));
         let is_inside = pixel.cmpge(Vec2::ZERO).all() && pixel.cmple(size).all();
-        let working = self
-            .undistorted_pixel(pixel.as_dvec2())
-            .filter(|_| is_inside);
-        let Some(working) = working else {
-            return Err(Error::Config {
-                key: key.into(),
-                value: format!("[{:?}, {:?}]", pixel.x, pixel.y),
-                accepted: format!(
-                    "a pixel of the photograph, [0, 0] to [{:?}, {:?}]",
-                    size.x, size.y
-                ),
-            });
-        };
+        let shown = self.camera_pixel(pixel.as_dvec2()).filter(|_| is_inside);
+        let pixel = shown.map(|p| p.as_vec2()).ok_or_else(|| Error::Config {
+            key: key.into(),
+            value: format!("[{:?}, {:?}]", pixel.x, pixel.y),
+            accepted: format!(
+                "a pixel of the photograph, [0, 0] to [{:?}, {:?}]",
+                size.x, size.y
+            ),
+        })?;
         let camera = &self.scene.camera;
-        let of = self
-            .original
-            .as_ref()
-            .map_or(self.photo.facts.size, |o| o.undistortion.size());
-        let scale =
-            Vec2::from(camera.resolution.map(|n| n as f32)) / Vec2::from(of.map(|n| n as f32));
-        let pixel = working.as_vec2() * scale;
-        let surface = self
-            .surfaces
-            .as_ref()
-            .and_then(|s| s.seen_at(camera, pixel));
-        match surface {
+        let surfaces = self.surfaces.as_ref();
+        match surfaces.and_then(|s| s.seen_at(camera, pixel)) {
             Some(found) => Ok(found.position),
             None => Ok(pixels::seen(camera, &self.scene.proxy, pixel, key)?.as_vec3()),
         }

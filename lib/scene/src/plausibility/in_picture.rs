@@ -152,7 +152,7 @@ fn pixels(low: f32, high: f32, size: usize) -> std::ops::Range<usize> {
 fn seen(mesh: &TriangleMesh, triangles: &[[u32; 3]], camera: &Camera) -> Option<[Vec2; 2]> {
     /// Where edges that go on behind the camera are cut: this share of the depth of their front end.
     const CUT: f32 = 1e-3;
-    let depth = |p: Vec3| (camera.position - p).dot(camera.rotation.z_axis);
+    let depth = |p: Vec3| camera.depth(p);
     let mut found: Option<[Vec2; 2]> = None;
     let mut add = |p: Vec3| {
         if let Some(pixel) = camera.project(p) {

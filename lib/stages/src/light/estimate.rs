@@ -248,14 +248,9 @@ fn known_sun(
                 return Err(wrong("light.shadow", message.into()).into());
             }
         };
-        // A preview's camera has fewer pixels than the photograph or its working picture.
-        let original = loaded.original.as_ref();
-        let working = original.map_or(facts.size, |o| o.undistortion.size());
-        let scale = DVec2::from_array(camera.resolution.map(f64::from))
-            / DVec2::from_array(working.map(f64::from));
         let ray = |pixel: DVec2| {
             // Both ends are shown.
-            let pixel = shown(pixel).unwrap_or(pixel) * scale;
+            let pixel = loaded.camera_pixel(pixel).unwrap_or(pixel);
             let ray = camera.ray(Vec2::new(pixel.x as f32, pixel.y as f32));
             (ray.origin.as_dvec3(), ray.direction.as_dvec3())
         };
