@@ -1,6 +1,9 @@
 //! `dipir-inspect` on what the stages write and on what is broken.
 use std::collections::HashMap;
 
+use dipir_imaging::layers::{Layers, Precision};
+use dipir_imaging::raster::Raster;
+use glam::Vec3;
 use safetensors::tensor::{Dtype, TensorView, serialize};
 use serde_json::{Value, json};
 
@@ -59,6 +62,17 @@ fn an_environment_map_names_its_peak_and_gets_a_ring() {
         json!([20.0, 20.0, 20.0])
     );
     assert_eq!(json(&project, "sky.png")["width"], 16);
+    // What a run refuses is no map here.
+    let mut layers = Layers::new(4, 2);
+    layers.latlong = true;
+    let texels = (0..8).map(|i| Vec3::splat(1.0 - 2.0 * (i / 7) as f32));
+    let texels = Raster::from_pixels(4, 2, texels.collect());
+    layers.insert_rgb("", Precision::Full, &texels).unwrap();
+    layers.write_exr(project.path("dark.exr")).unwrap();
+    let run = project.run(INSPECT, &["dark.exr"]);
+    run.expect_success();
+    let why = "no environment map: cannot light a scene with `dark.exr`: radiance [-1, -1, -1] at column 3, row 1";
+    assert!(run.stdout.contains(why), "{}", run.stdout);
 }
 
 #[test]

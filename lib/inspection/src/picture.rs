@@ -34,7 +34,7 @@ pub(crate) fn inspect(path: &Path, kind: Kind, view: &ViewArgs) -> anyhow::Resul
         Kind::Hdr => ("Radiance HDR", Some("rgbe")),
         _ => ("OpenEXR", None),
     };
-    let map = environment(&layers, kind);
+    let map = environment(path, &layers, kind);
     let mut shown: Vec<Shown> = layers
         .channels()
         .map(|(name, channel)| Shown {
@@ -49,7 +49,8 @@ pub(crate) fn inspect(path: &Path, kind: Kind, view: &ViewArgs) -> anyhow::Resul
     shown.sort_by_key(|channel| usual_order(&channel.name));
     if let Some(png) = &view.png {
         let displayed = display_referred(kind);
-        view::write(png, view, &layers, map.as_ref(), displayed)
+        let map = map.as_ref().and_then(|map| map.as_ref().ok());
+        view::write(png, view, &layers, map, displayed)
             .with_context(|| format!("cannot show {}", path.display()))?;
     }
     Ok(report(path, format, &layers, &shown, map.as_ref()))
@@ -78,15 +79,12 @@ fn layers_of_photo(path: &Path) -> anyhow::Result<Layers> {
     Ok(layers)
 }
 
-/// The image as an environment map, if it is one: marked as latitude-longitude, or an HDR file twice as
-/// wide as high.
-fn environment(layers: &Layers, kind: Kind) -> Option<EnvironmentMap> {
+/// The image as an environment map, as a run reads it, if it is meant for one: marked as latitude-longitude, or an HDR file
+/// twice as wide as high. An error says why it cannot be one.
+fn environment(path: &Path, layers: &Layers, kind: Kind) -> Option<anyhow::Result<EnvironmentMap>> {
     let panorama = kind == Kind::Hdr && layers.width() == 2 * layers.height();
-    if !(layers.latlong || panorama) {
-        return None;
-    }
-    let rgb = layers.rgb("").ok()?;
-    EnvironmentMap::new(layers.width(), layers.height(), rgb.pixels().to_vec()).ok()
+    let is_meant = layers.latlong || panorama;
+    is_meant.then(|| Ok(EnvironmentMap::read(path)?))
 }
 
 fn report(
@@ -94,7 +92,7 @@ fn report(
     format: &str,
     layers: &Layers,
     shown: &[Shown],
-    map: Option<&EnvironmentMap>,
+    map: Option<&anyhow::Result<EnvironmentMap>>,
 ) -> Report {
     let (width, height) = (layers.width(), layers.height());
     let mut table = Table::new(&["channel", "stored", ">min", ">mean", ">max", ""]);
@@ -122,7 +120,12 @@ fn report(
         "path": json_path(path), "kind": "image", "format": format, "width": width, "height": height,
         "latlong": layers.latlong, "channels": channels, "attributes": attributes,
     });
-    if let Some(map) = map {
+    if let Some(Err(e)) = map {
+        let why = format!("{e:#}");
+        text.push_str(&format!("  no environment map: {why}\n"));
+        json["no_environment"] = why.into();
+    }
+    if let Some(Ok(map)) = map {
         let (direction, radiance) = map.peak();
         let light = map.integral();
         text.push_str(&format!(

@@ -64,14 +64,18 @@ const CLOSED: f64 = 1e-3;
 /// How much of what it encloses a mesh that is inside out has, at least, as a negative volume.
 const INWARDS: f64 = 0.1;
 
+/// Whether its back faces are seen.
+fn has_backs(material: &Material) -> bool {
+    material.double_sided || material.transmission.is_some()
+}
+
 /// Whether a closed mesh whose backs do not show turns its fronts inwards, seen from outside: from inside it may be a room.
 fn is_inside_out(mesh: &TriangleMesh, used: &[&Material], camera: &Camera) -> bool {
-    let has_backs = |m: &&Material| m.double_sided || m.transmission.is_some();
     let Some((low, high)) = mesh.bounds() else {
         return false;
     };
     let eye = camera.position;
-    if used.iter().any(has_backs) || (eye.cmpge(low).all() && eye.cmple(high).all()) {
+    if used.iter().any(|m| has_backs(m)) || (eye.cmpge(low).all() && eye.cmple(high).all()) {
         return false;
     }
     let middle = (low.as_dvec3() + high.as_dvec3()) * 0.5;
@@ -95,7 +99,7 @@ fn is_all_behind(mesh: &TriangleMesh, materials: &[Material], camera: &Camera) -
         && triangles.all(|(corners, &material)| {
             let [a, b, c] = corners.map(|i| mesh.positions[i as usize].as_dvec3());
             let is_behind = (b - a).cross(c - a).dot(eye - a) <= 0.0;
-            is_behind && !materials[material as usize].double_sided
+            is_behind && !has_backs(&materials[material as usize])
         })
 }
 
