@@ -140,6 +140,25 @@ fn the_estimate_depends_on_photograph_and_camera_alone() {
 }
 
 #[test]
+fn a_preview_keeps_the_recovered_light_while_objects_are_moved() {
+    let project = project();
+    lit(&project, &[]);
+    let light = |set: &str| {
+        let run = project.run(DIPIR, &["preview", "-o", "look.png", "--set", set]);
+        run.expect_success();
+        let (_, light) = run.stdout.trim().split_once("light: ").unwrap();
+        light.to_string()
+    };
+    let recovered = "as the light stage left it";
+    assert_eq!(light("scene.objects.0.yaw_deg=20"), recovered);
+    assert_eq!(light("composite.exposure_ev=1"), recovered);
+    // Of another camera or another sun it tells nothing.
+    for other in ["scene.camera.fov_deg=41", "light.candidate=1"] {
+        assert_ne!(light(other), recovered, "{other}");
+    }
+}
+
+#[test]
 fn a_sun_that_is_known_becomes_a_source_where_it_is() {
     let project = project();
     let sun =

@@ -16,6 +16,7 @@ mod large;
 mod lens;
 mod look;
 mod manual;
+mod motion_blur;
 mod page;
 mod pipeline;
 mod polished_ground;

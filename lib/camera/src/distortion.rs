@@ -118,6 +118,15 @@ impl Distortion {
         })
     }
 
+    /// Of a picture that was turned by a quarter, clockwise.
+    pub(crate) fn turned(mut self) -> Self {
+        if let Model::Brown { tangential, .. } = &mut self.model {
+            let [p1, p2] = *tangential;
+            *tangential = [p2, -p1];
+        }
+        self
+    }
+
     /// Whether this is a pinhole camera.
     pub fn is_none(&self) -> bool {
         self.model == Model::None

@@ -7,6 +7,7 @@ use serde_json::Value;
 use crate::camera::{Camera, Lens, Pose, WorldUp};
 use crate::chan::Turns;
 use crate::error::CameraError;
+use crate::orientation::read_turned;
 use crate::{buffers, chan, colmap, foreign, fspy, kitti, moving, nuscenes, opencv, transforms};
 
 pub use crate::buffers::{from_base64, is_buffer};
@@ -59,8 +60,6 @@ pub struct Found {
     pub states_fov: bool,
 }
 
-/// By how much the shapes of two pictures may differ, relative.
-const SAME_SHAPE: f64 = 0.01;
 /// KITTI's left camera in colour.
 const KITTI_LEFT: u32 = 2;
 /// What to do about an axis that points up for no reason.
@@ -74,20 +73,7 @@ const NO_AXIS: &str = "leave out which axis points up";
 /// On files that cannot be read, without a camera for the photograph, and of pictures of another
 /// shape.
 pub fn read(path: &Path, wanted: &Wanted) -> Result<Found, CameraError> {
-    let mut found = found(path, wanted)?;
-    let ([w, h], size) = (found.lens.size, wanted.size);
-    if (w / h / (size[0] / size[1]) - 1.0).abs() > SAME_SHAPE {
-        return Err(CameraError::with_remedy(
-            found.program,
-            format!(
-                "it is of a picture of {w} x {h} pixels, and the photograph has {} x {}",
-                size[0], size[1]
-            ),
-            "use the picture that it was made for, uncropped, or name that picture's camera",
-        ));
-    }
-    found.lens = found.lens.scaled(size);
-    Ok(found)
+    read_turned(path, wanted, 1).map(|(found, _)| found)
 }
 
 /// The pictures of `transforms.json` or of COLMAP's model at `path`, by the names in it, and their cameras: without those that
@@ -336,7 +322,11 @@ pub(crate) fn only(wanted: &Wanted, format: &'static str) -> Result<(), CameraEr
 }
 
 /// Which one is wanted among cameras with these names.
-fn chosen(cameras: &[&str], wanted: &Wanted, format: &'static str) -> Result<usize, CameraError> {
+pub(crate) fn chosen(
+    cameras: &[&str],
+    wanted: &Wanted,
+    format: &'static str,
+) -> Result<usize, CameraError> {
     let (found, what) = match wanted.which {
         Which::Number(n) => (
             Some(n as usize).filter(|n| *n < cameras.len()),
@@ -414,7 +404,7 @@ fn agreement(own: &str, other: &Path) -> Option<(usize, bool)> {
 }
 
 /// A path's last component without its extension. A number is no extension: `Camera.001`, `plate.1001`.
-fn stem(path: &Path) -> Option<&OsStr> {
+pub(crate) fn stem(path: &Path) -> Option<&OsStr> {
     let is_number = |e: &OsStr| e.as_encoded_bytes().iter().all(u8::is_ascii_digit);
     match path.extension().is_some_and(is_number) {
         true => path.file_name(),

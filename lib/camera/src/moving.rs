@@ -79,6 +79,43 @@ struct Sampler {
 /// # Errors
 /// On a document or keys that are damaged, without a camera or a frame that is wanted.
 pub fn read(bytes: &[u8], folder: Option<&Path>, wanted: &Wanted) -> Result<Camera, CameraError> {
+    let (motion, at) = found(bytes, folder, wanted)?;
+    motion.camera(at.map_or(0.0, |(frames, n)| frames.time_s(n)))
+}
+
+/// Cameras at the frames before and after the one that is wanted, and by how many frames they are later; none where it stands
+/// still, or has no such frame.
+pub(crate) fn beside(
+    bytes: &[u8],
+    folder: Option<&Path>,
+    wanted: &Wanted,
+) -> Result<Vec<(i64, Camera)>, CameraError> {
+    let (motion, Some((frames, own))) = found(bytes, folder, wanted)? else {
+        return Ok(Vec::new());
+    };
+    let is_there = |n: &i64| (frames.first..=frames.last).contains(&(own + n));
+    let beside = [-1, 1].into_iter().filter(is_there);
+    let camera = |n: i64| Ok((n, motion.camera(frames.time_s(own + n))?));
+    beside.map(camera).collect()
+}
+
+/// A frame that is wanted before the first or after the last one, as a sentence.
+pub(crate) fn beyond(bytes: &[u8], folder: Option<&Path>, wanted: &Wanted) -> Option<String> {
+    let (_, at) = found(bytes, folder, wanted).ok()?;
+    let (frames, n) = at?;
+    let nearest = n.clamp(frames.first, frames.last);
+    (n != nearest).then(|| {
+        let words = frames.words();
+        format!("the camera moves, with {words}: in frame {n} it stands as in frame {nearest}")
+    })
+}
+
+/// How the wanted camera moves, and its frame; `None` for one that stands still.
+fn found(
+    bytes: &[u8],
+    folder: Option<&Path>,
+    wanted: &Wanted,
+) -> Result<(Motion, Option<(Frames, i64)>), CameraError> {
     let file = File::parse(bytes)?;
     let cameras = file.cameras(wanted.size)?;
     let is_one = cameras.len() == 1;
@@ -99,9 +136,9 @@ pub fn read(bytes: &[u8], folder: Option<&Path>, wanted: &Wanted) -> Result<Came
             )),
             Which::Number(_) if is_one => {
                 file::only(wanted, FORMAT)?;
-                motion.camera(0.0)
+                Ok((motion, None))
             }
-            _ => motion.camera(0.0),
+            _ => Ok((motion, None)),
         };
     };
     let number = match wanted.which {
@@ -114,7 +151,7 @@ pub fn read(bytes: &[u8], folder: Option<&Path>, wanted: &Wanted) -> Result<Came
             return Err(CameraError::with_remedy(FORMAT, detail, remedy));
         }
     };
-    motion.camera(frames.time_s(i64::from(number)))
+    Ok((motion, Some((frames, i64::from(number)))))
 }
 
 /// The frame that each of `photos` shows of the camera with this `name` or, without one, of the one that [`Which::Photo`]

@@ -1,8 +1,8 @@
 //! Models of COLMAP: which one a folder or a file of a project stands for.
 use std::path::Path;
 
-use dipir_cameras::WorldUp;
 use dipir_cameras::file::{self, Wanted, Which};
+use dipir_cameras::{WorldUp, orientation};
 use glam::DVec3;
 
 const CAMERA: &str = "1 PINHOLE 640 480 500 500 320 240\n";
@@ -40,6 +40,43 @@ fn a_project_stands_for_its_model() {
             assert_eq!(file::parts(path), parts);
         }
     }
+}
+
+#[test]
+fn a_model_sees_pictures_as_they_are_stored() {
+    let project = tempfile::tempdir().unwrap();
+    put(project.path(), 3.0, "a.jpg");
+    let read = |size, orientation| {
+        let wanted = Wanted {
+            size,
+            which: Which::Photo(Path::new("a.jpg")),
+            up: Some(WorldUp::Y),
+            fov_deg: None,
+            turns: None,
+        };
+        orientation::read_turned(project.path(), &wanted, orientation)
+    };
+    let [upright, portrait] = [[640.0, 480.0], [960.0, 1280.0]];
+    for (size, orientation, quarters) in [
+        (upright, 1, 0),
+        (upright, 3, 2),
+        (portrait, 6, 1),
+        (portrait, 8, 3),
+        // Of a picture that was turned before, and one that is mirrored, too.
+        (upright, 6, 0),
+        (upright, 2, 0),
+    ] {
+        let (found, turned) = read(size, orientation).unwrap();
+        assert_eq!(turned, quarters, "{orientation}");
+        assert_eq!(found.lens.size, size);
+        let up = found.pose.unwrap().rotation.y_axis;
+        // As stored, its right is +x and its up -y.
+        let want = [DVec3::NEG_Y, DVec3::NEG_X, DVec3::Y, DVec3::X][quarters as usize];
+        assert!(up.abs_diff_eq(want, 1e-12), "{orientation}: {up}");
+    }
+    assert!(read(portrait, 1).is_err());
+    let doubts = [1, 3, 6].map(|o| orientation::doubt_of_turn(project.path(), o).is_some());
+    assert_eq!(doubts, [false, true, false]);
 }
 
 #[test]

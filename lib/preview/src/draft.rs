@@ -12,8 +12,8 @@ use dipir_render::error::RenderError;
 use dipir_render::gloss;
 use dipir_render::light::SceneLight;
 use dipir_render::render::{Rendered, Renderer, Settings, Simulation};
-use dipir_scene::config::EffectSwitch;
 use dipir_scene::scene::LoadedScene;
+use dipir_stages::composite::shutter::that_blurs;
 use dipir_stages::light::at_hand::AtHand;
 
 /// Paths a pixel: the object's shape and shadow are clear, grain stays.
@@ -96,11 +96,12 @@ fn render<L: SceneLight>(
     let settings = Settings {
         tone: at_hand.tone.as_ref(),
         gloss: at_hand.gloss,
-        lens: at_hand.lens,
+        optics: that_blurs(at_hand.optics, loaded).0,
         ..settings(loaded, samples)
     };
-    let simulation = simulation(loaded, &settings);
-    Renderer::new(&loaded.scene).render(light, &simulation, &settings, &mut |_| go_on())
+    let renderer = Renderer::new(&loaded.scene);
+    let simulation = simulation(&renderer, loaded, &settings);
+    renderer.render(light, &simulation, &settings, &mut |_| go_on())
 }
 
 /// How a draft is rendered, with this many samples a pixel.
@@ -116,14 +117,17 @@ pub(crate) fn settings(loaded: &LoadedScene, samples: u32) -> Settings<'_> {
 }
 
 /// What a draft simulates.
-pub(crate) fn simulation(loaded: &LoadedScene, settings: &Settings) -> Simulation {
-    let everything = EffectsPlan::everything(&loaded.scene, settings).simulation();
+pub(crate) fn simulation(
+    renderer: &Renderer,
+    loaded: &LoadedScene,
+    settings: &Settings,
+) -> Simulation {
     let wanted = loaded.description.effects();
+    let simulation = EffectsPlan::new(renderer, wanted, settings).simulation();
     Simulation {
-        max_depth: everything.max_depth.min(DEPTH),
-        shadow: everything.shadow && wanted.shadow != Some(EffectSwitch::Off),
+        max_depth: simulation.max_depth.min(DEPTH),
         light_on_proxy: None,
-        ..everything
+        ..simulation
     }
 }
 

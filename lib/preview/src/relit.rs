@@ -180,8 +180,8 @@ fn work(
     answers: &Sender<Result<Small, RenderError>>,
 ) -> Result<(), RenderError> {
     let settings = settings(loaded, SUN_SAMPLES);
-    let simulation = simulation(loaded, &settings);
     let renderer = Renderer::new(&loaded.scene);
+    let simulation = simulation(&renderer, loaded, &settings);
     let (map, _) = first.parts();
     let record = RecordSettings {
         environment: MAP,

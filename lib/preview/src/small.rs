@@ -14,6 +14,7 @@ use dipir_scene::proxy::{Plane, Proxy};
 use dipir_scene::scene::{LoadedScene, Scene};
 use dipir_scene::surfaces::SeenSurfaces;
 use dipir_scene::undistortion::Undistortion;
+use dipir_stages::composite::table::CompositeTable;
 use dipir_stages::scene::with_place;
 use glam::{DMat4, DVec2};
 
@@ -98,6 +99,8 @@ impl SmallScene {
         let base_dir = session.config.base_dir();
         let mut loaded = Scene::load_for_a_look(&config, &base_dir)
             .map_err(|e| with_place(e, &session.config))?;
+        let composite: CompositeTable = session.config.table("composite")?;
+        composite.scale_emission(&mut loaded.scene);
         let mut warnings = std::mem::take(&mut loaded.warnings);
         warnings.extend(implausible(&loaded));
         let models = Model::all(&loaded);

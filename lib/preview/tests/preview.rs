@@ -15,6 +15,7 @@ use dipir_preview::picture::Preview;
 use dipir_preview::relit::Relit;
 use dipir_preview::small::SmallScene;
 use dipir_render::error::RenderError;
+use dipir_stages::composite::shutter::that_blurs;
 use dipir_stages::light::at_hand::{AtHand, Origin, at_hand};
 use glam::{DVec3, Vec3};
 use tempfile::TempDir;
@@ -187,9 +188,64 @@ fn sunny(direction: Vec3) -> AtHand {
         )),
         tone: None,
         gloss: None,
-        lens: None,
+        optics: Default::default(),
         origin: Origin::Estimate,
     }
+}
+
+#[test]
+fn drafts_glow_as_much_as_the_keys_say() {
+    let text = TEXT.replace("box.obj", "lamp.obj");
+    let (folder, _) = project_of(&text);
+    let lamp = format!("mtllib lamp.mtl\nusemtl lamp\n{BOX}");
+    fs::write(folder.path().join("lamp.obj"), lamp).unwrap();
+    let material = "newmtl lamp\nKd 0 0 0\nKs 0 0 0\nNs 0\nKe .4 .4 .4\n";
+    fs::write(folder.path().join("lamp.mtl"), material).unwrap();
+    let glow = |set: &[&str]| {
+        // Without a curve, that light is seen as it is.
+        let set = [&["composite.tone=none"], set].concat();
+        let session = open(folder.path(), &set);
+        let (small, _) = SmallScene::load(&session, 150).unwrap();
+        let light = at_hand(&session, &small.loaded).unwrap();
+        let go_on = &mut || ControlFlow::Continue(());
+        let draft = Draft::render(&small.loaded, &light, 4, go_on).unwrap();
+        let picture = small.loaded.photo.transfer.decode(draft.picture);
+        let pixels = picture.0.pixels().iter().zip(draft.alpha.pixels());
+        let whole: Vec<f32> = pixels
+            .filter(|(_, a)| **a == 1.0)
+            .map(|(p, _)| p.x)
+            .collect();
+        assert!(whole.len() > 50);
+        whole.iter().sum::<f32>() / whole.len() as f32
+    };
+    let reflected = glow(&["scene.effects.emission=off"]);
+    let emitted = |set: &[&str]| glow(set) - reflected;
+    // Values have 8 bits.
+    let whole = emitted(&[]);
+    assert!((whole - 0.4).abs() < 5e-3, "{whole} {reflected}");
+    let dimmer = emitted(&["composite.emission_ev=-1"]);
+    assert!((dimmer - 0.2).abs() < 5e-3, "{dimmer}");
+    let red = emitted(&["composite.emission_tint=[1.0, 0.0, 0.0]"]);
+    assert!((red - 0.8).abs() < 0.01, "{red}");
+}
+
+#[test]
+fn the_lens_of_a_draft_is_known_wherever_its_objects_stand() {
+    let text = format!("{TEXT}[composite]\nfocus_m = 5.0\naperture_mm = 40.0\n");
+    let (folder, session) = project_of(&text);
+    let (mut small, _) = SmallScene::load(&session, 150).unwrap();
+    let light = at_hand(&session, &small.loaded).unwrap();
+    let lens = |small: &SmallScene| that_blurs(light.optics, &small.loaded).0.lens;
+    assert_eq!(lens(&small), None);
+    let near = open(
+        folder.path(),
+        &["scene.objects.1.position=[0.0, 1.0, -2.3]"],
+    );
+    let config = near.config.table("scene").unwrap();
+    let arrangement = small.props.arranged(&config).unwrap();
+    small.arrange(&arrangement);
+    assert!(light.optics.lens.is_some());
+    assert_eq!(lens(&small), light.optics.lens);
 }
 
 #[test]

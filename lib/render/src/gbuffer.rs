@@ -114,12 +114,12 @@ pub(crate) fn auxiliary(world: &World, jobs: &[Job], seed: u64) -> Auxiliary {
         if view.object(&mut pixel, at, FIRST_SAMPLES) == First::Uneven {
             view.object(&mut pixel, at, SAMPLES);
         }
-        match world.lens {
-            // Out of focus, neighbours hardly differ, and a few rays through the lens tell only noise.
-            Some(lens) if lens.blur_px(world.camera(), pixel.depth).max_element() > 1.0 => {
-                auxiliary::Seen::default()
-            }
-            _ => auxiliary::Seen::new(pixel.normal, pixel.albedo),
+        let place = Vec2::new(x as f32, y as f32) + 0.5;
+        let reach = world.optics.reach_px(world.camera(), place, pixel.depth);
+        // Where it is blurred, neighbours hardly differ, and a few rays tell only noise.
+        match reach.max_element() > 1.0 {
+            true => auxiliary::Seen::default(),
+            false => auxiliary::Seen::new(pixel.normal, pixel.albedo),
         }
     });
     let seen: Vec<_> = seen.collect();
@@ -165,7 +165,7 @@ impl<'a> View<'a> {
         let bvh = &world.geometry.bvh;
         Self {
             world,
-            footprint: Footprint::new(world.camera(), world.lens, bvh.bounds(), bvh.clusters()),
+            footprint: Footprint::new(world.camera(), world.optics, bvh.bounds(), bvh.clusters()),
             seed,
         }
     }

@@ -32,8 +32,8 @@ use crate::coarse::shrink;
 use crate::error::RenderError;
 use crate::film::Film;
 use crate::job::{Job, Layer, PixelSet};
-use crate::lens::ThinLens;
 use crate::light::{PathLight, PreparedLight, SceneLight};
+use crate::optics::Optics;
 use crate::render::{Rendered, Renderer, Settings, Simulation};
 use crate::shadow::Block;
 use crate::viewing::background;
@@ -224,7 +224,7 @@ impl Renderer<'_> {
     pub(crate) fn mirror_jobs(
         &self,
         ground: &Polished,
-        lens: Option<ThinLens>,
+        optics: Optics,
         blocker: &Blocker,
     ) -> Vec<Job> {
         let ProxyGeometry::Plane(plane) = &self.geometry().proxy else {
@@ -262,17 +262,24 @@ impl Renderer<'_> {
             // Angles come from cosines: a thousandth covers their rounding.
             middle.angle_between(cone.axis) <= half + turn + spread + 1e-3
         };
-        // Through a lens, the ground around a pixel: as far as it is blurred, and mirrored things behind it, infinitely far at most.
+        // The ground around a pixel: as far as it is blurred, and mirrored things behind it, infinitely far at most.
         let widened = |[left, top, right, bottom]: [f32; 4]| {
-            let Some(lens) = lens else {
+            if optics.is_sharp() {
                 return [left, top, right, bottom];
-            };
-            let depths = [(left, top), (right, top), (left, bottom), (right, bottom)]
-                .map(|(x, y)| at(x, y).map_or(f32::INFINITY, |(p, _)| camera.depth(p.position)));
-            let blur = (depths.into_iter().chain([f32::INFINITY]))
-                .map(|depth| lens.blur_px(camera, depth))
-                .fold(Vec2::ZERO, Vec2::max);
-            [left - blur.x, top - blur.y, right + blur.x, bottom + blur.y]
+            }
+            let corners = [(left, top), (right, top), (left, bottom), (right, bottom)];
+            let reach = corners.map(|(x, y)| {
+                let depth = at(x, y).map_or(f32::INFINITY, |(p, _)| camera.depth(p.position));
+                let reach = |depth| optics.reach_px(camera, Vec2::new(x, y), depth);
+                reach(depth).max(reach(f32::INFINITY))
+            });
+            let reach = reach.into_iter().fold(Vec2::ZERO, Vec2::max);
+            [
+                left - reach.x,
+                top - reach.y,
+                right + reach.x,
+                bottom + reach.y,
+            ]
         };
         let may_show = |sides: [f32; 4]| may_show(widened(sides));
         let job = |block: Block| {

@@ -9,9 +9,6 @@ use dipir_scene::camera::{Camera, Ray};
 use glam::{DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::render::{Renderer, Settings};
-use crate::world::World;
-
 /// A lens without thickness or errors, focused on a plane that faces the camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ThinLens {
@@ -78,24 +75,6 @@ impl ThinLens {
             }
         });
         output
-    }
-}
-
-impl Renderer<'_> {
-    /// Blurs shadow ratios as the lens of `settings` does, if there is one.
-    pub(crate) fn defocus(&self, shadow: &mut Raster<Vec3>, world: &World, settings: &Settings) {
-        let Some(lens) = settings.lens else { return };
-        let camera = self.camera();
-        let depth = |x: usize, y: usize| {
-            let pixel = Vec2::new(x as f32, y as f32) + 0.5;
-            let surfaces = settings.seen_surfaces;
-            if let Some(seen) = surfaces.and_then(|s| s.seen_at(camera, pixel)) {
-                return Some(seen.depth);
-            }
-            let point = world.proxy_point(&camera.ray(pixel))?;
-            Some(camera.depth(point.position))
-        };
-        *shadow = lens.blurred(camera, shadow, depth);
     }
 }
 

@@ -22,10 +22,12 @@ pub mod job;
 pub mod lens;
 pub mod light;
 pub mod material_gradient;
+pub mod optics;
 pub mod photo;
 pub mod render;
 pub mod shadow;
 pub mod shapes;
+pub mod shutter;
 pub mod surface;
 #[cfg(test)]
 mod testing;

@@ -25,6 +25,7 @@ use crate::features::with_features;
 use crate::footprint::Footprint;
 use crate::foreground::{Gather, PathContext, Vertex};
 use crate::light::{PathLight, SceneLight};
+use crate::optics::Optics;
 use crate::render::{Renderer, Simulation, pixels_of, sequence};
 use crate::world::World;
 
@@ -216,7 +217,12 @@ impl Renderer<'_> {
         let on_object = light.on_object();
         let path = PathContext::from_camera(&world, &on_object, simulation, settings.background);
         let bvh = &self.geometry().bvh;
-        let footprint = Footprint::new(self.camera(), None, bvh.bounds(), bvh.clusters());
+        let footprint = Footprint::new(
+            self.camera(),
+            Optics::default(),
+            bvh.bounds(),
+            bvh.clusters(),
+        );
         let pixels: Vec<(u32, u32)> = self
             .blocks()
             .filter(|b| footprint.overlaps(b.x, b.y, b.width, b.height))

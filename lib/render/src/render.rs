@@ -32,8 +32,8 @@ use crate::gloss::{self, Gloss};
 use crate::guide::PathGuide;
 use crate::highlights::{self, Found, Limit};
 use crate::job::{Job, Layer, PixelSet};
-use crate::lens::ThinLens;
 use crate::light::{PathLight, PreparedLight, SceneLight};
+use crate::optics::Optics;
 use crate::shadow::{Block, LightDirections, LightOnProxy, ShadowContext};
 use crate::viewing::Viewing;
 use crate::world::{Geometry, ProxyGeometry, World};
@@ -83,8 +83,8 @@ pub struct Settings<'a> {
     pub shadow_tolerance: f32,
     /// How polished the ground is, if it is a plane; `None` for matt ground.
     pub gloss: Option<Gloss>,
-    /// What the camera looks through; `None` for a pinhole, to which everything is sharp.
-    pub lens: Option<ThinLens>,
+    /// What blurs what the camera sees.
+    pub optics: Optics,
     /// Whether to search for [`highlights`] smaller than a pixel; never done where the number of samples is given.
     pub highlights: bool,
     /// Whether noise is [removed](crate::denoise) from object and shadow.
@@ -141,7 +141,7 @@ impl Default for Settings<'_> {
             // Display values change by less than a tenth of an 8-bit step.
             shadow_tolerance: 2e-4,
             gloss: None,
-            lens: None,
+            optics: Optics::default(),
             highlights: true,
             denoise: false,
             blur_caustics: false,
@@ -279,14 +279,14 @@ impl<'a> Renderer<'a> {
                 _ => Vec::new(),
             },
         };
-        world.lens = settings.lens;
+        world.optics = settings.optics;
         let gloss = self.gloss_of(settings);
         let plain = &gloss::before(gloss.is_some(), settings);
         let mut first = gloss::first(gloss.is_some(), progress);
         let mut rendered =
             self.render_layers(light, world, simulation, plain, start, &mut first)?;
         drop(first);
-        self.defocus(&mut rendered.film.shadow, world, settings);
+        self.blur_shadow(&mut rendered.film.shadow, world, settings);
         if let Some(gloss) = gloss {
             self.add_mirrored(
                 &mut rendered,
@@ -348,7 +348,7 @@ impl<'a> Renderer<'a> {
             .bounding_sphere()
             .map(|whole| Blocker::new(whole, self.geometry.bvh.clusters()));
         let mut jobs = match (&world.polished, &blocker) {
-            (Some(ground), Some(blocker)) => self.mirror_jobs(ground, world.lens, blocker),
+            (Some(ground), Some(blocker)) => self.mirror_jobs(ground, world.optics, blocker),
             _ => self.object_jobs(settings),
         };
         let mut guide_rays = RayCounts::default();
@@ -421,12 +421,12 @@ impl<'a> Renderer<'a> {
             transfer: settings.transfer,
             gain: settings.gain,
             adds: path.world.polished.is_some(),
-            unfocused: path.world.lens.is_some(),
+            is_blurred: !path.world.optics.is_sharp(),
         };
         let find_highlights = |film: &Film, jobs: &[Job]| {
-            // Through a lens, a point of the image does not tell where a glint is.
+            // Of what is blurred, a point of the image does not tell where a glint is.
             let is_given = matches!(settings.stop, Stop::Samples(_));
-            if !settings.highlights || is_given || settings.lens.is_some() {
+            if !settings.highlights || is_given || !settings.optics.is_sharp() {
                 return Found::default();
             }
             let objects = jobs.iter().filter(|job| job.layer == Layer::Object);
@@ -522,7 +522,7 @@ impl<'a> Renderer<'a> {
 
     fn object_jobs(&self, settings: &Settings) -> Vec<Job> {
         let bvh = &self.geometry.bvh;
-        let footprint = Footprint::new(&self.camera, settings.lens, bvh.bounds(), bvh.clusters());
+        let footprint = Footprint::new(&self.camera, settings.optics, bvh.bounds(), bvh.clusters());
         self.blocks()
             .filter(|b| footprint.overlaps(b.x, b.y, b.width, b.height))
             .filter_map(|block| {
@@ -570,7 +570,10 @@ impl<'a> Renderer<'a> {
         };
         let shaded: Vec<Vec<_>> = blocks.par_chunks(BLOCKS_AT_ONCE).map(shaded).collect();
         let mask = settings.shadow_mask.or(settings.occluders);
-        let shows = |block: &Block| pixels_of(*block).any(|(x, y)| leaves(mask, x, y));
+        // What is blurred is seen beside what hides it.
+        let is_blurred = !settings.optics.is_sharp();
+        let shows =
+            |block: &Block| is_blurred || pixels_of(*block).any(|(x, y)| leaves(mask, x, y));
         shaded
             .into_iter()
             .flatten()

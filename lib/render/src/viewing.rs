@@ -22,8 +22,8 @@ pub struct Viewing<'a> {
     pub gain: f32,
     /// The object is seen by way of the ground: its light is added to the photograph, and hides nothing of it.
     pub adds: bool,
-    /// The object is out of focus: its edges are wide, and coverage has noise.
-    pub unfocused: bool,
+    /// Lens or motion blur the object: its edges are wide, and coverage has noise.
+    pub is_blurred: bool,
 }
 
 /// Sums over pixels, of one job, of the squared display-referred error.
@@ -212,7 +212,7 @@ mod tests {
             transfer: Transfer::Linear,
             gain: 1.0,
             adds: false,
-            unfocused: false,
+            is_blurred: false,
         };
         let mut film = Film::new(1, 1);
         for (radiance, alpha) in [(0.1, 1.0), (1.5, 1.0), (0.4, 0.5), (2.0, 0.9)] {
@@ -240,7 +240,7 @@ mod tests {
             transfer: Transfer::Srgb,
             gain: 1.0,
             adds: false,
-            unfocused: false,
+            is_blurred: false,
         };
         let mut film = Film::new(4, 4);
         // Two 8-bit steps darker, once with less noise than that, once with more.

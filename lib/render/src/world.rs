@@ -18,7 +18,7 @@ use crate::convexity::is_convex;
 use crate::counters::{RayCounts, RayKind};
 use crate::error::RenderError;
 use crate::gloss::Polished;
-use crate::lens::ThinLens;
+use crate::optics::Optics;
 use crate::surface::{ExtensionPoint, SurfacePoint, Surfaces};
 
 /// The proxy, ready for rays.
@@ -167,8 +167,8 @@ pub struct World<'a> {
     pub surfaces: Surfaces<'a>,
     /// The effects that `surfaces` was prepared for ([`crate::features`]).
     pub mask: u32,
-    /// What the camera looks through; `None` for a pinhole.
-    pub(crate) lens: Option<ThinLens>,
+    /// What blurs what the camera sees.
+    pub(crate) optics: Optics,
     /// Rays from the camera go on from this ground.
     pub(crate) polished: Option<Polished>,
     /// No ray that leaves the object outwards meets it again, and none passes through.
@@ -210,7 +210,7 @@ impl<'a> World<'a> {
             geometry,
             surfaces,
             mask,
-            lens: None,
+            optics: Optics::default(),
             polished: None,
         })
     }
@@ -221,12 +221,12 @@ impl<'a> World<'a> {
         &self.camera
     }
 
-    /// The ray from the camera through the image position `pixel`; a lens draws two numbers.
+    /// The ray from the camera through the image position `pixel`; [`Optics`] that blur draw numbers.
     #[inline]
     pub(crate) fn view_ray(&self, pixel: Vec2, sampler: &mut Sampler) -> Ray {
-        match &self.lens {
-            Some(lens) => lens.ray(&self.camera, pixel, sampler.next_2d()),
-            None => self.camera.ray(pixel),
+        match self.optics.is_sharp() {
+            true => self.camera.ray(pixel),
+            false => self.optics.ray(&self.camera, pixel, sampler),
         }
     }
 

@@ -116,7 +116,7 @@ impl CameraSettings {
     pub(crate) fn stands_still(&self, base_dir: &Path) -> bool {
         match self {
             Self::LookAt { .. } => true,
-            Self::File(file) => dipir_cameras::file::has_one(&base_dir.join(&file.path)),
+            Self::File(file) => file.stands_still(base_dir),
         }
     }
 }

@@ -332,7 +332,7 @@ impl Scene {
         of_shot: Option<&SceneDescription>,
         look: bool,
     ) -> Result<(LoadedScene, Option<Raster<f32>>), Error> {
-        let settings = config.validate()?;
+        let mut settings = config.validate()?;
         let mut files = Files::new(base_dir, settings.limits);
         let (photo, background) = files.photo(&settings.background, settings.transfer)?;
         let resolution = [background.width, background.height];
@@ -343,7 +343,8 @@ impl Scene {
                 files.record("occluders", path)?,
             )),
         };
-        if let CameraSettings::File(file) = &settings.camera {
+        if let CameraSettings::File(file) = &mut settings.camera {
+            file.orientation = photo.facts.orientation;
             for part in file.parts(base_dir) {
                 files.input("camera", &part);
             }

@@ -3,7 +3,8 @@ use std::path::Path;
 
 use dipir_cameras::chan::Turns;
 use dipir_cameras::file::{self, Wanted, Which};
-use dipir_cameras::{CameraError, Lens, Pose, WorldUp};
+use dipir_cameras::{CameraError, Lens, Pose, WorldUp, orientation};
+use dipir_imaging::facts::Facts;
 use dipir_scene::plausibility::{field_of_view, rounded};
 use glam::{DVec2, DVec3};
 
@@ -17,7 +18,7 @@ const LEAST_SHIFT_PX: f64 = 0.5;
 /// Least change of an axis of the camera that the order of its rotations makes: half a pixel at a focal length of 5,000.
 const LEAST_TURN: f64 = 1e-4;
 
-/// The camera that the file or folder at `path` has for `photo`, of `size` pixels, and what of it may be wrong, one
+/// The camera that the file or folder at `path` has for `photo`, of which `facts` are known, and what of it may be wrong, one
 /// sentence each. `up` overrules which axis of its world points up.
 ///
 /// # Errors
@@ -26,12 +27,12 @@ const LEAST_TURN: f64 = 1e-4;
 pub fn read(
     path: &Path,
     photo: &Path,
-    size: [u32; 2],
+    facts: &Facts,
     up: Option<WorldUp>,
     asked: &CameraOptions,
 ) -> Result<(View, Vec<String>), SetupError> {
     asked.check()?;
-    let size = size.map(f64::from);
+    let size = facts.size.map(f64::from);
     let is_chan = path
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("chan"));
@@ -58,7 +59,8 @@ pub fn read(
         fov_deg: asked.fov_deg.map(vertical),
         turns: None,
     };
-    let found = file::read(path, &wanted).map_err(|source| match source {
+    let found = orientation::read_turned(path, &wanted, facts.orientation);
+    let (found, _) = found.map_err(|source| match source {
         CameraError::Read { path, source } => SetupError::Read { path, source },
         source => SetupError::CameraFile {
             path: path.into(),
@@ -90,7 +92,9 @@ pub fn read(
         fov_deg: (!found.states_fov).then_some(view.fov_deg),
         why,
     });
-    let mut warnings = Vec::new();
+    let mut warnings: Vec<String> = orientation::doubt_of_turn(path, facts.orientation)
+        .into_iter()
+        .collect();
     if is_ambiguous {
         warnings.push(format!(
             "\"{}\": {order}: if it is Blender's, write file_rotation_order = \"xyz\" into [scene.camera]",
@@ -222,7 +226,7 @@ mod tests {
         let found = read(
             &path,
             Path::new("photos/b.jpg"),
-            size,
+            &Facts::of_size(size),
             None,
             &CameraOptions::default(),
         );
@@ -481,7 +485,14 @@ mod tests {
         };
         let of = |text: &str| {
             std::fs::write(&path, text).unwrap();
-            read(&path, Path::new("a.jpg"), [600, 400], None, &asked).map_err(|e| e.to_string())
+            read(
+                &path,
+                Path::new("a.jpg"),
+                &Facts::of_size([600, 400]),
+                None,
+                &asked,
+            )
+            .map_err(|e| e.to_string())
         };
         assert!(of("1 0 1.7 4 0 0 0").is_ok());
         let error = of("1 0 1.7 4 0 0 0 40").unwrap_err();

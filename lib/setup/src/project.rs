@@ -103,7 +103,7 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
             let (view, doubts) = camera_file::read(
                 path,
                 &request.photo,
-                photo.facts.size,
+                &photo.facts,
                 request.camera_up,
                 &request.asked,
             )?;

@@ -77,6 +77,8 @@ pub struct Truth {
     pub rmse_neutral: f64,
     /// Where most of the true light comes from.
     pub peak: Option<Vec3>,
+    /// What the stage's picture shows and the other pictures do not.
+    pub left_out: Vec<&'static str>,
 }
 
 /// What decides the comparison beside the stages' outputs.
@@ -129,7 +131,24 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
         rmse_recovered: apart(&found),
         rmse_neutral: apart(&neutral),
         peak: Some(peak),
+        left_out: left_out(&lit, &scene),
     }))
+}
+
+/// What the composite simulates beside what is compared.
+fn left_out(table: &CompositeTable, scene: &SceneFolder) -> Vec<&'static str> {
+    let focus = table.focus_m.is_some() || table.focus_at_pixel.is_some();
+    let catches = scene.loaded.catching().is_some();
+    [
+        ("depth of field", focus),
+        ("motion blur", table.shutter_deg.is_some()),
+        ("the ground's mirror image", table.gloss().is_some()),
+        ("shadows on what scene.depth shows", catches),
+        ("composite.emission_ev", table.emission_gain().is_some()),
+    ]
+    .into_iter()
+    .filter_map(|(what, is_shown)| is_shown.then_some(what))
+    .collect()
 }
 
 /// Degrees between the direction of a recovered light, turned as the picture has it, and the true one.
@@ -247,8 +266,15 @@ impl Truth {
             Some(angle) => format!("most light comes from {angle:.1} degrees off the true sun; "),
             None => String::new(),
         };
+        let left_out = match self.left_out.is_empty() {
+            true => String::new(),
+            false => format!(
+                "; the pictures under the true and the neutral light lack {}, which counts as an error",
+                self.left_out.join(", ")
+            ),
+        };
         format!(
-            "{sun}RMSE of the picture {:.4}, {than} the {:.4} under neutral light",
+            "{sun}RMSE of the picture {:.4}, {than} the {:.4} under neutral light{left_out}",
             self.rmse_recovered, self.rmse_neutral
         )
     }
@@ -276,6 +302,7 @@ mod tests {
                 rmse_recovered,
                 rmse_neutral,
                 peak: None,
+                left_out: vec![],
             };
             truth.in_words()
         };

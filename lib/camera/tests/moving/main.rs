@@ -5,6 +5,7 @@ mod wrong;
 use std::path::{Path, PathBuf};
 
 use dipir_cameras::file::{self, Found, Wanted, Which};
+use dipir_cameras::neighbours::neighbours;
 use dipir_cameras::{Pose, gltf};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde_json::json;
@@ -172,6 +173,19 @@ fn an_exported_rig_stands_as_in_chan_and_transforms_json() {
                 got.rotation.abs_diff_eq(want.rotation, 1e-4),
                 "{name} {frame}: {got:?}"
             );
+            let beside = neighbours(&at(name), &wanted).unwrap();
+            for (found, side) in beside.into_iter().zip([-1, 1]) {
+                let other = rig()
+                    .into_iter()
+                    .find(|(n, _)| i64::from(*n) == i64::from(frame) + side);
+                assert_eq!(found.map(|f| f.frames), other.map(|_| side), "{name}");
+                let (Some(found), Some((_, want))) = (found, other) else {
+                    continue;
+                };
+                let is_there = found.pose.position.abs_diff_eq(want.position, 1e-4)
+                    && found.pose.rotation.abs_diff_eq(want.rotation, 1e-4);
+                assert!(is_there, "{name} {frame}: {found:?}");
+            }
         }
     }
     let beside = [at("shot.gltf"), at("keys/my keys.bin")];

@@ -40,7 +40,7 @@ fn pixels_without_samples_do_not_make_the_error_smaller() {
         transfer: dipir_imaging::transfer::Transfer::Linear,
         gain: 1.0,
         adds: false,
-        unfocused: false,
+        is_blurred: false,
     };
     let errors = [0.64, 0.0].map(|sum| SquaredError { sum, variance: 0.0 });
     let error = total_error(&errors, &jobs, &film, &viewing);

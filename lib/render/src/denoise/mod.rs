@@ -68,8 +68,8 @@ pub(crate) struct Error {
 #[derive(Clone, Copy, PartialEq)]
 enum Kind {
     Object,
-    /// The object out of focus: coverage is as noisy as light, and filtered with it.
-    Unfocused,
+    /// The object, blurred by lens or motion: coverage is as noisy as light, and filtered with it.
+    Blurred,
     Shadow,
     /// Light of the object by way of the ground, which has no edges.
     Mirrored,
@@ -79,7 +79,7 @@ impl Kind {
     /// Pixels with a density of samples hold a highlight, and what their neighbours do not.
     fn holds(self, job: &Job) -> bool {
         match self {
-            Kind::Object | Kind::Unfocused => job.layer == Layer::Object && job.density.is_none(),
+            Kind::Object | Kind::Blurred => job.layer == Layer::Object && job.density.is_none(),
             Kind::Shadow => job.layer != Layer::Object,
             Kind::Mirrored => true,
         }
@@ -97,7 +97,7 @@ const OBJECT: Comparison<3, 1> = Comparison {
     channels: |radiance| radiance.truncate().to_array(),
 };
 /// By coverage, too.
-const UNFOCUSED: Comparison<4, 1> = Comparison {
+const BLURRED: Comparison<4, 1> = Comparison {
     with_own: false,
     channels: |value| value.to_array(),
 };
@@ -160,7 +160,7 @@ impl<'a> Tiles<'a> {
                 halves.values = estimates.map(|e| e.0.extend(0.0));
                 halves.is_inside = estimates.iter().all(|e| e.1 >= 1.0);
             }
-            Kind::Unfocused => halves.values = estimates.map(|e| e.0.extend(e.1)),
+            Kind::Blurred => halves.values = estimates.map(|e| e.0.extend(e.1)),
             Kind::Shadow => halves.values = estimates.map(|e| (Vec3::ONE - e.0).extend(0.0)),
             Kind::Mirrored => halves.values = estimates.map(|e| e.0.extend(0.0)),
         }
@@ -224,7 +224,7 @@ fn filter<const CHANNELS: usize, const PATCH: usize>(
         let (i, j) = place(pixel);
         // What is covered hides what is behind it: how far it is seen follows from both.
         let behind = match tiles.kind {
-            Kind::Unfocused => {
+            Kind::Blurred => {
                 let (x, y) = (pixel.0 as usize, pixel.1 as usize);
                 viewing.background(x, y) * *film.shadow.get(x, y)
             }
@@ -261,7 +261,7 @@ fn filter<const CHANNELS: usize, const PATCH: usize>(
         let value = ((both[0] + both[1]) * 0.5).truncate();
         let value = match tiles.kind {
             Kind::Object | Kind::Mirrored => value,
-            Kind::Unfocused => {
+            Kind::Blurred => {
                 coverage.push((both[0].w + both[1].w) * 0.5);
                 value
             }
@@ -322,9 +322,9 @@ impl<'a> Denoiser<'a> {
     ) -> Vec<Option<Error>> {
         self.known.resize(jobs.len(), Known::default());
         let mut errors = vec![None; jobs.len()];
-        let kinds: &[Kind] = match (viewing.adds, viewing.unfocused) {
+        let kinds: &[Kind] = match (viewing.adds, viewing.is_blurred) {
             (true, _) => &[Kind::Mirrored],
-            (false, true) => &[Kind::Unfocused, Kind::Shadow],
+            (false, true) => &[Kind::Blurred, Kind::Shadow],
             (false, false) => &[Kind::Object, Kind::Shadow],
         };
         for &kind in kinds {
@@ -396,7 +396,7 @@ fn filter_where(
     for indices in wanted.chunks(AT_ONCE) {
         let filter = |&index: &usize| match tiles.kind {
             Kind::Object => filter(OBJECT, tiles, &tiles.jobs[index], film, viewing),
-            Kind::Unfocused => filter(UNFOCUSED, tiles, &tiles.jobs[index], film, viewing),
+            Kind::Blurred => filter(BLURRED, tiles, &tiles.jobs[index], film, viewing),
             _ => filter(SHADOW, tiles, &tiles.jobs[index], film, viewing),
         };
         let filtered: Vec<_> = indices.par_iter().map(filter).collect();

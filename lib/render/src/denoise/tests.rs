@@ -63,7 +63,7 @@ const VIEWING: Viewing = Viewing {
     transfer: Transfer::Linear,
     gain: 1.0,
     adds: false,
-    unfocused: false,
+    is_blurred: false,
 };
 
 /// Squared error of `film` against `surface`, over the pixels that are wholly covered and for which `holds` is true.

@@ -4,10 +4,12 @@ use dipir_numerics::warp::square_to_sphere;
 use dipir_scene::material::Material;
 use dipir_scene::proxy::Proxy;
 use dipir_scene::surfaces::SeenSurfaces;
-use glam::Mat3;
+use glam::{Mat3, Quat};
 
 use super::*;
+use crate::lens::ThinLens;
 use crate::shapes::icosphere;
+use crate::shutter::{Shutter, Stand};
 use crate::testing::{
     camera, carry_on, everything, ground, lambertian, matte, render, scene, settings, sky,
 };
@@ -313,9 +315,33 @@ fn every_pixel_whose_lobe_meets_the_object_is_looked_at() {
         radius: 0.08,
         focus: 3.0,
     };
-    let lenses = [None, None, None, Some(lens), Some(lens)];
-    for (roughness, lens) in [0.0, 0.1, 0.3, 0.0, 0.3].into_iter().zip(lenses) {
-        world.lens = lens;
+    let sharp = Optics::default();
+    let blurred = Optics {
+        lens: Some(lens),
+        ..sharp
+    };
+    let end = |by: f32| Stand {
+        position: view().position + Vec3::new(0.3, 0.05, -0.1) * by,
+        rotation: Quat::from_rotation_z(0.1 * by) * Stand::of(&view()).rotation,
+    };
+    let moving = Optics {
+        shutter: Some(Shutter {
+            opens: end(-1.0),
+            middle: Stand::of(&view()),
+            closes: end(1.0),
+        }),
+        ..sharp
+    };
+    for (roughness, optics) in [
+        (0.0, sharp),
+        (0.1, sharp),
+        (0.3, sharp),
+        (0.0, blurred),
+        (0.3, blurred),
+        (0.0, moving),
+        (0.3, moving),
+    ] {
+        world.optics = optics;
         let gloss = Gloss {
             roughness,
             reflectance: 1.0,
@@ -323,7 +349,7 @@ fn every_pixel_whose_lobe_meets_the_object_is_looked_at() {
         let coat = Coat(Raster::filled(2, 2, CoatPoint::default()));
         let mut film = Film::new(SIDE as usize, SIDE as usize);
         let ground = Polished::new(gloss, coat, &mut film, &scene.camera, &settings(1, 0));
-        let jobs = renderer.mirror_jobs(&ground, lens, &blocker);
+        let jobs = renderer.mirror_jobs(&ground, optics, &blocker);
         let of = |x: usize, y: usize| {
             jobs.iter()
                 .any(|job| job.pixels.index_of(x as u32, y as u32).is_some())
@@ -348,7 +374,7 @@ fn every_pixel_whose_lobe_meets_the_object_is_looked_at() {
         );
         assert!(
             roughness > 0.0
-                || missed == 0 && lens.is_some()
+                || missed == 0 && !optics.is_sharp()
                 || missed == 0 && jobs.iter().map(|j| j.pixels.len()).sum::<usize>() < 2000
         );
     }

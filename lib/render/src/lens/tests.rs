@@ -12,7 +12,8 @@ use super::*;
 use crate::adaptive::Stop;
 use crate::gloss::Gloss;
 use crate::job::REPLICATES;
-use crate::render::Rendered;
+use crate::optics::Optics;
+use crate::render::{Rendered, Renderer, Settings};
 use crate::shapes::{icosphere, quad};
 use crate::testing::{
     camera, carry_on, everything, ground, matte, render, scene, settings, sky, sun,
@@ -47,9 +48,16 @@ fn glowing() -> Material {
     }
 }
 
+fn through(lens: Option<ThinLens>) -> Optics {
+    Optics {
+        lens,
+        ..Optics::default()
+    }
+}
+
 fn rendered(scene: &Scene, light: &EnvironmentSampler, lens: Option<ThinLens>) -> Rendered {
     let settings = Settings {
-        lens,
+        optics: through(lens),
         ..settings(PATHS, 5)
     };
     render(scene, light, &everything(1), &settings)
@@ -254,7 +262,7 @@ fn the_stated_error_holds_at_edges_that_are_out_of_focus() {
             seed,
             stop,
             denoise,
-            lens,
+            optics: through(lens),
             background: Some(&photo),
             transfer: Transfer::Srgb,
             ..Settings::default()
@@ -311,7 +319,7 @@ fn polished_ground_mirrors_as_much_light_through_a_lens() {
     let scene = scene(ball, glowing(), view(), ground());
     let sum = |lens| {
         let settings = Settings {
-            lens,
+            optics: through(lens),
             gloss: Some(Gloss {
                 roughness: 0.0,
                 reflectance: 0.5,
@@ -375,7 +383,7 @@ fn pictures_stay_finite_where_lens_and_scene_are_extreme() {
         for radius in [1e-6, 0.1, 10.0] {
             for focus in [1e-3, 3.0, 1e5] {
                 let settings = Settings {
-                    lens: Some(ThinLens { radius, focus }),
+                    optics: through(Some(ThinLens { radius, focus })),
                     denoise: true,
                     ..settings(4, 1)
                 };

@@ -185,7 +185,7 @@ fn toned(film: &Film) -> Vec<Vec3> {
         transfer: Transfer::Srgb,
         gain: 1.0,
         adds: false,
-        unfocused: false,
+        is_blurred: false,
     };
     let (width, height) = (film.alpha.width(), film.alpha.height());
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));

@@ -21,6 +21,7 @@ use crate::error::RenderError;
 use crate::features::with_features;
 use crate::footprint::Footprint;
 use crate::foreground::{Gather, PathContext};
+use crate::optics::Optics;
 use crate::render::{Renderer, pixels_of};
 use crate::shadow::{Block, LightOnProxy, SampleRange, ShadowContext, ShadowGather};
 use crate::world::{ProxyGeometry, World};
@@ -225,7 +226,7 @@ impl Transport {
         let recorder = Recorder {
             footprint: Footprint::new(
                 world.camera(),
-                None,
+                Optics::default(),
                 geometry.bvh.bounds(),
                 geometry.bvh.clusters(),
             ),

@@ -1,8 +1,54 @@
 //! What `[scene.camera]` says, checked.
 use dipir_cameras::Distortion;
+use dipir_cameras::neighbours::Neighbour;
+use dipir_imaging::facts::Facts;
 
 use super::*;
-use crate::camera::FARTHEST_M;
+use crate::camera::{FARTHEST_M, FileSettings};
+
+impl SceneConfig {
+    /// Where the camera stands in the frames of a shot before and after the photograph, of which `facts` are known, relative to
+    /// `base_dir` and as far as its file has them.
+    ///
+    /// # Errors
+    /// As where the scene is loaded.
+    pub fn neighbours(
+        &self,
+        facts: &Facts,
+        base_dir: &Path,
+    ) -> Result<[Option<Neighbour>; 2], Error> {
+        let Some(mut file) = self.camera_file()? else {
+            return Ok([None; 2]);
+        };
+        file.orientation = facts.orientation;
+        file.neighbours(facts.size, base_dir)
+    }
+
+    /// Whether every picture of a shot has the photograph's camera.
+    ///
+    /// # Errors
+    /// On a camera that cannot be one.
+    pub fn camera_stands_still(&self, base_dir: &Path) -> Result<bool, Error> {
+        let file = self.camera_file()?;
+        Ok(file.is_none_or(|file| file.stands_still(base_dir)))
+    }
+
+    /// The frame that the photograph shows of a camera that moves, if the names of the pictures beside it tell which.
+    pub fn shown_frame(&self, base_dir: &Path) -> Option<u32> {
+        let file = self.camera_file().ok()??;
+        Some(file.shown(base_dir)?.frame)
+    }
+
+    fn camera_file(&self) -> Result<Option<FileSettings>, Error> {
+        let Some((camera, photo)) = self.camera.as_ref().zip(self.background.as_ref()) else {
+            return Ok(None);
+        };
+        Ok(match camera.validate(photo)? {
+            CameraSettings::File(file) => Some(file),
+            CameraSettings::LookAt { .. } => None,
+        })
+    }
+}
 
 impl CameraConfig {
     /// `photo` is the photograph, by whose name a file's camera is found.

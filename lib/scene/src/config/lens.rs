@@ -141,6 +141,7 @@ impl CameraConfig {
                 None => None,
                 Some(table) => Some(table.validate()?),
             },
+            orientation: 1,
         }))
     }
 }

@@ -14,7 +14,7 @@ const FARTHEST_M: f32 = 1e5;
 /// Widest opening, millimetres, and most f-number.
 const WIDEST_MM: f32 = 1e3;
 /// Discs of a smaller radius are not seen, pixels.
-const LEAST_PX: f32 = 0.25;
+pub(super) const LEAST_PX: f32 = 0.25;
 
 impl CompositeTable {
     pub(super) fn check_focus(&self, config: &Config) -> Result<(), ConfigError> {
@@ -90,7 +90,11 @@ impl CompositeTable {
     ///
     /// # Errors
     /// Where nothing is seen at the pixel that is in focus, and where nothing tells how wide the lens was open.
-    pub fn lens(&self, config: &Config, loaded: &LoadedScene) -> anyhow::Result<Option<ThinLens>> {
+    pub(crate) fn lens(
+        &self,
+        config: &Config,
+        loaded: &LoadedScene,
+    ) -> anyhow::Result<Option<ThinLens>> {
         let camera = &loaded.scene.camera;
         let focus = match (self.focus_m, self.focus_at_pixel) {
             (Some(metres), _) => metres,
@@ -130,11 +134,6 @@ impl CompositeTable {
         );
         Err(config.invalid(key, message))
     }
-}
-
-/// `lens`, if it blurs any object visibly.
-pub fn that_blurs(lens: Option<ThinLens>, loaded: &LoadedScene) -> Option<ThinLens> {
-    lens.filter(|lens| blur_px(lens, loaded)[1] >= LEAST_PX)
 }
 
 /// Least and greatest radius of the discs that points of the objects are seen as, pixels.

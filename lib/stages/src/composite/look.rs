@@ -24,7 +24,7 @@ const MOST_BLUR_PX: f32 = 6.0;
 /// How the photograph looks beside a rendered picture.
 pub(super) struct Look {
     looks_for_blur: bool,
-    out_of_focus_px: Option<[f32; 2]>,
+    blurs: Blurs,
     edge_blur_px: Option<f32>,
     grain: Option<Grain>,
     shown: Shown,
@@ -45,6 +45,17 @@ pub struct Matched {
     /// in focus.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub out_of_focus_px: Option<[f32; 2]>,
+    /// Least and greatest length of the lines that points of the objects are seen as, pixels; absent if it is not known how long
+    /// the shutter was open.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub moving_px: Option<[f32; 2]>,
+}
+
+/// How wide points of the objects are seen, as [`Matched`] has it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Blurs {
+    pub out_of_focus_px: Option<[f32; 2]>,
+    pub moving_px: Option<[f32; 2]>,
 }
 
 /// From light to display values and back.
@@ -88,9 +99,8 @@ fn own_blur_px(divisor: u32) -> f32 {
 }
 
 impl Look {
-    /// Looks at the photograph as it was taken; `table` says for what. `out_of_focus_px` are radii of the discs that points of
-    /// the objects are seen as.
-    pub fn of(taken: &Photo, out_of_focus_px: Option<[f32; 2]>, table: &CompositeTable) -> Self {
+    /// Looks at the photograph as it was taken; `table` says for what. `blurs` is what blurs the objects beside it.
+    pub fn of(taken: &Photo, blurs: Blurs, table: &CompositeTable) -> Self {
         let shown = Shown {
             transfer: taken.transfer,
             gain: exposed::gain(taken, &taken.image),
@@ -99,7 +109,7 @@ impl Look {
         let looks_for_blur = table.matches_blur();
         Self {
             looks_for_blur,
-            out_of_focus_px,
+            blurs,
             edge_blur_px: looks_for_blur
                 .then(|| edge_blur_px(&taken.image, shown.gain.recip()))
                 .flatten()
@@ -130,7 +140,8 @@ impl Look {
             edge_blur_px: self.edge_blur_px,
             blur_px,
             grain: grain.map(|g| g.deviation(Vec3::splat(0.5)).to_array()),
-            out_of_focus_px: self.out_of_focus_px,
+            out_of_focus_px: self.blurs.out_of_focus_px,
+            moving_px: self.blurs.moving_px,
         }
     }
 
@@ -257,15 +268,25 @@ impl Matched {
 }
 
 impl Matched {
-    /// How far the objects are out of focus, as a sentence; `None` if nothing says what is in focus.
-    pub fn focus_text(&self) -> Option<String> {
-        let [least, most] = self.out_of_focus_px?.map(|radius| 2.0 * radius);
-        Some(match most < 1.0 {
-            true => "the objects are in focus".into(),
-            false => format!(
-                "out of focus, points of the objects are discs of {least:.0} to {most:.0} pixels"
-            ),
-        })
+    /// How wide points of the objects are seen, as sentences with what each is of; none where nothing says what is in focus or how
+    /// long the shutter was open.
+    pub fn blurs_texts(&self) -> Vec<[String; 2]> {
+        let focus = self.out_of_focus_px.map(|radii| {
+            let [least, most] = radii.map(|radius| 2.0 * radius);
+            let text = match most < 1.0 {
+                true => "the objects are in focus".into(),
+                false => format!("out of focus, points of the objects are discs of {least:.0} to {most:.0} pixels"),
+            };
+            ["Depth of field".into(), text]
+        });
+        let moving = self.moving_px.map(|[least, most]| {
+            let text = match most < 0.5 {
+                true => "the camera hardly moves past the objects".into(),
+                false => format!("points of the objects are lines of {least:.0} to {most:.0} pixels, as the camera moves"),
+            };
+            ["Motion blur".into(), text]
+        });
+        focus.into_iter().chain(moving).collect()
     }
 }
 

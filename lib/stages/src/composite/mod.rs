@@ -1,9 +1,10 @@
 //! The composite stage: the object at full quality, its shadow, and the layers of both.
 mod curve;
-pub mod focus;
+mod focus;
 mod lens;
 mod look;
 mod sharpness;
+pub mod shutter;
 pub mod table;
 
 use std::borrow::Cow;
@@ -30,6 +31,7 @@ use dipir_render::coarse::divisor_for;
 use dipir_render::film::Film;
 use dipir_render::gloss;
 use dipir_render::light::SceneLight;
+use dipir_render::optics::Optics;
 use dipir_render::render::{Rendered, Renderer, Settings};
 use dipir_scene::proxy::Proxy;
 use rayon::prelude::*;
@@ -119,6 +121,7 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     table.check(&session.config)?;
     let mut inputs = read(session)?;
     materials::use_recovered(session, &mut inputs.scene)?;
+    table.scale_emission(&mut inputs.scene.loaded.scene);
     let proxy = &inputs.scene.loaded.scene.proxy;
     if table.gloss().is_some() && !matches!(proxy, Proxy::Plane(_)) {
         session.warn("composite.ground_roughness: only a plane mirrors the objects, and [scene.proxy] is not one");
@@ -140,21 +143,19 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let mut writer = begin(session, plan(session, &table)?)?;
     writer.add_time(reading);
     let curve = Curve::of(table.tone, &light, inputs.scene.loaded.taken());
-    let lens = table.lens(&session.config, &inputs.scene.loaded)?;
-    let out_of_focus = lens.map(|lens| focus::blur_px(&lens, &inputs.scene.loaded));
-    let look = Look::of(inputs.scene.loaded.taken(), out_of_focus, &table);
+    let optics = table.optics(&session.config, &inputs.scene.loaded)?;
+    let (optics, blurs) = shutter::that_blurs(optics, &inputs.scene.loaded);
+    let look = Look::of(inputs.scene.loaded.taken(), blurs, &table);
     let resolution = inputs.scene.loaded.scene.camera.resolution;
     let enough = look.enough_pixels(resolution);
     let preset = &presets::of(session.pipeline.quality).composite;
-    let course = render(
-        session,
-        &table,
-        table.most_pixels(preset, enough),
-        within(stop, clock, &inputs),
-        &inputs,
-        &light,
-        curve.curves(),
-    )?;
+    let wanted = Wanted {
+        most_pixels: table.most_pixels(preset, enough),
+        stop: within(stop, clock, &inputs),
+        tone: curve.curves(),
+        optics,
+    };
+    let course = render(session, &table, wanted, &inputs, &light)?;
     let Course { rendered, .. } = course;
     let effects = inputs.scene.effects.rendered(&rendered);
     writer.write_json("effects", "effects.json", &effects)?;
@@ -294,11 +295,20 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
     if let Some(focus) = table.focus_params() {
         params["focus"] = focus;
     }
+    if let Some(shutter_deg) = table.shutter_deg {
+        params["shutter_deg"] = shutter_deg.into();
+    }
+    if let Some(emission) = table.emission_gain() {
+        params["emission"] = json!(emission.to_array());
+    }
     if let Some(follows) = odd_sharpness(table, session.pipeline.quality) {
         params["follow_sharpness"] = follows.into();
     }
     let mut plan = COMPOSITE.plan(session, params);
     scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
+    if table.shutter_deg.is_some() {
+        scene_folder::add_camera(session, &mut plan, &scene)?;
+    }
     match known {
         Some((_, path)) => plan.input("environment", path, &session.resolve(path))?,
         None => light_folder::add_inputs(session, &mut plan)?,
@@ -307,47 +317,45 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
     Ok(plan)
 }
 
+/// What a render is asked for, beside what the table says itself.
+#[derive(Clone, Copy)]
+struct Wanted<'a> {
+    most_pixels: Option<u64>,
+    stop: Stop,
+    tone: Option<&'a ToneCurves>,
+    optics: Optics,
+}
+
 fn render(
     session: &Session,
     table: &CompositeTable,
-    most_pixels: Option<u64>,
-    stop: Stop,
+    wanted: Wanted,
     inputs: &Inputs,
     light: &Source,
-    tone: Option<&ToneCurves>,
 ) -> anyhow::Result<Course> {
-    match light {
+    let light = match light {
         Source::Map(light) => {
             let map = EnvironmentSampler::new(light.map.clone());
-            render_under(session, table, most_pixels, stop, inputs, &map, tone)
+            return render_under(session, table, wanted, inputs, &map);
         }
-        Source::Recovered(light) => match &light.surroundings {
-            Some(map) => {
-                let map = EnvironmentSampler::new(Arc::new(map.clone()));
-                let light = MapWithLobes::new(map, light.lobes.clone());
-                render_under(session, table, most_pixels, stop, inputs, &light, tone)
-            }
-            None => render_under(
-                session,
-                table,
-                most_pixels,
-                stop,
-                inputs,
-                &light.lobes,
-                tone,
-            ),
-        },
+        Source::Recovered(light) => light,
+    };
+    match &light.surroundings {
+        Some(map) => {
+            let map = EnvironmentSampler::new(Arc::new(map.clone()));
+            let light = MapWithLobes::new(map, light.lobes.clone());
+            render_under(session, table, wanted, inputs, &light)
+        }
+        None => render_under(session, table, wanted, inputs, &light.lobes),
     }
 }
 
 fn render_under<L: SceneLight>(
     session: &Session,
     table: &CompositeTable,
-    most_pixels: Option<u64>,
-    stop: Stop,
+    wanted: Wanted,
     inputs: &Inputs,
     light: &L,
-    tone: Option<&ToneCurves>,
 ) -> anyhow::Result<Course> {
     let clock = Instant::now();
     let mut round = 0;
@@ -355,15 +363,15 @@ fn render_under<L: SceneLight>(
     let effects = &inputs.scene.effects;
     let settings = Settings {
         seed: session.pipeline.seed,
-        stop,
+        stop: wanted.stop,
         max_samples: table.max_samples.unwrap_or(MAX_SAMPLES),
         denoise: table.denoise(session.pipeline.quality),
         blur_caustics: table.blur_caustics(session.pipeline.quality),
-        most_pixels,
+        most_pixels: wanted.most_pixels,
         leave_out: effects.leave_out(loaded.description.effects()),
-        tone,
+        tone: wanted.tone,
         gloss: table.gloss(),
-        lens: focus::that_blurs(table.lens(&session.config, loaded)?, loaded),
+        optics: wanted.optics,
         gain: exposed::gain(loaded.taken(), &loaded.photo.image),
         ..Settings::of_scene(loaded)
     };
@@ -376,7 +384,7 @@ fn render_under<L: SceneLight>(
                 return interruption();
             }
             round = state.round;
-            let goal = match stop {
+            let goal = match wanted.stop {
                 Stop::TargetError(target) => format!(" -> {target}"),
                 _ => String::new(),
             };
@@ -560,11 +568,8 @@ impl fmt::Display for Done {
                 "\n  {matched} (composite.match_blur, composite.match_grain)"
             )?;
         }
-        if let Some(text) = self.matched.focus_text() {
-            write!(
-                f,
-                "\n  {text} (composite.focus_m, composite.focus_at_pixel)"
-            )?;
+        for [what, text] in self.matched.blurs_texts() {
+            write!(f, "\n  {}: {text}", what.to_lowercase())?;
         }
         if self.is_blur_unknown {
             f.write_str("\n  the photograph has too few clear edges to tell how soft it is: the object is sharp")?;

@@ -7,6 +7,7 @@ use dipir_pipeline::config::{Config, Quality};
 use dipir_pipeline::error::ConfigError;
 use dipir_render::adaptive::Stop;
 use dipir_render::gloss::Gloss;
+use dipir_scene::scene::Scene;
 use glam::Vec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -28,6 +29,12 @@ pub struct CompositeTable {
     /// Stops of red, green and blue of the light beside that, for another white balance.
     #[schemars(extend("x-default" = "none"), example = [0.1, 0.0, -0.15])]
     pub tint: Option<[f32; 3]>,
+    /// How much brighter objects glow than their files say, stops. Guidance sees them as the files say.
+    #[schemars(range(min = -64.0, max = 64.0), extend("x-default" = "0.0"), example = 1.0)]
+    pub emission_ev: Option<f32>,
+    /// Stops of red, green and blue of their glow beside that.
+    #[schemars(extend("x-default" = "none"), example = [0.1, 0.0, -0.15])]
+    pub emission_tint: Option<[f32; 3]>,
     /// Turn of the light about the vertical, degrees, counter-clockwise from above.
     #[schemars(example = 90.0)]
     pub rotation_deg: f32,
@@ -77,6 +84,10 @@ pub struct CompositeTable {
     /// Diameter of the opening of the photograph's lens, millimetres: its true focal length over its f-number. Excludes `f_number`.
     #[schemars(extend("exclusiveMinimum" = 0), range(max = 1e3), extend("x-default" = "focal length over `f_number`"), example = 28.0)]
     pub aperture_mm: Option<f32>,
+    /// How long the shutter was open, degrees: 360 is from frame to frame, 180 half of that. What the camera of a shot passes is
+    /// then blurred as by its way, the frame's own place being in the middle.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 360.0), extend("x-default" = "none: nothing moves"), example = 180.0)]
+    pub shutter_deg: Option<f32>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
     /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
     #[schemars(extend("x-default" = "the recovered curves with the recovered light, `none` with a map"), example = &"reinhard")]
@@ -123,6 +134,8 @@ const GROUND_REFLECTANCE: f32 = 0.04;
 
 /// Most stops of a channel that a tint has: beyond, a light has one colour.
 const MOST_TINT: f32 = 8.0;
+/// Most stops that objects glow brighter or dimmer by, as of light.
+const MOST_EMISSION_EV: f32 = 64.0;
 
 impl CompositeTable {
     /// Refuses what no run can work with.
@@ -155,18 +168,31 @@ impl CompositeTable {
         }
         self.check_ground(config)?;
         self.check_focus(config)?;
+        self.check_shutter(config)?;
         if self.max_samples == Some(0) {
             return Err(config.out_of_range("composite.max_samples", 0, "1 or more"));
         }
         if self.most_pixels == Some(0) {
             return Err(config.out_of_range("composite.most_pixels", 0, "1 or more"));
         }
-        if let Some(tint) = self.tint
-            && !tint.iter().all(|stops| stops.abs() <= MOST_TINT)
+        for (key, tint) in [
+            ("composite.tint", self.tint),
+            ("composite.emission_tint", self.emission_tint),
+        ] {
+            if let Some(tint) = tint
+                && !tint.iter().all(|stops| stops.abs() <= MOST_TINT)
+            {
+                let found = format!("{tint:?}");
+                let accepted = "three numbers of stops from -8 to 8, as in [0.1, 0.0, -0.15]";
+                return Err(config.out_of_range(key, found, accepted));
+            }
+        }
+        if let Some(ev) = self.emission_ev
+            && !(ev.abs() <= MOST_EMISSION_EV)
         {
-            let found = format!("{tint:?}");
-            let accepted = "three numbers of stops from -8 to 8, as in [0.1, 0.0, -0.15]";
-            return Err(config.out_of_range("composite.tint", found, accepted));
+            let found = format!("{ev:?}");
+            let accepted = "stops from -64 to 64, as in 1.0";
+            return Err(config.out_of_range("composite.emission_ev", found, accepted));
         }
         self.placement().check(config)
     }
@@ -203,6 +229,26 @@ impl CompositeTable {
     /// The factor of each channel that `tint` is.
     pub fn tint_gain(&self) -> Vec3 {
         Vec3::from(self.tint.unwrap_or_default()).exp2()
+    }
+
+    /// The factor of each channel of what objects emit; `None` for 1.
+    pub(crate) fn emission_gain(&self) -> Option<Vec3> {
+        let stops = Vec3::from(self.emission_tint.unwrap_or_default());
+        let stops = stops + self.emission_ev.unwrap_or_default();
+        (stops != Vec3::ZERO).then(|| stops.exp2())
+    }
+
+    /// Makes the objects of `scene` glow as much as the table says.
+    pub fn scale_emission(&self, scene: &mut Scene) {
+        let Some(gain) = self.emission_gain() else {
+            return;
+        };
+        for material in &mut scene.materials {
+            material.emissive *= gain;
+            if material.unlit {
+                material.base_color *= gain.extend(1.0);
+            }
+        }
     }
 
     /// How the map of `environment` is used.

@@ -9,12 +9,12 @@ use dipir_light::gaussian::{SgMixture, SphericalGaussian};
 use dipir_optimize::lighting::Lighting;
 use dipir_optimize::parameters::{Parameters, ambient_of};
 use dipir_optimize::settings::{LightTable, Start};
+use dipir_pipeline::fingerprint::StaleReason;
 use dipir_pipeline::status::State;
 use dipir_render::gloss::Gloss;
-use dipir_render::lens::ThinLens;
+use dipir_render::optics::Optics;
 use dipir_scene::scene::LoadedScene;
 
-use crate::composite::focus;
 use crate::composite::table::{CompositeTable, Tone};
 use crate::light::estimate::{distribution, estimate};
 use crate::light::exposed;
@@ -31,7 +31,7 @@ use crate::{graph, known_light};
 pub enum Origin {
     /// The map of `[composite] environment`.
     Map,
-    /// What the light stage left, which is up to date.
+    /// What the light stage left, which is up to date but for objects that were moved since.
     Stage,
     /// The file of `[light] start`.
     File,
@@ -90,8 +90,8 @@ pub struct AtHand {
     pub tone: Option<ToneCurves>,
     /// The ground that it shines on, if that is polished.
     pub gloss: Option<Gloss>,
-    /// What the photograph was taken through, if it is known where it is sharp.
-    pub lens: Option<ThinLens>,
+    /// What blurred the photograph, as far as it is known, whether or not it blurs the objects where they stand.
+    pub optics: Optics,
     /// Where it comes from.
     pub origin: Origin,
 }
@@ -105,15 +105,14 @@ pub struct AtHand {
 pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand> {
     let composite: CompositeTable = session.config.table("composite")?;
     composite.check(&session.config)?;
-    let lens = composite.lens(&session.config, loaded)?;
-    let lens = focus::that_blurs(lens, loaded);
+    let optics = composite.optics(&session.config, loaded)?;
     if let Some(light) = known_light::known(session, &composite)? {
         return Ok(AtHand {
             lobes: SgMixture::new(Vec::new())?,
             map: Some(light.map),
             tone: composite.tone.and_then(Tone::curves),
             gloss: composite.gloss(),
-            lens,
+            optics,
             origin: Origin::Map,
         });
     }
@@ -135,19 +134,30 @@ pub fn at_hand(session: &Session, loaded: &LoadedScene) -> anyhow::Result<AtHand
             None => exposed::tone(loaded.taken(), light.tone),
         },
         gloss: composite.gloss(),
-        lens,
+        optics,
         origin,
     })
 }
 
-/// Whether what the scene and light stages left is up to date.
+/// Whether what the scene and light stages left is up to date, but for objects that were moved since: the light is that of the
+/// place.
 fn is_fresh(session: &Session) -> bool {
+    let moves = |r: &StaleReason| matches!(r, StaleReason::Parameter { key, .. } if key.starts_with("scene.objects"));
     let fresh = || {
         let graph = graph::graph(session).ok()?;
         let states = graph::assess(session, &graph, &graph.up_to(LIGHT.name)).ok()?;
         let of = |stage: &str| states.iter().find(|s| s.stage == stage);
-        let both = [of(SCENE.name)?, of(LIGHT.name)?];
-        Some(both.iter().all(|s| s.state == State::Fresh))
+        let scene = match &of(SCENE.name)?.state {
+            State::Fresh => true,
+            State::Stale { reasons } => reasons.iter().all(moves),
+            _ => false,
+        };
+        let light = match &of(LIGHT.name)?.state {
+            State::Fresh => true,
+            State::Waits { on, reasons } => *on == [SCENE.name] && reasons.is_empty(),
+            _ => false,
+        };
+        Some(scene && light)
     };
     fresh() == Some(true)
 }

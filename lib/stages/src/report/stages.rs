@@ -118,9 +118,11 @@ pub fn effects(report: &Report) -> Section {
     };
     let blur = look.and_then(|look| look.text());
     let blur = blur.map(|text| format!("The object is {text} (look.json)."));
-    let focus = look.and_then(|look| look.focus_text());
-    let focus = focus.map(|text| format!("Depth of field: {text} (look.json)."));
-    let notes = [note].into_iter().chain(blur).chain(focus);
+    let blurs = look.map_or_else(Vec::new, |look| look.blurs_texts());
+    let blurs = blurs
+        .into_iter()
+        .map(|[what, text]| format!("{what}: {text} (look.json)."));
+    let notes = [note].into_iter().chain(blur).chain(blurs);
     let notes = notes.map(|note| Html::element("p", &[("class", "soft")], [Html::text(note)]));
     Ok(Some(Html::all(
         [html::table(&heads, rows.collect())]

@@ -65,6 +65,15 @@ pub fn add_inputs(plan: &mut StagePlan, scene: &Manifest, roles: &[&str]) -> any
     Ok(())
 }
 
+/// Adds the camera's files to the inputs of a plan, for a stage that reads more of them than is in `scene.json`.
+pub fn add_camera(session: &Session, plan: &mut StagePlan, scene: &Manifest) -> anyhow::Result<()> {
+    let files = scene.inputs.iter();
+    for file in files.filter(|a| unnumbered(&a.role) == "camera") {
+        plan.input("camera", &file.path, &session.resolve(&file.path))?;
+    }
+    Ok(())
+}
+
 /// Refuses a scene that lacks a file which is there now: its object would be read otherwise than it was.
 fn refuse_new_parts(session: &Session, manifest: &Manifest) -> anyhow::Result<()> {
     for part in &manifest.inputs {

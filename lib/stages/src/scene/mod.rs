@@ -88,7 +88,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     composite.check(&session.config)?;
     let mut loaded = load(session, &config)?.map_err(|e| with_place(e, &session.config))?;
     // What the composite needs to know of the photograph is missed here, before anything long runs.
-    composite.lens(&session.config, &loaded)?;
+    composite.optics(&session.config, &loaded)?;
     for warning in loaded.warnings.iter().chain(&implausible(&loaded)) {
         session.warn(warning);
     }
@@ -379,7 +379,10 @@ fn plan_with<'a>(
             "seed": recovery.seed,
         })
     });
-    let params = deciding(json!({"scene": config, "transport": transport}));
+    let mut params = deciding(json!({"scene": config, "transport": transport}));
+    if let Some(frame) = config.shown_frame(&session.config.base_dir()) {
+        params["camera_frame"] = frame.into();
+    }
     let mut plan = SCENE.plan(session, params);
     plan.comparable = deciding;
     for (role, path, location) in files {

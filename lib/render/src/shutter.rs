@@ -1,0 +1,146 @@
+//! Motion blur: a camera that moves while its shutter is open.
+//!
+//! Objects and ground stand still, so each of their points is seen along a line. The object is seen by rays of cameras along
+//! the way, so what it hides of itself and of the photograph behind it blurs as it does in a camera. The photograph was blurred
+//! when it was taken; only the shadow on it is new. Its ratio is averaged along the line that the pixel has seen.
+use dipir_imaging::raster::Raster;
+use dipir_scene::camera::Camera;
+use glam::{Mat3, Quat, Vec2, Vec3};
+use rayon::prelude::*;
+
+/// Where a camera stands, and how it is turned.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Stand {
+    /// Centre of projection, metres.
+    pub position: Vec3,
+    /// Turns the camera's right, up and backward axes into the world.
+    pub rotation: Quat,
+}
+
+/// The way of a camera while its shutter is open.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shutter {
+    /// Where it opens.
+    pub opens: Stand,
+    /// In the middle of that time: where the camera of the picture stands.
+    pub middle: Stand,
+    /// Where it closes.
+    pub closes: Stand,
+}
+
+/// Lines that reach less far leave a shadow as it is, pixels.
+const LEAST_PX: f32 = 0.25;
+
+impl Stand {
+    /// Of this camera.
+    pub fn of(camera: &Camera) -> Self {
+        Self {
+            position: camera.position,
+            rotation: Quat::from_mat3(&camera.rotation).normalize(),
+        }
+    }
+
+    /// On the way to `end`, of which `share` is behind it.
+    pub fn towards(&self, end: &Self, share: f32) -> Self {
+        Self {
+            position: self.position.lerp(end.position, share),
+            rotation: self.rotation.slerp(end.rotation, share),
+        }
+    }
+}
+
+impl Shutter {
+    /// `camera`, that of the picture, at a `time` from -1, where the shutter opens, to 1, where it closes.
+    pub fn camera(&self, camera: &Camera, time: f32) -> Camera {
+        let end = if time < 0.0 {
+            &self.opens
+        } else {
+            &self.closes
+        };
+        let stand = self.middle.towards(end, time.abs());
+        Camera {
+            position: stand.position,
+            rotation: Mat3::from_quat(stand.rotation),
+            ..*camera
+        }
+    }
+
+    /// How far from `pixel` the point that it shows at this distance along the optical axis, metres, is seen where the shutter
+    /// opens and where it closes, pixels. The distance may be infinite. `None` where the point is not before the camera then.
+    pub fn ends_px(&self, camera: &Camera, pixel: Vec2, depth: f32) -> [Option<Vec2>; 2] {
+        let d = (pixel - camera.principal_px) / camera.focal_px;
+        let ray = camera.rotation * Vec3::new(d.x, -d.y, -1.0);
+        [&self.opens, &self.closes].map(|end| {
+            let offset = ray + (camera.position - end.position) / depth;
+            let seen = Mat3::from_quat(end.rotation).transpose() * offset;
+            let image = || Vec2::new(seen.x, -seen.y) / -seen.z;
+            (seen.z < 0.0).then(|| camera.principal_px + camera.focal_px * image() - pixel)
+        })
+    }
+
+    /// Shadow ratios as they are seen while the shutter is open; `depth` is the distance along the optical axis of what the
+    /// pixel in a column and row shows of the ground, if it shows any.
+    pub(crate) fn blurred(
+        &self,
+        camera: &Camera,
+        shadow: &Raster<Vec3>,
+        depth: impl Fn(usize, usize) -> Option<f32> + Sync,
+    ) -> Raster<Vec3> {
+        let width = shadow.width();
+        let mut output = shadow.clone();
+        let rows = output.pixels_mut().par_chunks_mut(width).enumerate();
+        rows.for_each(|(y, row)| {
+            for (x, pixel) in row.iter_mut().enumerate() {
+                let at = Vec2::new(x as f32, y as f32) + 0.5;
+                let ends = depth(x, y).map(|depth| self.ends_px(camera, at, depth));
+                // What lies behind the camera then is nowhere in the picture.
+                let Some([Some(opens), Some(closes)]) = ends else {
+                    continue;
+                };
+                if opens.length().max(closes.length()) >= LEAST_PX {
+                    *pixel = 0.5 * (mean(shadow, at, -opens) + mean(shadow, at, -closes));
+                }
+            }
+        });
+        output
+    }
+}
+
+/// The mean of an image along a line from `start`, in the image.
+fn mean(image: &Raster<Vec3>, start: Vec2, along: Vec2) -> Vec3 {
+    let size = Vec2::new(image.width() as f32, image.height() as f32);
+    let along = clipped(start, along, size);
+    let count = 1 + (2.0 * along.length()) as u32;
+    let sum: Vec3 = (0..count)
+        .map(|i| {
+            let at = start + along * ((i as f32 + 0.5) / count as f32) - 0.5;
+            let at = at.clamp(Vec2::ZERO, size - 1.0);
+            let low = at.floor();
+            let (x, y) = (low.x as usize, low.y as usize);
+            let (right, below) = (
+                (x + 1).min(image.width() - 1),
+                (y + 1).min(image.height() - 1),
+            );
+            let rest = at - low;
+            let row = |y: usize| image.get(x, y).lerp(*image.get(right, y), rest.x);
+            row(y).lerp(row(below), rest.y)
+        })
+        .sum();
+    sum / count as f32
+}
+
+/// What of the line `along` from `start`, a place in a picture of `size`, lies in that.
+fn clipped(start: Vec2, along: Vec2, size: Vec2) -> Vec2 {
+    let share = |from: f32, by: f32, most: f32| {
+        let room = if by > 0.0 { most - from } else { from };
+        if by.abs() > room {
+            room / by.abs()
+        } else {
+            1.0
+        }
+    };
+    along * share(start.x, along.x, size.x).min(share(start.y, along.y, size.y))
+}
+
+#[cfg(test)]
+mod tests;

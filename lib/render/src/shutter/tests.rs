@@ -1,0 +1,423 @@
+use dipir_imaging::raster::LinearImage;
+use dipir_imaging::transfer::Transfer;
+use dipir_light::environment::EnvironmentSampler;
+use dipir_numerics::sampler::{Sampler, Stream};
+use dipir_scene::bvh::Bounds;
+use dipir_scene::material::Material;
+use dipir_scene::proxy::Proxy;
+use dipir_scene::scene::Scene;
+
+use super::*;
+use crate::adaptive::Stop;
+use crate::film::Film;
+use crate::footprint::Footprint;
+use crate::gloss::Gloss;
+use crate::job::REPLICATES;
+use crate::lens::ThinLens;
+use crate::optics::Optics;
+use crate::render::{Rendered, Renderer, Settings};
+use crate::shapes::icosphere;
+use crate::testing::{
+    camera, carry_on, everything, ground, matte, render, scene, settings, sky, sun,
+};
+
+const SIDE: u32 = 64;
+/// Paths a pixel and replicate; those by way of the ground.
+const PATHS: u32 = 256;
+const MIRRORED: u32 = 128;
+
+/// Down a street, four metres before a thing on it.
+fn view() -> Camera {
+    camera(
+        Vec3::new(0.0, 1.0, 4.0),
+        Vec3::new(0.0, 0.4, 0.0),
+        40.0,
+        SIDE,
+    )
+}
+
+fn glowing() -> Material {
+    Material {
+        emissive: Vec3::ONE,
+        ..matte(Vec3::ZERO)
+    }
+}
+
+/// The way of [`view`] that goes on by `by` metres of its right, up and back, and `turn` radians about these.
+fn way(by: Vec3, turn: Vec3) -> Shutter {
+    let middle = Stand::of(&view());
+    let end = |share: f32| Stand {
+        position: middle.position + middle.rotation * (by * share),
+        rotation: middle.rotation * Quat::from_scaled_axis(turn * share),
+    };
+    Shutter {
+        opens: end(-1.0),
+        middle,
+        closes: end(1.0),
+    }
+}
+
+fn ways() -> [Shutter; 4] {
+    [
+        way(Vec3::X * 0.15, Vec3::ZERO),
+        way(Vec3::Z * -0.3, Vec3::ZERO),
+        way(Vec3::ZERO, Vec3::new(0.02, 0.04, 0.08)),
+        way(Vec3::new(0.1, 0.04, 0.1), Vec3::new(-0.02, 0.05, 0.03)),
+    ]
+}
+
+fn moving(shutter: Shutter) -> Optics {
+    Optics {
+        shutter: Some(shutter),
+        ..Optics::default()
+    }
+}
+
+fn rendered(scene: &Scene, light: &EnvironmentSampler, optics: Optics) -> Film {
+    let settings = Settings {
+        optics,
+        ..settings(PATHS, 5)
+    };
+    render(scene, light, &everything(1), &settings).film
+}
+
+fn samplers(n: u32) -> impl Iterator<Item = Sampler> {
+    (0..n).map(|i| Sampler::new(7, Stream::TEST, 0, i))
+}
+
+#[test]
+fn the_ends_of_a_line_are_where_the_cameras_at_both_ends_see_the_point() {
+    for shutter in ways() {
+        for mut sampler in samplers(100) {
+            let pixel = sampler.next_2d() * SIDE as f32;
+            for depth in [0.7, 3.0, 1e3, f32::INFINITY] {
+                let ray = view().ray(pixel);
+                let along = ray.direction.dot(-view().rotation.z_axis);
+                let far = if depth.is_finite() { depth } else { 1e6 };
+                let point = ray.origin + ray.direction * (far / along);
+                let ends = shutter.ends_px(&view(), pixel, depth);
+                for (end, time) in ends.into_iter().zip([-1.0, 1.0]) {
+                    let seen = shutter.camera(&view(), time).project(point);
+                    let (Some(end), Some(seen)) = (end, seen) else {
+                        assert_eq!(end, seen, "{depth}");
+                        continue;
+                    };
+                    // Rounding of both, a thousandth of a pixel, grows as the point is far beside the picture.
+                    let off = (pixel + end).distance(seen);
+                    assert!(off < 1e-2 * (1.0 + seen.length() / 64.0), "{off} {depth}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_camera_that_stands_still_sees_what_a_pinhole_sees() {
+    let ball = icosphere(Vec3::new(0.0, 0.5, 0.0), 0.4, 4);
+    let scene = scene(ball, matte(Vec3::splat(0.5)), view(), ground());
+    let still = moving(way(Vec3::ZERO, Vec3::ZERO));
+    let [sharp, same] = [Optics::default(), still].map(|o| rendered(&scene, &sky(1.0), o));
+    for (a, b) in sharp.alpha.pixels().iter().zip(same.alpha.pixels()) {
+        // The same places in the pixel, but for rounding at the edge.
+        assert!((a - b).abs() < 0.02, "{a} {b}");
+    }
+    // Ground is sampled alike.
+    assert_eq!(sharp.shadow, same.shadow);
+}
+
+#[test]
+fn a_small_thing_is_seen_as_a_line() {
+    let center = Vec3::new(0.1, 0.7, 1.0);
+    let ball = icosphere(center, 0.03, 3);
+    let scene = scene(ball, glowing(), view(), Proxy::None);
+    let sharp = rendered(&scene, &sky(0.0), Optics::default());
+    for shutter in [
+        way(Vec3::X * 0.2, Vec3::ZERO),
+        way(Vec3::ZERO, Vec3::new(0.0, 0.05, 0.06)),
+    ] {
+        let soft = rendered(&scene, &sky(0.0), moving(shutter));
+        let [opens, closes] =
+            [-1.0, 1.0].map(|time| shutter.camera(&view(), time).project(center).unwrap());
+        let (middle, length) = (0.5 * (opens + closes), opens.distance(closes));
+        let along = (closes - opens) / length;
+        let moments = |film: &Film| {
+            let pixels = film.alpha.pixels().iter().enumerate();
+            pixels.fold((0.0, Vec2::ZERO), |(sum, square), (i, a)| {
+                let at = Vec2::new((i as u32 % SIDE) as f32, (i as u32 / SIDE) as f32) + 0.5;
+                let off = at - middle;
+                let parts = Vec2::new(off.dot(along), off.perp_dot(along));
+                (sum + a, square + *a * parts * parts)
+            })
+        };
+        let ((area, own), (blurred_area, blurred)) = (moments(&sharp), moments(&soft));
+        let hits = area * (PATHS * REPLICATES as u32) as f32;
+        // Its area changes with its distance by as little as its way is across the view: by a two-hundredth. Four deviations.
+        let change = (blurred_area / area - 1.0).abs();
+        assert!(change < 5e-3 + 4.0 / hits.sqrt(), "{area} {blurred_area}");
+        let [own, blurred] = [own / area, blurred / blurred_area];
+        // A line has a twelfth of its squared length along it, and the deviation of that is 1 / sqrt(1.25) of it; nothing across
+        // but its own bow, a small part of a pixel.
+        let expected = length * length / 12.0;
+        let tolerance = 4.0 / (1.25 * hits).sqrt() + 0.02;
+        assert!(length > 8.0, "{length}");
+        let found = blurred - own;
+        assert!(
+            (found.x / expected - 1.0).abs() < tolerance,
+            "{found} {expected}"
+        );
+        assert!(found.y.abs() < 0.2, "{found}");
+        // Light is spread as coverage is.
+        let off = |(o, a): (&Vec3, &f32)| (o.x - a).abs();
+        let pairs = soft.object.pixels().iter().zip(soft.alpha.pixels());
+        assert!(pairs.map(off).fold(0f32, f32::max) < 1e-5);
+    }
+}
+
+#[test]
+fn shadows_are_averaged_along_the_lines_of_the_ground() {
+    let ball = icosphere(Vec3::new(0.0, 0.5, 0.0), 0.35, 4);
+    let light = sun(Vec3::new(0.5, 1.0, 0.3).normalize(), 4e3, 0.3, 128);
+    let scene = scene(ball, matte(Vec3::splat(0.5)), view(), ground());
+    let light = EnvironmentSampler::new(light);
+    let sharp = rendered(&scene, &light, Optics::default()).shadow;
+    let ratio_at = |p: Vec2| {
+        let last = Vec2::splat(SIDE as f32 - 1.0);
+        let [x, y] = p.floor().clamp(Vec2::ZERO, last).to_array();
+        sharp.get(x as usize, y as usize).x
+    };
+    for shutter in ways() {
+        let optics = moving(shutter);
+        let soft = rendered(&scene, &light, optics).shadow;
+        let (mut most, mut changed) = (0f32, 0f32);
+        for i in 0..(SIDE * SIDE) as usize {
+            let (x, y) = (i % SIDE as usize, i / SIDE as usize);
+            let corner = Vec2::new(x as f32, y as f32);
+            // What the cameras of the way see of the ground, looked up where that of the picture sees it.
+            let (mut sum, mut is_whole) = (0.0, true);
+            for mut sampler in samplers(512) {
+                let place = corner + sampler.next_2d();
+                let ray = optics.ray(&view(), place, &mut sampler);
+                let ahead = -ray.origin.y / ray.direction.y;
+                match view().project(ray.origin + ray.direction * ahead) {
+                    Some(p) if ahead > 0.0 => {
+                        is_whole &= p.min_element() >= 0.0 && p.max_element() <= SIDE as f32;
+                        sum += ratio_at(p) / 512.0;
+                    }
+                    _ => is_whole = false,
+                }
+            }
+            // Beside the picture nothing is known.
+            if is_whole {
+                most = most.max((sum - soft.get(x, y).x).abs());
+                changed = changed.max((sharp.get(x, y).x - soft.get(x, y).x).abs());
+            }
+        }
+        // A ratio is looked up as that of a whole pixel, up to half a pixel off: of an edge by .8 over six pixels that is .07.
+        assert!(most < 0.07 && changed > 0.1, "{most} {changed}");
+    }
+}
+
+#[test]
+fn a_straight_edge_of_a_shadow_is_a_ramp() {
+    let edge = 48;
+    let values = (0..96 * 64).map(|i| Vec3::splat(if i % 96 < edge { 0.25 } else { 1.0 }));
+    let shadow = Raster::from_pixels(96, 64, values.collect());
+    let camera = Camera {
+        resolution: [96, 64],
+        ..view()
+    };
+    let shutter = way(Vec3::X * 0.1, Vec3::ZERO);
+    let blurred = shutter.blurred(&camera, &shadow, |_, y| (y < 60).then_some(2.0));
+    let [Some(opens), Some(closes)] = shutter.ends_px(&camera, camera.principal_px, 2.0) else {
+        panic!("it is before the camera");
+    };
+    let length = opens.distance(closes);
+    assert!(length > 8.0 && (opens + closes).length() < 1e-4);
+    for x in 0..96 {
+        let t = (x as f32 + 0.5 - edge as f32) / length;
+        let lit = (0.5 + t).clamp(0.0, 1.0);
+        let found = blurred.get(x, 32).x;
+        // An edge between two pixels is one pixel wide, and samples are half a pixel apart.
+        assert!(
+            (found - (0.25 + 0.75 * lit)).abs() < 0.75 * 0.5 / length,
+            "{x}: {found}"
+        );
+        assert_eq!(blurred.get(x, 62), shadow.get(x, 62));
+    }
+}
+
+#[test]
+fn the_stated_error_holds_at_edges_that_move() {
+    let ball = icosphere(Vec3::new(0.0, 0.5, 0.0), 0.5, 4);
+    let scene = scene(ball, matte(Vec3::splat(0.7)), view(), ground());
+    let n = SIDE as usize;
+    let photo = LinearImage(Raster::filled(n, n, Vec3::splat(0.5)));
+    let optics = Optics {
+        lens: Some(ThinLens {
+            radius: 0.03,
+            focus: 1.5,
+        }),
+        ..moving(way(Vec3::X * 0.3, Vec3::Z * 0.03))
+    };
+    let light = sky(0.4);
+    let with = |stop, seed, denoise| {
+        let settings = Settings {
+            seed,
+            stop,
+            denoise,
+            optics,
+            background: Some(&photo),
+            transfer: Transfer::Srgb,
+            ..Settings::default()
+        };
+        let simulation = everything(2);
+        let renderer = Renderer::new(&scene);
+        renderer
+            .render(&light, &simulation, &settings, &mut carry_on)
+            .expect("renders")
+    };
+    let shown = |film: &Film| -> Vec<f32> {
+        let pixels = photo.0.pixels().iter().enumerate();
+        let shown = pixels.map(|(i, b)| {
+            let (o, a, s) = (
+                film.object.pixels()[i],
+                film.alpha.pixels()[i],
+                film.shadow.pixels()[i],
+            );
+            Transfer::Srgb.encode_scalar((*b * s * (1.0 - a) + o).y)
+        });
+        shown.collect()
+    };
+    let truth = shown(&with(Stop::Samples(2048), 1, false).film);
+    let error = |rendered: &Rendered| {
+        let found = shown(&rendered.film);
+        let touched = (0..truth.len()).filter(|&i| {
+            rendered.film.alpha.pixels()[i] > 0.0
+                || (rendered.film.shadow.pixels()[i].y - 1.0).abs() > 0.01
+        });
+        let squares: Vec<f32> = touched.map(|i| (found[i] - truth[i]).powi(2)).collect();
+        f64::from(squares.iter().sum::<f32>() / squares.len() as f32).sqrt()
+    };
+    for denoise in [false, true] {
+        let rendered = with(Stop::TargetError(0.008), 2, denoise);
+        // Some thousand pixels know the error to a few per cent; the bound is one of 95%.
+        let error = error(&rendered);
+        assert!(
+            error < 1.1 * rendered.error.upper_95,
+            "{denoise}: {error} {:?}",
+            rendered.error
+        );
+    }
+}
+
+#[test]
+fn polished_ground_mirrors_as_much_light_for_a_camera_that_moves() {
+    let ball = icosphere(Vec3::new(0.0, 0.9, 0.0), 0.15, 4);
+    let scene = scene(ball, glowing(), view(), ground());
+    let sum = |optics| {
+        let settings = Settings {
+            optics,
+            gloss: Some(Gloss {
+                roughness: 0.0,
+                reflectance: 0.5,
+            }),
+            ..settings(MIRRORED, 3)
+        };
+        let rendered = render(&scene, &sky(0.0), &everything(1), &settings);
+        let mirrored = rendered.film.mirrored.expect("is polished");
+        mirrored.pixels().iter().map(|v| v.x).sum::<f32>()
+    };
+    let across = moving(way(Vec3::X * 0.2, Vec3::ZERO));
+    let [sharp, soft] = [Optics::default(), across].map(sum);
+    // Four deviations of the number of paths that meet the ball; each brings light of at most 1. A two-hundredth is what its
+    // distance changes.
+    let hits = sharp * (MIRRORED * REPLICATES as u32) as f32;
+    assert!(
+        (soft / sharp - 1.0).abs() < 5e-3 + 4.0 / hits.sqrt(),
+        "{sharp} {soft}"
+    );
+}
+
+#[test]
+fn every_pixel_that_sees_a_point_on_the_way_is_held() {
+    let bounds = Bounds {
+        min: Vec3::new(-0.6, 0.2, -0.5),
+        max: Vec3::new(0.3, 0.9, 0.5),
+    };
+    let whirl = way(Vec3::new(0.3, -0.1, 0.4), Vec3::new(0.1, 0.2, 2.8));
+    for shutter in ways().into_iter().chain([whirl]) {
+        let held = Footprint::new(&view(), moving(shutter), Some(bounds), &[]);
+        let mut seen = 0;
+        for mut sampler in samplers(4000) {
+            let (u, v) = (sampler.next_2d(), sampler.next_1d());
+            let p = bounds.min + (bounds.max - bounds.min) * u.extend(v);
+            let at = shutter.camera(&view(), 2.0 * sampler.next_1d() - 1.0);
+            let Some(px) = at.project(p) else { continue };
+            if px.min_element() >= 0.0 && px.max_element() < SIDE as f32 {
+                seen += 1;
+                assert!(held.holds(px.x as u32, px.y as u32), "{p}");
+            }
+        }
+        assert!(seen > 1000);
+        assert!(shutter == whirl || !held.holds(0, 0));
+    }
+}
+
+#[test]
+fn pictures_stay_finite_where_way_and_scene_are_extreme() {
+    let ball = |center: Vec3, radius: f32| icosphere(center, radius, 2);
+    let from = view().position;
+    let ahead = |far: f32| from - view().rotation.z_axis * far;
+    let offset = Vec3::splat(1e6);
+    let cases = [
+        ("a way through the object", ball(ahead(0.5), 0.3), view()),
+        (
+            "an object behind the camera",
+            ball(ahead(-2.0), 0.5),
+            view(),
+        ),
+        (
+            "a camera in the plane",
+            ball(Vec3::Y * 0.3, 0.3),
+            camera(Vec3::Z * 3.0, Vec3::ZERO, 40.0, 16),
+        ),
+        (
+            "a picture of one pixel",
+            ball(Vec3::Y * 0.4, 0.4),
+            view().scaled([1, 1]),
+        ),
+        (
+            "a scene far from the origin",
+            ball(offset + Vec3::Y, 1.0),
+            camera(offset + Vec3::new(0.0, 1.0, 8.0), offset, 40.0, 16),
+        ),
+    ];
+    for (name, mesh, view) in cases {
+        let view = view.scaled(view.resolution.map(|n| n.min(16)));
+        let scene = scene(mesh, glowing(), view, ground());
+        let middle = Stand::of(&view);
+        for by in [1e-6, 1.0, 1e4] {
+            for turn in [0.0, 1.5, 3.2] {
+                let end = |share: f32| Stand {
+                    position: middle.position - view.rotation.z_axis * by * share,
+                    rotation: middle.rotation * Quat::from_rotation_y(turn * share),
+                };
+                let settings = Settings {
+                    optics: moving(Shutter {
+                        opens: end(-1.0),
+                        middle,
+                        closes: end(1.0),
+                    }),
+                    denoise: true,
+                    ..settings(4, 1)
+                };
+                let film = render(&scene, &sky(1.0), &everything(2), &settings).film;
+                let case = format!("{name}, {by}, {turn}");
+                let finite = |r: &Raster<Vec3>| r.pixels().iter().all(|v| v.is_finite());
+                assert!(finite(&film.object) && finite(&film.shadow), "{case}");
+                let covers = |a: &f32| (0.0..=1.0 + 1e-6).contains(a);
+                assert!(film.alpha.pixels().iter().all(covers), "{case}");
+            }
+        }
+    }
+}

@@ -1,0 +1,113 @@
+//! Cameras that move while their shutter is open.
+use dipir_imaging::layers::Layers;
+use serde_json::Value;
+
+use crate::project::*;
+
+/// A project whose photograph is the second of three frames of a camera that goes a metre a frame to the right.
+fn project() -> Project {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    let (head, tail) = text.split_once("[scene.camera]\n").unwrap();
+    let (_, tail) = tail.split_once("[scene.proxy]\n").unwrap();
+    let text = format!("{head}[scene.camera]\nfile = \"shot.chan\"\n[scene.proxy]\n{tail}");
+    let text = text.replace("background.png", "f.02.png");
+    project.write("pipeline.toml", text);
+    project.write("f.02.png", project.read("background.png"));
+    let lines = ["1 -1", "2 0", "3 1"].map(|begin| format!("{begin} 1.2 4 -12 0 0 40\n"));
+    project.write("shot.chan", lines.concat());
+    project
+}
+
+fn blurred(project: &Project, frame: &str) -> (usize, Value) {
+    let folder = format!("out/{frame}composite");
+    let layers = Layers::read_exr(project.path(&format!("{folder}/composite.exr"))).unwrap();
+    let alpha = layers.channel("object.A").unwrap();
+    let [object, shadow, background, picture] =
+        ["object", "shadow", "background", ""].map(|name| layers.rgb(name).unwrap());
+    for (i, a) in alpha.pixels().iter().enumerate() {
+        let again = background.pixels()[i] * shadow.pixels()[i] * (1.0 - a) + object.pixels()[i];
+        // Half precision has 11 bits, and rounds each layer once.
+        let off = (again - picture.pixels()[i]).abs().max_element();
+        assert!(
+            off <= 2e-3 * picture.pixels()[i].max_element().max(0.01),
+            "{i} {off}"
+        );
+    }
+    let edges = alpha.pixels().iter().filter(|a| **a > 0.0 && **a < 1.0);
+    let look = serde_json::from_slice(&project.read(&format!("{folder}/look.json"))).unwrap();
+    (edges.count(), look)
+}
+
+#[test]
+fn what_the_camera_passes_is_blurred_and_takes_the_composite_alone() {
+    let project = project();
+    project.run_both(&[]);
+    let (sharp, look) = blurred(&project, "");
+    assert!(look.get("moving_px").is_none(), "{look}");
+    let plain = project.read("out/composite/composite.exr");
+    let open = ["--set", "composite.shutter_deg=180"];
+    let run = project.run(DIPIR, &[&["run"], &open[..]].concat());
+    run.expect_success();
+    assert!(run.stdout.contains("ran composite"), "{}", run.stdout);
+    assert!(!run.stdout.contains("ran scene"), "{}", run.stdout);
+    let told = "motion blur: points of the objects are lines of";
+    assert!(run.stdout.contains(told), "{}", run.stdout);
+    let file = project.read("out/composite/composite.exr");
+    let (soft, look) = blurred(&project, "");
+    // 24 rows of 40 degrees are 33 focal lengths: times .5 m, over 3 to 5 m.
+    let [least, most] = [0, 1].map(|i| look["moving_px"][i].as_f64().unwrap());
+    assert!(least > 3.2 && least < most && most < 5.6, "{look}");
+    assert!(soft > sharp, "{sharp} {soft}");
+    let run = project.run(COMPOSITE, &[&["-j", "1"], &open[..]].concat());
+    run.expect_success();
+    assert_eq!(project.read("out/composite/composite.exr"), file);
+    // Of a neighbour that was tracked anew the composite depends, though the scene is as it was.
+    let lines = String::from_utf8(project.read("shot.chan")).unwrap();
+    project.write("shot.chan", lines.replace("3 1 ", "3 2 "));
+    let run = project.run(DIPIR, &[&["run"], &open[..]].concat());
+    run.expect_success();
+    assert!(
+        run.stdout.contains("ran scene, composite"),
+        "{}",
+        run.stdout
+    );
+    assert_ne!(project.read("out/composite/composite.exr"), file);
+    project.write("shot.chan", lines);
+    // A frame at either end of the shot goes on as it came.
+    project.write("f.03.png", project.read("f.02.png"));
+    let run = project.run(DIPIR, &[&["shot", "f.03.png"], &open[..]].concat());
+    run.expect_success();
+    let (_, look) = blurred(&project, "frames/f.03/");
+    assert!(look["moving_px"][0].as_f64().unwrap() > 3.0, "{look}");
+    // Too short to be seen: the same picture as without.
+    let run = project.run(COMPOSITE, &["--set", "composite.shutter_deg=1"]);
+    run.expect_success();
+    let told = "motion blur: the camera hardly moves past the objects";
+    assert!(run.stdout.contains(told), "{}", run.stdout);
+    assert_eq!(project.read("out/composite/composite.exr"), plain);
+}
+
+#[test]
+fn a_shutter_that_makes_no_sense_is_refused() {
+    let project = project();
+    for deg in ["0", "361"] {
+        let set = format!("composite.shutter_deg={deg}");
+        let run = project.run(SCENE, &["--set", &set]);
+        run.expect_error(
+            2,
+            &format!(
+                "error: --set {set}: composite.shutter_deg: {deg}.0 is out of range; accepted: degrees above 0, at most 360, as in 180"
+            ),
+        );
+    }
+    let lines = String::from_utf8(project.read("shot.chan")).unwrap();
+    let own = lines.lines().nth(1).unwrap();
+    project.write("shot.chan", own);
+    let run = project.run(SCENE, &["--set", "composite.shutter_deg=180"]);
+    assert_eq!(run.code, Some(2), "{}", run.stderr);
+    let told = "composite.shutter_deg: the camera moves from frame to frame, and scene.camera.file has none before or after \
+                the photograph's: name the shot's .chan";
+    assert!(run.stderr.contains(told), "{}", run.stderr);
+    assert!(!project.path("out/scene").exists());
+}
