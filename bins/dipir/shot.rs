@@ -66,6 +66,8 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     };
     let of_photo = RunArgs::needed(&common, Some(last));
     if args.plan {
+        // Without a scene nobody knows yet.
+        focus(&mut frames, shot::focused(&session).unwrap_or_default());
         expose(args, &session, &mut frames, &told, false)?;
         let photo = run_one(&of_photo.planned(), &base)?;
         let (words, json) = plan::frames(&session, photo, &frames, args.force)?;
@@ -89,6 +91,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     if !common.output.json {
         common.output.result(|| done, || Value::Null);
     }
+    focus(&mut frames, shot::focused(&session)?);
     expose(args, &session, &mut frames, &told, true)?;
     let of_frames = RunArgs::needed(&common, None).forced(args.force);
     run_each(&of_frames, frames, |failed| {
@@ -159,6 +162,13 @@ fn frames(
         shot::check_cameras(&opened?)?;
     }
     Ok((frames, told))
+}
+
+/// Focuses all frames alike.
+fn focus(frames: &mut [Frame], focused: Vec<String>) {
+    for (_, frame) in frames {
+        frame.set.extend_from_slice(&focused);
+    }
 }
 
 /// Gives each frame light of its exposure and white balance: the exposure is what is `told`, all else what the pictures tell,

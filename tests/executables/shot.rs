@@ -149,6 +149,15 @@ fn frames_are_exposed_as_their_exif_data_say() {
     };
     shot(&project, &["longer.jpg", "same.jpg", "warm.jpg"]);
     assert_eq!(["longer", "same", "warm"].map(stops), [1.0, 0.0, 0.0]);
+    // What objects emit is exposed as long.
+    let emission = |name: &str| {
+        let manifest = project.read(&format!("out/frames/{name}/composite/stage.json"));
+        let value: Value = serde_json::from_slice(&manifest).unwrap();
+        value["params"]["emission"].clone()
+    };
+    assert_eq!(emission("longer"), json!([2.0, 2.0, 2.0]));
+    assert_eq!(emission("same"), Value::Null);
+    assert!(emission("warm")[0].as_f64() > Some(1.0));
     // The white balance is that of the pictures all the same: 110 is .61 stops over 90, and a level of 8 bits is .03.
     let warm = project.read("out/frames/warm/composite/stage.json");
     let warm: Value = serde_json::from_slice(&warm).unwrap();

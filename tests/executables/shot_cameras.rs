@@ -31,6 +31,25 @@ fn frame_at(name: &str, [x, y]: [f64; 2]) -> Value {
     json!({ "file_path": name, "transform_matrix": matrix })
 }
 
+/// Two cameras, one of which moves: x is .5, .25 and -.5 at 1/24, 2/24 and 3/24 s.
+fn moving_gltf() -> String {
+    let keys: [f32; 12] = [1.0, 2.0, 3.0, 0.5, 1.5, 5.0, 0.25, 1.5, 5.0, -0.5, 1.5, 5.0];
+    let keys = keys.iter().enumerate();
+    let keys = keys.flat_map(|(i, k)| if i < 3 { k / 24.0 } else { *k }.to_le_bytes());
+    let keys = BASE64_STANDARD_NO_PAD.encode(keys.collect::<Vec<u8>>());
+    let accessor = |view: u32, kind: &str| json!({ "bufferView": view, "componentType": 5126, "type": kind, "count": 3 });
+    let channel = json!({ "sampler": 0, "target": { "node": 1, "path": "translation" } });
+    let file = json!({
+        "nodes": [{ "name": "still", "camera": 0, "translation": [0.0, 1.5, 5.0] }, { "name": "tracked", "camera": 0 }],
+        "cameras": [{ "perspective": { "yfov": 0.7 } }],
+        "buffers": [{ "uri": format!("data:;base64,{keys}") }],
+        "bufferViews": [{ "buffer": 0, "byteLength": 12 }, { "buffer": 0, "byteOffset": 12, "byteLength": 36 }],
+        "accessors": [accessor(0, "SCALAR"), accessor(1, "VEC3")],
+        "animations": [{ "samplers": [{ "input": 0, "output": 1 }], "channels": [channel] }],
+    });
+    file.to_string()
+}
+
 #[test]
 fn every_frame_has_the_camera_of_its_name() {
     let project = project();
@@ -114,22 +133,21 @@ fn every_frame_has_the_camera_of_its_name() {
         &["a.png"],
         "a.png: its name does not end in the number of a frame of .chan",
     );
-    // So has a glTF camera that moves: x is .5, .25 and -.5 at 1/24, 2/24 and 3/24 s.
-    let keys: [f32; 12] = [1.0, 2.0, 3.0, 0.5, 1.5, 5.0, 0.25, 1.5, 5.0, -0.5, 1.5, 5.0];
-    let keys = keys.iter().enumerate();
-    let keys = keys.flat_map(|(i, k)| if i < 3 { k / 24.0 } else { *k }.to_le_bytes());
-    let keys = BASE64_STANDARD_NO_PAD.encode(keys.collect::<Vec<u8>>());
-    let accessor = |view: u32, kind: &str| json!({ "bufferView": view, "componentType": 5126, "type": kind, "count": 3 });
-    let channel = json!({ "sampler": 0, "target": { "node": 1, "path": "translation" } });
-    let moving = json!({
-        "nodes": [{ "name": "still", "camera": 0 }, { "name": "tracked", "camera": 0 }],
-        "cameras": [{ "perspective": { "yfov": 0.7 } }],
-        "buffers": [{ "uri": format!("data:;base64,{keys}") }],
-        "bufferViews": [{ "buffer": 0, "byteLength": 12 }, { "buffer": 0, "byteOffset": 12, "byteLength": 36 }],
-        "accessors": [accessor(0, "SCALAR"), accessor(1, "VEC3")],
-        "animations": [{ "samplers": [{ "input": 0, "output": 1 }], "channels": [channel] }],
-    });
-    project.write("shot.gltf", moving.to_string());
+    // A version is no number of a frame, and a frame that is written counts for others.
+    for name in ["p.1001_v2.png", "p.1002_v2.png", "f_1001.png", "f_1002.png"] {
+        project.write(name, &photo);
+    }
+    refused(
+        &["p.1001_v2.png", "p.1002_v2.png"],
+        "p.1002_v2.png: the camera moves, and 2, the number at the end of its name, is that of p.1001_v2.png, too: rename the \
+         pictures so that the frame's number ends their names, as in plate.1001.png",
+    );
+    let own = "scene.background=f_1001.png";
+    let run = project.run(DIPIR, &["shot", "--set", own, "f_1002.png"]);
+    run.expect_success();
+    assert_eq!(place("frames/f_1002"), -0.5);
+    // So has a glTF camera that moves.
+    project.write("shot.gltf", moving_gltf());
     let plates = ["p.1001.png", "p.1003.png"];
     plates.iter().for_each(|name| project.write(name, &photo));
     with("file = \"shot.gltf\"\nimage = \"tracked\"\nframe = 2");
@@ -146,11 +164,47 @@ fn every_frame_has_the_camera_of_its_name() {
     assert!(!run.stderr.contains("is taken to be"), "{}", run.stderr);
     let places = ["frames/p.1001", "frames/p.1003"].map(place);
     assert_eq!(places, [0.25, -0.5]);
+    let beyond = "in frame 4 it stands as in frame 3";
+    assert!(run.stderr.contains(beyond), "{}", run.stderr);
+    // One that stands still is that of all frames.
+    with("file = \"shot.gltf\"\nimage = \"still\"");
+    shot(&project, &["p.1001.png", "p.1003.png"]);
+    assert_eq!(["frames/p.1001", "frames/p.1003"].map(place), [0.0; 2]);
     with("transforms = \"transforms.json\"\ntransforms_up = \"y\"");
     refused(
         &["a.png"],
         "scene.camera.transforms names frames by number: write file in its place, which finds them by the names of their pictures",
     );
+}
+
+#[test]
+fn a_picture_that_joins_the_others_may_change_the_frame() {
+    let project = project();
+    let photo = project.read("background.png");
+    project.write("shot.gltf", moving_gltf());
+    let own = ["--set", "scene.background=p.1002.png"];
+    for name in ["p.1002.png", "p.1003.png"] {
+        project.write(name, &photo);
+    }
+    // Of one camera alone the pictures tell the frame.
+    let alone = moving_gltf().replacen("\"camera\":0,", "", 1);
+    project.write("shot.gltf", alone);
+    set_camera(&project, "file = \"shot.gltf\"", None);
+    project.run(SCENE, &own).expect_success();
+    let x = || {
+        let scene: Value = serde_json::from_slice(&project.read("out/scene/scene.json")).unwrap();
+        scene["camera"]["position"][0].as_f64().unwrap()
+    };
+    assert_eq!(x(), 0.5);
+    project.write("p.1001.png", &photo);
+    let status = project.run(DIPIR, &[&["status"], &own[..]].concat());
+    assert!(
+        status.stdout.contains("camera_frame changed from 1 to 2"),
+        "{}",
+        status.stdout
+    );
+    project.run(SCENE, &own).expect_success();
+    assert_eq!(x(), 0.25);
 }
 
 #[test]
@@ -178,6 +232,10 @@ fn objects_and_ground_are_as_in_the_photograph() {
     ];
     let run = project.run(DIPIR, &[&["shot", "f.1.png"][..], &at_pixel].concat());
     run.expect_error(2, "error: f.1.png: its mask roto.1.png is missing");
+    // What is switched off is not asked for.
+    let off = ["--plan", "--set", "scene.effects.occluders=off"];
+    let run = project.run(DIPIR, &[&["shot", "f.1.png"][..], &at_pixel, &off].concat());
+    run.expect_success();
     write_png(project.path("roto.1.png"), &black).unwrap();
     // Each frame of a camera that moves has depths of its own.
     for (depth, why) in [

@@ -1,4 +1,5 @@
 //! A shot: frames that one light lights.
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -8,12 +9,13 @@ use dipir_cli::exit::{Usage, printable};
 use dipir_cli::session::Session;
 use dipir_imaging::facts::Facts;
 use dipir_pipeline::mark::Owned;
-use dipir_scene::config::{CameraConfig, SceneConfig};
+use dipir_scene::config::{CameraConfig, EffectSwitch, SceneConfig};
 use rayon::prelude::*;
 use serde_json::json;
 
 use crate::composite::table::CompositeTable;
 use crate::names::COMPOSITE;
+use crate::scene::folder::SceneFolder;
 use crate::scene::with_place;
 
 pub mod exposure;
@@ -59,15 +61,14 @@ pub fn exposure_stops(session: &Session, path: &Path) -> anyhow::Result<Option<f
 /// Whether all frames have one camera.
 ///
 /// # Errors
-/// If `[scene]` cannot be read.
+/// If `[scene]` cannot be read, or has a camera that cannot be one.
 pub fn camera_stands_still(session: &Session) -> anyhow::Result<bool> {
     let scene: SceneConfig = session.config.table("scene")?;
-    let file = scene.camera.and_then(|camera| camera.file);
-    let has_one = |file| file::has_one(&session.config.base_dir().join(file));
-    Ok(file.is_none_or(has_one))
+    let still = scene.camera_stands_still(&session.config.base_dir());
+    still.map_err(|e| with_place(e, &session.config))
 }
 
-/// What makes the light that of a frame which is exposed by `stops` more than the session's photograph and has its white
+/// What makes the light, and what objects emit, that of a frame which is exposed by `stops` more than the session's photograph and has its white
 /// balance by `tint`, stops of each channel, as `KEY=VALUE`.
 ///
 /// # Errors
@@ -76,15 +77,48 @@ pub fn exposed(session: &Session, stops: f64, tint: [f64; 3]) -> anyhow::Result<
     let composite: CompositeTable = session.config.table("composite")?;
     let mut set = Vec::new();
     if stops != 0.0 {
-        let exposure_ev = f64::from(composite.exposure_ev) + stops;
-        set.push(format!("composite.exposure_ev={exposure_ev:.3}"));
+        let own = [
+            ("exposure_ev", composite.exposure_ev),
+            ("emission_ev", composite.emission_ev.unwrap_or_default()),
+        ];
+        set.extend(own.map(|(key, ev)| {
+            let ev = f64::from(ev) + stops;
+            format!("composite.{key}={ev:.3}")
+        }));
     }
     if tint != [0.0; 3] {
-        let own = composite.tint.unwrap_or_default();
-        let [r, g, b]: [f64; 3] = std::array::from_fn(|k| f64::from(own[k]) + tint[k]);
-        set.push(format!("composite.tint=[{r:.3}, {g:.3}, {b:.3}]"));
+        let own = [
+            ("tint", composite.tint),
+            ("emission_tint", composite.emission_tint),
+        ];
+        set.extend(own.map(|(key, own)| {
+            let own = own.unwrap_or_default();
+            let [r, g, b]: [f64; 3] = std::array::from_fn(|k| f64::from(own[k]) + tint[k]);
+            format!("composite.{key}=[{r:.3}, {g:.3}, {b:.3}]")
+        }));
     }
     Ok(set)
+}
+
+/// What makes a frame focused as the session's photograph is, whose scene is set up: the same distance and opening, as
+/// `KEY=VALUE`. Nothing where no key says what is in focus.
+///
+/// # Errors
+/// As [`CompositeTable::optics`], and if the scene cannot be read.
+pub fn focused(session: &Session) -> anyhow::Result<Vec<String>> {
+    let composite: CompositeTable = session.config.table("composite")?;
+    if composite.focus_m.is_none() && composite.focus_at_pixel.is_none() {
+        return Ok(Vec::new());
+    }
+    let loaded = SceneFolder::read(session)?.loaded;
+    let lens = composite.lens(&session.config, &loaded)?;
+    Ok(lens.map_or_else(Vec::new, |lens| {
+        let aperture_mm = 2e3 * lens.radius;
+        vec![
+            format!("composite.focus_m={:?}", lens.focus),
+            format!("composite.aperture_mm={aperture_mm:?}"),
+        ]
+    }))
 }
 
 /// What sets each of `frames` in place of the session's photograph, as `KEY=VALUE`. The camera is its own, unless it
@@ -107,7 +141,7 @@ pub fn overrides(
     if stands_still && camera.transforms.is_none() {
         return Ok(sets);
     }
-    if let Some(depth) = &scene.depth {
+    if let Some(depth) = scene.depth.as_ref().filter(|_| masks(&scene)) {
         let without = |path: &&PathBuf| beside(depth, &scene, path).is_none();
         if let Some(frame) = frames.iter().find(without) {
             let why = "the camera moves, and scene.depth has no file for it: name those of the frames as their pictures, or \
@@ -116,28 +150,52 @@ pub fn overrides(
         }
     }
     let moved = moved(session, &scene, camera, frames, tell)?;
+    let mut taken = BTreeMap::new();
     for ((set, path), moved) in sets.iter_mut().zip(frames).zip(moved) {
-        if let Some(number) = moved {
-            // The number alone would take the place of the camera's name.
-            let name = camera.image.iter();
+        let key = key_of_frame(camera)?;
+        let numbered = match (moved, key) {
+            (None, Some("frame")) => Some(frame_of_chan(&scene, camera, path)?),
+            _ => moved,
+        };
+        if let Some(frame) = numbered {
+            let own = number(path);
+            if let Some((own, other)) = own.and_then(|own| Some((own, taken.insert(own, path)?))) {
+                let why = format!(
+                    "the camera moves, and {own}, the number at the end of its name, is that of {}, too: rename the pictures so \
+                     that the frame's number ends their names, as in plate.1001.png",
+                    other.display()
+                );
+                return Err(wrong(path, &why).into());
+            }
+            // The number alone would take the place of a glTF camera's name.
+            let name = camera.image.iter().filter(|_| moved.is_some());
             set.extend(name.map(|name| format!("scene.camera.image={}", json!(name))));
-            set.push(format!("scene.camera.frame={number}"));
-        } else if let Some(key) = key_of_frame(camera)? {
-            let value = match key {
-                "frame" => number(path)
-                    .ok_or_else(|| {
-                        wrong(
-                            path,
-                            "its name does not end in the number of a frame of .chan",
-                        )
-                    })?
-                    .to_string(),
-                _ => text(path, &std::path::absolute(path)?)?,
-            };
+            set.push(format!("scene.camera.frame={frame}"));
+        } else if let Some(key) = key {
+            let value = text(path, &std::path::absolute(path)?)?;
             set.push(format!("scene.camera.{key}={value}"));
         }
     }
     Ok(sets)
+}
+
+/// Whether masks and depths are read.
+fn masks(scene: &SceneConfig) -> bool {
+    scene.effects.occluders != Some(EffectSwitch::Off)
+}
+
+/// The frame of a `.chan` file that the picture in `path` is. Where the photograph's is written, others are counted from it.
+fn frame_of_chan(scene: &SceneConfig, camera: &CameraConfig, path: &Path) -> Result<u32, Usage> {
+    let why = "its name does not end in the number of a frame of .chan";
+    let number = number(path).ok_or_else(|| wrong(path, why))?;
+    Ok(counted(scene, camera, number).unwrap_or(number))
+}
+
+/// The frame that a picture of this number is, by the photograph's number and the frame that is written for it.
+fn counted(scene: &SceneConfig, camera: &CameraConfig, number: u32) -> Option<u32> {
+    let photo = scene.background.as_deref().and_then(self::number)?;
+    let frame = i64::from(camera.frame?) + i64::from(number) - i64::from(photo);
+    Some(frame.clamp(0, u32::MAX.into()) as u32)
 }
 
 /// Refuses frames without a camera, each with the session that makes it, before anything runs.
@@ -201,7 +259,10 @@ fn picture(session: &Session, scene: &SceneConfig, path: &Path) -> anyhow::Resul
         "scene.background={}",
         text(path, &std::path::absolute(path)?)?
     )];
-    let own = |given: &Option<PathBuf>| beside(given.as_ref()?, scene, path);
+    let own = |given: &Option<PathBuf>| {
+        let given = given.as_ref().filter(|_| masks(scene));
+        beside(given?, scene, path)
+    };
     for (key, what, own) in [
         ("occluders", "its mask", own(&scene.occluders)),
         ("depth", "the file of its depths", own(&scene.depth)),
@@ -235,20 +296,18 @@ fn moved(
     let photos = frames.iter().map(std::path::absolute);
     let photos: Vec<PathBuf> = photos.collect::<std::io::Result<_>>()?;
     let shown = file::all_shown(&own, camera.image.as_deref(), &photos).map_err(named)?;
-    let photo = scene.background.as_deref().and_then(number);
     let mut frame_of = |path: &Path, shown: Shown| {
-        let written = camera.frame.zip(photo).zip(number(path));
-        if let Some(((written, photo), number)) = written {
-            let frame = i64::from(written) + i64::from(number) - i64::from(photo);
-            return Ok(u32::try_from(frame.max(0))?);
+        if let Some(frame) = number(path).and_then(|number| counted(scene, camera, number)) {
+            return frame;
         }
         let assumed = format!("\"{}\": {}", own.display(), shown.assumed);
         tell(assumed, shown.is_doubtful);
-        Ok(shown.frame)
+        shown.frame
     };
     let all = frames.iter().zip(shown);
-    all.map(|(path, shown)| shown.map(|shown| frame_of(path, shown)).transpose())
-        .collect()
+    Ok(all
+        .map(|(path, shown)| shown.map(|shown| frame_of(path, shown)))
+        .collect())
 }
 
 /// The key that chooses a frame's camera, if its picture's name does not.
