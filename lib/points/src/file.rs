@@ -53,6 +53,16 @@ fn is_colmap(path: &Path) -> bool {
     path.file_stem().is_some_and(|s| s == "points3D")
 }
 
+/// Whether a path of this name stands for COLMAP's points: its `points3D`, or a folder, which may have a dot in its name.
+pub fn is_model(path: &Path) -> bool {
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    let is_other = matches!(
+        extension.as_deref(),
+        Some("ply" | "pcd" | "bin" | "txt" | "exr" | "png")
+    );
+    !is_other || is_colmap(path)
+}
+
 /// Reads points.
 ///
 /// # Errors

@@ -235,8 +235,9 @@ fn points(
 
 /// Which axis points up in the points: of COLMAP's as `dipir run` has it, that of the camera, which is in their world.
 fn points_up(request: &Request, path: &Path) -> Option<WorldUp> {
-    let is_colmap = path.extension().is_none() || path.file_stem().is_some_and(|s| s == "points3D");
-    let of_camera = request.camera_up.filter(|_| is_colmap);
+    let of_camera = request
+        .camera_up
+        .filter(|_| dipir_points::file::is_model(path));
     request.points_up.or(of_camera)
 }
 
@@ -458,20 +459,20 @@ mod tests {
         put_turned(&at("photo.png"), [30, 20], &|x, _| x as u8, 1);
         std::fs::write(at("a.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
         // A level camera at the origin of a world with +y up, and the ground 2 m below it.
-        std::fs::create_dir(at("sparse")).unwrap();
-        std::fs::write(at("sparse/cameras.txt"), "1 PINHOLE 30 20 25 25 15 10\n").unwrap();
-        std::fs::write(at("sparse/images.txt"), "1 0 1 0 0 0 0 0 1 photo.png\n\n").unwrap();
+        std::fs::create_dir(at("v1.2")).unwrap();
+        std::fs::write(at("v1.2/cameras.txt"), "1 PINHOLE 30 20 25 25 15 10\n").unwrap();
+        std::fs::write(at("v1.2/images.txt"), "1 0 1 0 0 0 0 0 1 photo.png\n\n").unwrap();
         let point = |i: u32| format!("{i} {} -2 {} 9 9 9 0\n", i % 9, -f64::from(i / 9 + 6));
         let points: String = (0..90).map(point).collect();
-        std::fs::write(at("sparse/points3D.txt"), points).unwrap();
+        std::fs::write(at("v1.2/points3D.txt"), points).unwrap();
         let of = |points_up| {
             let request = Request {
                 photo: at("photo.png"),
                 models: vec![at("a.obj")],
                 out: at("pipeline.toml"),
-                camera: Some(at("sparse")),
+                camera: Some(at("v1.2")),
                 camera_up: Some(WorldUp::Y),
-                points: Some(at("sparse")),
+                points: Some(at("v1.2")),
                 points_up,
                 ..Request::default()
             };
@@ -479,7 +480,7 @@ mod tests {
         };
         let text = of(None).unwrap();
         assert!(
-            text.contains("points = \"sparse\"\npoints_up = \"y\"\n"),
+            text.contains("points = \"v1.2\"\npoints_up = \"y\"\n"),
             "{text}"
         );
         // Upside down the points are above the camera.

@@ -1,6 +1,7 @@
 //! The `[scene.proxy]` table: what receives the shadow.
 use dipir_cameras::Camera as LensCamera;
 use dipir_points::Cloud;
+use dipir_points::file::is_model;
 use dipir_points::ground::Shape;
 
 use super::lens::world_up;
@@ -167,10 +168,8 @@ impl ProxyConfig {
 
     fn validate_points(&self, camera: &CameraConfig) -> Result<PointsSettings, Error> {
         let path = self.points.clone().unwrap_or_default();
-        let is_colmap =
-            path.extension().is_none() || path.file_stem().is_some_and(|s| s == "points3D");
         // COLMAP's points are in the world of its cameras.
-        let of_camera = camera.file.as_ref().filter(|_| is_colmap);
+        let of_camera = camera.file.as_ref().filter(|_| is_model(&path));
         let up = match (&self.points_up, of_camera) {
             (None, Some(_)) => world_up("scene.camera.file_up", &camera.file_up)?,
             (word, _) => world_up("scene.proxy.points_up", word)?,
@@ -270,5 +269,42 @@ impl PlaneConfig {
             point,
             normal: unit,
         }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_of_colmap_have_the_scale_and_the_up_of_its_cameras_whatever_their_folder_is_called() {
+        let camera = CameraConfig {
+            file: Some("model".into()),
+            file_up: Some("y".into()),
+            file_scale: Some(0.1),
+            ..CameraConfig::default()
+        };
+        for (points, is_colmap) in [
+            ("model", true),
+            ("2026.06.21", true),
+            ("shot_v1.2", true),
+            ("sparse/points3D.bin", true),
+            ("points3D.txt", true),
+            ("scan.ply", false),
+            ("scan.PCD", false),
+            ("000042.bin", false),
+            ("depth.exr", false),
+        ] {
+            let config = ProxyConfig {
+                points: Some(points.into()),
+                ..ProxyConfig::default()
+            };
+            let found = config.validate_points(&camera).unwrap();
+            let wanted = match is_colmap {
+                true => (Some(WorldUp::Y), 0.1),
+                false => (None, 1.0),
+            };
+            assert_eq!((found.up, found.scale), wanted, "{points}");
+        }
     }
 }
