@@ -107,6 +107,26 @@ fn an_override_of_text_needs_no_quotes_whatever_it_looks_like() {
 }
 
 #[test]
+fn blanks_around_words_of_an_override_are_no_part_of_them() {
+    let scene = scene(TEXT, &["scene.background =  other photo.png "]).unwrap();
+    assert_eq!(scene.background, PathBuf::from("other photo.png"));
+}
+
+#[test]
+fn digits_that_begin_with_0_are_a_word_and_in_messages_as_they_were_written() {
+    for digits in ["0001", "-007", "01e3"] {
+        assert_eq!(
+            message(TEXT, &[&format!("scene.samples={digits}")]),
+            format!(
+                "--set scene.samples={digits}: scene.samples is the string \"{digits}\", accepted: a whole number, 0 or more"
+            )
+        );
+    }
+    let scene = scene(TEXT, &["scene.objects.0.position.0=00.5"]).unwrap();
+    assert_eq!(scene.objects[0].position[0], 0.5);
+}
+
+#[test]
 fn an_override_may_create_its_table() {
     let config = parse("", &["pipeline.threads=2"]).unwrap();
     assert_eq!(config.pipeline().unwrap().threads, 2);

@@ -231,7 +231,8 @@ pub(super) fn apply_override(root: &mut Node, text: &str) -> Result<(), ConfigEr
     }
     let place = Place::Flag(format!("--set {text}"));
     let at = |_: usize| place.clone();
-    let node = match DeValue::parse(value.trim()) {
+    let value = value.trim();
+    let node = match DeValue::parse(value) {
         Ok(parsed) => node(&parsed, &at, key)?,
         Err(_) => Node {
             value: shell_number(value).unwrap_or_else(|| Value::String(value.to_string())),
@@ -260,11 +261,12 @@ fn absent_list<'a>(root: &Node, steps: &[&'a str]) -> Option<(String, &'a str)> 
     there.is_none().then(|| (list.join("."), steps[at]))
 }
 
-/// A number as people write it on a command line and TOML does not: `.004`, `5.`.
+/// A number as people write it on a command line and TOML does not: `.004`, `5.`. Digits that begin with 0, without a point,
+/// are the name of something: `0042`.
 fn shell_number(text: &str) -> Option<Value> {
-    let text = text.trim();
     let numeric = |b: u8| b.is_ascii_digit() || b"+-.eE".contains(&b);
-    match text.bytes().all(numeric) {
+    let is_name = text.trim_start_matches(['+', '-']).starts_with('0') && !text.contains('.');
+    match text.bytes().all(numeric) && !is_name {
         true => text.parse().ok().map(Value::Float),
         false => None,
     }
