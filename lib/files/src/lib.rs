@@ -11,8 +11,8 @@ use std::io::{self, Read};
 use std::path::Path;
 
 pub use own::{
-    beginning, begins_with, is_at, is_partial_of, left_of_replacing, open_own, replace, sync_file,
-    sync_folder,
+    beginning, begins_with, is_anothers, is_at, is_partial_of, left_of_replacing, open_own,
+    replace, sync_file, sync_folder,
 };
 pub use rewrite::rewrite;
 

@@ -92,8 +92,13 @@ fn create_locked(partial: &Path) -> io::Result<Option<File>> {
         Err(e) if e.kind() == io::ErrorKind::AlreadyExists => return Ok(None),
         opened => opened?,
     };
-    let is_locked_by_other = matches!(file.try_lock(), Err(TryLockError::WouldBlock));
-    Ok((!is_locked_by_other && is_at(&file, partial)).then_some(file))
+    Ok((!is_anothers(&file) && is_at(&file, partial)).then_some(file))
+}
+
+/// Locks `file`, unless another process has; whether one has. On a file system without locks none has, and `file` is not
+/// locked either.
+pub fn is_anothers(file: &File) -> bool {
+    matches!(file.try_lock(), Err(TryLockError::WouldBlock))
 }
 
 /// What a killed [`replace`] left at `partial`, locked; `None` if nothing is there or a running one writes it. What does
@@ -103,7 +108,7 @@ fn left_at(partial: &Path, mark: &[u8]) -> io::Result<Option<File>> {
         Some(left) => left,
         None => return Ok(None),
     };
-    if matches!(left.try_lock(), Err(TryLockError::WouldBlock)) {
+    if is_anothers(&left) {
         return Ok(None);
     }
     let mut begins = Vec::with_capacity(mark.len());

@@ -3,13 +3,13 @@
 //! The lock is the operating system's own on an open file, so it ends with its process, however
 //! that ends: a killed run leaves nothing that blocks the next. The holder removes the file when
 //! done. A process that gets the lock of a file that is no longer at its name starts over, so that
-//! two processes never hold locks on two files of the same name.
-use std::fs::{self, File, TryLockError};
+//! two processes never hold locks on two files of the same name. A file system without locks refuses nobody.
+use std::fs::{self, File};
 use std::io::ErrorKind::NotFound;
 use std::io::{self, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
-use dipir_files::is_at;
+use dipir_files::{is_anothers, is_at};
 
 use crate::error::StageError;
 
@@ -67,18 +67,14 @@ impl FolderLock {
         loop {
             let mut file =
                 dipir_files::open_own(path).map_err(|e| StageError::io("write", path, e))?;
-            match file.try_lock() {
-                Ok(()) => {}
-                Err(TryLockError::WouldBlock) if when_locked == WhenLocked::Wait => {
-                    file.lock().map_err(|e| StageError::io("lock", path, e))?;
-                }
-                Err(TryLockError::WouldBlock) => {
+            if is_anothers(&file) {
+                if when_locked == WhenLocked::Refuse {
                     return Err(StageError::Locked {
                         folder: folder.into(),
                         holder: holder(&mut file),
                     });
                 }
-                Err(TryLockError::Error(e)) => return Err(StageError::io("lock", path, e)),
+                file.lock().map_err(|e| StageError::io("lock", path, e))?;
             }
             if is_at(&file, path) {
                 sign(&mut file, path)?;
