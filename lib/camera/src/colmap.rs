@@ -2,6 +2,8 @@
 //!
 //! Images map world to camera in image axes. The world has no known up and scale.
 use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Cursor, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -85,6 +87,14 @@ impl Files {
         let path = self.part(stem);
         dipir_files::read(&path).map_err(|source| CameraError::Read { path, source })
     }
+
+    /// Of the images, whose points make it a hundred times as long as what is read of it.
+    fn images(&self) -> Result<BufReader<File>, CameraError> {
+        let path = self.part("images");
+        let opened = dipir_files::open(&path);
+        let opened = opened.map_err(|source| CameraError::Read { path, source })?;
+        Ok(BufReader::new(opened))
+    }
 }
 
 const EXTENSIONS: [&str; 2] = ["bin", "txt"];
@@ -140,9 +150,13 @@ pub fn read_points(points: &[u8], binary: bool, up: WorldUp) -> Result<Vec<DVec3
 }
 
 fn text(bytes: &[u8]) -> Result<&str, CameraError> {
-    dipir_files::refuse_utf16(bytes).map_err(|e| CameraError::new(FORMAT, e.to_string()))?;
+    dipir_files::refuse_utf16(bytes).map_err(failed)?;
     let bytes = dipir_files::without_byte_order_mark(bytes);
     std::str::from_utf8(bytes).map_err(|_| CameraError::new(FORMAT, "it is not UTF-8"))
+}
+
+fn failed(error: io::Error) -> CameraError {
+    CameraError::new(FORMAT, error.to_string())
 }
 
 /// Reads the contents of the text files; `points` may be empty. Errors as [`read_camera`].
@@ -152,7 +166,7 @@ pub fn read_text(
     points: &str,
     up: WorldUp,
 ) -> Result<Model, CameraError> {
-    Contents::text(cameras, images, points)?.model(up)
+    Contents::text(cameras, images.as_bytes(), points)?.model(up)
 }
 
 /// Reads the contents of the binary files; `points` may be empty. Errors as [`read_camera`].
@@ -162,7 +176,7 @@ pub fn read_binary(
     points: &[u8],
     up: WorldUp,
 ) -> Result<Model, CameraError> {
-    Contents::binary(cameras, images, points)?.model(up)
+    Contents::binary(cameras, Cursor::new(images), points)?.model(up)
 }
 
 /// What the files of a model say. Lenses and poses are unchecked, so that one that cannot be read keeps no other from
@@ -195,14 +209,18 @@ struct Image {
 impl Contents {
     /// Without points.
     fn of_cameras(files: &Files) -> Result<Self, CameraError> {
-        let (cameras, images) = (files.bytes("cameras")?, files.bytes("images")?);
-        match files.extension {
-            "bin" => Self::binary(&cameras, &images, &[]),
-            _ => Self::text(text(&cameras)?, text(&images)?, ""),
+        let (cameras, mut images) = (files.bytes("cameras")?, files.images()?);
+        if files.extension == "bin" {
+            return Self::binary(&cameras, images, &[]);
         }
+        let head = images.fill_buf().map_err(failed)?;
+        dipir_files::refuse_utf16(head).map_err(failed)?;
+        let mark = head.len() - dipir_files::without_byte_order_mark(head).len();
+        images.consume(mark);
+        Self::text(text(&cameras)?, images, "")
     }
 
-    fn text(cameras: &str, images: &str, points: &str) -> Result<Self, CameraError> {
+    fn text(cameras: &str, images: impl BufRead, points: &str) -> Result<Self, CameraError> {
         let wrong = |what: &str, line: &str| {
             let line: String = line.chars().take(60).collect();
             CameraError::new(
@@ -229,8 +247,11 @@ impl Contents {
             file.lenses.insert(id, parameters);
         }
         // Each image is a line followed by one of its points, which may be empty; further empty lines mean nothing.
-        let mut lines = records(images);
-        while let Some(line) = lines.find(|l| !l.is_empty()) {
+        let mut lines = Lines(images, String::new());
+        while let Some(line) = lines.next()? {
+            if line.is_empty() {
+                continue;
+            }
             let words: Vec<&str> = line.splitn(10, char::is_whitespace).collect();
             let numbers: Option<Vec<f64>> = words
                 .iter()
@@ -251,7 +272,7 @@ impl Contents {
                 shift: DVec3::new(x, y, z),
                 lens: id,
             });
-            lines.next();
+            lines.next()?;
         }
         for line in records(points).filter(|l| !l.is_empty()) {
             let numbers = line.split_whitespace().skip(1).take(3);
@@ -264,9 +285,13 @@ impl Contents {
         Ok(file)
     }
 
-    fn binary(cameras: &[u8], images: &[u8], points: &[u8]) -> Result<Self, CameraError> {
+    fn binary(
+        cameras: &[u8],
+        images: impl BufRead + Seek,
+        points: &[u8],
+    ) -> Result<Self, CameraError> {
         let mut file = Self::default();
-        let mut at = Bytes(cameras);
+        let mut at = Bytes::of(Cursor::new(cameras))?;
         for _ in 0..at.u64()? {
             let (id, kind) = (at.u32()?, at.u32()?);
             let size = [at.u64()? as f64, at.u64()? as f64];
@@ -284,7 +309,7 @@ impl Contents {
             };
             file.lenses.insert(id, parameters);
         }
-        let mut at = Bytes(images);
+        let mut at = Bytes::of(images)?;
         for _ in 0..at.u64()? {
             at.u32()?;
             let turn = [at.f64()?, at.f64()?, at.f64()?, at.f64()?];
@@ -301,7 +326,7 @@ impl Contents {
             });
         }
         if !points.is_empty() {
-            let mut at = Bytes(points);
+            let mut at = Bytes::of(Cursor::new(points))?;
             for _ in 0..at.u64()? {
                 at.u64()?;
                 let point = DVec3::new(at.f64()?, at.f64()?, at.f64()?);
@@ -358,22 +383,51 @@ fn records(text: &str) -> impl Iterator<Item = &str> {
         .filter(|line| !line.starts_with('#'))
 }
 
-/// Little-endian values from the front of a slice.
-struct Bytes<'a>(&'a [u8]);
+/// As [`records`], of what is read line by line; the line last read is kept.
+struct Lines<R>(R, String);
 
-impl<'a> Bytes<'a> {
-    fn take(&mut self, count: usize) -> Result<&'a [u8], CameraError> {
-        let (front, rest) = self
-            .0
-            .split_at_checked(count)
-            .ok_or_else(|| CameraError::new(FORMAT, "it is cut short"))?;
-        self.0 = rest;
-        Ok(front)
+impl<R: BufRead> Lines<R> {
+    fn next(&mut self) -> Result<Option<&str>, CameraError> {
+        loop {
+            self.1.clear();
+            let read = self.0.read_line(&mut self.1);
+            let read = read.map_err(|e| match e.kind() {
+                io::ErrorKind::InvalidData => CameraError::new(FORMAT, "it is not UTF-8"),
+                _ => failed(e),
+            })?;
+            if read == 0 {
+                return Ok(None);
+            }
+            if !self.1.trim_start().starts_with('#') {
+                return Ok(Some(self.1.trim()));
+            }
+        }
+    }
+}
+
+/// Little-endian values from the front of a source, of which so many bytes are left.
+struct Bytes<R> {
+    source: R,
+    left: u64,
+}
+
+impl<R: BufRead + Seek> Bytes<R> {
+    fn of(mut source: R) -> Result<Self, CameraError> {
+        let left = source.seek(SeekFrom::End(0)).map_err(failed)?;
+        source.rewind().map_err(failed)?;
+        Ok(Self { source, left })
+    }
+
+    fn take(&mut self, count: u64) -> Result<(), CameraError> {
+        let left = self.left.checked_sub(count);
+        self.left = left.ok_or_else(|| CameraError::new(FORMAT, "it is cut short"))?;
+        Ok(())
     }
 
     fn array<const N: usize>(&mut self) -> Result<[u8; N], CameraError> {
+        self.take(N as u64)?;
         let mut out = [0; N];
-        out.copy_from_slice(self.take(N)?);
+        self.source.read_exact(&mut out).map_err(failed)?;
         Ok(out)
     }
 
@@ -391,17 +445,20 @@ impl<'a> Bytes<'a> {
 
     /// Up to a byte 0.
     fn text(&mut self) -> Result<String, CameraError> {
-        let end = self.0.iter().position(|&b| b == 0);
-        let end = end.ok_or_else(|| CameraError::new(FORMAT, "it is cut short"))?;
-        let text = String::from_utf8_lossy(self.take(end)?).into_owned();
-        self.take(1)?;
-        Ok(text)
+        let mut text = Vec::new();
+        let read = self.source.read_until(0, &mut text).map_err(failed)?;
+        self.take(read as u64)?;
+        match text.pop() {
+            Some(0) => Ok(String::from_utf8_lossy(&text).into_owned()),
+            _ => Err(CameraError::new(FORMAT, "it is cut short")),
+        }
     }
 
     fn skip(&mut self, count: u64, size: u64) -> Result<(), CameraError> {
         let bytes = count.saturating_mul(size);
-        self.take(usize::try_from(bytes).unwrap_or(usize::MAX))?;
-        Ok(())
+        self.take(bytes)?;
+        let bytes = i64::try_from(bytes).unwrap_or(i64::MAX);
+        self.source.seek_relative(bytes).map_err(failed)
     }
 }
 
@@ -471,4 +528,60 @@ fn lens(model: &str, size: [f64; 2], p: &[f64]) -> Result<Lens, CameraError> {
     };
     lens.check(FORMAT)?;
     Ok(lens)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+    use std::io::Read;
+
+    use super::*;
+
+    /// Counts what is read.
+    struct Counted<'a>(Cursor<&'a [u8]>, &'a Cell<usize>);
+
+    impl Read for Counted<'_> {
+        fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+            let read = self.0.read(into)?;
+            self.1.set(self.1.get() + read);
+            Ok(read)
+        }
+    }
+
+    impl Seek for Counted<'_> {
+        fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+            self.0.seek(to)
+        }
+    }
+
+    #[test]
+    fn points_of_images_are_passed_over_unread() {
+        const SEEN: usize = 5000;
+        let mut bytes = 3u64.to_le_bytes().to_vec();
+        for k in 0..3u32 {
+            bytes.extend([0; 4]);
+            bytes.extend(
+                [1.0f64, 0.0, 0.0, 0.0, 0.0, 0.0, f64::from(k)]
+                    .map(f64::to_le_bytes)
+                    .concat(),
+            );
+            bytes.extend(1u32.to_le_bytes());
+            bytes.extend(format!("{k}.png\0").bytes());
+            bytes.extend((SEEN as u64).to_le_bytes());
+            bytes.extend([0; SEEN * 24]);
+        }
+        let read = Cell::new(0);
+        let of = |bytes| {
+            let images = BufReader::new(Counted(Cursor::new(bytes), &read));
+            Contents::binary(&[0; 8], images, &[])
+        };
+        let images = of(&bytes).unwrap().images;
+        let found: Vec<_> = images
+            .iter()
+            .map(|i| (i.name.as_str(), i.shift.z))
+            .collect();
+        assert_eq!(found, [("0.png", 0.0), ("1.png", 1.0), ("2.png", 2.0)]);
+        assert!(read.get() < bytes.len() / 10, "{} bytes", read.get());
+        assert!(of(&bytes[..bytes.len() - 1]).is_err(), "cut short");
+    }
 }

@@ -217,3 +217,17 @@ fn texts_of_windows_are_read_and_their_pictures_are_found_by_name() {
     let calibrated = file::read(&at("calib.txt"), &wanted).unwrap();
     assert_eq!(calibrated.pose.unwrap().position.x, 3.0);
 }
+
+#[test]
+fn images_in_another_encoding_are_told() {
+    let folder = tempfile::tempdir().unwrap();
+    for (images, told) in [
+        (&b"\xff\xfe1\0 \0"[..], "it is UTF-16 text"),
+        (b"1 1 0 0 0 0 0 0 1 b\xe4r.jpg\n\n", "it is not UTF-8"),
+    ] {
+        put(folder.path(), 3.0, "a.jpg");
+        std::fs::write(folder.path().join("images.txt"), images).unwrap();
+        let error = position(folder.path(), "a.jpg").unwrap_err();
+        assert!(error.contains(told), "{error}");
+    }
+}
