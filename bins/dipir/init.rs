@@ -43,6 +43,16 @@ pub struct InitArgs {
     #[arg(long, value_name = "FILE")]
     camera: Option<PathBuf>,
 
+    /// Which camera of that file, by the name of its picture or its own [default: that of the photograph's
+    /// name]
+    #[arg(long, value_name = "NAME", requires = "camera")]
+    camera_image: Option<String>,
+
+    /// Which camera of that file, by number from 0; of .chan and of a glTF camera that moves the number
+    /// of the frame, of KITTI's n of Pn
+    #[arg(long, value_name = "N", requires = "camera")]
+    camera_frame: Option<u32>,
+
     /// Which axis of that camera's world points up [default: as the program that wrote it has it]
     #[arg(long, value_name = "AXIS", requires = "camera")]
     camera_up: Option<Axis>,
@@ -131,6 +141,8 @@ pub fn run(args: &InitArgs) -> anyhow::Result<()> {
         height_m: args.height_m,
         class: args.class.clone(),
         camera: args.camera.clone(),
+        camera_image: args.camera_image.clone(),
+        camera_frame: args.camera_frame,
         camera_up: args.camera_up.map(Into::into),
         asked: CameraOptions {
             fov_deg: args.fov,

@@ -352,7 +352,7 @@ pub(crate) fn chosen(
         CameraError::with_remedy(
             format,
             format!("it has {cameras_are} cameras, and {what}"),
-            "say which by its number from 0 or by the name of its picture",
+            "say which by its number from 0 or by the name of its picture (dipir init: --camera-frame, --camera-image)",
         )
     })
 }

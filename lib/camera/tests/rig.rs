@@ -299,7 +299,7 @@ fn the_one_reader_explains_what_it_cannot_choose() {
     assert_eq!(
         said(&wanted(Which::Number(3))),
         "the transforms.json file cannot be used: it has 3 cameras, and no camera 3; say which by \
-         its number from 0 or by the name of its picture"
+         its number from 0 or by the name of its picture (dipir init: --camera-frame, --camera-image)"
     );
     assert!(said(&wanted(Which::Photo(Path::new("b.jpg")))).contains("none for \"b.jpg\""));
     let cropped = file::Wanted {

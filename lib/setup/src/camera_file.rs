@@ -3,12 +3,13 @@ use std::path::Path;
 
 use dipir_cameras::chan::Turns;
 use dipir_cameras::file::{self, Wanted, Which};
-use dipir_cameras::{CameraError, Lens, Pose, WorldUp, orientation};
+use dipir_cameras::{CameraError, Lens, Pose, orientation};
 use dipir_imaging::facts::Facts;
 use dipir_scene::plausibility::{field_of_view, rounded};
 use glam::{DVec2, DVec3};
 
 use crate::error::SetupError;
+use crate::project::Request;
 use crate::view::{Aim, CameraFile, CameraOptions, EYE_HEIGHT_M, View};
 
 /// Most that a lens bends a corner, and that pixels differ from squares at a corner, pixels.
@@ -18,19 +19,18 @@ const LEAST_SHIFT_PX: f64 = 0.5;
 /// Least change of an axis of the camera that the order of its rotations makes: half a pixel at a focal length of 5,000.
 const LEAST_TURN: f64 = 1e-4;
 
-/// The camera that the file or folder at `path` has for `photo`, of which `facts` are known, and what of it may be wrong, one
-/// sentence each. `up` overrules which axis of its world points up.
+/// The camera that the file or folder at `path` has for the photograph of `request`, of which `facts` are known, and what of it
+/// may be wrong, one sentence each.
 ///
 /// # Errors
 /// On files that cannot be read, without a camera for the photograph, and of pictures of another
 /// shape.
 pub fn read(
     path: &Path,
-    photo: &Path,
+    request: &Request,
     facts: &Facts,
-    up: Option<WorldUp>,
-    asked: &CameraOptions,
 ) -> Result<(View, Vec<String>), SetupError> {
+    let (photo, asked, up) = (&*request.photo, &request.asked, request.camera_up);
     asked.check()?;
     let size = facts.size.map(f64::from);
     let is_chan = path
@@ -54,7 +54,19 @@ pub fn read(
     let whole = std::path::absolute(photo);
     let wanted = Wanted {
         size,
-        which: Which::Photo(whole.as_deref().unwrap_or(photo)),
+        which: match (request.camera_image.as_deref(), request.camera_frame) {
+            (None, None) => Which::Photo(whole.as_deref().unwrap_or(photo)),
+            (Some(name), None) => Which::Name(name),
+            (None, Some(frame)) => Which::Number(frame),
+            (Some(name), Some(frame)) if file::is_gltf(path) => Which::Frame(name, frame),
+            (Some(_), Some(frame)) => {
+                return Err(SetupError::Value {
+                    option: "--camera-frame",
+                    value: frame.to_string(),
+                    accepted: "left out, for --camera-image says which camera; only of glTF both do",
+                });
+            }
+        },
         up,
         fov_deg: asked.fov_deg.map(vertical),
         turns: None,
@@ -85,11 +97,13 @@ pub fn read(
     );
     let is_ambiguous = is_chan && depends_on_order(path, &wanted, &pose);
     let order = "it does not say in which order its rotations turn, and Nuke's is taken";
-    let why = more_than_numbers(path, &found.lens).or(is_ambiguous.then_some(order));
+    let why = more_than_numbers(path, &found.lens, wanted.which).or(is_ambiguous.then_some(order));
     view.file = why.map(|why| CameraFile {
         path: path.into(),
         up,
         fov_deg: (!found.states_fov).then_some(view.fov_deg),
+        image: request.camera_image.clone(),
+        frame: request.camera_frame,
         why,
     });
     let mut warnings: Vec<String> = orientation::doubt_of_turn(path, facts.orientation)
@@ -122,9 +136,14 @@ fn depends_on_order(path: &Path, wanted: &Wanted, pose: &Pose) -> bool {
 }
 
 /// What the file at `path` says that the numbers of a view do not, in words; `lens` is the photograph's.
-fn more_than_numbers(path: &Path, lens: &Lens) -> Option<&'static str> {
+fn more_than_numbers(path: &Path, lens: &Lens, which: Which) -> Option<&'static str> {
     if !file::has_one(path) {
-        return Some("it has several cameras, of which that of the photograph's name is taken");
+        return Some(match which {
+            Which::Photo(_) => {
+                "it has several cameras, of which that of the photograph's name is taken"
+            }
+            _ => "it has several cameras, or one that moves",
+        });
     }
     let focal = lens.focal_px;
     let oblong = (focal.x / focal.y - 1.0).abs() * 0.5 * lens.size[0];
@@ -195,13 +214,14 @@ fn bent_px(lens: &Lens) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use dipir_cameras::WorldUp;
     use dipir_imaging::raster::{DisplayImage, Raster};
     use dipir_pipeline::config::Config;
     use dipir_scene::camera::Camera;
     use dipir_scene::config::SceneConfig;
 
     use super::*;
-    use crate::project::{Request, draft};
+    use crate::project::draft;
 
     /// A camera 2 m over the origin's ground that looks down by atan(1/2), in Blender's world.
     const FSPY: &str = r#"{
@@ -223,14 +243,11 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(name);
         std::fs::write(&path, text).unwrap();
-        let found = read(
-            &path,
-            Path::new("photos/b.jpg"),
-            &Facts::of_size(size),
-            None,
-            &CameraOptions::default(),
-        );
-        found.map_err(|e| e.to_string())
+        let request = Request {
+            photo: "photos/b.jpg".into(),
+            ..Request::default()
+        };
+        read(&path, &request, &Facts::of_size(size)).map_err(|e| e.to_string())
     }
 
     #[test]
@@ -476,23 +493,54 @@ mod tests {
     }
 
     #[test]
+    fn a_camera_that_the_photograph_does_not_name_is_asked_for_and_written() {
+        let frame = |name: &str, z: f64| {
+            format!(
+                r#"{{ "file_path": "{name}", "transform_matrix":
+                [[1,0,0,0],[0,1,0,{z}],[0,0,1,3],[0,0,0,1]] }}"#
+            )
+        };
+        let frames = [frame("left.png", 1.0), frame("right.png", 2.0)].join(",");
+        let transforms = format!(r#"{{ "fl_x": 25, "frames": [{frames}] }}"#);
+        let asked = |image: Option<&str>, frame| Request {
+            camera_image: image.map(Into::into),
+            camera_frame: frame,
+            camera_up: Some(WorldUp::Y),
+            ..Request::default()
+        };
+        for (request, key) in [
+            (asked(Some("right.png"), None), "image = \"right.png\"\n"),
+            (asked(None, Some(1)), "frame = 1\n"),
+        ] {
+            let (text, got, want) = written("transforms.json", &transforms, request);
+            let keys = format!("file = \"transforms.json\"\n{key}file_up = \"y\"\n");
+            assert!(text.contains(&keys), "{text}");
+            assert!((want.position.y - 2.0).abs() < 1e-6, "{}", want.position);
+            assert!(got.position.distance(want.position) < 1e-5, "{key}");
+        }
+        let both = asked(Some("right.png"), Some(1));
+        let error = read(Path::new("t.json"), &both, [30, 20]).unwrap_err();
+        let error = error.to_string();
+        assert!(
+            error.starts_with("--camera-frame is 1; accepted: left out"),
+            "{error}"
+        );
+    }
+
+    #[test]
     fn a_field_of_view_that_the_file_has_is_not_asked_for() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("shot.chan");
-        let asked = CameraOptions {
-            fov_deg: Some(50.0),
-            ..CameraOptions::default()
+        let request = Request {
+            asked: CameraOptions {
+                fov_deg: Some(50.0),
+                ..CameraOptions::default()
+            },
+            ..Request::default()
         };
         let of = |text: &str| {
             std::fs::write(&path, text).unwrap();
-            read(
-                &path,
-                Path::new("a.jpg"),
-                &Facts::of_size([600, 400]),
-                None,
-                &asked,
-            )
-            .map_err(|e| e.to_string())
+            read(&path, &request, &Facts::of_size([600, 400])).map_err(|e| e.to_string())
         };
         assert!(of("1 0 1.7 4 0 0 0").is_ok());
         let error = of("1 0 1.7 4 0 0 0 40").unwrap_err();

@@ -231,6 +231,12 @@ fn camera_of_file(name: &str, file: &CameraFile, view: &View) -> String {
         file.why,
         quoted(name)
     );
+    if let Some(image) = &file.image {
+        text += &format!("image = {}\n", quoted(image));
+    }
+    if let Some(frame) = file.frame {
+        text += &format!("frame = {frame}\n");
+    }
     if let Some(up) = file.up {
         text += &format!("file_up = \"{}\"\n", up.word());
     }
@@ -381,6 +387,8 @@ mod tests {
                 path: "rig.json".into(),
                 up: Some(WorldUp::Z),
                 fov_deg: None,
+                image: None,
+                frame: None,
                 why: "it has several cameras",
             }),
             ..View::default()

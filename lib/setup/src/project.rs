@@ -51,6 +51,10 @@ pub struct Request {
     pub class: Option<String>,
     /// Another program's camera.
     pub camera: Option<PathBuf>,
+    /// Which of several cameras of that file: the name of the picture, or of the camera itself.
+    pub camera_image: Option<String>,
+    /// The same by number; of a camera that moves the frame.
+    pub camera_frame: Option<u32>,
     /// Which axis of that camera's world points up.
     pub camera_up: Option<WorldUp>,
     /// Of the camera.
@@ -100,13 +104,7 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
     warnings.extend(photo.warnings.iter().cloned());
     let view = match &request.camera {
         Some(path) => {
-            let (view, doubts) = camera_file::read(
-                path,
-                &request.photo,
-                &photo.facts,
-                request.camera_up,
-                &request.asked,
-            )?;
+            let (view, doubts) = camera_file::read(path, request, &photo.facts)?;
             warnings.extend(doubts);
             view
         }

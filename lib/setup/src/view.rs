@@ -63,6 +63,10 @@ pub struct CameraFile {
     pub up: Option<WorldUp>,
     /// Vertical field of view, degrees, if the file has none.
     pub fov_deg: Option<f64>,
+    /// Which of its cameras, by name and by number, as far as that was asked for.
+    pub image: Option<String>,
+    /// See `image`.
+    pub frame: Option<u32>,
     /// What of it numbers would not say.
     pub why: &'static str,
 }
