@@ -239,6 +239,53 @@ fn frames_without_exif_data_are_exposed_as_their_pictures_tell() {
 }
 
 #[test]
+fn a_frame_alone_is_exposed_as_in_its_shot_which_is_not_measured_again() {
+    let project = project();
+    // Of twelve columns of shades each frame shows seven, the others are too bright: the last one has one of the photograph's.
+    let frame = |name: &str, first: usize, stops: f32| {
+        let value = |n: usize| {
+            let (x, y) = (n % 96 / 8, n / 96 / 8);
+            let light = (0.08 + 0.2 * ((x * 37 + y * 101) % 17) as f32 / 17.0) * stops.exp2();
+            Vec3::splat(match (first..first + 7).contains(&x) {
+                true => light / (1.0 + light),
+                false => 1.0,
+            })
+        };
+        let pixels = (0..96 * 64).map(value).collect();
+        let image = LinearImage(Raster::from_pixels(96, 64, pixels));
+        write_png(project.path(name), &Transfer::Srgb.encode(&image)).unwrap();
+    };
+    for (k, (first, stops)) in [(0, 0.0), (3, 0.3), (6, 0.8)].into_iter().enumerate() {
+        frame(&format!("f_{k}.png"), first, stops);
+    }
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write("pipeline.toml", text.replace("background.png", "f_0.png"));
+    let stops = |out: &str| {
+        let manifest = project.read(&format!("{out}/frames/f_2/composite/stage.json"));
+        let value: Value = serde_json::from_slice(&manifest).unwrap();
+        value["params"]["light"]["exposure_ev"].as_f64().unwrap()
+    };
+    // Alone it is exposed as the photograph; what is told of it beside others takes the place of that.
+    shot(&project, &["f_2.png"]);
+    assert_eq!(stops("out"), 0.0);
+    shot(&project, &["f_1.png", "f_2.png"]);
+    let told = stops("out");
+    assert!((told - 0.75).abs() < 0.04, "{told}");
+    let kept = project.read("out/frames/exposures.json");
+    for frames in [&["f_2.png"][..], &["f_1.png", "f_2.png"]] {
+        for again in shot(&project, frames) {
+            assert_eq!(again["done"]["ran"], json!([]), "{frames:?}");
+        }
+        assert_eq!(project.read("out/frames/exposures.json"), kept);
+    }
+    // So it is in another folder with what was kept.
+    std::fs::create_dir_all(project.path("other/frames")).unwrap();
+    project.write("other/frames/exposures.json", &kept);
+    shot(&project, &["f_2.png", "--out", "other"]);
+    assert_eq!(stops("other"), told);
+}
+
+#[test]
 fn frames_of_linear_light_are_exposed_alike() {
     let project = project();
     let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
