@@ -147,7 +147,7 @@ fn found(
         Which::Photo(path) => frames.shown(path, &mut Numbers::new())?.frame,
         Which::Number(_) | Which::Name(_) => {
             let detail = format!("the camera moves, with {}", frames.words());
-            let remedy = "say which by its name and the number of the frame, for instance image = \"Camera\" with frame = 1";
+            let remedy = "say which by its name and the number of the frame, for instance image = \"Camera\" with frame = 1 (dipir init: --camera-image, --camera-frame)";
             return Err(CameraError::with_remedy(FORMAT, detail, remedy));
         }
     };
@@ -404,8 +404,7 @@ impl Frames {
                 "the camera moves, with {}, and {name:?} does not end in the number of one",
                 self.words()
             );
-            let remedy =
-                "name the picture by it (plate.1001.png), or say which, for instance frame = 1";
+            let remedy = "name the picture by it (plate.1001.png), or say which, for instance frame = 1 (dipir init: --camera-frame 1)";
             return Err(CameraError::with_remedy(FORMAT, detail, remedy));
         };
         let [low, high] = numbers_beside(photo, number, known);

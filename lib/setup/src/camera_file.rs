@@ -519,7 +519,7 @@ mod tests {
             assert!(got.position.distance(want.position) < 1e-5, "{key}");
         }
         let both = asked(Some("right.png"), Some(1));
-        let error = read(Path::new("t.json"), &both, [30, 20]).unwrap_err();
+        let error = read(Path::new("t.json"), &both, &Facts::of_size([30, 20])).unwrap_err();
         let error = error.to_string();
         assert!(
             error.starts_with("--camera-frame is 1; accepted: left out"),
