@@ -120,6 +120,10 @@ enum Axis {
     Z,
     /// -y
     MinusY,
+    /// +x
+    X,
+    /// -x
+    MinusX,
 }
 
 impl From<Axis> for dipir_cameras::WorldUp {
@@ -128,6 +132,8 @@ impl From<Axis> for dipir_cameras::WorldUp {
             Axis::Y => Self::Y,
             Axis::Z => Self::Z,
             Axis::MinusY => Self::MinusY,
+            Axis::X => Self::X,
+            Axis::MinusX => Self::MinusX,
         }
     }
 }

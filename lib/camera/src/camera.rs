@@ -153,11 +153,17 @@ pub enum WorldUp {
     Z,
     /// -y, as where a first camera in image axes is the world: (x, y, z) becomes (x, -y, -z).
     MinusY,
+    /// +x, as where that camera was turned by a quarter: (x, y, z) becomes (-y, x, z).
+    X,
+    /// -x, as where it was turned the other way: (x, y, z) becomes (y, -x, z).
+    MinusX,
 }
 
 impl WorldUp {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Y, Self::Z, Self::MinusY];
+    pub const ALL: [Self; 5] = [Self::Y, Self::Z, Self::MinusY, Self::X, Self::MinusX];
+    /// Those of pictures that were taken upright.
+    pub const USUAL: [Self; 3] = [Self::Y, Self::Z, Self::MinusY];
 
     /// Its word in configurations.
     pub fn word(self) -> &'static str {
@@ -165,6 +171,8 @@ impl WorldUp {
             Self::Y => "y",
             Self::Z => "z",
             Self::MinusY => "-y",
+            Self::X => "x",
+            Self::MinusX => "-x",
         }
     }
 
@@ -174,6 +182,8 @@ impl WorldUp {
             Self::Y => DMat3::IDENTITY,
             Self::Z => DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y),
             Self::MinusY => DMat3::from_cols(DVec3::X, DVec3::NEG_Y, DVec3::NEG_Z),
+            Self::X => DMat3::from_cols(DVec3::Y, DVec3::NEG_X, DVec3::Z),
+            Self::MinusX => DMat3::from_cols(DVec3::NEG_Y, DVec3::X, DVec3::Z),
         }
     }
 }

@@ -119,7 +119,7 @@ impl Distortion {
     }
 
     /// Of a picture that was turned by a quarter, clockwise.
-    pub(crate) fn turned(mut self) -> Self {
+    pub(crate) fn turned_by_a_quarter(mut self) -> Self {
         if let Model::Brown { tangential, .. } = &mut self.model {
             let [p1, p2] = *tangential;
             *tangential = [p2, -p1];

@@ -147,6 +147,14 @@ pub fn is_gltf(path: &Path) -> bool {
     is("gltf") || is("glb")
 }
 
+/// Whether this is the name of KITTI's calibration, whose cameras are fixed to a car.
+pub fn is_kitti(path: &Path) -> bool {
+    let is_text = path
+        .extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("txt"));
+    is_text && colmap::Files::at(path).is_none()
+}
+
 /// The files that [`read`] reads: `path` itself, and those that have the keys of a glTF's cameras, or those of COLMAP's model.
 pub fn parts(path: &Path) -> Vec<PathBuf> {
     match colmap::Files::at(path) {

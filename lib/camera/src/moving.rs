@@ -84,7 +84,7 @@ pub fn read(bytes: &[u8], folder: Option<&Path>, wanted: &Wanted) -> Result<Came
 }
 
 /// Cameras at the frames before and after the one that is wanted, and by how many frames they are later; none where it stands
-/// still, or has no such frame.
+/// still, or before the first and after the last frame.
 pub(crate) fn beside(
     bytes: &[u8],
     folder: Option<&Path>,
@@ -93,7 +93,9 @@ pub(crate) fn beside(
     let (motion, Some((frames, own))) = found(bytes, folder, wanted)? else {
         return Ok(Vec::new());
     };
-    let is_there = |n: &i64| (frames.first..=frames.last).contains(&(own + n));
+    let own_frames = frames.first..=frames.last;
+    // Beyond them it stands still.
+    let is_there = |n: &i64| own_frames.contains(&(own + n)) || !own_frames.contains(&own);
     let beside = [-1, 1].into_iter().filter(is_there);
     let camera = |n: i64| Ok((n, motion.camera(frames.time_s(own + n))?));
     beside.map(camera).collect()

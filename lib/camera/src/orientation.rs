@@ -50,14 +50,18 @@ pub fn read_turned(
     Ok((found, quarters))
 }
 
-/// What is assumed where [`read_turned`] turns a camera by two quarters, of which no shape tells, as a warning.
-pub fn doubt_of_turn(path: &Path, orientation: u8) -> Option<String> {
-    let is_turned = quarters(orientation) == 2 && colmap::Files::at(path).is_some();
-    is_turned.then(|| {
+/// What is assumed where [`read_turned`] turns the camera of a picture of `size` pixels, and no shape tells whether it is right, as a
+/// warning.
+pub fn doubt_of_turn(path: &Path, size: [f64; 2], orientation: u8) -> Option<String> {
+    let quarters = quarters(orientation);
+    let fits_both = quarters == 2 || (size[0] / size[1] - 1.0).abs() <= SAME_SHAPE;
+    let is_doubtful = quarters != 0 && fits_both && colmap::Files::at(path).is_some();
+    is_doubtful.then(|| {
         format!(
-            "\"{}\": COLMAP sees pictures as they are stored, and Exif data turn this one by 180 degrees: so its camera is turned, \
+            "\"{}\": COLMAP sees pictures as they are stored, and Exif data turn this one by {} degrees: so its camera is turned, \
              too. If the model was made of a picture that was turned before, name that one in place of the photograph",
-            path.display()
+            path.display(),
+            90 * quarters
         )
     })
 }
@@ -79,7 +83,7 @@ impl Lens {
             size: [lens.size[1], lens.size[0]],
             focal_px: DVec2::new(lens.focal_px.y, lens.focal_px.x),
             principal_px: DVec2::new(lens.size[1] - lens.principal_px.y, lens.principal_px.x),
-            distortion: lens.distortion.turned(),
+            distortion: lens.distortion.turned_by_a_quarter(),
         })
     }
 }

@@ -18,14 +18,16 @@ const DOUBTED: f64 = 0.5;
 const MEANT: f64 = 0.866;
 
 /// A warning if the pictures of the file at `path` are upright by another axis than the one that points up where nobody
-/// says which, of files whose programs differ in that: `transforms.json` and COLMAP's.
-pub fn doubt(path: &Path) -> Option<String> {
+/// says which, of files whose programs differ in that: `transforms.json` and COLMAP's. Cameras are turned by `quarters`, clockwise,
+/// as that of the photograph is.
+pub fn doubt(path: &Path, quarters: u32) -> Option<String> {
     let own = match colmap::Files::at(path) {
         Some(_) => WorldUp::MinusY,
         None => WorldUp::Z,
     };
     let pictures = pictures(path, Some(WorldUp::Y));
-    let rotations: Vec<DMat3> = pictures.iter().map(|p| p.1.pose.rotation).collect();
+    let rotations = pictures.iter().map(|p| p.1.pose.turned(quarters).rotation);
+    let rotations: Vec<DMat3> = rotations.collect();
     let meant = meant(&rotations, own)?.word();
     let name = path.file_name().unwrap_or(path.as_os_str());
     let own = own.word();

@@ -75,8 +75,9 @@ fn a_model_sees_pictures_as_they_are_stored() {
         assert!(up.abs_diff_eq(want, 1e-12), "{orientation}: {up}");
     }
     assert!(read(portrait, 1).is_err());
-    let doubts = [1, 3, 6].map(|o| orientation::doubt_of_turn(project.path(), o).is_some());
-    assert_eq!(doubts, [false, true, false]);
+    let doubt = |size, o| orientation::doubt_of_turn(project.path(), size, o).is_some();
+    assert_eq!([1, 3, 6].map(|o| doubt(upright, o)), [false, true, false]);
+    assert_eq!([1, 6].map(|o| doubt([500.0; 2], o)), [false, true]);
 }
 
 #[test]

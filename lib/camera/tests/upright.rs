@@ -16,7 +16,7 @@ fn said(rotations: impl Iterator<Item = DMat3>) -> Option<String> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("transforms.json");
     std::fs::write(&path, json!({ "fl_x": 500, "frames": frames }).to_string()).unwrap();
-    file::doubt(&path)
+    file::doubt(&path, 0)
 }
 
 #[test]
@@ -48,11 +48,19 @@ fn a_model_of_colmap_s_that_was_turned_to_the_earth_is_told() {
         let put = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
         put("cameras.txt", "1 PINHOLE 300 200 250 250 150 100\n");
         put("images.txt", &around(12).map(image).collect::<String>());
-        file::doubt(folder.path())
+        [0, 1].map(|quarters| file::doubt(folder.path(), quarters))
     };
     let by = DMat3::from_rotation_x;
-    assert_eq!(put(by(std::f64::consts::PI)), None);
-    let told = put(by(std::f64::consts::FRAC_PI_2)).unwrap();
+    let [upright, turned] = put(by(std::f64::consts::PI));
+    assert_eq!(upright, None);
+    // Of pictures that Exif turns by a quarter clockwise: what is up in them is to the left as they are stored.
+    assert!(
+        turned
+            .unwrap()
+            .contains("-x of its world points up, and -y is taken"),
+        "a quarter"
+    );
+    let told = put(by(std::f64::consts::FRAC_PI_2))[0].clone().unwrap();
     assert!(
         told.contains("z of its world points up, and -y is taken"),
         "{told}"

@@ -187,7 +187,7 @@ pub fn other_up(cloud: &Cloud, search: &Search, up: WorldUp) -> Option<WorldUp> 
         on.saturating_sub(below)
     };
     let least = FEWEST.max(CLEARLY_MORE * ground_seen(up));
-    let others = WorldUp::ALL.into_iter().filter(|axis| *axis != up);
+    let others = WorldUp::USUAL.into_iter().filter(|axis| *axis != up);
     let seen = others.map(|axis| (ground_seen(axis), axis));
     let (most, axis) = seen.max_by_key(|s| s.0)?;
     (most >= least).then_some(axis)

@@ -192,7 +192,7 @@ pub struct CameraConfig {
     pub image: Option<String>,
     /// Which axis of the world of `file` points up.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schemars(extend("enum" = ["z", "y", "-y"]), extend("x-default" = "as the program that wrote it has it: COLMAP `-y`, glTF and `.chan` `y`, others `z`"), example = &"z")]
+    #[schemars(extend("enum" = ["z", "y", "-y", "x", "-x"]), extend("x-default" = "as the program that wrote it has it: COLMAP `-y`, glTF and `.chan` `y`, others `z`"), example = &"z")]
     pub file_up: Option<String>,
     /// The axes about which rotations of a `.chan` file turn, the first one first; Blender's export is `xyz` unless it is told.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -210,7 +210,7 @@ pub struct CameraConfig {
     #[schemars(extend("x-default" = "`0` of `transforms`; of `file` as `image`"), example = 3)]
     pub frame: Option<u32>,
     /// Which axis of the world of `transforms` is up.
-    #[schemars(extend("enum" = ["z", "y", "-y"]), extend("default" = "z"), example = &"y")]
+    #[schemars(extend("enum" = ["z", "y", "-y", "x", "-x"]), extend("default" = "z"), example = &"y")]
     pub transforms_up: Option<String>,
 }
 

@@ -348,11 +348,8 @@ impl Scene {
             for part in file.parts(base_dir) {
                 files.input("camera", &part);
             }
-            files.warn(
-                file.choice(base_dir)
-                    .into_iter()
-                    .chain(file.doubt(base_dir)),
-            );
+            files.warn(file.choice(base_dir));
+            files.warn(file.doubts(resolution, base_dir));
         }
         let (camera, undistortion) =
             match of_shot.filter(|_| settings.camera.stands_still(base_dir)) {

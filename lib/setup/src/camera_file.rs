@@ -19,8 +19,8 @@ const LEAST_SHIFT_PX: f64 = 0.5;
 /// Least change of an axis of the camera that the order of its rotations makes: half a pixel at a focal length of 5,000.
 const LEAST_TURN: f64 = 1e-4;
 
-/// The camera that the file or folder at `path` has for the photograph of `request`, of which `facts` are known, and what of it
-/// may be wrong, one sentence each.
+/// The camera that the file or folder at `path` has for the photograph of `request`, of which `facts` are known, what of it
+/// may be wrong, one sentence each, and whether another axis of its world seems to point up.
 ///
 /// # Errors
 /// On files that cannot be read, without a camera for the photograph, and of pictures of another
@@ -29,7 +29,7 @@ pub fn read(
     path: &Path,
     request: &Request,
     facts: &Facts,
-) -> Result<(View, Vec<String>), SetupError> {
+) -> Result<(View, Vec<String>, Option<String>), SetupError> {
     let (photo, asked, up) = (&*request.photo, &request.asked, request.camera_up);
     asked.check()?;
     let size = facts.size.map(f64::from);
@@ -72,7 +72,7 @@ pub fn read(
         turns: None,
     };
     let found = orientation::read_turned(path, &wanted, facts.orientation);
-    let (found, _) = found.map_err(|source| match source {
+    let (found, quarters) = found.map_err(|source| match source {
         CameraError::Read { path, source } => SetupError::Read { path, source },
         source => SetupError::CameraFile {
             path: path.into(),
@@ -106,7 +106,7 @@ pub fn read(
         frame: request.camera_frame,
         why,
     });
-    let mut warnings: Vec<String> = orientation::doubt_of_turn(path, facts.orientation)
+    let mut warnings: Vec<String> = orientation::doubt_of_turn(path, size, facts.orientation)
         .into_iter()
         .collect();
     if is_ambiguous {
@@ -122,7 +122,8 @@ pub fn read(
             .flatten(),
     );
     warnings.extend(rounded(pose.position).map(|what| format!("\"{}\": {what}", path.display())));
-    Ok((view, warnings))
+    let up = up.is_none().then(|| file::doubt(path, quarters)).flatten();
+    Ok((view, warnings, up))
 }
 
 /// Whether a `.chan` file has another camera if its rotations turn as in Blender's default.
@@ -247,7 +248,8 @@ mod tests {
             photo: "photos/b.jpg".into(),
             ..Request::default()
         };
-        read(&path, &request, &Facts::of_size(size)).map_err(|e| e.to_string())
+        let found = read(&path, &request, &Facts::of_size(size)).map_err(|e| e.to_string())?;
+        Ok((found.0, found.1))
     }
 
     #[test]

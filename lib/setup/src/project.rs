@@ -102,10 +102,13 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
     let mut warnings = models.warnings;
     let photo = read_photo(&request.photo, Transfer::Srgb)?;
     warnings.extend(photo.warnings.iter().cloned());
+    // Of axes that point up.
+    let mut doubts: Vec<String> = Vec::new();
     let view = match &request.camera {
         Some(path) => {
-            let (view, doubts) = camera_file::read(path, request, &photo.facts)?;
-            warnings.extend(doubts);
+            let (view, told, doubt) = camera_file::read(path, request, &photo.facts)?;
+            warnings.extend(told);
+            doubts.extend(doubt);
             view
         }
         None => {
@@ -115,10 +118,6 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
             view
         }
     };
-    let camera_file = request.camera.as_deref();
-    let doubted = camera_file.filter(|_| request.camera_up.is_none());
-    // Of axes that point up.
-    let mut doubts: Vec<String> = doubted.and_then(file::doubt).into_iter().collect();
     for path in [&request.camera, &request.points].into_iter().flatten() {
         warnings.extend(file::choice(path).filter(|c| !warnings.contains(c)));
     }
@@ -135,7 +134,7 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
     let alone = request
         .points
         .as_ref()
-        .filter(|p| camera_file.is_none() && !is_depth(p));
+        .filter(|p| request.camera.is_none() && !is_depth(p));
     warnings.extend(alone.map(|path| {
         format!(
             "\"{}\": points belong to the photograph only with the camera of the same scene: name it with --camera",
@@ -143,7 +142,7 @@ pub fn draft(request: &Request) -> Result<Draft, SetupError> {
         )
     }));
     let spots = spots(&camera, &plane, &widths);
-    let spots = spots.map_err(|e| e.of_camera(camera_file.is_some(), &doubts))?;
+    let spots = spots.map_err(|e| e.of_camera(request.camera.is_some(), &doubts))?;
     warnings.append(&mut doubts);
     let crowded = crowded(&camera, &plane, &spots, &widths);
     warnings.extend(crowded.filter(|_| !request.place_auto));

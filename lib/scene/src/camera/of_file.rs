@@ -67,9 +67,6 @@ impl FileSettings {
     /// Which of several models is read, or at which frame a camera that moves stands, as a warning.
     pub(crate) fn choice(&self, base_dir: &Path) -> Option<String> {
         let path = base_dir.join(&self.path);
-        if let Some(doubt) = orientation::doubt_of_turn(&path, self.orientation) {
-            return Some(doubt);
-        }
         let doubtful = self.shown(base_dir).filter(|shown| shown.is_doubtful);
         let beyond = |path: &Path, wanted: &Wanted| Ok(neighbours::beyond(path, wanted));
         let assumed = match doubtful {
@@ -89,9 +86,7 @@ impl FileSettings {
         file::has_one(&path)
             || match &self.which {
                 Which::Photo(_) => false,
-                Which::Number(_) => path
-                    .extension()
-                    .is_some_and(|e| e.eq_ignore_ascii_case("txt")),
+                Which::Number(_) => file::is_kitti(&path),
                 Which::Name(name) | Which::Frame(name, _) => {
                     let shown = file::all_shown(&path, Some(name), &any);
                     file::is_gltf(&path) && shown.is_ok_and(|shown| shown == [None])
@@ -109,10 +104,18 @@ impl FileSettings {
         shown.ok().flatten()
     }
 
-    /// Whether another axis of the file's world seems to point up, as a warning, where nobody says which.
-    pub(crate) fn doubt(&self, base_dir: &Path) -> Option<String> {
-        let is_told = self.up.is_some();
-        (!is_told).then(|| file::doubt(&base_dir.join(&self.path)))?
+    /// What may be wrong with the camera of a photograph of `resolution`, as warnings: that it was turned, and, where nobody says
+    /// which axis of the file's world points up, that it seems to be another one.
+    pub(crate) fn doubts(&self, resolution: [u32; 2], base_dir: &Path) -> Vec<String> {
+        let path = base_dir.join(&self.path);
+        let size = resolution.map(f64::from);
+        let turn = orientation::doubt_of_turn(&path, size, self.orientation);
+        let up = || {
+            let quarters = self.read_turned(resolution, base_dir).ok()?.1;
+            file::doubt(&path, quarters)
+        };
+        let up = self.up.is_none().then(up).flatten();
+        turn.into_iter().chain(up).collect()
     }
 
     /// Errors if the file has no camera for the photograph, whatever the shape of that.
@@ -125,26 +128,31 @@ impl FileSettings {
         resolution: [u32; 2],
         base_dir: &Path,
     ) -> Result<(Camera, Option<Undistortion>), Error> {
-        let found = self.turned(resolution, base_dir)?.0;
+        let found = self.read_turned(resolution, base_dir)?.0;
         let pose = self.pose(found.pose, resolution)?;
         Ok(of_lens(&pose, &self.lens(&found)?, resolution))
     }
 
     /// The camera, and by how many quarters it was turned as the photograph was.
-    fn turned(&self, resolution: [u32; 2], base_dir: &Path) -> Result<(Found, u32), Error> {
+    fn read_turned(&self, resolution: [u32; 2], base_dir: &Path) -> Result<(Found, u32), Error> {
         let read =
             |path: &Path, wanted: &Wanted| orientation::read_turned(path, wanted, self.orientation);
         self.found(resolution, base_dir, read)
     }
 
-    /// Where the camera stands in the frames of a shot before and after the photograph, of `resolution`.
+    /// Where the camera stands in the frames of a shot before and after the photograph, turned as that is where its resolution is
+    /// known.
     pub(crate) fn neighbours(
         &self,
-        resolution: [u32; 2],
+        resolution: Option<[u32; 2]>,
         base_dir: &Path,
     ) -> Result<[Option<Neighbour>; 2], Error> {
-        let quarters = self.turned(resolution, base_dir)?.1;
-        let found = self.found(resolution, base_dir, neighbours::neighbours)?;
+        let quarters = match resolution {
+            Some(resolution) => self.read_turned(resolution, base_dir)?.1,
+            None => 0,
+        };
+        let any = resolution.unwrap_or([1000, 1000]);
+        let found = self.found(any, base_dir, neighbours::neighbours)?;
         Ok(found.map(|beside| {
             let mut beside = beside?.turned(quarters);
             beside.pose.position *= f64::from(self.scale);

@@ -7,21 +7,21 @@ use super::*;
 use crate::camera::{FARTHEST_M, FileSettings};
 
 impl SceneConfig {
-    /// Where the camera stands in the frames of a shot before and after the photograph, of which `facts` are known, relative to
-    /// `base_dir` and as far as its file has them.
+    /// Where the camera stands in the frames of a shot before and after the photograph, relative to `base_dir` and as far as its
+    /// file has them. They are turned as the photograph is, if `facts` of it are given.
     ///
     /// # Errors
     /// As where the scene is loaded.
     pub fn neighbours(
         &self,
-        facts: &Facts,
+        facts: Option<&Facts>,
         base_dir: &Path,
     ) -> Result<[Option<Neighbour>; 2], Error> {
         let Some(mut file) = self.camera_file()? else {
             return Ok([None; 2]);
         };
-        file.orientation = facts.orientation;
-        file.neighbours(facts.size, base_dir)
+        file.orientation = facts.map_or(1, |facts| facts.orientation);
+        file.neighbours(facts.map(|facts| facts.size), base_dir)
     }
 
     /// Whether every picture of a shot has the photograph's camera.

@@ -164,10 +164,10 @@ fn may_be_a_lens(path: &Path) -> bool {
 pub(super) fn world_up(key: &str, word: &Option<String>) -> Result<Option<WorldUp>, Error> {
     Ok(match word.as_deref() {
         None => None,
-        Some("z") => Some(WorldUp::Z),
-        Some("y") => Some(WorldUp::Y),
-        Some("-y") => Some(WorldUp::MinusY),
-        Some(other) => return Err(wrong_word(key, other, &["z", "y", "-y"])),
+        Some(word) => match WorldUp::ALL.into_iter().find(|up| up.word() == word) {
+            None => return Err(wrong_word(key, word, &["z", "y", "-y", "x", "-x"])),
+            found => found,
+        },
     })
 }
 

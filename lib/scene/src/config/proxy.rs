@@ -28,7 +28,7 @@ pub struct ProxyConfig {
     pub points: Option<PathBuf>,
     /// Which axis of `points` points up.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schemars(extend("enum" = ["z", "y", "-y"]), extend("x-default" = "`y` for `.ply`; for COLMAP that of the camera's `file`, else `-y`; others `z`"), example = &"z")]
+    #[schemars(extend("enum" = ["z", "y", "-y", "x", "-x"]), extend("x-default" = "`y` for `.ply`; for COLMAP that of the camera's `file`, else `-y`; others `z`"), example = &"z")]
     pub points_up: Option<String>,
     /// Metres of a unit of `points`; a factor on the metres of a depth map.
     #[serde(skip_serializing_if = "Option::is_none")]
