@@ -10,8 +10,9 @@ use dipir_cli::interrupt;
 use dipir_cli::output::json_path;
 use dipir_cli::session::Session;
 use dipir_pipeline::error::StageError;
+use dipir_pipeline::status::State;
 use dipir_stages::names::{LIGHT, SCENE};
-use dipir_stages::{report, shot};
+use dipir_stages::{graph, report, shot};
 use serde_json::{Map, Value, json};
 
 use crate::lock::lock_folder;
@@ -66,8 +67,10 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     };
     let of_photo = RunArgs::needed(&common, Some(last));
     if args.plan {
-        // Without a scene nobody knows yet.
-        focus(&mut frames, shot::focused(&session).unwrap_or_default());
+        // Where the scene is not set up yet, what is in focus is not known.
+        if graph::state_of(&session, SCENE.name)? == State::Fresh {
+            focus(&mut frames, &shot::focused(&session)?);
+        }
         expose(args, &session, &mut frames, &told, false)?;
         let photo = run_one(&of_photo.planned(), &base)?;
         let (words, json) = plan::frames(&session, photo, &frames, args.force)?;
@@ -91,7 +94,7 @@ pub fn run(args: &ShotArgs) -> anyhow::Result<()> {
     if !common.output.json {
         common.output.result(|| done, || Value::Null);
     }
-    focus(&mut frames, shot::focused(&session)?);
+    focus(&mut frames, &shot::focused(&session)?);
     expose(args, &session, &mut frames, &told, true)?;
     let of_frames = RunArgs::needed(&common, None).forced(args.force);
     run_each(&of_frames, frames, |failed| {
@@ -156,18 +159,24 @@ fn frames(
         }
         frames.push((path.clone(), frame));
     }
-    if !stands_still {
-        let open = |(path, frame): &Frame| Ok((path.clone(), frame.open()?.0));
-        let opened: anyhow::Result<Vec<_>> = frames.iter().map(open).collect();
-        shot::check_cameras(&opened?)?;
-    }
+    let open = |(path, frame): &Frame| Ok((path.clone(), frame.open()?.0));
+    let opened: anyhow::Result<Vec<_>> = frames.iter().map(open).collect();
+    shot::check_cameras(&opened?)?;
     Ok((frames, told))
 }
 
-/// Focuses all frames alike.
-fn focus(frames: &mut [Frame], focused: Vec<String>) {
+/// Focuses all frames alike, as `focused` says if it says anything.
+fn focus(frames: &mut [Frame], focused: &[String]) {
+    if focused.is_empty() {
+        return;
+    }
+    let is_of_focus = |set: &String| {
+        let key = set.split('=').next().unwrap_or_default().trim();
+        shot::FOCUS.contains(&key)
+    };
     for (_, frame) in frames {
-        frame.set.extend_from_slice(&focused);
+        frame.set.retain(|set| !is_of_focus(set));
+        frame.set.extend_from_slice(focused);
     }
 }
 

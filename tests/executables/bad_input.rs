@@ -241,7 +241,7 @@ fn light_beyond_all_numbers_is_told_by_its_cause() {
     assert!(
         run.stderr.starts_with("error: the light in column ")
             && run.stderr.trim_end().ends_with(
-                "of the picture is beyond what 32-bit numbers hold: lower composite.exposure_ev, or the \
+                "of the picture is beyond what 32-bit numbers hold: lower composite.exposure_ev or emission_ev, or the \
                  radiance of the light or of what the object emits"
             ),
         "{}",

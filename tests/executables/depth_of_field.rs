@@ -45,7 +45,7 @@ fn what_is_out_of_focus_is_soft_and_takes_the_composite_alone() {
     let file = project.read("out/composite/composite.exr");
     let (soft, look) = softness(&project);
     let [least, most] = [0, 1].map(|i| look["out_of_focus_px"][i].as_f64().unwrap());
-    // 24 rows of 40 degrees are 33 focal lengths: times .2 m, times 1/1.5 less 1/4.6 and 1/3.5.
+    // Of 24 rows that see 40 degrees the focal length is 33 pixels: times .2 m, times 1/1.5 less 1/4.6 and 1/3.5.
     assert!(
         (2.4..=2.7).contains(&least) && (2.8..=3.1).contains(&most),
         "{look}"
@@ -108,6 +108,43 @@ fn the_photograph_says_how_wide_its_lens_was_open() {
     let (_, read) = softness(&project);
     assert_eq!(known["out_of_focus_px"], read["out_of_focus_px"]);
     assert!(read["out_of_focus_px"][0].as_f64().unwrap() > 2.0, "{read}");
+}
+
+#[test]
+fn all_frames_of_a_shot_are_focused_as_its_photograph() {
+    let project = Project::new();
+    let text = String::from_utf8(project.read("pipeline.toml")).unwrap();
+    project.write("pipeline.toml", text.replace("background.png", "photo.jpg"));
+    let lens = [(F_NUMBER, [1, 2]), (FOCAL_LENGTH, [200, 1])];
+    project.write_jpeg("photo.jpg", [90; 3], &lens);
+    // Frames of a film say nothing of the lens.
+    for name in ["a.png", "b.png"] {
+        project.write(name, project.read("background.png"));
+    }
+    let at = ["--set", "composite.focus_at_pixel=[18, 15]"];
+    let shot = |more: &[&str]| {
+        let run = project.run(
+            DIPIR,
+            &[&["shot", "a.png", "b.png"], &at[..], more].concat(),
+        );
+        run.expect_success();
+        run.stdout
+    };
+    project
+        .run(DIPIR, &[&["run"], &at[..]].concat())
+        .expect_success();
+    let (_, photo) = softness(&project);
+    shot(&[]);
+    for name in ["a", "b"] {
+        let look = project.read(&format!("out/frames/{name}/composite/look.json"));
+        let look: Value = serde_json::from_slice(&look).unwrap();
+        assert_eq!(look["out_of_focus_px"], photo["out_of_focus_px"], "{name}");
+    }
+    assert!(!shot(&[]).contains("ran "));
+    let planned = shot(&["--plan"]);
+    assert!(planned.contains("nothing to do"), "{planned}");
+    // Of a flag, too.
+    assert!(shot(&["--set", "composite.f_number=1"]).contains("ran composite"));
 }
 
 #[test]

@@ -55,7 +55,7 @@ fn what_the_camera_passes_is_blurred_and_takes_the_composite_alone() {
     assert!(run.stdout.contains(told), "{}", run.stdout);
     let file = project.read("out/composite/composite.exr");
     let (soft, look) = blurred(&project, "");
-    // 24 rows of 40 degrees are 33 focal lengths: times .5 m, over 3 to 5 m.
+    // Of 24 rows that see 40 degrees the focal length is 33 pixels: times .5 m, over 3 to 5 m.
     let [least, most] = [0, 1].map(|i| look["moving_px"][i].as_f64().unwrap());
     assert!(least > 3.2 && least < most && most < 5.6, "{look}");
     assert!(soft > sharp, "{sharp} {soft}");
@@ -73,6 +73,36 @@ fn what_the_camera_passes_is_blurred_and_takes_the_composite_alone() {
         run.stdout
     );
     assert_ne!(project.read("out/composite/composite.exr"), file);
+    project.write("shot.chan", &lines);
+    // The composite alone does not mix old and new.
+    let run = project.run(COMPOSITE, &open);
+    run.expect_error(
+        1,
+        "error: the camera's file \"shot.chan\" changed since the scene was set up; run dipir-scene again",
+    );
+    // Half as fast over twice as many frames is as far, and so are units of twice the length at half the numbers.
+    let slower = lines
+        .replace("1 -1 1.2 4", "0 -2 1.2 4")
+        .replace("3 1 1.2 4", "4 2 1.2 4");
+    for (lines, scale) in [
+        (slower, 1.0),
+        (
+            lines
+                .replace("1.2 4", ".6 2")
+                .replace("-1 .6", "-.5 .6")
+                .replace("1 .6", ".5 .6"),
+            2.0,
+        ),
+    ] {
+        project.write("shot.chan", lines);
+        let scale = format!("scene.camera.file_scale={scale}");
+        let run = project.run(DIPIR, &[&["run", "--set", &scale], &open[..]].concat());
+        run.expect_success();
+        assert!(
+            project.read("out/composite/composite.exr") == file,
+            "{scale}"
+        );
+    }
     project.write("shot.chan", lines);
     // A frame at either end of the shot goes on as it came.
     project.write("f.03.png", project.read("f.02.png"));
@@ -80,12 +110,48 @@ fn what_the_camera_passes_is_blurred_and_takes_the_composite_alone() {
     run.expect_success();
     let (_, look) = blurred(&project, "frames/f.03/");
     assert!(look["moving_px"][0].as_f64().unwrap() > 3.0, "{look}");
+    let run = project.run(DIPIR, &[&["shot", "f.03.png"], &open[..]].concat());
+    run.expect_success();
+    assert!(!run.stdout.contains("ran "), "{}", run.stdout);
     // Too short to be seen: the same picture as without.
     let run = project.run(COMPOSITE, &["--set", "composite.shutter_deg=1"]);
     run.expect_success();
     let told = "motion blur: the camera hardly moves past the objects";
     assert!(run.stdout.contains(told), "{}", run.stdout);
     assert_eq!(project.read("out/composite/composite.exr"), plain);
+}
+
+#[test]
+fn motion_blur_goes_with_everything_else() {
+    let project = project();
+    project.write("mask.png", project.read("f.02.png"));
+    let open = ["--set", "composite.shutter_deg=180"];
+    for set in [
+        "composite.most_pixels=216",
+        "composite.time_budget_s=1",
+        "composite.aperture_mm=100",
+        "composite.ground_roughness=0.1",
+        "scene.occluders=mask.png",
+        "composite.denoise=false",
+    ] {
+        let more: &[&str] = match set {
+            "composite.aperture_mm=100" => &["--set", "composite.focus_m=2"],
+            _ => &[],
+        };
+        let run = project.run(DIPIR, &[&["run", "--set", set], more, &open].concat());
+        run.expect_success();
+        let (_, look) = blurred(&project, "");
+        assert!(
+            look["moving_px"][0].as_f64().unwrap() > 3.0,
+            "{set}: {look}"
+        );
+    }
+    let look = |name: &str, more: &[&str]| {
+        let run = project.run(DIPIR, &[&["preview", "-o", name], more].concat());
+        run.expect_success();
+        project.read(name)
+    };
+    assert!(look("sharp.png", &[]) != look("moving.png", &open));
 }
 
 #[test]
@@ -104,10 +170,20 @@ fn a_shutter_that_makes_no_sense_is_refused() {
     let lines = String::from_utf8(project.read("shot.chan")).unwrap();
     let own = lines.lines().nth(1).unwrap();
     project.write("shot.chan", own);
+    // Of the place alone a photograph need not be a frame of the shot.
     let run = project.run(SCENE, &["--set", "composite.shutter_deg=180"]);
-    assert_eq!(run.code, Some(2), "{}", run.stderr);
-    let told = "composite.shutter_deg: the camera moves from frame to frame, and scene.camera.file has none before or after \
-                the photograph's: name the shot's .chan";
-    assert!(run.stderr.contains(told), "{}", run.stderr);
-    assert!(!project.path("out/scene").exists());
+    run.expect_success();
+    let told = "composite.shutter_deg: nothing tells how the camera moves: scene.camera.file has no frame before or after the \
+                photograph's. Name the shot's .chan";
+    for command in [&["run"][..], &["shot", "f.02.png"]] {
+        let args = [
+            command,
+            &["--set", "composite.shutter_deg=180", "-o", "new"],
+        ]
+        .concat();
+        let run = project.run(DIPIR, &args);
+        assert_eq!(run.code, Some(2), "{}", run.stderr);
+        assert!(run.stderr.contains(told), "{}", run.stderr);
+        assert!(!project.path("new/scene").exists());
+    }
 }

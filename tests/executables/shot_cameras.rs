@@ -81,6 +81,18 @@ fn every_frame_has_the_camera_of_its_name() {
         assert_eq!(places, [0.5, -0.5, 0.0], "{own}");
         project.run(DIPIR, &["clean"]).expect_success();
     }
+    // A number that names the photograph's camera does not hold those of COLMAP's model still.
+    std::fs::create_dir_all(project.path("sparse/0")).unwrap();
+    project.write("sparse/0/cameras.txt", "1 PINHOLE 36 24 40 40 18 12\n");
+    let image = |(name, x): (&str, f64)| format!("1 0 1 0 0 {} 1.5 5 1 {name}\n\n", -x);
+    let images = [("background.png", 0.0), ("a.png", 0.5), ("b.png", -0.5)].map(image);
+    project.write("sparse/0/images.txt", images.concat());
+    with("file = \"sparse/0/images.txt\"\nfile_up = \"y\"\nframe = 0");
+    shot(&project, &["b.png", "a.png"]);
+    let places = ["frames/a", "frames/b", "."].map(place);
+    assert_eq!(places, [0.5, -0.5, 0.0]);
+    project.run(DIPIR, &["clean"]).expect_success();
+    with("file = \"transforms.json\"\nfile_up = \"y\"");
     // What cannot be is said before anything runs.
     let refused = |args: &[&str], message: &str| {
         let run = project.run(DIPIR, &[&["shot"], args].concat());

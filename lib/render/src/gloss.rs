@@ -281,7 +281,11 @@ impl Renderer<'_> {
                 bottom + reach.y,
             ]
         };
-        let may_show = |sides: [f32; 4]| may_show(widened(sides));
+        let may_show = |sides: [f32; 4]| {
+            let widened = widened(sides);
+            // Ground that passes behind the camera may be anywhere.
+            !widened.iter().all(|side| side.is_finite()) || may_show(widened)
+        };
         let job = |block: Block| {
             if !may_show(sides(block)) {
                 return None;

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 /// Where a camera stands, and how it is turned.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Stand {
+pub struct CameraPose {
     /// Centre of projection, metres.
     pub position: Vec3,
     /// Turns the camera's right, up and backward axes into the world.
@@ -21,17 +21,17 @@ pub struct Stand {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Shutter {
     /// Where it opens.
-    pub opens: Stand,
+    pub opens: CameraPose,
     /// In the middle of that time: where the camera of the picture stands.
-    pub middle: Stand,
+    pub middle: CameraPose,
     /// Where it closes.
-    pub closes: Stand,
+    pub closes: CameraPose,
 }
 
 /// Lines that reach less far leave a shadow as it is, pixels.
 const LEAST_PX: f32 = 0.25;
 
-impl Stand {
+impl CameraPose {
     /// Of this camera.
     pub fn of(camera: &Camera) -> Self {
         Self {
@@ -57,10 +57,10 @@ impl Shutter {
         } else {
             &self.closes
         };
-        let stand = self.middle.towards(end, time.abs());
+        let pose = self.middle.towards(end, time.abs());
         Camera {
-            position: stand.position,
-            rotation: Mat3::from_quat(stand.rotation),
+            position: pose.position,
+            rotation: Mat3::from_quat(pose.rotation),
             ..*camera
         }
     }
@@ -88,6 +88,9 @@ impl Shutter {
     ) -> Raster<Vec3> {
         let width = shadow.width();
         let mut output = shadow.clone();
+        let Some([low, high]) = shaded(shadow) else {
+            return output;
+        };
         let rows = output.pixels_mut().par_chunks_mut(width).enumerate();
         rows.for_each(|(y, row)| {
             for (x, pixel) in row.iter_mut().enumerate() {
@@ -97,13 +100,32 @@ impl Shutter {
                 let Some([Some(opens), Some(closes)]) = ends else {
                     continue;
                 };
-                if opens.length().max(closes.length()) >= LEAST_PX {
+                let first = at.min(at - opens).min(at - closes);
+                let last = at.max(at - opens).max(at - closes);
+                let meets = last.cmpge(low).all() && first.cmple(high).all();
+                if meets && opens.length().max(closes.length()) >= LEAST_PX {
                     *pixel = 0.5 * (mean(shadow, at, -opens) + mean(shadow, at, -closes));
                 }
             }
         });
         output
     }
+}
+
+/// Corners of a box that holds all that is not 1, and a pixel around it; `None` if everything is.
+fn shaded(shadow: &Raster<Vec3>) -> Option<[Vec2; 2]> {
+    let columns = |row: &[Vec3]| {
+        let first = row.iter().position(|s| *s != Vec3::ONE)?;
+        let last = row.iter().rposition(|s| *s != Vec3::ONE)?;
+        Some((first, last))
+    };
+    let rows = (0..shadow.height()).filter_map(|y| Some((y, columns(shadow.row(y))?)));
+    rows.fold(None, |all, (y, (first, last))| {
+        let low = Vec2::new(first as f32, y as f32) - 1.0;
+        let high = Vec2::new(last as f32, y as f32) + 2.0;
+        let [l, h] = all.unwrap_or([low, high]);
+        Some([l.min(low), h.max(high)])
+    })
 }
 
 /// The mean of an image along a line from `start`, in the image.

@@ -22,6 +22,13 @@ pub mod exposure;
 
 /// Folder of the frames' artifacts in that of all.
 pub const FOLDER: &str = "frames";
+/// Keys that say what is in focus, and how wide the lens was open.
+pub const FOCUS: [&str; 4] = [
+    "composite.focus_m",
+    "composite.focus_at_pixel",
+    "composite.f_number",
+    "composite.aperture_mm",
+];
 /// Exposures that differ by less are one, stops: cameras round times and f-numbers.
 const SAME_EXPOSURE: f64 = 0.05;
 
@@ -101,13 +108,14 @@ pub fn exposed(session: &Session, stops: f64, tint: [f64; 3]) -> anyhow::Result<
 }
 
 /// What makes a frame focused as the session's photograph is, whose scene is set up: the same distance and opening, as
-/// `KEY=VALUE`. Nothing where no key says what is in focus.
+/// `KEY=VALUE` in place of all keys of [`FOCUS`]. Nothing where these say it alike of every frame, or say nothing.
 ///
 /// # Errors
 /// As [`CompositeTable::optics`], and if the scene cannot be read.
 pub fn focused(session: &Session) -> anyhow::Result<Vec<String>> {
     let composite: CompositeTable = session.config.table("composite")?;
-    if composite.focus_m.is_none() && composite.focus_at_pixel.is_none() {
+    let is_told = composite.focus_m.is_some() && composite.aperture_mm.is_some();
+    if is_told || (composite.focus_m.is_none() && composite.focus_at_pixel.is_none()) {
         return Ok(Vec::new());
     }
     let loaded = SceneFolder::read(session)?.loaded;
@@ -159,7 +167,10 @@ pub fn overrides(
         };
         if let Some(frame) = numbered {
             let own = number(path);
-            if let Some((own, other)) = own.and_then(|own| Some((own, taken.insert(own, path)?))) {
+            let other = own.and_then(|own| Some((own, taken.insert(own, path)?)));
+            // Of one name they have one folder, which is refused elsewhere.
+            let other = other.filter(|(_, other)| stem(other) != stem(path));
+            if let Some((own, other)) = other {
                 let why = format!(
                     "the camera moves, and {own}, the number at the end of its name, is that of {}, too: rename the pictures so \
                      that the frame's number ends their names, as in plate.1001.png",
@@ -188,17 +199,23 @@ fn masks(scene: &SceneConfig) -> bool {
 fn frame_of_chan(scene: &SceneConfig, camera: &CameraConfig, path: &Path) -> Result<u32, Usage> {
     let why = "its name does not end in the number of a frame of .chan";
     let number = number(path).ok_or_else(|| wrong(path, why))?;
-    Ok(counted(scene, camera, number).unwrap_or(number))
+    let frame = counted(scene, camera, path).unwrap_or(number.into());
+    u32::try_from(frame).map_err(|_| {
+        let why = format!("counted from the photograph's frame it is frame {frame}");
+        wrong(path, &why)
+    })
 }
 
-/// The frame that a picture of this number is, by the photograph's number and the frame that is written for it.
-fn counted(scene: &SceneConfig, camera: &CameraConfig, number: u32) -> Option<u32> {
-    let photo = scene.background.as_deref().and_then(self::number)?;
-    let frame = i64::from(camera.frame?) + i64::from(number) - i64::from(photo);
-    Some(frame.clamp(0, u32::MAX.into()) as u32)
+/// The frame that the picture in `path` is, by the frame that is written for the photograph, if their names are alike but for
+/// their numbers.
+fn counted(scene: &SceneConfig, camera: &CameraConfig, path: &Path) -> Option<i64> {
+    let [own, photo] = [path, scene.background.as_deref()?].map(|p| Some(split(stem(p)?)));
+    let (own, photo) = own.zip(photo).filter(|(own, photo)| own.0 == photo.0)?;
+    let number = |digits: &str| digits.parse::<u32>().ok().map(i64::from);
+    Some(i64::from(camera.frame?) + number(own.1)? - number(photo.1)?)
 }
 
-/// Refuses frames without a camera, each with the session that makes it, before anything runs.
+/// Refuses frames without a camera, or with a shutter and a camera that nothing says the motion of, each with the session that makes it, before anything runs.
 ///
 /// # Errors
 /// Where the camera's file has none for a frame.
@@ -207,7 +224,9 @@ pub fn check_cameras(frames: &[(PathBuf, Session)]) -> anyhow::Result<()> {
         let view = exposure::settings(session)?;
         let checked = view.check_camera(&session.config.base_dir());
         let placed = checked.map_err(|e| with_place(e, &session.config));
-        placed.with_context(|| path.display().to_string())
+        let composite: CompositeTable = session.config.table("composite")?;
+        let moves = placed.and_then(|()| composite.shutter_params(&session.config).map(|_| ()));
+        moves.with_context(|| path.display().to_string())
     };
     let checked: Vec<_> = frames.par_iter().map(check).collect();
     all_or_first(checked).map(|_| ())
@@ -297,8 +316,9 @@ fn moved(
     let photos: Vec<PathBuf> = photos.collect::<std::io::Result<_>>()?;
     let shown = file::all_shown(&own, camera.image.as_deref(), &photos).map_err(named)?;
     let mut frame_of = |path: &Path, shown: Shown| {
-        if let Some(frame) = number(path).and_then(|number| counted(scene, camera, number)) {
-            return frame;
+        if let Some(frame) = counted(scene, camera, path) {
+            // Before the first frame the camera stands still.
+            return frame.clamp(0, u32::MAX.into()) as u32;
         }
         let assumed = format!("\"{}\": {}", own.display(), shown.assumed);
         tell(assumed, shown.is_doubtful);

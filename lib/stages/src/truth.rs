@@ -24,6 +24,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
+use crate::composite::shutter::that_blurs;
 use crate::composite::table::{CompositeTable, Tone};
 use crate::interruption;
 use crate::known_light::Placement;
@@ -131,24 +132,30 @@ pub fn compare(session: &Session) -> anyhow::Result<Option<Truth>> {
         rmse_recovered: apart(&found),
         rmse_neutral: apart(&neutral),
         peak: Some(peak),
-        left_out: left_out(&lit, &scene),
+        left_out: left_out(session, &scene)?,
     }))
 }
 
 /// What the composite simulates beside what is compared.
-fn left_out(table: &CompositeTable, scene: &SceneFolder) -> Vec<&'static str> {
-    let focus = table.focus_m.is_some() || table.focus_at_pixel.is_some();
-    let catches = scene.loaded.catching().is_some();
-    [
-        ("depth of field", focus),
-        ("motion blur", table.shutter_deg.is_some()),
+fn left_out(session: &Session, scene: &SceneFolder) -> anyhow::Result<Vec<&'static str>> {
+    let table: CompositeTable = session.config.table("composite")?;
+    let optics = table.optics(&session.config, &scene.loaded)?;
+    let (optics, _) = that_blurs(optics, &scene.loaded);
+    let all = [
+        ("depth of field", optics.lens.is_some()),
+        ("motion blur", optics.shutter.is_some()),
         ("the ground's mirror image", table.gloss().is_some()),
-        ("shadows on what scene.depth shows", catches),
-        ("composite.emission_ev", table.emission_gain().is_some()),
-    ]
-    .into_iter()
-    .filter_map(|(what, is_shown)| is_shown.then_some(what))
-    .collect()
+        (
+            "shadows on what scene.depth shows",
+            scene.loaded.catching().is_some(),
+        ),
+        (
+            "what composite.emission_ev and emission_tint change",
+            table.emission_gain().is_some(),
+        ),
+    ];
+    let shown = all.into_iter().filter(|(_, is_shown)| *is_shown);
+    Ok(shown.map(|(what, _)| what).collect())
 }
 
 /// Degrees between the direction of a recovered light, turned as the picture has it, and the true one.

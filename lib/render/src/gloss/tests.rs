@@ -9,7 +9,7 @@ use glam::{Mat3, Quat};
 use super::*;
 use crate::lens::ThinLens;
 use crate::shapes::icosphere;
-use crate::shutter::{Shutter, Stand};
+use crate::shutter::{CameraPose, Shutter};
 use crate::testing::{
     camera, carry_on, everything, ground, lambertian, matte, render, scene, settings, sky,
 };
@@ -320,14 +320,14 @@ fn every_pixel_whose_lobe_meets_the_object_is_looked_at() {
         lens: Some(lens),
         ..sharp
     };
-    let end = |by: f32| Stand {
+    let end = |by: f32| CameraPose {
         position: view().position + Vec3::new(0.3, 0.05, -0.1) * by,
-        rotation: Quat::from_rotation_z(0.1 * by) * Stand::of(&view()).rotation,
+        rotation: Quat::from_rotation_z(0.1 * by) * CameraPose::of(&view()).rotation,
     };
     let moving = Optics {
         shutter: Some(Shutter {
             opens: end(-1.0),
-            middle: Stand::of(&view()),
+            middle: CameraPose::of(&view()),
             closes: end(1.0),
         }),
         ..sharp

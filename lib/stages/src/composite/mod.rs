@@ -143,6 +143,9 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     let mut writer = begin(session, plan(session, &table)?)?;
     writer.add_time(reading);
     let curve = Curve::of(table.tone, &light, inputs.scene.loaded.taken());
+    if table.shutter_deg.is_some() {
+        scene_folder::refuse_other_camera(session, &inputs.scene.manifest)?;
+    }
     let optics = table.optics(&session.config, &inputs.scene.loaded)?;
     let (optics, blurs) = shutter::that_blurs(optics, &inputs.scene.loaded);
     let look = Look::of(inputs.scene.loaded.taken(), blurs, &table);
@@ -240,7 +243,7 @@ fn check_finite(picture: &LinearImage) -> anyhow::Result<()> {
     let width = picture.0.width();
     bail!(
         "the light in column {}, row {} of the picture is beyond what 32-bit numbers hold: lower \
-         composite.exposure_ev, or the radiance of the light or of what the object emits",
+         composite.exposure_ev or emission_ev, or the radiance of the light or of what the object emits",
         at % width,
         at / width
     )
@@ -272,6 +275,7 @@ pub fn plan_of(session: &Session) -> anyhow::Result<StagePlan> {
 /// What a run with `table` would be.
 fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> {
     table.check(&session.config)?;
+    let shutter = table.shutter_params(&session.config)?;
     let scene = scene_folder::manifest(session)?;
     let known = known_light::known_params(table);
     let mut params = json!({
@@ -295,20 +299,17 @@ fn plan(session: &Session, table: &CompositeTable) -> anyhow::Result<StagePlan> 
     if let Some(focus) = table.focus_params() {
         params["focus"] = focus;
     }
-    if let Some(shutter_deg) = table.shutter_deg {
-        params["shutter_deg"] = shutter_deg.into();
+    if let Some(shutter) = shutter {
+        params["shutter"] = shutter;
     }
-    if let Some(emission) = table.emission_gain() {
-        params["emission"] = json!(emission.to_array());
+    if let Some(emission) = table.emission_params() {
+        params["emission"] = emission;
     }
     if let Some(follows) = odd_sharpness(table, session.pipeline.quality) {
         params["follow_sharpness"] = follows.into();
     }
     let mut plan = COMPOSITE.plan(session, params);
     scene_folder::add_inputs(&mut plan, &scene, &["scene", "effects", "gbuffer"])?;
-    if table.shutter_deg.is_some() {
-        scene_folder::add_camera(session, &mut plan, &scene)?;
-    }
     match known {
         Some((_, path)) => plan.input("environment", path, &session.resolve(path))?,
         None => light_folder::add_inputs(session, &mut plan)?,

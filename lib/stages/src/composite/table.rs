@@ -11,6 +11,7 @@ use dipir_scene::scene::Scene;
 use glam::Vec3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
 
 use crate::known_light::Placement;
 use crate::presets::{self, CompositePreset};
@@ -84,9 +85,9 @@ pub struct CompositeTable {
     /// Diameter of the opening of the photograph's lens, millimetres: its true focal length over its f-number. Excludes `f_number`.
     #[schemars(extend("exclusiveMinimum" = 0), range(max = 1e3), extend("x-default" = "focal length over `f_number`"), example = 28.0)]
     pub aperture_mm: Option<f32>,
-    /// How long the shutter was open, degrees: 360 is from frame to frame, 180 half of that. What the camera of a shot passes is
-    /// then blurred as by its way, the frame's own place being in the middle.
-    #[schemars(extend("exclusiveMinimum" = 0), range(max = 360.0), extend("x-default" = "none: nothing moves"), example = 180.0)]
+    /// How long the shutter was open, degrees: 360 is from frame to frame, 180 half of that. The objects are then blurred by the
+    /// motion of a shot's camera around each frame.
+    #[schemars(extend("exclusiveMinimum" = 0), range(max = 360.0), extend("x-default" = "none: no motion blur"), example = 180.0)]
     pub shutter_deg: Option<f32>,
     /// Curve on the object's light before it is laid over the photograph: `none`, or `reinhard`, `x
     /// / (1 + x)` on every channel, for photographs whose highlights are compressed.
@@ -236,6 +237,12 @@ impl CompositeTable {
         let stops = Vec3::from(self.emission_tint.unwrap_or_default());
         let stops = stops + self.emission_ev.unwrap_or_default();
         (stops != Vec3::ZERO).then(|| stops.exp2())
+    }
+
+    /// What the table says of that, if anything.
+    pub(super) fn emission_params(&self) -> Option<Value> {
+        let params = json!({"ev": self.emission_ev, "tint": self.emission_tint});
+        self.emission_gain().map(|_| params)
     }
 
     /// Makes the objects of `scene` glow as much as the table says.

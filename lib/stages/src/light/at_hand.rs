@@ -154,7 +154,11 @@ fn is_fresh(session: &Session) -> bool {
         };
         let light = match &of(LIGHT.name)?.state {
             State::Fresh => true,
-            State::Waits { on, reasons } => *on == [SCENE.name] && reasons.is_empty(),
+            // Whether it can run is not told while it waits.
+            State::Waits { on, reasons } => {
+                let own = || graph::state_of(session, LIGHT.name).ok() == Some(State::Fresh);
+                *on == [SCENE.name] && reasons.is_empty() && own()
+            }
             _ => false,
         };
         Some(scene && light)

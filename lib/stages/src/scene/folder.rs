@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use dipir_cli::session::Session;
 use dipir_pipeline::error::StageError;
 use dipir_pipeline::fingerprint::{StaleReason, parameter_changes};
-use dipir_pipeline::manifest::{Artifact, Manifest};
+use dipir_pipeline::manifest::{Artifact, Manifest, hash_file};
 use dipir_pipeline::stage::{MISSING, StagePlan};
 use dipir_render::effects::EffectsPlan;
 use dipir_scene::config::SceneConfig;
@@ -65,11 +65,17 @@ pub fn add_inputs(plan: &mut StagePlan, scene: &Manifest, roles: &[&str]) -> any
     Ok(())
 }
 
-/// Adds the camera's files to the inputs of a plan, for a stage that reads more of them than is in `scene.json`.
-pub fn add_camera(session: &Session, plan: &mut StagePlan, scene: &Manifest) -> anyhow::Result<()> {
-    let files = scene.inputs.iter();
-    for file in files.filter(|a| unnumbered(&a.role) == "camera") {
-        plan.input("camera", &file.path, &session.resolve(&file.path))?;
+/// Refuses a scene whose camera's files are others now, for a stage that reads more of them than is in `scene.json`.
+pub fn refuse_other_camera(session: &Session, scene: &Manifest) -> anyhow::Result<()> {
+    for file in &scene.inputs {
+        let is_camera = unnumbered(&file.role) == "camera";
+        if is_camera && hash_file(&session.resolve(&file.path))?.1 != file.blake3 {
+            anyhow::bail!(
+                "the camera's file \"{}\" changed since the scene was set up; run {} again",
+                file.path.display(),
+                SCENE.executable
+            );
+        }
     }
     Ok(())
 }

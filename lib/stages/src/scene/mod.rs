@@ -88,7 +88,7 @@ pub fn run(session: &Session) -> anyhow::Result<Done> {
     composite.check(&session.config)?;
     let mut loaded = load(session, &config)?.map_err(|e| with_place(e, &session.config))?;
     // What the composite needs to know of the photograph is missed here, before anything long runs.
-    composite.optics(&session.config, &loaded)?;
+    composite.lens(&session.config, &loaded)?;
     for warning in loaded.warnings.iter().chain(&implausible(&loaded)) {
         session.warn(warning);
     }
