@@ -38,31 +38,37 @@ fn pictures_that_are_upright_by_another_axis_are_told() {
 #[test]
 fn a_model_of_colmap_s_that_was_turned_to_the_earth_is_told() {
     let folder = tempfile::tempdir().unwrap();
-    let put = |turn: DMat3| {
+    let put = |turn: DMat3, is_stored_turned: bool| {
         let image = |r: DMat3| {
+            let upright = turn * r;
+            // Turned by a quarter clockwise it is upright.
+            let stored = match is_stored_turned {
+                true => DMat3::from_cols(-upright.y_axis, upright.x_axis, upright.z_axis),
+                false => upright,
+            };
             // World to camera, in image axes.
             let to_image = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-            let q = DQuat::from_mat3(&(to_image * (turn * r).transpose()));
+            let q = DQuat::from_mat3(&(to_image * stored.transpose()));
             format!("1 {} {} {} {} 0 0 0 1 a.png\n\n", q.w, q.x, q.y, q.z)
         };
         let put = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
         put("cameras.txt", "1 PINHOLE 300 200 250 250 150 100\n");
         put("images.txt", &around(12).map(image).collect::<String>());
-        [0, 1].map(|quarters| file::doubt(folder.path(), quarters))
+        file::doubt(folder.path(), is_stored_turned.into())
     };
     let by = DMat3::from_rotation_x;
-    let [upright, turned] = put(by(std::f64::consts::PI));
-    assert_eq!(upright, None);
-    // Of pictures that Exif turns by a quarter clockwise: what is up in them is to the left as they are stored.
-    assert!(
-        turned
-            .unwrap()
-            .contains("-x of its world points up, and -y is taken"),
-        "a quarter"
-    );
-    let told = put(by(std::f64::consts::FRAC_PI_2))[0].clone().unwrap();
+    assert_eq!(put(by(std::f64::consts::PI), false), None);
+    let told = put(by(std::f64::consts::FRAC_PI_2), false).unwrap();
     assert!(
         told.contains("z of its world points up, and -y is taken"),
+        "{told}"
+    );
+    // The first camera as it is stored has -y up, the picture of it -x.
+    assert_eq!(put(by(std::f64::consts::PI), true), None);
+    let sideways = DMat3::from_rotation_z(std::f64::consts::FRAC_PI_2);
+    let told = put(sideways, true).unwrap();
+    assert!(
+        told.contains("-x of its world points up, and -y is taken"),
         "{told}"
     );
 }
