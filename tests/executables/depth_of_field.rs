@@ -1,5 +1,4 @@
 //! Objects out of focus.
-use dipir_imaging::layers::Layers;
 use serde_json::Value;
 
 use crate::project::*;
@@ -7,30 +6,11 @@ use crate::project::*;
 /// A lens so wide that the object, four metres away, is a disc of pixels.
 const WIDE: &str = "composite.aperture_mm=400";
 
-fn softness(project: &Project) -> (usize, Value) {
-    let layers = Layers::read_exr(project.path("out/composite/composite.exr")).unwrap();
-    let alpha = layers.channel("object.A").unwrap();
-    let [object, shadow, background, picture] =
-        ["object", "shadow", "background", ""].map(|name| layers.rgb(name).unwrap());
-    for (i, a) in alpha.pixels().iter().enumerate() {
-        let again = background.pixels()[i] * shadow.pixels()[i] * (1.0 - a) + object.pixels()[i];
-        // Half precision has 11 bits, and rounds each layer once.
-        let off = (again - picture.pixels()[i]).abs().max_element();
-        assert!(
-            off <= 2e-3 * picture.pixels()[i].max_element().max(0.01),
-            "{i} {off}"
-        );
-    }
-    let edges = alpha.pixels().iter().filter(|a| **a > 0.0 && **a < 1.0);
-    let look = serde_json::from_slice(&project.read("out/composite/look.json")).unwrap();
-    (edges.count(), look)
-}
-
 #[test]
 fn what_is_out_of_focus_is_soft_and_takes_the_composite_alone() {
     let project = Project::new();
     project.run_both(&[]);
-    let (sharp, look) = softness(&project);
+    let (sharp, look) = project.edges_and_look("out");
     assert!(look.get("out_of_focus_px").is_none(), "{look}");
     let near = ["--set", WIDE, "--set", "composite.focus_m=1.5"];
     let run = project.run(DIPIR, &[&["run"], &near[..]].concat());
@@ -43,7 +23,7 @@ fn what_is_out_of_focus_is_soft_and_takes_the_composite_alone() {
         run.stdout
     );
     let file = project.read("out/composite/composite.exr");
-    let (soft, look) = softness(&project);
+    let (soft, look) = project.edges_and_look("out");
     let [least, most] = [0, 1].map(|i| look["out_of_focus_px"][i].as_f64().unwrap());
     // Of 24 rows that see 40 degrees the focal length is 33 pixels: times .2 m, times 1/1.5 less 1/4.6 and 1/3.5.
     assert!(
@@ -58,7 +38,7 @@ fn what_is_out_of_focus_is_soft_and_takes_the_composite_alone() {
     // The ground under the object: in focus.
     let there = ["--set", WIDE, "--set", "composite.focus_at_pixel=[18, 15]"];
     project.run(COMPOSITE, &there).expect_success();
-    let (there, look) = softness(&project);
+    let (there, look) = project.edges_and_look("out");
     assert_eq!(look["out_of_focus_px"][0], 0.0, "{look}");
     assert!(there < soft, "{there} {soft}");
     // A lens too small to blur: the same picture as without.
@@ -98,14 +78,14 @@ fn the_photograph_says_how_wide_its_lens_was_open() {
             &[&focused[..], &["--set", "composite.f_number=0.5"]].concat(),
         )
         .expect_success();
-    let (_, known) = softness(&project);
+    let (_, known) = project.edges_and_look("out");
     project.write_jpeg(
         "photo.jpg",
         [90; 3],
         &[(F_NUMBER, [1, 2]), (FOCAL_LENGTH, [200, 1])],
     );
     project.run(DIPIR, &focused).expect_success();
-    let (_, read) = softness(&project);
+    let (_, read) = project.edges_and_look("out");
     assert_eq!(known["out_of_focus_px"], read["out_of_focus_px"]);
     assert!(read["out_of_focus_px"][0].as_f64().unwrap() > 2.0, "{read}");
 }
@@ -133,7 +113,7 @@ fn all_frames_of_a_shot_are_focused_as_its_photograph() {
     project
         .run(DIPIR, &[&["run"], &at[..]].concat())
         .expect_success();
-    let (_, photo) = softness(&project);
+    let (_, photo) = project.edges_and_look("out");
     shot(&[]);
     for name in ["a", "b"] {
         let look = project.read(&format!("out/frames/{name}/composite/look.json"));

@@ -1,7 +1,4 @@
 //! Cameras that move while their shutter is open.
-use dipir_imaging::layers::Layers;
-use serde_json::Value;
-
 use crate::project::*;
 
 /// A project whose photograph is the second of three frames of a camera that goes a metre a frame to the right.
@@ -19,31 +16,11 @@ fn project() -> Project {
     project
 }
 
-fn blurred(project: &Project, frame: &str) -> (usize, Value) {
-    let folder = format!("out/{frame}composite");
-    let layers = Layers::read_exr(project.path(&format!("{folder}/composite.exr"))).unwrap();
-    let alpha = layers.channel("object.A").unwrap();
-    let [object, shadow, background, picture] =
-        ["object", "shadow", "background", ""].map(|name| layers.rgb(name).unwrap());
-    for (i, a) in alpha.pixels().iter().enumerate() {
-        let again = background.pixels()[i] * shadow.pixels()[i] * (1.0 - a) + object.pixels()[i];
-        // Half precision has 11 bits, and rounds each layer once.
-        let off = (again - picture.pixels()[i]).abs().max_element();
-        assert!(
-            off <= 2e-3 * picture.pixels()[i].max_element().max(0.01),
-            "{i} {off}"
-        );
-    }
-    let edges = alpha.pixels().iter().filter(|a| **a > 0.0 && **a < 1.0);
-    let look = serde_json::from_slice(&project.read(&format!("{folder}/look.json"))).unwrap();
-    (edges.count(), look)
-}
-
 #[test]
 fn what_the_camera_passes_is_blurred_and_takes_the_composite_alone() {
     let project = project();
     project.run_both(&[]);
-    let (sharp, look) = blurred(&project, "");
+    let (sharp, look) = project.edges_and_look("out");
     assert!(look.get("moving_px").is_none(), "{look}");
     let plain = project.read("out/composite/composite.exr");
     let open = ["--set", "composite.shutter_deg=180"];
@@ -54,7 +31,7 @@ fn what_the_camera_passes_is_blurred_and_takes_the_composite_alone() {
     let told = "motion blur: points of the objects are lines of";
     assert!(run.stdout.contains(told), "{}", run.stdout);
     let file = project.read("out/composite/composite.exr");
-    let (soft, look) = blurred(&project, "");
+    let (soft, look) = project.edges_and_look("out");
     // Of 24 rows that see 40 degrees the focal length is 33 pixels: times .5 m, over 3 to 5 m.
     let [least, most] = [0, 1].map(|i| look["moving_px"][i].as_f64().unwrap());
     assert!(least > 3.2 && least < most && most < 5.6, "{look}");
@@ -108,7 +85,7 @@ fn what_the_camera_passes_is_blurred_and_takes_the_composite_alone() {
     project.write("f.03.png", project.read("f.02.png"));
     let run = project.run(DIPIR, &[&["shot", "f.03.png"], &open[..]].concat());
     run.expect_success();
-    let (_, look) = blurred(&project, "frames/f.03/");
+    let (_, look) = project.edges_and_look("out/frames/f.03");
     assert!(look["moving_px"][0].as_f64().unwrap() > 3.0, "{look}");
     let run = project.run(DIPIR, &[&["shot", "f.03.png"], &open[..]].concat());
     run.expect_success();
@@ -140,7 +117,7 @@ fn motion_blur_goes_with_everything_else() {
         };
         let run = project.run(DIPIR, &[&["run", "--set", set], more, &open].concat());
         run.expect_success();
-        let (_, look) = blurred(&project, "");
+        let (_, look) = project.edges_and_look("out");
         assert!(
             look["moving_px"][0].as_f64().unwrap() > 3.0,
             "{set}: {look}"

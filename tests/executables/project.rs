@@ -4,9 +4,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use dipir_imaging::file::write_png;
+use dipir_imaging::layers::Layers;
 use dipir_imaging::raster::{DisplayImage, Raster};
 use dipir_light::environment::EnvironmentMap;
 use glam::Vec3;
+use serde_json::Value;
 use tempfile::TempDir;
 
 /// `dipir`.
@@ -146,6 +148,26 @@ impl Project {
         let length = u16::try_from(bytes.len() + 2).unwrap().to_be_bytes();
         let all = [&encoded[..2], &[0xff, 0xe1], &length, &bytes, &encoded[2..]];
         self.write(name, all.concat());
+    }
+
+    /// How many pixels the objects cover in part, and what `look.json` says, of the composite in this folder of artifacts. Its
+    /// layers give its picture.
+    pub fn edges_and_look(&self, out: &str) -> (usize, Value) {
+        let folder = format!("{out}/composite");
+        let layers = Layers::read_exr(self.path(&format!("{folder}/composite.exr"))).unwrap();
+        let alpha = layers.channel("object.A").unwrap().pixels();
+        let [object, shadow, background, picture] =
+            ["object", "shadow", "background", ""].map(|name| layers.rgb(name).unwrap());
+        for (i, a) in alpha.iter().enumerate() {
+            let behind = background.pixels()[i] * shadow.pixels()[i] * (1.0 - a);
+            let (again, picture) = (behind + object.pixels()[i], picture.pixels()[i]);
+            // Half precision has 11 bits, and rounds each layer once.
+            let off = (again - picture).abs().max_element();
+            assert!(off <= 2e-3 * picture.max_element().max(0.01), "{i} {off}");
+        }
+        let edges = alpha.iter().filter(|a| **a > 0.0 && **a < 1.0);
+        let look = serde_json::from_slice(&self.read(&format!("{folder}/look.json"))).unwrap();
+        (edges.count(), look)
     }
 
     /// Reads a file.

@@ -76,3 +76,6 @@ impl Renderer<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -45,6 +45,19 @@ pub fn camera(position: Vec3, target: Vec3, fov_deg: f32, n: u32) -> Camera {
     }
 }
 
+/// Down a street, four metres before a thing on it; `n` pixels square.
+pub fn street(n: u32) -> Camera {
+    camera(Vec3::new(0.0, 1.0, 4.0), Vec3::new(0.0, 0.4, 0.0), 40.0, n)
+}
+
+/// Sends light of 1, and reflects none.
+pub fn glowing() -> Material {
+    Material {
+        emissive: Vec3::ONE,
+        ..matte(Vec3::ZERO)
+    }
+}
+
 /// The ground: y = 0, seen from above.
 pub fn ground() -> Proxy {
     Proxy::Plane(Plane {
