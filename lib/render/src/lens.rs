@@ -6,7 +6,7 @@
 use dipir_imaging::raster::Raster;
 use dipir_numerics::warp::square_to_disk;
 use dipir_scene::camera::{Camera, Ray};
-use glam::{DVec3, Vec2, Vec3};
+use glam::{DVec4, Vec2, Vec3};
 use rayon::prelude::*;
 
 /// A lens without thickness or errors, focused on a plane that faces the camera.
@@ -40,12 +40,13 @@ impl ThinLens {
         camera.focal_px * (self.radius * (1.0 / depth - 1.0 / self.focus).abs())
     }
 
-    /// Shadow ratios as they are seen through the lens; `depth` is the distance along the optical axis of what the pixel
-    /// in a column and row shows of the ground, if it shows any.
+    /// Shadow ratios as they are seen through the lens, of ground that is seen as far as `seen` says; `depth` is the distance along
+    /// the optical axis of what the pixel in a column and row shows of it, if it shows any.
     pub(crate) fn blurred(
         &self,
         camera: &Camera,
         shadow: &Raster<Vec3>,
+        seen: &Raster<f32>,
         depth: impl Fn(usize, usize) -> Option<f32> + Sync,
     ) -> Raster<Vec3> {
         let (width, height) = (shadow.width(), shadow.height());
@@ -66,11 +67,13 @@ impl ThinLens {
             if !shaded[first..end].contains(&true) {
                 return;
             }
-            let missing = Missing::new(shadow, first, end);
+            let missing = Missing::new(shadow, seen, first, end);
             for (i, (pixel, radius)) in output.iter_mut().zip(&radii).enumerate() {
                 if let Some(radius) = radius {
                     let center = [i % width, band * BAND + i / width];
-                    *pixel = Vec3::ONE - missing.mean(center, *radius, height);
+                    if let Some(missing) = missing.mean(center, *radius, height) {
+                        *pixel = Vec3::ONE - missing;
+                    }
                 }
             }
         });
@@ -78,23 +81,27 @@ impl ThinLens {
     }
 }
 
-/// What shadow ratios lack of 1, summed along rows.
+/// What shadow ratios lack of 1, and how much of the ground is seen, summed along rows.
 struct Missing {
     first: usize,
     width: usize,
-    /// Of each row from `first` on, the sums up to each pixel's left side, and the whole.
-    sums: Vec<DVec3>,
+    /// Of each row from `first` on, the sums up to each pixel's left side, and the whole; last how much is seen, which weighs the
+    /// others.
+    sums: Vec<DVec4>,
 }
 
+/// Less of an area is noise, as a share.
+const LEAST_SEEN: f64 = 1e-3;
+
 impl Missing {
-    fn new(shadow: &Raster<Vec3>, first: usize, end: usize) -> Self {
+    fn new(shadow: &Raster<Vec3>, seen: &Raster<f32>, first: usize, end: usize) -> Self {
         let width = shadow.width();
         let mut sums = Vec::with_capacity((end - first) * (width + 1));
         for y in first..end {
-            let mut sum = DVec3::ZERO;
+            let mut sum = DVec4::ZERO;
             sums.push(sum);
-            sums.extend(shadow.row(y).iter().map(|s| {
-                sum += (Vec3::ONE - *s).as_dvec3();
+            sums.extend(shadow.row(y).iter().zip(seen.row(y)).map(|(s, w)| {
+                sum += ((Vec3::ONE - *s).extend(1.0) * *w).as_dvec4();
                 sum
             }));
         }
@@ -102,19 +109,19 @@ impl Missing {
     }
 
     /// Of row `y` up to the position `x`.
-    fn up_to(&self, y: usize, x: f64) -> DVec3 {
+    fn up_to(&self, y: usize, x: f64) -> DVec4 {
         let row = &self.sums[(y - self.first) * (self.width + 1)..][..self.width + 1];
         let at = x.clamp(0.0, self.width as f64);
         let left = (at as usize).min(self.width - 1);
         row[left].lerp(row[left + 1], at - left as f64)
     }
 
-    /// The mean over the part of an ellipse that lies in the picture.
-    fn mean(&self, [x, y]: [usize; 2], radius: Vec2, height: usize) -> Vec3 {
+    /// The mean over what is seen of the part of an ellipse that lies in the picture, if that is anything.
+    fn mean(&self, [x, y]: [usize; 2], radius: Vec2, height: usize) -> Option<Vec3> {
         let radius = radius.as_dvec2().max(glam::DVec2::splat(0.5));
         let middle = x as f64 + 0.5;
         let reach = radius.y as usize;
-        let (mut sum, mut area) = (DVec3::ZERO, 0.0);
+        let (mut sum, mut area) = (DVec4::ZERO, 0.0);
         for row in y.saturating_sub(reach)..(y + reach + 1).min(height) {
             let off = (row as f64 - y as f64) / radius.y;
             let half = radius.x * (1.0 - off * off).max(0.0).sqrt();
@@ -122,7 +129,7 @@ impl Missing {
             sum += self.up_to(row, ends[1]) - self.up_to(row, ends[0]);
             area += ends[1] - ends[0];
         }
-        (sum / area).as_vec3()
+        (sum.w > LEAST_SEEN * area).then(|| (sum.truncate() / sum.w).as_vec3())
     }
 }
 

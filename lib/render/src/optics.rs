@@ -1,9 +1,13 @@
 //! How the photograph was taken, where that was not through a pinhole at one moment.
 use dipir_imaging::raster::Raster;
+use dipir_numerics::hashing::hash_u64s;
 use dipir_numerics::sampler::Sampler;
 use dipir_scene::camera::{Camera, Ray};
 use glam::{Vec2, Vec3};
+use rayon::prelude::*;
 
+use crate::features::with_features;
+use crate::footprint::Footprint;
 use crate::lens::ThinLens;
 use crate::render::{Renderer, Settings};
 use crate::shutter::Shutter;
@@ -68,13 +72,60 @@ impl Renderer<'_> {
             let point = world.proxy_point(&camera.ray(pixel))?;
             Some(camera.depth(point.position))
         };
+        if settings.optics.is_sharp() {
+            return;
+        }
+        let seen = beside(world);
         if let Some(lens) = settings.optics.lens {
-            *shadow = lens.blurred(camera, shadow, depth);
+            *shadow = lens.blurred(camera, shadow, &seen, depth);
         }
         if let Some(shutter) = settings.optics.shutter {
-            *shadow = shutter.blurred(camera, shadow, depth);
+            *shadow = shutter.blurred(camera, shadow, &seen, depth);
         }
     }
+}
+
+/// How much of each pixel is seen beside the objects, by a pinhole that stands still.
+///
+/// Where an object stands on the ground, that is blurred as the object is: what is hidden of it is not seen at the edge, whatever
+/// its ratio.
+fn beside(world: &World) -> Raster<f32> {
+    let camera = world.camera();
+    let bvh = &world.geometry.bvh;
+    let footprint = Footprint::new(camera, Optics::default(), bvh.bounds(), bvh.clusters());
+    let [width, height] = camera.resolution.map(|n| n as usize);
+    let is_hidden = |x: usize, y: usize, place: Vec2| {
+        let ray = camera.ray(Vec2::new(x as f32, y as f32) + place);
+        let key = hash_u64s(&[x as u64, y as u64]);
+        with_features!(world.mask, F => world.closest::<F>(&ray, key).is_some())
+    };
+    let mut hidden = Raster::filled(width, height, false);
+    let rows = hidden.pixels_mut().par_chunks_mut(width).enumerate();
+    rows.for_each(|(y, row)| {
+        for (x, hidden) in row.iter_mut().enumerate() {
+            *hidden = footprint.holds(x as u32, y as u32) && is_hidden(x, y, Vec2::splat(0.5));
+        }
+    });
+    let mut seen = Raster::filled(width, height, 1.0);
+    let rows = seen.pixels_mut().par_chunks_mut(width).enumerate();
+    rows.for_each(|(y, row)| {
+        for (x, seen) in row.iter_mut().enumerate() {
+            let own = *hidden.get(x, y);
+            let around = |n: usize, end: usize| n.saturating_sub(1)..(n + 2).min(end);
+            let mut others = around(y, height).flat_map(|v| around(x, width).map(move |u| (u, v)));
+            *seen = match others.all(|(u, v)| *hidden.get(u, v) == own) {
+                true => f32::from(u8::from(!own)),
+                false => {
+                    let quarters = [(0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)];
+                    let free = quarters
+                        .iter()
+                        .filter(|q| !is_hidden(x, y, Vec2::from(**q)));
+                    0.25 * free.count() as f32
+                }
+            };
+        }
+    });
+    seen
 }
 
 #[cfg(test)]

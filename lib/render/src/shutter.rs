@@ -5,7 +5,7 @@
 //! when it was taken; only the shadow on it is new. Its ratio is averaged along the line that the pixel has seen.
 use dipir_imaging::raster::Raster;
 use dipir_scene::camera::Camera;
-use glam::{Mat3, Quat, Vec2, Vec3};
+use glam::{Mat3, Quat, Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 
 /// Where a camera stands, and how it is turned.
@@ -30,6 +30,8 @@ pub struct Shutter {
 
 /// Lines that reach less far leave a shadow as it is, pixels.
 const LEAST_PX: f32 = 0.25;
+/// Of less of a line, as a share, ratios are noise.
+const LEAST_SEEN: f32 = 1e-3;
 
 impl CameraPose {
     /// Of this camera.
@@ -78,12 +80,13 @@ impl Shutter {
         })
     }
 
-    /// Shadow ratios as they are seen while the shutter is open; `depth` is the distance along the optical axis of what the
-    /// pixel in a column and row shows of the ground, if it shows any.
+    /// Shadow ratios as they are seen while the shutter is open, of ground that is seen as far as `seen` says; `depth` is the
+    /// distance along the optical axis of what the pixel in a column and row shows of it, if it shows any.
     pub(crate) fn blurred(
         &self,
         camera: &Camera,
         shadow: &Raster<Vec3>,
+        seen: &Raster<f32>,
         depth: impl Fn(usize, usize) -> Option<f32> + Sync,
     ) -> Raster<Vec3> {
         let width = shadow.width();
@@ -104,7 +107,10 @@ impl Shutter {
                 let last = at.max(at - opens).max(at - closes);
                 let meets = last.cmpge(low).all() && first.cmple(high).all();
                 if meets && opens.length().max(closes.length()) >= LEAST_PX {
-                    *pixel = 0.5 * (mean(shadow, at, -opens) + mean(shadow, at, -closes));
+                    let sum = mean(shadow, seen, at, -opens) + mean(shadow, seen, at, -closes);
+                    if sum.w > LEAST_SEEN {
+                        *pixel = sum.truncate() / sum.w;
+                    }
                 }
             }
         });
@@ -128,23 +134,24 @@ fn shaded(shadow: &Raster<Vec3>) -> Option<[Vec2; 2]> {
     })
 }
 
-/// The mean of an image along a line from `start`, in the image.
-fn mean(image: &Raster<Vec3>, start: Vec2, along: Vec2) -> Vec3 {
-    let size = Vec2::new(image.width() as f32, image.height() as f32);
+/// The mean of ratios along a line from `start`, in the picture, each weighed by how far it is `seen`; last the mean of that.
+fn mean(ratios: &Raster<Vec3>, seen: &Raster<f32>, start: Vec2, along: Vec2) -> Vec4 {
+    let size = Vec2::new(ratios.width() as f32, ratios.height() as f32);
     let along = clipped(start, along, size);
     let count = 1 + (2.0 * along.length()) as u32;
-    let sum: Vec3 = (0..count)
+    let value = |x: usize, y: usize| ratios.get(x, y).extend(1.0) * *seen.get(x, y);
+    let sum: Vec4 = (0..count)
         .map(|i| {
             let at = start + along * ((i as f32 + 0.5) / count as f32) - 0.5;
             let at = at.clamp(Vec2::ZERO, size - 1.0);
             let low = at.floor();
             let (x, y) = (low.x as usize, low.y as usize);
             let (right, below) = (
-                (x + 1).min(image.width() - 1),
-                (y + 1).min(image.height() - 1),
+                (x + 1).min(ratios.width() - 1),
+                (y + 1).min(ratios.height() - 1),
             );
             let rest = at - low;
-            let row = |y: usize| image.get(x, y).lerp(*image.get(right, y), rest.x);
+            let row = |y: usize| value(x, y).lerp(value(right, y), rest.x);
             row(y).lerp(row(below), rest.y)
         })
         .sum();

@@ -1,6 +1,8 @@
 //! What lens and shutter have in common.
 use dipir_imaging::raster::LinearImage;
 use dipir_imaging::transfer::Transfer;
+use dipir_light::environment::EnvironmentSampler;
+use dipir_numerics::sampler::Stream;
 use dipir_scene::scene::Scene;
 use glam::Quat;
 
@@ -13,7 +15,7 @@ use crate::render::Rendered;
 use crate::shapes::icosphere;
 use crate::shutter::CameraPose;
 use crate::testing::{
-    camera, carry_on, everything, glowing, ground, matte, render, scene, settings, sky, street,
+    camera, carry_on, everything, glowing, ground, matte, render, scene, settings, sky, street, sun,
 };
 
 const SIDE: u32 = 64;
@@ -213,4 +215,78 @@ fn check_finite(scene: &Scene, optics: Optics, name: &str) {
     assert!(finite(&film.object) && finite(&film.shadow), "{case}");
     let covers = |a: &f32| (0.0..=1.0 + 1e-6).contains(a);
     assert!(film.alpha.pixels().iter().all(covers), "{case}");
+}
+
+#[test]
+fn shadows_are_averaged_over_what_each_pixel_sees_of_the_ground() {
+    let view = street(SIDE);
+    let light = sun(Vec3::new(0.5, 1.0, 0.3).normalize(), 4e3, 0.3, 128);
+    let light = EnvironmentSampler::new(light);
+    // Above the ground, and on it: what the ball hides is in its shadow then, and what is beside it in the sun.
+    for height in [0.5, 0.34] {
+        let ball = icosphere(Vec3::new(0.0, height, 0.0), 0.35, 4);
+        let scene = scene(ball, matte(Vec3::splat(0.5)), view, ground());
+        let shadow = |optics| {
+            let settings = Settings {
+                optics,
+                ..settings(256, 5)
+            };
+            render(&scene, &light, &everything(1), &settings)
+                .film
+                .shadow
+        };
+        let sharp = shadow(Optics::default());
+        let ratio_at = |p: Vec2| {
+            let last = Vec2::splat(SIDE as f32 - 1.0);
+            let [x, y] = p.floor().clamp(Vec2::ZERO, last).to_array();
+            sharp.get(x as usize, y as usize).x
+        };
+        let renderer = Renderer::new(&scene);
+        let world = renderer.world(0).unwrap();
+        let lens = through(0.06, 1.2);
+        let along = moving(&view, Vec3::X * 0.15, Vec3::ZERO);
+        let into = moving(&view, Vec3::Z * -0.3, Vec3::ZERO);
+        let turning = moving(&view, Vec3::ZERO, Vec3::new(0.02, 0.04, 0.08));
+        let all = moving(
+            &view,
+            Vec3::new(0.1, 0.04, 0.1),
+            Vec3::new(-0.02, 0.05, 0.03),
+        );
+        for optics in [lens, along, into, turning, all] {
+            let soft = shadow(optics);
+            let (mut most, mut changed) = (0f32, 0f32);
+            for i in 0..(SIDE * SIDE) as usize {
+                let (x, y) = (i % SIDE as usize, i / SIDE as usize);
+                let corner = Vec2::new(x as f32, y as f32);
+                // What of the ground is seen beside the ball, and its ratio, looked up where the pinhole sees it.
+                let (mut seen, mut sum, mut is_whole) = (0.0, 0.0, true);
+                for k in 0..512 {
+                    let mut sampler = Sampler::new(7, Stream::TEST, 0, k);
+                    let place = corner + sampler.next_2d();
+                    let ray = optics.ray(&view, place, &mut sampler);
+                    if world.closest::<0>(&ray, 0).is_some() {
+                        continue;
+                    }
+                    let ahead = -ray.origin.y / ray.direction.y;
+                    match view.project(ray.origin + ray.direction * ahead) {
+                        Some(p) if ahead > 0.0 => {
+                            is_whole &= p.min_element() >= 0.0 && p.max_element() <= SIDE as f32;
+                            seen += 1.0 / 512.0;
+                            sum += ratio_at(p) / 512.0;
+                        }
+                        _ => is_whole = false,
+                    }
+                }
+                // Beside the picture nothing is known.
+                if is_whole {
+                    let off = (sum - seen * soft.get(x, y).x).abs();
+                    most = most.max(off);
+                    changed = changed.max((sharp.get(x, y).x - soft.get(x, y).x).abs());
+                }
+            }
+            // A ratio is looked up as that of a whole pixel, up to half a pixel off: of an edge by .8 over lines and discs of
+            // eight pixels that is .05.
+            assert!(most < 0.05 && changed > 0.1, "{height} {most} {changed}");
+        }
+    }
 }

@@ -121,7 +121,8 @@ pub fn run(session: &Session, args: &StopArgs) -> anyhow::Result<Done> {
     table.check(&session.config)?;
     let mut inputs = read(session)?;
     materials::use_recovered(session, &mut inputs.scene)?;
-    table.scale_emission(&mut inputs.scene.loaded.scene);
+    let glows = table.scale_emission(&mut inputs.scene.loaded.scene);
+    table.warn_of_unused(session, glows);
     let proxy = &inputs.scene.loaded.scene.proxy;
     if table.gloss().is_some() && !matches!(proxy, Proxy::Plane(_)) {
         session.warn("composite.ground_roughness: only a plane mirrors the objects, and [scene.proxy] is not one");

@@ -2,6 +2,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use dipir_cli::session::Session;
 use dipir_imaging::tone::ToneCurves;
 use dipir_pipeline::config::{Config, Quality};
 use dipir_pipeline::error::ConfigError;
@@ -245,16 +246,24 @@ impl CompositeTable {
         self.emission_gain().map(|_| params)
     }
 
-    /// Makes the objects of `scene` glow as much as the table says.
-    pub fn scale_emission(&self, scene: &mut Scene) {
-        let Some(gain) = self.emission_gain() else {
-            return;
-        };
+    /// Makes the objects of `scene` glow as much as the table says; whether any does.
+    pub fn scale_emission(&self, scene: &mut Scene) -> bool {
+        let gain = self.emission_gain().unwrap_or(Vec3::ONE);
+        let mut glows = false;
         for material in &mut scene.materials {
+            glows |= material.unlit || material.emissive != Vec3::ZERO;
             material.emissive *= gain;
             if material.unlit {
                 material.base_color *= gain.extend(1.0);
             }
+        }
+        glows
+    }
+
+    /// Warns of keys about what objects emit if none `glows`. Of the frames of a shot they are set in any case.
+    pub(super) fn warn_of_unused(&self, session: &Session, glows: bool) {
+        if !glows && self.emission_gain().is_some() && session.placed.is_none() {
+            session.warn("composite.emission_ev, emission_tint: no object emits light");
         }
     }
 
