@@ -37,10 +37,11 @@ pub fn run(args: &StatusArgs) -> anyhow::Result<()> {
     let all = graph::assess(&session, &graph, &needed)?;
     let frames = shot::folders(&session.out);
     let made = frames.iter().filter(|frame| shot::is_made(frame)).count();
-    let words = || match made {
+    let begun = frames.len();
+    let words = || match begun {
         0 => in_words(&all),
         _ => format!(
-            "{}\nframes     {made} in {}; dipir shot --plan FRAME… says which of them are up to date",
+            "{}\nframes     {made} of {begun} that were begun, in {}; dipir shot --plan FRAME… says which of them are up to date",
             in_words(&all),
             printable(&session.out.join(shot::FOLDER).display().to_string()),
         ),

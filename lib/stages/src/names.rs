@@ -24,7 +24,7 @@ pub struct StageName {
 pub const SCENE: StageName = StageName {
     name: "scene",
     executable: "dipir-scene",
-    version: 20,
+    version: 21,
 };
 /// Samples images of the object's class.
 pub const CONCEPTS: StageName = StageName {
@@ -48,7 +48,7 @@ pub const LIGHT: StageName = StageName {
 pub const COMPOSITE: StageName = StageName {
     name: "composite",
     executable: "dipir-composite",
-    version: 20,
+    version: 21,
 };
 
 /// All stages, each after those that it reads.
