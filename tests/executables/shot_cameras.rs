@@ -291,7 +291,11 @@ fn objects_and_ground_are_as_in_the_photograph() {
     assert_ne!(of("out/frames/f.1")["objects"], frame["objects"]);
     let status = project.run(DIPIR, &["status"]);
     status.expect_success();
-    assert!(status.stdout.contains("1 in "), "{}", status.stdout);
+    assert!(
+        status.stdout.contains("1 of 1 that were begun, in "),
+        "{}",
+        status.stdout
+    );
 }
 
 #[test]

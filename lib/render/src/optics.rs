@@ -75,7 +75,7 @@ impl Renderer<'_> {
         if settings.optics.is_sharp() {
             return;
         }
-        let seen = beside(world);
+        let seen = beside(world, camera);
         if let Some(lens) = settings.optics.lens {
             *shadow = lens.blurred(camera, shadow, &seen, depth);
         }
@@ -85,12 +85,11 @@ impl Renderer<'_> {
     }
 }
 
-/// How much of each pixel is seen beside the objects, by a pinhole that stands still.
+/// How much of each pixel of `camera` is seen beside the objects, by a pinhole that stands still.
 ///
 /// Where an object stands on the ground, that is blurred as the object is: what is hidden of it is not seen at the edge, whatever
 /// its ratio.
-fn beside(world: &World) -> Raster<f32> {
-    let camera = world.camera();
+fn beside(world: &World, camera: &Camera) -> Raster<f32> {
     let bvh = &world.geometry.bvh;
     let footprint = Footprint::new(camera, Optics::default(), bvh.bounds(), bvh.clusters());
     let [width, height] = camera.resolution.map(|n| n as usize);
