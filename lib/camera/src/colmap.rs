@@ -88,7 +88,7 @@ impl Files {
         dipir_files::read(&path).map_err(|source| CameraError::Read { path, source })
     }
 
-    /// Of the images, whose points make it a hundred times as long as what is read of it.
+    /// The file of the images, opened: most of it is 2D points, which are passed over.
     fn images(&self) -> Result<BufReader<File>, CameraError> {
         let path = self.part("images");
         let opened = dipir_files::open(&path);

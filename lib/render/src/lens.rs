@@ -40,8 +40,8 @@ impl ThinLens {
         camera.focal_px * (self.radius * (1.0 / depth - 1.0 / self.focus).abs())
     }
 
-    /// Shadow ratios as they are seen through the lens, of ground that is seen as far as `seen` says; `depth` is the distance along
-    /// the optical axis of what the pixel in a column and row shows of it, if it shows any.
+    /// The shadow ratios, averaged over the lens. `seen` is the share of each pixel that shows ground, and `depth` the ground's
+    /// distance along the optical axis in a column and row, metres, if there is any.
     pub(crate) fn blurred(
         &self,
         camera: &Camera,
@@ -81,16 +81,16 @@ impl ThinLens {
     }
 }
 
-/// What shadow ratios lack of 1, and how much of the ground is seen, summed along rows.
+/// What shadow ratios lack of 1, and the shares of pixels that show ground, summed along rows.
 struct Missing {
     first: usize,
     width: usize,
-    /// Of each row from `first` on, the sums up to each pixel's left side, and the whole; last how much is seen, which weighs the
-    /// others.
+    /// Of each row from `first` on, the sums up to each pixel's left side, and the whole. The fourth number sums the shares, by
+    /// which the others are weighed.
     sums: Vec<DVec4>,
 }
 
-/// Less of an area is noise, as a share.
+/// Least share of a disc that has to be seen beside the objects for its ratios to be averaged.
 const LEAST_SEEN: f64 = 1e-3;
 
 impl Missing {

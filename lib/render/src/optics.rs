@@ -42,7 +42,7 @@ impl Optics {
         }
     }
 
-    /// How far from `pixel` a point that it shows at this distance along the optical axis, metres, is seen at most, pixels.
+    /// The most that blur moves a point from `pixel`, which shows it at the distance `depth` along the optical axis, metres; pixels.
     pub(crate) fn reach_px(&self, camera: &Camera, pixel: Vec2, depth: f32) -> Vec2 {
         let disc = self.lens.map_or(Vec2::ZERO, |l| l.blur_px(camera, depth));
         let Some(shutter) = &self.shutter else {
@@ -62,6 +62,9 @@ impl Renderer<'_> {
         world: &World,
         settings: &Settings,
     ) {
+        if settings.optics.is_sharp() {
+            return;
+        }
         let camera = self.camera();
         let depth = |x: usize, y: usize| {
             let pixel = Vec2::new(x as f32, y as f32) + 0.5;
@@ -72,9 +75,6 @@ impl Renderer<'_> {
             let point = world.proxy_point(&camera.ray(pixel))?;
             Some(camera.depth(point.position))
         };
-        if settings.optics.is_sharp() {
-            return;
-        }
         let seen = beside(world, camera);
         if let Some(lens) = settings.optics.lens {
             *shadow = lens.blurred(camera, shadow, &seen, depth);
@@ -85,10 +85,9 @@ impl Renderer<'_> {
     }
 }
 
-/// How much of each pixel of `camera` is seen beside the objects, by a pinhole that stands still.
+/// The share of each pixel of `camera` that no object covers, through a pinhole that stands still.
 ///
-/// Where an object stands on the ground, that is blurred as the object is: what is hidden of it is not seen at the edge, whatever
-/// its ratio.
+/// Ground that an object hides has a ratio, too. It must not count beside the object, where it is never seen.
 fn beside(world: &World, camera: &Camera) -> Raster<f32> {
     let bvh = &world.geometry.bvh;
     let footprint = Footprint::new(camera, Optics::default(), bvh.bounds(), bvh.clusters());

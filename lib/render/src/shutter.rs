@@ -28,9 +28,9 @@ pub struct Shutter {
     pub closes: CameraPose,
 }
 
-/// Lines that reach less far leave a shadow as it is, pixels.
+/// Least reach of a line that changes a shadow, pixels.
 const LEAST_PX: f32 = 0.25;
-/// Of less of a line, as a share, ratios are noise.
+/// Least share of a line that has to be seen beside the objects for its ratios to be averaged.
 const LEAST_SEEN: f32 = 1e-3;
 
 impl CameraPose {
@@ -42,7 +42,7 @@ impl CameraPose {
         }
     }
 
-    /// On the way to `end`, of which `share` is behind it.
+    /// The pose at this share of the way to `end`: a straight line, and the shortest turn.
     pub fn towards(&self, end: &Self, share: f32) -> Self {
         Self {
             position: self.position.lerp(end.position, share),
@@ -67,8 +67,8 @@ impl Shutter {
         }
     }
 
-    /// How far from `pixel` the point that it shows at this distance along the optical axis, metres, is seen where the shutter
-    /// opens and where it closes, pixels. The distance may be infinite. `None` where the point is not before the camera then.
+    /// Offsets from `pixel`, in pixels, of the point that it shows, when the shutter opens and when it closes. `depth` is the
+    /// point's distance along the optical axis, metres; it may be infinite. `None` where the point is then behind the camera.
     pub fn ends_px(&self, camera: &Camera, pixel: Vec2, depth: f32) -> [Option<Vec2>; 2] {
         let d = (pixel - camera.principal_px) / camera.focal_px;
         let ray = camera.rotation * Vec3::new(d.x, -d.y, -1.0);
@@ -80,8 +80,8 @@ impl Shutter {
         })
     }
 
-    /// Shadow ratios as they are seen while the shutter is open, of ground that is seen as far as `seen` says; `depth` is the
-    /// distance along the optical axis of what the pixel in a column and row shows of it, if it shows any.
+    /// The shadow ratios, averaged over the time that the shutter is open. `seen` is the share of each pixel that shows ground, and
+    /// `depth` the ground's distance along the optical axis in a column and row, metres, if there is any.
     pub(crate) fn blurred(
         &self,
         camera: &Camera,
@@ -99,7 +99,7 @@ impl Shutter {
             for (x, pixel) in row.iter_mut().enumerate() {
                 let at = Vec2::new(x as f32, y as f32) + 0.5;
                 let ends = depth(x, y).map(|depth| self.ends_px(camera, at, depth));
-                // What lies behind the camera then is nowhere in the picture.
+                // A point that is behind the camera at either end has no place in the picture then.
                 let Some([Some(opens), Some(closes)]) = ends else {
                     continue;
                 };

@@ -297,7 +297,7 @@ pub(crate) fn named(part: &Path, path: &Path, base_dir: &Path) -> PathBuf {
     match part.strip_prefix(&whole) {
         _ if part == whole => path.into(),
         Ok(inside) => path.join(inside),
-        // A file that is found from the folder of the one that is named.
+        // A file beside the named one, or one that is found from its folder.
         Err(_) => match whole.parent().map(|folder| part.strip_prefix(folder)) {
             Some(Ok(beside)) => path.with_file_name(beside),
             _ => part.into(),

@@ -341,6 +341,22 @@ mod tests {
     }
 
     #[test]
+    fn a_camera_of_kitti_that_is_named_is_that_of_every_picture() {
+        let folder = tempfile::tempdir().unwrap();
+        let line = |n: u32| format!("P{n}: 700 0 300 0 0 700 200 0 0 0 1 0\n");
+        std::fs::write(folder.path().join("calib.txt"), line(0) + &line(1)).unwrap();
+        let stands_still = |more: &str| {
+            let config = format!("file = \"calib.txt\"\n{more}");
+            let config: CameraConfig = toml::from_str(&config).unwrap();
+            match config.validate(Path::new("a.png")).unwrap() {
+                CameraSettings::File(file) => file.stands_still(folder.path()),
+                CameraSettings::LookAt { .. } => panic!("a file"),
+            }
+        };
+        assert!(stands_still("frame = 0") && !stands_still(""));
+    }
+
+    #[test]
     fn a_key_that_the_file_has_is_refused() {
         for key in [
             "position = [0.0, 1.0, 0.0]",

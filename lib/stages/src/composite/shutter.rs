@@ -14,7 +14,7 @@ use super::look::Blurs;
 use super::table::CompositeTable;
 use crate::scene::with_place;
 
-/// Lines that are shorter are not seen, pixels.
+/// Least length of a line that is seen as one, pixels.
 const LEAST_PX: f32 = 0.5;
 /// Degrees of a shutter that is open from frame to frame.
 const WHOLE_DEG: f32 = 360.0;
@@ -75,7 +75,7 @@ impl CompositeTable {
         let beside = neighbours(config, Some(&loaded.taken().facts))?;
         let middle = CameraPose::of(&loaded.scene.camera);
         let half = 0.5 * shutter_deg / WHOLE_DEG;
-        // Half of the time that the shutter is open towards a neighbour or, on the other side, away from it.
+        // The way of half of the exposure, towards the neighbour or, by a negative sign, away from it.
         let along = |n: &Neighbour, share: f32| {
             middle.towards(&pose_of(n), share * half / n.frames.unsigned_abs() as f32)
         };
